@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+#
+# Every third-party library of the runtime, and the only place where versions are pinned.
+
+# ggml: the graph library of llama.cpp, from the package registry unless VLA_GGML_DIR names a tree.
+set(VLA_GGML_ARCHIVE llama_cpp_python-0.3.36)
+set(VLA_GGML_SHA256 832db0699007f1be95a7e41ef12e88926b02ba836461e36a36372db2760c1a2e)
+
+function(vla_fetch_ggml out)
+  set(cache ${CMAKE_SOURCE_DIR}/.cache)
+  set(archive ${cache}/${VLA_GGML_ARCHIVE}.tar.gz)
+  set(tree ${cache}/${VLA_GGML_ARCHIVE}/vendor/llama.cpp/ggml)
+  set(${out} ${tree} PARENT_SCOPE)
+  if(EXISTS ${tree}/.complete)
+    return()
+  endif()
+  if(NOT EXISTS ${archive})
+    message(STATUS "Downloading ggml (75 MB, once)")
+    find_program(VLA_PYTHON NAMES python3 PATHS ${CMAKE_SOURCE_DIR}/.venv/bin NO_DEFAULT_PATH)
+    find_program(VLA_PYTHON NAMES python3 REQUIRED)
+    execute_process(
+      COMMAND ${VLA_PYTHON} -m pip download --quiet --disable-pip-version-check --no-deps --no-binary llama-cpp-python
+              --require-hashes -r ${CMAKE_SOURCE_DIR}/cmake/ggml-requirements.txt -d ${cache}
+      RESULT_VARIABLE failed ERROR_VARIABLE why)
+    if(failed)
+      message(FATAL_ERROR "ggml could not be downloaded with pip:\n${why}\n"
+                          "Without a network, pass -DVLA_GGML_DIR=/path/to/llama.cpp/ggml")
+    endif()
+  endif()
+  file(SHA256 ${archive} found)
+  if(NOT found STREQUAL VLA_GGML_SHA256)
+    message(FATAL_ERROR "${archive}: expected SHA-256 ${VLA_GGML_SHA256}, found ${found}; delete it and configure again")
+  endif()
+  file(ARCHIVE_EXTRACT INPUT ${archive} DESTINATION ${cache} PATTERNS "${VLA_GGML_ARCHIVE}/vendor/llama.cpp/ggml/*")
+  file(TOUCH ${tree}/.complete)
+endfunction()
+
+set(vla_ggml_tree ${VLA_GGML_DIR})
+if(NOT vla_ggml_tree)
+  vla_fetch_ggml(vla_ggml_tree)
+endif()
+set(BUILD_SHARED_LIBS OFF)
+set(GGML_NATIVE ${VLA_NATIVE} CACHE BOOL "" FORCE)
+set(GGML_OPENMP OFF CACHE BOOL "" FORCE)      # one persistent pool of ours instead: its threads sleep between requests
+set(GGML_LLAMAFILE ON CACHE BOOL "" FORCE)    # blocked float32 products
+set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle uses
+set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)
+set(GGML_BUILD_EXAMPLES OFF CACHE BOOL "" FORCE)
+add_subdirectory(${vla_ggml_tree} ${CMAKE_BINARY_DIR}/ggml EXCLUDE_FROM_ALL)
+
+# Debian packages: README.md lists them, `make packages` installs them.
+find_package(fmt REQUIRED)
+find_package(nlohmann_json REQUIRED)
+find_package(JPEG REQUIRED)
+find_package(PNG REQUIRED)
+find_package(Threads REQUIRED)
+find_path(VLA_CLI11_DIR CLI/CLI.hpp REQUIRED)
+find_path(VLA_XXHASH_DIR xxhash.h REQUIRED)
+find_library(VLA_XXHASH_LIBRARY xxhash REQUIRED)
