@@ -1,0 +1,57 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <memory>
+#include <span>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "base/result.h"
+#include "bundle/keys.h"
+
+namespace vla {
+
+enum class DType { f32, f16, bf16, i32 };
+
+const char* dtype_name(DType type);
+std::size_t dtype_size(DType type);
+
+/// A tensor as it lies in the file. `shape` follows ggml: fastest dimension first.
+struct TensorInfo {
+  std::string name;
+  DType type;
+  std::vector<std::int64_t> shape;
+  std::span<const std::byte> data;
+
+  std::int64_t count() const;
+};
+
+/// An opened, fully checked GGUF file: see docs/bundle.md. The file is mapped, and every length in it was compared with
+/// the file's size before it was used, so that a truncated or hostile file is refused instead of read.
+class Bundle {
+ public:
+  /// Maps the file, parses it, and compares checksum and version. Errors: io, bad_bundle.
+  static Result<Bundle> open(const std::string& path);
+  /// The same on bytes in memory, which must outlive the bundle.
+  static Result<Bundle> parse(std::span<const std::byte> bytes, std::string name);
+
+  const std::string& path() const { return path_; }
+  const Keys& keys() const { return keys_; }
+  const std::vector<TensorInfo>& tensors() const { return tensors_; }
+  const TensorInfo* find(std::string_view name) const;
+  /// A one-dimensional f32 tensor of finite values, for statistics. Errors: bad_bundle.
+  Result<std::vector<float>> stats(std::string_view name) const;
+  std::size_t file_size() const { return bytes_.size(); }
+
+ private:
+  std::string path_;
+  std::shared_ptr<const void> mapping_;
+  std::span<const std::byte> bytes_;
+  Keys keys_;
+  std::vector<TensorInfo> tensors_;
+};
+
+}  // namespace vla
