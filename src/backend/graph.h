@@ -1,0 +1,72 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <functional>
+#include <map>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "backend/device.h"
+#include "backend/store.h"
+#include "backend/weights.h"
+
+namespace vla {
+
+/// Chooses taps by path; see `match_path`. An empty pattern records nothing.
+using TapPattern = std::string;
+
+/// `*` stands for any characters; several patterns are separated by commas: `lm.blk.*,chunk`.
+bool match_path(const std::string& pattern, const std::string& path);
+
+/// Working memory that all graphs share, since only one of them runs at a time.
+class ComputeMemory {
+ public:
+  explicit ComputeMemory(const Device& device) : allocator_(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend()))) {}
+  ggml_gallocr_t allocator() const { return allocator_.get(); }
+  std::size_t size() const { return ggml_gallocr_get_buffer_size(allocator_.get(), 0); }
+
+ private:
+  ggml_gallocr_ptr allocator_;
+};
+
+/// One graph: built once, given memory once, then run as often as wanted. `nn` adds operations through `context()`.
+class Graph {
+ public:
+  /// `store` holds what outlives a run: constants that modules ask for, and whatever the owner adds.
+  Graph(const Weights& weights, Store& store, TapPattern taps);
+
+  ggml_context* context() const { return context_.get(); }
+  Tensor weight(const Param* param) const { return weights_[param]; }
+  Store& store() { return store_; }
+
+  /// Values that depend on the shape alone (masks, rotary tables): made once per graph for each `key`.
+  Tensor constant(const std::string& key, const std::function<Tensor(Store&)>& make);
+
+  /// Gives `value` its path; where the path matches the tap pattern, its values are kept for `taps`.
+  Tensor name(const std::string& path, Tensor value);
+  /// Orders `value` into the graph: results, and writes into the store.
+  void require(Tensor value);
+  /// Writes `value` into `target`, a tensor of the store.
+  void write(Tensor value, Tensor target);
+
+  /// After everything is built and the store is allocated. Errors: out_of_memory.
+  Status allocate(ComputeMemory& memory);
+  /// Errors: device.
+  Status run(const Device& device);
+
+  int n_node() const;
+  const std::vector<std::pair<std::string, Tensor>>& taps() const { return taps_; }
+
+ private:
+  const Weights& weights_;
+  Store& store_;
+  TapPattern pattern_;
+  ggml_context_ptr context_;
+  ggml_cgraph* graph_;
+  std::map<std::string, Tensor> constants_;
+  std::vector<std::pair<std::string, Tensor>> taps_;
+};
+
+}  // namespace vla
