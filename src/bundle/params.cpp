@@ -8,9 +8,6 @@
 namespace vla {
 namespace {
 
-constexpr int kMaxDim = 1 << 24;
-constexpr int kMaxLayers = 512;
-
 std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
 
 }  // namespace
@@ -75,17 +72,10 @@ T Scope::take(Result<T> result, T otherwise) const {
   return otherwise;
 }
 
-int Scope::dim(const std::string& key) const {
+int Scope::dim(const std::string& key, int max) const {
   const int value = take(list_->keys().integer(key_of(key)), 1);
-  const bool in_range = value >= 1 && value <= kMaxDim;
-  require(in_range, key, fmt::format("1 to {}", kMaxDim), std::to_string(value));
-  return in_range ? value : 1;
-}
-
-int Scope::n_layer(const std::string& key) const {
-  const int value = take(list_->keys().integer(key_of(key)), 1);
-  const bool in_range = value >= 1 && value <= kMaxLayers;
-  require(in_range, key, fmt::format("1 to {}", kMaxLayers), std::to_string(value));
+  const bool in_range = value >= 1 && value <= max;
+  require(in_range, key, fmt::format("1 to {}", max), std::to_string(value));
   return in_range ? value : 1;
 }
 
