@@ -9,25 +9,14 @@ namespace {
 constexpr std::size_t kNodesPerParam = 48;
 constexpr std::size_t kLeastNodes = 4096;
 
-bool match_one(std::string_view pattern, std::string_view path) {
-  if (pattern.empty()) return path.empty();
-  if (pattern.front() == '*') return match_one(pattern.substr(1), path) || (!path.empty() && match_one(pattern, path.substr(1)));
-  return !path.empty() && pattern.front() == path.front() && match_one(pattern.substr(1), path.substr(1));
-}
-
 }  // namespace
 
-bool match_path(const std::string& pattern, const std::string& path) {
-  std::string_view rest = pattern;
-  while (!rest.empty()) {
-    const std::size_t comma = std::min(rest.find(','), rest.size());
-    if (comma > 0 && match_one(rest.substr(0, comma), path)) return true;
-    rest.remove_prefix(std::min(comma + 1, rest.size()));
-  }
-  return false;
+Status ComputeMemory::reserve(ggml_cgraph* graph) {
+  if (ggml_gallocr_reserve(allocator_.get(), graph)) return {};
+  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation", "free memory or use a smaller model"};
 }
 
-Graph::Graph(const Weights& weights, Store& store, TapPattern taps) : weights_(weights), store_(store), pattern_(std::move(taps)) {
+Graph::Graph(const Weights& weights, Store& store, TapFilter keep) : weights_(weights), store_(store), keep_(std::move(keep)) {
   const std::size_t n_node = kLeastNodes + kNodesPerParam * weights.count();
   const std::size_t memory = ggml_graph_overhead_custom(n_node, false) + n_node * ggml_tensor_overhead();
   context_.reset(ggml_init({.mem_size = memory, .mem_buffer = nullptr, .no_alloc = true}));
@@ -41,7 +30,7 @@ Tensor Graph::constant(const std::string& key, const std::function<Tensor(Store&
 }
 
 Tensor Graph::name(const std::string& path, Tensor value) {
-  if (pattern_.empty() || !match_path(pattern_, path)) return value;
+  if (!keep_ || !keep_(path)) return value;
   // A view's memory belongs to another tensor, which may be overwritten later in the run: keep a copy.
   ggml_tensor* kept = value.node();
   if (kept->view_src != nullptr || !ggml_is_contiguous(kept)) kept = ggml_cont(context_.get(), kept);
@@ -57,7 +46,7 @@ void Graph::write(Tensor value, Tensor target) { require(ggml_cpy(context_.get()
 
 Status Graph::allocate(ComputeMemory& memory) {
   if (ggml_gallocr_alloc_graph(memory.allocator(), graph_)) return {};
-  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation", "free memory or use a smaller model"};
+  return Error{Code::out_of_memory, "working memory", "", "the graph does not fit into what was reserved for it"};
 }
 
 Status Graph::run(const Device& device) {
