@@ -28,18 +28,13 @@ void upload(Tensor tensor, const Param& param) {
 
 }  // namespace
 
-Result<Weights> Weights::load(const ParamList& list, const Device& device) {
+Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill) {
   Weights weights(list.params().size());
   for (const Param& param : list.params()) weights.tensors_.push_back(weights.store_.add(resident_type(param), param.shape));
   VLA_CHECK(weights.store_.allocate(device));
-  for (const Param& param : list.params()) upload(weights[&param], param);
+  if (fill == Fill::yes)
+    for (const Param& param : list.params()) upload(weights[&param], param);
   return weights;
-}
-
-std::size_t Weights::predict_size(const ParamList& list) {
-  std::size_t bytes = 0;
-  for (const Param& param : list.params()) bytes += static_cast<std::size_t>(param.count()) * ggml_type_size(resident_type(param));
-  return bytes;
 }
 
 }  // namespace vla

@@ -13,14 +13,15 @@ namespace vla {
 /// float32 reference whatever the bundle's dtype; tables keep their dtype, since a looked-up row is widened exactly.
 class Weights {
  public:
-  /// Every parameter must have its source: call ParamList::report first. Errors: out_of_memory.
-  static Result<Weights> load(const ParamList& list, const Device& device);
+  enum class Fill { no, yes };
+
+  /// Every parameter must have its source: call ParamList::report first. Without filling, memory is reserved and never
+  /// touched, which is enough to learn sizes. Errors: out_of_memory.
+  static Result<Weights> load(const ParamList& list, const Device& device, Fill fill);
 
   Tensor operator[](const Param* param) const { return tensors_[static_cast<std::size_t>(param->id)]; }
   std::size_t size() const { return store_.size(); }
   std::size_t count() const { return tensors_.size(); }
-  /// Bytes that `load` will take for this list.
-  static std::size_t predict_size(const ParamList& list);
 
  private:
   explicit Weights(std::size_t n_param) : store_(n_param) {}

@@ -25,15 +25,16 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   VLA_TRY(Device device, Device::cpu(options.n_thread));
   std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
   engine->tap_pattern_ = options.tap_pattern;
-  VLA_CHECK(engine->load_policy());
+  VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
   engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_, engine->solver_,
                                                        engine->conditions_, engine->d_action_, engine->horizon_, engine->tap_pattern_});
   VLA_CHECK(engine->warm_up());
+  engine->bundle_.release_pages();
   return engine;
 }
 
-Status Engine::load_policy() {
+Status Engine::load_policy(bool dry) {
   const Keys& keys = bundle_.keys();
   VLA_TRY(const std::string arch, keys.string("vla.arch"));
   VLA_TRY(const PolicyEntry entry, find_policy(arch));
@@ -47,7 +48,7 @@ Status Engine::load_policy() {
   if (horizon_ < 1 || horizon_ > kMaxHorizon)
     return Error{Code::bad_bundle, "policy.horizon", fmt::format("1 to {}", kMaxHorizon), std::to_string(horizon_)};
   VLA_CHECK(agree("policy.d_state", d_state_, processor_.d_state()));
-  VLA_TRY(Weights weights, Weights::load(*params_, device_));
+  VLA_TRY(Weights weights, Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes));
   weights_ = std::make_unique<Weights>(std::move(weights));
   return {};
 }
@@ -71,8 +72,9 @@ Status Engine::warm_up() {
   const InputShape largest = {processor_.image_width(), processor_.image_height(), static_cast<int>(processor_.views().size()),
                               processor_.max_text_tokens(), d_state_};
   VLA_CHECK(policy_->check(largest));
-  const auto plan = plans_->for_shape(largest);
-  return plan ? Status() : Status(plan.error());
+  VLA_TRY(const Plan* plan, plans_->for_shape(largest));
+  largest_plan_ = plan->size();
+  return {};
 }
 
 Result<std::vector<float>> Engine::start(const Noise& noise) const {
@@ -112,6 +114,6 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   return chunk;
 }
 
-MemoryUse Engine::memory() const { return {weights_->size() + tables_->size(), 0, plans_->working_size()}; }
+MemoryUse Engine::memory() const { return {weights_->size() + tables_->size(), largest_plan_, plans_->working_size()}; }
 
 }  // namespace vla

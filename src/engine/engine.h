@@ -17,6 +17,7 @@ namespace vla {
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
+  bool dry = false;         // reserve memory without filling it: sizes are exact, and `act` must not be called
 };
 
 /// What a policy answers to one observation.
@@ -29,9 +30,10 @@ struct ActionChunk {
   std::vector<Tap> taps;
 };
 
-/// Memory by what it holds, in bytes.
+/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of one plan; what graphs share while they run.
 struct MemoryUse {
   std::size_t weights = 0, plan = 0, working = 0;
+  std::size_t total() const { return weights + plan + working; }
 };
 
 /// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps, unnormalize.
@@ -47,11 +49,15 @@ class Engine {
   const Bundle& bundle() const { return bundle_; }
   const Processor& processor() const { return processor_; }
   const Device& device() const { return device_; }
+  const Solver& solver() const { return solver_; }
+  const ParamList& params() const { return *params_; }
+  int horizon() const { return horizon_; }
+  int d_action() const { return d_action_; }
   MemoryUse memory() const;
 
  private:
   Engine(Bundle bundle, Processor processor, Device device) : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
-  Status load_policy();
+  Status load_policy(bool dry);
   Status make_conditions();
   Status warm_up();
   Result<std::vector<float>> start(const Noise& noise) const;
@@ -68,6 +74,7 @@ class Engine {
   std::unique_ptr<Store> tables_;
   Tensor conditions_;
   std::unique_ptr<Plans> plans_;
+  std::size_t largest_plan_ = 0;
 };
 
 }  // namespace vla
