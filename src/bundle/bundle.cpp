@@ -117,6 +117,10 @@ Result<Bundle> Bundle::parse(std::span<const std::byte> bytes, std::string name)
   return bundle;
 }
 
+void Bundle::release_pages() const {
+  if (mapping_) ::madvise(const_cast<void*>(mapping_.get()), bytes_.size(), MADV_DONTNEED);
+}
+
 const TensorInfo* Bundle::find(std::string_view name) const {
   for (const TensorInfo& tensor : tensors_)
     if (tensor.name == name) return &tensor;
