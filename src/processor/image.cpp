@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include "base/npy.h"
 #include "processor/image_codecs.h"
 
 namespace vla {
@@ -41,6 +42,18 @@ Result<Frame> decode_picture(codecs::Bytes file, const std::string& where, const
   return Frame{picture.width, picture.height, std::move(picture.rgb)};
 }
 
+Result<Frame> decode_npy(codecs::Bytes file, const std::string& where, const ImageLimits& limits) {
+  VLA_TRY(NpyArray array, parse_npy(file, where));
+  if (array.shape.size() != 3 || array.shape[2] != 3)
+    return codecs::refused(where, "an array (height, width, 3)",
+                           fmt::format("shape ({})", fmt::join(array.shape, ", ")));
+  const auto height = static_cast<std::int64_t>(array.shape[0]), width = static_cast<std::int64_t>(array.shape[1]);
+  VLA_CHECK(codecs::check_size(width, height, where, limits));
+  Frame frame{static_cast<int>(width), static_cast<int>(height), std::move(array.values)};
+  VLA_CHECK(check_frame(frame, where, limits));
+  return frame;
+}
+
 }  // namespace
 
 Status check_frame(const Frame& frame, const std::string& where, const ImageLimits& limits) {
@@ -58,10 +71,8 @@ Result<Frame> decode_image(std::span<const std::byte> file, const std::string& w
   constexpr const char* kFormats = "a PNG, JPEG or .npy image";
   if (file.empty()) return codecs::refused(where, kFormats, "an empty file");
   if (codecs::is_png(file) || codecs::is_jpeg(file)) return decode_picture(file, where, limits);
-  if (!codecs::is_npy(file)) return codecs::refused(where, kFormats, "a file of another kind");
-  VLA_TRY(Frame frame, codecs::decode_npy(file, where, limits));
-  VLA_CHECK(check_frame(frame, where, limits));
-  return frame;
+  if (is_npy(file)) return decode_npy(file, where, limits);
+  return codecs::refused(where, kFormats, "a file of another kind");
 }
 
 }  // namespace vla

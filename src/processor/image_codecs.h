@@ -30,10 +30,8 @@ Status check_size(std::int64_t width, std::int64_t height, const std::string& wh
 
 bool is_png(Bytes file);
 bool is_jpeg(Bytes file);
-bool is_npy(Bytes file);
 Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits);
 Result<Picture> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits);
-Result<Frame> decode_npy(Bytes file, const std::string& where, const ImageLimits& limits);
 
 /// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says. Errors: bad_observation for EXIF
 /// data that does not start as a TIFF structure. Source: Pillow Image.getexif, TiffImagePlugin
