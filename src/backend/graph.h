@@ -58,6 +58,8 @@ class Graph {
   Status run(const Device& device);
 
   int n_node() const;
+  /// Threads that a run takes: one where products are too small to be worth a barrier after each node.
+  int n_thread(const Device& device) const;
   const std::vector<std::pair<std::string, Tensor>>& taps() const { return taps_; }
 
  private:
@@ -66,6 +68,7 @@ class Graph {
   TapFilter keep_;
   ggml_context_ptr context_;
   ggml_cgraph* graph_;
+  int n_thread_ = 0;  // chosen at the first run
   std::map<std::string, Tensor> constants_;
   std::vector<std::pair<std::string, Tensor>> taps_;
 };

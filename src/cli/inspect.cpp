@@ -21,7 +21,7 @@ std::string human_size(double bytes) {
   constexpr const char* kUnits[] = {"B", "kB", "MB", "GB", "TB"};
   int unit = 0;
   for (; bytes >= 1000 && unit < 4; ++unit) bytes /= 1000;
-  return fmt::format(unit == 0 ? "{:.0f} {}" : "{:.1f} {}", bytes, kUnits[unit]);
+  return fmt::format("{:.{}f} {}", bytes, unit == 0 ? 0 : 1, kUnits[unit]);
 }
 
 /// What one module of the first two path levels weighs: `vision`, `lm`, `expert`, `action_in`, ...
@@ -101,8 +101,8 @@ void print_numbers(const std::vector<std::string>& names, const std::vector<std:
 void print_features(const Engine& engine) {
   const Keys& keys = engine.bundle().keys();
   const auto views = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
-  fmt::print("views        any size, letterboxed to {} x {}; at least {} of {} must be present\n", engine.processor().image_width(),
-             engine.processor().image_height(), *keys.integer("observation.min_views"), views.size());
+  fmt::print("views        any size, letterboxed to {} x {}; at least {} of {} must be present\n", engine.processor().recipe().letterbox.width,
+             engine.processor().recipe().letterbox.height, *keys.integer("observation.min_views"), views.size());
   for (std::size_t i = 0; i < views.size(); ++i)
     fmt::print("    {}{}\n", views[i], aliases[i].empty() ? "" : fmt::format("  (also {})", aliases[i]));
 
@@ -119,7 +119,7 @@ void print_features(const Engine& engine) {
   fmt::print("action       {} rows of {} numbers{}\n", engine.horizon(), keys.strings("action.names")->size(),
              rate > 0 ? fmt::format(", {:g} rows a second", rate) : ", control rate unstated");
   print_numbers(*keys.strings("action.names"), *keys.strings("action.units"), read_stats(engine.bundle(), "action"));
-  fmt::print("instruction  at most {} tokens\n", engine.processor().max_text_tokens());
+  fmt::print("instruction  at most {} tokens\n", engine.processor().recipe().max_tokens);
 }
 
 void print_human(const Engine& engine) {

@@ -68,8 +68,8 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   if (argument.find('=') != std::string::npos) {
     VLA_TRY(const NameValue state, split("--state", argument));
     name = state.name, numbers = state.value;
-  } else if (processor.states().size() == 1) {
-    name = processor.states().front().name;
+  } else if (processor.states().names().size() == 1) {
+    name = processor.states().names().front();
   } else {
     return Error{Code::usage, "--state", "NAME=v,v,... because the bundle has several state features", argument};
   }

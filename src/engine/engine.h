@@ -61,6 +61,10 @@ class Engine {
   Status make_conditions();
   Status warm_up();
   Result<std::vector<float>> start(const Noise& noise) const;
+  template <class T>
+  void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape, const std::vector<T>& values) const;
+  void record_inputs(std::vector<Tap>& taps) const;
+  void record_chunk(const std::vector<float>& x, ActionChunk& chunk) const;
 
   Bundle bundle_;
   Processor processor_;
@@ -75,6 +79,7 @@ class Engine {
   Tensor conditions_;
   std::unique_ptr<Plans> plans_;
   std::size_t largest_plan_ = 0;
+  Inputs inputs_;  // of the last observation; its vectors keep their memory
 };
 
 }  // namespace vla
