@@ -19,7 +19,7 @@ from ..errors import Problems
 from ..features import feature_keys
 from ..tokenizer import JSON_FILE, read_tokenizer
 from . import MATRIX, TABLE, VECTOR, Dropped, Options, Plan, Weight
-from .smolvla_config import Sizes, read_sizes
+from ._smolvla_sizes import Sizes, read_sizes
 
 VLM = "model.vlm_with_expert.vlm.model."
 EXPERT = "model.vlm_with_expert.lm_expert."
