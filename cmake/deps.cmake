@@ -48,6 +48,12 @@ set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle
 set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)
 set(GGML_BUILD_EXAMPLES OFF CACHE BOOL "" FORCE)
 add_subdirectory(${vla_ggml_tree} ${CMAKE_BINARY_DIR}/ggml EXCLUDE_FROM_ALL)
+foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about
+  get_target_property(headers ${target} INTERFACE_INCLUDE_DIRECTORIES)
+  if(headers)
+    set_target_properties(${target} PROPERTIES INTERFACE_SYSTEM_INCLUDE_DIRECTORIES "${headers}")
+  endif()
+endforeach()
 
 # Debian packages: README.md lists them, `make packages` installs them.
 find_package(fmt REQUIRED)

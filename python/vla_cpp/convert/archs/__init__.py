@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""One module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`."""
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from dataclasses import dataclass, field
+from typing import Dict, List, NamedTuple, Sequence, Tuple
+
+import numpy as np
+
+from ..bundle import Key
+from ..errors import Code, refuse
+
+MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
+
+
+class Weight(NamedTuple):
+    """One row of a mapping: the bundle's name, the checkpoint's name, storage class, the checkpoint's shape, the bundle's shape."""
+
+    target: str
+    source: str
+    kind: str
+    stored: Tuple[int, ...]
+    shape: Tuple[int, ...]
+
+
+class Dropped(NamedTuple):
+    """A tensor that the checkpoint may have and the policy never reads, with the reason."""
+
+    source: str
+    stored: Tuple[int, ...]
+    reason: str
+
+
+@dataclass
+class Options:
+    """What a person chose beyond the checkpoint. Empty means: as the checkpoint says."""
+
+    backbone: str = ""
+    dtype: str = ""
+    dataset_info: str = ""
+    identity_stats: Sequence[str] = ()
+    position_precision: str = ""
+
+
+@dataclass
+class Plan:
+    """Everything of a bundle but the numbers of the weights."""
+
+    keys: List[Key]
+    weights: List[Weight]
+    dropped: List[Dropped]
+    statistics: Dict[str, np.ndarray]
+    hints: Dict[str, str] = field(default_factory=dict)  # prefix of an unexpected tensor's name -> why it is not expected
+
+
+def names() -> List[str]:
+    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+
+
+def load(name):
+    """The module of an architecture. Errors: unsupported."""
+    if name not in names():
+        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), code=Code.UNSUPPORTED)
+    return importlib.import_module("." + name, __name__)

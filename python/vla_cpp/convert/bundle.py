@@ -1,0 +1,184 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A streaming writer of bundles (docs/bundle.md) and a reader for tests and tools.
+
+The header states every tensor before the first byte of data is written, so the file grows in one pass and never lies in
+memory. It carries a temporary name until the checksum is in place: a bundle that exists is complete.
+"""
+from __future__ import annotations
+
+import os
+import struct
+from typing import BinaryIO, Dict, List, NamedTuple, Sequence, Tuple
+
+import numpy as np
+
+from .dtypes import BUNDLE_DTYPES, GGML_TYPES
+from .errors import Code, refuse
+from .files import missing_extra
+
+ALIGNMENT = 32  # the format's default
+BUNDLE_VERSION = 1
+CHECKSUM_KEY = "vla.checksum"
+CHECKSUM_ZERO = "xxh3:" + "0" * 16
+HASH_CHUNK = 8 << 20
+# GGUF's numbers of value types, and how a value is packed.
+SCALARS = {"u32": (4, "<I"), "f32": (6, "<f"), "bool": (7, "<?"), "f64": (12, "<d")}
+STRING, ARRAY = 8, 9
+
+
+class Key(NamedTuple):
+    """One metadata value. `kind`: u32, f32, f64, bool, string, u32[] or string[]."""
+
+    name: str
+    kind: str
+    value: object
+
+
+class TensorInfo(NamedTuple):
+    """A tensor of the bundle: shape as torch has it, dtype f32, bf16 or f16."""
+
+    name: str
+    shape: Tuple[int, ...]
+    dtype: str
+
+    @property
+    def n_bytes(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64)) * BUNDLE_DTYPES[self.dtype].itemsize
+
+
+def _string(text: str) -> bytes:
+    data = text.encode("utf-8")
+    return struct.pack("<Q", len(data)) + data
+
+
+def _value(kind: str, value) -> bytes:
+    return _string(value) if kind == "string" else struct.pack(SCALARS[kind][1], value)
+
+
+def _pack(key: Key) -> bytes:
+    base = key.kind[:-2] if key.kind.endswith("[]") else key.kind
+    number = STRING if base == "string" else SCALARS[base][0]
+    if base == key.kind:
+        return _string(key.name) + struct.pack("<I", number) + _value(base, key.value)
+    head = struct.pack("<IIQ", ARRAY, number, len(key.value))
+    return _string(key.name) + head + b"".join(_value(base, item) for item in key.value)
+
+
+def _padding(size: int) -> bytes:
+    return b"\0" * (-size % ALIGNMENT)
+
+
+def _header(keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> bytes:
+    parts = [b"GGUF", struct.pack("<IQQ", 3, len(tensors), len(keys))]
+    parts += [_pack(key) for key in keys]
+    offset = 0
+    for tensor in tensors:
+        shape = tensor.shape[::-1]  # GGUF lists the fastest dimension first
+        parts.append(_string(tensor.name) + struct.pack("<I{}QIQ".format(len(shape)), len(shape), *shape, GGML_TYPES[tensor.dtype], offset))
+        offset += tensor.n_bytes + len(_padding(tensor.n_bytes))
+    header = b"".join(parts)
+    return header + _padding(len(header))
+
+
+class BundleWriter:
+    """`with BundleWriter(path, keys, tensors) as out:` and then `out.write(name, array)` in the order of `tensors`, in pieces
+    if one likes. Leaving the block completes the file; an exception removes it."""
+
+    def __init__(self, path: str, keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> None:
+        self.path, self.part = path, path + ".part"
+        self.tensors: List[TensorInfo] = list(tensors)
+        checksum = Key(CHECKSUM_KEY, "string", CHECKSUM_ZERO)
+        # The checksum stands first, so that the text of its key is found before any vocabulary could contain it.
+        self.header = _header([checksum, *keys], tensors)
+        self.left = 0
+        self.next = 0
+
+    def __enter__(self) -> "BundleWriter":
+        self.file: BinaryIO = open(self.part, "w+b")
+        self.file.write(self.header)
+        return self
+
+    def write(self, name: str, data: np.ndarray) -> None:
+        if self.left == 0:
+            tensor = self.tensors[self.next]
+            self.next, self.left = self.next + 1, tensor.n_bytes
+        tensor = self.tensors[self.next - 1]
+        if name != tensor.name or data.nbytes > self.left or data.dtype != BUNDLE_DTYPES[tensor.dtype]:
+            raise AssertionError("{}: {} bytes of {} do not belong to {}".format(name, data.nbytes, data.dtype, tensor))
+        self.file.write(np.ascontiguousarray(data).data)
+        self.left -= data.nbytes
+        if self.left == 0:
+            self.file.write(_padding(tensor.n_bytes))
+
+    def __exit__(self, kind, error, trace) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            self.file.close()
+            if kind is not None and os.path.exists(self.part):
+                os.remove(self.part)
+        if kind is None:
+            os.replace(self.part, self.path)
+
+    def _finish(self) -> None:
+        if self.left or self.next != len(self.tensors):
+            raise AssertionError("{} of {} tensors written, {} bytes missing".format(self.next, len(self.tensors), self.left))
+        digits = self.header.index(CHECKSUM_ZERO.encode()) + len("xxh3:")
+        digest = file_digest(self.file)
+        self.file.seek(digits)
+        self.file.write(digest.encode())
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+
+def file_digest(file: BinaryIO, digits: int = -1) -> str:
+    """XXH3-64 of the file in hex. `digits`: where 16 bytes are read as zeros, for a file that carries its checksum."""
+    try:
+        import xxhash
+    except ImportError:
+        raise missing_extra("xxhash")
+    state = xxhash.xxh3_64()
+    file.seek(0)
+    position = 0
+    while True:
+        block = bytearray(file.read(HASH_CHUNK))
+        if not block:
+            return state.hexdigest()
+        if digits >= 0:
+            first, last = max(digits - position, 0), max(min(digits + 16 - position, len(block)), 0)
+            block[first:last] = b"0" * max(last - first, 0)
+        state.update(bytes(block))
+        position += len(block)
+
+
+class BundleContent(NamedTuple):
+    """A bundle in memory: metadata by key, tensors by name in torch's order of dimensions (bf16 as uint16 bits)."""
+
+    keys: Dict[str, object]
+    tensors: Dict[str, np.ndarray]
+    dtypes: Dict[str, str]
+
+
+def read_bundle(path: str) -> BundleContent:
+    """Reads a bundle and verifies its checksum. For tests and tools; the runtime has its own bounded reader."""
+    try:
+        from gguf import GGUFReader
+    except ImportError:
+        raise missing_extra("gguf")
+    reader = GGUFReader(path)
+    keys = {name: field.contents() for name, field in reader.fields.items()}
+    with open(path, "rb") as file:
+        stated = keys[CHECKSUM_KEY]
+        digits = file.read().index(stated.encode()) + len("xxh3:")
+        found = "xxh3:" + file_digest(file, digits)
+    if found != stated:
+        raise refuse(path, "content with checksum {}".format(stated), found, "the file was damaged or edited", Code.BAD_BUNDLE)
+    names = {number: name for name, number in GGML_TYPES.items()}
+    tensors, dtypes = {}, {}
+    for tensor in reader.tensors:
+        dtypes[tensor.name] = names[int(tensor.tensor_type)]
+        shape = tuple(int(dim) for dim in tensor.shape[::-1])
+        tensors[tensor.name] = np.asarray(tensor.data).view(BUNDLE_DTYPES[dtypes[tensor.name]]).reshape(shape)
+    return BundleContent(keys, tensors, dtypes)

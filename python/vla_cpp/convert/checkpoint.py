@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The hub layout that LeRobot writes, opened without reading weights: configs, processors, tensor headers, statistics."""
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Dict, List, Optional, Tuple
+
+import numpy as np
+
+from .dtypes import STATISTICS, to_f32
+from .errors import Code, ConvertError, Problems, refuse
+from .files import BACKBONE_PATTERNS, HUB_PATTERNS, download, is_hub_id, plain_name, read_json
+from .safetensors_file import Entry, read_safetensors
+
+WEIGHTS = "model.safetensors"
+INDEX = WEIGHTS + ".index.json"
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+# Where releases without processor files kept statistics: "<group>.buffer_<feature, dots as underscores>.<statistic>".
+OLD_GROUPS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets.")
+MAX_STATISTIC = 1 << 24  # bytes; a statistic has one number per joint, or per pixel channel
+
+
+@dataclass
+class Checkpoint:
+    """A policy on disk. `tensors` maps the policy's own names, without what torch.compile adds to them."""
+
+    name: str
+    folder: str
+    revision: str
+    config: dict
+    tensors: Dict[str, Entry]
+    aliases: Dict[str, str]  # a tensor that was not stored because it shares memory -> the one that was
+    old_statistics: Dict[str, Entry]
+    processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
+    notes: List[str] = field(default_factory=list)
+
+    def path(self, name: str) -> str:
+        return os.path.join(self.folder, name)
+
+
+def _shards(folder: str, problems: Problems) -> List[str]:
+    index = read_json(os.path.join(folder, INDEX)).get("weight_map")
+    if not isinstance(index, dict) or not index or not all(plain_name(file) for file in index.values()):
+        raise refuse(os.path.join(folder, INDEX) + ": weight_map", "tensor names with file names", str(index)[:100])
+    files = sorted(set(index.values()))
+    found = {file: read_safetensors(os.path.join(folder, file)).entries for file in files}
+    for name, file in index.items():
+        if name not in found[file]:
+            problems.add("tensor " + name, "the tensor in {} as {} says".format(file, INDEX), "none")
+    for file, entries in found.items():
+        for name in entries:
+            if index.get(name) != file:
+                problems.add("tensor " + name, "the tensor in {}".format(index.get(name, "no file, as " + INDEX + " says")), file)
+    return files
+
+
+def _weight_files(folder: str, problems: Problems) -> List[str]:
+    single, index = (os.path.exists(os.path.join(folder, name)) for name in (WEIGHTS, INDEX))
+    if single and index:
+        raise refuse(folder, "either {} or {}".format(WEIGHTS, INDEX), "both", "remove the one that is not the policy's")
+    if not single and not index:
+        hint = "merge the adapter into the policy and save it again" if os.path.exists(os.path.join(folder, "adapter_config.json")) else \
+            "give the folder that holds config.json and " + WEIGHTS
+        raise refuse(folder, WEIGHTS, "no such file", hint, Code.IO)
+    return [WEIGHTS] if single else _shards(folder, problems)
+
+
+def _read_tensors(folder: str, problems: Problems) -> Tuple[Dict[str, Entry], Dict[str, str]]:
+    tensors: Dict[str, Entry] = {}
+    aliases: Dict[str, str] = {}
+    for file in _weight_files(folder, problems):
+        content = read_safetensors(os.path.join(folder, file))
+        # Every key of the metadata that names a stored tensor as its value is a shared tensor that was left out.
+        aliases.update({clean(k): clean(v) for k, v in content.metadata.items() if v in content.entries})
+        for stored, entry in content.entries.items():
+            name = clean(stored)
+            if name in tensors:
+                problems.add("tensor " + name, "one tensor of this name", "a second one in " + file)
+            tensors[name] = entry._replace(name=name)
+    return tensors, aliases
+
+
+def clean(name: str) -> str:
+    """A compiled module's name without the infix of torch.compile."""
+    return name.replace("._orig_mod", "")
+
+
+def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
+    present = [os.path.exists(os.path.join(folder, name)) for name in PROCESSORS]
+    if not any(present):
+        return None
+    if not all(present):
+        missing = PROCESSORS[present.index(False)]
+        raise refuse(os.path.join(folder, missing), "the file beside " + PROCESSORS[present.index(True)], "none", "save the policy again", Code.IO)
+    return read_json(os.path.join(folder, PROCESSORS[0])), read_json(os.path.join(folder, PROCESSORS[1]))
+
+
+def open_checkpoint(source: str) -> Checkpoint:
+    """A folder or a hub id. Errors: io, bad_bundle."""
+    revision = ""
+    folder = source
+    if not os.path.isdir(source):
+        if os.path.exists(source) or not is_hub_id(source):
+            raise refuse(source, "a checkpoint folder or a hub id like owner/name", "neither", code=Code.IO)
+        folder, revision = download(source, HUB_PATTERNS)
+    name = source if revision else os.path.basename(os.path.abspath(folder))
+    config = read_json(os.path.join(folder, "config.json"))
+    problems = Problems(name)
+    tensors, aliases = _read_tensors(folder, problems)
+    problems.raise_any()
+    old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
+    weights = {key: entry for key, entry in tensors.items() if key not in old}
+    return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder))
+
+
+def find_backbone(checkpoint: Checkpoint, given: str, named) -> str:
+    """The folder with the backbone's config.json: as given, inside the checkpoint, or by the name that the policy's config states."""
+    if given:
+        if not os.path.isdir(given):
+            raise refuse("--backbone " + given, "a folder", "none", code=Code.IO)
+        return given
+    inside = checkpoint.path("vlm")
+    if os.path.exists(os.path.join(inside, "config.json")):
+        checkpoint.notes.append("backbone config and tokenizer: from vlm/ inside the checkpoint")
+        return inside
+    if isinstance(named, str) and os.path.isabs(named) and os.path.isdir(named):
+        checkpoint.notes.append("backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named)))
+        return named
+    if isinstance(named, str) and is_hub_id(named):
+        try:
+            folder, revision = download(named, BACKBONE_PATTERNS)
+        except ConvertError as error:
+            raise refuse("backbone " + named, "--backbone DIR, vlm/ inside the checkpoint, or a reachable hub", error.problems[0].found,
+                         "give the folder with the backbone's config.json and tokenizer.json by --backbone", Code.IO)
+        checkpoint.notes.append("backbone config and tokenizer: {} at revision {}".format(named, revision))
+        return folder
+    raise refuse("config.json: vlm_model_name", "the name of a backbone", str(named), "give its folder by --backbone", Code.IO)
+
+
+def read_statistic(entry: Entry) -> np.ndarray:
+    """A small tensor as float32, as the reference loads statistics."""
+    if entry.dtype not in STATISTICS or entry.n_bytes > MAX_STATISTIC:
+        raise refuse("{}: tensor {}".format(entry.path, entry.name), "a statistic in F32", "{} bytes of {}".format(entry.n_bytes, entry.dtype))
+    parts = [to_f32(part, entry.dtype) for part in entry.chunks()]
+    return (np.concatenate(parts) if parts else np.zeros(0, np.float32)).reshape(entry.shape)

@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `vla-convert`: arguments in, exit code out; decides nothing about numbers."""
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import contextmanager
+
+from .. import __version__
+from .archs import Options, names
+from .conversion import Summary, convert_checkpoint
+from .errors import Code, ConvertError
+
+DESCRIPTION = """\
+Converts a Vision-Language-Action policy as LeRobot saves it into one self-contained GGUF bundle for the vla runtime:
+weights, tokenizer, image recipe, statistics, feature names. Architectures: {archs}.
+It refuses what it does not fully understand and then lists everything at once."""
+
+EPILOG = """\
+without --dtype the stored type is kept when all matrices share one; mixed types become f32, which is exact.
+
+--position-precision: the reference computes the rows of the vision position table in the precision of its tower, and that
+is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
+two agree for grids whose side is a power of two. 'shifted' reproduces transformers 4.55 to 4.57.
+
+exit codes: 0 done, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot be read or written."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> None:
+        self.exit(int(Code.USAGE), "error: arguments: {}; see {} --help\n".format(message, self.prog))
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="vla-convert", description=DESCRIPTION.format(archs=", ".join(names())), epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("checkpoint", metavar="CHECKPOINT", help="folder with config.json and model.safetensors, or a hub id owner/name")
+    add("-o", "--out", metavar="OUT.gguf", required=True, help="the bundle to write; appears only when it is complete")
+    add("--backbone", metavar="DIR", default="", help="folder with the backbone's config.json and tokenizer.json, where they live elsewhere")
+    add("--dtype", choices=("f32", "bf16", "f16"), default="", help="storage of matrices and tables; vectors and statistics are always f32")
+    add("--dataset-info", metavar="INFO.json", default="", help="meta/info.json of the LeRobot data set: names of state and action numbers, control rate")
+    add("--identity-stats", metavar="FEATURE", action="append", default=[], help="let FEATURE (observation.state or action) pass unnormalised when its statistics are missing")
+    add("--position-precision", choices=("float32", "bfloat16", "shifted"), default="", help="rule for the rows of the vision position table; see below")
+    add("--force", action="store_true", help="overwrite OUT.gguf")
+    add("--quiet", action="store_true", help="no progress bar and no summary")
+    add("--version", action="version", version="vla-convert " + __version__)
+    return parser
+
+
+@contextmanager
+def _progress(quiet: bool):
+    """A bar on stderr while it is a terminal; nothing otherwise, so that logs stay readable."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda *_: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description:<32.32}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading", total=None)
+        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+
+
+def report(summary: Summary) -> str:
+    """The summary as text, a line per fact."""
+    lines = ["wrote {}: {}, {} tensors, {}, {:,} bytes".format(summary.path, summary.arch, summary.n_tensor, summary.dtype, summary.n_bytes)]
+    error, tensor = summary.rounding
+    if summary.dtype != "f32":
+        lines.append("  rounding  " + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor)))
+    for reason, tensors in summary.dropped.items():
+        lines.append("  dropped   {} ({})".format(tensors[0] if len(tensors) == 1 else "{} tensors such as {}".format(len(tensors), tensors[0]), reason))
+    return "\n".join(lines + ["  note      " + note for note in summary.notes])
+
+
+def main(argv=None) -> int:
+    args = build_parser().parse_args(argv)
+    options = Options(args.backbone, args.dtype, args.dataset_info, args.identity_stats, args.position_precision)
+    try:
+        with _progress(args.quiet) as progress:
+            summary = convert_checkpoint(args.checkpoint, args.out, options, args.force, progress)
+    except ConvertError as error:
+        print("error: " + error.message(), file=sys.stderr)
+        return int(error.code)
+    except ImportError as error:
+        print("error: vla-convert: expected the packages of the extra, found no {}; pip install 'vla-cpp[convert]'".format(error.name), file=sys.stderr)
+        return int(Code.USAGE)
+    if not args.quiet:
+        print(report(summary))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""From an opened checkpoint to a written bundle: match tensors, choose a dtype, stream, report."""
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Callable, Dict, List, Tuple
+
+from .. import __version__
+from . import archs
+from .archs import MATRIX, TABLE, Options, Plan, Weight
+from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
+from .checkpoint import Checkpoint, open_checkpoint
+from .dtypes import BUNDLE_NAME, WEIGHTS, convert
+from .errors import Code, Problems, refuse
+from .safetensors_file import Entry
+
+Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
+
+
+@dataclass
+class Summary:
+    """What a person should know afterwards."""
+
+    path: str
+    arch: str
+    dtype: str
+    n_tensor: int = 0
+    n_bytes: int = 0
+    dropped: Dict[str, List[str]] = field(default_factory=dict)  # reason -> tensors
+    notes: List[str] = field(default_factory=list)
+    rounding: Tuple[float, str] = (0.0, "")  # largest |stored - original| and its tensor
+
+
+def convert_checkpoint(source: str, out: str, options: Options, force: bool = False, progress: Progress = lambda *_: None) -> Summary:
+    """Writes `out` or raises ConvertError and leaves nothing behind."""
+    _check_out(out, force)
+    checkpoint = open_checkpoint(source)
+    problems = Problems(checkpoint.name)
+    plan = archs.load(checkpoint.config.get("type")).plan(checkpoint, options, problems)
+    dropped = _match(checkpoint, plan, problems)
+    problems.raise_any()
+    dtype = _choose_dtype(checkpoint, plan, options.dtype)
+    summary = Summary(out, checkpoint.config["type"], dtype, dropped=dropped, notes=checkpoint.notes)
+    _write(checkpoint, plan, summary, problems, progress)
+    summary.n_bytes = os.path.getsize(out)
+    return summary
+
+
+def _check_out(out: str, force: bool) -> None:
+    if os.path.isdir(out):
+        raise refuse("-o " + out, "a file name", "a folder", code=Code.USAGE)
+    if os.path.exists(out) and not force:
+        raise refuse("-o " + out, "a name that is free", "an existing file", "--force overwrites it", Code.USAGE)
+    if not os.path.isdir(os.path.dirname(os.path.abspath(out))):
+        raise refuse("-o " + out, "an existing folder", "none", code=Code.IO)
+
+
+def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, List[str]]:
+    """Compares what the configs ask for with what the file has: every missing, extra and misshapen tensor in one report."""
+    expected = {weight.source: weight.stored for weight in plan.weights}
+    optional = {row.source: row for row in plan.dropped}
+    for source in expected:
+        shared = checkpoint.aliases.get(source)
+        if source not in checkpoint.tensors and shared in checkpoint.tensors:
+            checkpoint.tensors[source] = checkpoint.tensors[shared]
+            checkpoint.notes.append("{}: stored once, as {}".format(source, shared))
+    for source in sorted(set(expected) | set(checkpoint.tensors)):
+        entry, shape = checkpoint.tensors.get(source), expected.get(source)
+        if shape is None and source in optional:
+            shape = optional[source].stored
+        _check_entry(source, entry, shape, plan, problems)
+    dropped: Dict[str, List[str]] = {}
+    for source, row in optional.items():
+        if source in checkpoint.tensors:
+            dropped.setdefault(row.reason, []).append(source)
+    return dropped
+
+
+def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> None:
+    where = "tensor " + source
+    if entry is None:
+        problems.add(where, str(shape), "none")
+    elif shape is None:
+        why = next((text for prefix, text in plan.hints.items() if source.startswith(prefix)), "no part of this policy reads it")
+        problems.add(where, "no such tensor", "{} {}".format(entry.dtype, entry.shape), why)
+    elif entry.shape != shape:
+        problems.add(where, str(shape), str(entry.shape))
+    elif entry.dtype not in WEIGHTS:
+        problems.unsupported(where, " or ".join(WEIGHTS), entry.dtype, "save the policy in one of these")
+
+
+def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
+    """As asked; else the stored one when all matrices share it; else f32, which holds every stored number exactly."""
+    if wanted:
+        return wanted
+    stored = Counter(checkpoint.tensors[weight.source].dtype for weight in plan.weights if weight.kind in (MATRIX, TABLE))
+    if len(stored) == 1:
+        return BUNDLE_NAME[next(iter(stored))]
+    mixed = ", ".join("{} {}".format(count, name) for name, count in sorted(stored.items()))
+    checkpoint.notes.append("matrices are stored in mixed types ({}): written as f32, which is exact; --dtype bf16 halves the file".format(mixed))
+    return "f32"
+
+
+def _tensor_dtype(weight: Weight, dtype: str) -> str:
+    return dtype if weight.kind in (MATRIX, TABLE) else "f32"
+
+
+def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress) -> None:
+    keys = _identity_keys(checkpoint, summary) + plan.keys
+    tensors = [TensorInfo(weight.target, weight.shape, _tensor_dtype(weight, summary.dtype)) for weight in plan.weights]
+    tensors += [TensorInfo(name, value.shape, "f32") for name, value in plan.statistics.items()]
+    total = sum(tensor.n_bytes for tensor in tensors)
+    done = 0
+    try:
+        with BundleWriter(summary.path, keys, tensors) as out:
+            for weight, tensor in zip(plan.weights, tensors):
+                progress(weight.target, done, total)
+                _stream(checkpoint.tensors[weight.source], tensor, out, summary, problems)
+                done += tensor.n_bytes
+            for name, value in plan.statistics.items():
+                out.write(name, value)
+            progress("checksum", total, total)
+            problems.raise_any()
+    except OSError as error:
+        raise refuse(summary.path, "a file that can be written", error.strerror or str(error), code=Code.IO)
+    summary.n_tensor = len(tensors)
+
+
+def _stream(entry: Entry, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems) -> None:
+    finite, overflow = True, False
+    for raw in entry.chunks():
+        part = convert(raw, entry.dtype, tensor.dtype)
+        finite, overflow = finite and part.finite, overflow or part.overflow
+        summary.rounding = max(summary.rounding, (part.error, tensor.name))
+        out.write(tensor.name, part.data)
+    if not finite:
+        problems.add("tensor " + entry.name, "finite numbers", "NaN or infinity", "the training run diverged or the file is damaged")
+    elif overflow:
+        problems.add("tensor {} ({})".format(entry.name, tensor.name), "numbers that {} can hold".format(tensor.dtype), "larger ones",
+                     "use --dtype " + ("bf16 or f32" if tensor.dtype == "f16" else "f32"), Code.UNSUPPORTED)
+
+
+def _identity_keys(checkpoint: Checkpoint, summary: Summary) -> List[Key]:
+    return [Key("general.architecture", "string", "vla"), Key("vla.arch", "string", summary.arch), Key("vla.bundle_version", "u32", BUNDLE_VERSION),
+            Key("vla.dtype", "string", summary.dtype), Key("vla.source.name", "string", checkpoint.name),
+            Key("vla.source.revision", "string", checkpoint.revision), Key("vla.source.converter", "string", "vla-cpp " + __version__)]

@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Typed refusals: the same classes, exit codes and wording as the C++ runtime (src/base/result.h)."""
+from __future__ import annotations
+
+import enum
+from typing import List, NamedTuple
+
+
+class Code(enum.IntEnum):
+    """Error classes that a conversion can end in; the value is the exit code of the process."""
+
+    INTERNAL = 1
+    USAGE = 2
+    BAD_BUNDLE = 3  # the checkpoint is damaged, incomplete or contradicts itself
+    UNSUPPORTED = 6  # the checkpoint may be fine, but asks for something that the runtime does not do
+    IO = 9
+
+
+class Problem(NamedTuple):
+    """Where it was, what was expected, what was found, and the next move if there is one."""
+
+    where: str
+    expected: str
+    found: str
+    hint: str = ""
+    code: Code = Code.BAD_BUNDLE
+
+    def message(self) -> str:
+        text = "{}: expected {}, found {}".format(self.where, self.expected, self.found)
+        return text + ("; " + self.hint if self.hint else "")
+
+
+class ConvertError(Exception):
+    """A refusal with one or several problems, all of which are shown at once."""
+
+    def __init__(self, problems: List[Problem], subject: str = "") -> None:
+        self.problems = list(problems)
+        self.subject = subject
+        super().__init__(self.message())
+
+    @property
+    def code(self) -> Code:
+        return self.problems[0].code
+
+    def message(self) -> str:
+        if len(self.problems) == 1:
+            return self.problems[0].message()
+        head = "{}: {} problems".format(self.subject or "checkpoint", len(self.problems))
+        return "\n".join([head] + ["  " + problem.message() for problem in self.problems])
+
+
+def refuse(where: str, expected: str, found: str, hint: str = "", code: Code = Code.BAD_BUNDLE) -> ConvertError:
+    """One problem as an exception, to be raised by the caller."""
+    return ConvertError([Problem(where, expected, found, hint, code)])
+
+
+class Problems:
+    """Collects what is wrong, so that a person reads one complete report instead of one refusal per attempt."""
+
+    def __init__(self, subject: str) -> None:
+        self.subject = subject
+        self.list: List[Problem] = []
+
+    def add(self, where: str, expected: str, found: str, hint: str = "", code: Code = Code.BAD_BUNDLE) -> None:
+        self.list.append(Problem(where, expected, str(found), hint, code))
+
+    def unsupported(self, where: str, expected: str, found: str, hint: str = "") -> None:
+        self.add(where, expected, found, hint, Code.UNSUPPORTED)
+
+    def raise_any(self) -> None:
+        if self.list:
+            raise ConvertError(self.list, self.subject)

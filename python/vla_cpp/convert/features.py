@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Names of the numbers of states and actions, and the control rate, from a LeRobot data set's meta/info.json where there is one."""
+from __future__ import annotations
+
+from typing import Dict, List, Optional
+
+from .bundle import Key
+from .errors import Problems
+from .files import read_json
+from .recipe import ACTION, STATE
+
+
+def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problems: Problems) -> List[Key]:
+    """Without a data set the names are generated and the rate is 0, which the runtime reads as unstated."""
+    info = read_json(info_path) if info_path else {}
+    names = {feature: _names(info, info_path, feature, dim, problems) for feature, dim in dims.items()}
+    if not info_path:
+        notes.append("names of state and action numbers are generated; --dataset-info meta/info.json gives the data set's")
+    rate = info.get("fps", 0)
+    if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
+        problems.add(info_path + ": fps", "a rate in Hz", repr(rate))
+        rate = 0
+    return [Key("observation.state_names", "string[]", names[STATE]), Key("observation.state_units", "string[]", [""] * dims[STATE]),
+            Key("action.names", "string[]", names[ACTION]), Key("action.units", "string[]", [""] * dims[ACTION]), Key("action.rate_hz", "f32", float(rate))]
+
+
+def _names(info: dict, path: str, feature: str, dim: int, problems: Problems) -> List[str]:
+    generated = ["{}.{}".format(feature.rsplit(".", 1)[-1], i) for i in range(dim)]
+    stated = _stated_names((info.get("features") or {}).get(feature))
+    if stated is None:
+        return generated
+    if len(stated) != dim or len(set(stated)) != dim or not all(isinstance(name, str) and name for name in stated):
+        problems.add("{}: features.{}.names".format(path, feature), "{} different names".format(dim), str(stated)[:120], "the data set is not the policy's")
+        return generated
+    return stated
+
+
+def _stated_names(feature) -> Optional[list]:
+    """A list, or an object around one list such as {"motors": [...]}; shape is compared by the caller through the length."""
+    names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    return names if isinstance(names, list) else None

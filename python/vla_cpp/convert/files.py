@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""JSON files and hub folders, read with refusals that name the file."""
+from __future__ import annotations
+
+import json
+import os
+from typing import Tuple
+
+from .errors import Code, ConvertError, refuse
+
+MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
+HUB_PATTERNS = ["*.json", "*.safetensors", "tokenizer/*", "vlm/*.json"]
+BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json"]
+
+
+def _no_constant(name: str):
+    raise ValueError("the number {} is not JSON".format(name))
+
+
+def read_json(path: str) -> dict:
+    """A JSON object. Errors: io when it cannot be read, bad_bundle when it is something else."""
+    try:
+        if os.path.getsize(path) > MAX_JSON:
+            raise refuse(path, "at most {} bytes".format(MAX_JSON), "{} bytes".format(os.path.getsize(path)))
+        with open(path, "rb") as file:
+            data = file.read()
+    except OSError as error:
+        raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
+    try:
+        value = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise refuse(path, "JSON", str(error)[:200], "the file is damaged: download or save it again")
+    if not isinstance(value, dict):
+        raise refuse(path, "a JSON object", type(value).__name__)
+    return value
+
+
+def plain_name(name) -> bool:
+    """Whether a file name that a checkpoint states stays inside the checkpoint's folder."""
+    return isinstance(name, str) and bool(name) and name not in (".", "..") and not set(name) & set("/\\\0")
+
+
+def is_hub_id(source: str) -> bool:
+    parts = source.split("/")
+    return len(parts) == 2 and all(parts) and not source.startswith((".", "~"))
+
+
+def download(repo: str, patterns) -> Tuple[str, str]:
+    """Folder and revision of a hub repository, from the local cache where it is complete. Errors: io."""
+    try:
+        from huggingface_hub import snapshot_download
+
+        folder = snapshot_download(repo, allow_patterns=patterns)
+    except ImportError:
+        raise missing_extra("huggingface_hub")
+    except Exception as error:  # noqa: BLE001 - the library has a class for every kind of failure
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise refuse(repo, "a folder or a reachable hub repository", reason[:200], "download it and give the folder", Code.IO)
+    return folder, os.path.basename(folder)
+
+
+def missing_extra(package: str) -> ConvertError:
+    return refuse("vla-convert", "the package " + package, "none", "pip install 'vla-cpp[convert]'", Code.USAGE)

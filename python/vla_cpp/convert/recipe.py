@@ -1,0 +1,287 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""LeRobot's pre- and post-processors as recipe operations.
+
+Every step and every field is either translated or refused: a step that is skipped is a number that changes.
+Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_processor.py, rename_processor.py, pipeline.py).
+"""
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Dict, List, Optional, Sequence
+
+import numpy as np
+
+from .checkpoint import Checkpoint, read_statistic
+from .errors import Problems
+from .files import plain_name
+from .safetensors_file import read_safetensors
+
+STATE, ACTION = "observation.state", "action"
+# Normalization mode -> the recipe's kind and the statistics that its formula reads.
+MODES = {"IDENTITY": ("identity", ()), "MEAN_STD": ("mean_std", ("mean", "std")), "MIN_MAX": ("min_max", ("min", "max")),
+         "QUANTILES": ("quantiles", ("q01", "q99")), "QUANTILE10": ("quantile10", ("q10", "q90"))}
+PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
+
+# Fields of each step that this converter knows. A tuple of values: only these leave the numbers as the recipe has them.
+ANY = object()
+DEVICE = {"device": ANY, "float_dtype": (None, "float32", "float")}
+NORMALIZER = {"eps": ANY, "features": ANY, "norm_map": ANY, "normalize_observation_keys": ANY}
+STEPS = {
+    PRE: {
+        "rename_observations_processor": {"rename_map": ANY},
+        "to_batch_processor": {},
+        "smolvla_new_line_processor": {},
+        "tokenizer_processor": {"max_length": ANY, "task_key": ("task",), "padding_side": ("right",), "truncation": (True,),
+                                "padding": ("max_length", "longest", True, False, "do_not_pad"), "tokenizer_name": ANY},
+        "device_processor": DEVICE,
+        "normalizer_processor": NORMALIZER,
+    },
+    POST: {"unnormalizer_processor": NORMALIZER, "device_processor": DEVICE},
+}
+
+
+@dataclass
+class Normalization:
+    """What happens to one feature: the formula, the reference's epsilon, and its statistics by name."""
+
+    kind: str = "identity"
+    eps: float = 1e-8
+    statistics: Dict[str, np.ndarray] = field(default_factory=dict)
+
+    def op(self, name: str, feature: str) -> List[dict]:
+        if self.kind == "identity":
+            return []
+        return [{"op": name, "kind": self.kind, "stats": "stats." + feature, "eps": self.eps}]
+
+
+@dataclass
+class Processors:
+    """What the two pipelines say, free of their format."""
+
+    rename: Dict[str, str] = field(default_factory=dict)  # accepted name -> the policy's name
+    newline: bool = False
+    max_tokens: int = 0
+    own_tokenizer: str = ""  # folder inside the checkpoint
+    state: Normalization = field(default_factory=Normalization)
+    action: Normalization = field(default_factory=Normalization)
+
+
+class _Reader:
+    """Walks over both pipelines and collects what it cannot translate."""
+
+    def __init__(self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems) -> None:
+        self.checkpoint, self.dims, self.identity, self.problems = checkpoint, dims, set(identity), problems
+        self.result, self.known = Processors(), []  # `known`: features that the statistics in hand belong to
+        self.seen: List[str] = []
+
+    def pipeline(self, file: str, content: dict) -> None:
+        steps = content.get("steps")
+        for key in sorted(set(content) - {"name", "steps"}):
+            self.problems.unsupported("{}: {}".format(file, key), "name and steps only", "the field " + key)
+        if not isinstance(steps, list):
+            self.problems.add(file + ": steps", "a list of steps", type(steps).__name__)
+            return
+        self.seen = []
+        for i, step in enumerate(steps):
+            self.step(file, "{}: steps[{}]".format(file, i), step)
+
+    def step(self, file: str, where: str, step) -> None:
+        name = step.get("registry_name", step.get("class")) if isinstance(step, dict) else None
+        known = STEPS[file].get(name) if isinstance(name, str) else None
+        if known is None:
+            self.problems.unsupported(where, "one of " + ", ".join(STEPS[file]), str(name),
+                                      "this step changes what the policy sees or returns, and the recipe has no operation for it")
+            return
+        where += " " + name
+        if name in self.seen and name != "device_processor":
+            self.problems.unsupported(where, "the step once", "the step a second time")
+        self.seen.append(name)
+        config = step.get("config", {})
+        extra = sorted(set(step) - {"registry_name", "config", "state_file", "artifacts"})
+        extra += sorted(set(config) - set(known)) if isinstance(config, dict) else ["config"]
+        for key in extra:
+            self.problems.unsupported("{}: {}".format(where, key), "no such field", str(step.get(key, config))[:80])
+        if extra:
+            return
+        for key, allowed in known.items():
+            if allowed is not ANY and key in config and config[key] not in allowed:
+                self.problems.unsupported("{}: {}".format(where, key), " or ".join(map(repr, allowed)), repr(config[key]))
+        handler = getattr(self, "_" + name.replace("_processor", ""), None)
+        if handler:
+            handler(where, config, step)
+
+    def _rename_observations(self, where: str, config: dict, step: dict) -> None:
+        if "normalizer_processor" in self.seen:
+            self.problems.unsupported(where, "renaming before normalization", "the opposite order")
+        names = config.get("rename_map", {})
+        if not isinstance(names, dict) or not all(isinstance(v, str) for v in names.values()):
+            self.problems.add(where + ": rename_map", "names with names", str(names)[:80])
+            return
+        self.result.rename = {old: new for old, new in names.items() if old != new}
+
+    def _smolvla_new_line(self, where: str, config: dict, step: dict) -> None:
+        if "tokenizer_processor" in self.seen:
+            self.problems.unsupported(where, "the newline before tokenization", "the opposite order")
+        self.result.newline = True
+
+    def _tokenizer(self, where: str, config: dict, step: dict) -> None:
+        length = config.get("max_length", 512)
+        if not isinstance(length, int) or isinstance(length, bool) or length < 1:
+            self.problems.add(where + ": max_length", "a count of tokens", repr(length))
+            return
+        self.result.max_tokens = length
+        folder = (step.get("artifacts") or {}).get("tokenizer_name", "")
+        if folder and not plain_name(folder):
+            self.problems.add(where + ": artifacts", "a folder inside the checkpoint", repr(folder))
+        elif folder:
+            self.result.own_tokenizer = folder
+
+    def _normalizer(self, where: str, config: dict, step: dict) -> None:
+        keys = config.get("normalize_observation_keys")
+        if keys is not None and STATE not in keys:
+            self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
+        features = config.get("features", {})
+        stated = features.get(STATE, {}) if isinstance(features, dict) else {}
+        if list(stated.get("shape", [])) != [self.dims[STATE]] or stated.get("type") != "STATE":
+            self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(self.dims[STATE]), str(stated)[:80])
+        self.result.state = self.normalization(where, config, step, STATE, "STATE")
+
+    def _unnormalizer(self, where: str, config: dict, step: dict) -> None:
+        self.result.action = self.normalization(where, config, step, ACTION, "ACTION")
+
+    def normalization(self, where: str, config: dict, step: dict, feature: str, kind: str) -> Normalization:
+        modes = config.get("norm_map", {})
+        if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
+            self.problems.unsupported(where + ": norm_map.VISUAL", "IDENTITY", str(modes["VISUAL"]), "the recipe does not normalise pixels by statistics")
+        stated = self.checkpoint.config.get("normalization_mapping", {}).get(kind, modes.get(kind))
+        if stated != modes.get(kind):
+            self.problems.add("{}: norm_map.{}".format(where, kind), "{} as in config.json".format(stated), str(modes.get(kind)))
+        state_file = step.get("state_file")
+        found: Dict[str, np.ndarray] = {}
+        if state_file is not None:
+            if not plain_name(state_file):
+                self.problems.add(where + ": state_file", "a file beside the JSON", repr(state_file))
+            else:
+                entries = read_safetensors(self.checkpoint.path(state_file)).entries
+                found = {name: read_statistic(entry) for name, entry in entries.items() if name.startswith(feature + ".")}
+                self.known = sorted({name.rsplit(".", 1)[0] for name in entries})
+        else:
+            self.known = []
+        eps = config.get("eps", 1e-8)
+        if not isinstance(eps, float) or not 0 <= eps < 1:
+            self.problems.add(where + ": eps", "a small number", repr(eps))
+        by_name = {name[len(feature) + 1:]: value for name, value in found.items()}
+        return choose(feature, modes.get(kind, "IDENTITY"), eps, by_name, self)
+
+    def finish(self, file: str, required: Sequence[str]) -> None:
+        for name in required:
+            if name not in self.seen:
+                self.problems.add("{}: steps".format(file), "a step " + name, "none")
+
+
+def choose(feature: str, mode: str, eps: float, found: Dict[str, np.ndarray], reader: "_Reader") -> Normalization:
+    """The normalization of one feature with its statistics checked, or the identity that was asked for."""
+    problems, dim = reader.problems, reader.dims[feature]
+    if mode not in MODES:
+        problems.unsupported("normalization of " + feature, " or ".join(MODES), str(mode))
+        return Normalization()
+    kind, names = MODES[mode]
+    if not names:
+        return Normalization()
+    missing = [name for name in names if name not in found]
+    if missing and feature in reader.identity:
+        reader.checkpoint.notes.append("DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(feature, ", ".join(missing)))
+        return Normalization()
+    for name in missing:
+        problems.add("statistics of {}: {}".format(feature, name), "{} numbers for {}".format(dim, mode), "none" + _others(reader.known),
+                     "fine-tune or save the policy with its data set's statistics, or accept unnormalised numbers by --identity-stats " + feature)
+    chosen = {name: found[name] for name in names if name in found}
+    for name, value in chosen.items():
+        _check_statistic("statistics of {}: {}".format(feature, name), name, value, dim, reader)
+    return Normalization(kind, eps, chosen)
+
+
+def _others(known: Sequence[str]) -> str:
+    return " (there are some for {})".format(", ".join(known)) if known else ""
+
+
+def _check_statistic(where: str, name: str, value: np.ndarray, dim: int, reader: "_Reader") -> None:
+    if value.shape != (dim,):
+        reader.problems.add(where, "shape ({},)".format(dim), str(value.shape))
+    elif not np.isfinite(value).all():
+        reader.problems.add(where, "finite numbers", str(value[~np.isfinite(value)][0]), "the statistics were never filled in: save the policy again")
+    elif name == "std" and (value < 0).any():
+        reader.problems.add(where, "numbers >= 0", str(value.min()))
+    elif name == "std" and (value == 0).any():
+        dead = ", ".join(str(i) for i in np.flatnonzero(value == 0))
+        reader.checkpoint.notes.append("{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead))
+
+
+def read_processors(checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems) -> Processors:
+    """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights."""
+    reader = _Reader(checkpoint, dims, identity, problems)
+    if checkpoint.processors is None:
+        return _from_weights(checkpoint, reader)
+    for file, content in zip((PRE, POST), checkpoint.processors):
+        reader.pipeline(file, content)
+        reader.finish(file, ("tokenizer_processor", "normalizer_processor") if file == PRE else ("unnormalizer_processor",))
+    if checkpoint.old_statistics:
+        checkpoint.notes.append("dropped: statistics inside the weights, which the processor files supersede")
+    return reader.result
+
+
+def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
+    """Reference: lerobot processor/migrate_policy_normalization.py, which builds today's pipelines for such checkpoints."""
+    checkpoint.notes.append("no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them")
+    config = checkpoint.config
+    modes = config.get("normalization_mapping", {})
+    if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
+        reader.problems.unsupported("config.json: normalization_mapping.VISUAL", "IDENTITY", str(modes["VISUAL"]))
+    reader.known = sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics})
+    result = Processors(newline=True, max_tokens=config.get("tokenizer_max_length", 48))
+    for feature, kind, attribute in ((STATE, "STATE", "state"), (ACTION, "ACTION", "action")):
+        found = _old_statistics(checkpoint, feature, reader.problems)
+        setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader))
+    return result
+
+
+def _old_statistics(checkpoint: Checkpoint, feature: str, problems: Problems) -> Dict[str, np.ndarray]:
+    """Statistics of one feature; groups that hold the same statistic must agree."""
+    marker = "buffer_" + feature.replace(".", "_") + "."
+    found: Dict[str, np.ndarray] = {}
+    for name, entry in sorted(checkpoint.old_statistics.items()):
+        group, _, rest = name.partition(".")
+        if not rest.startswith(marker):
+            continue
+        statistic, value = rest[len(marker):], read_statistic(entry)
+        before = found.setdefault(statistic, value)
+        if not np.array_equal(before, value, equal_nan=True):
+            problems.add("tensor " + name, "the numbers that another group has", "others")
+    return found
+
+
+def text_ops(processors: Processors) -> List[dict]:
+    newline = [{"op": "ensure_suffix", "suffix": "\n"}] if processors.newline else []
+    return newline + [{"op": "tokenize", "max_tokens": processors.max_tokens, "truncate": "right"}]
+
+
+def view_aliases(views: Sequence[str], processors: Processors, problems: Problems) -> List[str]:
+    """Per view the other name that the rename step accepts. A renaming that the bundle cannot express is refused."""
+    aliases = dict.fromkeys(views, "")
+    for old, new in processors.rename.items():
+        where = "{}: rename_map".format(PRE)
+        if new not in aliases:
+            expected = "names of views ({})".format(", ".join(views))
+            problems.unsupported(where, expected, "{} -> {}".format(old, new), "send the feature under the policy's own name and remove the entry")
+        elif old in aliases or aliases[new]:
+            problems.unsupported(where, "one other name per view, which is no view itself", "{} -> {}".format(old, new))
+        else:
+            aliases[new] = old
+    return [aliases[view] for view in views]
+
+
+def identity_unused(identity: Sequence[str], known: Sequence[str]) -> Optional[str]:
+    """A feature named by --identity-stats that the policy does not have."""
+    return next((feature for feature in identity if feature not in known), None)
