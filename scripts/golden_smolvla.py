@@ -3,8 +3,10 @@
 """Writes the golden cases under tests/golden/smolvla: tiny checkpoints, observations, noise, and what the reference says.
 
     python scripts/golden_smolvla.py [NAME ...] [--out DIR]
+    python scripts/golden_smolvla.py --bundles [NAME ...]       only convert the checkpoints again
 
-Needs torch, lerobot and gguf (see vla_cpp.convert.golden).  The same versions write the same bytes.
+Needs torch, lerobot and gguf (see vla_cpp.convert.golden); --bundles needs vla_cpp's [convert] extra alone.  The same
+versions write the same bytes.
 """
 import argparse
 import json
@@ -49,20 +51,21 @@ def policy(horizon, steps, size, width, **more):
 CASES = {
     # Two views, both shrunk; one language layer cut off; attention wider than the model (6 x 12 against 48).
     "two_views": Case(1, {"camera1": (40, 90, "png"), "camera2": (75, 52, "png")}, "open the middle drawer", Description(
-        vision(36, 2, 3, 72, 32, 8), text(48, 4, 6, 2, 12, 80), 2,
+        vision(36, 2, 3, 60, 32, 8), text(48, 4, 6, 2, 12, 56), 2,
         policy(5, 4, (32, 32), 0.75, num_vlm_layers=3, max_state_dim=8, max_action_dim=8, tokenizer_max_length=24,
                pad_language_to="max_length"), {"camera1": (40, 90), "camera2": (75, 52)})),
     # Three views of three aspects, one a JPEG file; an instruction beyond the bucket; self attention every third layer;
     # one key-value head; patch columns (3 * 7 * 7) that no vector width divides.
     "long_text": Case(2, {"top": (20, 27, "png"), "wrist": (53, 53, "jpg"), "side": (64, 37, "png")},
                       "put the black bowl on top of the stove, then close the bottom drawer of the cabinet", Description(
-        vision(40, 3, 5, 56, 28, 7), text(40, 4, 5, 1, 8, 64), 2,
+        vision(40, 3, 5, 56, 28, 7), text(40, 4, 5, 1, 8, 48), 2,
         policy(7, 3, (28, 28), 0.6, num_vlm_layers=4, self_attn_every_n_layers=3, max_state_dim=16, max_action_dim=16,
                tokenizer_max_length=12, pad_language_to="longest"),
         {"top": (20, 27), "wrist": (53, 53), "side": (64, 37)}, d_state=14, d_action=14)),
-    # The second of three views is absent; order of features is not alphabetical; ranges and quantiles instead of means;
+    # The second of three views is absent, and so is the one that empty_cameras adds; order of features is not alphabetical; ranges and quantiles instead of means;
     # a prefix padded at its end; an expert as wide as the backbone; other periods of the time embedding.
-    "absent_view": Case(3, {"wrist": (31, 60, "png"), "front": None, "base": (45, 45, "png")}, "push the plate", Description(
+    "absent_view": Case(3, {"wrist": (31, 60, "png"), "front": None, "base": (45, 45, "png"), "empty_camera_0": None},
+                        "push the plate", Description(
         vision(32, 1, 2, 64, 32, 8), text(32, 3, 4, 2, 8, 48, 1e-6), 2,
         policy(9, 6, (32, 32), 1.0, num_vlm_layers=2, empty_cameras=1, prefix_length=60, max_state_dim=4,
                max_action_dim=4, tokenizer_max_length=16, pad_language_to="max_length", min_period=2e-3, max_period=8.0,
@@ -79,7 +82,7 @@ CASES = {
     # One view that needs no resizing, a 6 x 6 grid, pixel shuffle by 3, ten steps; a state number that never moved in the
     # data; an instruction that already ends its line and is not plain English.
     "one_view": Case(5, {"camera1": (48, 48, "png")}, "Öffne die Schublade 12, bitte: 开抽屉\n", Description(
-        vision(36, 2, 4, 72, 48, 8), text(48, 3, 3, 3, 16, 72), 3,
+        vision(36, 2, 4, 44, 48, 8), text(48, 3, 3, 3, 16, 36), 3,
         policy(8, 10, (48, 48), 0.5, num_vlm_layers=3, max_state_dim=8, max_action_dim=8, tokenizer_max_length=64,
                pad_language_to="max_length"), {"camera1": (48, 48)}, d_state=5, d_action=3, zero_spread=(2,))),
 }
@@ -116,22 +119,40 @@ def write_observation(case, folder):
     np.save(folder / "noise.npy", noise.numpy())
 
 
+def write_bundle(folder):
+    """bundle.gguf as vla-convert makes it, in bfloat16: every stored value has one, so no number changes."""
+    from vla_cpp.convert import cli
+
+    checkpoint = folder / "checkpoint"
+    code = cli.main([str(checkpoint), "--backbone", str(checkpoint / "vlm"), "-o", str(folder / "bundle.gguf"),
+                     "--dtype", "bf16", "--force", "--quiet"])
+    if code:
+        raise SystemExit(code)
+
+
+def write_case(name, folder):
+    case = CASES[name]
+    n = random_smolvla.write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
+    write_observation(case, folder)
+    taps = golden.write_expected(folder, case.seed)
+    largest = np.abs(taps["chunk"]).max()
+    print(f"{name}: {n:,} parameters, {len(taps)} taps, chunk up to {largest:.2f}, published dtypes "
+          f"{np.abs(taps['chunk.bf16'] - taps['chunk']).max() / largest:.1e} away")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", nargs="*", choices=[[], *CASES])
     parser.add_argument("--out", type=Path, default=ROOT / "tests/golden/smolvla")
+    parser.add_argument("--bundles", action="store_true", help="only convert the checkpoints that are there")
     args = parser.parse_args()
-    golden.open_reference()
-    warnings.filterwarnings("ignore")
+    if not args.bundles:
+        golden.open_reference()
+        warnings.filterwarnings("ignore")
     for name in args.name or CASES:
-        case, folder = CASES[name], args.out / name
-        n = random_smolvla.write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
-        write_observation(case, folder)
-        taps = golden.write_expected(folder, case.seed)
-        largest = np.abs(taps["chunk"]).max()
-        kib = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 1024
-        print(f"{name}: {n:,} parameters, {len(taps)} taps, {kib:.0f} KiB, chunk up to {largest:.2f}, published dtypes "
-              f"{np.abs(taps['chunk.bf16'] - taps['chunk']).max() / largest:.1e} away")
+        if not args.bundles:
+            write_case(name, args.out / name)
+        write_bundle(args.out / name)
 
 
 if __name__ == "__main__":
