@@ -42,8 +42,9 @@ class Description:
 
 def published(views):
     """The description of the published size: 450 M parameters, 500 tensors."""
-    return Description(PUBLISHED_VISION, PUBLISHED_TEXT, 4, {"pad_language_to": "max_length", "prefix_length": 0,
-                       "num_expert_layers": 0}, views, n_merge=400, n_vocab=49280)
+    policy = {"pad_language_to": "max_length", "prefix_length": 0, "num_expert_layers": 0, "chunk_size": 50,
+              "n_action_steps": 50, "max_state_dim": 32, "max_action_dim": 32, "num_steps": 10}
+    return Description(PUBLISHED_VISION, PUBLISHED_TEXT, 4, policy, views, n_merge=400, n_vocab=49280)
 
 
 def backbone_config(description, n_vocab):
