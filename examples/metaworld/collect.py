@@ -1,3 +1,4 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Collects demonstrations of the scripted experts: one .npz file per episode.
 
@@ -25,9 +26,8 @@ from typing import Dict, List, Tuple
 
 import numpy as np
 
-from sim import LIMIT, TASKS, Scene
+from sim import HORIZON, LIMIT, TASKS, Scene
 
-HORIZON = 16  # steps per action chunk
 STRIDE = 2  # a frame is kept every second step
 AFTER = 6  # steps kept after success
 NOISE = (0.0, 0.15, 0.4)  # standard deviation of the action noise, one of them per episode

@@ -1,3 +1,4 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's SmolVLA on a CPU, from packages alone: import this before lerobot.
 

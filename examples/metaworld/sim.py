@@ -1,3 +1,4 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The simulated robot: four MetaWorld tasks, one camera, the scripted experts.
 
@@ -8,6 +9,7 @@ Everything that touches MetaWorld and MuJoCo is here; the other scripts see only
     frame, state = scene.frame(), scene.state()     # (128, 128, 3) uint8, (4,) float32
     success = scene.step(action)                    # action (4,) float32 in [-1, 1]
     action = scene.expert()                         # what the scripted expert would do now, (4,) float32
+    draw = noise(seed=900000, replan=0)             # (16, 8) float32: where the policy's flow starts, fixed by the seed
 
 State: x, y, z of the hand in metres and the opening of the gripper in [0, 1].
 Action: dx, dy, dz of the hand in hundredths of a metre per step, and the gripper's effort (positive closes).
@@ -23,7 +25,9 @@ import numpy as np  # noqa: E402
 
 SIZE = 128  # pixels, both ways
 LIMIT = 150  # steps after which an episode counts as failed
+HORIZON, EXECUTE = 16, 8  # steps in a chunk, and how many of them are executed before the next look
 CAMERA = "corner4"
+UNSEEN = 900000  # seeds from here on are never used for training
 STATE_NAMES = ["hand_x", "hand_y", "hand_z", "gripper"]
 ACTION_NAMES = ["dx", "dy", "dz", "gripper"]
 TASKS = {  # task -> the sentence that asks for it; the faucet pair shares its scene, so only the sentence tells them apart
@@ -87,3 +91,12 @@ class Scene:
         """Executes one action (4,) in [-1, 1], clipped; returns whether the task is solved now."""
         self._obs, _, _, _, info = self.env.step(np.clip(action, -1, 1).astype(np.float32))
         return bool(info["success"])
+
+    def turned(self) -> float:
+        """How far the faucet's handle is turned, in radians: about 1.4 is open, -1.3 closed, 0 the start.  0 without a faucet."""
+        return float(self.env.data.joint("knob_Joint_1").qpos[0]) if "faucet" in self.task else 0.0
+
+
+def noise(seed: int, replan: int) -> np.ndarray:
+    """(16, 8) float32: the starting noise of one chunk.  Every runtime gets the same, so their chunks can be compared."""
+    return np.random.default_rng([seed, replan]).standard_normal((HORIZON, 8), dtype=np.float32)

@@ -1,3 +1,4 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Trains LeRobot's own SmolVLA class, at 4.7 million parameters, on the demonstrations of collect.py.
 
@@ -25,9 +26,9 @@ import reference  # before lerobot
 import numpy as np
 import torch
 
-from sim import CAMERA, SIZE, TASKS
+from sim import CAMERA, EXECUTE, HORIZON, SIZE, TASKS
 
-CHUNK, EXECUTE, FLOW_STEPS = 16, 8, 10  # steps predicted, steps executed before the next look, Euler steps
+FLOW_STEPS = 10  # Euler steps from noise to chunk
 VOCABULARY = 384  # 256 bytes, the special tokens and merges learned from the sentences
 SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
 IMAGE = {"image_token": "<image>", "fake_image_token": "<fake_token_around_image>", "global_image_token": "<global-img>"}
@@ -88,7 +89,7 @@ def make_policy(backbone: Path, statistics: Dict[str, Dict[str, torch.Tensor]]) 
                         reference.CAMERA_KEY: PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
         vlm_model_name=str(backbone), load_vlm_weights=False, num_vlm_layers=4, expert_width_multiplier=0.75,
-        chunk_size=CHUNK, n_action_steps=EXECUTE, num_steps=FLOW_STEPS, max_state_dim=8, max_action_dim=8,
+        chunk_size=HORIZON, n_action_steps=EXECUTE, num_steps=FLOW_STEPS, max_state_dim=8, max_action_dim=8,
         resize_imgs_with_padding=(SIZE, SIZE), tokenizer_max_length=24, pad_language_to="max_length",
         freeze_vision_encoder=False, train_expert_only=False, device="cpu", push_to_hub=False)
     policy = SmolVLAPolicy(config).float()
@@ -233,7 +234,7 @@ def main() -> int:
     for (name, one), other in zip(policy.named_parameters(), loaded.parameters()):
         assert torch.equal(one, other), f"{name} changed on its way through {a.out}"
     frame, state = data["frame"][0].permute(1, 2, 0).contiguous().numpy(), data["state"][0].numpy()
-    noise = torch.randn(CHUNK, 8, generator=random).numpy()
+    noise = torch.randn(HORIZON, 8, generator=random).numpy()
     chunk = reference.predict(loaded, before, after, frame, state, sentences[0], noise)
     print(f"{a.out}: {step} steps in {spent / 60:.1f} min, loss {curve[-1]:.3f}; '{sentences[0]}' -> {chunk[0].round(3).tolist()}, "
           f"the expert: {data['action'][0, 0].numpy().round(3).tolist()}")
