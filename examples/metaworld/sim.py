@@ -17,6 +17,7 @@ One step is 12.5 ms.  A seed fixes the layout: the same seed gives the same fram
 """
 import os
 import warnings
+from typing import Any, List
 
 os.environ.setdefault("MUJOCO_GL", "osmesa")  # software rendering, no display needed
 os.environ.setdefault("LP_NUM_THREADS", "1")  # one render thread per process: the processes are the parallelism
@@ -36,6 +37,9 @@ TASKS = {  # task -> the sentence that asks for it; the faucet pair shares its s
     "button-press-topdown": "press the button from above",
     "drawer-close": "close the drawer",
 }
+
+
+_renderers: List[Any] = []  # never dropped: closing one renderer makes the next ones return noise (MuJoCo 3.3 with OSMesa)
 
 
 class Scene:
@@ -61,6 +65,7 @@ class Scene:
         model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = SIZE
         self._renderer = mujoco.Renderer(model, SIZE, SIZE)
+        _renderers.append(self._renderer)
         self._options = mujoco.MjvOption()
         self._options.sitegroup[:] = 0  # coloured goal markers would betray the task
 
