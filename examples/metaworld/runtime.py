@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Asks the C++ runtime for a chunk: one call of `vla run`, as anybody would make it from a shell."""
 import json
+import shlex
 import subprocess
 from pathlib import Path
 from typing import Any, Dict, List, Union
@@ -28,7 +29,7 @@ def run(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, nois
     except subprocess.TimeoutExpired:
         raise SystemExit(f"{vla} gave no answer within 5 minutes")
     if done.returncode:
-        raise SystemExit(f"{vla} run failed ({done.returncode}):\n{done.stderr.strip()}\nThe call was:\n{' '.join(line)}")
+        raise SystemExit(f"{vla} run failed ({done.returncode}):\n{done.stderr.strip()}\nThe call was:\n{' '.join(shlex.quote(x) for x in line)}")
     try:
         answer = json.loads(done.stdout.strip().splitlines()[-1])
         answer["actions"] = np.asarray(answer["actions"], np.float32)
