@@ -4,6 +4,7 @@
 
     python evaluate.py --checkpoint checkpoint --episodes 50 --out evaluation.json           # PyTorch
     python evaluate.py --bundle policy.gguf --vla build/vla --episodes 50 --out evaluation_cpp.json   # the C++ runtime
+    python evaluate.py --expert --episodes 50 --swapped 0                                             # the scripted experts
 
 Each episode: look, predict 16 actions, execute 8, look again, until the task is solved or 150 steps are over.  Episode
 e has the layout of seed 900000 + e and a fixed noise for each chunk, so two runtimes start from the same numbers.
@@ -21,7 +22,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, Callable, Dict, List, Tuple
+from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import numpy as np
 
@@ -65,14 +66,15 @@ def cpp(vla: str, bundle: str) -> Policy:
     return predict
 
 
-def episode(scene: Scene, policy: Policy, seed: int, text: str) -> Dict[str, Any]:
-    """One closed-loop run: whether the scene's own task was solved, after how many steps, how far the faucet was turned."""
+def episode(scene: Scene, policy: Optional[Policy], seed: int, text: str) -> Dict[str, Any]:
+    """One closed-loop run: whether the scene's own task was solved, after how many steps, how far the faucet was turned.
+    Without a policy the scripted expert drives, looking anew at every step."""
     scene.reset(seed)
     sign = -1 if text == TASKS["faucet-close"] else 1
     swapped, seconds, solved, step = text != TASKS[scene.task], [], False, 0
     while step < LIMIT and not solved:
         begin = time.perf_counter()
-        chunk = policy(scene.frame(), scene.state(), text, noise(seed, step // EXECUTE))
+        chunk = policy(scene.frame(), scene.state(), text, noise(seed, step // EXECUTE)) if policy else scene.expert()[None]
         seconds.append(time.perf_counter() - begin)
         for action in chunk[:EXECUTE]:
             solved, step = scene.step(action), step + 1
@@ -86,7 +88,7 @@ def episode(scene: Scene, policy: Policy, seed: int, text: str) -> Dict[str, Any
 
 def work(jobs: List[Tuple[str, int, str]], checkpoint: str, vla: str, bundle: str, done: Any) -> None:
     """One process: runs its episodes (task, seed, sentence)."""
-    policy = cpp(vla, bundle) if bundle else pytorch(checkpoint)
+    policy = cpp(vla, bundle) if bundle else pytorch(checkpoint) if checkpoint else None
     scenes: Dict[str, Scene] = {}
     for task, seed, text in jobs:
         scenes[task] = scenes.get(task) or Scene(task)
@@ -106,14 +108,15 @@ def main() -> int:
     ap = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ap.add_argument("--checkpoint", default="", metavar="DIR", help="evaluate this checkpoint of train.py with PyTorch")
     ap.add_argument("--bundle", default="", metavar="FILE", help="evaluate this bundle with the C++ runtime instead")
+    ap.add_argument("--expert", action="store_true", help="evaluate the scripted experts instead, which know where the object is")
     ap.add_argument("--vla", default="vla", help="the C++ runtime (default: vla from the PATH)")
     ap.add_argument("--episodes", type=int, default=50, help="per task (default 50)")
     ap.add_argument("--swapped", type=int, default=20, help="per faucet task, with the other sentence (default 20)")
     ap.add_argument("--processes", type=int, default=2, help="episodes side by side (default 2)")
     ap.add_argument("--out", type=Path, metavar="FILE", help="write every episode and the summary as JSON")
     a = ap.parse_args()
-    if bool(a.checkpoint) == bool(a.bundle):
-        ap.error("give either --checkpoint DIR (PyTorch) or --bundle FILE (C++)")
+    if bool(a.checkpoint) + bool(a.bundle) + a.expert != 1:
+        ap.error("give one of --checkpoint DIR (PyTorch), --bundle FILE (C++) and --expert")
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.table import Table
@@ -151,9 +154,11 @@ def main() -> int:
     for name, s in summary.items():
         table.add_row(name, f"{s['successes']}/{s['episodes']}", f"{100 * s['wilson95'][0]:.0f} to {100 * s['wilson95'][1]:.0f} %")
     Console().print(table)
-    print(f"median time of one prediction, start of the process included for C++: {np.median([r['ms'] for r in rows]):.0f} ms")
+    if not a.expert:
+        ms = np.median([r["ms"] for r in rows])
+        print(f"median time of one prediction: {ms:.0f} ms" + (", start of the process and loading included" if a.bundle else ""))
     if a.out:
-        head = {"runtime": "vla run" if a.bundle else "PyTorch float32", "limit_steps": LIMIT, "execute": EXECUTE, "summary": summary}
+        head = {"runtime": "vla run" if a.bundle else "PyTorch float32" if a.checkpoint else "scripted expert", "limit_steps": LIMIT, "execute": EXECUTE, "summary": summary}
         a.out.write_text(json.dumps({**head, "episodes": rows}, indent=1) + "\n")
     return 0
 
