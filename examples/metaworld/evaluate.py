@@ -73,8 +73,9 @@ def episode(scene: Scene, policy: Optional[Policy], seed: int, text: str) -> Dic
     sign = -1 if text == TASKS["faucet-close"] else 1
     swapped, seconds, solved, step = text != TASKS[scene.task], [], False, 0
     while step < LIMIT and not solved:
+        frame = scene.frame() if policy else np.zeros(0, np.uint8)
         begin = time.perf_counter()
-        chunk = policy(scene.frame(), scene.state(), text, noise(seed, step // EXECUTE)) if policy else scene.expert()[None]
+        chunk = policy(frame, scene.state(), text, noise(seed, step // EXECUTE)) if policy else scene.expert()[None]
         seconds.append(time.perf_counter() - begin)
         for action in chunk[:EXECUTE]:
             solved, step = scene.step(action), step + 1
