@@ -16,10 +16,12 @@ constexpr double kLeastWork = 4e6;
 
 Status ComputeMemory::reserve(ggml_cgraph* graph) {
   if (ggml_gallocr_reserve(allocator_.get(), graph)) return {};
-  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation", "free memory or use a smaller model"};
+  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation",
+               "free memory or use a smaller model"};
 }
 
-Graph::Graph(const Weights& weights, Store& store, TapFilter keep) : weights_(weights), store_(store), keep_(std::move(keep)) {
+Graph::Graph(const Weights& weights, Store& store, TapFilter keep)
+    : weights_(weights), store_(store), keep_(std::move(keep)) {
   const std::size_t n_node = kLeastNodes + kNodesPerParam * weights.count();
   const std::size_t memory = ggml_graph_overhead_custom(n_node, false) + n_node * ggml_tensor_overhead();
   context_.reset(ggml_init({.mem_size = memory, .mem_buffer = nullptr, .no_alloc = true}));
@@ -68,7 +70,8 @@ Status Graph::run(const Device& device) {
   ggml_backend_cpu_set_n_threads(device.backend(), n_thread_ > 0 ? n_thread_ : n_thread_ = n_thread(device));
   const ggml_status status = ggml_backend_graph_compute(device.backend(), graph_);
   if (status == GGML_STATUS_SUCCESS) return {};
-  if (status == GGML_STATUS_ALLOC_FAILED) return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
+  if (status == GGML_STATUS_ALLOC_FAILED)
+    return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
   return Error{Code::device, "graph", "a finished run", ggml_status_to_string(status)};
 }
 

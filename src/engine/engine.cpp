@@ -21,8 +21,9 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   engine->tap_pattern_ = options.tap_pattern;
   VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
-  engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_, engine->solver_,
-                                                       engine->conditions_, engine->d_action_, engine->horizon_, engine->tap_pattern_});
+  engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_,
+                                                       engine->solver_, engine->conditions_, engine->d_action_,
+                                                       engine->horizon_, engine->tap_pattern_});
   VLA_CHECK(engine->warm_up());
   engine->bundle_.release_pages();
   return engine;
@@ -63,8 +64,8 @@ Status Engine::make_conditions() {
 /// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
 Status Engine::warm_up() {
   const Recipe& recipe = processor_.recipe();
-  const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height, static_cast<int>(processor_.views().names().size()),
-                              recipe.max_tokens, d_state_};
+  const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
+                              static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
   VLA_CHECK(policy_->check(largest));
   VLA_TRY(const Plan* plan, plans_->for_shape(largest));
   largest_plan_ = plan->size();
@@ -76,14 +77,16 @@ Result<std::vector<float>> Engine::start(const Noise& noise) const {
   if (const auto* seed = std::get_if<std::uint64_t>(&noise)) return draw_noise(solver_.noise, *seed, count);
   const auto& values = std::get<std::vector<float>>(noise);
   if (values.size() != count)
-    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_), fmt::format("{} numbers", values.size())};
+    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_),
+                 fmt::format("{} numbers", values.size())};
   for (float value : values)
     if (!std::isfinite(value)) return Error{Code::bad_observation, "noise", "finite numbers", fmt::format("{}", value)};
   return values;
 }
 
 template <class T>
-void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape, const std::vector<T>& values) const {
+void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
+                    const std::vector<T>& values) const {
   if (match_path(tap_pattern_, path)) taps.push_back({path, std::move(shape), {values.begin(), values.end()}});
 }
 
@@ -97,7 +100,8 @@ void Engine::record_inputs(std::vector<Tap>& taps) const {
 void Engine::record_chunk(const std::vector<float>& x, ActionChunk& chunk) const {
   if (tap_pattern_.empty()) return;
   std::vector<float> cut;
-  for (int row = 0; row < horizon_; ++row) cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + chunk.d_action);
+  for (int row = 0; row < horizon_; ++row)
+    cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + chunk.d_action);
   record(chunk.taps, "chunk", {chunk.d_action, horizon_}, cut);
   record(chunk.taps, "actions", {chunk.d_action, horizon_}, chunk.actions);
 }
@@ -112,7 +116,8 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   VLA_CHECK(processor_.encode_text(observation, inputs_));
   clock.lap(chunk.timing, "tokenize");
   VLA_TRY(const std::vector<float> x, start(noise));
-  VLA_TRY(Plan* plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view, static_cast<int>(inputs_.tokens.size()), d_state_}));
+  VLA_TRY(Plan * plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view,
+                                          static_cast<int>(inputs_.tokens.size()), d_state_}));
   plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
   plan->set_x(x);
   record_inputs(chunk.taps);

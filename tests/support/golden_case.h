@@ -9,7 +9,8 @@
 
 namespace vla::test {
 
-/// One folder of tests/golden/<arch>/: a bundle, an observation, the solver's noise, and what the reference computes on them.
+/// One folder of tests/golden/<arch>/: a bundle, an observation, the solver's noise, and what the reference computes on
+/// them.
 struct GoldenCase {
   std::string path;
   Observation observation;
