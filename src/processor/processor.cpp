@@ -49,10 +49,10 @@ Result<std::vector<Processor::PresentView>> Processor::present_views(const Obser
   std::vector<PresentView> present;
   for (std::size_t i = 0; i < given.size(); ++i) {
     const std::string& name = views_.names()[i];
-    if (given[i] == nullptr)
+    if (given[i] == nullptr && view_optional_[i] == 0)
       return bad_observation(name, "an image, or the view declared absent", "neither",
                              "the bundle's views are " + views_.listed());
-    if (*given[i]) present.push_back({&name, &**given[i]});
+    if (given[i] != nullptr && *given[i]) present.push_back({&name, &**given[i]});
   }
   if (present.size() < static_cast<std::size_t>(min_views_))
     return bad_observation("observation.images",

@@ -84,6 +84,7 @@ class Processor {
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;
+  std::vector<int> view_optional_;  // per view 1 where it may be left unmentioned
   int min_views_ = 0;
   std::vector<int> state_dims_;
   std::vector<std::string> action_names_;

@@ -58,9 +58,11 @@ Status Processor::read_features(const Bundle& bundle) {
   const Keys& keys = bundle.keys();
   VLA_TRY(std::vector<std::string> views, keys.strings("observation.views"));
   VLA_TRY(std::vector<std::string> aliases, keys.strings("observation.view_aliases"));
+  VLA_TRY(view_optional_, keys.integers("observation.view_optional"));
   VLA_TRY(min_views_, keys.integer("observation.min_views"));
   VLA_CHECK(check_names("observation.views", views));
   VLA_CHECK(check_size("observation.view_aliases", aliases, views.size()));
+  VLA_CHECK(check_size("observation.view_optional", view_optional_, views.size()));
   if (min_views_ < 1 || static_cast<std::size_t>(min_views_) > views.size())
     return mismatch("observation.min_views", fmt::format("1 to {}", views.size()), std::to_string(min_views_));
   views_ = FeatureNames("view", std::move(views), std::move(aliases));
