@@ -96,6 +96,17 @@ def test_the_gpt2_class_brings_a_pre_tokenizer_of_its_own(converter, tiny):
     assert any("GPT2Tokenizer" in note for note in converter.summary.notes)
 
 
+@pytest.mark.parametrize("stated, in_file, side", [(None, None, "right"), ("left", None, "left"), (None, "Left", "left"), ("right", "Left", "right")])
+def test_a_long_text_is_cut_on_the_side_that_the_tokenizer_states(converter, tiny, stated, in_file, side):
+    """The config's side counts before the file's; taken from transformers by running it."""
+    if stated:
+        tiny.tokenizer_config["truncation_side"] = stated
+    if in_file:
+        tiny.tokenizer["truncation"] = {"direction": in_file, "max_length": 9, "strategy": "LongestFirst", "stride": 0}
+    recipe = json.loads(converter.bundle(tiny).keys["processor.recipe"])
+    assert recipe["text"][-1] == {"op": "tokenize", "max_tokens": 7, "truncate": side}
+
+
 def test_a_template_that_adds_nothing_is_accepted(converter, tiny):
     tiny.tokenizer["post_processor"] = {"type": "TemplateProcessing", "single": [{"Sequence": {"id": "A", "type_id": 0}}], "pair": [], "special_tokens": {}}
     assert converter.bundle(tiny).keys["tokenizer.kind"] == "byte_level_bpe"
@@ -127,10 +138,9 @@ CASES = {
     "pre_tokenizer: expected Digits and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
     "pre_tokenizer: expected ByteLevel once, as the last step": (spec(pre_tokenizer=SEQUENCE), UNSUPPORTED),
     "post_processor: expected none, ByteLevel, or a template of the text alone": (spec(post_processor={"type": "TemplateProcessing", "single": BOS}), UNSUPPORTED),
-    "truncation.direction: expected Right, found Left": (spec(truncation={"direction": "Left"}), UNSUPPORTED),
     "added_tokens: expected tokens with id and content": (spec(added_tokens=[{"id": "0", "content": "x"}]), BAD),
     "tokenizer_class: expected TokenizersBackend or": (settings(tokenizer_class="LlamaTokenizer"), UNSUPPORTED),
-    "truncation_side: expected 'right', found 'left'": (settings(truncation_side="left"), UNSUPPORTED),
+    "truncation_side: expected 'left' or 'right', found 'middle'": (settings(truncation_side="middle"), UNSUPPORTED),
     "add_bos_token: expected False, found True": (settings(add_bos_token=True), UNSUPPORTED),
     "split_special_tokens: expected False, found True": (settings(split_special_tokens=True), UNSUPPORTED),
     "pad_token: expected a token among the added tokens of tokenizer.json, found '<pad>'": (settings(pad_token="<pad>"), BAD),

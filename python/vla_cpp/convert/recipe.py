@@ -264,9 +264,9 @@ def _old_statistics(checkpoint: Checkpoint, feature: str, problems: Problems) ->
     return found
 
 
-def text_ops(processors: Processors) -> List[dict]:
+def text_ops(processors: Processors, truncate: str) -> List[dict]:
     newline = [{"op": "ensure_suffix", "suffix": "\n"}] if processors.newline else []
-    return newline + [{"op": "tokenize", "max_tokens": processors.max_tokens, "truncate": "right"}]
+    return newline + [{"op": "tokenize", "max_tokens": processors.max_tokens, "truncate": truncate}]
 
 
 def view_aliases(views: Sequence[str], processors: Processors, notes: List[str], problems: Problems) -> List[str]:

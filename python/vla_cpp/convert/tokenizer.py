@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Dict, List, Optional, Tuple
+from typing import Dict, List, NamedTuple, Optional, Tuple
 
 from .errors import Code, Problems, refuse
 from .files import member, read_json
@@ -29,8 +29,13 @@ def byte_symbols() -> List[str]:
     return [chr(moved.get(byte, byte)) for byte in range(256)]
 
 
-def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> Dict[str, object]:
-    """The bundle's `tokenizer.*` keys. `n_vocab`: rows of the embedding table, which no id may reach."""
+class TokenizerPlan(NamedTuple):
+    keys: Dict[str, object]  # the bundle's `tokenizer.*`
+    truncate: str  # the side on which a text that is too long loses tokens: left or right
+
+
+def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> TokenizerPlan:
+    """`n_vocab`: rows of the embedding table, which no id may reach."""
     if not os.path.exists(os.path.join(folder, JSON_FILE)):
         raise refuse(os.path.join(folder, JSON_FILE), "the tokenizer in one file", "none", "load it with transformers and save it again, or give its folder by --backbone", Code.IO)
     spec = read_json(os.path.join(folder, JSON_FILE))
@@ -52,8 +57,19 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
                 CONFIG_FILE, config["tokenizer_class"], JSON_FILE))
         pre = own
     tokens, merges = _vocabulary(model, added, n_vocab, problems)
-    return {"tokenizer.kind": "byte_level_bpe", "tokenizer.tokens": tokens, "tokenizer.merges": merges,
+    keys = {"tokenizer.kind": "byte_level_bpe", "tokenizer.tokens": tokens, "tokenizer.merges": merges,
             "tokenizer.pre": _json(pre), "tokenizer.added": _json(added), "tokenizer.ignore_merges": bool(model.get("ignore_merges", False)) and not gpt2}
+    return TokenizerPlan(keys, _truncation_side(spec, config, problems))
+
+
+def _truncation_side(spec: dict, config: dict, problems: Problems) -> str:
+    """LeRobot's tokenizer step does not state a side, so the tokenizer's own holds: that of its config, else that of its file
+    (transformers tokenization_utils_tokenizers.py). The published SmolVLM2 tokenizer says left."""
+    stated = member(spec, "truncation", dict, JSON_FILE).get("direction")
+    side = config.get("truncation_side", "right" if stated is None else str(stated).lower())
+    if side not in ("left", "right"):
+        problems.unsupported(CONFIG_FILE + ": truncation_side", "'left' or 'right'", repr(side))
+    return side
 
 
 def _json(value) -> str:
@@ -75,14 +91,11 @@ def _check_surroundings(spec: dict, config: dict, problems: Problems) -> None:
         problems.unsupported(JSON_FILE + ": normalizer", "none", _json(normalizer)[:80], "the runtime does not normalise text")
     if not _adds_nothing(spec.get("post_processor")):
         problems.unsupported(JSON_FILE + ": post_processor", "none, ByteLevel, or a template of the text alone", _json(spec["post_processor"])[:80])
-    truncation = member(spec, "truncation", dict, JSON_FILE)
-    if truncation.get("direction", "Right") != "Right":
-        problems.unsupported(JSON_FILE + ": truncation.direction", "Right", str(truncation["direction"]))
     name = config.get("tokenizer_class")
     if name is not None and name not in GENERIC + GPT2:
         problems.unsupported(CONFIG_FILE + ": tokenizer_class", " or ".join(GENERIC + GPT2), str(name),
                              "other classes build a tokenizer of their own around the same file")
-    for key, value in (("truncation_side", "right"), ("split_special_tokens", False), ("add_bos_token", False), ("add_eos_token", False)):
+    for key, value in (("split_special_tokens", False), ("add_bos_token", False), ("add_eos_token", False)):
         if config.get(key, value) not in (value, None):
             problems.unsupported("{}: {}".format(CONFIG_FILE, key), repr(value), repr(config[key]))
 
