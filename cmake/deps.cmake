@@ -42,12 +42,18 @@ if(NOT vla_ggml_tree)
 endif()
 set(BUILD_SHARED_LIBS OFF)
 set(GGML_NATIVE ${VLA_NATIVE} CACHE BOOL "" FORCE)
-set(GGML_OPENMP OFF CACHE BOOL "" FORCE)      # one persistent pool of ours instead: its threads sleep between requests
+set(GGML_OPENMP ON CACHE BOOL "" FORCE)       # its barriers go to sleep on a busy machine; ggml's own only spin
 set(GGML_LLAMAFILE ON CACHE BOOL "" FORCE)    # blocked float32 products
 set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle uses
 set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)
 set(GGML_BUILD_EXAMPLES OFF CACHE BOOL "" FORCE)
 add_subdirectory(${vla_ggml_tree} ${CMAKE_BINARY_DIR}/ggml EXCLUDE_FROM_ALL)
+foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about
+  get_target_property(headers ${target} INTERFACE_INCLUDE_DIRECTORIES)
+  if(headers)
+    set_target_properties(${target} PROPERTIES INTERFACE_SYSTEM_INCLUDE_DIRECTORIES "${headers}")
+  endif()
+endforeach()
 
 # Debian packages: README.md lists them, `make packages` installs them.
 find_package(fmt REQUIRED)

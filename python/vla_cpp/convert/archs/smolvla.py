@@ -67,15 +67,18 @@ def _recipe(s: Sizes, processors: recipe.Processors, truncate: str) -> Dict[str,
 
 
 def _feature_keys(checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[Key]:
-    """The auto-generated empty cameras never have a frame; of the others the reference fills up to `empty_cameras`."""
+    """One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same.
+
+    The cameras that `empty_cameras` adds to the features stand in no data set, so nobody need declare them absent.
+    """
     empty = [view for view in s.views if view.startswith(EMPTY_CAMERA)]
-    min_views = max(1, len(s.views) - len(empty) - s.empty_cameras)
     if empty:
         checkpoint.notes.append("views that stay empty unless a frame is given: " + ", ".join(empty))
     return [
         Key("observation.views", "string[]", s.views),
         Key("observation.view_aliases", "string[]", recipe.view_aliases(s.views, processors, checkpoint.notes, problems)),
-        Key("observation.min_views", "u32", min_views),
+        Key("observation.view_optional", "u32[]", [int(view in empty) for view in s.views]),
+        Key("observation.min_views", "u32", 1),
         Key("observation.states", "string[]", [recipe.STATE]),
         Key("observation.state_dims", "u32[]", [s.state_dim]),
         Key("observation.max_text_tokens", "u32", processors.max_tokens),

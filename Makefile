@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+
+.PHONY: help demo test build packages asan fuzz format clean
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+VENV   := .venv
+STAMP  := $(VENV)/.complete
+
+help:
+	@echo "make demo      install what is needed, build, and play the shipped policy on real camera frames"
+	@echo "make test      build and run the whole test suite, also under the sanitizers"
+	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
+	@echo "make fuzz      build the fuzz targets (clang) and run each for SECONDS=600"
+	@echo "make format    format the C++ sources"
+	@echo "make clean     remove what was built"
+
+packages:
+	@scripts/packages.sh
+
+$(STAMP): python/pyproject.toml python/requirements-test.txt
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check -r python/requirements-test.txt
+	$(VENV)/bin/pip install --quiet --disable-pip-version-check --no-deps -e python
+	@touch $(STAMP)
+
+build: packages $(STAMP)
+	@test -f build/cpu/build.ninja || cmake --preset cpu
+	cmake --build --preset cpu
+
+demo: build
+	$(VENV)/bin/python examples/metaworld/play.py --vla build/cpu/bin/vla
+
+asan: packages $(STAMP)
+	@test -f build/asan/build.ninja || cmake --preset asan
+	cmake --build --preset asan
+
+test: build asan
+	$(VENV)/bin/python scripts/test.py
+
+SECONDS ?= 600
+fuzz: packages
+	@test -f build/fuzz/build.ninja || cmake --preset fuzz
+	cmake --build --preset fuzz
+	scripts/fuzz.sh $(SECONDS)
+
+format:
+	clang-format -i $$(git ls-files 'src/*.h' 'src/*.cpp' 'tests/*.h' 'tests/*.cpp')
+
+clean:
+	rm -rf build $(VENV)

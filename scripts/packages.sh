@@ -1,0 +1,34 @@
+#!/usr/bin/env bash
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+#
+# Installs the Debian or Ubuntu packages that the build needs, or says which are missing where that takes a password.
+set -euo pipefail
+
+packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
+          libcli11-dev nlohmann-json3-dev libfmt-dev libpng-dev libjpeg-dev libxxhash-dev doctest-dev)
+
+if ! command -v dpkg-query >/dev/null; then
+  echo "packages: this is not Debian or Ubuntu; install what corresponds to: ${packages[*]}" >&2
+  exit 0
+fi
+missing=()
+for package in "${packages[@]}"; do
+  status=$(dpkg-query -W -f '${Status}' "$package" 2>/dev/null || true)
+  [ "$status" = "install ok installed" ] || missing+=("$package")
+done
+[ ${#missing[@]} -eq 0 ] && exit 0
+
+as_root=()
+if [ "$(id -u)" -ne 0 ]; then
+  if command -v sudo >/dev/null && sudo -n true 2>/dev/null; then
+    as_root=(sudo)
+  else
+    echo "packages: missing ${missing[*]}" >&2
+    echo "packages: please run:  sudo apt-get install ${missing[*]}" >&2
+    exit 1
+  fi
+fi
+echo "packages: installing ${missing[*]}"
+"${as_root[@]}" apt-get update -qq
+DEBIAN_FRONTEND=noninteractive "${as_root[@]}" apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null

@@ -1,0 +1,61 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Runs every suite of both builds and ends with one line that counts the tests.
+
+    make test                       the usual way
+    scripts/test.py --preset cpu    one build only
+"""
+import argparse
+import re
+import subprocess
+import sys
+from collections import Counter
+
+# What the test programs print about themselves; ctest -V passes it on with a number in front of each line.
+DOCTEST = re.compile(r"\[doctest\] test cases:\s*(\d+)\s*\|\s*(\d+) passed\s*\|\s*(\d+) failed\s*\|\s*(\d+) skipped")
+PYTEST = re.compile(r"^\d+: =* ?(?=.*\b(?:passed|failed|error)).* in [\d.]+s", re.M)
+SKIPPED = re.compile(r"^\d+: (?:SKIP(?:PED)?:? .*)$", re.M)
+
+
+def run_preset(preset):
+    """Runs ctest of one build. Returns (counts of tests by outcome, whether ctest was content)."""
+    print(f"== {preset}", flush=True)
+    process = subprocess.Popen(["ctest", "--preset", preset, "-V", "--no-tests=error"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    counts, lines = Counter(), []
+    for line in process.stdout:
+        lines.append(line)
+        if re.match(r"^\s*\d+/\d+ Test|^\d+: SKIP|^The following|^\d+: .*(ERROR|FAILED|error:)", line):
+            print(line, end="", flush=True)
+    content = process.wait() == 0
+    text = "".join(lines)
+    for _, passed, failed, _skipped in DOCTEST.findall(text):
+        counts["passed"] += int(passed)
+        counts["failed"] += int(failed)
+    for summary in PYTEST.findall(text):
+        for number, outcome in re.findall(r"(\d+) (passed|failed|skipped|error)", summary):
+            counts["failed" if outcome == "error" else outcome] += int(number)
+    counts["skipped"] += len(SKIPPED.findall(text))
+    if not content:
+        print(text[-20000:])
+        counts["failed"] = max(counts["failed"], 1)
+    return counts, content
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", action="append", help="builds to test; default: cpu and asan")
+    total, content = Counter(), True
+    for preset in parser.parse_args().preset or ["cpu", "asan"]:
+        counts, ok = run_preset(preset)
+        print(f"   {preset}: {counts['passed']} passed, {counts['failed']} failed, {counts['skipped']} skipped")
+        total += counts
+        content &= ok
+    if total["passed"] == 0:
+        sys.exit("no test ran")
+    print(f"{total['passed']} passed, {total['failed']} failed, {total['skipped']} skipped")
+    return 0 if content else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

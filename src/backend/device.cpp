@@ -1,0 +1,32 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "backend/device.h"
+
+#include <fmt/format.h>
+#include <sched.h>
+
+namespace vla {
+namespace {
+
+int usable_cores() {
+  cpu_set_t set;
+  return sched_getaffinity(0, sizeof(set), &set) == 0 ? CPU_COUNT(&set) : 1;
+}
+
+}  // namespace
+
+Result<Device> Device::cpu(int n_thread) {
+  Device device;
+  device.n_thread_ = n_thread > 0 ? n_thread : usable_cores();
+  if (device.n_thread_ > GGML_MAX_N_THREADS)
+    return Error{Code::device, "threads", fmt::format("at most {}", GGML_MAX_N_THREADS),
+                 std::to_string(device.n_thread_)};
+  device.backend_.reset(ggml_backend_cpu_init());
+  if (!device.backend_) return Error{Code::device, "cpu", "a backend", "the system refused it"};
+  ggml_backend_cpu_set_n_threads(device.backend_.get(), device.n_thread_);
+  return device;
+}
+
+std::string Device::name() const { return fmt::format("cpu, {} thread{}", n_thread_, n_thread_ == 1 ? "" : "s"); }
+
+}  // namespace vla

@@ -1,0 +1,29 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <ggml-cpp.h>
+#include <ggml-cpu.h>
+
+#include <string>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// Where graphs run. The threads belong to the OpenMP runtime, which keeps them and lets them sleep between requests.
+class Device {
+ public:
+  /// The CPU with `n_thread` threads; 0 takes every core that the process may use. Errors: device.
+  static Result<Device> cpu(int n_thread);
+
+  ggml_backend_t backend() const { return backend_.get(); }
+  int n_thread() const { return n_thread_; }
+  std::string name() const;
+
+ private:
+  ggml_backend_ptr backend_;
+  int n_thread_ = 0;
+};
+
+}  // namespace vla

@@ -1,0 +1,80 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "backend/graph.h"
+
+namespace vla {
+namespace {
+
+/// Room for a graph: no module makes more than this many nodes for each of its parameters.
+constexpr std::size_t kNodesPerParam = 48;
+constexpr std::size_t kLeastNodes = 4096;
+
+/// A product with fewer operations than this takes about as long as bringing the threads together after it.
+constexpr double kLeastWork = 4e6;
+
+}  // namespace
+
+Status ComputeMemory::reserve(ggml_cgraph* graph) {
+  if (ggml_gallocr_reserve(allocator_.get(), graph)) return {};
+  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation",
+               "free memory or use a smaller model"};
+}
+
+Graph::Graph(const Weights& weights, Store& store, TapFilter keep)
+    : weights_(weights), store_(store), keep_(std::move(keep)) {
+  const std::size_t n_node = kLeastNodes + kNodesPerParam * weights.count();
+  const std::size_t memory = ggml_graph_overhead_custom(n_node, false) + n_node * ggml_tensor_overhead();
+  context_.reset(ggml_init({.mem_size = memory, .mem_buffer = nullptr, .no_alloc = true}));
+  graph_ = ggml_new_graph_custom(context_.get(), n_node, false);
+}
+
+Tensor Graph::constant(const std::string& key, const std::function<Tensor(Store&)>& make) {
+  const auto [place, is_new] = constants_.try_emplace(key);
+  if (is_new) place->second = make(store_);
+  return place->second;
+}
+
+Tensor Graph::name(const std::string& path, Tensor value) {
+  if (!keep_ || !keep_(path)) return value;
+  // A view's memory belongs to another tensor, which may be overwritten later in the run: keep a copy.
+  ggml_tensor* kept = value.node();
+  if (kept->view_src != nullptr || !ggml_is_contiguous(kept)) kept = ggml_cont(context_.get(), kept);
+  ggml_set_output(kept);
+  require(kept);
+  taps_.emplace_back(path, kept);
+  return value;
+}
+
+void Graph::require(Tensor value) { ggml_build_forward_expand(graph_, value.node()); }
+
+void Graph::write(Tensor value, Tensor target) { require(ggml_cpy(context_.get(), value.node(), target.node())); }
+
+Status Graph::allocate(ComputeMemory& memory) {
+  if (ggml_gallocr_alloc_graph(memory.allocator(), graph_)) return {};
+  return Error{Code::out_of_memory, "working memory", "", "the graph does not fit into what was reserved for it"};
+}
+
+int Graph::n_thread(const Device& device) const {
+  double work = 0;
+  int n_product = 0;
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
+    const ggml_tensor* node = ggml_graph_node(graph_, i);
+    if (node->op != GGML_OP_MUL_MAT) continue;
+    work += 2.0 * static_cast<double>(ggml_nelements(node)) * static_cast<double>(node->src[0]->ne[0]);
+    ++n_product;
+  }
+  return work < kLeastWork * n_product ? 1 : device.n_thread();
+}
+
+Status Graph::run(const Device& device) {
+  ggml_backend_cpu_set_n_threads(device.backend(), n_thread_ > 0 ? n_thread_ : n_thread_ = n_thread(device));
+  const ggml_status status = ggml_backend_graph_compute(device.backend(), graph_);
+  if (status == GGML_STATUS_SUCCESS) return {};
+  if (status == GGML_STATUS_ALLOC_FAILED)
+    return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
+  return Error{Code::device, "graph", "a finished run", ggml_status_to_string(status)};
+}
+
+int Graph::n_node() const { return ggml_graph_n_nodes(graph_); }
+
+}  // namespace vla

@@ -1,0 +1,78 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <functional>
+#include <map>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "backend/device.h"
+#include "backend/store.h"
+#include "backend/weights.h"
+
+namespace vla {
+
+/// Says of a path whether its values are to be kept. An empty function keeps nothing, and the graph is the production
+/// graph.
+using TapFilter = std::function<bool(const std::string& path)>;
+
+/// Working memory that all graphs share, since only one of them runs at a time.
+class ComputeMemory {
+ public:
+  explicit ComputeMemory(const Device& device)
+      : allocator_(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend()))) {}
+  ggml_gallocr_t allocator() const { return allocator_.get(); }
+  /// Makes the memory large enough for `graph`. Growing invalidates every graph that was allocated before.
+  Status reserve(ggml_cgraph* graph);
+  std::size_t size() const { return ggml_gallocr_get_buffer_size(allocator_.get(), 0); }
+
+ private:
+  ggml_gallocr_ptr allocator_;
+};
+
+/// One graph: built once, given memory once, then run as often as wanted. `nn` adds operations through `context()`.
+class Graph {
+ public:
+  /// `store` holds what outlives a run: constants that modules ask for, and whatever the owner adds.
+  Graph(const Weights& weights, Store& store, TapFilter keep);
+
+  ggml_context* context() const { return context_.get(); }
+  Tensor weight(const Param* param) const { return weights_[param]; }
+  Store& store() { return store_; }
+
+  /// Values that depend on the shape alone (masks, rotary tables): made once per graph for each `key`.
+  Tensor constant(const std::string& key, const std::function<Tensor(Store&)>& make);
+
+  /// Gives `value` its path; where the filter wants it, its values are kept for `taps`.
+  Tensor name(const std::string& path, Tensor value);
+  /// Orders `value` into the graph: results, and writes into the store.
+  void require(Tensor value);
+  /// Writes `value` into `target`, a tensor of the store.
+  void write(Tensor value, Tensor target);
+
+  /// After everything is built and the store is allocated: first `reserve` for every graph that is to run side by side,
+  /// then `allocate` for each. Errors: out_of_memory.
+  Status reserve(ComputeMemory& memory) { return memory.reserve(graph_); }
+  Status allocate(ComputeMemory& memory);
+  /// Errors: device.
+  Status run(const Device& device);
+
+  int n_node() const;
+  /// Threads that a run takes: one where products are too small to be worth a barrier after each node.
+  int n_thread(const Device& device) const;
+  const std::vector<std::pair<std::string, Tensor>>& taps() const { return taps_; }
+
+ private:
+  const Weights& weights_;
+  Store& store_;
+  TapFilter keep_;
+  ggml_context_ptr context_;
+  ggml_cgraph* graph_;
+  int n_thread_ = 0;  // chosen at the first run
+  std::map<std::string, Tensor> constants_;
+  std::vector<std::pair<std::string, Tensor>> taps_;
+};
+
+}  // namespace vla

@@ -1,0 +1,144 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bundle/bundle.h"
+
+#include <fcntl.h>
+#include <fmt/format.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+#include <xxhash.h>
+
+#include <cerrno>
+#include <cmath>
+#include <cstring>
+
+#include "bundle/gguf_reader.h"
+
+namespace vla {
+namespace {
+
+constexpr int kBundleVersion = 1;
+constexpr std::string_view kChecksumKey = "vla.checksum";
+constexpr std::string_view kChecksumPrefix = "xxh3:";
+constexpr std::size_t kDigits = 16;
+
+Error io_error(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
+
+struct Mapping {
+  std::shared_ptr<const void> owner;
+  std::span<const std::byte> bytes;
+};
+
+Result<Mapping> map_file(const std::string& path) {
+  const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  if (file < 0) return io_error(path, "a readable bundle");
+  struct stat info = {};
+  const bool regular = ::fstat(file, &info) == 0 && S_ISREG(info.st_mode);
+  const std::size_t size = regular ? static_cast<std::size_t>(info.st_size) : 0;
+  void* memory = size > 0 ? ::mmap(nullptr, size, PROT_READ, MAP_PRIVATE, file, 0) : MAP_FAILED;
+  const int why = errno;
+  ::close(file);
+  if (!regular) return Error{Code::io, path, "a file", "something that is not a regular file"};
+  if (size == 0) return Error{Code::bad_bundle, path, "a GGUF file", "an empty file", "copy or convert it again"};
+  errno = why;
+  if (memory == MAP_FAILED) return io_error(path, "a file that can be mapped");
+  const auto* data = static_cast<const std::byte*>(memory);
+  return Mapping{{memory, [size](void* pointer) { ::munmap(pointer, size); }}, {data, size}};
+}
+
+/// XXH3-64 of the file with the digits at `digits` read as zeros.
+std::string file_checksum(std::span<const std::byte> bytes, std::size_t digits) {
+  constexpr char kZeros[kDigits + 1] = "0000000000000000";
+  const std::unique_ptr<XXH3_state_t, decltype(&XXH3_freeState)> state(XXH3_createState(), XXH3_freeState);
+  XXH3_64bits_reset(state.get());
+  XXH3_64bits_update(state.get(), bytes.data(), digits);
+  XXH3_64bits_update(state.get(), kZeros, kDigits);
+  XXH3_64bits_update(state.get(), bytes.data() + digits + kDigits, bytes.size() - digits - kDigits);
+  return fmt::format("{:016x}", XXH3_64bits_digest(state.get()));
+}
+
+Status check_sum(std::span<const std::byte> bytes, const Keys& keys, const std::string& name) {
+  VLA_TRY(const std::string stated, keys.string(kChecksumKey));
+  if (stated.size() != kChecksumPrefix.size() + kDigits || !stated.starts_with(kChecksumPrefix))
+    return Error{Code::bad_bundle, name + ": " + std::string(kChecksumKey), "xxh3: and 16 hex digits", stated};
+  // The digits are found by their key, whose text stands once before them: any other place would not hash to them.
+  const std::string_view text(reinterpret_cast<const char*>(bytes.data()), bytes.size());
+  const std::size_t key = text.find(kChecksumKey);
+  const std::size_t digits = text.find(stated, key) + kChecksumPrefix.size();
+  const std::string found = file_checksum(bytes, digits);
+  if (stated.ends_with(found)) return {};
+  return Error{Code::bad_bundle, name, "content with checksum " + stated, std::string(kChecksumPrefix) + found,
+               "the file was damaged or edited: copy or convert it again"};
+}
+
+Status check_version(const Keys& keys, const std::string& name) {
+  VLA_TRY(const int version, keys.integer("vla.bundle_version"));
+  if (version == kBundleVersion) return {};
+  return Error{Code::bad_bundle, name + ": vla.bundle_version", std::to_string(kBundleVersion), std::to_string(version),
+               version < kBundleVersion ? "run vla-convert again" : "this bundle needs a newer vla"};
+}
+
+}  // namespace
+
+const char* dtype_name(DType type) {
+  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32"};
+  return kNames[static_cast<int>(type)];
+}
+
+std::size_t dtype_size(DType type) { return type == DType::f32 || type == DType::i32 ? 4 : 2; }
+
+std::int64_t TensorInfo::count() const {
+  std::int64_t product = 1;
+  for (std::int64_t dim : shape) product *= dim;
+  return product;
+}
+
+Result<Bundle> Bundle::open(const std::string& path) {
+  VLA_TRY(Mapping mapping, map_file(path));
+  VLA_TRY(Bundle bundle, parse(mapping.bytes, path));
+  bundle.mapping_ = std::move(mapping.owner);
+  return bundle;
+}
+
+Result<Bundle> Bundle::parse(std::span<const std::byte> bytes, std::string name) {
+  VLA_TRY(GgufContent content, read_gguf(bytes, name));
+  if (!content.keys.has("vla.bundle_version"))
+    return Error{Code::bad_bundle, name, "a vla bundle", "a GGUF file of another kind",
+                 "make a bundle with vla-convert"};
+  VLA_CHECK(check_version(content.keys, name));
+  VLA_CHECK(check_sum(bytes, content.keys, name));
+  Bundle bundle;
+  bundle.path_ = std::move(name);
+  bundle.bytes_ = bytes;
+  bundle.keys_ = std::move(content.keys);
+  bundle.tensors_ = std::move(content.tensors);
+  return bundle;
+}
+
+void Bundle::release_pages() const {
+  if (mapping_) ::madvise(const_cast<void*>(mapping_.get()), bytes_.size(), MADV_DONTNEED);
+}
+
+const TensorInfo* Bundle::find(std::string_view name) const {
+  for (const TensorInfo& tensor : tensors_)
+    if (tensor.name == name) return &tensor;
+  return nullptr;
+}
+
+Result<std::vector<float>> Bundle::stats(std::string_view name) const {
+  const std::string where = path_ + ": tensor " + std::string(name);
+  const TensorInfo* tensor = find(name);
+  if (tensor == nullptr)
+    return Error{Code::bad_bundle, where, "statistics", "no such tensor", "convert the checkpoint again"};
+  if (tensor->type != DType::f32 || tensor->shape.size() != 1)
+    return Error{Code::bad_bundle, where, "a one-dimensional f32 tensor",
+                 fmt::format("{} dimensions of {}", tensor->shape.size(), dtype_name(tensor->type))};
+  std::vector<float> values(static_cast<std::size_t>(tensor->count()));
+  std::memcpy(values.data(), tensor->data.data(), tensor->data.size());
+  for (float value : values)
+    if (!std::isfinite(value)) return Error{Code::bad_bundle, where, "finite numbers", fmt::format("{}", value)};
+  return values;
+}
+
+}  // namespace vla

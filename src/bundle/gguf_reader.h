@@ -1,0 +1,25 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+#include "bundle/bundle.h"
+
+namespace vla {
+
+/// What stands in a GGUF file. Tensor data points into the parsed bytes.
+struct GgufContent {
+  Keys keys;
+  std::vector<TensorInfo> tensors;
+};
+
+/// Parses GGUF version 3 (ggml docs/gguf.md). A reader of our own instead of ggml's, because a bundle may be hostile:
+/// here every count and length is compared with the bytes that are left before anything is allocated or read, and the
+/// refusal names the key or tensor. Errors: bad_bundle.
+Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::string& name);
+
+}  // namespace vla

@@ -1,0 +1,66 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bundle/keys.h"
+
+#include <cmath>
+#include <limits>
+
+namespace vla {
+namespace {
+
+constexpr const char* kTypeNames[] = {"a boolean",        "an integer",         "a floating-point number",
+                                      "a string",         "a list of integers", "a list of floating-point numbers",
+                                      "a list of strings"};
+
+Error missing(std::string_view key, const std::string& expected) {
+  return {Code::bad_bundle, std::string(key), expected, "no such key", "convert the checkpoint again"};
+}
+
+template <class T>
+Result<T> get(const std::map<std::string, Value, std::less<>>& values, std::string_view key) {
+  constexpr std::size_t index = Value(T{}).index();
+  const auto found = values.find(key);
+  if (found == values.end()) return missing(key, kTypeNames[index]);
+  if (const T* value = std::get_if<T>(&found->second)) return *value;
+  return Error{Code::bad_bundle, std::string(key), kTypeNames[index], kTypeNames[found->second.index()]};
+}
+
+bool fits_int(std::int64_t value) { return value >= 0 && value <= std::numeric_limits<int>::max(); }
+
+Error not_a_size(std::string_view key, std::int64_t value) {
+  return {Code::bad_bundle, std::string(key), "an integer from 0 to 2^31 - 1", std::to_string(value)};
+}
+
+}  // namespace
+
+Result<bool> Keys::boolean(std::string_view key) const { return get<bool>(values_, key); }
+
+Result<std::string> Keys::string(std::string_view key) const { return get<std::string>(values_, key); }
+
+Result<std::vector<std::string>> Keys::strings(std::string_view key) const {
+  return get<std::vector<std::string>>(values_, key);
+}
+
+Result<int> Keys::integer(std::string_view key) const {
+  VLA_TRY(const std::int64_t value, get<std::int64_t>(values_, key));
+  if (!fits_int(value)) return not_a_size(key, value);
+  return static_cast<int>(value);
+}
+
+Result<double> Keys::number(std::string_view key) const {
+  VLA_TRY(const double value, get<double>(values_, key));
+  if (!std::isfinite(value)) return Error{Code::bad_bundle, std::string(key), "a finite number", std::to_string(value)};
+  return value;
+}
+
+Result<std::vector<int>> Keys::integers(std::string_view key) const {
+  VLA_TRY(const std::vector<std::int64_t> wide, get<std::vector<std::int64_t>>(values_, key));
+  std::vector<int> narrow;
+  for (std::int64_t value : wide) {
+    if (!fits_int(value)) return not_a_size(key, value);
+    narrow.push_back(static_cast<int>(value));
+  }
+  return narrow;
+}
+
+}  // namespace vla

@@ -1,0 +1,111 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bundle/params.h"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+namespace vla {
+namespace {
+
+std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
+
+}  // namespace
+
+const char* storage_name(Storage storage) {
+  constexpr const char* kNames[] = {"matrix", "table", "vector"};
+  return kNames[static_cast<int>(storage)];
+}
+
+std::int64_t Param::count() const {
+  std::int64_t product = 1;
+  for (std::int64_t dim : shape) product *= dim;
+  return product;
+}
+
+const Param& ParamList::declare(std::string name, Storage storage, std::vector<std::int64_t> shape) {
+  Param& param = params_.emplace_back();
+  param.id = static_cast<int>(params_.size()) - 1;
+  param.name = std::move(name);
+  param.storage = storage;
+  param.shape = std::move(shape);
+  names_.insert(param.name);
+  if (bundle_ != nullptr) look_up(param);
+  return param;
+}
+
+void ParamList::look_up(Param& param) {
+  const TensorInfo* tensor = bundle_->find(param.name);
+  if (tensor == nullptr)
+    return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.shape),
+                               storage_name(param.storage)));
+  if (tensor->shape != param.shape)
+    return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name, shape_text(param.shape),
+                               shape_text(tensor->shape)));
+  const bool fits = tensor->type == DType::f32 || (param.storage != Storage::vector && tensor->type != DType::i32);
+  if (!fits)
+    return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name,
+                               param.storage == Storage::vector ? "f32" : "f32, bf16 or f16",
+                               dtype_name(tensor->type)));
+  param.source = tensor;
+}
+
+void ParamList::problem(const Error& error) {
+  problem(fmt::format("{:<15} {:<40} expected {}", error.found == "no such key" ? "missing key" : "wrong key",
+                      error.where,
+                      error.found == "no such key" ? error.expected : error.expected + ", file has " + error.found));
+}
+
+Status ParamList::report(const std::string& policy, const std::function<bool(const std::string&)>& is_used) const {
+  std::vector<std::string> lines = problems_;
+  if (bundle_ != nullptr)
+    for (const TensorInfo& tensor : bundle_->tensors())
+      if (names_.count(tensor.name) == 0 && !is_used(tensor.name))
+        lines.push_back(fmt::format("unused tensor   {:<40} no module of {} declares it", tensor.name, policy));
+  if (lines.empty()) return {};
+  return Error{Code::bad_bundle, bundle_ != nullptr ? bundle_->path() : policy, "",
+               fmt::format("does not fit policy {}: {} problem{}\n  {}", policy, lines.size(),
+                           lines.size() == 1 ? "" : "s", fmt::join(lines, "\n  ")),
+               "convert the checkpoint again with the vla-convert of this version"};
+}
+
+template <class T>
+T Scope::take(Result<T> result, T otherwise) const {
+  if (result) return std::move(*result);
+  list_->problem(result.error());
+  return otherwise;
+}
+
+int Scope::dim(const std::string& key, int max) const {
+  const int value = take(list_->keys().integer(key_of(key)), 1);
+  const bool in_range = value >= 1 && value <= max;
+  require(in_range, key, fmt::format("1 to {}", max), std::to_string(value));
+  return in_range ? value : 1;
+}
+
+double Scope::precise(const std::string& key) const { return take(list_->keys().number(key_of(key)), 1.0); }
+float Scope::number(const std::string& key) const { return static_cast<float>(precise(key)); }
+std::string Scope::string(const std::string& key) const {
+  return take(list_->keys().string(key_of(key)), std::string());
+}
+std::vector<std::string> Scope::strings(const std::string& key) const {
+  return take(list_->keys().strings(key_of(key)), std::vector<std::string>());
+}
+
+void Scope::require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const {
+  if (!holds) list_->problem(Error{Code::bad_bundle, key_of(key), expected, found});
+}
+
+const Param* Scope::matrix(const std::string& name, int d_in, int d_out) const {
+  return &list_->declare((*this / name).path(), Storage::matrix, {d_in, d_out});
+}
+
+const Param* Scope::table(const std::string& name, int d_model, int n_row) const {
+  return &list_->declare((*this / name).path(), Storage::table, {d_model, n_row});
+}
+
+const Param* Scope::vector(const std::string& name, int size) const {
+  return &list_->declare((*this / name).path(), Storage::vector, {size});
+}
+
+}  // namespace vla

@@ -1,0 +1,93 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <deque>
+#include <functional>
+#include <initializer_list>
+#include <set>
+#include <string>
+#include <vector>
+
+#include "bundle/bundle.h"
+
+namespace vla {
+
+/// How a parameter may be stored: a matrix or a table in any dtype of the bundle, a vector in f32 only.
+enum class Storage { matrix, table, vector };
+
+const char* storage_name(Storage storage);
+
+/// One declared weight. `shape` follows ggml, fastest first: a matrix is [d_in, d_out].
+struct Param {
+  int id = 0;
+  std::string name;
+  Storage storage = Storage::matrix;
+  std::vector<std::int64_t> shape;
+  const TensorInfo* source = nullptr;  // set where the bundle has a tensor that fits
+
+  std::int64_t count() const;
+};
+
+/// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they
+/// record, and `report` gives all problems in one error, so that a wrong bundle is understood at the first try.
+class ParamList {
+ public:
+  /// `bundle` may be null: then the list is a manifest of what the keys ask for, and tensors are not looked up.
+  ParamList(const Keys& keys, const Bundle* bundle) : keys_(keys), bundle_(bundle) {}
+
+  const Keys& keys() const { return keys_; }
+  const std::deque<Param>& params() const { return params_; }
+
+  const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape);
+  void problem(std::string line) { problems_.push_back(std::move(line)); }
+  void problem(const Error& error);
+
+  /// All problems, and every tensor of the bundle that nobody declared or `is_used` does not know. Errors: bad_bundle.
+  Status report(const std::string& policy, const std::function<bool(const std::string&)>& is_used) const;
+
+ private:
+  void look_up(Param& param);
+
+  const Keys& keys_;
+  const Bundle* bundle_;
+  std::deque<Param> params_;  // a deque: modules keep pointers to their parameters
+  std::set<std::string> names_;
+  std::vector<std::string> problems_;
+};
+
+/// A place in the module tree: its path is the prefix of its config keys, its tensors, its taps and its error messages.
+class Scope {
+ public:
+  Scope(ParamList& list, std::string path) : list_(&list), path_(std::move(path)) {}
+
+  Scope operator/(const std::string& child) const { return {*list_, path_.empty() ? child : path_ + "." + child}; }
+  Scope operator/(int index) const { return *this / std::to_string(index); }
+  const std::string& path() const { return path_; }
+
+  /// Sizes and counts from the configuration, from 1 to `max`: small enough that products of two of them stay in range.
+  /// A problem is recorded and 1 returned where one is wrong.
+  int dim(const std::string& key, int max = 1 << 16) const;
+  /// A number of layers or blocks, from 1 to 512, so that a damaged bundle cannot ask for endless work.
+  int n_layer(const std::string& key) const { return dim(key, 512); }
+  float number(const std::string& key) const;
+  double precise(const std::string& key) const;
+  std::string string(const std::string& key) const;
+  std::vector<std::string> strings(const std::string& key) const;
+  /// Records a problem at `key` of this scope unless `holds`.
+  void require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const;
+
+  const Param* matrix(const std::string& name, int d_in, int d_out) const;
+  const Param* table(const std::string& name, int d_model, int n_row) const;
+  const Param* vector(const std::string& name, int size) const;
+
+ private:
+  std::string key_of(const std::string& key) const { return path_.empty() ? "policy." + key : path_ + "." + key; }
+  template <class T>
+  T take(Result<T> result, T otherwise) const;
+
+  ParamList* list_;
+  std::string path_;
+};
+
+}  // namespace vla

@@ -1,0 +1,19 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <CLI/CLI.hpp>
+#include <functional>
+
+#include "base/result.h"
+
+namespace vla::cli {
+
+/// Adds one subcommand. What it returns is run after parsing; its Status becomes the exit code (base/result.h).
+using Command = std::function<Status()>;
+
+Command add_run(CLI::App& app);
+Command add_inspect(CLI::App& app);
+Command add_compare(CLI::App& app);
+
+}  // namespace vla::cli

@@ -1,0 +1,63 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// One binary, one file per subcommand. This file parses, prints errors and chooses the exit code.
+#include <fmt/format.h>
+
+#include <exception>
+#include <new>
+
+#include "cli/commands.h"
+
+namespace {
+
+constexpr const char* kFooter = R"(Start here:
+  vla run policy.gguf --image top=top.png --image wrist=wrist.jpg --state 0.1,0.2,0.3 --text "pick up the red cube"
+  vla inspect policy.gguf
+
+Bundles are made with vla-convert (docs/converting.md).
+Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation, 5 bad_action, 6 unsupported, 7 out_of_memory,
+8 device, 9 io, 10 mismatch.)";
+
+int fail(const vla::Error& error) {
+  fmt::print(stderr, "error: {}: {}\n", vla::code_name(error.code), error.message());
+  return vla::exit_code(error.code);
+}
+
+int run(int argc, char** argv) {
+  CLI::App app("vla: Vision-Language-Action policies, from camera frames and a sentence to robot actions.", "vla");
+  app.footer(kFooter);
+  app.require_subcommand(1);
+  app.set_version_flag("--version", VLA_VERSION);
+
+  vla::cli::Command command;
+  const auto choose = [&](const char* name, const vla::cli::Command& chosen) {
+    app.get_subcommand(name)->callback([&command, chosen] { command = chosen; });
+  };
+  choose("run", vla::cli::add_run(app));
+  choose("inspect", vla::cli::add_inspect(app));
+  choose("compare", vla::cli::add_compare(app));
+
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& parse_error) {
+    const bool asked_for_help = parse_error.get_exit_code() == 0;
+    app.exit(parse_error);
+    return asked_for_help ? 0 : vla::exit_code(vla::Code::usage);
+  }
+  const vla::Status status = command();
+  return status ? 0 : fail(status.error());
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  try {  // what libraries may throw ends here
+    return run(argc, argv);
+  } catch (const std::bad_alloc&) {
+    return fail(
+        {vla::Code::out_of_memory, "vla", "", "the system has no memory left", "use a smaller model or free memory"});
+  } catch (const std::exception& exception) {
+    return fail({vla::Code::internal, "vla", "", exception.what(), "please report this"});
+  }
+}

@@ -1,0 +1,205 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <charconv>
+#include <random>
+
+#include "base/file.h"
+#include "base/npy.h"
+#include "cli/commands.h"
+#include "cli/json.h"
+#include "engine/engine.h"
+
+namespace vla::cli {
+namespace {
+
+constexpr std::size_t kMaxFile = std::size_t{1} << 30;
+
+struct RunOptions {
+  std::string bundle, text, noise, out, tap, taps_out;
+  std::vector<std::string> images, states;
+  std::optional<std::uint64_t> seed;
+  int n_thread = 0;
+  bool json = false;
+};
+
+struct NameValue {
+  std::string name, value;
+};
+
+/// `NAME=VALUE`, split at the first `=`.
+Result<NameValue> split(const std::string& option, const std::string& argument) {
+  const std::size_t equals = argument.find('=');
+  if (equals == std::string::npos || equals == 0) return Error{Code::usage, option, "NAME=VALUE", argument};
+  return NameValue{argument.substr(0, equals), argument.substr(equals + 1)};
+}
+
+Result<std::vector<float>> parse_numbers(const std::string& text) {
+  std::vector<float> values;
+  for (const char *at = text.data(), *end = at + text.size(); at != end;) {
+    while (at != end && *at == ' ') ++at;
+    float value;
+    const auto [next, error] = std::from_chars(at, end, value);
+    if (error != std::errc() || (next != end && *next != ',') || (next != end && next + 1 == end))
+      return Error{Code::usage, "--state", "numbers separated by commas", text};
+    values.push_back(value);
+    at = next == end ? next : next + 1;
+  }
+  return values;
+}
+
+Status add_image(Observation& observation, const std::string& argument) {
+  VLA_TRY(const NameValue image, split("--image", argument));
+  std::optional<Frame> frame;  // `NAME=`: declared absent
+  if (!image.value.empty()) {
+    VLA_TRY(const std::vector<std::byte> bytes, read_file(image.value, kMaxFile));
+    VLA_TRY(frame, decode_image(bytes, fmt::format("image {} ({})", image.name, image.value)));
+  }
+  if (!observation.views.emplace(image.name, std::move(frame)).second)
+    return Error{Code::usage, "--image", "each view once", image.name + " twice"};
+  return {};
+}
+
+Status add_state(Observation& observation, const std::string& argument, const Processor& processor) {
+  // Without a name the numbers are the only state feature that there is.
+  std::string name, numbers = argument;
+  if (argument.find('=') != std::string::npos) {
+    VLA_TRY(const NameValue state, split("--state", argument));
+    name = state.name, numbers = state.value;
+  } else if (processor.states().names().size() == 1) {
+    name = processor.states().names().front();
+  } else {
+    return Error{Code::usage, "--state", "NAME=v,v,... because the bundle has several state features", argument};
+  }
+  VLA_TRY(std::vector<float> values, parse_numbers(numbers));
+  if (!observation.states.emplace(name, std::move(values)).second)
+    return Error{Code::usage, "--state", "each state once", name + " twice"};
+  return {};
+}
+
+Result<Noise> read_noise(const RunOptions& options) {
+  if (options.noise.empty()) return Noise(*options.seed);
+  VLA_TRY(const std::vector<std::byte> bytes, read_file(options.noise, kMaxFile));
+  VLA_TRY(NpyArray array, parse_npy(bytes, options.noise));
+  auto* values = std::get_if<std::vector<float>>(&array.values);
+  if (values == nullptr) return Error{Code::bad_observation, options.noise, "float32 noise", "uint8"};
+  return Noise(std::move(*values));
+}
+
+void print_table(const ActionChunk& chunk, const Engine& engine) {
+  const std::vector<std::string>& names = engine.processor().action_names();
+  std::size_t width = 9;
+  for (const std::string& name : names) width = std::max(width, name.size());
+  fmt::print("{:>4}", "step");
+  for (const std::string& name : names) fmt::print("  {:>{}}", name, width);
+  fmt::print("\n");
+  for (int row = 0; row < chunk.horizon; ++row) {
+    fmt::print("{:>4}", row);
+    for (int i = 0; i < chunk.d_action; ++i)
+      fmt::print("  {:>{}.4f}", chunk.actions[static_cast<std::size_t>(row * chunk.d_action + i)], width);
+    fmt::print("\n");
+  }
+}
+
+void print_timing(const Timing& timing) {
+  std::vector<std::string> parts;
+  for (const auto& [stage, ms] : timing) parts.push_back(fmt::format("{} {:.1f}", stage, ms));
+  fmt::print("ms: {}\n", fmt::join(parts, ", "));
+}
+
+void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions& options) {
+  Json actions = Json::array();
+  for (int row = 0; row < chunk.horizon; ++row) {
+    const auto first = chunk.actions.begin() + row * chunk.d_action;
+    actions.push_back(std::vector<float>(first, first + chunk.d_action));
+  }
+  Json timing = Json::object();
+  for (const auto& [stage, ms] : chunk.timing) timing[stage] = static_cast<float>(ms);
+  Json root;
+  root["actions"] = std::move(actions);
+  root["action_names"] = engine.processor().action_names();
+  root["timing_ms"] = std::move(timing);
+  root["bundle"] = identity_json(engine.bundle());
+  root["notes"] = chunk.notes;
+  if (options.seed && options.noise.empty()) root["seed"] = *options.seed;
+  fmt::print("{}\n", root.dump());
+}
+
+Status check(RunOptions& options) {
+  if (!options.noise.empty() && options.seed) return Error{Code::usage, "--seed", "--noise or --seed", "both"};
+  if (options.tap.empty() != options.taps_out.empty())
+    return Error{Code::usage, "--tap", "--tap PATTERN and --taps-out FILE together", "one of them"};
+  if (options.noise.empty() && !options.seed) {
+    options.seed = std::random_device()();
+    fmt::print(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
+  }
+  return {};
+}
+
+Status run(RunOptions& options) {
+  VLA_CHECK(check(options));
+  StageClock clock;
+  Timing before;
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.tap}));
+  clock.lap(before, "load");
+  Observation observation;
+  observation.text = options.text;
+  for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image));
+  for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, engine->processor()));
+  clock.lap(before, "decode");
+  VLA_TRY(const Noise noise, read_noise(options));
+  VLA_TRY(ActionChunk chunk, engine->act(observation, noise));
+  chunk.timing.insert(chunk.timing.begin(), before.begin(), before.end());
+
+  for (const std::string& note : chunk.notes) fmt::print(stderr, "note: {}\n", note);
+  if (!options.taps_out.empty()) VLA_CHECK(write_taps(chunk.taps, options.taps_out));
+  if (!options.out.empty())
+    VLA_CHECK(write_npy(options.out, chunk.actions, static_cast<std::size_t>(chunk.horizon),
+                        static_cast<std::size_t>(chunk.d_action)));
+  if (options.json) {
+    print_json(chunk, *engine, options);
+    return {};
+  }
+  print_table(chunk, *engine);
+  print_timing(chunk.timing);
+  return {};
+}
+
+}  // namespace
+
+Command add_run(CLI::App& app) {
+  auto options = std::make_shared<RunOptions>();
+  CLI::App* command = app.add_subcommand("run", "One observation in, one action chunk out");
+  command->footer(
+      "NAME is a camera feature of the bundle or its last part: camera1 for observation.images.camera1 (vla inspect "
+      "lists\n"
+      "them). NAME= declares a view absent; a view that is simply not mentioned is an error.\n"
+      "  vla run policy.gguf --image camera1=top.png --image camera2= --state 0.1,0.2,0.3 --text \"open the drawer\" "
+      "--seed 1 --json");
+  command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert")->required();
+  command
+      ->add_option("--image", options->images,
+                   "NAME=FILE: a frame as PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3)")
+      ->required()
+      ->allow_extra_args(false);
+  command->add_option("--state", options->states, "v,v,... or NAME=v,v,...: the robot's state in its own units")
+      ->required()
+      ->allow_extra_args(false);
+  command->add_option("--text", options->text, "The instruction")->required();
+  command->add_option("--noise", options->noise,
+                      "The solver's starting noise: a float32 .npy file, horizon x padded action width");
+  command->add_option("--seed", options->seed, "Draw the noise; the same seed gives the same bytes on every machine");
+  command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
+  command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions");
+  command->add_option("--tap", options->tap,
+                      "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns");
+  command->add_option("--taps-out", options->taps_out, "Where the recorded values go (GGUF), for vla compare");
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+      ->check(CLI::Range(0, 512))
+      ->capture_default_str();
+  return [options] { return run(*options); };
+}
+
+}  // namespace vla::cli

@@ -1,0 +1,145 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "engine/engine.h"
+
+#include <fmt/format.h>
+
+#include <cmath>
+
+namespace vla {
+namespace {
+
+constexpr int kMaxHorizon = 4096;
+
+}  // namespace
+
+Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
+  VLA_TRY(Bundle bundle, Bundle::open(path));
+  VLA_TRY(Processor processor, Processor::create(bundle));
+  VLA_TRY(Device device, Device::cpu(options.n_thread));
+  std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
+  engine->tap_pattern_ = options.tap_pattern;
+  VLA_CHECK(engine->load_policy(options.dry));
+  VLA_CHECK(engine->make_conditions());
+  engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_,
+                                                       engine->solver_, engine->conditions_, engine->d_action_,
+                                                       engine->horizon_, engine->tap_pattern_});
+  VLA_CHECK(engine->warm_up());
+  engine->bundle_.release_pages();
+  return engine;
+}
+
+Status Engine::load_policy(bool dry) {
+  const Keys& keys = bundle_.keys();
+  VLA_TRY(const std::string arch, keys.string("vla.arch"));
+  VLA_TRY(const PolicyEntry entry, find_policy(arch));
+  params_ = std::make_unique<ParamList>(keys, &bundle_);
+  policy_ = entry.make(*params_);
+  VLA_CHECK(params_->report(arch, [](const std::string& tensor) { return tensor.starts_with("stats."); }));
+  VLA_TRY(solver_, Solver::read(keys));
+  VLA_TRY(horizon_, keys.integer("policy.horizon"));
+  VLA_TRY(d_action_, keys.integer("policy.d_action"));
+  VLA_TRY(d_state_, keys.integer("policy.d_state"));
+  if (horizon_ < 1 || horizon_ > kMaxHorizon)
+    return Error{Code::bad_bundle, "policy.horizon", fmt::format("1 to {}", kMaxHorizon), std::to_string(horizon_)};
+  VLA_TRY(Weights weights, Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes));
+  weights_ = std::make_unique<Weights>(std::move(weights));
+  return {};
+}
+
+/// Load rate: the table of everything that depends on the time alone.
+Status Engine::make_conditions() {
+  tables_ = std::make_unique<Store>(64);
+  Graph graph(*weights_, *tables_, {});
+  const Tensor computed = policy_->condition(graph, solver_.times);
+  conditions_ = tables_->add_like(computed);
+  graph.write(computed, conditions_);
+  VLA_CHECK(tables_->allocate(device_));
+  ComputeMemory memory(device_);
+  VLA_CHECK(graph.reserve(memory));
+  VLA_CHECK(graph.allocate(memory));
+  return graph.run(device_);
+}
+
+/// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
+Status Engine::warm_up() {
+  const Recipe& recipe = processor_.recipe();
+  const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
+                              static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
+  VLA_CHECK(policy_->check(largest));
+  VLA_TRY(const Plan* plan, plans_->for_shape(largest));
+  largest_plan_ = plan->size();
+  return {};
+}
+
+Result<std::vector<float>> Engine::start(const Noise& noise) const {
+  const std::size_t count = static_cast<std::size_t>(horizon_) * static_cast<std::size_t>(d_action_);
+  if (const auto* seed = std::get_if<std::uint64_t>(&noise)) return draw_noise(solver_.noise, *seed, count);
+  const auto& values = std::get<std::vector<float>>(noise);
+  if (values.size() != count)
+    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_),
+                 fmt::format("{} numbers", values.size())};
+  for (float value : values)
+    if (!std::isfinite(value)) return Error{Code::bad_observation, "noise", "finite numbers", fmt::format("{}", value)};
+  return values;
+}
+
+template <class T>
+void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
+                    const std::vector<T>& values) const {
+  if (match_path(tap_pattern_, path)) taps.push_back({path, std::move(shape), {values.begin(), values.end()}});
+}
+
+void Engine::record_inputs(std::vector<Tap>& taps) const {
+  record(taps, "pixels", {inputs_.width, inputs_.height, 3, inputs_.n_view}, inputs_.pixels);
+  record(taps, "tokens", {static_cast<std::int64_t>(inputs_.tokens.size())}, inputs_.tokens);
+  record(taps, "state", {d_state_}, inputs_.state);
+}
+
+/// `chunk` is what the network answers, cut to the robot's columns; `actions` is the same in world units.
+void Engine::record_chunk(const std::vector<float>& x, ActionChunk& chunk) const {
+  if (tap_pattern_.empty()) return;
+  std::vector<float> cut;
+  for (int row = 0; row < horizon_; ++row)
+    cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + chunk.d_action);
+  record(chunk.taps, "chunk", {chunk.d_action, horizon_}, cut);
+  record(chunk.taps, "actions", {chunk.d_action, horizon_}, chunk.actions);
+}
+
+Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) {
+  ActionChunk chunk;
+  StageClock clock;
+  inputs_.notes.clear();
+  VLA_CHECK(processor_.encode_images(observation, inputs_));
+  VLA_CHECK(processor_.encode_state(observation, inputs_));
+  clock.lap(chunk.timing, "preprocess");
+  VLA_CHECK(processor_.encode_text(observation, inputs_));
+  clock.lap(chunk.timing, "tokenize");
+  VLA_TRY(const std::vector<float> x, start(noise));
+  VLA_TRY(Plan * plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view,
+                                          static_cast<int>(inputs_.tokens.size()), d_state_}));
+  plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
+  plan->set_x(x);
+  record_inputs(chunk.taps);
+  clock.lap(chunk.timing, "plan");
+  VLA_CHECK(plan->run_prefix(device_));
+  clock.lap(chunk.timing, "prefix");
+  plan->collect_prefix_taps(chunk.taps);
+  for (int k = 0; k < solver_.n_step; ++k) {
+    VLA_CHECK(plan->run_step(device_, k));
+    plan->collect_step_taps(k, chunk.taps);
+  }
+  clock.lap(chunk.timing, "steps");
+  const std::vector<float> result = plan->x();
+  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_));
+  clock.lap(chunk.timing, "postprocess");
+  chunk.horizon = horizon_;
+  chunk.d_action = static_cast<int>(processor_.action_names().size());
+  chunk.notes = inputs_.notes;
+  record_chunk(result, chunk);
+  return chunk;
+}
+
+MemoryUse Engine::memory() const { return {weights_->size() + tables_->size(), largest_plan_, plans_->working_size()}; }
+
+}  // namespace vla

@@ -1,0 +1,89 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "engine/noise.h"
+#include "engine/plan.h"
+#include "engine/timing.h"
+#include "processor/processor.h"
+
+namespace vla {
+
+struct EngineOptions {
+  int n_thread = 0;         // 0: every core that the process may use
+  std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
+  bool dry = false;         // reserve memory without filling it: sizes are exact, and `act` must not be called
+};
+
+/// What a policy answers to one observation.
+struct ActionChunk {
+  int horizon = 0;
+  int d_action = 0;
+  std::vector<float> actions;      // (horizon, d_action) in the robot's own units
+  std::vector<std::string> notes;  // what the user must be told about this answer
+  Timing timing;
+  std::vector<Tap> taps;
+};
+
+/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of one plan; what graphs share while they
+/// run.
+struct MemoryUse {
+  std::size_t weights = 0, plan = 0, working = 0;
+  std::size_t total() const { return weights + plan + working; }
+};
+
+/// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps,
+/// unnormalize. One thread at a time may call it.
+class Engine {
+ public:
+  /// Opens, checks and loads a bundle, and builds the largest plan. Errors: io, bad_bundle, unsupported, out_of_memory,
+  /// device.
+  static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
+
+  /// Errors: bad_observation, bad_action (a number that is not finite came out), device, out_of_memory.
+  Result<ActionChunk> act(const Observation& observation, const Noise& noise);
+
+  const Bundle& bundle() const { return bundle_; }
+  const Processor& processor() const { return processor_; }
+  const Device& device() const { return device_; }
+  const Solver& solver() const { return solver_; }
+  const ParamList& params() const { return *params_; }
+  int horizon() const { return horizon_; }
+  int d_action() const { return d_action_; }
+  MemoryUse memory() const;
+
+ private:
+  Engine(Bundle bundle, Processor processor, Device device)
+      : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
+  Status load_policy(bool dry);
+  Status make_conditions();
+  Status warm_up();
+  Result<std::vector<float>> start(const Noise& noise) const;
+  template <class T>
+  void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
+              const std::vector<T>& values) const;
+  void record_inputs(std::vector<Tap>& taps) const;
+  void record_chunk(const std::vector<float>& x, ActionChunk& chunk) const;
+
+  Bundle bundle_;
+  Processor processor_;
+  Device device_;
+  Solver solver_;
+  int horizon_ = 0, d_action_ = 0, d_state_ = 0;
+  std::string tap_pattern_;
+  std::unique_ptr<ParamList> params_;
+  std::unique_ptr<Policy> policy_;
+  std::unique_ptr<Weights> weights_;
+  std::unique_ptr<Store> tables_;
+  Tensor conditions_;
+  std::unique_ptr<Plans> plans_;
+  std::size_t largest_plan_ = 0;
+  Inputs inputs_;  // of the last observation; its vectors keep their memory
+};
+
+}  // namespace vla

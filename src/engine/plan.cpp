@@ -1,0 +1,112 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "engine/plan.h"
+
+#include <fmt/format.h>
+
+namespace vla {
+namespace {
+
+/// Tensors of a plan's store: inputs, x, k, two for each cached layer, and a handful of constants for each graph.
+std::size_t store_capacity(const Weights& weights) { return 64 + 2 * weights.count(); }
+
+/// How many plans are kept. A robot uses a few instructions of a few lengths; a plan costs about a megabyte.
+constexpr std::size_t kMaxPlans = 64;
+
+TapFilter prefix_filter(const std::string& pattern) {
+  if (pattern.empty()) return {};
+  return [pattern](const std::string& path) { return match_path(pattern, path); };
+}
+
+/// The step graph is one for all steps: it keeps what any step wants, and `collect_step_taps` picks.
+TapFilter step_filter(const std::string& pattern, int n_step) {
+  if (pattern.empty()) return {};
+  return [pattern, n_step](const std::string& path) {
+    for (int k = 0; k < n_step; ++k)
+      if (match_path(pattern, fmt::format("step.{}.{}", k, path))) return true;
+    return false;
+  };
+}
+
+Tap read_tap(std::string path, Tensor tensor) {
+  const ggml_tensor* node = tensor.node();
+  Tap tap{std::move(path),
+          {node->ne, node->ne + ggml_n_dims(node)},
+          std::vector<float>(static_cast<std::size_t>(ggml_nelements(node)))};
+  Store::get(tensor, tap.values.data(), tap.values.size() * sizeof(float));
+  return tap;
+}
+
+}  // namespace
+
+Plan::Plan(const PlanContext& context, const InputShape& shape)
+    : tap_pattern_(context.tap_pattern),
+      store_(store_capacity(context.weights)),
+      in_{store_.add(GGML_TYPE_F32, std::vector<std::int64_t>{shape.width, shape.height, 3, shape.n_view}),
+          store_.add(GGML_TYPE_I32, std::vector<std::int64_t>{shape.n_text}),
+          store_.add(GGML_TYPE_F32, std::vector<std::int64_t>{shape.d_state, 1})},
+      x_(store_.add(GGML_TYPE_F32, std::vector<std::int64_t>{context.d_action, context.horizon})),
+      k_(store_.add(GGML_TYPE_I32, std::vector<std::int64_t>{1})),
+      prefix_(context.weights, store_, prefix_filter(tap_pattern_)),
+      step_(context.weights, store_, step_filter(tap_pattern_, context.solver.n_step)) {}
+
+void Plan::build_prefix(const PlanContext& context) { context.policy.prefix(prefix_, in_, cache_); }
+
+void Plan::build_step(const PlanContext& context) {
+  ggml_context* c = step_.context();
+  const Tensor condition = ggml_get_rows(c, context.conditions.node(), k_.node());
+  const Tensor velocity = context.policy.velocity(step_, x_, condition, cache_);
+  const Tensor next = ggml_add(c, x_.node(), ggml_scale(c, velocity.node(), context.solver.dt));
+  step_.write(step_.name("x", next), x_);
+}
+
+Result<std::unique_ptr<Plan>> Plan::build(const PlanContext& context, const InputShape& shape, ComputeMemory& memory) {
+  std::unique_ptr<Plan> plan(new Plan(context, shape));
+  plan->build_prefix(context);
+  plan->build_step(context);
+  VLA_CHECK(plan->store_.allocate(context.device));
+  VLA_CHECK(plan->prefix_.reserve(memory));
+  VLA_CHECK(plan->step_.reserve(memory));
+  VLA_CHECK(plan->prefix_.allocate(memory));
+  VLA_CHECK(plan->step_.allocate(memory));
+  return plan;
+}
+
+void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens,
+                      std::span<const float> state) {
+  Store::set(in_.images, pixels.data(), pixels.size_bytes());
+  Store::set(in_.tokens, tokens.data(), tokens.size_bytes());
+  Store::set(in_.state, state.data(), state.size_bytes());
+}
+
+void Plan::set_x(std::span<const float> x) { Store::set(x_, x.data(), x.size_bytes()); }
+
+std::vector<float> Plan::x() const { return read_tap("x", x_).values; }
+
+Status Plan::run_step(const Device& device, int k) {
+  const std::int32_t index = k;
+  Store::set(k_, &index, sizeof(index));
+  return step_.run(device);
+}
+
+void Plan::collect_prefix_taps(std::vector<Tap>& taps) const {
+  for (const auto& [path, tensor] : prefix_.taps()) taps.push_back(read_tap(path, tensor));
+}
+
+void Plan::collect_step_taps(int k, std::vector<Tap>& taps) const {
+  for (const auto& [path, tensor] : step_.taps()) {
+    const std::string full = fmt::format("step.{}.{}", k, path);
+    if (match_path(tap_pattern_, full)) taps.push_back(read_tap(full, tensor));
+  }
+}
+
+Result<Plan*> Plans::for_shape(const InputShape& shape) {
+  if (const auto found = plans_.find(shape); found != plans_.end()) return found->second.get();
+  if (plans_.size() >= kMaxPlans) plans_.clear();
+  const std::size_t before = memory_.size();
+  VLA_TRY(std::unique_ptr<Plan> plan, Plan::build(context_, shape, memory_));
+  if (memory_.size() != before) plans_.clear();  // their graphs point into memory that is gone
+  return (plans_[shape] = std::move(plan)).get();
+}
+
+}  // namespace vla

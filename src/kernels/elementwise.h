@@ -1,0 +1,19 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "backend/graph.h"
+
+namespace vla::kernels {
+
+/// GELU in its tanh form, float32 throughout: x * 0.5 * (1 + tanh(sqrt(2/pi) * (x + 0.044715 x^3))). ggml's own
+/// operation reads a float16 table, which alone costs more than the parity bar. Any contiguous shape -> the same shape.
+/// Source: transformers activations.py NewGELU / torch gelu(approximate="tanh").
+Tensor gelu_tanh(Graph& g, Tensor x);
+
+/// Turns the pairs (x_i, x_{i + d/2}) of every head by the angles of its token.
+/// x [d_head, n_head, n_token], table [d_head, n_token] with d/2 cosines, then d/2 sines -> the shape of x.
+/// Source: lerobot policies/smolvla/smolvlm_with_expert.py apply_rope.
+Tensor rotate_half(Graph& g, Tensor x, Tensor table);
+
+}  // namespace vla::kernels

@@ -1,0 +1,83 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "modules/action/expert.h"
+
+#include <fmt/format.h>
+
+#include "nn/attention.h"
+#include "nn/tokens.h"
+
+namespace vla {
+
+ExpertSelfBlock::ExpertSelfBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
+    : Module(s), kv_(s, d_model, heads, eps), rest_(s, d_model, d_ff, heads, eps) {}
+
+Tensor ExpertSelfBlock::forward(Graph& g, Tensor x, const KeyValue& prefix) const {
+  const int n_prefix = static_cast<int>(prefix.key.dim(2)), horizon = static_cast<int>(x.dim(1));
+  const Tensor h = kv_.norm(g, x);
+  const KeyValue own = kv_(g, h, n_prefix);
+  const KeyValue seen = {append_keys(g, prefix.key, own.key), append_keys(g, prefix.value, own.value)};
+  return rest_(g, x, h, n_prefix, seen, causal_mask(g, n_prefix, horizon));
+}
+
+ExpertCrossBlock::ExpertCrossBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
+    : Module(s),
+      heads_(heads),
+      attn_norm_(s / "attn_norm", d_model, eps),
+      k_(s / "attn_k", heads.d_key(), heads.d_key(), Bias::no),
+      v_(s / "attn_v", heads.d_key(), heads.d_key(), Bias::no),
+      rest_(s, d_model, d_ff, heads, eps) {}
+
+void ExpertCrossBlock::prepare(Graph& g, const KeyValue& prefix, Cache& cache) const {
+  // The cached keys already carry their rotation, and the reference projects them as they are.
+  cache.put(g, path() + ".k", split_heads(g, k_(g, merge_heads(g, prefix.key)), heads_.n_head_kv));
+  cache.put(g, path() + ".v", split_heads(g, v_(g, merge_heads(g, prefix.value)), heads_.n_head_kv));
+}
+
+Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
+  // Positions of a cross layer's queries start at 0, not behind the prefix: forward_cross_attn_layer subtracts their
+  // least.
+  const KeyValue prefix = {cache.get(path() + ".k"), cache.get(path() + ".v")};
+  return rest_(g, x, attn_norm_(g, x), 0, prefix, {});
+}
+
+Expert::Expert(const Scope& s, const SmolLm& lm)
+    : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps")) {
+  const std::vector<std::string> kinds = s.strings("layer_kinds");
+  const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
+  const float eps = s.number("norm_eps");
+  Heads heads = lm.heads();
+  heads.rope_base = s.number("rope_base");
+  s.require(static_cast<int>(kinds.size()) == lm.n_layer(), "layer_kinds",
+            fmt::format("{} entries, one per language layer", lm.n_layer()), std::to_string(kinds.size()));
+  for (int i = 0; i < std::min(lm.n_layer(), static_cast<int>(kinds.size())); ++i) {
+    const std::string& kind = kinds[static_cast<std::size_t>(i)];
+    const Scope place = s / "blk" / static_cast<int>(layers_.size());
+    if (kind == "self")
+      layers_.push_back({i, ExpertSelfBlock(place, d_model_, d_ff, heads, eps)});
+    else if (kind == "cross")
+      layers_.push_back({i, ExpertCrossBlock(place, d_model_, d_ff, heads, eps)});
+    else
+      s.require(kind == "none", "layer_kinds", "self, cross or none", kind);
+  }
+  s.require(static_cast<int>(layers_.size()) == n_layer, "n_layer",
+            fmt::format("{}, as layer_kinds counts", layers_.size()), std::to_string(n_layer));
+}
+
+void Expert::prepare(Graph& g, Cache& cache) const {
+  for (const Layer& layer : layers_)
+    if (const auto* cross = std::get_if<ExpertCrossBlock>(&layer.block))
+      cross->prepare(g, lm_.cached(cache, layer.i_lm), cache);
+}
+
+Tensor Expert::operator()(Graph& g, Tensor x, const Cache& cache) const {
+  for (const Layer& layer : layers_) {
+    if (const auto* cross = std::get_if<ExpertCrossBlock>(&layer.block))
+      x = (*cross)(g, x, cache);
+    else
+      x = std::get<ExpertSelfBlock>(layer.block)(g, x, lm_.cached(cache, layer.i_lm));
+  }
+  return norm_(g, x);
+}
+
+}  // namespace vla

@@ -1,0 +1,24 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "nn/linear.h"
+
+namespace vla {
+
+/// Fewer, wider image tokens: squares of `<path>.factor`^2 patches become one token of the language model's width.
+/// Source: transformers modeling_smolvlm.py SmolVLMConnector.
+class PixelConnector : public Module<PixelConnector> {
+ public:
+  PixelConnector(const Scope& s, int d_vision, int d_model);
+  /// x [d_vision, side^2, n_view] -> [d_model, (side / factor)^2, n_view]. `check` must have accepted the side.
+  Tensor forward(Graph& g, Tensor x) const;
+  /// Whether a grid of `side` x `side` patches can be divided. Errors: unsupported.
+  Status check(int side) const;
+
+ private:
+  int factor_;
+  Linear project_;
+};
+
+}  // namespace vla

@@ -1,0 +1,69 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "modules/vision/position_ids.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+
+namespace vla {
+namespace {
+
+/// torch.arange(1/n, 1, 1/n) in float32. Its blocks start at a rounded multiple and count on from there in double, so
+/// the last bits depend on the block's width: 8 with AVX2, 16 with AVX-512, 1 at the end and without vectors.
+std::vector<float> boundaries(int n_table, int width) {
+  const double step = 1.0 / n_table;
+  const int count = static_cast<int>(std::ceil((1.0 - step) / step));
+  std::vector<float> edges;
+  int i = 0;
+  for (; width > 1 && i + width <= count; i += width) {
+    const float base = static_cast<float>(step + i * step);
+    for (int k = 0; k < width; ++k) edges.push_back(static_cast<float>(double{base} + k * step));
+  }
+  for (; i < count; ++i) edges.push_back(static_cast<float>(step + i * step));
+  return edges;
+}
+
+float round_to_bfloat16(float x) {
+  const std::uint32_t bits = std::bit_cast<std::uint32_t>(x);
+  return std::bit_cast<float>((bits + 0x7fff + ((bits >> 16) & 1)) & 0xffff0000u);
+}
+
+/// The fraction of the picture at which patch i of n lies, in the arithmetic of the rule.
+float fraction(const std::string& rule, int i, int n) {
+  if (rule == "bucketize_shifted")
+    return static_cast<float>(i) / static_cast<float>(n) * static_cast<float>(1.0 - 1e-6);
+  const float exact = std::min(static_cast<float>(i) * (1.0f / static_cast<float>(n)), static_cast<float>(1.0 - 1e-6));
+  return rule == "bucketize_bfloat16" ? round_to_bfloat16(exact) : exact;
+}
+
+/// torch.bucketize(right=True): how many boundaries are not above the fraction.
+std::vector<std::int32_t> axis_ids(const std::string& rule, int n_grid, const std::vector<float>& edges) {
+  std::vector<std::int32_t> ids;
+  for (int i = 0; i < n_grid; ++i)
+    ids.push_back(static_cast<std::int32_t>(std::upper_bound(edges.begin(), edges.end(), fraction(rule, i, n_grid)) -
+                                            edges.begin()));
+  return ids;
+}
+
+}  // namespace
+
+Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, int n_grid, int n_table) {
+  if (rule != "bucketize_float32" && rule != "bucketize_bfloat16" && rule != "bucketize_shifted")
+    return Error{Code::bad_bundle, "vision.position_rule", "bucketize_float32, bucketize_bfloat16 or bucketize_shifted",
+                 rule};
+  const std::vector<std::int32_t> axis = axis_ids(rule, n_grid, boundaries(n_table, 1));
+  for (int width : {8, 16})
+    if (axis_ids(rule, n_grid, boundaries(n_table, width)) != axis)
+      return Error{Code::unsupported, "vision.position_rule", "a grid whose position ids are the same on every machine",
+                   fmt::format("{} x {} patches on a table of {} x {}", n_grid, n_grid, n_table, n_table),
+                   "the reference's own result depends on the machine here; use another image size"};
+  std::vector<std::int32_t> ids;
+  for (std::int32_t row : axis)
+    for (std::int32_t column : axis) ids.push_back(row * n_table + column);
+  return ids;
+}
+
+}  // namespace vla

@@ -1,0 +1,64 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "modules/vision/siglip.h"
+
+#include <fmt/format.h>
+
+#include "modules/vision/position_ids.h"
+#include "nn/attention.h"
+#include "nn/tokens.h"
+
+namespace vla {
+
+SiglipBlock::SiglipBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps)
+    : Module(s),
+      n_head_(n_head),
+      attn_norm_(s / "attn_norm", d_model, eps),
+      q_(s / "attn_q", d_model, d_model, Bias::yes),
+      k_(s / "attn_k", d_model, d_model, Bias::yes),
+      v_(s / "attn_v", d_model, d_model, Bias::yes),
+      out_(s / "attn_out", d_model, d_model, Bias::yes),
+      ffn_norm_(s / "ffn_norm", d_model, eps),
+      mlp_(s, d_model, d_ff) {}
+
+Tensor SiglipBlock::forward(Graph& g, Tensor x) const {
+  const Tensor h = attn_norm_(g, x);
+  const Tensor q = split_heads(g, q_(g, h), n_head_), k = split_heads(g, k_(g, h), n_head_),
+               v = split_heads(g, v_(g, h), n_head_);
+  x = add(g, x, out_(g, attention(g, q, k, v, {})));
+  return add(g, x, mlp_(g, ffn_norm_(g, x)));
+}
+
+Siglip::Siglip(const Scope& s)
+    : d_model_(s.dim("d_model")),
+      patch_size_(s.dim("patch_size", 256)),
+      n_table_(std::max(1, s.dim("image_size", 16384) / patch_size_)),
+      position_rule_(s.string("position_rule")),
+      patch_embed_(s / "patch_embed", patch_size_, d_model_),
+      position_(s / "position", d_model_, n_position()),
+      post_norm_(s / "post_norm", d_model_, s.number("norm_eps")) {
+  const int n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff"), n_layer = s.n_layer("n_layer");
+  s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
+  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps"));
+}
+
+Status Siglip::check(int width, int height) const {
+  if (width != height || width < patch_size_)
+    return Error{Code::unsupported, "vision", fmt::format("a square picture of {} pixels or more", patch_size_),
+                 fmt::format("{} x {}", width, height)};
+  const auto ids = vision_position_ids(position_rule_, width / patch_size_, n_table_);
+  return ids ? Status() : Status(ids.error());
+}
+
+Tensor Siglip::operator()(Graph& g, Tensor images) const {
+  Tensor x = patch_embed_(g, images);
+  const Tensor ids = g.constant("vision_position_ids", [&](Store& store) {
+    return store.add_constant(
+        *vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_), {x.dim(1)});
+  });
+  x = add(g, x, position_(g, ids));
+  for (const SiglipBlock& block : blocks_) x = block(g, x);
+  return post_norm_(g, x);
+}
+
+}  // namespace vla

@@ -1,0 +1,31 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+
+#include "backend/graph.h"
+
+namespace vla {
+
+/// softmax(q k / sqrt(d_head) + mask) v, float32 throughout, heads concatenated.
+/// q [d_head, n_head, n_query, n_batch], k and v [d_head, n_head_kv, n_key, n_batch], mask [n_key, n_query] of 0 and
+/// -infinity, or none -> [d_head * n_head, n_query, n_batch]. Query head h reads key head h / (n_head / n_head_kv).
+/// Every query must see at least one key.
+/// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
+Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
+
+/// The mask of consecutive groups of tokens: a token sees its own group and every earlier one. Sizes in tokens; the
+/// mask is [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.
+Tensor group_mask(Graph& g, std::span<const int> group_sizes);
+
+/// The mask of `n_query` tokens that see `n_past` earlier tokens, themselves, and those before them: [n_past + n_query,
+/// n_query].
+Tensor causal_mask(Graph& g, int n_past, int n_query);
+
+/// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...], without a copy.
+Tensor split_heads(Graph& g, Tensor x, int n_head);
+/// [d_head, n_head, n] -> [d_head * n_head, n], without a copy.
+Tensor merge_heads(Graph& g, Tensor x);
+
+}  // namespace vla

@@ -1,0 +1,29 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "nn/embedding.h"
+
+namespace vla {
+
+Embedding::Embedding(const Scope& s, int d_model, int n_row) : Module(s), weight_(s.table("weight", d_model, n_row)) {}
+
+Tensor Embedding::forward(Graph& g, Tensor ids) const {
+  return ggml_get_rows(g.context(), g.weight(weight_).node(), ids.node());
+}
+
+PatchEmbed::PatchEmbed(const Scope& s, int patch_size, int d_model)
+    : Module(s),
+      patch_size_(patch_size),
+      weight_(s.matrix("weight", 3 * patch_size * patch_size, d_model)),
+      bias_(s.vector("bias", d_model)) {}
+
+Tensor PatchEmbed::forward(Graph& g, Tensor images) const {
+  ggml_context* c = g.context();
+  const int p = patch_size_;
+  ggml_tensor* weight = g.weight(weight_).node();
+  ggml_tensor* kernel = ggml_reshape_4d(c, weight, p, p, 3, weight->ne[1]);  // read for its shape only
+  ggml_tensor* patches = ggml_im2col(c, kernel, images.node(), p, p, 0, 0, 1, 1, true, GGML_TYPE_F32);
+  patches = ggml_reshape_3d(c, patches, patches->ne[0], patches->ne[1] * patches->ne[2], patches->ne[3]);
+  return ggml_add(c, ggml_mul_mat(c, weight, patches), g.weight(bias_).node());
+}
+
+}  // namespace vla

@@ -1,0 +1,32 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "nn/module.h"
+
+namespace vla {
+
+/// Rows of a table. ids [n] i32 -> [d_model, n]. Ids must be below n_row: whoever makes them checks.
+class Embedding : public Module<Embedding> {
+ public:
+  Embedding(const Scope& s, int d_model, int n_row);
+  Tensor forward(Graph& g, Tensor ids) const;
+
+ private:
+  const Param* weight_;
+};
+
+/// Non-overlapping patches through one product, which equals a convolution with stride = patch.
+/// images [width, height, 3, n_view] -> [d_model, n_patch, n_view], patches row by row.
+class PatchEmbed : public Module<PatchEmbed> {
+ public:
+  PatchEmbed(const Scope& s, int patch_size, int d_model);
+  Tensor forward(Graph& g, Tensor images) const;
+
+ private:
+  int patch_size_;
+  const Param* weight_;
+  const Param* bias_;
+};
+
+}  // namespace vla

@@ -1,0 +1,25 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "nn/mlp.h"
+
+#include "kernels/elementwise.h"
+
+namespace vla {
+
+GeluMlp::GeluMlp(const Scope& s, int d_model, int d_ff)
+    : up_(s / "ffn_up", d_model, d_ff, Bias::yes), down_(s / "ffn_down", d_ff, d_model, Bias::yes) {}
+
+Tensor GeluMlp::operator()(Graph& g, Tensor x) const { return down_(g, kernels::gelu_tanh(g, up_(g, x))); }
+
+SiluGatedMlp::SiluGatedMlp(const Scope& s, int d_model, int d_ff)
+    : gate_(s / "ffn_gate", d_model, d_ff, Bias::no),
+      up_(s / "ffn_up", d_model, d_ff, Bias::no),
+      down_(s / "ffn_down", d_ff, d_model, Bias::no) {}
+
+Tensor SiluGatedMlp::operator()(Graph& g, Tensor x) const {
+  return down_(g, Tensor(ggml_swiglu_split(g.context(), gate_(g, x).node(), up_(g, x).node())));
+}
+
+Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }
+
+}  // namespace vla

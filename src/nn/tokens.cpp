@@ -1,0 +1,45 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "nn/tokens.h"
+
+#include <cmath>
+
+namespace vla {
+
+Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts) {
+  ggml_tensor* all = nullptr;
+  for (Tensor part : parts) all = all == nullptr ? part.node() : ggml_concat(g.context(), all, part.node(), 1);
+  return all;
+}
+
+Tensor append_keys(Graph& g, Tensor past, Tensor present) {
+  return ggml_concat(g.context(), past.node(), present.node(), 2);
+}
+
+Tensor concat_features(Graph& g, Tensor first, Tensor second) {
+  return ggml_concat(g.context(), first.node(), second.node(), 0);
+}
+
+Tensor repeat_like(Graph& g, Tensor x, Tensor like) {
+  return ggml_repeat_4d(g.context(), x.node(), x.dim(0), like.dim(1), 1, 1);
+}
+
+Tensor add(Graph& g, Tensor a, Tensor b) { return ggml_add(g.context(), a.node(), b.node()); }
+
+Tensor scale(Graph& g, Tensor x, float factor) { return ggml_scale(g.context(), x.node(), factor); }
+
+Tensor flatten_views(Graph& g, Tensor x) {
+  return ggml_reshape_2d(g.context(), x.node(), x.dim(0), x.dim(1) * x.dim(2));
+}
+
+Tensor pixel_shuffle(Graph& g, Tensor x, int factor) {
+  ggml_context* c = g.context();
+  const std::int64_t d = x.dim(0), n_view = x.dim(2), side = std::llround(std::sqrt(static_cast<double>(x.dim(1))));
+  const std::int64_t n = side / factor;
+  // Patch (factor R + r, factor C + c): c is the fastest after the features, then C, r, R; C and r change places.
+  ggml_tensor* split = ggml_reshape_4d(c, x.node(), d * factor, n, factor, n * n_view);
+  ggml_tensor* swapped = ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3));
+  return ggml_reshape_3d(c, swapped, d * factor * factor, n * n, n_view);
+}
+
+}  // namespace vla

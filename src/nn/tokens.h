@@ -1,0 +1,29 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <initializer_list>
+
+#include "backend/graph.h"
+
+namespace vla {
+
+/// Sequences one after the other: [d, n_1], [d, n_2], ... -> [d, n_1 + n_2 + ...].
+Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts);
+/// Keys or values one after the other: [d_head, n_head, n_1], [d_head, n_head, n_2] -> [d_head, n_head, n_1 + n_2].
+Tensor append_keys(Graph& g, Tensor past, Tensor present);
+/// Two feature vectors per token, the first above the second: [d_1, n], [d_2, n] -> [d_1 + d_2, n].
+Tensor concat_features(Graph& g, Tensor first, Tensor second);
+/// One vector for every token of `like`: [d, 1] -> [d, n].
+Tensor repeat_like(Graph& g, Tensor x, Tensor like);
+
+Tensor add(Graph& g, Tensor a, Tensor b);
+Tensor scale(Graph& g, Tensor x, float factor);
+/// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
+Tensor flatten_views(Graph& g, Tensor x);
+/// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2,
+/// n_view]. Within a token the patches follow each other row by row. Source: transformers modeling_smolvlm.py
+/// pixel_shuffle.
+Tensor pixel_shuffle(Graph& g, Tensor x, int factor);
+
+}  // namespace vla

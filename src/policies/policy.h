@@ -1,0 +1,61 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "backend/cache.h"
+#include "bundle/params.h"
+
+namespace vla {
+
+/// What the processor made of one observation, as the prefix graph reads it. Absent views and text padding do not
+/// appear.
+struct PrefixInputs {
+  Tensor images;  // [width, height, 3, n_view], in the range that the image recipe makes
+  Tensor tokens;  // [n_text] i32
+  Tensor state;   // [d_state, 1], normalized and padded
+};
+
+/// The sizes of PrefixInputs. A plan is built once for each.
+struct InputShape {
+  int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
+  auto operator<=>(const InputShape&) const = default;
+};
+
+/// An architecture: which modules run in which order, at which of the three rates. It owns no loop, memory or file. The
+/// constructor declares every parameter; nothing else may fail.
+class Policy {
+ public:
+  virtual ~Policy() = default;
+
+  /// Whether the network is defined on inputs of this size; asked at load. Errors: bad_bundle, unsupported.
+  virtual Status check(const InputShape& shape) const = 0;
+
+  /// Load rate: everything that depends on the time alone, one column per solver step: [d, times.size()].
+  virtual Tensor condition(Graph& g, std::span<const float> times) const = 0;
+
+  /// Observation rate: encodes images, text and state into the cache.
+  virtual void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const = 0;
+
+  /// Step rate: the velocity at x_t, [d_action, horizon] -> the same shape. `condition` is this step's column, [d, 1].
+  virtual Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const = 0;
+};
+
+/// A policy that the registry knows.
+struct PolicyEntry {
+  std::string name;
+  std::unique_ptr<Policy> (*make)(ParamList& list);
+  /// The published model's keys, for manifests and for random weights of full size.
+  Keys (*published)();
+};
+
+/// Every architecture of src/policies/registry.inc.
+const std::vector<PolicyEntry>& policy_registry();
+/// Errors: unsupported, naming the architectures that there are.
+Result<PolicyEntry> find_policy(const std::string& name);
+
+}  // namespace vla

@@ -1,0 +1,120 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// SmolVLA: SmolVLM prefix, a narrower action expert that alternates self and cross attention, flow matching from noise
+// (t = 1) to actions (t = 0). Reference: lerobot src/lerobot/policies/smolvla/modeling_smolvla.py (embed_prefix,
+// embed_suffix, denoise_step) and smolvlm_with_expert.py.
+
+#include "modules/action/expert.h"
+#include "modules/language/smollm.h"
+#include "modules/time_embedding.h"
+#include "modules/vision/pixel_connector.h"
+#include "modules/vision/siglip.h"
+#include "nn/attention.h"
+#include "nn/linear.h"
+#include "nn/tokens.h"
+#include "policies/policy.h"
+
+namespace vla {
+namespace {
+
+class SmolVla final : public Policy {
+  Siglip vision_;
+  SmolLm lm_;
+  PixelConnector connector_;
+  Linear state_in_;  // observation rate
+  Expert expert_;
+  Linear action_in_, action_time_in_, action_time_out_, action_out_;  // step rate
+  float image_scale_, text_scale_;
+  double min_period_, max_period_;
+
+ public:
+  explicit SmolVla(const Scope& s)
+      : vision_(s / "vision"),
+        lm_(s / "lm"),
+        connector_(s / "connector", vision_.d_model(), lm_.d_model()),
+        state_in_(s / "state_in", s.dim("d_state"), lm_.d_model(), Bias::yes),
+        expert_(s / "expert", lm_),
+        action_in_(s / "action_in", s.dim("d_action"), expert_.d_model(), Bias::yes),
+        action_time_in_(s / "action_time_in", 2 * expert_.d_model(), expert_.d_model(), Bias::yes),
+        action_time_out_(s / "action_time_out", expert_.d_model(), expert_.d_model(), Bias::yes),
+        action_out_(s / "action_out", expert_.d_model(), s.dim("d_action"), Bias::yes),
+        image_scale_(s.number("image_scale")),
+        text_scale_(s.number("text_scale")),
+        min_period_((s / "time").precise("min_period")),
+        max_period_((s / "time").precise("max_period")) {}
+
+  Status check(const InputShape& shape) const override {
+    VLA_CHECK(vision_.check(shape.width, shape.height));
+    return connector_.check(shape.width / vision_.patch_size());
+  }
+
+  Tensor condition(Graph& g, std::span<const float> times) const override {
+    return g.store().add_constant(sinusoidal_time_embedding(times, expert_.d_model(), min_period_, max_period_),
+                                  {expert_.d_model(), static_cast<std::int64_t>(times.size())});
+  }
+
+  void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
+    const Tensor image = flatten_views(g, connector_(g, vision_(g, in.images)));  // [d_model, n_view * n_token]
+    const Tensor text = lm_.embed(g, in.tokens);                                  // [d_model, n_text]
+    const Tensor state = state_in_(g, in.state);                                  // [d_model, 1]
+    const Tensor x =
+        g.name("prefix", concat_tokens(g, {scale(g, image, image_scale_), scale(g, text, text_scale_), state}));
+    // Images and text see each other and not the state; the state sees everything.
+    const int groups[] = {static_cast<int>(image.dim(1) + text.dim(1)), 1};
+    lm_.prefill(g, x, group_mask(g, groups), cache);
+    expert_.prepare(g, cache);
+  }
+
+  Tensor velocity(Graph& g, Tensor x_t, Tensor time, const Cache& cache) const override {
+    const Tensor action = action_in_(g, x_t);  // [d_expert, horizon]
+    const Tensor mixed =
+        action_time_in_(g, concat_features(g, action, repeat_like(g, time, action)));  // [d_expert, horizon]
+    const Tensor x = action_time_out_(g, silu(g, mixed));                              // [d_expert, horizon]
+    return action_out_(g, expert_(g, x, cache));                                       // [d_action, horizon]
+  }
+};
+
+/// lerobot/smolvla_base: 450 M parameters. Source: shared inventory of the published checkpoint and its config.json.
+Keys published() {
+  Keys keys;
+  const auto sizes = [&](const std::string& path, std::initializer_list<std::pair<const char*, std::int64_t>> values) {
+    for (const auto& [key, value] : values) keys.set(path + "." + key, Value(value));
+  };
+  sizes("policy", {{"d_state", 32}, {"d_action", 32}, {"horizon", 50}});
+  sizes("vision",
+        {{"d_model", 768}, {"n_layer", 12}, {"n_head", 12}, {"d_ff", 3072}, {"image_size", 512}, {"patch_size", 16}});
+  sizes("connector", {{"factor", 4}});
+  sizes("lm", {{"d_model", 960},
+               {"n_layer", 16},
+               {"n_head", 15},
+               {"n_head_kv", 5},
+               {"d_head", 64},
+               {"d_ff", 2560},
+               {"n_vocab", 49280}});
+  sizes("expert", {{"d_model", 720}, {"n_layer", 16}, {"d_ff", 2048}});
+  for (const auto& [key, value] :
+       std::initializer_list<std::pair<const char*, double>>{{"policy.image_scale", 30.983866769659336},
+                                                             {"policy.text_scale", 30.983866769659336},
+                                                             {"vision.norm_eps", 1e-6},
+                                                             {"lm.norm_eps", 1e-5},
+                                                             {"lm.rope_base", 10000.0},
+                                                             {"expert.norm_eps", 1e-5},
+                                                             {"expert.rope_base", 10000.0},
+                                                             {"time.min_period", 4e-3},
+                                                             {"time.max_period", 4.0}})
+    keys.set(key, Value(value));
+  keys.set("vision.position_rule", Value(std::string("bucketize_float32")));
+  std::vector<std::string> kinds;
+  for (int i = 0; i < 16; ++i) kinds.push_back(i % 2 == 0 ? "self" : "cross");
+  keys.set("expert.layer_kinds", Value(kinds));
+  return keys;
+}
+
+std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<SmolVla>(Scope(list, "")); }
+
+}  // namespace
+
+PolicyEntry smolvla_policy() { return {"smolvla", make, published}; }
+
+}  // namespace vla

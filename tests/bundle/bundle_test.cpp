@@ -1,0 +1,172 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bundle/bundle.h"
+
+#include <doctest/doctest.h>
+
+#include <cstring>
+#include <limits>
+#include <random>
+
+#include "bundle/params.h"
+#include "support/gguf_writer.h"
+
+using namespace vla;
+using test::EditableBundle;
+
+namespace {
+
+EditableBundle small_bundle() {
+  EditableBundle bundle;
+  bundle.set("vla.bundle_version", Value(std::int64_t{1}));
+  bundle.set("vla.arch", Value(std::string("smolvla")));
+  bundle.set("lm.d_model", Value(std::int64_t{4}));
+  bundle.set("lm.names", Value(std::vector<std::string>{"a", "b"}));
+  bundle.tensors.push_back({"lm.weight", DType::f32, {4, 2}, std::string(32, '\1')});
+  bundle.tensors.push_back({"stats.x", DType::f32, {3}, std::string(12, '\0')});
+  return bundle;
+}
+
+Result<Bundle> parse(const std::string& bytes) { return Bundle::parse(std::as_bytes(std::span(bytes)), "test.gguf"); }
+
+std::string refusal(const std::string& bytes) {
+  const auto bundle = parse(bytes);
+  REQUIRE_FALSE(bundle.ok());
+  CHECK(bundle.error().code == Code::bad_bundle);
+  return bundle.error().message();
+}
+
+bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+
+}  // namespace
+
+TEST_CASE("a sound bundle gives back its keys and tensors") {
+  const std::string bytes = small_bundle().bytes();
+  const auto bundle = parse(bytes);
+  REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
+  CHECK(*bundle->keys().integer("lm.d_model") == 4);
+  CHECK(bundle->keys().strings("lm.names")->at(1) == "b");
+  REQUIRE(bundle->find("lm.weight") != nullptr);
+  CHECK(bundle->find("lm.weight")->shape == std::vector<std::int64_t>{4, 2});
+  CHECK(bundle->stats("stats.x")->size() == 3);
+}
+
+TEST_CASE("a bundle that is cut anywhere is refused") {
+  const std::string bytes = small_bundle().bytes();
+  for (std::size_t size = 0; size < bytes.size(); ++size) refusal(bytes.substr(0, size));
+}
+
+TEST_CASE("a bundle in which any one bit is flipped is refused") {
+  const std::string bytes = small_bundle().bytes();
+  for (std::size_t i = 0; i < bytes.size(); ++i)
+    for (int bit = 0; bit < 8; ++bit) {
+      std::string damaged = bytes;
+      damaged[i] = static_cast<char>(damaged[i] ^ (1 << bit));
+      CHECK_FALSE(parse(damaged).ok());
+    }
+}
+
+TEST_CASE("bytes after the last tensor are refused") {
+  CHECK(contains(refusal(small_bundle().bytes() + std::string(64, 'x')), "end: expected"));
+}
+
+TEST_CASE("a flipped weight is reported as a checksum that does not fit") {
+  std::string bytes = small_bundle().bytes();
+  bytes[bytes.find(std::string(32, '\1'))] = 2;
+  CHECK(contains(refusal(bytes), "damaged or edited"));
+}
+
+TEST_CASE("another version of the bundle is refused with the next move") {
+  EditableBundle bundle = small_bundle();
+  bundle.set("vla.bundle_version", Value(std::int64_t{0}));
+  CHECK(contains(refusal(bundle.bytes()), "run vla-convert again"));
+  bundle.set("vla.bundle_version", Value(std::int64_t{2}));
+  CHECK(contains(refusal(bundle.bytes()), "needs a newer vla"));
+}
+
+TEST_CASE("a GGUF file that is no vla bundle says so") {
+  EditableBundle bundle = small_bundle();
+  bundle.remove_key("vla.bundle_version");
+  CHECK(contains(refusal(bundle.bytes()), "a GGUF file of another kind"));
+}
+
+TEST_CASE("a file of another kind is refused by its first bytes") {
+  CHECK(contains(refusal(std::string(4096, 'P')), "a GGUF file"));
+}
+
+TEST_CASE("a list that claims more elements than the file has bytes is refused before memory is taken") {
+  std::string bytes = small_bundle().bytes();
+  const std::size_t count = bytes.find("lm.names") + 8 + 4 + 4;
+  const std::uint64_t huge = std::numeric_limits<std::uint64_t>::max() / 8;
+  std::memcpy(bytes.data() + count, &huge, 8);
+  CHECK(contains(refusal(bytes), "lm.names"));
+}
+
+TEST_CASE("random bytes behind a GGUF header never crash the reader") {
+  std::mt19937 random(7);
+  for (int round = 0; round < 20000; ++round) {
+    std::string bytes = "GGUF";
+    bytes += std::string("\3\0\0\0", 4);
+    for (int i = 0; i < 16; ++i) bytes += static_cast<char>(i % 8 == 0 ? random() % 4 : 0);
+    const std::size_t size = random() % 200;
+    for (std::size_t i = 0; i < size; ++i) bytes += static_cast<char>(random() % 3 == 0 ? random() : 0);
+    CHECK_FALSE(parse(bytes).ok());
+  }
+}
+
+TEST_CASE("statistics that are not finite are refused") {
+  EditableBundle bundle = small_bundle();
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  std::memcpy(bundle.tensor("stats.x").data.data(), &nan, 4);
+  const std::string bytes = bundle.bytes();
+  const auto stats = parse(bytes)->stats("stats.x");
+  REQUIRE_FALSE(stats.ok());
+  CHECK(contains(stats.error().message(), "finite"));
+}
+
+TEST_CASE("a key of another type names both types") {
+  const std::string bytes = small_bundle().bytes();
+  const auto value = parse(bytes)->keys().string("lm.d_model");
+  REQUIRE_FALSE(value.ok());
+  CHECK(value.error().message() == "lm.d_model: expected a string, found an integer");
+}
+
+TEST_CASE("a missing file is an io error with its path") {
+  const auto bundle = Bundle::open("/nowhere/policy.gguf");
+  REQUIRE_FALSE(bundle.ok());
+  CHECK(bundle.error().code == Code::io);
+  CHECK(contains(bundle.error().message(), "/nowhere/policy.gguf"));
+}
+
+TEST_CASE("an empty file is a bad bundle") {
+  const auto bundle = Bundle::open(test::write_file("empty.gguf", ""));
+  REQUIRE_FALSE(bundle.ok());
+  CHECK(bundle.error().code == Code::bad_bundle);
+}
+
+TEST_CASE("bind reports every missing, misshapen and unused tensor and every missing key in one error") {
+  const std::string bytes = small_bundle().bytes();
+  const auto bundle = parse(bytes);
+  ParamList list(bundle->keys(), &*bundle);
+  const Scope root(list, "");
+  const Scope lm = root / "lm";
+  lm.matrix("weight", 4, 3);
+  lm.vector("bias", 3);
+  lm.dim("n_layer");
+  const Status status = list.report("smolvla", [](const std::string&) { return false; });
+  REQUIRE_FALSE(status.ok());
+  const std::string text = status.error().message();
+  CHECK(contains(text, "4 problems"));
+  CHECK(contains(text, "wrong shape     lm.weight"));
+  CHECK(contains(text, "missing tensor  lm.bias"));
+  CHECK(contains(text, "missing key     lm.n_layer"));
+  CHECK(contains(text, "unused tensor   stats.x"));
+}
+
+TEST_CASE("a size out of range is a problem and never a loop without end") {
+  Keys keys;
+  keys.set("lm.n_layer", Value(std::int64_t{2000000000}));
+  ParamList list(keys, nullptr);
+  CHECK((Scope(list, "") / "lm").n_layer("n_layer") == 1);
+  CHECK_FALSE(list.report("smolvla", {}).ok());
+}

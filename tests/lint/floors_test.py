@@ -1,0 +1,105 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Includes point down only: reads the #include lines under src/ and names every pair that does not.
+
+    python3 tests/lint/floors_test.py
+"""
+import re
+import tempfile
+import unittest
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+GROUND = {"base", "bundle", "backend", "kernels"}
+# What each room may include besides itself. Policies and modules compose nn and know neither kernels nor the host side.
+ROOMS = {
+    "base": set(),
+    "bundle": {"base"},
+    "backend": {"base", "bundle"},
+    "kernels": {"base", "bundle", "backend"},
+    "nn": GROUND,
+    "processor": {"base", "bundle"},
+    "modules": {"nn", "base", "bundle", "backend"},
+    "policies": {"modules", "nn", "base", "bundle", "backend"},
+    "engine": {"policies", "modules", "nn", "processor"} | GROUND,
+    "serve": {"engine", "policies", "processor", "bundle", "base"},
+    "capi": {"engine", "policies", "processor", "bundle", "base"},
+    "cli": {"engine", "policies", "processor", "bundle", "base", "serve"},  # `vla serve` starts the server
+}
+# Libraries that belong to some rooms: the graph language to nn and below, its machinery to backend alone. The engine's
+# taps are a GGUF file of tensors.
+LIBRARIES = [
+    (re.compile(r"gguf\.h"), {"bundle", "backend", "engine"}),
+    (re.compile(r"ggml\.h"), {"backend", "kernels", "nn", "engine"}),
+    (re.compile(r"ggml-cpp\.h"), {"backend", "engine"}),
+    (re.compile(r"ggml-.*\.h"), {"backend"}),
+    (re.compile(r"CLI/.*"), {"cli"}),
+    (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve"}),
+    (re.compile(r"(jpeglib|png)\.h"), {"processor"}),
+]
+INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
+
+
+def library_problem(room, header):
+    """Why `room` may not include <header>, or None."""
+    for pattern, rooms in LIBRARIES:
+        if pattern.fullmatch(header):
+            return None if room in rooms else f"belongs to {', '.join(sorted(rooms))}"
+    return None
+
+
+def problems(src):
+    """`file: includes "x": reason` for every include that points up or to a library of another room."""
+    found = []
+    for file in sorted(p for p in src.rglob("*") if p.suffix in (".h", ".cpp", ".inc", ".cu", ".cuh")):
+        name = file.relative_to(src).as_posix()
+        room = name.split("/")[0]
+        if room not in ROOMS:
+            found.append(f"{name}: is in no room of the house; rooms are {', '.join(ROOMS)}")
+            continue
+        for quoted, angled in INCLUDE.findall(file.read_text(encoding="utf-8")):
+            header = quoted or angled
+            other = header.split("/")[0]
+            reason = library_problem(room, header)
+            if other in ROOMS and other != room and other not in ROOMS[room]:
+                reason = f"{room} may include {', '.join(sorted(ROOMS[room])) or 'only itself'}"
+            elif quoted and other not in ROOMS:
+                reason = reason or "is named by no room; write the path from src/"
+            if reason:
+                found.append(f'{name}: includes "{header}": {reason}')
+    return found
+
+
+class Floors(unittest.TestCase):
+    maxDiff = None
+
+    def check(self, files):
+        with tempfile.TemporaryDirectory() as folder:
+            for name, text in files.items():
+                (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
+                (Path(folder) / name).write_text(text)
+            return problems(Path(folder))
+
+    def test_every_include_under_src_points_down(self):
+        self.assertTrue(list((ROOT / "src").rglob("*.cpp")), "no sources found: is this the repository?")
+        found = problems(ROOT / "src")
+        self.assertFalse(found, "\n" + "\n".join(found))
+
+    def test_an_include_of_a_higher_room_is_named_with_its_file(self):
+        found = self.check({"nn/linear.cpp": '#include "engine/engine.h"\n#include "backend/graph.h"\n'})
+        self.assertEqual(len(found), 1)
+        self.assertIn('nn/linear.cpp: includes "engine/engine.h"', found[0])
+
+    def test_processor_and_nn_never_meet(self):
+        self.assertEqual(len(self.check({"processor/a.h": '#include "nn/b.h"\n', "nn/b.h": '#include "processor/a.h"\n'})), 2)
+
+    def test_a_policy_that_includes_ggml_or_a_kernel_is_refused(self):
+        self.assertEqual(len(self.check({"policies/p.cpp": '#include <ggml.h>\n#include "kernels/gelu.h"\n'})), 2)
+
+    def test_a_folder_that_is_no_room_is_refused(self):
+        self.assertIn("is in no room", self.check({"utils/misc.h": "\n"})[0])
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,51 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A registered policy is complete: lists what is missing for every POLICY(name) of src/policies/registry.inc.
+
+    python3 tests/lint/registry_test.py
+"""
+import re
+import tempfile
+import unittest
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def registered(root):
+    text = (root / "src/policies/registry.inc").read_text()
+    return re.findall(r"^\s*POLICY\(\s*(\w+)\s*\)", text, re.M)
+
+
+def problems(root):
+    """`name: what is missing`, over the five touches of an architecture."""
+    found, models = [], root / "docs/models.md"
+    rows = models.read_text(encoding="utf-8") if models.is_file() else ""
+    for name in registered(root):
+        for path in (f"src/policies/{name}.cpp", f"python/vla_cpp/convert/archs/{name}.py"):
+            if not (root / path).is_file():
+                found.append(f"{name}: missing {path}")
+        if not list((root / "tests/golden" / name).glob("*/expected.gguf")):
+            found.append(f"{name}: missing a case with expected.gguf under tests/golden/{name}/")
+        if not re.search(rf"^\|\s*`{name}`\s*\|", rows, re.M):
+            found.append(f"{name}: missing a row that starts with `{name}` in docs/models.md")
+    return found
+
+
+class Registry(unittest.TestCase):
+    def test_every_registered_policy_has_source_mapping_fixture_and_row(self):
+        self.assertTrue(registered(ROOT), "src/policies/registry.inc registers nothing")
+        found = problems(ROOT)
+        self.assertFalse(found, "\n" + "\n".join(found))
+
+    def test_a_policy_of_one_line_lacks_four_things(self):
+        with tempfile.TemporaryDirectory() as folder:
+            registry = Path(folder) / "src/policies/registry.inc"
+            registry.parent.mkdir(parents=True)
+            registry.write_text("// one line per policy\nPOLICY(pi0)\n")
+            self.assertEqual(len(problems(Path(folder))), 4)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,46 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <doctest/doctest.h>
+
+#include <functional>
+#include <vector>
+
+#include "backend/graph.h"
+
+namespace vla::test {
+
+/// Builds a graph without weights, runs it, and returns the values of what `build` returns.
+inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build) {
+  const auto device = Device::cpu(2);
+  REQUIRE(device.ok());
+  const ParamList none(Keys(), nullptr);
+  const auto weights = Weights::load(none, *device, Weights::Fill::yes);
+  REQUIRE(weights.ok());
+  Store store(256);
+  Graph graph(*weights, store, [](const std::string& path) { return path == "result"; });
+  graph.name("result", build(graph));
+  ComputeMemory memory(*device);
+  REQUIRE(store.allocate(*device).ok());
+  REQUIRE(graph.reserve(memory).ok());
+  REQUIRE(graph.allocate(memory).ok());
+  REQUIRE(graph.run(*device).ok());
+  const Tensor result = graph.taps().front().second;
+  std::vector<float> values(static_cast<std::size_t>(ggml_nelements(result.node())));
+  Store::get(result, values.data(), values.size() * sizeof(float));
+  return values;
+}
+
+/// Deterministic values in [-range, range].
+inline std::vector<float> ramp(std::size_t count, float range) {
+  std::vector<float> values(count);
+  std::uint32_t state = 12345;
+  for (float& value : values) {
+    state = state * 1664525u + 1013904223u;
+    value = range * (static_cast<float>(state >> 8) / 8388608.0f - 1.0f);
+  }
+  return values;
+}
+
+}  // namespace vla::test
