@@ -19,13 +19,11 @@ Result<Device> Device::cpu(int n_thread) {
   Device device;
   device.n_thread_ = n_thread > 0 ? n_thread : usable_cores();
   if (device.n_thread_ > GGML_MAX_N_THREADS)
-    return Error{Code::device, "threads", fmt::format("at most {}", GGML_MAX_N_THREADS), std::to_string(device.n_thread_)};
+    return Error{Code::device, "threads", fmt::format("at most {}", GGML_MAX_N_THREADS),
+                 std::to_string(device.n_thread_)};
   device.backend_.reset(ggml_backend_cpu_init());
-  ggml_threadpool_params params = ggml_threadpool_params_default(device.n_thread_);
-  device.pool_.reset(ggml_threadpool_new(&params));
-  if (!device.backend_ || !device.pool_) return Error{Code::device, "cpu", "a thread pool", "the system refused it"};
+  if (!device.backend_) return Error{Code::device, "cpu", "a backend", "the system refused it"};
   ggml_backend_cpu_set_n_threads(device.backend_.get(), device.n_thread_);
-  ggml_backend_cpu_set_threadpool(device.backend_.get(), device.pool_.get());
   return device;
 }
 

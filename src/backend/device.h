@@ -5,14 +5,13 @@
 #include <ggml-cpp.h>
 #include <ggml-cpu.h>
 
-#include <memory>
 #include <string>
 
 #include "base/result.h"
 
 namespace vla {
 
-/// Where graphs run. One persistent pool of threads serves every graph; between requests its threads sleep.
+/// Where graphs run. The threads belong to the OpenMP runtime, which keeps them and lets them sleep between requests.
 class Device {
  public:
   /// The CPU with `n_thread` threads; 0 takes every core that the process may use. Errors: device.
@@ -23,11 +22,6 @@ class Device {
   std::string name() const;
 
  private:
-  struct PoolDeleter {
-    void operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
-  };
-
-  std::unique_ptr<ggml_threadpool, PoolDeleter> pool_;  // declared first: it outlives the backend that uses it
   ggml_backend_ptr backend_;
   int n_thread_ = 0;
 };

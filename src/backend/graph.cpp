@@ -9,14 +9,19 @@ namespace {
 constexpr std::size_t kNodesPerParam = 48;
 constexpr std::size_t kLeastNodes = 4096;
 
+/// A product with fewer operations than this takes about as long as bringing the threads together after it.
+constexpr double kLeastWork = 4e6;
+
 }  // namespace
 
 Status ComputeMemory::reserve(ggml_cgraph* graph) {
   if (ggml_gallocr_reserve(allocator_.get(), graph)) return {};
-  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation", "free memory or use a smaller model"};
+  return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation",
+               "free memory or use a smaller model"};
 }
 
-Graph::Graph(const Weights& weights, Store& store, TapFilter keep) : weights_(weights), store_(store), keep_(std::move(keep)) {
+Graph::Graph(const Weights& weights, Store& store, TapFilter keep)
+    : weights_(weights), store_(store), keep_(std::move(keep)) {
   const std::size_t n_node = kLeastNodes + kNodesPerParam * weights.count();
   const std::size_t memory = ggml_graph_overhead_custom(n_node, false) + n_node * ggml_tensor_overhead();
   context_.reset(ggml_init({.mem_size = memory, .mem_buffer = nullptr, .no_alloc = true}));
@@ -49,10 +54,24 @@ Status Graph::allocate(ComputeMemory& memory) {
   return Error{Code::out_of_memory, "working memory", "", "the graph does not fit into what was reserved for it"};
 }
 
+int Graph::n_thread(const Device& device) const {
+  double work = 0;
+  int n_product = 0;
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
+    const ggml_tensor* node = ggml_graph_node(graph_, i);
+    if (node->op != GGML_OP_MUL_MAT) continue;
+    work += 2.0 * static_cast<double>(ggml_nelements(node)) * static_cast<double>(node->src[0]->ne[0]);
+    ++n_product;
+  }
+  return work < kLeastWork * n_product ? 1 : device.n_thread();
+}
+
 Status Graph::run(const Device& device) {
+  ggml_backend_cpu_set_n_threads(device.backend(), n_thread_ > 0 ? n_thread_ : n_thread_ = n_thread(device));
   const ggml_status status = ggml_backend_graph_compute(device.backend(), graph_);
   if (status == GGML_STATUS_SUCCESS) return {};
-  if (status == GGML_STATUS_ALLOC_FAILED) return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
+  if (status == GGML_STATUS_ALLOC_FAILED)
+    return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
   return Error{Code::device, "graph", "a finished run", ggml_status_to_string(status)};
 }
 

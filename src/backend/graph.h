@@ -14,13 +14,15 @@
 
 namespace vla {
 
-/// Says of a path whether its values are to be kept. An empty function keeps nothing, and the graph is the production graph.
+/// Says of a path whether its values are to be kept. An empty function keeps nothing, and the graph is the production
+/// graph.
 using TapFilter = std::function<bool(const std::string& path)>;
 
 /// Working memory that all graphs share, since only one of them runs at a time.
 class ComputeMemory {
  public:
-  explicit ComputeMemory(const Device& device) : allocator_(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend()))) {}
+  explicit ComputeMemory(const Device& device)
+      : allocator_(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend()))) {}
   ggml_gallocr_t allocator() const { return allocator_.get(); }
   /// Makes the memory large enough for `graph`. Growing invalidates every graph that was allocated before.
   Status reserve(ggml_cgraph* graph);
@@ -58,6 +60,8 @@ class Graph {
   Status run(const Device& device);
 
   int n_node() const;
+  /// Threads that a run takes: one where products are too small to be worth a barrier after each node.
+  int n_thread(const Device& device) const;
   const std::vector<std::pair<std::string, Tensor>>& taps() const { return taps_; }
 
  private:
@@ -66,6 +70,7 @@ class Graph {
   TapFilter keep_;
   ggml_context_ptr context_;
   ggml_cgraph* graph_;
+  int n_thread_ = 0;  // chosen at the first run
   std::map<std::string, Tensor> constants_;
   std::vector<std::pair<std::string, Tensor>> taps_;
 };

@@ -34,7 +34,9 @@ Tensor Store::add_constant(std::vector<std::int32_t> values, std::initializer_li
 Status Store::allocate(const Device& device) {
   if (ggml_get_first_tensor(context_.get()) == nullptr) return {};
   buffer_.reset(ggml_backend_alloc_ctx_tensors(context_.get(), device.backend()));
-  if (!buffer_) return Error{Code::out_of_memory, "buffer", "", "the device refused the allocation", "free memory or use a smaller model"};
+  if (!buffer_)
+    return Error{Code::out_of_memory, "buffer", "", "the device refused the allocation",
+                 "free memory or use a smaller model"};
   for (const Pending& pending : pending_) set(pending.tensor, pending.bytes.data(), pending.bytes.size());
   pending_.clear();
   return {};
@@ -42,7 +44,9 @@ Status Store::allocate(const Device& device) {
 
 std::size_t Store::size() const { return buffer_ ? ggml_backend_buffer_get_size(buffer_.get()) : 0; }
 
-void Store::set(Tensor tensor, const void* data, std::size_t size) { ggml_backend_tensor_set(tensor.node(), data, 0, size); }
+void Store::set(Tensor tensor, const void* data, std::size_t size) {
+  ggml_backend_tensor_set(tensor.node(), data, 0, size);
+}
 void Store::get(Tensor tensor, void* data, std::size_t size) { ggml_backend_tensor_get(tensor.node(), data, 0, size); }
 
 }  // namespace vla

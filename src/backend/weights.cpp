@@ -8,9 +8,12 @@ namespace {
 ggml_type resident_type(const Param& param) {
   if (param.storage != Storage::table || param.source == nullptr) return GGML_TYPE_F32;
   switch (param.source->type) {
-    case DType::bf16: return GGML_TYPE_BF16;
-    case DType::f16: return GGML_TYPE_F16;
-    default: return GGML_TYPE_F32;
+    case DType::bf16:
+      return GGML_TYPE_BF16;
+    case DType::f16:
+      return GGML_TYPE_F16;
+    default:
+      return GGML_TYPE_F32;
   }
 }
 
@@ -30,7 +33,8 @@ void upload(Tensor tensor, const Param& param) {
 
 Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill) {
   Weights weights(list.params().size());
-  for (const Param& param : list.params()) weights.tensors_.push_back(weights.store_.add(resident_type(param), param.shape));
+  for (const Param& param : list.params())
+    weights.tensors_.push_back(weights.store_.add(resident_type(param), param.shape));
   VLA_CHECK(weights.store_.allocate(device));
   if (fill == Fill::yes)
     for (const Param& param : list.params()) upload(weights[&param], param);

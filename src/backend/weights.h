@@ -9,8 +9,9 @@
 
 namespace vla {
 
-/// The parameters of a policy, resident on a device. Matrices are widened to f32 at load, so that products round like the
-/// float32 reference whatever the bundle's dtype; tables keep their dtype, since a looked-up row is widened exactly.
+/// The parameters of a policy, resident on a device. Matrices are widened to f32 at load, so that products round like
+/// the float32 reference whatever the bundle's dtype; tables keep their dtype, since a looked-up row is widened
+/// exactly.
 class Weights {
  public:
   enum class Fill { no, yes };

@@ -14,7 +14,8 @@ namespace {
 
 constexpr std::string_view kMagic = "\x93NUMPY";
 
-/// The header is a Python dictionary literal that NumPy itself writes: {'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }
+/// The header is a Python dictionary literal that NumPy itself writes: {'descr': '<f4', 'fortran_order': False,
+/// 'shape': (2, 3), }
 std::string_view after(std::string_view header, std::string_view key) {
   const std::size_t at = header.find(key);
   if (at == std::string_view::npos) return {};
@@ -55,7 +56,8 @@ bool is_npy(std::span<const std::byte> bytes) {
 
 Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& where) {
   const auto bad = [&](const std::string& found) {
-    return Error{Code::bad_observation, where, "a .npy array of uint8 or float32 in C order", found, "save it with numpy.save"};
+    return Error{Code::bad_observation, where, "a .npy array of uint8 or float32 in C order", found,
+                 "save it with numpy.save"};
   };
   if (!is_npy(bytes) || bytes.size() < 12) return bad("other or too few bytes");
   const int version = static_cast<int>(bytes[6]);
@@ -75,7 +77,8 @@ Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& 
   std::size_t count = 0;
   if (!parse_shape(after(header, "'shape'"), array.shape, count)) return bad("a damaged shape");
   const std::size_t element = is_float ? 4 : 1;
-  if (count > data.size() / element || data.size() != count * element) return bad(fmt::format("{} bytes of data for {} elements", data.size(), count));
+  if (count > data.size() / element || data.size() != count * element)
+    return bad(fmt::format("{} bytes of data for {} elements", data.size(), count));
   if (is_float)
     array.values = copy_values<float>(data, count);
   else

@@ -10,14 +10,26 @@
 namespace vla {
 
 /// One class per exit code and per wire code; `code_name` gives the spelling that users see.
-enum class Code { internal, usage, bad_bundle, bad_observation, bad_action, unsupported, out_of_memory, device, io, mismatch };
+enum class Code {
+  internal,
+  usage,
+  bad_bundle,
+  bad_observation,
+  bad_action,
+  unsupported,
+  out_of_memory,
+  device,
+  io,
+  mismatch
+};
 
 /// The exit code of the process: 0 is success, each class has its own number.
 constexpr int exit_code(Code code) { return 1 + static_cast<int>(code); }
 
 constexpr const char* code_name(Code code) {
-  constexpr const char* kNames[] = {"internal",      "usage",  "bad_bundle", "bad_observation", "bad_action", "unsupported",
-                                    "out_of_memory", "device", "io",         "mismatch"};
+  constexpr const char* kNames[] = {"internal",   "usage",       "bad_bundle",    "bad_observation",
+                                    "bad_action", "unsupported", "out_of_memory", "device",
+                                    "io",         "mismatch"};
   return kNames[static_cast<int>(code)];
 }
 
@@ -82,15 +94,15 @@ using Status = Result<void>;
 #define VLA_CONCAT(a, b) VLA_CONCAT_INNER(a, b)
 
 /// `VLA_TRY(Inputs in, encode(obs));` declares `in`, or returns the error from the enclosing function.
-#define VLA_TRY(declaration, expression)                          \
-  auto VLA_CONCAT(result_, __LINE__) = (expression);              \
-  if (!VLA_CONCAT(result_, __LINE__)) {                           \
-    return VLA_CONCAT(result_, __LINE__).error();                 \
-  }                                                               \
+#define VLA_TRY(declaration, expression)             \
+  auto VLA_CONCAT(result_, __LINE__) = (expression); \
+  if (!VLA_CONCAT(result_, __LINE__)) {              \
+    return VLA_CONCAT(result_, __LINE__).error();    \
+  }                                                  \
   declaration = std::move(VLA_CONCAT(result_, __LINE__).value())
 
 /// `VLA_CHECK(run());` returns the error of a Status from the enclosing function.
-#define VLA_CHECK(expression)                                                           \
-  do {                                                                                  \
-    if (auto status_ = (expression); !status_) return status_.error();                  \
+#define VLA_CHECK(expression)                                          \
+  do {                                                                 \
+    if (auto status_ = (expression); !status_) return status_.error(); \
   } while (false)

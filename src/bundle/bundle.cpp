@@ -23,9 +23,7 @@ constexpr std::string_view kChecksumKey = "vla.checksum";
 constexpr std::string_view kChecksumPrefix = "xxh3:";
 constexpr std::size_t kDigits = 16;
 
-Error io_error(const std::string& path, const char* what) {
-  return {Code::io, path, what, std::strerror(errno)};
-}
+Error io_error(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
 
 struct Mapping {
   std::shared_ptr<const void> owner;
@@ -106,7 +104,8 @@ Result<Bundle> Bundle::open(const std::string& path) {
 Result<Bundle> Bundle::parse(std::span<const std::byte> bytes, std::string name) {
   VLA_TRY(GgufContent content, read_gguf(bytes, name));
   if (!content.keys.has("vla.bundle_version"))
-    return Error{Code::bad_bundle, name, "a vla bundle", "a GGUF file of another kind", "make a bundle with vla-convert"};
+    return Error{Code::bad_bundle, name, "a vla bundle", "a GGUF file of another kind",
+                 "make a bundle with vla-convert"};
   VLA_CHECK(check_version(content.keys, name));
   VLA_CHECK(check_sum(bytes, content.keys, name));
   Bundle bundle;
@@ -130,9 +129,11 @@ const TensorInfo* Bundle::find(std::string_view name) const {
 Result<std::vector<float>> Bundle::stats(std::string_view name) const {
   const std::string where = path_ + ": tensor " + std::string(name);
   const TensorInfo* tensor = find(name);
-  if (tensor == nullptr) return Error{Code::bad_bundle, where, "statistics", "no such tensor", "convert the checkpoint again"};
+  if (tensor == nullptr)
+    return Error{Code::bad_bundle, where, "statistics", "no such tensor", "convert the checkpoint again"};
   if (tensor->type != DType::f32 || tensor->shape.size() != 1)
-    return Error{Code::bad_bundle, where, "a one-dimensional f32 tensor", fmt::format("{} dimensions of {}", tensor->shape.size(), dtype_name(tensor->type))};
+    return Error{Code::bad_bundle, where, "a one-dimensional f32 tensor",
+                 fmt::format("{} dimensions of {}", tensor->shape.size(), dtype_name(tensor->type))};
   std::vector<float> values(static_cast<std::size_t>(tensor->count()));
   std::memcpy(values.data(), tensor->data.data(), tensor->data.size());
   for (float value : values)

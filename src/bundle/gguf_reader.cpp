@@ -14,7 +14,8 @@ namespace {
 enum GgufType : std::uint32_t { u8, i8, u16, i16, u32, i32, f32, boolean, string, array, u64, i64, f64 };
 
 constexpr std::uint64_t kMaxDims = 4;
-constexpr std::uint64_t kMaxNameLength = 65535;  // of keys and tensor names, as the format's own description limits them
+constexpr std::uint64_t kMaxNameLength =
+    65535;  // of keys and tensor names, as the format's own description limits them
 
 /// Walks over the bytes. Every read checks what is left; after the first failure the reader stays failed.
 class Cursor {
@@ -46,7 +47,8 @@ class Cursor {
   }
 
   Error bad(const std::string& what, std::string expected, std::string found, std::string hint = {}) const {
-    return {Code::bad_bundle, fmt::format("{}: {}", name_, what), std::move(expected), std::move(found), std::move(hint)};
+    return {Code::bad_bundle, fmt::format("{}: {}", name_, what), std::move(expected), std::move(found),
+            std::move(hint)};
   }
 
   std::uint64_t left() const { return bytes_.size() - position_; }
@@ -70,14 +72,22 @@ Result<std::int64_t> read_integer(Cursor& cursor, const std::string& what) {
 
 Result<std::int64_t> read_integer(Cursor& cursor, std::uint32_t type, const std::string& what) {
   switch (type) {
-    case u8: return read_integer<std::uint8_t>(cursor, what);
-    case i8: return read_integer<std::int8_t>(cursor, what);
-    case u16: return read_integer<std::uint16_t>(cursor, what);
-    case i16: return read_integer<std::int16_t>(cursor, what);
-    case u32: return read_integer<std::uint32_t>(cursor, what);
-    case i32: return read_integer<std::int32_t>(cursor, what);
-    case u64: return read_integer<std::uint64_t>(cursor, what);
-    default: return read_integer<std::int64_t>(cursor, what);
+    case u8:
+      return read_integer<std::uint8_t>(cursor, what);
+    case i8:
+      return read_integer<std::int8_t>(cursor, what);
+    case u16:
+      return read_integer<std::uint16_t>(cursor, what);
+    case i16:
+      return read_integer<std::int16_t>(cursor, what);
+    case u32:
+      return read_integer<std::uint32_t>(cursor, what);
+    case i32:
+      return read_integer<std::int32_t>(cursor, what);
+    case u64:
+      return read_integer<std::uint64_t>(cursor, what);
+    default:
+      return read_integer<std::int64_t>(cursor, what);
   }
 }
 
@@ -156,11 +166,16 @@ Result<Keys> read_keys(Cursor& cursor, std::uint64_t count) {
 Result<DType> read_dtype(Cursor& cursor, const std::string& what) {
   VLA_TRY(const std::uint32_t type, cursor.scalar<std::uint32_t>(what));
   switch (type) {  // numbers of ggml's enum ggml_type
-    case 0: return DType::f32;
-    case 1: return DType::f16;
-    case 26: return DType::i32;
-    case 30: return DType::bf16;
-    default: return cursor.bad(what, "type f32, f16, bf16 or i32", fmt::format("ggml type {}", type));
+    case 0:
+      return DType::f32;
+    case 1:
+      return DType::f16;
+    case 26:
+      return DType::i32;
+    case 30:
+      return DType::bf16;
+    default:
+      return cursor.bad(what, "type f32, f16, bf16 or i32", fmt::format("ggml type {}", type));
   }
 }
 
@@ -199,23 +214,29 @@ Result<std::uint64_t> read_alignment(const Cursor& cursor, const Keys& keys) {
   return static_cast<std::uint64_t>(alignment);
 }
 
-std::uint64_t round_up(std::uint64_t value, std::uint64_t alignment) { return (value + alignment - 1) / alignment * alignment; }
+std::uint64_t round_up(std::uint64_t value, std::uint64_t alignment) {
+  return (value + alignment - 1) / alignment * alignment;
+}
 
 /// Tensors must follow each other without gaps, in the order in which they are listed, up to the end of the file.
-Status place(std::span<const std::byte> bytes, const Cursor& cursor, std::uint64_t alignment, std::vector<PlacedTensor>& tensors) {
+Status place(std::span<const std::byte> bytes, const Cursor& cursor, std::uint64_t alignment,
+             std::vector<PlacedTensor>& tensors) {
   const std::uint64_t start = round_up(cursor.position(), alignment);
   std::uint64_t expected = 0;
   for (PlacedTensor& tensor : tensors) {
     const std::string what = "tensor " + tensor.info.name;
-    if (tensor.offset != expected) return cursor.bad(what, fmt::format("offset {}", expected), std::to_string(tensor.offset));
-    if (start > bytes.size() || tensor.offset > bytes.size() - start || tensor.size > bytes.size() - start - tensor.offset)
+    if (tensor.offset != expected)
+      return cursor.bad(what, fmt::format("offset {}", expected), std::to_string(tensor.offset));
+    if (start > bytes.size() || tensor.offset > bytes.size() - start ||
+        tensor.size > bytes.size() - start - tensor.offset)
       return cursor.bad(what, fmt::format("{} bytes of data", tensor.size), "the end of the file",
                         "the file is truncated: copy or convert it again");
     tensor.info.data = bytes.subspan(start + tensor.offset, tensor.size);
     expected = round_up(tensor.offset + tensor.size, alignment);
   }
   const std::uint64_t end = tensors.empty() ? cursor.position() : start + expected;
-  if (bytes.size() > std::max(end, start)) return cursor.bad("end", fmt::format("a file of {} bytes", end), std::to_string(bytes.size()));
+  if (bytes.size() > std::max(end, start))
+    return cursor.bad("end", fmt::format("a file of {} bytes", end), std::to_string(bytes.size()));
   return {};
 }
 
@@ -224,7 +245,8 @@ Status place(std::span<const std::byte> bytes, const Cursor& cursor, std::uint64
 Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::string& name) {
   Cursor cursor(bytes, name);
   VLA_TRY(const std::uint32_t magic, cursor.scalar<std::uint32_t>("header"));
-  if (magic != 0x46554747) return cursor.bad("header", "a GGUF file", "other first bytes", "make a bundle with vla-convert");
+  if (magic != 0x46554747)
+    return cursor.bad("header", "a GGUF file", "other first bytes", "make a bundle with vla-convert");
   VLA_TRY(const std::uint32_t version, cursor.scalar<std::uint32_t>("header"));
   if (version != 3) return cursor.bad("header", "GGUF version 3", fmt::format("version {}", version));
   VLA_TRY(const std::uint64_t n_tensor, cursor.scalar<std::uint64_t>("header"));
@@ -237,7 +259,8 @@ Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::strin
   std::set<std::string> names;
   for (std::uint64_t i = 0; i < n_tensor; ++i) {
     VLA_TRY(PlacedTensor tensor, read_tensor(cursor, bytes.size(), fmt::format("tensor {} of {}", i + 1, n_tensor)));
-    if (!names.insert(tensor.info.name).second) return cursor.bad("tensor " + tensor.info.name, "one tensor", "the name a second time");
+    if (!names.insert(tensor.info.name).second)
+      return cursor.bad("tensor " + tensor.info.name, "one tensor", "the name a second time");
     tensors.push_back(std::move(tensor));
   }
   VLA_CHECK(place(bytes, cursor, alignment, tensors));

@@ -17,9 +17,9 @@ struct GgufContent {
   std::vector<TensorInfo> tensors;
 };
 
-/// Parses GGUF version 3 (ggml docs/gguf.md). A reader of our own instead of ggml's, because a bundle may be hostile: here
-/// every count and length is compared with the bytes that are left before anything is allocated or read, and the refusal
-/// names the key or tensor. Errors: bad_bundle.
+/// Parses GGUF version 3 (ggml docs/gguf.md). A reader of our own instead of ggml's, because a bundle may be hostile:
+/// here every count and length is compared with the bytes that are left before anything is allocated or read, and the
+/// refusal names the key or tensor. Errors: bad_bundle.
 Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::string& name);
 
 }  // namespace vla

@@ -8,8 +8,8 @@
 namespace vla {
 namespace {
 
-constexpr const char* kTypeNames[] = {"a boolean",           "an integer",        "a floating-point number",
-                                      "a string",            "a list of integers", "a list of floating-point numbers",
+constexpr const char* kTypeNames[] = {"a boolean",        "an integer",         "a floating-point number",
+                                      "a string",         "a list of integers", "a list of floating-point numbers",
                                       "a list of strings"};
 
 Error missing(std::string_view key, const std::string& expected) {

@@ -37,18 +37,22 @@ const Param& ParamList::declare(std::string name, Storage storage, std::vector<s
 void ParamList::look_up(Param& param) {
   const TensorInfo* tensor = bundle_->find(param.name);
   if (tensor == nullptr)
-    return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.shape), storage_name(param.storage)));
+    return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.shape),
+                               storage_name(param.storage)));
   if (tensor->shape != param.shape)
-    return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name, shape_text(param.shape), shape_text(tensor->shape)));
+    return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name, shape_text(param.shape),
+                               shape_text(tensor->shape)));
   const bool fits = tensor->type == DType::f32 || (param.storage != Storage::vector && tensor->type != DType::i32);
   if (!fits)
     return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name,
-                               param.storage == Storage::vector ? "f32" : "f32, bf16 or f16", dtype_name(tensor->type)));
+                               param.storage == Storage::vector ? "f32" : "f32, bf16 or f16",
+                               dtype_name(tensor->type)));
   param.source = tensor;
 }
 
 void ParamList::problem(const Error& error) {
-  problem(fmt::format("{:<15} {:<40} expected {}", error.found == "no such key" ? "missing key" : "wrong key", error.where,
+  problem(fmt::format("{:<15} {:<40} expected {}", error.found == "no such key" ? "missing key" : "wrong key",
+                      error.where,
                       error.found == "no such key" ? error.expected : error.expected + ", file has " + error.found));
 }
 
@@ -60,8 +64,8 @@ Status ParamList::report(const std::string& policy, const std::function<bool(con
         lines.push_back(fmt::format("unused tensor   {:<40} no module of {} declares it", tensor.name, policy));
   if (lines.empty()) return {};
   return Error{Code::bad_bundle, bundle_ != nullptr ? bundle_->path() : policy, "",
-               fmt::format("does not fit policy {}: {} problem{}\n  {}", policy, lines.size(), lines.size() == 1 ? "" : "s",
-                           fmt::join(lines, "\n  ")),
+               fmt::format("does not fit policy {}: {} problem{}\n  {}", policy, lines.size(),
+                           lines.size() == 1 ? "" : "s", fmt::join(lines, "\n  ")),
                "convert the checkpoint again with the vla-convert of this version"};
 }
 
@@ -81,7 +85,9 @@ int Scope::dim(const std::string& key, int max) const {
 
 double Scope::precise(const std::string& key) const { return take(list_->keys().number(key_of(key)), 1.0); }
 float Scope::number(const std::string& key) const { return static_cast<float>(precise(key)); }
-std::string Scope::string(const std::string& key) const { return take(list_->keys().string(key_of(key)), std::string()); }
+std::string Scope::string(const std::string& key) const {
+  return take(list_->keys().string(key_of(key)), std::string());
+}
 std::vector<std::string> Scope::strings(const std::string& key) const {
   return take(list_->keys().strings(key_of(key)), std::vector<std::string>());
 }

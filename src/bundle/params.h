@@ -65,8 +65,8 @@ class Scope {
   Scope operator/(int index) const { return *this / std::to_string(index); }
   const std::string& path() const { return path_; }
 
-  /// Sizes and counts from the configuration, from 1 to `max`: small enough that products of two of them stay in range. A
-  /// problem is recorded and 1 returned where one is wrong.
+  /// Sizes and counts from the configuration, from 1 to `max`: small enough that products of two of them stay in range.
+  /// A problem is recorded and 1 returned where one is wrong.
   int dim(const std::string& key, int max = 1 << 16) const;
   /// A number of layers or blocks, from 1 to 512, so that a damaged bundle cannot ask for endless work.
   int n_layer(const std::string& key) const { return dim(key, 512); }

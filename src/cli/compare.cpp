@@ -27,22 +27,26 @@ Status compare(const CompareOptions& options) {
   std::vector<TapDifference> rows = compare_taps(expected, got);
   std::erase_if(rows, [&](const TapDifference& row) { return !match_path(options.only, row.path); });
   if (rows.empty())
-    return Error{Code::mismatch, options.got, "taps that stand in both files", "none", "record with vla run --tap '*' --taps-out FILE"};
+    return Error{Code::mismatch, options.got, "taps that stand in both files", "none",
+                 "record with vla run --tap '*' --taps-out FILE"};
 
   std::size_t width = 4;
   for (const TapDifference& row : rows) width = std::max(width, row.path.size());
-  fmt::print("{:<{}}  {:>9}  {:>9}  {:<10}  tolerance {:g} of the largest magnitude\n", "path", width, "max_abs", "relative", "cosine", options.tolerance);
+  fmt::print("{:<{}}  {:>9}  {:>9}  {:<10}  tolerance {:g} of the largest magnitude\n", "path", width, "max_abs",
+             "relative", "cosine", options.tolerance);
   std::size_t n_failed = 0;
   for (const TapDifference& row : rows) {
     const bool failed = !row.within(options.tolerance);
     print_row(row, options.tolerance, failed && n_failed == 0, width);
     n_failed += failed;
   }
-  fmt::print("{} of {} taps within {:g}; {} of {} expected taps were not recorded\n", rows.size() - n_failed, rows.size(), options.tolerance,
-             expected.size() - compare_taps(expected, got).size(), expected.size());
+  fmt::print("{} of {} taps within {:g}; {} of {} expected taps were not recorded\n", rows.size() - n_failed,
+             rows.size(), options.tolerance, expected.size() - compare_taps(expected, got).size(), expected.size());
   if (n_failed == 0) return {};
-  const auto first = std::find_if(rows.begin(), rows.end(), [&](const TapDifference& row) { return !row.within(options.tolerance); });
-  return Error{Code::mismatch, first->path, fmt::format("a relative difference of at most {:g}", options.tolerance), fmt::format("{:.3g}", first->relative),
+  const auto first =
+      std::find_if(rows.begin(), rows.end(), [&](const TapDifference& row) { return !row.within(options.tolerance); });
+  return Error{Code::mismatch, first->path, fmt::format("a relative difference of at most {:g}", options.tolerance),
+               fmt::format("{:.3g}", first->relative),
                fmt::format("{} of {} taps differ; this is the first", n_failed, rows.size())};
 }
 
@@ -50,14 +54,21 @@ Status compare(const CompareOptions& options) {
 
 Command add_compare(CLI::App& app) {
   auto options = std::make_shared<CompareOptions>();
-  CLI::App* command = app.add_subcommand("compare", "Compare recorded taps with expected ones and show the first divergence");
-  command->footer("The taps are listed in the order in which the reference computes them, so the first FAIL is where to look.\n"
-                  "  vla run policy.gguf ... --tap '*' --taps-out got.gguf\n"
-                  "  vla compare tests/golden/smolvla/base/expected.gguf got.gguf");
+  CLI::App* command =
+      app.add_subcommand("compare", "Compare recorded taps with expected ones and show the first divergence");
+  command->footer(
+      "The taps are listed in the order in which the reference computes them, so the first FAIL is where to look.\n"
+      "  vla run policy.gguf ... --tap '*' --taps-out got.gguf\n"
+      "  vla compare tests/golden/smolvla/base/expected.gguf got.gguf");
   command->add_option("EXPECTED", options->expected, "Taps of the reference (GGUF)")->required();
   command->add_option("GOT", options->got, "Taps of a run (GGUF)")->required();
-  command->add_option("--only", options->only, "Compare only these paths; * stands for any characters, commas separate patterns");
-  command->add_option("--tolerance", options->tolerance, "Largest difference allowed, relative to the largest expected magnitude of a tap")->check(CLI::PositiveNumber)->capture_default_str();
+  command->add_option("--only", options->only,
+                      "Compare only these paths; * stands for any characters, commas separate patterns");
+  command
+      ->add_option("--tolerance", options->tolerance,
+                   "Largest difference allowed, relative to the largest expected magnitude of a tap")
+      ->check(CLI::PositiveNumber)
+      ->capture_default_str();
   return [options] { return compare(*options); };
 }
 

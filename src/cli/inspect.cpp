@@ -21,7 +21,7 @@ std::string human_size(double bytes) {
   constexpr const char* kUnits[] = {"B", "kB", "MB", "GB", "TB"};
   int unit = 0;
   for (; bytes >= 1000 && unit < 4; ++unit) bytes /= 1000;
-  return fmt::format(unit == 0 ? "{:.0f} {}" : "{:.1f} {}", bytes, kUnits[unit]);
+  return fmt::format("{:.{}f} {}", bytes, unit == 0 ? 0 : 1, kUnits[unit]);
 }
 
 /// What one module of the first two path levels weighs: `vision`, `lm`, `expert`, `action_in`, ...
@@ -85,7 +85,8 @@ StatsColumns read_stats(const Bundle& bundle, const std::string& feature) {
   return columns;
 }
 
-void print_numbers(const std::vector<std::string>& names, const std::vector<std::string>& units, const StatsColumns& stats) {
+void print_numbers(const std::vector<std::string>& names, const std::vector<std::string>& units,
+                   const StatsColumns& stats) {
   std::size_t width = 4;
   for (const std::string& name : names) width = std::max(width, name.size());
   fmt::print("    {:<{}}  {:<10}", "name", width, "unit");
@@ -101,8 +102,9 @@ void print_numbers(const std::vector<std::string>& names, const std::vector<std:
 void print_features(const Engine& engine) {
   const Keys& keys = engine.bundle().keys();
   const auto views = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
-  fmt::print("views        any size, letterboxed to {} x {}; at least {} of {} must be present\n", engine.processor().image_width(),
-             engine.processor().image_height(), *keys.integer("observation.min_views"), views.size());
+  fmt::print("views        any size, letterboxed to {} x {}; at least {} of {} must be present\n",
+             engine.processor().recipe().letterbox.width, engine.processor().recipe().letterbox.height,
+             *keys.integer("observation.min_views"), views.size());
   for (std::size_t i = 0; i < views.size(); ++i)
     fmt::print("    {}{}\n", views[i], aliases[i].empty() ? "" : fmt::format("  (also {})", aliases[i]));
 
@@ -119,19 +121,24 @@ void print_features(const Engine& engine) {
   fmt::print("action       {} rows of {} numbers{}\n", engine.horizon(), keys.strings("action.names")->size(),
              rate > 0 ? fmt::format(", {:g} rows a second", rate) : ", control rate unstated");
   print_numbers(*keys.strings("action.names"), *keys.strings("action.units"), read_stats(engine.bundle(), "action"));
-  fmt::print("instruction  at most {} tokens\n", engine.processor().max_text_tokens());
+  fmt::print("instruction  at most {} tokens\n", engine.processor().recipe().max_tokens);
 }
 
 void print_human(const Engine& engine) {
   const Bundle& bundle = engine.bundle();
-  const auto text = [&](const char* key) { return bundle.keys().string(key) ? *bundle.keys().string(key) : std::string("?"); };
+  const auto text = [&](const char* key) {
+    return bundle.keys().string(key) ? *bundle.keys().string(key) : std::string("?");
+  };
   fmt::print("bundle       {}\n", bundle.path());
-  fmt::print("policy       {}, stored as {}, {}\n", text("vla.arch"), text("vla.dtype"), human_size(static_cast<double>(bundle.file_size())));
+  fmt::print("policy       {}, stored as {}, {}\n", text("vla.arch"), text("vla.dtype"),
+             human_size(static_cast<double>(bundle.file_size())));
   fmt::print("source       {}{}, converted by {}\n", text("vla.source.name"),
-             text("vla.source.revision").empty() ? "" : " at " + text("vla.source.revision"), text("vla.source.converter"));
+             text("vla.source.revision").empty() ? "" : " at " + text("vla.source.revision"),
+             text("vla.source.converter"));
   fmt::print("checksum     {}\n", text("vla.checksum"));
   print_features(engine);
-  fmt::print("solver       euler, {} steps from {:g}, {} noise\n", engine.solver().n_step, engine.solver().times.front(), engine.solver().noise);
+  fmt::print("solver       euler, {} steps from {:g}, {} noise\n", engine.solver().n_step,
+             engine.solver().times.front(), engine.solver().noise);
   const Json recipe = Json::parse(text("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {
     fmt::print("recipe       {}\n", list);
@@ -140,13 +147,15 @@ void print_human(const Engine& engine) {
   fmt::print("modules      {:<18}  {:>14}  {:>10}\n", "path", "parameters", "stored");
   std::int64_t n_param = 0;
   for (const auto& [path, size] : module_sizes(engine.params())) {
-    fmt::print("             {:<18}  {:>14}  {:>10}\n", path, fmt::format("{}", size.n_param), human_size(static_cast<double>(size.stored)));
+    fmt::print("             {:<18}  {:>14}  {:>10}\n", path, fmt::format("{}", size.n_param),
+               human_size(static_cast<double>(size.stored)));
     n_param += size.n_param;
   }
   const MemoryUse memory = engine.memory();
   fmt::print("             {:<18}  {:>14}\n", "all", n_param);
-  fmt::print("memory       {} in all: weights {}, inputs and cache {}, working memory {}\n", human_size(static_cast<double>(memory.total())),
-             human_size(static_cast<double>(memory.weights)), human_size(static_cast<double>(memory.plan)), human_size(static_cast<double>(memory.working)));
+  fmt::print("memory       {} in all: weights {}, inputs and cache {}, working memory {}\n",
+             human_size(static_cast<double>(memory.total())), human_size(static_cast<double>(memory.weights)),
+             human_size(static_cast<double>(memory.plan)), human_size(static_cast<double>(memory.working)));
 }
 
 void print_json(const Engine& engine) {
@@ -164,12 +173,14 @@ void print_json(const Engine& engine) {
   for (const auto& [path, size] : module_sizes(engine.params()))
     root["modules"][path] = {{"parameters", size.n_param}, {"stored_bytes", size.stored}};
   const MemoryUse memory = engine.memory();
-  root["memory_bytes"] = {{"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
+  root["memory_bytes"] = {
+      {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
   fmt::print("{}\n", root.dump(2));
 }
 
 Status inspect(const InspectOptions& options) {
-  if (options.manifest.empty() == options.bundle.empty()) return Error{Code::usage, "inspect", "BUNDLE or --manifest ARCH", options.bundle.empty() ? "neither" : "both"};
+  if (options.manifest.empty() == options.bundle.empty())
+    return Error{Code::usage, "inspect", "BUNDLE or --manifest ARCH", options.bundle.empty() ? "neither" : "both"};
   if (!options.manifest.empty()) return print_manifest(options.manifest);
   // A dry load checks everything that a run would check and reserves the memory that it would take, without filling it.
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.dry = true}));
@@ -181,10 +192,14 @@ Status inspect(const InspectOptions& options) {
 
 Command add_inspect(CLI::App& app) {
   auto options = std::make_shared<InspectOptions>();
-  CLI::App* command = app.add_subcommand("inspect", "Show what a bundle is: features, statistics, recipe, sizes, memory");
-  command->footer("  vla inspect policy.gguf\n  vla inspect policy.gguf --json\n  vla inspect --manifest smolvla    # parameters at the published size");
+  CLI::App* command =
+      app.add_subcommand("inspect", "Show what a bundle is: features, statistics, recipe, sizes, memory");
+  command->footer(
+      "  vla inspect policy.gguf\n  vla inspect policy.gguf --json\n  vla inspect --manifest smolvla    # parameters "
+      "at the published size");
   command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert");
-  command->add_option("--manifest", options->manifest, "Print the keys and parameters that an architecture declares, as JSON");
+  command->add_option("--manifest", options->manifest,
+                      "Print the keys and parameters that an architecture declares, as JSON");
   command->add_flag("--json", options->json, "Print JSON for machines");
   return [options] { return inspect(*options); };
 }

@@ -9,13 +9,15 @@
 namespace vla::cli {
 
 /// JSON with members in the order of insertion and floats in their shortest form that reads back to the same float32.
-using Json = nlohmann::basic_json<nlohmann::ordered_map, std::vector, std::string, bool, std::int64_t, std::uint64_t, float>;
+using Json =
+    nlohmann::basic_json<nlohmann::ordered_map, std::vector, std::string, bool, std::int64_t, std::uint64_t, float>;
 
 /// Which bundle answered: path, architecture, dtype, source and checksum.
 inline Json identity_json(const Bundle& bundle) {
   Json identity;
   identity["path"] = bundle.path();
-  for (const char* key : {"vla.arch", "vla.dtype", "vla.checksum", "vla.source.name", "vla.source.revision", "vla.source.converter"})
+  for (const char* key :
+       {"vla.arch", "vla.dtype", "vla.checksum", "vla.source.name", "vla.source.revision", "vla.source.converter"})
     identity[std::string(key).substr(4)] = bundle.keys().string(key) ? *bundle.keys().string(key) : "";
   return identity;
 }

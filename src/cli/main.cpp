@@ -55,7 +55,8 @@ int main(int argc, char** argv) {
   try {  // what libraries may throw ends here
     return run(argc, argv);
   } catch (const std::bad_alloc&) {
-    return fail({vla::Code::out_of_memory, "vla", "", "the system has no memory left", "use a smaller model or free memory"});
+    return fail(
+        {vla::Code::out_of_memory, "vla", "", "the system has no memory left", "use a smaller model or free memory"});
   } catch (const std::exception& exception) {
     return fail({vla::Code::internal, "vla", "", exception.what(), "please report this"});
   }

@@ -68,13 +68,14 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   if (argument.find('=') != std::string::npos) {
     VLA_TRY(const NameValue state, split("--state", argument));
     name = state.name, numbers = state.value;
-  } else if (processor.states().size() == 1) {
-    name = processor.states().front().name;
+  } else if (processor.states().names().size() == 1) {
+    name = processor.states().names().front();
   } else {
     return Error{Code::usage, "--state", "NAME=v,v,... because the bundle has several state features", argument};
   }
   VLA_TRY(std::vector<float> values, parse_numbers(numbers));
-  if (!observation.states.emplace(name, std::move(values)).second) return Error{Code::usage, "--state", "each state once", name + " twice"};
+  if (!observation.states.emplace(name, std::move(values)).second)
+    return Error{Code::usage, "--state", "each state once", name + " twice"};
   return {};
 }
 
@@ -128,7 +129,8 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
 
 Status check(RunOptions& options) {
   if (!options.noise.empty() && options.seed) return Error{Code::usage, "--seed", "--noise or --seed", "both"};
-  if (options.tap.empty() != options.taps_out.empty()) return Error{Code::usage, "--tap", "--tap PATTERN and --taps-out FILE together", "one of them"};
+  if (options.tap.empty() != options.taps_out.empty())
+    return Error{Code::usage, "--tap", "--tap PATTERN and --taps-out FILE together", "one of them"};
   if (options.noise.empty() && !options.seed) {
     options.seed = std::random_device()();
     fmt::print(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
@@ -154,7 +156,8 @@ Status run(RunOptions& options) {
   for (const std::string& note : chunk.notes) fmt::print(stderr, "note: {}\n", note);
   if (!options.taps_out.empty()) VLA_CHECK(write_taps(chunk.taps, options.taps_out));
   if (!options.out.empty())
-    VLA_CHECK(write_npy(options.out, chunk.actions, static_cast<std::size_t>(chunk.horizon), static_cast<std::size_t>(chunk.d_action)));
+    VLA_CHECK(write_npy(options.out, chunk.actions, static_cast<std::size_t>(chunk.horizon),
+                        static_cast<std::size_t>(chunk.d_action)));
   if (options.json) {
     print_json(chunk, *engine, options);
     return {};
@@ -170,20 +173,32 @@ Command add_run(CLI::App& app) {
   auto options = std::make_shared<RunOptions>();
   CLI::App* command = app.add_subcommand("run", "One observation in, one action chunk out");
   command->footer(
-      "NAME is a camera feature of the bundle or its last part: camera1 for observation.images.camera1 (vla inspect lists\n"
+      "NAME is a camera feature of the bundle or its last part: camera1 for observation.images.camera1 (vla inspect "
+      "lists\n"
       "them). NAME= declares a view absent; a view that is simply not mentioned is an error.\n"
-      "  vla run policy.gguf --image camera1=top.png --image camera2= --state 0.1,0.2,0.3 --text \"open the drawer\" --seed 1 --json");
+      "  vla run policy.gguf --image camera1=top.png --image camera2= --state 0.1,0.2,0.3 --text \"open the drawer\" "
+      "--seed 1 --json");
   command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert")->required();
-  command->add_option("--image", options->images, "NAME=FILE: a frame as PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3)")->required()->allow_extra_args(false);
-  command->add_option("--state", options->states, "v,v,... or NAME=v,v,...: the robot's state in its own units")->required()->allow_extra_args(false);
+  command
+      ->add_option("--image", options->images,
+                   "NAME=FILE: a frame as PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3)")
+      ->required()
+      ->allow_extra_args(false);
+  command->add_option("--state", options->states, "v,v,... or NAME=v,v,...: the robot's state in its own units")
+      ->required()
+      ->allow_extra_args(false);
   command->add_option("--text", options->text, "The instruction")->required();
-  command->add_option("--noise", options->noise, "The solver's starting noise: a float32 .npy file, horizon x padded action width");
+  command->add_option("--noise", options->noise,
+                      "The solver's starting noise: a float32 .npy file, horizon x padded action width");
   command->add_option("--seed", options->seed, "Draw the noise; the same seed gives the same bytes on every machine");
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions");
-  command->add_option("--tap", options->tap, "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns");
+  command->add_option("--tap", options->tap,
+                      "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns");
   command->add_option("--taps-out", options->taps_out, "Where the recorded values go (GGUF), for vla compare");
-  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")->check(CLI::Range(0, 512))->capture_default_str();
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+      ->check(CLI::Range(0, 512))
+      ->capture_default_str();
   return [options] { return run(*options); };
 }
 

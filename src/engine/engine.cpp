@@ -11,12 +11,6 @@ namespace {
 
 constexpr int kMaxHorizon = 4096;
 
-/// The sizes that processor and network must agree on; each stands once in the bundle's keys and once in its recipe.
-Status agree(const std::string& key, int network, int recipe) {
-  if (network == recipe) return {};
-  return Error{Code::bad_bundle, "processor.recipe", fmt::format("{} {}", key, network), std::to_string(recipe), "convert the checkpoint again"};
-}
-
 }  // namespace
 
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
@@ -27,8 +21,9 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   engine->tap_pattern_ = options.tap_pattern;
   VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
-  engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_, engine->solver_,
-                                                       engine->conditions_, engine->d_action_, engine->horizon_, engine->tap_pattern_});
+  engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_,
+                                                       engine->solver_, engine->conditions_, engine->d_action_,
+                                                       engine->horizon_, engine->tap_pattern_});
   VLA_CHECK(engine->warm_up());
   engine->bundle_.release_pages();
   return engine;
@@ -40,14 +35,13 @@ Status Engine::load_policy(bool dry) {
   VLA_TRY(const PolicyEntry entry, find_policy(arch));
   params_ = std::make_unique<ParamList>(keys, &bundle_);
   policy_ = entry.make(*params_);
-  VLA_CHECK(params_->report(arch, [this](const std::string& tensor) { return processor_.uses(tensor); }));
+  VLA_CHECK(params_->report(arch, [](const std::string& tensor) { return tensor.starts_with("stats."); }));
   VLA_TRY(solver_, Solver::read(keys));
   VLA_TRY(horizon_, keys.integer("policy.horizon"));
   VLA_TRY(d_action_, keys.integer("policy.d_action"));
   VLA_TRY(d_state_, keys.integer("policy.d_state"));
   if (horizon_ < 1 || horizon_ > kMaxHorizon)
     return Error{Code::bad_bundle, "policy.horizon", fmt::format("1 to {}", kMaxHorizon), std::to_string(horizon_)};
-  VLA_CHECK(agree("policy.d_state", d_state_, processor_.d_state()));
   VLA_TRY(Weights weights, Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes));
   weights_ = std::make_unique<Weights>(std::move(weights));
   return {};
@@ -69,8 +63,9 @@ Status Engine::make_conditions() {
 
 /// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
 Status Engine::warm_up() {
-  const InputShape largest = {processor_.image_width(), processor_.image_height(), static_cast<int>(processor_.views().size()),
-                              processor_.max_text_tokens(), d_state_};
+  const Recipe& recipe = processor_.recipe();
+  const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
+                              static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
   VLA_CHECK(policy_->check(largest));
   VLA_TRY(const Plan* plan, plans_->for_shape(largest));
   largest_plan_ = plan->size();
@@ -82,21 +77,50 @@ Result<std::vector<float>> Engine::start(const Noise& noise) const {
   if (const auto* seed = std::get_if<std::uint64_t>(&noise)) return draw_noise(solver_.noise, *seed, count);
   const auto& values = std::get<std::vector<float>>(noise);
   if (values.size() != count)
-    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_), fmt::format("{} numbers", values.size())};
+    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_),
+                 fmt::format("{} numbers", values.size())};
   for (float value : values)
     if (!std::isfinite(value)) return Error{Code::bad_observation, "noise", "finite numbers", fmt::format("{}", value)};
   return values;
 }
 
+template <class T>
+void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
+                    const std::vector<T>& values) const {
+  if (match_path(tap_pattern_, path)) taps.push_back({path, std::move(shape), {values.begin(), values.end()}});
+}
+
+void Engine::record_inputs(std::vector<Tap>& taps) const {
+  record(taps, "pixels", {inputs_.width, inputs_.height, 3, inputs_.n_view}, inputs_.pixels);
+  record(taps, "tokens", {static_cast<std::int64_t>(inputs_.tokens.size())}, inputs_.tokens);
+  record(taps, "state", {d_state_}, inputs_.state);
+}
+
+/// `chunk` is what the network answers, cut to the robot's columns; `actions` is the same in world units.
+void Engine::record_chunk(const std::vector<float>& x, ActionChunk& chunk) const {
+  if (tap_pattern_.empty()) return;
+  std::vector<float> cut;
+  for (int row = 0; row < horizon_; ++row)
+    cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + chunk.d_action);
+  record(chunk.taps, "chunk", {chunk.d_action, horizon_}, cut);
+  record(chunk.taps, "actions", {chunk.d_action, horizon_}, chunk.actions);
+}
+
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) {
   ActionChunk chunk;
   StageClock clock;
-  VLA_TRY(const Inputs in, processor_.encode(observation));
+  inputs_.notes.clear();
+  VLA_CHECK(processor_.encode_images(observation, inputs_));
+  VLA_CHECK(processor_.encode_state(observation, inputs_));
   clock.lap(chunk.timing, "preprocess");
+  VLA_CHECK(processor_.encode_text(observation, inputs_));
+  clock.lap(chunk.timing, "tokenize");
   VLA_TRY(const std::vector<float> x, start(noise));
-  VLA_TRY(Plan* plan, plans_->for_shape({in.width, in.height, in.n_view, static_cast<int>(in.tokens.size()), d_state_}));
-  plan->set_inputs(in.pixels, in.tokens, in.state);
+  VLA_TRY(Plan * plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view,
+                                          static_cast<int>(inputs_.tokens.size()), d_state_}));
+  plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
   plan->set_x(x);
+  record_inputs(chunk.taps);
   clock.lap(chunk.timing, "plan");
   VLA_CHECK(plan->run_prefix(device_));
   clock.lap(chunk.timing, "prefix");
@@ -106,11 +130,13 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
     plan->collect_step_taps(k, chunk.taps);
   }
   clock.lap(chunk.timing, "steps");
-  VLA_TRY(chunk.actions, processor_.decode(plan->x(), horizon_, d_action_));
+  const std::vector<float> result = plan->x();
+  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_));
   clock.lap(chunk.timing, "postprocess");
   chunk.horizon = horizon_;
   chunk.d_action = static_cast<int>(processor_.action_names().size());
-  chunk.notes = in.notes;
+  chunk.notes = inputs_.notes;
+  record_chunk(result, chunk);
   return chunk;
 }
 

@@ -30,17 +30,19 @@ struct ActionChunk {
   std::vector<Tap> taps;
 };
 
-/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of one plan; what graphs share while they run.
+/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of one plan; what graphs share while they
+/// run.
 struct MemoryUse {
   std::size_t weights = 0, plan = 0, working = 0;
   std::size_t total() const { return weights + plan + working; }
 };
 
-/// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps, unnormalize.
-/// One thread at a time may call it.
+/// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps,
+/// unnormalize. One thread at a time may call it.
 class Engine {
  public:
-  /// Opens, checks and loads a bundle, and builds the largest plan. Errors: io, bad_bundle, unsupported, out_of_memory, device.
+  /// Opens, checks and loads a bundle, and builds the largest plan. Errors: io, bad_bundle, unsupported, out_of_memory,
+  /// device.
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
   /// Errors: bad_observation, bad_action (a number that is not finite came out), device, out_of_memory.
@@ -56,11 +58,17 @@ class Engine {
   MemoryUse memory() const;
 
  private:
-  Engine(Bundle bundle, Processor processor, Device device) : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
+  Engine(Bundle bundle, Processor processor, Device device)
+      : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
   Status load_policy(bool dry);
   Status make_conditions();
   Status warm_up();
   Result<std::vector<float>> start(const Noise& noise) const;
+  template <class T>
+  void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
+              const std::vector<T>& values) const;
+  void record_inputs(std::vector<Tap>& taps) const;
+  void record_chunk(const std::vector<float>& x, ActionChunk& chunk) const;
 
   Bundle bundle_;
   Processor processor_;
@@ -75,6 +83,7 @@ class Engine {
   Tensor conditions_;
   std::unique_ptr<Plans> plans_;
   std::size_t largest_plan_ = 0;
+  Inputs inputs_;  // of the last observation; its vectors keep their memory
 };
 
 }  // namespace vla

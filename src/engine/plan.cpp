@@ -30,7 +30,9 @@ TapFilter step_filter(const std::string& pattern, int n_step) {
 
 Tap read_tap(std::string path, Tensor tensor) {
   const ggml_tensor* node = tensor.node();
-  Tap tap{std::move(path), {node->ne, node->ne + ggml_n_dims(node)}, std::vector<float>(static_cast<std::size_t>(ggml_nelements(node)))};
+  Tap tap{std::move(path),
+          {node->ne, node->ne + ggml_n_dims(node)},
+          std::vector<float>(static_cast<std::size_t>(ggml_nelements(node)))};
   Store::get(tensor, tap.values.data(), tap.values.size() * sizeof(float));
   return tap;
 }
@@ -70,7 +72,8 @@ Result<std::unique_ptr<Plan>> Plan::build(const PlanContext& context, const Inpu
   return plan;
 }
 
-void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state) {
+void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens,
+                      std::span<const float> state) {
   Store::set(in_.images, pixels.data(), pixels.size_bytes());
   Store::set(in_.tokens, tokens.data(), tokens.size_bytes());
   Store::set(in_.state, state.data(), state.size_bytes());

@@ -22,11 +22,13 @@ struct PlanContext {
   std::string tap_pattern;
 };
 
-/// The two graphs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only replayed.
+/// The two graphs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
+/// replayed.
 class Plan {
  public:
   /// Errors: out_of_memory.
-  static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape, ComputeMemory& memory);
+  static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape,
+                                             ComputeMemory& memory);
 
   void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
   void set_x(std::span<const float> x);

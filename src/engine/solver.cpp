@@ -9,11 +9,13 @@ Result<Solver> Solver::read(const Keys& keys) {
   if (kind != "euler") return Error{Code::bad_bundle, "solver.kind", "euler", kind};
   Solver solver;
   VLA_TRY(solver.n_step, keys.integer("solver.steps"));
-  if (solver.n_step < 1 || solver.n_step > 1000) return Error{Code::bad_bundle, "solver.steps", "1 to 1000", std::to_string(solver.n_step)};
+  if (solver.n_step < 1 || solver.n_step > 1000)
+    return Error{Code::bad_bundle, "solver.steps", "1 to 1000", std::to_string(solver.n_step)};
   VLA_TRY(const double start, keys.number("solver.t_start"));
   VLA_TRY(const double end, keys.number("solver.t_end"));
   VLA_TRY(solver.noise, keys.string("solver.noise"));
-  if (solver.noise != "normal" && solver.noise != "uniform") return Error{Code::bad_bundle, "solver.noise", "normal or uniform", solver.noise};
+  if (solver.noise != "normal" && solver.noise != "uniform")
+    return Error{Code::bad_bundle, "solver.noise", "normal or uniform", solver.noise};
   const double dt = (end - start) / solver.n_step;
   solver.dt = static_cast<float>(dt);
   for (int k = 0; k < solver.n_step; ++k) solver.times.push_back(static_cast<float>(start + k * dt));

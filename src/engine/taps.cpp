@@ -17,7 +17,8 @@ namespace {
 
 bool match_one(std::string_view pattern, std::string_view path) {
   if (pattern.empty()) return path.empty();
-  if (pattern.front() == '*') return match_one(pattern.substr(1), path) || (!path.empty() && match_one(pattern, path.substr(1)));
+  if (pattern.front() == '*')
+    return match_one(pattern.substr(1), path) || (!path.empty() && match_one(pattern, path.substr(1)));
   return !path.empty() && pattern.front() == path.front() && match_one(pattern.substr(1), path.substr(1));
 }
 
@@ -57,11 +58,13 @@ bool match_path(const std::string& pattern, const std::string& path) {
 }
 
 Status write_taps(const std::vector<Tap>& taps, const std::string& file) {
-  const ggml_context_ptr context(ggml_init({.mem_size = (taps.size() + 1) * ggml_tensor_overhead(), .mem_buffer = nullptr, .no_alloc = true}));
+  const ggml_context_ptr context(
+      ggml_init({.mem_size = (taps.size() + 1) * ggml_tensor_overhead(), .mem_buffer = nullptr, .no_alloc = true}));
   const gguf_context_ptr gguf(gguf_init_empty());
   gguf_set_val_str(gguf.get(), "general.architecture", "vla-taps");
   for (const Tap& tap : taps) {
-    ggml_tensor* tensor = ggml_new_tensor(context.get(), GGML_TYPE_F32, static_cast<int>(tap.shape.size()), tap.shape.data());
+    ggml_tensor* tensor =
+        ggml_new_tensor(context.get(), GGML_TYPE_F32, static_cast<int>(tap.shape.size()), tap.shape.data());
     ggml_set_name(tensor, tap.path.c_str());
     tensor->data = const_cast<float*>(tap.values.data());
     gguf_add_tensor(gguf.get(), tensor);
@@ -77,8 +80,10 @@ Result<std::vector<Tap>> read_taps(const std::string& file) {
   VLA_TRY(const GgufContent content, read_gguf(std::as_bytes(std::span(text)), file));
   std::vector<Tap> taps;
   for (const TensorInfo& tensor : content.tensors) {
-    if (tensor.type != DType::f32) return Error{Code::bad_bundle, file + ": tensor " + tensor.name, "f32", dtype_name(tensor.type)};
-    Tap& tap = taps.emplace_back(Tap{tensor.name, tensor.shape, std::vector<float>(static_cast<std::size_t>(tensor.count()))});
+    if (tensor.type != DType::f32)
+      return Error{Code::bad_bundle, file + ": tensor " + tensor.name, "f32", dtype_name(tensor.type)};
+    Tap& tap =
+        taps.emplace_back(Tap{tensor.name, tensor.shape, std::vector<float>(static_cast<std::size_t>(tensor.count()))});
     std::memcpy(tap.values.data(), tensor.data.data(), tensor.data.size());
   }
   return taps;

@@ -28,9 +28,9 @@ Result<std::vector<Tap>> read_taps(const std::string& file);
 /// How far one recorded value is from what was expected.
 struct TapDifference {
   std::string path;
-  double max_abs = 0;    // largest difference of two elements
-  double relative = 0;   // the same, in units of the largest expected magnitude
-  double cosine = 1;     // of the two values as vectors
+  double max_abs = 0;      // largest difference of two elements
+  double relative = 0;     // the same, in units of the largest expected magnitude
+  double cosine = 1;       // of the two values as vectors
   bool comparable = true;  // same shape, all numbers finite
   bool within(double tolerance) const { return comparable && relative <= tolerance; }
 };

@@ -22,8 +22,9 @@ struct Range {
   Range(std::int64_t count, int ith, int nth) : begin(count * ith / nth), end(count * (ith + 1) / nth) {}
 };
 
-/// exp(x) to about one unit in the last place, written so that compilers vectorize it: x = n ln2 + r, a polynomial for e^r
-/// (the Taylor series to the seventh power; |r| <= ln2 / 2), and n added to the exponent. Clamped where float32 ends.
+/// exp(x) to about one unit in the last place, written so that compilers vectorize it: x = n ln2 + r, a polynomial for
+/// e^r (the Taylor series to the seventh power; |r| <= ln2 / 2), and n added to the exponent. Clamped where float32
+/// ends.
 inline float fast_exp(float x) {
   x = x < -87.0f ? -87.0f : (x > 88.0f ? 88.0f : x);
   const float n = __builtin_floorf(x * 1.44269504f + 0.5f);
@@ -49,7 +50,8 @@ VLA_CLONES void gelu_row(const float* x, float* y, std::int64_t count) {
 
 void gelu_task(ggml_tensor* y, const ggml_tensor* x, int ith, int nth, void*) {
   const Range range(ggml_nelements(x), ith, nth);
-  gelu_row(static_cast<const float*>(x->data) + range.begin, static_cast<float*>(y->data) + range.begin, range.end - range.begin);
+  gelu_row(static_cast<const float*>(x->data) + range.begin, static_cast<float*>(y->data) + range.begin,
+           range.end - range.begin);
 }
 
 VLA_CLONES void rotate_head(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half) {
@@ -66,14 +68,17 @@ void rotate_task(ggml_tensor* y, const ggml_tensor* x, const ggml_tensor* table,
     const float* cosine = static_cast<const float*>(table->data) + token * d;
     for (std::int64_t head = 0; head < n_head; ++head) {
       const std::int64_t offset = (token * n_head + head) * d;
-      rotate_head(static_cast<const float*>(x->data) + offset, cosine, cosine + d / 2, static_cast<float*>(y->data) + offset, d / 2);
+      rotate_head(static_cast<const float*>(x->data) + offset, cosine, cosine + d / 2,
+                  static_cast<float*>(y->data) + offset, d / 2);
     }
   }
 }
 
 }  // namespace
 
-Tensor gelu_tanh(Graph& g, Tensor x) { return ggml_map_custom1(g.context(), x.node(), gelu_task, GGML_N_TASKS_MAX, nullptr); }
+Tensor gelu_tanh(Graph& g, Tensor x) {
+  return ggml_map_custom1(g.context(), x.node(), gelu_task, GGML_N_TASKS_MAX, nullptr);
+}
 
 Tensor rotate_half(Graph& g, Tensor x, Tensor table) {
   return ggml_map_custom2(g.context(), x.node(), table.node(), rotate_task, GGML_N_TASKS_MAX, nullptr);

@@ -6,8 +6,8 @@
 
 namespace vla::kernels {
 
-/// GELU in its tanh form, float32 throughout: x * 0.5 * (1 + tanh(sqrt(2/pi) * (x + 0.044715 x^3))). ggml's own operation
-/// reads a float16 table, which alone costs more than the parity bar. Any contiguous shape -> the same shape.
+/// GELU in its tanh form, float32 throughout: x * 0.5 * (1 + tanh(sqrt(2/pi) * (x + 0.044715 x^3))). ggml's own
+/// operation reads a float16 table, which alone costs more than the parity bar. Any contiguous shape -> the same shape.
 /// Source: transformers activations.py NewGELU / torch gelu(approximate="tanh").
 Tensor gelu_tanh(Graph& g, Tensor x);
 

@@ -7,7 +7,8 @@
 
 namespace vla {
 
-std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period, double max_period) {
+std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period,
+                                             double max_period) {
   const int half = d / 2;
   std::vector<float> table;
   for (float time : times) {

@@ -7,9 +7,9 @@
 
 namespace vla {
 
-/// Sines, then cosines, of times at geometrically spaced periods: values of [d, n_time], one column per time. `d` is even.
-/// The times are float32; everything after is double, as in the reference, since in float32 the shortest period alone would
-/// cost 1e-4. Source: lerobot policies/common/vla_utils.py create_sinusoidal_pos_embedding.
+/// Sines, then cosines, of times at geometrically spaced periods: values of [d, n_time], one column per time. `d` is
+/// even. The times are float32; everything after is double, as in the reference, since in float32 the shortest period
+/// alone would cost 1e-4. Source: lerobot policies/common/vla_utils.py create_sinusoidal_pos_embedding.
 std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period, double max_period);
 
 }  // namespace vla

@@ -29,12 +29,13 @@ Tensor make_mask(Graph& g, const std::string& key, int n_key, int n_query, Sees 
 Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) {
   ggml_context* c = g.context();
   const float scale = 1.0f / std::sqrt(static_cast<float>(q.dim(0)));
-  ggml_tensor* query = ggml_permute(c, q.node(), 0, 2, 1, 3);              // [d_head, n_query, n_head, n_batch]
-  ggml_tensor* key = ggml_permute(c, k.node(), 0, 2, 1, 3);                // [d_head, n_key, n_head_kv, n_batch]
+  ggml_tensor* query = ggml_permute(c, q.node(), 0, 2, 1, 3);                // [d_head, n_query, n_head, n_batch]
+  ggml_tensor* key = ggml_permute(c, k.node(), 0, 2, 1, 3);                  // [d_head, n_key, n_head_kv, n_batch]
   ggml_tensor* value = ggml_cont(c, ggml_permute(c, v.node(), 1, 2, 0, 3));  // [n_key, d_head, n_head_kv, n_batch]
-  ggml_tensor* score = ggml_mul_mat(c, key, query);                        // [n_key, n_query, n_head, n_batch]
+  ggml_tensor* score = ggml_mul_mat(c, key, query);                          // [n_key, n_query, n_head, n_batch]
   ggml_tensor* weight = ggml_soft_max_ext(c, score, mask.node(), scale, 0.0f);
-  ggml_tensor* mixed = ggml_permute(c, ggml_mul_mat(c, value, weight), 0, 2, 1, 3);  // [d_head, n_head, n_query, n_batch]
+  ggml_tensor* mixed =
+      ggml_permute(c, ggml_mul_mat(c, value, weight), 0, 2, 1, 3);  // [d_head, n_head, n_query, n_batch]
   return ggml_cont_3d(c, mixed, q.dim(0) * q.dim(1), q.dim(2), q.dim(3));
 }
 
@@ -43,8 +44,9 @@ Tensor group_mask(Graph& g, std::span<const int> group_sizes) {
   for (std::size_t i = 0; i < group_sizes.size(); ++i)
     group.insert(group.end(), static_cast<std::size_t>(group_sizes[i]), static_cast<int>(i));
   const int n = static_cast<int>(group.size());
-  return make_mask(g, fmt::format("group_mask/{}", fmt::join(group_sizes, "/")), n, n,
-                   [&](int i, int j) { return group[static_cast<std::size_t>(j)] <= group[static_cast<std::size_t>(i)]; });
+  return make_mask(g, fmt::format("group_mask/{}", fmt::join(group_sizes, "/")), n, n, [&](int i, int j) {
+    return group[static_cast<std::size_t>(j)] <= group[static_cast<std::size_t>(i)];
+  });
 }
 
 Tensor causal_mask(Graph& g, int n_past, int n_query) {

@@ -15,11 +15,12 @@ namespace vla {
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
 Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
 
-/// The mask of consecutive groups of tokens: a token sees its own group and every earlier one. Sizes in tokens; the mask is
-/// [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.
+/// The mask of consecutive groups of tokens: a token sees its own group and every earlier one. Sizes in tokens; the
+/// mask is [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.
 Tensor group_mask(Graph& g, std::span<const int> group_sizes);
 
-/// The mask of `n_query` tokens that see `n_past` earlier tokens, themselves, and those before them: [n_past + n_query, n_query].
+/// The mask of `n_query` tokens that see `n_past` earlier tokens, themselves, and those before them: [n_past + n_query,
+/// n_query].
 Tensor causal_mask(Graph& g, int n_past, int n_query);
 
 /// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...], without a copy.

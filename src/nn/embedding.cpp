@@ -6,7 +6,9 @@ namespace vla {
 
 Embedding::Embedding(const Scope& s, int d_model, int n_row) : Module(s), weight_(s.table("weight", d_model, n_row)) {}
 
-Tensor Embedding::forward(Graph& g, Tensor ids) const { return ggml_get_rows(g.context(), g.weight(weight_).node(), ids.node()); }
+Tensor Embedding::forward(Graph& g, Tensor ids) const {
+  return ggml_get_rows(g.context(), g.weight(weight_).node(), ids.node());
+}
 
 PatchEmbed::PatchEmbed(const Scope& s, int patch_size, int d_model)
     : Module(s),

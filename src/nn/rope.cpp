@@ -11,8 +11,8 @@
 namespace vla {
 namespace {
 
-/// [d_head, n_token]: per token d/2 cosines, then d/2 sines. The angle is a float32 quotient, as in the reference, which
-/// matters at the last bit of large positions; its cosine and sine are rounded once from double.
+/// [d_head, n_token]: per token d/2 cosines, then d/2 sines. The angle is a float32 quotient, as in the reference,
+/// which matters at the last bit of large positions; its cosine and sine are rounded once from double.
 std::vector<float> rotary_table(int d_head, float base, int first, int n_token) {
   std::vector<float> table;
   table.reserve(static_cast<std::size_t>(d_head) * static_cast<std::size_t>(n_token));
@@ -32,8 +32,9 @@ std::vector<float> rotary_table(int d_head, float base, int first, int n_token) 
 Tensor rope(Graph& g, Tensor x, float base, int first) {
   const int d_head = static_cast<int>(x.dim(0)), n_token = static_cast<int>(x.dim(2));
   const std::string key = fmt::format("rope/{}/{}/{}/{}", base, d_head, first, n_token);
-  const Tensor table = g.constant(
-      key, [&](Store& store) { return store.add_constant(rotary_table(d_head, base, first, n_token), {d_head, n_token}); });
+  const Tensor table = g.constant(key, [&](Store& store) {
+    return store.add_constant(rotary_table(d_head, base, first, n_token), {d_head, n_token});
+  });
   return kernels::rotate_half(g, x, table);
 }
 

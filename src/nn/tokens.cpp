@@ -12,9 +12,13 @@ Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts) {
   return all;
 }
 
-Tensor append_keys(Graph& g, Tensor past, Tensor present) { return ggml_concat(g.context(), past.node(), present.node(), 2); }
+Tensor append_keys(Graph& g, Tensor past, Tensor present) {
+  return ggml_concat(g.context(), past.node(), present.node(), 2);
+}
 
-Tensor concat_features(Graph& g, Tensor first, Tensor second) { return ggml_concat(g.context(), first.node(), second.node(), 0); }
+Tensor concat_features(Graph& g, Tensor first, Tensor second) {
+  return ggml_concat(g.context(), first.node(), second.node(), 0);
+}
 
 Tensor repeat_like(Graph& g, Tensor x, Tensor like) {
   return ggml_repeat_4d(g.context(), x.node(), x.dim(0), like.dim(1), 1, 1);
@@ -24,7 +28,9 @@ Tensor add(Graph& g, Tensor a, Tensor b) { return ggml_add(g.context(), a.node()
 
 Tensor scale(Graph& g, Tensor x, float factor) { return ggml_scale(g.context(), x.node(), factor); }
 
-Tensor flatten_views(Graph& g, Tensor x) { return ggml_reshape_2d(g.context(), x.node(), x.dim(0), x.dim(1) * x.dim(2)); }
+Tensor flatten_views(Graph& g, Tensor x) {
+  return ggml_reshape_2d(g.context(), x.node(), x.dim(0), x.dim(1) * x.dim(2));
+}
 
 Tensor pixel_shuffle(Graph& g, Tensor x, int factor) {
   ggml_context* c = g.context();

@@ -21,8 +21,9 @@ Tensor add(Graph& g, Tensor a, Tensor b);
 Tensor scale(Graph& g, Tensor x, float factor);
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
-/// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2, n_view].
-/// Within a token the patches follow each other row by row. Source: transformers modeling_smolvlm.py pixel_shuffle.
+/// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2,
+/// n_view]. Within a token the patches follow each other row by row. Source: transformers modeling_smolvlm.py
+/// pixel_shuffle.
 Tensor pixel_shuffle(Graph& g, Tensor x, int factor);
 
 }  // namespace vla

@@ -12,7 +12,8 @@
 
 namespace vla {
 
-/// What the processor made of one observation, as the prefix graph reads it. Absent views and text padding do not appear.
+/// What the processor made of one observation, as the prefix graph reads it. Absent views and text padding do not
+/// appear.
 struct PrefixInputs {
   Tensor images;  // [width, height, 3, n_view], in the range that the image recipe makes
   Tensor tokens;  // [n_text] i32

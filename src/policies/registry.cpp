@@ -27,7 +27,8 @@ Result<PolicyEntry> find_policy(const std::string& name) {
     if (entry.name == name) return entry;
     names.push_back(entry.name);
   }
-  return Error{Code::unsupported, "vla.arch", fmt::format("one of {}", fmt::join(names, ", ")), name, "this build does not know the architecture"};
+  return Error{Code::unsupported, "vla.arch", fmt::format("one of {}", fmt::join(names, ", ")), name,
+               "this build does not know the architecture"};
 }
 
 }  // namespace vla

@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// SmolVLA: SmolVLM prefix, a narrower action expert that alternates self and cross attention, flow matching from noise (t = 1)
-// to actions (t = 0). Reference: lerobot src/lerobot/policies/smolvla/modeling_smolvla.py (embed_prefix, embed_suffix,
-// denoise_step) and smolvlm_with_expert.py.
+// SmolVLA: SmolVLM prefix, a narrower action expert that alternates self and cross attention, flow matching from noise
+// (t = 1) to actions (t = 0). Reference: lerobot src/lerobot/policies/smolvla/modeling_smolvla.py (embed_prefix,
+// embed_suffix, denoise_step) and smolvlm_with_expert.py.
 
 #include "modules/action/expert.h"
 #include "modules/language/smollm.h"
@@ -58,7 +58,8 @@ class SmolVla final : public Policy {
     const Tensor image = flatten_views(g, connector_(g, vision_(g, in.images)));  // [d_model, n_view * n_token]
     const Tensor text = lm_.embed(g, in.tokens);                                  // [d_model, n_text]
     const Tensor state = state_in_(g, in.state);                                  // [d_model, 1]
-    const Tensor x = g.name("prefix", concat_tokens(g, {scale(g, image, image_scale_), scale(g, text, text_scale_), state}));
+    const Tensor x =
+        g.name("prefix", concat_tokens(g, {scale(g, image, image_scale_), scale(g, text, text_scale_), state}));
     // Images and text see each other and not the state; the state sees everything.
     const int groups[] = {static_cast<int>(image.dim(1) + text.dim(1)), 1};
     lm_.prefill(g, x, group_mask(g, groups), cache);
@@ -66,10 +67,11 @@ class SmolVla final : public Policy {
   }
 
   Tensor velocity(Graph& g, Tensor x_t, Tensor time, const Cache& cache) const override {
-    const Tensor action = action_in_(g, x_t);                                                          // [d_expert, horizon]
-    const Tensor mixed = action_time_in_(g, concat_features(g, action, repeat_like(g, time, action)));  // [d_expert, horizon]
-    const Tensor x = action_time_out_(g, silu(g, mixed));                                              // [d_expert, horizon]
-    return action_out_(g, expert_(g, x, cache));                                                       // [d_action, horizon]
+    const Tensor action = action_in_(g, x_t);  // [d_expert, horizon]
+    const Tensor mixed =
+        action_time_in_(g, concat_features(g, action, repeat_like(g, time, action)));  // [d_expert, horizon]
+    const Tensor x = action_time_out_(g, silu(g, mixed));                              // [d_expert, horizon]
+    return action_out_(g, expert_(g, x, cache));                                       // [d_action, horizon]
   }
 };
 
@@ -80,14 +82,27 @@ Keys published() {
     for (const auto& [key, value] : values) keys.set(path + "." + key, Value(value));
   };
   sizes("policy", {{"d_state", 32}, {"d_action", 32}, {"horizon", 50}});
-  sizes("vision", {{"d_model", 768}, {"n_layer", 12}, {"n_head", 12}, {"d_ff", 3072}, {"image_size", 512}, {"patch_size", 16}});
+  sizes("vision",
+        {{"d_model", 768}, {"n_layer", 12}, {"n_head", 12}, {"d_ff", 3072}, {"image_size", 512}, {"patch_size", 16}});
   sizes("connector", {{"factor", 4}});
-  sizes("lm", {{"d_model", 960}, {"n_layer", 16}, {"n_head", 15}, {"n_head_kv", 5}, {"d_head", 64}, {"d_ff", 2560}, {"n_vocab", 49280}});
+  sizes("lm", {{"d_model", 960},
+               {"n_layer", 16},
+               {"n_head", 15},
+               {"n_head_kv", 5},
+               {"d_head", 64},
+               {"d_ff", 2560},
+               {"n_vocab", 49280}});
   sizes("expert", {{"d_model", 720}, {"n_layer", 16}, {"d_ff", 2048}});
-  for (const auto& [key, value] : std::initializer_list<std::pair<const char*, double>>{
-           {"policy.image_scale", 30.983866769659336}, {"policy.text_scale", 30.983866769659336}, {"vision.norm_eps", 1e-6},
-           {"lm.norm_eps", 1e-5}, {"lm.rope_base", 10000.0}, {"expert.norm_eps", 1e-5}, {"expert.rope_base", 10000.0},
-           {"time.min_period", 4e-3}, {"time.max_period", 4.0}})
+  for (const auto& [key, value] :
+       std::initializer_list<std::pair<const char*, double>>{{"policy.image_scale", 30.983866769659336},
+                                                             {"policy.text_scale", 30.983866769659336},
+                                                             {"vision.norm_eps", 1e-6},
+                                                             {"lm.norm_eps", 1e-5},
+                                                             {"lm.rope_base", 10000.0},
+                                                             {"expert.norm_eps", 1e-5},
+                                                             {"expert.rope_base", 10000.0},
+                                                             {"time.min_period", 4e-3},
+                                                             {"time.max_period", 4.0}})
     keys.set(key, Value(value));
   keys.set("vision.position_rule", Value(std::string("bucketize_float32")));
   std::vector<std::string> kinds;

@@ -35,8 +35,11 @@ TEST_CASE("arrays of other types, orders and damaged headers are refused") {
   const std::string good = npy("{'descr': '|u1', 'fortran_order': False, 'shape': (2, 2), }", "abcd");
   REQUIRE(parse(good).ok());
   for (std::size_t size = 0; size < good.size(); ++size) CHECK_FALSE(parse(good.substr(0, size)).ok());
-  for (const char* header : {"{'descr': '<f8', 'fortran_order': False, 'shape': (4,), }", "{'descr': '|u1', 'fortran_order': True, 'shape': (4,), }",
-                             "{'descr': '|u1', 'fortran_order': False, 'shape': (5,), }", "{'descr': '|u1', 'fortran_order': False, 'shape': 4}",
-                             "{'descr': '|u1', 'fortran_order': False, 'shape': (99999999999, 99999999999, 99999999999)}", "{}", ""})
+  for (const char* header :
+       {"{'descr': '<f8', 'fortran_order': False, 'shape': (4,), }",
+        "{'descr': '|u1', 'fortran_order': True, 'shape': (4,), }",
+        "{'descr': '|u1', 'fortran_order': False, 'shape': (5,), }",
+        "{'descr': '|u1', 'fortran_order': False, 'shape': 4}",
+        "{'descr': '|u1', 'fortran_order': False, 'shape': (99999999999, 99999999999, 99999999999)}", "{}", ""})
     CHECK_FALSE(parse(npy(header, "abcd")).ok());
 }

@@ -66,7 +66,9 @@ TEST_CASE("a bundle in which any one bit is flipped is refused") {
     }
 }
 
-TEST_CASE("bytes after the last tensor are refused") { CHECK(contains(refusal(small_bundle().bytes() + std::string(64, 'x')), "end: expected")); }
+TEST_CASE("bytes after the last tensor are refused") {
+  CHECK(contains(refusal(small_bundle().bytes() + std::string(64, 'x')), "end: expected"));
+}
 
 TEST_CASE("a flipped weight is reported as a checksum that does not fit") {
   std::string bytes = small_bundle().bytes();
@@ -88,7 +90,9 @@ TEST_CASE("a GGUF file that is no vla bundle says so") {
   CHECK(contains(refusal(bundle.bytes()), "a GGUF file of another kind"));
 }
 
-TEST_CASE("a file of another kind is refused by its first bytes") { CHECK(contains(refusal(std::string(4096, 'P')), "a GGUF file")); }
+TEST_CASE("a file of another kind is refused by its first bytes") {
+  CHECK(contains(refusal(std::string(4096, 'P')), "a GGUF file"));
+}
 
 TEST_CASE("a list that claims more elements than the file has bytes is refused before memory is taken") {
   std::string bytes = small_bundle().bytes();

@@ -18,7 +18,8 @@ TEST_CASE("the shifted rule reads row 0 twice and never the last, in both axes")
   const auto ids = vision_position_ids("bucketize_shifted", 32, 32);
   REQUIRE(ids.ok());
   for (int r = 0; r < 32; ++r)
-    for (int c = 0; c < 32; ++c) CHECK((*ids)[static_cast<std::size_t>(32 * r + c)] == 32 * std::max(r - 1, 0) + std::max(c - 1, 0));
+    for (int c = 0; c < 32; ++c)
+      CHECK((*ids)[static_cast<std::size_t>(32 * r + c)] == 32 * std::max(r - 1, 0) + std::max(c - 1, 0));
   CHECK(std::set<int>(ids->begin(), ids->end()).size() == 31 * 31);
 }
 

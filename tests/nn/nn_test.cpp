@@ -25,7 +25,8 @@ struct Shape {
 };
 
 /// The definition of attention, with a mask that lets query i see the first `n_seen(i)` keys.
-std::vector<float> attention_by_hand(const Shape& s, const std::vector<float>& q, const std::vector<float>& k, const std::vector<float>& v, bool causal) {
+std::vector<float> attention_by_hand(const Shape& s, const std::vector<float>& q, const std::vector<float>& k,
+                                     const std::vector<float>& v, bool causal) {
   std::vector<float> out;
   for (int i = 0; i < s.n_query; ++i)
     for (int h = 0; h < s.n_head; ++h) {
@@ -34,13 +35,17 @@ std::vector<float> attention_by_hand(const Shape& s, const std::vector<float>& q
       double sum = 0;
       for (int j = 0; j < n_seen; ++j) {
         double dot = 0;
-        for (int d = 0; d < s.d_head; ++d) dot += double{q[static_cast<std::size_t>((i * s.n_head + h) * s.d_head + d)]} * k[static_cast<std::size_t>((j * s.n_head_kv + kv) * s.d_head + d)];
+        for (int d = 0; d < s.d_head; ++d)
+          dot += double{q[static_cast<std::size_t>((i * s.n_head + h) * s.d_head + d)]} *
+                 k[static_cast<std::size_t>((j * s.n_head_kv + kv) * s.d_head + d)];
         weight.push_back(std::exp(dot / std::sqrt(s.d_head)));
         sum += weight.back();
       }
       for (int d = 0; d < s.d_head; ++d) {
         double mixed = 0;
-        for (int j = 0; j < n_seen; ++j) mixed += weight[static_cast<std::size_t>(j)] / sum * v[static_cast<std::size_t>((j * s.n_head_kv + kv) * s.d_head + d)];
+        for (int j = 0; j < n_seen; ++j)
+          mixed += weight[static_cast<std::size_t>(j)] / sum *
+                   v[static_cast<std::size_t>((j * s.n_head_kv + kv) * s.d_head + d)];
         out.push_back(static_cast<float>(mixed));
       }
     }
@@ -57,7 +62,9 @@ void check_close(const std::vector<float>& got, const std::vector<float>& expect
 TEST_CASE("gelu agrees with its definition over the whole range of float32") {
   std::vector<float> x = ramp(4099, 12);
   for (float edge : {0.0f, -0.0f, 1e-30f, -1e-30f, 100.0f, -100.0f, 1e30f, -1e30f}) x.push_back(edge);
-  const auto y = run_graph([&](Graph& g) { return kernels::gelu_tanh(g, g.store().add_constant(x, {static_cast<std::int64_t>(x.size())})); });
+  const auto y = run_graph([&](Graph& g) {
+    return kernels::gelu_tanh(g, g.store().add_constant(x, {static_cast<std::int64_t>(x.size())}));
+  });
   for (std::size_t i = 0; i < x.size(); ++i) {
     const double expected = gelu(x[i]);
     // An absolute part for the negative tail, where the value itself is a difference of nearly equal numbers.
@@ -68,17 +75,21 @@ TEST_CASE("gelu agrees with its definition over the whole range of float32") {
 TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for d_head = 64") {
   constexpr int kHead = 64, kTokens = 3, kFirst = 200;
   const std::vector<float> x = ramp(kHead * 2 * kTokens, 1);
-  const auto y = run_graph([&](Graph& g) { return rope(g, g.store().add_constant(x, {kHead, 2, kTokens}), 10000.0f, kFirst); });
+  const auto y = run_graph([&](Graph& g) {
+    return rope(g, g.store().add_constant(x, {kHead, 2, kTokens}), 10000.0f, kFirst);
+  });
   double interleaved_difference = 0;
   for (int token = 0; token < kTokens; ++token)
     for (int head = 0; head < 2; ++head)
       for (int i = 0; i < kHead / 2; ++i) {
         const std::size_t at = static_cast<std::size_t>((token * 2 + head) * kHead + i), other = at + kHead / 2;
         const double angle = (kFirst + token) / std::pow(10000.0, 2.0 * i / kHead);
-        CHECK(std::abs(y[at] - (x[at] * std::cos(angle) - x[other] * std::sin(angle))) <= 3e-5);  // float32 angles up to 202
+        CHECK(std::abs(y[at] - (x[at] * std::cos(angle) - x[other] * std::sin(angle))) <=
+              3e-5);  // float32 angles up to 202
         CHECK(std::abs(y[other] - (x[other] * std::cos(angle) + x[at] * std::sin(angle))) <= 3e-5);
         const std::size_t even = at - static_cast<std::size_t>(i) + 2 * static_cast<std::size_t>(i);
-        interleaved_difference = std::max(interleaved_difference, std::abs(y[even] - (x[even] * std::cos(angle) - x[even + 1] * std::sin(angle))));
+        interleaved_difference = std::max(
+            interleaved_difference, std::abs(y[even] - (x[even] * std::cos(angle) - x[even + 1] * std::sin(angle))));
       }
   CHECK(interleaved_difference > 0.1);
 }
@@ -86,12 +97,14 @@ TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for
 TEST_CASE("attention with grouped heads agrees with its definition, with and without a causal mask") {
   for (const Shape s : {Shape{16, 6, 2, 5, 17}, Shape{8, 3, 3, 1, 1}, Shape{64, 15, 5, 50, 177}})
     for (bool causal : {false, true}) {
-      const auto q = ramp(static_cast<std::size_t>(s.d_head * s.n_head * s.n_query), 2), k = ramp(static_cast<std::size_t>(s.d_head * s.n_head_kv * s.n_key), 1),
+      const auto q = ramp(static_cast<std::size_t>(s.d_head * s.n_head * s.n_query), 2),
+                 k = ramp(static_cast<std::size_t>(s.d_head * s.n_head_kv * s.n_key), 1),
                  v = ramp(static_cast<std::size_t>(s.d_head * s.n_head_kv * s.n_key), 3);
       const auto got = run_graph([&](Graph& g) {
         Store& store = g.store();
         const Tensor mask = causal ? causal_mask(g, s.n_key - s.n_query, s.n_query) : Tensor();
-        return attention(g, store.add_constant(q, {s.d_head, s.n_head, s.n_query}), store.add_constant(k, {s.d_head, s.n_head_kv, s.n_key}),
+        return attention(g, store.add_constant(q, {s.d_head, s.n_head, s.n_query}),
+                         store.add_constant(k, {s.d_head, s.n_head_kv, s.n_key}),
                          store.add_constant(v, {s.d_head, s.n_head_kv, s.n_key}), mask);
       });
       check_close(got, attention_by_hand(s, q, k, v, causal), 2e-6f);
@@ -118,6 +131,8 @@ TEST_CASE("pixel shuffle puts the patches of a square into one token, row by row
 
 TEST_CASE("a tap of a view keeps its values when later nodes reuse the memory") {
   const std::vector<float> x = {1, 2, 3, 4};
-  const auto y = run_graph([&](Graph& g) { return merge_heads(g, split_heads(g, scale(g, g.store().add_constant(x, {4, 1}), 2), 2)); });
+  const auto y = run_graph([&](Graph& g) {
+    return merge_heads(g, split_heads(g, scale(g, g.store().add_constant(x, {4, 1}), 2), 2));
+  });
   CHECK(y == std::vector<float>{2, 4, 6, 8});
 }

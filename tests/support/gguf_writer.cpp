@@ -63,7 +63,10 @@ EditableBundle EditableBundle::read(const std::string& path) {
   EditableBundle copy;
   copy.keys = bundle->keys();
   for (const TensorInfo& tensor : bundle->tensors())
-    copy.tensors.push_back({tensor.name, tensor.type, tensor.shape, {reinterpret_cast<const char*>(tensor.data.data()), tensor.data.size()}});
+    copy.tensors.push_back({tensor.name,
+                            tensor.type,
+                            tensor.shape,
+                            {reinterpret_cast<const char*>(tensor.data.data()), tensor.data.size()}});
   return copy;
 }
 

@@ -9,7 +9,8 @@
 
 namespace vla::test {
 
-/// A bundle in pieces, to be changed and written again with a checksum that fits, so that a test reaches the check it means.
+/// A bundle in pieces, to be changed and written again with a checksum that fits, so that a test reaches the check it
+/// means.
 struct EditableBundle {
   Keys keys;
   struct Piece {

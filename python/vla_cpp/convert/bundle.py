@@ -112,15 +112,17 @@ class BundleWriter:
             self.file.write(_padding(tensor.n_bytes))
 
     def __exit__(self, kind, error, trace) -> None:
+        complete = False
         try:
             if kind is None:
                 self._finish()
+                complete = True
         finally:
             self.file.close()
-            if kind is not None and os.path.exists(self.part):
+            if complete:
+                os.replace(self.part, self.path)
+            else:
                 os.remove(self.part)
-        if kind is None:
-            os.replace(self.part, self.path)
 
     def _finish(self) -> None:
         if self.left or self.next != len(self.tensors):
@@ -153,6 +155,16 @@ def file_digest(file: BinaryIO, digits: int = -1) -> str:
         position += len(block)
 
 
+def _check_digest(path: str) -> None:
+    with open(path, "rb") as file:
+        head = file.read(4096)
+        # Behind the key stand the type (4 bytes), the length (8) and "xxh3:".
+        digits = head.find(CHECKSUM_KEY.encode()) + len(CHECKSUM_KEY) + 4 + 8 + len("xxh3:")
+        stated, found = head[digits:digits + 16].decode("latin1"), file_digest(file, digits)
+    if found != stated:
+        raise refuse(path, "content with checksum xxh3:" + stated, "xxh3:" + found, "the file was damaged or edited", Code.BAD_BUNDLE)
+
+
 class BundleContent(NamedTuple):
     """A bundle in memory: metadata by key, tensors by name in torch's order of dimensions (bf16 as uint16 bits)."""
 
@@ -167,14 +179,9 @@ def read_bundle(path: str) -> BundleContent:
         from gguf import GGUFReader
     except ImportError:
         raise missing_extra("gguf")
+    _check_digest(path)
     reader = GGUFReader(path)
     keys = {name: field.contents() for name, field in reader.fields.items()}
-    with open(path, "rb") as file:
-        stated = keys[CHECKSUM_KEY]
-        digits = file.read().index(stated.encode()) + len("xxh3:")
-        found = "xxh3:" + file_digest(file, digits)
-    if found != stated:
-        raise refuse(path, "content with checksum {}".format(stated), found, "the file was damaged or edited", Code.BAD_BUNDLE)
     names = {number: name for name, number in GGML_TYPES.items()}
     tensors, dtypes = {}, {}
     for tensor in reader.tensors:

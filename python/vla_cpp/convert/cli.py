@@ -86,6 +86,11 @@ def main(argv=None) -> int:
     except ImportError as error:
         print("error: vla-convert: expected the packages of the extra, found no {}; pip install 'vla-cpp[convert]'".format(error.name), file=sys.stderr)
         return int(Code.USAGE)
+    except KeyboardInterrupt:
+        return 130  # what shells report for an interrupt; the unfinished file is gone
+    except Exception as error:  # noqa: BLE001 - a robot's operator gets one line and a class, whatever we overlooked
+        print("error: vla-convert: {}: {}; this is a fault of the converter, please report it".format(type(error).__name__, error), file=sys.stderr)
+        return int(Code.INTERNAL)
     if not args.quiet:
         print(report(summary))
     return 0

@@ -65,7 +65,7 @@ def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, 
     for source in expected:
         shared = checkpoint.aliases.get(source)
         if source not in checkpoint.tensors and shared in checkpoint.tensors:
-            checkpoint.tensors[source] = checkpoint.tensors[shared]
+            checkpoint.tensors[source] = checkpoint.tensors[shared] if shared in expected else checkpoint.tensors.pop(shared)
             checkpoint.notes.append("{}: stored once, as {}".format(source, shared))
     for source in sorted(set(expected) | set(checkpoint.tensors)):
         entry, shape = checkpoint.tensors.get(source), expected.get(source)

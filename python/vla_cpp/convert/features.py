@@ -14,7 +14,7 @@ from .recipe import ACTION, STATE
 def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problems: Problems) -> List[Key]:
     """Without a data set the names are generated and the rate is 0, which the runtime reads as unstated."""
     info = read_json(info_path) if info_path else {}
-    names = {feature: _names(info, info_path, feature, dim, problems) for feature, dim in dims.items()}
+    names = {feature: _names(info, info_path, feature, dim, notes, problems) for feature, dim in dims.items()}
     if not info_path:
         notes.append("names of state and action numbers are generated; --dataset-info meta/info.json gives the data set's")
     rate = info.get("fps", 0)
@@ -25,10 +25,12 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
             Key("action.names", "string[]", names[ACTION]), Key("action.units", "string[]", [""] * dims[ACTION]), Key("action.rate_hz", "f32", float(rate))]
 
 
-def _names(info: dict, path: str, feature: str, dim: int, problems: Problems) -> List[str]:
+def _names(info: dict, path: str, feature: str, dim: int, notes: List[str], problems: Problems) -> List[str]:
     generated = ["{}.{}".format(feature.rsplit(".", 1)[-1], i) for i in range(dim)]
     stated = _stated_names((info.get("features") or {}).get(feature))
     if stated is None:
+        if path:
+            notes.append("{}: no names for {}, so they are generated".format(path, feature))
         return generated
     if len(stated) != dim or len(set(stated)) != dim or not all(isinstance(name, str) and name for name in stated):
         problems.add("{}: features.{}.names".format(path, feature), "{} different names".format(dim), str(stated)[:120], "the data set is not the policy's")
@@ -37,8 +39,10 @@ def _names(info: dict, path: str, feature: str, dim: int, problems: Problems) ->
 
 
 def _stated_names(feature) -> Optional[list]:
-    """A list, or an object around one list such as {"motors": [...]}; shape is compared by the caller through the length."""
+    """The spellings of data sets: a list, an object around one list ({"motors": [...]}), or an object from name to index."""
     names = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(names, dict) and names and all(isinstance(index, int) for index in names.values()):
+        return sorted(names, key=names.get) if sorted(names.values()) == list(range(len(names))) else list(names.values())
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
     return names if isinstance(names, list) else None

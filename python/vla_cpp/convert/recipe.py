@@ -7,7 +7,6 @@ Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_proc
 """
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence
 
@@ -267,14 +266,15 @@ def text_ops(processors: Processors) -> List[dict]:
     return newline + [{"op": "tokenize", "max_tokens": processors.max_tokens, "truncate": "right"}]
 
 
-def view_aliases(views: Sequence[str], processors: Processors, problems: Problems) -> List[str]:
+def view_aliases(views: Sequence[str], processors: Processors, notes: List[str], problems: Problems) -> List[str]:
     """Per view the other name that the rename step accepts. A renaming that the bundle cannot express is refused."""
     aliases = dict.fromkeys(views, "")
     for old, new in processors.rename.items():
         where = "{}: rename_map".format(PRE)
-        if new not in aliases:
-            expected = "names of views ({})".format(", ".join(views))
-            problems.unsupported(where, expected, "{} -> {}".format(old, new), "send the feature under the policy's own name and remove the entry")
+        if new == STATE:
+            problems.unsupported(where, "renamings of views", "{} -> {}".format(old, new), "remove the entry and send the state as " + STATE)
+        elif new not in aliases:
+            notes.append("{}: {} -> {} renames nothing that the policy reads".format(where, old, new))
         elif old in aliases or aliases[new]:
             problems.unsupported(where, "one other name per view, which is no view itself", "{} -> {}".format(old, new))
         else:

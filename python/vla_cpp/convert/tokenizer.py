@@ -11,7 +11,7 @@ import json
 import os
 from typing import Dict, List, Optional, Tuple
 
-from .errors import Problems, refuse
+from .errors import Code, Problems, refuse
 from .files import read_json
 
 JSON_FILE, CONFIG_FILE = "tokenizer.json", "tokenizer_config.json"
@@ -31,15 +31,19 @@ def byte_symbols() -> List[str]:
 
 def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> Dict[str, object]:
     """The bundle's `tokenizer.*` keys. `n_vocab`: rows of the embedding table, which no id may reach."""
+    if not os.path.exists(os.path.join(folder, JSON_FILE)):
+        raise refuse(os.path.join(folder, JSON_FILE), "the tokenizer in one file", "none", "load it with transformers and save it again, or give its folder by --backbone", Code.IO)
     spec = read_json(os.path.join(folder, JSON_FILE))
     config_path = os.path.join(folder, CONFIG_FILE)
     config = read_json(config_path) if os.path.exists(config_path) else {}
+    gpt2 = config.get("tokenizer_class") in GPT2
+    if gpt2:  # the class's own defaults, which it adds to the vocabulary like stated ones
+        config = dict({key: "<|endoftext|>" for key in ("unk_token", "bos_token", "eos_token")}, **config)
     model = spec.get("model") if isinstance(spec.get("model"), dict) else {}
     _check_model(model, problems)
     _check_surroundings(spec, config, problems)
     added = _added_tokens(spec, problems)
     _check_config_tokens(config, added, problems)
-    gpt2 = config.get("tokenizer_class") in GPT2
     pre = _pre_tokenizer(spec.get("pre_tokenizer"), problems)
     if gpt2:
         own = [{"type": "byte_level", "add_prefix_space": bool(config.get("add_prefix_space", False)), "use_regex": True}]

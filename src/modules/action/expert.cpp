@@ -35,18 +35,21 @@ void ExpertCrossBlock::prepare(Graph& g, const KeyValue& prefix, Cache& cache) c
 }
 
 Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
-  // Positions of a cross layer's queries start at 0, not behind the prefix: forward_cross_attn_layer subtracts their least.
+  // Positions of a cross layer's queries start at 0, not behind the prefix: forward_cross_attn_layer subtracts their
+  // least.
   const KeyValue prefix = {cache.get(path() + ".k"), cache.get(path() + ".v")};
   return rest_(g, x, attn_norm_(g, x), 0, prefix, {});
 }
 
-Expert::Expert(const Scope& s, const SmolLm& lm) : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps")) {
+Expert::Expert(const Scope& s, const SmolLm& lm)
+    : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps")) {
   const std::vector<std::string> kinds = s.strings("layer_kinds");
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
   const float eps = s.number("norm_eps");
   Heads heads = lm.heads();
   heads.rope_base = s.number("rope_base");
-  s.require(static_cast<int>(kinds.size()) == lm.n_layer(), "layer_kinds", fmt::format("{} entries, one per language layer", lm.n_layer()), std::to_string(kinds.size()));
+  s.require(static_cast<int>(kinds.size()) == lm.n_layer(), "layer_kinds",
+            fmt::format("{} entries, one per language layer", lm.n_layer()), std::to_string(kinds.size()));
   for (int i = 0; i < std::min(lm.n_layer(), static_cast<int>(kinds.size())); ++i) {
     const std::string& kind = kinds[static_cast<std::size_t>(i)];
     const Scope place = s / "blk" / static_cast<int>(layers_.size());
@@ -57,12 +60,14 @@ Expert::Expert(const Scope& s, const SmolLm& lm) : lm_(lm), d_model_(s.dim("d_mo
     else
       s.require(kind == "none", "layer_kinds", "self, cross or none", kind);
   }
-  s.require(static_cast<int>(layers_.size()) == n_layer, "n_layer", fmt::format("{}, as layer_kinds counts", layers_.size()), std::to_string(n_layer));
+  s.require(static_cast<int>(layers_.size()) == n_layer, "n_layer",
+            fmt::format("{}, as layer_kinds counts", layers_.size()), std::to_string(n_layer));
 }
 
 void Expert::prepare(Graph& g, Cache& cache) const {
   for (const Layer& layer : layers_)
-    if (const auto* cross = std::get_if<ExpertCrossBlock>(&layer.block)) cross->prepare(g, lm_.cached(cache, layer.i_lm), cache);
+    if (const auto* cross = std::get_if<ExpertCrossBlock>(&layer.block))
+      cross->prepare(g, lm_.cached(cache, layer.i_lm), cache);
 }
 
 Tensor Expert::operator()(Graph& g, Tensor x, const Cache& cache) const {

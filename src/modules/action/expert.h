@@ -37,9 +37,9 @@ class ExpertCrossBlock : public Module<ExpertCrossBlock> {
   DecoderRest rest_;
 };
 
-/// The action expert beside a language model: a narrower decoder whose layer i attends to what layer i of the language model
-/// left in the cache. `<path>.layer_kinds` says for each of them whether the expert's layer is self or cross attention, or
-/// missing. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
+/// The action expert beside a language model: a narrower decoder whose layer i attends to what layer i of the language
+/// model left in the cache. `<path>.layer_kinds` says for each of them whether the expert's layer is self or cross
+/// attention, or missing. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
 class Expert {
  public:
   Expert(const Scope& s, const SmolLm& lm);

@@ -20,7 +20,8 @@ void put(Graph& g, Cache& cache, const std::string& path, const KeyValue& kv) {
 
 Heads Heads::read(const Scope& s) {
   const Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head"), s.number("rope_base")};
-  s.require(heads.n_head % heads.n_head_kv == 0, "n_head_kv", fmt::format("a divisor of n_head {}", heads.n_head), std::to_string(heads.n_head_kv));
+  s.require(heads.n_head % heads.n_head_kv == 0, "n_head_kv", fmt::format("a divisor of n_head {}", heads.n_head),
+            std::to_string(heads.n_head_kv));
   s.require(heads.d_head % 2 == 0, "d_head", "an even number, for the rotary pairs", std::to_string(heads.d_head));
   s.require(heads.rope_base > 0, "rope_base", "a positive number", std::to_string(heads.rope_base));
   return heads;

@@ -44,8 +44,8 @@ class KeyValueProjection {
   Linear k_, v_;
 };
 
-/// A pre-norm decoder layer after its keys and values: queries, attention, output product, residual, gated MLP, residual.
-/// Source: lerobot policies/smolvla/smolvlm_with_expert.py forward, forward_attn_layer.
+/// A pre-norm decoder layer after its keys and values: queries, attention, output product, residual, gated MLP,
+/// residual. Source: lerobot policies/smolvla/smolvlm_with_expert.py forward, forward_attn_layer.
 class DecoderRest {
  public:
   DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
@@ -70,8 +70,8 @@ class SmolLmBlock : public Module<SmolLmBlock> {
   DecoderRest rest_;
 };
 
-/// The language model as a policy uses it: it embeds tokens and turns a prefix into keys and values, layer by layer. Nothing
-/// reads the last layer's output, so that layer stops at its keys and values.
+/// The language model as a policy uses it: it embeds tokens and turns a prefix into keys and values, layer by layer.
+/// Nothing reads the last layer's output, so that layer stops at its keys and values.
 class SmolLm {
  public:
   explicit SmolLm(const Scope& s);

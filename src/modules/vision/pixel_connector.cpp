@@ -15,7 +15,8 @@ Tensor PixelConnector::forward(Graph& g, Tensor x) const { return project_.forwa
 
 Status PixelConnector::check(int side) const {
   if (side % factor_ == 0) return {};
-  return Error{Code::unsupported, "connector.factor", fmt::format("a divisor of the {0} x {0} patches of a view", side), std::to_string(factor_)};
+  return Error{Code::unsupported, "connector.factor", fmt::format("a divisor of the {0} x {0} patches of a view", side),
+               std::to_string(factor_)};
 }
 
 }  // namespace vla

@@ -11,8 +11,8 @@
 namespace vla {
 namespace {
 
-/// torch.arange(1/n, 1, 1/n) in float32. Its blocks start at a rounded multiple and count on from there in double, so the
-/// last bits depend on the block's width: 8 with AVX2, 16 with AVX-512, 1 at the end and without vectors.
+/// torch.arange(1/n, 1, 1/n) in float32. Its blocks start at a rounded multiple and count on from there in double, so
+/// the last bits depend on the block's width: 8 with AVX2, 16 with AVX-512, 1 at the end and without vectors.
 std::vector<float> boundaries(int n_table, int width) {
   const double step = 1.0 / n_table;
   const int count = static_cast<int>(std::ceil((1.0 - step) / step));
@@ -33,7 +33,8 @@ float round_to_bfloat16(float x) {
 
 /// The fraction of the picture at which patch i of n lies, in the arithmetic of the rule.
 float fraction(const std::string& rule, int i, int n) {
-  if (rule == "bucketize_shifted") return static_cast<float>(i) / static_cast<float>(n) * static_cast<float>(1.0 - 1e-6);
+  if (rule == "bucketize_shifted")
+    return static_cast<float>(i) / static_cast<float>(n) * static_cast<float>(1.0 - 1e-6);
   const float exact = std::min(static_cast<float>(i) * (1.0f / static_cast<float>(n)), static_cast<float>(1.0 - 1e-6));
   return rule == "bucketize_bfloat16" ? round_to_bfloat16(exact) : exact;
 }
@@ -42,7 +43,8 @@ float fraction(const std::string& rule, int i, int n) {
 std::vector<std::int32_t> axis_ids(const std::string& rule, int n_grid, const std::vector<float>& edges) {
   std::vector<std::int32_t> ids;
   for (int i = 0; i < n_grid; ++i)
-    ids.push_back(static_cast<std::int32_t>(std::upper_bound(edges.begin(), edges.end(), fraction(rule, i, n_grid)) - edges.begin()));
+    ids.push_back(static_cast<std::int32_t>(std::upper_bound(edges.begin(), edges.end(), fraction(rule, i, n_grid)) -
+                                            edges.begin()));
   return ids;
 }
 
@@ -50,7 +52,8 @@ std::vector<std::int32_t> axis_ids(const std::string& rule, int n_grid, const st
 
 Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, int n_grid, int n_table) {
   if (rule != "bucketize_float32" && rule != "bucketize_bfloat16" && rule != "bucketize_shifted")
-    return Error{Code::bad_bundle, "vision.position_rule", "bucketize_float32, bucketize_bfloat16 or bucketize_shifted", rule};
+    return Error{Code::bad_bundle, "vision.position_rule", "bucketize_float32, bucketize_bfloat16 or bucketize_shifted",
+                 rule};
   const std::vector<std::int32_t> axis = axis_ids(rule, n_grid, boundaries(n_table, 1));
   for (int width : {8, 16})
     if (axis_ids(rule, n_grid, boundaries(n_table, width)) != axis)

@@ -12,12 +12,12 @@ namespace vla {
 
 /// Which row of the position table each patch of a square picture reads, row by row: [n_grid * n_grid].
 ///
-/// The reference places patch i of n at the fraction i/n of the picture and looks up the table's interval that holds it, all
-/// in floating point. Fractions that equal a boundary in exact arithmetic may fall on either side of it, so the result
-/// depends on the precision of the pixels and on the release (docs/bundle.md, `vision.position_rule`); the weights were
-/// trained with whatever came out. A grid for which the reference's own result depends on the vector width of the machine
-/// (its boundaries are made by torch.arange in blocks) has no right answer, and is refused.
-/// Source: transformers modeling_smolvlm.py SmolVLMVisionEmbeddings.forward.
+/// The reference places patch i of n at the fraction i/n of the picture and looks up the table's interval that holds
+/// it, all in floating point. Fractions that equal a boundary in exact arithmetic may fall on either side of it, so the
+/// result depends on the precision of the pixels and on the release (docs/bundle.md, `vision.position_rule`); the
+/// weights were trained with whatever came out. A grid for which the reference's own result depends on the vector width
+/// of the machine (its boundaries are made by torch.arange in blocks) has no right answer, and is refused. Source:
+/// transformers modeling_smolvlm.py SmolVLMVisionEmbeddings.forward.
 ///
 /// `rule`: bucketize_float32, bucketize_bfloat16 or bucketize_shifted; `n_table`: rows of the table per side.
 /// Errors: bad_bundle for another rule, unsupported for an ambiguous grid.

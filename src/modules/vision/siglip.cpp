@@ -23,7 +23,8 @@ SiglipBlock::SiglipBlock(const Scope& s, int d_model, int n_head, int d_ff, floa
 
 Tensor SiglipBlock::forward(Graph& g, Tensor x) const {
   const Tensor h = attn_norm_(g, x);
-  const Tensor q = split_heads(g, q_(g, h), n_head_), k = split_heads(g, k_(g, h), n_head_), v = split_heads(g, v_(g, h), n_head_);
+  const Tensor q = split_heads(g, q_(g, h), n_head_), k = split_heads(g, k_(g, h), n_head_),
+               v = split_heads(g, v_(g, h), n_head_);
   x = add(g, x, out_(g, attention(g, q, k, v, {})));
   return add(g, x, mlp_(g, ffn_norm_(g, x)));
 }
@@ -43,7 +44,8 @@ Siglip::Siglip(const Scope& s)
 
 Status Siglip::check(int width, int height) const {
   if (width != height || width < patch_size_)
-    return Error{Code::unsupported, "vision", fmt::format("a square picture of {} pixels or more", patch_size_), fmt::format("{} x {}", width, height)};
+    return Error{Code::unsupported, "vision", fmt::format("a square picture of {} pixels or more", patch_size_),
+                 fmt::format("{} x {}", width, height)};
   const auto ids = vision_position_ids(position_rule_, width / patch_size_, n_table_);
   return ids ? Status() : Status(ids.error());
 }
@@ -51,7 +53,8 @@ Status Siglip::check(int width, int height) const {
 Tensor Siglip::operator()(Graph& g, Tensor images) const {
   Tensor x = patch_embed_(g, images);
   const Tensor ids = g.constant("vision_position_ids", [&](Store& store) {
-    return store.add_constant(*vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_), {x.dim(1)});
+    return store.add_constant(
+        *vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_), {x.dim(1)});
   });
   x = add(g, x, position_(g, ids));
   for (const SiglipBlock& block : blocks_) x = block(g, x);

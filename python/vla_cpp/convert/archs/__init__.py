@@ -57,7 +57,8 @@ class Plan:
 
 
 def names() -> List[str]:
-    return sorted(module.name for module in pkgutil.iter_modules(__path__))
+    """Modules with a leading underscore are parts of an architecture's."""
+    return sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_"))
 
 
 def load(name):

@@ -14,12 +14,12 @@ from typing import Dict, List
 
 from .. import recipe
 from ..bundle import Key
-from ..checkpoint import Checkpoint, find_backbone
+from ..checkpoint import Checkpoint
 from ..errors import Problems
 from ..features import feature_keys
 from ..tokenizer import JSON_FILE, read_tokenizer
 from . import MATRIX, TABLE, VECTOR, Dropped, Options, Plan, Weight
-from .smolvla_config import Sizes, read_sizes
+from ._smolvla_sizes import Sizes, read_sizes
 
 VLM = "model.vlm_with_expert.vlm.model."
 EXPERT = "model.vlm_with_expert.lm_expert."
@@ -51,10 +51,10 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 def _tokenizer_folder(checkpoint: Checkpoint, options: Options, sizes: Sizes, processors: recipe.Processors) -> str:
     """The tokenizer that the reference would load: the checkpoint's own where its processor declares one, else the backbone's."""
     own = processors.own_tokenizer or ("" if options.backbone else "tokenizer")
-    if own and os.path.exists(os.path.join(checkpoint.path(own), JSON_FILE)):
-        checkpoint.notes.append("tokenizer: from {}/ inside the checkpoint".format(own))
-        return checkpoint.path(own)
-    return sizes.backbone
+    if not own or not (processors.own_tokenizer or os.path.exists(checkpoint.path(own))):
+        return sizes.backbone
+    checkpoint.notes.append("tokenizer: from {}/ inside the checkpoint".format(own))
+    return checkpoint.path(own)
 
 
 def _recipe(s: Sizes, processors: recipe.Processors) -> Dict[str, List[dict]]:
@@ -67,15 +67,18 @@ def _recipe(s: Sizes, processors: recipe.Processors) -> Dict[str, List[dict]]:
 
 
 def _feature_keys(checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[Key]:
-    """The auto-generated empty cameras never have a frame; of the others the reference fills up to `empty_cameras`."""
+    """One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same.
+
+    The cameras that `empty_cameras` adds to the features stand in no data set, so nobody need declare them absent.
+    """
     empty = [view for view in s.views if view.startswith(EMPTY_CAMERA)]
-    min_views = max(1, len(s.views) - len(empty) - s.empty_cameras)
     if empty:
         checkpoint.notes.append("views that stay empty unless a frame is given: " + ", ".join(empty))
     return [
         Key("observation.views", "string[]", s.views),
-        Key("observation.view_aliases", "string[]", recipe.view_aliases(s.views, processors, problems)),
-        Key("observation.min_views", "u32", min_views),
+        Key("observation.view_aliases", "string[]", recipe.view_aliases(s.views, processors, checkpoint.notes, problems)),
+        Key("observation.view_optional", "u32[]", [int(view in empty) for view in s.views]),
+        Key("observation.min_views", "u32", 1),
         Key("observation.states", "string[]", [recipe.STATE]),
         Key("observation.state_dims", "u32[]", [s.state_dim]),
         Key("observation.max_text_tokens", "u32", processors.max_tokens),

@@ -35,7 +35,9 @@ VISION = {"hidden_size": 1152, "intermediate_size": 3072, "num_hidden_layers": 1
 TEXT = {"hidden_size": 4096, "intermediate_size": 11008, "num_hidden_layers": 32, "num_attention_heads": 32, "vocab_size": 32000, "rms_norm_eps": 1e-6}
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
-PRECISIONS = ("float32", "bfloat16", "shifted")
+# Bounds far above any policy, so that a hostile config cannot make the converter plan without end.
+MAX_SIZE, MAX_LAYERS, MAX_DIM, MAX_EMPTY = 1 << 24, 1024, 1 << 16, 64
+ANY_INT = -1 << 31
 
 
 @dataclass
@@ -92,11 +94,11 @@ class _Section:
         value = self.values.get(key)
         return self.defaults.get(key) if value is None else value
 
-    def count(self, key: str, least: int = 1) -> int:
+    def count(self, key: str, least: int = 1, most: int = MAX_SIZE) -> int:
         value = self.get(key)
-        if isinstance(value, int) and not isinstance(value, bool) and least <= value < 1 << 31:
+        if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most:
             return value
-        self.bad(key, "a whole number from {}".format(least) if least > -1 << 30 else "a whole number")
+        self.bad(key, "a whole number from {} to {}".format(least, most))
         return max(least, 1)
 
     def number(self, key: str, above: float = 0.0) -> float:
@@ -136,6 +138,8 @@ def _check_policy(policy: _Section) -> None:
         policy.bad(key, "a key of SmolVLAConfig that this converter knows", hint="it may change numbers; a newer vla-convert may know it", unsupported=True)
     for key, (value, hint) in FIXED.items():
         policy.fixed(key, value, hint)
+    if not isinstance(policy.get("load_vlm_weights"), bool):
+        policy.bad("load_vlm_weights", "true or false")
     rtc = policy.get("rtc_config")
     if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
         policy.bad("rtc_config", "none, or one that is not enabled", hint="real-time chunking changes the velocity", unsupported=True)
@@ -143,7 +147,7 @@ def _check_policy(policy: _Section) -> None:
 
 def _read_features(policy: _Section, checkpoint: Checkpoint, s: Sizes) -> None:
     inputs, outputs = (policy.get(key) if isinstance(policy.get(key), dict) else {} for key in ("input_features", "output_features"))
-    s.empty_cameras = policy.count("empty_cameras", 0)
+    s.empty_cameras = policy.count("empty_cameras", 0, MAX_EMPTY)
     views = []
     for name, feature in inputs.items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
@@ -154,7 +158,7 @@ def _read_features(policy: _Section, checkpoint: Checkpoint, s: Sizes) -> None:
         elif name != STATE:
             checkpoint.notes.append("input feature {} ({}): not read by this policy".format(name, kind))
     # The reference adds these itself (SmolVLAConfig.validate_features), to whatever the file lists.
-    added = ["observation.images.empty_camera_{}".format(i) for i in range(min(s.empty_cameras, 64))]
+    added = ["observation.images.empty_camera_{}".format(i) for i in range(s.empty_cameras)]
     s.views = views + [name for name in added if name not in views]
     if not views:
         policy.bad("input_features", "a VISUAL feature or several", "none")
@@ -165,7 +169,7 @@ def _read_features(policy: _Section, checkpoint: Checkpoint, s: Sizes) -> None:
 def _vector_dim(policy: _Section, key: str, features: dict, name: str, kind: str) -> int:
     feature = features.get(name)
     shape = feature.get("shape") if isinstance(feature, dict) and feature.get("type") == kind else None
-    if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int) and shape[0] > 0:
+    if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int) and 0 < shape[0] <= MAX_DIM:
         return shape[0]
     policy.bad("{}.{}".format(key, name), "type {} and one dimension".format(kind), str(feature))
     return 1
@@ -178,7 +182,7 @@ def _read_policy(policy: _Section, s: Sizes) -> None:
             policy.bad(key, "at least the feature's width {}".format(real))
     s.horizon, s.n_step = policy.count("chunk_size"), policy.count("num_steps")
     s.min_period, s.max_period = policy.number("min_period"), policy.number("max_period")
-    policy.count("prefix_length", -1 << 31)  # pads the prefix with masked tokens, which changes no number
+    policy.count("prefix_length", ANY_INT)  # pads the prefix with masked tokens, which changes no number
     frame = policy.get("resize_imgs_with_padding")
     if "resize_imgs_with_padding" in policy.values and policy.values["resize_imgs_with_padding"] is None:
         policy.bad("resize_imgs_with_padding", "[width, height]", "null", "frames of any size would reach the tower", unsupported=True)
@@ -195,7 +199,7 @@ def _read_text(policy: _Section, text: _Section, s: Sizes) -> None:
     s.n_head = text.count("num_attention_heads")
     text.defaults = dict(TEXT, num_key_value_heads=s.n_head, head_dim=s.d_model // s.n_head)
     s.n_head_kv, s.d_head, s.lm_eps = text.count("num_key_value_heads"), text.count("head_dim"), text.number("rms_norm_eps")
-    total, wanted = text.count("num_hidden_layers"), policy.count("num_vlm_layers", -1 << 31)
+    total, wanted = text.count("num_hidden_layers", most=MAX_LAYERS), policy.count("num_vlm_layers", ANY_INT)
     s.n_layer = min(wanted, total) if wanted > 0 else total
     if s.n_head % s.n_head_kv:
         text.bad("num_key_value_heads", "a divisor of num_attention_heads {}".format(s.n_head))
@@ -207,7 +211,7 @@ def _read_vision(vision: _Section, backbone: _Section, s: Sizes) -> None:
     for key, value in VISION_FIXED.items():
         vision.fixed(key, value)
     s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-    s.n_vision_layer, s.n_vision_head = vision.count("num_hidden_layers"), vision.count("num_attention_heads")
+    s.n_vision_layer, s.n_vision_head = vision.count("num_hidden_layers", most=MAX_LAYERS), vision.count("num_attention_heads")
     s.image_size, s.patch_size, s.vision_eps = vision.count("image_size"), vision.count("patch_size"), vision.number("layer_norm_eps")
     s.factor = backbone.count("scale_factor")
     if s.d_vision % s.n_vision_head:
@@ -236,8 +240,8 @@ def layer_kinds(n_layer: int, n_expert: int, mode: str, every: int) -> List[str]
 
 
 def _read_expert(policy: _Section, s: Sizes) -> None:
-    multiplier, mode, every = policy.number("expert_width_multiplier"), policy.get("attention_mode"), policy.count("self_attn_every_n_layers", -1 << 31)
-    wanted = policy.count("num_expert_layers", -1 << 31)
+    multiplier, mode, every = policy.number("expert_width_multiplier"), policy.get("attention_mode"), policy.count("self_attn_every_n_layers", ANY_INT)
+    wanted = policy.count("num_expert_layers", ANY_INT)
     if not isinstance(mode, str):
         policy.bad("attention_mode", "a string")
         return
@@ -277,7 +281,9 @@ def _position_precision(policy: _Section, vision: _Section, options: Options, ch
     if options.position_precision:
         return options.position_precision
     stated = vision.get("dtype") or vision.get("torch_dtype")
-    bfloat16 = policy.get("load_vlm_weights") is True or stated in ("bfloat16", "torch.bfloat16")
+    if stated not in (None, "float32", "bfloat16"):
+        vision.bad("dtype", "float32 or bfloat16", repr(stated), "choose the rule for the position table by --position-precision", unsupported=True)
+    bfloat16 = policy.get("load_vlm_weights") is True or stated == "bfloat16"
     precision = "bfloat16" if bfloat16 else "float32"
     why = "load_vlm_weights is true" if policy.get("load_vlm_weights") is True else "vision_config says so" if bfloat16 else "the tower runs in float32"
     checkpoint.notes.append("position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why))

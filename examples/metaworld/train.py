@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Trains LeRobot's own SmolVLA class, at 4.7 million parameters, on the demonstrations of collect.py.
+
+    python train.py --data data --out checkpoint --minutes 60
+    python train.py --data data --out smoke --steps 60            # a quick look
+
+Nothing is pretrained: the weights start random and the tokenizer is trained on the four sentences.  The learning rate
+warms up, then follows a cosine to 0, which it reaches when the steps or the minutes are used up, whichever is first.
+An interrupted training continues where it stopped (its state is in OUT/state.pt) when the same command is run again.
+
+OUT holds what a published checkpoint holds (config.json, model.safetensors, the two processors), and vlm/ holds what a
+hub keeps in the repository of the backbone (its config and tokenizer).  Every parameter is rounded to a value that
+bfloat16 can represent and stored as float32: a bfloat16 copy of the file then holds exactly the same numbers, and
+differences between runtimes come from their arithmetic alone.
+"""
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any, Dict, List, Tuple
+
+import reference  # before lerobot
+import numpy as np
+import torch
+
+from sim import CAMERA, EXECUTE, HORIZON, SIZE, TASKS
+
+FLOW_STEPS = 10  # Euler steps from noise to chunk
+VOCABULARY = 384  # 256 bytes, the special tokens and merges learned from the sentences
+SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
+IMAGE = {"image_token": "<image>", "fake_image_token": "<fake_token_around_image>", "global_image_token": "<global-img>"}
+END = "<end_of_utterance>"
+BACKBONE_NAME = "vlm"  # what config.json calls the backbone; load() in reference.py looks in the checkpoint's own folder
+
+
+def make_tokenizer() -> Any:
+    """A byte-level BPE as SmolLM2 has one, digits split off singly, trained on the sentences; any text can be encoded."""
+    from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
+
+    bpe = Tokenizer(models.BPE())
+    digits, byte_level = pre_tokenizers.Digits(individual_digits=True), pre_tokenizers.ByteLevel(add_prefix_space=False)
+    bpe.pre_tokenizer = pre_tokenizers.Sequence([digits, byte_level])
+    bpe.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(vocab_size=VOCABULARY, special_tokens=SPECIAL, show_progress=False,
+                                  initial_alphabet=pre_tokenizers.ByteLevel.alphabet())
+    verbs, places = ["open", "close", "press", "push", "pull", "turn"], ["from above", "from the side", "to the left", "to the right"]
+    things = ["faucet", "button", "drawer", "door", "window", "handle"]
+    other = [f"{v} the {t} {p}\n" for v in verbs for t in things for p in places]
+    bpe.train_from_iterator([s + "\n" for s in TASKS.values()] * len(other) + other, trainer)
+    bpe.add_special_tokens([AddedToken(t, special=True, normalized=False) for t in [*IMAGE.values(), END]])
+    return bpe
+
+
+def save_backbone(folder: Path) -> None:
+    """Config, tokenizer and processor files, as the backbone's repository would hold them, without weights."""
+    from transformers import (PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor,
+                              SmolVLMVideoProcessor)
+
+    bpe = make_tokenizer()
+    pad = bpe.token_to_id("<|im_end|>")
+    SmolVLMConfig(
+        vision_config=dict(hidden_size=192, intermediate_size=768, num_hidden_layers=4, num_attention_heads=6,
+                           image_size=SIZE, patch_size=16),
+        text_config=dict(model_type="llama", hidden_size=192, intermediate_size=512, num_hidden_layers=4,
+                         num_attention_heads=6, num_key_value_heads=2, head_dim=32, rms_norm_eps=1e-5, rope_theta=100000.0,
+                         vocab_size=-(-bpe.get_vocab_size() // 8) * 8, max_position_embeddings=512,
+                         bos_token_id=bpe.token_to_id("<|im_start|>"), eos_token_id=pad, pad_token_id=pad, tie_word_embeddings=False),
+        scale_factor=2, image_token_id=bpe.token_to_id("<image>"), pad_token_id=pad, tie_word_embeddings=False,
+    ).save_pretrained(folder)
+    fast = PreTrainedTokenizerFast(tokenizer_object=bpe, bos_token="<|im_start|>", eos_token=END, unk_token="<|endoftext|>",
+                                   pad_token="<|im_end|>", model_max_length=512, extra_special_tokens=IMAGE)
+    patches = (SIZE // 16 // 2) ** 2
+    SmolVLMProcessor(SmolVLMImageProcessor(), fast, SmolVLMVideoProcessor(), image_seq_len=patches,
+                     chat_template="{{ messages }}").save_pretrained(folder)
+
+
+def make_policy(backbone: Path, statistics: Dict[str, Dict[str, torch.Tensor]]) -> Tuple[Any, Any, Any]:
+    """The policy with random weights, its pre- and its post-processor."""
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+    from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors
+
+    config = SmolVLAConfig(
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (4,)),
+                        reference.CAMERA_KEY: PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
+        vlm_model_name=str(backbone), load_vlm_weights=False, num_vlm_layers=4, expert_width_multiplier=0.75,
+        chunk_size=HORIZON, n_action_steps=EXECUTE, num_steps=FLOW_STEPS, max_state_dim=8, max_action_dim=8,
+        resize_imgs_with_padding=(SIZE, SIZE), tokenizer_max_length=24, pad_language_to="max_length",
+        freeze_vision_encoder=False, train_expert_only=False, device="cpu", push_to_hub=False)
+    policy = SmolVLAPolicy(config).float()
+    for name, parameter in policy.named_parameters():  # the class freezes the last language layer; here all of them are new
+        parameter.requires_grad_("lm_head" not in name)
+    return (policy, *make_smolvla_pre_post_processors(config, statistics))
+
+
+def save(policy: Any, before: Any, after: Any, out: Path) -> None:
+    """Rounds the parameters to bfloat16 values and writes the published layout (see the top of this file)."""
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.copy_(parameter.bfloat16().float())
+    local = policy.config.vlm_model_name
+    steps = [s for s in before.steps if hasattr(s, "tokenizer_name")]
+    policy.config.vlm_model_name = steps[0].tokenizer_name = BACKBONE_NAME
+    for part in (policy, before, after):
+        part.save_pretrained(out)
+    policy.config.vlm_model_name = steps[0].tokenizer_name = local
+
+
+def read_demonstrations(folder: Path) -> Tuple[Dict[str, torch.Tensor], List[str]]:
+    """All kept steps of all files: frame (n, 3, 128, 128) uint8, state (n, 4), action (n, 16, 4), pad (n, 16); the sentences."""
+    from rich.progress import track
+
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise SystemExit(f"no demonstrations in {folder}: run  python collect.py --out {folder}")
+    parts: Dict[str, List[np.ndarray]] = {"frame": [], "state": [], "action": [], "valid": []}
+    sentences: List[str] = []
+    for path in track(files, description="reading"):
+        with np.load(path) as episode:
+            for key in parts:
+                parts[key].append(episode[key])
+            sentences += [TASKS[str(episode["task"])]] * len(parts["state"][-1])
+    data = {key: torch.from_numpy(np.concatenate(part)) for key, part in parts.items()}
+    data["pad"] = ~data.pop("valid")
+    data["frame"] = data["frame"].permute(0, 3, 1, 2)
+    return data, sentences
+
+
+def measure(data: Dict[str, torch.Tensor]) -> Dict[str, Dict[str, torch.Tensor]]:
+    """Mean and standard deviation of state and action.  The gripper hardly moves: a floor keeps its deviation usable."""
+    action = data["action"][~data["pad"]]
+    return {"observation.state": {"mean": data["state"].mean(0), "std": data["state"].std(0).clamp_min(0.01)},
+            "action": {"mean": action.mean(0), "std": action.std(0).clamp_min(0.05)}}
+
+
+def light(frames: torch.Tensor, random: torch.Generator) -> torch.Tensor:
+    """(n, 3, h, w) in [0, 1]: a little other brightness, contrast and colour for each image."""
+    n = len(frames)
+    gain = 1 + 0.1 * torch.randn(n, 1, 1, 1, generator=random) + 0.05 * torch.randn(n, 3, 1, 1, generator=random)
+    return (frames * gain + 0.03 * torch.randn(n, 3, 1, 1, generator=random)).clamp(0, 1)
+
+
+def rate(progress: float, step: int, warm_up: int) -> float:
+    """Share of the peak learning rate: linear over the first steps, then a cosine that is 0 at progress 1."""
+    return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+
+def main() -> int:
+    ap = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ap.add_argument("--data", type=Path, required=True, metavar="DIR", help="the folder that collect.py filled")
+    ap.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the checkpoint goes")
+    ap.add_argument("--minutes", type=float, default=60, help="wall clock at most, over all runs (default 60)")
+    ap.add_argument("--steps", type=int, default=6000, help="optimizer steps at most (default 6000)")
+    ap.add_argument("--batch", type=int, default=40, help="default 40")
+    ap.add_argument("--rate", type=float, default=8e-4, help="peak learning rate (default 8e-4)")
+    ap.add_argument("--threads", type=int, default=2, help="default 2")
+    ap.add_argument("--seed", type=int, default=0, help="of the weights and of the order of the data (default 0)")
+    a = ap.parse_args()
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    torch.set_num_threads(a.threads)
+    torch.manual_seed(a.seed)
+    data, sentences = read_demonstrations(a.data)
+    a.out.mkdir(parents=True, exist_ok=True)
+    save_backbone(a.out / "vlm")
+    policy, before, after = make_policy(a.out / "vlm", measure(data))
+    size = sum(p.numel() for p in policy.parameters())
+    print(f"{len(sentences):,} frames, {size:,} parameters, camera {CAMERA}")
+
+    trained = [p for p in policy.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(trained, lr=a.rate, betas=(0.9, 0.95), weight_decay=0.01)
+    random = torch.Generator().manual_seed(a.seed)
+    step, spent, losses, state_file = 0, 0.0, [], a.out / "state.pt"
+    if state_file.exists():
+        saved = torch.load(state_file, weights_only=True)
+        policy.load_state_dict(saved["policy"])
+        optimizer.load_state_dict(saved["optimizer"])
+        step, spent, losses = saved["step"], saved["spent"], saved["losses"]
+        random.manual_seed(a.seed + step)
+        print(f"continuing at step {step}, {spent / 60:.1f} minutes in")
+
+    def keep() -> None:
+        partial = state_file.with_suffix(".part")
+        torch.save({"policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "step": step, "spent": spent,
+                    "losses": losses}, partial)
+        partial.replace(state_file)
+
+    policy.train()
+    order = torch.randperm(len(sentences), generator=random)
+    at, clock = 0, time.monotonic()
+    with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+                  TextColumn("{task.fields[note]}")) as bar:
+        row = bar.add_task("training", total=a.steps, completed=step, note="")
+        while True:
+            progress = max(step / a.steps, spent / (60 * a.minutes))
+            if progress >= 1:
+                break
+            if at + a.batch > len(order):
+                order, at = torch.randperm(len(sentences), generator=random), 0
+            pick, at = order[at : at + a.batch], at + a.batch
+            batch = before({
+                reference.CAMERA_KEY: light(data["frame"][pick].float() / 255, random), "observation.state": data["state"][pick],
+                "action": data["action"][pick], "action_is_pad": data["pad"][pick], "task": [sentences[i] for i in pick]})
+            for group in optimizer.param_groups:
+                group["lr"] = a.rate * rate(progress, step, 100)
+            loss, _ = policy.forward(dict(batch))
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(trained, 1.0)
+            optimizer.step()
+            now = time.monotonic()
+            spent, clock, step = spent + now - clock, now, step + 1
+            losses.append(loss.item())
+            mean = sum(losses[-100:]) / len(losses[-100:])
+            left = (1 - max(step / a.steps, spent / (60 * a.minutes))) * spent / max(step / a.steps, spent / (60 * a.minutes))
+            bar.update(row, completed=step, note=f"loss {mean:.3f}, {spent / step:.2f} s a step, {left / 60:.0f} min left")
+            if step % 100 == 0:
+                print(f"step {step}: loss {mean:.4f}, {spent / 60:.1f} min, rate {group['lr']:.2e}", flush=True)
+            if step % 250 == 0:
+                keep()
+    keep()
+    save(policy, before, after, a.out)
+    curve = [sum(losses[i : i + 100]) / len(losses[i : i + 100]) for i in range(0, len(losses), 100)]
+    summary = {"steps": step, "minutes": round(spent / 60, 2), "batch": a.batch, "frames": len(sentences), "parameters": size,
+               "loss_per_100_steps": [round(x, 4) for x in curve]}
+    (a.out / "training.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+    loaded, before, after = reference.load(a.out)  # what is on disk must be usable and hold the same numbers
+    for (name, one), other in zip(policy.named_parameters(), loaded.parameters()):
+        assert torch.equal(one, other), f"{name} changed on its way through {a.out}"
+    frame, state = data["frame"][0].permute(1, 2, 0).contiguous().numpy(), data["state"][0].numpy()
+    noise = torch.randn(HORIZON, 8, generator=random).numpy()
+    chunk = reference.predict(loaded, before, after, frame, state, sentences[0], noise)
+    print(f"{a.out}: {step} steps in {spent / 60:.1f} min, loss {curve[-1]:.3f}; '{sentences[0]}' -> {chunk[0].round(3).tolist()}, "
+          f"the expert: {data['action'][0, 0].numpy().round(3).tolist()}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,57 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <functional>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// A token that is cut out of the text before anything else looks at it, e.g. `<image>`.
+struct AddedToken {
+  std::int32_t id = 0;
+  std::string content;
+  bool single_word = false;  // only where no word character stands next to it
+  bool lstrip = false;       // takes the white space on its left with it
+  bool rstrip = false;       // ... on its right
+  bool normalized = false;   // looked for after all others, in what they left
+};
+
+/// Reads `tokenizer.added`. Errors: bad_bundle, also for ids at or beyond `n_vocab`, repeated ids or contents.
+Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int n_vocab);
+
+/// Finds added tokens in text: leftmost, and the longest of those that start there.
+/// Source: tokenizers added_vocabulary.rs (extract_and_normalize, find_matches).
+class AddedTokens {
+ public:
+  AddedTokens() = default;
+  explicit AddedTokens(std::vector<AddedToken> tokens);
+
+  /// Calls `on_text` for each piece between added tokens (never empty) and `on_token` for each token, in text order.
+  void split(std::string_view text, const std::function<void(std::string_view)>& on_text,
+             const std::function<void(std::int32_t)>& on_token) const;
+
+ private:
+  struct Node {
+    std::vector<std::pair<std::uint8_t, int>> next;  // by byte
+    int token = -1;                                  // index into tokens_ of the content that ends here
+  };
+  using Trie = std::vector<Node>;
+
+  void insert(Trie& trie, int token);
+  int longest_at(const Trie& trie, std::string_view text) const;
+  void split(const Trie& trie, std::string_view text, const std::function<void(std::string_view)>& on_text,
+             const std::function<void(std::int32_t)>& on_token) const;
+
+  std::vector<AddedToken> tokens_;
+  Trie plain_{1};  // tokens that are not `normalized`
+  Trie normalized_{1};
+};
+
+}  // namespace vla

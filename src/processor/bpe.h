@@ -1,0 +1,46 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <string>
+#include <string_view>
+#include <unordered_map>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// The byte that a character of the byte-level alphabet stands for (U+0100 is byte 0, `Ġ` is the blank, printable ASCII
+/// is itself); -1 for every other character.
+int byte_of_symbol(std::uint32_t code_point);
+
+/// Byte-level byte-pair encoding of one word.
+/// Source: tokenizers models/bpe/model.rs and word.rs (merge_all).
+class Bpe {
+ public:
+  /// `tokens` by id, `merges` as `left right` by rank, both in the byte-level alphabet. With `ignore_merges` a word
+  /// that is a token as a whole becomes it at once, unless the token `is_added` (by id). Errors: bad_bundle when a byte
+  /// has no token, two ids share a text, or a merge names what is not a token.
+  static Result<Bpe> create(const std::vector<std::string>& tokens, const std::vector<std::string>& merges,
+                            bool ignore_merges, const std::vector<bool>& is_added);
+
+  /// Appends the ids of one word, given as raw bytes. Time grows as n log n with the length of the word.
+  void encode(std::string_view word, std::vector<std::int32_t>& ids) const;
+
+ private:
+  struct Merge {
+    std::int32_t rank;
+    std::int32_t id;  // of the token that the pair becomes
+  };
+
+  const Merge* find(std::int32_t left, std::int32_t right) const;
+
+  std::array<std::int32_t, 256> byte_ids_{};
+  std::unordered_map<std::uint64_t, Merge> merges_;            // by the pair of ids
+  std::unordered_map<std::string, std::int32_t> whole_words_;  // raw bytes to id; empty without ignore_merges
+};
+
+}  // namespace vla

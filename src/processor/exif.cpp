@@ -1,0 +1,121 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <optional>
+
+#include "processor/image_codecs.h"
+
+namespace vla::codecs {
+namespace {
+
+constexpr std::uint16_t kOrientationTag = 0x0112;
+constexpr std::size_t kEntrySize = 12;
+
+/// Bounds-checked reads from a TIFF structure of either byte order.
+class Tiff {
+ public:
+  Tiff(std::span<const std::uint8_t> bytes, bool little) : bytes_(bytes), little_(little) {}
+
+  std::optional<std::uint32_t> read(std::uint64_t offset, int size) const {
+    if (offset > bytes_.size() || bytes_.size() - offset < static_cast<std::size_t>(size)) return std::nullopt;
+    std::uint32_t value = 0;
+    for (int i = 0; i < size; ++i) {
+      const int place = little_ ? size - 1 - i : i;
+      value = value << 8 | bytes_[offset + static_cast<std::size_t>(place)];
+    }
+    return value;
+  }
+  bool contains(std::uint64_t offset, std::uint64_t size) const {
+    return offset <= bytes_.size() && size <= bytes_.size() - offset;
+  }
+
+ private:
+  std::span<const std::uint8_t> bytes_;
+  bool little_;
+};
+
+/// Bytes per value of a TIFF type, 0 for types that the reference passes over.
+std::uint64_t type_size(std::uint32_t type) {
+  constexpr std::uint8_t kSizes[] = {0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8};
+  return type < std::size(kSizes) ? kSizes[type] : 0;
+}
+
+/// The first value of an integer entry; other types never compare equal to an orientation.
+std::optional<int> integer_at(const Tiff& tiff, std::uint64_t data, std::uint32_t type) {
+  const bool is_byte = type == 6;  // the unsigned byte, type 1, is a string to the reference
+  const bool is_short = type == 3 || type == 8;
+  const bool is_long = type == 4 || type == 9 || type == 13;
+  if (!is_byte && !is_short && !is_long) return std::nullopt;
+  const auto value = tiff.read(data, is_byte ? 1 : is_short ? 2 : 4);
+  return value && *value <= 8 ? static_cast<int>(*value) : 0;
+}
+
+/// Looks through the first directory. An entry that points outside ends the search, as a read error does in the
+/// reference; of several entries the last counts.
+std::optional<int> search_directory(const Tiff& tiff, std::uint64_t directory) {
+  std::optional<int> found;
+  const std::uint32_t count = tiff.read(directory, 2).value_or(0);
+  for (std::uint32_t i = 0; i < count; ++i) {
+    const std::uint64_t entry = directory + 2 + i * kEntrySize;
+    if (!tiff.contains(entry, kEntrySize)) break;
+    const std::uint32_t type = *tiff.read(entry + 2, 2);
+    const std::uint64_t size = type_size(type) * *tiff.read(entry + 4, 4);
+    const std::uint64_t data = size > 4 ? *tiff.read(entry + 8, 4) : entry + 8;
+    if (size == 0) continue;
+    if (!tiff.contains(data, size)) break;
+    if (tiff.read(entry, 2) == kOrientationTag) found = integer_at(tiff, data, type).value_or(0);
+  }
+  return found;
+}
+
+std::optional<int> search_xmp(const std::string& xmp) {
+  constexpr std::string_view kName = "tiff:Orientation";
+  for (std::size_t at = xmp.find(kName); at != std::string::npos; at = xmp.find(kName, at + 1)) {
+    std::string_view rest = std::string_view(xmp).substr(at + kName.size());
+    const std::size_t skip = rest.starts_with("=\"") ? 2 : rest.starts_with(">") ? 1 : 0;
+    if (skip > 0 && skip < rest.size() && rest[skip] >= '0' && rest[skip] <= '9') return rest[skip] - '0';
+  }
+  return std::nullopt;
+}
+
+}  // namespace
+
+Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& xmp, const std::string& where) {
+  std::optional<int> found;
+  if (!exif.empty()) {
+    const bool little = exif.size() >= 8 && exif[0] == 'I' && exif[1] == 'I';
+    const bool big = exif.size() >= 8 && exif[0] == 'M' && exif[1] == 'M';
+    const Tiff tiff(exif, little);
+    if ((!little && !big) || tiff.read(2, 2) != 42u)
+      return refused(where, "EXIF data that starts as a TIFF structure", "other bytes", "remove the EXIF data");
+    found = search_directory(tiff, *tiff.read(4, 4));
+  }
+  if (!found) found = search_xmp(xmp);
+  return found && *found >= 1 && *found <= 8 ? *found : 1;
+}
+
+void turn_upright(Picture& picture, int orientation) {
+  if (orientation == 1) return;
+  // Source coordinates of the upright pixel (x, y): optionally exchanged, then mirrored.
+  const bool exchanged = orientation >= 5;
+  const bool mirror_x = orientation == 2 || orientation == 3 || orientation == 7 || orientation == 8;
+  const bool mirror_y = orientation == 3 || orientation == 4 || orientation == 6 || orientation == 7;
+  const int width = exchanged ? picture.height : picture.width;
+  const int height = exchanged ? picture.width : picture.height;
+  std::vector<std::uint8_t> turned(picture.rgb.size());
+  std::uint8_t* out = turned.data();
+  for (int y = 0; y < height; ++y) {
+    for (int x = 0; x < width; ++x, out += 3) {
+      const int along_x = exchanged ? y : x;
+      const int along_y = exchanged ? x : y;
+      const int source_x = mirror_x ? picture.width - 1 - along_x : along_x;
+      const int source_y = mirror_y ? picture.height - 1 - along_y : along_y;
+      const auto pixel = static_cast<std::size_t>(source_y) * static_cast<std::size_t>(picture.width) +
+                         static_cast<std::size_t>(source_x);
+      std::copy_n(picture.rgb.data() + pixel * 3, 3, out);
+    }
+  }
+  picture = {width, height, std::move(turned), std::move(picture.exif), std::move(picture.xmp)};
+}
+
+}  // namespace vla::codecs

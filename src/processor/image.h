@@ -1,0 +1,40 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <span>
+#include <string>
+#include <variant>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// One camera frame: rows top to bottom, RGB interleaved, (height, width, 3); 8 bits, or float32 in [0, 1].
+struct Frame {
+  int width = 0;
+  int height = 0;
+  std::variant<std::vector<std::uint8_t>, std::vector<float>> rgb;
+};
+
+struct ImageLimits {
+  std::int64_t max_pixels = 64'000'000;  // compared with a file's header before memory is taken
+};
+
+/// Decodes a PNG, a JPEG or a NumPy array file (uint8 or float32, (height, width, 3), C order), told apart by content.
+///
+/// The pixels are those of Pillow after `exif_transpose` and `convert("RGB")`, as LeRobot's data sets are decoded: grey
+/// is replicated, palettes are expanded, transparency is dropped without blending, EXIF or XMP orientation is applied,
+/// colour profiles and gamma are ignored. Refused: 16-bit PNG and CMYK JPEG (Pillow's conversions of them lose or
+/// invert values), anything truncated or corrupt, also where Pillow or libjpeg would go on with a warning, and float
+/// values outside [0, 1]. `where` names the image in errors. Errors: bad_observation.
+Result<Frame> decode_image(std::span<const std::byte> file, const std::string& where, const ImageLimits& limits = {});
+
+/// What `decode_image` guarantees, for frames that come from elsewhere: a size within the limits, as many numbers as
+/// the size says, floats in [0, 1]. Errors: bad_observation.
+Status check_frame(const Frame& frame, const std::string& where, const ImageLimits& limits = {});
+
+}  // namespace vla

@@ -1,0 +1,44 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+#include "processor/image.h"
+
+/// The parts of `decode_image`, one per file format.
+namespace vla::codecs {
+
+using Bytes = std::span<const std::byte>;
+
+/// What a PNG or JPEG file holds, before orientation.
+struct Picture {
+  int width = 0;
+  int height = 0;
+  std::vector<std::uint8_t> rgb;   // (height, width, 3)
+  std::vector<std::uint8_t> exif;  // a TIFF structure, or empty
+  std::string xmp;                 // an XML packet, or empty
+};
+
+Error refused(const std::string& where, std::string expected, std::string found, std::string hint = {});
+Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits);
+
+bool is_png(Bytes file);
+bool is_jpeg(Bytes file);
+Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits);
+Result<Picture> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits);
+
+/// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says. Errors: bad_observation for EXIF
+/// data that does not start as a TIFF structure. Source: Pillow Image.getexif, TiffImagePlugin
+/// ImageFileDirectory_v2.load.
+Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& xmp, const std::string& where);
+
+/// Turns the picture upright. Source: Pillow ImageOps.exif_transpose.
+void turn_upright(Picture& picture, int orientation);
+
+}  // namespace vla::codecs

@@ -1,0 +1,94 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/json_fields.h"
+
+#include <cmath>
+
+namespace vla {
+namespace {
+
+constexpr std::size_t kShown = 60;  // characters of a wrong value in a message
+
+std::string shown(const Json& value) {
+  const std::string text = value.dump(-1, ' ', true, Json::error_handler_t::replace);
+  return text.size() <= kShown ? text : text.substr(0, kShown) + "...";
+}
+
+}  // namespace
+
+Result<Json> parse_json_list(const std::string& text, const std::string& where) {
+  Json document = Json::parse(text, nullptr, /*allow_exceptions=*/false);
+  if (document.is_discarded()) return Error{Code::bad_bundle, where, "a JSON list", "text that is not JSON"};
+  if (!document.is_array()) return Error{Code::bad_bundle, where, "a JSON list", shown(document)};
+  return document;
+}
+
+Result<JsonFields> JsonFields::open(const Json& object, std::string where) {
+  if (!object.is_object()) return Error{Code::bad_bundle, std::move(where), "a JSON object", shown(object)};
+  return JsonFields(object, std::move(where));
+}
+
+Error JsonFields::wrong(const std::string& name, std::string expected) const {
+  return {Code::bad_bundle, where_ + "." + name, std::move(expected), shown(object_->at(name))};
+}
+
+Result<const Json*> JsonFields::field(const std::string& name, const char* expected) {
+  const auto found = object_->find(name);
+  if (found == object_->end())
+    return Error{Code::bad_bundle, where_ + "." + name, expected, "no such field", "convert the checkpoint again"};
+  read_.insert(name);
+  return &*found;
+}
+
+Result<int> JsonFields::integer(const std::string& name, int low, int high) {
+  VLA_TRY(const Json* value, field(name, "an integer"));
+  const std::string expected = "an integer from " + std::to_string(low) + " to " + std::to_string(high);
+  if (!value->is_number_integer()) return wrong(name, expected);
+  // An unsigned number beyond int64 would wrap when read as one.
+  if (value->is_number_unsigned() && value->get<std::uint64_t>() > static_cast<std::uint64_t>(high))
+    return wrong(name, expected);
+  const auto wide = value->get<std::int64_t>();
+  if (wide < low || wide > high) return wrong(name, expected);
+  return static_cast<int>(wide);
+}
+
+Result<float> JsonFields::number(const std::string& name) {
+  VLA_TRY(const Json* value, field(name, "a number"));
+  if (!value->is_number()) return wrong(name, "a number");
+  const double wide = value->get<double>();
+  if (!(std::abs(wide) <= static_cast<double>(std::numeric_limits<float>::max())))
+    return wrong(name, "a float32 number");
+  return static_cast<float>(wide);
+}
+
+Result<bool> JsonFields::boolean(const std::string& name) {
+  VLA_TRY(const Json* value, field(name, "true or false"));
+  if (!value->is_boolean()) return wrong(name, "true or false");
+  return value->get<bool>();
+}
+
+Result<std::string> JsonFields::string(const std::string& name) {
+  VLA_TRY(const Json* value, field(name, "a string"));
+  if (!value->is_string()) return wrong(name, "a string");
+  return value->get<std::string>();
+}
+
+Result<int> JsonFields::choice(const std::string& name, std::initializer_list<const char*> spellings) {
+  VLA_TRY(const std::string text, string(name));
+  std::string expected;
+  int index = 0;
+  for (const char* spelling : spellings) {
+    if (text == spelling) return index;
+    expected += (index++ == 0 ? "\"" : ", \"") + std::string(spelling) + "\"";
+  }
+  return wrong(name, (spellings.size() > 1 ? "one of " : "") + expected);
+}
+
+Status JsonFields::done() const {
+  for (const auto& item : object_->items())
+    if (!read_.contains(item.key()))
+      return Error{Code::bad_bundle, where_ + "." + item.key(), "", "unknown field", "this bundle needs a newer vla"};
+  return {};
+}
+
+}  // namespace vla

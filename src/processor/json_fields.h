@@ -1,0 +1,48 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <set>
+#include <string>
+
+#include "base/result.h"
+
+namespace vla {
+
+using Json = nlohmann::json;
+
+/// Parses a JSON list held by a bundle. Errors: bad_bundle at `where`.
+Result<Json> parse_json_list(const std::string& text, const std::string& where);
+
+/// One JSON object of a bundle whose fields are all required and all known: each is read by name and type, and `done`
+/// refuses what nobody read. Errors: bad_bundle at `where.field`.
+class JsonFields {
+ public:
+  static Result<JsonFields> open(const Json& object, std::string where);
+
+  const std::string& where() const { return where_; }
+  bool has(const std::string& name) const { return object_->contains(name); }
+
+  /// An integer in [low, high].
+  Result<int> integer(const std::string& name, int low, int high);
+  /// A number that is finite as float32.
+  Result<float> number(const std::string& name);
+  Result<bool> boolean(const std::string& name);
+  Result<std::string> string(const std::string& name);
+  /// One of the spellings; the result is its index.
+  Result<int> choice(const std::string& name, std::initializer_list<const char*> spellings);
+
+  Status done() const;
+  Error wrong(const std::string& name, std::string expected) const;
+
+ private:
+  JsonFields(const Json& object, std::string where) : object_(&object), where_(std::move(where)) {}
+  Result<const Json*> field(const std::string& name, const char* expected);
+
+  const Json* object_;
+  std::string where_;
+  std::set<std::string> read_;
+};
+
+}  // namespace vla

@@ -1,0 +1,32 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+
+#include "base/result.h"
+#include "processor/image.h"
+
+namespace vla {
+
+/// A frame of any size into `width` x `height`: aspect kept, the picture at the bottom right, the rest `fill`.
+struct Letterbox {
+  int width = 0;
+  int height = 0;
+  float fill = 0.0f;
+};
+
+/// Writes (3, height, width) float32 to `out`; 8-bit values are divided by 255. A frame that has the size already is
+/// copied. Otherwise it is resampled bilinearly, without antialiasing, to the largest size that fits.
+///
+/// The result equals torch's bit for bit on machines where torch uses fused multiply-add: sizes are truncated from
+/// double, source positions are rounded once to float32, and the four taps are summed in torch's order. Errors:
+/// bad_observation when a side of the resized picture is shorter than a pixel. Source: lerobot
+/// policies/common/vla_utils.py resize_with_pad; torch F.interpolate(mode="bilinear", align_corners=False).
+Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
+
+/// `x * scale + shift`, each rounded to float32, in place.
+void affine(std::span<float> values, float scale, float shift);
+
+}  // namespace vla

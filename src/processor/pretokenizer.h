@@ -1,0 +1,41 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <functional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// Splits text into the words inside which tokens are formed.
+/// Source: tokenizers pre_tokenizers/digits.rs and byte_level.rs.
+class Pretokenizer {
+ public:
+  /// Reads `tokenizer.pre`: any number of digits steps, then one byte_level step. Errors: bad_bundle.
+  static Result<Pretokenizer> parse(const std::string& json);
+
+  /// Calls `on_word` for every word of valid UTF-8 `text`, in order; a word may start with a blank that the text does
+  /// not have (`add_prefix_space`).
+  void split(std::string_view text, const std::function<void(std::string_view)>& on_word) const;
+
+ private:
+  enum class Digits { together, individual };
+
+  void split_digits(std::size_t step, std::string_view text,
+                    const std::function<void(std::string_view)>& on_word) const;
+  void split_bytes(std::string_view text, const std::function<void(std::string_view)>& on_word) const;
+
+  std::vector<Digits> digits_;
+  bool add_prefix_space_ = false;
+  bool use_regex_ = true;
+};
+
+/// Bytes of the first match at the start of non-empty, valid UTF-8 of the GPT-2 splitting expression
+/// `'s|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+`, which matches everywhere.
+std::size_t gpt2_word(std::string_view text);
+
+}  // namespace vla

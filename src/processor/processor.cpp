@@ -1,0 +1,151 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/processor.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+
+namespace vla {
+namespace {
+
+Error bad_observation(std::string where, std::string expected, std::string found, std::string hint = {}) {
+  return {Code::bad_observation, std::move(where), std::move(expected), std::move(found), std::move(hint)};
+}
+
+/// Index of the first value that is not finite, or the size.
+std::size_t first_bad(std::span<const float> values) {
+  const auto found = std::find_if(values.begin(), values.end(), [](float value) { return !std::isfinite(value); });
+  return static_cast<std::size_t>(found - values.begin());
+}
+
+/// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
+template <class T>
+Result<std::vector<const T*>> by_feature(const FeatureNames& features, const std::map<std::string, T>& given) {
+  std::vector<const T*> ordered(features.names().size());
+  for (const auto& [name, value] : given) {
+    VLA_TRY(const int index, features.find(name));
+    const T*& slot = ordered[static_cast<std::size_t>(index)];
+    const std::string& feature = features.names()[static_cast<std::size_t>(index)];
+    if (slot != nullptr) return bad_observation(feature, "one value", fmt::format("a second one, under \"{}\"", name));
+    slot = &value;
+  }
+  return ordered;
+}
+
+}  // namespace
+
+Result<Inputs> Processor::encode(const Observation& observation) const {
+  Inputs inputs;
+  VLA_CHECK(encode_images(observation, inputs));
+  VLA_CHECK(encode_text(observation, inputs));
+  VLA_CHECK(encode_state(observation, inputs));
+  return inputs;
+}
+
+Result<std::vector<Processor::PresentView>> Processor::present_views(const Observation& observation) const {
+  VLA_TRY(const auto given, by_feature(views_, observation.views));
+  std::vector<PresentView> present;
+  for (std::size_t i = 0; i < given.size(); ++i) {
+    const std::string& name = views_.names()[i];
+    if (given[i] == nullptr && view_optional_[i] == 0)
+      return bad_observation(name, "an image, or the view declared absent", "neither",
+                             "the bundle's views are " + views_.listed());
+    if (given[i] != nullptr && *given[i]) present.push_back({&name, &**given[i]});
+  }
+  if (present.size() < static_cast<std::size_t>(min_views_))
+    return bad_observation("observation.images",
+                           fmt::format("at least {} of the views {}", min_views_, views_.listed()),
+                           fmt::format("{} present", present.size()));
+  return present;
+}
+
+Status Processor::encode_images(const Observation& observation, Inputs& inputs) const {
+  VLA_TRY(const std::vector<PresentView> present, present_views(observation));
+  inputs.n_view = static_cast<int>(present.size());
+  inputs.width = recipe_.letterbox.width;
+  inputs.height = recipe_.letterbox.height;
+  const std::size_t size =
+      static_cast<std::size_t>(3) * static_cast<std::size_t>(inputs.width) * static_cast<std::size_t>(inputs.height);
+  inputs.pixels.resize(present.size() * size);
+  for (std::size_t i = 0; i < present.size(); ++i) {
+    const auto& [name, frame] = present[i];
+    const std::span<float> out(inputs.pixels.data() + i * size, size);
+    VLA_CHECK(check_frame(*frame, *name));
+    VLA_CHECK(letterbox(*frame, recipe_.letterbox, out, *name));
+    for (const AffineOp& op : recipe_.image) affine(out, op.scale, op.shift);
+  }
+  return {};
+}
+
+Status Processor::encode_text(const Observation& observation, Inputs& inputs) const {
+  inputs.notes.clear();
+  if (observation.text.empty()) return bad_observation("instruction", "a sentence", "empty text");
+  std::string text = observation.text;
+  for (const EnsureSuffixOp& op : recipe_.text)
+    if (!text.ends_with(op.suffix)) text += op.suffix;
+  VLA_TRY(inputs.tokens, tokenizer_.encode(text));
+  const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
+  if (inputs.tokens.size() > limit) {
+    inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the first {}", inputs.tokens.size(), limit));
+    inputs.tokens.resize(limit);
+  }
+  return {};
+}
+
+Status Processor::gather_states(const Observation& observation, std::vector<float>& state) const {
+  VLA_TRY(const auto given, by_feature(states_, observation.states));
+  state.clear();
+  for (std::size_t i = 0; i < given.size(); ++i) {
+    const std::string& name = states_.names()[i];
+    const std::string expected = fmt::format("{} numbers", state_dims_[i]);
+    if (given[i] == nullptr)
+      return bad_observation(name, expected, "nothing", "the bundle's states are " + states_.listed());
+    const std::vector<float>& values = *given[i];
+    if (values.size() != static_cast<std::size_t>(state_dims_[i]))
+      return bad_observation(name, expected, std::to_string(values.size()));
+    if (const std::size_t bad = first_bad(values); bad < values.size())
+      return bad_observation(fmt::format("{}[{}]", name, bad), "a finite number", fmt::format("{}", values[bad]));
+    state.insert(state.end(), values.begin(), values.end());
+  }
+  return {};
+}
+
+Status Processor::encode_state(const Observation& observation, Inputs& inputs) const {
+  VLA_CHECK(gather_states(observation, inputs.state));
+  const std::span<float> state(inputs.state);
+  for (const StateStep& step : state_steps_) step.normalizer.apply(state.subspan(step.offset, step.width));
+  if (const std::size_t bad = first_bad(state); bad < state.size())
+    return bad_observation(fmt::format("state[{}]", bad), "a number that stays finite when normalized",
+                           fmt::format("{}", state[bad]));
+  inputs.state.resize(d_state_, 0.0f);
+  return {};
+}
+
+Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int horizon, int d_action) const {
+  if (d_action != d_action_ || horizon < 1 ||
+      chunk.size() != static_cast<std::size_t>(horizon) * static_cast<std::size_t>(d_action))
+    return Error{Code::internal, "action chunk", fmt::format("({}, {})", horizon, d_action_),
+                 fmt::format("{} numbers in rows of {}", chunk.size(), d_action)};
+  const std::size_t width = action_names_.size();
+  std::vector<float> actions, row;
+  actions.reserve(static_cast<std::size_t>(horizon) * width);
+  for (int i = 0; i < horizon; ++i) {
+    const auto numbers = chunk.subspan(static_cast<std::size_t>(i) * static_cast<std::size_t>(d_action),
+                                       static_cast<std::size_t>(d_action));
+    row.assign(numbers.begin(), numbers.end());
+    for (const ActionStep& step : action_steps_) {
+      row.resize(step.width);
+      step.normalizer.apply(row);
+    }
+    row.resize(width);
+    if (const std::size_t bad = first_bad(row); bad < width)
+      return Error{Code::bad_action, fmt::format("actions[{}][\"{}\"]", i, action_names_[bad]), "a finite number",
+                   fmt::format("{}", row[bad])};
+    actions.insert(actions.end(), row.begin(), row.end());
+  }
+  return actions;
+}
+
+}  // namespace vla

@@ -1,0 +1,99 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+#include "bundle/bundle.h"
+#include "processor/image.h"
+#include "processor/names.h"
+#include "processor/recipe.h"
+#include "processor/tokenizer.h"
+#include "processor/vector.h"
+
+namespace vla {
+
+/// What a robot sees and is told, by name: see `FeatureNames` for the names that are understood.
+struct Observation {
+  std::map<std::string, std::optional<Frame>> views;  // nullopt: declared absent
+  std::map<std::string, std::vector<float>> states;   // world units
+  std::string text;                                   // the instruction, UTF-8
+};
+
+/// The host side of one observation, as the network reads it. Vectors keep their memory when filled again.
+struct Inputs {
+  int n_view = 0;
+  int height = 0, width = 0;
+  std::vector<float> pixels;         // (n_view, 3, height, width), present views only, in the bundle's order
+  std::vector<std::int32_t> tokens;  // at most `recipe().max_tokens`
+  std::vector<float> state;          // normalized, padded
+  std::vector<std::string> notes;    // what the user must be told, e.g. that the instruction was cut
+};
+
+/// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
+class Processor {
+ public:
+  /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state` and
+  /// `policy.d_action`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
+  static Result<Processor> create(const Bundle& bundle);
+
+  /// All three parts below. Errors: bad_observation.
+  Result<Inputs> encode(const Observation& observation) const;
+
+  /// Each fills its own fields of `inputs`; they are apart so that they can be timed apart.
+  Status encode_images(const Observation& observation, Inputs& inputs) const;
+  Status encode_text(const Observation& observation, Inputs& inputs) const;
+  Status encode_state(const Observation& observation, Inputs& inputs) const;
+
+  /// chunk (horizon, d_action), in the network's units -> (horizon, action_names().size()) in world units.
+  /// Errors: bad_action for a number that is not finite, naming its row and column.
+  Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action) const;
+
+  const FeatureNames& views() const { return views_; }
+  int min_views() const { return min_views_; }
+  const FeatureNames& states() const { return states_; }
+  const std::vector<int>& state_dims() const { return state_dims_; }
+  const std::vector<std::string>& action_names() const { return action_names_; }
+  const Recipe& recipe() const { return recipe_; }
+
+ private:
+  /// A normalizer and the columns that it works on.
+  struct StateStep {
+    Normalizer normalizer;
+    std::size_t offset, width;
+  };
+  struct ActionStep {
+    Normalizer normalizer;
+    std::size_t width;
+  };
+
+  Status read_features(const Bundle& bundle);
+  Status read_state_steps(const Bundle& bundle);
+  Status read_action_steps(const Bundle& bundle);
+  struct PresentView {
+    const std::string* name;
+    const Frame* frame;
+  };
+  Result<std::vector<PresentView>> present_views(const Observation& observation) const;
+  Status gather_states(const Observation& observation, std::vector<float>& state) const;
+
+  FeatureNames views_, states_;
+  std::vector<int> view_optional_;  // per view 1 where it may be left unmentioned
+  int min_views_ = 0;
+  std::vector<int> state_dims_;
+  std::vector<std::string> action_names_;
+  Recipe recipe_;
+  Tokenizer tokenizer_;
+  std::vector<StateStep> state_steps_;
+  std::vector<ActionStep> action_steps_;
+  std::size_t d_state_ = 0;  // after padding
+  int d_action_ = 0;         // of the network
+};
+
+}  // namespace vla

@@ -1,0 +1,141 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The load-rate half of Processor: reading a bundle and checking that its parts fit each other.
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <numeric>
+#include <set>
+
+#include "processor/processor.h"
+
+namespace vla {
+namespace {
+
+Error mismatch(std::string where, std::string expected, std::string found) {
+  return {Code::bad_bundle, std::move(where), std::move(expected), std::move(found), "convert the checkpoint again"};
+}
+
+Status check_names(const std::string& key, const std::vector<std::string>& names) {
+  const std::set<std::string> unique(names.begin(), names.end());
+  if (unique.size() != names.size()) return mismatch(key, "distinct names", "a name twice");
+  if (unique.contains("")) return mismatch(key, "names", "an empty one");
+  return {};
+}
+
+template <class T>
+Status check_size(const std::string& key, const std::vector<T>& list, std::size_t expected) {
+  if (list.size() == expected) return {};
+  return mismatch(key, fmt::format("{} entries", expected), std::to_string(list.size()));
+}
+
+std::int64_t total_dims(std::span<const int> dims) {
+  return std::accumulate(dims.begin(), dims.end(), std::int64_t{0});
+}
+
+}  // namespace
+
+Result<Processor> Processor::create(const Bundle& bundle) {
+  const Keys& keys = bundle.keys();
+  Processor processor;
+  VLA_TRY(const std::string recipe, keys.string("processor.recipe"));
+  VLA_TRY(processor.recipe_, parse_recipe(recipe));
+  VLA_CHECK(processor.read_features(bundle));
+  VLA_CHECK(processor.read_state_steps(bundle));
+  VLA_CHECK(processor.read_action_steps(bundle));
+  VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab"));
+  VLA_TRY(processor.tokenizer_, Tokenizer::create(keys, n_vocab));
+  VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens"));
+  if (processor.recipe_.max_tokens > max_text_tokens)
+    return mismatch("processor.recipe.text",
+                    fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
+                    std::to_string(processor.recipe_.max_tokens));
+  return processor;
+}
+
+Status Processor::read_features(const Bundle& bundle) {
+  const Keys& keys = bundle.keys();
+  VLA_TRY(std::vector<std::string> views, keys.strings("observation.views"));
+  VLA_TRY(std::vector<std::string> aliases, keys.strings("observation.view_aliases"));
+  VLA_TRY(view_optional_, keys.integers("observation.view_optional"));
+  VLA_TRY(min_views_, keys.integer("observation.min_views"));
+  VLA_CHECK(check_names("observation.views", views));
+  VLA_CHECK(check_size("observation.view_aliases", aliases, views.size()));
+  VLA_CHECK(check_size("observation.view_optional", view_optional_, views.size()));
+  if (min_views_ < 1 || static_cast<std::size_t>(min_views_) > views.size())
+    return mismatch("observation.min_views", fmt::format("1 to {}", views.size()), std::to_string(min_views_));
+  views_ = FeatureNames("view", std::move(views), std::move(aliases));
+
+  VLA_TRY(std::vector<std::string> states, keys.strings("observation.states"));
+  VLA_TRY(state_dims_, keys.integers("observation.state_dims"));
+  VLA_CHECK(check_names("observation.states", states));
+  VLA_CHECK(check_size("observation.state_dims", state_dims_, states.size()));
+  for (const int dim : state_dims_)
+    if (dim < 1 || dim > kMaxVector)
+      return mismatch("observation.state_dims", fmt::format("1 to {}", kMaxVector), std::to_string(dim));
+  if (total_dims(state_dims_) > kMaxVector)
+    return mismatch("observation.state_dims", fmt::format("at most {} numbers in all", kMaxVector), "more");
+  std::vector<std::string> no_aliases(states.size());
+  states_ = FeatureNames("state", std::move(states), std::move(no_aliases));
+
+  VLA_TRY(action_names_, keys.strings("action.names"));
+  return {};
+}
+
+Status Processor::read_state_steps(const Bundle& bundle) {
+  const auto total = static_cast<std::size_t>(total_dims(state_dims_));
+  std::size_t width = total;
+  for (std::size_t i = 0; i < recipe_.state.size(); ++i) {
+    const std::string where = fmt::format("processor.recipe.state[{}]", i);
+    if (const auto* pad = std::get_if<PadOp>(&recipe_.state[i])) {
+      if (static_cast<std::size_t>(pad->size) < width)
+        return mismatch(where + ".size", fmt::format("at least the {} numbers of the state", width),
+                        std::to_string(pad->size));
+      width = static_cast<std::size_t>(pad->size);
+      continue;
+    }
+    const auto& op = std::get<NormalizeOp>(recipe_.state[i]);
+    std::size_t offset = 0, n_column = total;
+    if (!op.feature.empty() || states_.names().size() > 1) {
+      const auto& names = states_.names();
+      const auto index = static_cast<std::size_t>(std::find(names.begin(), names.end(), op.feature) - names.begin());
+      if (index == names.size())
+        return mismatch(where + ".feature", "one of " + states_.listed(), "\"" + op.feature + "\"");
+      offset = static_cast<std::size_t>(total_dims(std::span(state_dims_).first(index)));
+      n_column = static_cast<std::size_t>(state_dims_[index]);
+    }
+    VLA_TRY(Normalizer normalizer,
+            Normalizer::create(bundle, op, Normalizer::Direction::normalize, static_cast<int>(n_column), where));
+    state_steps_.push_back({std::move(normalizer), offset, n_column});
+  }
+  d_state_ = width;
+  VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state"));
+  if (width != static_cast<std::size_t>(d_state))
+    return mismatch("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
+                    std::to_string(width));
+  return {};
+}
+
+Status Processor::read_action_steps(const Bundle& bundle) {
+  VLA_TRY(d_action_, bundle.keys().integer("policy.d_action"));
+  int width = d_action_;
+  for (std::size_t i = 0; i < recipe_.action.size(); ++i) {
+    const std::string where = fmt::format("processor.recipe.action[{}]", i);
+    if (const auto* take = std::get_if<TakeOp>(&recipe_.action[i])) {
+      if (take->size > width)
+        return mismatch(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
+      width = take->size;
+      continue;
+    }
+    const auto& op = std::get<NormalizeOp>(recipe_.action[i]);
+    VLA_TRY(Normalizer normalizer, Normalizer::create(bundle, op, Normalizer::Direction::unnormalize, width, where));
+    action_steps_.push_back({std::move(normalizer), static_cast<std::size_t>(width)});
+  }
+  if (static_cast<std::size_t>(width) != action_names_.size())
+    return mismatch("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", width),
+                    std::to_string(action_names_.size()));
+  return {};
+}
+
+}  // namespace vla

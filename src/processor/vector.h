@@ -1,0 +1,53 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+#include "bundle/bundle.h"
+#include "processor/recipe.h"
+
+namespace vla {
+
+/// Maps numbers between world units and the network's, per column, in float32 and in the reference's order of
+/// operations:
+///
+///   kind        normalize                               unnormalize                            low, high
+///   mean_std    (x - mean) / (std + eps)                x * std + mean                         mean, std
+///   min_max     2 * (x - min) / range - 1               (x + 1) / 2 * range + min              min, max
+///   quantiles   2 * (x - q01) / range - 1               (x + 1) * range / 2 + q01              q01, q99
+///   quantile10  2 * (x - q10) / range - 1               (x + 1) * range / 2 + q10              q10, q90
+///   identity    x                                       x
+///
+/// A range (high - low) of exactly 0 is replaced by eps; mean_std un-normalizes without eps, though it normalizes with
+/// it. Source: lerobot processor/normalize_processor.py _apply_transform.
+class Normalizer {
+ public:
+  enum class Direction { normalize, unnormalize };
+
+  /// Reads the statistics `<stats>.mean`, ... of `width` columns. `where` is the recipe's place. Errors: bad_bundle,
+  /// also where a number that normalizes would be divided by zero.
+  static Result<Normalizer> create(const Bundle& bundle, const NormalizeOp& op, Direction direction, int width,
+                                   const std::string& where);
+  /// The same with the two statistics given, of equal length.
+  Normalizer(NormKind kind, Direction direction, float eps, std::vector<float> low, std::vector<float> high);
+
+  /// In place; as many values as columns.
+  void apply(std::span<float> values) const;
+
+ private:
+  float normalized(float x, std::size_t column) const;
+  float unnormalized(float x, std::size_t column) const;
+  Status check_divisors(const NormalizeOp& op) const;
+
+  NormKind kind_;
+  Direction direction_;
+  std::vector<float> low_;      // mean, min or lower quantile
+  std::vector<float> factor_;   // std, or the range
+  std::vector<float> divisor_;  // std + eps, or the range
+};
+
+}  // namespace vla

@@ -1,0 +1,85 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Every golden case end to end, block by block, against what the reference computed (python/vla_cpp/convert/golden.py).
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+#include "support/golden_case.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+// Both sides compute in float32 and differ in the order of their sums only: a few parts in 10^7 for each block, growing
+// with depth. A tenth of the bar that a released bundle must meet leaves room for other machines' vector widths.
+constexpr double kTolerance = 1e-5;
+
+/// What the golden writer stores beside taps: the same chunk in PyTorch's bf16, and the vision ids.
+bool is_no_tap(const std::string& path) { return path == "chunk.bf16" || path.starts_with("position_ids"); }
+
+double max_difference(const std::vector<float>& a, const std::vector<float>& b) {
+  double largest = 0;
+  REQUIRE(a.size() == b.size());
+  for (std::size_t i = 0; i < a.size(); ++i) largest = std::max(largest, std::abs(double{a[i]} - b[i]));
+  return largest;
+}
+
+}  // namespace
+
+TEST_CASE("there are golden cases to check") { CHECK(golden_paths().size() >= 3); }
+
+TEST_CASE("every tap of every golden case, from pixels to actions, matches the reference") {
+  for (const std::string& path : golden_paths()) {
+    CAPTURE(path);
+    const GoldenCase golden = GoldenCase::read(path);
+    const auto chunk = load_engine(golden.bundle(), "*")->act(golden.observation, golden.noise);
+    REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
+    for (const Tap& expected : golden.expected()) {
+      if (is_no_tap(expected.path)) continue;
+      const auto difference = compare_taps({expected}, {find_tap(chunk->taps, expected.path)}).front();
+      CAPTURE(expected.path);
+      CAPTURE(difference.relative);
+      CHECK(difference.within(kTolerance));
+    }
+  }
+}
+
+TEST_CASE("with the same bf16 weights the chunk is nearer to the float32 reference than PyTorch's bf16 is") {
+  for (const std::string& path : golden_paths()) {
+    CAPTURE(path);
+    const GoldenCase golden = GoldenCase::read(path);
+    const auto expected = golden.expected();
+    const auto chunk = load_engine(golden.bundle(), "chunk")->act(golden.observation, golden.noise);
+    REQUIRE(chunk.ok());
+    const std::vector<float>& reference = find_tap(expected, "chunk").values;
+    const double ours = max_difference(find_tap(chunk->taps, "chunk").values, reference);
+    CHECK(ours <= max_difference(find_tap(expected, "chunk.bf16").values, reference));
+  }
+}
+
+TEST_CASE("taps do not change the answer, and without a pattern nothing is recorded") {
+  const GoldenCase golden = GoldenCase::read(golden_paths().front());
+  const auto plain = load_engine(golden.bundle())->act(golden.observation, golden.noise);
+  const auto tapped = load_engine(golden.bundle(), "*")->act(golden.observation, golden.noise);
+  REQUIRE(plain.ok());
+  REQUIRE(tapped.ok());
+  CHECK(plain->taps.empty());
+  CHECK(max_difference(plain->actions, tapped->actions) <= 1e-5);
+}
+
+TEST_CASE("a second request, and one after a request of another shape, give the same bytes as the first") {
+  for (const std::string& path : golden_paths()) {
+    CAPTURE(path);
+    const GoldenCase golden = GoldenCase::read(path);
+    const auto engine = load_engine(golden.bundle());
+    const auto first = engine->act(golden.observation, golden.noise);
+    REQUIRE(first.ok());
+    Observation shorter = golden.observation;
+    shorter.text = "go";
+    REQUIRE(engine->act(shorter, golden.noise).ok());
+    CHECK(engine->act(golden.observation, golden.noise)->actions == first->actions);
+  }
+}

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Writes src/processor/unicode_classes.inc: the character classes of the reference tokenizer, found by asking it.
+
+    python tests/reference/make_unicode_classes.py src/processor/unicode_classes.inc
+
+Needs the Hugging Face `tokenizers` package, the release that the lab environment pins.  Every code point is put through the
+three engines that look at characters (the regular expression of ByteLevel, Digits, and the word and space tests of
+added tokens), and what each did with it is recorded.  Code points are not read from Python's own Unicode tables, whose
+version is another.
+"""
+
+import sys
+
+import tokenizers
+from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
+
+LETTER, NUMBER, SPACE, DIGIT, WORD = 1, 2, 4, 8, 16
+CODE_POINTS = [c for c in range(0x110000) if not 0xD800 <= c <= 0xDFFF]
+
+
+def added_token_tokenizer(**options) -> Tokenizer:
+    tokenizer = Tokenizer(models.BPE(vocab={"a": 0}, merges=[], unk_token=None))
+    tokenizer.add_tokens([AddedToken("qz", normalized=False, **options)])
+    return tokenizer
+
+
+def classify() -> list[int]:
+    flags = [0] * 0x110000
+    pieces = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=True)
+    digits = pre_tokenizers.Digits(individual_digits=True)
+    for c in CODE_POINTS:
+        joins = [len(pieces.pre_tokenize_str(head + chr(c))) == 1 for head in "a1!\t"]
+        # Each class of the expression is closed under concatenation with itself and with no other.
+        assert sum(joins) == 1, (hex(c), joins)
+        flags[c] |= (LETTER, NUMBER, 0, SPACE)[joins.index(True)]
+        if len(digits.pre_tokenize_str("a" + chr(c))) == 2:
+            flags[c] |= DIGIT
+    word, strip = added_token_tokenizer(single_word=True), added_token_tokenizer(rstrip=True)
+    for start in range(0, len(CODE_POINTS), 65536):
+        block = CODE_POINTS[start : start + 65536]
+        for c, encoding in zip(block, word.encode_batch(["qz" + chr(c) for c in block])):
+            if 1 not in encoding.ids:  # the added token is not alone, so its neighbour is a word character
+                flags[c] |= WORD
+        for c, encoding in zip(block, strip.encode_batch(["qz" + chr(c) for c in block])):
+            # Two engines test for white space; one class serves both as long as they agree.
+            assert (encoding.offsets[0][1] == 3) == bool(flags[c] & SPACE), hex(c)
+    return flags
+
+
+def main() -> None:
+    flags = classify()
+    runs = [(c, flags[c]) for c in range(0x110000) if c == 0 or flags[c] != flags[c - 1]]
+    cells = [f"{{0x{c:x}, {f}}}," for c, f in runs]
+    lines = []
+    for cell in cells:
+        if not lines or len(lines[-1]) + len(cell) + 1 > 118:
+            lines.append(cell)
+        else:
+            lines[-1] += " " + cell
+    with open(sys.argv[1], "w") as out:
+        out.write("// SPDX-FileCopyrightText: The vla.cpp authors\n// SPDX-License-Identifier: Apache-2.0\n")
+        out.write("// Written by tests/reference/make_unicode_classes.py from tokenizers ")
+        out.write(f"{tokenizers.__version__}: first code point of a run, classes.\n// clang-format off\n")
+        out.write("\n".join(lines) + "\n")
+    print(f"{len(runs)} runs")
+
+
+main()

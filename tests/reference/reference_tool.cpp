@@ -1,0 +1,82 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The processor's pure functions behind a pipe, for the comparison scripts of this folder.
+//   reference_tool tokenize KEYS.json      stdin: u32 length, text, ...         stdout: u32 count, i32 ids, ...
+//   reference_tool image WIDTH HEIGHT      stdin: u32 length, image file, ...   stdout: u32 count, f32 pixels, ...
+// KEYS.json holds the tokenizer.* keys of a bundle as one JSON object. An input that is refused gives count 0 and a
+// line on stderr.
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <fstream>
+#include <iterator>
+#include <nlohmann/json.hpp>
+
+#include "processor/image.h"
+#include "processor/letterbox.h"
+#include "processor/tokenizer.h"
+
+namespace {
+
+bool read_item(std::string& item) {
+  std::uint32_t size = 0;
+  if (std::fread(&size, sizeof size, 1, stdin) != 1) return false;
+  item.resize(size);
+  return std::fread(item.data(), 1, size, stdin) == size;
+}
+
+template <class T>
+void write_items(const std::vector<T>& items) {
+  const auto count = static_cast<std::uint32_t>(items.size());
+  std::fwrite(&count, sizeof count, 1, stdout);
+  std::fwrite(items.data(), sizeof(T), items.size(), stdout);
+  std::fflush(stdout);
+}
+
+vla::Keys read_keys(const char* path) {
+  std::ifstream file(path);
+  const auto object = nlohmann::json::parse(file, nullptr, false);
+  vla::Keys keys;
+  for (const auto& item : object.items()) {
+    if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
+    if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
+    if (item.value().is_array()) keys.set(item.key(), item.value().get<std::vector<std::string>>());
+  }
+  return keys;
+}
+
+int tokenize(const char* path) {
+  auto tokenizer = vla::Tokenizer::create(read_keys(path), 1 << 20);
+  if (!tokenizer) return std::fprintf(stderr, "%s\n", tokenizer.error().message().c_str()), 1;
+  std::string text;
+  while (read_item(text)) {
+    auto ids = tokenizer->encode(text);
+    if (!ids) std::fprintf(stderr, "%s\n", ids.error().message().c_str());
+    write_items(ids ? *ids : std::vector<std::int32_t>{});
+  }
+  return 0;
+}
+
+int image(int width, int height) {
+  std::string file;
+  while (read_item(file)) {
+    auto frame = vla::decode_image(std::as_bytes(std::span(file)), "stdin", {});
+    std::vector<float> pixels(static_cast<std::size_t>(3) * width * height);
+    vla::Status status = frame ? vla::letterbox(*frame, {width, height, 0.0f}, pixels, "stdin") : frame.error();
+    if (!status) std::fprintf(stderr, "%s\n", status.error().message().c_str());
+    if (!status) pixels.clear();
+    vla::affine(pixels, 2.0f, -1.0f);
+    write_items(pixels);
+  }
+  return 0;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  if (argc == 3 && std::strcmp(argv[1], "tokenize") == 0) return tokenize(argv[2]);
+  if (argc == 4 && std::strcmp(argv[1], "image") == 0) return image(std::atoi(argv[2]), std::atoi(argv[3]));
+  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT\n", stderr);
+  return 2;
+}

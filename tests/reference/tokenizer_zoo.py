@@ -1,0 +1,190 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Small tokenizers that between them use every setting the runtime knows, and strings that are hard to split.
+
+Both are deterministic.  The sentences are the authors' own.
+"""
+
+import random
+import sys
+import unicodedata
+
+from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers, trainers
+
+SENTENCES = """
+pick up the red cube and place it in the bowl
+Pick up the red cube, then place it in the bowl!
+open the top drawer 10 cm, close it after 3.5 s, don't drop the cup; it's hot, they'll say we've failed
+I'd move the robot's arm 45° left, you're right; I'm sure she's seen 1,234,567 cubes
+stack block_7 onto block-12 (x=0.25, y=-1e-3) <now>
+heb den roten Würfel auf und lege ihn in die Schüssel, größer als 20 Äpfel
+prends le cube rouge et pose-le dans le bol, s'il te plaît; c'est l'été à l'œuvre
+recoge el cubo rojo y ponlo en el cuenco, ¿mañana o el año próximo?
+pegue o cubo vermelho e coloque-o na tigela, não é difícil
+raccogli il cubo rosso e mettilo nella ciotola perché è già tardi
+возьми красный кубик и положи его в миску, ещё 5 раз
+взяти червоний кубик і покласти в миску, їжак і ґанок
+podnieś czerwoną kostkę i włóż ją do miski, żółć gęślą jaźń
+zvedni červenou kostku a polož ji do misky, příliš žluťoučký kůň
+kırmızı küpü al ve kaseye koy, İstanbul ılık ğüşçö
+σήκωσε τον κόκκινο κύβο και βάλε τον στο μπολ, ὦ ἄνδρες Ἀθηναῖοι
+拿起红色的方块放进碗里，然后关上第三个抽屉。
+赤い立方体を拾ってボウルに入れてください。コップは３つです。
+빨간 큐브를 집어서 그릇에 넣으세요, 그리고 서랍을 닫아요
+ยกลูกบาศก์สีแดงแล้ววางลงในชามเบอร์ ๑๒๓
+लाल घन उठाओ और कटोरे में रखो, संख्या १२३ है
+লাল ঘনকটি তুলে বাটিতে রাখুন, ৪৫ বার
+சிவப்பு கனசதுரத்தை எடுத்து கிண்ணத்தில் வை
+التقط المكعب الأحمر وضعه في الوعاء رقم ١٢٣
+הרם את הקובייה האדומה ושים אותה בקערה
+مکعب قرمز را بردار و در کاسه بگذار، شماره ۴۵۶
+nhặt khối lập phương màu đỏ và đặt vào bát, đừng đánh rơi
+angkat kubus merah dan letakkan di mangkuk
+chukua mchemraba mwekundu na uweke kwenye bakuli
+ቀዩን ኩብ አንስተህ በሳህኑ ውስጥ አስቀምጥ ፲፪
+აიღე წითელი კუბი და ჩადე თასში
+վերցրու կարմիր խորանարդը և դիր ամանի մեջ
+ხმა ⵣ ᚠᛇᚻ ꦲ ᐃᓄᒃ
+⅓ cup, ½ turn, ², Ⅷ, ①②, 〇, x₁ ← x₀ + Δt·v(xₜ, t) ∀ t ∈ [0, 1]
+emoji 🤖🦾 👩🏽‍🔬 🏳️‍🌈 👨‍👩‍👧‍👦 🇫🇷🇩🇪 ✋🏿 1️⃣ ☕️
+``code()`` { "key": [1, 2, null] } http://a.b/c?d=e&f=%20#g \\path\\to\\file $HOME ~/x
+""".strip().split("\n")
+SENTENCES.append("tabs\tand\t\ttabs  double  blanks   triple   end   \n\nnew lines\r\n\r\nand more\n")
+
+SPECIALS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<image>", "<fake_token_around_image>", "<global-img>"]
+
+
+def train(pre_tokenizer, vocab_size: int, specials: list, **model_options) -> Tokenizer:
+    tokenizer = Tokenizer(models.BPE(**model_options))
+    tokenizer.pre_tokenizer = pre_tokenizer
+    trainer = trainers.BpeTrainer(
+        vocab_size=vocab_size, special_tokens=specials, initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()), show_progress=False
+    )
+    tokenizer.train_from_iterator(SENTENCES * 3, trainer)
+    return tokenizer
+
+
+def smol() -> Tokenizer:
+    """The shape of SmolLM2's: single digits, no blank in front, special tokens inside and after the vocabulary."""
+    steps = [pre_tokenizers.Digits(individual_digits=True), pre_tokenizers.ByteLevel(add_prefix_space=False)]
+    tokenizer = train(pre_tokenizers.Sequence(steps), 700, SPECIALS[:3])
+    tokenizer.add_special_tokens([AddedToken(text, normalized=False, special=True) for text in SPECIALS[3:]])
+    return tokenizer
+
+
+def awkward() -> Tokenizer:
+    """Added tokens with every option, overlapping each other; digits in runs; a blank in front of every piece."""
+    steps = [pre_tokenizers.Digits(individual_digits=False), pre_tokenizers.ByteLevel(add_prefix_space=True)]
+    tokenizer = train(pre_tokenizers.Sequence(steps), 500, [])
+    tokenizer.add_tokens(
+        [
+            AddedToken("<l>", lstrip=True, normalized=False),
+            AddedToken("<r>", rstrip=True, normalized=False),
+            AddedToken("<lr>", lstrip=True, rstrip=True, normalized=True),
+            AddedToken("cube", single_word=True, normalized=False),
+            AddedToken("cube bowl", normalized=False),
+            AddedToken("bow", single_word=True, normalized=True),
+            AddedToken("ab", normalized=True),
+            AddedToken("abc", normalized=True),
+            AddedToken("bcd", normalized=True),
+            AddedToken(" <sp> ", normalized=False),
+            AddedToken("\n<nl>", rstrip=True, normalized=False),
+            AddedToken("größer", single_word=True, lstrip=True, normalized=True),
+            AddedToken("🤖", rstrip=True, normalized=False),
+            AddedToken("<<", normalized=False),
+            AddedToken("<", single_word=True, rstrip=True, normalized=True),
+        ]
+    )
+    return tokenizer
+
+
+def whole() -> Tokenizer:
+    """Whole words before merges, no digits step; some words can be reached in that way only."""
+    tokenizer = train(pre_tokenizers.ByteLevel(add_prefix_space=False), 600, SPECIALS[:1], ignore_merges=True)
+    return with_words(tokenizer, ["Ġrobot's", "Ġgripper", "12", "Ġ7", "ĠвÐ", "ĊĊĊ", "Ġ<|im_end|>", "!!!!"], ignore_merges=True)
+
+
+def with_words(tokenizer: Tokenizer, words: list[str], **model_options) -> Tokenizer:
+    import json
+
+    spec = json.loads(tokenizer.to_str())
+    for word in words:
+        spec["model"]["vocab"].setdefault(word, len(spec["model"]["vocab"]))
+    spec["model"].update(model_options)
+    return Tokenizer.from_str(json.dumps(spec))
+
+
+def tangled() -> Tokenizer:
+    """Random merges over few symbols: many ways to the same token at different ranks, one split for the whole text."""
+    rng = random.Random(7)
+    alphabet = sorted(pre_tokenizers.ByteLevel.alphabet())
+    vocab = {symbol: i for i, symbol in enumerate(alphabet)}
+    pool, merges = list("abcĠ1"), []
+    while len(merges) < 600:
+        left, right = rng.choice(pool), rng.choice(pool)
+        if len(left + right) > 9 or (left, right) in merges:
+            continue
+        merges.append((left, right))
+        if left + right not in vocab:
+            vocab[left + right] = len(vocab)
+            pool.append(left + right)
+    tokenizer = Tokenizer(models.BPE(vocab=vocab, merges=merges))
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)
+    return tokenizer
+
+
+ZOO = {"smol": smol, "awkward": awkward, "whole": whole, "tangled": tangled}
+
+SPACES = [c for c in map(chr, range(0x110000)) if c.isspace()] + list("\u200b\u200c\u200d\u2060\ufeff\u180e\u00ad")
+DIGITS = [c for c in map(chr, range(0x110000)) if unicodedata.category(c) in ("Nd", "Nl", "No")]
+MARKS = [c for c in map(chr, range(0x110000)) if unicodedata.category(c).startswith("M")]
+CONTRACTIONS = ["'s", "'t", "'re", "'ve", "'m", "'ll", "'d", "'S", "'LL", "'", "''s", "’s", "'sx", "'r", "'l"]
+EMOJI = ["🤖", "👩🏽‍🔬", "🏳️‍🌈", "🇫🇷", "1️⃣", "☕️", "\u200d", "\ufe0f", "🏽"]
+PLANES = [(0, 0x7F), (0x80, 0x24F), (0x250, 0x7FF), (0x800, 0xD7FF), (0xE000, 0xFFFF), (0x10000, 0x1FFFF), (0x20000, 0x10FFFF)]
+
+
+def any_char(rng: random.Random) -> str:
+    low, high = rng.choice(PLANES)
+    return chr(rng.randint(low, high))
+
+
+def fuzz_piece(rng: random.Random, added: list[str]) -> str:
+    kind = rng.randrange(14)
+    if kind == 0:
+        return any_char(rng)
+    if kind == 1:
+        return rng.choice(SPACES) * rng.choice([1, 1, 2, 3])
+    if kind == 2:
+        return "".join(rng.choice(DIGITS) for _ in range(rng.randint(1, 4)))
+    if kind == 3:
+        return rng.choice("aeiouszAEé가水") + "".join(rng.choice(MARKS) for _ in range(rng.randint(1, 3)))
+    if kind == 4:
+        return rng.choice(CONTRACTIONS)
+    if kind == 5:
+        return rng.choice(EMOJI)
+    if kind == 6 and added:
+        return rng.choice(added)
+    if kind == 7 and added:  # a token that is not quite there
+        token = rng.choice(added)
+        return token[: rng.randint(1, len(token))] + rng.choice(["", "x", " "])
+    if kind == 8:
+        return rng.choice("abc1 <>\n") * rng.choice([1, 2, 5, 17, 60])
+    if kind == 9:
+        return "".join(rng.choice("abc1 ") for _ in range(rng.randint(1, 30)))
+    sentence = rng.choice(SENTENCES)
+    start = rng.randrange(len(sentence))
+    return sentence[start : start + rng.randint(1, 25)]
+
+
+def fuzz_string(rng: random.Random, added: list[str]) -> str:
+    if rng.random() < 0.02:
+        return "".join(any_char(rng) for _ in range(rng.randint(1, 200)))
+    if rng.random() < 0.002:
+        return fuzz_piece(rng, added) * rng.randint(50, 500)
+    joint = rng.choice(["", "", " ", "\n"])
+    return joint.join(fuzz_piece(rng, added) for _ in range(rng.randint(1, 8)))
+
+
+if __name__ == "__main__":
+    for name, make in ZOO.items():
+        print(name, make().get_vocab_size(), file=sys.stderr)
