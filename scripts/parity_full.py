@@ -63,12 +63,12 @@ def run_torch(case, dtype, blocks, threads):
 
 
 def child(command):
-    """(standard output, peak resident bytes) of a program; its failure ends this one."""
+    """(standard output, peak resident bytes) of a program; CalledProcessError when it fails."""
     process = subprocess.Popen([str(c) for c in command], stdout=subprocess.PIPE, text=True)
     out = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
     if status:
-        raise SystemExit(f"{command[0]} failed; its command line: {' '.join(map(str, command))}")
+        raise subprocess.CalledProcessError(os.waitstatus_to_exitcode(status), [str(c) for c in command])
     return out, usage.ru_maxrss * 1024
 
 
