@@ -3,7 +3,7 @@
 """Closed loop: the policy drives the simulated robot on layouts it has never seen, and we count.
 
     python evaluate.py --checkpoint checkpoint --episodes 50 --out evaluation.json           # PyTorch
-    python evaluate.py --bundle policy.gguf --vla build/vla --episodes 50 --out evaluation_cpp.json   # the C++ runtime
+    python evaluate.py --bundle policy.gguf --vla vla --episodes 50 --out evaluation_cpp.json    # the C++ runtime
     python evaluate.py --expert --episodes 50 --swapped 0                                             # the scripted experts
 
 Each episode: look, predict 16 actions, execute 8, look again, until the task is solved or 150 steps are over.  Episode

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plays recorded robot episodes through the C++ runtime and compares every action chunk with PyTorch's.
 
-    python play.py --vla build/vla --bundle policy.gguf
-    python play.py --vla build/vla --bundle policy.gguf --task faucet-open --text "close the faucet"    # another sentence
+    python play.py --vla build/cpu/bin/vla
+    python play.py --vla build/cpu/bin/vla --task faucet-open --text "close the faucet"      # another sentence
 
 For each look at the scene it calls `vla run` with the picture, the robot's state, the sentence and the recorded noise,
 and shows the picture, the predicted actions, the scripted expert's, the time and the largest difference to the chunk that
@@ -48,7 +48,7 @@ def read_episode(folder: Path) -> Dict[str, Any]:
     return episode
 
 
-def answer(vla: str, bundle: str, episode: Dict[str, Any], i: int, text: str) -> Dict[str, Any]:
+def answer(vla: str, bundle: Path, episode: Dict[str, Any], i: int, text: str) -> Dict[str, Any]:
     """The runtime's answer to look i, with `difference` (to PyTorch's chunk) and `wall_ms` (of the whole process) added."""
     look = episode["looks"][i]
     begin = time.perf_counter()
@@ -65,9 +65,8 @@ def answer(vla: str, bundle: str, episode: Dict[str, Any], i: int, text: str) ->
 
 
 def compute_ms(got: Dict[str, Any]) -> float:
-    """Milliseconds of the prediction itself: `total` of timing_ms, or the sum of its parts."""
-    timing = got.get("timing_ms", {})
-    return float(timing["total"] if "total" in timing else sum(v for v in timing.values() if isinstance(v, (int, float))))
+    """Milliseconds from picture, state and sentence to the chunk: all stages but the loading of the bundle."""
+    return float(sum(v for stage, v in got["timing_ms"].items() if stage != "load"))
 
 
 # ---- the terminal --------------------------------------------------------------------------------------------------
@@ -252,7 +251,7 @@ def draw_episode(episode: Dict[str, Any], got: List[Dict[str, Any]], text: str, 
 
 def main() -> int:
     ap = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    ap.add_argument("--bundle", required=True, metavar="FILE", help="the policy, converted to a bundle")
+    ap.add_argument("--bundle", type=Path, default=HERE / "policy.gguf", metavar="FILE", help="the policy (default: policy.gguf beside this file)")
     ap.add_argument("--vla", default="vla", metavar="FILE", help="the runtime's binary (default: vla from the PATH)")
     ap.add_argument("--episodes", type=Path, default=HERE / "episodes", metavar="DIR", help="recorded by record.py (default: the ones beside this file)")
     ap.add_argument("--task", action="append", help="play only this episode; may be given again (default: all)")
@@ -263,8 +262,8 @@ def main() -> int:
     a = ap.parse_args()
 
     console = Console()
-    if not Path(a.bundle).exists():
-        raise SystemExit(f"no bundle at {a.bundle}. Convert the checkpoint first; examples/metaworld/README.md says how.")
+    if not a.bundle.exists():
+        raise SystemExit(f"no bundle at {a.bundle}. README.md beside {Path(__file__).name} says how to make it.")
     found = sorted(p.parent.name for p in a.episodes.glob("*/episode.json"))
     tasks = a.task or found
     if not found or not set(tasks) <= set(found):

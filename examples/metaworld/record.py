@@ -25,7 +25,7 @@ import reference  # before lerobot
 import numpy as np
 from PIL import Image
 
-from sim import ACTION_NAMES, CAMERA, EXECUTE, HORIZON, LIMIT, STATE_NAMES, TASKS, UNSEEN, Scene, noise
+from sim import ACTION_NAMES, CAMERA, EXECUTE, HORIZON, LIMIT, RATE_HZ, STATE_NAMES, TASKS, UNSEEN, Scene, noise
 
 FIRST = UNSEEN + 10000  # evaluate.py counts on the seeds below
 
@@ -93,7 +93,7 @@ def main() -> int:
         np.save(folder / "expert.npy", np.stack([take_over(scene, seed, run["executed"][: look["step"]]) for look in run["looks"]]))
         (folder / "episode.json").write_text(json.dumps({
             "task": task, "sentence": TASKS[task], "camera": CAMERA, "seed": seed, "seeds_not_solved": missed,
-            "solved_after_steps": len(run["executed"]), "execute": EXECUTE, "horizon": HORIZON, "ms_per_step": 12.5,
+            "solved_after_steps": len(run["executed"]), "execute": EXECUTE, "horizon": HORIZON, "ms_per_step": 1e3 / RATE_HZ,
             "state_names": STATE_NAMES, "action_names": ACTION_NAMES,
             "looks": [{"step": look["step"], "frame": f"step_{i:02d}.png", "noise": f"step_{i:02d}_noise.npy",
                        "state": [float(format(float(x), ".9g")) for x in look["state"]]} for i, look in enumerate(run["looks"])],

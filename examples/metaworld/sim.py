@@ -28,6 +28,7 @@ SIZE = 128  # pixels, both ways
 LIMIT = 150  # steps after which an episode counts as failed
 HORIZON, EXECUTE = 16, 8  # steps in a chunk, and how many of them are executed before the next look
 CAMERA = "corner4"
+RATE_HZ = 80  # control steps per second
 UNSEEN = 900000  # seeds from here on are never used for training
 STATE_NAMES = ["hand_x", "hand_y", "hand_z", "gripper"]
 ACTION_NAMES = ["dx", "dy", "dz", "gripper"]

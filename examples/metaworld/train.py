@@ -9,8 +9,8 @@ Nothing is pretrained: the weights start random and the tokenizer is trained on 
 warms up, then follows a cosine to 0, which it reaches when the steps or the minutes are used up, whichever is first.
 An interrupted training continues where it stopped (its state is in OUT/state.pt) when the same command is run again.
 
-OUT holds what a published checkpoint holds (config.json, model.safetensors, the two processors), and vlm/ holds what a
-hub keeps in the repository of the backbone (its config and tokenizer).  Every parameter is rounded to a value that
+OUT holds what a published checkpoint holds (config.json, model.safetensors, the two processors), vlm/ what a hub keeps in
+the repository of the backbone (its config and tokenizer), meta/ the names of state and action numbers.  Every parameter is rounded to a value that
 bfloat16 can represent and stored as float32: a bfloat16 copy of the file then holds exactly the same numbers, and
 differences between runtimes come from their arithmetic alone.
 """
@@ -26,7 +26,7 @@ import reference  # before lerobot
 import numpy as np
 import torch
 
-from sim import CAMERA, EXECUTE, HORIZON, SIZE, TASKS
+from sim import ACTION_NAMES, CAMERA, EXECUTE, HORIZON, RATE_HZ, SIZE, STATE_NAMES, TASKS
 
 FLOW_STEPS = 10  # Euler steps from noise to chunk
 VOCABULARY = 384  # 256 bytes, the special tokens and merges learned from the sentences
@@ -109,6 +109,14 @@ def save(policy: Any, before: Any, after: Any, out: Path) -> None:
     for part in (policy, before, after):
         part.save_pretrained(out)
     policy.config.vlm_model_name = steps[0].tokenizer_name = local
+
+
+def describe(out: Path) -> None:
+    """meta/info.json as a LeRobot data set has it: the names of the numbers and the control rate, for the converter."""
+    features = {"observation.state": STATE_NAMES, "action": ACTION_NAMES}
+    info = {"fps": RATE_HZ, "features": {k: {"dtype": "float32", "shape": [len(names)], "names": names} for k, names in features.items()}}
+    (out / "meta").mkdir(exist_ok=True)
+    (out / "meta" / "info.json").write_text(json.dumps(info, indent=1) + "\n")
 
 
 def read_demonstrations(folder: Path) -> Tuple[Dict[str, torch.Tensor], List[str]]:
@@ -225,6 +233,7 @@ def main() -> int:
                 keep()
     keep()
     save(policy, before, after, a.out)
+    describe(a.out)
     curve = [sum(losses[i : i + 100]) / len(losses[i : i + 100]) for i in range(0, len(losses), 100)]
     summary = {"steps": step, "minutes": round(spent / 60, 2), "batch": a.batch, "frames": len(sentences), "parameters": size,
                "loss_per_100_steps": [round(x, 4) for x in curve]}

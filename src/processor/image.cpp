@@ -3,6 +3,7 @@
 #include "processor/image.h"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include "base/npy.h"
 #include "processor/image_codecs.h"

@@ -112,10 +112,11 @@ Result<Picture> decode_jpeg(Bytes file, const std::string& where, const ImageLim
   if (reader.jpeg.num_components != 1 && reader.jpeg.num_components != 3)
     return refused(where, "a grey or RGB JPEG",
                    reader.jpeg.num_components == 4 ? "a CMYK one" : "another number of channels", "convert it to RGB");
+  Picture picture{static_cast<int>(width), static_cast<int>(height), {}, {}, {}};
+  read_metadata(reader, picture);  // now, because finishing frees the markers
   reader.pixels.resize(static_cast<std::size_t>(width * height) * 3);
   if (!guarded_pixels(reader)) return corrupt(reader, where);
-  Picture picture{static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, {}};
-  read_metadata(reader, picture);
+  picture.rgb = std::move(reader.pixels);
   return picture;
 }
 

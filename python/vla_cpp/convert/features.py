@@ -7,7 +7,7 @@ from typing import Dict, List, Optional
 
 from .bundle import Key
 from .errors import Problems
-from .files import read_json
+from .files import member, read_json
 from .recipe import ACTION, STATE
 
 
@@ -27,7 +27,7 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
 
 def _names(info: dict, path: str, feature: str, dim: int, notes: List[str], problems: Problems) -> List[str]:
     generated = ["{}.{}".format(feature.rsplit(".", 1)[-1], i) for i in range(dim)]
-    stated = _stated_names((info.get("features") or {}).get(feature))
+    stated = _stated_names(member(info, "features", dict, path).get(feature))
     if stated is None:
         if path:
             notes.append("{}: no names for {}, so they are generated".format(path, feature))

@@ -36,6 +36,19 @@ def read_json(path: str) -> dict:
     return value
 
 
+KINDS = {dict: "a JSON object", list: "a list", str: "a string"}
+
+
+def member(value: dict, key: str, kind: type, where: str):
+    """A member of a JSON object that is an object, a list or a string; an absent one is empty. Errors: bad_bundle."""
+    found = value.get(key)
+    if found is None:
+        return kind()
+    if not isinstance(found, kind):
+        raise refuse("{}: {}".format(where, key), KINDS[kind], repr(found)[:80])
+    return found
+
+
 def plain_name(name) -> bool:
     """Whether a file name that a checkpoint states stays inside the checkpoint's folder."""
     return isinstance(name, str) and bool(name) and name not in (".", "..") and not set(name) & set("/\\\0")

@@ -14,13 +14,14 @@ import numpy as np
 
 from .checkpoint import Checkpoint, read_statistic
 from .errors import Problems
-from .files import plain_name
+from .files import member, plain_name
 from .safetensors_file import read_safetensors
 
 STATE, ACTION = "observation.state", "action"
 # Normalization mode -> the recipe's kind and the statistics that its formula reads.
 MODES = {"IDENTITY": ("identity", ()), "MEAN_STD": ("mean_std", ("mean", "std")), "MIN_MAX": ("min_max", ("min", "max")),
          "QUANTILES": ("quantiles", ("q01", "q99")), "QUANTILE10": ("quantile10", ("q10", "q90"))}
+MAX_TOKENS = 1 << 16  # far above any instruction
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 
 # Fields of each step that this converter knows. A tuple of values: only these leave the numbers as the recipe has them.
@@ -126,24 +127,25 @@ class _Reader:
         self.result.newline = True
 
     def _tokenizer(self, where: str, config: dict, step: dict) -> None:
-        length = config.get("max_length", 512)
-        if not isinstance(length, int) or isinstance(length, bool) or length < 1:
-            self.problems.add(where + ": max_length", "a count of tokens", repr(length))
-            return
-        self.result.max_tokens = length
-        folder = (step.get("artifacts") or {}).get("tokenizer_name", "")
+        self.result.max_tokens = self.token_count(where + ": max_length", config.get("max_length", 512))
+        folder = member(step, "artifacts", dict, where).get("tokenizer_name", "")
         if folder and not plain_name(folder):
             self.problems.add(where + ": artifacts", "a folder inside the checkpoint", repr(folder))
         elif folder:
             self.result.own_tokenizer = folder
 
+    def token_count(self, where: str, length) -> int:
+        if isinstance(length, int) and not isinstance(length, bool) and 0 < length <= MAX_TOKENS:
+            return length
+        self.problems.add(where, "a count of tokens from 1 to {}".format(MAX_TOKENS), repr(length))
+        return 1
+
     def _normalizer(self, where: str, config: dict, step: dict) -> None:
-        keys = config.get("normalize_observation_keys")
-        if keys is not None and STATE not in keys:
+        keys = member(config, "normalize_observation_keys", list, where)
+        if keys and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
-        features = config.get("features", {})
-        stated = features.get(STATE, {}) if isinstance(features, dict) else {}
-        if list(stated.get("shape", [])) != [self.dims[STATE]] or stated.get("type") != "STATE":
+        stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
+        if stated.get("shape") != [self.dims[STATE]] or stated.get("type") != "STATE":
             self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(self.dims[STATE]), str(stated)[:80])
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
 
@@ -151,12 +153,13 @@ class _Reader:
         self.result.action = self.normalization(where, config, step, ACTION, "ACTION")
 
     def normalization(self, where: str, config: dict, step: dict, feature: str, kind: str) -> Normalization:
-        modes = config.get("norm_map", {})
+        modes = member(config, "norm_map", dict, where)
         if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
             self.problems.unsupported(where + ": norm_map.VISUAL", "IDENTITY", str(modes["VISUAL"]), "the recipe does not normalise pixels by statistics")
-        stated = self.checkpoint.config.get("normalization_mapping", {}).get(kind, modes.get(kind))
-        if stated != modes.get(kind):
-            self.problems.add("{}: norm_map.{}".format(where, kind), "{} as in config.json".format(stated), str(modes.get(kind)))
+        stated = member(self.checkpoint.config, "normalization_mapping", dict, "config.json")
+        for key in (kind, "VISUAL"):
+            if stated.get(key, modes.get(key)) != modes.get(key):
+                self.problems.add("{}: norm_map.{}".format(where, key), "{} as in config.json".format(stated[key]), str(modes.get(key)))
         state_file = step.get("state_file")
         found: Dict[str, np.ndarray] = {}
         if state_file is not None:
@@ -183,7 +186,7 @@ class _Reader:
 def choose(feature: str, mode: str, eps: float, found: Dict[str, np.ndarray], reader: "_Reader") -> Normalization:
     """The normalization of one feature with its statistics checked, or the identity that was asked for."""
     problems, dim = reader.problems, reader.dims[feature]
-    if mode not in MODES:
+    if not isinstance(mode, str) or mode not in MODES:
         problems.unsupported("normalization of " + feature, " or ".join(MODES), str(mode))
         return Normalization()
     kind, names = MODES[mode]
@@ -235,11 +238,11 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
     """Reference: lerobot processor/migrate_policy_normalization.py, which builds today's pipelines for such checkpoints."""
     checkpoint.notes.append("no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them")
     config = checkpoint.config
-    modes = config.get("normalization_mapping", {})
+    modes = member(config, "normalization_mapping", dict, "config.json")
     if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
         reader.problems.unsupported("config.json: normalization_mapping.VISUAL", "IDENTITY", str(modes["VISUAL"]))
     reader.known = sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics})
-    result = Processors(newline=True, max_tokens=config.get("tokenizer_max_length", 48))
+    result = Processors(newline=True, max_tokens=reader.token_count("config.json: tokenizer_max_length", config.get("tokenizer_max_length", 48)))
     for feature, kind, attribute in ((STATE, "STATE", "state"), (ACTION, "ACTION", "action")):
         found = _old_statistics(checkpoint, feature, reader.problems)
         setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader))
@@ -261,9 +264,9 @@ def _old_statistics(checkpoint: Checkpoint, feature: str, problems: Problems) ->
     return found
 
 
-def text_ops(processors: Processors) -> List[dict]:
+def text_ops(processors: Processors, truncate: str) -> List[dict]:
     newline = [{"op": "ensure_suffix", "suffix": "\n"}] if processors.newline else []
-    return newline + [{"op": "tokenize", "max_tokens": processors.max_tokens, "truncate": "right"}]
+    return newline + [{"op": "tokenize", "max_tokens": processors.max_tokens, "truncate": truncate}]
 
 
 def view_aliases(views: Sequence[str], processors: Processors, notes: List[str], problems: Problems) -> List[str]:

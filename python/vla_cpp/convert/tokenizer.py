@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Dict, List, Optional, Tuple
+from typing import Dict, List, NamedTuple, Optional, Tuple
 
 from .errors import Code, Problems, refuse
-from .files import read_json
+from .files import member, read_json
 
 JSON_FILE, CONFIG_FILE = "tokenizer.json", "tokenizer_config.json"
 GENERIC = ("TokenizersBackend", "PreTrainedTokenizerFast", "PreTrainedTokenizer")
@@ -29,8 +29,13 @@ def byte_symbols() -> List[str]:
     return [chr(moved.get(byte, byte)) for byte in range(256)]
 
 
-def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> Dict[str, object]:
-    """The bundle's `tokenizer.*` keys. `n_vocab`: rows of the embedding table, which no id may reach."""
+class TokenizerPlan(NamedTuple):
+    keys: Dict[str, object]  # the bundle's `tokenizer.*`
+    truncate: str  # the side on which a text that is too long loses tokens: left or right
+
+
+def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> TokenizerPlan:
+    """`n_vocab`: rows of the embedding table, which no id may reach."""
     if not os.path.exists(os.path.join(folder, JSON_FILE)):
         raise refuse(os.path.join(folder, JSON_FILE), "the tokenizer in one file", "none", "load it with transformers and save it again, or give its folder by --backbone", Code.IO)
     spec = read_json(os.path.join(folder, JSON_FILE))
@@ -39,7 +44,7 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
     gpt2 = config.get("tokenizer_class") in GPT2
     if gpt2:  # the class's own defaults, which it adds to the vocabulary like stated ones
         config = dict({key: "<|endoftext|>" for key in ("unk_token", "bos_token", "eos_token")}, **config)
-    model = spec.get("model") if isinstance(spec.get("model"), dict) else {}
+    model = member(spec, "model", dict, JSON_FILE)
     _check_model(model, problems)
     _check_surroundings(spec, config, problems)
     added = _added_tokens(spec, problems)
@@ -52,8 +57,19 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
                 CONFIG_FILE, config["tokenizer_class"], JSON_FILE))
         pre = own
     tokens, merges = _vocabulary(model, added, n_vocab, problems)
-    return {"tokenizer.kind": "byte_level_bpe", "tokenizer.tokens": tokens, "tokenizer.merges": merges,
+    keys = {"tokenizer.kind": "byte_level_bpe", "tokenizer.tokens": tokens, "tokenizer.merges": merges,
             "tokenizer.pre": _json(pre), "tokenizer.added": _json(added), "tokenizer.ignore_merges": bool(model.get("ignore_merges", False)) and not gpt2}
+    return TokenizerPlan(keys, _truncation_side(spec, config, problems))
+
+
+def _truncation_side(spec: dict, config: dict, problems: Problems) -> str:
+    """LeRobot's tokenizer step does not state a side, so the tokenizer's own holds: that of its config, else that of its file
+    (transformers tokenization_utils_tokenizers.py). The published SmolVLM2 tokenizer says left."""
+    stated = member(spec, "truncation", dict, JSON_FILE).get("direction")
+    side = config.get("truncation_side", "right" if stated is None else str(stated).lower())
+    if side not in ("left", "right"):
+        problems.unsupported(CONFIG_FILE + ": truncation_side", "'left' or 'right'", repr(side))
+    return side
 
 
 def _json(value) -> str:
@@ -75,14 +91,11 @@ def _check_surroundings(spec: dict, config: dict, problems: Problems) -> None:
         problems.unsupported(JSON_FILE + ": normalizer", "none", _json(normalizer)[:80], "the runtime does not normalise text")
     if not _adds_nothing(spec.get("post_processor")):
         problems.unsupported(JSON_FILE + ": post_processor", "none, ByteLevel, or a template of the text alone", _json(spec["post_processor"])[:80])
-    truncation = spec.get("truncation") or {}
-    if truncation.get("direction", "Right") != "Right":
-        problems.unsupported(JSON_FILE + ": truncation.direction", "Right", str(truncation["direction"]))
     name = config.get("tokenizer_class")
     if name is not None and name not in GENERIC + GPT2:
         problems.unsupported(CONFIG_FILE + ": tokenizer_class", " or ".join(GENERIC + GPT2), str(name),
                              "other classes build a tokenizer of their own around the same file")
-    for key, value in (("truncation_side", "right"), ("split_special_tokens", False), ("add_bos_token", False), ("add_eos_token", False)):
+    for key, value in (("split_special_tokens", False), ("add_bos_token", False), ("add_eos_token", False)):
         if config.get(key, value) not in (value, None):
             problems.unsupported("{}: {}".format(CONFIG_FILE, key), repr(value), repr(config[key]))
 
@@ -93,15 +106,15 @@ def _adds_nothing(post) -> bool:
         return True
     kind = post.get("type") if isinstance(post, dict) else None
     if kind == "Sequence":
-        return all(_adds_nothing(part) for part in post.get("processors", [None]))
+        return all(_adds_nothing(part) for part in member(post, "processors", list, JSON_FILE))
     if kind == "TemplateProcessing":
         single = post.get("single")
-        return isinstance(single, list) and len(single) == 1 and single[0].get("Sequence", {}).get("id") == "A"
+        return single in ([{"Sequence": {"id": "A"}}], [{"Sequence": {"id": "A", "type_id": 0}}])
     return kind == "ByteLevel"
 
 
 def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
-    parts = pre.get("pretokenizers", []) if isinstance(pre, dict) and pre.get("type") == "Sequence" else [pre]
+    parts = member(pre, "pretokenizers", list, JSON_FILE) if isinstance(pre, dict) and pre.get("type") == "Sequence" else [pre]
     steps = []
     for part in parts:
         kind = part.get("type") if isinstance(part, dict) else None
@@ -119,7 +132,7 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
 
 def _added_tokens(spec: dict, problems: Problems) -> List[dict]:
     added = []
-    for token in spec.get("added_tokens") or []:
+    for token in member(spec, "added_tokens", list, JSON_FILE):
         content, number = (token.get("content"), token.get("id")) if isinstance(token, dict) else (None, None)
         if not isinstance(content, str) or not content or not isinstance(number, int) or isinstance(number, bool):
             problems.add(JSON_FILE + ": added_tokens", "tokens with id and content", _json(token)[:80])
@@ -139,13 +152,14 @@ def _check_config_tokens(config: dict, added: List[dict], problems: Problems) ->
         value = config.get(key)
         values = list(value.values()) if isinstance(value, dict) and "content" not in value else value if isinstance(value, list) else [value]
         for token in (_content(v) for v in values if v is not None):
-            if token not in by_content:
+            if not isinstance(token, str) or token not in by_content:
                 problems.add("{}: {}".format(CONFIG_FILE, key), "a token among the added tokens of " + JSON_FILE, repr(token),
                              "load the tokenizer with transformers and save it again")
-    for number, token in (config.get("added_tokens_decoder") or {}).items():
-        own = by_content.get(_content(token))
-        stated = {"id": int(number), **{flag: bool(token.get(flag, False)) for flag in FLAGS}}
-        if own is None or any(own[key] != value for key, value in stated.items()):
+    for number, token in member(config, "added_tokens_decoder", dict, CONFIG_FILE).items():
+        content = _content(token)
+        own = by_content.get(content) if isinstance(content, str) else None
+        stated = {flag: bool(token.get(flag, False)) for flag in FLAGS} if isinstance(token, dict) else {}
+        if own is None or str(own["id"]) != number or any(own[flag] != value for flag, value in stated.items()):
             problems.add("{}: added_tokens_decoder.{}".format(CONFIG_FILE, number), "the token as {} has it".format(JSON_FILE), _json(token)[:120],
                          "load the tokenizer with transformers and save it again")
 

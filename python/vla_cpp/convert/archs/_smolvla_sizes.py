@@ -12,13 +12,13 @@ from typing import Dict, List, Sequence, Tuple
 
 from ..checkpoint import Checkpoint, find_backbone
 from ..errors import Problems
-from ..files import read_json
+from ..files import member, read_json
 from ..recipe import ACTION, STATE
 from . import Options
 
 BACKBONE = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 # SmolVLAConfig's keys that numbers depend on, with the defaults of the class.
-POLICY = {"chunk_size": 50, "max_state_dim": 32, "max_action_dim": 32, "resize_imgs_with_padding": [512, 512], "empty_cameras": 0, "num_steps": 10,
+POLICY = {"chunk_size": 50, "n_action_steps": 50, "max_state_dim": 32, "max_action_dim": 32, "resize_imgs_with_padding": [512, 512], "empty_cameras": 0, "num_steps": 10,
           "tokenizer_max_length": 48, "vlm_model_name": BACKBONE, "load_vlm_weights": False, "attention_mode": "cross_attn", "prefix_length": -1,
           "num_expert_layers": -1, "num_vlm_layers": 16, "self_attn_every_n_layers": 2, "expert_width_multiplier": 0.75, "min_period": 4e-3, "max_period": 4.0}
 # Keys whose other values ask for something that the runtime does not do.
@@ -26,7 +26,7 @@ FIXED = {"n_obs_steps": (1, "the reference reads one observation"), "adapt_to_pi
          "use_delta_joint_actions_aloha": (False, "the reference refuses it too"), "use_cache": (True, "the reference cannot take steps without its cache"),
          "add_image_special_tokens": (False, "the prefix would hold further tokens"), "use_peft": (False, "merge the adapter into the policy and save it again")}
 # Keys that no number of an action chunk depends on.
-IGNORED = {"type", "input_features", "output_features", "normalization_mapping", "rtc_config", "n_action_steps", "device", "use_amp", "push_to_hub", "repo_id", "private",
+IGNORED = {"type", "input_features", "output_features", "normalization_mapping", "rtc_config", "device", "use_amp", "push_to_hub", "repo_id", "private",
            "tags", "license", "pretrained_path", "pretrained_revision", "pad_language_to", "freeze_vision_encoder", "train_expert_only", "train_state_proj",
            "optimizer_lr", "optimizer_betas", "optimizer_eps", "optimizer_weight_decay", "optimizer_grad_clip_norm", "scheduler_warmup_steps",
            "scheduler_decay_steps", "scheduler_decay_lr", "compile_model", "compile_mode"}
@@ -38,6 +38,7 @@ TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, 
 # Bounds far above any policy, so that a hostile config cannot make the converter plan without end.
 MAX_SIZE, MAX_LAYERS, MAX_DIM, MAX_EMPTY = 1 << 24, 1024, 1 << 16, 64
 ANY_INT = -1 << 31
+NULLABLE = {"num_key_value_heads", "head_dim"}  # null means the default for these alone
 
 
 @dataclass
@@ -91,8 +92,9 @@ class _Section:
         add("{}: {}".format(self.where, key), expected, repr(self.get(key)) if found is None else found, hint)
 
     def get(self, key: str):
-        value = self.values.get(key)
-        return self.defaults.get(key) if value is None else value
+        if key in self.values and (self.values[key] is not None or key not in NULLABLE):
+            return self.values[key]
+        return self.defaults.get(key)
 
     def count(self, key: str, least: int = 1, most: int = MAX_SIZE) -> int:
         value = self.get(key)
@@ -109,7 +111,7 @@ class _Section:
         return 1.0
 
     def fixed(self, key: str, value, hint: str = "") -> None:
-        if self.values.get(key, value) not in (value, None):
+        if self.values.get(key, value) != value:
             self.bad(key, repr(value), hint=hint, unsupported=True)
 
 
@@ -119,8 +121,8 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     sizes = Sizes(backbone=find_backbone(checkpoint, options.backbone, policy.get("vlm_model_name")))
     config = read_json(os.path.join(sizes.backbone, "config.json"))
     where = "backbone config.json"
-    vision = _Section(where + ": vision_config", config.get("vision_config") or {}, VISION, problems)
-    text = _Section(where + ": text_config", config.get("text_config") or {}, TEXT, problems)
+    vision = _Section(where + ": vision_config", member(config, "vision_config", dict, where), VISION, problems)
+    text = _Section(where + ": text_config", member(config, "text_config", dict, where), TEXT, problems)
     backbone = _Section(where, config, {"scale_factor": 2}, problems)
     backbone.fixed("model_type", "smolvlm", "--backbone needs the folder of the SmolVLM backbone")
     _read_features(policy, checkpoint, sizes)
@@ -181,10 +183,12 @@ def _read_policy(policy: _Section, s: Sizes) -> None:
         if real > padded:
             policy.bad(key, "at least the feature's width {}".format(real))
     s.horizon, s.n_step = policy.count("chunk_size"), policy.count("num_steps")
+    if policy.count("n_action_steps") > s.horizon:
+        policy.bad("n_action_steps", "at most chunk_size {}".format(s.horizon), hint="the reference refuses it too")
     s.min_period, s.max_period = policy.number("min_period"), policy.number("max_period")
     policy.count("prefix_length", ANY_INT)  # pads the prefix with masked tokens, which changes no number
     frame = policy.get("resize_imgs_with_padding")
-    if "resize_imgs_with_padding" in policy.values and policy.values["resize_imgs_with_padding"] is None:
+    if frame is None:
         policy.bad("resize_imgs_with_padding", "[width, height]", "null", "frames of any size would reach the tower", unsupported=True)
     elif not isinstance(frame, list) or len(frame) != 2 or not all(isinstance(n, int) and n > 0 for n in frame):
         policy.bad("resize_imgs_with_padding", "[width, height]")

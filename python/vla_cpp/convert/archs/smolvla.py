@@ -38,8 +38,8 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     keys += _feature_keys(checkpoint, options, sizes, processors, problems)
     tokenizer = read_tokenizer(_tokenizer_folder(checkpoint, options, sizes, processors), sizes.n_vocab, problems, checkpoint.notes)
     kinds = {"tokenizer.tokens": "string[]", "tokenizer.merges": "string[]", "tokenizer.ignore_merges": "bool"}
-    keys += [Key(name, kinds.get(name, "string"), value) for name, value in tokenizer.items()]
-    keys.append(Key("processor.recipe", "string", json.dumps(_recipe(sizes, processors), ensure_ascii=False)))
+    keys += [Key(name, kinds.get(name, "string"), value) for name, value in tokenizer.keys.items()]
+    keys.append(Key("processor.recipe", "string", json.dumps(_recipe(sizes, processors, tokenizer.truncate), ensure_ascii=False)))
     problems.raise_any()
     statistics = {"stats.{}.{}".format(feature, name): value
                   for feature, norm in ((recipe.STATE, processors.state), (recipe.ACTION, processors.action)) for name, value in norm.statistics.items()}
@@ -57,11 +57,11 @@ def _tokenizer_folder(checkpoint: Checkpoint, options: Options, sizes: Sizes, pr
     return checkpoint.path(own)
 
 
-def _recipe(s: Sizes, processors: recipe.Processors) -> Dict[str, List[dict]]:
+def _recipe(s: Sizes, processors: recipe.Processors, truncate: str) -> Dict[str, List[dict]]:
     width, height = s.frame
     letterbox = {"op": "letterbox", "width": width, "height": height, "filter": "bilinear", "antialias": False, "align": "bottom_right", "fill": 0.0}
     return {"image": [letterbox, {"op": "affine", "scale": 2.0, "shift": -1.0}],
-            "text": recipe.text_ops(processors),
+            "text": recipe.text_ops(processors, truncate),
             "state": [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}],
             "action": [{"op": "take", "size": s.action_dim}, *processors.action.op("unnormalize", recipe.ACTION)]}
 

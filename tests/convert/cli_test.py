@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command as a person or a script meets it: exit codes, streams, wording."""
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from vla_cpp.convert.cli import main
+
+PACKAGE = os.path.join(os.path.dirname(__file__), "..", "..", "python")
+
+
+def run(*args, **environment):
+    command = [sys.executable, "-m", "vla_cpp.convert.cli", *map(str, args)]
+    return subprocess.run(command, env={**os.environ, "PYTHONPATH": PACKAGE, **environment}, capture_output=True, text=True)
+
+
+def test_a_conversion_exits_with_zero_and_says_what_it_wrote_and_dropped(converter, tiny):
+    result = run(converter.save(tiny), "-o", converter.out)
+    assert result.returncode == 0 and result.stderr == ""
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("wrote " + converter.out + ": smolvla, ") and "{:,} bytes".format(os.path.getsize(converter.out)) in lines[0]
+    assert any("lm_head" in line and "dropped" in line for line in lines)
+
+
+def test_quiet_says_nothing(converter, tiny):
+    result = run(converter.save(tiny), "-o", converter.out, "--quiet")
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def test_a_refusal_goes_to_stderr_in_the_form_of_the_runtime(converter, tiny, capsys):
+    tiny.config["add_image_special_tokens"] = True
+    assert main([converter.save(tiny), "-o", converter.out]) == 6
+    streams = capsys.readouterr()
+    assert streams.out == ""
+    assert streams.err == "error: config.json: add_image_special_tokens: expected False, found True; the prefix would hold further tokens\n"
+
+
+@pytest.mark.parametrize("code, change", [(3, lambda t: t.tensors.pop("model.state_proj.bias")), (6, lambda t: t.config.update(use_cache=False))])
+def test_each_class_of_refusal_has_its_exit_code(converter, tiny, capsys, code, change):
+    change(tiny)
+    assert main([converter.save(tiny), "-o", converter.out]) == code
+
+
+def test_a_checkpoint_that_is_not_there_is_an_io_error(tmp_path, capsys):
+    assert main([str(tmp_path / "nothing"), "-o", str(tmp_path / "o.gguf")]) == 9
+    assert "expected a checkpoint folder or a hub id" in capsys.readouterr().err
+
+
+def test_a_hub_id_without_a_network_is_an_io_error_that_says_what_to_do(tmp_path):
+    result = run("nobody/nothing", "-o", tmp_path / "o.gguf", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
+    assert result.returncode == 9
+    assert result.stderr.startswith("error: nobody/nothing: expected a folder or a reachable hub repository")
+    assert "download it and give the folder" in result.stderr
+
+
+@pytest.mark.parametrize("args", [[], ["only"], ["a", "-o", "b", "--dtype", "int3"], ["a", "-o", "b", "--frobnicate"]])
+def test_wrong_arguments_are_a_usage_error(args, capsys):
+    with pytest.raises(SystemExit) as info:
+        main(args)
+    assert info.value.code == 2 and capsys.readouterr().err.startswith("error: arguments: ")
+
+
+def test_an_existing_file_is_overwritten_only_by_force(converter, tiny, capsys):
+    folder = converter.save(tiny)
+    open(converter.out, "w").write("precious")
+    assert main([folder, "-o", converter.out]) == 2
+    assert "--force overwrites it" in capsys.readouterr().err and open(converter.out).read() == "precious"
+    assert main([folder, "-o", converter.out, "--force"]) == 0
+    assert open(converter.out, "rb").read(4) == b"GGUF"
+
+
+def test_an_output_folder_that_is_missing_is_an_io_error(converter, tiny, tmp_path, capsys):
+    assert main([converter.save(tiny), "-o", str(tmp_path / "no" / "o.gguf")]) == 9
+
+
+def test_a_full_disk_is_an_io_error_that_leaves_nothing(converter, tiny, monkeypatch, capsys):
+    import vla_cpp.convert.bundle as bundle
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(bundle.os, "fsync", full)
+    assert main([converter.save(tiny), "-o", converter.out]) == 9
+    assert "found No space left on device" in capsys.readouterr().err
+    assert not os.path.exists(converter.out) and not os.path.exists(converter.out + ".part")
+
+
+def test_help_names_every_architecture_and_exit_code():
+    text = run("--help").stdout
+    for word in ("smolvla", "--backbone", "--identity-stats", "--position-precision", "load_vlm_weights", "exit codes"):
+        assert word in text
+
+
+def test_a_fault_of_the_converter_is_one_line_and_class_internal(converter, tiny, monkeypatch, capsys):
+    import vla_cpp.convert.conversion as conversion
+
+    def fault(*_):
+        raise KeyError("surprise")
+
+    monkeypatch.setattr(conversion, "_choose_dtype", fault)
+    assert main([converter.save(tiny), "-o", converter.out]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def mutate(rng, value, depth=0):
+    """One random change somewhere in a JSON value."""
+    if isinstance(value, dict) and value and rng.random() < 0.9:
+        key = list(value)[rng.integers(len(value))]
+        return {**value, key: mutate(rng, value[key], depth + 1)} if rng.random() < 0.85 else {k: v for k, v in value.items() if k != key}
+    if isinstance(value, list) and value and rng.random() < 0.8:
+        i = int(rng.integers(len(value)))
+        return value[:i] + [mutate(rng, value[i], depth + 1)] + value[i + 1:]
+    junk = [None, True, -1, 0, 3, 10**30, 1.5, 1e308, "", "x", "../..", [], [1], {}, {"a": 1}, [[]], ["a", 2], {"type": "STATE"}]
+    return junk[rng.integers(len(junk))]
+
+
+@pytest.mark.parametrize("file", ["config.json", "vlm/config.json", "vlm/tokenizer.json", "vlm/tokenizer_config.json", "policy_preprocessor.json", "policy_postprocessor.json"])
+def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny, capsys, file):
+    rng = np.random.default_rng(len(file))
+    converter.save(tiny)
+    path = converter.folder / file
+    good = json.loads(path.read_text())
+    codes = set()
+    for _ in range(40):
+        path.write_text(json.dumps(mutate(rng, good)))
+        codes.add(main([str(converter.folder), "-o", converter.out, "--force", "--quiet"]))
+        assert 1 not in codes, (capsys.readouterr().err, path.read_text()[:3000])
+    assert codes & {3, 6}

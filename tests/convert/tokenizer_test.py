@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tokenizer's keys: enough to rebuild it exactly, and nothing that the runtime does not implement."""
+import json
+
+import pytest
+from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
+from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
+
+from vla_cpp.convert import Code
+from vla_cpp.convert.tokenizer import byte_symbols
+
+STRINGS = ["pick up the top\n", "to top 12 top", "  1  a  ", "in in\u00e9 \u4e2d\u6587 \U0001f642", "<image>top<|end|> to", "it's 3.5\u00b2 \u0661\u0662", "\t\r\n \u00a0\u2003x", ""]
+
+
+def rebuilt(keys):
+    """The tokenizer that a reader of docs/bundle.md builds from the keys alone."""
+    tokens, added = keys["tokenizer.tokens"], json.loads(keys["tokenizer.added"])
+    # Added tokens above the model's own vocabulary are no tokens of the model.
+    own = {token["content"]: token["id"] for token in added}
+    vocab = {text: i for i, text in enumerate(tokens) if text not in own or own[text] == 0}
+    merges = [tuple(merge.split(" ")) for merge in keys["tokenizer.merges"]]
+    tokenizer = Tokenizer(models.BPE(vocab=vocab, merges=merges, ignore_merges=bool(keys["tokenizer.ignore_merges"])))
+    make = {"digits": lambda s: pre_tokenizers.Digits(individual_digits=s["individual"]),
+            "byte_level": lambda s: pre_tokenizers.ByteLevel(add_prefix_space=s["add_prefix_space"], use_regex=s["use_regex"])}
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence([make[step["type"]](step) for step in json.loads(keys["tokenizer.pre"])])
+    return tokenizer, added
+
+
+def ids(keys, text):
+    """Added tokens get their ids from the list, because a library numbers them anew."""
+    tokenizer, added = rebuilt(keys)
+    for token in added:
+        tokenizer.add_special_tokens([AddedToken(token["content"], special=True, normalized=False, lstrip=token["lstrip"], rstrip=token["rstrip"])])
+    number = {token["content"]: token["id"] for token in added}
+    encoding = tokenizer.encode(text, add_special_tokens=False)
+    return [number.get(piece, i) for piece, i in zip(encoding.tokens, encoding.ids)]
+
+
+def reference(tiny, text):
+    return Tokenizer.from_str(json.dumps(compacted(tiny.tokenizer))).encode(text, add_special_tokens=False)
+
+
+def compacted(spec):
+    """The library refuses added tokens above a gap in the ids, as written by trainers it accepts them: fill the gap."""
+    spec = json.loads(json.dumps(spec))
+    first = len(spec["model"]["vocab"])
+    last = spec["added_tokens"][-1]["id"]
+    for i in range(first, last):
+        spec["model"]["vocab"]["hole {}".format(i)] = i
+    return spec
+
+
+@pytest.mark.parametrize("pretokenizers", [
+    None,
+    {"type": "ByteLevel", "add_prefix_space": True, "trim_offsets": True, "use_regex": True},
+    {"type": "Sequence", "pretokenizers": [{"type": "Digits", "individual_digits": False}, {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True}]},
+    {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": False}])
+def test_a_tokenizer_rebuilt_from_the_keys_gives_the_same_ids(converter, tiny, pretokenizers):
+    if pretokenizers:
+        tiny.tokenizer["pre_tokenizer"] = pretokenizers
+    keys = converter.bundle(tiny).keys
+    for text in STRINGS:
+        assert ids(keys, text) == reference(tiny, text).ids, text
+
+
+def test_byte_symbols_are_those_of_the_library():
+    assert sorted(byte_symbols()) == sorted(pre_tokenizers.ByteLevel.alphabet()) and byte_symbols() == byte_alphabet()
+
+
+def test_merges_spelled_as_strings_and_as_pairs_give_the_same_bundle(converter, tiny):
+    converter.bundle(tiny)
+    first = open(converter.out, "rb").read()
+    tiny.tokenizer["model"]["merges"] = [" ".join(pair) for pair in tiny.tokenizer["model"]["merges"]]
+    converter.bundle(tiny)
+    assert open(converter.out, "rb").read() == first
+
+
+def test_holes_in_the_vocabulary_get_texts_that_no_text_can_become(converter, tiny):
+    tokens = converter.bundle(tiny).keys["tokenizer.tokens"]
+    last = tiny.tokenizer["added_tokens"][1]["id"]
+    assert len(tokens) == last + 1 and tokens[last] == SPECIAL[1]
+    assert tokens[last - 1] == "<no token {}>".format(last - 1)
+    assert len(set(tokens)) == len(tokens) and " " not in "".join(byte_symbols())
+
+
+def test_an_added_token_inside_the_vocabulary_is_listed_with_its_flags(converter, tiny):
+    added = json.loads(converter.bundle(tiny).keys["tokenizer.added"])
+    assert added[0] == {"id": 0, "content": SPECIAL[0], "single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
+
+
+def test_the_gpt2_class_brings_a_pre_tokenizer_of_its_own(converter, tiny):
+    tiny.tokenizer_config = {"tokenizer_class": "GPT2Tokenizer", **{key: SPECIAL[0] for key in ("unk_token", "bos_token", "eos_token")}}
+    keys = converter.bundle(tiny).keys
+    assert json.loads(keys["tokenizer.pre"]) == [{"type": "byte_level", "add_prefix_space": False, "use_regex": True}]
+    assert any("GPT2Tokenizer" in note for note in converter.summary.notes)
+
+
+@pytest.mark.parametrize("stated, in_file, side", [(None, None, "right"), ("left", None, "left"), (None, "Left", "left"), ("right", "Left", "right")])
+def test_a_long_text_is_cut_on_the_side_that_the_tokenizer_states(converter, tiny, stated, in_file, side):
+    """The config's side counts before the file's; taken from transformers by running it."""
+    if stated:
+        tiny.tokenizer_config["truncation_side"] = stated
+    if in_file:
+        tiny.tokenizer["truncation"] = {"direction": in_file, "max_length": 9, "strategy": "LongestFirst", "stride": 0}
+    recipe = json.loads(converter.bundle(tiny).keys["processor.recipe"])
+    assert recipe["text"][-1] == {"op": "tokenize", "max_tokens": 7, "truncate": side}
+
+
+def test_a_template_that_adds_nothing_is_accepted(converter, tiny):
+    tiny.tokenizer["post_processor"] = {"type": "TemplateProcessing", "single": [{"Sequence": {"id": "A", "type_id": 0}}], "pair": [], "special_tokens": {}}
+    assert converter.bundle(tiny).keys["tokenizer.kind"] == "byte_level_bpe"
+
+
+def model(**values):
+    return lambda t: t.tokenizer["model"].update(values)
+
+
+def spec(**values):
+    return lambda t: t.tokenizer.update(values)
+
+
+def settings(**values):
+    return lambda t: t.tokenizer_config.update(values)
+
+
+SEQUENCE = {"type": "Sequence", "pretokenizers": [{"type": "ByteLevel"}, {"type": "Digits"}]}
+BOS = [{"SpecialToken": {"id": "<|end|>", "type_id": 0}}, {"Sequence": {"id": "A", "type_id": 0}}]
+UNSUPPORTED, BAD = Code.UNSUPPORTED, Code.BAD_BUNDLE
+CASES = {
+    "model.type: expected 'BPE', found 'WordPiece'": (model(type="WordPiece"), UNSUPPORTED),
+    "model.dropout: expected None, found 0.1": (model(dropout=0.1), UNSUPPORTED),
+    "model.byte_fallback: expected False, found True": (model(byte_fallback=True), UNSUPPORTED),
+    "model.continuing_subword_prefix: expected None, found '##'": (model(continuing_subword_prefix="##"), UNSUPPORTED),
+    "model.end_of_word_suffix: expected None, found '</w>'": (model(end_of_word_suffix="</w>"), UNSUPPORTED),
+    "normalizer: expected none, found": (spec(normalizer={"type": "NFC"}), UNSUPPORTED),
+    "pre_tokenizer: expected Digits and ByteLevel, found {\"type\":\"Metaspace\"": (spec(pre_tokenizer={"type": "Metaspace"}), UNSUPPORTED),
+    "pre_tokenizer: expected Digits and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
+    "pre_tokenizer: expected ByteLevel once, as the last step": (spec(pre_tokenizer=SEQUENCE), UNSUPPORTED),
+    "post_processor: expected none, ByteLevel, or a template of the text alone": (spec(post_processor={"type": "TemplateProcessing", "single": BOS}), UNSUPPORTED),
+    "added_tokens: expected tokens with id and content": (spec(added_tokens=[{"id": "0", "content": "x"}]), BAD),
+    "tokenizer_class: expected TokenizersBackend or": (settings(tokenizer_class="LlamaTokenizer"), UNSUPPORTED),
+    "truncation_side: expected 'left' or 'right', found 'middle'": (settings(truncation_side="middle"), UNSUPPORTED),
+    "add_bos_token: expected False, found True": (settings(add_bos_token=True), UNSUPPORTED),
+    "split_special_tokens: expected False, found True": (settings(split_special_tokens=True), UNSUPPORTED),
+    "pad_token: expected a token among the added tokens of tokenizer.json, found '<pad>'": (settings(pad_token="<pad>"), BAD),
+    "bos_token: expected a token among": (settings(tokenizer_class="GPT2Tokenizer"), BAD),
+    "added_tokens_decoder.5: expected the token as tokenizer.json has it": (settings(added_tokens_decoder={"5": {"content": "<|end|>", "special": True}}), BAD),
+    "model.vocab: expected tokens with ids": (model(vocab={}), BAD),
+    "model.vocab: expected all 256 byte symbols, found 1 missing, the first is 'Q'": (lambda t: t.tokenizer["model"]["vocab"].pop("Q"), BAD),
+    "ids: expected ids below vocab_size 300, found 1 above, the first is 300 ('<late>')": (
+        lambda t: t.tokenizer["added_tokens"].append({"id": N_VOCAB, "content": "<late>"}), BAD),
+    "id 9: expected one token": (lambda t: t.tokenizer["model"]["vocab"].update({"twice": 9}), BAD),
+    "id 270: expected one token": (lambda t: t.tokenizer["added_tokens"].append({"id": 270, "content": "Q"}), BAD),
+    "model.merges[1]: expected two tokens whose union is a token": (lambda t: t.tokenizer["model"]["merges"].insert(1, ["t", "q"]), BAD),
+    "model.merges[0]: expected two tokens": (lambda t: t.tokenizer["model"].update(merges=["t o o"]), BAD),
+    "model.merges: expected a list": (lambda t: t.tokenizer["model"].update(merges=None), BAD),
+}
+
+
+@pytest.mark.parametrize("message", CASES)
+def test_another_tokenizer_is_refused_by_field(converter, tiny, message):
+    change, code = CASES[message]
+    change(tiny)
+    error = converter.refusal(tiny)
+    assert message in error.message()
+    assert error.code == code
+
+
+def test_an_unknown_token_is_no_obstacle_because_no_byte_is_unknown(converter, tiny):
+    tiny.tokenizer["model"]["unk_token"] = SPECIAL[0]
+    assert converter.bundle(tiny).keys["tokenizer.kind"] == "byte_level_bpe"
+
+
+def test_a_token_that_is_no_unicode_text_is_refused(converter, tiny):
+    converter.save(tiny)
+    path = converter.folder / "vlm" / "tokenizer.json"
+    path.write_text(path.read_text().replace('"<image>"', '"\\ud800"'))
+    assert "model.vocab: expected UTF-8 text" in converter.refusal().message()
+
+
+def test_a_tokenizer_without_tokenizer_json_is_told_how_to_get_one(converter):
+    converter.save(Tiny())
+    (converter.folder / "vlm" / "tokenizer.json").unlink()
+    write_json(str(converter.folder / "vlm" / "vocab.json"), {})
+    error = converter.refusal()
+    assert "save it again" in error.message() and error.code == Code.IO

@@ -1,0 +1,129 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/image.h"
+
+#include <filesystem>
+
+#include "processor/support.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+std::vector<std::uint8_t> pixels(const Frame& frame) { return std::get<std::vector<std::uint8_t>>(frame.rgb); }
+
+std::string refusal_of(const std::string& name) { return refusal(decode_data(name), Code::bad_observation); }
+
+/// Bytes of a .npy file with a header of our choosing.
+std::string npy(const std::string& header, const std::string& data) {
+  return std::string("\x93NUMPY\1\0", 8) + static_cast<char>(header.size()) + '\0' + header + data;
+}
+
+std::string float_npy(const std::vector<float>& values) {
+  const std::string data(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(float));
+  return npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1, " + std::to_string(values.size() / 3) + ", 3), }",
+             data);
+}
+
+}  // namespace
+
+TEST_CASE("every readable PNG and JPEG decodes to Pillow's pixels") {
+  int compared = 0;
+  for (const auto& entry : std::filesystem::directory_iterator(data_path("images"))) {
+    const std::string name = entry.path().filename();
+    if (name.ends_with(".npy") || name.starts_with("bad_")) continue;
+    CAPTURE(name);
+    const auto found = decode_data(name), expected = decode_data(name + ".npy");
+    REQUIRE_MESSAGE(found.ok(), found.error().message());
+    REQUIRE(expected.ok());
+    CHECK(found->width == expected->width);
+    CHECK(found->height == expected->height);
+    CHECK(pixels(*found) == pixels(*expected));
+    ++compared;
+  }
+  CHECK(compared == 35);
+}
+
+TEST_CASE("EXIF orientations 5 to 8 exchange width and height") {
+  for (int value = 1; value <= 8; ++value) {
+    const auto frame = decode_data("exif_" + std::to_string(value) + ".jpg");
+    REQUIRE(frame.ok());
+    CHECK(frame->width == (value >= 5 ? 7 : 11));
+  }
+}
+
+TEST_CASE("16-bit PNG and CMYK JPEG are refused by name") {
+  CHECK(contains(refusal_of("bad_16_bit.png"), "a 16-bit PNG"));
+  CHECK(contains(refusal_of("bad_16_bit_rgb.png"), "a 16-bit PNG"));
+  CHECK(contains(refusal_of("bad_cmyk.jpg"), "CMYK"));
+}
+
+TEST_CASE("truncated and damaged images are refused") {
+  for (const char* name : {"bad_truncated.png", "bad_no_end.png", "bad_checksum.png", "bad_few_rows.png"})
+    CHECK(contains(refusal_of(name), "expected a whole PNG image"));
+  for (const char* name : {"bad_truncated.jpg", "bad_no_end.jpg", "bad_header_only.jpg"})
+    CHECK(contains(refusal_of(name), "expected a whole JPEG image"));
+  CHECK(contains(refusal_of("bad_palette_index.png"), "beyond its palette"));
+  CHECK(contains(refusal_of("bad_exif.jpg"), "EXIF"));
+}
+
+TEST_CASE("an image that is cut anywhere is refused") {
+  for (const char* name : {"interlaced.png", "palette.png", "rgb.jpg", "progressive.jpg"}) {
+    const std::string file = read_text(data_path("images/" + std::string(name)));
+    for (std::size_t size = 0; size < file.size(); ++size) {
+      const std::string part = file.substr(0, size);
+      CHECK_FALSE(decode_image(bytes_of(part), name).ok());
+    }
+  }
+}
+
+TEST_CASE("a 20000 x 20000 image is refused by its header") {
+  CHECK(contains(refusal_of("bad_huge.png"), "at most 64000000 pixels, found 20000 x 20000"));
+  CHECK(contains(refusal_of("bad_huge.jpg"), "at most 64000000 pixels, found 20000 x 20000"));
+}
+
+TEST_CASE("the pixel limit is inclusive and holds for every format") {
+  for (const char* name : {"rgb.png", "rgb.png.npy", "rgb.jpg", "rgb.jpg.npy"}) {
+    const auto frame = decode_data(name);
+    REQUIRE(frame.ok());
+    const std::int64_t count = frame->width * frame->height;
+    CHECK(decode_data(name, {count}).ok());
+    refusal(decode_data(name, {count - 1}), Code::bad_observation);
+  }
+}
+
+TEST_CASE("empty files and files of another kind are refused") {
+  CHECK(contains(refusal(decode_image({}, "top.png"), Code::bad_observation),
+                 "top.png: expected a PNG, JPEG or .npy image, found an empty file"));
+  const std::string gif = "GIF89a..........";
+  CHECK(contains(refusal(decode_image(bytes_of(gif), "top.png"), Code::bad_observation), "another kind"));
+}
+
+TEST_CASE("a float array in [0, 1] is a frame, other floats are refused") {
+  const std::string good = float_npy({0.0f, 0.5f, 1.0f});
+  const auto frame = decode_image(bytes_of(good), "f");
+  REQUIRE(frame.ok());
+  CHECK(std::get<std::vector<float>>(frame->rgb) == std::vector<float>{0.0f, 0.5f, 1.0f});
+  for (const float bad :
+       {-0.001f, 1.001f, 255.0f, std::numeric_limits<float>::infinity(), std::numeric_limits<float>::quiet_NaN()}) {
+    const std::string file = float_npy({0.0f, bad, 1.0f});
+    CHECK(contains(refusal(decode_image(bytes_of(file), "f"), Code::bad_observation), "float pixels in [0, 1]"));
+  }
+}
+
+TEST_CASE("arrays that are not (height, width, 3) are refused") {
+  for (const char* shape : {"(6,)", "(2, 3)", "(1, 2, 3, 1)", "(3, 1, 2)", "(0, 2, 3)"}) {
+    const std::size_t n = std::string(shape) == "(0, 2, 3)" ? 0 : 6;
+    const std::string file =
+        npy("{'descr': '|u1', 'fortran_order': False, 'shape': " + std::string(shape) + ", }", std::string(n, 'x'));
+    refusal(decode_image(bytes_of(file), "f"), Code::bad_observation);
+  }
+}
+
+TEST_CASE("a frame whose pixels do not fit its size is refused") {
+  CHECK(check_frame({2, 1, std::vector<std::uint8_t>(6)}, "f").ok());
+  refusal(check_frame({2, 1, std::vector<std::uint8_t>(5)}, "f"), Code::bad_observation);
+  refusal(check_frame({0, 0, std::vector<std::uint8_t>()}, "f"), Code::bad_observation);
+  refusal(check_frame({-1, -2, std::vector<float>(6)}, "f"), Code::bad_observation);
+}

@@ -1,0 +1,88 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/letterbox.h"
+
+#include <cmath>
+
+#include "base/npy.h"
+#include "processor/support.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+/// The same picture as `frame_of` in the script that wrote the expected planes.
+Frame frame_of(int width, int height) {
+  std::vector<std::uint8_t> rgb;
+  for (int y = 0; y < height; ++y)
+    for (int x = 0; x < width; ++x)
+      for (int c = 0; c < 3; ++c)
+        rgb.push_back(static_cast<std::uint8_t>((x * 7 + y * 13 + c * 29 + (x * y) % 17) % 256));
+  return {width, height, std::move(rgb)};
+}
+
+Frame as_floats(const Frame& frame) {
+  std::vector<float> values;
+  for (const std::uint8_t byte : std::get<std::vector<std::uint8_t>>(frame.rgb))
+    values.push_back(static_cast<float>(byte) / 255.0f);
+  return {frame.width, frame.height, std::move(values)};
+}
+
+std::vector<float> boxed(const Frame& frame, int width, int height, float fill = 0.0f) {
+  std::vector<float> out(static_cast<std::size_t>(3 * width * height), NAN);
+  REQUIRE(letterbox(frame, {width, height, fill}, out, "f").ok());
+  return out;
+}
+
+}  // namespace
+
+TEST_CASE("letterbox and affine equal torch bit for bit at every size and aspect") {
+  const std::string file = read_text(data_path("letterbox.npy"));
+  const auto planes = parse_npy(bytes_of(file), "letterbox.npy");
+  REQUIRE(planes.ok());
+  std::span<const float> rest = std::get<std::vector<float>>(planes->values);
+  for (const auto& sizes : data_json("letterbox.json")) {
+    CAPTURE(sizes.dump());
+    const Frame frame = frame_of(sizes[0], sizes[1]);
+    std::vector<float> found = boxed(frame, sizes[2], sizes[3]);
+    CHECK(found == boxed(as_floats(frame), sizes[2], sizes[3]));
+    affine(found, 2.0f, -1.0f);
+    const auto expected = rest.first(found.size());
+    CHECK(std::equal(found.begin(), found.end(), expected.begin()));
+    rest = rest.subspan(found.size());
+  }
+  CHECK(rest.empty());
+}
+
+TEST_CASE("letterbox puts the picture at the bottom right and fills the rest") {
+  const Frame white{1, 2, std::vector<std::uint8_t>(6, 255)};
+  const std::vector<float> wide = boxed(white, 4, 4, 0.25f);  // 2 x 4 of the 4 x 4
+  CHECK(wide[1] == 0.25f);
+  CHECK(wide[2] == 1.0f);
+  const Frame flat{2, 1, std::vector<std::uint8_t>(6, 255)};
+  const std::vector<float> tall = boxed(flat, 4, 4, 0.25f);
+  CHECK(tall[7] == 0.25f);
+  CHECK(tall[8] == 1.0f);
+}
+
+TEST_CASE("a frame of the right size is copied untouched") {
+  const Frame frame = frame_of(5, 3);
+  const std::vector<float> out = boxed(frame, 5, 3);
+  const auto& rgb = std::get<std::vector<std::uint8_t>>(frame.rgb);
+  CHECK(out[15 + 7] == static_cast<float>(rgb[7 * 3 + 1]) / 255.0f);
+}
+
+TEST_CASE("a picture too narrow to leave a pixel is refused") {
+  std::vector<float> out(3 * 16 * 16);
+  CHECK(contains(refusal(letterbox(frame_of(1000, 2), {16, 16, 0.0f}, out, "top"), Code::bad_observation), "top: "));
+  refusal(letterbox(frame_of(2, 1000), {16, 16, 0.0f}, out, "top"), Code::bad_observation);
+}
+
+TEST_CASE("affine rounds the product before it adds") {
+  std::vector<float> values = {0.1f};
+  affine(values, 3.0f, -0.3f);
+  volatile float product = 0.1f * 3.0f;
+  CHECK(values[0] == product - 0.3f);
+  CHECK(values[0] != std::fma(0.1f, 3.0f, -0.3f));
+}

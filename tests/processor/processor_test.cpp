@@ -1,0 +1,337 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/processor.h"
+
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "processor/support.h"
+
+using namespace vla;
+using namespace vla::test;
+using Json = nlohmann::json;
+
+namespace {
+
+constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+constexpr float kInf = std::numeric_limits<float>::infinity();
+
+void add_stats(EditableBundle& bundle, const std::string& name, const std::vector<float>& values) {
+  const std::string data(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(float));
+  bundle.tensors.push_back({name, DType::f32, {static_cast<std::int64_t>(values.size())}, data});
+}
+
+/// Three views of which two are needed, one state of two numbers, two actions out of four columns.
+EditableBundle sample() {
+  EditableBundle bundle;
+  bundle.keys = tokenizer_keys("smol");
+  bundle.set("vla.bundle_version", std::int64_t{1});
+  bundle.set("observation.views",
+             std::vector<std::string>{"observation.images.top", "observation.images.wrist", "observation.images.side"});
+  bundle.set("observation.view_aliases", std::vector<std::string>{"", "observation.images.hand", ""});
+  bundle.set("observation.min_views", std::int64_t{2});
+  bundle.set("observation.states", std::vector<std::string>{"observation.state"});
+  bundle.set("observation.state_dims", std::vector<std::int64_t>{2});
+  bundle.set("observation.max_text_tokens", std::int64_t{8});
+  bundle.set("action.names", std::vector<std::string>{"shoulder", "gripper"});
+  bundle.set("lm.n_vocab", std::int64_t{4096});
+  bundle.set("policy.d_state", std::int64_t{4});
+  bundle.set("policy.d_action", std::int64_t{4});
+  bundle.set("processor.recipe", std::string(R"({
+    "image":  [{"op": "letterbox", "width": 4, "height": 2, "filter": "bilinear", "antialias": false,
+                "align": "bottom_right", "fill": 0.0},
+               {"op": "affine", "scale": 2.0, "shift": -1.0}],
+    "text":   [{"op": "ensure_suffix", "suffix": "\n"}, {"op": "tokenize", "max_tokens": 8, "truncate": "right"}],
+    "state":  [{"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 0.5},
+               {"op": "pad", "size": 4}],
+    "action": [{"op": "take", "size": 2}, {"op": "unnormalize", "kind": "mean_std", "stats": "stats.action", "eps": 0.5}]})"));
+  add_stats(bundle, "stats.observation.state.mean", {1.0f, 2.0f});
+  add_stats(bundle, "stats.observation.state.std", {0.5f, 1.5f});
+  add_stats(bundle, "stats.action.mean", {10.0f, 20.0f});
+  add_stats(bundle, "stats.action.std", {2.0f, 0.0f});
+  return bundle;
+}
+
+Result<Processor> create(const EditableBundle& editable) {
+  const std::string bytes = editable.bytes();
+  const auto bundle = Bundle::parse(bytes_of(bytes), "test.gguf");
+  REQUIRE_MESSAGE(bundle.ok(), bundle.error().message());
+  return Processor::create(*bundle);
+}
+
+Processor make(const EditableBundle& bundle = sample()) {
+  auto processor = create(bundle);
+  REQUIRE_MESSAGE(processor.ok(), processor.error().message());
+  return std::move(*processor);
+}
+
+Frame grey(std::uint8_t value) { return {4, 2, std::vector<std::uint8_t>(24, value)}; }
+
+Observation observation() {
+  return {{{"top", grey(0)}, {"wrist", grey(255)}, {"side", std::nullopt}}, {{"state", {1.5f, 6.0f}}}, "pick up"};
+}
+
+std::string refused(const Observation& bad) { return refusal(make().encode(bad), Code::bad_observation); }
+
+std::string refused_with(const std::string& key, Value value) {
+  EditableBundle bundle = sample();
+  bundle.set(key, std::move(value));
+  return refusal(create(bundle), Code::bad_bundle);
+}
+
+/// The refusal of a bundle whose recipe has one value replaced.
+std::string refused_recipe(const char* pointer, const Json& value) {
+  Json recipe = Json::parse(*sample().keys.string("processor.recipe"));
+  recipe[Json::json_pointer(pointer)] = value;
+  return refused_with("processor.recipe", recipe.dump());
+}
+
+}  // namespace
+
+TEST_CASE("an observation becomes pixels, tokens and a padded state") {
+  const auto inputs = make().encode(observation());
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->n_view == 2);
+  CHECK(inputs->width == 4);
+  CHECK(inputs->height == 2);
+  REQUIRE(inputs->pixels.size() == 2 * 24);
+  CHECK(inputs->pixels.front() == -1.0f);
+  CHECK(inputs->pixels.back() == 1.0f);
+  CHECK(inputs->state == std::vector<float>{0.5f, 2.0f, 0.0f, 0.0f});
+  CHECK(inputs->notes.empty());
+  const auto ids = Tokenizer::create(tokenizer_keys("smol"), 4096)->encode("pick up\n");
+  CHECK(inputs->tokens == *ids);
+}
+
+TEST_CASE("views go in the bundle's order under full name, last part or alias") {
+  Observation seen = observation();
+  seen.views = {{"hand", grey(51)}, {"observation.images.top", grey(102)}, {"side", grey(255)}};
+  const auto inputs = make().encode(seen);
+  REQUIRE(inputs.ok());
+  CHECK(inputs->n_view == 3);
+  CHECK(inputs->pixels[0] == 102.0f / 255.0f * 2.0f - 1.0f);
+  CHECK(inputs->pixels[24] == 51.0f / 255.0f * 2.0f - 1.0f);
+  CHECK(inputs->pixels[48] == 1.0f);
+  seen.views.erase("hand");
+  seen.views["observation.images.hand"] = grey(51);
+  CHECK(make().encode(seen).ok());
+}
+
+TEST_CASE("inputs that are filled again keep their memory and drop what they held") {
+  const Processor processor = make();
+  Inputs inputs;
+  Observation seen = observation();
+  seen.text = "pick up the red cube and place it in the bowl";
+  REQUIRE(processor.encode_text(seen, inputs).ok());
+  CHECK(inputs.notes.size() == 1);
+  REQUIRE(processor.encode_images(seen, inputs).ok());
+  REQUIRE(processor.encode_state(seen, inputs).ok());
+  const float* pixels = inputs.pixels.data();
+  const float* state = inputs.state.data();
+  REQUIRE(processor.encode_text(observation(), inputs).ok());
+  REQUIRE(processor.encode_images(observation(), inputs).ok());
+  REQUIRE(processor.encode_state(observation(), inputs).ok());
+  CHECK(inputs.pixels.data() == pixels);
+  CHECK(inputs.state.data() == state);
+  CHECK(inputs.state.size() == 4);
+  CHECK(inputs.notes.empty());
+}
+
+TEST_CASE("views that are unknown, doubled, missing or too few are refused with the bundle's names") {
+  Observation bad = observation();
+  bad.views["front"] = grey(0);
+  CHECK(contains(refused(bad),
+                 "observation view \"front\": expected one of observation.images.top, observation.images.wrist"));
+  bad = observation();
+  bad.views["hand"] = grey(0);
+  CHECK(contains(refused(bad), "observation.images.wrist: expected one value, found a second one"));
+  bad = observation();
+  bad.views.erase("side");
+  CHECK(contains(refused(bad), "observation.images.side: expected an image, or the view declared absent"));
+  bad = observation();
+  bad.views["wrist"] = std::nullopt;
+  CHECK(contains(refused(bad), "expected at least 2 of the views"));
+  bad = observation();
+  bad.views[""] = grey(0);
+  CHECK(contains(refused(bad), "no such view"));
+}
+
+TEST_CASE("a name that two views share must be given in full") {
+  EditableBundle bundle = sample();
+  bundle.set("observation.views", std::vector<std::string>{"left.top", "right.top", "side"});
+  const Processor processor = make(bundle);
+  Observation seen = observation();
+  seen.views = {{"top", grey(0)}, {"right.top", grey(0)}, {"side", grey(0)}};
+  CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "give the full name"));
+  seen.views = {{"left.top", grey(0)}, {"right.top", grey(0)}, {"side", grey(0)}};
+  CHECK(processor.encode(seen).ok());
+}
+
+TEST_CASE("a whole name goes before a last part") {
+  EditableBundle bundle = sample();
+  bundle.set("observation.views", std::vector<std::string>{"top", "right.top", "side"});
+  Observation seen = observation();
+  seen.views = {{"top", grey(0)}, {"right.top", grey(255)}, {"side", std::nullopt}};
+  const auto inputs = make(bundle).encode(seen);
+  REQUIRE(inputs.ok());
+  CHECK(inputs->pixels.front() == -1.0f);
+}
+
+TEST_CASE("frames that are damaged or leave no pixel are refused by their view") {
+  Observation bad = observation();
+  bad.views["wrist"] = Frame{4, 2, std::vector<std::uint8_t>(23)};
+  CHECK(contains(refused(bad), "observation.images.wrist: "));
+  bad.views["wrist"] = Frame{1, 2, std::vector<float>{0, 0, 0, 0, 0, kNaN}};
+  CHECK(contains(refused(bad), "observation.images.wrist: expected float pixels in [0, 1]"));
+  bad.views["wrist"] = Frame{100, 1, std::vector<std::uint8_t>(300)};
+  CHECK(contains(refused(bad), "observation.images.wrist: "));
+}
+
+TEST_CASE("states that are missing, unknown, of another width or not finite are refused") {
+  Observation bad = observation();
+  bad.states.clear();
+  CHECK(contains(refused(bad), "observation.state: expected 2 numbers, found nothing"));
+  bad = observation();
+  bad.states["gripper"] = {0.0f};
+  CHECK(contains(refused(bad), "observation state \"gripper\": expected one of observation.state"));
+  bad = observation();
+  bad.states["observation.state"] = {0.0f, 0.0f};
+  CHECK(contains(refused(bad), "a second one"));
+  for (const std::vector<float>& wrong : {std::vector<float>{}, {1.0f}, {1.0f, 2.0f, 3.0f}}) {
+    bad = observation();
+    bad.states["state"] = wrong;
+    CHECK(contains(refused(bad), "observation.state: expected 2 numbers, found " + std::to_string(wrong.size())));
+  }
+  for (const float wrong : {kNaN, kInf, -kInf}) {
+    bad = observation();
+    bad.states["state"] = {0.0f, wrong};
+    CHECK(contains(refused(bad), "observation.state[1]: expected a finite number"));
+  }
+}
+
+TEST_CASE("a state that overflows when normalized is refused") {
+  EditableBundle bundle = sample();
+  bundle.tensor("stats.observation.state.mean").data = std::string("\xff\xff\x7f\xff\0\0\0\0", 8);  // -max of float32
+  Observation bad = observation();
+  bad.states["state"] = {3e38f, 0.0f};
+  CHECK(contains(refusal(make(bundle).encode(bad), Code::bad_observation), "state[0]"));
+}
+
+TEST_CASE("several states are concatenated in order and normalized by feature") {
+  EditableBundle bundle = sample();
+  bundle.set("observation.states", std::vector<std::string>{"observation.state", "observation.gripper"});
+  bundle.set("observation.state_dims", std::vector<std::int64_t>{2, 1});
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["state"][0]["feature"] = "observation.state";
+  bundle.set("processor.recipe", recipe.dump());
+  Observation seen = observation();
+  seen.states["gripper"] = {7.0f};
+  const auto inputs = make(bundle).encode(seen);
+  REQUIRE(inputs.ok());
+  CHECK(inputs->state == std::vector<float>{0.5f, 2.0f, 7.0f, 0.0f});
+  recipe["state"][0].erase("feature");
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.state[0].feature"));
+}
+
+TEST_CASE("a long instruction is cut on the right with a note") {
+  Observation seen = observation();
+  const auto whole =
+      *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode("pick up the red cube and place it in the bowl\n");
+  seen.text = "pick up the red cube and place it in the bowl";
+  const auto inputs = make().encode(seen);
+  REQUIRE(inputs.ok());
+  REQUIRE(inputs->notes.size() == 1);
+  CHECK(inputs->notes[0] == "instruction: 13 tokens, cut to the first 8");
+  CHECK(inputs->tokens == std::vector<std::int32_t>(whole.begin(), whole.begin() + 8));
+}
+
+TEST_CASE("the suffix is added once") {
+  Observation once = observation(), twice = observation();
+  once.text = "pick up";
+  twice.text = "pick up\n";
+  CHECK(make().encode(once)->tokens == make().encode(twice)->tokens);
+}
+
+TEST_CASE("instructions that are empty, too long or not UTF-8 are refused") {
+  Observation bad = observation();
+  bad.text = "";
+  CHECK(contains(refused(bad), "instruction: expected a sentence, found empty text"));
+  bad.text = std::string(100'000, 'a');
+  CHECK(contains(refused(bad), "instruction: expected at most 65536 bytes"));
+  bad.text = "pick \xc3 up";
+  CHECK(contains(refused(bad), "instruction: expected UTF-8 text"));
+}
+
+TEST_CASE("a chunk becomes actions in world units") {
+  const std::vector<float> chunk = {0.5f, 9.0f, kNaN, kNaN, -1.0f, 3.0f, kNaN, kNaN};  // padded columns do not matter
+  const auto actions = make().decode(chunk, 2, 4);
+  REQUIRE_MESSAGE(actions.ok(), actions.error().message());
+  CHECK(*actions == std::vector<float>{11.0f, 20.0f, 8.0f, 20.0f});
+}
+
+TEST_CASE("an action that is not finite is refused by row and name") {
+  std::vector<float> chunk(8, 0.0f);
+  chunk[5] = kInf;
+  CHECK(contains(refusal(make().decode(chunk, 2, 4), Code::bad_action),
+                 "actions[1][\"gripper\"]: expected a finite number"));
+  chunk[5] = 0.0f;
+  chunk[0] = 3e38f;  // finite, but not in world units
+  CHECK(contains(refusal(make().decode(chunk, 2, 4), Code::bad_action), "actions[0][\"shoulder\"]"));
+}
+
+TEST_CASE("a chunk of another shape is our own mistake") {
+  const std::vector<float> chunk(8);
+  for (const auto& [horizon, d_action] : {std::pair{2, 3}, {3, 4}, {0, 4}, {-2, -4}, {4, 2}})
+    refusal(make().decode(chunk, horizon, d_action), Code::internal);
+}
+
+TEST_CASE("every key that the processor reads is required") {
+  for (const char* key : {"processor.recipe", "observation.views", "observation.view_aliases", "observation.min_views",
+                          "observation.states", "observation.state_dims", "observation.max_text_tokens", "action.names",
+                          "tokenizer.tokens", "lm.n_vocab", "policy.d_state", "policy.d_action"}) {
+    EditableBundle bundle = sample();
+    bundle.remove_key(key);
+    CHECK(contains(refusal(create(bundle), Code::bad_bundle), key));
+  }
+}
+
+TEST_CASE("features that do not fit each other are refused") {
+  CHECK(contains(refused_with("observation.views", std::vector<std::string>{"a", "a", "b"}), "observation.views"));
+  CHECK(contains(refused_with("observation.views", std::vector<std::string>{"a", "", "b"}), "observation.views"));
+  CHECK(contains(refused_with("observation.view_aliases", std::vector<std::string>{"a"}), "3 entries"));
+  CHECK(contains(refused_with("observation.min_views", std::int64_t{0}), "1 to 3"));
+  CHECK(contains(refused_with("observation.min_views", std::int64_t{4}), "1 to 3"));
+  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{2, 1}), "observation.state_dims"));
+  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{0}), "observation.state_dims"));
+  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{3}), "3 numbers"));
+  CHECK(contains(refused_recipe("/state/1/size", 1), "processor.recipe.state[1].size: expected at least the 2"));
+  CHECK(contains(refused_with("observation.max_text_tokens", std::int64_t{7}), "observation.max_text_tokens"));
+  CHECK(contains(refused_with("action.names", std::vector<std::string>{"one"}), "action.names"));
+  CHECK(contains(refused_with("policy.d_state", std::int64_t{5}), "policy.d_state"));
+  CHECK(contains(refused_with("policy.d_action", std::int64_t{1}), "processor.recipe.action[0].size"));
+}
+
+TEST_CASE("statistics that are missing, not finite or of another length are refused") {
+  EditableBundle bundle = sample();
+  bundle.erase("stats.action.std");
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "stats.action.std"));
+  bundle = sample();
+  bundle.tensor("stats.action.std").data = std::string("\0\0\xc0\x7f\0\0\0\0", 8);
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "finite numbers"));
+  CHECK(contains(refused_recipe("/action/0/size", 1), "stats.action.mean: expected 1 numbers"));
+  CHECK(contains(refused_recipe("/state/0/kind", "quantiles"), "stats.observation.state.q01"));
+}
+
+TEST_CASE("a spread of zero without eps is refused where it would divide") {
+  EditableBundle bundle = sample();
+  bundle.tensor("stats.observation.state.std").data = std::string(8, '\0');
+  CHECK(create(bundle).ok());
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["state"][0]["eps"] = 0.0;
+  recipe["action"][1]["eps"] = 0.0;
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle),
+                 "stats.observation.state: expected a spread to divide by in column 0"));
+}

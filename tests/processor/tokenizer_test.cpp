@@ -1,0 +1,191 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/tokenizer.h"
+
+#include <chrono>
+
+#include "processor/support.h"
+#include "processor/unicode.h"
+
+using namespace vla;
+using namespace vla::test;
+using Json = nlohmann::json;
+
+namespace {
+
+constexpr int kVocab = 4096;
+
+Tokenizer make(const Keys& keys) {
+  auto tokenizer = Tokenizer::create(keys, kVocab);
+  REQUIRE_MESSAGE(tokenizer.ok(), tokenizer.error().message());
+  return std::move(*tokenizer);
+}
+
+Tokenizer load(const std::string& name) { return make(tokenizer_keys(name)); }
+
+std::vector<std::int32_t> encode(const Tokenizer& tokenizer, const std::string& text) {
+  auto ids = tokenizer.encode(text);
+  REQUIRE_MESSAGE(ids.ok(), ids.error().message());
+  return *ids;
+}
+
+std::string refused_keys(const Keys& keys, int n_vocab = kVocab) {
+  return refusal(Tokenizer::create(keys, n_vocab), Code::bad_bundle);
+}
+
+std::string refused_text(const std::string& text) { return refusal(load("smol").encode(text), Code::bad_observation); }
+
+/// Changes the first added token of a tokenizer and gives the refusal.
+std::string refused_added(const std::string& tokenizer, const char* field, const Json& value) {
+  Keys keys = tokenizer_keys(tokenizer);
+  Json added = Json::parse(*keys.string("tokenizer.added"));
+  if (value.is_discarded()) {
+    added[0].erase(field);
+  } else {
+    added[0][field] = value;
+  }
+  keys.set("tokenizer.added", added.dump());
+  return refused_keys(keys);
+}
+
+}  // namespace
+
+TEST_CASE("four tokenizers give the reference's ids on two thousand texts") {
+  int compared = 0;
+  const Json all = data_json("tokenizer_cases.json");
+  for (const auto& item : all.items()) {
+    const Tokenizer tokenizer = load(item.key());
+    for (const Json& text_and_ids : item.value()) {
+      const std::string text = text_and_ids[0];
+      CAPTURE(item.key());
+      CAPTURE(text);
+      const std::vector<std::int32_t> expected(text_and_ids.begin() + 1, text_and_ids.end());
+      CHECK(encode(tokenizer, text) == expected);
+      ++compared;
+    }
+  }
+  CHECK(compared == 2000);
+}
+
+TEST_CASE("a word of 64 KiB takes milliseconds") {
+  for (const char* name : {"smol", "tangled"}) {
+    const Tokenizer tokenizer = load(name);
+    std::string word;
+    while (word.size() < Tokenizer::kMaxText) word += "abcab"[word.size() % 5];
+    const auto start = std::chrono::steady_clock::now();
+    CHECK(encode(tokenizer, word).size() > 1000);
+    // Quadratic merging takes minutes; the bound leaves room for sanitizers and a busy machine.
+    CHECK(std::chrono::steady_clock::now() - start < std::chrono::seconds(3));
+  }
+}
+
+TEST_CASE("NUL is a character like any other") {
+  const Tokenizer tokenizer = load("smol");
+  std::vector<std::int32_t> expected = encode(tokenizer, "a");
+  const auto nul = encode(tokenizer, std::string(1, '\0'));
+  CHECK(nul.size() == 1);
+  expected.insert(expected.end(), nul.begin(), nul.end());
+  CHECK(encode(tokenizer, std::string("a\0", 2)) == expected);
+}
+
+TEST_CASE("empty text has no tokens") { CHECK(encode(load("awkward"), "").empty()); }
+
+TEST_CASE("text that is not UTF-8 is refused at its first bad byte") {
+  const std::string bad[] = {"\xff",     "\xc0\x80",         "\xc1\xbf",         "\xe0\x80\x80",     "\xed\xa0\x80",
+                             "\xe2\x82", "\xf0\x80\x80\x80", "\xf4\x90\x80\x80", "\xf5\x80\x80\x80", "\x80"};
+  for (const std::string& tail : bad) CHECK(contains(refused_text("go" + tail), "offset 2"));
+}
+
+TEST_CASE("text beyond 64 KiB is refused and text of 64 KiB is not") {
+  CHECK(contains(refused_text(std::string(Tokenizer::kMaxText + 1, 'a')), "65537 bytes"));
+  CHECK(load("smol").encode(std::string(Tokenizer::kMaxText, 'a')).ok());
+}
+
+TEST_CASE("first and last agree on every code point") {
+  for (std::uint32_t c : {0u, 0x7Fu, 0x80u, 0x7FFu, 0x800u, 0xD7FFu, 0xE000u, 0xFFFFu, 0x10000u, 0x10FFFFu}) {
+    std::string text = c < 0x80    ? std::string(1, static_cast<char>(c))
+                       : c < 0x800 ? std::string{static_cast<char>(0xC0 | c >> 6), static_cast<char>(0x80 | (c & 63))}
+                       : c < 0x10000
+                           ? std::string{static_cast<char>(0xE0 | c >> 12), static_cast<char>(0x80 | (c >> 6 & 63)),
+                                         static_cast<char>(0x80 | (c & 63))}
+                           : std::string{static_cast<char>(0xF0 | c >> 18), static_cast<char>(0x80 | (c >> 12 & 63)),
+                                         static_cast<char>(0x80 | (c >> 6 & 63)), static_cast<char>(0x80 | (c & 63))};
+    CHECK(unicode::first(text).code_point == c);
+    CHECK(unicode::first(text).size == text.size());
+    CHECK(unicode::last("xy" + text).code_point == c);
+  }
+}
+
+TEST_CASE("a vocabulary larger than the embedding is refused") {
+  const Keys keys = tokenizer_keys("smol");
+  const int size = static_cast<int>(keys.strings("tokenizer.tokens")->size());
+  CHECK(Tokenizer::create(keys, size).ok());
+  CHECK(contains(refused_keys(keys, size - 1), "lm.n_vocab"));
+}
+
+TEST_CASE("a vocabulary without a byte, or with a text twice or empty, is refused") {
+  for (const std::string& text : {std::string("no byte"), std::string("a"), std::string()}) {
+    Keys keys = tokenizer_keys("tangled");
+    auto tokens = *keys.strings("tokenizer.tokens");
+    tokens[40] = text;
+    keys.set("tokenizer.tokens", tokens);
+    CHECK(contains(refused_keys(keys), "tokenizer.tokens"));
+  }
+}
+
+TEST_CASE("merges of what is not a token, or without two parts, are refused at their rank") {
+  for (const char* merge : {"a", "a b c", "", " ", "a nothing", "nothing a", "Ā Ā"}) {
+    Keys keys = tokenizer_keys("tangled");
+    auto merges = *keys.strings("tokenizer.merges");
+    merges[5] = merge;
+    keys.set("tokenizer.merges", merges);
+    CHECK(contains(refused_keys(keys), "tokenizer.merges[5]"));
+  }
+}
+
+TEST_CASE("added tokens are checked field by field") {
+  CHECK(contains(refused_added("smol", "id", 4096), "tokenizer.added[0].id"));
+  CHECK(contains(refused_added("smol", "id", "0"), "tokenizer.added[0].id"));
+  CHECK(contains(refused_added("smol", "id", 1), "tokenizer.added"));
+  CHECK(contains(refused_added("smol", "content", ""), "tokenizer.added[0].content"));
+  CHECK(contains(refused_added("smol", "content", "<other>"), "tokenizer.added[0].content"));
+  CHECK(contains(refused_added("smol", "content", std::string(257, 'x')), "256 bytes"));
+  CHECK(contains(refused_added("smol", "lstrip", 1), "tokenizer.added[0].lstrip"));
+  CHECK(contains(refused_added("smol", "special", Json(Json::value_t::discarded)), "no such field"));
+  CHECK(contains(refused_added("smol", "extra", true), "unknown field"));
+  CHECK(contains(refused_added("whole", "single_word", true), "ignore_merges"));
+}
+
+TEST_CASE("pre-tokenizer steps that the runtime does not know are refused") {
+  const std::pair<const char*, const char*> cases[] = {
+      {"not json", "tokenizer.pre"},
+      {"{}", "a JSON list"},
+      {"[]", "byte_level"},
+      {R"([{"type":"digits","individual":true}])", "byte_level"},
+      {R"([{"type":"split"}])", "tokenizer.pre[0].type"},
+      {R"([{"type":"digits"}])", "tokenizer.pre[0].individual"},
+      {R"([{"type":"byte_level","add_prefix_space":false}])", "tokenizer.pre[0].use_regex"},
+      {R"([{"type":"byte_level","add_prefix_space":false,"use_regex":1}])", "true or false"},
+      {R"([{"type":"byte_level","add_prefix_space":false,"use_regex":true},{"type":"digits","individual":true}])",
+       "tokenizer.pre[1]"},
+      {R"([0])", "tokenizer.pre[0]"},
+      {R"([0,0,0,0,0,0,0,0,0])", "at most 8 steps"},
+  };
+  for (const auto& [pre, part] : cases) {
+    Keys keys = tokenizer_keys("smol");
+    keys.set("tokenizer.pre", std::string(pre));
+    CHECK(contains(refused_keys(keys), part));
+  }
+}
+
+TEST_CASE("another kind of tokenizer and a missing key are refused") {
+  Keys keys = tokenizer_keys("smol");
+  keys.set("tokenizer.kind", std::string("sentencepiece"));
+  CHECK(contains(refused_keys(keys), "tokenizer.kind: expected byte_level_bpe, found sentencepiece"));
+  for (const char* key : {"tokenizer.kind", "tokenizer.tokens", "tokenizer.merges", "tokenizer.pre", "tokenizer.added",
+                          "tokenizer.ignore_merges"}) {
+    auto values = tokenizer_keys("smol").all();
+    values.erase(values.find(key));
+    CHECK(contains(refused_keys(Keys(values)), key));
+  }
+}
