@@ -80,6 +80,20 @@ Status Processor::read_features(const Bundle& bundle) {
   states_ = FeatureNames("state", std::move(states), std::move(no_aliases));
 
   VLA_TRY(action_names_, keys.strings("action.names"));
+  return check_descriptions(keys);
+}
+
+/// Names, units and the rate change no number, but a reader of the answer relies on them.
+Status Processor::check_descriptions(const Keys& keys) const {
+  VLA_TRY(const auto action_units, keys.strings("action.units"));
+  VLA_TRY(const auto state_names, keys.strings("observation.state_names"));
+  VLA_TRY(const auto state_units, keys.strings("observation.state_units"));
+  const auto n_state = static_cast<std::size_t>(total_dims(state_dims_));
+  VLA_CHECK(check_size("action.units", action_units, action_names_.size()));
+  VLA_CHECK(check_size("observation.state_names", state_names, n_state));
+  VLA_CHECK(check_size("observation.state_units", state_units, n_state));
+  VLA_TRY(const double rate, keys.number("action.rate_hz"));
+  if (rate < 0) return mismatch(std::string("action.rate_hz"), "0 or more", fmt::format("{}", rate));
   return {};
 }
 

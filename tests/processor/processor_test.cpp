@@ -27,14 +27,21 @@ EditableBundle sample() {
   EditableBundle bundle;
   bundle.keys = tokenizer_keys("smol");
   bundle.set("vla.bundle_version", std::int64_t{1});
+  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"), {"vla.dtype", "f32"}, {"vla.source.name", "x"}, {"vla.source.revision", ""}, {"vla.source.converter", "test"}})
+    bundle.set(key, std::string(value));
   bundle.set("observation.views",
              std::vector<std::string>{"observation.images.top", "observation.images.wrist", "observation.images.side"});
   bundle.set("observation.view_aliases", std::vector<std::string>{"", "observation.images.hand", ""});
+  bundle.set("observation.view_optional", std::vector<std::int64_t>{0, 0, 0});
   bundle.set("observation.min_views", std::int64_t{2});
   bundle.set("observation.states", std::vector<std::string>{"observation.state"});
   bundle.set("observation.state_dims", std::vector<std::int64_t>{2});
   bundle.set("observation.max_text_tokens", std::int64_t{8});
+  bundle.set("observation.state_names", std::vector<std::string>{"x", "y"});
+  bundle.set("observation.state_units", std::vector<std::string>{"m", ""});
   bundle.set("action.names", std::vector<std::string>{"shoulder", "gripper"});
+  bundle.set("action.units", std::vector<std::string>{"rad", ""});
+  bundle.set("action.rate_hz", 0.0);
   bundle.set("lm.n_vocab", std::int64_t{4096});
   bundle.set("policy.d_state", std::int64_t{4});
   bundle.set("policy.d_action", std::int64_t{4});
@@ -222,6 +229,8 @@ TEST_CASE("several states are concatenated in order and normalized by feature") 
   EditableBundle bundle = sample();
   bundle.set("observation.states", std::vector<std::string>{"observation.state", "observation.gripper"});
   bundle.set("observation.state_dims", std::vector<std::int64_t>{2, 1});
+  bundle.set("observation.state_names", std::vector<std::string>{"x", "y", "grip"});
+  bundle.set("observation.state_units", std::vector<std::string>{"m", "", ""});
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
   recipe["state"][0]["feature"] = "observation.state";
   bundle.set("processor.recipe", recipe.dump());
