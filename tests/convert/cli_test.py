@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The command as a person or a script meets it: exit codes, streams, wording."""
+
 import json
 import os
 import subprocess
@@ -16,14 +17,19 @@ PACKAGE = os.path.join(os.path.dirname(__file__), "..", "..", "python")
 
 def run(*args, **environment):
     command = [sys.executable, "-m", "vla_cpp.convert.cli", *map(str, args)]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": PACKAGE, **environment}, capture_output=True, text=True)
+    return subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": PACKAGE, **environment}, capture_output=True, text=True
+    )
 
 
 def test_a_conversion_exits_with_zero_and_says_what_it_wrote_and_dropped(converter, tiny):
     result = run(converter.save(tiny), "-o", converter.out)
     assert result.returncode == 0 and result.stderr == ""
     lines = result.stdout.splitlines()
-    assert lines[0].startswith("wrote " + converter.out + ": smolvla, ") and "{:,} bytes".format(os.path.getsize(converter.out)) in lines[0]
+    assert (
+        lines[0].startswith("wrote " + converter.out + ": smolvla, ")
+        and "{:,} bytes".format(os.path.getsize(converter.out)) in lines[0]
+    )
     assert any("lm_head" in line and "dropped" in line for line in lines)
 
 
@@ -37,10 +43,16 @@ def test_a_refusal_goes_to_stderr_in_the_form_of_the_runtime(converter, tiny, ca
     assert main([converter.save(tiny), "-o", converter.out]) == 6
     streams = capsys.readouterr()
     assert streams.out == ""
-    assert streams.err == "error: config.json: add_image_special_tokens: expected False, found True; the prefix would hold further tokens\n"
+    assert (
+        streams.err
+        == "error: config.json: add_image_special_tokens: expected False, found True; the prefix would hold further tokens\n"
+    )
 
 
-@pytest.mark.parametrize("code, change", [(3, lambda t: t.tensors.pop("model.state_proj.bias")), (6, lambda t: t.config.update(use_cache=False))])
+@pytest.mark.parametrize(
+    "code, change",
+    [(3, lambda t: t.tensors.pop("model.state_proj.bias")), (6, lambda t: t.config.update(use_cache=False))],
+)
 def test_each_class_of_refusal_has_its_exit_code(converter, tiny, capsys, code, change):
     change(tiny)
     assert main([converter.save(tiny), "-o", converter.out]) == code
@@ -111,15 +123,48 @@ def mutate(rng, value, depth=0):
     """One random change somewhere in a JSON value."""
     if isinstance(value, dict) and value and rng.random() < 0.9:
         key = list(value)[rng.integers(len(value))]
-        return {**value, key: mutate(rng, value[key], depth + 1)} if rng.random() < 0.85 else {k: v for k, v in value.items() if k != key}
+        return (
+            {**value, key: mutate(rng, value[key], depth + 1)}
+            if rng.random() < 0.85
+            else {k: v for k, v in value.items() if k != key}
+        )
     if isinstance(value, list) and value and rng.random() < 0.8:
         i = int(rng.integers(len(value)))
-        return value[:i] + [mutate(rng, value[i], depth + 1)] + value[i + 1:]
-    junk = [None, True, -1, 0, 3, 10**30, 1.5, 1e308, "", "x", "../..", [], [1], {}, {"a": 1}, [[]], ["a", 2], {"type": "STATE"}]
+        return value[:i] + [mutate(rng, value[i], depth + 1)] + value[i + 1 :]
+    junk = [
+        None,
+        True,
+        -1,
+        0,
+        3,
+        10**30,
+        1.5,
+        1e308,
+        "",
+        "x",
+        "../..",
+        [],
+        [1],
+        {},
+        {"a": 1},
+        [[]],
+        ["a", 2],
+        {"type": "STATE"},
+    ]
     return junk[rng.integers(len(junk))]
 
 
-@pytest.mark.parametrize("file", ["config.json", "vlm/config.json", "vlm/tokenizer.json", "vlm/tokenizer_config.json", "policy_preprocessor.json", "policy_postprocessor.json"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "config.json",
+        "vlm/config.json",
+        "vlm/tokenizer.json",
+        "vlm/tokenizer_config.json",
+        "policy_preprocessor.json",
+        "policy_postprocessor.json",
+    ],
+)
 def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny, capsys, file):
     rng = np.random.default_rng(len(file))
     converter.save(tiny)

@@ -5,6 +5,7 @@
 A checkpoint comes from somewhere else, so every length and offset is compared with the size of the file before it is used.
 Data is read in chunks, never mapped as a whole: a conversion needs a few megabytes whatever the size of the checkpoint.
 """
+
 from __future__ import annotations
 
 import json
@@ -40,7 +41,11 @@ class Entry(NamedTuple):
             while left:
                 part = np.fromfile(file, dtype=kind, count=min(left, chunk_bytes // kind.itemsize))
                 if part.size == 0:
-                    raise refuse("{}: tensor {}".format(self.path, self.name), "{} more elements".format(left), "the end of the file")
+                    raise refuse(
+                        "{}: tensor {}".format(self.path, self.name),
+                        "{} more elements".format(left),
+                        "the end of the file",
+                    )
                 left -= part.size
                 yield part
 
@@ -67,7 +72,12 @@ def _read_header(path: str) -> Tuple[dict, int, int]:
     with open(path, "rb") as file:
         length = int.from_bytes(file.read(8), "little")
         if size < 8 or length > min(size - 8, MAX_HEADER):
-            raise refuse(path, "a safetensors header inside the file", "a header of {} bytes in a file of {}".format(length, size), hint)
+            raise refuse(
+                path,
+                "a safetensors header inside the file",
+                "a header of {} bytes in a file of {}".format(length, size),
+                hint,
+            )
         text = file.read(length)
     try:
         header = json.loads(text.decode("utf-8"), object_pairs_hook=_unique)
@@ -93,9 +103,16 @@ def _read_entry(path: str, name: str, value, start: int, size: int) -> Entry:
     for dim in shape:
         n_bytes *= dim
     if offsets[1] - offsets[0] != n_bytes:
-        raise refuse(where, "{} bytes for {} of {}".format(n_bytes, shape, dtype), "{} bytes".format(offsets[1] - offsets[0]))
+        raise refuse(
+            where, "{} bytes for {} of {}".format(n_bytes, shape, dtype), "{} bytes".format(offsets[1] - offsets[0])
+        )
     if start + offsets[1] > size:
-        raise refuse(where, "data up to byte {}".format(start + offsets[1]), "a file of {} bytes".format(size), "the file is truncated")
+        raise refuse(
+            where,
+            "data up to byte {}".format(start + offsets[1]),
+            "a file of {} bytes".format(size),
+            "the file is truncated",
+        )
     return Entry(name, dtype, tuple(shape), path, start + offsets[0], n_bytes)
 
 
@@ -104,10 +121,19 @@ def _check_layout(path: str, entries: Dict[str, Entry], start: int, size: int) -
     position = start
     for entry in sorted(entries.values(), key=lambda e: (e.offset, e.n_bytes)):
         if entry.offset != position:
-            raise refuse("{}: tensor {}".format(path, entry.name), "data at byte {}".format(position), "byte {}".format(entry.offset))
+            raise refuse(
+                "{}: tensor {}".format(path, entry.name),
+                "data at byte {}".format(position),
+                "byte {}".format(entry.offset),
+            )
         position += entry.n_bytes
     if position != size:
-        raise refuse(path, "a file of {} bytes".format(position), "{} bytes".format(size), "the file is damaged: download or save it again")
+        raise refuse(
+            path,
+            "a file of {} bytes".format(position),
+            "{} bytes".format(size),
+            "the file is damaged: download or save it again",
+        )
 
 
 def read_safetensors(path: str) -> SafetensorsFile:

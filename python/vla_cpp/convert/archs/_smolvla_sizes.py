@@ -4,6 +4,7 @@
 
 An absent key means the default of the reference's own class, which is stated here beside the key.
 """
+
 from __future__ import annotations
 
 import os
@@ -18,21 +19,84 @@ from . import Options
 
 BACKBONE = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 # SmolVLAConfig's keys that numbers depend on, with the defaults of the class.
-POLICY = {"chunk_size": 50, "n_action_steps": 50, "max_state_dim": 32, "max_action_dim": 32, "resize_imgs_with_padding": [512, 512], "empty_cameras": 0, "num_steps": 10,
-          "tokenizer_max_length": 48, "vlm_model_name": BACKBONE, "load_vlm_weights": False, "attention_mode": "cross_attn", "prefix_length": -1,
-          "num_expert_layers": -1, "num_vlm_layers": 16, "self_attn_every_n_layers": 2, "expert_width_multiplier": 0.75, "min_period": 4e-3, "max_period": 4.0}
+POLICY = {
+    "chunk_size": 50,
+    "n_action_steps": 50,
+    "max_state_dim": 32,
+    "max_action_dim": 32,
+    "resize_imgs_with_padding": [512, 512],
+    "empty_cameras": 0,
+    "num_steps": 10,
+    "tokenizer_max_length": 48,
+    "vlm_model_name": BACKBONE,
+    "load_vlm_weights": False,
+    "attention_mode": "cross_attn",
+    "prefix_length": -1,
+    "num_expert_layers": -1,
+    "num_vlm_layers": 16,
+    "self_attn_every_n_layers": 2,
+    "expert_width_multiplier": 0.75,
+    "min_period": 4e-3,
+    "max_period": 4.0,
+}
 # Keys whose other values ask for something that the runtime does not do.
-FIXED = {"n_obs_steps": (1, "the reference reads one observation"), "adapt_to_pi_aloha": (False, "joint flips and gripper maps of that robot are not in the recipe"),
-         "use_delta_joint_actions_aloha": (False, "the reference refuses it too"), "use_cache": (True, "the reference cannot take steps without its cache"),
-         "add_image_special_tokens": (False, "the prefix would hold further tokens"), "use_peft": (False, "merge the adapter into the policy and save it again")}
+FIXED = {
+    "n_obs_steps": (1, "the reference reads one observation"),
+    "adapt_to_pi_aloha": (False, "joint flips and gripper maps of that robot are not in the recipe"),
+    "use_delta_joint_actions_aloha": (False, "the reference refuses it too"),
+    "use_cache": (True, "the reference cannot take steps without its cache"),
+    "add_image_special_tokens": (False, "the prefix would hold further tokens"),
+    "use_peft": (False, "merge the adapter into the policy and save it again"),
+}
 # Keys that no number of an action chunk depends on.
-IGNORED = {"type", "input_features", "output_features", "normalization_mapping", "rtc_config", "device", "use_amp", "push_to_hub", "repo_id", "private",
-           "tags", "license", "pretrained_path", "pretrained_revision", "pad_language_to", "freeze_vision_encoder", "train_expert_only", "train_state_proj",
-           "optimizer_lr", "optimizer_betas", "optimizer_eps", "optimizer_weight_decay", "optimizer_grad_clip_norm", "scheduler_warmup_steps",
-           "scheduler_decay_steps", "scheduler_decay_lr", "compile_model", "compile_mode"}
+IGNORED = {
+    "type",
+    "input_features",
+    "output_features",
+    "normalization_mapping",
+    "rtc_config",
+    "device",
+    "use_amp",
+    "push_to_hub",
+    "repo_id",
+    "private",
+    "tags",
+    "license",
+    "pretrained_path",
+    "pretrained_revision",
+    "pad_language_to",
+    "freeze_vision_encoder",
+    "train_expert_only",
+    "train_state_proj",
+    "optimizer_lr",
+    "optimizer_betas",
+    "optimizer_eps",
+    "optimizer_weight_decay",
+    "optimizer_grad_clip_norm",
+    "scheduler_warmup_steps",
+    "scheduler_decay_steps",
+    "scheduler_decay_lr",
+    "compile_model",
+    "compile_mode",
+}
 # SmolVLMVisionConfig and LlamaConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
-VISION = {"hidden_size": 1152, "intermediate_size": 3072, "num_hidden_layers": 12, "num_attention_heads": 16, "image_size": 224, "patch_size": 32, "layer_norm_eps": 1e-6}
-TEXT = {"hidden_size": 4096, "intermediate_size": 11008, "num_hidden_layers": 32, "num_attention_heads": 32, "vocab_size": 32000, "rms_norm_eps": 1e-6}
+VISION = {
+    "hidden_size": 1152,
+    "intermediate_size": 3072,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 16,
+    "image_size": 224,
+    "patch_size": 32,
+    "layer_norm_eps": 1e-6,
+}
+TEXT = {
+    "hidden_size": 4096,
+    "intermediate_size": 11008,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "vocab_size": 32000,
+    "rms_norm_eps": 1e-6,
+}
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
 # Bounds far above any policy, so that a hostile config cannot make the converter plan without end.
@@ -137,18 +201,30 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
 
 def _check_policy(policy: _Section) -> None:
     for key in sorted(set(policy.values) - set(POLICY) - set(FIXED) - IGNORED):
-        policy.bad(key, "a key of SmolVLAConfig that this converter knows", hint="it may change numbers; a newer vla-convert may know it", unsupported=True)
+        policy.bad(
+            key,
+            "a key of SmolVLAConfig that this converter knows",
+            hint="it may change numbers; a newer vla-convert may know it",
+            unsupported=True,
+        )
     for key, (value, hint) in FIXED.items():
         policy.fixed(key, value, hint)
     if not isinstance(policy.get("load_vlm_weights"), bool):
         policy.bad("load_vlm_weights", "true or false")
     rtc = policy.get("rtc_config")
     if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
-        policy.bad("rtc_config", "none, or one that is not enabled", hint="real-time chunking changes the velocity", unsupported=True)
+        policy.bad(
+            "rtc_config",
+            "none, or one that is not enabled",
+            hint="real-time chunking changes the velocity",
+            unsupported=True,
+        )
 
 
 def _read_features(policy: _Section, checkpoint: Checkpoint, s: Sizes) -> None:
-    inputs, outputs = (policy.get(key) if isinstance(policy.get(key), dict) else {} for key in ("input_features", "output_features"))
+    inputs, outputs = (
+        policy.get(key) if isinstance(policy.get(key), dict) else {} for key in ("input_features", "output_features")
+    )
     s.empty_cameras = policy.count("empty_cameras", 0, MAX_EMPTY)
     views = []
     for name, feature in inputs.items():
@@ -189,7 +265,13 @@ def _read_policy(policy: _Section, s: Sizes) -> None:
     policy.count("prefix_length", ANY_INT)  # pads the prefix with masked tokens, which changes no number
     frame = policy.get("resize_imgs_with_padding")
     if frame is None:
-        policy.bad("resize_imgs_with_padding", "[width, height]", "null", "frames of any size would reach the tower", unsupported=True)
+        policy.bad(
+            "resize_imgs_with_padding",
+            "[width, height]",
+            "null",
+            "frames of any size would reach the tower",
+            unsupported=True,
+        )
     elif not isinstance(frame, list) or len(frame) != 2 or not all(isinstance(n, int) and n > 0 for n in frame):
         policy.bad("resize_imgs_with_padding", "[width, height]")
     else:
@@ -202,7 +284,11 @@ def _read_text(policy: _Section, text: _Section, s: Sizes) -> None:
     s.d_model, s.d_ff, s.n_vocab = text.count("hidden_size"), text.count("intermediate_size"), text.count("vocab_size")
     s.n_head = text.count("num_attention_heads")
     text.defaults = dict(TEXT, num_key_value_heads=s.n_head, head_dim=s.d_model // s.n_head)
-    s.n_head_kv, s.d_head, s.lm_eps = text.count("num_key_value_heads"), text.count("head_dim"), text.number("rms_norm_eps")
+    s.n_head_kv, s.d_head, s.lm_eps = (
+        text.count("num_key_value_heads"),
+        text.count("head_dim"),
+        text.number("rms_norm_eps"),
+    )
     total, wanted = text.count("num_hidden_layers", most=MAX_LAYERS), policy.count("num_vlm_layers", ANY_INT)
     s.n_layer = min(wanted, total) if wanted > 0 else total
     if s.n_head % s.n_head_kv:
@@ -215,8 +301,15 @@ def _read_vision(vision: _Section, backbone: _Section, s: Sizes) -> None:
     for key, value in VISION_FIXED.items():
         vision.fixed(key, value)
     s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-    s.n_vision_layer, s.n_vision_head = vision.count("num_hidden_layers", most=MAX_LAYERS), vision.count("num_attention_heads")
-    s.image_size, s.patch_size, s.vision_eps = vision.count("image_size"), vision.count("patch_size"), vision.number("layer_norm_eps")
+    s.n_vision_layer, s.n_vision_head = (
+        vision.count("num_hidden_layers", most=MAX_LAYERS),
+        vision.count("num_attention_heads"),
+    )
+    s.image_size, s.patch_size, s.vision_eps = (
+        vision.count("image_size"),
+        vision.count("patch_size"),
+        vision.number("layer_norm_eps"),
+    )
     s.factor = backbone.count("scale_factor")
     if s.d_vision % s.n_vision_head:
         vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(s.d_vision))
@@ -225,9 +318,16 @@ def _read_vision(vision: _Section, backbone: _Section, s: Sizes) -> None:
     width, height = s.frame
     key = "config.json: resize_imgs_with_padding"
     if width != height:
-        backbone.problems.unsupported(key, "a square", "{} x {}".format(width, height), "the reference's pixel shuffle takes a square grid of patches")
+        backbone.problems.unsupported(
+            key,
+            "a square",
+            "{} x {}".format(width, height),
+            "the reference's pixel shuffle takes a square grid of patches",
+        )
     elif width and width % (s.patch_size * s.factor):
-        backbone.problems.unsupported(key, "a multiple of patch_size * scale_factor = {}".format(s.patch_size * s.factor), str(width))
+        backbone.problems.unsupported(
+            key, "a multiple of patch_size * scale_factor = {}".format(s.patch_size * s.factor), str(width)
+        )
 
 
 def expert_ff(d_model: int) -> int:
@@ -244,7 +344,11 @@ def layer_kinds(n_layer: int, n_expert: int, mode: str, every: int) -> List[str]
 
 
 def _read_expert(policy: _Section, s: Sizes) -> None:
-    multiplier, mode, every = policy.number("expert_width_multiplier"), policy.get("attention_mode"), policy.count("self_attn_every_n_layers", ANY_INT)
+    multiplier, mode, every = (
+        policy.number("expert_width_multiplier"),
+        policy.get("attention_mode"),
+        policy.count("self_attn_every_n_layers", ANY_INT),
+    )
     wanted = policy.count("num_expert_layers", ANY_INT)
     if not isinstance(mode, str):
         policy.bad("attention_mode", "a string")
@@ -252,10 +356,18 @@ def _read_expert(policy: _Section, s: Sizes) -> None:
     s.d_expert = int(s.d_model * multiplier)
     s.d_expert_ff = expert_ff(s.d_expert)
     if s.d_expert < 2 or s.d_expert % 2:
-        policy.bad("expert_width_multiplier", "an even expert width, for the time embedding", "{} * {} = {}".format(s.d_model, multiplier, s.d_expert))
+        policy.bad(
+            "expert_width_multiplier",
+            "an even expert width, for the time embedding",
+            "{} * {} = {}".format(s.d_model, multiplier, s.d_expert),
+        )
     s.n_expert_layer = wanted if wanted > 0 else s.n_layer
     if s.n_layer % s.n_expert_layer:
-        policy.bad("num_expert_layers", "a divisor of the {} language-model layers".format(s.n_layer), hint="the reference asserts it")
+        policy.bad(
+            "num_expert_layers",
+            "a divisor of the {} language-model layers".format(s.n_layer),
+            hint="the reference asserts it",
+        )
         return
     s.layer_kinds = layer_kinds(s.n_layer, s.n_expert_layer, mode, every)
     _check_expert_layers(policy, s, mode, every)
@@ -265,17 +377,29 @@ def _check_expert_layers(policy: _Section, s: Sizes, mode: str, every: int) -> N
     """The reference counts in expert layers when it builds k and v, and in language-model layers when it runs them, so with
     fewer expert layers the two can disagree; it also cannot run self-attention where the expert has no layer."""
     d_kv, ratio = s.n_head_kv * s.d_head, s.n_layer // s.n_expert_layer
-    s.d_kv_in = [d_kv if "cross" in mode and not (every > 0 and j % every == 0) else s.d_expert for j in range(s.n_expert_layer)]
+    s.d_kv_in = [
+        d_kv if "cross" in mode and not (every > 0 and j % every == 0) else s.d_expert for j in range(s.n_expert_layer)
+    ]
     for i, kind in enumerate(s.layer_kinds):
         is_self = "cross" not in mode or (every > 0 and i % every == 0)
         where = "layers {} of the language model".format(i)
         if kind == "none" and is_self:
-            policy.bad("num_expert_layers", "an expert layer wherever self-attention runs", "none at " + where,
-                       "the reference stops there: with fewer expert layers only cross-attention layers may lack one", unsupported=True)
+            policy.bad(
+                "num_expert_layers",
+                "an expert layer wherever self-attention runs",
+                "none at " + where,
+                "the reference stops there: with fewer expert layers only cross-attention layers may lack one",
+                unsupported=True,
+            )
             return
         if kind != "none" and s.d_kv_in[i // ratio] != (s.d_expert if is_self else d_kv):
-            policy.bad("num_expert_layers", "k and v of expert layer {} built for {}-attention".format(i // ratio, kind),
-                       "an input width of {}".format(s.d_kv_in[i // ratio]), "the reference cannot run this combination with self_attn_every_n_layers", unsupported=True)
+            policy.bad(
+                "num_expert_layers",
+                "k and v of expert layer {} built for {}-attention".format(i // ratio, kind),
+                "an input width of {}".format(s.d_kv_in[i // ratio]),
+                "the reference cannot run this combination with self_attn_every_n_layers",
+                unsupported=True,
+            )
             return
 
 
@@ -286,9 +410,23 @@ def _position_precision(policy: _Section, vision: _Section, options: Options, ch
         return options.position_precision
     stated = vision.get("dtype") or vision.get("torch_dtype")
     if stated not in (None, "float32", "bfloat16"):
-        vision.bad("dtype", "float32 or bfloat16", repr(stated), "choose the rule for the position table by --position-precision", unsupported=True)
+        vision.bad(
+            "dtype",
+            "float32 or bfloat16",
+            repr(stated),
+            "choose the rule for the position table by --position-precision",
+            unsupported=True,
+        )
     bfloat16 = policy.get("load_vlm_weights") is True or stated == "bfloat16"
     precision = "bfloat16" if bfloat16 else "float32"
-    why = "load_vlm_weights is true" if policy.get("load_vlm_weights") is True else "vision_config says so" if bfloat16 else "the tower runs in float32"
-    checkpoint.notes.append("position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why))
+    why = (
+        "load_vlm_weights is true"
+        if policy.get("load_vlm_weights") is True
+        else "vision_config says so"
+        if bfloat16
+        else "the tower runs in float32"
+    )
+    checkpoint.notes.append(
+        "position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why)
+    )
     return precision
