@@ -133,6 +133,10 @@ CASES = {  # what the message must contain: (change, class)
         step("normalizer_processor", normalize_observation_keys=["x"]),
         UNSUPPORTED,
     ),
+    "normalize_observation_keys: expected observation.state among them, found []": (
+        step("normalizer_processor", normalize_observation_keys=[]),
+        UNSUPPORTED,
+    ),
     "features.observation.state: expected STATE of [3]": (step("normalizer_processor", features={}), BAD),
     "norm_map.VISUAL: expected IDENTITY, found MEAN_STD": (
         lambda t: t.normalization("MEAN_STD", "VISUAL"),

@@ -11,22 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Sequence
 
-import numpy as np
-
-from .checkpoint import Checkpoint, read_statistic
+from .checkpoint import Checkpoint
 from .errors import Problems
 from .files import member, plain_name
-from .safetensors_file import read_safetensors
+from .normalization import Context, Found, Normalization, choose, from_file, from_weights
 
 STATE, ACTION = "observation.state", "action"
-# Normalization mode -> the recipe's kind and the statistics that its formula reads.
-MODES = {
-    "IDENTITY": ("identity", ()),
-    "MEAN_STD": ("mean_std", ("mean", "std")),
-    "MIN_MAX": ("min_max", ("min", "max")),
-    "QUANTILES": ("quantiles", ("q01", "q99")),
-    "QUANTILE10": ("quantile10", ("q10", "q90")),
-}
 MAX_TOKENS = 1 << 16  # far above any instruction
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 
@@ -55,20 +45,6 @@ STEPS = {
 
 
 @dataclass
-class Normalization:
-    """What happens to one feature: the formula, the reference's epsilon, and its statistics by name."""
-
-    kind: str = "identity"
-    eps: float = 1e-8
-    statistics: Dict[str, np.ndarray] = field(default_factory=dict)
-
-    def op(self, name: str, feature: str) -> List[dict]:
-        if self.kind == "identity":
-            return []
-        return [{"op": name, "kind": self.kind, "stats": "stats." + feature, "eps": self.eps}]
-
-
-@dataclass
 class Processors:
     """What the two pipelines say, free of their format."""
 
@@ -86,8 +62,8 @@ class _Reader:
     def __init__(
         self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems
     ) -> None:
-        self.checkpoint, self.dims, self.identity, self.problems = checkpoint, dims, set(identity), problems
-        self.result, self.known = Processors(), []  # `known`: features that the statistics in hand belong to
+        self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
+        self.context = Context(dims, identity, checkpoint.notes, problems)
         self.seen: List[str] = []
 
     def pipeline(self, file: str, content: dict) -> None:
@@ -162,13 +138,13 @@ class _Reader:
 
     def _normalizer(self, where: str, config: dict, step: dict) -> None:
         keys = member(config, "normalize_observation_keys", list, where)
-        if keys and STATE not in keys:
+        if config.get("normalize_observation_keys") is not None and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
-        if stated.get("shape") != [self.dims[STATE]] or stated.get("type") != "STATE":
+        if stated.get("shape") != [self.context.dims[STATE]] or stated.get("type") != "STATE":
             self.problems.add(
                 "{}: features.{}".format(where, STATE),
-                "STATE of [{}] as in config.json".format(self.dims[STATE]),
+                "STATE of [{}] as in config.json".format(self.context.dims[STATE]),
                 str(stated)[:80],
             )
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
@@ -193,83 +169,20 @@ class _Reader:
                     "{} as in config.json".format(stated[key]),
                     str(modes.get(key)),
                 )
-        state_file = step.get("state_file")
-        found: Dict[str, np.ndarray] = {}
-        if state_file is not None:
-            if not plain_name(state_file):
-                self.problems.add(where + ": state_file", "a file beside the JSON", repr(state_file))
-            else:
-                entries = read_safetensors(self.checkpoint.path(state_file)).entries
-                found = {
-                    name: read_statistic(entry) for name, entry in entries.items() if name.startswith(feature + ".")
-                }
-                self.known = sorted({name.rsplit(".", 1)[0] for name in entries})
-        else:
-            self.known = []
+        found = Found({}, [])
+        if plain_name(step.get("state_file")):
+            found = from_file(self.checkpoint.path(step["state_file"]), feature)
+        elif step.get("state_file") is not None:
+            self.problems.add(where + ": state_file", "a file beside the JSON", repr(step["state_file"]))
         eps = config.get("eps", 1e-8)
         if not isinstance(eps, float) or not 0 <= eps < 1:
             self.problems.add(where + ": eps", "a small number", repr(eps))
-        by_name = {name[len(feature) + 1 :]: value for name, value in found.items()}
-        return choose(feature, modes.get(kind, "IDENTITY"), eps, by_name, self)
+        return choose(feature, modes.get(kind, "IDENTITY"), eps, found, self.context)
 
     def finish(self, file: str, required: Sequence[str]) -> None:
         for name in required:
             if name not in self.seen:
                 self.problems.add("{}: steps".format(file), "a step " + name, "none")
-
-
-def choose(feature: str, mode: str, eps: float, found: Dict[str, np.ndarray], reader: "_Reader") -> Normalization:
-    """The normalization of one feature with its statistics checked, or the identity that was asked for."""
-    problems, dim = reader.problems, reader.dims[feature]
-    if not isinstance(mode, str) or mode not in MODES:
-        problems.unsupported("normalization of " + feature, " or ".join(MODES), str(mode))
-        return Normalization()
-    kind, names = MODES[mode]
-    if not names:
-        return Normalization()
-    missing = [name for name in names if name not in found]
-    if missing and feature in reader.identity:
-        reader.checkpoint.notes.append(
-            "DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(
-                feature, ", ".join(missing)
-            )
-        )
-        return Normalization()
-    for name in missing:
-        problems.add(
-            "statistics of {}: {}".format(feature, name),
-            "{} numbers for {}".format(dim, mode),
-            "none" + _others(reader.known),
-            "fine-tune or save the policy with its data set's statistics, or accept unnormalised numbers by --identity-stats "
-            + feature,
-        )
-    chosen = {name: found[name] for name in names if name in found}
-    for name, value in chosen.items():
-        _check_statistic("statistics of {}: {}".format(feature, name), name, value, dim, reader)
-    return Normalization(kind, eps, chosen)
-
-
-def _others(known: Sequence[str]) -> str:
-    return " (there are some for {})".format(", ".join(known)) if known else ""
-
-
-def _check_statistic(where: str, name: str, value: np.ndarray, dim: int, reader: "_Reader") -> None:
-    if value.shape != (dim,):
-        reader.problems.add(where, "shape ({},)".format(dim), str(value.shape))
-    elif not np.isfinite(value).all():
-        reader.problems.add(
-            where,
-            "finite numbers",
-            str(value[~np.isfinite(value)][0]),
-            "the statistics were never filled in: save the policy again",
-        )
-    elif name == "std" and (value < 0).any():
-        reader.problems.add(where, "numbers >= 0", str(value.min()))
-    elif name == "std" and (value == 0).any():
-        dead = ", ".join(str(i) for i in np.flatnonzero(value == 0))
-        reader.checkpoint.notes.append(
-            "{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead)
-        )
 
 
 def read_processors(
@@ -298,30 +211,14 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
     modes = member(config, "normalization_mapping", dict, "config.json")
     if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
         reader.problems.unsupported("config.json: normalization_mapping.VISUAL", "IDENTITY", str(modes["VISUAL"]))
-    reader.known = sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics})
     result = Processors(
         newline=True,
         max_tokens=reader.token_count("config.json: tokenizer_max_length", config.get("tokenizer_max_length", 48)),
     )
     for feature, kind, attribute in ((STATE, "STATE", "state"), (ACTION, "ACTION", "action")):
-        found = _old_statistics(checkpoint, feature, reader.problems)
-        setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader))
+        found = from_weights(checkpoint, feature, reader.problems)
+        setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader.context))
     return result
-
-
-def _old_statistics(checkpoint: Checkpoint, feature: str, problems: Problems) -> Dict[str, np.ndarray]:
-    """Statistics of one feature; groups that hold the same statistic must agree."""
-    marker = "buffer_" + feature.replace(".", "_") + "."
-    found: Dict[str, np.ndarray] = {}
-    for name, entry in sorted(checkpoint.old_statistics.items()):
-        group, _, rest = name.partition(".")
-        if not rest.startswith(marker):
-            continue
-        statistic, value = rest[len(marker) :], read_statistic(entry)
-        before = found.setdefault(statistic, value)
-        if not np.array_equal(before, value, equal_nan=True):
-            problems.add("tensor " + name, "the numbers that another group has", "others")
-    return found
 
 
 def text_ops(processors: Processors, truncate: str) -> List[dict]:
