@@ -35,7 +35,7 @@ Status Engine::load_policy(bool dry) {
   VLA_TRY(const PolicyEntry entry, find_policy(arch));
   params_ = std::make_unique<ParamList>(keys, &bundle_);
   policy_ = entry.make(*params_);
-  VLA_CHECK(params_->report(arch, [](const std::string& tensor) { return tensor.starts_with("stats."); }));
+  VLA_CHECK(params_->report(arch, [this](const std::string& tensor) { return processor_.reads(tensor); }));
   VLA_TRY(solver_, Solver::read(keys));
   VLA_TRY(horizon_, keys.integer("policy.horizon"));
   VLA_TRY(d_action_, keys.integer("policy.d_action"));

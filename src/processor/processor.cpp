@@ -148,4 +148,15 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
   return actions;
 }
 
+bool Processor::reads(const std::string& tensor) const {
+  const auto read_by = [&](const auto& op) {
+    const auto* normalize = std::get_if<NormalizeOp>(&op);
+    if (normalize == nullptr) return false;
+    const std::vector<std::string> names = statistics_of(*normalize);
+    return std::find(names.begin(), names.end(), tensor) != names.end();
+  };
+  return std::any_of(recipe_.state.begin(), recipe_.state.end(), read_by) ||
+         std::any_of(recipe_.action.begin(), recipe_.action.end(), read_by);
+}
+
 }  // namespace vla

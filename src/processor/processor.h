@@ -55,6 +55,9 @@ class Processor {
   /// Errors: bad_action for a number that is not finite, naming its row and column.
   Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action) const;
 
+  /// Whether a step of the recipe reads this tensor; any other statistics in a bundle are a mistake.
+  bool reads(const std::string& tensor) const;
+
   const FeatureNames& views() const { return views_; }
   int min_views() const { return min_views_; }
   const FeatureNames& states() const { return states_; }

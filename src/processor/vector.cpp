@@ -9,16 +9,6 @@
 namespace vla {
 namespace {
 
-struct StatNames {
-  const char* low;
-  const char* high;
-};
-
-StatNames names_of(NormKind kind) {
-  constexpr StatNames kNames[] = {{"mean", "std"}, {"min", "max"}, {"q01", "q99"}, {"q10", "q90"}, {"", ""}};
-  return kNames[static_cast<int>(kind)];
-}
-
 Result<std::vector<float>> read(const Bundle& bundle, const std::string& name, int width, const std::string& where) {
   VLA_TRY(std::vector<float> values, bundle.stats(name));
   if (values.size() == static_cast<std::size_t>(width)) return values;
@@ -26,6 +16,14 @@ Result<std::vector<float>> read(const Bundle& bundle, const std::string& name, i
 }
 
 }  // namespace
+
+std::vector<std::string> statistics_of(const NormalizeOp& op) {
+  constexpr const char* kLow[] = {"mean", "min", "q01", "q10"};
+  constexpr const char* kHigh[] = {"std", "max", "q99", "q90"};
+  if (op.kind == NormKind::identity) return {};
+  const int kind = static_cast<int>(op.kind);
+  return {op.stats + "." + kLow[kind], op.stats + "." + kHigh[kind]};
+}
 
 Normalizer::Normalizer(NormKind kind, Direction direction, float eps, std::vector<float> low, std::vector<float> high)
     : kind_(kind), direction_(direction), low_(std::move(low)), factor_(std::move(high)) {
@@ -40,10 +38,10 @@ Normalizer::Normalizer(NormKind kind, Direction direction, float eps, std::vecto
 
 Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormalizeOp& op, Direction direction, int width,
                                       const std::string& where) {
-  if (op.kind == NormKind::identity) return Normalizer(op.kind, direction, op.eps, {}, {});
-  const StatNames names = names_of(op.kind);
-  VLA_TRY(std::vector<float> low, read(bundle, op.stats + "." + names.low, width, where));
-  VLA_TRY(std::vector<float> high, read(bundle, op.stats + "." + names.high, width, where));
+  const std::vector<std::string> names = statistics_of(op);
+  if (names.empty()) return Normalizer(op.kind, direction, op.eps, {}, {});
+  VLA_TRY(std::vector<float> low, read(bundle, names[0], width, where));
+  VLA_TRY(std::vector<float> high, read(bundle, names[1], width, where));
   Normalizer normalizer(op.kind, direction, op.eps, std::move(low), std::move(high));
   if (direction == Direction::normalize) VLA_CHECK(normalizer.check_divisors(op));
   return normalizer;

@@ -12,6 +12,9 @@
 
 namespace vla {
 
+/// Names of the two tensors that a step reads; none for identity.
+std::vector<std::string> statistics_of(const NormalizeOp& op);
+
 /// Maps numbers between world units and the network's, per column, in float32 and in the reference's order of
 /// operations:
 ///

@@ -1,0 +1,170 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Bad bundles and bad observations end to end: each is one typed error that names its place, and the engine goes on.
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "support/gguf_writer.h"
+#include "support/golden_case.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+const std::string kCase = source_path("tests/golden/smolvla/two_views");
+
+EditableBundle sound_bundle() { return EditableBundle::read(kCase + "/bundle.gguf"); }
+
+/// The error with which a changed bundle is refused.
+Error refusal(const EditableBundle& bundle) {
+  const auto engine = Engine::load(bundle.write("changed.gguf"), {.n_thread = 1});
+  REQUIRE_FALSE(engine.ok());
+  return engine.error();
+}
+
+void check_refused(const EditableBundle& bundle, Code code, const std::string& part) {
+  const Error error = refusal(bundle);
+  CAPTURE(error.message());
+  CHECK(error.code == code);
+  CHECK(error.message().find(part) != std::string::npos);
+}
+
+/// The error with which an observation is refused; afterwards the engine must still answer the sound one.
+void check_observation_refused(const Observation& bad, const Noise& noise, Code code, const std::string& part) {
+  const GoldenCase golden = GoldenCase::read(kCase);
+  const auto engine = load_engine(golden.bundle());
+  const auto chunk = engine->act(bad, noise);
+  REQUIRE_FALSE(chunk.ok());
+  CAPTURE(chunk.error().message());
+  CHECK(chunk.error().code == code);
+  CHECK(chunk.error().message().find(part) != std::string::npos);
+  CHECK(engine->act(golden.observation, golden.noise).ok());
+}
+
+}  // namespace
+
+TEST_CASE("a bundle of an architecture that this build does not know is unsupported") {
+  EditableBundle bundle = sound_bundle();
+  bundle.set("vla.arch", Value(std::string("octo")));
+  check_refused(bundle, Code::unsupported, "one of smolvla, found octo");
+}
+
+TEST_CASE("missing, extra and misshapen tensors are named in one error") {
+  EditableBundle bundle = sound_bundle();
+  bundle.erase("expert.norm.weight");
+  bundle.erase("vision.blk.0.attn_q.bias");
+  bundle.tensors.push_back({"lm.blk.99.attn_q.weight", DType::f32, {1}, std::string(4, '\0')});
+  bundle.tensor("state_in.weight").shape = {4, bundle.tensor("state_in.weight").shape[0] * bundle.tensor("state_in.weight").shape[1] / 4};
+  const std::string message = refusal(bundle).message();
+  CAPTURE(message);
+  for (const char* part : {"4 problems", "missing tensor  expert.norm.weight", "missing tensor  vision.blk.0.attn_q.bias",
+                           "unused tensor   lm.blk.99.attn_q.weight", "wrong shape     state_in.weight"})
+    CHECK(message.find(part) != std::string::npos);
+}
+
+TEST_CASE("every required key is missed when it is gone") {
+  // Of the tokenizer, the processor and the network alike; a key that nobody misses would be a default in hiding.
+  const EditableBundle sound = sound_bundle();
+  int n_checked = 0;
+  for (const auto& [key, value] : sound.keys.all()) {
+    if (key.starts_with("general.") || key.starts_with("vla.source.") || key.starts_with("GGUF.")) continue;
+    if (key == "vla.checksum") continue;  // the writer adds it
+    CAPTURE(key);
+    EditableBundle bundle = sound;
+    bundle.remove_key(key);
+    const auto engine = Engine::load(bundle.write("changed.gguf"), {.n_thread = 1, .dry = true});
+    CHECK_FALSE(engine.ok());
+    ++n_checked;
+  }
+  CHECK(n_checked > 40);
+}
+
+TEST_CASE("sizes that do not go together are refused before memory is taken") {
+  for (const auto& [key, value] : std::initializer_list<std::pair<const char*, std::int64_t>>{
+           {"lm.n_layer", 2000000000}, {"lm.n_layer", 0}, {"vision.patch_size", 65536}, {"lm.n_head", 0}, {"lm.n_head_kv", 5},
+           {"policy.horizon", 1000000}, {"policy.horizon", 0}, {"solver.steps", 0}, {"solver.steps", 1000000000}, {"connector.factor", 3},
+           {"vision.image_size", 8}, {"lm.n_vocab", 1}, {"policy.d_state", -1}}) {
+    CAPTURE(key);
+    CAPTURE(value);
+    EditableBundle bundle = sound_bundle();
+    bundle.set(key, Value(value));
+    CHECK_FALSE(Engine::load(bundle.write("changed.gguf"), {.n_thread = 1}).ok());
+  }
+}
+
+TEST_CASE("statistics that the recipe does not read are an unused tensor") {
+  EditableBundle bundle = sound_bundle();
+  bundle.tensors.push_back({"stats.gripper.mean", DType::f32, {1}, std::string(4, '\0')});
+  check_refused(bundle, Code::bad_bundle, "unused tensor   stats.gripper.mean");
+}
+
+TEST_CASE("statistics that are missing refuse the bundle instead of passing numbers through") {
+  EditableBundle bundle = sound_bundle();
+  bundle.erase("stats.observation.state.std");
+  check_refused(bundle, Code::bad_bundle, "stats.observation.state.std");
+}
+
+TEST_CASE("a zero standard deviation divides by eps alone, as the reference does, and un-normalizes to the mean") {
+  EditableBundle bundle = sound_bundle();
+  for (const char* name : {"stats.observation.state.std", "stats.action.std"}) std::memset(bundle.tensor(name).data.data(), 0, 4);
+  GoldenCase golden = GoldenCase::read(kCase);
+  float state_mean, action_mean;
+  std::memcpy(&state_mean, bundle.tensor("stats.observation.state.mean").data.data(), 4);
+  std::memcpy(&action_mean, bundle.tensor("stats.action.mean").data.data(), 4);
+  golden.observation.states["state"][0] = state_mean;
+  const auto chunk = load_engine(bundle.write("zero_std.gguf"), "state")->act(golden.observation, golden.noise);
+  REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
+  CHECK(find_tap(chunk->taps, "state").values[0] == 0.0f);
+  for (int row = 0; row < chunk->horizon; ++row) CHECK(chunk->actions[static_cast<std::size_t>(row * chunk->d_action)] == action_mean);
+}
+
+TEST_CASE("wrong views, counts and numbers are refused by name, and the next request is answered") {
+  const GoldenCase golden = GoldenCase::read(kCase);
+  Observation bad = golden.observation;
+  bad.views.erase("camera2");
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "camera2");
+  bad = golden.observation;
+  bad.views["camera9"] = bad.views["camera1"];
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "camera9");
+  bad = golden.observation;
+  bad.views["camera1"] = bad.views["camera2"] = std::nullopt;
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "at least 1");
+  bad = golden.observation;
+  bad.states["state"].pop_back();
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "state");
+  bad = golden.observation;
+  bad.states["state"][2] = std::numeric_limits<float>::quiet_NaN();
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "nan");
+  bad = golden.observation;
+  bad.text = "";
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "instruction");
+  bad.text = std::string(100000, 'a');
+  check_observation_refused(bad, golden.noise, Code::bad_observation, "instruction");
+}
+
+TEST_CASE("noise of another size, or that is not finite, is refused") {
+  const GoldenCase golden = GoldenCase::read(kCase);
+  std::vector<float> noise = golden.noise;
+  noise.pop_back();
+  check_observation_refused(golden.observation, noise, Code::bad_observation, "noise");
+  noise.push_back(std::numeric_limits<float>::infinity());
+  check_observation_refused(golden.observation, noise, Code::bad_observation, "noise");
+}
+
+TEST_CASE("an action that is not finite never leaves the engine") {
+  const GoldenCase golden = GoldenCase::read(kCase);
+  check_observation_refused(golden.observation, std::vector<float>(golden.noise.size(), 3e38f), Code::bad_action, "");
+}
+
+TEST_CASE("a seed gives the same bytes every time and another seed others") {
+  const GoldenCase golden = GoldenCase::read(kCase);
+  const auto engine = load_engine(golden.bundle());
+  const auto first = engine->act(golden.observation, std::uint64_t{7});
+  CHECK(first->actions == engine->act(golden.observation, std::uint64_t{7})->actions);
+  CHECK(first->actions != engine->act(golden.observation, std::uint64_t{8})->actions);
+}
