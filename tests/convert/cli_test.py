@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 
+from vla_cpp.convert import read_bundle
 from vla_cpp.convert.cli import main
 
 PACKAGE = os.path.join(os.path.dirname(__file__), "..", "..", "python")
@@ -176,3 +177,32 @@ def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny,
         codes.add(main([str(converter.folder), "-o", converter.out, "--force", "--quiet"]))
         assert 1 not in codes, (capsys.readouterr().err, path.read_text()[:3000])
     assert codes & {3, 6}
+
+
+def test_a_hub_id_is_downloaded_and_recorded_with_its_revision(converter, tiny, monkeypatch, tmp_path):
+    """The hub's cache keeps a snapshot in a folder that is named by its revision."""
+    import huggingface_hub
+
+    snapshot = tmp_path / "snapshots" / "0123abc"
+    tiny.save(snapshot)
+    asked = []
+
+    def download(repo, allow_patterns):
+        asked.append((repo, tuple(allow_patterns)))
+        return str(snapshot)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    assert main(["someone/policy", "-o", converter.out, "--quiet"]) == 0
+    keys = read_bundle(converter.out).keys
+    assert (keys["vla.source.name"], keys["vla.source.revision"]) == ("someone/policy", "0123abc")
+    assert asked[0][0] == "someone/policy" and "*.safetensors" in asked[0][1]
+
+
+def test_the_backbone_is_downloaded_by_the_name_in_the_config(converter, tiny, monkeypatch, tmp_path):
+    import huggingface_hub
+
+    folder = converter.save(tiny)
+    (converter.folder / "vlm").rename(tmp_path / "hub")
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo, allow_patterns: str(tmp_path / "hub"))
+    assert main([folder, "-o", converter.out, "--quiet"]) == 0
+    assert read_bundle(converter.out).keys["lm.n_vocab"] == 300
