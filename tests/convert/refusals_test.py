@@ -362,6 +362,15 @@ def test_two_sets_of_weights_in_one_folder_are_refused(converter, tiny):
     )
 
 
+def test_the_folder_above_a_trainers_policy_is_told_where_the_policy_is(converter, tiny):
+    converter.save(tiny)
+    (converter.folder.parent / "step").mkdir()
+    converter.folder.rename(converter.folder.parent / "step" / "pretrained_model")
+    converter.folder = converter.folder.parent / "step"
+    error = converter.refusal()
+    assert "give " + str(converter.folder / "pretrained_model") in error.message() and error.code == IO
+
+
 def test_an_adapter_without_weights_is_told_to_be_merged(converter, tiny):
     converter.save(tiny)
     (converter.folder / "model.safetensors").rename(converter.folder / "adapter_model.safetensors")

@@ -120,6 +120,9 @@ def open_checkpoint(source: str) -> Checkpoint:
             raise refuse(source, "a checkpoint folder or a hub id like owner/name", "neither", code=Code.IO)
         folder, revision = download(source, HUB_PATTERNS)
     name = source if revision else os.path.basename(os.path.abspath(folder))
+    inner = os.path.join(folder, "pretrained_model")
+    if not os.path.exists(os.path.join(folder, "config.json")) and os.path.isdir(inner):
+        raise refuse(os.path.join(folder, "config.json"), "a policy", "none", "give " + inner, Code.IO)
     config = read_json(os.path.join(folder, "config.json"))
     problems = Problems(name)
     tensors, aliases = _read_tensors(folder, problems)

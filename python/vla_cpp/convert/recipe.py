@@ -9,10 +9,12 @@ Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_proc
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Dict, List, Optional, Sequence
+from typing import Dict, List, Sequence
+
+import numpy as np
 
 from .checkpoint import Checkpoint
-from .errors import Problems
+from .errors import Code, Problems
 from .files import member, plain_name
 from .normalization import Context, Found, Normalization, choose, from_file, from_weights
 
@@ -54,6 +56,11 @@ class Processors:
     own_tokenizer: str = ""  # folder inside the checkpoint
     state: Normalization = field(default_factory=Normalization)
     action: Normalization = field(default_factory=Normalization)
+
+    def statistics(self) -> Dict[str, np.ndarray]:
+        """By the name of the bundle's tensor."""
+        both = ((STATE, self.state), (ACTION, self.action))
+        return {"stats.{}.{}".format(f, name): v for f, norm in both for name, v in norm.statistics.items()}
 
 
 class _Reader:
@@ -190,6 +197,9 @@ def read_processors(
 ) -> Processors:
     """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights."""
     reader = _Reader(checkpoint, dims, identity, problems)
+    for feature in identity:
+        if feature not in dims:
+            problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
     if checkpoint.processors is None:
         return _from_weights(checkpoint, reader)
     for file, content in zip((PRE, POST), checkpoint.processors):
@@ -245,8 +255,3 @@ def view_aliases(views: Sequence[str], processors: Processors, notes: List[str],
         else:
             aliases[new] = old
     return [aliases[view] for view in views]
-
-
-def identity_unused(identity: Sequence[str], known: Sequence[str]) -> Optional[str]:
-    """A feature named by --identity-stats that the policy does not have."""
-    return next((feature for feature in identity if feature not in known), None)

@@ -10,16 +10,23 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Dict, Iterator, NamedTuple, Tuple
+from typing import BinaryIO, Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
 
 from .dtypes import SIZES, STATISTICS
-from .errors import Code, ConvertError, refuse
+from .errors import Code, refuse
 
 # The limit that the format's own library sets; a header of a large checkpoint takes less than a megabyte.
 MAX_HEADER = 100_000_000
 CHUNK_BYTES = 8 << 20
+
+
+def open_file(path: str) -> BinaryIO:
+    try:
+        return open(path, "rb")
+    except OSError as error:
+        raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
 
 
 class Entry(NamedTuple):
@@ -36,7 +43,7 @@ class Entry(NamedTuple):
         """The tensor's elements in order, as flat arrays of bounded size (BF16 as uint16 bits)."""
         kind = STATISTICS[self.dtype]
         left = self.n_bytes // kind.itemsize
-        with open(self.path, "rb") as file:
+        with open_file(self.path) as file:
             file.seek(self.offset)
             while left:
                 part = np.fromfile(file, dtype=kind, count=min(left, chunk_bytes // kind.itemsize))
@@ -67,9 +74,9 @@ def _is_count(value) -> bool:
 
 
 def _read_header(path: str) -> Tuple[dict, int, int]:
-    size = os.path.getsize(path)
     hint = "the file is truncated or not a safetensors file: download or save it again"
-    with open(path, "rb") as file:
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
         length = int.from_bytes(file.read(8), "little")
         if size < 8 or length > min(size - 8, MAX_HEADER):
             raise refuse(
@@ -138,17 +145,10 @@ def _check_layout(path: str, entries: Dict[str, Entry], start: int, size: int) -
 
 def read_safetensors(path: str) -> SafetensorsFile:
     """Parses and checks the header; no tensor data is read."""
-    try:
-        header, start, size = _read_header(path)
-    except OSError as error:
-        raise io_error(path, error)
+    header, start, size = _read_header(path)
     metadata = header.pop("__metadata__", {})
     if not isinstance(metadata, dict) or not all(isinstance(v, str) for v in metadata.values()):
         raise refuse(path + ": __metadata__", "a JSON object of strings", str(metadata)[:100])
     entries = {name: _read_entry(path, name, value, start, size) for name, value in header.items()}
     _check_layout(path, entries, start, size)
     return SafetensorsFile(entries, metadata)
-
-
-def io_error(path: str, error: OSError) -> ConvertError:
-    return refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)

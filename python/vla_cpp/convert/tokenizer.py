@@ -12,6 +12,7 @@ import json
 import os
 from typing import Dict, List, NamedTuple, Optional, Tuple
 
+from .bundle import Key
 from .errors import Code, Problems, refuse
 from .files import member, read_json
 
@@ -45,7 +46,7 @@ def byte_symbols() -> List[str]:
 
 
 class TokenizerPlan(NamedTuple):
-    keys: Dict[str, object]  # the bundle's `tokenizer.*`
+    keys: List[Key]  # the bundle's `tokenizer.*`
     truncate: str  # the side on which a text that is too long loses tokens: left or right
 
 
@@ -83,14 +84,14 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
             )
         pre = own
     tokens, merges = _vocabulary(model, added, n_vocab, problems)
-    keys = {
-        "tokenizer.kind": "byte_level_bpe",
-        "tokenizer.tokens": tokens,
-        "tokenizer.merges": merges,
-        "tokenizer.pre": _json(pre),
-        "tokenizer.added": _json(added),
-        "tokenizer.ignore_merges": bool(model.get("ignore_merges", False)) and not gpt2,
-    }
+    keys = [
+        Key("tokenizer.kind", "string", "byte_level_bpe"),
+        Key("tokenizer.tokens", "string[]", tokens),
+        Key("tokenizer.merges", "string[]", merges),
+        Key("tokenizer.pre", "string", _json(pre)),
+        Key("tokenizer.added", "string", _json(added)),
+        Key("tokenizer.ignore_merges", "bool", bool(model.get("ignore_merges", False)) and not gpt2),
+    ]
     return TokenizerPlan(keys, _truncation_side(spec, config, problems))
 
 

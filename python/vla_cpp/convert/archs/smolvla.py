@@ -31,35 +31,25 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     sizes = read_sizes(checkpoint, options, problems)
     problems.raise_any()
     dims = {recipe.STATE: sizes.state_dim, recipe.ACTION: sizes.action_dim}
-    unused = recipe.identity_unused(options.identity_stats, list(dims))
-    if unused:
-        problems.add("--identity-stats", " or ".join(dims), unused)
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems)
-    keys = _network_keys(sizes)
-    keys += _feature_keys(checkpoint, options, sizes, processors, problems)
-    tokenizer = read_tokenizer(
-        _tokenizer_folder(checkpoint, options, sizes, processors), sizes.n_vocab, problems, checkpoint.notes
-    )
-    kinds = {"tokenizer.tokens": "string[]", "tokenizer.merges": "string[]", "tokenizer.ignore_merges": "bool"}
-    keys += [Key(name, kinds.get(name, "string"), value) for name, value in tokenizer.keys.items()]
-    keys.append(
-        Key(
-            "processor.recipe", "string", json.dumps(_recipe(sizes, processors, tokenizer.truncate), ensure_ascii=False)
-        )
-    )
+    tokenizer_folder = _tokenizer_folder(checkpoint, options, sizes, processors)
+    tokenizer = read_tokenizer(tokenizer_folder, sizes.n_vocab, problems, checkpoint.notes)
+    document = json.dumps(_recipe(sizes, processors, tokenizer.truncate), ensure_ascii=False)
+    keys = [
+        *_network_keys(sizes),
+        *_feature_keys(checkpoint, options, sizes, processors, problems),
+        *tokenizer.keys,
+        Key("processor.recipe", "string", document),
+    ]
     problems.raise_any()
-    statistics = {
-        "stats.{}.{}".format(feature, name): value
-        for feature, norm in ((recipe.STATE, processors.state), (recipe.ACTION, processors.action))
-        for name, value in norm.statistics.items()
+    return Plan(keys, _weights(sizes), _dropped(sizes), processors.statistics(), _hints(sizes))
+
+
+def _hints(s: Sizes) -> Dict[str, str]:
+    return {
+        VLM + "text_model.layers.": "num_vlm_layers is {}: text layers are 0 to {}".format(s.n_layer, s.n_layer - 1),
+        EXPERT + "layers.": "the expert's layers are 0 to {}".format(s.n_expert_layer - 1),
     }
-    hints = {
-        VLM + "text_model.layers.": "num_vlm_layers is {}: text layers are 0 to {}".format(
-            sizes.n_layer, sizes.n_layer - 1
-        ),
-        EXPERT + "layers.": "the expert's layers are 0 to {}".format(sizes.n_expert_layer - 1),
-    }
-    return Plan(keys, _weights(sizes), _dropped(sizes), statistics, hints)
 
 
 def _tokenizer_folder(checkpoint: Checkpoint, options: Options, sizes: Sizes, processors: recipe.Processors) -> str:
