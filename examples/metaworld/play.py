@@ -48,12 +48,12 @@ def read_episode(folder: Path) -> Dict[str, Any]:
     return episode
 
 
-def answer(vla: str, bundle: Path, episode: Dict[str, Any], i: int, text: str) -> Dict[str, Any]:
+def answer(vla: str, bundle: Path, episode: Dict[str, Any], i: int, text: str, threads: int) -> Dict[str, Any]:
     """The runtime's answer to look i, with `difference` (to PyTorch's chunk) and `wall_ms` (of the whole process) added."""
     look = episode["looks"][i]
     begin = time.perf_counter()
     frame, noise = episode["folder"] / look["frame"], episode["folder"] / look["noise"]
-    got = runtime.run(vla, bundle, frame, np.asarray(look["state"], np.float32), text, noise)
+    got = runtime.run(vla, bundle, frame, np.asarray(look["state"], np.float32), text, noise, threads)
     got["wall_ms"] = 1e3 * (time.perf_counter() - begin)
     expected = episode["expected"][i]
     if got["actions"].shape != expected.shape:
@@ -258,6 +258,7 @@ def main() -> int:
     ap.add_argument("--text", help="say this instead of the recorded sentence; there is then nothing to match, and no verdict")
     ap.add_argument("--tolerance", type=float, default=1e-4, help="largest allowed difference to PyTorch's chunk, in action units (default 1e-4)")
     ap.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where the pictures go (default out/demo)")
+    ap.add_argument("--threads", type=int, default=1, help="of the runtime; 0 takes every core (default 1, enough for so small a policy)")
     ap.add_argument("--pause", type=float, default=0.0, metavar="SECONDS", help="wait after each look, to watch")
     a = ap.parse_args()
 
@@ -279,7 +280,7 @@ def main() -> int:
         for i in range(len(episode["looks"])):
             if not console.is_terminal:
                 print(f"{task} {i + 1}/{len(episode['looks'])}", flush=True)
-            got.append(answer(a.vla, a.bundle, episode, i, text))
+            got.append(answer(a.vla, a.bundle, episode, i, text, a.threads))
             if console.is_terminal or i == 0:  # a log needs one panel per episode, a person wants to watch
                 console.print(show(console, episode, i, got[-1], text, tolerance))
             time.sleep(a.pause)
