@@ -8,11 +8,14 @@
 #include <fstream>
 #include <string_view>
 
+#include "base/file.h"
 #include "bundle/gguf_reader.h"
 #include "bundle/gguf_writer.h"
 
 namespace vla {
 namespace {
+
+constexpr std::size_t kMaxFile = std::size_t{1} << 36;
 
 bool match_one(std::string_view pattern, std::string_view path) {
   if (pattern.empty()) return path.empty();
@@ -70,10 +73,8 @@ Status write_taps(const std::vector<Tap>& taps, const std::string& file) {
 }
 
 Result<std::vector<Tap>> read_taps(const std::string& file) {
-  std::ifstream stream(file, std::ios::binary);
-  const std::vector<char> text((std::istreambuf_iterator<char>(stream)), {});
-  if (!stream) return Error{Code::io, file, "a readable file of taps", "none"};
-  VLA_TRY(const GgufContent content, read_gguf(std::as_bytes(std::span(text)), file));
+  VLA_TRY(const std::vector<std::byte> bytes, read_file(file, kMaxFile));
+  VLA_TRY(const GgufContent content, read_gguf(bytes, file));
   std::vector<Tap> taps;
   for (const TensorInfo& tensor : content.tensors) {
     if (tensor.type != DType::f32)
