@@ -31,7 +31,8 @@ struct Mapping {
 };
 
 Result<Mapping> map_file(const std::string& path) {
-  const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  // Opening a pipe waits for its writer unless told not to; a file is not affected.
+  const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK);
   if (file < 0) return io_error(path, "a readable bundle");
   struct stat info = {};
   const bool regular = ::fstat(file, &info) == 0 && S_ISREG(info.st_mode);
