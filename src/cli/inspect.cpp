@@ -63,7 +63,7 @@ Status print_manifest(const std::string& arch) {
     row["storage"] = storage_name(param.storage);
     root["parameters"].push_back(std::move(row));
   }
-  fmt::print("{}\n", root.dump(2));
+  fmt::print("{}\n", text_of(root, 2));
   return {};
 }
 
@@ -142,7 +142,7 @@ void print_human(const Engine& engine) {
   const Json recipe = Json::parse(text("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {
     fmt::print("recipe       {}\n", list);
-    for (const Json& op : ops) fmt::print("    {}\n", op.dump());
+    for (const Json& op : ops) fmt::print("    {}\n", text_of(op));
   }
   fmt::print("modules      {:<18}  {:>14}  {:>10}\n", "path", "parameters", "stored");
   std::int64_t n_param = 0;
@@ -175,7 +175,7 @@ void print_json(const Engine& engine) {
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
-  fmt::print("{}\n", root.dump(2));
+  fmt::print("{}\n", text_of(root, 2));
 }
 
 Status inspect(const InspectOptions& options) {

@@ -12,6 +12,12 @@ namespace vla::cli {
 using Json =
     nlohmann::basic_json<nlohmann::ordered_map, std::vector, std::string, bool, std::int64_t, std::uint64_t, float>;
 
+/// One line, or indented lines. Bytes that are not UTF-8, as a path may have them, become U+FFFD: JSON cannot hold
+/// them.
+inline std::string text_of(const Json& json, int indent = -1) {
+  return json.dump(indent, ' ', false, Json::error_handler_t::replace);
+}
+
 /// Which bundle answered: path, architecture, dtype, source and checksum.
 inline Json identity_json(const Bundle& bundle) {
   Json identity;

@@ -4,8 +4,13 @@
 // One binary, one file per subcommand. This file parses, prints errors and chooses the exit code.
 #include <fmt/format.h>
 
+#include <algorithm>
+#include <cerrno>
+#include <cstdio>
+#include <cstring>
 #include <exception>
 #include <new>
+#include <system_error>
 
 #include "cli/commands.h"
 
@@ -22,6 +27,21 @@ Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation, 5 bad_
 int fail(const vla::Error& error) {
   fmt::print(stderr, "error: {}: {}\n", vla::code_name(error.code), error.message());
   return vla::exit_code(error.code);
+}
+
+/// What CLI11 says of a wrong call, in one line and with the help that explains it.
+int fail_usage(const CLI::App& app, const CLI::ParseError& parse_error) {
+  std::string what = parse_error.what();
+  std::replace(what.begin(), what.end(), '\n', ' ');
+  const auto chosen = app.get_subcommands();
+  const std::string help = chosen.empty() ? "vla --help" : "vla " + chosen.front()->get_name() + " --help";
+  return fail({vla::Code::usage, "arguments", "a call as " + help + " explains it", what});
+}
+
+/// A script must not take an answer for whole that a full disk or a closed pipe cut off.
+int finish() {
+  if (std::fflush(stdout) == 0 && std::ferror(stdout) == 0) return 0;
+  return fail({vla::Code::io, "standard output", "a place that can be written", std::strerror(errno)});
 }
 
 int run(int argc, char** argv) {
@@ -41,12 +61,12 @@ int run(int argc, char** argv) {
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& parse_error) {
-    const bool asked_for_help = parse_error.get_exit_code() == 0;
-    app.exit(parse_error);
-    return asked_for_help ? 0 : vla::exit_code(vla::Code::usage);
+    if (parse_error.get_exit_code() != 0) return fail_usage(app, parse_error);
+    app.exit(parse_error);  // help or version was asked for
+    return finish();
   }
   const vla::Status status = command();
-  return status ? 0 : fail(status.error());
+  return status ? finish() : fail(status.error());
 }
 
 }  // namespace
@@ -57,6 +77,9 @@ int main(int argc, char** argv) {
   } catch (const std::bad_alloc&) {
     return fail(
         {vla::Code::out_of_memory, "vla", "", "the system has no memory left", "use a smaller model or free memory"});
+  } catch (const std::system_error& exception) {  // fmt throws it where printing fails
+    if (std::ferror(stdout) == 0) return fail({vla::Code::internal, "vla", "", exception.what(), "please report this"});
+    return fail({vla::Code::io, "standard output", "a place that can be written", exception.what()});
   } catch (const std::exception& exception) {
     return fail({vla::Code::internal, "vla", "", exception.what(), "please report this"});
   }

@@ -40,11 +40,11 @@ Result<std::vector<float>> parse_numbers(const std::string& text) {
   std::vector<float> values;
   for (const char *at = text.data(), *end = at + text.size(); at != end;) {
     while (at != end && *at == ' ') ++at;
-    float value;
+    double value;  // a float32 reader would refuse 1e-60 as out of range; narrowed it is the zero that is meant
     const auto [next, error] = std::from_chars(at, end, value);
     if (error != std::errc() || (next != end && *next != ',') || (next != end && next + 1 == end))
       return Error{Code::usage, "--state", "numbers separated by commas", text};
-    values.push_back(value);
+    values.push_back(static_cast<float>(value));
     at = next == end ? next : next + 1;
   }
   return values;
@@ -79,12 +79,18 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   return {};
 }
 
-Result<Noise> read_noise(const RunOptions& options) {
+/// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from.
+Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
   if (options.noise.empty()) return Noise(*options.seed);
   VLA_TRY(const std::vector<std::byte> bytes, read_file(options.noise, kMaxFile));
   VLA_TRY(NpyArray array, parse_npy(bytes, options.noise));
   auto* values = std::get_if<std::vector<float>>(&array.values);
   if (values == nullptr) return Error{Code::bad_observation, options.noise, "float32 noise", "uint8"};
+  const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.horizon()),
+                                          static_cast<std::size_t>(engine.d_action())};
+  if (array.shape != shape)
+    return Error{Code::bad_observation, options.noise, fmt::format("noise of shape ({})", fmt::join(shape, ", ")),
+                 fmt::format("({})", fmt::join(array.shape, ", "))};
   return Noise(std::move(*values));
 }
 
@@ -124,7 +130,7 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   root["bundle"] = identity_json(engine.bundle());
   root["notes"] = chunk.notes;
   if (options.seed && options.noise.empty()) root["seed"] = *options.seed;
-  fmt::print("{}\n", root.dump());
+  fmt::print("{}\n", text_of(root));
 }
 
 Status check(RunOptions& options) {
@@ -138,6 +144,12 @@ Status check(RunOptions& options) {
   return {};
 }
 
+Status write_recorded(const std::vector<Tap>& taps, const RunOptions& options) {
+  if (taps.empty())
+    return Error{Code::usage, "--tap", "a pattern that names a value", options.tap, "'*' records all of them"};
+  return write_taps(taps, options.taps_out);
+}
+
 Status run(RunOptions& options) {
   VLA_CHECK(check(options));
   StageClock clock;
@@ -149,12 +161,12 @@ Status run(RunOptions& options) {
   for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image));
   for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, engine->processor()));
   clock.lap(before, "decode");
-  VLA_TRY(const Noise noise, read_noise(options));
+  VLA_TRY(const Noise noise, read_noise(options, *engine));
   VLA_TRY(ActionChunk chunk, engine->act(observation, noise));
   chunk.timing.insert(chunk.timing.begin(), before.begin(), before.end());
 
   for (const std::string& note : chunk.notes) fmt::print(stderr, "note: {}\n", note);
-  if (!options.taps_out.empty()) VLA_CHECK(write_taps(chunk.taps, options.taps_out));
+  if (!options.taps_out.empty()) VLA_CHECK(write_recorded(chunk.taps, options));
   if (!options.out.empty())
     VLA_CHECK(write_npy(options.out, chunk.actions, static_cast<std::size_t>(chunk.horizon),
                         static_cast<std::size_t>(chunk.d_action)));
@@ -166,6 +178,16 @@ Status run(RunOptions& options) {
   print_timing(chunk.timing);
   return {};
 }
+
+/// CLI11 wraps -1 around and reads an empty text as nothing given; a seed of either would be a guess.
+std::string check_seed(const std::string& text) {
+  std::uint64_t seed;
+  const char* const end = text.data() + text.size();
+  const auto [next, error] = std::from_chars(text.data(), end, seed);
+  return error == std::errc() && next == end ? "" : "expected an integer from 0 to 2^64 - 1, found '" + text + "'";
+}
+
+std::string check_given(const std::string& text) { return text.empty() ? "expected a value, found empty text" : ""; }
 
 }  // namespace
 
@@ -188,14 +210,21 @@ Command add_run(CLI::App& app) {
       ->required()
       ->allow_extra_args(false);
   command->add_option("--text", options->text, "The instruction")->required();
-  command->add_option("--noise", options->noise,
-                      "The solver's starting noise: a float32 .npy file, horizon x padded action width");
-  command->add_option("--seed", options->seed, "Draw the noise; the same seed gives the same bytes on every machine");
+  command
+      ->add_option("--noise", options->noise,
+                   "The solver's starting noise: a float32 .npy file, horizon x padded action width")
+      ->check(CLI::Validator(check_given, ""));
+  command->add_option("--seed", options->seed, "Draw the noise; the same seed gives the same bytes on every machine")
+      ->check(CLI::Validator(check_seed, ""));
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
-  command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions");
-  command->add_option("--tap", options->tap,
-                      "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns");
-  command->add_option("--taps-out", options->taps_out, "Where the recorded values go (GGUF), for vla compare");
+  command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions")
+      ->check(CLI::Validator(check_given, ""));
+  command
+      ->add_option("--tap", options->tap,
+                   "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns")
+      ->check(CLI::Validator(check_given, ""));
+  command->add_option("--taps-out", options->taps_out, "Where the recorded values go (GGUF), for vla compare")
+      ->check(CLI::Validator(check_given, ""));
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
