@@ -45,7 +45,7 @@ def commands(text):
 
 def named_paths(command):
     """Words of a command that claim to be files of the tree, as patterns for glob."""
-    for word in re.split(r"[\s=,;()'\"]+", command):
+    for word in re.split(r"(?:[\s=;()'\"]|,(?![^{}]*\}))+", command):  # a comma inside {b,c} is part of the word
         word = word.rstrip(".:").removeprefix("./")
         if word.startswith(MADE) or not word.startswith(tuple(f"{p}/" for p in PLACES)):
             continue
@@ -145,6 +145,10 @@ class Documents(unittest.TestCase):
     def test_a_placeholder_matches_any_name_but_not_none(self):
         self.assertEqual(len(self.check("`src/policies/<arch>.cpp`")), 1)
         self.assertEqual(self.check("`src/policies/<arch>.cpp`", **{"src__policies__pi0.cpp": ""}), [])
+
+    def test_each_path_of_a_list_in_braces_is_sought(self):
+        found = self.check("`src/{engine,gone}`, `src/engine`,`src/none`", **{"src__engine__a.cpp": ""})
+        self.assertEqual([f.split()[2] for f in found], ["src/gone,", "src/none,"])
 
     def test_a_flag_is_sought_in_the_program_that_the_command_starts_with(self):
         readme = "```\nvla run FILE --dtype f32\n```\nand `vla-convert DIR --dtype f32`"
