@@ -51,7 +51,7 @@ def pytorch(checkpoint: str) -> Policy:
 
 
 def cpp(vla: str, bundle: str) -> Policy:
-    """The C++ runtime: one call of `vla run` per chunk."""
+    """The C++ runtime: one call of `vla run` per chunk, one thread (the episodes side by side use the cores)."""
     from PIL import Image
 
     import runtime
@@ -61,7 +61,7 @@ def cpp(vla: str, bundle: str) -> Policy:
     def predict(frame: np.ndarray, state: np.ndarray, text: str, draw: np.ndarray) -> np.ndarray:
         Image.fromarray(frame).save(folder / "frame.png", compress_level=1)
         np.save(folder / "noise.npy", draw)
-        return runtime.run(vla, bundle, folder / "frame.png", state, text, folder / "noise.npy")["actions"]
+        return runtime.run(vla, bundle, folder / "frame.png", state, text, folder / "noise.npy", threads=1)["actions"]
 
     return predict
 

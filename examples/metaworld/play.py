@@ -48,12 +48,12 @@ def read_episode(folder: Path) -> Dict[str, Any]:
     return episode
 
 
-def answer(vla: str, bundle: Path, episode: Dict[str, Any], i: int, text: str) -> Dict[str, Any]:
+def answer(vla: str, bundle: Path, episode: Dict[str, Any], i: int, text: str, threads: int) -> Dict[str, Any]:
     """The runtime's answer to look i, with `difference` (to PyTorch's chunk) and `wall_ms` (of the whole process) added."""
     look = episode["looks"][i]
     begin = time.perf_counter()
     frame, noise = episode["folder"] / look["frame"], episode["folder"] / look["noise"]
-    got = runtime.run(vla, bundle, frame, np.asarray(look["state"], np.float32), text, noise)
+    got = runtime.run(vla, bundle, frame, np.asarray(look["state"], np.float32), text, noise, threads)
     got["wall_ms"] = 1e3 * (time.perf_counter() - begin)
     expected = episode["expected"][i]
     if got["actions"].shape != expected.shape:
@@ -191,8 +191,8 @@ def draw_episode(episode: Dict[str, Any], got: List[Dict[str, Any]], text: str, 
     sheet = Sheet(max(width, 900), below + 128)
 
     sheet.text(left, 14, f"\u201c{text}\u201d", 22)
-    worst = max(g["difference"] for g in got)
-    verdict = f"largest difference to PyTorch {worst:.1e}"
+    worst, other = max(g["difference"] for g in got), text != episode["sentence"]
+    verdict = f"largest difference to PyTorch {worst:.1e}" + (", which was told something else" if other else "")
     colour = INK if tolerance is None else GOOD if worst <= tolerance else BAD
     solved = f"{episode['task']}, unseen layout (seed {episode['seed']}), solved after {episode['solved_after_steps']} steps"
     sheet.text(left, 46, solved, 13, FAINT)
@@ -237,12 +237,13 @@ def draw_episode(episode: Dict[str, Any], got: List[Dict[str, Any]], text: str, 
         sheet.text(x + wide / 2, below + 70, f"{g['difference']:.1e}", 11, INK if tolerance is None else GOOD if good else BAD, "mm")
 
     x, y = left, below + 104
-    for colour, label in ((OURS, "vla.cpp, executed"), (lighter(OURS, 0.72), "vla.cpp, replaced by the next look"), (EXPERT, "scripted expert from the same state")):
+    ours, asked = ("steps a robot would execute", f", \u201c{episode['sentence']}\u201d") if other else ("executed", "")
+    for colour, label in ((OURS, f"vla.cpp, {ours}"), (lighter(OURS, 0.72), "replaced by the next look"), (EXPERT, f"scripted expert from the same state{asked}")):
         sheet.line([(x, y), (x + 26, y)], colour, 2.4)
         sheet.text(x + 34, y, label, 12, INK, "lm")
         x += 60 + sheet.width(label, 12)
     sheet.ring(x + 8, y, 3, GOLDEN)
-    sheet.text(x + 20, y, "PyTorch float32" + ("" if text == episode["sentence"] else f", recorded with \u201c{episode['sentence']}\u201d"), 12, INK, "lm")
+    sheet.text(x + 20, y, f"PyTorch float32{asked}", 12, INK, "lm")
     sheet.save(path)
 
 
@@ -258,6 +259,7 @@ def main() -> int:
     ap.add_argument("--text", help="say this instead of the recorded sentence; there is then nothing to match, and no verdict")
     ap.add_argument("--tolerance", type=float, default=1e-4, help="largest allowed difference to PyTorch's chunk, in action units (default 1e-4)")
     ap.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where the pictures go (default out/demo)")
+    ap.add_argument("--threads", type=int, default=1, help="of the runtime; 0 takes every core (default 1, enough for so small a policy)")
     ap.add_argument("--pause", type=float, default=0.0, metavar="SECONDS", help="wait after each look, to watch")
     a = ap.parse_args()
 
@@ -272,18 +274,19 @@ def main() -> int:
 
     tolerance = None if a.text else a.tolerance
     summary = Table("episode", "sentence", "chunks", "median ms", "largest difference", "", box=None, header_style="dim")
-    matched, total, times = 0, 0, []
+    matched, total, times, paths = 0, 0, [], []
     for task in tasks:
         episode = read_episode(a.episodes / task)
         text, got = a.text or episode["sentence"], []
         for i in range(len(episode["looks"])):
             if not console.is_terminal:
                 print(f"{task} {i + 1}/{len(episode['looks'])}", flush=True)
-            got.append(answer(a.vla, a.bundle, episode, i, text))
+            got.append(answer(a.vla, a.bundle, episode, i, text, a.threads))
             if console.is_terminal or i == 0:  # a log needs one panel per episode, a person wants to watch
                 console.print(show(console, episode, i, got[-1], text, tolerance))
             time.sleep(a.pause)
-        path = a.out / f"{task}.png"
+        path = a.out / (f"{task}-other-sentence.png" if a.text else f"{task}.png")
+        paths.append(str(path))
         draw_episode(episode, got, text, tolerance, path)
         worst, ms = max(g["difference"] for g in got), [compute_ms(g) for g in got]
         good = sum(g["difference"] <= a.tolerance for g in got)
@@ -293,7 +296,7 @@ def main() -> int:
 
     console.print()
     console.print(summary)
-    console.print(f"\nPictures: {', '.join(str(a.out / (t + '.png')) for t in tasks)}", soft_wrap=True, highlight=False)
+    console.print(f"\nPictures: {', '.join(paths)}", soft_wrap=True, highlight=False)
     if tolerance is None:
         console.print(f"Another sentence was asked for, so the differences to the recorded chunks are its effect. Median {np.median(times):.1f} ms per chunk.")
         return 0

@@ -12,16 +12,17 @@ import numpy as np
 Name = Union[str, Path]
 
 
-def command(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, noise: Name) -> List[str]:
-    """The command line.  frame: a PNG file; state (4,) in metres and gripper opening; noise: a .npy file (16, 8) float32."""
+def command(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, noise: Name, threads: int = 0) -> List[str]:
+    """The command line.  frame: a PNG file; state (4,) in metres and gripper opening; noise: a .npy file (16, 8) float32;
+    threads: 0 takes every core."""
     values = ",".join(format(float(x), ".9g") for x in state)  # 9 digits bring a float32 back exactly
     return [str(vla), "run", str(bundle), "--image", f"corner4={frame}", "--state", values, "--text", text,
-            "--noise", str(noise), "--json"]
+            "--noise", str(noise), "--threads", str(threads), "--json"]
 
 
-def run(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, noise: Name) -> Dict[str, Any]:
+def run(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, noise: Name, threads: int = 0) -> Dict[str, Any]:
     """The runtime's answer: `actions` as an array (16, 4) float32, `timing_ms`, `bundle` and what else it says."""
-    line = command(vla, bundle, frame, state, text, noise)
+    line = command(vla, bundle, frame, state, text, noise, threads)
     try:
         done = subprocess.run(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, universal_newlines=True, timeout=300)
     except (FileNotFoundError, PermissionError) as e:

@@ -7,6 +7,7 @@
 namespace vla {
 
 std::int64_t Tensor::dim(int i) const { return node_->ne[i]; }
+std::vector<std::int64_t> Tensor::shape() const { return {node_->ne, node_->ne + ggml_n_dims(node_)}; }
 
 Store::Store(std::size_t capacity)
     : context_(ggml_init({.mem_size = capacity * ggml_tensor_overhead(), .mem_buffer = nullptr, .no_alloc = true})) {}
@@ -47,6 +48,10 @@ std::size_t Store::size() const { return buffer_ ? ggml_backend_buffer_get_size(
 void Store::set(Tensor tensor, const void* data, std::size_t size) {
   ggml_backend_tensor_set(tensor.node(), data, 0, size);
 }
-void Store::get(Tensor tensor, void* data, std::size_t size) { ggml_backend_tensor_get(tensor.node(), data, 0, size); }
+std::vector<float> Store::get(Tensor tensor) {
+  std::vector<float> values(static_cast<std::size_t>(ggml_nelements(tensor.node())));
+  ggml_backend_tensor_get(tensor.node(), values.data(), 0, values.size() * sizeof(float));
+  return values;
+}
 
 }  // namespace vla

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 struct ggml_tensor;
 
@@ -18,6 +19,8 @@ class Tensor {
   ggml_tensor* node() const { return node_; }
   explicit operator bool() const { return node_ != nullptr; }
   std::int64_t dim(int i) const;
+  /// All dimensions up to the last that is not 1.
+  std::vector<std::int64_t> shape() const;
 
  private:
   ggml_tensor* node_ = nullptr;

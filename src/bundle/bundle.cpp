@@ -79,6 +79,15 @@ Status check_version(const Keys& keys, const std::string& name) {
                version < kBundleVersion ? "run vla-convert again" : "this bundle needs a newer vla"};
 }
 
+/// Every answer and every report names where the weights come from.
+Status check_identity(const Keys& keys) {
+  for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
+    if (const auto text = keys.string(key); !text) return text.error();
+  VLA_TRY(const std::string dtype, keys.string("vla.dtype"));
+  if (dtype == "f32" || dtype == "bf16" || dtype == "f16") return {};
+  return Error{Code::bad_bundle, "vla.dtype", "f32, bf16 or f16", dtype};
+}
+
 }  // namespace
 
 const char* dtype_name(DType type) {
@@ -108,6 +117,7 @@ Result<Bundle> Bundle::parse(std::span<const std::byte> bytes, std::string name)
                  "make a bundle with vla-convert"};
   VLA_CHECK(check_version(content.keys, name));
   VLA_CHECK(check_sum(bytes, content.keys, name));
+  VLA_CHECK(check_identity(content.keys));
   Bundle bundle;
   bundle.path_ = std::move(name);
   bundle.bytes_ = bytes;

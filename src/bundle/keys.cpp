@@ -18,7 +18,7 @@ Error missing(std::string_view key, const std::string& expected) {
 
 template <class T>
 Result<T> get(const std::map<std::string, Value, std::less<>>& values, std::string_view key) {
-  constexpr std::size_t index = Value(T{}).index();
+  const std::size_t index = Value(T{}).index();
   const auto found = values.find(key);
   if (found == values.end()) return missing(key, kTypeNames[index]);
   if (const T* value = std::get_if<T>(&found->second)) return *value;

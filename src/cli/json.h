@@ -18,7 +18,7 @@ inline Json identity_json(const Bundle& bundle) {
   identity["path"] = bundle.path();
   for (const char* key :
        {"vla.arch", "vla.dtype", "vla.checksum", "vla.source.name", "vla.source.revision", "vla.source.converter"})
-    identity[std::string(key).substr(4)] = bundle.keys().string(key) ? *bundle.keys().string(key) : "";
+    identity[std::string(key).substr(4)] = *bundle.keys().string(key);
   return identity;
 }
 

@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include "nn/tokens.h"
+
 namespace vla {
 namespace {
 
@@ -28,36 +30,28 @@ TapFilter step_filter(const std::string& pattern, int n_step) {
   };
 }
 
-Tap read_tap(std::string path, Tensor tensor) {
-  const ggml_tensor* node = tensor.node();
-  Tap tap{std::move(path),
-          {node->ne, node->ne + ggml_n_dims(node)},
-          std::vector<float>(static_cast<std::size_t>(ggml_nelements(node)))};
-  Store::get(tensor, tap.values.data(), tap.values.size() * sizeof(float));
-  return tap;
-}
+Tap read_tap(std::string path, Tensor tensor) { return {std::move(path), tensor.shape(), Store::get(tensor)}; }
 
 }  // namespace
 
 Plan::Plan(const PlanContext& context, const InputShape& shape)
     : tap_pattern_(context.tap_pattern),
       store_(store_capacity(context.weights)),
-      in_{store_.add(GGML_TYPE_F32, std::vector<std::int64_t>{shape.width, shape.height, 3, shape.n_view}),
-          store_.add(GGML_TYPE_I32, std::vector<std::int64_t>{shape.n_text}),
-          store_.add(GGML_TYPE_F32, std::vector<std::int64_t>{shape.d_state, 1})},
-      x_(store_.add(GGML_TYPE_F32, std::vector<std::int64_t>{context.d_action, context.horizon})),
-      k_(store_.add(GGML_TYPE_I32, std::vector<std::int64_t>{1})),
+      in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}),
+          store_.add_i32({shape.n_text}),
+          store_.add_f32({shape.d_state, 1})},
+      x_(store_.add_f32({context.d_action, context.horizon})),
+      k_(store_.add_i32({1})),
       prefix_(context.weights, store_, prefix_filter(tap_pattern_)),
       step_(context.weights, store_, step_filter(tap_pattern_, context.solver.n_step)) {}
 
 void Plan::build_prefix(const PlanContext& context) { context.policy.prefix(prefix_, in_, cache_); }
 
 void Plan::build_step(const PlanContext& context) {
-  ggml_context* c = step_.context();
-  const Tensor condition = ggml_get_rows(c, context.conditions.node(), k_.node());
-  const Tensor velocity = context.policy.velocity(step_, x_, condition, cache_);
-  const Tensor next = ggml_add(c, x_.node(), ggml_scale(c, velocity.node(), context.solver.dt));
-  step_.write(step_.name("x", next), x_);
+  Graph& g = step_;
+  const Tensor condition = column(g, context.conditions, k_);
+  const Tensor velocity = context.policy.velocity(g, x_, condition, cache_);
+  g.write(g.name("x", add(g, x_, scale(g, velocity, context.solver.dt))), x_);
 }
 
 Result<std::unique_ptr<Plan>> Plan::build(const PlanContext& context, const InputShape& shape, ComputeMemory& memory) {
@@ -81,7 +75,7 @@ void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_
 
 void Plan::set_x(std::span<const float> x) { Store::set(x_, x.data(), x.size_bytes()); }
 
-std::vector<float> Plan::x() const { return read_tap("x", x_).values; }
+std::vector<float> Plan::x() const { return Store::get(x_); }
 
 Status Plan::run_step(const Device& device, int k) {
   const std::int32_t index = k;

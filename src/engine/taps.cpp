@@ -2,8 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "engine/taps.h"
 
-#include <ggml-cpp.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstring>
@@ -11,6 +9,7 @@
 #include <string_view>
 
 #include "bundle/gguf_reader.h"
+#include "bundle/gguf_writer.h"
 
 namespace vla {
 namespace {
@@ -58,18 +57,15 @@ bool match_path(const std::string& pattern, const std::string& path) {
 }
 
 Status write_taps(const std::vector<Tap>& taps, const std::string& file) {
-  const ggml_context_ptr context(
-      ggml_init({.mem_size = (taps.size() + 1) * ggml_tensor_overhead(), .mem_buffer = nullptr, .no_alloc = true}));
-  const gguf_context_ptr gguf(gguf_init_empty());
-  gguf_set_val_str(gguf.get(), "general.architecture", "vla-taps");
-  for (const Tap& tap : taps) {
-    ggml_tensor* tensor =
-        ggml_new_tensor(context.get(), GGML_TYPE_F32, static_cast<int>(tap.shape.size()), tap.shape.data());
-    ggml_set_name(tensor, tap.path.c_str());
-    tensor->data = const_cast<float*>(tap.values.data());
-    gguf_add_tensor(gguf.get(), tensor);
-  }
-  if (gguf_write_to_file(gguf.get(), file.c_str(), false)) return {};
+  Keys keys;
+  keys.set("general.architecture", Value(std::string("vla-taps")));
+  std::vector<TensorInfo> tensors;
+  for (const Tap& tap : taps)
+    tensors.push_back({tap.path, DType::f32, tap.shape, std::as_bytes(std::span(tap.values))});
+  std::ofstream stream(file, std::ios::binary);
+  stream << write_gguf(keys, tensors);
+  stream.close();
+  if (stream) return {};
   return Error{Code::io, file, "a file that can be written", "an error while writing"};
 }
 

@@ -17,6 +17,9 @@ Tensor concat_features(Graph& g, Tensor first, Tensor second);
 /// One vector for every token of `like`: [d, 1] -> [d, n].
 Tensor repeat_like(Graph& g, Tensor x, Tensor like);
 
+/// One column of a table, chosen at run time: [d, n], index [1] i32 -> [d, 1].
+Tensor column(Graph& g, Tensor table, Tensor index);
+
 Tensor add(Graph& g, Tensor a, Tensor b);
 Tensor scale(Graph& g, Tensor x, float factor);
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].

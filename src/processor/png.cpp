@@ -12,6 +12,8 @@
 namespace vla::codecs {
 namespace {
 
+constexpr std::string_view kSignature = "\x89PNG\r\n\x1A\n";
+
 /// libpng reports errors by longjmp, which destroys nothing. So everything that owns memory lives here, outside the
 /// functions that a jump leaves, and those functions (`guarded_*`) hold only plain values.
 struct PngReader {
@@ -143,6 +145,20 @@ void drop_exif_name(std::vector<std::uint8_t>& exif) {
     exif.erase(exif.begin(), exif.begin() + sizeof kName);
 }
 
+/// Whether every chunk up to the end lies within the file. libpng takes memory for the length that a chunk states, up
+/// to 2 GiB, before it reads.
+bool chunks_fit(Bytes file) {
+  constexpr std::size_t kAround = 12;  // length, type and checksum
+  for (std::size_t at = kSignature.size(); file.size() - at >= kAround;) {
+    std::size_t length = 0;
+    for (std::size_t i = 0; i < 4; ++i) length = length << 8 | std::to_integer<std::size_t>(file[at + i]);
+    if (length > file.size() - at - kAround) return false;
+    if (std::memcmp(file.data() + at + 4, "IEND", 4) == 0) return true;
+    at += length + kAround;
+  }
+  return false;
+}
+
 Error corrupt(const PngReader& reader, const std::string& where) {
   return refused(where, "a whole PNG image", reader.message[0] != 0 ? reader.message : "a damaged one");
 }
@@ -150,11 +166,11 @@ Error corrupt(const PngReader& reader, const std::string& where) {
 }  // namespace
 
 bool is_png(Bytes file) {
-  constexpr std::uint8_t kSignature[] = {0x89, 'P', 'N', 'G', '\r', '\n', 0x1A, '\n'};
-  return file.size() >= sizeof kSignature && std::memcmp(file.data(), kSignature, sizeof kSignature) == 0;
+  return file.size() >= kSignature.size() && std::memcmp(file.data(), kSignature.data(), kSignature.size()) == 0;
 }
 
 Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {
+  if (!chunks_fit(file)) return refused(where, "a whole PNG image", "a truncated one");
   PngReader reader(file);
   if (!open(reader)) return Error{Code::out_of_memory, where, "", "no memory for the PNG decoder"};
   if (!guarded_header(reader)) return corrupt(reader, where);

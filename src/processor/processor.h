@@ -77,6 +77,7 @@ class Processor {
   };
 
   Status read_features(const Bundle& bundle);
+  Status check_descriptions(const Keys& keys) const;
   Status read_state_steps(const Bundle& bundle);
   Status read_action_steps(const Bundle& bundle);
   struct PresentView {

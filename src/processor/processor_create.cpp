@@ -13,21 +13,21 @@
 namespace vla {
 namespace {
 
-Error mismatch(std::string where, std::string expected, std::string found) {
+Error misfit(std::string where, std::string expected, std::string found) {
   return {Code::bad_bundle, std::move(where), std::move(expected), std::move(found), "convert the checkpoint again"};
 }
 
 Status check_names(const std::string& key, const std::vector<std::string>& names) {
   const std::set<std::string> unique(names.begin(), names.end());
-  if (unique.size() != names.size()) return mismatch(key, "distinct names", "a name twice");
-  if (unique.contains("")) return mismatch(key, "names", "an empty one");
+  if (unique.size() != names.size()) return misfit(key, "distinct names", "a name twice");
+  if (unique.contains("")) return misfit(key, "names", "an empty one");
   return {};
 }
 
 template <class T>
 Status check_size(const std::string& key, const std::vector<T>& list, std::size_t expected) {
   if (list.size() == expected) return {};
-  return mismatch(key, fmt::format("{} entries", expected), std::to_string(list.size()));
+  return misfit(key, fmt::format("{} entries", expected), std::to_string(list.size()));
 }
 
 std::int64_t total_dims(std::span<const int> dims) {
@@ -48,9 +48,9 @@ Result<Processor> Processor::create(const Bundle& bundle) {
   VLA_TRY(processor.tokenizer_, Tokenizer::create(keys, n_vocab));
   VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens"));
   if (processor.recipe_.max_tokens > max_text_tokens)
-    return mismatch("processor.recipe.text",
-                    fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
-                    std::to_string(processor.recipe_.max_tokens));
+    return misfit("processor.recipe.text",
+                  fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
+                  std::to_string(processor.recipe_.max_tokens));
   return processor;
 }
 
@@ -63,8 +63,10 @@ Status Processor::read_features(const Bundle& bundle) {
   VLA_CHECK(check_names("observation.views", views));
   VLA_CHECK(check_size("observation.view_aliases", aliases, views.size()));
   VLA_CHECK(check_size("observation.view_optional", view_optional_, views.size()));
+  for (const int flag : view_optional_)
+    if (flag != 0 && flag != 1) return misfit("observation.view_optional", "0 or 1", std::to_string(flag));
   if (min_views_ < 1 || static_cast<std::size_t>(min_views_) > views.size())
-    return mismatch("observation.min_views", fmt::format("1 to {}", views.size()), std::to_string(min_views_));
+    return misfit("observation.min_views", fmt::format("1 to {}", views.size()), std::to_string(min_views_));
   views_ = FeatureNames("view", std::move(views), std::move(aliases));
 
   VLA_TRY(std::vector<std::string> states, keys.strings("observation.states"));
@@ -73,13 +75,27 @@ Status Processor::read_features(const Bundle& bundle) {
   VLA_CHECK(check_size("observation.state_dims", state_dims_, states.size()));
   for (const int dim : state_dims_)
     if (dim < 1 || dim > kMaxVector)
-      return mismatch("observation.state_dims", fmt::format("1 to {}", kMaxVector), std::to_string(dim));
+      return misfit("observation.state_dims", fmt::format("1 to {}", kMaxVector), std::to_string(dim));
   if (total_dims(state_dims_) > kMaxVector)
-    return mismatch("observation.state_dims", fmt::format("at most {} numbers in all", kMaxVector), "more");
+    return misfit("observation.state_dims", fmt::format("at most {} numbers in all", kMaxVector), "more");
   std::vector<std::string> no_aliases(states.size());
   states_ = FeatureNames("state", std::move(states), std::move(no_aliases));
 
   VLA_TRY(action_names_, keys.strings("action.names"));
+  return check_descriptions(keys);
+}
+
+/// Names, units and the rate change no number, but a reader of the answer relies on them.
+Status Processor::check_descriptions(const Keys& keys) const {
+  VLA_TRY(const auto action_units, keys.strings("action.units"));
+  VLA_TRY(const auto state_names, keys.strings("observation.state_names"));
+  VLA_TRY(const auto state_units, keys.strings("observation.state_units"));
+  const auto n_state = static_cast<std::size_t>(total_dims(state_dims_));
+  VLA_CHECK(check_size("action.units", action_units, action_names_.size()));
+  VLA_CHECK(check_size("observation.state_names", state_names, n_state));
+  VLA_CHECK(check_size("observation.state_units", state_units, n_state));
+  VLA_TRY(const double rate, keys.number("action.rate_hz"));
+  if (rate < 0) return mismatch(std::string("action.rate_hz"), "0 or more", fmt::format("{}", rate));
   return {};
 }
 
@@ -90,8 +106,8 @@ Status Processor::read_state_steps(const Bundle& bundle) {
     const std::string where = fmt::format("processor.recipe.state[{}]", i);
     if (const auto* pad = std::get_if<PadOp>(&recipe_.state[i])) {
       if (static_cast<std::size_t>(pad->size) < width)
-        return mismatch(where + ".size", fmt::format("at least the {} numbers of the state", width),
-                        std::to_string(pad->size));
+        return misfit(where + ".size", fmt::format("at least the {} numbers of the state", width),
+                      std::to_string(pad->size));
       width = static_cast<std::size_t>(pad->size);
       continue;
     }
@@ -101,7 +117,7 @@ Status Processor::read_state_steps(const Bundle& bundle) {
       const auto& names = states_.names();
       const auto index = static_cast<std::size_t>(std::find(names.begin(), names.end(), op.feature) - names.begin());
       if (index == names.size())
-        return mismatch(where + ".feature", "one of " + states_.listed(), "\"" + op.feature + "\"");
+        return misfit(where + ".feature", "one of " + states_.listed(), "\"" + op.feature + "\"");
       offset = static_cast<std::size_t>(total_dims(std::span(state_dims_).first(index)));
       n_column = static_cast<std::size_t>(state_dims_[index]);
     }
@@ -112,8 +128,8 @@ Status Processor::read_state_steps(const Bundle& bundle) {
   d_state_ = width;
   VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state"));
   if (width != static_cast<std::size_t>(d_state))
-    return mismatch("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
-                    std::to_string(width));
+    return misfit("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
+                  std::to_string(width));
   return {};
 }
 
@@ -124,7 +140,7 @@ Status Processor::read_action_steps(const Bundle& bundle) {
     const std::string where = fmt::format("processor.recipe.action[{}]", i);
     if (const auto* take = std::get_if<TakeOp>(&recipe_.action[i])) {
       if (take->size > width)
-        return mismatch(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
+        return misfit(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
       width = take->size;
       continue;
     }
@@ -133,8 +149,8 @@ Status Processor::read_action_steps(const Bundle& bundle) {
     action_steps_.push_back({std::move(normalizer), static_cast<std::size_t>(width)});
   }
   if (static_cast<std::size_t>(width) != action_names_.size())
-    return mismatch("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", width),
-                    std::to_string(action_names_.size()));
+    return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", width),
+                  std::to_string(action_names_.size()));
   return {};
 }
 

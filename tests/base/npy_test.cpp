@@ -4,7 +4,7 @@
 
 #include <doctest/doctest.h>
 
-#include "support/gguf_writer.h"
+#include "support/editable_bundle.h"
 
 using namespace vla;
 

@@ -9,7 +9,7 @@
 #include <random>
 
 #include "bundle/params.h"
-#include "support/gguf_writer.h"
+#include "support/editable_bundle.h"
 
 using namespace vla;
 using test::EditableBundle;
@@ -19,7 +19,8 @@ namespace {
 EditableBundle small_bundle() {
   EditableBundle bundle;
   bundle.set("vla.bundle_version", Value(std::int64_t{1}));
-  bundle.set("vla.arch", Value(std::string("smolvla")));
+  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"), {"vla.dtype", "f32"}, {"vla.source.name", "x"}, {"vla.source.revision", ""}, {"vla.source.converter", "test"}})
+    bundle.set(key, Value(std::string(value)));
   bundle.set("lm.d_model", Value(std::int64_t{4}));
   bundle.set("lm.names", Value(std::vector<std::string>{"a", "b"}));
   bundle.tensors.push_back({"lm.weight", DType::f32, {4, 2}, std::string(32, '\1')});

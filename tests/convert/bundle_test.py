@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The file itself: readable by GGUF's own tools, checksummed, deterministic, complete or absent, written in bounded memory."""
+
 import json
 import os
 import shutil
@@ -16,8 +17,16 @@ from gguf import GGUFReader
 from vla_cpp.convert import ConvertError, read_bundle
 from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo
 
-KEYS = [Key("general.architecture", "string", "vla"), Key("n", "u32", 7), Key("x", "f32", 0.1), Key("y", "f64", 0.1), Key("yes", "bool", True),
-        Key("list", "u32[]", [1, 2**32 - 1]), Key("words", "string[]", ["", "\u0120x", "\U0001f642"]), Key("none", "string[]", [])]
+KEYS = [
+    Key("general.architecture", "string", "vla"),
+    Key("n", "u32", 7),
+    Key("x", "f32", 0.1),
+    Key("y", "f64", 0.1),
+    Key("yes", "bool", True),
+    Key("list", "u32[]", [1, 2**32 - 1]),
+    Key("words", "string[]", ["", "\u0120x", "\U0001f642"]),
+    Key("none", "string[]", []),
+]
 
 
 def write(path, tensors=()):
@@ -29,8 +38,11 @@ def write(path, tensors=()):
 
 def some_tensors():
     rng = np.random.default_rng(0)
-    return [("a", "f32", rng.standard_normal((3, 5)).astype(np.float32)), ("b", "bf16", rng.integers(0, 1 << 15, (2, 3, 7)).astype(np.uint16)),
-            ("c", "f16", rng.standard_normal(1).astype(np.float16))]
+    return [
+        ("a", "f32", rng.standard_normal((3, 5)).astype(np.float32)),
+        ("b", "bf16", rng.integers(0, 1 << 15, (2, 3, 7)).astype(np.uint16)),
+        ("c", "f16", rng.standard_normal(1).astype(np.float16)),
+    ]
 
 
 def test_values_of_every_type_are_read_back_by_the_formats_own_reader(tmp_path):
@@ -52,8 +64,8 @@ def test_tensors_are_read_back_bit_by_bit(tmp_path):
 def test_the_checksum_is_xxh3_of_the_file_with_its_digits_as_zeros(tmp_path):
     data = open(write(tmp_path / "b.gguf", some_tensors()), "rb").read()
     at = data.index(b"xxh3:") + 5
-    stated = data[at:at + 16].decode()
-    assert stated == "{:016x}".format(xxhash.xxh3_64_intdigest(data[:at] + b"0" * 16 + data[at + 16:]))
+    stated = data[at : at + 16].decode()
+    assert stated == "{:016x}".format(xxhash.xxh3_64_intdigest(data[:at] + b"0" * 16 + data[at + 16 :]))
 
 
 def test_a_flipped_bit_is_noticed_wherever_it_is(tmp_path):
@@ -129,11 +141,19 @@ def test_memory_does_not_grow_with_the_size_of_a_tensor(converter, tiny):
     """A 96 MB table must not show: the promise is 1.5 times the largest tensor plus 500 MB, streaming needs far less."""
     rows = 2_000_000
     tiny.backbone["text_config"]["vocab_size"] = rows
-    for name in ("model.vlm_with_expert.vlm.model.text_model.embed_tokens.weight", "model.vlm_with_expert.vlm.lm_head.weight"):
+    for name in (
+        "model.vlm_with_expert.vlm.model.text_model.embed_tokens.weight",
+        "model.vlm_with_expert.vlm.lm_head.weight",
+    ):
         tiny.tensors[name] = np.ones((rows, 12), np.float32)
     folder = converter.save(tiny)
     package = os.path.join(os.path.dirname(__file__), "..", "..", "python")
-    result = subprocess.run([sys.executable, "-c", MEASURE, folder, converter.out], env={**os.environ, "PYTHONPATH": package}, capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", MEASURE, folder, converter.out],
+        env={**os.environ, "PYTHONPATH": package},
+        capture_output=True,
+        text=True,
+    )
     assert result.returncode == 0, result.stderr
     before, peak = json.loads(result.stdout)
     assert os.path.getsize(converter.out) > rows * 12 * 4

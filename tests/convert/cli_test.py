@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The command as a person or a script meets it: exit codes, streams, wording."""
+
 import json
 import os
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 
+from vla_cpp.convert import read_bundle
 from vla_cpp.convert.cli import main
 
 PACKAGE = os.path.join(os.path.dirname(__file__), "..", "..", "python")
@@ -16,14 +18,19 @@ PACKAGE = os.path.join(os.path.dirname(__file__), "..", "..", "python")
 
 def run(*args, **environment):
     command = [sys.executable, "-m", "vla_cpp.convert.cli", *map(str, args)]
-    return subprocess.run(command, env={**os.environ, "PYTHONPATH": PACKAGE, **environment}, capture_output=True, text=True)
+    return subprocess.run(
+        command, env={**os.environ, "PYTHONPATH": PACKAGE, **environment}, capture_output=True, text=True
+    )
 
 
 def test_a_conversion_exits_with_zero_and_says_what_it_wrote_and_dropped(converter, tiny):
     result = run(converter.save(tiny), "-o", converter.out)
     assert result.returncode == 0 and result.stderr == ""
     lines = result.stdout.splitlines()
-    assert lines[0].startswith("wrote " + converter.out + ": smolvla, ") and "{:,} bytes".format(os.path.getsize(converter.out)) in lines[0]
+    assert (
+        lines[0].startswith("wrote " + converter.out + ": smolvla, ")
+        and "{:,} bytes".format(os.path.getsize(converter.out)) in lines[0]
+    )
     assert any("lm_head" in line and "dropped" in line for line in lines)
 
 
@@ -37,10 +44,16 @@ def test_a_refusal_goes_to_stderr_in_the_form_of_the_runtime(converter, tiny, ca
     assert main([converter.save(tiny), "-o", converter.out]) == 6
     streams = capsys.readouterr()
     assert streams.out == ""
-    assert streams.err == "error: config.json: add_image_special_tokens: expected False, found True; the prefix would hold further tokens\n"
+    assert (
+        streams.err
+        == "error: config.json: add_image_special_tokens: expected False, found True; the prefix would hold further tokens\n"
+    )
 
 
-@pytest.mark.parametrize("code, change", [(3, lambda t: t.tensors.pop("model.state_proj.bias")), (6, lambda t: t.config.update(use_cache=False))])
+@pytest.mark.parametrize(
+    "code, change",
+    [(3, lambda t: t.tensors.pop("model.state_proj.bias")), (6, lambda t: t.config.update(use_cache=False))],
+)
 def test_each_class_of_refusal_has_its_exit_code(converter, tiny, capsys, code, change):
     change(tiny)
     assert main([converter.save(tiny), "-o", converter.out]) == code
@@ -111,15 +124,48 @@ def mutate(rng, value, depth=0):
     """One random change somewhere in a JSON value."""
     if isinstance(value, dict) and value and rng.random() < 0.9:
         key = list(value)[rng.integers(len(value))]
-        return {**value, key: mutate(rng, value[key], depth + 1)} if rng.random() < 0.85 else {k: v for k, v in value.items() if k != key}
+        return (
+            {**value, key: mutate(rng, value[key], depth + 1)}
+            if rng.random() < 0.85
+            else {k: v for k, v in value.items() if k != key}
+        )
     if isinstance(value, list) and value and rng.random() < 0.8:
         i = int(rng.integers(len(value)))
-        return value[:i] + [mutate(rng, value[i], depth + 1)] + value[i + 1:]
-    junk = [None, True, -1, 0, 3, 10**30, 1.5, 1e308, "", "x", "../..", [], [1], {}, {"a": 1}, [[]], ["a", 2], {"type": "STATE"}]
+        return value[:i] + [mutate(rng, value[i], depth + 1)] + value[i + 1 :]
+    junk = [
+        None,
+        True,
+        -1,
+        0,
+        3,
+        10**30,
+        1.5,
+        1e308,
+        "",
+        "x",
+        "../..",
+        [],
+        [1],
+        {},
+        {"a": 1},
+        [[]],
+        ["a", 2],
+        {"type": "STATE"},
+    ]
     return junk[rng.integers(len(junk))]
 
 
-@pytest.mark.parametrize("file", ["config.json", "vlm/config.json", "vlm/tokenizer.json", "vlm/tokenizer_config.json", "policy_preprocessor.json", "policy_postprocessor.json"])
+@pytest.mark.parametrize(
+    "file",
+    [
+        "config.json",
+        "vlm/config.json",
+        "vlm/tokenizer.json",
+        "vlm/tokenizer_config.json",
+        "policy_preprocessor.json",
+        "policy_postprocessor.json",
+    ],
+)
 def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny, capsys, file):
     rng = np.random.default_rng(len(file))
     converter.save(tiny)
@@ -131,3 +177,32 @@ def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny,
         codes.add(main([str(converter.folder), "-o", converter.out, "--force", "--quiet"]))
         assert 1 not in codes, (capsys.readouterr().err, path.read_text()[:3000])
     assert codes & {3, 6}
+
+
+def test_a_hub_id_is_downloaded_and_recorded_with_its_revision(converter, tiny, monkeypatch, tmp_path):
+    """The hub's cache keeps a snapshot in a folder that is named by its revision."""
+    import huggingface_hub
+
+    snapshot = tmp_path / "snapshots" / "0123abc"
+    tiny.save(snapshot)
+    asked = []
+
+    def download(repo, allow_patterns):
+        asked.append((repo, tuple(allow_patterns)))
+        return str(snapshot)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    assert main(["someone/policy", "-o", converter.out, "--quiet"]) == 0
+    keys = read_bundle(converter.out).keys
+    assert (keys["vla.source.name"], keys["vla.source.revision"]) == ("someone/policy", "0123abc")
+    assert asked[0][0] == "someone/policy" and "*.safetensors" in asked[0][1]
+
+
+def test_the_backbone_is_downloaded_by_the_name_in_the_config(converter, tiny, monkeypatch, tmp_path):
+    import huggingface_hub
+
+    folder = converter.save(tiny)
+    (converter.folder / "vlm").rename(tmp_path / "hub")
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo, allow_patterns: str(tmp_path / "hub"))
+    assert main([folder, "-o", converter.out, "--quiet"]) == 0
+    assert read_bundle(converter.out).keys["lm.n_vocab"] == 300

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Exact conversions between number formats."""
+
 import numpy as np
 import pytest
-from tiny import VLM, Tiny
 
+from tiny import VLM, Tiny
 from vla_cpp.convert.dtypes import bf16_to_f32, convert, f32_to_bf16
 
 
@@ -28,7 +29,24 @@ def test_bf16_rounding_is_to_nearest_with_ties_to_even_for_every_kind_of_number(
     bits = rng.integers(0, 1 << 32, 20000, dtype=np.uint32)
     ties = (rng.integers(0, 1 << 16, 5000, dtype=np.uint32) << 16) | 0x8000
     around = np.concatenate([ties - 1, ties + 1])
-    edges = np.array([0, 1 << 31, 1, 0x8000, 0x8001, 0x17FFF, 0x18000, 0x7F7FFFFF, 0xFF7FFFFF, 0x7F7F7FFF, 0x7F7F8000, 0x007FFFFF, 0x00800000], np.uint32)
+    edges = np.array(
+        [
+            0,
+            1 << 31,
+            1,
+            0x8000,
+            0x8001,
+            0x17FFF,
+            0x18000,
+            0x7F7FFFFF,
+            0xFF7FFFFF,
+            0x7F7F7FFF,
+            0x7F7F8000,
+            0x007FFFFF,
+            0x00800000,
+        ],
+        np.uint32,
+    )
     values = np.concatenate([bits, ties, around, edges]).view(np.float32)
     values = values[np.isfinite(values)]
     expected = np.array([nearest_even_bf16(value) for value in values], np.uint16)
@@ -49,14 +67,18 @@ def test_every_bf16_survives_the_way_through_f32():
     np.testing.assert_array_equal(f32_to_bf16(values)[numbers], every[numbers])
 
 
-@pytest.mark.parametrize("dtype, target", [("F32", "f32"), ("F16", "f32"), ("BF16", "f32"), ("F16", "f16"), ("BF16", "bf16")])
+@pytest.mark.parametrize(
+    "dtype, target", [("F32", "f32"), ("F16", "f32"), ("BF16", "f32"), ("F16", "f16"), ("BF16", "bf16")]
+)
 def test_a_conversion_to_a_type_that_holds_everything_has_no_error(dtype, target):
     values = np.random.default_rng(1).standard_normal(1000).astype(np.float32)
     raw = {"F32": values, "F16": values.astype(np.float16), "BF16": f32_to_bf16(values)}[dtype]
     part = convert(raw, dtype, target)
     assert part.error == 0 and part.finite and not part.overflow
-    np.testing.assert_array_equal(part.data if target != "f32" else part.data.astype(np.float64), raw if target != "f32" else
-                                  (bf16_to_f32(raw) if dtype == "BF16" else raw).astype(np.float64))
+    np.testing.assert_array_equal(
+        part.data if target != "f32" else part.data.astype(np.float64),
+        raw if target != "f32" else (bf16_to_f32(raw) if dtype == "BF16" else raw).astype(np.float64),
+    )
 
 
 def test_the_largest_rounding_error_is_reported():
@@ -100,7 +122,9 @@ def test_one_stored_type_is_kept_and_mixed_types_become_exact_f32(converter):
     tiny.tensors["model.state_proj.weight"] = values["model.state_proj.weight"]
     bundle = converter.bundle(tiny)
     assert bundle.keys["vla.dtype"] == "f32" and any("mixed types" in note for note in converter.summary.notes)
-    np.testing.assert_array_equal(bundle.tensors["lm.token_embd.weight"], values[VLM + "text_model.embed_tokens.weight"])
+    np.testing.assert_array_equal(
+        bundle.tensors["lm.token_embd.weight"], values[VLM + "text_model.embed_tokens.weight"]
+    )
 
 
 def test_f32_and_bf16_files_of_the_same_numbers_give_the_same_bf16_bundle(converter):

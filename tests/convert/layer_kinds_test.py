@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which attention runs where. The expectations were taken from the reference by running its SmolVLMWithExpertModel over a
 prefix and one step and recording the calls; `None` means that it raised."""
+
 import pytest
 
 CASES = [  # vlm layers, num_expert_layers, self_attn_every_n_layers, attention_mode, kinds, input widths of k and v (own 6, cross 4)
@@ -23,11 +24,18 @@ CASES = [  # vlm layers, num_expert_layers, self_attn_every_n_layers, attention_
 
 def configure(tiny, n_layer, n_expert, every, mode, widths):
     import numpy as np
+
     from tiny import D_EXPERT, D_EXPERT_FF, D_FF, D_MODEL, EXPERT, VLM, llama_block
 
-    tiny.config.update(num_vlm_layers=n_layer, num_expert_layers=n_expert, self_attn_every_n_layers=every, attention_mode=mode)
+    tiny.config.update(
+        num_vlm_layers=n_layer, num_expert_layers=n_expert, self_attn_every_n_layers=every, attention_mode=mode
+    )
     tiny.backbone["text_config"]["num_hidden_layers"] = 8
-    tiny.tensors = {name: value for name, value in tiny.tensors.items() if "text_model.layers." not in name and "lm_expert.layers." not in name}
+    tiny.tensors = {
+        name: value
+        for name, value in tiny.tensors.items()
+        if "text_model.layers." not in name and "lm_expert.layers." not in name
+    }
     blocks = {}
     for i in range(n_layer):
         blocks.update(llama_block("{}text_model.layers.{}.".format(VLM, i), D_MODEL, D_FF, D_MODEL))
@@ -37,7 +45,9 @@ def configure(tiny, n_layer, n_expert, every, mode, widths):
 
 
 @pytest.mark.parametrize("n_layer, n_expert, every, mode, kinds, widths", [case for case in CASES if case[4]])
-def test_layer_kinds_and_widths_are_those_of_the_reference(converter, tiny, n_layer, n_expert, every, mode, kinds, widths):
+def test_layer_kinds_and_widths_are_those_of_the_reference(
+    converter, tiny, n_layer, n_expert, every, mode, kinds, widths
+):
     configure(tiny, n_layer, n_expert, every, mode, widths)
     bundle = converter.bundle(tiny)
     assert bundle.keys["expert.layer_kinds"] == kinds
@@ -45,7 +55,9 @@ def test_layer_kinds_and_widths_are_those_of_the_reference(converter, tiny, n_la
 
 
 @pytest.mark.parametrize("n_layer, n_expert, every, mode, kinds, widths", [case for case in CASES if not case[4]])
-def test_a_combination_that_the_reference_cannot_run_is_refused_with_the_reason(converter, tiny, n_layer, n_expert, every, mode, kinds, widths):
+def test_a_combination_that_the_reference_cannot_run_is_refused_with_the_reason(
+    converter, tiny, n_layer, n_expert, every, mode, kinds, widths
+):
     configure(tiny, n_layer, n_expert, every, mode, widths)
     error = converter.refusal(tiny)
     assert "num_expert_layers" in error.message() and "the reference" in error.message()

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The header reader on hostile and truncated files."""
+
 import json
 import struct
 
@@ -11,7 +12,10 @@ from safetensors.numpy import save_file
 from vla_cpp.convert import Code, ConvertError
 from vla_cpp.convert.safetensors_file import MAX_HEADER, read_safetensors
 
-GOOD = {"a": {"dtype": "F32", "shape": [2, 3], "data_offsets": [0, 24]}, "b": {"dtype": "BF16", "shape": [4], "data_offsets": [24, 32]}}
+GOOD = {
+    "a": {"dtype": "F32", "shape": [2, 3], "data_offsets": [0, 24]},
+    "b": {"dtype": "BF16", "shape": [4], "data_offsets": [24, 32]},
+}
 
 
 def write(path, header, data=32, length=None):
@@ -26,7 +30,11 @@ def changed(**fields):
 
 def test_a_file_of_the_formats_own_library_is_read_back(tmp_path):
     rng = np.random.default_rng(0)
-    tensors = {"x": rng.standard_normal((3, 5)).astype(np.float32), "y": rng.standard_normal(7).astype(np.float16), "empty": np.zeros((0, 4), np.float32)}
+    tensors = {
+        "x": rng.standard_normal((3, 5)).astype(np.float32),
+        "y": rng.standard_normal(7).astype(np.float16),
+        "empty": np.zeros((0, 4), np.float32),
+    }
     save_file(tensors, str(tmp_path / "f"), metadata={"format": "pt"})
     content = read_safetensors(str(tmp_path / "f"))
     assert content.metadata == {"format": "pt"}
@@ -42,7 +50,7 @@ def test_the_well_formed_header_of_these_tests_is_accepted(tmp_path):
     assert set(read_safetensors(write(tmp_path / "f", GOOD)).entries) == {"a", "b"}
 
 
-@pytest.mark.parametrize("size", range(0, 9))
+@pytest.mark.parametrize("size", range(9))
 def test_a_file_shorter_than_its_header_is_refused(tmp_path, size):
     (tmp_path / "f").write_bytes(struct.pack("<Q", 100)[:size] + b"x" * max(0, size - 8))
     with pytest.raises(ConvertError, match="a safetensors header inside the file"):
@@ -74,7 +82,9 @@ HOSTILE = {
     "expected 8 bytes for \\[4\\] of BF16, found -8 bytes": dict(header=changed(data_offsets=[32, 24])),
     "expected data at byte .*, found byte": dict(header=changed(data_offsets=[16, 24])),
     "expected a file of .* bytes, found": dict(header=GOOD, data=40),
-    "expected .* bytes for .2305843009213693952, 2305843009213693952. of BF16": dict(header=changed(shape=[1 << 61, 1 << 61])),
+    "expected .* bytes for .2305843009213693952, 2305843009213693952. of BF16": dict(
+        header=changed(shape=[1 << 61, 1 << 61])
+    ),
     "__metadata__: expected a JSON object of strings": dict(header={**GOOD, "__metadata__": {"format": 1}}),
 }
 

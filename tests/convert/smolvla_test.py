@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """What a SmolVLA bundle holds, for checkpoints in every layout that LeRobot writes."""
+
 import json
 
 import numpy as np
 import pytest
+
 from tiny import ACTION_DIM, D_VISION, EXPERT, N_LAYER, STATE_DIM, VLM, Tiny, write_json, write_safetensors
 
 PAIRS = {  # the bundle's name -> the checkpoint's, one per rule of the mapping
@@ -67,7 +69,11 @@ def test_the_patch_convolution_becomes_a_matrix_over_channel_row_column(converte
 def test_what_no_action_depends_on_is_left_out_and_named(converter, tiny):
     bundle = converter.bundle(tiny)
     last = "lm.blk.{}.".format(N_LAYER - 1)
-    assert sorted(name[len(last):] for name in bundle.tensors if name.startswith(last)) == ["attn_k.weight", "attn_norm.weight", "attn_v.weight"]
+    assert sorted(name[len(last) :] for name in bundle.tensors if name.startswith(last)) == [
+        "attn_k.weight",
+        "attn_norm.weight",
+        "attn_v.weight",
+    ]
     dropped = [name for names in converter.summary.dropped.values() for name in names]
     assert len(dropped) == 8 and "model.vlm_with_expert.vlm.lm_head.weight" in dropped
     assert len(bundle.tensors) == len(tiny.tensors) - len(dropped) + 4  # four statistics
@@ -75,9 +81,27 @@ def test_what_no_action_depends_on_is_left_out_and_named(converter, tiny):
 
 def test_sizes_and_schedule_come_from_the_configs(converter, tiny):
     keys = converter.bundle(tiny).keys
-    expected = {"vla.arch": "smolvla", "vla.bundle_version": 1, "vla.dtype": "f32", "vla.source.name": "policy", "policy.horizon": 6, "policy.d_action": 5,
-                "vision.image_size": 16, "connector.factor": 2, "lm.n_layer": 2, "lm.n_head_kv": 1, "lm.d_head": 4, "lm.n_vocab": 300, "expert.d_model": 6,
-                "expert.d_ff": 256, "expert.n_layer": 2, "solver.steps": 3, "solver.noise": "normal", "observation.max_text_tokens": 7, "time.min_period": 4e-3}
+    expected = {
+        "vla.arch": "smolvla",
+        "vla.bundle_version": 1,
+        "vla.dtype": "f32",
+        "vla.source.name": "policy",
+        "policy.horizon": 6,
+        "policy.d_action": 5,
+        "vision.image_size": 16,
+        "connector.factor": 2,
+        "lm.n_layer": 2,
+        "lm.n_head_kv": 1,
+        "lm.d_head": 4,
+        "lm.n_vocab": 300,
+        "expert.d_model": 6,
+        "expert.d_ff": 256,
+        "expert.n_layer": 2,
+        "solver.steps": 3,
+        "solver.noise": "normal",
+        "observation.max_text_tokens": 7,
+        "time.min_period": 4e-3,
+    }
     assert {key: keys[key] for key in expected} == expected
     assert keys["policy.image_scale"] == np.float32(np.sqrt(12))
     assert keys["lm.rope_base"] == 10000  # not rope_theta of the backbone, which the reference does not read
@@ -93,21 +117,45 @@ def test_an_absent_key_means_the_default_of_the_references_class(converter, tiny
 
 def test_the_recipe_is_the_pipelines_arithmetic(converter, tiny):
     assert recipe(converter.bundle(tiny)) == {
-        "image": [{"op": "letterbox", "width": 16, "height": 16, "filter": "bilinear", "antialias": False, "align": "bottom_right", "fill": 0.0},
-                  {"op": "affine", "scale": 2.0, "shift": -1.0}],
+        "image": [
+            {
+                "op": "letterbox",
+                "width": 16,
+                "height": 16,
+                "filter": "bilinear",
+                "antialias": False,
+                "align": "bottom_right",
+                "fill": 0.0,
+            },
+            {"op": "affine", "scale": 2.0, "shift": -1.0},
+        ],
         "text": [{"op": "ensure_suffix", "suffix": "\n"}, {"op": "tokenize", "max_tokens": 7, "truncate": "right"}],
-        "state": [{"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 1e-8}, {"op": "pad", "size": 4}],
-        "action": [{"op": "take", "size": ACTION_DIM}, {"op": "unnormalize", "kind": "mean_std", "stats": "stats.action", "eps": 1e-8}]}
+        "state": [
+            {"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 1e-8},
+            {"op": "pad", "size": 4},
+        ],
+        "action": [
+            {"op": "take", "size": ACTION_DIM},
+            {"op": "unnormalize", "kind": "mean_std", "stats": "stats.action", "eps": 1e-8},
+        ],
+    }
 
 
-@pytest.mark.parametrize("mode, kind, names", [("MEAN_STD", "mean_std", ["mean", "std"]), ("MIN_MAX", "min_max", ["max", "min"]),
-                                               ("QUANTILES", "quantiles", ["q01", "q99"]), ("QUANTILE10", "quantile10", ["q10", "q90"])])
+@pytest.mark.parametrize(
+    "mode, kind, names",
+    [
+        ("MEAN_STD", "mean_std", ["mean", "std"]),
+        ("MIN_MAX", "min_max", ["max", "min"]),
+        ("QUANTILES", "quantiles", ["q01", "q99"]),
+        ("QUANTILE10", "quantile10", ["q10", "q90"]),
+    ],
+)
 def test_each_normalization_mode_carries_the_statistics_of_its_formula(converter, tiny, mode, kind, names):
     tiny.normalization(mode)
     bundle = converter.bundle(tiny)
     assert recipe(bundle)["state"][0]["kind"] == kind
     prefix = "stats.observation.state."
-    assert sorted(name[len(prefix):] for name in bundle.tensors if name.startswith(prefix)) == names
+    assert sorted(name[len(prefix) :] for name in bundle.tensors if name.startswith(prefix)) == names
     for name in names:
         np.testing.assert_array_equal(bundle.tensors[prefix + name], tiny.stats["observation.state." + name])
 
@@ -149,7 +197,10 @@ def test_the_older_layout_gives_the_same_weights_statistics_and_recipe(converter
 
 def test_names_of_a_compiled_policy_lose_their_infix(converter, tiny):
     plain = converter.bundle(tiny)
-    tiny.tensors = {name.replace("model.vlm_with_expert", "model._orig_mod.vlm_with_expert"): value for name, value in tiny.tensors.items()}
+    tiny.tensors = {
+        name.replace("model.vlm_with_expert", "model._orig_mod.vlm_with_expert"): value
+        for name, value in tiny.tensors.items()
+    }
     compiled = converter.bundle(tiny)
     np.testing.assert_array_equal(compiled.tensors["connector.weight"], plain.tensors["connector.weight"])
 
@@ -169,7 +220,9 @@ def test_more_vlm_layers_than_the_backbone_has_means_all_of_them(converter, tiny
 
 
 def test_views_keep_the_order_of_the_config_and_rename_entries_become_aliases(converter, tiny):
-    tiny.step("rename_observations_processor")["config"]["rename_map"] = {"observation.images.front": "observation.images.wrist"}
+    tiny.step("rename_observations_processor")["config"]["rename_map"] = {
+        "observation.images.front": "observation.images.wrist"
+    }
     keys = converter.bundle(tiny).keys
     assert keys["observation.views"] == ["observation.images.top", "observation.images.wrist"]
     assert keys["observation.view_aliases"] == ["", "observation.images.front"]
@@ -182,7 +235,11 @@ def test_empty_cameras_become_views_that_may_be_absent(converter, tiny, listed):
     if listed:
         tiny.config["input_features"]["observation.images.empty_camera_0"] = {"type": "VISUAL", "shape": [3, 480, 640]}
     keys = converter.bundle(tiny).keys
-    assert keys["observation.views"] == ["observation.images.top", "observation.images.wrist", "observation.images.empty_camera_0"]
+    assert keys["observation.views"] == [
+        "observation.images.top",
+        "observation.images.wrist",
+        "observation.images.empty_camera_0",
+    ]
     assert list(keys["observation.view_optional"]) == [0, 0, 1]
 
 
@@ -193,7 +250,13 @@ def test_an_input_feature_that_the_policy_never_reads_is_noted(converter, tiny):
 
 
 def test_a_data_set_gives_names_and_the_rate(converter, tiny, tmp_path):
-    info = {"fps": 30, "features": {"action": {"names": {"motors": ["pan", "grip"]}}, "observation.state": {"names": {"y": 1, "x": 0, "z": 2}}}}
+    info = {
+        "fps": 30,
+        "features": {
+            "action": {"names": {"motors": ["pan", "grip"]}},
+            "observation.state": {"names": {"y": 1, "x": 0, "z": 2}},
+        },
+    }
     (tmp_path / "info.json").write_text(json.dumps(info))
     keys = converter.bundle(tiny, dataset_info=str(tmp_path / "info.json")).keys
     assert keys["action.names"] == ["pan", "grip"] and keys["action.rate_hz"] == 30
@@ -222,9 +285,17 @@ def test_a_standard_deviation_of_zero_is_kept_and_noted(converter, tiny):
     assert any("std is 0 at index 1" in note for note in converter.summary.notes)
 
 
-@pytest.mark.parametrize("policy, vision, option, rule", [
-    ({}, {}, "", "float32"), ({"load_vlm_weights": True}, {}, "", "bfloat16"), ({}, {"torch_dtype": "bfloat16"}, "", "bfloat16"),
-    ({}, {"dtype": "float32"}, "", "float32"), ({"load_vlm_weights": True}, {}, "float32", "float32"), ({}, {}, "shifted", "shifted")])
+@pytest.mark.parametrize(
+    "policy, vision, option, rule",
+    [
+        ({}, {}, "", "float32"),
+        ({"load_vlm_weights": True}, {}, "", "bfloat16"),
+        ({}, {"torch_dtype": "bfloat16"}, "", "bfloat16"),
+        ({}, {"dtype": "float32"}, "", "float32"),
+        ({"load_vlm_weights": True}, {}, "float32", "float32"),
+        ({}, {}, "shifted", "shifted"),
+    ],
+)
 def test_the_position_rule_follows_the_precision_of_the_references_tower(converter, tiny, policy, vision, option, rule):
     tiny.config.update(policy)
     tiny.backbone["vision_config"].update(vision)

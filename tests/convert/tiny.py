@@ -4,6 +4,7 @@
 
 Its shapes are written down here a second time, independently of the converter, from the reference's constructors.
 """
+
 import copy
 import json
 import os
@@ -18,22 +19,54 @@ D_MODEL, D_FF, N_HEAD, N_KV, D_HEAD, N_VOCAB = 12, 10, 3, 1, 4, 300
 N_LAYER, N_LAYER_BACKBONE, D_EXPERT, D_EXPERT_FF = 2, 3, 6, 256
 
 CONFIG = {
-    "type": "smolvla", "n_obs_steps": 1,
-    "input_features": {"observation.state": {"type": "STATE", "shape": [STATE_DIM]},
-                       "observation.images.top": {"type": "VISUAL", "shape": [3, 12, 16]},
-                       "observation.images.wrist": {"type": "VISUAL", "shape": [3, 16, 16]}},
+    "type": "smolvla",
+    "n_obs_steps": 1,
+    "input_features": {
+        "observation.state": {"type": "STATE", "shape": [STATE_DIM]},
+        "observation.images.top": {"type": "VISUAL", "shape": [3, 12, 16]},
+        "observation.images.wrist": {"type": "VISUAL", "shape": [3, 16, 16]},
+    },
     "output_features": {"action": {"type": "ACTION", "shape": [ACTION_DIM]}},
     "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
-    "chunk_size": 6, "n_action_steps": 6, "max_state_dim": D_STATE, "max_action_dim": D_ACTION, "resize_imgs_with_padding": [IMAGE, IMAGE], "empty_cameras": 0,
-    "tokenizer_max_length": 7, "num_steps": 3, "vlm_model_name": "nobody/none", "load_vlm_weights": False, "num_vlm_layers": N_LAYER,
-    "expert_width_multiplier": 0.5, "self_attn_every_n_layers": 2, "rtc_config": None,
+    "chunk_size": 6,
+    "n_action_steps": 6,
+    "max_state_dim": D_STATE,
+    "max_action_dim": D_ACTION,
+    "resize_imgs_with_padding": [IMAGE, IMAGE],
+    "empty_cameras": 0,
+    "tokenizer_max_length": 7,
+    "num_steps": 3,
+    "vlm_model_name": "nobody/none",
+    "load_vlm_weights": False,
+    "num_vlm_layers": N_LAYER,
+    "expert_width_multiplier": 0.5,
+    "self_attn_every_n_layers": 2,
+    "rtc_config": None,
 }
 BACKBONE = {
-    "model_type": "smolvlm", "scale_factor": FACTOR,
-    "text_config": {"model_type": "llama", "hidden_size": D_MODEL, "intermediate_size": D_FF, "num_attention_heads": N_HEAD, "num_key_value_heads": N_KV,
-                    "head_dim": D_HEAD, "num_hidden_layers": N_LAYER_BACKBONE, "vocab_size": N_VOCAB, "rms_norm_eps": 1e-5, "rope_theta": 100000.0},
-    "vision_config": {"model_type": "smolvlm_vision", "hidden_size": D_VISION, "intermediate_size": D_VISION_FF, "num_hidden_layers": 1, "num_attention_heads": 2,
-                      "image_size": IMAGE, "patch_size": PATCH},
+    "model_type": "smolvlm",
+    "scale_factor": FACTOR,
+    "text_config": {
+        "model_type": "llama",
+        "hidden_size": D_MODEL,
+        "intermediate_size": D_FF,
+        "num_attention_heads": N_HEAD,
+        "num_key_value_heads": N_KV,
+        "head_dim": D_HEAD,
+        "num_hidden_layers": N_LAYER_BACKBONE,
+        "vocab_size": N_VOCAB,
+        "rms_norm_eps": 1e-5,
+        "rope_theta": 100000.0,
+    },
+    "vision_config": {
+        "model_type": "smolvlm_vision",
+        "hidden_size": D_VISION,
+        "intermediate_size": D_VISION_FF,
+        "num_hidden_layers": 1,
+        "num_attention_heads": 2,
+        "image_size": IMAGE,
+        "patch_size": PATCH,
+    },
 }
 SPECIAL = ["<|end|>", "<image>"]
 
@@ -52,23 +85,51 @@ def tokenizer():
     flags = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
     added = [{"id": 0, "content": SPECIAL[0], **flags}, {"id": len(vocab) + 3, "content": SPECIAL[1], **flags}]
     return {
-        "version": "1.0", "truncation": None, "padding": None, "added_tokens": added, "normalizer": None,
-        "pre_tokenizer": {"type": "Sequence", "pretokenizers": [{"type": "Digits", "individual_digits": True},
-                                                                {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True}]},
-        "post_processor": {"type": "ByteLevel", "add_prefix_space": True, "trim_offsets": False, "use_regex": True}, "decoder": None,
-        "model": {"type": "BPE", "dropout": None, "unk_token": None, "continuing_subword_prefix": None, "end_of_word_suffix": None, "fuse_unk": False,
-                  "byte_fallback": False, "ignore_merges": False, "vocab": vocab, "merges": merges},
+        "version": "1.0",
+        "truncation": None,
+        "padding": None,
+        "added_tokens": added,
+        "normalizer": None,
+        "pre_tokenizer": {
+            "type": "Sequence",
+            "pretokenizers": [
+                {"type": "Digits", "individual_digits": True},
+                {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True},
+            ],
+        },
+        "post_processor": {"type": "ByteLevel", "add_prefix_space": True, "trim_offsets": False, "use_regex": True},
+        "decoder": None,
+        "model": {
+            "type": "BPE",
+            "dropout": None,
+            "unk_token": None,
+            "continuing_subword_prefix": None,
+            "end_of_word_suffix": None,
+            "fuse_unk": False,
+            "byte_fallback": False,
+            "ignore_merges": False,
+            "vocab": vocab,
+            "merges": merges,
+        },
     }
 
 
 def shapes():
     """Every tensor that the reference saves for CONFIG, by name."""
     d, s = D_VISION, {}
-    for name, d_out, d_in in (("state_proj", D_MODEL, D_STATE), ("action_in_proj", D_EXPERT, D_ACTION), ("action_time_mlp_in", D_EXPERT, 2 * D_EXPERT),
-                              ("action_time_mlp_out", D_EXPERT, D_EXPERT), ("action_out_proj", D_ACTION, D_EXPERT)):
+    for name, d_out, d_in in (
+        ("state_proj", D_MODEL, D_STATE),
+        ("action_in_proj", D_EXPERT, D_ACTION),
+        ("action_time_mlp_in", D_EXPERT, 2 * D_EXPERT),
+        ("action_time_mlp_out", D_EXPERT, D_EXPERT),
+        ("action_out_proj", D_ACTION, D_EXPERT),
+    ):
         s["model." + name + ".weight"], s["model." + name + ".bias"] = (d_out, d_in), (d_out,)
     vision = VLM + "vision_model."
-    s[vision + "embeddings.patch_embedding.weight"], s[vision + "embeddings.patch_embedding.bias"] = (d, 3, PATCH, PATCH), (d,)
+    s[vision + "embeddings.patch_embedding.weight"], s[vision + "embeddings.patch_embedding.bias"] = (
+        (d, 3, PATCH, PATCH),
+        (d,),
+    )
     s[vision + "embeddings.position_embedding.weight"] = ((IMAGE // PATCH) ** 2, d)
     block = vision + "encoder.layers.0."
     for norm in (block + "layer_norm1", block + "layer_norm2", vision + "post_layernorm"):
@@ -82,16 +143,25 @@ def shapes():
     s[VLM + "text_model.norm.weight"], s[EXPERT + "norm.weight"] = (D_MODEL,), (D_EXPERT,)
     for i in range(N_LAYER):
         s.update(llama_block("{}text_model.layers.{}.".format(VLM, i), D_MODEL, D_FF, D_MODEL))
-        s.update(llama_block("{}layers.{}.".format(EXPERT, i), D_EXPERT, D_EXPERT_FF, N_KV * D_HEAD if i % 2 else D_EXPERT))
+        s.update(
+            llama_block("{}layers.{}.".format(EXPERT, i), D_EXPERT, D_EXPERT_FF, N_KV * D_HEAD if i % 2 else D_EXPERT)
+        )
     return s
 
 
 def llama_block(prefix, d, d_ff, d_kv_in):
     heads, kv = N_HEAD * D_HEAD, N_KV * D_HEAD
-    return {prefix + "input_layernorm.weight": (d,), prefix + "post_attention_layernorm.weight": (d,),
-            prefix + "self_attn.q_proj.weight": (heads, d), prefix + "self_attn.k_proj.weight": (kv, d_kv_in),
-            prefix + "self_attn.v_proj.weight": (kv, d_kv_in), prefix + "self_attn.o_proj.weight": (d, heads),
-            prefix + "mlp.gate_proj.weight": (d_ff, d), prefix + "mlp.up_proj.weight": (d_ff, d), prefix + "mlp.down_proj.weight": (d, d_ff)}
+    return {
+        prefix + "input_layernorm.weight": (d,),
+        prefix + "post_attention_layernorm.weight": (d,),
+        prefix + "self_attn.q_proj.weight": (heads, d),
+        prefix + "self_attn.k_proj.weight": (kv, d_kv_in),
+        prefix + "self_attn.v_proj.weight": (kv, d_kv_in),
+        prefix + "self_attn.o_proj.weight": (d, heads),
+        prefix + "mlp.gate_proj.weight": (d_ff, d),
+        prefix + "mlp.up_proj.weight": (d_ff, d),
+        prefix + "mlp.down_proj.weight": (d, d_ff),
+    }
 
 
 def write_safetensors(path, tensors, metadata=None):
@@ -126,19 +196,53 @@ class Tiny:
         self.stats = {}
         for feature, dim in (("observation.state", STATE_DIM), ("action", ACTION_DIM)):
             for statistic in ("mean", "std", "min", "max", "q01", "q99", "q10", "q90"):
-                self.stats["{}.{}".format(feature, statistic)] = np.abs(rng.standard_normal(dim)).astype(np.float32) + 0.1
+                self.stats["{}.{}".format(feature, statistic)] = (
+                    np.abs(rng.standard_normal(dim)).astype(np.float32) + 0.1
+                )
         self.pre, self.post = self._pipelines()
 
     def _pipelines(self):
-        normalizer = {"eps": 1e-8, "norm_map": dict(self.config["normalization_mapping"]),
-                      "features": {**copy.deepcopy(self.config["input_features"]), **copy.deepcopy(self.config["output_features"])}}
-        pre = [("rename_observations_processor", {"rename_map": {}}, None), ("to_batch_processor", {}, None), ("smolvla_new_line_processor", {}, None),
-               ("tokenizer_processor", {"max_length": 7, "task_key": "task", "padding_side": "right", "padding": "max_length", "truncation": True,
-                                        "tokenizer_name": "nobody/none"}, None),
-               ("device_processor", {"device": "cuda", "float_dtype": None}, None), ("normalizer_processor", normalizer, "pre_5.safetensors")]
-        post = [("unnormalizer_processor", copy.deepcopy(normalizer), "post_0.safetensors"), ("device_processor", {"device": "cpu", "float_dtype": None}, None)]
-        return tuple({"name": name, "steps": [{"registry_name": step, "config": config, **({"state_file": state} if state else {})} for step, config, state in steps]}
-                     for name, steps in (("policy_preprocessor", pre), ("policy_postprocessor", post)))
+        normalizer = {
+            "eps": 1e-8,
+            "norm_map": dict(self.config["normalization_mapping"]),
+            "features": {
+                **copy.deepcopy(self.config["input_features"]),
+                **copy.deepcopy(self.config["output_features"]),
+            },
+        }
+        pre = [
+            ("rename_observations_processor", {"rename_map": {}}, None),
+            ("to_batch_processor", {}, None),
+            ("smolvla_new_line_processor", {}, None),
+            (
+                "tokenizer_processor",
+                {
+                    "max_length": 7,
+                    "task_key": "task",
+                    "padding_side": "right",
+                    "padding": "max_length",
+                    "truncation": True,
+                    "tokenizer_name": "nobody/none",
+                },
+                None,
+            ),
+            ("device_processor", {"device": "cuda", "float_dtype": None}, None),
+            ("normalizer_processor", normalizer, "pre_5.safetensors"),
+        ]
+        post = [
+            ("unnormalizer_processor", copy.deepcopy(normalizer), "post_0.safetensors"),
+            ("device_processor", {"device": "cpu", "float_dtype": None}, None),
+        ]
+        return tuple(
+            {
+                "name": name,
+                "steps": [
+                    {"registry_name": step, "config": config, **({"state_file": state} if state else {})}
+                    for step, config, state in steps
+                ],
+            }
+            for name, steps in (("policy_preprocessor", pre), ("policy_postprocessor", post))
+        )
 
     def step(self, name):
         """The step of either pipeline by its registry name."""
@@ -151,7 +255,11 @@ class Tiny:
 
     def old_layout(self):
         """Statistics inside the weights and no processor files."""
-        for group, feature in (("normalize_inputs", "observation.state"), ("normalize_targets", "action"), ("unnormalize_outputs", "action")):
+        for group, feature in (
+            ("normalize_inputs", "observation.state"),
+            ("normalize_targets", "action"),
+            ("unnormalize_outputs", "action"),
+        ):
             for statistic in ("mean", "std"):
                 name = "{}.buffer_{}.{}".format(group, feature.replace(".", "_"), statistic)
                 self.tensors[name] = self.stats["{}.{}".format(feature, statistic)]
@@ -180,6 +288,6 @@ class Tiny:
         names, index = sorted(self.tensors), {}
         for k in range(shards):
             file = "model-{:05d}-of-{:05d}.safetensors".format(k + 1, shards)
-            index.update({name: file for name in names[k::shards]})
+            index.update(dict.fromkeys(names[k::shards], file))
             write_safetensors(os.path.join(folder, file), {name: self.tensors[name] for name in names[k::shards]})
         write_json(os.path.join(folder, "model.safetensors.index.json"), {"metadata": {}, "weight_map": index})

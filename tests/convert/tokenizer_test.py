@@ -1,16 +1,26 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The tokenizer's keys: enough to rebuild it exactly, and nothing that the runtime does not implement."""
+
 import json
 
 import pytest
-from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
 from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
 
+from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
 from vla_cpp.convert import Code
 from vla_cpp.convert.tokenizer import byte_symbols
 
-STRINGS = ["pick up the top\n", "to top 12 top", "  1  a  ", "in in\u00e9 \u4e2d\u6587 \U0001f642", "<image>top<|end|> to", "it's 3.5\u00b2 \u0661\u0662", "\t\r\n \u00a0\u2003x", ""]
+STRINGS = [
+    "pick up the top\n",
+    "to top 12 top",
+    "  1  a  ",
+    "in in\u00e9 \u4e2d\u6587 \U0001f642",
+    "<image>top<|end|> to",
+    "it's 3.5\u00b2 \u0661\u0662",
+    "\t\r\n \u00a0\u2003x",
+    "",
+]
 
 
 def rebuilt(keys):
@@ -21,9 +31,15 @@ def rebuilt(keys):
     vocab = {text: i for i, text in enumerate(tokens) if text not in own or own[text] == 0}
     merges = [tuple(merge.split(" ")) for merge in keys["tokenizer.merges"]]
     tokenizer = Tokenizer(models.BPE(vocab=vocab, merges=merges, ignore_merges=bool(keys["tokenizer.ignore_merges"])))
-    make = {"digits": lambda s: pre_tokenizers.Digits(individual_digits=s["individual"]),
-            "byte_level": lambda s: pre_tokenizers.ByteLevel(add_prefix_space=s["add_prefix_space"], use_regex=s["use_regex"])}
-    tokenizer.pre_tokenizer = pre_tokenizers.Sequence([make[step["type"]](step) for step in json.loads(keys["tokenizer.pre"])])
+    make = {
+        "digits": lambda s: pre_tokenizers.Digits(individual_digits=s["individual"]),
+        "byte_level": lambda s: pre_tokenizers.ByteLevel(
+            add_prefix_space=s["add_prefix_space"], use_regex=s["use_regex"]
+        ),
+    }
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [make[step["type"]](step) for step in json.loads(keys["tokenizer.pre"])]
+    )
     return tokenizer, added
 
 
@@ -31,7 +47,13 @@ def ids(keys, text):
     """Added tokens get their ids from the list, because a library numbers them anew."""
     tokenizer, added = rebuilt(keys)
     for token in added:
-        tokenizer.add_special_tokens([AddedToken(token["content"], special=True, normalized=False, lstrip=token["lstrip"], rstrip=token["rstrip"])])
+        tokenizer.add_special_tokens(
+            [
+                AddedToken(
+                    token["content"], special=True, normalized=False, lstrip=token["lstrip"], rstrip=token["rstrip"]
+                )
+            ]
+        )
     number = {token["content"]: token["id"] for token in added}
     encoding = tokenizer.encode(text, add_special_tokens=False)
     return [number.get(piece, i) for piece, i in zip(encoding.tokens, encoding.ids)]
@@ -51,11 +73,21 @@ def compacted(spec):
     return spec
 
 
-@pytest.mark.parametrize("pretokenizers", [
-    None,
-    {"type": "ByteLevel", "add_prefix_space": True, "trim_offsets": True, "use_regex": True},
-    {"type": "Sequence", "pretokenizers": [{"type": "Digits", "individual_digits": False}, {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True}]},
-    {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": False}])
+@pytest.mark.parametrize(
+    "pretokenizers",
+    [
+        None,
+        {"type": "ByteLevel", "add_prefix_space": True, "trim_offsets": True, "use_regex": True},
+        {
+            "type": "Sequence",
+            "pretokenizers": [
+                {"type": "Digits", "individual_digits": False},
+                {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True},
+            ],
+        },
+        {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": False},
+    ],
+)
 def test_a_tokenizer_rebuilt_from_the_keys_gives_the_same_ids(converter, tiny, pretokenizers):
     if pretokenizers:
         tiny.tokenizer["pre_tokenizer"] = pretokenizers
@@ -86,17 +118,31 @@ def test_holes_in_the_vocabulary_get_texts_that_no_text_can_become(converter, ti
 
 def test_an_added_token_inside_the_vocabulary_is_listed_with_its_flags(converter, tiny):
     added = json.loads(converter.bundle(tiny).keys["tokenizer.added"])
-    assert added[0] == {"id": 0, "content": SPECIAL[0], "single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
+    assert added[0] == {
+        "id": 0,
+        "content": SPECIAL[0],
+        "single_word": False,
+        "lstrip": False,
+        "rstrip": False,
+        "normalized": False,
+        "special": True,
+    }
 
 
 def test_the_gpt2_class_brings_a_pre_tokenizer_of_its_own(converter, tiny):
-    tiny.tokenizer_config = {"tokenizer_class": "GPT2Tokenizer", **{key: SPECIAL[0] for key in ("unk_token", "bos_token", "eos_token")}}
+    tiny.tokenizer_config = {
+        "tokenizer_class": "GPT2Tokenizer",
+        **dict.fromkeys(("unk_token", "bos_token", "eos_token"), SPECIAL[0]),
+    }
     keys = converter.bundle(tiny).keys
     assert json.loads(keys["tokenizer.pre"]) == [{"type": "byte_level", "add_prefix_space": False, "use_regex": True}]
     assert any("GPT2Tokenizer" in note for note in converter.summary.notes)
 
 
-@pytest.mark.parametrize("stated, in_file, side", [(None, None, "right"), ("left", None, "left"), (None, "Left", "left"), ("right", "Left", "right")])
+@pytest.mark.parametrize(
+    "stated, in_file, side",
+    [(None, None, "right"), ("left", None, "left"), (None, "Left", "left"), ("right", "Left", "right")],
+)
 def test_a_long_text_is_cut_on_the_side_that_the_tokenizer_states(converter, tiny, stated, in_file, side):
     """The config's side counts before the file's; taken from transformers by running it."""
     if stated:
@@ -108,7 +154,12 @@ def test_a_long_text_is_cut_on_the_side_that_the_tokenizer_states(converter, tin
 
 
 def test_a_template_that_adds_nothing_is_accepted(converter, tiny):
-    tiny.tokenizer["post_processor"] = {"type": "TemplateProcessing", "single": [{"Sequence": {"id": "A", "type_id": 0}}], "pair": [], "special_tokens": {}}
+    tiny.tokenizer["post_processor"] = {
+        "type": "TemplateProcessing",
+        "single": [{"Sequence": {"id": "A", "type_id": 0}}],
+        "pair": [],
+        "special_tokens": {},
+    }
     assert converter.bundle(tiny).keys["tokenizer.kind"] == "byte_level_bpe"
 
 
@@ -134,25 +185,45 @@ CASES = {
     "model.continuing_subword_prefix: expected None, found '##'": (model(continuing_subword_prefix="##"), UNSUPPORTED),
     "model.end_of_word_suffix: expected None, found '</w>'": (model(end_of_word_suffix="</w>"), UNSUPPORTED),
     "normalizer: expected none, found": (spec(normalizer={"type": "NFC"}), UNSUPPORTED),
-    "pre_tokenizer: expected Digits and ByteLevel, found {\"type\":\"Metaspace\"": (spec(pre_tokenizer={"type": "Metaspace"}), UNSUPPORTED),
+    'pre_tokenizer: expected Digits and ByteLevel, found {"type":"Metaspace"': (
+        spec(pre_tokenizer={"type": "Metaspace"}),
+        UNSUPPORTED,
+    ),
     "pre_tokenizer: expected Digits and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
     "pre_tokenizer: expected ByteLevel once, as the last step": (spec(pre_tokenizer=SEQUENCE), UNSUPPORTED),
-    "post_processor: expected none, ByteLevel, or a template of the text alone": (spec(post_processor={"type": "TemplateProcessing", "single": BOS}), UNSUPPORTED),
+    "post_processor: expected none, ByteLevel, or a template of the text alone": (
+        spec(post_processor={"type": "TemplateProcessing", "single": BOS}),
+        UNSUPPORTED,
+    ),
     "added_tokens: expected tokens with id and content": (spec(added_tokens=[{"id": "0", "content": "x"}]), BAD),
     "tokenizer_class: expected TokenizersBackend or": (settings(tokenizer_class="LlamaTokenizer"), UNSUPPORTED),
     "truncation_side: expected 'left' or 'right', found 'middle'": (settings(truncation_side="middle"), UNSUPPORTED),
     "add_bos_token: expected False, found True": (settings(add_bos_token=True), UNSUPPORTED),
     "split_special_tokens: expected False, found True": (settings(split_special_tokens=True), UNSUPPORTED),
-    "pad_token: expected a token among the added tokens of tokenizer.json, found '<pad>'": (settings(pad_token="<pad>"), BAD),
+    "pad_token: expected a token among the added tokens of tokenizer.json, found '<pad>'": (
+        settings(pad_token="<pad>"),
+        BAD,
+    ),
     "bos_token: expected a token among": (settings(tokenizer_class="GPT2Tokenizer"), BAD),
-    "added_tokens_decoder.5: expected the token as tokenizer.json has it": (settings(added_tokens_decoder={"5": {"content": "<|end|>", "special": True}}), BAD),
+    "added_tokens_decoder.5: expected the token as tokenizer.json has it": (
+        settings(added_tokens_decoder={"5": {"content": "<|end|>", "special": True}}),
+        BAD,
+    ),
     "model.vocab: expected tokens with ids": (model(vocab={}), BAD),
-    "model.vocab: expected all 256 byte symbols, found 1 missing, the first is 'Q'": (lambda t: t.tokenizer["model"]["vocab"].pop("Q"), BAD),
+    "model.vocab: expected all 256 byte symbols, found 1 missing, the first is 'Q'": (
+        lambda t: t.tokenizer["model"]["vocab"].pop("Q"),
+        BAD,
+    ),
     "ids: expected ids below vocab_size 300, found 1 above, the first is 300 ('<late>')": (
-        lambda t: t.tokenizer["added_tokens"].append({"id": N_VOCAB, "content": "<late>"}), BAD),
+        lambda t: t.tokenizer["added_tokens"].append({"id": N_VOCAB, "content": "<late>"}),
+        BAD,
+    ),
     "id 9: expected one token": (lambda t: t.tokenizer["model"]["vocab"].update({"twice": 9}), BAD),
     "id 270: expected one token": (lambda t: t.tokenizer["added_tokens"].append({"id": 270, "content": "Q"}), BAD),
-    "model.merges[1]: expected two tokens whose union is a token": (lambda t: t.tokenizer["model"]["merges"].insert(1, ["t", "q"]), BAD),
+    "model.merges[1]: expected two tokens whose union is a token": (
+        lambda t: t.tokenizer["model"]["merges"].insert(1, ["t", "q"]),
+        BAD,
+    ),
     "model.merges[0]: expected two tokens": (lambda t: t.tokenizer["model"].update(merges=["t o o"]), BAD),
     "model.merges: expected a list": (lambda t: t.tokenizer["model"].update(merges=None), BAD),
 }

@@ -9,7 +9,7 @@
 #include <cmath>
 
 #include "modules/vision/position_ids.h"
-#include "support/gguf_writer.h"
+#include "support/editable_bundle.h"
 #include "support/golden_case.h"
 
 #include <doctest/doctest.h>

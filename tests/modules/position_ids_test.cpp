@@ -4,7 +4,10 @@
 
 #include <doctest/doctest.h>
 
+#include <nlohmann/json.hpp>
 #include <set>
+
+#include "support/editable_bundle.h"
 
 using namespace vla;
 
@@ -30,10 +33,25 @@ TEST_CASE("a smaller picture on the same table skips rows evenly") {
   CHECK((*ids)[16] == 64);
 }
 
-TEST_CASE("a grid whose ids depend on the machine's vector width is refused") {
-  const auto ids = vision_position_ids("bucketize_float32", 25, 25);
-  REQUIRE_FALSE(ids.ok());
-  CHECK(ids.error().code == Code::unsupported);
+TEST_CASE("ids equal the reference's for every grid that it computes alike on every machine, and other grids are refused") {
+  const auto json = nlohmann::json::parse(test::read_text(test::source_path("tests/golden/positions.json")));
+  for (const auto& table : json.at("tables"))
+    for (const char* precision : {"float32", "bfloat16"}) {
+      const int grid = table.at("grid"), n_table = table.at("table");
+      CAPTURE(grid);
+      CAPTURE(n_table);
+      CAPTURE(precision);
+      const auto ids = vision_position_ids(std::string("bucketize_") + precision, grid, n_table);
+      REQUIRE(ids.ok());
+      const std::vector<std::int32_t> axis = table.at(precision);
+      for (int i = 0; i < grid * grid; ++i)
+        CHECK((*ids)[static_cast<std::size_t>(i)] == axis[static_cast<std::size_t>(i / grid)] * n_table + axis[static_cast<std::size_t>(i % grid)]);
+    }
+  for (const auto& pair : json.at("machine_dependent")) {
+    const auto ids = vision_position_ids("bucketize_float32", pair.at(0), pair.at(1));
+    REQUIRE_FALSE(ids.ok());
+    CHECK(ids.error().code == Code::unsupported);
+  }
 }
 
 TEST_CASE("an unknown position rule is a bad bundle") {

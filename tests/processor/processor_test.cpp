@@ -27,14 +27,21 @@ EditableBundle sample() {
   EditableBundle bundle;
   bundle.keys = tokenizer_keys("smol");
   bundle.set("vla.bundle_version", std::int64_t{1});
+  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"), {"vla.dtype", "f32"}, {"vla.source.name", "x"}, {"vla.source.revision", ""}, {"vla.source.converter", "test"}})
+    bundle.set(key, std::string(value));
   bundle.set("observation.views",
              std::vector<std::string>{"observation.images.top", "observation.images.wrist", "observation.images.side"});
   bundle.set("observation.view_aliases", std::vector<std::string>{"", "observation.images.hand", ""});
+  bundle.set("observation.view_optional", std::vector<std::int64_t>{0, 0, 0});
   bundle.set("observation.min_views", std::int64_t{2});
   bundle.set("observation.states", std::vector<std::string>{"observation.state"});
   bundle.set("observation.state_dims", std::vector<std::int64_t>{2});
   bundle.set("observation.max_text_tokens", std::int64_t{8});
+  bundle.set("observation.state_names", std::vector<std::string>{"x", "y"});
+  bundle.set("observation.state_units", std::vector<std::string>{"m", ""});
   bundle.set("action.names", std::vector<std::string>{"shoulder", "gripper"});
+  bundle.set("action.units", std::vector<std::string>{"rad", ""});
+  bundle.set("action.rate_hz", 0.0);
   bundle.set("lm.n_vocab", std::int64_t{4096});
   bundle.set("policy.d_state", std::int64_t{4});
   bundle.set("policy.d_action", std::int64_t{4});
@@ -157,6 +164,20 @@ TEST_CASE("views that are unknown, doubled, missing or too few are refused with 
   CHECK(contains(refused(bad), "no such view"));
 }
 
+TEST_CASE("an optional view that is not mentioned is absent") {
+  EditableBundle bundle = sample();
+  bundle.set("observation.view_optional", std::vector<std::int64_t>{0, 0, 1});
+  Observation seen = observation();
+  seen.views.erase("side");
+  const auto inputs = make(bundle).encode(seen);
+  REQUIRE(inputs.ok());
+  CHECK(inputs->n_view == 2);
+  seen.views["side"] = grey(0);
+  CHECK(make(bundle).encode(seen)->n_view == 3);
+  seen.views.erase("top");
+  CHECK(contains(refusal(make(bundle).encode(seen), Code::bad_observation), "observation.images.top"));
+}
+
 TEST_CASE("a name that two views share must be given in full") {
   EditableBundle bundle = sample();
   bundle.set("observation.views", std::vector<std::string>{"left.top", "right.top", "side"});
@@ -222,6 +243,8 @@ TEST_CASE("several states are concatenated in order and normalized by feature") 
   EditableBundle bundle = sample();
   bundle.set("observation.states", std::vector<std::string>{"observation.state", "observation.gripper"});
   bundle.set("observation.state_dims", std::vector<std::int64_t>{2, 1});
+  bundle.set("observation.state_names", std::vector<std::string>{"x", "y", "grip"});
+  bundle.set("observation.state_units", std::vector<std::string>{"m", "", ""});
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
   recipe["state"][0]["feature"] = "observation.state";
   bundle.set("processor.recipe", recipe.dump());
@@ -288,9 +311,10 @@ TEST_CASE("a chunk of another shape is our own mistake") {
 }
 
 TEST_CASE("every key that the processor reads is required") {
-  for (const char* key : {"processor.recipe", "observation.views", "observation.view_aliases", "observation.min_views",
-                          "observation.states", "observation.state_dims", "observation.max_text_tokens", "action.names",
-                          "tokenizer.tokens", "lm.n_vocab", "policy.d_state", "policy.d_action"}) {
+  for (const char* key :
+       {"processor.recipe", "observation.views", "observation.view_aliases", "observation.view_optional",
+        "observation.min_views", "observation.states", "observation.state_dims", "observation.max_text_tokens",
+        "action.names", "tokenizer.tokens", "lm.n_vocab", "policy.d_state", "policy.d_action"}) {
     EditableBundle bundle = sample();
     bundle.remove_key(key);
     CHECK(contains(refusal(create(bundle), Code::bad_bundle), key));
@@ -301,6 +325,8 @@ TEST_CASE("features that do not fit each other are refused") {
   CHECK(contains(refused_with("observation.views", std::vector<std::string>{"a", "a", "b"}), "observation.views"));
   CHECK(contains(refused_with("observation.views", std::vector<std::string>{"a", "", "b"}), "observation.views"));
   CHECK(contains(refused_with("observation.view_aliases", std::vector<std::string>{"a"}), "3 entries"));
+  CHECK(contains(refused_with("observation.view_optional", std::vector<std::int64_t>{0}), "3 entries"));
+  CHECK(contains(refused_with("observation.view_optional", std::vector<std::int64_t>{0, 0, 2}), "0 or 1"));
   CHECK(contains(refused_with("observation.min_views", std::int64_t{0}), "1 to 3"));
   CHECK(contains(refused_with("observation.min_views", std::int64_t{4}), "1 to 3"));
   CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{2, 1}), "observation.state_dims"));

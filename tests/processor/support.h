@@ -10,7 +10,7 @@
 
 #include "bundle/keys.h"
 #include "processor/image.h"
-#include "support/gguf_writer.h"
+#include "support/editable_bundle.h"
 
 /// Helpers of this room's tests. The data files are written by tests/reference/make_processor_data.py.
 namespace vla::test {

@@ -10,7 +10,7 @@
 
 #include "base/file.h"
 #include "base/npy.h"
-#include "support/gguf_writer.h"
+#include "support/editable_bundle.h"
 
 namespace vla::test {
 

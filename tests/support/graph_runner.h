@@ -26,10 +26,7 @@ inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build) 
   REQUIRE(graph.reserve(memory).ok());
   REQUIRE(graph.allocate(memory).ok());
   REQUIRE(graph.run(*device).ok());
-  const Tensor result = graph.taps().front().second;
-  std::vector<float> values(static_cast<std::size_t>(ggml_nelements(result.node())));
-  Store::get(result, values.data(), values.size() * sizeof(float));
-  return values;
+  return Store::get(graph.taps().front().second);
 }
 
 /// Deterministic values in [-range, range].

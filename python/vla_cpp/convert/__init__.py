@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Converts checkpoints into bundles (docs/converting.md). Needs the extra: pip install 'vla-cpp[convert]'."""
+
 from .archs import Options
 from .bundle import read_bundle
 from .conversion import Summary, convert_checkpoint

@@ -5,6 +5,7 @@
 The header states every tensor before the first byte of data is written, so the file grows in one pass and never lies in
 memory. It carries a temporary name until the checksum is in place: a bundle that exists is complete.
 """
+
 from __future__ import annotations
 
 import os
@@ -75,7 +76,10 @@ def _header(keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> bytes:
     offset = 0
     for tensor in tensors:
         shape = tensor.shape[::-1]  # GGUF lists the fastest dimension first
-        parts.append(_string(tensor.name) + struct.pack("<I{}QIQ".format(len(shape)), len(shape), *shape, GGML_TYPES[tensor.dtype], offset))
+        parts.append(
+            _string(tensor.name)
+            + struct.pack("<I{}QIQ".format(len(shape)), len(shape), *shape, GGML_TYPES[tensor.dtype], offset)
+        )
         offset += tensor.n_bytes + len(_padding(tensor.n_bytes))
     header = b"".join(parts)
     return header + _padding(len(header))
@@ -126,7 +130,9 @@ class BundleWriter:
 
     def _finish(self) -> None:
         if self.left or self.next != len(self.tensors):
-            raise AssertionError("{} of {} tensors written, {} bytes missing".format(self.next, len(self.tensors), self.left))
+            raise AssertionError(
+                "{} of {} tensors written, {} bytes missing".format(self.next, len(self.tensors), self.left)
+            )
         digits = self.header.index(CHECKSUM_ZERO.encode()) + len("xxh3:")
         digest = file_digest(self.file)
         self.file.seek(digits)
@@ -160,9 +166,15 @@ def _check_digest(path: str) -> None:
         head = file.read(4096)
         # Behind the key stand the type (4 bytes), the length (8) and "xxh3:".
         digits = head.find(CHECKSUM_KEY.encode()) + len(CHECKSUM_KEY) + 4 + 8 + len("xxh3:")
-        stated, found = head[digits:digits + 16].decode("latin1"), file_digest(file, digits)
+        stated, found = head[digits : digits + 16].decode("latin1"), file_digest(file, digits)
     if found != stated:
-        raise refuse(path, "content with checksum xxh3:" + stated, "xxh3:" + found, "the file was damaged or edited", Code.BAD_BUNDLE)
+        raise refuse(
+            path,
+            "content with checksum xxh3:" + stated,
+            "xxh3:" + found,
+            "the file was damaged or edited",
+            Code.BAD_BUNDLE,
+        )
 
 
 class BundleContent(NamedTuple):

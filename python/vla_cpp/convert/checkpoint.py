@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The hub layout that LeRobot writes, opened without reading weights: configs, processors, tensor headers, statistics."""
+
 from __future__ import annotations
 
 import os
@@ -52,17 +53,24 @@ def _shards(folder: str, problems: Problems) -> List[str]:
     for file, entries in found.items():
         for name in entries:
             if index.get(name) != file:
-                problems.add("tensor " + name, "the tensor in {}".format(index.get(name, "no file, as " + INDEX + " says")), file)
+                problems.add(
+                    "tensor " + name, "the tensor in {}".format(index.get(name, "no file, as " + INDEX + " says")), file
+                )
     return files
 
 
 def _weight_files(folder: str, problems: Problems) -> List[str]:
     single, index = (os.path.exists(os.path.join(folder, name)) for name in (WEIGHTS, INDEX))
     if single and index:
-        raise refuse(folder, "either {} or {}".format(WEIGHTS, INDEX), "both", "remove the one that is not the policy's")
+        raise refuse(
+            folder, "either {} or {}".format(WEIGHTS, INDEX), "both", "remove the one that is not the policy's"
+        )
     if not single and not index:
-        hint = "merge the adapter into the policy and save it again" if os.path.exists(os.path.join(folder, "adapter_config.json")) else \
-            "give the folder that holds config.json and " + WEIGHTS
+        hint = (
+            "merge the adapter into the policy and save it again"
+            if os.path.exists(os.path.join(folder, "adapter_config.json"))
+            else "give the folder that holds config.json and " + WEIGHTS
+        )
         raise refuse(folder, WEIGHTS, "no such file", hint, Code.IO)
     return [WEIGHTS] if single else _shards(folder, problems)
 
@@ -93,7 +101,13 @@ def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
         return None
     if not all(present):
         missing = PROCESSORS[present.index(False)]
-        raise refuse(os.path.join(folder, missing), "the file beside " + PROCESSORS[present.index(True)], "none", "save the policy again", Code.IO)
+        raise refuse(
+            os.path.join(folder, missing),
+            "the file beside " + PROCESSORS[present.index(True)],
+            "none",
+            "save the policy again",
+            Code.IO,
+        )
     return read_json(os.path.join(folder, PROCESSORS[0])), read_json(os.path.join(folder, PROCESSORS[1]))
 
 
@@ -106,6 +120,9 @@ def open_checkpoint(source: str) -> Checkpoint:
             raise refuse(source, "a checkpoint folder or a hub id like owner/name", "neither", code=Code.IO)
         folder, revision = download(source, HUB_PATTERNS)
     name = source if revision else os.path.basename(os.path.abspath(folder))
+    inner = os.path.join(folder, "pretrained_model")
+    if not os.path.exists(os.path.join(folder, "config.json")) and os.path.isdir(inner):
+        raise refuse(os.path.join(folder, "config.json"), "a policy", "none", "give " + inner, Code.IO)
     config = read_json(os.path.join(folder, "config.json"))
     problems = Problems(name)
     tensors, aliases = _read_tensors(folder, problems)
@@ -126,22 +143,35 @@ def find_backbone(checkpoint: Checkpoint, given: str, named) -> str:
         checkpoint.notes.append("backbone config and tokenizer: from vlm/ inside the checkpoint")
         return inside
     if isinstance(named, str) and os.path.isabs(named) and os.path.isdir(named):
-        checkpoint.notes.append("backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named)))
+        checkpoint.notes.append(
+            "backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named))
+        )
         return named
     if isinstance(named, str) and is_hub_id(named):
         try:
             folder, revision = download(named, BACKBONE_PATTERNS)
         except ConvertError as error:
-            raise refuse("backbone " + named, "--backbone DIR, vlm/ inside the checkpoint, or a reachable hub", error.problems[0].found,
-                         "give the folder with the backbone's config.json and tokenizer.json by --backbone", Code.IO)
+            raise refuse(
+                "backbone " + named,
+                "--backbone DIR, vlm/ inside the checkpoint, or a reachable hub",
+                error.problems[0].found,
+                "give the folder with the backbone's config.json and tokenizer.json by --backbone",
+                Code.IO,
+            )
         checkpoint.notes.append("backbone config and tokenizer: {} at revision {}".format(named, revision))
         return folder
-    raise refuse("config.json: vlm_model_name", "the name of a backbone", str(named), "give its folder by --backbone", Code.IO)
+    raise refuse(
+        "config.json: vlm_model_name", "the name of a backbone", str(named), "give its folder by --backbone", Code.IO
+    )
 
 
 def read_statistic(entry: Entry) -> np.ndarray:
     """A small tensor as float32, as the reference loads statistics."""
     if entry.dtype not in STATISTICS or entry.n_bytes > MAX_STATISTIC:
-        raise refuse("{}: tensor {}".format(entry.path, entry.name), "a statistic in F32", "{} bytes of {}".format(entry.n_bytes, entry.dtype))
+        raise refuse(
+            "{}: tensor {}".format(entry.path, entry.name),
+            "a statistic in F32",
+            "{} bytes of {}".format(entry.n_bytes, entry.dtype),
+        )
     parts = [to_f32(part, entry.dtype) for part in entry.chunks()]
     return (np.concatenate(parts) if parts else np.zeros(0, np.float32)).reshape(entry.shape)

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """The command `vla-convert`: arguments in, exit code out; decides nothing about numbers."""
+
 from __future__ import annotations
 
 import argparse
@@ -33,15 +34,48 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="vla-convert", description=DESCRIPTION.format(archs=", ".join(names())), epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _Parser(
+        prog="vla-convert",
+        description=DESCRIPTION.format(archs=", ".join(names())),
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     add = parser.add_argument
-    add("checkpoint", metavar="CHECKPOINT", help="folder with config.json and model.safetensors, or a hub id owner/name")
+    add(
+        "checkpoint", metavar="CHECKPOINT", help="folder with config.json and model.safetensors, or a hub id owner/name"
+    )
     add("-o", "--out", metavar="OUT.gguf", required=True, help="the bundle to write; appears only when it is complete")
-    add("--backbone", metavar="DIR", default="", help="folder with the backbone's config.json and tokenizer.json, where they live elsewhere")
-    add("--dtype", choices=("f32", "bf16", "f16"), default="", help="storage of matrices and tables; vectors and statistics are always f32")
-    add("--dataset-info", metavar="INFO.json", default="", help="meta/info.json of the LeRobot data set: names of state and action numbers, control rate")
-    add("--identity-stats", metavar="FEATURE", action="append", default=[], help="let FEATURE (observation.state or action) pass unnormalised when its statistics are missing")
-    add("--position-precision", choices=("float32", "bfloat16", "shifted"), default="", help="rule for the rows of the vision position table; see below")
+    add(
+        "--backbone",
+        metavar="DIR",
+        default="",
+        help="folder with the backbone's config.json and tokenizer.json, where they live elsewhere",
+    )
+    add(
+        "--dtype",
+        choices=("f32", "bf16", "f16"),
+        default="",
+        help="storage of matrices and tables; vectors and statistics are always f32",
+    )
+    add(
+        "--dataset-info",
+        metavar="INFO.json",
+        default="",
+        help="meta/info.json of the LeRobot data set: names of state and action numbers, control rate",
+    )
+    add(
+        "--identity-stats",
+        metavar="FEATURE",
+        action="append",
+        default=[],
+        help="let FEATURE (observation.state or action) pass unnormalised when its statistics are missing",
+    )
+    add(
+        "--position-precision",
+        choices=("float32", "bfloat16", "shifted"),
+        default="",
+        help="rule for the rows of the vision position table; see below",
+    )
     add("--force", action="store_true", help="overwrite OUT.gguf")
     add("--quiet", action="store_true", help="no progress bar and no summary")
     add("--version", action="version", version="vla-convert " + __version__)
@@ -65,12 +99,23 @@ def _progress(quiet: bool):
 
 def report(summary: Summary) -> str:
     """The summary as text, a line per fact."""
-    lines = ["wrote {}: {}, {} tensors, {}, {:,} bytes".format(summary.path, summary.arch, summary.n_tensor, summary.dtype, summary.n_bytes)]
+    lines = [
+        "wrote {}: {}, {} tensors, {}, {:,} bytes".format(
+            summary.path, summary.arch, summary.n_tensor, summary.dtype, summary.n_bytes
+        )
+    ]
     error, tensor = summary.rounding
     if summary.dtype != "f32":
-        lines.append("  rounding  " + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor)))
+        lines.append(
+            "  rounding  "
+            + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor))
+        )
     for reason, tensors in summary.dropped.items():
-        lines.append("  dropped   {} ({})".format(tensors[0] if len(tensors) == 1 else "{} tensors such as {}".format(len(tensors), tensors[0]), reason))
+        lines.append(
+            "  dropped   {} ({})".format(
+                tensors[0] if len(tensors) == 1 else "{} tensors such as {}".format(len(tensors), tensors[0]), reason
+            )
+        )
     return "\n".join(lines + ["  note      " + note for note in summary.notes])
 
 
@@ -84,12 +129,22 @@ def main(argv=None) -> int:
         print("error: " + error.message(), file=sys.stderr)
         return int(error.code)
     except ImportError as error:
-        print("error: vla-convert: expected the packages of the extra, found no {}; pip install 'vla-cpp[convert]'".format(error.name), file=sys.stderr)
+        print(
+            "error: vla-convert: expected the packages of the extra, found no {}; pip install 'vla-cpp[convert]'".format(
+                error.name
+            ),
+            file=sys.stderr,
+        )
         return int(Code.USAGE)
     except KeyboardInterrupt:
         return 130  # what shells report for an interrupt; the unfinished file is gone
     except Exception as error:  # noqa: BLE001 - a robot's operator gets one line and a class, whatever we overlooked
-        print("error: vla-convert: {}: {}; this is a fault of the converter, please report it".format(type(error).__name__, error), file=sys.stderr)
+        print(
+            "error: vla-convert: {}: {}; this is a fault of the converter, please report it".format(
+                type(error).__name__, error
+            ),
+            file=sys.stderr,
+        )
         return int(Code.INTERNAL)
     if not args.quiet:
         print(report(summary))

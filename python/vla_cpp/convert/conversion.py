@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """From an opened checkpoint to a written bundle: match tensors, choose a dtype, stream, report."""
+
 from __future__ import annotations
 
 import os
@@ -34,7 +35,9 @@ class Summary:
     rounding: Tuple[float, str] = (0.0, "")  # largest |stored - original| and its tensor
 
 
-def convert_checkpoint(source: str, out: str, options: Options, force: bool = False, progress: Progress = lambda *_: None) -> Summary:
+def convert_checkpoint(
+    source: str, out: str, options: Options, force: bool = False, progress: Progress = lambda *_: None
+) -> Summary:
     """Writes `out` or raises ConvertError and leaves nothing behind."""
     _check_out(out, force)
     checkpoint = open_checkpoint(source)
@@ -65,7 +68,9 @@ def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, 
     for source in expected:
         shared = checkpoint.aliases.get(source)
         if source not in checkpoint.tensors and shared in checkpoint.tensors:
-            checkpoint.tensors[source] = checkpoint.tensors[shared] if shared in expected else checkpoint.tensors.pop(shared)
+            checkpoint.tensors[source] = (
+                checkpoint.tensors[shared] if shared in expected else checkpoint.tensors.pop(shared)
+            )
             checkpoint.notes.append("{}: stored once, as {}".format(source, shared))
     for source in sorted(set(expected) | set(checkpoint.tensors)):
         entry, shape = checkpoint.tensors.get(source), expected.get(source)
@@ -84,7 +89,10 @@ def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> N
     if entry is None:
         problems.add(where, str(shape), "none")
     elif shape is None:
-        why = next((text for prefix, text in plan.hints.items() if source.startswith(prefix)), "no part of this policy reads it")
+        why = next(
+            (text for prefix, text in plan.hints.items() if source.startswith(prefix)),
+            "no part of this policy reads it",
+        )
         problems.add(where, "no such tensor", "{} {}".format(entry.dtype, entry.shape), why)
     elif entry.shape != shape:
         problems.add(where, str(shape), str(entry.shape))
@@ -96,11 +104,17 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
     """As asked; else the stored one when all matrices share it; else f32, which holds every stored number exactly."""
     if wanted:
         return wanted
-    stored = Counter(checkpoint.tensors[weight.source].dtype for weight in plan.weights if weight.kind in (MATRIX, TABLE))
+    stored = Counter(
+        checkpoint.tensors[weight.source].dtype for weight in plan.weights if weight.kind in (MATRIX, TABLE)
+    )
     if len(stored) == 1:
         return BUNDLE_NAME[next(iter(stored))]
     mixed = ", ".join("{} {}".format(count, name) for name, count in sorted(stored.items()))
-    checkpoint.notes.append("matrices are stored in mixed types ({}): written as f32, which is exact; --dtype bf16 halves the file".format(mixed))
+    checkpoint.notes.append(
+        "matrices are stored in mixed types ({}): written as f32, which is exact; --dtype bf16 halves the file".format(
+            mixed
+        )
+    )
     return "f32"
 
 
@@ -137,13 +151,29 @@ def _stream(entry: Entry, tensor: TensorInfo, out: BundleWriter, summary: Summar
         summary.rounding = max(summary.rounding, (part.error, tensor.name))
         out.write(tensor.name, part.data)
     if not finite:
-        problems.add("tensor " + entry.name, "finite numbers", "NaN or infinity", "the training run diverged or the file is damaged")
+        problems.add(
+            "tensor " + entry.name,
+            "finite numbers",
+            "NaN or infinity",
+            "the training run diverged or the file is damaged",
+        )
     elif overflow:
-        problems.add("tensor {} ({})".format(entry.name, tensor.name), "numbers that {} can hold".format(tensor.dtype), "larger ones",
-                     "use --dtype " + ("bf16 or f32" if tensor.dtype == "f16" else "f32"), Code.UNSUPPORTED)
+        problems.add(
+            "tensor {} ({})".format(entry.name, tensor.name),
+            "numbers that {} can hold".format(tensor.dtype),
+            "larger ones",
+            "use --dtype " + ("bf16 or f32" if tensor.dtype == "f16" else "f32"),
+            Code.UNSUPPORTED,
+        )
 
 
 def _identity_keys(checkpoint: Checkpoint, summary: Summary) -> List[Key]:
-    return [Key("general.architecture", "string", "vla"), Key("vla.arch", "string", summary.arch), Key("vla.bundle_version", "u32", BUNDLE_VERSION),
-            Key("vla.dtype", "string", summary.dtype), Key("vla.source.name", "string", checkpoint.name),
-            Key("vla.source.revision", "string", checkpoint.revision), Key("vla.source.converter", "string", "vla-cpp " + __version__)]
+    return [
+        Key("general.architecture", "string", "vla"),
+        Key("vla.arch", "string", summary.arch),
+        Key("vla.bundle_version", "u32", BUNDLE_VERSION),
+        Key("vla.dtype", "string", summary.dtype),
+        Key("vla.source.name", "string", checkpoint.name),
+        Key("vla.source.revision", "string", checkpoint.revision),
+        Key("vla.source.converter", "string", "vla-cpp " + __version__),
+    ]

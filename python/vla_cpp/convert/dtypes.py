@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Number formats of weights: what safetensors stores, what a bundle stores, and exact conversions between them."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -8,8 +9,23 @@ from typing import NamedTuple
 import numpy as np
 
 # Size in bytes of every element type that the safetensors format defines.
-SIZES = {"BOOL": 1, "U8": 1, "I8": 1, "F8_E5M2": 1, "F8_E4M3": 1, "I16": 2, "U16": 2, "F16": 2, "BF16": 2,
-         "I32": 4, "U32": 4, "F32": 4, "F64": 8, "I64": 8, "U64": 8}
+SIZES = {
+    "BOOL": 1,
+    "U8": 1,
+    "I8": 1,
+    "F8_E5M2": 1,
+    "F8_E4M3": 1,
+    "I16": 2,
+    "U16": 2,
+    "F16": 2,
+    "BF16": 2,
+    "I32": 4,
+    "U32": 4,
+    "F32": 4,
+    "F64": 8,
+    "I64": 8,
+    "U64": 8,
+}
 
 # Element types that weights may have, as numpy sees their bytes: numpy has no bfloat16, so its bits are uint16.
 WEIGHTS = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "BF16": np.dtype("<u2")}

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Typed refusals: the same classes, exit codes and wording as the C++ runtime (src/base/result.h)."""
+
 from __future__ import annotations
 
 import enum

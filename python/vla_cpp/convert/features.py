@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Names of the numbers of states and actions, and the control rate, from a LeRobot data set's meta/info.json where there is one."""
+
 from __future__ import annotations
 
 from typing import Dict, List, Optional
@@ -16,13 +17,20 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
     info = read_json(info_path) if info_path else {}
     names = {feature: _names(info, info_path, feature, dim, notes, problems) for feature, dim in dims.items()}
     if not info_path:
-        notes.append("names of state and action numbers are generated; --dataset-info meta/info.json gives the data set's")
+        notes.append(
+            "names of state and action numbers are generated; --dataset-info meta/info.json gives the data set's"
+        )
     rate = info.get("fps", 0)
     if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
         problems.add(info_path + ": fps", "a rate in Hz", repr(rate))
         rate = 0
-    return [Key("observation.state_names", "string[]", names[STATE]), Key("observation.state_units", "string[]", [""] * dims[STATE]),
-            Key("action.names", "string[]", names[ACTION]), Key("action.units", "string[]", [""] * dims[ACTION]), Key("action.rate_hz", "f32", float(rate))]
+    return [
+        Key("observation.state_names", "string[]", names[STATE]),
+        Key("observation.state_units", "string[]", [""] * dims[STATE]),
+        Key("action.names", "string[]", names[ACTION]),
+        Key("action.units", "string[]", [""] * dims[ACTION]),
+        Key("action.rate_hz", "f32", float(rate)),
+    ]
 
 
 def _names(info: dict, path: str, feature: str, dim: int, notes: List[str], problems: Problems) -> List[str]:
@@ -33,7 +41,12 @@ def _names(info: dict, path: str, feature: str, dim: int, notes: List[str], prob
             notes.append("{}: no names for {}, so they are generated".format(path, feature))
         return generated
     if len(stated) != dim or len(set(stated)) != dim or not all(isinstance(name, str) and name for name in stated):
-        problems.add("{}: features.{}.names".format(path, feature), "{} different names".format(dim), str(stated)[:120], "the data set is not the policy's")
+        problems.add(
+            "{}: features.{}.names".format(path, feature),
+            "{} different names".format(dim),
+            str(stated)[:120],
+            "the data set is not the policy's",
+        )
         return generated
     return stated
 
@@ -42,7 +55,9 @@ def _stated_names(feature) -> Optional[list]:
     """The spellings of data sets: a list, an object around one list ({"motors": [...]}), or an object from name to index."""
     names = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(names, dict) and names and all(isinstance(index, int) for index in names.values()):
-        return sorted(names, key=names.get) if sorted(names.values()) == list(range(len(names))) else list(names.values())
+        return (
+            sorted(names, key=names.get) if sorted(names.values()) == list(range(len(names))) else list(names.values())
+        )
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
     return names if isinstance(names, list) else None

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """JSON files and hub folders, read with refusals that name the file."""
+
 from __future__ import annotations
 
 import json
@@ -69,7 +70,9 @@ def download(repo: str, patterns) -> Tuple[str, str]:
         raise missing_extra("huggingface_hub")
     except Exception as error:  # noqa: BLE001 - the library has a class for every kind of failure
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise refuse(repo, "a folder or a reachable hub repository", reason[:200], "download it and give the folder", Code.IO)
+        raise refuse(
+            repo, "a folder or a reachable hub repository", reason[:200], "download it and give the folder", Code.IO
+        )
     return folder, os.path.basename(folder)
 
 

@@ -5,22 +5,20 @@
 Every step and every field is either translated or refused: a step that is skipped is a number that changes.
 Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_processor.py, rename_processor.py, pipeline.py).
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Dict, List, Optional, Sequence
+from typing import Dict, List, Sequence
 
 import numpy as np
 
-from .checkpoint import Checkpoint, read_statistic
-from .errors import Problems
+from .checkpoint import Checkpoint
+from .errors import Code, Problems
 from .files import member, plain_name
-from .safetensors_file import read_safetensors
+from .normalization import Context, Found, Normalization, choose, from_file, from_weights
 
 STATE, ACTION = "observation.state", "action"
-# Normalization mode -> the recipe's kind and the statistics that its formula reads.
-MODES = {"IDENTITY": ("identity", ()), "MEAN_STD": ("mean_std", ("mean", "std")), "MIN_MAX": ("min_max", ("min", "max")),
-         "QUANTILES": ("quantiles", ("q01", "q99")), "QUANTILE10": ("quantile10", ("q10", "q90"))}
 MAX_TOKENS = 1 << 16  # far above any instruction
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 
@@ -33,27 +31,19 @@ STEPS = {
         "rename_observations_processor": {"rename_map": ANY},
         "to_batch_processor": {},
         "smolvla_new_line_processor": {},
-        "tokenizer_processor": {"max_length": ANY, "task_key": ("task",), "padding_side": ("right",), "truncation": (True,),
-                                "padding": ("max_length", "longest", True, False, "do_not_pad"), "tokenizer_name": ANY},
+        "tokenizer_processor": {
+            "max_length": ANY,
+            "task_key": ("task",),
+            "padding_side": ("right",),
+            "truncation": (True,),
+            "padding": ("max_length", "longest", True, False, "do_not_pad"),
+            "tokenizer_name": ANY,
+        },
         "device_processor": DEVICE,
         "normalizer_processor": NORMALIZER,
     },
     POST: {"unnormalizer_processor": NORMALIZER, "device_processor": DEVICE},
 }
-
-
-@dataclass
-class Normalization:
-    """What happens to one feature: the formula, the reference's epsilon, and its statistics by name."""
-
-    kind: str = "identity"
-    eps: float = 1e-8
-    statistics: Dict[str, np.ndarray] = field(default_factory=dict)
-
-    def op(self, name: str, feature: str) -> List[dict]:
-        if self.kind == "identity":
-            return []
-        return [{"op": name, "kind": self.kind, "stats": "stats." + feature, "eps": self.eps}]
 
 
 @dataclass
@@ -67,13 +57,20 @@ class Processors:
     state: Normalization = field(default_factory=Normalization)
     action: Normalization = field(default_factory=Normalization)
 
+    def statistics(self) -> Dict[str, np.ndarray]:
+        """By the name of the bundle's tensor."""
+        both = ((STATE, self.state), (ACTION, self.action))
+        return {"stats.{}.{}".format(f, name): v for f, norm in both for name, v in norm.statistics.items()}
+
 
 class _Reader:
     """Walks over both pipelines and collects what it cannot translate."""
 
-    def __init__(self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems) -> None:
-        self.checkpoint, self.dims, self.identity, self.problems = checkpoint, dims, set(identity), problems
-        self.result, self.known = Processors(), []  # `known`: features that the statistics in hand belong to
+    def __init__(
+        self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems
+    ) -> None:
+        self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
+        self.context = Context(dims, identity, checkpoint.notes, problems)
         self.seen: List[str] = []
 
     def pipeline(self, file: str, content: dict) -> None:
@@ -91,8 +88,12 @@ class _Reader:
         name = step.get("registry_name", step.get("class")) if isinstance(step, dict) else None
         known = STEPS[file].get(name) if isinstance(name, str) else None
         if known is None:
-            self.problems.unsupported(where, "one of " + ", ".join(STEPS[file]), str(name),
-                                      "this step changes what the policy sees or returns, and the recipe has no operation for it")
+            self.problems.unsupported(
+                where,
+                "one of " + ", ".join(STEPS[file]),
+                str(name),
+                "this step changes what the policy sees or returns, and the recipe has no operation for it",
+            )
             return
         where += " " + name
         if name in self.seen and name != "device_processor":
@@ -107,7 +108,9 @@ class _Reader:
             return
         for key, allowed in known.items():
             if allowed is not ANY and key in config and config[key] not in allowed:
-                self.problems.unsupported("{}: {}".format(where, key), " or ".join(map(repr, allowed)), repr(config[key]))
+                self.problems.unsupported(
+                    "{}: {}".format(where, key), " or ".join(map(repr, allowed)), repr(config[key])
+                )
         handler = getattr(self, "_" + name.replace("_processor", ""), None)
         if handler:
             handler(where, config, step)
@@ -142,11 +145,15 @@ class _Reader:
 
     def _normalizer(self, where: str, config: dict, step: dict) -> None:
         keys = member(config, "normalize_observation_keys", list, where)
-        if keys and STATE not in keys:
+        if config.get("normalize_observation_keys") is not None and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
-        if stated.get("shape") != [self.dims[STATE]] or stated.get("type") != "STATE":
-            self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(self.dims[STATE]), str(stated)[:80])
+        if stated.get("shape") != [self.context.dims[STATE]] or stated.get("type") != "STATE":
+            self.problems.add(
+                "{}: features.{}".format(where, STATE),
+                "STATE of [{}] as in config.json".format(self.context.dims[STATE]),
+                str(stated)[:80],
+            )
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
 
     def _unnormalizer(self, where: str, config: dict, step: dict) -> None:
@@ -155,27 +162,29 @@ class _Reader:
     def normalization(self, where: str, config: dict, step: dict, feature: str, kind: str) -> Normalization:
         modes = member(config, "norm_map", dict, where)
         if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
-            self.problems.unsupported(where + ": norm_map.VISUAL", "IDENTITY", str(modes["VISUAL"]), "the recipe does not normalise pixels by statistics")
+            self.problems.unsupported(
+                where + ": norm_map.VISUAL",
+                "IDENTITY",
+                str(modes["VISUAL"]),
+                "the recipe does not normalise pixels by statistics",
+            )
         stated = member(self.checkpoint.config, "normalization_mapping", dict, "config.json")
         for key in (kind, "VISUAL"):
             if stated.get(key, modes.get(key)) != modes.get(key):
-                self.problems.add("{}: norm_map.{}".format(where, key), "{} as in config.json".format(stated[key]), str(modes.get(key)))
-        state_file = step.get("state_file")
-        found: Dict[str, np.ndarray] = {}
-        if state_file is not None:
-            if not plain_name(state_file):
-                self.problems.add(where + ": state_file", "a file beside the JSON", repr(state_file))
-            else:
-                entries = read_safetensors(self.checkpoint.path(state_file)).entries
-                found = {name: read_statistic(entry) for name, entry in entries.items() if name.startswith(feature + ".")}
-                self.known = sorted({name.rsplit(".", 1)[0] for name in entries})
-        else:
-            self.known = []
+                self.problems.add(
+                    "{}: norm_map.{}".format(where, key),
+                    "{} as in config.json".format(stated[key]),
+                    str(modes.get(key)),
+                )
+        found = Found({}, [])
+        if plain_name(step.get("state_file")):
+            found = from_file(self.checkpoint.path(step["state_file"]), feature)
+        elif step.get("state_file") is not None:
+            self.problems.add(where + ": state_file", "a file beside the JSON", repr(step["state_file"]))
         eps = config.get("eps", 1e-8)
         if not isinstance(eps, float) or not 0 <= eps < 1:
             self.problems.add(where + ": eps", "a small number", repr(eps))
-        by_name = {name[len(feature) + 1:]: value for name, value in found.items()}
-        return choose(feature, modes.get(kind, "IDENTITY"), eps, by_name, self)
+        return choose(feature, modes.get(kind, "IDENTITY"), eps, found, self.context)
 
     def finish(self, file: str, required: Sequence[str]) -> None:
         for name in required:
@@ -183,52 +192,21 @@ class _Reader:
                 self.problems.add("{}: steps".format(file), "a step " + name, "none")
 
 
-def choose(feature: str, mode: str, eps: float, found: Dict[str, np.ndarray], reader: "_Reader") -> Normalization:
-    """The normalization of one feature with its statistics checked, or the identity that was asked for."""
-    problems, dim = reader.problems, reader.dims[feature]
-    if not isinstance(mode, str) or mode not in MODES:
-        problems.unsupported("normalization of " + feature, " or ".join(MODES), str(mode))
-        return Normalization()
-    kind, names = MODES[mode]
-    if not names:
-        return Normalization()
-    missing = [name for name in names if name not in found]
-    if missing and feature in reader.identity:
-        reader.checkpoint.notes.append("DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(feature, ", ".join(missing)))
-        return Normalization()
-    for name in missing:
-        problems.add("statistics of {}: {}".format(feature, name), "{} numbers for {}".format(dim, mode), "none" + _others(reader.known),
-                     "fine-tune or save the policy with its data set's statistics, or accept unnormalised numbers by --identity-stats " + feature)
-    chosen = {name: found[name] for name in names if name in found}
-    for name, value in chosen.items():
-        _check_statistic("statistics of {}: {}".format(feature, name), name, value, dim, reader)
-    return Normalization(kind, eps, chosen)
-
-
-def _others(known: Sequence[str]) -> str:
-    return " (there are some for {})".format(", ".join(known)) if known else ""
-
-
-def _check_statistic(where: str, name: str, value: np.ndarray, dim: int, reader: "_Reader") -> None:
-    if value.shape != (dim,):
-        reader.problems.add(where, "shape ({},)".format(dim), str(value.shape))
-    elif not np.isfinite(value).all():
-        reader.problems.add(where, "finite numbers", str(value[~np.isfinite(value)][0]), "the statistics were never filled in: save the policy again")
-    elif name == "std" and (value < 0).any():
-        reader.problems.add(where, "numbers >= 0", str(value.min()))
-    elif name == "std" and (value == 0).any():
-        dead = ", ".join(str(i) for i in np.flatnonzero(value == 0))
-        reader.checkpoint.notes.append("{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead))
-
-
-def read_processors(checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems) -> Processors:
+def read_processors(
+    checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems
+) -> Processors:
     """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights."""
     reader = _Reader(checkpoint, dims, identity, problems)
+    for feature in identity:
+        if feature not in dims:
+            problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
     if checkpoint.processors is None:
         return _from_weights(checkpoint, reader)
     for file, content in zip((PRE, POST), checkpoint.processors):
         reader.pipeline(file, content)
-        reader.finish(file, ("tokenizer_processor", "normalizer_processor") if file == PRE else ("unnormalizer_processor",))
+        reader.finish(
+            file, ("tokenizer_processor", "normalizer_processor") if file == PRE else ("unnormalizer_processor",)
+        )
     if checkpoint.old_statistics:
         checkpoint.notes.append("dropped: statistics inside the weights, which the processor files supersede")
     return reader.result
@@ -236,32 +214,21 @@ def read_processors(checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequ
 
 def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
     """Reference: lerobot processor/migrate_policy_normalization.py, which builds today's pipelines for such checkpoints."""
-    checkpoint.notes.append("no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them")
+    checkpoint.notes.append(
+        "no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them"
+    )
     config = checkpoint.config
     modes = member(config, "normalization_mapping", dict, "config.json")
     if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
         reader.problems.unsupported("config.json: normalization_mapping.VISUAL", "IDENTITY", str(modes["VISUAL"]))
-    reader.known = sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics})
-    result = Processors(newline=True, max_tokens=reader.token_count("config.json: tokenizer_max_length", config.get("tokenizer_max_length", 48)))
+    result = Processors(
+        newline=True,
+        max_tokens=reader.token_count("config.json: tokenizer_max_length", config.get("tokenizer_max_length", 48)),
+    )
     for feature, kind, attribute in ((STATE, "STATE", "state"), (ACTION, "ACTION", "action")):
-        found = _old_statistics(checkpoint, feature, reader.problems)
-        setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader))
+        found = from_weights(checkpoint, feature, reader.problems)
+        setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader.context))
     return result
-
-
-def _old_statistics(checkpoint: Checkpoint, feature: str, problems: Problems) -> Dict[str, np.ndarray]:
-    """Statistics of one feature; groups that hold the same statistic must agree."""
-    marker = "buffer_" + feature.replace(".", "_") + "."
-    found: Dict[str, np.ndarray] = {}
-    for name, entry in sorted(checkpoint.old_statistics.items()):
-        group, _, rest = name.partition(".")
-        if not rest.startswith(marker):
-            continue
-        statistic, value = rest[len(marker):], read_statistic(entry)
-        before = found.setdefault(statistic, value)
-        if not np.array_equal(before, value, equal_nan=True):
-            problems.add("tensor " + name, "the numbers that another group has", "others")
-    return found
 
 
 def text_ops(processors: Processors, truncate: str) -> List[dict]:
@@ -275,7 +242,12 @@ def view_aliases(views: Sequence[str], processors: Processors, notes: List[str],
     for old, new in processors.rename.items():
         where = "{}: rename_map".format(PRE)
         if new == STATE:
-            problems.unsupported(where, "renamings of views", "{} -> {}".format(old, new), "remove the entry and send the state as " + STATE)
+            problems.unsupported(
+                where,
+                "renamings of views",
+                "{} -> {}".format(old, new),
+                "remove the entry and send the state as " + STATE,
+            )
         elif new not in aliases:
             notes.append("{}: {} -> {} renames nothing that the policy reads".format(where, old, new))
         elif old in aliases or aliases[new]:
@@ -283,8 +255,3 @@ def view_aliases(views: Sequence[str], processors: Processors, notes: List[str],
         else:
             aliases[new] = old
     return [aliases[view] for view in views]
-
-
-def identity_unused(identity: Sequence[str], known: Sequence[str]) -> Optional[str]:
-    """A feature named by --identity-stats that the policy does not have."""
-    return next((feature for feature in identity if feature not in known), None)

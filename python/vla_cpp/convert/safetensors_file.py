@@ -5,20 +5,28 @@
 A checkpoint comes from somewhere else, so every length and offset is compared with the size of the file before it is used.
 Data is read in chunks, never mapped as a whole: a conversion needs a few megabytes whatever the size of the checkpoint.
 """
+
 from __future__ import annotations
 
 import json
 import os
-from typing import Dict, Iterator, NamedTuple, Tuple
+from typing import BinaryIO, Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
 
 from .dtypes import SIZES, STATISTICS
-from .errors import Code, ConvertError, refuse
+from .errors import Code, refuse
 
 # The limit that the format's own library sets; a header of a large checkpoint takes less than a megabyte.
 MAX_HEADER = 100_000_000
 CHUNK_BYTES = 8 << 20
+
+
+def open_file(path: str) -> BinaryIO:
+    try:
+        return open(path, "rb")
+    except OSError as error:
+        raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
 
 
 class Entry(NamedTuple):
@@ -35,12 +43,16 @@ class Entry(NamedTuple):
         """The tensor's elements in order, as flat arrays of bounded size (BF16 as uint16 bits)."""
         kind = STATISTICS[self.dtype]
         left = self.n_bytes // kind.itemsize
-        with open(self.path, "rb") as file:
+        with open_file(self.path) as file:
             file.seek(self.offset)
             while left:
                 part = np.fromfile(file, dtype=kind, count=min(left, chunk_bytes // kind.itemsize))
                 if part.size == 0:
-                    raise refuse("{}: tensor {}".format(self.path, self.name), "{} more elements".format(left), "the end of the file")
+                    raise refuse(
+                        "{}: tensor {}".format(self.path, self.name),
+                        "{} more elements".format(left),
+                        "the end of the file",
+                    )
                 left -= part.size
                 yield part
 
@@ -62,12 +74,17 @@ def _is_count(value) -> bool:
 
 
 def _read_header(path: str) -> Tuple[dict, int, int]:
-    size = os.path.getsize(path)
     hint = "the file is truncated or not a safetensors file: download or save it again"
-    with open(path, "rb") as file:
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
         length = int.from_bytes(file.read(8), "little")
         if size < 8 or length > min(size - 8, MAX_HEADER):
-            raise refuse(path, "a safetensors header inside the file", "a header of {} bytes in a file of {}".format(length, size), hint)
+            raise refuse(
+                path,
+                "a safetensors header inside the file",
+                "a header of {} bytes in a file of {}".format(length, size),
+                hint,
+            )
         text = file.read(length)
     try:
         header = json.loads(text.decode("utf-8"), object_pairs_hook=_unique)
@@ -93,9 +110,16 @@ def _read_entry(path: str, name: str, value, start: int, size: int) -> Entry:
     for dim in shape:
         n_bytes *= dim
     if offsets[1] - offsets[0] != n_bytes:
-        raise refuse(where, "{} bytes for {} of {}".format(n_bytes, shape, dtype), "{} bytes".format(offsets[1] - offsets[0]))
+        raise refuse(
+            where, "{} bytes for {} of {}".format(n_bytes, shape, dtype), "{} bytes".format(offsets[1] - offsets[0])
+        )
     if start + offsets[1] > size:
-        raise refuse(where, "data up to byte {}".format(start + offsets[1]), "a file of {} bytes".format(size), "the file is truncated")
+        raise refuse(
+            where,
+            "data up to byte {}".format(start + offsets[1]),
+            "a file of {} bytes".format(size),
+            "the file is truncated",
+        )
     return Entry(name, dtype, tuple(shape), path, start + offsets[0], n_bytes)
 
 
@@ -104,25 +128,27 @@ def _check_layout(path: str, entries: Dict[str, Entry], start: int, size: int) -
     position = start
     for entry in sorted(entries.values(), key=lambda e: (e.offset, e.n_bytes)):
         if entry.offset != position:
-            raise refuse("{}: tensor {}".format(path, entry.name), "data at byte {}".format(position), "byte {}".format(entry.offset))
+            raise refuse(
+                "{}: tensor {}".format(path, entry.name),
+                "data at byte {}".format(position),
+                "byte {}".format(entry.offset),
+            )
         position += entry.n_bytes
     if position != size:
-        raise refuse(path, "a file of {} bytes".format(position), "{} bytes".format(size), "the file is damaged: download or save it again")
+        raise refuse(
+            path,
+            "a file of {} bytes".format(position),
+            "{} bytes".format(size),
+            "the file is damaged: download or save it again",
+        )
 
 
 def read_safetensors(path: str) -> SafetensorsFile:
     """Parses and checks the header; no tensor data is read."""
-    try:
-        header, start, size = _read_header(path)
-    except OSError as error:
-        raise io_error(path, error)
+    header, start, size = _read_header(path)
     metadata = header.pop("__metadata__", {})
     if not isinstance(metadata, dict) or not all(isinstance(v, str) for v in metadata.values()):
         raise refuse(path + ": __metadata__", "a JSON object of strings", str(metadata)[:100])
     entries = {name: _read_entry(path, name, value, start, size) for name, value in header.items()}
     _check_layout(path, entries, start, size)
     return SafetensorsFile(entries, metadata)
-
-
-def io_error(path: str, error: OSError) -> ConvertError:
-    return refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)

@@ -11,17 +11,19 @@
 namespace vla {
 namespace {
 
-/// torch.arange(1/n, 1, 1/n) in float32. Its blocks start at a rounded multiple and count on from there in double, so
-/// the last bits depend on the block's width: 8 with AVX2, 16 with AVX-512, 1 at the end and without vectors.
+/// torch.arange(1/n, 1, 1/n) in float32. Vectors of `width` numbers start at a rounded multiple and count on from there in
+/// double; they come in pairs, and what is left over is made one by one. So the last bits depend on the machine: 8 with AVX2
+/// and AVX-512, 4 with NEON, 1 without vectors.
 std::vector<float> boundaries(int n_table, int width) {
   const double step = 1.0 / n_table;
   const int count = static_cast<int>(std::ceil((1.0 - step) / step));
   std::vector<float> edges;
   int i = 0;
-  for (; width > 1 && i + width <= count; i += width) {
-    const float base = static_cast<float>(step + i * step);
-    for (int k = 0; k < width; ++k) edges.push_back(static_cast<float>(double{base} + k * step));
-  }
+  for (; width > 1 && i + 2 * width <= count; i += 2 * width)
+    for (int k = 0; k < 2 * width; ++k) {
+      const float base = static_cast<float>(step + (i + k / width * width) * step);
+      edges.push_back(static_cast<float>(double{base} + k % width * step));
+    }
   for (; i < count; ++i) edges.push_back(static_cast<float>(step + i * step));
   return edges;
 }
@@ -55,7 +57,7 @@ Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, i
     return Error{Code::bad_bundle, "vision.position_rule", "bucketize_float32, bucketize_bfloat16 or bucketize_shifted",
                  rule};
   const std::vector<std::int32_t> axis = axis_ids(rule, n_grid, boundaries(n_table, 1));
-  for (int width : {8, 16})
+  for (int width : {4, 8, 16})
     if (axis_ids(rule, n_grid, boundaries(n_table, width)) != axis)
       return Error{Code::unsupported, "vision.position_rule", "a grid whose position ids are the same on every machine",
                    fmt::format("{} x {} patches on a table of {} x {}", n_grid, n_grid, n_table, n_table),

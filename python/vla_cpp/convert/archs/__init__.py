@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """One module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`."""
+
 from __future__ import annotations
 
 import importlib
@@ -53,7 +54,9 @@ class Plan:
     weights: List[Weight]
     dropped: List[Dropped]
     statistics: Dict[str, np.ndarray]
-    hints: Dict[str, str] = field(default_factory=dict)  # prefix of an unexpected tensor's name -> why it is not expected
+    hints: Dict[str, str] = field(
+        default_factory=dict
+    )  # prefix of an unexpected tensor's name -> why it is not expected
 
 
 def names() -> List[str]:

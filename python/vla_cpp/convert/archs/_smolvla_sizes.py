@@ -4,41 +4,84 @@
 
 An absent key means the default of the reference's own class, which is stated here beside the key.
 """
+
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Dict, List, Sequence, Tuple
+from typing import Sequence, Tuple
 
 from ..checkpoint import Checkpoint, find_backbone
 from ..errors import Problems
 from ..files import member, read_json
 from ..recipe import ACTION, STATE
+from ..section import ANY_INT, Section
 from . import Options
+from ._smolvla_expert import read_expert
 
 BACKBONE = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
 # SmolVLAConfig's keys that numbers depend on, with the defaults of the class.
-POLICY = {"chunk_size": 50, "n_action_steps": 50, "max_state_dim": 32, "max_action_dim": 32, "resize_imgs_with_padding": [512, 512], "empty_cameras": 0, "num_steps": 10,
-          "tokenizer_max_length": 48, "vlm_model_name": BACKBONE, "load_vlm_weights": False, "attention_mode": "cross_attn", "prefix_length": -1,
-          "num_expert_layers": -1, "num_vlm_layers": 16, "self_attn_every_n_layers": 2, "expert_width_multiplier": 0.75, "min_period": 4e-3, "max_period": 4.0}
+POLICY = {
+    "chunk_size": 50,
+    "n_action_steps": 50,
+    "max_state_dim": 32,
+    "max_action_dim": 32,
+    "resize_imgs_with_padding": [512, 512],
+    "empty_cameras": 0,
+    "num_steps": 10,
+    "tokenizer_max_length": 48,
+    "vlm_model_name": BACKBONE,
+    "load_vlm_weights": False,
+    "attention_mode": "cross_attn",
+    "prefix_length": -1,
+    "num_expert_layers": -1,
+    "num_vlm_layers": 16,
+    "self_attn_every_n_layers": 2,
+    "expert_width_multiplier": 0.75,
+    "min_period": 4e-3,
+    "max_period": 4.0,
+}
 # Keys whose other values ask for something that the runtime does not do.
-FIXED = {"n_obs_steps": (1, "the reference reads one observation"), "adapt_to_pi_aloha": (False, "joint flips and gripper maps of that robot are not in the recipe"),
-         "use_delta_joint_actions_aloha": (False, "the reference refuses it too"), "use_cache": (True, "the reference cannot take steps without its cache"),
-         "add_image_special_tokens": (False, "the prefix would hold further tokens"), "use_peft": (False, "merge the adapter into the policy and save it again")}
+FIXED = {
+    "n_obs_steps": (1, "the reference reads one observation"),
+    "adapt_to_pi_aloha": (False, "joint flips and gripper maps of that robot are not in the recipe"),
+    "use_delta_joint_actions_aloha": (False, "the reference refuses it too"),
+    "use_cache": (True, "the reference cannot take steps without its cache"),
+    "add_image_special_tokens": (False, "the prefix would hold further tokens"),
+    "use_peft": (False, "merge the adapter into the policy and save it again"),
+}
 # Keys that no number of an action chunk depends on.
-IGNORED = {"type", "input_features", "output_features", "normalization_mapping", "rtc_config", "device", "use_amp", "push_to_hub", "repo_id", "private",
-           "tags", "license", "pretrained_path", "pretrained_revision", "pad_language_to", "freeze_vision_encoder", "train_expert_only", "train_state_proj",
-           "optimizer_lr", "optimizer_betas", "optimizer_eps", "optimizer_weight_decay", "optimizer_grad_clip_norm", "scheduler_warmup_steps",
-           "scheduler_decay_steps", "scheduler_decay_lr", "compile_model", "compile_mode"}
+IGNORED = set(
+    """
+    type input_features output_features normalization_mapping rtc_config device use_amp push_to_hub repo_id
+    private tags license pretrained_path pretrained_revision pad_language_to freeze_vision_encoder
+    train_expert_only train_state_proj optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
+    optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr compile_model
+    compile_mode
+    """.split()
+)
 # SmolVLMVisionConfig and LlamaConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
-VISION = {"hidden_size": 1152, "intermediate_size": 3072, "num_hidden_layers": 12, "num_attention_heads": 16, "image_size": 224, "patch_size": 32, "layer_norm_eps": 1e-6}
-TEXT = {"hidden_size": 4096, "intermediate_size": 11008, "num_hidden_layers": 32, "num_attention_heads": 32, "vocab_size": 32000, "rms_norm_eps": 1e-6}
+VISION = {
+    "hidden_size": 1152,
+    "intermediate_size": 3072,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 16,
+    "image_size": 224,
+    "patch_size": 32,
+    "layer_norm_eps": 1e-6,
+}
+TEXT = {
+    "hidden_size": 4096,
+    "intermediate_size": 11008,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "vocab_size": 32000,
+    "rms_norm_eps": 1e-6,
+}
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
-# Bounds far above any policy, so that a hostile config cannot make the converter plan without end.
-MAX_SIZE, MAX_LAYERS, MAX_DIM, MAX_EMPTY = 1 << 24, 1024, 1 << 16, 64
-ANY_INT = -1 << 31
-NULLABLE = {"num_key_value_heads", "head_dim"}  # null means the default for these alone
+TEXT_NULLABLE = ("num_key_value_heads", "head_dim")
+MAX_LAYERS, MAX_DIM, MAX_EMPTY = 1024, 1 << 16, 64
 
 
 @dataclass
@@ -81,74 +124,52 @@ class Sizes:
     d_kv_in: Sequence[int] = ()  # per expert layer: input width of its k and v projections
 
 
-class _Section:
-    """One JSON object, read with defaults; what does not fit is collected."""
-
-    def __init__(self, where: str, values: dict, defaults: Dict[str, object], problems: Problems) -> None:
-        self.where, self.values, self.defaults, self.problems = where, values, defaults, problems
-
-    def bad(self, key: str, expected: str, found=None, hint: str = "", unsupported: bool = False) -> None:
-        add = self.problems.unsupported if unsupported else self.problems.add
-        add("{}: {}".format(self.where, key), expected, repr(self.get(key)) if found is None else found, hint)
-
-    def get(self, key: str):
-        if key in self.values and (self.values[key] is not None or key not in NULLABLE):
-            return self.values[key]
-        return self.defaults.get(key)
-
-    def count(self, key: str, least: int = 1, most: int = MAX_SIZE) -> int:
-        value = self.get(key)
-        if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most:
-            return value
-        self.bad(key, "a whole number from {} to {}".format(least, most))
-        return max(least, 1)
-
-    def number(self, key: str, above: float = 0.0) -> float:
-        value = self.get(key)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and above < value < 1e30:
-            return float(value)
-        self.bad(key, "a number above {}".format(above))
-        return 1.0
-
-    def fixed(self, key: str, value, hint: str = "") -> None:
-        if self.values.get(key, value) != value:
-            self.bad(key, repr(value), hint=hint, unsupported=True)
-
-
 def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> Sizes:
-    policy = _Section("config.json", checkpoint.config, POLICY, problems)
+    policy = Section("config.json", checkpoint.config, POLICY, problems)
     _check_policy(policy)
     sizes = Sizes(backbone=find_backbone(checkpoint, options.backbone, policy.get("vlm_model_name")))
     config = read_json(os.path.join(sizes.backbone, "config.json"))
     where = "backbone config.json"
-    vision = _Section(where + ": vision_config", member(config, "vision_config", dict, where), VISION, problems)
-    text = _Section(where + ": text_config", member(config, "text_config", dict, where), TEXT, problems)
-    backbone = _Section(where, config, {"scale_factor": 2}, problems)
+    vision = Section(where + ": vision_config", member(config, "vision_config", dict, where), VISION, problems)
+    text = Section(where + ": text_config", member(config, "text_config", dict, where), TEXT, problems, TEXT_NULLABLE)
+    backbone = Section(where, config, {"scale_factor": 2}, problems)
     backbone.fixed("model_type", "smolvlm", "--backbone needs the folder of the SmolVLM backbone")
     _read_features(policy, checkpoint, sizes)
     _read_policy(policy, sizes)
     _read_text(policy, text, sizes)
     _read_vision(vision, backbone, sizes)
     problems.raise_any()
-    _read_expert(policy, sizes)
+    read_expert(policy, sizes)
     sizes.position_precision = _position_precision(policy, vision, options, checkpoint)
     return sizes
 
 
-def _check_policy(policy: _Section) -> None:
+def _check_policy(policy: Section) -> None:
     for key in sorted(set(policy.values) - set(POLICY) - set(FIXED) - IGNORED):
-        policy.bad(key, "a key of SmolVLAConfig that this converter knows", hint="it may change numbers; a newer vla-convert may know it", unsupported=True)
+        policy.bad(
+            key,
+            "a key of SmolVLAConfig that this converter knows",
+            hint="it may change numbers; a newer vla-convert may know it",
+            unsupported=True,
+        )
     for key, (value, hint) in FIXED.items():
         policy.fixed(key, value, hint)
     if not isinstance(policy.get("load_vlm_weights"), bool):
         policy.bad("load_vlm_weights", "true or false")
     rtc = policy.get("rtc_config")
     if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
-        policy.bad("rtc_config", "none, or one that is not enabled", hint="real-time chunking changes the velocity", unsupported=True)
+        policy.bad(
+            "rtc_config",
+            "none, or one that is not enabled",
+            hint="real-time chunking changes the velocity",
+            unsupported=True,
+        )
 
 
-def _read_features(policy: _Section, checkpoint: Checkpoint, s: Sizes) -> None:
-    inputs, outputs = (policy.get(key) if isinstance(policy.get(key), dict) else {} for key in ("input_features", "output_features"))
+def _read_features(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
+    inputs, outputs = (
+        policy.get(key) if isinstance(policy.get(key), dict) else {} for key in ("input_features", "output_features")
+    )
     s.empty_cameras = policy.count("empty_cameras", 0, MAX_EMPTY)
     views = []
     for name, feature in inputs.items():
@@ -168,7 +189,7 @@ def _read_features(policy: _Section, checkpoint: Checkpoint, s: Sizes) -> None:
     s.action_dim = _vector_dim(policy, "output_features", outputs, ACTION, "ACTION")
 
 
-def _vector_dim(policy: _Section, key: str, features: dict, name: str, kind: str) -> int:
+def _vector_dim(policy: Section, key: str, features: dict, name: str, kind: str) -> int:
     feature = features.get(name)
     shape = feature.get("shape") if isinstance(feature, dict) and feature.get("type") == kind else None
     if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int) and 0 < shape[0] <= MAX_DIM:
@@ -177,7 +198,7 @@ def _vector_dim(policy: _Section, key: str, features: dict, name: str, kind: str
     return 1
 
 
-def _read_policy(policy: _Section, s: Sizes) -> None:
+def _read_policy(policy: Section, s: Sizes) -> None:
     s.d_state, s.d_action = policy.count("max_state_dim"), policy.count("max_action_dim")
     for key, padded, real in (("max_state_dim", s.d_state, s.state_dim), ("max_action_dim", s.d_action, s.action_dim)):
         if real > padded:
@@ -189,20 +210,30 @@ def _read_policy(policy: _Section, s: Sizes) -> None:
     policy.count("prefix_length", ANY_INT)  # pads the prefix with masked tokens, which changes no number
     frame = policy.get("resize_imgs_with_padding")
     if frame is None:
-        policy.bad("resize_imgs_with_padding", "[width, height]", "null", "frames of any size would reach the tower", unsupported=True)
+        policy.bad(
+            "resize_imgs_with_padding",
+            "[width, height]",
+            "null",
+            "frames of any size would reach the tower",
+            unsupported=True,
+        )
     elif not isinstance(frame, list) or len(frame) != 2 or not all(isinstance(n, int) and n > 0 for n in frame):
         policy.bad("resize_imgs_with_padding", "[width, height]")
     else:
         s.frame = (frame[0], frame[1])
 
 
-def _read_text(policy: _Section, text: _Section, s: Sizes) -> None:
+def _read_text(policy: Section, text: Section, s: Sizes) -> None:
     for key, value in TEXT_FIXED.items():
         text.fixed(key, value)
     s.d_model, s.d_ff, s.n_vocab = text.count("hidden_size"), text.count("intermediate_size"), text.count("vocab_size")
     s.n_head = text.count("num_attention_heads")
-    text.defaults = dict(TEXT, num_key_value_heads=s.n_head, head_dim=s.d_model // s.n_head)
-    s.n_head_kv, s.d_head, s.lm_eps = text.count("num_key_value_heads"), text.count("head_dim"), text.number("rms_norm_eps")
+    text.defaults.update(num_key_value_heads=s.n_head, head_dim=s.d_model // s.n_head)
+    s.n_head_kv, s.d_head, s.lm_eps = (
+        text.count("num_key_value_heads"),
+        text.count("head_dim"),
+        text.number("rms_norm_eps"),
+    )
     total, wanted = text.count("num_hidden_layers", most=MAX_LAYERS), policy.count("num_vlm_layers", ANY_INT)
     s.n_layer = min(wanted, total) if wanted > 0 else total
     if s.n_head % s.n_head_kv:
@@ -211,12 +242,19 @@ def _read_text(policy: _Section, text: _Section, s: Sizes) -> None:
         text.bad("head_dim", "an even number, for the rotary embedding")
 
 
-def _read_vision(vision: _Section, backbone: _Section, s: Sizes) -> None:
+def _read_vision(vision: Section, backbone: Section, s: Sizes) -> None:
     for key, value in VISION_FIXED.items():
         vision.fixed(key, value)
     s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-    s.n_vision_layer, s.n_vision_head = vision.count("num_hidden_layers", most=MAX_LAYERS), vision.count("num_attention_heads")
-    s.image_size, s.patch_size, s.vision_eps = vision.count("image_size"), vision.count("patch_size"), vision.number("layer_norm_eps")
+    s.n_vision_layer, s.n_vision_head = (
+        vision.count("num_hidden_layers", most=MAX_LAYERS),
+        vision.count("num_attention_heads"),
+    )
+    s.image_size, s.patch_size, s.vision_eps = (
+        vision.count("image_size"),
+        vision.count("patch_size"),
+        vision.number("layer_norm_eps"),
+    )
     s.factor = backbone.count("scale_factor")
     if s.d_vision % s.n_vision_head:
         vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(s.d_vision))
@@ -225,70 +263,42 @@ def _read_vision(vision: _Section, backbone: _Section, s: Sizes) -> None:
     width, height = s.frame
     key = "config.json: resize_imgs_with_padding"
     if width != height:
-        backbone.problems.unsupported(key, "a square", "{} x {}".format(width, height), "the reference's pixel shuffle takes a square grid of patches")
+        backbone.problems.unsupported(
+            key,
+            "a square",
+            "{} x {}".format(width, height),
+            "the reference's pixel shuffle takes a square grid of patches",
+        )
     elif width and width % (s.patch_size * s.factor):
-        backbone.problems.unsupported(key, "a multiple of patch_size * scale_factor = {}".format(s.patch_size * s.factor), str(width))
+        backbone.problems.unsupported(
+            key, "a multiple of patch_size * scale_factor = {}".format(s.patch_size * s.factor), str(width)
+        )
 
 
-def expert_ff(d_model: int) -> int:
-    """Width of the expert's MLP: four thirds of twice the width, cut to whole numbers and raised to a multiple of 256
-    (smolvlm_with_expert.py: get_intermediate_size)."""
-    return 256 * ((4 * int(2 * d_model / 3) + 255) // 256)
-
-
-def layer_kinds(n_layer: int, n_expert: int, mode: str, every: int) -> List[str]:
-    """What the reference does in each language-model layer during a step (get_model_layers, forward)."""
-    ratio = n_layer // n_expert
-    crossing = ["cross" in mode and not (every > 0 and i % every == 0) for i in range(n_layer)]
-    return ["none" if i % ratio else "cross" if cross else "self" for i, cross in enumerate(crossing)]
-
-
-def _read_expert(policy: _Section, s: Sizes) -> None:
-    multiplier, mode, every = policy.number("expert_width_multiplier"), policy.get("attention_mode"), policy.count("self_attn_every_n_layers", ANY_INT)
-    wanted = policy.count("num_expert_layers", ANY_INT)
-    if not isinstance(mode, str):
-        policy.bad("attention_mode", "a string")
-        return
-    s.d_expert = int(s.d_model * multiplier)
-    s.d_expert_ff = expert_ff(s.d_expert)
-    if s.d_expert < 2 or s.d_expert % 2:
-        policy.bad("expert_width_multiplier", "an even expert width, for the time embedding", "{} * {} = {}".format(s.d_model, multiplier, s.d_expert))
-    s.n_expert_layer = wanted if wanted > 0 else s.n_layer
-    if s.n_layer % s.n_expert_layer:
-        policy.bad("num_expert_layers", "a divisor of the {} language-model layers".format(s.n_layer), hint="the reference asserts it")
-        return
-    s.layer_kinds = layer_kinds(s.n_layer, s.n_expert_layer, mode, every)
-    _check_expert_layers(policy, s, mode, every)
-
-
-def _check_expert_layers(policy: _Section, s: Sizes, mode: str, every: int) -> None:
-    """The reference counts in expert layers when it builds k and v, and in language-model layers when it runs them, so with
-    fewer expert layers the two can disagree; it also cannot run self-attention where the expert has no layer."""
-    d_kv, ratio = s.n_head_kv * s.d_head, s.n_layer // s.n_expert_layer
-    s.d_kv_in = [d_kv if "cross" in mode and not (every > 0 and j % every == 0) else s.d_expert for j in range(s.n_expert_layer)]
-    for i, kind in enumerate(s.layer_kinds):
-        is_self = "cross" not in mode or (every > 0 and i % every == 0)
-        where = "layers {} of the language model".format(i)
-        if kind == "none" and is_self:
-            policy.bad("num_expert_layers", "an expert layer wherever self-attention runs", "none at " + where,
-                       "the reference stops there: with fewer expert layers only cross-attention layers may lack one", unsupported=True)
-            return
-        if kind != "none" and s.d_kv_in[i // ratio] != (s.d_expert if is_self else d_kv):
-            policy.bad("num_expert_layers", "k and v of expert layer {} built for {}-attention".format(i // ratio, kind),
-                       "an input width of {}".format(s.d_kv_in[i // ratio]), "the reference cannot run this combination with self_attn_every_n_layers", unsupported=True)
-            return
-
-
-def _position_precision(policy: _Section, vision: _Section, options: Options, checkpoint: Checkpoint) -> str:
+def _position_precision(policy: Section, vision: Section, options: Options, checkpoint: Checkpoint) -> str:
     """The reference computes position rows in the precision of the pixels, which is the tower's: bfloat16 when the policy loads
     the backbone's weights (from_pretrained with torch_dtype bfloat16) or when vision_config says so (_from_config), else float32."""
     if options.position_precision:
         return options.position_precision
     stated = vision.get("dtype") or vision.get("torch_dtype")
     if stated not in (None, "float32", "bfloat16"):
-        vision.bad("dtype", "float32 or bfloat16", repr(stated), "choose the rule for the position table by --position-precision", unsupported=True)
+        vision.bad(
+            "dtype",
+            "float32 or bfloat16",
+            repr(stated),
+            "choose the rule for the position table by --position-precision",
+            unsupported=True,
+        )
     bfloat16 = policy.get("load_vlm_weights") is True or stated == "bfloat16"
     precision = "bfloat16" if bfloat16 else "float32"
-    why = "load_vlm_weights is true" if policy.get("load_vlm_weights") is True else "vision_config says so" if bfloat16 else "the tower runs in float32"
-    checkpoint.notes.append("position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why))
+    why = (
+        "load_vlm_weights is true"
+        if policy.get("load_vlm_weights") is True
+        else "vision_config says so"
+        if bfloat16
+        else "the tower runs in float32"
+    )
+    checkpoint.notes.append(
+        "position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why)
+    )
     return precision

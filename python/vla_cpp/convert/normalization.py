@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics of features: where a checkpoint keeps them, which of them a mode reads, and what they must look like.
+
+Reference: lerobot src/lerobot/processor/normalize_processor.py and migrate_policy_normalization.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Dict, List, NamedTuple, Sequence
+
+import numpy as np
+
+from .checkpoint import Checkpoint, read_statistic
+from .errors import Problems
+from .safetensors_file import read_safetensors
+
+# Normalization mode -> the recipe's kind and the statistics that its formula reads.
+MODES = {
+    "IDENTITY": ("identity", ()),
+    "MEAN_STD": ("mean_std", ("mean", "std")),
+    "MIN_MAX": ("min_max", ("min", "max")),
+    "QUANTILES": ("quantiles", ("q01", "q99")),
+    "QUANTILE10": ("quantile10", ("q10", "q90")),
+}
+
+
+@dataclass
+class Normalization:
+    """What happens to one feature: the formula, the reference's epsilon, and its statistics by name."""
+
+    kind: str = "identity"
+    eps: float = 1e-8
+    statistics: Dict[str, np.ndarray] = field(default_factory=dict)
+
+    def op(self, name: str, feature: str) -> List[dict]:
+        if self.kind == "identity":
+            return []
+        return [{"op": name, "kind": self.kind, "stats": "stats." + feature, "eps": self.eps}]
+
+
+class Found(NamedTuple):
+    """Statistics of one feature by name, and all features that the same place has statistics of."""
+
+    values: Dict[str, np.ndarray]
+    features: List[str]
+
+
+class Context(NamedTuple):
+    """What is asked of statistics: widths by feature, and the features that may do without."""
+
+    dims: Dict[str, int]
+    identity: Sequence[str]
+    notes: List[str]
+    problems: Problems
+
+
+def choose(feature: str, mode: str, eps: float, found: Found, context: Context) -> Normalization:
+    """The normalization of one feature with its statistics checked, or the identity that was asked for."""
+    problems, dim = context.problems, context.dims[feature]
+    if not isinstance(mode, str) or mode not in MODES:
+        problems.unsupported("normalization of " + feature, " or ".join(MODES), str(mode))
+        return Normalization()
+    kind, names = MODES[mode]
+    if not names:
+        return Normalization()
+    missing = [name for name in names if name not in found.values]
+    if missing and feature in context.identity:
+        context.notes.append(
+            "DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(
+                feature, ", ".join(missing)
+            )
+        )
+        return Normalization()
+    for name in missing:
+        problems.add(
+            "statistics of {}: {}".format(feature, name),
+            "{} numbers for {}".format(dim, mode),
+            "none" + _others(found.features),
+            "fine-tune or save the policy with its data set's statistics, or accept unnormalised numbers by --identity-stats "
+            + feature,
+        )
+    chosen = {name: found.values[name] for name in names if name in found.values}
+    for name, value in chosen.items():
+        _check_statistic("statistics of {}: {}".format(feature, name), name, value, dim, context)
+    return Normalization(kind, eps, chosen)
+
+
+def _others(known: Sequence[str]) -> str:
+    return " (there are some for {})".format(", ".join(known)) if known else ""
+
+
+def _check_statistic(where: str, name: str, value: np.ndarray, dim: int, context: Context) -> None:
+    if value.shape != (dim,):
+        context.problems.add(where, "shape ({},)".format(dim), str(value.shape))
+    elif not np.isfinite(value).all():
+        context.problems.add(
+            where,
+            "finite numbers",
+            str(value[~np.isfinite(value)][0]),
+            "the statistics were never filled in: save the policy again",
+        )
+    elif name == "std" and (value < 0).any():
+        context.problems.add(where, "numbers >= 0", str(value.min()))
+    elif name == "std" and (value == 0).any():
+        dead = ", ".join(str(i) for i in np.flatnonzero(value == 0))
+        context.notes.append(
+            "{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead)
+        )
+
+
+def from_file(path: str, feature: str) -> Found:
+    """Statistics as a processor step stores them, "<feature>.<statistic>"."""
+    entries = read_safetensors(path).entries
+    prefix = feature + "."
+    values = {name[len(prefix) :]: read_statistic(entry) for name, entry in entries.items() if name.startswith(prefix)}
+    return Found(values, sorted({name.rsplit(".", 1)[0] for name in entries}))
+
+
+def from_weights(checkpoint: Checkpoint, feature: str, problems: Problems) -> Found:
+    """Statistics as the older layout has them among the weights; groups that hold the same statistic must agree."""
+    marker = "buffer_" + feature.replace(".", "_") + "."
+    values: Dict[str, np.ndarray] = {}
+    for name, entry in sorted(checkpoint.old_statistics.items()):
+        _, _, rest = name.partition(".")
+        if not rest.startswith(marker):
+            continue
+        statistic, value = rest[len(marker) :], read_statistic(entry)
+        before = values.setdefault(statistic, value)
+        if not np.array_equal(before, value, equal_nan=True):
+            problems.add("tensor " + name, "the numbers that another group has", "others")
+    return Found(values, sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics}))

@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A JSON object of a config, read by type and range; what does not fit is collected and a harmless stand-in returned."""
+
+from __future__ import annotations
+
+from typing import Dict
+
+from .errors import Problems
+
+# Far above any policy: a hostile config must not make the converter plan without end.
+MAX_SIZE = 1 << 24
+ANY_INT = -1 << 31
+
+
+class Section:
+    """`defaults` are those of the reference's own class. `nullable`: keys whose null means the default, as it does there."""
+
+    def __init__(self, where: str, values: dict, defaults: Dict[str, object], problems: Problems, nullable=()):
+        self.where, self.values, self.defaults, self.problems = where, values, dict(defaults), problems
+        self.nullable = nullable
+
+    def bad(self, key: str, expected: str, found=None, hint: str = "", unsupported: bool = False) -> None:
+        add = self.problems.unsupported if unsupported else self.problems.add
+        add("{}: {}".format(self.where, key), expected, repr(self.get(key)) if found is None else found, hint)
+
+    def get(self, key: str):
+        if key in self.values and (self.values[key] is not None or key not in self.nullable):
+            return self.values[key]
+        return self.defaults.get(key)
+
+    def count(self, key: str, least: int = 1, most: int = MAX_SIZE) -> int:
+        value = self.get(key)
+        if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most:
+            return value
+        self.bad(key, "a whole number from {} to {}".format(least, most))
+        return max(least, 1)
+
+    def number(self, key: str, above: float = 0.0) -> float:
+        value = self.get(key)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and above < value < 1e30:
+            return float(value)
+        self.bad(key, "a number above {}".format(above))
+        return 1.0
+
+    def fixed(self, key: str, value, hint: str = "") -> None:
+        if self.values.get(key, value) != value:
+            self.bad(key, repr(value), hint=hint, unsupported=True)

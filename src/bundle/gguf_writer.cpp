@@ -1,0 +1,75 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bundle/gguf_writer.h"
+
+namespace vla {
+namespace {
+
+constexpr std::size_t kAlignment = 32;  // the format's own default
+
+template <class T>
+void put(std::string& out, T value) {
+  out.append(reinterpret_cast<const char*>(&value), sizeof(T));
+}
+
+void put_text(std::string& out, const std::string& text) {
+  put<std::uint64_t>(out, text.size());
+  out += text;
+}
+
+void pad(std::string& out) { out.append((kAlignment - out.size() % kAlignment) % kAlignment, '\0'); }
+
+/// Writes a value behind the number of its type, as the format counts types.
+struct PutValue {
+  std::string& out;
+
+  void operator()(bool value) { type(7), put<std::uint8_t>(out, value); }
+  void operator()(std::int64_t value) { type(11), put(out, value); }
+  void operator()(double value) { type(12), put(out, value); }
+  void operator()(const std::string& value) { type(8), put_text(out, value); }
+  void operator()(const std::vector<std::int64_t>& values) { list(11, values); }
+  void operator()(const std::vector<double>& values) { list(12, values); }
+  void operator()(const std::vector<std::string>& values) { list(8, values); }
+
+ private:
+  void type(std::uint32_t number) { put(out, number); }
+  template <class T>
+  void list(std::uint32_t element, const std::vector<T>& values) {
+    type(9), put(out, element), put<std::uint64_t>(out, values.size());
+    for (const T& value : values) {
+      if constexpr (std::is_same_v<T, std::string>)
+        put_text(out, value);
+      else
+        put(out, value);
+    }
+  }
+};
+
+std::uint32_t ggml_type_of(DType type) {
+  constexpr std::uint32_t kTypes[] = {0, 1, 30, 26};  // numbers of ggml's enum ggml_type, in the order of DType
+  return kTypes[static_cast<int>(type)];
+}
+
+}  // namespace
+
+std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors) {
+  std::string out = "GGUF";
+  put<std::uint32_t>(out, 3), put<std::uint64_t>(out, tensors.size()), put<std::uint64_t>(out, keys.all().size());
+  for (const auto& [key, value] : keys.all()) put_text(out, key), std::visit(PutValue{out}, value);
+  std::uint64_t offset = 0;
+  for (const TensorInfo& tensor : tensors) {
+    put_text(out, tensor.name);
+    put<std::uint32_t>(out, static_cast<std::uint32_t>(tensor.shape.size()));
+    for (std::int64_t dim : tensor.shape) put(out, dim);
+    put(out, ggml_type_of(tensor.type)), put(out, offset);
+    offset += (tensor.data.size() + kAlignment - 1) / kAlignment * kAlignment;
+  }
+  pad(out);
+  for (const TensorInfo& tensor : tensors) {
+    out.append(reinterpret_cast<const char*>(tensor.data.data()), tensor.data.size());
+    pad(out);
+  }
+  return out;
+}
+
+}  // namespace vla

@@ -1,0 +1,58 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdlib>
+#include <fstream>
+#include <nlohmann/json.hpp>
+#include <span>
+#include <string>
+
+#include "processor/recipe.h"
+#include "processor/tokenizer.h"
+#include "processor/unicode.h"
+
+namespace vla::fuzz {
+
+constexpr int kVocab = 4096;
+
+inline Tokenizer load_tokenizer(const std::string& name) {
+  std::ifstream file(VLA_SOURCE_DIR "/tests/processor/data/tokenizer_" + name + ".json");
+  const auto document = nlohmann::json::parse(file, nullptr, false);
+  Keys keys;
+  for (const auto& item : document.items()) {
+    if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
+    if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
+    if (item.value().is_array()) keys.set(item.key(), item.value().get<std::vector<std::string>>());
+  }
+  auto tokenizer = Tokenizer::create(keys, kVocab);
+  if (!tokenizer) std::abort();
+  return std::move(*tokenizer);
+}
+
+/// The first byte says what the others are: text for one of the tokenizers, or the JSON of a pre-tokenizer, of added
+/// tokens or of a recipe. Text is refused exactly when it is not UTF-8 or too long; every id is of the vocabulary.
+inline void check_tokenizer(std::string_view input) {
+  static const Tokenizer tokenizers[] = {load_tokenizer("smol"), load_tokenizer("awkward"), load_tokenizer("whole"),
+                                         load_tokenizer("tangled")};
+  if (input.empty()) return;
+  const int kind = input[0] & 7;
+  const std::string text(input.substr(1));
+  if (kind == 4 || kind == 7) {
+    const auto pretokenizer = Pretokenizer::parse(text);
+    if (pretokenizer) pretokenizer->split("one 2 three", [](std::string_view) {});
+  } else if (kind == 5) {
+    (void)parse_added_tokens(text, kVocab).ok();
+  } else if (kind == 6) {
+    (void)parse_recipe(text).ok();
+  } else {
+    const auto ids = tokenizers[kind].encode(text);
+    const bool sound = unicode::valid_prefix(text) == text.size() && text.size() <= Tokenizer::kMaxText;
+    if (ids.ok() != sound) std::abort();
+    if (ids.ok())
+      for (const std::int32_t id : *ids)
+        if (id < 0 || id >= kVocab) std::abort();
+  }
+}
+
+}  // namespace vla::fuzz
