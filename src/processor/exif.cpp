@@ -25,6 +25,7 @@ class Tiff {
     }
     return value;
   }
+  std::size_t size() const { return bytes_.size(); }
   bool contains(std::uint64_t offset, std::uint64_t size) const {
     return offset <= bytes_.size() && size <= bytes_.size() - offset;
   }
@@ -50,11 +51,11 @@ std::optional<int> integer_at(const Tiff& tiff, std::uint64_t data, std::uint32_
   return value && *value <= 8 ? static_cast<int>(*value) : 0;
 }
 
-/// Looks through the first directory. An entry that points outside ends the search, as a read error does in the
-/// reference; of several entries the last counts.
+/// Looks through the first directory, forgiving what the reference forgives: values that together would be larger than
+/// the file are passed over, one that points outside ends the search, and of several orientations the first counts.
 std::optional<int> search_directory(const Tiff& tiff, std::uint64_t directory) {
-  std::optional<int> found;
   const std::uint32_t count = tiff.read(directory, 2).value_or(0);
+  std::uint64_t total = 0;
   for (std::uint32_t i = 0; i < count; ++i) {
     const std::uint64_t entry = directory + 2 + i * kEntrySize;
     if (!tiff.contains(entry, kEntrySize)) break;
@@ -62,10 +63,11 @@ std::optional<int> search_directory(const Tiff& tiff, std::uint64_t directory) {
     const std::uint64_t size = type_size(type) * *tiff.read(entry + 4, 4);
     const std::uint64_t data = size > 4 ? *tiff.read(entry + 8, 4) : entry + 8;
     if (size == 0) continue;
+    if (size > 4 && (total += size) > tiff.size()) continue;
     if (!tiff.contains(data, size)) break;
-    if (tiff.read(entry, 2) == kOrientationTag) found = integer_at(tiff, data, type).value_or(0);
+    if (tiff.read(entry, 2) == kOrientationTag) return integer_at(tiff, data, type).value_or(0);
   }
-  return found;
+  return std::nullopt;
 }
 
 std::optional<int> search_xmp(const std::string& xmp) {

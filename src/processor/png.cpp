@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <fmt/format.h>
 #include <png.h>
+#include <zlib.h>
 
 #include <algorithm>
 #include <csetjmp>
@@ -124,9 +125,6 @@ std::vector<std::uint8_t> from_raw_profile(std::string_view text) {
 }
 
 void read_metadata(PngReader& reader, png_infop info, Picture& picture) {
-  png_bytep exif = nullptr;
-  png_uint_32 exif_size = 0;
-  if (png_get_eXIf_1(reader.png, info, &exif_size, &exif) != 0) picture.exif.assign(exif, exif + exif_size);
   png_textp texts = nullptr;
   int count = 0;
   png_get_text(reader.png, info, &texts, &count);
@@ -145,18 +143,27 @@ void drop_exif_name(std::vector<std::uint8_t>& exif) {
     exif.erase(exif.begin(), exif.begin() + sizeof kName);
 }
 
-/// Whether every chunk up to the end lies within the file. libpng takes memory for the length that a chunk states, up
-/// to 2 GiB, before it reads.
-bool chunks_fit(Bytes file) {
+/// Walks the chunks up to the end before libpng does: it would take memory for the length that a chunk states, up to
+/// 2 GiB, before it reads, and would go on without an orientation whose chunk is damaged. `exif` is the last eXIf
+/// chunk.
+const char* damage(Bytes file, Bytes& exif) {
   constexpr std::size_t kAround = 12;  // length, type and checksum
+  const auto number = [&](std::size_t at) {
+    std::uint32_t value = 0;
+    for (std::size_t i = 0; i < 4; ++i) value = value << 8 | std::to_integer<std::uint32_t>(file[at + i]);
+    return value;
+  };
   for (std::size_t at = kSignature.size(); file.size() - at >= kAround;) {
-    std::size_t length = 0;
-    for (std::size_t i = 0; i < 4; ++i) length = length << 8 | std::to_integer<std::size_t>(file[at + i]);
-    if (length > file.size() - at - kAround) return false;
-    if (std::memcmp(file.data() + at + 4, "IEND", 4) == 0) return true;
+    const std::size_t length = number(at);
+    if (length > file.size() - at - kAround) break;
+    const Bytes content = file.subspan(at + 4, length + 4);  // the type belongs to the checksum
+    const auto checksum = crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
+    if (checksum != number(at + 8 + length)) return "a chunk with another checksum";
+    if (std::memcmp(content.data(), "IEND", 4) == 0) return nullptr;
+    if (std::memcmp(content.data(), "eXIf", 4) == 0) exif = content.subspan(4);
     at += length + kAround;
   }
-  return false;
+  return "a truncated one";
 }
 
 Error corrupt(const PngReader& reader, const std::string& where) {
@@ -170,7 +177,8 @@ bool is_png(Bytes file) {
 }
 
 Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {
-  if (!chunks_fit(file)) return refused(where, "a whole PNG image", "a truncated one");
+  Bytes exif;
+  if (const char* found = damage(file, exif)) return refused(where, "a whole PNG image", found);
   PngReader reader(file);
   if (!open(reader)) return Error{Code::out_of_memory, where, "", "no memory for the PNG decoder"};
   if (!guarded_header(reader)) return corrupt(reader, where);
@@ -192,6 +200,7 @@ Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimi
   if (palette && !expand_palette(reader)) return refused(where, "a whole PNG image", "a pixel beyond its palette");
 
   Picture picture{static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, {}};
+  for (const std::byte byte : exif) picture.exif.push_back(std::to_integer<std::uint8_t>(byte));
   read_metadata(reader, reader.info, picture);
   read_metadata(reader, reader.end, picture);
   drop_exif_name(picture.exif);

@@ -88,7 +88,9 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   VLA_TRY(inputs.tokens, tokenizer_.encode(text));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
-    inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the first {}", inputs.tokens.size(), limit));
+    inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the {} {}", inputs.tokens.size(),
+                                       recipe_.keep_last ? "last" : "first", limit));
+    if (recipe_.keep_last) inputs.tokens.erase(inputs.tokens.begin(), inputs.tokens.end() - recipe_.max_tokens);
     inputs.tokens.resize(limit);
   }
   return {};

@@ -95,7 +95,7 @@ Status Processor::check_descriptions(const Keys& keys) const {
   VLA_CHECK(check_size("observation.state_names", state_names, n_state));
   VLA_CHECK(check_size("observation.state_units", state_units, n_state));
   VLA_TRY(const double rate, keys.number("action.rate_hz"));
-  if (rate < 0) return mismatch(std::string("action.rate_hz"), "0 or more", fmt::format("{}", rate));
+  if (rate < 0) return misfit("action.rate_hz", "0 or more", fmt::format("{}", rate));
   return {};
 }
 

@@ -46,7 +46,8 @@ Status parse_text_op(JsonFields& fields, int, Recipe& recipe) {
     return {};
   }
   VLA_TRY(recipe.max_tokens, fields.integer("max_tokens", 1, kMaxVector));
-  VLA_CHECK(fields.choice("truncate", {"right"}));
+  VLA_TRY(const int truncate, fields.choice("truncate", {"right", "left"}));
+  recipe.keep_last = truncate == 1;
   return {};
 }
 

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the documents name exists: every path, every `--flag` and every make target in README.md and docs/*.md.
+"""What the documents name exists: every path, `--flag`, make target and function in README.md, python/README.md and docs/*.md.
 
     python3 tests/lint/docs_test.py
 
 Looked at are code spans, code blocks and links. A path is a word that starts with a top-level folder of the tree;
 <name>, {name} and * stand for anything. A flag is looked up in the program that its command line starts with; a flag on its own may
-belong to any of ours. Flags of other programs (cmake, pip, git) are theirs to document.
+belong to any of ours. Flags of other programs (cmake, pip, git) are theirs to document. A span `Type::name` or `name()` is a
+function of src/ or python/.
 """
 import re
 import tempfile
@@ -44,7 +45,7 @@ def commands(text):
 
 def named_paths(command):
     """Words of a command that claim to be files of the tree, as patterns for glob."""
-    for word in re.split(r"[\s=,;()'\"]+", command):
+    for word in re.split(r"(?:[\s=;()'\"]|,(?![^{}]*\}))+", command):  # a comma inside {b,c} is part of the word
         word = word.rstrip(".:").removeprefix("./")
         if word.startswith(MADE) or not word.startswith(tuple(f"{p}/" for p in PLACES)):
             continue
@@ -63,6 +64,8 @@ def expand(word):
 def sources_of(command):
     """Glob patterns of the sources that must write the flags of this command; None if the program is not ours."""
     words = [w for w in command.split() if not re.fullmatch(r"[A-Z_]+=\S*", w)]
+    if not words:  # `NAME=` alone
+        return None
     program = words[0].rsplit("/", 1)[-1]
     if program in PROGRAMS:
         return PROGRAMS[program]
@@ -72,16 +75,36 @@ def sources_of(command):
     return tuple(scripts) or None
 
 
+def named_functions(text):
+    """(type or empty, name) of every span that is a function: `Engine::act`, `draw_noise()`."""
+    for span in re.findall(r"`([^`\n]+)`", text):
+        found = re.fullmatch(r"(?:(\w+)::)?(\w+)(\(\))?", span)
+        if found and (found[1] or found[3]):
+            yield found[1] or "", found[2]
+
+
+def is_function(root, owner, name):
+    """Whether a source defines or declares it: as `owner::name(`, in the file of `owner`, or anywhere without an owner."""
+    files = [f for place in ("src/**/*.h", "src/**/*.cpp", "python/**/*.py") for f in root.glob(place)]
+    called = re.compile(rf"\b{owner}::{name}\s*\(" if owner else rf"\b{name}\s*\(")
+    inline = re.compile(rf"\b(?:class|struct) {owner}\b.*\b{name}\s*\(", re.S)
+    texts = [f.read_text(encoding="utf-8") for f in files]
+    return any(called.search(text) or (owner and inline.search(text)) for text in texts)
+
+
 def problems(root):
     """`document: what it names and where that was sought`."""
     found = []
     makefile = (root / "Makefile").read_text() if (root / "Makefile").is_file() else ""
     targets = set(re.findall(r"^([\w-]+):(?!=)", makefile, re.M))
-    for document in [root / "README.md", *sorted((root / "docs").glob("*.md"))]:
+    for document in [root / "README.md", *root.glob("python/README.md"), *sorted((root / "docs").glob("*.md"))]:
         text, name = document.read_text(encoding="utf-8"), document.relative_to(root).as_posix()
         for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
             if "://" not in link and not (document.parent / link).exists():
                 found.append(f"{name}: link to {link}, which does not exist")
+        for owner, function in sorted(set(named_functions(text))):
+            if not is_function(root, owner, function):
+                found.append(f"{name}: no function {owner}{'::' if owner else ''}{function} in src/ or python/")
         for command in commands(text):
             for path in named_paths(command):
                 if not list(root.glob(path.rstrip("/"))):
@@ -125,6 +148,10 @@ class Documents(unittest.TestCase):
         self.assertEqual(len(self.check("`src/policies/<arch>.cpp`")), 1)
         self.assertEqual(self.check("`src/policies/<arch>.cpp`", **{"src__policies__pi0.cpp": ""}), [])
 
+    def test_each_path_of_a_list_in_braces_is_sought(self):
+        found = self.check("`src/{engine,gone}`, `src/engine`,`src/none`", **{"src__engine__a.cpp": ""})
+        self.assertEqual([f.split()[2] for f in found], ["src/gone,", "src/none,"])
+
     def test_a_flag_is_sought_in_the_program_that_the_command_starts_with(self):
         readme = "```\nvla run FILE --dtype f32\n```\nand `vla-convert DIR --dtype f32`"
         files = {"src__cli__run.cpp": '"--image"', "python__vla_cpp__convert__main.py": '"--dtype"'}
@@ -135,10 +162,15 @@ class Documents(unittest.TestCase):
         self.assertIn("no --gone", found[0])
 
     def test_flags_of_other_programs_are_not_ours_to_check(self):
-        self.assertEqual(self.check("`cmake --preset cpu` and `pip install --no-deps x`"), [])
+        self.assertEqual(self.check("`cmake --preset cpu`, `pip install --no-deps x`, `NAME=`"), [])
 
     def test_a_make_target_that_is_gone_is_named(self):
         self.assertIn("no target demo", self.check("`make demo`", Makefile="test:\n")[0])
+
+    def test_a_function_that_is_gone_is_named_and_one_that_stands_in_a_class_is_found(self):
+        source = {"src__engine__engine.h": "class Engine {\n  void act(int x);\n};\nint draw_noise(int seed);\n"}
+        self.assertEqual(self.check("`Engine::act`, then `draw_noise()`", **source), [])
+        self.assertEqual(len(self.check("`Engine::gone`, then `gone()`, in a `Mapping` of `x`", **source)), 2)
 
     def test_a_broken_link_is_named(self):
         self.assertIn("link to docs/gone.md", self.check("[text](docs/gone.md)")[0])

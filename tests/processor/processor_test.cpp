@@ -270,6 +270,20 @@ TEST_CASE("a long instruction is cut on the right with a note") {
   CHECK(inputs->tokens == std::vector<std::int32_t>(whole.begin(), whole.begin() + 8));
 }
 
+TEST_CASE("a tokenizer that cuts on the left keeps the end of a long instruction") {
+  EditableBundle bundle = sample();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["text"][1]["truncate"] = "left";
+  bundle.set("processor.recipe", recipe.dump());
+  Observation seen = observation();
+  seen.text = "pick up the red cube and place it in the bowl";
+  const auto whole = *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode(seen.text + "\n");
+  const auto inputs = make(bundle).encode(seen);
+  REQUIRE(inputs.ok());
+  CHECK(inputs->notes[0] == "instruction: 13 tokens, cut to the last 8");
+  CHECK(inputs->tokens == std::vector<std::int32_t>(whole.end() - 8, whole.end()));
+}
+
 TEST_CASE("the suffix is added once") {
   Observation once = observation(), twice = observation();
   once.text = "pick up";
