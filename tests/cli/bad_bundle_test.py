@@ -115,6 +115,8 @@ def test_a_weight_that_is_not_finite_is_a_bad_action_and_never_a_number(vla, gol
 
 
 def test_a_picture_size_that_no_memory_holds_is_refused(vla, golden, sound, tmp_path):
+    if vla.is_sanitized():
+        pytest.skip("the sanitizer's operator new ends the program where the standard one throws")
     old, new = b'"width": 32, "height": 32, "filter": "bilinear"', b'"width":8192,"height":8192,"filter":"bilinear"'
     path = tmp_path / "policy.gguf"
     path.write_bytes(sealed(replaced(sound, old, new.ljust(len(old)))))

@@ -58,6 +58,10 @@ class Program:
         # A sanitizer's allocator must answer an impossible request as malloc does, so that the program's answer is seen.
         self.environment = {**os.environ, "ASAN_OPTIONS": "allocator_may_return_null=1", "OMP_NUM_THREADS": "2"}
 
+    def is_sanitized(self):
+        with open(self.path, "rb") as file:
+            return b"__asan_init" in file.read()
+
     def __call__(self, *args, stdout=None, limit=60):
         with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
             start = time.monotonic()
