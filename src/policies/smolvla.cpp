@@ -5,6 +5,8 @@
 // (t = 1) to actions (t = 0). Reference: lerobot src/lerobot/policies/smolvla/modeling_smolvla.py (embed_prefix,
 // embed_suffix, denoise_step) and smolvlm_with_expert.py.
 
+#include <fmt/format.h>
+
 #include "modules/action/expert.h"
 #include "modules/language/smollm.h"
 #include "modules/time_embedding.h"
@@ -42,7 +44,10 @@ class SmolVla final : public Policy {
         image_scale_(s.number("image_scale")),
         text_scale_(s.number("text_scale")),
         min_period_((s / "time").precise("min_period")),
-        max_period_((s / "time").precise("max_period")) {}
+        max_period_((s / "time").precise("max_period")) {
+    (s / "time").require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period", fmt::format("{}", min_period_));
+    (s / "expert").require(expert_.d_model() % 2 == 0, "d_model", "an even number, for sines and cosines", fmt::format("{}", expert_.d_model()));
+  }
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));

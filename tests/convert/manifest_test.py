@@ -75,11 +75,11 @@ def test_the_published_configs_ask_for_the_published_tensors(sizes):
 
 
 def vla():
-    """The built program, named by VLA or where the build puts it."""
+    """The built program, named by VLA_BINARY or where the build puts it."""
     built = os.path.join(os.path.dirname(__file__), "..", "..", "build", "cpu", "bin", "vla")
-    path = os.environ.get("VLA", built)
+    path = os.environ.get("VLA_BINARY", built)
     if not os.path.exists(path):
-        pytest.skip("no vla program; build it or name it by VLA")
+        pytest.skip("no vla program; build it or name it by VLA_BINARY")
     return path
 
 

@@ -62,6 +62,9 @@ Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, i
       return Error{Code::unsupported, "vision.position_rule", "a grid whose position ids are the same on every machine",
                    fmt::format("{} x {} patches on a table of {} x {}", n_grid, n_grid, n_table, n_table),
                    "the reference's own result depends on the machine here; use another image size"};
+  if (axis.back() >= n_table)  // torch would stop with an IndexError
+    return Error{Code::unsupported, "vision.position_rule", fmt::format("position ids below {}", n_table), std::to_string(axis.back()),
+                 "the reference fails on this grid too; use another image size"};
   std::vector<std::int32_t> ids;
   for (std::int32_t row : axis)
     for (std::int32_t column : axis) ids.push_back(row * n_table + column);
