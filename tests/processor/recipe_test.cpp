@@ -102,7 +102,7 @@ TEST_CASE("values that the document does not name are refused") {
   CHECK(contains(refused_at("/image/0/height", 1000000), "an integer from 1 to 8192"));
   CHECK(contains(refused_at("/image/0/height", 18446744073709551615u), "an integer from 1 to 8192"));
   CHECK(contains(refused_at("/image/1/scale", 1e300), "processor.recipe.image[1].scale"));
-  CHECK(contains(refused_at("/text/1/truncate", "left"), "processor.recipe.text[1].truncate"));
+  CHECK(contains(refused_at("/text/1/truncate", "both"), "processor.recipe.text[1].truncate"));
   CHECK(contains(refused_at("/state/0/kind", "robust"), "processor.recipe.state[0].kind"));
   CHECK(contains(refused_at("/state/0/eps", -1e-8), "processor.recipe.state[0].eps"));
   CHECK(contains(refused_at("/action/1/op", "normalize"), "processor.recipe.action[1].op"));
