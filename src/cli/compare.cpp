@@ -46,7 +46,8 @@ Status compare(const CompareOptions& options) {
   const auto first =
       std::find_if(rows.begin(), rows.end(), [&](const TapDifference& row) { return !row.within(options.tolerance); });
   if (!first->comparable)
-    return Error{Code::mismatch, first->path, "finite values of the expected shape", "other values", "this is the first tap that differs"};
+    return Error{Code::mismatch, first->path, "finite values of the expected shape", "other values",
+                 "this is the first tap that differs"};
   return Error{Code::mismatch, first->path, fmt::format("a relative difference of at most {:g}", options.tolerance),
                fmt::format("{:.3g}", first->relative),
                fmt::format("{} of {} taps differ; this is the first", n_failed, rows.size())};

@@ -138,6 +138,8 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   return chunk;
 }
 
-MemoryUse Engine::memory() const { return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size()}; }
+MemoryUse Engine::memory() const {
+  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size()};
+}
 
 }  // namespace vla

@@ -12,7 +12,8 @@ namespace {
 /// Tensors of a plan's store: inputs, x, k, two for each cached layer, and a handful of constants for each graph.
 std::size_t store_capacity(const Weights& weights) { return 64 + 2 * weights.count(); }
 
-/// Memory that all plans together may take. A robot uses a few instructions of a few lengths; the limit is for the others.
+/// Memory that all plans together may take. A robot uses a few instructions of a few lengths; the limit is for the
+/// others.
 constexpr std::size_t kMaxPlanBytes = std::size_t{256} << 20;
 
 TapFilter prefix_filter(const std::string& pattern) {
@@ -37,8 +38,7 @@ Tap read_tap(std::string path, Tensor tensor) { return {std::move(path), tensor.
 Plan::Plan(const PlanContext& context, const InputShape& shape)
     : tap_pattern_(context.tap_pattern),
       store_(store_capacity(context.weights)),
-      in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}),
-          store_.add_i32({shape.n_text}),
+      in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}), store_.add_i32({shape.n_text}),
           store_.add_f32({shape.d_state, 1})},
       x_(store_.add_f32({context.d_action, context.horizon})),
       k_(store_.add_i32({1})),

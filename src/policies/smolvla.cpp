@@ -45,8 +45,12 @@ class SmolVla final : public Policy {
         text_scale_(s.number("text_scale")),
         min_period_((s / "time").precise("min_period")),
         max_period_((s / "time").precise("max_period")) {
-    (s / "time").require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period", fmt::format("{}", min_period_));
-    (s / "expert").require(expert_.d_model() % 2 == 0, "d_model", "an even number, for sines and cosines", fmt::format("{}", expert_.d_model()));
+    (s / "time")
+        .require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period",
+                 fmt::format("{}", min_period_));
+    (s / "expert")
+        .require(expert_.d_model() % 2 == 0, "d_model", "an even number, for sines and cosines",
+                 fmt::format("{}", expert_.d_model()));
   }
 
   Status check(const InputShape& shape) const override {
