@@ -3,9 +3,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs every suite of both builds and ends with one line that counts the tests.
 
-    make test                       the usual way
-    scripts/test.py --preset cpu    one build only
+make test                       the usual way
+scripts/test.py --preset cpu    one build only
 """
+
 import argparse
 import re
 import subprocess
@@ -14,14 +15,18 @@ from collections import Counter
 
 # What the test programs print about themselves; ctest -V passes it on with a number in front of each line.
 DOCTEST = re.compile(r"\[doctest\] test cases:\s*(\d+)\s*\|\s*(\d+) passed\s*\|\s*(\d+) failed\s*\|\s*(\d+) skipped")
-PYTEST = re.compile(r"^\d+: =* ?(?=.*\b(?:passed|failed|error)).* in [\d.]+s", re.M)
-SKIPPED = re.compile(r"^\d+: (?:SKIP(?:PED)?:? .*)$", re.M)
+PYTEST = re.compile(r"^\d+: (?:=+ )?(\d+ (?:passed|failed|skipped|deselected|error).*) in [\d.]+s", re.M)
 
 
 def run_preset(preset):
     """Runs ctest of one build. Returns (counts of tests by outcome, whether ctest was content)."""
     print(f"== {preset}", flush=True)
-    process = subprocess.Popen(["ctest", "--preset", preset, "-V", "--no-tests=error"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        ["ctest", "--preset", preset, "-V", "--no-tests=error"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
     counts, lines = Counter(), []
     for line in process.stdout:
         lines.append(line)
@@ -29,13 +34,11 @@ def run_preset(preset):
             print(line, end="", flush=True)
     content = process.wait() == 0
     text = "".join(lines)
-    for _, passed, failed, _skipped in DOCTEST.findall(text):
-        counts["passed"] += int(passed)
-        counts["failed"] += int(failed)
+    for _, *numbers in DOCTEST.findall(text):
+        counts.update(dict(zip(("passed", "failed", "skipped"), map(int, numbers))))
     for summary in PYTEST.findall(text):
         for number, outcome in re.findall(r"(\d+) (passed|failed|skipped|error)", summary):
             counts["failed" if outcome == "error" else outcome] += int(number)
-    counts["skipped"] += len(SKIPPED.findall(text))
     if not content:
         print(text[-20000:])
         counts["failed"] = max(counts["failed"], 1)

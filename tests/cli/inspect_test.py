@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""vla inspect: what a bundle is, for a person and for a machine, and what an architecture declares."""
+
+import json
+from math import prod
+
+import gguf
+import numpy as np
+import pytest
+from golden_cases import NAMES, Golden, tensors
+from program import EXIT
+
+
+def test_a_person_reads_features_statistics_recipe_sizes_and_memory(vla):
+    case = Golden("absent_view")
+    answer = vla("inspect", case.bundle)
+    assert answer.code == 0 and answer.err == ""
+    rows = [line.split() for line in answer.out.splitlines()]
+    heads = [line.split()[0] for line in answer.out.splitlines() if not line.startswith(" ")]
+    assert heads == [
+        "bundle",
+        "policy",
+        "source",
+        "checksum",
+        "views",
+        "state",
+        "action",
+        "instruction",
+        "solver",
+        *["recipe"] * 4,
+        "modules",
+        "memory",
+    ]
+    assert ["observation.images.base", "(also", "observation.images.left)"] in rows
+    assert ["name", "unit", "max", "min"] in rows or ["name", "unit", "min", "max"] in rows
+    assert "at least 1 of 4 must be present" in answer.out and '"op":"letterbox"' in answer.out
+    stats = tensors(case.bundle)["stats.observation.state.min"]
+    assert any(row[:2] == ["state.0", "unstated"] and f"{stats[0]:.6g}" in row for row in rows)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_json_has_every_key_and_statistic_of_the_file_and_counts_its_parameters(vla, name):
+    case = Golden(name)
+    answer = vla("inspect", case.bundle, "--json")
+    assert answer.code == 0 and answer.err == ""
+    root, file = json.loads(answer.out), gguf.GGUFReader(case.bundle)
+    keys = {k for k in file.fields if not k.startswith(("GGUF.", "tokenizer."))}
+    assert (
+        set(root["keys"]) == keys and root["keys"]["observation.views"] == file.fields["observation.views"].contents()
+    )
+    found = tensors(case.bundle)
+    stats = {n: v for n, v in found.items() if n.startswith("stats.")}
+    assert set(root["stats"]) == set(stats)
+    assert all(np.array_equal(np.float32(root["stats"][n]), v) for n, v in stats.items())
+    assert sum(m["parameters"] for m in root["modules"].values()) == sum(
+        prod(map(int, t.shape)) for t in file.tensors if not t.name.startswith("stats.")
+    )
+    memory = root["memory_bytes"]
+    assert memory["weights"] > 0 and memory["total"] == memory["weights"] + memory["plan"] + memory["working"]
+    assert root["bundle"]["checksum"] == file.fields["vla.checksum"].contents()
+
+
+def test_the_manifest_lists_the_parameters_of_the_published_size(vla):
+    root = vla("inspect", "--manifest", "smolvla")
+    assert root.code == 0 and root.err == ""
+    root = json.loads(root.out)
+    assert root["arch"] == "smolvla" and root["config"]["lm.n_layer"] == 16
+    shapes = {p["name"]: (p["storage"], p["shape"]) for p in root["parameters"]}
+    assert len(shapes) == len(root["parameters"])
+    assert shapes["lm.token_embd.weight"] == ("table", [49280, 960])
+    assert shapes["state_in.weight"] == ("matrix", [960, 32]) and shapes["state_in.bias"] == ("vector", [960])
+    assert shapes["expert.blk.1.attn_k.weight"] == ("matrix", [320, 320])  # a cross layer reads cached keys
+    assert shapes["expert.blk.2.attn_k.weight"] == ("matrix", [320, 720])
+    assert "lm.blk.15.attn_k.weight" in shapes and "lm.blk.15.attn_q.weight" not in shapes
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
+    def without_numbers(names):
+        return {".".join("#" if part.isdigit() else part for part in name.split(".")) for name in names}
+
+    manifest = json.loads(vla("inspect", "--manifest", "smolvla").out)
+    bundle = [n for n in tensors(Golden(name).bundle) if not n.startswith("stats.")]
+    assert without_numbers(bundle) == without_numbers(p["name"] for p in manifest["parameters"])
+
+
+def test_the_manifest_of_an_unknown_architecture_is_unsupported(vla):
+    vla("inspect", "--manifest", "octo").refused("unsupported", "expected one of smolvla, found octo")
+
+
+def test_inspect_takes_no_more_memory_for_weights_than_the_file_has(vla):
+    case = Golden("long_text")
+    answer = vla("inspect", case.bundle)
+    assert answer.code == 0 and answer.peak < 1 << 29
+    assert EXIT["io"] == vla("inspect", case.folder / "nothing.gguf").code
