@@ -252,7 +252,7 @@ def draw_episode(episode: Dict[str, Any], got: List[Dict[str, Any]], text: str, 
 
 def main() -> int:
     ap = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    ap.add_argument("--bundle", type=Path, default=HERE / "policy.gguf", metavar="FILE", help="the policy (default: policy.gguf beside this file)")
+    ap.add_argument("--bundle", type=Path, default=HERE.parent.parent / "models" / "metaworld-tiny.gguf", metavar="FILE", help="the policy (default: the shipped models/metaworld-tiny.gguf)")
     ap.add_argument("--vla", default="vla", metavar="FILE", help="the runtime's binary (default: vla from the PATH)")
     ap.add_argument("--episodes", type=Path, default=HERE / "episodes", metavar="DIR", help="recorded by record.py (default: the ones beside this file)")
     ap.add_argument("--task", action="append", help="play only this episode; may be given again (default: all)")

@@ -23,8 +23,12 @@ class Store {
 
   /// Shapes follow ggml, fastest first, one to four dimensions.
   Tensor add(ggml_type type, std::span<const std::int64_t> shape);
-  Tensor add_f32(std::initializer_list<std::int64_t> shape) { return add(GGML_TYPE_F32, {shape.begin(), shape.size()}); }
-  Tensor add_i32(std::initializer_list<std::int64_t> shape) { return add(GGML_TYPE_I32, {shape.begin(), shape.size()}); }
+  Tensor add_f32(std::initializer_list<std::int64_t> shape) {
+    return add(GGML_TYPE_F32, {shape.begin(), shape.size()});
+  }
+  Tensor add_i32(std::initializer_list<std::int64_t> shape) {
+    return add(GGML_TYPE_I32, {shape.begin(), shape.size()});
+  }
   Tensor add_like(Tensor other);
   /// An f32 or i32 tensor with fixed values, which `allocate` uploads.
   Tensor add_constant(std::vector<float> values, std::initializer_list<std::int64_t> shape);

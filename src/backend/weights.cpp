@@ -37,7 +37,10 @@ Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill 
     weights.tensors_.push_back(weights.store_.add(resident_type(param), param.shape));
   VLA_CHECK(weights.store_.allocate(device));
   if (fill == Fill::yes)
-    for (const Param& param : list.params()) upload(weights[&param], param);
+    for (const Param& param : list.params()) {
+      upload(weights[&param], param);
+      list.bundle()->release_pages(param.source->data);  // so that file and weights do not stand in memory together
+    }
   return weights;
 }
 

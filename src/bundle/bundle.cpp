@@ -108,6 +108,7 @@ Result<Bundle> Bundle::open(const std::string& path) {
   VLA_TRY(Mapping mapping, map_file(path));
   VLA_TRY(Bundle bundle, parse(mapping.bytes, path));
   bundle.mapping_ = std::move(mapping.owner);
+  bundle.release_pages(bundle.bytes_);  // the checksum has read them all; the weights come tensor by tensor
   return bundle;
 }
 
@@ -127,8 +128,12 @@ Result<Bundle> Bundle::parse(std::span<const std::byte> bytes, std::string name)
   return bundle;
 }
 
-void Bundle::release_pages() const {
-  if (mapping_) ::madvise(const_cast<void*>(mapping_.get()), bytes_.size(), MADV_DONTNEED);
+void Bundle::release_pages(std::span<const std::byte> part) const {
+  if (!mapping_ || part.empty()) return;
+  const auto page = static_cast<std::size_t>(::sysconf(_SC_PAGESIZE));
+  const auto offset = static_cast<std::size_t>(part.data() - bytes_.data()), first = (offset + page - 1) / page * page;
+  const std::size_t last = (offset + part.size()) / page * page;
+  if (first < last) ::madvise(const_cast<std::byte*>(bytes_.data()) + first, last - first, MADV_DONTNEED);
 }
 
 const TensorInfo* Bundle::find(std::string_view name) const {

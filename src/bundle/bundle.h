@@ -45,8 +45,8 @@ class Bundle {
   /// A one-dimensional f32 tensor of finite values, for statistics. Errors: bad_bundle.
   Result<std::vector<float>> stats(std::string_view name) const;
   std::size_t file_size() const { return bytes_.size(); }
-  /// Gives the pages of a mapped file back to the system; they are read again where they are needed again.
-  void release_pages() const;
+  /// Gives whole pages of a part of a mapped file back to the system; they are read again where they are needed again.
+  void release_pages(std::span<const std::byte> part) const;
 
  private:
   std::string path_;

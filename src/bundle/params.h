@@ -38,6 +38,7 @@ class ParamList {
 
   const Keys& keys() const { return keys_; }
   const std::deque<Param>& params() const { return params_; }
+  const Bundle* bundle() const { return bundle_; }
 
   const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape);
   void problem(std::string line) { problems_.push_back(std::move(line)); }

@@ -45,6 +45,9 @@ Status compare(const CompareOptions& options) {
   if (n_failed == 0) return {};
   const auto first =
       std::find_if(rows.begin(), rows.end(), [&](const TapDifference& row) { return !row.within(options.tolerance); });
+  if (!first->comparable)
+    return Error{Code::mismatch, first->path, "finite values of the expected shape", "other values",
+                 "this is the first tap that differs"};
   return Error{Code::mismatch, first->path, fmt::format("a relative difference of at most {:g}", options.tolerance),
                fmt::format("{:.3g}", first->relative),
                fmt::format("{} of {} taps differ; this is the first", n_failed, rows.size())};
@@ -59,7 +62,7 @@ Command add_compare(CLI::App& app) {
   command->footer(
       "The taps are listed in the order in which the reference computes them, so the first FAIL is where to look.\n"
       "  vla run policy.gguf ... --tap '*' --taps-out got.gguf\n"
-      "  vla compare tests/golden/smolvla/base/expected.gguf got.gguf");
+      "  vla compare tests/golden/smolvla/two_views/expected.gguf got.gguf");
   command->add_option("EXPECTED", options->expected, "Taps of the reference (GGUF)")->required();
   command->add_option("GOT", options->got, "Taps of a run (GGUF)")->required();
   command->add_option("--only", options->only,

@@ -25,7 +25,6 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
                                                        engine->solver_, engine->conditions_, engine->d_action_,
                                                        engine->horizon_, engine->tap_pattern_});
   VLA_CHECK(engine->warm_up());
-  engine->bundle_.release_pages();
   return engine;
 }
 
@@ -67,9 +66,8 @@ Status Engine::warm_up() {
   const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
                               static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
   VLA_CHECK(policy_->check(largest));
-  VLA_TRY(const Plan* plan, plans_->for_shape(largest));
-  largest_plan_ = plan->size();
-  return {};
+  const auto plan = plans_->for_shape(largest);
+  return plan ? Status() : Status(plan.error());
 }
 
 Result<std::vector<float>> Engine::start(const Noise& noise) const {
@@ -140,6 +138,8 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   return chunk;
 }
 
-MemoryUse Engine::memory() const { return {weights_->size() + tables_->size(), largest_plan_, plans_->working_size()}; }
+MemoryUse Engine::memory() const {
+  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size()};
+}
 
 }  // namespace vla

@@ -30,8 +30,8 @@ struct ActionChunk {
   std::vector<Tap> taps;
 };
 
-/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of one plan; what graphs share while they
-/// run.
+/// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
+/// they run.
 struct MemoryUse {
   std::size_t weights = 0, plan = 0, working = 0;
   std::size_t total() const { return weights + plan + working; }
@@ -82,7 +82,6 @@ class Engine {
   std::unique_ptr<Store> tables_;
   Tensor conditions_;
   std::unique_ptr<Plans> plans_;
-  std::size_t largest_plan_ = 0;
   Inputs inputs_;  // of the last observation; its vectors keep their memory
 };
 

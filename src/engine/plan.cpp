@@ -12,8 +12,9 @@ namespace {
 /// Tensors of a plan's store: inputs, x, k, two for each cached layer, and a handful of constants for each graph.
 std::size_t store_capacity(const Weights& weights) { return 64 + 2 * weights.count(); }
 
-/// How many plans are kept. A robot uses a few instructions of a few lengths; a plan costs about a megabyte.
-constexpr std::size_t kMaxPlans = 64;
+/// Memory that all plans together may take. A robot uses a few instructions of a few lengths; the limit is for the
+/// others.
+constexpr std::size_t kMaxPlanBytes = std::size_t{256} << 20;
 
 TapFilter prefix_filter(const std::string& pattern) {
   if (pattern.empty()) return {};
@@ -37,8 +38,7 @@ Tap read_tap(std::string path, Tensor tensor) { return {std::move(path), tensor.
 Plan::Plan(const PlanContext& context, const InputShape& shape)
     : tap_pattern_(context.tap_pattern),
       store_(store_capacity(context.weights)),
-      in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}),
-          store_.add_i32({shape.n_text}),
+      in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}), store_.add_i32({shape.n_text}),
           store_.add_f32({shape.d_state, 1})},
       x_(store_.add_f32({context.d_action, context.horizon})),
       k_(store_.add_i32({1})),
@@ -96,11 +96,18 @@ void Plan::collect_step_taps(int k, std::vector<Tap>& taps) const {
 
 Result<Plan*> Plans::for_shape(const InputShape& shape) {
   if (const auto found = plans_.find(shape); found != plans_.end()) return found->second.get();
-  if (plans_.size() >= kMaxPlans) plans_.clear();
+  if (size() > kMaxPlanBytes) plans_.clear();
   const std::size_t before = memory_.size();
-  VLA_TRY(std::unique_ptr<Plan> plan, Plan::build(context_, shape, memory_));
+  auto plan = Plan::build(context_, shape, memory_);
   if (memory_.size() != before) plans_.clear();  // their graphs point into memory that is gone
-  return (plans_[shape] = std::move(plan)).get();
+  if (!plan) return plan.error();
+  return (plans_[shape] = std::move(*plan)).get();
+}
+
+std::size_t Plans::size() const {
+  std::size_t bytes = 0;
+  for (const auto& [shape, plan] : plans_) bytes += plan->size();
+  return bytes;
 }
 
 }  // namespace vla

@@ -62,6 +62,8 @@ class Plans {
  public:
   Plans(PlanContext context) : context_(std::move(context)), memory_(context_.device) {}
   Result<Plan*> for_shape(const InputShape& shape);
+  /// Bytes of inputs, caches and constants of all plans.
+  std::size_t size() const;
   std::size_t working_size() const { return memory_.size(); }
 
  private:

@@ -24,9 +24,7 @@ Tensor repeat_like(Graph& g, Tensor x, Tensor like) {
   return ggml_repeat_4d(g.context(), x.node(), x.dim(0), like.dim(1), 1, 1);
 }
 
-Tensor column(Graph& g, Tensor table, Tensor index) {
-  return ggml_get_rows(g.context(), table.node(), index.node());
-}
+Tensor column(Graph& g, Tensor table, Tensor index) { return ggml_get_rows(g.context(), table.node(), index.node()); }
 
 Tensor add(Graph& g, Tensor a, Tensor b) { return ggml_add(g.context(), a.node(), b.node()); }
 

@@ -5,6 +5,8 @@
 // (t = 1) to actions (t = 0). Reference: lerobot src/lerobot/policies/smolvla/modeling_smolvla.py (embed_prefix,
 // embed_suffix, denoise_step) and smolvlm_with_expert.py.
 
+#include <fmt/format.h>
+
 #include "modules/action/expert.h"
 #include "modules/language/smollm.h"
 #include "modules/time_embedding.h"
@@ -42,7 +44,14 @@ class SmolVla final : public Policy {
         image_scale_(s.number("image_scale")),
         text_scale_(s.number("text_scale")),
         min_period_((s / "time").precise("min_period")),
-        max_period_((s / "time").precise("max_period")) {}
+        max_period_((s / "time").precise("max_period")) {
+    (s / "time")
+        .require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period",
+                 fmt::format("{}", min_period_));
+    (s / "expert")
+        .require(expert_.d_model() % 2 == 0, "d_model", "an even number, for sines and cosines",
+                 fmt::format("{}", expert_.d_model()));
+  }
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
@@ -75,40 +84,24 @@ class SmolVla final : public Policy {
   }
 };
 
-/// lerobot/smolvla_base: 450 M parameters. Source: shared inventory of the published checkpoint and its config.json.
+/// lerobot/smolvla_base: 450 M parameters. Source: its config.json and that of its backbone.
 Keys published() {
-  Keys keys;
-  const auto sizes = [&](const std::string& path, std::initializer_list<std::pair<const char*, std::int64_t>> values) {
-    for (const auto& [key, value] : values) keys.set(path + "." + key, Value(value));
-  };
-  sizes("policy", {{"d_state", 32}, {"d_action", 32}, {"horizon", 50}});
-  sizes("vision",
-        {{"d_model", 768}, {"n_layer", 12}, {"n_head", 12}, {"d_ff", 3072}, {"image_size", 512}, {"patch_size", 16}});
-  sizes("connector", {{"factor", 4}});
-  sizes("lm", {{"d_model", 960},
-               {"n_layer", 16},
-               {"n_head", 15},
-               {"n_head_kv", 5},
-               {"d_head", 64},
-               {"d_ff", 2560},
-               {"n_vocab", 49280}});
-  sizes("expert", {{"d_model", 720}, {"n_layer", 16}, {"d_ff", 2048}});
-  for (const auto& [key, value] :
-       std::initializer_list<std::pair<const char*, double>>{{"policy.image_scale", 30.983866769659336},
-                                                             {"policy.text_scale", 30.983866769659336},
-                                                             {"vision.norm_eps", 1e-6},
-                                                             {"lm.norm_eps", 1e-5},
-                                                             {"lm.rope_base", 10000.0},
-                                                             {"expert.norm_eps", 1e-5},
-                                                             {"expert.rope_base", 10000.0},
-                                                             {"time.min_period", 4e-3},
-                                                             {"time.max_period", 4.0}})
-    keys.set(key, Value(value));
-  keys.set("vision.position_rule", Value(std::string("bucketize_float32")));
-  std::vector<std::string> kinds;
-  for (int i = 0; i < 16; ++i) kinds.push_back(i % 2 == 0 ? "self" : "cross");
-  keys.set("expert.layer_kinds", Value(kinds));
-  return keys;
+  // clang-format off
+  return Keys({
+      {"policy.d_state", 32}, {"policy.d_action", 32}, {"policy.horizon", 50},
+      {"policy.image_scale", 30.983866769659336}, {"policy.text_scale", 30.983866769659336},
+      {"vision.d_model", 768}, {"vision.n_layer", 12}, {"vision.n_head", 12}, {"vision.d_ff", 3072},
+      {"vision.image_size", 512}, {"vision.patch_size", 16}, {"vision.norm_eps", 1e-6},
+      {"vision.position_rule", "bucketize_float32"},
+      {"connector.factor", 4},
+      {"lm.d_model", 960}, {"lm.n_layer", 16}, {"lm.n_head", 15}, {"lm.n_head_kv", 5}, {"lm.d_head", 64},
+      {"lm.d_ff", 2560}, {"lm.n_vocab", 49280}, {"lm.norm_eps", 1e-5}, {"lm.rope_base", 10000.0},
+      {"expert.d_model", 720}, {"expert.n_layer", 16}, {"expert.d_ff", 2048}, {"expert.norm_eps", 1e-5},
+      {"expert.rope_base", 10000.0},
+      {"expert.layer_kinds", std::vector<std::string>{"self", "cross", "self", "cross", "self", "cross", "self", "cross",
+                                                      "self", "cross", "self", "cross", "self", "cross", "self", "cross"}},
+      {"time.min_period", 4e-3}, {"time.max_period", 4.0}});
+  // clang-format on
 }
 
 std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<SmolVla>(Scope(list, "")); }

@@ -2,11 +2,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/json_fields.h"
 
+#include <fmt/format.h>
+
 #include <cmath>
 
 namespace vla {
 namespace {
 
+constexpr int kMaxDepth = 16;
 constexpr std::size_t kShown = 60;  // characters of a wrong value in a message
 
 std::string shown(const Json& value) {
@@ -16,9 +19,21 @@ std::string shown(const Json& value) {
 
 }  // namespace
 
+Result<Json> parse_json(const std::string& text, const std::string& where) {
+  bool too_deep = false;
+  const auto shallow = [&](int depth, Json::parse_event_t, Json&) {
+    too_deep |= depth > kMaxDepth;
+    return !too_deep;
+  };
+  Json document = Json::parse(text, shallow, /*allow_exceptions=*/false);
+  if (too_deep)
+    return Error{Code::bad_bundle, where, fmt::format("JSON that nests at most {} deep", kMaxDepth), "deeper nesting"};
+  if (document.is_discarded()) return Error{Code::bad_bundle, where, "JSON", "text that is not JSON"};
+  return document;
+}
+
 Result<Json> parse_json_list(const std::string& text, const std::string& where) {
-  Json document = Json::parse(text, nullptr, /*allow_exceptions=*/false);
-  if (document.is_discarded()) return Error{Code::bad_bundle, where, "a JSON list", "text that is not JSON"};
+  VLA_TRY(Json document, parse_json(text, where));
   if (!document.is_array()) return Error{Code::bad_bundle, where, "a JSON list", shown(document)};
   return document;
 }

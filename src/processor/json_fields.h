@@ -12,7 +12,10 @@ namespace vla {
 
 using Json = nlohmann::json;
 
-/// Parses a JSON list held by a bundle. Errors: bad_bundle at `where`.
+/// Parses a JSON document held by a bundle. What a bundle holds nests three deep; a document that nests without end, on
+/// which the library's recursive functions would exhaust the stack, is refused. Errors: bad_bundle at `where`.
+Result<Json> parse_json(const std::string& text, const std::string& where);
+/// The same for a document that must be a list.
 Result<Json> parse_json_list(const std::string& text, const std::string& where);
 
 /// One JSON object of a bundle whose fields are all required and all known: each is read by name and type, and `done`

@@ -51,6 +51,7 @@ Result<Processor> Processor::create(const Bundle& bundle) {
     return misfit("processor.recipe.text",
                   fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
                   std::to_string(processor.recipe_.max_tokens));
+  VLA_CHECK(processor.check_descriptions(keys));
   return processor;
 }
 
@@ -82,7 +83,7 @@ Status Processor::read_features(const Bundle& bundle) {
   states_ = FeatureNames("state", std::move(states), std::move(no_aliases));
 
   VLA_TRY(action_names_, keys.strings("action.names"));
-  return check_descriptions(keys);
+  return {};
 }
 
 /// Names, units and the rate change no number, but a reader of the answer relies on them.

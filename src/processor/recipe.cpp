@@ -115,7 +115,7 @@ Status parse_list(const Json& document, const char* name, ParseOp parse_op, Reci
 }  // namespace
 
 Result<Recipe> parse_recipe(const std::string& json) {
-  const Json document = Json::parse(json, nullptr, /*allow_exceptions=*/false);
+  VLA_TRY(const Json document, parse_json(json, kWhere));
   if (!document.is_object()) return Error{Code::bad_bundle, kWhere, "a JSON object", "other text"};
   const std::map<std::string, ParseOp> lists = {
       {"image", parse_image_op}, {"text", parse_text_op}, {"state", parse_state_op}, {"action", parse_action_op}};

@@ -47,7 +47,7 @@ struct Recipe {
   std::vector<AffineOp> image;       // the others
   std::vector<EnsureSuffixOp> text;  // all but the last op, which is tokenize
   int max_tokens = 0;
-  bool keep_last = false;            // of more tokens the last are kept, else the first
+  bool keep_last = false;  // of more tokens the last are kept, else the first
   std::vector<StateOp> state;
   std::vector<ActionOp> action;
 };

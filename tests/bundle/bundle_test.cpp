@@ -19,7 +19,11 @@ namespace {
 EditableBundle small_bundle() {
   EditableBundle bundle;
   bundle.set("vla.bundle_version", Value(std::int64_t{1}));
-  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"), {"vla.dtype", "f32"}, {"vla.source.name", "x"}, {"vla.source.revision", ""}, {"vla.source.converter", "test"}})
+  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"),
+                                   {"vla.dtype", "f32"},
+                                   {"vla.source.name", "x"},
+                                   {"vla.source.revision", ""},
+                                   {"vla.source.converter", "test"}})
     bundle.set(key, Value(std::string(value)));
   bundle.set("lm.d_model", Value(std::int64_t{4}));
   bundle.set("lm.names", Value(std::vector<std::string>{"a", "b"}));

@@ -1,9 +1,10 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// The precision trap of the vision tower. The reference looks up its position table through floating-point arithmetic whose
-// rounding depends on the precision of the pixels and on the release; a runtime that uses another rule than the one that the
-// weights were trained with stays within a few per cent everywhere, and is wrong. These tests show the failure and its size.
+// The precision trap of the vision tower. The reference looks up its position table through floating-point arithmetic
+// whose rounding depends on the precision of the pixels and on the release; a runtime that uses another rule than the
+// one that the weights were trained with stays within a few per cent everywhere, and is wrong. These tests show the
+// failure and its size.
 #include <fmt/format.h>
 
 #include <cmath>
@@ -47,7 +48,10 @@ std::vector<float> our_chunk(const std::string& rule, int n_step) {
 
 /// Largest difference, in units of the largest magnitude of `expected`.
 double displacement(const std::vector<float>& got, const std::vector<float>& expected) {
-  return compare_taps({{"chunk", {static_cast<std::int64_t>(expected.size())}, expected}}, {{"chunk", {static_cast<std::int64_t>(got.size())}, got}}).front().relative;
+  return compare_taps({{"chunk", {static_cast<std::int64_t>(expected.size())}, expected}},
+                      {{"chunk", {static_cast<std::int64_t>(got.size())}, got}})
+      .front()
+      .relative;
 }
 
 }  // namespace
@@ -64,7 +68,8 @@ TEST_CASE("position ids equal the reference's under every rule") {
 }
 
 TEST_CASE("the rules read different rows of the table on a 6 x 6 grid") {
-  const auto exact = *vision_position_ids("bucketize_float32", 6, 6), shifted = *vision_position_ids("bucketize_shifted", 6, 6);
+  const auto exact = *vision_position_ids("bucketize_float32", 6, 6),
+             shifted = *vision_position_ids("bucketize_shifted", 6, 6);
   int n_different = 0;
   for (std::size_t i = 0; i < exact.size(); ++i) n_different += exact[i] != shifted[i];
   CHECK(n_different == 35);  // all but the first patch
@@ -82,9 +87,11 @@ TEST_CASE("with the rule of the reference the chunk agrees for every number of s
 TEST_CASE("with another rule than the reference's the actions are displaced, however many solver steps are taken") {
   for (int n_step : kSteps) {
     CAPTURE(n_step);
-    const double matched = displacement(our_chunk("bucketize_float32", n_step), reference_chunk("bucketize_float32", n_step));
-    const double mismatched = displacement(our_chunk("bucketize_shifted", n_step), reference_chunk("bucketize_float32", n_step));
-    CHECK(mismatched > 1e-3);          // ten times the parity bar
+    const double matched =
+        displacement(our_chunk("bucketize_float32", n_step), reference_chunk("bucketize_float32", n_step));
+    const double mismatched =
+        displacement(our_chunk("bucketize_shifted", n_step), reference_chunk("bucketize_float32", n_step));
+    CHECK(mismatched > 1e-3);  // ten times the parity bar
     CHECK(mismatched > 100 * matched);
   }
 }

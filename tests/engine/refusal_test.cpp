@@ -59,11 +59,13 @@ TEST_CASE("missing, extra and misshapen tensors are named in one error") {
   bundle.erase("expert.norm.weight");
   bundle.erase("vision.blk.0.attn_q.bias");
   bundle.tensors.push_back({"lm.blk.99.attn_q.weight", DType::f32, {1}, std::string(4, '\0')});
-  bundle.tensor("state_in.weight").shape = {4, bundle.tensor("state_in.weight").shape[0] * bundle.tensor("state_in.weight").shape[1] / 4};
+  bundle.tensor("state_in.weight").shape = {
+      4, bundle.tensor("state_in.weight").shape[0] * bundle.tensor("state_in.weight").shape[1] / 4};
   const std::string message = refusal(bundle).message();
   CAPTURE(message);
-  for (const char* part : {"4 problems", "missing tensor  expert.norm.weight", "missing tensor  vision.blk.0.attn_q.bias",
-                           "unused tensor   lm.blk.99.attn_q.weight", "wrong shape     state_in.weight"})
+  for (const char* part :
+       {"4 problems", "missing tensor  expert.norm.weight", "missing tensor  vision.blk.0.attn_q.bias",
+        "unused tensor   lm.blk.99.attn_q.weight", "wrong shape     state_in.weight"})
     CHECK(message.find(part) != std::string::npos);
 }
 
@@ -85,10 +87,20 @@ TEST_CASE("every required key is missed when it is gone") {
 }
 
 TEST_CASE("sizes that do not go together are refused before memory is taken") {
-  for (const auto& [key, value] : std::initializer_list<std::pair<const char*, std::int64_t>>{
-           {"lm.n_layer", 2000000000}, {"lm.n_layer", 0}, {"vision.patch_size", 65536}, {"lm.n_head", 0}, {"lm.n_head_kv", 5},
-           {"policy.horizon", 1000000}, {"policy.horizon", 0}, {"solver.steps", 0}, {"solver.steps", 1000000000}, {"connector.factor", 3},
-           {"vision.image_size", 8}, {"lm.n_vocab", 1}, {"policy.d_state", -1}}) {
+  for (const auto& [key, value] :
+       std::initializer_list<std::pair<const char*, std::int64_t>>{{"lm.n_layer", 2000000000},
+                                                                   {"lm.n_layer", 0},
+                                                                   {"vision.patch_size", 65536},
+                                                                   {"lm.n_head", 0},
+                                                                   {"lm.n_head_kv", 5},
+                                                                   {"policy.horizon", 1000000},
+                                                                   {"policy.horizon", 0},
+                                                                   {"solver.steps", 0},
+                                                                   {"solver.steps", 1000000000},
+                                                                   {"connector.factor", 3},
+                                                                   {"vision.image_size", 8},
+                                                                   {"lm.n_vocab", 1},
+                                                                   {"policy.d_state", -1}}) {
     CAPTURE(key);
     CAPTURE(value);
     EditableBundle bundle = sound_bundle();
@@ -111,7 +123,8 @@ TEST_CASE("statistics that are missing refuse the bundle instead of passing numb
 
 TEST_CASE("a zero standard deviation divides by eps alone, as the reference does, and un-normalizes to the mean") {
   EditableBundle bundle = sound_bundle();
-  for (const char* name : {"stats.observation.state.std", "stats.action.std"}) std::memset(bundle.tensor(name).data.data(), 0, 4);
+  for (const char* name : {"stats.observation.state.std", "stats.action.std"})
+    std::memset(bundle.tensor(name).data.data(), 0, 4);
   GoldenCase golden = GoldenCase::read(kCase);
   float state_mean, action_mean;
   std::memcpy(&state_mean, bundle.tensor("stats.observation.state.mean").data.data(), 4);
@@ -120,7 +133,8 @@ TEST_CASE("a zero standard deviation divides by eps alone, as the reference does
   const auto chunk = load_engine(bundle.write("zero_std.gguf"), "state")->act(golden.observation, golden.noise);
   REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
   CHECK(find_tap(chunk->taps, "state").values[0] == 0.0f);
-  for (int row = 0; row < chunk->horizon; ++row) CHECK(chunk->actions[static_cast<std::size_t>(row * chunk->d_action)] == action_mean);
+  for (int row = 0; row < chunk->horizon; ++row)
+    CHECK(chunk->actions[static_cast<std::size_t>(row * chunk->d_action)] == action_mean);
 }
 
 TEST_CASE("wrong views, counts and numbers are refused by name, and the next request is answered") {

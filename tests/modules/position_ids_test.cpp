@@ -33,7 +33,8 @@ TEST_CASE("a smaller picture on the same table skips rows evenly") {
   CHECK((*ids)[16] == 64);
 }
 
-TEST_CASE("ids equal the reference's for every grid that it computes alike on every machine, and other grids are refused") {
+TEST_CASE(
+    "ids equal the reference's for every grid that it computes alike on every machine, and other grids are refused") {
   const auto json = nlohmann::json::parse(test::read_text(test::source_path("tests/golden/positions.json")));
   for (const auto& table : json.at("tables"))
     for (const char* precision : {"float32", "bfloat16"}) {
@@ -45,7 +46,8 @@ TEST_CASE("ids equal the reference's for every grid that it computes alike on ev
       REQUIRE(ids.ok());
       const std::vector<std::int32_t> axis = table.at(precision);
       for (int i = 0; i < grid * grid; ++i)
-        CHECK((*ids)[static_cast<std::size_t>(i)] == axis[static_cast<std::size_t>(i / grid)] * n_table + axis[static_cast<std::size_t>(i % grid)]);
+        CHECK((*ids)[static_cast<std::size_t>(i)] ==
+              axis[static_cast<std::size_t>(i / grid)] * n_table + axis[static_cast<std::size_t>(i % grid)]);
     }
   for (const auto& pair : json.at("machine_dependent")) {
     const auto ids = vision_position_ids("bucketize_float32", pair.at(0), pair.at(1));

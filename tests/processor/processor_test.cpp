@@ -27,7 +27,11 @@ EditableBundle sample() {
   EditableBundle bundle;
   bundle.keys = tokenizer_keys("smol");
   bundle.set("vla.bundle_version", std::int64_t{1});
-  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"), {"vla.dtype", "f32"}, {"vla.source.name", "x"}, {"vla.source.revision", ""}, {"vla.source.converter", "test"}})
+  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"),
+                                   {"vla.dtype", "f32"},
+                                   {"vla.source.name", "x"},
+                                   {"vla.source.revision", ""},
+                                   {"vla.source.converter", "test"}})
     bundle.set(key, std::string(value));
   bundle.set("observation.views",
              std::vector<std::string>{"observation.images.top", "observation.images.wrist", "observation.images.side"});
@@ -324,11 +328,12 @@ TEST_CASE("a chunk of another shape is our own mistake") {
     refusal(make().decode(chunk, horizon, d_action), Code::internal);
 }
 
-TEST_CASE("every key that the processor reads is required") {
+TEST_CASE("every key that the processor reads or that describes its features is required") {
   for (const char* key :
        {"processor.recipe", "observation.views", "observation.view_aliases", "observation.view_optional",
         "observation.min_views", "observation.states", "observation.state_dims", "observation.max_text_tokens",
-        "action.names", "tokenizer.tokens", "lm.n_vocab", "policy.d_state", "policy.d_action"}) {
+        "observation.state_names", "observation.state_units", "action.names", "action.units", "action.rate_hz",
+        "tokenizer.tokens", "lm.n_vocab", "policy.d_state", "policy.d_action"}) {
     EditableBundle bundle = sample();
     bundle.remove_key(key);
     CHECK(contains(refusal(create(bundle), Code::bad_bundle), key));
@@ -345,10 +350,13 @@ TEST_CASE("features that do not fit each other are refused") {
   CHECK(contains(refused_with("observation.min_views", std::int64_t{4}), "1 to 3"));
   CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{2, 1}), "observation.state_dims"));
   CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{0}), "observation.state_dims"));
-  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{3}), "3 numbers"));
+  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{3}), "observation.state_names"));
+  CHECK(contains(refused_with("observation.state_units", std::vector<std::string>{}), "observation.state_units"));
+  CHECK(contains(refused_with("action.rate_hz", -1.0), "action.rate_hz"));
   CHECK(contains(refused_recipe("/state/1/size", 1), "processor.recipe.state[1].size: expected at least the 2"));
   CHECK(contains(refused_with("observation.max_text_tokens", std::int64_t{7}), "observation.max_text_tokens"));
-  CHECK(contains(refused_with("action.names", std::vector<std::string>{"one"}), "action.names"));
+  CHECK(contains(refused_with("action.names", std::vector<std::string>{"one"}), "action.units"));
+  CHECK(contains(refused_recipe("/action", Json::array()), "action.names: expected one name for each of the 4"));
   CHECK(contains(refused_with("policy.d_state", std::int64_t{5}), "policy.d_state"));
   CHECK(contains(refused_with("policy.d_action", std::int64_t{1}), "processor.recipe.action[0].size"));
 }

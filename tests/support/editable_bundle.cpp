@@ -48,7 +48,8 @@ std::string EditableBundle::bytes() const {
   Keys complete = keys;
   complete.set("vla.checksum", Value(std::string("xxh3:0000000000000000")));
   std::vector<TensorInfo> infos;
-  for (const Piece& piece : tensors) infos.push_back({piece.name, piece.type, piece.shape, std::as_bytes(std::span(piece.data))});
+  for (const Piece& piece : tensors)
+    infos.push_back({piece.name, piece.type, piece.shape, std::as_bytes(std::span(piece.data))});
   std::string out = write_gguf(complete, infos);
   const std::size_t digits = out.find("xxh3:0000000000000000", out.find("vla.checksum")) + 5;
   out.replace(digits, 16, fmt::format("{:016x}", XXH3_64bits(out.data(), out.size())));

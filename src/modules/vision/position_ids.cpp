@@ -11,9 +11,9 @@
 namespace vla {
 namespace {
 
-/// torch.arange(1/n, 1, 1/n) in float32. Vectors of `width` numbers start at a rounded multiple and count on from there in
-/// double; they come in pairs, and what is left over is made one by one. So the last bits depend on the machine: 8 with AVX2
-/// and AVX-512, 4 with NEON, 1 without vectors.
+/// torch.arange(1/n, 1, 1/n) in float32. Vectors of `width` numbers start at a rounded multiple and count on from there
+/// in double; they come in pairs, and what is left over is made one by one. So the last bits depend on the machine: 8
+/// with AVX2 and AVX-512, 4 with NEON, 1 without vectors.
 std::vector<float> boundaries(int n_table, int width) {
   const double step = 1.0 / n_table;
   const int count = static_cast<int>(std::ceil((1.0 - step) / step));
@@ -62,6 +62,9 @@ Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, i
       return Error{Code::unsupported, "vision.position_rule", "a grid whose position ids are the same on every machine",
                    fmt::format("{} x {} patches on a table of {} x {}", n_grid, n_grid, n_table, n_table),
                    "the reference's own result depends on the machine here; use another image size"};
+  if (axis.back() >= n_table)  // torch would stop with an IndexError
+    return Error{Code::unsupported, "vision.position_rule", fmt::format("position ids below {}", n_table),
+                 std::to_string(axis.back()), "the reference fails on this grid too; use another image size"};
   std::vector<std::int32_t> ids;
   for (std::int32_t row : axis)
     for (std::int32_t column : axis) ids.push_back(row * n_table + column);
