@@ -16,6 +16,7 @@ int usable_cores() {
 }  // namespace
 
 Result<Device> Device::cpu(int n_thread) {
+  ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);  // what fails becomes an Error, told once
   Device device;
   device.n_thread_ = n_thread > 0 ? n_thread : usable_cores();
   if (device.n_thread_ > GGML_MAX_N_THREADS)
