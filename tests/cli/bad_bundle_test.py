@@ -114,15 +114,25 @@ def test_a_weight_that_is_not_finite_is_a_bad_action_and_never_a_number(vla, gol
     vla(*golden.arguments(bundle=path)).refused("bad_action", 'actions[0]["action.0"]: expected a finite number')
 
 
-def test_a_picture_size_that_no_memory_holds_is_refused(vla, golden, sound, tmp_path):
+def with_picture_size(data, size):
+    old, new = b'"width": 32, "height": 32, "filter": "bilinear"', b'"width":%d,"height":%d,"filter":"bilinear"'
+    return sealed(replaced(data, old, (new % (size, size)).ljust(len(old))))
+
+
+def test_a_picture_size_beyond_any_attention_is_refused_at_once(refused, sound):
+    answer = refused(with_picture_size(sound, 8192), "unsupported", "expected at most 8192 tokens")
+    assert answer.seconds < 10 and answer.peak < 1 << 29
+
+
+def test_a_picture_size_that_memory_cannot_hold_is_out_of_memory(vla, golden, sound, tmp_path):
     if vla.is_sanitized():
-        pytest.skip("the sanitizer's operator new ends the program where the standard one throws")
-    old, new = b'"width": 32, "height": 32, "filter": "bilinear"', b'"width":8192,"height":8192,"filter":"bilinear"'
+        pytest.skip("a sanitizer needs more address space than any limit leaves")
     path = tmp_path / "policy.gguf"
-    path.write_bytes(sealed(replaced(sound, old, new.ljust(len(old)))))
-    for answer in (vla(*golden.arguments(bundle=path)), vla("inspect", path)):
-        assert answer.code in (EXIT["out_of_memory"], EXIT["unsupported"]), (answer.code, answer.err)
-        assert answer.out == "" and answer.err.startswith("error: ")
+    path.write_bytes(with_picture_size(sound, 960))
+    for arguments in (golden.arguments(bundle=path), ["inspect", path]):
+        answer = vla(*arguments, memory=3 << 30)
+        assert answer.code == EXIT["out_of_memory"] and answer.out == ""
+        assert answer.err.startswith("error: out_of_memory: ") and answer.err.count("\n") == 1, answer.err
 
 
 def test_a_missing_bundle_is_an_io_error_with_its_path(vla, golden, tmp_path):

@@ -5,6 +5,7 @@
 import json
 import os
 import re
+import resource
 import subprocess
 import tempfile
 import threading
@@ -62,7 +63,8 @@ class Program:
         with open(self.path, "rb") as file:
             return b"__asan_init" in file.read()
 
-    def __call__(self, *args, stdout=None, limit=60):
+    def __call__(self, *args, stdout=None, limit=60, memory=None):
+        """memory: bytes of address space that the program may take."""
         with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
             start = time.monotonic()
             process = subprocess.Popen(
@@ -71,6 +73,7 @@ class Program:
                 stdout=stdout or out,
                 stderr=err,
                 env=self.environment,
+                preexec_fn=memory and (lambda: resource.setrlimit(resource.RLIMIT_AS, (memory, memory))),
             )
             killer = threading.Timer(limit, process.kill)
             killer.start()

@@ -15,6 +15,8 @@ class PixelConnector : public Module<PixelConnector> {
   Tensor forward(Graph& g, Tensor x) const;
   /// Whether a grid of `side` x `side` patches can be divided. Errors: unsupported.
   Status check(int side) const;
+  /// Tokens that a grid of `side` x `side` patches becomes.
+  int n_token(int side) const { return (side / factor_) * (side / factor_); }
 
  private:
   int factor_;
