@@ -7,6 +7,8 @@
 PYTHON ?= python3
 VENV   := .venv
 STAMP  := $(VENV)/.complete
+# Passed on when a build is configured for the first time, e.g. CMAKE_ARGS=-DVLA_GGML_DIR=...
+CMAKE_ARGS ?=
 
 help:
 	@echo "make demo      install what is needed, build, and play the shipped policy on real camera frames"
@@ -26,14 +28,14 @@ $(STAMP): python/pyproject.toml python/requirements-test.txt
 	@touch $(STAMP)
 
 build: packages $(STAMP)
-	@test -f build/cpu/build.ninja || cmake --preset cpu
+	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
 	cmake --build --preset cpu
 
 demo: build
 	$(VENV)/bin/python examples/metaworld/play.py --vla build/cpu/bin/vla
 
 asan: packages $(STAMP)
-	@test -f build/asan/build.ninja || cmake --preset asan
+	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
 	cmake --build --preset asan
 
 test: build asan
@@ -41,7 +43,7 @@ test: build asan
 
 SECONDS ?= 600
 fuzz: packages
-	@test -f build/fuzz/build.ninja || cmake --preset fuzz
+	@test -f build/fuzz/build.ninja || cmake --preset fuzz $(CMAKE_ARGS)
 	cmake --build --preset fuzz
 	scripts/fuzz.sh $(SECONDS)
 
