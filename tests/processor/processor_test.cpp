@@ -350,12 +350,12 @@ TEST_CASE("features that do not fit each other are refused") {
   CHECK(contains(refused_with("observation.min_views", std::int64_t{4}), "1 to 3"));
   CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{2, 1}), "observation.state_dims"));
   CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{0}), "observation.state_dims"));
-  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{3}), "observation.state_names"));
+  CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{3}), "3 numbers"));
   CHECK(contains(refused_with("observation.state_units", std::vector<std::string>{}), "observation.state_units"));
   CHECK(contains(refused_with("action.rate_hz", -1.0), "action.rate_hz"));
   CHECK(contains(refused_recipe("/state/1/size", 1), "processor.recipe.state[1].size: expected at least the 2"));
   CHECK(contains(refused_with("observation.max_text_tokens", std::int64_t{7}), "observation.max_text_tokens"));
-  CHECK(contains(refused_with("action.names", std::vector<std::string>{"one"}), "action.units"));
+  CHECK(contains(refused_with("action.names", std::vector<std::string>{"one"}), "action.names"));
   CHECK(contains(refused_recipe("/action", Json::array()), "action.names: expected one name for each of the 4"));
   CHECK(contains(refused_with("policy.d_state", std::int64_t{5}), "policy.d_state"));
   CHECK(contains(refused_with("policy.d_action", std::int64_t{1}), "processor.recipe.action[0].size"));
