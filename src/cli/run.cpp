@@ -79,7 +79,8 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   return {};
 }
 
-/// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from.
+/// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from; the
+/// reference's own arrays have a batch of one before it.
 Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
   if (options.noise.empty()) return Noise(*options.seed);
   VLA_TRY(const std::vector<std::byte> bytes, read_file(options.noise, kMaxFile));
@@ -88,6 +89,7 @@ Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
   if (values == nullptr) return Error{Code::bad_observation, options.noise, "float32 noise", "uint8"};
   const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.horizon()),
                                           static_cast<std::size_t>(engine.d_action())};
+  if (array.shape.size() == 3 && array.shape.front() == 1) array.shape.erase(array.shape.begin());
   if (array.shape != shape)
     return Error{Code::bad_observation, options.noise, fmt::format("noise of shape ({})", fmt::join(shape, ", ")),
                  fmt::format("({})", fmt::join(array.shape, ", "))};
@@ -211,8 +213,9 @@ Command add_run(CLI::App& app) {
       ->allow_extra_args(false);
   command->add_option("--text", options->text, "The instruction")->required();
   command
-      ->add_option("--noise", options->noise,
-                   "The solver's starting noise: a float32 .npy file, horizon x padded action width")
+      ->add_option(
+          "--noise", options->noise,
+          "The solver's starting noise: a float32 .npy file, horizon x padded action width, or a batch of one of it")
       ->check(CLI::Validator(check_given, ""));
   command->add_option("--seed", options->seed, "Draw the noise; the same seed gives the same bytes on every machine")
       ->check(CLI::Validator(check_seed, ""));

@@ -146,3 +146,9 @@ def test_help_of_every_subcommand_teaches_with_an_example(vla):
         assert answer.code == 0 and answer.err == "" and "\n  vla " in answer.out
     assert "Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation" in vla("--help").out
     assert re.fullmatch(r"\d+\.\d+\.\d+\n", vla("--version").out)
+
+
+def test_noise_with_the_references_batch_of_one_is_the_same_noise(vla, golden, tmp_path):
+    np.save(tmp_path / "batch.npy", np.load(golden.noise)[None])
+    batched = actions(vla(*golden.arguments(noise=tmp_path / "batch.npy")))
+    assert np.array_equal(batched, actions(vla(*golden.arguments())))
