@@ -25,6 +25,7 @@ Status compare(const CompareOptions& options) {
   VLA_TRY(const std::vector<Tap> expected, read_taps(options.expected));
   VLA_TRY(const std::vector<Tap> got, read_taps(options.got));
   std::vector<TapDifference> rows = compare_taps(expected, got);
+  const std::size_t n_missing = expected.size() - rows.size();
   std::erase_if(rows, [&](const TapDifference& row) { return !match_path(options.only, row.path); });
   if (rows.empty())
     return Error{Code::mismatch, options.got, "taps that stand in both files", "none",
@@ -41,7 +42,7 @@ Status compare(const CompareOptions& options) {
     n_failed += failed;
   }
   fmt::print("{} of {} taps within {:g}; {} of {} expected taps were not recorded\n", rows.size() - n_failed,
-             rows.size(), options.tolerance, expected.size() - compare_taps(expected, got).size(), expected.size());
+             rows.size(), options.tolerance, n_missing, expected.size());
   if (n_failed == 0) return {};
   const auto first =
       std::find_if(rows.begin(), rows.end(), [&](const TapDifference& row) { return !row.within(options.tolerance); });

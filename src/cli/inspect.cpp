@@ -126,9 +126,7 @@ void print_features(const Engine& engine) {
 
 void print_human(const Engine& engine) {
   const Bundle& bundle = engine.bundle();
-  const auto text = [&](const char* key) {
-    return bundle.keys().string(key) ? *bundle.keys().string(key) : std::string("?");
-  };
+  const auto text = [&](const char* key) { return *bundle.keys().string(key); };
   fmt::print("bundle       {}\n", bundle.path());
   fmt::print("policy       {}, stored as {}, {}\n", text("vla.arch"), text("vla.dtype"),
              human_size(static_cast<double>(bundle.file_size())));
