@@ -26,7 +26,7 @@ Error too_large(std::string where, std::string expected, std::string found) {
 }
 
 /// The fields of a message in the order of their numbers, from 1: v varint, b bytes or text, f floats (packed or not),
-/// and a digit for a message, the index of its own row. tests/serve/codec_test.cpp compares the rows with the schema.
+/// and a digit for a message, the index of its own row.
 constexpr std::array<const char*, 7> kActFields = {
     "15b3vvv",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms
     "b2bb4",    // 1 View: name, rgb, jpeg, png, absent
@@ -64,17 +64,11 @@ Result<Message> parse(std::span<const std::byte> bytes, std::size_t row, const c
 
 std::span<const std::byte> bytes_of(const std::string& text) { return std::as_bytes(std::span(text)); }
 
-/// A size over the limit is told apart from a corrupt picture, as the client can help it.
-Status check_pixels(std::int64_t width, std::int64_t height, const std::string& where, const ActLimits& limits) {
-  if (width < 1 || height < 1 || width <= limits.max_pixels / height) return {};
-  return too_large(where, fmt::format("at most {} pixels", limits.max_pixels), fmt::format("{} x {}", width, height));
-}
+ImageLimits image_limits(const ActLimits& limits) { return {limits.max_pixels, Code::too_large}; }
 
 Result<Frame> decode_raw(const v1::RawRgb& raw, const std::string& where, const ActLimits& limits) {
   const std::int64_t width = raw.width(), height = raw.height();
-  VLA_CHECK(check_pixels(width, height, where, limits));
-  if (width < 1 || height < 1)
-    return bad_observation(where, "at least one pixel", fmt::format("{} x {}", width, height));
+  VLA_CHECK(codecs::check_size(width, height, where, image_limits(limits)));
   const std::string& rows = raw.rows();
   if (rows.size() != static_cast<std::size_t>(width * height * 3))
     return bad_observation(where, fmt::format("{} bytes for {} x {} RGB", width * height * 3, width, height),
@@ -85,7 +79,7 @@ Result<Frame> decode_raw(const v1::RawRgb& raw, const std::string& where, const 
 Result<Frame> decode_file(const std::string& file, bool is_format, const char* format, const std::string& where,
                           const ActLimits& limits) {
   if (!is_format) return bad_observation(where, format, "bytes that do not begin as one");
-  return decode_image(bytes_of(file), where, {limits.max_pixels});
+  return decode_image(bytes_of(file), where, image_limits(limits));
 }
 
 Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string& where, const ActLimits& limits) {
