@@ -9,6 +9,7 @@
 #include <string_view>
 
 #include "processor/image_codecs.h"
+#include "processor/unicode.h"
 #include "serve/codec.h"
 #include "serve/envelope.h"
 #include "serve/fields.h"
@@ -25,31 +26,43 @@ Error too_large(std::string where, std::string expected, std::string found) {
           "Description.limits has all limits"};
 }
 
-/// The fields of a message in the order of their numbers, from 1: v varint, b bytes or text, f floats (packed or not),
+std::span<const std::byte> bytes_of(const std::string& text) { return std::as_bytes(std::span(text)); }
+
+std::string_view text_of(std::span<const std::byte> bytes) {
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
+
+/// The fields of a message in the order of their numbers, from 1: v varint, b bytes, t text, f floats (packed or not),
 /// and a digit for a message, the index of its own row.
-constexpr std::array<const char*, 7> kActFields = {
-    "15b3vvv",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms
-    "b2bb4",    // 1 View: name, rgb, jpeg, png, absent
+constexpr std::array<const char*, 7> kFields = {
+    "15t3vvv",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms
+    "t2bb4",    // 1 View: name, rgb, jpeg, png, absent
     "vvb",      // 2 RawRgb: width, height, rows
     "vvf",      // 3 Noise: horizon, d_action, values
     "",         // 4 Absent
-    "bf",       // 5 State: name, values
-    "vvbb",     // 6 Hello: min_version, max_version, client_name, client_version
+    "tf",       // 5 State: name, values
+    "vvtt",     // 6 Hello: min_version, max_version, client_name, client_version
 };
+
+/// Whether a field that was read is encoded as its type says.
+bool fits(const Fields& field, char type) {
+  if (type == 'v') return field.type == 'v';
+  return field.type == 'b' || (type == 'f' && field.type == 'f');
+}
 
 /// Whether a message holds known fields only, each in its own encoding. Protobuf would skip any other, and what it
 /// skipped might have changed the answer: a seed in a wrong encoding would become a fresh one.
 Status check_fields(std::span<const std::byte> bytes, std::size_t row, const char* where) {
-  const std::string_view types = kActFields[row];
+  const std::string_view types = kFields[row];
   for (Fields field(bytes, where);;) {
     VLA_TRY(const bool more, field.next());
     if (!more) return {};
-    if (field.number < 1 || static_cast<std::size_t>(field.number) > types.size()) return field.unknown();
-    const char type = types[static_cast<std::size_t>(field.number - 1)];
-    const bool is_message = type >= '0' && type <= '9';
-    const bool fits = type == 'f' ? field.type == 'b' || field.type == 'f' : field.type == (is_message ? 'b' : type);
-    if (!fits) return field.unknown();
-    if (is_message) VLA_CHECK(check_fields(field.value, static_cast<std::size_t>(type - '0'), where));
+    const auto index = static_cast<std::size_t>(field.number) - 1;
+    if (index >= types.size() || !fits(field, types[index])) return field.unknown();
+    const char type = types[index];
+    if (type == 't' && unicode::valid_prefix(text_of(field.value)) < field.value.size())
+      return not_a_request(where, "text in UTF-8", fmt::format("field {} with other bytes", field.number));
+    if (type >= '0' && type <= '9') VLA_CHECK(check_fields(field.value, static_cast<std::size_t>(type - '0'), where));
   }
 }
 
@@ -58,11 +71,9 @@ Result<Message> parse(std::span<const std::byte> bytes, std::size_t row, const c
   VLA_CHECK(check_fields(bytes, row, where));
   Message message;
   if (!message.ParseFromArray(bytes.data(), static_cast<int>(bytes.size())))
-    return not_a_request(where, "text in UTF-8", "other bytes");  // what check_fields leaves to Protobuf
+    return not_a_request(where, "a serialized message", "bytes that do not parse as one");
   return message;
 }
-
-std::span<const std::byte> bytes_of(const std::string& text) { return std::as_bytes(std::span(text)); }
 
 ImageLimits image_limits(const ActLimits& limits) { return {limits.max_pixels, Code::too_large}; }
 
