@@ -17,6 +17,8 @@
 namespace vla::serve {
 namespace {
 
+constexpr std::size_t kMaxName = 256;  // bytes; a name is told back in errors
+
 Error bad_observation(std::string where, std::string expected, std::string found) {
   return {Code::bad_observation, std::move(where), std::move(expected), std::move(found)};
 }
@@ -75,6 +77,11 @@ Result<Message> parse(std::span<const std::byte> bytes, std::size_t row, const c
   return message;
 }
 
+Status check_name(const std::string& name, const char* where) {
+  if (name.size() <= kMaxName) return {};
+  return too_large(where, fmt::format("names of at most {} bytes", kMaxName), fmt::format("{} bytes", name.size()));
+}
+
 ImageLimits image_limits(const ActLimits& limits) { return {limits.max_pixels, Code::too_large}; }
 
 Result<Frame> decode_raw(const v1::RawRgb& raw, const std::string& where, const ActLimits& limits) {
@@ -120,6 +127,7 @@ Status decode_views(const v1::Act& act, const ActLimits& limits, Observation& ob
   if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
     return too_large("act.views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
   for (const v1::View& view : act.views()) {
+    VLA_CHECK(check_name(view.name(), "act.views"));
     const std::string where = fmt::format("act.views[\"{}\"]", view.name());
     if (observation.views.contains(view.name())) return bad_observation(where, "each view once", "a second one");
     VLA_TRY(std::optional<Frame> frame, decode_view(view, where, limits));
@@ -130,6 +138,7 @@ Status decode_views(const v1::Act& act, const ActLimits& limits, Observation& ob
 
 Status decode_states(const v1::Act& act, Observation& observation) {
   for (const v1::State& state : act.states()) {
+    VLA_CHECK(check_name(state.name(), "act.states"));
     const std::string where = fmt::format("act.states[\"{}\"]", state.name());
     std::vector<float> values(state.values().begin(), state.values().end());
     if (!observation.states.emplace(state.name(), std::move(values)).second)

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Answers, from what the engine gives to their messages.
+#include "processor/unicode.h"
 #include "serve/codec.h"
 #include "serve/envelope.h"
 
@@ -17,6 +18,13 @@ std::string text(const Engine& engine, const char* key) {
 std::vector<std::string> texts(const Engine& engine, const char* key) {
   const auto value = engine.bundle().keys().strings(key);
   return value ? *value : std::vector<std::string>();
+}
+
+/// Protobuf's text is UTF-8, which a file name need not be.
+std::string utf8(std::string bytes) {
+  for (std::size_t bad = 0; (bad += unicode::valid_prefix(std::string_view(bytes).substr(bad))) < bytes.size();)
+    bytes[bad] = '?';
+  return bytes;
 }
 
 void describe_views(const Engine& engine, v1::Description& out) {
@@ -62,7 +70,7 @@ void describe_actions(const Engine& engine, v1::Description& out) {
 
 void describe_bundle(const Engine& engine, v1::Bundle& out) {
   const std::string& path = engine.bundle().path();
-  out.set_name(path.substr(path.rfind('/') + 1));
+  out.set_name(utf8(path.substr(path.rfind('/') + 1)));
   out.set_arch(text(engine, "vla.arch"));
   out.set_checksum(text(engine, "vla.checksum"));
   out.set_dtype(text(engine, "vla.dtype"));
@@ -117,10 +125,10 @@ v1::ActionChunk encode_chunk(const ActRequest& request, ActionChunk chunk, const
 v1::Error encode_error(const Error& error) {
   v1::Error out;
   out.set_code(static_cast<v1::Error::Code>(exit_code(error.code)));
-  out.set_where(error.where);
-  out.set_expected(error.expected);
-  out.set_found(error.found);
-  out.set_hint(error.hint);
+  out.set_where(utf8(error.where));
+  out.set_expected(utf8(error.expected));
+  out.set_found(utf8(error.found));
+  out.set_hint(utf8(error.hint));
   return out;
 }
 

@@ -116,6 +116,21 @@ TEST_CASE("what is over a limit is told apart from what is wrong") {
   check_refused(act, Code::too_large, "act.views[\"jpeg\"]");
 }
 
+TEST_CASE("a name that would make an error long is refused without being told back") {
+  v1::Act act = full_act();
+  act.mutable_views(0)->set_name(std::string(257, 'n'));
+  check_refused(act, Code::too_large, "act.views");
+  act = full_act();
+  act.mutable_states(0)->set_name(std::string(257, 'n'));
+  check_refused(act, Code::too_large, "act.states");
+}
+
+TEST_CASE("an error is text even where it tells of bytes that are none") {
+  const v1::Error error = encode_error({Code::io, "a\xff\xfe", "", "\xc3"});
+  CHECK(error.where() == "a??");
+  CHECK(error.found() == "?");
+}
+
 TEST_CASE("a view is refused by name: no picture, another format, other bytes than its size says, twice") {
   v1::Act act = full_act();
   act.mutable_views(0)->clear_picture();
