@@ -14,7 +14,7 @@ namespace vla::cli {
 namespace {
 
 struct ServeOptions {
-  std::string bundle;
+  std::string bundle, kernels;
   int n_thread = 0;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
@@ -50,7 +50,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
 Status serve(ServeOptions& options) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread}));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
   print_ready(*server, *engine, warm_up_ms);
@@ -76,6 +76,8 @@ Command add_serve(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
+  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best of this machine")
+      ->check([](const std::string& text) { return text.empty() ? "expected a value, found empty text" : ""; });
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();
