@@ -32,6 +32,13 @@ void stop_on_signals(serve::Server& server) {
   sigaction(SIGINT, &action, nullptr);
 }
 
+/// As a shell reads it back.
+std::string quoted(const std::string& text) {
+  std::string out = "'";
+  for (const char c : text) out += c == '\'' ? std::string("'\\''") : std::string(1, c);
+  return out + "'";
+}
+
 /// One line for people, and for programs that split it as a shell would.
 void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms) {
   const Processor& processor = engine.processor();
@@ -39,11 +46,12 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   features.insert(features.end(), processor.states().names().begin(), processor.states().names().end());
   const v1::Description description = serve::describe(engine, {});
   fmt::print(
-      "ready address={} bundle='{}' arch={} device='{}' precision={} kernels='{}' memory_mb={:.1f} features={} "
+      "ready address={} bundle={} arch={} device={} precision={} kernels={} memory_mb={:.1f} features={} "
       "warm_up_ms={:.1f}\n",
-      fmt::join(server.addresses(), ","), description.bundle().name(), description.bundle().arch(),
-      description.runtime().device(), description.runtime().precision(), description.runtime().kernels(),
-      static_cast<double>(engine.memory().total()) / 1e6, fmt::join(features, ","), warm_up_ms);
+      fmt::join(server.addresses(), ","), quoted(description.bundle().name()), description.bundle().arch(),
+      quoted(description.runtime().device()), description.runtime().precision(),
+      quoted(description.runtime().kernels()), static_cast<double>(engine.memory().total()) / 1e6,
+      fmt::join(features, ","), warm_up_ms);
   std::fflush(stdout);
 }
 
