@@ -111,6 +111,12 @@ class TooLarge(VlaError):
     code = "too_large"
 
 
+class BadRequest(VlaError):
+    """Server: the bytes are no request of its schema; a fault of the client."""
+
+    code = "bad_request"
+
+
 class Incompatible(VlaError):
     """Server and client speak no common version of the protocol."""
 
@@ -139,7 +145,7 @@ _CLASSES = {
     c.code: c
     for c in (
         InternalError, UsageError, BadBundle, BadObservation, BadAction, Unsupported, OutOfMemory, DeviceError, IoError,
-        Superseded, Late, Busy, TooLarge, Incompatible, ShuttingDown, Timeout, Disconnected,
+        Superseded, Late, Busy, TooLarge, BadRequest, Incompatible, ShuttingDown, Timeout, Disconnected,
     )
 }  # fmt: skip
 

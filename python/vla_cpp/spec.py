@@ -21,16 +21,25 @@ class ViewSpec:
 
 @dataclass(frozen=True)
 class StateSpec:
-    """A state vector of `width` numbers. units: one text per number, or none where the bundle does not say; never guessed."""
+    """A state vector of `width` numbers.
+
+    units, names: one text per number, empty where the bundle does not say; never guessed
+    """
 
     name: str
     width: int
     units: Tuple[str, ...] = ()
+    names: Tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class BundleInfo:
-    """Which weights answered. checksum: 16 hexadecimal digits."""
+    """Which weights answered.
+
+    name      file name, without folders
+    checksum  of the file: "xxh3:" and 16 hexadecimal digits
+    source    the checkpoint that was converted, and after an @ its revision; empty where unknown
+    """
 
     name: str
     arch: str
@@ -43,7 +52,7 @@ class Spec:
     """A policy from outside: what `act` takes and what it returns.
 
     min_views     how many views must be present at least
-    action_units  one text per action, or none where the bundle does not say
+    action_units  one text per action, empty where the bundle does not say
     horizon       rows of a chunk
     d_action      columns of a chunk
     d_noise       columns of the noise, which has `horizon` rows
