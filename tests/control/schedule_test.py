@@ -80,9 +80,8 @@ def changes(life):
         if moment.action.held or moment.last is None:
             continue
         old, new = (dict(m.action.sources) for m in (before, moment))
-        if before.action.held or (
-            None in new and None not in old
-        ):  # a fade begins at the last command, whatever made it
+        # A fade from a held command begins at the last one, whatever made that: then no chunk is in both.
+        if before.action.held or (None in new and not (set(old) & set(new)) - {None}):
             held, old = moment.last, {None: 1.0}
         yield (before, moment, *({t: (held if t is None else t, w) for t, w in x.items()} for x in (old, new)))
 

@@ -38,11 +38,13 @@ class Moment:
     was_missed: bool  # a tick went by without a call
 
 
+NONE = st.none()
+AGES = st.one_of(st.none(), st.integers(0, 15))
 BLENDS = st.one_of(st.builds(CrossFade, st.integers(0, 6)), st.builds(Ensemble, st.floats(0, 3)))
 
 
 @st.composite
-def lives(draw, blend=BLENDS, max_gap=3, jump=st.none(), age=st.one_of(st.none(), st.integers(0, 15))):
+def lives(draw, blend=BLENDS, max_gap=3, jump=NONE, age=AGES):
     horizon = draw(st.integers(1, 12))
     latency = st.one_of(st.integers(0, 3), st.integers(0, 2 * horizon + 2), st.none())
     event = st.tuples(st.one_of(st.just(1), st.integers(1, max_gap)), latency)
