@@ -97,8 +97,8 @@ def test_no_server_is_a_timeout_and_a_server_that_comes_later_is_found():
             client.health()
         with zmq.Context.instance().socket(zmq.ROUTER) as server:
             server.bind(f"tcp://127.0.0.1:{port}")
-            assert not client._ask("health", 1.0, _health).done()
-            assert server.poll(1000), "the request reaches the server that was started after the client"
+            assert not client._ask("health", 5.0, _health).done()
+            assert server.poll(5000), "the request reaches the server that was started after the client"
 
 
 @pytest.mark.parametrize("code", list(wire.MESSAGES["Error"].DESCRIPTOR.enum_types_by_name["Code"].values_by_name))
