@@ -197,7 +197,7 @@ def test_a_child_process_is_refused_and_the_parent_goes_on(faulty, client):
         except vla_cpp.UsageError:
             os._exit(7)
         os._exit(1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    assert os.WEXITSTATUS(os.waitpid(child, 0)[1]) == 7
     assert client.health().ready
     with pytest.raises(vla_cpp.UsageError):
         pickle.dumps(client)
