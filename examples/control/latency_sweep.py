@@ -159,7 +159,7 @@ def print_table(results: Sweep, intervals) -> None:
 # --- the picture ------------------------------------------------------------------------------------------------------------------
 
 COLOURS = {"replace": "#c2410c", "linear": "#0369a1", "ensemble": "#15803d"}
-ROWS = (("error_mm", "tracking error (mm)"), ("jump_mm", "change of command, 99th percentile (mm)"))
+ROWS = (("error_mm", "tracking error (mm)"), ("jump_mm", "change of command, p99 (mm)"))
 PANEL_W, PANEL_H, GAP_X, GAP_Y, LEFT, TOP = 200, 150, 26, 46, 64, 74
 
 
