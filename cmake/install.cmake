@@ -11,7 +11,8 @@ set_target_properties(vla_shared PROPERTIES INSTALL_RPATH "$ORIGIN")
 target_link_options(vla_shared PRIVATE -Wl,--disable-new-dtags)
 
 install(TARGETS vla RUNTIME DESTINATION ${CMAKE_INSTALL_BINDIR})
-install(TARGETS vla_shared EXPORT vlaTargets LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR})
+install(TARGETS vla_shared EXPORT vlaTargets
+        LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT library NAMELINK_COMPONENT development)
 install(FILES include/vla/vla.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)
 install(FILES LICENSE LICENSES-third-party.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
 

@@ -56,17 +56,20 @@ static void* read_file(const char* path, size_t* size) {
   return data;
 }
 
-/* NAME=FILE as a view whose `data` is to be freed. Cuts the argument at its =. Returns 0 where that is impossible. */
+/* NAME=FILE as a view whose `data` is to be freed. Cuts the argument at its =. */
 static int read_view(char* argument, vla_view* view) {
   const vla_view empty = VLA_VIEW_INIT;
-  char* equals = strchr(argument, '=');
+  char* file = strchr(argument, '=');
   *view = empty;
-  if (equals == NULL) return 0;
-  *equals = '\0';
+  if (file == NULL) return misused(argument);
+  *file++ = '\0';
   view->name = argument;
-  view->kind = equals[1] == '\0' ? VLA_IMAGE_ABSENT : VLA_IMAGE_FILE;
-  if (view->kind == VLA_IMAGE_FILE) view->data = read_file(equals + 1, &view->size);
-  return view->kind == VLA_IMAGE_ABSENT || view->data != NULL;
+  view->kind = *file == '\0' ? VLA_IMAGE_ABSENT : VLA_IMAGE_FILE;
+  if (view->kind == VLA_IMAGE_ABSENT) return VLA_OK;
+  view->data = read_file(file, &view->size);
+  if (view->data != NULL) return VLA_OK;
+  fprintf(stderr, "error: io: %s: cannot be read\n", file);
+  return VLA_IO;
 }
 
 static void print_chunk(const vla_chunk* chunk) {
@@ -110,8 +113,7 @@ int main(int argc, char** argv) {
   observation.has_seed = 1;
   observation.seed = strtoull(argv[4], &end, 10);
   if (end == argv[4] || *end != '\0' || *argv[4] == '-' || errno != 0) return misused("SEED");
-  for (i = 5; i < argc && status == VLA_OK; ++i, ++n_view)
-    if (!read_view(argv[i], &views[n_view])) status = misused(argv[i]);
+  for (i = 5; i < argc && status == VLA_OK; ++i) status = read_view(argv[i], &views[n_view++]);
   observation.views = views;
   observation.n_view = n_view;
 

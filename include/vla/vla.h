@@ -84,12 +84,14 @@ VLA_API const vla_error* vla_last_error(const vla_policy* policy);
 
 typedef struct vla_options {
   size_t struct_size;
-  int32_t n_thread; /* CPU threads, at most 512; 0: every core that the process may use */
+  int32_t n_thread;    /* CPU threads, at most 512; 0: every core that the process may use */
+  const char* kernels; /* "ggml", "avx2", "avx512" or "amx"; NULL: the best that the machine has */
 } vla_options;
 #define VLA_OPTIONS_INIT \
-  { sizeof(vla_options), 0 }
+  { sizeof(vla_options), 0, NULL }
 
-/* Opens, checks and loads a bundle. `options` may be NULL: nothing in it changes a number. On failure *out is NULL. */
+/* Opens, checks and loads a bundle. `options` may be NULL: then they are as VLA_OPTIONS_INIT has them. On failure *out
+ * is NULL. */
 VLA_API vla_status vla_open(const char* path, const vla_options* options, vla_policy** out);
 /* Frees a policy; NULL is allowed. */
 VLA_API void vla_policy_close(vla_policy* policy);
@@ -137,7 +139,7 @@ typedef struct vla_description {
   const char* converter; /* what made the bundle */
   const char* dtype;     /* how matrices are stored: "f32", "bf16" or "f16" */
   const char* precision; /* arithmetic of the large products: "f32" */
-  const char* kernels;   /* what computes them: "ggml" */
+  const char* kernels;   /* what computes them: "ggml", "avx2", ... */
   const char* device;
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */
 } vla_description;

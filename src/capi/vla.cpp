@@ -41,7 +41,11 @@ Result<EngineOptions> read_options(const vla_options* given) {
   VLA_TRY(const vla_options known, read_struct<vla_options>(given, "options"));
   if (known.n_thread < 0 || known.n_thread > kMaxThread)
     return usage("options.n_thread", fmt::format("0 to {}", kMaxThread), std::to_string(known.n_thread));
-  return EngineOptions{.n_thread = known.n_thread};
+  EngineOptions options{.n_thread = known.n_thread};
+  if (known.kernels != nullptr) {
+    VLA_TRY(options.kernels, read_name(known.kernels, "options.kernels"));
+  }
+  return options;
 }
 
 Status open(const char* path, const vla_options* options, vla_policy** out) {

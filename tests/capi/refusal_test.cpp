@@ -152,13 +152,21 @@ TEST_CASE("a file that cannot be read or is no bundle is a typed error, and opti
     options.n_thread = n_thread;
     check_error(nullptr, vla_open(file.c_str(), &options, &policy), VLA_USAGE, "options.n_thread");
   }
+  const Call sound;
+  options = VLA_OPTIONS_INIT;
+  options.kernels = "abacus";
+  check_error(nullptr, vla_open(sound.golden.bundle().c_str(), &options, &policy), VLA_USAGE, "abacus");
+  options.kernels = "ggml";
+  REQUIRE(vla_open(sound.golden.bundle().c_str(), &options, &policy) == VLA_OK);
+  CHECK(std::string(vla_describe(policy)->kernels) == "ggml");
+  vla_policy_close(policy);
 }
 
 TEST_CASE("a caller that was compiled with fewer fields works, and one with more is refused only where it uses them") {
   const std::string bundle = kTwoViews + "/bundle.gguf";
   struct {
     vla_options options = VLA_OPTIONS_INIT;
-    std::uint64_t later = 0;
+    std::uint64_t later = 0;  // of a version to come
   } newer;
   newer.options.struct_size = sizeof newer;
   vla_policy* policy = nullptr;
