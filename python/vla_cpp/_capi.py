@@ -171,5 +171,7 @@ def load() -> ctypes.CDLL:
         raise IoError(str(path), "a library of vla.cpp", str(error)) from None
     version = library.vla_abi_version()
     if version != ABI_VERSION:
-        raise Unsupported(str(path), f"binary interface {ABI_VERSION}", str(version), "install package and library together")
+        raise Unsupported(
+            str(path), f"binary interface {ABI_VERSION}", str(version), "install package and library together"
+        )
     return library

@@ -42,7 +42,9 @@ class Policy:
         self._library = _capi.load()
         if not isinstance(threads, int) or not 0 <= threads <= 512:
             raise UsageError("threads", "a whole number from 0 to 512", repr(threads))
-        options = _capi.Options(n_thread=threads, kernels=None if kernels is None else _encoded("kernels", kernels, UsageError))
+        options = _capi.Options(
+            n_thread=threads, kernels=None if kernels is None else _encoded("kernels", kernels, UsageError)
+        )
         if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
             raise self._last_error(None)
         self._spec = _spec_of(self._library.vla_describe(self._handle).contents)
@@ -111,7 +113,9 @@ class Policy:
 
     def _check_usable(self) -> None:
         if os.getpid() != self._pid:
-            raise UsageError("Policy", "use in the process that made it", "use in a child process", "make one per process")
+            raise UsageError(
+                "Policy", "use in the process that made it", "use in a child process", "make one per process"
+            )
         if not self._handle:
             raise UsageError("Policy", "an open policy", "one that was closed")
 
@@ -164,12 +168,12 @@ class _Call:
             self.observation.noise, self.observation.n_noise = self._address(values), values.size
 
     def _view(self, name: str, image: Image) -> _capi.View:
-        kind, data = picture_of(name, image)
+        data = picture_of(name, image)[1]
         view = _capi.View(name=_name_of("images", name), kind=_capi.IMAGE_ABSENT)
-        if kind == "rgb":
-            view.kind, (view.height, view.width) = _capi.IMAGE_RGB8, data.shape[:2]
-        elif data is not None:
+        if isinstance(data, bytes):
             view.kind, data = _capi.IMAGE_FILE, np.frombuffer(data, np.uint8)
+        elif data is not None:
+            view.kind, (view.height, view.width) = _capi.IMAGE_RGB8, data.shape[:2]
         if data is not None:
             view.data, view.size = self._address(data), data.size
         return view
@@ -196,7 +200,7 @@ def _name_of(where: str, name: object) -> bytes:
     return data
 
 
-def _path_of(path: object) -> bytes:
+def _path_of(path: Union[str, os.PathLike]) -> bytes:
     try:
         data = os.fsencode(path)
     except (TypeError, UnicodeError):

@@ -45,7 +45,10 @@ def test_an_installation_has_these_files_and_no_others(prefix):
         *(f"lib/cmake/vla/{f}.cmake" for f in ("vlaConfig", "vlaConfigVersion", "vlaTargets", "vlaTargets-release")),
         "share/doc/vla/LICENSE", "share/doc/vla/LICENSES-third-party.md",
     }  # fmt: skip
-    assert run(prefix / "bin/vla", "--version").strip() == run("pkg-config", "--modversion", prefix / "lib/pkgconfig/vla.pc").strip()
+    assert (
+        run(prefix / "bin/vla", "--version").strip()
+        == run("pkg-config", "--modversion", prefix / "lib/pkgconfig/vla.pc").strip()
+    )
 
 
 @pytest.mark.parametrize("case", ["two_views", "absent_view"])

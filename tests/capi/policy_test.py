@@ -20,7 +20,9 @@ import vla_cpp
 
 def frames(case):
     """The images of a case as arrays; None where a view is declared absent."""
-    return {view: None if file is None else np.array(Image.open(file).convert("RGB")) for view, file in case.images.items()}
+    return {
+        view: None if file is None else np.array(Image.open(file).convert("RGB")) for view, file in case.images.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,12 @@ def test_a_frame_in_any_memory_order_and_the_bytes_of_its_file_are_the_same_fram
 
 def test_state_may_be_float64_and_come_by_name_or_alone(act, golden):
     expected = np.asarray(act())
-    for state in (np.array(golden.state), tuple(golden.state), {"observation.state": golden.state}, {"state": golden.state}):
+    for state in (
+        np.array(golden.state),
+        tuple(golden.state),
+        {"observation.state": golden.state},
+        {"state": golden.state},
+    ):
         assert np.array_equal(act(state=state), expected)
 
 
@@ -94,11 +101,17 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
     assert [v.name for v in spec.views] == keys["observation.views"] and spec.min_views == keys["observation.min_views"]
     assert [v.optional for v in spec.views] == [bool(o) for o in keys["observation.view_optional"]]
     assert [v.aliases for v in spec.views] == [(a,) if a else () for a in keys["observation.view_aliases"]]
-    assert [(s.name, s.width) for s in spec.states] == list(zip(keys["observation.states"], keys["observation.state_dims"]))
+    assert [(s.name, s.width) for s in spec.states] == list(
+        zip(keys["observation.states"], keys["observation.state_dims"])
+    )
     assert [n for s in spec.states for n in s.names] == keys["observation.state_names"]
     assert [u for s in spec.states for u in s.units] == keys["observation.state_units"]
     assert list(spec.action_names) == keys["action.names"] and list(spec.action_units) == keys["action.units"]
-    assert (spec.horizon, spec.d_noise, spec.noise) == (keys["policy.horizon"], keys["policy.d_action"], keys["solver.noise"])
+    assert (spec.horizon, spec.d_noise, spec.noise) == (
+        keys["policy.horizon"],
+        keys["policy.d_action"],
+        keys["solver.noise"],
+    )
     assert (spec.bundle.name, spec.bundle.checksum) == (golden.bundle.name, told["bundle"]["checksum"])
     assert spec.bundle.source == keys["vla.source.name"] and spec.precision == "f32"
 
@@ -130,7 +143,9 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
         (dict(seed=1.5), vla_cpp.UsageError, "seed"),
     ],
 )
-def test_what_the_policy_cannot_take_is_an_exception_of_its_class_and_the_next_call_is_answered(act, changes, error, part):
+def test_what_the_policy_cannot_take_is_an_exception_of_its_class_and_the_next_call_is_answered(
+    act, changes, error, part
+):
     with pytest.raises(error) as caught:
         act(**changes)
     assert part in str(caught.value) and caught.value.found
@@ -141,7 +156,12 @@ def test_an_error_carries_all_its_parts(act):
     with pytest.raises(vla_cpp.BadObservation) as caught:
         act(state=[0.0] * 5)
     error = caught.value
-    assert (error.code, error.where, error.expected, error.found) == ("bad_observation", "observation.state", "6 numbers", "5")
+    assert (error.code, error.where, error.expected, error.found) == (
+        "bad_observation",
+        "observation.state",
+        "6 numbers",
+        "5",
+    )
 
 
 @pytest.mark.parametrize(
@@ -203,12 +223,18 @@ def test_a_child_process_and_a_pickle_are_refused_instead_of_hanging(policy, act
 def in_python(code, **environment):
     paths = {"PYTHONPATH": str(ROOT / "python"), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", f"import vla_cpp\n{code}"]
-    return subprocess.run(command, env={**os.environ, **paths, **environment}, capture_output=True, text=True, timeout=60)
+    return subprocess.run(
+        command, env={**os.environ, **paths, **environment}, capture_output=True, text=True, timeout=60
+    )
 
 
 def test_a_library_that_is_missing_or_another_is_told_by_its_path(tmp_path):
     (tmp_path / "text.so").write_text("not a library")
-    for library, part in ((tmp_path / "none.so", "no such file"), (tmp_path / "text.so", "text.so"), ("libm.so.6", "no such file")):
+    for library, part in (
+        (tmp_path / "none.so", "no such file"),
+        (tmp_path / "text.so", "text.so"),
+        ("libm.so.6", "no such file"),
+    ):
         result = in_python("vla_cpp.Policy('x.gguf')", VLA_LIBRARY=str(library))
         assert "IoError" in result.stderr and part in result.stderr
 

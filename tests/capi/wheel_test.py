@@ -89,7 +89,18 @@ def test_an_editable_install_compiles_nothing(build, tmp_path):
     tree = tmp_path / "tree/python"
     shutil.copytree(ROOT / "python", tree, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
     environment = {**os.environ, "PATH": str(tmp_path)}  # no cmake to be found
-    run(*PIP, "install", "--no-deps", "--no-build-isolation", "--no-index", "--target", tmp_path / "site", "-e", tree, env=environment)
+    run(
+        *PIP,
+        "install",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+        "--target",
+        tmp_path / "site",
+        "-e",
+        tree,
+        env=environment,
+    )
     assert not list(tree.rglob("*.so*"))
 
 
