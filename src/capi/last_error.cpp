@@ -45,6 +45,12 @@ vla_status fail(const vla_policy* policy, Error error) noexcept try {
   return fail_without_memory(policy);
 }
 
+vla_status fail_unexpected(const vla_policy* policy, const char* what) noexcept try {
+  return fail(policy, {Code::internal, "vla", "", what, "please report this"});
+} catch (...) {
+  return fail_without_memory(policy);
+}
+
 const vla_error* last_error(const vla_policy* policy) noexcept { return last.policy == policy ? &last.seen : &kNone; }
 
 }  // namespace vla::capi

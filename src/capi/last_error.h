@@ -13,7 +13,8 @@ namespace vla::capi {
 
 /// Keeps an error for `last_error` of this thread. Returns its status.
 vla_status fail(const vla_policy* policy, Error error) noexcept;
-/// The same for a system without memory, where no string can be made any more.
+/// The same for an exception that nobody expected, and for a system without memory, where no string can be made.
+vla_status fail_unexpected(const vla_policy* policy, const char* what) noexcept;
 vla_status fail_without_memory(const vla_policy* policy) noexcept;
 const vla_error* last_error(const vla_policy* policy) noexcept;
 
@@ -26,13 +27,9 @@ vla_status guarded(const vla_policy* policy, F&& body) noexcept {
   } catch (const std::bad_alloc&) {
     return fail_without_memory(policy);
   } catch (const std::exception& exception) {
-    try {
-      return fail(policy, {Code::internal, "vla", "", exception.what(), "please report this"});
-    } catch (...) {
-      return fail_without_memory(policy);
-    }
+    return fail_unexpected(policy, exception.what());
   } catch (...) {
-    return fail_without_memory(policy);
+    return fail_unexpected(policy, "an exception without a name");
   }
 }
 

@@ -65,17 +65,19 @@ Status read_views(const vla_observation& given, Observation& observation) {
   return {};
 }
 
+/// Without a name a state is the only one that there is.
+Result<std::string> state_name(const vla_state& state, const FeatureNames& features, const std::string& where) {
+  if (state.name != nullptr) return read_name(state.name, where);
+  if (features.names().size() == 1) return features.names().front();
+  return Error{Code::bad_observation, where, "one of " + features.listed(), "NULL"};
+}
+
 Status read_states(const vla_observation& given, const FeatureNames& features, Observation& observation) {
   VLA_TRY(const std::vector<vla_state> states, read_structs(given.states, given.n_state, "observation.states"));
   for (std::size_t i = 0; i < states.size(); ++i) {
     const vla_state& state = states[i];
     const std::string where = fmt::format("observation.states[{}]", i);
-    std::string name = features.names().front();
-    if (state.name != nullptr) {
-      VLA_TRY(name, read_name(state.name, where + ".name"));
-    } else if (features.names().size() != 1) {
-      return Error{Code::bad_observation, where + ".name", "one of " + features.listed(), "NULL"};
-    }
+    VLA_TRY(const std::string name, state_name(state, features, where + ".name"));
     if (state.n_value > kMaxVector)
       return Error{Code::bad_observation, name, fmt::format("at most {} numbers", kMaxVector),
                    std::to_string(state.n_value)};

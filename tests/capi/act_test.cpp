@@ -135,3 +135,22 @@ TEST_CASE("threads that share a policy get the answers that each would get alone
   for (std::thread& thread : threads) thread.join();
   CHECK(n_same == 4 * static_cast<int>(kThread));
 }
+
+TEST_CASE("policies are opened and act at the same time without touching each other") {
+  const std::vector<std::string> paths = golden_paths();
+  std::vector<std::vector<float>> alone;
+  for (const std::string& path : paths) {
+    const Call call(path);
+    alone.push_back(actions_of(open_policy(call.golden.bundle()).get(), call.observation));
+  }
+  std::atomic<int> n_same = 0;
+  std::vector<std::thread> threads;
+  for (std::size_t i = 0; i < paths.size(); ++i)
+    threads.emplace_back([&, i] {
+      const Call call(paths[i]);
+      for (int repeat = 0; repeat < 3; ++repeat)
+        n_same += actions_of(open_policy(call.golden.bundle()).get(), call.observation) == alone[i];
+    });
+  for (std::thread& thread : threads) thread.join();
+  CHECK(n_same == 3 * static_cast<int>(paths.size()));
+}
