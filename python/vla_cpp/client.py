@@ -8,7 +8,6 @@ import os
 import random
 import threading
 import time
-from dataclasses import dataclass
 from typing import Any, Callable, Dict, Mapping, Optional, Union
 
 import zmq
@@ -16,48 +15,11 @@ from google.protobuf.message import DecodeError
 
 from . import __version__, wire
 from .chunk import Chunk
-from .connection import Connection
+from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
 from .observation import Image, State, check_start
-from .spec import BundleInfo, Spec
-
-
-@dataclass(frozen=True)
-class Health:
-    """How the server is. uptime_s: seconds since it became ready. queue_depth: acts that wait, beside one that is computed."""
-
-    ready: bool
-    queue_depth: int
-    computing: bool
-    uptime_s: float
-    chunks_served: int
-    errors_served: int
-
-
-class Pending:
-    """An answer that is under way."""
-
-    def __init__(self, client: Client, request_id: int, kind: str, timeout: float) -> None:
-        self._client, self._id, self._kind = client, request_id, kind
-        self._timeout, self._until = timeout, time.monotonic() + timeout
-        self._answer: Any = None
-        self._error: Optional[VlaError] = None
-
-    def done(self) -> bool:
-        """Whether `result` would return, or raise, at once. Never waits."""
-        return self._client._settle(self, 0.0)
-
-    def result(self) -> Any:
-        """Waits for the answer, until the timeout that the request was made with. Errors: as `Client.act`."""
-        while not self._client._settle(self, self._until - time.monotonic()):
-            pass
-        if self._error:
-            raise self._error
-        return self._answer
-
-    @property
-    def _is_over(self) -> bool:
-        return self._answer is not None or self._error is not None
+from .pending import Health, Pending
+from .spec import Spec
 
 
 class Client:
@@ -68,7 +30,8 @@ class Client:
 
     address             tcp://HOST:PORT or ipc://PATH
     timeout             seconds that a call may take, connecting included
-    server_key          the server's public CURVE key; with it go public_key and secret_key, the client's own (Z85, 40 characters)
+    server_key          for a server with CURVE: its public key, and with it
+    secret_key          this client's secret key: 40 characters each, or the files of `vla keygen` (server.public, robot.secret)
 
     The first call connects. When the server goes away, or does not answer in time, the call raises and the next one connects anew,
     so that a program survives a restart of its server; a server that comes back with other weights is refused with Incompatible.
@@ -82,17 +45,15 @@ class Client:
         address: str,
         *,
         timeout: float = 10.0,
-        server_key: Union[str, bytes, None] = None,
-        public_key: Union[str, bytes, None] = None,
-        secret_key: Union[str, bytes, None] = None,
+        server_key: Union[str, os.PathLike, None] = None,
+        secret_key: Union[str, os.PathLike, None] = None,
     ) -> None:
         if not timeout > 0:
             raise UsageError("timeout", "seconds above 0", str(timeout))
-        keys = [k.encode() if isinstance(k, str) else k for k in (server_key, public_key, secret_key)]
-        if any(keys) and not all(keys):
-            raise UsageError("CURVE", "server_key, public_key and secret_key", "some of them")
+        if (server_key is None) != (secret_key is None):
+            raise UsageError("CURVE", "server_key and secret_key", "one of them")
         self.address, self.timeout = address, timeout
-        self._curve = tuple(keys) if all(keys) else None
+        self._curve = None if server_key is None else curve_keys(server_key, secret_key)
         self._pid = os.getpid()
         self._lock = threading.RLock()
         self._context: Optional[zmq.Context] = zmq.Context()
@@ -115,7 +76,7 @@ class Client:
         """What the policy takes and gives; asked for once. Errors: Timeout, Disconnected, Incompatible."""
         with self._lock:
             if self._spec is None:
-                description = self._ask("description", self.timeout, lambda r: r.describe.SetInParent()).result()
+                description = self._ask("description", self.timeout, _describe).result()
                 self._spec, self._limits = wire.spec_of(description), description.limits
             return self._spec
 
@@ -171,19 +132,17 @@ class Client:
         timeout = self.timeout if timeout is None else timeout
         spec = self.spec
 
-        def fill(request: Any) -> None:
-            wire.fill_act(
-                request.act, spec, images=images, state=state, text=text, seed=seed, noise=noise,
+        def write(request: Any) -> bytes:
+            return wire.act_bytes(
+                request, spec, self._limits, images=images, state=state, text=text, seed=seed, noise=noise,
                 deadline_ms=timeout * 1000 if deadline_ms is None else deadline_ms, capture_time_ns=capture_time_ns,
             )  # fmt: skip
 
-        return self._ask("chunk", timeout, fill)
+        return self._ask("chunk", timeout, write)
 
     def health(self, timeout: Optional[float] = None) -> Health:
         """Answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""
-        return self._ask(
-            "health", self.timeout if timeout is None else timeout, lambda r: r.health.SetInParent()
-        ).result()
+        return self._ask("health", self.timeout if timeout is None else timeout, _health).result()
 
     def close(self) -> None:
         """Ends the connection; requests under way end with Disconnected. A second call does nothing."""
@@ -210,15 +169,12 @@ class Client:
 
     # --- requests and answers ------------------------------------------------------------------------------------------------
 
-    def _ask(self, kind: str, timeout: float, fill: Callable[[Any], None]) -> Pending:
-        """Sends a request that `fill` completes. kind: the field of the Response that answers it."""
+    def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes]) -> Pending:
+        """Sends a request that `write` completes. kind: the field of the Response that answers it."""
         with self._lock:
             self._connect()
             request = self._new_request()
-            fill(request)
-            data = request.SerializeToString()
-            if kind == "chunk":
-                wire.check_limits(request.act, len(data), self._limits)
+            data = write(request)
             pending = Pending(self, request.request_id, kind, timeout)
             self._connection.send(data)
             self._pending[pending._id] = pending
@@ -241,6 +197,8 @@ class Client:
             hello.hello.min_version = hello.hello.max_version = wire.PROTOCOL_VERSION
             hello.hello.client_name, hello.hello.client_version = "vla-cpp-python", __version__
             self._connection.send(hello.SerializeToString())
+            if self._spec is not None:  # the server may be another one by now
+                self._connection.send(_describe(self._new_request()))
 
     def _check_process(self) -> None:
         if os.getpid() != self._pid:
@@ -286,8 +244,10 @@ class Client:
         if response.protocol_version != wire.PROTOCOL_VERSION:
             found = f"version {response.protocol_version}"
             raise Incompatible(self.address, f"answers of protocol version {wire.PROTOCOL_VERSION}", found)
+        if kind in ("description", "chunk"):
+            self._check_bundle(getattr(response, kind).bundle)
         pending = self._pending.pop(response.request_id, None)
-        if pending is None:  # to a hello, or to a request that nobody waits for
+        if pending is None:  # to a greeting, or to a request that nobody waits for
             return
         try:
             if error:
@@ -303,11 +263,9 @@ class Client:
             return Health(**{f.name: getattr(response.health, f.name) for f in response.health.DESCRIPTOR.fields})
         if kind == "description":
             return response.description
-        chunk = wire.chunk_of(response.chunk)
-        self._check_bundle(chunk.bundle)
-        return chunk
+        return wire.chunk_of(response.chunk)
 
-    def _check_bundle(self, bundle: BundleInfo) -> None:
+    def _check_bundle(self, bundle: Any) -> None:
         known = self._spec.bundle if self._spec else bundle
         if bundle.checksum != known.checksum:
             hint = "make a new Client, and read its spec"
@@ -323,3 +281,13 @@ class Client:
         for pending in self._pending.values():
             pending._error = error
         self._pending.clear()
+
+
+def _describe(request: Any) -> bytes:
+    request.describe.SetInParent()
+    return request.SerializeToString()
+
+
+def _health(request: Any) -> bytes:
+    request.health.SetInParent()
+    return request.SerializeToString()

@@ -8,9 +8,13 @@ earlier request can come out of it.
 
 from __future__ import annotations
 
-from typing import List, Optional, Tuple
+import os
+import struct
+from pathlib import Path
+from typing import List, Optional, Tuple, Union
 
 import zmq
+from zmq.utils import z85
 from zmq.utils.monitor import recv_monitor_message
 
 from .errors import Disconnected, UsageError
@@ -19,6 +23,27 @@ HEARTBEAT_MS = 1000  # a server that is cut off, and so cannot say that it goes,
 RECONNECT_MS = 100
 
 _REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+
+
+def curve_keys(server: Union[str, os.PathLike], secret: Union[str, os.PathLike]) -> Tuple[bytes, bytes, bytes]:
+    """What a connection takes, from keys or the files that hold them. Errors: UsageError, which does not show the key."""
+    server_key, secret_key = _key("server_key", server), _key("secret_key", secret)
+    return server_key, zmq.curve_public(secret_key), secret_key
+
+
+def _key(where: str, given: Union[str, os.PathLike]) -> bytes:
+    text = given
+    if not isinstance(given, str) or len(given) != 40:
+        try:
+            text = Path(given).read_text(encoding="ascii").strip()
+        except (OSError, ValueError, TypeError) as error:
+            raise UsageError(where, "a key of 40 characters, or the file of one", type(error).__name__) from None
+    try:
+        if len(text) != 40 or len(z85.decode(text)) != 32:
+            raise ValueError
+        return text.encode()
+    except (ValueError, KeyError, struct.error):
+        raise UsageError(where, "a key of 40 characters, or the file of one", "something else", "vla keygen") from None
 
 
 class Connection:
@@ -41,13 +66,12 @@ class Connection:
             self._socket.connect(address)
         except (zmq.ZMQError, ValueError) as error:
             self.close()
-            hint = "e.g. tcp://127.0.0.1:5555; CURVE keys are 40 characters each"
-            raise UsageError(address, "an address and keys that ZeroMQ takes", str(error), hint) from None
+            raise UsageError(address, "an address like tcp://127.0.0.1:5555", str(error)) from None
 
     def send(self, data: bytes) -> None:
         """Never waits: what has no connection yet lies in the socket's queue. Errors: Disconnected for a full queue."""
         try:
-            self._socket.send(data, zmq.DONTWAIT)
+            self._socket.send(data, zmq.DONTWAIT, copy=False)
         except zmq.Again:
             raise Disconnected(self._address, "a server that reads", "a full queue", "ask less often") from None
 
@@ -68,7 +92,11 @@ class Connection:
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
             if event & _REFUSED:
-                keys = "check the three keys" if self._curve else "does the server want CURVE keys?"
+                keys = (
+                    "check the keys, and that the server admits this client's"
+                    if self._curve
+                    else "does the server want CURVE keys?"
+                )
                 raise Disconnected(self._address, "a handshake", "a refusal", keys)
             raise Disconnected(self._address, "", "the connection was lost", "the next call connects anew")
 

@@ -8,14 +8,15 @@ protoc generates would tie the package to the releases of protobuf that accept t
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any, Dict, Optional
+from typing import Any, Dict, Iterable, List, Mapping, Optional, Tuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from .chunk import Chunk
-from .errors import BadAction, BadObservation, TooLarge, VlaError, error_of
+from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
 from .observation import Image, State, noise_of, picture_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
@@ -46,21 +47,31 @@ def new_request(request_id: int) -> Any:
     return Request(protocol_version=PROTOCOL_VERSION, request_id=request_id)
 
 
-def fill_act(
-    act: Any,
+def act_bytes(
+    request: Any,
     spec: Spec,
+    limits: Any,
     *,
-    images: Dict[str, Image],
+    images: Mapping[str, Image],
     state: State,
     text: str,
     seed: Optional[int],
     noise: object,
-    deadline_ms: Optional[float],
+    deadline_ms: float,
     capture_time_ns: Optional[int],
-) -> None:
-    """Writes an observation into a message. Errors: BadObservation, by the argument's name."""
-    for name, image in images.items():
-        _fill_view(act.views.add(name=name), name, image)
+) -> bytes:
+    """A request with an observation, as bytes. Errors: BadObservation, UsageError, TooLarge, by the argument's name."""
+    act = request.act
+    act.SetInParent()
+    raw: Dict[str, np.ndarray] = {}
+    for name, image in _items("images", images):
+        kind, data = picture_of(name, image)
+        if kind == "rgb":
+            raw[name] = data
+        elif kind == "absent":
+            act.views.add(name=name).absent.SetInParent()
+        else:
+            setattr(act.views.add(name=name), kind, data)
     for name, values in states_of(state, spec.states).items():
         act.states.add(name=name).values.extend(values.tolist())
     if not isinstance(text, str):
@@ -69,35 +80,71 @@ def fill_act(
         act.text = text
     except (ValueError, UnicodeError):
         raise BadObservation("text", "characters that UTF-8 can write", repr(text)[:80]) from None
-    if seed is not None:
-        act.seed = int(seed)
     if noise is not None:
         values = noise_of(noise, spec.horizon, spec.d_noise)
         act.noise.horizon, act.noise.d_action = values.shape
         act.noise.values.extend(values.ravel().tolist())
-    if deadline_ms is not None:
-        act.deadline_ms = max(1, int(deadline_ms))
+    elif seed is not None:
+        act.seed = int(seed)
+    act.deadline_ms = _milliseconds(deadline_ms)
     if capture_time_ns is not None:
-        act.capture_time_ns = int(capture_time_ns)
+        act.capture_time_ns = _int64("capture_time_ns", capture_time_ns)
+    data = b"".join(_with_raw_pictures(request, raw))
+    _check_limits(raw, len(data), limits)
+    return data
 
 
-def _fill_view(view: Any, name: str, image: Image) -> None:
-    kind, data = picture_of(name, image)
-    if kind == "absent":
-        view.absent.SetInParent()
-    elif kind == "rgb":
-        view.rgb.height, view.rgb.width = data.shape[:2]
-        view.rgb.rows = data.tobytes()
-    else:
-        setattr(view, kind, data)
+def _with_raw_pictures(request: Any, raw: Mapping[str, np.ndarray]) -> List[Any]:
+    """The request's bytes in pieces, with the raw pictures appended to its act.
+
+    They are framed here because protobuf would copy them twice into memory that is new each time, which takes longer than
+    everything else that a client does. A repeated field may come in pieces, and a message's fields in any order.
+    """
+    views: List[Any] = []
+    for name, rows in raw.items():
+        rgb = MESSAGES["RawRgb"](height=rows.shape[0], width=rows.shape[1]).SerializeToString()
+        rgb += _head("RawRgb", "rows", rows.nbytes)
+        view = MESSAGES["View"](name=name).SerializeToString() + _head("View", "rgb", len(rgb) + rows.nbytes) + rgb
+        views += [_head("Act", "views", len(view) + rows.nbytes) + view, rows.data.cast("B")]
+    act = request.act.SerializeToString()
+    envelope = Request(protocol_version=request.protocol_version, request_id=request.request_id).SerializeToString()
+    return [envelope, _head("Request", "act", len(act) + sum(map(len, views))), act, *views]
 
 
-def check_limits(act: Any, size: int, limits: Any) -> None:
+def _head(message: str, field: str, size: int) -> bytes:
+    """What stands before the `size` bytes of a field: its number with the wire type 2 (so many bytes), and their count."""
+    head = bytearray([MESSAGES[message].DESCRIPTOR.fields_by_name[field].number << 3 | 2])
+    while size > 0x7F:
+        head.append(size & 0x7F | 0x80)
+        size >>= 7
+    head.append(size)
+    return bytes(head)
+
+
+def _items(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
+    if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
+        raise BadObservation(where, "a dict by name", repr(mapping)[:80])
+    return mapping.items()
+
+
+def _milliseconds(value: float) -> int:
+    if not 0 < value < 2**63:
+        raise UsageError("deadline_ms", "milliseconds above 0", str(value))
+    return math.ceil(value)
+
+
+def _int64(where: str, value: int) -> int:
+    if not isinstance(value, (int, np.integer)) or not -(2**63) <= value < 2**63:
+        raise UsageError(where, "a whole number of 64 bits", repr(value))
+    return int(value)
+
+
+def _check_limits(raw: Mapping[str, np.ndarray], size: int, limits: Any) -> None:
     """Refuses what the server would refuse; it would end the connection over a message that is too large, and tell nothing."""
-    for view in act.views:
-        pixels = view.rgb.width * view.rgb.height
+    for name, rows in raw.items():
+        pixels = rows.shape[0] * rows.shape[1]
         if pixels > limits.max_pixels > 0:
-            raise TooLarge(f'images["{view.name}"]', f"at most {limits.max_pixels} pixels", str(pixels))
+            raise TooLarge(f'images["{name}"]', f"at most {limits.max_pixels} pixels", str(pixels))
     if size > limits.max_message_bytes > 0:
         hint = "send smaller frames, or JPEG; the server's option --max-message sets the limit"
         raise TooLarge("observation", f"at most {limits.max_message_bytes} bytes", str(size), hint)
