@@ -27,14 +27,16 @@ struct Reduced {
   typename V::Float mantissa, low;  // low is what the mantissa lost in its last rounding
   typename V::Int n;
 
-  VLA_INLINE Reduced(typename V::Float x, typename V::Float x_low) {
+  /// Of x + low for each `low` that there is, far below 1.
+  template <class... Low>
+  VLA_INLINE explicit Reduced(typename V::Float x, Low... x_low) {
     using Float = typename V::Float;
     constexpr float kShift = 12582912.0f;  // 1.5 * 2^23: adding it rounds to a whole number, in the low bits
     const Float shifted = V::fma(x, V::set(1.44269504f), V::set(kShift));
     n = std::bit_cast<typename V::Int>(shifted) - std::bit_cast<std::int32_t>(kShift);
     const Float whole = shifted - kShift;
     Float rest = V::fma(whole, V::set(-0x1.62e43p-1f), x);
-    rest = V::fma(whole, V::set(0x1.05c61p-29f), rest) + x_low;
+    rest = (V::fma(whole, V::set(0x1.05c61p-29f), rest) + ... + x_low);
     // Minimax: relative error 2^-28 of the whole.
     Float p = V::fma(rest, V::set(1.3814540579915047e-3f), V::set(8.36874544620514e-3f));
     p = V::fma(p, rest, V::set(4.166838899254799e-2f));
@@ -65,7 +67,7 @@ VLA_INLINE typename V::Float exp(typename V::Float x) {
 /// e^x for x <= 0, zero below -87.68, where it leaves the normal numbers; what a softmax needs, at half the cost.
 template <class V>
 VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
-  const Reduced<V> reduced(V::max(V::set(-88.0f), x), typename V::Float{});
+  const Reduced<V> reduced(V::max(V::set(-88.0f), x));
   return reduced.mantissa * power_of_two<V>(reduced.n);
 }
 

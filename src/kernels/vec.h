@@ -24,7 +24,7 @@ struct Lanes {
   typedef float Float __attribute__((vector_size(4 * W)));
   typedef std::int32_t Int __attribute__((vector_size(4 * W)));
 
-  static VLA_INLINE Float set(float x) { return Float{} + x; }
+  static VLA_INLINE Float set(float x) { return x - Float{}; }
   static VLA_INLINE Float load(const float* p) {
     Float x;
     std::memcpy(&x, p, sizeof(x));
@@ -68,6 +68,7 @@ struct Portable : Lanes<4> {
 
 #if defined(__AVX2__) && defined(__FMA__)
 struct Avx2 : Lanes<8> {
+  static VLA_INLINE Float set(float x) { return _mm256_set1_ps(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm256_fmadd_ps(a, b, c); }
   static VLA_INLINE Float max(Float a, Float b) { return _mm256_max_ps(a, b); }
   static VLA_INLINE float sum(Float x) {
@@ -84,19 +85,31 @@ struct Avx2 : Lanes<8> {
 #endif
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
+// Whole masks, where an instruction without one would do: GCC 12 warns of the undefined lanes in its own header.
 struct Avx512 : Lanes<16> {
+  static VLA_INLINE Float set(float x) { return _mm512_set1_ps(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm512_fmadd_ps(a, b, c); }
-  static VLA_INLINE Float max(Float a, Float b) { return _mm512_max_ps(a, b); }
+  static VLA_INLINE Float max(Float a, Float b) { return _mm512_maskz_max_ps(0xffff, a, b); }
   static VLA_INLINE Float load_part(const float* p, int n) { return _mm512_maskz_loadu_ps(mask(n), p); }
   static VLA_INLINE void store_part(float* p, Float x, int n) { _mm512_mask_storeu_ps(p, mask(n), x); }
-  static VLA_INLINE float sum(Float x) { return Avx2::sum(_mm512_castps512_ps256(x) + _mm512_extractf32x8_ps(x, 1)); }
-  static VLA_INLINE float max(Float x) {
-    return Avx2::max(_mm256_max_ps(_mm512_castps512_ps256(x), _mm512_extractf32x8_ps(x, 1)));
-  }
+  static VLA_INLINE float sum(Float x) { return Avx2::sum(lower(x) + upper(x)); }
+  static VLA_INLINE float max(Float x) { return Avx2::max(Avx2::max(lower(x), upper(x))); }
 
  private:
   static VLA_INLINE __mmask16 mask(int n) { return static_cast<__mmask16>((1U << n) - 1U); }
+  static VLA_INLINE __m256 lower(Float x) { return _mm512_maskz_extractf32x8_ps(0xff, x, 0); }
+  static VLA_INLINE __m256 upper(Float x) { return _mm512_maskz_extractf32x8_ps(0xff, x, 1); }
 };
 #endif
+
+/// A vector from p where `left` numbers remain; lanes beyond them are zeros.
+template <class V>
+VLA_INLINE typename V::Float load(const float* p, std::int64_t left) {
+  return left >= V::width ? V::load(p) : V::load_part(p, static_cast<int>(left));
+}
+template <class V>
+VLA_INLINE void store(float* p, typename V::Float x, std::int64_t left) {
+  left >= V::width ? V::store(p, x) : V::store_part(p, x, static_cast<int>(left));
+}
 
 }  // namespace vla::kernels
