@@ -121,6 +121,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   record_inputs(chunk.taps);
   clock.lap(chunk.timing, "plan");
   VLA_CHECK(plan->run_prefix(device_));
+  for (const Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
   clock.lap(chunk.timing, "prefix");
   plan->collect_prefix_taps(chunk.taps);
   for (int k = 0; k < solver_.n_step; ++k) {

@@ -38,6 +38,9 @@ class Plan {
   /// Solver step k: x <- x + dt * velocity(x, t_k).
   Status run_step(const Device& device, int k);
 
+  /// The stages that the policy's prefix names, with the times of the last run.
+  const std::deque<Stage>& prefix_stages() const { return prefix_.stages(); }
+
   /// What the last run recorded; of a step graph the paths are `step.<k>.<path>`.
   void collect_prefix_taps(std::vector<Tap>& taps) const;
   void collect_step_taps(int k, std::vector<Tap>& taps) const;
