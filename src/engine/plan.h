@@ -11,6 +11,9 @@
 
 namespace vla {
 
+/// Work by stage, under the names that Timing has.
+using StageWork = std::vector<std::pair<std::string, Work>>;
+
 /// What every plan is built from and shares.
 struct PlanContext {
   const Policy& policy;
@@ -40,6 +43,9 @@ class Plan {
 
   /// The stages that the policy's prefix names, with the times of the last run.
   const std::deque<Stage>& prefix_stages() const { return prefix_.stages(); }
+
+  /// What the network computes for one observation: the prefix, stage by stage, and `n_step` solver steps.
+  StageWork work(int n_step) const;
 
   /// What the last run recorded; of a step graph the paths are `step.<k>.<path>`.
   void collect_prefix_taps(std::vector<Tap>& taps) const;
