@@ -57,6 +57,7 @@ int run(int argc, char** argv) {
   choose("run", vla::cli::add_run(app));
   choose("inspect", vla::cli::add_inspect(app));
   choose("compare", vla::cli::add_compare(app));
+  choose("bench", vla::cli::add_bench(app));
 
   try {
     app.parse(argc, argv);
