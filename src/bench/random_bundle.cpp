@@ -43,10 +43,17 @@ std::string recipe(int image_size, int max_tokens, int d_state, int d_robot) {
   return root.dump();
 }
 
-/// The byte-level alphabet, and no merges: every byte of a text is a token.
+/// The byte-level alphabet in any order, and no merges: every byte of a text is a token. It is Latin-1 without what
+/// cannot be printed, which moves to U+0100 and after.
 std::vector<std::string> byte_tokens() {
   std::vector<std::string> tokens;
-  for (int code = '!'; code <= '~'; ++code) tokens.emplace_back(1, static_cast<char>(code));
+  for (unsigned code = '!'; code < 0x100 + 68; ++code) {
+    const bool printable = code <= '~' || (code >= 0xA1 && code != 0xAD);
+    if (!printable) continue;
+    tokens.push_back(code < 0x80
+                         ? std::string(1, static_cast<char>(code))
+                         : std::string{static_cast<char>(0xC0 | code >> 6), static_cast<char>(0x80 | (code & 0x3F))});
+  }
   return tokens;
 }
 

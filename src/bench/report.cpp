@@ -67,6 +67,12 @@ Json rounds_json(const Report& report) {
 
 }  // namespace
 
+double Report::peak() const {
+  double best = std::max(before.peak(peak_name), after.peak(peak_name));
+  for (const Round& round : rounds) best = std::max(best, round.peak);
+  return best;
+}
+
 std::string Report::regime(const StageRow& row) const {
   if (row.work.flop == 0) return "host";
   return row.intensity() >= ridge() ? "compute" : "memory";

@@ -44,8 +44,9 @@ struct Report {
   std::vector<StageRow> stages;  // in order of time, then `network` and `total`
   std::optional<StepFit> fit;
 
-  /// The better of the two measurements around the runs: what the machine can do. Operations and bytes per second.
-  double peak() const { return std::max(before.peak(peak_name), after.peak(peak_name)); }
+  /// What the machine can do: the best that was measured before, between and after the runs. Operations and bytes per
+  /// second.
+  double peak() const;
   double bandwidth() const { return std::max(before.bandwidth, after.bandwidth); }
   /// Where the roofline bends: a stage with fewer operations per byte is bound by memory.
   double ridge() const { return peak() / bandwidth(); }

@@ -31,8 +31,8 @@ std::vector<std::string> cells(const StageRow& row, const Report& report) {
 std::vector<std::string> around(const Report& report) {
   const Conditions& c = report.conditions;
   std::vector<std::string> lines = {
-      fmt::format("{}, {} weights ({}): {} views {} x {}, {} tokens, {} steps, batch 1", c.policy, c.weights, c.source,
-                  c.n_view, c.width, c.height, c.n_text, c.n_step),
+      fmt::format("{}, {} weights ({}): {} view{} of {} x {}, {} tokens, {} steps, batch 1", c.policy, c.weights,
+                  c.source, c.n_view, c.n_view == 1 ? "" : "s", c.width, c.height, c.n_text, c.n_step),
       fmt::format("{}, {} thread{}, kernels: {}", report.cpu, c.n_thread, c.n_thread == 1 ? "" : "s", c.kernels)};
   for (std::size_t i = 0; i < report.before.peaks.size(); ++i) {
     const Roofs::Peak &before = report.before.peaks[i], &after = report.after.peaks[i];

@@ -58,6 +58,10 @@ class Drawing {
     for (const Roofs::Peak& peak : report.before.peaks) y_high = std::max(y_high, peak.all);
     x_ = {x_low / 6, x_high * 6, kLeft, kRight};
     y_ = {y_low / 4, y_high * 2.2, kBottom, kTop};
+    for (const StageRow* row : rows_) {  // nothing is written over a point
+      const double x = x_.at(row->intensity()), y = y_.at(row->flop_rate);
+      taken_.push_back({x - 8, y - 8, x + 8, y + 8});
+    }
   }
 
   std::string svg() {
@@ -87,8 +91,9 @@ class Drawing {
     text(kLeft, 32, fmt::format("Roofline of {} on {}", c.policy, report_.cpu),
          "font-size=\"18\" font-weight=\"bold\"");
     text(kLeft, 54,
-         fmt::format("{} thread{}, kernels {}; {} weights, {} views, {} tokens, {} steps", c.n_thread,
-                     c.n_thread == 1 ? "" : "s", c.kernels, c.weights, c.n_view, c.n_text, c.n_step),
+         fmt::format("{} thread{}, kernels {}; {} weights, {} view{}, {} tokens, {} steps", c.n_thread,
+                     c.n_thread == 1 ? "" : "s", c.kernels, c.weights, c.n_view, c.n_view == 1 ? "" : "s", c.n_text,
+                     c.n_step),
          "fill=\"#444\"");
   }
 
@@ -113,11 +118,13 @@ class Drawing {
     text(24, middle, "GFLOP per second", fmt::format("text-anchor=\"middle\" transform=\"rotate(-90 24 {})\"", middle));
   }
 
-  /// A roof over all intensities at which memory is fast enough for it.
-  void flat_roof(double rate, const std::string& label, const std::string& style, double label_dy) {
+  /// A roof over all intensities at which memory is fast enough for it, with its name above or below.
+  void flat_roof(double rate, const std::string& label, const std::string& style) {
     const double left = std::max(x_.at(std::max(rate / report_.bandwidth(), x_.low)), kLeft), y = y_.at(rate);
     line(left, y, kRight, y, style);
-    text(kRight - 6, y + label_dy, label, "text-anchor=\"end\" fill=\"#222\"");
+    const double width = 6.8 * static_cast<double>(label.size());
+    const Box box = place(kRight - 6 - width, y, width, {{0, -7}, {0, 16}, {-width - 20, -7}, {-width - 20, 16}});
+    text(box.left, box.bottom - 3, label, "fill=\"#222\"");
   }
 
   void roofs() {
@@ -125,10 +132,10 @@ class Drawing {
       const bool is_ours = peak.name == report_.peak_name;
       const double rate = is_ours ? report_.peak() : peak.all;
       flat_roof(rate, fmt::format("{}, all threads: {:.4g} G/s", peak.name, 1e-9 * rate),
-                is_ours ? "stroke=\"#000\" stroke-width=\"2.5\"" : "stroke=\"#888\"", -7);
+                is_ours ? "stroke=\"#000\" stroke-width=\"2.5\"" : "stroke=\"#888\"");
       if (is_ours && report_.conditions.n_thread > 1)
         flat_roof(peak.one, fmt::format("{}, one thread: {:.4g} G/s", peak.name, 1e-9 * peak.one),
-                  "stroke=\"#555\" stroke-dasharray=\"6 4\"", -6);
+                  "stroke=\"#555\" stroke-dasharray=\"6 4\"");
     }
     slope();
   }
@@ -147,34 +154,35 @@ class Drawing {
          fmt::format("text-anchor=\"middle\" transform=\"rotate({:.1f} {:.1f} {:.1f})\"", angle, x, y));
   }
 
-  /// Labels stand beside their points where no other label and no point stands.
-  void points() {
-    std::vector<Box> taken;
-    for (const StageRow* row : rows_) {
-      const double x = x_.at(row->intensity()), y = y_.at(row->flop_rate);
-      taken.push_back({x - 8, y - 8, x + 8, y + 8});
+  /// The first of several places around (x, y) for a text of this width that meets nothing placed before.
+  Box place(double x, double y, double width, std::initializer_list<std::pair<double, double>> offsets) {
+    Box box = {};
+    for (const auto& [dx, dy] : offsets) {
+      box = {x + dx, y + dy - 12, x + dx + width, y + dy + 3};
+      if (std::none_of(taken_.begin(), taken_.end(), [&](const Box& other) { return other.meets(box); })) break;
     }
+    taken_.push_back(box);
+    return box;
+  }
+
+  void points() {
     for (std::size_t i = 0; i < rows_.size(); ++i) {
       const double x = x_.at(rows_[i]->intensity()), y = y_.at(rows_[i]->flop_rate);
       const double width = 8.0 * static_cast<double>(rows_[i]->name.size());
-      Box label = {};
-      for (const auto& [dx, dy] : {std::pair(12.0, 5.0),
-                                   {-12.0 - width, 5.0},
-                                   {-width / 2, 26.0},
-                                   {-width / 2, -14.0},
-                                   {12.0, 24.0},
-                                   {12.0, -12.0},
-                                   {-width / 2, 42.0},
-                                   {-width / 2, 58.0}}) {
-        label = {x + dx, y + dy - 12, x + dx + width, y + dy + 3};
-        if (std::none_of(taken.begin(), taken.end(), [&](const Box& box) { return box.meets(label); })) break;
-      }
-      taken.push_back(label);
+      const Box label = place(x, y, width,
+                              {{12, 5},
+                               {-12 - width, 5},
+                               {-width / 2, 26},
+                               {-width / 2, -14},
+                               {12, 24},
+                               {12, -12},
+                               {-width / 2, 42},
+                               {-width / 2, 58}});
       svg_ += fmt::format(
           "<circle cx=\"{:.1f}\" cy=\"{:.1f}\" r=\"7\" fill=\"{}\" stroke=\"white\" stroke-width=\"1.5\"/>\n", x, y,
           colour(i));
-      text(label.left, label.bottom - 3, rows_[i]->name,
-           "font-weight=\"bold\" paint-order=\"stroke\" stroke=\"white\" stroke-width=\"4\" fill=\"#111\"");
+      for (const char* style : {"stroke=\"white\" stroke-width=\"4\"", "fill=\"#111\""})  // a rim, then the letters
+        text(label.left, label.bottom - 3, rows_[i]->name, std::string("font-weight=\"bold\" ") + style);
     }
   }
 
@@ -207,6 +215,7 @@ class Drawing {
   const Report& report_;
   std::vector<const StageRow*> rows_;
   Axis x_{}, y_{};
+  std::vector<Box> taken_;
   std::string svg_;
 };
 
