@@ -32,18 +32,15 @@ def curve_keys(server: Union[str, os.PathLike], secret: Union[str, os.PathLike])
 
 
 def _key(where: str, given: Union[str, os.PathLike]) -> bytes:
-    text = given
-    if not isinstance(given, str) or len(given) != 40:
-        try:
-            text = Path(given).read_text(encoding="ascii").strip()
-        except (OSError, ValueError, TypeError) as error:
-            raise UsageError(where, "a key of 40 characters, or the file of one", type(error).__name__) from None
     try:
+        is_key = isinstance(given, str) and len(given) == 40
+        text = str(given) if is_key else Path(given).read_text(encoding="ascii").strip()
         if len(text) != 40 or len(z85.decode(text)) != 32:
-            raise ValueError
+            raise ValueError("something else")
         return text.encode()
-    except (ValueError, KeyError, struct.error):
-        raise UsageError(where, "a key of 40 characters, or the file of one", "something else", "vla keygen") from None
+    except (OSError, ValueError, TypeError, KeyError, struct.error) as error:
+        hint = "vla keygen makes them"
+        raise UsageError(where, "a key of 40 characters, or the file of one", type(error).__name__, hint) from None
 
 
 class Connection:
