@@ -25,6 +25,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from peer import ROOT, STAGES
@@ -122,7 +123,7 @@ def print_table(args, vla, results):
     gflop = report["stages"]["network"]["gflop"]
     print(f"{report['cpu']}, {args.threads} threads; {args.views} views, {args.tokens} tokens, {report['conditions']['steps']} steps, batch 1; "
           f"{len(ours)} interleaved rounds. Peak {report['peak_name']}: {median(peaks):.0f} GFLOP/s (median of rounds, "
-          f"{min(peaks):.0f} to {max(peaks):.0f}); {gflop:.0f} GFLOP counted for vla.\n")
+          f"{min(peaks):.0f} to {max(peaks):.0f}); {gflop:.4g} GFLOP counted for vla.\n")
     print("| program | network, ms: median (fastest) | vision | prefix | steps | its time over vla's, median of rounds | vision | prefix | steps | of the peak |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for name, rounds in {vla.name: ours, **results}.items():
@@ -164,6 +165,7 @@ def main():
     for turn in range(args.rounds + 1):  # the first warms up
         shift = turn % len(everyone)
         for peer in everyone[shift:] + everyone[:shift]:
+            time.sleep(0.5)  # threads of the one before may spin for a while before they sleep
             stages = peer.run()
             if turn and peer is not vla:
                 results[peer].append(stages)
