@@ -9,8 +9,9 @@
 namespace vla::bench {
 namespace {
 
-Result<RandomBundle> make_random(const Request& request) {
+Result<RandomBundle> make_random(const Request& request, const Watcher& watcher) {
   VLA_TRY(const PolicyEntry entry, find_policy(request.arch));
+  watcher.tell(fmt::format("filling {} with random weights", request.arch));
   RandomSizes sizes;
   sizes.n_view = request.sizes.n_view.value_or(sizes.n_view);
   sizes.max_tokens = request.sizes.n_text.value_or(sizes.max_tokens);
@@ -47,8 +48,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   VLA_TRY(const Device device, Device::cpu(request.n_thread, request.kernels));
   std::optional<RandomBundle> random;
   if (request.bundle.empty()) {
-    watcher.tell(fmt::format("filling {} with random weights", request.arch));
-    VLA_TRY(RandomBundle made, make_random(request));
+    VLA_TRY(RandomBundle made, make_random(request, watcher));
     random.emplace(std::move(made));
   }
   Report report;

@@ -95,10 +95,12 @@ def test_markdown_has_a_row_for_every_stage_and_an_earlier_run_is_compared_with(
     rows = [line.split(" | ")[0] for line in out.splitlines() if line.startswith("| ")]
     assert rows == [f"| {name}" for name in ["stage", "---", *STAGES, "network", "total"]]
     assert "times as fast" in out and "warning: the machine's own peak" in out
-    vla("bench", DEMO, *FEW, "--steps", "1", "--vs", earlier).refused("usage", "--vs", "1 steps", "3 steps")
+    other = vla("bench", DEMO, *FEW, "--steps", "1", "--vs", earlier)
+    assert other.code == 2 and other.out == ""
+    assert all(part in other.err.splitlines()[-1] for part in ("error: usage: --vs", "1 steps", "found smolvla", "3 steps"))
 
 
-def test_random_weights_need_no_bundle_and_an_unknown_architecture_is_refused(vla):
+def test_random_weights_of_an_unknown_architecture_are_refused(vla):
     vla("bench", "--arch", "octo", "--size", "full").refused("unsupported", "octo")
 
 
