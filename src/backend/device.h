@@ -5,6 +5,7 @@
 #include <ggml-cpp.h>
 #include <ggml-cpu.h>
 
+#include <memory>
 #include <string>
 
 #include "backend/isa.h"
@@ -25,6 +26,12 @@ class Device {
   std::string name() const;
 
  private:
+  struct FreePool {
+    void operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
+  };
+
+  // What threads share during a run; without one of ours ggml makes and frees one in every run.
+  std::unique_ptr<ggml_threadpool, FreePool> pool_;
   ggml_backend_ptr backend_;
   int n_thread_ = 0;
   Isa isa_ = Isa::ggml;
