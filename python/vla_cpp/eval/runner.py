@@ -15,6 +15,7 @@ from typing import Any, Callable, Dict, List, Optional
 from .environment import EnvironmentFault, Guard
 from .episode import Job, Outcome, run_episode
 from .journal import Journal
+from .serving import die_with_parent
 
 
 class RunFailed(Exception):
@@ -34,6 +35,7 @@ class Plan:
 
 def _work(plan: Plan, jobs: Any, results: Any) -> None:
     """One process: takes jobs until a None comes. Whatever goes wrong is told, with the job that it happened in."""
+    die_with_parent()
     # Simulator and policy libraries start threads that would take the cores from the other workers.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

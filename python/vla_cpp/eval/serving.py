@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
@@ -15,6 +16,14 @@ from pathlib import Path
 from typing import IO, List, Optional
 
 ADDRESS = re.compile(r"\b(?:tcp|ipc)://\S+")
+
+
+def die_with_parent() -> None:
+    """Called in a child: the system kills it when its parent is gone, however that ended. Linux only; elsewhere nothing happens."""
+    try:
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    except (OSError, AttributeError):
+        pass
 
 
 class ServerFailed(Exception):
@@ -39,13 +48,19 @@ class Server:
         # Threads that wait must sleep, or they take the cores that the simulators need.
         environment = {**os.environ, "OMP_WAIT_POLICY": "passive"}
         self._log: IO[bytes] = tempfile.TemporaryFile()
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, env=environment)
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=self._log, env=environment, preexec_fn=die_with_parent
+        )
         self.ready_line = self._process.stdout.readline().decode("utf-8", "replace").strip()  # type: ignore[union-attr]
         address = ADDRESS.search(self.ready_line)
         if address is None:
             self._process.wait()
             raise ServerFailed(f"vla serve did not start: {self.last_words() or self.ready_line or 'it said nothing'}")
         self.address = address.group().rstrip(",;")
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
 
     def fault(self) -> Optional[str]:
         """What became of the server, if it is gone."""
