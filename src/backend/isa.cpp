@@ -24,13 +24,6 @@ bool may_use_tiles() {
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
 }
 
-/// Asked of the processor itself: not every compiler's __builtin_cpu_supports knows it.
-bool has_f16c() {
-  unsigned a = 0, b = 0, c = 0, d = 0;
-  constexpr unsigned kF16c = 1U << 29;
-  return __get_cpuid(1, &a, &b, &c, &d) != 0 && (c & kF16c) != 0;
-}
-
 bool has_amx_bf16() {
   unsigned a = 0, b = 0, c = 0, d = 0;
   if (__get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
