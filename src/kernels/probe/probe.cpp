@@ -59,9 +59,9 @@ double shortest_burst(int n_thread, double seconds, const std::function<void(int
   return shortest;
 }
 
-/// Rounds that take about two milliseconds: long beside a clock, short beside what interrupts a thread.
+/// Rounds that take about a millisecond: long beside a clock, short beside what interrupts a thread.
 long rounds_of_a_burst(const PeakProbe& probe) {
-  constexpr double kBurst = 2e-3;
+  constexpr double kBurst = 1e-3;
   for (long n = 1024;; n *= 2) {
     const Clock::time_point start = Clock::now();
     probe.run(n);
