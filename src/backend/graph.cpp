@@ -2,6 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "backend/graph.h"
 
+#include <sys/mman.h>
+#include <unistd.h>
+
+#include <set>
+
 namespace vla {
 namespace {
 
@@ -16,6 +21,9 @@ constexpr double kLeastWork = 4e6;
 void note_time(ggml_tensor*, const ggml_tensor*, int, int, void* stage) {
   static_cast<Stage*>(stage)->done = std::chrono::steady_clock::now();
 }
+
+/// MADV_POPULATE_WRITE, which headers older than Linux 5.14 lack.
+constexpr int kPopulateWrite = 23;
 
 }  // namespace
 
@@ -80,6 +88,22 @@ std::vector<Work> Graph::work() const {
 Status Graph::allocate(ComputeMemory& memory) {
   if (ggml_gallocr_alloc_graph(memory.allocator(), graph_)) return {};
   return Error{Code::out_of_memory, "working memory", "", "the graph does not fit into what was reserved for it"};
+}
+
+void Graph::touch() const {
+  std::set<ggml_backend_buffer_t> buffers;
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) buffers.insert(ggml_graph_node(graph_, i)->buffer);
+  buffers.erase(nullptr);
+  const std::uintptr_t page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
+  for (ggml_backend_buffer_t buffer : buffers) {
+    const auto first =
+        (reinterpret_cast<std::uintptr_t>(ggml_backend_buffer_get_base(buffer)) + page - 1) / page * page;
+    const auto end = first + ggml_backend_buffer_get_size(buffer) / page * page - page;
+    if (end <= first) continue;
+    // Hints both: a system without them gives the pages when they are first written.
+    madvise(reinterpret_cast<void*>(first), end - first, MADV_HUGEPAGE);
+    madvise(reinterpret_cast<void*>(first), end - first, kPopulateWrite);
+  }
 }
 
 int Graph::n_thread(const Device& device) const {

@@ -84,6 +84,8 @@ class Graph {
   /// then `allocate` for each. Errors: out_of_memory.
   Status reserve(ComputeMemory& memory) { return memory.reserve(graph_); }
   Status allocate(ComputeMemory& memory);
+  /// Has the system back everything that a run writes with memory now, so that no request waits for it.
+  void touch() const;
   /// Errors: device.
   Status run(const Device& device);
 

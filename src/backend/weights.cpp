@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
 #include <map>
 
 namespace vla {
@@ -49,8 +50,22 @@ Weights::Place Weights::declare(const Param& param, ChooseFormat choose) {
   return {store_.add(GGML_TYPE_F32, param.shape), nullptr};
 }
 
+namespace {
+
+/// Tiles of bf16 round what they multiply. That is how a bundle of bf16 matrices is meant to be computed, and no other.
+Isa isa_for(const ParamList& list, Isa isa) {
+  const auto& all = list.params();
+  const bool has_bf16 = std::any_of(all.begin(), all.end(), [](const Param& param) {
+    return param.storage == Storage::matrix && param.source != nullptr && param.source->type == DType::bf16;
+  });
+  return isa == Isa::amx && !has_bf16 ? Isa::avx512 : isa;
+}
+
+}  // namespace
+
 Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill, ChooseFormat choose) {
   Weights weights(list.params().size(), device);
+  weights.isa_ = isa_for(list, device.isa());
   for (const Param& param : list.params()) weights.places_.push_back(weights.declare(param, choose));
   weights.describe(list);
   VLA_CHECK(weights.store_.allocate(device));

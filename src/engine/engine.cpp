@@ -24,6 +24,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
   VLA_CHECK(engine->make_plans());
+  if (!options.dry) engine->plans_->touch();
   return engine;
 }
 
