@@ -9,6 +9,7 @@
 #include <string>
 
 #include "backend/isa.h"
+#include "backend/scratch.h"
 #include "base/result.h"
 
 namespace vla {
@@ -23,6 +24,7 @@ class Device {
   ggml_backend_t backend() const { return backend_.get(); }
   int n_thread() const { return n_thread_; }
   Isa isa() const { return isa_; }
+  const std::shared_ptr<Scratch>& scratch() const { return scratch_; }
   std::string name() const;
 
  private:
@@ -35,6 +37,7 @@ class Device {
   ggml_backend_ptr backend_;
   int n_thread_ = 0;
   Isa isa_ = Isa::ggml;
+  std::shared_ptr<Scratch> scratch_;
 };
 
 }  // namespace vla
