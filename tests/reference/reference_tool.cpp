@@ -41,7 +41,12 @@ vla::Keys read_keys(const char* path) {
   for (const auto& item : object.items()) {
     if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
     if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (item.value().is_array()) keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    if (!item.value().is_array()) continue;
+    if (item.key() == "tokenizer.prefix_ids") {
+      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
+    } else {
+      keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    }
   }
   return keys;
 }
