@@ -392,7 +392,8 @@ EditableBundle robot() {
   EditableBundle bundle = sample();
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
   recipe["text"] = Json::parse(R"([{"op": "strip"}, {"op": "template", "text": "{instruction} {state}"},
-                                   {"op": "tokenize", "max_tokens": 8, "truncate": "right"}])");
+                                   {"op": "tokenize", "max_tokens": 32, "truncate": "right"}])");
+  bundle.set("observation.max_text_tokens", std::int64_t{32});
   recipe["state"] = Json::parse(R"([{"op": "affine", "columns": [1], "scale": -2.0, "shift": 1.0},
     {"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 0.5},
     {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}])");

@@ -25,13 +25,14 @@ from ._smolvla_sizes import Sizes, read_sizes
 
 VLM = "model.vlm_with_expert.vlm.model."
 EXPERT = "model.vlm_with_expert.lm_expert."
+STEPS: recipe.Steps = {recipe.PRE: {"smolvla_new_line_processor": {}}}
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     sizes = read_sizes(checkpoint, options, problems)
     problems.raise_any()
     dims = {recipe.STATE: sizes.state_dim, recipe.ACTION: sizes.action_dim}
-    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems)
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     folder = tokenizer_folder(checkpoint, options, processors) or sizes.backbone
     tokenizer = read_tokenizer(folder, sizes.n_vocab, problems, checkpoint.notes)
     document = json.dumps(_recipe(sizes, processors, tokenizer.truncate), ensure_ascii=False)
