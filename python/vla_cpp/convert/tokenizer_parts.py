@@ -139,9 +139,8 @@ def vocabulary(tokenizer: Tokenizer, problems: Problems) -> List[str]:
             )
     _check_ids(vocab, by_id, tokenizer.n_vocab, problems)
     # A hole gets a text that no merge and no word can produce: symbols contain no blank.
-    return [
-        by_id.get(number, "<no token {}>".format(number)) for number in range(min(max(by_id) + 1, tokenizer.n_vocab))
-    ]
+    last = max((number for number in by_id if number < tokenizer.n_vocab), default=-1)
+    return [by_id.get(number, "<no token {}>".format(number)) for number in range(last + 1)]
 
 
 def check_symbols(model: dict, symbols: List[str], problems: Problems) -> None:
