@@ -11,9 +11,10 @@
 
 namespace vla::test {
 
-/// Builds a graph without weights, runs it, and returns the values of what `build` returns.
-inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build) {
-  const auto device = Device::cpu(2);
+/// Builds a graph without weights, runs it, and returns the values of what `build` returns. An empty name takes the
+/// best kernels that the machine has.
+inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build, const std::string& kernels = "") {
+  const auto device = Device::cpu(2, kernels);
   REQUIRE(device.ok());
   const ParamList none(Keys(), nullptr);
   const auto weights = Weights::load(none, *device, Weights::Fill::yes);
