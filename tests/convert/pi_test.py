@@ -301,6 +301,17 @@ def test_pipelines_that_the_recipe_cannot_follow_are_refused(converter, message)
     assert message in converter.refusal(tiny).message()
 
 
+def test_relative_actions_of_which_every_joint_is_excluded_add_nothing(converter):
+    found = recipe(converter.bundle(TinyPi("pi0").relative(["a1", "a2", "a3", "a4", "a5"], ["a"])))
+    assert [op["op"] for op in found["action"]] == ["take", "unnormalize"]
+
+
+def test_absolute_actions_without_the_step_that_makes_them_relative_are_refused(converter):
+    tiny = TinyPi("pi0").relative()
+    tiny.pre["steps"].remove(tiny.step("relative_actions_processor"))
+    assert "enabled: expected False as the relative_actions_processor has it" in converter.refusal(tiny).message()
+
+
 def test_relative_actions_beyond_the_state_are_refused(converter):
     tiny = TinyPi("pi0").relative()
     tiny.config["input_features"]["observation.state"]["shape"] = [3]

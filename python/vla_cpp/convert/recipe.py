@@ -54,7 +54,8 @@ class Processors:
     rename: Dict[str, str] = field(default_factory=dict)  # accepted name -> the policy's name
     newline: bool = False
     state_words: bool = False  # the state goes into the prompt as whole numbers
-    add_state: Sequence[int] = ()  # columns of actions that are relative to the state
+    relative: bool = False  # actions are relative to the state
+    add_state: Sequence[int] = ()  # in these columns
     max_tokens: int = 0
     own_tokenizer: str = ""  # folder inside the checkpoint
     state: Normalization = field(default_factory=Normalization)
@@ -145,6 +146,7 @@ class _Reader:
             self.problems.unsupported(where, "the state of the robot, before normalization", "the opposite order")
         if config.get("enabled", False) is not True:
             return
+        self.result.relative = True
         exclude = member(config, "exclude_joints", list, where)
         names = config.get("action_names")
         width = self.context.dims[ACTION]
@@ -160,22 +162,12 @@ class _Reader:
     def _absolute_actions(self, where: str, config: dict, step: dict) -> None:
         if "unnormalizer_processor" not in self.seen:
             self.problems.unsupported(where, "un-normalization before it", "the opposite order")
-        if bool(config.get("enabled", False)) != self.relative_enabled:
+        if bool(config.get("enabled", False)) != self.result.relative:
             self.problems.add(
                 where + ": enabled",
-                "{} as the relative_actions_processor has it".format(self.relative_enabled),
+                "{} as the relative_actions_processor has it".format(self.result.relative),
                 str(config.get("enabled")),
             )
-
-    @property
-    def relative_enabled(self) -> bool:
-        steps = member(self.checkpoint.processors[0], "steps", list, PRE)
-        return any(
-            isinstance(step, dict)
-            and step.get("registry_name") == "relative_actions_processor"
-            and member(step, "config", dict, PRE).get("enabled") is True
-            for step in steps
-        )
 
     def _tokenizer(self, where: str, config: dict, step: dict) -> None:
         self.result.max_tokens = self.token_count(where + ": max_length", config.get("max_length", 512))
@@ -285,6 +277,12 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
         found = from_weights(checkpoint, feature, reader.problems)
         setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader.context))
     return result
+
+
+def letterbox(width: int, height: int, align: str, antialias: bool = False) -> dict:
+    """Into black: whatever the policy, the reference fills with 0 before it scales."""
+    size = {"width": width, "height": height}
+    return {"op": "letterbox", **size, "filter": "bilinear", "antialias": antialias, "align": align, "fill": 0.0}
 
 
 def text_ops(processors: Processors, truncate: str) -> List[dict]:

@@ -22,9 +22,9 @@ from ..features import feature_keys
 from ..files import member, read_json
 from ..section import Section
 from . import Options
-from ._pi import Family, Source, letterbox
 from ._pi_lerobot import CLEAN, PROMPT, WORDS
 from ._pi_sizes import Sizes, check_image, read_towers
+from ._pi_source import Family, Source
 
 STATS_FILE = "norm_stats.json"
 SIDE = 224  # every configuration resizes to this (ModelTransformFactory)
@@ -144,7 +144,7 @@ def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, proble
     return Source(
         sizes=sizes,
         processors=recipe.Processors(),
-        image=[letterbox(sizes.image_size, antialias=True), {"op": "affine", "scale": 2.0, "shift": -1.0}],
+        image=[recipe.letterbox(sizes.image_size, sizes.image_size, "center", antialias=True), {"op": "affine", "scale": 2.0, "shift": -1.0}],
         text=[*CLEAN, PROMPT] if _has_words(family, variant) else [*CLEAN, NEWLINE],
         state=[*robot.decode, *(_normalize("normalize", kind, name, state_names) for name in state_names)]
         + [_state_end(family, variant, sizes)],

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Dict, List, NamedTuple
+from typing import Dict, List
 
 from .. import recipe
 from ..bundle import Key
@@ -17,45 +17,16 @@ from ..tokenizer import TokenizerPlan, read_tokenizer
 from . import TABLE, Dropped, Options, Plan, Weight
 from . import _pi_names as names
 from ._lerobot import tokenizer_folder
+from ._openpi import read_openpi
+from ._pi_lerobot import read_lerobot
 from ._pi_sizes import Sizes, network_keys
+from ._pi_source import Family
 from ._rows import KEPT_OF_LAST, gated_block, linear, siglip, vector
 
 TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
 
 
-class Family(NamedTuple):
-    """In what the two differ."""
-
-    arch: str
-    config_class: str
-    max_tokens: int  # default of the reference's class
-    time_mlp: str  # the tensors of the time layers
-    other_time_mlp: str  # what the other family calls them
-
-    @property
-    def state_token(self) -> bool:
-        """π0 has the state as a token; π0.5 has it in the prompt and time in its norms."""
-        return self.arch == "pi0"
-
-
-class Source(NamedTuple):
-    """What the layout of the checkpoint contributes: sizes, recipe, features, statistics."""
-
-    sizes: Sizes
-    processors: recipe.Processors  # LeRobot's; of openpi's layout only the statistics' place is used
-    image: List[dict]
-    text: List[dict]  # without the last op
-    state: List[dict]
-    action: List[dict]
-    features: List[Key]
-    statistics: Dict[str, object]
-    max_tokens: int
-
-
 def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    from ._openpi import read_openpi
-    from ._pi_lerobot import read_lerobot
-
     read = read_openpi if checkpoint.is_openpi else read_lerobot
     source = read(family, checkpoint, options, problems)
     checkpoint.tensors = names.rename(
@@ -82,18 +53,6 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
     problems.raise_any()
     weights = _weights(family, source.sizes, checkpoint)
     return Plan(keys, weights, _dropped(family, source.sizes, checkpoint), source.statistics, _hints(source.sizes))
-
-
-def letterbox(side: int, antialias: bool) -> dict:
-    return {
-        "op": "letterbox",
-        "width": side,
-        "height": side,
-        "filter": "bilinear",
-        "antialias": antialias,
-        "align": "center",
-        "fill": 0.0,
-    }
 
 
 def _tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:

@@ -18,8 +18,8 @@ from ..features import feature_keys
 from ..section import Section
 from . import Options
 from ._lerobot import check_keys, read_views, vector_dim, view_keys
-from ._pi import Family, Source, letterbox
 from ._pi_sizes import Sizes, check_image, read_towers
+from ._pi_source import Family, Source
 
 POLICY: Dict[str, object] = {
     "paligemma_variant": "gemma_2b",
@@ -92,7 +92,7 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
         sizes=sizes,
         processors=processors,
         image=[
-            letterbox(sizes.image_size, antialias=False),
+            recipe.letterbox(sizes.image_size, sizes.image_size, "center"),
             {"op": "clip", "low": 0.0, "high": 1.0},
             {"op": "affine", "scale": 2.0, "shift": -1.0},
         ],
@@ -132,8 +132,8 @@ def _check_pipelines(family: Family, policy: Section, processors: recipe.Process
     )
     if not found or (processors.newline and processors.state_words):
         policy.problems.add(recipe.PRE + ": steps", "{}, and not the other family's".format(wanted), "other steps")
-    if bool(processors.add_state) != bool(policy.get("use_relative_actions")):
-        policy.bad("use_relative_actions", "{} as the pipelines have it".format(bool(processors.add_state)))
+    if processors.relative != bool(policy.get("use_relative_actions")):
+        policy.bad("use_relative_actions", "{} as the pipelines have it".format(processors.relative))
 
 
 def _text(processors: recipe.Processors) -> List[dict]:

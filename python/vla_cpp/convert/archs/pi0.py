@@ -11,7 +11,8 @@ from ..checkpoint import Checkpoint
 from ..errors import Problems
 from . import Options, Plan
 from ._openpi import variants_of
-from ._pi import Family, make_plan
+from ._pi import make_plan
+from ._pi_source import Family
 
 FAMILY = Family(
     arch="pi0",

@@ -54,18 +54,8 @@ def _hints(s: Sizes) -> Dict[str, str]:
 
 
 def _recipe(s: Sizes, processors: recipe.Processors, truncate: str) -> Dict[str, List[dict]]:
-    width, height = s.frame
-    letterbox = {
-        "op": "letterbox",
-        "width": width,
-        "height": height,
-        "filter": "bilinear",
-        "antialias": False,
-        "align": "bottom_right",
-        "fill": 0.0,
-    }
     return {
-        "image": [letterbox, {"op": "affine", "scale": 2.0, "shift": -1.0}],
+        "image": [recipe.letterbox(*s.frame, "bottom_right"), {"op": "affine", "scale": 2.0, "shift": -1.0}],
         "text": recipe.text_ops(processors, truncate),
         "state": [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}],
         "action": [{"op": "take", "size": s.action_dim}, *processors.action.op("unnormalize", recipe.ACTION)],
