@@ -32,7 +32,7 @@ class Source(NamedTuple):
     """What the layout of the checkpoint contributes: sizes, recipe, features, statistics."""
 
     sizes: Sizes
-    processors: recipe.Processors  # LeRobot's; of openpi's layout only the statistics' place is used
+    processors: recipe.Processors  # empty for openpi, which has none
     image: List[dict]
     text: List[dict]  # without the last op
     state: List[dict]
