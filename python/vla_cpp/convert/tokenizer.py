@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """tokenizer.json as the keys of a bundle, after checking that it is a tokenizer that the runtime implements.
 
-Two kinds are known, each with a module of its own: byte-level BPE and BPE with byte fallback. What
-they share stands in tokenizer_parts.py.
+Two kinds are known, each with a module of its own: byte-level BPE and BPE with byte fallback. What they share stands in
+tokenizer_parts.py.
 """
 
 from __future__ import annotations
@@ -15,7 +15,16 @@ from . import tokenizer_byte_fallback, tokenizer_byte_level
 from .bundle import Key
 from .errors import Code, Problems, refuse
 from .files import member, read_json
-from .tokenizer_parts import CONFIG_FILE, JSON_FILE, Tokenizer, added_tokens, check_config_tokens, merges_of, to_json, vocabulary
+from .tokenizer_parts import (
+    CONFIG_FILE,
+    JSON_FILE,
+    Tokenizer,
+    added_tokens,
+    check_config_tokens,
+    merges_of,
+    to_json,
+    vocabulary,
+)
 
 NO_ROW = -1  # the id of an added token that the embedding has no row for
 
