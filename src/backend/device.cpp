@@ -15,9 +15,10 @@ int usable_cores() {
 
 }  // namespace
 
-Result<Device> Device::cpu(int n_thread) {
+Result<Device> Device::cpu(int n_thread, const std::string& kernels) {
   ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);  // what fails becomes an Error, told once
   Device device;
+  VLA_TRY(device.isa_, choose_isa(kernels));
   device.n_thread_ = n_thread > 0 ? n_thread : usable_cores();
   if (device.n_thread_ > GGML_MAX_N_THREADS)
     return Error{Code::device, "threads", fmt::format("at most {}", GGML_MAX_N_THREADS),

@@ -7,6 +7,7 @@
 
 #include <string>
 
+#include "backend/isa.h"
 #include "base/result.h"
 
 namespace vla {
@@ -14,16 +15,19 @@ namespace vla {
 /// Where graphs run. The threads belong to the OpenMP runtime, which keeps them and lets them sleep between requests.
 class Device {
  public:
-  /// The CPU with `n_thread` threads; 0 takes every core that the process may use. Errors: device.
-  static Result<Device> cpu(int n_thread);
+  /// The CPU with `n_thread` threads, 0 for every core that the process may use, and the kernels of choose_isa.
+  /// Errors: device, usage.
+  static Result<Device> cpu(int n_thread, const std::string& kernels);
 
   ggml_backend_t backend() const { return backend_.get(); }
   int n_thread() const { return n_thread_; }
+  Isa isa() const { return isa_; }
   std::string name() const;
 
  private:
   ggml_backend_ptr backend_;
   int n_thread_ = 0;
+  Isa isa_ = Isa::ggml;
 };
 
 }  // namespace vla

@@ -41,6 +41,8 @@ class Graph {
   ggml_context* context() const { return context_.get(); }
   Tensor weight(const Param* param) const { return weights_[param]; }
   Store& store() { return store_; }
+  /// Which kernels the operations are to be built from.
+  Isa isa() const { return weights_.isa(); }
 
   /// Values that depend on the shape alone (masks, rotary tables): made once per graph for each `key`.
   Tensor constant(const std::string& key, const std::function<Tensor(Store&)>& make);

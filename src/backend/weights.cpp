@@ -32,7 +32,7 @@ void upload(Tensor tensor, const Param& param) {
 }  // namespace
 
 Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill) {
-  Weights weights(list.params().size());
+  Weights weights(list.params().size(), device.isa());
   for (const Param& param : list.params())
     weights.tensors_.push_back(weights.store_.add(resident_type(param), param.shape));
   VLA_CHECK(weights.store_.allocate(device));

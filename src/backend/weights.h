@@ -22,12 +22,14 @@ class Weights {
 
   Tensor operator[](const Param* param) const { return tensors_[static_cast<std::size_t>(param->id)]; }
   std::size_t size() const { return store_.size(); }
+  Isa isa() const { return isa_; }
   std::size_t count() const { return tensors_.size(); }
 
  private:
-  explicit Weights(std::size_t n_param) : store_(n_param) {}
+  Weights(std::size_t n_param, Isa isa) : store_(n_param), isa_(isa) {}
 
   Store store_;
+  Isa isa_;
   std::vector<Tensor> tensors_;
 };
 

@@ -18,7 +18,7 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 
 struct RunOptions {
-  std::string bundle, text, noise, out, tap, taps_out;
+  std::string bundle, text, noise, out, tap, taps_out, kernels;
   std::vector<std::string> images, states;
   std::optional<std::uint64_t> seed;
   int n_thread = 0;
@@ -156,7 +156,8 @@ Status run(RunOptions& options) {
   VLA_CHECK(check(options));
   StageClock clock;
   Timing before;
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.tap}));
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          Engine::load(options.bundle, {options.n_thread, options.kernels, options.tap}));
   clock.lap(before, "load");
   Observation observation;
   observation.text = options.text;
@@ -231,6 +232,8 @@ Command add_run(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
+  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best of this machine")
+      ->check(CLI::Validator(check_given, ""));
   return [options] { return run(*options); };
 }
 

@@ -16,7 +16,7 @@ constexpr int kMaxHorizon = 4096;
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
   VLA_TRY(Bundle bundle, Bundle::open(path));
   VLA_TRY(Processor processor, Processor::create(bundle));
-  VLA_TRY(Device device, Device::cpu(options.n_thread));
+  VLA_TRY(Device device, Device::cpu(options.n_thread, options.kernels));
   std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
   engine->tap_pattern_ = options.tap_pattern;
   VLA_CHECK(engine->load_policy(options.dry));

@@ -16,6 +16,7 @@ namespace vla {
 
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
+  std::string kernels;      // ggml, avx2, avx512 or amx; empty: the best that the machine has
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
   bool dry = false;         // reserve memory without filling it: sizes are exact, and `act` must not be called
 };

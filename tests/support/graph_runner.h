@@ -13,7 +13,7 @@ namespace vla::test {
 
 /// Builds a graph without weights, runs it, and returns the values of what `build` returns.
 inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build) {
-  const auto device = Device::cpu(2);
+  const auto device = Device::cpu(2, "");
   REQUIRE(device.ok());
   const ParamList none(Keys(), nullptr);
   const auto weights = Weights::load(none, *device, Weights::Fill::yes);

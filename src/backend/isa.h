@@ -1,0 +1,30 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// Which kernels a device uses, each with what stands before it: a machine for `amx` runs `avx512` ones too.
+enum class Isa {
+  ggml,    // no kernels of our own: plain ggml operations, the reference of every other row
+  avx2,    // AVX2, FMA, F16C
+  avx512,  // AVX-512 F, BW, DQ, VL
+  amx      // AMX tiles of bf16, with the system's leave to use them
+};
+
+/// The name that `--kernels` takes.
+std::string isa_name(Isa isa);
+
+/// What this machine can run, `ggml` first and the best last.
+const std::vector<Isa>& usable_isas();
+
+/// The kernels by name; an empty name takes the best that the machine has. Errors: usage for an unknown name,
+/// device for one that the machine cannot run.
+Result<Isa> choose_isa(const std::string& name);
+
+}  // namespace vla
