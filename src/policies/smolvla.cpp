@@ -32,7 +32,7 @@ class SmolVla final : public Policy {
   Expert expert_;
   Linear action_in_, action_time_in_, action_time_out_, action_out_;  // step rate
   float image_scale_, text_scale_;
-  double min_period_, max_period_;
+  TimeEmbedding time_;  // load rate
 
  public:
   explicit SmolVla(const Scope& s)
@@ -47,15 +47,7 @@ class SmolVla final : public Policy {
         action_out_(s / "action_out", expert_.d_model(), s.dim("d_action"), Bias::yes),
         image_scale_(s.number("image_scale")),
         text_scale_(s.number("text_scale")),
-        min_period_((s / "time").precise("min_period")),
-        max_period_((s / "time").precise("max_period")) {
-    (s / "time")
-        .require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period",
-                 fmt::format("{}", min_period_));
-    (s / "expert")
-        .require(expert_.d_model() % 2 == 0, "d_model", "an even number, for sines and cosines",
-                 fmt::format("{}", expert_.d_model()));
-  }
+        time_(s / "time", expert_.d_model()) {}
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
@@ -67,10 +59,7 @@ class SmolVla final : public Policy {
                  std::to_string(n_prefix), "use smaller pictures or fewer views"};
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override {
-    return g.store().add_constant(sinusoidal_time_embedding(times, expert_.d_model(), min_period_, max_period_),
-                                  {expert_.d_model(), static_cast<std::int64_t>(times.size())});
-  }
+  Tensor condition(Graph& g, std::span<const float> times) const override { return time_(g, times); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
     const Tensor image = flatten_views(g, connector_(g, vision_(g, in.images)));  // [d_model, n_view * n_token]
