@@ -8,7 +8,7 @@
 #include <fmt/format.h>
 
 #include "modules/action/expert.h"
-#include "modules/language/smollm.h"
+#include "modules/language/decoder.h"
 #include "modules/time_embedding.h"
 #include "modules/vision/pixel_connector.h"
 #include "modules/vision/siglip.h"
@@ -26,7 +26,7 @@ constexpr int kMaxPrefix = 8192;
 
 class SmolVla final : public Policy {
   Siglip vision_;
-  SmolLm lm_;
+  Decoder lm_;
   PixelConnector connector_;
   Linear state_in_;  // observation rate
   Expert expert_;

@@ -41,7 +41,7 @@ Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
   return rest_(g, x, attn_norm_(g, x), 0, prefix, {});
 }
 
-Expert::Expert(const Scope& s, const SmolLm& lm)
+Expert::Expert(const Scope& s, const Decoder& lm)
     : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps")) {
   const std::vector<std::string> kinds = s.strings("layer_kinds");
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");

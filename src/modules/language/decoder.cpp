@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "modules/language/smollm.h"
+#include "modules/language/decoder.h"
 
 #include <fmt/format.h>
 
@@ -51,17 +51,17 @@ Tensor DecoderRest::operator()(Graph& g, Tensor x, Tensor h, int first, const Ke
   return add(g, x, mlp_(g, ffn_norm_(g, x)));
 }
 
-SmolLmBlock::SmolLmBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
+DecoderBlock::DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
     : Module(s), kv_(s, d_model, heads, eps), rest_(s, d_model, d_ff, heads, eps) {}
 
-Tensor SmolLmBlock::forward(Graph& g, Tensor x, Tensor mask, Cache& cache) const {
+Tensor DecoderBlock::forward(Graph& g, Tensor x, Tensor mask, Cache& cache) const {
   const Tensor h = kv_.norm(g, x);
   const KeyValue kv = kv_(g, h, 0);
   put(g, cache, path(), kv);
   return rest_(g, x, h, 0, kv, mask);
 }
 
-SmolLm::SmolLm(const Scope& s)
+Decoder::Decoder(const Scope& s)
     : path_(s.path()),
       d_model_(s.dim("d_model")),
       heads_(Heads::read(s)),
@@ -72,14 +72,14 @@ SmolLm::SmolLm(const Scope& s)
   last_.emplace(s / "blk" / (n_layer - 1), d_model_, heads_, eps);
 }
 
-std::string SmolLm::layer_path(int i_layer) const { return fmt::format("{}.blk.{}", path_, i_layer); }
+std::string Decoder::layer_path(int i_layer) const { return fmt::format("{}.blk.{}", path_, i_layer); }
 
-void SmolLm::prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const {
-  for (const SmolLmBlock& block : blocks_) x = block(g, x, mask, cache);
+void Decoder::prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const {
+  for (const DecoderBlock& block : blocks_) x = block(g, x, mask, cache);
   put(g, cache, layer_path(n_layer() - 1), (*last_)(g, last_->norm(g, x), 0));
 }
 
-KeyValue SmolLm::cached(const Cache& cache, int i_layer) const {
+KeyValue Decoder::cached(const Cache& cache, int i_layer) const {
   return {cache.get(layer_path(i_layer) + ".k"), cache.get(layer_path(i_layer) + ".v")};
 }
 

@@ -60,9 +60,9 @@ class DecoderRest {
 };
 
 /// One layer of the language model; it leaves its keys and values in the cache.
-class SmolLmBlock : public Module<SmolLmBlock> {
+class DecoderBlock : public Module<DecoderBlock> {
  public:
-  SmolLmBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
+  DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
   Tensor forward(Graph& g, Tensor x, Tensor mask, Cache& cache) const;
 
  private:
@@ -72,9 +72,9 @@ class SmolLmBlock : public Module<SmolLmBlock> {
 
 /// The language model as a policy uses it: it embeds tokens and turns a prefix into keys and values, layer by layer.
 /// Nothing reads the last layer's output, so that layer stops at its keys and values.
-class SmolLm {
+class Decoder {
  public:
-  explicit SmolLm(const Scope& s);
+  explicit Decoder(const Scope& s);
 
   /// tokens [n] i32 -> [d_model, n], not scaled.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }
@@ -94,7 +94,7 @@ class SmolLm {
   int d_model_;
   Heads heads_;
   Embedding token_embd_;
-  std::vector<SmolLmBlock> blocks_;
+  std::vector<DecoderBlock> blocks_;
   std::optional<KeyValueProjection> last_;
 };
 
