@@ -17,6 +17,7 @@ class ExpertSelfBlock : public Module<ExpertSelfBlock> {
   Tensor forward(Graph& g, Tensor x, const KeyValue& prefix) const;
 
  private:
+  RmsNorm attn_norm_;
   KeyValueProjection kv_;
   DecoderRest rest_;
 };

@@ -11,12 +11,23 @@
 namespace vla {
 namespace {
 
-void put(Graph& g, Cache& cache, const std::string& path, const KeyValue& kv) {
-  cache.put(g, path + ".k", kv.key);
-  cache.put(g, path + ".v", kv.value);
+using GatedMlp = std::variant<SiluGatedMlp, GeluGatedMlp>;
+
+GatedMlp make_mlp(const Scope& s, int d_model, int d_ff, Activation activation) {
+  if (activation == Activation::silu) return SiluGatedMlp(s, d_model, d_ff);
+  return GeluGatedMlp(s, d_model, d_ff);
 }
 
 }  // namespace
+
+void KeyValue::put(Graph& g, Cache& cache, const std::string& path) const {
+  cache.put(g, path + ".k", key);
+  cache.put(g, path + ".v", value);
+}
+
+KeyValue KeyValue::get(const Cache& cache, const std::string& path) {
+  return {cache.get(path + ".k"), cache.get(path + ".v")};
+}
 
 Heads Heads::read(const Scope& s) {
   const Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head"), s.number("rope_base")};
@@ -27,9 +38,8 @@ Heads Heads::read(const Scope& s) {
   return heads;
 }
 
-KeyValueProjection::KeyValueProjection(const Scope& s, int d_model, const Heads& heads, float eps)
+KeyValueProjection::KeyValueProjection(const Scope& s, int d_model, const Heads& heads)
     : heads_(heads),
-      norm_(s / "attn_norm", d_model, eps),
       k_(s / "attn_k", d_model, heads.d_key(), Bias::no),
       v_(s / "attn_v", d_model, heads.d_key(), Bias::no) {}
 
@@ -38,49 +48,60 @@ KeyValue KeyValueProjection::operator()(Graph& g, Tensor h, int first) const {
   return {key, split_heads(g, v_(g, h), heads_.n_head_kv)};
 }
 
-DecoderRest::DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
+QueryAttention::QueryAttention(const Scope& s, int d_model, const Heads& heads)
     : heads_(heads),
       q_(s / "attn_q", d_model, heads.d_query(), Bias::no),
-      out_(s / "attn_out", heads.d_query(), d_model, Bias::no),
-      ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(s, d_model, d_ff) {}
+      out_(s / "attn_out", heads.d_query(), d_model, Bias::no) {}
 
-Tensor DecoderRest::operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
+Tensor QueryAttention::operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
   const Tensor query = rope(g, split_heads(g, q_(g, h), heads_.n_head), heads_.rope_base, first);
-  x = add(g, x, out_(g, attention(g, query, seen.key, seen.value, mask)));
-  return add(g, x, mlp_(g, ffn_norm_(g, x)));
+  return out_(g, attention(g, query, seen.key, seen.value, mask));
 }
 
-DecoderBlock::DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
-    : Module(s), kv_(s, d_model, heads, eps), rest_(s, d_model, d_ff, heads, eps) {}
+DecoderRest::DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps)
+    : attention_(s, d_model, heads),
+      ffn_norm_(s / "ffn_norm", d_model, eps),
+      mlp_(make_mlp(s, d_model, d_ff, activation)) {}
+
+Tensor DecoderRest::operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
+  x = add(g, x, attention_(g, h, first, seen, mask));
+  const Tensor f = ffn_norm_(g, x);
+  return add(g, x, std::visit([&](const auto& mlp) { return mlp(g, f); }, mlp_));
+}
+
+DecoderBlock::DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps)
+    : Module(s),
+      attn_norm_(s / "attn_norm", d_model, eps),
+      kv_(s, d_model, heads),
+      rest_(s, d_model, d_ff, heads, activation, eps) {}
 
 Tensor DecoderBlock::forward(Graph& g, Tensor x, Tensor mask, Cache& cache) const {
-  const Tensor h = kv_.norm(g, x);
+  const Tensor h = attn_norm_(g, x);
   const KeyValue kv = kv_(g, h, 0);
-  put(g, cache, path(), kv);
+  kv.put(g, cache, path());
   return rest_(g, x, h, 0, kv, mask);
 }
 
-Decoder::Decoder(const Scope& s)
+Decoder::Decoder(const Scope& s, Activation activation)
     : path_(s.path()),
       d_model_(s.dim("d_model")),
       heads_(Heads::read(s)),
       token_embd_(s / "token_embd", d_model_, s.dim("n_vocab", 1 << 24)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
   const float eps = s.number("norm_eps");
-  for (int i = 0; i + 1 < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, eps);
-  last_.emplace(s / "blk" / (n_layer - 1), d_model_, heads_, eps);
+  for (int i = 0; i + 1 < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, activation, eps);
+  const Scope last = s / "blk" / (n_layer - 1);
+  last_norm_.emplace(last / "attn_norm", d_model_, eps);
+  last_kv_.emplace(last, d_model_, heads_);
 }
 
 std::string Decoder::layer_path(int i_layer) const { return fmt::format("{}.blk.{}", path_, i_layer); }
 
 void Decoder::prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const {
   for (const DecoderBlock& block : blocks_) x = block(g, x, mask, cache);
-  put(g, cache, layer_path(n_layer() - 1), (*last_)(g, last_->norm(g, x), 0));
+  (*last_kv_)(g, (*last_norm_)(g, x), 0).put(g, cache, layer_path(n_layer() - 1));
 }
 
-KeyValue Decoder::cached(const Cache& cache, int i_layer) const {
-  return {cache.get(layer_path(i_layer) + ".k"), cache.get(layer_path(i_layer) + ".v")};
-}
+KeyValue Decoder::cached(const Cache& cache, int i_layer) const { return KeyValue::get(cache, layer_path(i_layer)); }
 
 }  // namespace vla

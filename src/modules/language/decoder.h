@@ -3,10 +3,12 @@
 #pragma once
 
 #include <optional>
+#include <variant>
 #include <vector>
 
 #include "backend/cache.h"
 #include "nn/embedding.h"
+#include "nn/gated_mlp.h"
 #include "nn/linear.h"
 #include "nn/mlp.h"
 #include "nn/norm.h"
@@ -27,58 +29,75 @@ struct Heads {
 /// What a layer attends to. Both [d_head, n_head_kv, n_token], keys after the rotary embedding.
 struct KeyValue {
   Tensor key, value;
+
+  /// Into the cache, as `<path>.k` and `<path>.v`.
+  void put(Graph& g, Cache& cache, const std::string& path) const;
+  static KeyValue get(const Cache& cache, const std::string& path);
 };
 
-/// The norm and the key and value products of a decoder layer: all that the last layer of a prefix needs.
+/// The activation of a decoder's gated MLP: SiLU in the Llama family, GELU in Gemma.
+enum class Activation { silu, gelu_tanh };
+
+/// The key and value products of a layer.
 class KeyValueProjection {
  public:
-  KeyValueProjection(const Scope& s, int d_model, const Heads& heads, float eps);
-
-  Tensor norm(Graph& g, Tensor x) const { return norm_(g, x); }
+  KeyValueProjection(const Scope& s, int d_model, const Heads& heads);
   /// `h` [d_model, n_token], already normalized; token 0 stands at position `first`.
   KeyValue operator()(Graph& g, Tensor h, int first) const;
 
  private:
   Heads heads_;
-  RmsNorm norm_;
   Linear k_, v_;
 };
 
-/// A pre-norm decoder layer after its keys and values: queries, attention, output product, residual, gated MLP,
-/// residual. Source: lerobot policies/smolvla/smolvlm_with_expert.py forward, forward_attn_layer.
-class DecoderRest {
+/// Queries, attention to given keys and values, output product.
+class QueryAttention {
  public:
-  DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
-  /// `h` is the normalized x; its token 0 stands at position `first`. x [d_model, n_token] -> the same shape.
-  Tensor operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const;
+  QueryAttention(const Scope& s, int d_model, const Heads& heads);
+  /// `h` [d_model, n_token], already normalized; token 0 stands at position `first`. -> the same shape.
+  Tensor operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const;
 
  private:
   Heads heads_;
   Linear q_, out_;
+};
+
+/// A pre-norm decoder layer after its keys and values: attention, residual, gated MLP, residual.
+/// Source: lerobot policies/smolvla/smolvlm_with_expert.py forward, forward_attn_layer.
+class DecoderRest {
+ public:
+  DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps);
+  /// `h` is the normalized x; its token 0 stands at position `first`. x [d_model, n_token] -> the same shape.
+  Tensor operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const;
+
+ private:
+  QueryAttention attention_;
   RmsNorm ffn_norm_;
-  SiluGatedMlp mlp_;
+  std::variant<SiluGatedMlp, GeluGatedMlp> mlp_;
 };
 
 /// One layer of the language model; it leaves its keys and values in the cache.
 class DecoderBlock : public Module<DecoderBlock> {
  public:
-  DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
+  DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps);
   Tensor forward(Graph& g, Tensor x, Tensor mask, Cache& cache) const;
 
  private:
+  RmsNorm attn_norm_;
   KeyValueProjection kv_;
   DecoderRest rest_;
 };
 
-/// The language model as a policy uses it: it embeds tokens and turns a prefix into keys and values, layer by layer.
-/// Nothing reads the last layer's output, so that layer stops at its keys and values.
+/// A language model of the Llama or Gemma family as a policy uses it: it embeds tokens and turns a prefix into keys and
+/// values, layer by layer. Nothing reads the last layer's output, so that layer stops at its keys and values.
 class Decoder {
  public:
-  explicit Decoder(const Scope& s);
+  Decoder(const Scope& s, Activation activation);
 
   /// tokens [n] i32 -> [d_model, n], not scaled.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }
-  /// x [d_model, n], mask [n, n] -> cache `<path>.blk.<i>.{k,v}`, each [d_head, n_head_kv, n].
+  /// x [d_model, n], mask [n, n] or none where all see all -> cache `<path>.blk.<i>.{k,v}`, each [d_head, n_head_kv,
+  /// n].
   void prefill(Graph& g, Tensor x, Tensor mask, Cache& cache) const;
 
   /// The cached keys and values of layer i.
@@ -95,7 +114,8 @@ class Decoder {
   Heads heads_;
   Embedding token_embd_;
   std::vector<DecoderBlock> blocks_;
-  std::optional<KeyValueProjection> last_;
+  std::optional<RmsNorm> last_norm_;
+  std::optional<KeyValueProjection> last_kv_;
 };
 
 }  // namespace vla
