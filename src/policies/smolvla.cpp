@@ -20,10 +20,6 @@
 namespace vla {
 namespace {
 
-/// Memory of the prefix grows with the square of its tokens: 256 MB for the mask of this many, where published policies
-/// have about 200.
-constexpr int kMaxPrefix = 8192;
-
 class SmolVla final : public Policy {
   Siglip vision_;
   Decoder lm_;
@@ -53,10 +49,7 @@ class SmolVla final : public Policy {
     VLA_CHECK(vision_.check(shape.width, shape.height));
     const int side = shape.width / vision_.patch_size();
     VLA_CHECK(connector_.check(side));
-    const std::int64_t n_prefix = std::int64_t{connector_.n_token(side)} * shape.n_view + shape.n_text + 1;
-    if (n_prefix <= kMaxPrefix) return {};
-    return Error{Code::unsupported, "prefix", fmt::format("at most {} tokens of views, text and state", kMaxPrefix),
-                 std::to_string(n_prefix), "use smaller pictures or fewer views"};
+    return check_prefix(shape.n_view, connector_.n_token(side), shape.n_text + 1);
   }
 
   Tensor condition(Graph& g, std::span<const float> times) const override { return time_(g, times); }
