@@ -52,7 +52,7 @@ def run_torch(case, dtype, blocks, threads):
     torch.set_num_threads(threads)
     policy, before, after = golden.load(case / "checkpoint", dtype)
     noise, batch = torch.from_numpy(np.load(case / "noise.npy"))[None], before(golden.read_observation(case))
-    recorder = golden.Recorder(policy) if blocks else None
+    recorder = golden.recorder(policy) if blocks else None
     start = time.perf_counter()
     with torch.inference_mode():
         chunk = None if blocks else policy.predict_action_chunk(dict(batch), noise=noise)[0].float().numpy()
