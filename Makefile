@@ -48,7 +48,7 @@ fuzz: packages
 	scripts/fuzz.sh $(SECONDS)
 
 format:
-	clang-format -i $$(git ls-files 'src/*.h' 'src/*.cpp' 'tests/*.h' 'tests/*.cpp')
+	clang-format -i $$(git ls-files '*.h' '*.c' '*.cpp')
 
 clean:
 	rm -rf build $(VENV)

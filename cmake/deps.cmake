@@ -64,3 +64,7 @@ find_package(Threads REQUIRED)
 find_path(VLA_CLI11_DIR CLI/CLI.hpp REQUIRED)
 find_path(VLA_XXHASH_DIR xxhash.h REQUIRED)
 find_library(VLA_XXHASH_LIBRARY xxhash REQUIRED)
+
+# The wire: the schema is compiled at build time, and the server needs the small runtime of Protobuf only.
+find_package(Protobuf REQUIRED)
+find_package(cppzmq REQUIRED)

@@ -12,6 +12,11 @@ constexpr std::size_t kLeastNodes = 4096;
 /// A product with fewer operations than this takes about as long as bringing the threads together after it.
 constexpr double kLeastWork = 4e6;
 
+/// A node that passes its operand on and notes when it was reached: ggml starts a node after the one before it is done.
+void note_time(ggml_tensor*, const ggml_tensor*, int, int, void* stage) {
+  static_cast<Stage*>(stage)->done = std::chrono::steady_clock::now();
+}
+
 }  // namespace
 
 Status ComputeMemory::reserve(ggml_cgraph* graph) {
@@ -48,6 +53,25 @@ Tensor Graph::name(const std::string& path, Tensor value) {
 void Graph::require(Tensor value) { ggml_build_forward_expand(graph_, value.node()); }
 
 void Graph::write(Tensor value, Tensor target) { require(ggml_cpy(context_.get(), value.node(), target.node())); }
+
+Tensor Graph::stage(const std::string& name, Tensor value) {
+  Stage& stage = stages_.emplace_back(Stage{name, {}, {}});
+  stage.mark = ggml_map_custom1_inplace(context_.get(), value.node(), note_time, 1, &stage);
+  note_work(stage.mark, {});
+  require(stage.mark);
+  return stage.mark;
+}
+
+std::vector<Work> Graph::work() const {
+  std::vector<Work> parts(1);
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
+    const ggml_tensor* node = ggml_graph_node(graph_, i);
+    const auto noted = noted_work_.find(node);
+    parts.back() += noted != noted_work_.end() ? noted->second : work_of(node);
+    if (parts.size() <= stages_.size() && node == stages_[parts.size() - 1].mark.node()) parts.emplace_back();
+  }
+  return parts;
+}
 
 Status Graph::allocate(ComputeMemory& memory) {
   if (ggml_gallocr_alloc_graph(memory.allocator(), graph_)) return {};

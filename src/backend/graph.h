@@ -2,15 +2,19 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <chrono>
+#include <deque>
 #include <functional>
 #include <map>
 #include <string>
+#include <unordered_map>
 #include <utility>
 #include <vector>
 
 #include "backend/device.h"
 #include "backend/store.h"
 #include "backend/weights.h"
+#include "backend/work.h"
 
 namespace vla {
 
@@ -30,6 +34,13 @@ class ComputeMemory {
 
  private:
   ggml_gallocr_ptr allocator_;
+};
+
+/// A named part of a graph that ends where `mark` is computed; `done` is when that was in the last run.
+struct Stage {
+  std::string name;
+  Tensor mark;
+  std::chrono::steady_clock::time_point done;
 };
 
 /// One graph: built once, given memory once, then run as often as wanted. `nn` adds operations through `context()`.
@@ -53,6 +64,15 @@ class Graph {
   void require(Tensor value);
   /// Writes `value` into `target`, a tensor of the store.
   void write(Tensor value, Tensor target);
+  /// Ends a stage: what `value` needs is computed before everything that is built later, and a run notes the time at
+  /// which it is there. Use what this returns instead of `value`.
+  Tensor stage(const std::string& name, Tensor value);
+  const std::deque<Stage>& stages() const { return stages_; }
+
+  /// Says what a custom node does; ggml's own are counted by their shapes (backend/work.h).
+  void note_work(Tensor node, Work work) { noted_work_[node.node()] = work; }
+  /// The work of a run: one entry for each stage, then one for all that follows the last.
+  std::vector<Work> work() const;
 
   /// After everything is built and the store is allocated: first `reserve` for every graph that is to run side by side,
   /// then `allocate` for each. Errors: out_of_memory.
@@ -75,6 +95,8 @@ class Graph {
   int n_thread_ = 0;  // chosen at the first run
   std::map<std::string, Tensor> constants_;
   std::vector<std::pair<std::string, Tensor>> taps_;
+  std::deque<Stage> stages_;  // a deque: the marks in the graph keep pointers to them
+  std::unordered_map<const ggml_tensor*, Work> noted_work_;
 };
 
 }  // namespace vla

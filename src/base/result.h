@@ -9,7 +9,8 @@
 
 namespace vla {
 
-/// One class per exit code and per wire code; `code_name` gives the spelling that users see.
+/// One class per exit code and per code on the wire (src/serve/vla.proto), which are the same number; `code_name` gives
+/// the spelling that users see. The last seven are answers of a server.
 enum class Code {
   internal,
   usage,
@@ -20,16 +21,24 @@ enum class Code {
   out_of_memory,
   device,
   io,
-  mismatch
+  mismatch,
+  bad_request,
+  incompatible,
+  too_large,
+  busy,
+  superseded,
+  late,
+  shutting_down
 };
 
 /// The exit code of the process: 0 is success, each class has its own number.
 constexpr int exit_code(Code code) { return 1 + static_cast<int>(code); }
 
 constexpr const char* code_name(Code code) {
-  constexpr const char* kNames[] = {"internal",   "usage",       "bad_bundle",    "bad_observation",
-                                    "bad_action", "unsupported", "out_of_memory", "device",
-                                    "io",         "mismatch"};
+  constexpr const char* kNames[] = {
+      "internal",   "usage", "bad_bundle",   "bad_observation", "bad_action",   "unsupported", "out_of_memory",
+      "device",     "io",    "mismatch",     "bad_request",     "incompatible", "too_large",   "busy",
+      "superseded", "late",  "shutting_down"};
   return kNames[static_cast<int>(code)];
 }
 

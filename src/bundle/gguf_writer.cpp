@@ -5,8 +5,6 @@
 namespace vla {
 namespace {
 
-constexpr std::size_t kAlignment = 32;  // the format's own default
-
 template <class T>
 void put(std::string& out, T value) {
   out.append(reinterpret_cast<const char*>(&value), sizeof(T));
@@ -17,7 +15,7 @@ void put_text(std::string& out, const std::string& text) {
   out += text;
 }
 
-void pad(std::string& out) { out.append((kAlignment - out.size() % kAlignment) % kAlignment, '\0'); }
+void pad(std::string& out) { out.append((kGgufAlignment - out.size() % kGgufAlignment) % kGgufAlignment, '\0'); }
 
 /// Writes a value behind the number of its type, as the format counts types.
 struct PutValue {
@@ -52,7 +50,7 @@ std::uint32_t ggml_type_of(DType type) {
 
 }  // namespace
 
-std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors) {
+std::string write_gguf_head(const Keys& keys, std::span<const TensorInfo> tensors) {
   std::string out = "GGUF";
   put<std::uint32_t>(out, 3), put<std::uint64_t>(out, tensors.size()), put<std::uint64_t>(out, keys.all().size());
   for (const auto& [key, value] : keys.all()) put_text(out, key), std::visit(PutValue{out}, value);
@@ -62,9 +60,14 @@ std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors) {
     put<std::uint32_t>(out, static_cast<std::uint32_t>(tensor.shape.size()));
     for (std::int64_t dim : tensor.shape) put(out, dim);
     put(out, ggml_type_of(tensor.type)), put(out, offset);
-    offset += (tensor.data.size() + kAlignment - 1) / kAlignment * kAlignment;
+    offset += (tensor.data.size() + kGgufAlignment - 1) / kGgufAlignment * kGgufAlignment;
   }
   pad(out);
+  return out;
+}
+
+std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors) {
+  std::string out = write_gguf_head(keys, tensors);
   for (const TensorInfo& tensor : tensors) {
     out.append(reinterpret_cast<const char*>(tensor.data.data()), tensor.data.size());
     pad(out);

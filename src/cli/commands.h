@@ -15,5 +15,8 @@ using Command = std::function<Status()>;
 Command add_run(CLI::App& app);
 Command add_inspect(CLI::App& app);
 Command add_compare(CLI::App& app);
+Command add_serve(CLI::App& app);
+Command add_keygen(CLI::App& app);
+Command add_bench(CLI::App& app);
 
 }  // namespace vla::cli

@@ -22,7 +22,7 @@ constexpr const char* kFooter = R"(Start here:
 
 Bundles are made with vla-convert (docs/converting.md).
 Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation, 5 bad_action, 6 unsupported, 7 out_of_memory,
-8 device, 9 io, 10 mismatch.)";
+8 device, 9 io, 10 mismatch; 11 and up are answers of a server (docs/protocol.md).)";
 
 int fail(const vla::Error& error) {
   fmt::print(stderr, "error: {}: {}\n", vla::code_name(error.code), error.message());
@@ -57,6 +57,9 @@ int run(int argc, char** argv) {
   choose("run", vla::cli::add_run(app));
   choose("inspect", vla::cli::add_inspect(app));
   choose("compare", vla::cli::add_compare(app));
+  choose("serve", vla::cli::add_serve(app));
+  choose("keygen", vla::cli::add_keygen(app));
+  choose("bench", vla::cli::add_bench(app));
 
   try {
     app.parse(argc, argv);

@@ -21,10 +21,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   engine->tap_pattern_ = options.tap_pattern;
   VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
-  engine->plans_ = std::make_unique<Plans>(PlanContext{*engine->policy_, *engine->weights_, engine->device_,
-                                                       engine->solver_, engine->conditions_, engine->d_action_,
-                                                       engine->horizon_, engine->tap_pattern_});
-  VLA_CHECK(engine->warm_up());
+  VLA_CHECK(engine->make_plans());
   return engine;
 }
 
@@ -61,13 +58,24 @@ Status Engine::make_conditions() {
 }
 
 /// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
-Status Engine::warm_up() {
+Status Engine::make_plans() {
+  last_plan_ = nullptr;
+  plans_ = std::make_unique<Plans>(
+      PlanContext{*policy_, *weights_, device_, solver_, conditions_, d_action_, horizon_, tap_pattern_});
   const Recipe& recipe = processor_.recipe();
   const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
                               static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
   VLA_CHECK(policy_->check(largest));
   const auto plan = plans_->for_shape(largest);
   return plan ? Status() : Status(plan.error());
+}
+
+Status Engine::set_steps(int n_step) {
+  Keys keys = bundle_.keys();
+  keys.set("solver.steps", std::int64_t{n_step});
+  VLA_TRY(solver_, Solver::read(keys));
+  VLA_CHECK(make_conditions());
+  return make_plans();
 }
 
 Result<std::vector<float>> Engine::start(const Noise& noise) const {
@@ -114,13 +122,16 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   VLA_CHECK(processor_.encode_text(observation, inputs_));
   clock.lap(chunk.timing, "tokenize");
   VLA_TRY(const std::vector<float> x, start(noise));
+  last_plan_ = nullptr;  // a plan of another shape may take its place
   VLA_TRY(Plan * plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view,
                                           static_cast<int>(inputs_.tokens.size()), d_state_}));
+  last_plan_ = plan;
   plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
   plan->set_x(x);
   record_inputs(chunk.taps);
   clock.lap(chunk.timing, "plan");
   VLA_CHECK(plan->run_prefix(device_));
+  for (const Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
   clock.lap(chunk.timing, "prefix");
   plan->collect_prefix_taps(chunk.taps);
   for (int k = 0; k < solver_.n_step; ++k) {

@@ -49,6 +49,12 @@ class Engine {
   /// Errors: bad_observation, bad_action (a number that is not finite came out), device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise);
 
+  /// Solves in another number of steps than the bundle asks for, to measure what a step costs. Errors: bad_bundle,
+  /// out_of_memory, device.
+  Status set_steps(int n_step);
+  /// What the network computed for the last observation; empty before the first.
+  StageWork work() const { return last_plan_ != nullptr ? last_plan_->work(solver_.n_step) : StageWork(); }
+
   const Bundle& bundle() const { return bundle_; }
   const Processor& processor() const { return processor_; }
   const Device& device() const { return device_; }
@@ -63,7 +69,7 @@ class Engine {
       : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
   Status load_policy(bool dry);
   Status make_conditions();
-  Status warm_up();
+  Status make_plans();
   Result<std::vector<float>> start(const Noise& noise) const;
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
@@ -83,6 +89,7 @@ class Engine {
   std::unique_ptr<Store> tables_;
   Tensor conditions_;
   std::unique_ptr<Plans> plans_;
+  const Plan* last_plan_ = nullptr;
   Inputs inputs_;  // of the last observation; its vectors keep their memory
 };
 

@@ -83,6 +83,17 @@ Status Plan::run_step(const Device& device, int k) {
   return step_.run(device);
 }
 
+StageWork Plan::work(int n_step) const {
+  StageWork parts;
+  for (const Stage& stage : prefix_.stages()) parts.emplace_back(stage.name, Work());
+  parts.emplace_back("prefix", Work());
+  const std::vector<Work> prefix = prefix_.work();
+  for (std::size_t i = 0; i < prefix.size(); ++i) parts[i].second = prefix[i];
+  const Work step = step_.work().front();
+  parts.emplace_back("steps", Work{n_step * step.flop, n_step * step.bytes});
+  return parts;
+}
+
 void Plan::collect_prefix_taps(std::vector<Tap>& taps) const {
   for (const auto& [path, tensor] : prefix_.taps()) taps.push_back(read_tap(path, tensor));
 }

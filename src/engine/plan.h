@@ -11,6 +11,9 @@
 
 namespace vla {
 
+/// Work by stage, under the names that Timing has.
+using StageWork = std::vector<std::pair<std::string, Work>>;
+
 /// What every plan is built from and shares.
 struct PlanContext {
   const Policy& policy;
@@ -37,6 +40,12 @@ class Plan {
   Status run_prefix(const Device& device) { return prefix_.run(device); }
   /// Solver step k: x <- x + dt * velocity(x, t_k).
   Status run_step(const Device& device, int k);
+
+  /// The stages that the policy's prefix names, with the times of the last run.
+  const std::deque<Stage>& prefix_stages() const { return prefix_.stages(); }
+
+  /// What the network computes for one observation: the prefix, stage by stage, and `n_step` solver steps.
+  StageWork work(int n_step) const;
 
   /// What the last run recorded; of a step graph the paths are `step.<k>.<path>`.
   void collect_prefix_taps(std::vector<Tap>& taps) const;

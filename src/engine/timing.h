@@ -15,14 +15,17 @@ using Timing = std::vector<std::pair<std::string, double>>;
 /// Cuts the time since the last cut into named stages.
 class StageClock {
  public:
-  void lap(Timing& timing, const std::string& stage) {
-    const auto now = std::chrono::steady_clock::now();
-    timing.emplace_back(stage, std::chrono::duration<double, std::milli>(now - last_).count());
-    last_ = now;
+  using Time = std::chrono::steady_clock::time_point;
+
+  void lap(Timing& timing, const std::string& stage) { lap(timing, stage, std::chrono::steady_clock::now()); }
+  /// A stage that ended at a time noted elsewhere.
+  void lap(Timing& timing, const std::string& stage, Time end) {
+    timing.emplace_back(stage, std::chrono::duration<double, std::milli>(end - last_).count());
+    last_ = end;
   }
 
  private:
-  std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
+  Time last_ = std::chrono::steady_clock::now();
 };
 
 }  // namespace vla

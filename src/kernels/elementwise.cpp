@@ -5,6 +5,9 @@
 #include <bit>
 #include <cstdint>
 
+#include "kernels/cpu_kernels.h"
+#include "kernels/custom.h"
+
 // One source, one clone per instruction set, chosen at run time by the loader. The sanitizers instrument the resolver
 // before they are ready, so their builds keep the baseline.
 #if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
@@ -15,12 +18,6 @@
 
 namespace vla::kernels {
 namespace {
-
-/// The part of [0, count) that thread `ith` of `nth` works on.
-struct Range {
-  std::int64_t begin, end;
-  Range(std::int64_t count, int ith, int nth) : begin(count * ith / nth), end(count * (ith + 1) / nth) {}
-};
 
 /// exp(x) to about one unit in the last place, written so that compilers vectorize it: x = n ln2 + r, a polynomial for
 /// e^r (the Taylor series to the seventh power; |r| <= ln2 / 2), and n added to the exponent. Clamped where float32
@@ -40,6 +37,10 @@ inline float fast_exp(float x) {
   return p * std::bit_cast<float>((static_cast<std::int32_t>(n) + 127) << 23);
 }
 
+struct MapParams {
+  CpuKernels::Map map;
+};
+
 VLA_CLONES void gelu_row(const float* x, float* y, std::int64_t count) {
   for (std::int64_t i = 0; i < count; ++i) {
     // 0.5 (1 + tanh(u)) = 1 / (1 + exp(-2u)): one exponential and one division.
@@ -48,10 +49,10 @@ VLA_CLONES void gelu_row(const float* x, float* y, std::int64_t count) {
   }
 }
 
-void gelu_task(ggml_tensor* y, const ggml_tensor* x, int ith, int nth, void*) {
-  const Range range(ggml_nelements(x), ith, nth);
-  gelu_row(static_cast<const float*>(x->data) + range.begin, static_cast<float*>(y->data) + range.begin,
-           range.end - range.begin);
+void map_task(ggml_tensor* y, int ith, int nth, void* user) {
+  const Range range(ggml_nelements(y), ith, nth);
+  static_cast<const MapParams*>(user)->map(values(y->src[0]) + range.begin, static_cast<float*>(y->data) + range.begin,
+                                           range.end - range.begin);
 }
 
 VLA_CLONES void rotate_head(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half) {
@@ -61,27 +62,33 @@ VLA_CLONES void rotate_head(const float* x, const float* cosine, const float* si
   }
 }
 
-void rotate_task(ggml_tensor* y, const ggml_tensor* x, const ggml_tensor* table, int ith, int nth, void*) {
-  const std::int64_t d = x->ne[0], n_head = x->ne[1];
-  const Range tokens(x->ne[2], ith, nth);
-  for (std::int64_t token = tokens.begin; token < tokens.end; ++token) {
-    const float* cosine = static_cast<const float*>(table->data) + token * d;
-    for (std::int64_t head = 0; head < n_head; ++head) {
-      const std::int64_t offset = (token * n_head + head) * d;
-      rotate_head(static_cast<const float*>(x->data) + offset, cosine, cosine + d / 2,
-                  static_cast<float*>(y->data) + offset, d / 2);
-    }
+struct RotateParams {
+  decltype(CpuKernels::rotate_half) rotate;
+};
+
+void rotate_task(ggml_tensor* y, int ith, int nth, void* user) {
+  const ggml_tensor *x = y->src[0], *table = y->src[1];
+  const std::int64_t d = x->ne[0];
+  const Range rows(ggml_nrows(x), ith, nth);
+  for (std::int64_t row = rows.begin; row < rows.end; ++row) {
+    const float* cosine = values(table) + row / x->ne[1] * d;
+    static_cast<const RotateParams*>(user)->rotate(row_of(x, row), cosine, cosine + d / 2,
+                                                   static_cast<float*>(y->data) + row * d, d / 2);
   }
 }
 
 }  // namespace
 
 Tensor gelu_tanh(Graph& g, Tensor x) {
-  return ggml_map_custom1(g.context(), x.node(), gelu_task, GGML_N_TASKS_MAX, nullptr);
+  const CpuKernels* kernels = cpu_kernels(g.isa());
+  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x}, map_task,
+                keep(g, MapParams{kernels != nullptr ? kernels->gelu_tanh : gelu_row}));
 }
 
 Tensor rotate_half(Graph& g, Tensor x, Tensor table) {
-  return ggml_map_custom2(g.context(), x.node(), table.node(), rotate_task, GGML_N_TASKS_MAX, nullptr);
+  const CpuKernels* kernels = cpu_kernels(g.isa());
+  return custom(g, {x.dim(0), x.dim(1), x.dim(2)}, {x, table}, rotate_task,
+                keep(g, RotateParams{kernels != nullptr ? kernels->rotate_half : rotate_head}));
 }
 
 }  // namespace vla::kernels

@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include "kernels/norm.h"
+
 namespace vla {
 
 AdaptiveRmsNorm::AdaptiveRmsNorm(const Scope& s, int d, int d_condition, float eps)
@@ -20,9 +22,8 @@ Tensor AdaptiveRmsNorm::modulation(Graph& g, Tensor condition) const {
 }
 
 Tensor AdaptiveRmsNorm::forward(Graph& g, Tensor x, Tensor modulation) const {
-  ggml_context* c = g.context();
   const Tensor factor = slice_features(g, modulation, 0, d_), shift = slice_features(g, modulation, d_, d_);
-  return ggml_add(c, ggml_mul(c, ggml_rms_norm(c, x.node(), eps_), factor.node()), shift.node());
+  return kernels::rms_norm(g, x, factor, shift, eps_);
 }
 
 Tensor AdaptiveRmsNorm::gate(Graph& g, Tensor modulation) const { return slice_features(g, modulation, 2 * d_, d_); }

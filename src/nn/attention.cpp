@@ -9,6 +9,8 @@
 #include <limits>
 #include <numeric>
 
+#include "kernels/attention.h"
+
 namespace vla {
 namespace {
 
@@ -27,6 +29,7 @@ Tensor make_mask(Graph& g, const std::string& key, int n_key, int n_query, Sees 
 }  // namespace
 
 Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) {
+  if (kernels::has_attention(g, q.dim(0))) return kernels::attention(g, q, k, v, mask);
   ggml_context* c = g.context();
   const float scale = 1.0f / std::sqrt(static_cast<float>(q.dim(0)));
   ggml_tensor* query = ggml_permute(c, q.node(), 0, 2, 1, 3);                // [d_head, n_query, n_head, n_batch]

@@ -55,7 +55,8 @@ class SmolVla final : public Policy {
   Tensor condition(Graph& g, std::span<const float> times) const override { return time_(g, times); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
-    const Tensor image = flatten_views(g, connector_(g, vision_(g, in.images)));  // [d_model, n_view * n_token]
+    const Tensor view = g.stage("vision", connector_(g, vision_(g, in.images)));  // [d_model, n_token, n_view]
+    const Tensor image = flatten_views(g, view);                                  // [d_model, n_token * n_view]
     const Tensor text = lm_.embed(g, in.tokens);                                  // [d_model, n_text]
     const Tensor state = state_in_(g, in.state);                                  // [d_model, 1]
     const Tensor x =

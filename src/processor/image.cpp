@@ -20,7 +20,8 @@ Status check_size(std::int64_t width, std::int64_t height, const std::string& wh
   if (width < 1 || height < 1) return refused(where, "an image with at least one pixel", found);
   // Divided, because the product of two hostile numbers may not fit.
   if (width > limits.max_pixels / height)
-    return refused(where, fmt::format("at most {} pixels", limits.max_pixels), found, "scale the image down");
+    return Error{limits.over, where, fmt::format("at most {} pixels", limits.max_pixels), found,
+                 "scale the image down"};
   return {};
 }
 

@@ -22,6 +22,7 @@ struct Frame {
 
 struct ImageLimits {
   std::int64_t max_pixels = 64'000'000;  // compared with a file's header before memory is taken
+  Code over = Code::bad_observation;     // the class of the refusal of a larger one
 };
 
 /// Decodes a PNG, a JPEG or a NumPy array file (uint8 or float32, (height, width, 3), C order), told apart by content.

@@ -10,7 +10,7 @@ import pictures
 import pytest
 from golden_cases import NAMES, Golden, tensors
 
-STAGES = ["load", "decode", "preprocess", "tokenize", "plan", "prefix", "steps", "postprocess"]
+STAGES = ["load", "decode", "preprocess", "tokenize", "plan", "vision", "prefix", "steps", "postprocess"]
 
 
 def actions(answer):

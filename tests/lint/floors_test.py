@@ -23,9 +23,10 @@ ROOMS = {
     "modules": {"nn", "base", "bundle", "backend"},
     "policies": {"modules", "nn", "base", "bundle", "backend"},
     "engine": {"policies", "modules", "nn", "processor"} | GROUND,
+    "bench": {"engine", "policies", "processor"} | GROUND,
     "serve": {"engine", "policies", "processor", "bundle", "base"},
     "capi": {"engine", "policies", "processor", "bundle", "base"},
-    "cli": {"engine", "policies", "processor", "bundle", "base", "serve"},  # `vla serve` starts the server
+    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "bench"},  # doors that the program opens
 }
 # Libraries that belong to some rooms: the graph language to nn and below, its machinery to backend alone. The engine's
 # taps are a GGUF file of tensors.
@@ -35,8 +36,10 @@ LIBRARIES = [
     (re.compile(r"ggml-cpp\.h"), {"backend", "engine"}),
     (re.compile(r"ggml-.*\.h"), {"backend"}),
     (re.compile(r"CLI/.*"), {"cli"}),
-    (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve"}),
-    (re.compile(r"(jpeglib|png)\.h"), {"processor"}),
+    (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve", "bench"}),
+    (re.compile(r"jpeglib\.h"), {"processor"}),
+    (re.compile(r"png\.h"), {"processor", "bench"}),
+    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*"), {"serve"}),
 ]
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 

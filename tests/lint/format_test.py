@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 RELEASE = "14"
-SOURCES = {".h", ".cpp", ".inc", ".cu", ".cuh", ".py", ".sh", ".cmake"}
+SOURCES = {".h", ".c", ".cpp", ".inc", ".cu", ".cuh", ".py", ".sh", ".cmake"}
 NAMED = {"CMakeLists.txt", "Makefile"}
 COPYRIGHT, LICENCE = "SPDX-FileCopyrightText: The vla.cpp authors", "SPDX-License-Identifier: Apache-2.0"
 
@@ -66,7 +66,7 @@ class Format(unittest.TestCase):
         if reason:
             print(f"SKIP test_cpp_sources_are_as_clang_format_writes_them: {reason}")
             self.skipTest(reason)
-        files = [str(f) for f in tracked("src", "tests", "include") if f.suffix in (".h", ".cpp")]
+        files = [str(f) for f in tracked("src", "tests", "include", "examples") if f.suffix in (".h", ".c", ".cpp")]
         result = subprocess.run([program, "--dry-run", "-Werror", "--style=file", *files], capture_output=True, text=True)
         wrong = sorted({line.split(":")[0].removeprefix(f"{ROOT}/") for line in result.stderr.splitlines() if ": error:" in line})
         self.assertEqual(result.returncode, 0, "\nnot as clang-format writes them (run: make format):\n" + "\n".join(wrong))

@@ -11,9 +11,11 @@
 
 namespace vla::test {
 
-/// Builds a graph on these parameters, runs it, and returns the values of what `build` returns.
-inline std::vector<float> run_graph(const ParamList& params, const std::function<Tensor(Graph&)>& build) {
-  const auto device = Device::cpu(2, "");
+/// Builds a graph on these parameters, runs it, and returns the values of what `build` returns. An empty name takes the
+/// best kernels that the machine has.
+inline std::vector<float> run_graph(const ParamList& params, const std::function<Tensor(Graph&)>& build,
+                                    const std::string& kernels = "") {
+  const auto device = Device::cpu(2, kernels);
   REQUIRE(device.ok());
   const auto weights = Weights::load(params, *device, Weights::Fill::yes);
   REQUIRE(weights.ok());
@@ -29,8 +31,8 @@ inline std::vector<float> run_graph(const ParamList& params, const std::function
 }
 
 /// The same without parameters.
-inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build) {
-  return run_graph(ParamList(Keys(), nullptr), build);
+inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build, const std::string& kernels = "") {
+  return run_graph(ParamList(Keys(), nullptr), build, kernels);
 }
 
 /// Deterministic values in [-range, range].

@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a policy answers to one observation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Dict, Optional, Tuple
+
+import numpy as np
+
+from .spec import BundleInfo
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """Actions for the next `horizon` control steps; `np.asarray(chunk)` is float32 (horizon, d_action) in world units.
+
+    names            one per column
+    rate_hz          rows per second that the policy was trained for; 0 where the bundle does not say
+    timing           milliseconds per stage, in the order in which they ran
+    queue_ms         milliseconds that the request waited at a server; 0 in process
+    seed             what the noise was drawn from; None where the noise was given
+    notes            what the user must be told, e.g. that the instruction was cut
+    capture_time_ns  as given with the observation; None where it was not
+    """
+
+    actions: np.ndarray
+    names: Tuple[str, ...]
+    rate_hz: float
+    bundle: BundleInfo
+    timing: Dict[str, float] = field(default_factory=dict)
+    queue_ms: float = 0.0
+    seed: Optional[int] = None
+    notes: Tuple[str, ...] = ()
+    capture_time_ns: Optional[int] = None
+
+    def __array__(self, dtype=None, copy=None):
+        """NumPy's protocol, that of release 1 (no `copy`) and of release 2."""
+        if dtype is not None and np.dtype(dtype) != self.actions.dtype:
+            if copy is False:
+                raise ValueError(f"a chunk is {self.actions.dtype}; as {np.dtype(dtype)} it must be copied")
+            return self.actions.astype(dtype)
+        return self.actions.copy() if copy else self.actions
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def __getitem__(self, index):
+        return self.actions[index]

@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A policy at `vla serve`."""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+import time
+from typing import Any, Callable, Dict, Mapping, Optional, Union
+
+import zmq
+from google.protobuf.message import DecodeError
+
+from . import __version__, wire
+from .chunk import Chunk
+from .connection import Connection, curve_keys
+from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
+from .observation import Image, State, check_start
+from .pending import Health, Pending
+from .spec import Spec
+
+
+class Client:
+    """Speaks with a server: `act` sends an observation and returns a chunk.
+
+        with vla_cpp.Client("tcp://127.0.0.1:5555") as policy:
+            chunk = policy.act(images={"top": frame}, state=q, text="open the drawer")
+
+    address             tcp://HOST:PORT or ipc://PATH
+    timeout             seconds that a call may take, connecting included
+    server_key          for a server with CURVE: its public key, and with it
+    secret_key          this client's secret key: 40 characters each, or the files of `vla keygen` (server.public, robot.secret)
+
+    The first call connects. When the server goes away, or does not answer in time, the call raises and the next one connects anew,
+    so that a program survives a restart of its server; a server that comes back with other weights is refused with Incompatible.
+
+    Threads may share a client; their calls take turns. But a server keeps only the newest waiting observation of each client, so
+    robots that act at the same time need a client each. A child process cannot use the client of its parent, nor can it be pickled.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        timeout: float = 10.0,
+        server_key: Union[str, os.PathLike, None] = None,
+        secret_key: Union[str, os.PathLike, None] = None,
+    ) -> None:
+        if not timeout > 0:
+            raise UsageError("timeout", "seconds above 0", str(timeout))
+        if (server_key is None) != (secret_key is None):
+            raise UsageError("CURVE", "server_key and secret_key", "one of them")
+        self.address, self.timeout = address, timeout
+        self._curve = None if server_key is None else curve_keys(server_key, secret_key)
+        self._pid = os.getpid()
+        self._lock = threading.RLock()
+        self._context: Optional[zmq.Context] = zmq.Context()
+        self._connection: Optional[Connection] = None
+        self._pending: Dict[int, Pending] = {}
+        # Ids start anywhere, so that two clients, or two lives of one, hardly ever use the same.
+        self._last_id = random.SystemRandom().getrandbits(62)
+        self._spec: Optional[Spec] = None
+        self._limits: Any = None
+        try:
+            self._connect()
+        except VlaError:
+            self.close()
+            raise
+
+    # --- what a user calls ---------------------------------------------------------------------------------------------------
+
+    @property
+    def spec(self) -> Spec:
+        """What the policy takes and gives; asked for once. Errors: Timeout, Disconnected, Incompatible."""
+        with self._lock:
+            if self._spec is None:
+                description = self._ask("description", self.timeout, _describe).result()
+                self._spec, self._limits = wire.spec_of(description), description.limits
+            return self._spec
+
+    def act(
+        self,
+        *,
+        images: Mapping[str, Image],
+        state: State,
+        text: str,
+        seed: Optional[int] = None,
+        noise: object = None,
+        deadline_ms: Optional[float] = None,
+        capture_time_ns: Optional[int] = None,
+        timeout: Optional[float] = None,
+    ) -> Chunk:
+        """One observation in, one action chunk out.
+
+        images           frames by view: uint8 (height, width, 3) RGB of any size, the bytes of a JPEG or PNG file, or None for a
+                         camera that the robot does not have
+        state            world units: vectors by name, or one vector where the policy has one state
+        text             the instruction, as a person says it
+        seed, noise      where the solver starts: a number, or float32 (horizon, d_noise); with neither the server draws a seed and
+                         the chunk tells it
+        deadline_ms      after so many milliseconds at the server the answer is worthless and not computed; the timeout by default
+        capture_time_ns  when the frames were taken; comes back in the chunk
+        timeout          seconds, instead of the client's
+
+        Errors: BadObservation (what the policy cannot take, by name), Timeout, Disconnected, Superseded, Late, Busy, TooLarge,
+        Incompatible, ShuttingDown, and what the runtime itself may raise: BadAction, DeviceError, OutOfMemory, InternalError.
+        """
+        return self.submit(
+            images=images, state=state, text=text, seed=seed, noise=noise,
+            deadline_ms=deadline_ms, capture_time_ns=capture_time_ns, timeout=timeout,
+        ).result()  # fmt: skip
+
+    def submit(
+        self,
+        *,
+        images: Mapping[str, Image],
+        state: State,
+        text: str,
+        seed: Optional[int] = None,
+        noise: object = None,
+        deadline_ms: Optional[float] = None,
+        capture_time_ns: Optional[int] = None,
+        timeout: Optional[float] = None,
+    ) -> Pending:
+        """Sends what `act` sends and returns at once: `done()` of the result never waits, `result()` is the chunk.
+
+        Only the first call of a client may wait, for the description of the policy.
+        """
+        check_start(seed, noise)
+        timeout = self.timeout if timeout is None else timeout
+        spec = self.spec
+
+        def write(request: Any) -> bytes:
+            return wire.act_bytes(
+                request, spec, self._limits, images=images, state=state, text=text, seed=seed, noise=noise,
+                deadline_ms=timeout * 1000 if deadline_ms is None else deadline_ms, capture_time_ns=capture_time_ns,
+            )  # fmt: skip
+
+        return self._ask("chunk", timeout, write)
+
+    def health(self, timeout: Optional[float] = None) -> Health:
+        """Answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""
+        return self._ask("health", self.timeout if timeout is None else timeout, _health).result()
+
+    def close(self) -> None:
+        """Ends the connection; requests under way end with Disconnected. A second call does nothing."""
+        if os.getpid() != self._pid:
+            return
+        with self._lock:
+            self._drop(Disconnected(self.address, "", "the client was closed"))
+            if self._context is not None:
+                self._context.term()
+                self._context = None
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if getattr(self, "_context", None) is not None:
+            self.close()
+
+    def __reduce__(self):
+        raise UsageError("Client", "use in the process that made it", "pickling", "make one per process")
+
+    # --- requests and answers ------------------------------------------------------------------------------------------------
+
+    def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes]) -> Pending:
+        """Sends a request that `write` completes. kind: the field of the Response that answers it."""
+        with self._lock:
+            self._connect()
+            request = self._new_request()
+            data = write(request)
+            pending = Pending(self, request.request_id, kind, timeout)
+            self._connection.send(data)
+            self._pending[pending._id] = pending
+            return pending
+
+    def _new_request(self) -> Any:
+        self._last_id += 1
+        return wire.new_request(self._last_id)
+
+    def _connect(self) -> None:
+        """A connection that is alive as far as one can know, greeted. Does not wait for anything."""
+        self._check_process()
+        if self._context is None:
+            raise Disconnected(self.address, "an open client", "one that was closed")
+        if self._connection is not None:
+            self._pump(0.0)
+        if self._connection is None:
+            self._connection = Connection(self._context, self.address, self._curve)
+            hello = self._new_request()
+            hello.hello.min_version = hello.hello.max_version = wire.PROTOCOL_VERSION
+            hello.hello.client_name, hello.hello.client_version = "vla-cpp-python", __version__
+            self._connection.send(hello.SerializeToString())
+            if self._spec is not None:  # the server may be another one by now
+                self._connection.send(_describe(self._new_request()))
+
+    def _check_process(self) -> None:
+        if os.getpid() != self._pid:
+            raise UsageError("Client", "use in the process that made it", "another process", "make one per process")
+
+    def _settle(self, pending: Pending, seconds: float) -> bool:
+        """Whether the request is over, after waiting at most so long. Threads that wait take turns, in short slices."""
+        with self._lock:
+            if not pending._is_over and self._connection is not None:
+                self._check_process()
+                self._pump(min(max(seconds, 0.0), 0.05))
+            if not pending._is_over and time.monotonic() >= pending._until:
+                # A fresh socket for what comes next: this one may lead to a host that will never answer.
+                hint = "is the server up, and its address right? `health()` tells; or give more time"
+                pending._error = Timeout(self.address, f"an answer within {pending._timeout:g} s", "none", hint)
+                del self._pending[pending._id]
+                self._drop(
+                    Disconnected(self.address, "", "another request timed out, and with it the connection ended")
+                )
+            return pending._is_over
+
+    def _pump(self, seconds: float) -> None:
+        """Takes what has come and hands it to those who asked."""
+        try:
+            for frames in self._connection.receive(seconds):
+                self._take(frames)
+        except VlaError as error:
+            self._drop(error)
+
+    def _take(self, frames: list) -> None:
+        try:
+            if len(frames) != 1:
+                raise DecodeError(f"{len(frames)} frames")
+            response = wire.Response.FromString(frames[0])
+        except DecodeError as error:
+            raise Incompatible(
+                self.address, "answers of vla serve", f"other bytes ({error})", "what listens there?"
+            ) from None
+        kind = response.WhichOneof("kind")
+        error = wire.exception_of(response.error) if kind == "error" else None
+        if isinstance(error, Incompatible) or (error and response.request_id == 0):
+            raise error  # the server could not read what it got, or never will: nothing else will be answered either
+        if response.protocol_version != wire.PROTOCOL_VERSION:
+            found = f"version {response.protocol_version}"
+            raise Incompatible(self.address, f"answers of protocol version {wire.PROTOCOL_VERSION}", found)
+        if kind in ("description", "chunk"):
+            self._check_bundle(getattr(response, kind).bundle)
+        pending = self._pending.pop(response.request_id, None)
+        if pending is None:  # to a greeting, or to a request that nobody waits for
+            return
+        try:
+            if error:
+                raise error
+            pending._answer = self._read(pending, kind, response)
+        except VlaError as problem:
+            pending._error = problem
+
+    def _read(self, pending: Pending, kind: Optional[str], response: Any) -> Any:
+        if kind != pending._kind:
+            raise Incompatible(self.address, f"an answer of the kind {pending._kind}", kind or "none")
+        if kind == "health":
+            return Health(**{f.name: getattr(response.health, f.name) for f in response.health.DESCRIPTOR.fields})
+        if kind == "description":
+            return response.description
+        return wire.chunk_of(response.chunk)
+
+    def _check_bundle(self, bundle: Any) -> None:
+        known = self._spec.bundle if self._spec else bundle
+        if bundle.checksum != known.checksum:
+            hint = "make a new Client, and read its spec"
+            raise Incompatible(
+                self.address, f"{known.name} ({known.checksum})", f"{bundle.name} ({bundle.checksum})", hint
+            )
+
+    def _drop(self, error: VlaError) -> None:
+        """Ends the connection, and with it every request under way."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        for pending in self._pending.values():
+            pending._error = error
+        self._pending.clear()
+
+
+def _describe(request: Any) -> bytes:
+    request.describe.SetInParent()
+    return request.SerializeToString()
+
+
+def _health(request: Any) -> bytes:
+    request.health.SetInParent()
+    return request.SerializeToString()

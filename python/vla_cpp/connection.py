@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""One connection to a server: a DEALER socket, and a monitor that tells when the other side is gone.
+
+A connection is never repaired. After a loss or a timeout it is closed and a fresh one made, so that nothing that was meant for an
+earlier request can come out of it.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from pathlib import Path
+from typing import List, Optional, Tuple, Union
+
+import zmq
+from zmq.utils import z85
+from zmq.utils.monitor import recv_monitor_message
+
+from .errors import Disconnected, UsageError
+
+HEARTBEAT_MS = 1000  # a server that is cut off, and so cannot say that it goes, is missed after three of these
+RECONNECT_MS = 100
+
+_REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+
+
+def curve_keys(server: Union[str, os.PathLike], secret: Union[str, os.PathLike]) -> Tuple[bytes, bytes, bytes]:
+    """What a connection takes, from keys or the files that hold them. Errors: UsageError, which does not show the key."""
+    server_key, secret_key = _key("server_key", server), _key("secret_key", secret)
+    return server_key, zmq.curve_public(secret_key), secret_key
+
+
+def _key(where: str, given: Union[str, os.PathLike]) -> bytes:
+    text = given
+    if not isinstance(given, str) or len(given) != 40:
+        try:
+            text = Path(given).read_text(encoding="ascii").strip()
+        except (OSError, ValueError, TypeError) as error:
+            raise UsageError(where, "a key of 40 characters, or the file of one", type(error).__name__) from None
+    try:
+        if len(text) != 40 or len(z85.decode(text)) != 32:
+            raise ValueError
+        return text.encode()
+    except (ValueError, KeyError, struct.error):
+        raise UsageError(where, "a key of 40 characters, or the file of one", "something else", "vla keygen") from None
+
+
+class Connection:
+    def __init__(self, context: zmq.Context, address: str, curve: Optional[Tuple[bytes, bytes, bytes]]) -> None:
+        """curve: the server's public key, our public key, our secret key. Errors: UsageError for an impossible address."""
+        self._address = address
+        self._curve = bool(curve)
+        self._socket = context.socket(zmq.DEALER)
+        self._socket.linger = 0
+        self._socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
+        self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * HEARTBEAT_MS)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
+        self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED | _REFUSED)
+        self._poller = zmq.Poller()
+        self._poller.register(self._socket, zmq.POLLIN)
+        self._poller.register(self._monitor, zmq.POLLIN)
+        try:
+            if curve:
+                self._socket.curve_serverkey, self._socket.curve_publickey, self._socket.curve_secretkey = curve
+            self._socket.connect(address)
+        except (zmq.ZMQError, ValueError) as error:
+            self.close()
+            raise UsageError(address, "an address like tcp://127.0.0.1:5555", str(error)) from None
+
+    def send(self, data: bytes) -> None:
+        """Never waits: what has no connection yet lies in the socket's queue. Errors: Disconnected for a full queue."""
+        try:
+            self._socket.send(data, zmq.DONTWAIT, copy=False)
+        except zmq.Again:
+            raise Disconnected(self._address, "a server that reads", "a full queue", "ask less often") from None
+
+    def receive(self, seconds: float) -> List[List[bytes]]:
+        """Waits for the first message at most so long, and returns all that have come. Errors: Disconnected.
+
+        What arrived before the loss is returned first; the next call tells of the loss.
+        """
+        self._poller.poll(max(0, int(seconds * 1000 + 0.999)))
+        messages = []
+        while self._socket.poll(0):
+            messages.append(self._socket.recv_multipart())
+        if not messages:
+            self._check()
+        return messages
+
+    def _check(self) -> None:
+        while self._monitor.poll(0):
+            event = recv_monitor_message(self._monitor)["event"]
+            if event & _REFUSED:
+                keys = (
+                    "check the keys, and that the server admits this client's"
+                    if self._curve
+                    else "does the server want CURVE keys?"
+                )
+                raise Disconnected(self._address, "a handshake", "a refusal", keys)
+            raise Disconnected(self._address, "", "the connection was lost", "the next call connects anew")
+
+    def close(self) -> None:
+        self._socket.disable_monitor()
+        self._monitor.close(0)
+        self._socket.close(0)

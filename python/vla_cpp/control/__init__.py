@@ -1,0 +1,9 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Running action chunks on a robot: when to ask, which row to command, what to do when the answer is late (docs/control.md)."""
+
+from .blend import Blend, CrossFade, Ensemble
+from .loop import ChunkLoop
+from .schedule import Action, ChunkSchedule
+
+__all__ = ["Action", "Blend", "ChunkLoop", "ChunkSchedule", "CrossFade", "Ensemble"]

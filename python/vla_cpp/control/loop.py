@@ -1,0 +1,239 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The driver of a ChunkSchedule: asks a policy, keeps the time."""
+
+from __future__ import annotations
+
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Callable, Dict, Mapping, Optional, Union
+
+import numpy as np
+
+from ..errors import Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout, UsageError, VlaError
+from .blend import Blend, CrossFade, Ensemble
+from .schedule import Action, ChunkSchedule, OnLate, late_rule
+
+Observation = Union[Mapping[str, Any], Callable[[], Mapping[str, Any]]]
+
+# What another observation may well survive. Everything else would come again, and is raised.
+PASSING = (Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout)
+ACT_DECAY = 0.01
+
+
+class ChunkLoop:
+    """Turns observations into one action per control period, with a policy that answers in chunks.
+
+        loop = ChunkLoop(policy, rate_hz=20, replan_every=8, mode="async", blend="ensemble", on_late="hold")
+        while running:
+            action = loop.step(lambda: dict(images=cameras(), state=joints(), text="open the drawer"))
+            if action.values is not None:
+                command(action.values)
+            loop.pace()
+
+    policy        vla_cpp.Client, vla_cpp.Policy, or anything with their `spec` and `act`
+    rate_hz       control periods per second; must be what the policy was trained for, where its bundle says, unless
+                  allow_other_rate is set
+    replan_every  rows of a chunk that are commanded before the next observation is taken
+    mode          "sync": `step` waits for the chunk; the robot stands meanwhile. "async": the chunk is computed while rows of the
+                  one before are commanded, and those rows of it that are past when it comes are skipped
+    blend         "replace"; "linear", over `fade_steps` steps; "ensemble", with `decay`; or a Blend
+    on_late       what to command when no chunk has a row: "hold" repeats the last command, which is right for positions and WRONG
+                  for velocities and differences; "zero" commands zeros; "stop" raises Late; a function (last command or None, tick)
+                  returns the values, or None to command nothing. When a chunk comes, commands go on with its row for this step
+    max_age       seconds between an observation and the last command that may come of it. By default the time that the rows of a
+                  chunk take in "async" mode; in "sync" mode, where the robot stands still meanwhile, any
+    max_jump      largest change of each value from one command to the next, beyond which it is cut: a number, or one per value
+    clock, sleep  seconds, and waiting for so many: time.monotonic and time.sleep
+
+    One thread may use a loop. `step` is to be called once in each control period. Errors of the policy that another try may
+    survive (Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout) are counted in `stats`; the next period tries again, and
+    `on_late` decides what happens meanwhile. `last_error` is that of the newest inference, or None. All others are raised by `step`.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        *,
+        rate_hz: float,
+        replan_every: int,
+        mode: str,
+        blend: Union[str, Blend],
+        on_late: Union[str, OnLate],
+        fade_steps: Optional[int] = None,
+        decay: float = ACT_DECAY,
+        max_age: Optional[float] = None,
+        max_jump: Union[float, np.ndarray, None] = None,
+        allow_other_rate: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        if mode not in ("sync", "async"):
+            raise UsageError("mode", '"sync" or "async"', repr(mode))
+        if not 0 < rate_hz < math.inf:
+            raise UsageError("rate_hz", "periods per second, above 0", str(rate_hz))
+        spec = policy.spec
+        if spec.rate_hz > 0 and abs(spec.rate_hz - rate_hz) > 1e-6 * rate_hz and not allow_other_rate:
+            hint = "a robot at another rate moves at another speed; allow_other_rate=True if that is meant"
+            raise UsageError("rate_hz", f"{spec.rate_hz:g}, that of {spec.bundle.name}", f"{rate_hz:g}", hint)
+        self.schedule = ChunkSchedule(
+            horizon=spec.horizon,
+            d_action=spec.d_action,
+            replan_every=replan_every,
+            blend=_blend_of(blend, fade_steps, decay),
+            on_late=late_rule(on_late, spec.d_action),
+            max_age=_age_in_ticks(max_age, rate_hz, spec.horizon if mode == "async" else None),
+            max_jump=max_jump,
+        )
+        self.rate_hz, self.mode = rate_hz, mode
+        self._policy, self._clock, self._sleep = policy, clock, sleep
+        # A client answers without waiting by itself; any other policy computes in a thread of its own.
+        self._worker = None if hasattr(policy, "submit") else ThreadPoolExecutor(1, "vla-act")
+        self._handle: Any = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._start: Optional[float] = None
+        self._tick = -1
+        self._missed = 0
+        self._errors: Dict[str, int] = {}
+        self.last_error: Optional[VlaError] = None
+
+    def step(self, observation: Observation) -> Action:
+        """One control period.
+
+        observation  the arguments of `policy.act`, or a function that returns them, called only when an observation is wanted:
+                     cameras need not be read for a period that does not look at them
+        """
+        tick = self._now()
+        self._collect(tick)
+        if self.schedule.wants(tick):
+            self._submit(observation, tick)
+            if self.mode == "sync":
+                self._wait()
+                tick = self._now()
+                self._collect(tick)
+        self._missed += tick - self._tick - 1
+        self._tick = tick
+        return self.schedule.next(tick)
+
+    def begin(self, observation: Observation) -> None:
+        """Waits for a first chunk, so that the first `step` has an action. Errors: all that `policy.act` raises."""
+        tick = self._now()
+        if self.schedule.wants(tick):
+            self._submit(observation, tick)
+        self._wait()
+        self._start = None
+        self._collect(self._now())
+        if self.last_error:
+            raise self.last_error
+
+    def pace(self) -> None:
+        """Waits until the next control period begins."""
+        if self._start is not None:
+            self._sleep(max(0.0, self._start + (self._tick + 1) / self.rate_hz - self._clock()))
+
+    @property
+    def stats(self) -> Dict[str, Any]:
+        """Counts since the start: actions, held, chunks, stale (dropped for their age), failed (in all, and by the error's code),
+        limited, missed (periods without a call of `step`); and the delay in steps."""
+        return {**self.schedule.counts, **self._errors, "missed": self._missed, "delay": self.schedule.delay}
+
+    def reset(self) -> None:
+        """Begins a new episode. What is still under way is not used."""
+        self._handle = None
+        self._forget()
+        self.schedule.reset()
+
+    def close(self) -> None:
+        """Ends the thread of the loop; the policy stays open, as it was given."""
+        self._handle = None
+        if self._worker:
+            self._worker.shutdown(wait=False)
+
+    def __enter__(self) -> ChunkLoop:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --- inside ----------------------------------------------------------------------------------------------------------------
+
+    def _now(self) -> int:
+        """The control period that it is. A caller that is early gets the next one; one that is late has missed some."""
+        now = self._clock()
+        if self._start is None:
+            self._start = now - (self._tick + 1) / self.rate_hz
+        return max(self._tick + 1, math.floor((now - self._start) * self.rate_hz + 0.5))
+
+    def _submit(self, observation: Observation, tick: int) -> None:
+        arguments = observation() if callable(observation) else observation
+        self.schedule.observe(tick)
+        try:
+            if self._worker:
+                self._handle = self._worker.submit(self._policy.act, **_snapshot(arguments))
+            else:
+                self._handle = self._policy.submit(**arguments)
+        except VlaError as error:
+            self._fail(error)
+
+    def _wait(self) -> None:
+        if self._handle is not None:
+            try:
+                self._handle.result()
+            except VlaError:
+                pass  # `_collect` takes it, as in the other mode
+
+    def _collect(self, tick: int) -> None:
+        if self._handle is None or not self._handle.done():
+            return
+        handle, self._handle = self._handle, None
+        try:
+            chunk = handle.result()
+        except VlaError as error:
+            self._fail(error)
+        except BaseException:
+            self.schedule.fail()
+            raise
+        else:
+            self.last_error = None
+            self.schedule.receive(chunk, tick)
+
+    def _fail(self, error: VlaError) -> None:
+        self.schedule.fail()
+        self._errors[error.code] = self._errors.get(error.code, 0) + 1
+        self.last_error = error
+        if not isinstance(error, PASSING):
+            raise error
+
+
+def _snapshot(value: Any) -> Any:
+    """Arrays are copied: a camera may write its next frame while another thread still reads this one."""
+    if isinstance(value, Mapping):
+        return {key: _snapshot(part) for key, part in value.items()}
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _blend_of(blend: Union[str, Blend], fade_steps: Optional[int], decay: float) -> Blend:
+    if isinstance(blend, Blend):
+        return blend
+    if blend == "replace":
+        return CrossFade(0)
+    if blend == "ensemble":
+        return Ensemble(decay)
+    if blend != "linear":
+        raise UsageError("blend", '"replace", "linear", "ensemble" or a Blend', repr(blend))
+    if fade_steps is None:
+        raise UsageError(
+            "fade_steps", "the steps of the cross-fade", "none", "half of replan_every is a place to begin"
+        )
+    return CrossFade(fade_steps)
+
+
+def _age_in_ticks(seconds: Optional[float], rate_hz: float, default: Optional[int]) -> Optional[int]:
+    if seconds is None:
+        return default
+    if not seconds >= 0:
+        raise UsageError("max_age", "seconds, 0 or more", str(seconds))
+    return math.floor(seconds * rate_hz + 1e-9)

@@ -1,0 +1,155 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every way in which a policy refuses, as one exception class per code.
+
+The codes and the four texts are those of the runtime (`src/base/result.h`); a server adds some of its own, and so does the client.
+"""
+
+from __future__ import annotations
+
+
+class VlaError(Exception):
+    """What went wrong, for a person (`str(error)`) and for a program.
+
+    code      the class of the problem, e.g. "bad_observation"
+    where     file, feature or address
+    expected  may be empty when `found` says it all
+    found     what was there instead
+    hint      the next move, if there is one
+    """
+
+    code = "internal"
+
+    def __init__(self, where: str, expected: str = "", found: str = "", hint: str = "", code: str = "") -> None:
+        super().__init__(where, expected, found, hint)
+        self.where, self.expected, self.found, self.hint = where, expected, found, hint
+        if code:
+            self.code = code
+
+    def __str__(self) -> str:
+        text = f"{self.where}: "
+        text += f"expected {self.expected}, found {self.found}" if self.expected else self.found
+        return f"{text}; {self.hint}" if self.hint else text
+
+    def __reduce__(self):
+        return type(self), (self.where, self.expected, self.found, self.hint, self.code)
+
+
+class InternalError(VlaError):
+    """A fault of the runtime; please report it."""
+
+    code = "internal"
+
+
+class UsageError(VlaError):
+    """Wrong arguments."""
+
+    code = "usage"
+
+
+class BadBundle(VlaError):
+    """The bundle is damaged, incomplete or of another version."""
+
+    code = "bad_bundle"
+
+
+class BadObservation(VlaError):
+    """A frame, state, sentence or noise that the policy cannot take."""
+
+    code = "bad_observation"
+
+
+class BadAction(VlaError):
+    """A number that is not finite came out, so there is no chunk."""
+
+    code = "bad_action"
+
+
+class Unsupported(VlaError):
+    """Sound, but nothing that this build can do."""
+
+    code = "unsupported"
+
+
+class OutOfMemory(VlaError):
+    code = "out_of_memory"
+
+
+class DeviceError(VlaError):
+    """The device that computes failed."""
+
+    code = "device"
+
+
+class IoError(VlaError):
+    """A file or an address that cannot be used."""
+
+    code = "io"
+
+
+class Superseded(VlaError):
+    """Server: a newer observation of the same client took this one's place in the queue."""
+
+    code = "superseded"
+
+
+class Late(VlaError):
+    """Server: the request's deadline passed before its turn came, so it was not computed."""
+
+    code = "late"
+
+
+class Busy(VlaError):
+    """Server: the queue is full."""
+
+    code = "busy"
+
+
+class TooLarge(VlaError):
+    """Server: the message, a picture or the text is larger than the server admits."""
+
+    code = "too_large"
+
+
+class BadRequest(VlaError):
+    """Server: the bytes are no request of its schema; a fault of the client."""
+
+    code = "bad_request"
+
+
+class Incompatible(VlaError):
+    """Server and client speak no common version of the protocol."""
+
+    code = "incompatible"
+
+
+class ShuttingDown(VlaError):
+    """Server: it is going down and takes no new requests."""
+
+    code = "shutting_down"
+
+
+class Timeout(VlaError):
+    """Client: no answer within the time given."""
+
+    code = "timeout"
+
+
+class Disconnected(VlaError):
+    """Client: the connection was lost, or the client is closed."""
+
+    code = "disconnected"
+
+
+_CLASSES = {
+    c.code: c
+    for c in (
+        InternalError, UsageError, BadBundle, BadObservation, BadAction, Unsupported, OutOfMemory, DeviceError, IoError,
+        Superseded, Late, Busy, TooLarge, BadRequest, Incompatible, ShuttingDown, Timeout, Disconnected,
+    )
+}  # fmt: skip
+
+
+def error_of(code: str, where: str, expected: str = "", found: str = "", hint: str = "") -> VlaError:
+    """The exception of a code; a code that this package does not know yet becomes a plain VlaError that carries it."""
+    return _CLASSES.get(code, VlaError)(where, expected, found, hint, code)

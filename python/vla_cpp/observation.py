@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a caller may give as an observation, brought into one form or refused by name."""
+
+from __future__ import annotations
+
+from typing import Dict, Mapping, Optional, Sequence, Tuple, Union
+
+import numpy as np
+
+from .errors import BadObservation, UsageError
+from .spec import StateSpec
+
+Image = Union[np.ndarray, bytes, bytearray, memoryview, None]
+State = Union[Mapping[str, object], Sequence[float], np.ndarray, float]
+
+MAX_SEED = 2**64 - 1
+
+
+def picture_of(name: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
+    """("rgb", contiguous uint8 array (height, width, 3)), ("jpeg" or "png", the file's bytes), or ("absent", None)."""
+    where = f'images["{name}"]'
+    if image is None:
+        return "absent", None
+    if isinstance(image, (bytes, bytearray, memoryview)):
+        data = bytes(image)
+        if data.startswith(b"\xff\xd8\xff"):
+            return "jpeg", data
+        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+            return "png", data
+        raise BadObservation(where, "the bytes of a JPEG or PNG file", f"{len(data)} bytes that start otherwise")
+    if not isinstance(image, np.ndarray):
+        raise BadObservation(where, "a uint8 array, the bytes of a JPEG or PNG file, or None", type(image).__name__)
+    if image.dtype != np.uint8:
+        raise BadObservation(where, "uint8 pixels", str(image.dtype), "give 0 to 255, not 0 to 1")
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise BadObservation(where, "shape (height, width, 3)", str(image.shape), "rows first, channels last: RGB")
+    return "rgb", np.ascontiguousarray(image)
+
+
+def states_of(state: State, specs: Sequence[StateSpec]) -> Dict[str, np.ndarray]:
+    """Float32 vectors by name. One array stands for the only state of a policy."""
+    if isinstance(state, Mapping):
+        return {str(name): floats(f'state["{name}"]', values, 1) for name, values in state.items()}
+    if len(specs) != 1:
+        names = ", ".join(s.name for s in specs) or "none"
+        raise BadObservation("state", f"a dict with {names}", type(state).__name__)
+    return {specs[0].name: floats("state", state, 1)}
+
+
+def noise_of(noise: object, horizon: int, d_noise: int) -> np.ndarray:
+    """Float32 (horizon, d_noise); the reference's batch of one is taken off."""
+    values = floats("noise", noise, 2)
+    if values.shape != (horizon, d_noise):
+        raise BadObservation("noise", f"shape ({horizon}, {d_noise})", str(np.shape(noise)))
+    return values
+
+
+def floats(where: str, values: object, n_dim: int) -> np.ndarray:
+    """Float32 of `n_dim` dimensions, finite; a scalar is a vector of one, and a leading batch of one is taken off."""
+    try:
+        given = np.asarray(values)
+        # Text and objects would be parsed by the conversion: a number in quotes is a mistake of the caller.
+        if given.dtype.kind not in "fiub":
+            raise TypeError
+    except (TypeError, ValueError, RuntimeError):
+        raise BadObservation(where, "numbers", type(values).__name__) from None
+    with np.errstate(over="ignore"):
+        array = given.astype(np.float32)
+    if array.ndim == 0:
+        array = array[None]
+    if array.ndim == n_dim + 1 and array.shape[0] == 1:
+        array = array[0]
+    if array.ndim != n_dim:
+        raise BadObservation(where, f"{n_dim} dimension{'s' if n_dim > 1 else ''}", f"shape {given.shape}")
+    if not np.isfinite(array).all():
+        at = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise BadObservation(where, "finite float32 numbers", f"{given.reshape(array.shape)[at]} at {list(at)}")
+    return np.ascontiguousarray(array)
+
+
+def check_start(seed: Optional[int], noise: object) -> None:
+    if seed is not None and noise is not None:
+        raise UsageError("act", "seed= or noise=", "both")
+    if seed is not None and not (
+        isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and 0 <= seed <= MAX_SEED
+    ):
+        raise UsageError("seed", f"a whole number from 0 to {MAX_SEED}", repr(seed))

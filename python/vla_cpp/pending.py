@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a client gives back: answers that are under way, and how the server is."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Optional
+
+from .errors import VlaError
+
+if TYPE_CHECKING:
+    from .client import Client
+
+
+@dataclass(frozen=True)
+class Health:
+    """How the server is. uptime_s: seconds since it became ready. queue_depth: acts that wait, beside one that is computed."""
+
+    ready: bool
+    queue_depth: int
+    computing: bool
+    uptime_s: float
+    chunks_served: int
+    errors_served: int
+
+
+class Pending:
+    """An answer that is under way."""
+
+    def __init__(self, client: Client, request_id: int, kind: str, timeout: float) -> None:
+        self._client, self._id, self._kind = client, request_id, kind
+        self._timeout, self._until = timeout, time.monotonic() + timeout
+        self._answer: Any = None
+        self._error: Optional[VlaError] = None
+
+    def done(self) -> bool:
+        """Whether `result` would return, or raise, at once. Never waits."""
+        return self._client._settle(self, 0.0)
+
+    def result(self) -> Any:
+        """Waits for the answer, until the timeout that the request was made with. Errors: as `Client.act`."""
+        while not self._client._settle(self, self._until - time.monotonic()):
+            pass
+        if self._error:
+            raise self._error
+        return self._answer
+
+    @property
+    def _is_over(self) -> bool:
+        return self._answer is not None or self._error is not None

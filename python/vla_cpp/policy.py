@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A policy in this process: no server, no copy on a wire, the same methods as `Client`."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import random
+import threading
+from typing import Any, List, Mapping, Optional, Tuple, Type, Union
+
+import numpy as np
+
+from . import _capi
+from .chunk import Chunk
+from .errors import BadObservation, UsageError, VlaError, error_of
+from .observation import Image, State, check_start, noise_of, picture_of, states_of
+from .spec import BundleInfo, Spec, StateSpec, ViewSpec
+
+
+class Policy:
+    """A loaded bundle: `act` takes an observation and returns a chunk.
+
+        with vla_cpp.Policy("policy.gguf") as policy:
+            chunk = policy.act(images={"top": frame}, state=q, text="open the drawer")
+
+    path     a bundle that vla-convert made
+    threads  of the CPU; 0 takes every core that the process may use
+    kernels  "ggml", "avx2", "avx512" or "amx"; None: the best that the machine has
+
+    Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
+    of its parent, since the threads that compute stay behind, nor can it be pickled.
+
+    Errors: IoError, BadBundle, Unsupported, OutOfMemory, DeviceError, UsageError.
+    """
+
+    def __init__(self, path: Union[str, os.PathLike], *, threads: int = 0, kernels: Optional[str] = None) -> None:
+        self._handle = ctypes.c_void_p()
+        self._lock = threading.Lock()
+        self._pid = os.getpid()
+        self._library = _capi.load()
+        if not isinstance(threads, int) or not 0 <= threads <= 512:
+            raise UsageError("threads", "a whole number from 0 to 512", repr(threads))
+        options = _capi.Options(
+            n_thread=threads, kernels=None if kernels is None else _encoded("kernels", kernels, UsageError)
+        )
+        if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
+            raise self._last_error(None)
+        self._spec = _spec_of(self._library.vla_describe(self._handle).contents)
+
+    @property
+    def spec(self) -> Spec:
+        """What the policy takes and gives."""
+        return self._spec
+
+    def act(
+        self,
+        *,
+        images: Mapping[str, Image],
+        state: State,
+        text: str,
+        seed: Optional[int] = None,
+        noise: object = None,
+        capture_time_ns: Optional[int] = None,
+    ) -> Chunk:
+        """One observation in, one action chunk out.
+
+        images           frames by view: uint8 (height, width, 3) RGB of any size, the bytes of a JPEG or PNG file, or None for a
+                         camera that the robot does not have
+        state            world units: vectors by name, or one vector where the policy has one state
+        text             the instruction, as a person says it
+        seed, noise      where the solver starts: a number, or float32 (horizon, d_noise); with neither a seed is drawn and the chunk
+                         tells it
+        capture_time_ns  when the frames were taken; comes back in the chunk
+
+        Errors: BadObservation (what the policy cannot take, by name), BadAction, DeviceError, OutOfMemory, InternalError.
+        """
+        check_start(seed, noise)
+        if noise is None and seed is None:
+            seed = random.SystemRandom().getrandbits(32)
+        call = _Call(self._spec, images, state, text, seed, noise)
+        with self._lock:
+            self._check_usable()
+            answer = ctypes.c_void_p()
+            if self._library.vla_act(self._handle, call.observation, ctypes.byref(answer)):
+                raise self._last_error(self._handle)
+        try:
+            return self._chunk_of(answer, seed, capture_time_ns)
+        finally:
+            self._library.vla_chunk_close(answer)
+
+    def close(self) -> None:
+        """Frees the policy, after a call that is under way. A second call does nothing."""
+        if os.getpid() != self._pid:
+            return
+        with self._lock:
+            self._library.vla_policy_close(self._handle)
+            self._handle = ctypes.c_void_p()
+
+    def __enter__(self) -> Policy:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if getattr(self, "_library", None) is not None:
+            self.close()
+
+    def __reduce__(self):
+        raise UsageError("Policy", "use in the process that made it", "an attempt to pickle it", "make one per process")
+
+    def _check_usable(self) -> None:
+        if os.getpid() != self._pid:
+            raise UsageError(
+                "Policy", "use in the process that made it", "use in a child process", "make one per process"
+            )
+        if not self._handle:
+            raise UsageError("Policy", "an open policy", "one that was closed")
+
+    def _last_error(self, handle: Optional[ctypes.c_void_p]) -> VlaError:
+        error = self._library.vla_last_error(handle).contents
+        return error_of(*(_text(getattr(error, part)) for part in ("code_name", "where", "expected", "found", "hint")))
+
+    def _chunk_of(self, answer: ctypes.c_void_p, seed: Optional[int], capture_time_ns: Optional[int]) -> Chunk:
+        lib, spec = self._library, self._spec
+        actions = np.ctypeslib.as_array(lib.vla_chunk_actions(answer), (spec.horizon, spec.d_action)).copy()
+        stages = range(lib.vla_chunk_n_stage(answer))
+        return Chunk(
+            actions=actions,
+            names=spec.action_names,
+            rate_hz=spec.rate_hz,
+            bundle=spec.bundle,
+            timing={_text(lib.vla_chunk_stage_name(answer, i)): lib.vla_chunk_stage_ms(answer, i) for i in stages},
+            seed=None if seed is None else int(seed),
+            notes=tuple(_text(lib.vla_chunk_note(answer, i)) for i in range(lib.vla_chunk_n_note(answer))),
+            capture_time_ns=capture_time_ns,
+        )
+
+
+class _Call:
+    """An observation as the library reads it, together with the arrays that it points into."""
+
+    def __init__(
+        self, spec: Spec, images: Mapping[str, Image], state: State, text: str, seed: Optional[int], noise: object
+    ) -> None:
+        self._kept: List[Any] = []
+        views = [self._view(name, image) for name, image in images.items()]
+        states = [
+            _capi.State(name=_name_of("state", name), values=self._address(values), n_value=values.size)
+            for name, values in states_of(state, spec.states).items()
+        ]
+        self._kept += [views, states]
+        sentence = _encoded("text", text, BadObservation)
+        self.observation = _capi.Observation(
+            views=(_capi.View * len(views))(*views),
+            n_view=len(views),
+            states=(_capi.State * len(states))(*states),
+            n_state=len(states),
+            text=sentence,
+            text_size=len(sentence),
+            has_seed=seed is not None,
+            seed=0 if seed is None else int(seed),
+        )
+        if noise is not None:
+            values = noise_of(noise, spec.horizon, spec.d_noise)
+            self.observation.noise, self.observation.n_noise = self._address(values), values.size
+
+    def _view(self, name: str, image: Image) -> _capi.View:
+        data = picture_of(name, image)[1]
+        view = _capi.View(name=_name_of("images", name), kind=_capi.IMAGE_ABSENT)
+        if isinstance(data, bytes):
+            view.kind, data = _capi.IMAGE_FILE, np.frombuffer(data, np.uint8)
+        elif data is not None:
+            view.kind, (view.height, view.width) = _capi.IMAGE_RGB8, data.shape[:2]
+        if data is not None:
+            view.data, view.size = self._address(data), data.size
+        return view
+
+    def _address(self, array: np.ndarray) -> int:
+        self._kept.append(array)
+        return array.ctypes.data
+
+
+def _encoded(where: str, text: object, refusal: Type[VlaError]) -> bytes:
+    if not isinstance(text, str):
+        raise refusal(where, "a str", type(text).__name__)
+    try:
+        return text.encode()
+    except UnicodeError:
+        raise refusal(where, "characters that UTF-8 can write", repr(text)[:80]) from None
+
+
+def _name_of(where: str, name: object) -> bytes:
+    """A name without a NUL, at which the library would take it to end."""
+    data = _encoded(where, name, BadObservation)
+    if b"\0" in data:
+        raise BadObservation(where, "a name", repr(name)[:80])
+    return data
+
+
+def _path_of(path: Union[str, os.PathLike]) -> bytes:
+    try:
+        data = os.fsencode(path)
+    except (TypeError, UnicodeError):
+        data = b"\0"
+    if b"\0" in data:
+        raise UsageError("path", "a file name", repr(path)[:80])
+    return data
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
+
+
+def _texts(pointers: Any, count: int) -> Tuple[str, ...]:
+    return tuple(_text(pointers[i]) for i in range(count))
+
+
+def _spec_of(d: _capi.Description) -> Spec:
+    views = [d.views[i].contents for i in range(d.n_view)]
+    states = [d.states[i].contents for i in range(d.n_state)]
+    source, revision = _text(d.source), _text(d.revision)
+    return Spec(
+        views=tuple(
+            ViewSpec(_text(v.name), bool(v.optional), v.width, v.height, (_text(v.alias),) if v.alias else ())
+            for v in views
+        ),
+        min_views=d.min_views,
+        states=tuple(
+            StateSpec(_text(s.name), s.width, _texts(s.units, s.width), _texts(s.number_names, s.width)) for s in states
+        ),
+        action_names=_texts(d.action_names, d.d_action),
+        action_units=_texts(d.action_units, d.d_action),
+        horizon=d.horizon,
+        d_action=d.d_action,
+        d_noise=d.d_noise,
+        noise=_text(d.noise),
+        rate_hz=d.rate_hz,
+        bundle=BundleInfo(
+            os.path.basename(_text(d.bundle_path)),
+            _text(d.arch),
+            _text(d.checksum),
+            source + (f"@{revision}" if revision else ""),
+        ),
+        precision=_text(d.precision),
+        kernels=_text(d.kernels),
+        device=_text(d.device),
+    )

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a policy takes and gives, as its bundle says it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Tuple
+
+
+@dataclass(frozen=True)
+class ViewSpec:
+    """A camera. width, height: pixels that the network sees; frames of any size are letterboxed to it."""
+
+    name: str
+    optional: bool
+    width: int
+    height: int
+    aliases: Tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class StateSpec:
+    """A state vector of `width` numbers.
+
+    units, names: one text per number, empty where the bundle does not say; never guessed
+    """
+
+    name: str
+    width: int
+    units: Tuple[str, ...] = ()
+    names: Tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class BundleInfo:
+    """Which weights answered.
+
+    name      file name, without folders
+    checksum  of the file: "xxh3:" and 16 hexadecimal digits
+    source    the checkpoint that was converted, and after an @ its revision; empty where unknown
+    """
+
+    name: str
+    arch: str
+    checksum: str
+    source: str
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A policy from outside: what `act` takes and what it returns.
+
+    min_views     how many views must be present at least
+    action_units  one text per action, empty where the bundle does not say
+    horizon       rows of a chunk
+    d_action      columns of a chunk
+    d_noise       columns of the noise, which has `horizon` rows
+    noise         its distribution, e.g. "normal"
+    rate_hz       rows per second that the policy was trained for; 0 where the bundle does not say
+    """
+
+    views: Tuple[ViewSpec, ...]
+    min_views: int
+    states: Tuple[StateSpec, ...]
+    action_names: Tuple[str, ...]
+    action_units: Tuple[str, ...]
+    horizon: int
+    d_action: int
+    d_noise: int
+    noise: str
+    rate_hz: float
+    bundle: BundleInfo
+    precision: str
+    kernels: str
+    device: str

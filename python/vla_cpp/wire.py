@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The messages of `vla serve`, to and from Python. docs/protocol.md and src/serve/vla.proto say what they mean.
+
+The schema comes as a serialized descriptor (`vla.desc`), from which protobuf makes classes when this module is imported. Code that
+protoc generates would tie the package to the releases of protobuf that accept that code; a descriptor is read by all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Dict, Iterable, List, Mapping, Optional, Tuple
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from .chunk import Chunk
+from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
+from .observation import Image, State, noise_of, picture_of, states_of
+from .spec import BundleInfo, Spec, StateSpec, ViewSpec
+
+PROTOCOL_VERSION = 1
+DESCRIPTOR = Path(__file__).with_name("vla.desc")
+
+
+def _load_messages() -> Dict[str, Any]:
+    """Message classes by name, in a pool of their own: another package may have a vla.v1 of another age."""
+    files = descriptor_pb2.FileDescriptorSet.FromString(DESCRIPTOR.read_bytes())
+    pool = descriptor_pool.DescriptorPool()
+    for file in files.file:
+        pool.AddSerializedFile(file.SerializeToString())
+    if hasattr(message_factory, "GetMessageClass"):
+        make = message_factory.GetMessageClass
+    else:  # protobuf before 4.22
+        make = message_factory.MessageFactory(pool).GetPrototype
+    names = [message.name for file in files.file for message in file.message_type]
+    return {name: make(pool.FindMessageTypeByName(f"vla.v1.{name}")) for name in names}
+
+
+MESSAGES = _load_messages()
+Request, Response = MESSAGES["Request"], MESSAGES["Response"]
+_CODES = MESSAGES["Error"].DESCRIPTOR.enum_types_by_name["Code"].values_by_number
+
+
+def new_request(request_id: int) -> Any:
+    return Request(protocol_version=PROTOCOL_VERSION, request_id=request_id)
+
+
+def act_bytes(
+    request: Any,
+    spec: Spec,
+    limits: Any,
+    *,
+    images: Mapping[str, Image],
+    state: State,
+    text: str,
+    seed: Optional[int],
+    noise: object,
+    deadline_ms: float,
+    capture_time_ns: Optional[int],
+) -> bytes:
+    """A request with an observation, as bytes. Errors: BadObservation, UsageError, TooLarge, by the argument's name."""
+    act = request.act
+    act.SetInParent()
+    raw: Dict[str, np.ndarray] = {}
+    for name, image in _items("images", images):
+        kind, data = picture_of(name, image)
+        if kind == "rgb":
+            raw[name] = data
+        elif kind == "absent":
+            act.views.add(name=name).absent.SetInParent()
+        else:
+            setattr(act.views.add(name=name), kind, data)
+    for name, values in states_of(state, spec.states).items():
+        act.states.add(name=name).values.extend(values.tolist())
+    if not isinstance(text, str):
+        raise BadObservation("text", "a str", type(text).__name__)
+    try:
+        act.text = text
+    except (ValueError, UnicodeError):
+        raise BadObservation("text", "characters that UTF-8 can write", repr(text)[:80]) from None
+    if noise is not None:
+        values = noise_of(noise, spec.horizon, spec.d_noise)
+        act.noise.horizon, act.noise.d_action = values.shape
+        act.noise.values.extend(values.ravel().tolist())
+    elif seed is not None:
+        act.seed = int(seed)
+    act.deadline_ms = _milliseconds(deadline_ms)
+    if capture_time_ns is not None:
+        act.capture_time_ns = _int64("capture_time_ns", capture_time_ns)
+    data = b"".join(_with_raw_pictures(request, raw))
+    _check_limits(raw, len(data), limits)
+    return data
+
+
+def _with_raw_pictures(request: Any, raw: Mapping[str, np.ndarray]) -> List[Any]:
+    """The request's bytes in pieces, with the raw pictures appended to its act.
+
+    They are framed here because protobuf would copy them twice into memory that is new each time, which takes longer than
+    everything else that a client does. A repeated field may come in pieces, and a message's fields in any order.
+    """
+    views: List[Any] = []
+    for name, rows in raw.items():
+        rgb = MESSAGES["RawRgb"](height=rows.shape[0], width=rows.shape[1]).SerializeToString()
+        rgb += _head("RawRgb", "rows", rows.nbytes)
+        view = MESSAGES["View"](name=name).SerializeToString() + _head("View", "rgb", len(rgb) + rows.nbytes) + rgb
+        views += [_head("Act", "views", len(view) + rows.nbytes) + view, rows.data.cast("B")]
+    act = request.act.SerializeToString()
+    envelope = Request(protocol_version=request.protocol_version, request_id=request.request_id).SerializeToString()
+    return [envelope, _head("Request", "act", len(act) + sum(map(len, views))), act, *views]
+
+
+def _head(message: str, field: str, size: int) -> bytes:
+    """What stands before the `size` bytes of a field: its number with the wire type 2 (so many bytes), and their count."""
+    head = bytearray([MESSAGES[message].DESCRIPTOR.fields_by_name[field].number << 3 | 2])
+    while size > 0x7F:
+        head.append(size & 0x7F | 0x80)
+        size >>= 7
+    head.append(size)
+    return bytes(head)
+
+
+def _items(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
+    if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
+        raise BadObservation(where, "a dict by name", repr(mapping)[:80])
+    return mapping.items()
+
+
+def _milliseconds(value: float) -> int:
+    if not 0 < value < 2**63:
+        raise UsageError("deadline_ms", "milliseconds above 0", str(value))
+    return math.ceil(value)
+
+
+def _int64(where: str, value: int) -> int:
+    if not isinstance(value, (int, np.integer)) or not -(2**63) <= value < 2**63:
+        raise UsageError(where, "a whole number of 64 bits", repr(value))
+    return int(value)
+
+
+def _check_limits(raw: Mapping[str, np.ndarray], size: int, limits: Any) -> None:
+    """Refuses what the server would refuse; it would end the connection over a message that is too large, and tell nothing."""
+    for name, rows in raw.items():
+        pixels = rows.shape[0] * rows.shape[1]
+        if pixels > limits.max_pixels > 0:
+            raise TooLarge(f'images["{name}"]', f"at most {limits.max_pixels} pixels", str(pixels))
+    if size > limits.max_message_bytes > 0:
+        hint = "send smaller frames, or JPEG; the server's option --max-message sets the limit"
+        raise TooLarge("observation", f"at most {limits.max_message_bytes} bytes", str(size), hint)
+
+
+def spec_of(description: Any) -> Spec:
+    runtime = description.runtime
+    return Spec(
+        views=tuple(ViewSpec(v.name, v.optional, v.width, v.height, tuple(v.aliases)) for v in description.views),
+        min_views=description.min_views,
+        states=tuple(
+            StateSpec(
+                s.name, len(s.dimensions), tuple(d.unit for d in s.dimensions), tuple(d.name for d in s.dimensions)
+            )
+            for s in description.states
+        ),
+        action_names=tuple(d.name for d in description.actions),
+        action_units=tuple(d.unit for d in description.actions),
+        horizon=description.horizon,
+        d_action=len(description.actions),
+        d_noise=description.d_noise,
+        noise=description.noise_kind,
+        rate_hz=description.rate_hz,
+        bundle=bundle_of(description.bundle),
+        precision=runtime.precision,
+        kernels=runtime.kernels,
+        device=runtime.device,
+    )
+
+
+def bundle_of(bundle: Any) -> BundleInfo:
+    source = bundle.source_name + (f"@{bundle.source_revision}" if bundle.source_revision else "")
+    return BundleInfo(bundle.name, bundle.arch, bundle.checksum, source)
+
+
+def chunk_of(message: Any) -> Chunk:
+    """Errors: BadAction where the rows are not what the answer says of them."""
+    actions = np.array(message.actions, np.float32)
+    if actions.size != message.horizon * message.d_action or not actions.size:
+        raise BadAction("answer", f"{message.horizon} x {message.d_action} actions", str(actions.size))
+    if not np.isfinite(actions).all():
+        raise BadAction("answer", "finite actions", "one that is not")
+    return Chunk(
+        actions=actions.reshape(message.horizon, message.d_action),
+        names=tuple(message.names),
+        rate_hz=message.rate_hz,
+        bundle=bundle_of(message.bundle),
+        timing={stage.name: stage.ms for stage in message.stages},
+        queue_ms=message.queue_ms,
+        seed=message.seed if message.HasField("seed") else None,
+        notes=tuple(message.notes),
+        capture_time_ns=message.capture_time_ns or None,
+    )
+
+
+def exception_of(error: Any) -> VlaError:
+    known = _CODES.get(error.code)
+    code = known.name.lower() if known else f"code_{error.code}"
+    return error_of(code, error.where, error.expected, error.found, error.hint)

@@ -1,0 +1,82 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bench/bench.h"
+
+#include <fmt/format.h>
+
+#include "policies/policy.h"
+
+namespace vla::bench {
+namespace {
+
+Result<RandomBundle> make_random(const Request& request) {
+  VLA_TRY(const PolicyEntry entry, find_policy(request.arch));
+  RandomSizes sizes;
+  sizes.n_view = request.sizes.n_view.value_or(sizes.n_view);
+  sizes.max_tokens = request.sizes.n_text.value_or(sizes.max_tokens);
+  sizes.dtype = request.dtype;
+  return RandomBundle::make(request.arch, entry.published(), sizes);
+}
+
+Conditions conditions_of(const Engine& engine, const Workload& workload, int n_step) {
+  const auto text = [&](const char* key) { return *engine.bundle().keys().string(key); };  // every bundle has them
+  return {text("vla.arch"),           text("vla.dtype"),
+          text("vla.source.name"),    workload.n_view(),
+          workload.width(),           workload.height(),
+          workload.n_text(),          n_step,
+          engine.device().n_thread(), isa_name(engine.device().isa())};
+}
+
+/// Rounds of every number of steps.
+Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const std::vector<int>& steps,
+                                    const Request& request, const Progress& tell) {
+  std::vector<Series> all;
+  for (int n_step : steps) {
+    if (n_step != engine.solver().n_step) VLA_CHECK(engine.set_steps(n_step));
+    tell(fmt::format("{} solver steps", n_step));
+    VLA_TRY(Series series, run_series(engine, workload, request.n_warmup, request.n_round, tell));
+    all.push_back(std::move(series));
+  }
+  return all;
+}
+
+}  // namespace
+
+Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
+                       const Progress& tell) {
+  VLA_TRY(const Device device, Device::cpu(request.n_thread, request.kernels));
+  std::optional<RandomBundle> random;
+  if (request.bundle.empty()) {
+    tell(fmt::format("filling {} with random weights", request.arch));
+    VLA_TRY(RandomBundle made, make_random(request));
+    random.emplace(std::move(made));
+  }
+  Report report;
+  report.cpu = cpu_name();
+  tell("measuring what the machine can do");
+  report.before = measure_roofs(device.n_thread());
+  forget_peak_memory();
+  StageClock clock;
+  Timing load;
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          Engine::load(random ? random->path() : request.bundle,
+                       {.n_thread = request.n_thread, .kernels = request.kernels}));
+  clock.lap(load, "load");
+  report.load = load.front().second;
+
+  VLA_TRY(Workload workload, Workload::make(engine->processor(), request.sizes));
+  std::vector<int> steps = request.steps;
+  if (steps.empty()) steps.push_back(engine->solver().n_step);
+  report.conditions = conditions_of(*engine, workload, steps.back());
+  VLA_CHECK(accept(report.conditions));
+  VLA_TRY(const std::vector<Series> all, run_all(*engine, workload, steps, request, tell));
+  report.predicted = engine->memory();
+  report.process = process_memory();
+  tell("measuring what the machine can do now");
+  report.after = measure_roofs(device.n_thread());
+  summarize(all.back(), report);
+  if (all.size() > 1) report.fit = fit_steps(all);
+  return report;
+}
+
+}  // namespace vla::bench

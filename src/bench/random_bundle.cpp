@@ -1,0 +1,240 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bench/random_bundle.h"
+
+#include <fmt/format.h>
+#include <sys/mman.h>
+#include <unistd.h>
+#include <xxhash.h>
+
+#include <algorithm>
+#include <cstring>
+#include <memory>
+#include <nlohmann/json.hpp>
+
+#include "bundle/gguf_writer.h"
+#include "policies/policy.h"
+
+namespace vla::bench {
+namespace {
+
+constexpr int kRobot = 7;  // joints of the robot that the features describe
+constexpr std::string_view kNoDigits = "xxh3:0000000000000000";
+
+std::vector<std::string> numbered(const std::string& name, int count) {
+  std::vector<std::string> names;
+  for (int i = 0; i < count; ++i) names.push_back(fmt::format("{}{}", name, i));
+  return names;
+}
+
+std::string recipe(int image_size, int max_tokens, int d_state, int d_robot) {
+  using Json = nlohmann::ordered_json;
+  const Json letterbox = {{"op", "letterbox"},    {"width", image_size}, {"height", image_size},
+                          {"filter", "bilinear"}, {"antialias", false},  {"align", "bottom_right"},
+                          {"fill", 0.0}};
+  const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
+  const Json tokenize = {{"op", "tokenize"}, {"max_tokens", max_tokens}, {"truncate", "right"}};
+  const Json pad = {{"op", "pad"}, {"size", d_state}}, take = {{"op", "take"}, {"size", d_robot}};
+  Json root;
+  root["image"] = Json::array({letterbox, affine});
+  root["text"] = Json::array({tokenize});
+  root["state"] = Json::array({pad});
+  root["action"] = Json::array({take});
+  return root.dump();
+}
+
+/// The byte-level alphabet in any order, and no merges: every byte of a text is a token. It is Latin-1 without what
+/// cannot be printed, which moves to U+0100 and after.
+std::vector<std::string> byte_tokens() {
+  std::vector<std::string> tokens;
+  for (unsigned code = '!'; code < 0x100 + 68; ++code) {
+    const bool printable = code <= '~' || (code >= 0xA1 && code != 0xAD);
+    if (!printable) continue;
+    tokens.push_back(code < 0x80
+                         ? std::string(1, static_cast<char>(code))
+                         : std::string{static_cast<char>(0xC0 | code >> 6), static_cast<char>(0x80 | (code & 0x3F))});
+  }
+  return tokens;
+}
+
+Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
+  VLA_TRY(const int image_size, keys.integer("vision.image_size"));
+  VLA_TRY(const int d_state, keys.integer("policy.d_state"));
+  VLA_TRY(const int d_action, keys.integer("policy.d_action"));
+  const int d_robot = std::min({kRobot, d_state, d_action});
+  const std::vector<std::string> views = numbered("observation.images.view", sizes.n_view);
+  const std::vector<std::string> nothing(static_cast<std::size_t>(d_robot));
+  const Keys added({
+      {"general.architecture", "vla"},
+      {"vla.arch", arch},
+      {"vla.bundle_version", std::int64_t{1}},
+      {"vla.checksum", std::string(kNoDigits)},
+      {"vla.dtype", dtype_name(sizes.dtype)},
+      {"vla.source.name", fmt::format("random weights, seed {}", sizes.seed)},
+      {"vla.source.revision", ""},
+      {"vla.source.converter", "vla bench"},
+      {"observation.views", views},
+      {"observation.view_aliases", std::vector<std::string>(views.size())},
+      {"observation.view_optional", std::vector<std::int64_t>(views.size(), 0)},
+      {"observation.min_views", std::int64_t{1}},
+      {"observation.states", std::vector<std::string>{"observation.state"}},
+      {"observation.state_dims", std::vector<std::int64_t>{d_robot}},
+      {"observation.state_names", numbered("state.", d_robot)},
+      {"observation.state_units", nothing},
+      {"observation.max_text_tokens", std::int64_t{sizes.max_tokens}},
+      {"action.names", numbered("action.", d_robot)},
+      {"action.units", nothing},
+      {"action.rate_hz", 0.0},
+      {"solver.kind", "euler"},
+      {"solver.steps", std::int64_t{sizes.n_step}},
+      {"solver.t_start", 1.0},
+      {"solver.t_end", 0.0},
+      {"solver.noise", "normal"},
+      {"tokenizer.kind", "byte_level_bpe"},
+      {"tokenizer.tokens", byte_tokens()},
+      {"tokenizer.merges", std::vector<std::string>()},
+      {"tokenizer.pre", R"([{"type":"byte_level","add_prefix_space":false,"use_regex":true}])"},
+      {"tokenizer.added", "[]"},
+      {"tokenizer.ignore_merges", false},
+      {"processor.recipe", recipe(image_size, sizes.max_tokens, d_state, d_robot)},
+  });
+  for (const auto& [key, value] : added.all()) keys.set(key, value);
+  return {};
+}
+
+/// SplitMix64. Source: Steele, Lea and Flood, Fast splittable pseudorandom number generators (OOPSLA 2014).
+std::uint64_t next_random(std::uint64_t& state) {
+  std::uint64_t z = (state += 0x9E3779B97F4A7C15);
+  z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9;
+  z = (z ^ (z >> 27)) * 0x94D049BB133111EB;
+  return z ^ (z >> 31);
+}
+
+/// The same number in 16 bits, cut off. Exact enough for random numbers of ordinary size; what f16 has no normal
+/// number for becomes zero.
+std::uint16_t to_16_bits(float value, DType type) {
+  std::uint32_t bits;
+  std::memcpy(&bits, &value, sizeof(bits));
+  if (type == DType::bf16) return static_cast<std::uint16_t>(bits >> 16);
+  const std::uint32_t exponent = bits >> 23 & 0xFF;
+  if (exponent <= 112) return 0;
+  return static_cast<std::uint16_t>((bits >> 16 & 0x8000) | (exponent - 112) << 10 | (bits >> 13 & 0x3FF));
+}
+
+/// The bytes of `count` numbers, evenly drawn from -0.04 to 0.04: rows of any length keep the size of what they
+/// multiply.
+std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
+  std::string bytes(count * dtype_size(type), '\0');
+  for (std::size_t i = 0; i < count; ++i) {
+    const float value = 0.08f * static_cast<float>(next_random(seed) >> 40) / 16777216.0f - 0.04f;
+    const std::uint16_t half = type == DType::f32 ? 0 : to_16_bits(value, type);
+    std::memcpy(bytes.data() + i * dtype_size(type), type == DType::f32 ? static_cast<const void*>(&value) : &half,
+                dtype_size(type));
+  }
+  return bytes;
+}
+
+/// Where the values of tensors come from: random ones for matrices and tables; ones for the weights of norms and zeros
+/// for biases, so that numbers stay finite through any depth.
+class Values {
+ public:
+  Values(const ParamList& list, const RandomSizes& sizes) {
+    std::size_t longest = 0;
+    for (const Param& param : list.params()) longest = std::max(longest, static_cast<std::size_t>(param.count()));
+    pool_ = random_bytes(std::min(longest, kPool), sizes.dtype, sizes.seed);
+    const std::vector<float> one(longest_vector(list), 1.0f);
+    ones_.assign(reinterpret_cast<const char*>(one.data()), one.size() * sizeof(float));
+    zeros_.assign(ones_.size(), '\0');
+  }
+
+  /// Calls `use` with the bytes of `param`, in pieces.
+  template <class Use>
+  void each_piece(const Param& param, std::size_t size, Use use) const {
+    const bool is_vector = param.storage == Storage::vector;
+    const std::string& source = !is_vector ? pool_ : param.name.ends_with("bias") ? zeros_ : ones_;
+    for (std::size_t at = 0; at < size; at += source.size())
+      use(std::string_view(source).substr(0, std::min(source.size(), size - at)));
+  }
+
+ private:
+  static constexpr std::size_t kPool = std::size_t{1} << 22;  // numbers that are drawn before they repeat
+
+  static std::size_t longest_vector(const ParamList& list) {
+    std::int64_t longest = 1;
+    for (const Param& param : list.params())
+      if (param.storage == Storage::vector) longest = std::max(longest, param.count());
+    return static_cast<std::size_t>(longest);
+  }
+
+  std::string pool_, ones_, zeros_;
+};
+
+/// A growing file in memory with its checksum.
+class Output {
+ public:
+  explicit Output(int file) : file_(file), state_(XXH3_createState(), XXH3_freeState) {
+    XXH3_64bits_reset(state_.get());
+  }
+
+  void put(std::string_view bytes) {
+    XXH3_64bits_update(state_.get(), bytes.data(), bytes.size());
+    for (size_ += bytes.size(); !bytes.empty() && !failed_;) {
+      const ssize_t n = ::write(file_, bytes.data(), bytes.size());
+      failed_ = n <= 0;
+      if (!failed_) bytes.remove_prefix(static_cast<std::size_t>(n));
+    }
+  }
+  void pad() { put(std::string((kGgufAlignment - size_ % kGgufAlignment) % kGgufAlignment, '\0')); }
+  /// Writes the checksum of everything over the zeros at `place`. False if anything could not be written.
+  bool seal(std::size_t place) {
+    const std::string digits = fmt::format("{:016x}", XXH3_64bits_digest(state_.get()));
+    return !failed_ && ::pwrite(file_, digits.data(), digits.size(), static_cast<off_t>(place)) == 16;
+  }
+
+ private:
+  int file_;
+  std::size_t size_ = 0;
+  bool failed_ = false;
+  std::unique_ptr<XXH3_state_t, decltype(&XXH3_freeState)> state_;
+};
+
+bool write_bundle(int file, const Keys& keys, const ParamList& list, const RandomSizes& sizes) {
+  std::vector<TensorInfo> tensors;
+  std::vector<std::byte> nothing;
+  for (const Param& param : list.params()) {
+    const DType type = param.storage == Storage::vector ? DType::f32 : sizes.dtype;
+    const std::size_t size = static_cast<std::size_t>(param.count()) * dtype_size(type);
+    tensors.push_back({param.name, type, param.shape, {nothing.data(), size}});
+  }
+  Output out(file);
+  const std::string head = write_gguf_head(keys, tensors);
+  out.put(head);
+  const Values values(list, sizes);
+  for (std::size_t i = 0; i < tensors.size(); ++i) {
+    values.each_piece(list.params()[i], tensors[i].data.size(), [&](std::string_view piece) { out.put(piece); });
+    out.pad();
+  }
+  return out.seal(head.find(kNoDigits) + kNoDigits.find('0'));
+}
+
+}  // namespace
+
+Result<RandomBundle> RandomBundle::make(const std::string& arch, const Keys& network, const RandomSizes& sizes) {
+  VLA_TRY(const PolicyEntry entry, find_policy(arch));
+  Keys keys = network;
+  VLA_CHECK(add_keys(keys, arch, sizes));
+  ParamList list(keys, nullptr);
+  const std::unique_ptr<Policy> policy = entry.make(list);
+  VLA_CHECK(list.report(arch, {}));
+  RandomBundle bundle(::memfd_create("random bundle", MFD_CLOEXEC));
+  if (bundle.file_ < 0 || !write_bundle(bundle.file_, keys, list, sizes))
+    return Error{Code::out_of_memory, "random weights", "", "the system has no memory for a bundle of this size",
+                 "use a machine with more memory, or a 16-bit --dtype"};
+  return bundle;
+}
+
+RandomBundle::~RandomBundle() {
+  if (file_ >= 0) ::close(file_);
+}
+
+}  // namespace vla::bench

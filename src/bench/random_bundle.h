@@ -1,0 +1,38 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+#include "bundle/bundle.h"
+
+namespace vla::bench {
+
+struct RandomSizes {
+  int n_view = 2, max_tokens = 48, n_step = 10;
+  DType dtype = DType::bf16;  // of matrices and tables
+  std::uint64_t seed = 0;
+};
+
+/// A sound bundle of random weights in memory: what a network of that size costs, without a checkpoint. Nothing is
+/// written to a disk; the memory goes with the object. The values repeat after some millions, which no product notices.
+class RandomBundle {
+ public:
+  /// `network` has the keys that the architecture declares, such as PolicyEntry::published; features, recipe, solver
+  /// and a vocabulary of single bytes are added. Errors: unsupported, bad_bundle, out_of_memory.
+  static Result<RandomBundle> make(const std::string& arch, const Keys& network, const RandomSizes& sizes);
+
+  RandomBundle(RandomBundle&& other) noexcept : file_(other.file_) { other.file_ = -1; }
+  RandomBundle& operator=(RandomBundle&&) = delete;
+  ~RandomBundle();
+
+  /// A name under which this process can open it.
+  std::string path() const { return "/proc/self/fd/" + std::to_string(file_); }
+
+ private:
+  explicit RandomBundle(int file) : file_(file) {}
+  int file_;
+};
+
+}  // namespace vla::bench

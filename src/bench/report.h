@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "bench/machine.h"
+#include "bench/rounds.h"
+
+namespace vla::bench {
+
+/// What was measured: two reports with the same conditions may be compared.
+struct Conditions {
+  std::string policy, weights, source;  // architecture, dtype, where the bundle's weights come from
+  int n_view = 0, width = 0, height = 0, n_text = 0, n_step = 0, n_thread = 0;
+  std::string kernels;
+};
+
+/// One line of the report: a stage, or `network` (the stages that compute on the device), or `total`. Rates and shares
+/// are of the median time; shares of the peak compare each round with the peak beside it.
+struct StageRow {
+  std::string name;
+  double p50 = 0, p90 = 0, min = 0;     // ms
+  Work work;                            // zero for the host's stages
+  double flop_rate = 0, byte_rate = 0;  // per second
+  double share_of_peak = 0;             // of the best round
+  double share_of_peak_p50 = 0;
+  double share_of_bandwidth = 0;
+
+  /// Operations per byte; 0 where nothing is counted.
+  double intensity() const { return work.bytes > 0 ? work.flop / work.bytes : 0; }
+};
+
+struct Report {
+  Conditions conditions;
+  std::string cpu, peak_name;  // the probe that shares refer to
+  double load = 0;             // ms, from opening the bundle to being ready
+  Roofs before, after;
+  MemoryUse predicted;
+  ProcessMemory process;
+  std::vector<Round> rounds;
+  std::vector<StageRow> stages;  // in order of time, then `network` and `total`
+  std::optional<StepFit> fit;
+
+  /// What the machine can do: the best that was measured before, between and after the runs. Operations and bytes per
+  /// second.
+  double peak() const;
+  double bandwidth() const { return std::max(before.bandwidth, after.bandwidth); }
+  /// Where the roofline bends: a stage with fewer operations per byte is bound by memory.
+  double ridge() const { return peak() / bandwidth(); }
+  /// "compute", "memory", or "host" for a stage without counted work.
+  std::string regime(const StageRow& row) const;
+  const StageRow* find(const std::string& stage) const;
+};
+
+/// Fills `rounds`, `peak_name` and `stages`; the roofs must stand.
+void summarize(const Series& series, Report& report);
+
+/// One JSON object on one line.
+std::string to_json(const Report& report);
+/// For a person: a table with what stands around it, or the same as Markdown.
+std::string to_text(const Report& report);
+std::string to_markdown(const Report& report);
+
+}  // namespace vla::bench

@@ -1,0 +1,91 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "bench/report.h"
+
+namespace vla::bench {
+namespace {
+
+constexpr const char* kColumns[] = {"stage",  "p50 ms",  "p90 ms",         "min ms", "GFLOP",        "GB",
+                                    "FLOP/B", "GFLOP/s", "of peak (best)", "GB/s",   "of bandwidth", "bound by"};
+
+std::vector<std::string> cells(const StageRow& row, const Report& report) {
+  std::vector<std::string> cells = {row.name, fmt::format("{:.2f}", row.p50), fmt::format("{:.2f}", row.p90),
+                                    fmt::format("{:.2f}", row.min)};
+  if (row.work.flop == 0) {
+    cells.resize(std::size(kColumns));
+    cells.back() = "host";
+    return cells;
+  }
+  for (std::string cell : {fmt::format("{:.3g}", 1e-9 * row.work.flop), fmt::format("{:.3g}", 1e-9 * row.work.bytes),
+                           fmt::format("{:.1f}", row.intensity()), fmt::format("{:.1f}", 1e-9 * row.flop_rate),
+                           fmt::format("{:.1f} % ({:.1f} %)", 100 * row.share_of_peak_p50, 100 * row.share_of_peak),
+                           fmt::format("{:.1f}", 1e-9 * row.byte_rate),
+                           fmt::format("{:.0f} %", 100 * row.share_of_bandwidth), report.regime(row)})
+    cells.push_back(std::move(cell));
+  return cells;
+}
+
+std::vector<std::string> around(const Report& report) {
+  const Conditions& c = report.conditions;
+  std::vector<std::string> lines = {
+      fmt::format("{}, {} weights ({}): {} view{} of {} x {}, {} tokens, {} steps, batch 1", c.policy, c.weights,
+                  c.source, c.n_view, c.n_view == 1 ? "" : "s", c.width, c.height, c.n_text, c.n_step),
+      fmt::format("{}, {} thread{}, kernels: {}", report.cpu, c.n_thread, c.n_thread == 1 ? "" : "s", c.kernels)};
+  for (std::size_t i = 0; i < report.before.peaks.size(); ++i) {
+    const Roofs::Peak &before = report.before.peaks[i], &after = report.after.peaks[i];
+    lines.push_back(fmt::format("peak {}: {:.1f} G/s before the runs, {:.1f} after; one thread {:.1f}, {:.1f}{}",
+                                before.name, 1e-9 * before.all, 1e-9 * after.all, 1e-9 * before.one, 1e-9 * after.one,
+                                before.name == report.peak_name ? " (what shares refer to)" : ""));
+  }
+  lines.push_back(
+      fmt::format("memory bandwidth: {:.1f} GB/s before the runs, {:.1f} after; compute-bound from {:.1f} FLOP/B",
+                  1e-9 * report.before.bandwidth, 1e-9 * report.after.bandwidth, report.ridge()));
+  std::vector<double> cores, peaks;
+  for (const Round& round : report.rounds) cores.push_back(round.cores), peaks.push_back(1e-9 * round.peak);
+  lines.push_back(
+      fmt::format("{} rounds, each beside its own peak ({:.1f} to {:.1f} GFLOP/s), on {:.2f} cores (median)",
+                  report.rounds.size(), quantile(peaks, 0), quantile(peaks, 1), quantile(cores, 0.5)));
+  lines.push_back(fmt::format("loaded in {:.0f} ms; memory: {:.0f} MB predicted, {:.0f} MB at the most, {:.0f} MB now",
+                              report.load, 1e-6 * static_cast<double>(report.predicted.total()),
+                              1e-6 * static_cast<double>(report.process.peak),
+                              1e-6 * static_cast<double>(report.process.now)));
+  if (report.fit) {
+    std::vector<std::string> points;
+    for (const auto& [n_step, ms] : report.fit->points) points.push_back(fmt::format("{}: {:.1f}", n_step, ms));
+    lines.push_back(fmt::format("network over steps: {:.2f} ms + {:.2f} ms a step, within {:.2f} ms ({})",
+                                report.fit->prefix, report.fit->step, report.fit->worst, fmt::join(points, ", ")));
+  }
+  return lines;
+}
+
+}  // namespace
+
+std::string to_text(const Report& report) {
+  std::vector<std::vector<std::string>> table = {{std::begin(kColumns), std::end(kColumns)}};
+  for (const StageRow& row : report.stages) table.push_back(cells(row, report));
+  std::string text;
+  for (const std::string& line : around(report)) text += line + "\n";
+  text += "\n";
+  for (const auto& row : table)
+    for (std::size_t i = 0; i < row.size(); ++i) {
+      std::size_t width = 0;
+      for (const auto& other : table) width = std::max(width, other[i].size());
+      text += i == 0 ? fmt::format("{:<{}}", row[i], width) : fmt::format("  {:>{}}", row[i], width);
+      if (i + 1 == row.size()) text += "\n";
+    }
+  return text;
+}
+
+std::string to_markdown(const Report& report) {
+  std::string text;
+  for (const std::string& line : around(report)) text += "- " + line + "\n";
+  text += fmt::format("\n| {} |\n|", fmt::join(kColumns, " | "));
+  for (std::size_t i = 0; i < std::size(kColumns); ++i) text += i == 0 ? " --- |" : " ---: |";
+  for (const StageRow& row : report.stages) text += fmt::format("\n| {} |", fmt::join(cells(row, report), " | "));
+  return text + "\n";
+}
+
+}  // namespace vla::bench

@@ -1,0 +1,103 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bench/rounds.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "bench/machine.h"
+#include "kernels/probe/probe.h"
+
+namespace vla::bench {
+namespace {
+
+constexpr double kProbeSeconds = 0.03;
+
+Result<Round> run_round(Engine& engine, Workload& workload) {
+  Round round;
+  const double cpu_before = cpu_seconds();
+  StageClock clock;
+  VLA_CHECK(workload.decode());
+  clock.lap(round.stages, "decode");
+  VLA_TRY(const ActionChunk chunk, engine.act(workload.observation(), std::uint64_t{0}));
+  round.cores = cpu_seconds() - cpu_before;
+  round.stages.insert(round.stages.end(), chunk.timing.begin(), chunk.timing.end());
+  round.cores /= 1e-3 * round.total();
+  return round;
+}
+
+/// The network's share of a round, without the host's work before and after it.
+double network_time(const Round& round, const StageWork& work) {
+  double time = 0;
+  for (const auto& [stage, ms] : round.stages)
+    for (const auto& part : work)
+      if (part.first == stage) time += ms;
+  return time;
+}
+
+}  // namespace
+
+double Round::total() const {
+  double sum = 0;
+  for (const auto& stage : stages) sum += stage.second;
+  return sum;
+}
+
+Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Progress& tell) {
+  const kernels::PeakProbe& probe = kernels::peak_probe_of(engine.device().isa());
+  const auto measure_peak = [&] { return kernels::measure_peak(probe, engine.device().n_thread(), kProbeSeconds); };
+  Series series{engine.solver().n_step, probe.name, {}, {}};
+  for (int i = 0; i < n_warmup; ++i) {
+    VLA_TRY(const Round round, run_round(engine, workload));
+    tell(fmt::format("warm-up {}/{}: {:.1f} ms", i + 1, n_warmup, round.total()));
+  }
+  double before = measure_peak();
+  for (int i = 0; i < n_round; ++i) {
+    VLA_TRY(Round round, run_round(engine, workload));
+    const double after = measure_peak();
+    round.peak = (before + after) / 2;
+    before = after;
+    tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores, peak {:.1f} GFLOP/s", i + 1, n_round, round.total(),
+                     round.cores, 1e-9 * round.peak));
+    series.rounds.push_back(std::move(round));
+  }
+  series.work = engine.work();
+  return series;
+}
+
+StepFit fit_steps(const std::vector<Series>& series) {
+  StepFit fit;
+  double mean_x = 0, mean_y = 0, xx = 0, xy = 0;
+  for (const Series& one : series) {
+    std::vector<double> times;
+    for (const Round& round : one.rounds) times.push_back(network_time(round, one.work));
+    fit.points.emplace_back(one.n_step, quantile(times, 0.5));
+    mean_x += one.n_step / static_cast<double>(series.size());
+    mean_y += fit.points.back().second / static_cast<double>(series.size());
+  }
+  for (const auto& [x, y] : fit.points) xx += (x - mean_x) * (x - mean_x), xy += (x - mean_x) * (y - mean_y);
+  fit.step = xy / xx;
+  fit.prefix = mean_y - fit.step * mean_x;
+  for (const auto& [x, y] : fit.points) fit.worst = std::max(fit.worst, std::abs(y - fit.prefix - fit.step * x));
+  return fit;
+}
+
+double quantile(std::vector<double> values, double share) {
+  if (values.empty()) return 0;
+  std::sort(values.begin(), values.end());
+  const double place = share * static_cast<double>(values.size() - 1);
+  const auto low = static_cast<std::size_t>(place), high = std::min(low + 1, values.size() - 1);
+  return values[low] + (place - static_cast<double>(low)) * (values[high] - values[low]);
+}
+
+std::vector<double> stage_times(const Series& series, const std::string& stage) {
+  std::vector<double> times;
+  for (const Round& round : series.rounds)
+    for (const auto& [name, ms] : round.stages)
+      if (name == stage) times.push_back(ms);
+  return times;
+}
+
+}  // namespace vla::bench

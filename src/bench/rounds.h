@@ -1,0 +1,51 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <functional>
+#include <string>
+#include <vector>
+
+#include "bench/workload.h"
+#include "engine/engine.h"
+
+namespace vla::bench {
+
+/// One observation, timed, between two short probes of the machine's peak.
+struct Round {
+  Timing stages;     // ms; "decode" first
+  double peak = 0;   // operations per second of all threads, the mean of before and after
+  double cores = 0;  // CPU time over wall time: how many cores the run really had
+
+  double total() const;  // ms
+};
+
+/// Rounds of one number of solver steps.
+struct Series {
+  int n_step = 0;
+  std::string peak_name;  // of the probe between the rounds
+  std::vector<Round> rounds;
+  StageWork work;  // of the network's stages
+};
+
+/// Told what happens, a line at a time.
+using Progress = std::function<void(const std::string& line)>;
+
+/// Runs the loop: probe, observation, probe, ..., after rounds that are not counted. Errors: those of Engine::act.
+Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Progress& tell);
+
+/// total(T) = prefix + T * step, fitted by least squares to the median times of the network alone. In ms.
+struct StepFit {
+  double prefix = 0, step = 0;
+  double worst = 0;  // largest distance of a measured median from the line
+  std::vector<std::pair<int, double>> points;
+};
+/// Needs series of two different numbers of steps.
+StepFit fit_steps(const std::vector<Series>& series);
+
+/// The value that a part `share` of the values does not exceed, between neighbours linearly; NumPy's default.
+double quantile(std::vector<double> values, double share);
+/// Milliseconds of one stage in every round.
+std::vector<double> stage_times(const Series& series, const std::string& stage);
+
+}  // namespace vla::bench

@@ -1,0 +1,104 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bench/workload.h"
+
+#include <fmt/format.h>
+#include <png.h>
+
+#include <cmath>
+
+namespace vla::bench {
+namespace {
+
+/// A picture that compresses like a camera's: smooth shapes under the noise of a sensor.
+std::vector<std::uint8_t> draw_frame(int width, int height, std::uint32_t seed) {
+  std::vector<std::uint8_t> rgb;
+  rgb.reserve(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3);
+  for (int y = 0; y < height; ++y)
+    for (int x = 0; x < width; ++x)
+      for (int c = 0; c < 3; ++c) {
+        seed = seed * 1664525u + 1013904223u;
+        const double shape = std::sin(7.0 * x / width + c) * std::cos(5.0 * y / height - c);
+        rgb.push_back(static_cast<std::uint8_t>(124 + 110 * shape + static_cast<double>(seed >> 29)));
+      }
+  return rgb;
+}
+
+Result<std::vector<std::byte>> write_png(const std::vector<std::uint8_t>& rgb, int width, int height) {
+  png_image image = {};
+  image.version = PNG_IMAGE_VERSION;
+  image.width = static_cast<png_uint_32>(width);
+  image.height = static_cast<png_uint_32>(height);
+  image.format = PNG_FORMAT_RGB;
+  std::vector<std::byte> file(PNG_IMAGE_PNG_SIZE_MAX(image));
+  png_alloc_size_t size = file.size();
+  if (png_image_write_to_memory(&image, file.data(), &size, 0, rgb.data(), 0, nullptr) == 0)
+    return Error{Code::internal, "frame", "a PNG file", image.message, "please report this"};
+  file.resize(size);
+  return file;
+}
+
+Result<int> count_tokens(const Processor& processor, const std::string& text) {
+  Observation observation;
+  observation.text = text;
+  Inputs inputs;
+  VLA_CHECK(processor.encode_text(observation, inputs));
+  return static_cast<int>(inputs.tokens.size());
+}
+
+/// A text of exactly `n_token` tokens: the same word again and again, for a few words that tokenizers cut differently.
+Result<std::string> find_text(const Processor& processor, int n_token) {
+  const int most = processor.recipe().max_tokens;
+  if (n_token > most)
+    return Error{Code::usage, "--tokens", fmt::format("at most {}, which the bundle allows", most),
+                 std::to_string(n_token)};
+  for (const char* word : {"the ", "a", "1", "!?"}) {
+    std::string text;
+    for (int i = 0; i < n_token; ++i) {
+      text += word;
+      const auto count = count_tokens(processor, text);
+      if (!count || *count > n_token) break;  // a vocabulary need not have this word
+      if (*count == n_token) return text;
+    }
+  }
+  return Error{Code::usage, "--tokens", "a number of tokens that some text has", std::to_string(n_token),
+               "try one more or one less"};
+}
+
+}  // namespace
+
+Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes& sizes) {
+  const std::vector<std::string>& views = processor.views().names();
+  Workload workload;
+  const int n_view = sizes.n_view.value_or(static_cast<int>(views.size()));
+  if (n_view < processor.min_views() || n_view > static_cast<int>(views.size()))
+    return Error{Code::usage, "--views",
+                 fmt::format("{} to {}, which the bundle allows", processor.min_views(), views.size()),
+                 std::to_string(n_view)};
+  const auto& letterbox = processor.recipe().letterbox;
+  workload.width_ = sizes.width > 0 ? sizes.width : letterbox.width;
+  workload.height_ = sizes.height > 0 ? sizes.height : letterbox.height;
+  for (int i = 0; i < static_cast<int>(views.size()); ++i) {
+    const std::string& view = views[static_cast<std::size_t>(i)];
+    workload.observation_.views[view] = std::nullopt;
+    if (i >= n_view) continue;
+    const auto rgb = draw_frame(workload.width_, workload.height_, static_cast<std::uint32_t>(i));
+    VLA_TRY(std::vector<std::byte> png, write_png(rgb, workload.width_, workload.height_));
+    workload.frames_.push_back({view, std::move(png)});
+  }
+  const std::vector<std::string>& states = processor.states().names();
+  for (std::size_t i = 0; i < states.size(); ++i)
+    workload.observation_.states[states[i]].assign(static_cast<std::size_t>(processor.state_dims()[i]), 0.0f);
+  workload.n_text_ = sizes.n_text.value_or(processor.recipe().max_tokens);
+  VLA_TRY(workload.observation_.text, find_text(processor, workload.n_text_));
+  return workload;
+}
+
+Status Workload::decode() {
+  for (const File& file : frames_) {
+    VLA_TRY(observation_.views[file.view], decode_image(file.png, file.view));
+  }
+  return {};
+}
+
+}  // namespace vla::bench

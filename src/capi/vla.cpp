@@ -1,0 +1,126 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The functions of include/vla/vla.h: they translate and decide nothing.
+#include <vla/vla.h>
+
+#include <mutex>
+
+#include "capi/description.h"
+#include "capi/last_error.h"
+#include "capi/observation.h"
+#include "capi/structs.h"
+#include "engine/engine.h"
+
+struct vla_policy {
+  explicit vla_policy(std::unique_ptr<vla::Engine> loaded) : engine(std::move(loaded)), description(*engine) {}
+  std::unique_ptr<vla::Engine> engine;
+  vla::capi::Description description;
+  std::mutex mutex;  // the engine answers one observation at a time
+};
+
+struct vla_chunk {
+  vla::ActionChunk answer;
+  double queue_ms = 0;
+};
+
+namespace vla::capi {
+namespace {
+
+static_assert(VLA_INTERNAL == exit_code(Code::internal) && VLA_USAGE == exit_code(Code::usage) &&
+              VLA_BAD_BUNDLE == exit_code(Code::bad_bundle) &&
+              VLA_BAD_OBSERVATION == exit_code(Code::bad_observation) &&
+              VLA_BAD_ACTION == exit_code(Code::bad_action) && VLA_UNSUPPORTED == exit_code(Code::unsupported) &&
+              VLA_OUT_OF_MEMORY == exit_code(Code::out_of_memory) && VLA_DEVICE == exit_code(Code::device) &&
+              VLA_IO == exit_code(Code::io));
+
+constexpr int kMaxThread = 512;
+
+Result<EngineOptions> read_options(const vla_options* given) {
+  if (given == nullptr) return EngineOptions{};
+  VLA_TRY(const vla_options known, read_struct<vla_options>(given, "options"));
+  if (known.n_thread < 0 || known.n_thread > kMaxThread)
+    return usage("options.n_thread", fmt::format("0 to {}", kMaxThread), std::to_string(known.n_thread));
+  EngineOptions options{.n_thread = known.n_thread};
+  if (known.kernels != nullptr) {
+    VLA_TRY(options.kernels, read_name(known.kernels, "options.kernels"));
+  }
+  return options;
+}
+
+Status open(const char* path, const vla_options* options, vla_policy** out) {
+  if (out == nullptr) return usage("out", "a place for the policy", "NULL");
+  *out = nullptr;
+  VLA_TRY(const std::string file, read_name(path, "path"));
+  VLA_TRY(const EngineOptions engine_options, read_options(options));
+  VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(file, engine_options));
+  *out = new vla_policy(std::move(engine));
+  return {};
+}
+
+/// Pictures are decoded before the turn comes, so that callers wait for the engine alone.
+Status act(vla_policy* policy, const vla_observation* observation, vla_chunk** out) {
+  if (out == nullptr) return usage("out", "a place for the chunk", "NULL");
+  *out = nullptr;
+  if (policy == nullptr) return usage("policy", "an open policy", "NULL");
+  auto chunk = std::make_unique<vla_chunk>();
+  StageClock clock;
+  Timing before, queue;
+  VLA_TRY(const Request request, read_observation(observation, *policy->engine));
+  clock.lap(before, "decode");
+  const std::lock_guard<std::mutex> turn(policy->mutex);
+  clock.lap(queue, "queue");
+  VLA_TRY(chunk->answer, policy->engine->act(request.observation, request.noise));
+  Timing& timing = chunk->answer.timing;
+  timing.insert(timing.begin(), before.begin(), before.end());
+  chunk->queue_ms = queue.front().second;
+  *out = chunk.release();
+  return {};
+}
+
+/// The i-th stage, or nothing.
+const std::pair<std::string, double>* stage(const vla_chunk* chunk, std::size_t i) {
+  return chunk != nullptr && i < chunk->answer.timing.size() ? &chunk->answer.timing[i] : nullptr;
+}
+
+}  // namespace
+}  // namespace vla::capi
+
+using namespace vla::capi;
+
+uint32_t vla_abi_version(void) { return VLA_ABI_VERSION; }
+const char* vla_version(void) { return VLA_VERSION; }
+const vla_error* vla_last_error(const vla_policy* policy) { return last_error(policy); }
+
+vla_status vla_open(const char* path, const vla_options* options, vla_policy** out) {
+  return guarded(nullptr, [&] { return vla::capi::open(path, options, out); });
+}
+void vla_policy_close(vla_policy* policy) { delete policy; }
+const vla_description* vla_describe(const vla_policy* policy) {
+  return policy == nullptr ? nullptr : policy->description.get();
+}
+
+vla_status vla_act(vla_policy* policy, const vla_observation* observation, vla_chunk** out) {
+  return guarded(policy, [&] { return vla::capi::act(policy, observation, out); });
+}
+void vla_chunk_close(vla_chunk* chunk) { delete chunk; }
+
+const float* vla_chunk_actions(const vla_chunk* chunk) { return chunk ? chunk->answer.actions.data() : nullptr; }
+size_t vla_chunk_horizon(const vla_chunk* chunk) { return chunk ? static_cast<std::size_t>(chunk->answer.horizon) : 0; }
+size_t vla_chunk_d_action(const vla_chunk* chunk) {
+  return chunk ? static_cast<std::size_t>(chunk->answer.d_action) : 0;
+}
+size_t vla_chunk_n_note(const vla_chunk* chunk) { return chunk ? chunk->answer.notes.size() : 0; }
+const char* vla_chunk_note(const vla_chunk* chunk, size_t i) {
+  return i < vla_chunk_n_note(chunk) ? chunk->answer.notes[i].c_str() : nullptr;
+}
+size_t vla_chunk_n_stage(const vla_chunk* chunk) { return chunk ? chunk->answer.timing.size() : 0; }
+const char* vla_chunk_stage_name(const vla_chunk* chunk, size_t i) {
+  const auto* found = stage(chunk, i);
+  return found ? found->first.c_str() : nullptr;
+}
+double vla_chunk_stage_ms(const vla_chunk* chunk, size_t i) {
+  const auto* found = stage(chunk, i);
+  return found ? found->second : 0.0;
+}
+double vla_chunk_queue_ms(const vla_chunk* chunk) { return chunk ? chunk->queue_ms : 0.0; }

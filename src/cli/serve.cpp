@@ -1,0 +1,99 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <csignal>
+#include <cstdio>
+
+#include "cli/commands.h"
+#include "serve/codec.h"
+#include "serve/server.h"
+
+namespace vla::cli {
+namespace {
+
+struct ServeOptions {
+  std::string bundle;
+  int n_thread = 0;
+  std::size_t max_message_mb = 32;
+  serve::ServerOptions server;
+};
+
+serve::Server* stopped_by_signals = nullptr;
+
+/// The first SIGTERM or SIGINT lets the server finish; the next one ends the process.
+void stop_on_signals(serve::Server& server) {
+  stopped_by_signals = &server;
+  struct sigaction action = {};
+  action.sa_handler = [](int) { stopped_by_signals->stop(); };
+  action.sa_flags = static_cast<int>(SA_RESETHAND);
+  sigaction(SIGTERM, &action, nullptr);
+  sigaction(SIGINT, &action, nullptr);
+}
+
+/// One line for people, and for programs that split it as a shell would.
+void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms) {
+  const Processor& processor = engine.processor();
+  std::vector<std::string> features = processor.views().names();
+  features.insert(features.end(), processor.states().names().begin(), processor.states().names().end());
+  const v1::Description description = serve::describe(engine, {});
+  fmt::print(
+      "ready address={} bundle='{}' arch={} device='{}' precision={} kernels='{}' memory_mb={:.1f} features={} "
+      "warm_up_ms={:.1f}\n",
+      fmt::join(server.addresses(), ","), description.bundle().name(), description.bundle().arch(),
+      description.runtime().device(), description.runtime().precision(), description.runtime().kernels(),
+      static_cast<double>(engine.memory().total()) / 1e6, fmt::join(features, ","), warm_up_ms);
+  std::fflush(stdout);
+}
+
+Status serve(ServeOptions& options) {
+  options.server.max_message = options.max_message_mb << 20;
+  VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread}));
+  VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
+  stop_on_signals(*server);
+  print_ready(*server, *engine, warm_up_ms);
+  return server->run(*engine);
+}
+
+}  // namespace
+
+Command add_serve(CLI::App& app) {
+  auto options = std::make_shared<ServeOptions>();
+  serve::ServerOptions& server = options->server;
+  CLI::App* command = app.add_subcommand("serve", "Keep a policy loaded and answer clients over the network");
+  command->footer(
+      "Clients: docs/serving.md; the protocol: docs/protocol.md. SIGTERM or Ctrl-C answers what waits, then ends.\n"
+      "  vla serve policy.gguf\n"
+      "  vla serve policy.gguf --bind tcp://0.0.0.0:5555 --curve-secret server.secret --curve-clients clients.public");
+  command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert")->required();
+  command
+      ->add_option("--bind", server.bind,
+                   "tcp://ADDRESS:PORT (port 0: a free one) or ipc://PATH; may be given several times")
+      ->allow_extra_args(false)
+      ->capture_default_str();
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+      ->check(CLI::Range(0, 512))
+      ->capture_default_str();
+  command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
+      ->check(CLI::Range(1, 1024))
+      ->capture_default_str();
+  command->add_option("--max-pixels", server.max_pixels, "Largest picture, in pixels")
+      ->check(CLI::Range(1, 1 << 28))
+      ->capture_default_str();
+  command->add_option("--max-text", server.max_text, "Longest instruction, in bytes")
+      ->check(CLI::Range(1, 1 << 20))
+      ->capture_default_str();
+  command->add_option("--queue", server.max_queue, "Acts that may wait, one for each client; further ones are refused")
+      ->check(CLI::Range(1, 4096))
+      ->capture_default_str();
+  command->add_flag("--insecure", server.insecure, "Let everybody in who can reach an address that is not local");
+  command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")
+      ->check(CLI::ExistingFile);
+  command->add_option("--curve-clients", server.curve_clients, "Public keys of the clients that are let in, one a line")
+      ->check(CLI::ExistingFile);
+  return [options] { return serve(*options); };
+}
+
+}  // namespace vla::cli

@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "kernels/attention.h"
+
+#include <cmath>
+
+#include "kernels/cpu_kernels.h"
+#include "kernels/custom.h"
+
+namespace vla::kernels {
+namespace {
+
+AttentionJob::Rows rows(const ggml_tensor* x) {
+  const auto floats = [&](int i) { return static_cast<std::int64_t>(x->nb[i] / sizeof(float)); };
+  return {values(x), floats(1), floats(2), floats(3)};
+}
+
+/// Sizes and places of keys and values; what remains depends on the operation.
+AttentionJob make_job(const ggml_tensor* q, const ggml_tensor* k, const ggml_tensor* v) {
+  AttentionJob job = {};
+  job.d_head = q->ne[0];
+  job.n_head = q->ne[1];
+  job.n_query = q->ne[2];
+  job.n_batch = q->ne[3];
+  job.n_head_kv = k->ne[1];
+  job.n_key = k->ne[2];
+  job.scale = 1.0f / std::sqrt(static_cast<float>(q->ne[0]));
+  job.q = rows(q);
+  job.k = rows(k);
+  job.v = rows(v);
+  return job;
+}
+
+enum Source { kQ, kK, kV, kPacked, kMask };
+
+void pack_task(ggml_tensor* packed, int ith, int nth, void* kernel) {
+  AttentionJob job = make_job(packed->src[kQ], packed->src[kK], packed->src[kV]);
+  job.packed = static_cast<float*>(packed->data);
+  static_cast<const AttentionKernel*>(kernel)->pack(job, ith, nth);
+}
+
+void run_task(ggml_tensor* out, int ith, int nth, void* kernel) {
+  AttentionJob job = make_job(out->src[kQ], out->src[kK], out->src[kV]);
+  job.packed = static_cast<float*>(out->src[kPacked]->data);
+  job.mask = out->src[kMask] != nullptr ? values(out->src[kMask]) : nullptr;
+  job.out = static_cast<float*>(out->data);
+  static_cast<const AttentionKernel*>(kernel)->run(job, ith, nth);
+}
+
+}  // namespace
+
+bool has_attention(const Graph& g, std::int64_t d_head) {
+  return cpu_kernels(g.isa()) != nullptr && d_head <= kMaxHead;
+}
+
+Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) {
+  return attention(g, cpu_kernels(g.isa())->attention, q, k, v, mask);
+}
+
+Tensor attention(Graph& g, const AttentionKernel& kernel, Tensor q, Tensor k, Tensor v, Tensor mask) {
+  const std::int64_t size = kernel.packed_size(make_job(q.node(), k.node(), v.node()));
+  const auto user = const_cast<AttentionKernel*>(&kernel);  // ggml's type for user data; the tasks only read it
+  const Tensor packed = custom(g, {size}, {q, k, v}, pack_task, user);
+  return custom(g, {q.dim(0) * q.dim(1), q.dim(2), q.dim(3)}, {q, k, v, packed, mask}, run_task, user);
+}
+
+}  // namespace vla::kernels

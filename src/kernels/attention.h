@@ -1,0 +1,22 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "backend/graph.h"
+#include "kernels/attention_kernel.h"
+
+namespace vla::kernels {
+
+/// Whether the graph's kernels have an attention for heads of this width.
+bool has_attention(const Graph& g, std::int64_t d_head);
+
+/// softmax(q k / sqrt(d_head) + mask) v in float32, heads concatenated, without a matrix of scores in memory.
+/// q [d_head, n_head, n_query, n_batch], k and v [d_head, n_head_kv, n_key, n_batch], each with any strides but
+/// contiguous in d_head; mask [n_key, n_query], or none -> [d_head * n_head, n_query, n_batch].
+/// Chunks of keys that a block of queries sees nothing of (-infinity all over) are skipped.
+Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
+
+/// The same through a kernel of one's choice.
+Tensor attention(Graph& g, const AttentionKernel& kernel, Tensor q, Tensor k, Tensor v, Tensor mask);
+
+}  // namespace vla::kernels

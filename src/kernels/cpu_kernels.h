@@ -1,0 +1,29 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "backend/isa.h"
+#include "kernels/attention_kernel.h"
+
+namespace vla::kernels {
+
+/// Everything that is not a matrix product, for one instruction set. Rows are contiguous, and need no alignment.
+struct CpuKernels {
+  using Map = void (*)(const float* x, float* y, std::int64_t n);
+  /// y = (x - mean) / deviation * weight + bias; weight and bias may be null.
+  using Norm = void (*)(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n);
+
+  Map exp, silu, gelu_tanh;  // math.h
+  Norm layer_norm, rms_norm;
+  /// Turns the pairs (x_i, x_{i + half}).
+  void (*rotate_half)(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half);
+  AttentionKernel attention;
+};
+
+/// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used.
+const CpuKernels* cpu_kernels(Isa isa);
+
+/// The same templates without any instruction set: slow, and there to test them at another width.
+const CpuKernels& portable_kernels();
+
+}  // namespace vla::kernels

@@ -1,0 +1,12 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#if defined(__x86_64__)
+#include "kernels/cpu_kernels_make.h"
+
+namespace vla::kernels {
+
+extern const CpuKernels kAvx512Kernels;
+const CpuKernels kAvx512Kernels = CpuKernelsMaker<Avx512, 12>::make();
+
+}  // namespace vla::kernels
+#endif

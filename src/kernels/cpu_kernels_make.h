@@ -1,0 +1,92 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "kernels/attention_tile.h"
+#include "kernels/cpu_kernels.h"
+
+namespace vla::kernels {
+
+/// The kernels of one instruction set, all from the same templates. Only a file that is compiled for V's instructions
+/// may include this. `kTile`: rows of a register tile that is two vectors wide.
+template <class V, int kTile>
+class CpuKernelsMaker {
+  using Float = typename V::Float;
+
+ public:
+  static constexpr CpuKernels make() {
+    using Attention = AttentionTile<V, kTile>;
+    return {map<Exp>,
+            map<Silu>,
+            map<GeluTanh>,
+            layer_norm,
+            rms_norm,
+            rotate_half,
+            {Attention::packed_size, Attention::pack, Attention::run}};
+  }
+
+ private:
+  struct Exp {
+    static VLA_INLINE Float of(Float x) { return exp<V>(x); }
+  };
+  struct Silu {
+    static VLA_INLINE Float of(Float x) { return silu<V>(x); }
+  };
+  struct GeluTanh {
+    static VLA_INLINE Float of(Float x) { return gelu_tanh<V>(x); }
+  };
+
+  template <class F>
+  static void map(const float* x, float* y, std::int64_t n) {
+    for (std::int64_t i = 0; i < n; i += V::width) store<V>(y + i, F::of(load<V>(x + i, n - i)), n - i);
+  }
+
+  /// The sum of (x - mean)^2, or of x where `mean` is null. Two chains of sums, so that one need not wait for the
+  /// other.
+  static VLA_INLINE float sum(const float* x, const float* mean, std::int64_t n) {
+    const auto term = [&](Float value) { return mean == nullptr ? value : (value - *mean) * (value - *mean); };
+    Float even = {}, odd = {};
+    std::int64_t i = 0;
+    for (; i + 2 * V::width <= n; i += 2 * V::width) {
+      even += term(V::load(x + i));
+      odd += term(V::load(x + i + V::width));
+    }
+    float total = V::sum(even + odd);
+    for (; i < n; ++i) total += mean == nullptr ? x[i] : (x[i] - *mean) * (x[i] - *mean);
+    return total;
+  }
+
+  /// y = (x - mean) * factor * weight + bias
+  static VLA_INLINE void scale(const float* x, float mean, float factor, const float* weight, const float* bias,
+                               float* y, std::int64_t n) {
+    for (std::int64_t i = 0; i < n; i += V::width) {
+      Float value = (load<V>(x + i, n - i) - mean) * factor;
+      if (weight != nullptr) value *= load<V>(weight + i, n - i);
+      if (bias != nullptr) value += load<V>(bias + i, n - i);
+      store<V>(y + i, value, n - i);
+    }
+  }
+
+  static void layer_norm(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n) {
+    const float mean = sum(x, nullptr, n) / static_cast<float>(n);
+    const float variance = sum(x, &mean, n) / static_cast<float>(n);
+    scale(x, mean, 1.0f / __builtin_sqrtf(variance + eps), weight, bias, y, n);
+  }
+
+  static void rms_norm(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n) {
+    const float zero = 0.0f, mean_square = sum(x, &zero, n) / static_cast<float>(n);
+    scale(x, zero, 1.0f / __builtin_sqrtf(mean_square + eps), weight, bias, y, n);
+  }
+
+  static void rotate_half(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half) {
+    for (std::int64_t i = 0; i < half; i += V::width) {
+      const std::int64_t left = half - i;
+      const Float a = load<V>(x + i, left), b = load<V>(x + half + i, left);
+      const Float c = load<V>(cosine + i, left), s = load<V>(sine + i, left);
+      store<V>(y + i, a * c - b * s, left);
+      store<V>(y + half + i, b * c + a * s, left);
+    }
+  }
+};
+
+}  // namespace vla::kernels

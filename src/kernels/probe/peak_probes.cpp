@@ -1,0 +1,148 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Loops of multiply-adds on registers alone, one for each instruction set. In every loop the sums are as many as the
+// registers allow, so that no multiply-add waits for the one before it, and each starts from another value, so that no
+// compiler finds two of them equal. Each function names the instructions that it is compiled for, and runs only where
+// the machine has them.
+#include <algorithm>
+
+#include "kernels/probe/probe.h"
+
+#if defined(__x86_64__)
+#include <cpuid.h>
+#include <immintrin.h>
+#endif
+
+namespace vla::kernels {
+namespace {
+
+volatile float sink;  // what is stored here must be computed
+
+/// Factors that keep every sum finite and normal: x <- 0.999 x + 0.001 tends to 1.
+constexpr float kFactor = 0.999f, kTerm = 0.001f;
+
+void multiply_add_any(long n_round) {
+  using Vector [[gnu::vector_size(16)]] = float;
+  Vector sums[8];
+#pragma GCC unroll 8
+  for (int i = 0; i < 8; ++i) sums[i] = Vector{} + static_cast<float>(i);
+  for (; n_round > 0; --n_round)
+#pragma GCC unroll 8
+    for (Vector& s : sums) s = s * kFactor + kTerm;
+  for (const Vector& s : sums) sink = s[0];
+}
+
+#if defined(__x86_64__)
+
+[[gnu::target("avx2,fma")]] void multiply_add_avx2(long n_round) {
+  const __m256 factor = _mm256_set1_ps(kFactor), term = _mm256_set1_ps(kTerm);
+  __m256 sums[12];
+#pragma GCC unroll 12
+  for (int i = 0; i < 12; ++i) sums[i] = _mm256_set1_ps(static_cast<float>(i));
+  for (; n_round > 0; --n_round)
+#pragma GCC unroll 12
+    for (__m256& s : sums) s = _mm256_fmadd_ps(s, factor, term);
+  for (const __m256& s : sums) sink = _mm256_cvtss_f32(s);
+}
+
+[[gnu::target("avx512f")]] void multiply_add_avx512(long n_round) {
+  const __m512 factor = _mm512_set1_ps(kFactor), term = _mm512_set1_ps(kTerm);
+  __m512 sums[28];
+#pragma GCC unroll 28
+  for (int i = 0; i < 28; ++i) sums[i] = _mm512_set1_ps(static_cast<float>(i));
+  for (; n_round > 0; --n_round)
+#pragma GCC unroll 28
+    for (__m512& s : sums) s = _mm512_fmadd_ps(s, factor, term);
+  for (const __m512& s : sums) sink = _mm512_cvtss_f32(s);
+}
+
+/// The whole loop in assembler: of the intrinsic, compilers copy every sum, which halves the rate.
+[[gnu::target("avx512f")]] void multiply_add_vnni(long n_round) {
+  if (n_round <= 0) return;
+  __asm__ volatile(
+      "1:\n"
+      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24,25,26,27\n"
+      "vpdpbusd %%zmm30, %%zmm31, %%zmm\\sum\n"
+      ".endr\n"
+      "dec %0\n"
+      "jnz 1b"
+      : "+r"(n_round)
+      :
+      : "cc", "zmm0", "zmm1", "zmm2", "zmm3", "zmm4", "zmm5", "zmm6", "zmm7", "zmm8", "zmm9", "zmm10", "zmm11", "zmm12",
+        "zmm13", "zmm14", "zmm15", "zmm16", "zmm17", "zmm18", "zmm19", "zmm20", "zmm21", "zmm22", "zmm23", "zmm24",
+        "zmm25", "zmm26", "zmm27");
+}
+
+/// All eight tiles as 16 rows of 64 bytes, palette 1. Source: Intel Architecture Instruction Set Extensions,
+/// chapter on AMX, LDTILECFG.
+struct alignas(64) TileConfig {
+  std::uint8_t palette = 1, start_row = 0, reserved[14] = {};
+  std::uint16_t n_byte[16] = {64, 64, 64, 64, 64, 64, 64, 64};
+  std::uint8_t n_row[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+};
+
+constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell the compiler that it reads all of it
+
+/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero: the time does not depend on the values.
+// clang-format off
+#define VLA_TILE_LOOP(multiply_add)                                                \
+  _tile_loadconfig(&kTiles);                                                       \
+  _tile_zero(0); _tile_zero(1); _tile_zero(2); _tile_zero(3);                      \
+  _tile_zero(4); _tile_zero(5); _tile_zero(6); _tile_zero(7);                      \
+  for (; n_round > 0; --n_round) {                                                 \
+    multiply_add(0, 6, 7); multiply_add(1, 6, 7); multiply_add(2, 6, 7);           \
+    multiply_add(3, 6, 7); multiply_add(4, 6, 7); multiply_add(5, 6, 7);           \
+  }                                                                                \
+  _tile_release()
+// clang-format on
+
+[[gnu::target("amx-tile,amx-bf16")]] void multiply_add_amx_bf16(long n_round) { VLA_TILE_LOOP(_tile_dpbf16ps); }
+[[gnu::target("amx-tile,amx-int8")]] void multiply_add_amx_int8(long n_round) { VLA_TILE_LOOP(_tile_dpbssd); }
+
+#undef VLA_TILE_LOOP
+
+bool has_amx_int8() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  return __get_cpuid_count(7, 0, &a, &b, &c, &d) != 0 && (d & (1U << 25)) != 0;
+}
+
+#endif
+
+std::vector<PeakProbe> detect() {
+  std::vector<PeakProbe> found = {{"baseline f32", Isa::ggml, Number::f32, 8 * 4 * 2, multiply_add_any}};
+#if defined(__x86_64__)
+  const std::vector<Isa>& usable = usable_isas();
+  const auto has = [&](Isa isa) { return std::find(usable.begin(), usable.end(), isa) != usable.end(); };
+  if (has(Isa::avx2)) found.push_back({"avx2 f32", Isa::avx2, Number::f32, 12 * 8 * 2, multiply_add_avx2});
+  if (has(Isa::avx512)) {
+    found.push_back({"avx512 f32", Isa::avx512, Number::f32, 28 * 16 * 2, multiply_add_avx512});
+    if (__builtin_cpu_supports("avx512vnni"))
+      found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
+  }
+  if (has(Isa::amx)) {
+    constexpr double kTileProduct = 16 * 16 * 32 * 2;  // of bf16; a tile holds twice as many int8
+    found.push_back({"amx bf16", Isa::amx, Number::bf16, 6 * kTileProduct, multiply_add_amx_bf16});
+    if (has_amx_int8())
+      found.push_back({"amx int8", Isa::amx, Number::int8, 2 * 6 * kTileProduct, multiply_add_amx_int8});
+  }
+#endif
+  return found;
+}
+
+}  // namespace
+
+const std::vector<PeakProbe>& peak_probes() {
+  static const std::vector<PeakProbe> probes = detect();
+  return probes;
+}
+
+const PeakProbe& peak_probe_of(Isa isa) {
+  const PeakProbe* best = &peak_probes().front();
+  for (const PeakProbe& probe : peak_probes())
+    if (isa == Isa::ggml ? probe.number == Number::f32 : probe.isa == isa && probe.number != Number::int8)
+      best = &probe;
+  return *best;
+}
+
+}  // namespace vla::kernels

@@ -1,0 +1,115 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <bit>
+#include <cstdint>
+#include <cstring>
+
+#if defined(__AVX2__) && defined(__FMA__)
+#include <immintrin.h>
+#endif
+
+/// Kernels are templates over one of the types below, which is never used outside a file that is compiled for its
+/// instructions. Everything they call is forced inline: a function of its own could be merged by the linker with the
+/// copy of a file that was compiled for a better machine.
+#define VLA_INLINE inline __attribute__((always_inline))
+
+namespace vla::kernels {
+
+/// `W` lanes in the compiler's vector extension. Arithmetic, comparisons and `mask ? a : b` are its operators.
+template <int W>
+struct Lanes {
+  static constexpr int width = W;
+  typedef float Float __attribute__((vector_size(4 * W)));
+  typedef std::int32_t Int __attribute__((vector_size(4 * W)));
+
+  static VLA_INLINE Float set(float x) { return x - Float{}; }
+  static VLA_INLINE Float load(const float* p) {
+    Float x;
+    std::memcpy(&x, p, sizeof(x));
+    return x;
+  }
+  static VLA_INLINE void store(float* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
+  /// The first `n` lanes, 0 <= n <= W, and zeros.
+  static VLA_INLINE Float load_part(const float* p, int n) {
+    Float x = {};
+    std::memcpy(&x, p, static_cast<std::size_t>(n) * sizeof(float));
+    return x;
+  }
+  static VLA_INLINE void store_part(float* p, Float x, int n) {
+    std::memcpy(p, &x, static_cast<std::size_t>(n) * sizeof(float));
+  }
+  static VLA_INLINE float sum(Float x) {
+    float all[W];
+    store(all, x);
+    for (int step = W / 2; step > 0; step /= 2)
+      for (int i = 0; i < step; ++i) all[i] += all[i + step];
+    return all[0];
+  }
+};
+
+/// Four lanes on every machine. Its multiply-add is made in double, which keeps the error terms of math.h exact where
+/// no instruction does.
+struct Portable : Lanes<4> {
+  static VLA_INLINE Float fma(Float a, Float b, Float c) {
+    Float y;
+    for (int i = 0; i < width; ++i) y[i] = static_cast<float>(double{a[i]} * double{b[i]} + double{c[i]});
+    return y;
+  }
+  /// Of a number and NaN, `max` is the second.
+  static VLA_INLINE Float max(Float a, Float b) { return a > b ? a : b; }
+  static VLA_INLINE float max(Float x) {
+    float most = x[0];
+    for (int i = 1; i < width; ++i) most = x[i] > most ? x[i] : most;
+    return most;
+  }
+};
+
+#if defined(__AVX2__) && defined(__FMA__)
+struct Avx2 : Lanes<8> {
+  static VLA_INLINE Float set(float x) { return _mm256_set1_ps(x); }
+  static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm256_fmadd_ps(a, b, c); }
+  static VLA_INLINE Float max(Float a, Float b) { return _mm256_max_ps(a, b); }
+  static VLA_INLINE float sum(Float x) {
+    __m128 y = _mm256_castps256_ps128(x) + _mm256_extractf128_ps(x, 1);
+    y += _mm_movehl_ps(y, y);
+    return y[0] + y[1];
+  }
+  static VLA_INLINE float max(Float x) {
+    __m128 y = _mm_max_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps(x, 1));
+    y = _mm_max_ps(y, _mm_movehl_ps(y, y));
+    return y[0] > y[1] ? y[0] : y[1];
+  }
+};
+#endif
+
+#if defined(__AVX512F__) && defined(__AVX512DQ__)
+// Whole masks, where an instruction without one would do: GCC 12 warns of the undefined lanes in its own header.
+struct Avx512 : Lanes<16> {
+  static VLA_INLINE Float set(float x) { return _mm512_set1_ps(x); }
+  static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm512_fmadd_ps(a, b, c); }
+  static VLA_INLINE Float max(Float a, Float b) { return _mm512_maskz_max_ps(0xffff, a, b); }
+  static VLA_INLINE Float load_part(const float* p, int n) { return _mm512_maskz_loadu_ps(mask(n), p); }
+  static VLA_INLINE void store_part(float* p, Float x, int n) { _mm512_mask_storeu_ps(p, mask(n), x); }
+  static VLA_INLINE float sum(Float x) { return Avx2::sum(lower(x) + upper(x)); }
+  static VLA_INLINE float max(Float x) { return Avx2::max(Avx2::max(lower(x), upper(x))); }
+
+ private:
+  static VLA_INLINE __mmask16 mask(int n) { return static_cast<__mmask16>((1U << n) - 1U); }
+  static VLA_INLINE __m256 lower(Float x) { return _mm512_maskz_extractf32x8_ps(0xff, x, 0); }
+  static VLA_INLINE __m256 upper(Float x) { return _mm512_maskz_extractf32x8_ps(0xff, x, 1); }
+};
+#endif
+
+/// A vector from p where `left` numbers remain; lanes beyond them are zeros.
+template <class V>
+VLA_INLINE typename V::Float load(const float* p, std::int64_t left) {
+  return left >= V::width ? V::load(p) : V::load_part(p, static_cast<int>(left));
+}
+template <class V>
+VLA_INLINE void store(float* p, typename V::Float x, std::int64_t left) {
+  left >= V::width ? V::store(p, x) : V::store_part(p, x, static_cast<int>(left));
+}
+
+}  // namespace vla::kernels

@@ -1,0 +1,52 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <span>
+
+#include "engine/engine.h"
+#include "serve/vla.pb.h"
+
+namespace vla::serve {
+
+/// What an act may hold. All are compared before memory is taken that the sizes ask for.
+struct ActLimits {
+  std::int64_t max_pixels = 0;  // of one picture
+  std::size_t max_text = 0;     // bytes
+  std::size_t max_views = 0;
+  int horizon = 0, d_noise = 0;  // of the noise that the policy takes
+};
+
+/// An act, ready for the engine.
+struct ActRequest {
+  Observation observation;
+  Noise noise;
+  std::optional<std::uint64_t> seed;  // that the noise is drawn from: the client's or a fresh one
+  std::int64_t capture_time_ns = 0;
+};
+
+/// A serialized Act -> what the engine takes; pictures are decoded. Errors: bad_request (not an Act), too_large,
+/// bad_observation.
+Result<ActRequest> decode_act(std::span<const std::byte> act, const ActLimits& limits);
+
+/// A serialized Hello -> the reply. Errors: bad_request, incompatible.
+Result<v1::HelloReply> answer_hello(std::span<const std::byte> hello);
+
+/// Whether the body of a Describe or Health is the empty message that it has to be. Errors: bad_request.
+Status check_empty(std::span<const std::byte> body);
+
+/// What stays the same in every answer, made once from a loaded engine.
+v1::Description describe(const Engine& engine, const v1::Limits& limits);
+
+/// A chunk of the engine -> its message. `stages` has the server's own stages in it; `names` and so on come from
+/// `description`.
+v1::ActionChunk encode_chunk(const ActRequest& request, ActionChunk chunk, const v1::Description& description);
+
+v1::Error encode_error(const Error& error);
+
+/// The response to a request of this number, of the newest version that this build speaks.
+v1::Response response_to(std::uint64_t request_id);
+
+}  // namespace vla::serve

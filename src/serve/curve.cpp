@@ -1,0 +1,125 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/curve.h"
+
+#include <fcntl.h>
+#include <fmt/format.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <array>
+#include <cerrno>
+#include <cstring>
+#include <sstream>
+#include <vector>
+
+#include "base/file.h"
+
+namespace vla::serve {
+namespace {
+
+constexpr std::size_t kKeySize = 40;  // characters of Z85 for 32 bytes
+constexpr std::size_t kMaxFile = 1 << 20;
+
+bool is_key(const std::string& text) {
+  std::array<std::uint8_t, 32> bytes;
+  return text.size() == kKeySize && zmq_z85_decode(bytes.data(), text.c_str()) != nullptr;
+}
+
+Result<std::string> read_text(const std::string& file) {
+  VLA_TRY(const std::vector<std::byte> bytes, read_file(file, kMaxFile));
+  return std::string(reinterpret_cast<const char*>(bytes.data()), bytes.size());
+}
+
+/// Creates the file or fails: a key that others use is never lost.
+Status write_new(const std::string& file, const char* key, mode_t mode) {
+  const auto failed = [&] {
+    const std::string hint = errno == EEXIST ? "name another prefix, or remove the old keys" : "";
+    return Error{Code::io, file, "a new file", std::strerror(errno), hint};
+  };
+  const int fd = ::open(file.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode);
+  if (fd < 0) return failed();
+  const std::string line = std::string(key) + "\n";
+  const bool written = ::write(fd, line.data(), line.size()) == static_cast<ssize_t>(line.size());
+  const bool closed = ::close(fd) == 0;
+  return written && closed ? Status() : Status(failed());
+}
+
+}  // namespace
+
+Status write_key_pair(const std::string& prefix) {
+  std::array<char, kKeySize + 1> public_key, secret_key;
+  if (zmq_curve_keypair(public_key.data(), secret_key.data()) != 0)
+    return Error{Code::unsupported, "keygen", "a ZeroMQ library with CURVE", "one without"};
+  struct stat there;
+  if (::stat((prefix + ".public").c_str(), &there) == 0)
+    return Error{Code::io, prefix + ".public", "a new file", "File exists",
+                 "name another prefix, or remove the old keys"};
+  VLA_CHECK(write_new(prefix + ".secret", secret_key.data(), 0600));
+  return write_new(prefix + ".public", public_key.data(), 0644);
+}
+
+Result<std::string> read_secret_key(const std::string& file) {
+  VLA_TRY(std::string text, read_text(file));
+  while (!text.empty() && std::strchr(" \t\r\n", text.back()) != nullptr) text.pop_back();
+  if (!is_key(text))
+    return Error{Code::usage, file, "one CURVE key of 40 characters", "something else", "vla keygen writes one"};
+  struct stat info;
+  if (::stat(file.c_str(), &info) == 0 && (info.st_mode & 077) != 0)
+    return Error{Code::usage, file, "a secret that only its owner may read",
+                 fmt::format("mode {:o}", info.st_mode & 0777), "chmod 600 " + file};
+  return text;
+}
+
+Result<std::set<std::string>> read_public_keys(const std::string& file) {
+  VLA_TRY(const std::string text, read_text(file));
+  std::set<std::string> keys;
+  std::istringstream lines(text);
+  std::string line, key;
+  for (int number = 1; std::getline(lines, line); ++number) {
+    std::istringstream words(line);
+    if (!(words >> key) || key == "#") continue;
+    if (!is_key(key))
+      return Error{Code::usage, fmt::format("{}:{}", file, number), "a CURVE key of 40 characters", "something else",
+                   "vla keygen writes one into PREFIX.public"};
+    keys.insert(key);
+  }
+  if (keys.empty()) return Error{Code::usage, file, "at least one public key of a client", "none"};
+  return keys;
+}
+
+Result<std::string> public_key_of(const std::string& secret) {
+  std::array<char, kKeySize + 1> key;
+  if (zmq_curve_public(key.data(), secret.c_str()) != 0)
+    return Error{Code::usage, "secret key", "a CURVE key", "something else"};
+  return std::string(key.data());
+}
+
+Gate::Gate(zmq::context_t& context, std::set<std::string> clients)
+    : socket_(context, zmq::socket_type::rep), clients_(std::move(clients)) {
+  socket_.bind("inproc://zeromq.zap.01");
+}
+
+void Gate::answer() {
+  // version, request id, domain, address, routing id, mechanism, credentials
+  std::vector<zmq::message_t> frames;
+  for (bool more = true; more;) {
+    zmq::message_t frame;
+    if (!socket_.recv(frame, zmq::recv_flags::dontwait)) return;
+    more = frame.more();
+    frames.push_back(std::move(frame));
+  }
+  bool admitted = false;
+  if (frames.size() == 7 && frames[5].to_string_view() == "CURVE" && frames[6].size() == 32) {
+    std::array<char, kKeySize + 1> key;
+    zmq_z85_encode(key.data(), frames[6].data<std::uint8_t>(), 32);
+    admitted = clients_.contains(key.data());
+  }
+  const std::string id = frames.size() > 1 ? frames[1].to_string() : std::string();
+  for (const std::string& part : {std::string("1.0"), id, std::string(admitted ? "200" : "400"),
+                                  std::string(admitted ? "" : "no client of this server"), std::string()})
+    socket_.send(zmq::buffer(part), zmq::send_flags::sndmore);
+  socket_.send(zmq::message_t(), zmq::send_flags::none);
+}
+
+}  // namespace vla::serve

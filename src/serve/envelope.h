@@ -1,0 +1,37 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+#include <span>
+
+#include "base/result.h"
+#include "serve/observer.h"
+
+namespace vla::serve {
+
+/// The protocol versions that this build speaks, and the most fields that a request or an act may have. A field takes
+/// two bytes on the wire and a hundred in memory, so their number is bounded before anything is parsed.
+constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
+constexpr int kMaxFields = 1024;
+
+/// What the I/O thread knows of a request: enough to queue, answer or refuse it, without looking at a picture.
+struct Envelope {
+  std::uint32_t version = 0;
+  std::uint64_t request_id = 0;
+  Kind kind = Kind::unknown;
+  std::span<const std::byte> body;  // the serialized Hello, Describe, Act or Health, inside the request's bytes
+  std::optional<std::uint64_t> deadline_ms;  // of an act
+};
+
+/// Walks over the fields of a serialized Request, and of an Act in it, without copying one. After an error `envelope`
+/// holds what was read before it, so that the refusal can carry the request's number. Errors: bad_request,
+/// incompatible.
+Status read_envelope(std::span<const std::byte> request, Envelope& envelope);
+
+/// The refusal of a peer that speaks versions `min` to `max` only.
+Error incompatible(std::uint32_t min, std::uint32_t max);
+
+}  // namespace vla::serve

@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "engine/engine.h"
+#include "serve/io.h"
+#include "serve/observer.h"
+
+namespace vla::serve {
+
+struct ServerOptions {
+  std::vector<std::string> bind = {"tcp://127.0.0.1:5555"};
+  bool insecure = false;                    // an address that others can reach may be bound without keys
+  std::string curve_secret, curve_clients;  // files; both or neither
+  std::size_t max_message = 32 << 20;       // bytes
+  std::int64_t max_pixels = 1 << 24;        // of one picture
+  std::size_t max_text = 4096;              // bytes
+  std::size_t max_queue = 64;               // acts
+};
+
+/// Computes one act of a synthetic observation with every view and the longest text, so that the first client does not
+/// pay for what happens once. A policy may refuse such an observation; what fails otherwise would fail every act.
+/// Milliseconds. Errors: device, out_of_memory, internal.
+Result<double> warm_up(Engine& engine);
+
+/// One resident policy behind a ZeroMQ ROUTER. It keeps nothing between requests.
+class Server {
+ public:
+  /// Binds the addresses. Requests that come before `run` wait. Errors: usage (an address or a key that is none; an
+  /// address that others can reach, without keys), io (in use, not of this machine).
+  static Result<std::unique_ptr<Server>> open(const ServerOptions& options);
+
+  /// What was bound, ports filled in.
+  const std::vector<std::string>& addresses() const { return addresses_; }
+
+  /// Serves on this thread, which computes, and a second one, which talks, until `stop`; then answers what waits and
+  /// returns. Observers outlive the call. Once for each server. Errors: internal.
+  Status run(Engine& engine, std::span<Observer* const> observers = {});
+  /// From any thread or signal handler.
+  void stop() noexcept;
+  /// From any thread.
+  Health health() const { return vitals_.health(exchange_); }
+
+ private:
+  explicit Server(const ServerOptions& options);
+  Status guard();
+  Status bind();
+  Status talk(std::span<Observer* const> observers) noexcept;
+  Answer compute(Engine& engine, Job job) const;
+  Result<v1::ActionChunk> act(Engine& engine, const Job& job, Timing& stages) const;
+
+  ServerOptions options_;
+  Vitals vitals_;
+  Exchange exchange_;
+  v1::Description description_;
+  zmq::context_t context_;
+  std::unique_ptr<Gate> gate_;
+  zmq::socket_t router_;
+  std::vector<std::string> addresses_;
+};
+
+}  // namespace vla::serve

@@ -1,0 +1,249 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The client against a server that misbehaves, and against none."""
+
+import os
+import pickle
+import threading
+import time
+
+import numpy as np
+import pytest
+import zmq
+from faulty_server import chunk, response
+
+import vla_cpp
+from vla_cpp import wire
+from vla_cpp.client import _health
+
+FRAME = np.zeros((64, 64, 3), np.uint8)
+OBSERVATION = {"images": {"top": FRAME}, "state": [0.0, 0.0], "text": "go"}
+
+
+@pytest.fixture
+def client(faulty):
+    with vla_cpp.Client(faulty.address, timeout=2) as client:
+        yield client
+
+
+def error_message(code, **fields):
+    number = wire.MESSAGES["Error"].DESCRIPTOR.enum_types_by_name["Code"].values_by_name[code].number
+    return wire.MESSAGES["Error"](code=number, **fields)
+
+
+def test_a_chunk_is_an_array_of_float32_with_its_facts(faulty, client):
+    got = client.act(**OBSERVATION, seed=7, capture_time_ns=5)
+    assert np.asarray(got).dtype == np.float32 and np.asarray(got).shape == (4, 2)
+    assert (np.asarray(got) == 7).all()
+    assert got.bundle.checksum == "xxh3:1"
+    assert faulty.acts[0].act.capture_time_ns == 5
+
+
+def test_the_first_thing_sent_is_a_hello_and_the_description_is_asked_for_once(faulty, client):
+    client.act(**OBSERVATION)
+    client.act(**OBSERVATION)
+    assert faulty.kinds == ["hello", "describe", "act", "act"]
+
+
+def test_the_timeout_is_the_deadline_unless_another_is_given(faulty, client):
+    client.act(**OBSERVATION)
+    client.act(**OBSERVATION, deadline_ms=30)
+    assert [a.act.deadline_ms for a in faulty.acts] == [2000, 30]
+
+
+def test_a_late_answer_is_never_taken_for_the_answer_to_another_request(faulty, client):
+    kept = []
+
+    def crossed(request):
+        kept.append(request)
+        if len(kept) == 1:
+            return []
+        return [response(r, chunk=chunk(r.act.seed)) for r in kept]  # the one of the first request goes out first
+
+    faulty.on_act = crossed
+    with pytest.raises(vla_cpp.Timeout):
+        client.act(**OBSERVATION, seed=1, timeout=0.2)
+    assert client.act(**OBSERVATION, seed=2)[0, 0] == 2
+
+
+def test_answers_that_come_in_another_order_reach_those_who_asked(faulty, client):
+    kept = []
+
+    def reversed_pairs(request):
+        kept.append(request)
+        return [response(r, chunk=chunk(r.act.seed)) for r in reversed(kept)] if len(kept) == 2 else []
+
+    faulty.on_act = reversed_pairs
+    first, second = client.submit(**OBSERVATION, seed=1), client.submit(**OBSERVATION, seed=2)
+    assert first.result()[0, 0] == 1 and second.result()[0, 0] == 2
+
+
+def test_silence_ends_with_a_timeout_and_the_next_call_has_a_fresh_socket(faulty, client):
+    faulty.on_act = lambda request: []
+    start = time.monotonic()
+    with pytest.raises(vla_cpp.Timeout) as caught:
+        client.act(**OBSERVATION, timeout=0.3)
+    assert 0.3 <= time.monotonic() - start < 1
+    assert caught.value.where == faulty.address and "0.3 s" in str(caught.value)
+    client.health()
+    assert len(faulty.peers) == 2 and faulty.kinds[-3:] == ["hello", "describe", "health"]
+
+
+def test_no_server_is_a_timeout_and_a_server_that_comes_later_is_found():
+    with zmq.Context.instance().socket(zmq.ROUTER) as probe:
+        port = probe.bind_to_random_port("tcp://127.0.0.1")
+    with vla_cpp.Client(f"tcp://127.0.0.1:{port}", timeout=0.2) as client:
+        with pytest.raises(vla_cpp.Timeout):
+            client.health()
+        with zmq.Context.instance().socket(zmq.ROUTER) as server:
+            server.bind(f"tcp://127.0.0.1:{port}")
+            assert not client._ask("health", 5.0, _health).done()
+            assert server.poll(5000), "the request reaches the server that was started after the client"
+
+
+@pytest.mark.parametrize("code", list(wire.MESSAGES["Error"].DESCRIPTOR.enum_types_by_name["Code"].values_by_name))
+def test_each_code_is_an_exception_that_carries_its_fields(faulty, client, code):
+    told = error_message(code, where="w", expected="e", found="f", hint="h")
+    faulty.on_act = lambda request: [response(request, error=told)]
+    with pytest.raises(vla_cpp.VlaError) as caught:
+        client.act(**OBSERVATION)
+    error = caught.value
+    assert (error.code, error.where, error.expected, error.found, error.hint) == (code.lower(), "w", "e", "f", "h")
+    if code not in ("CODE_UNSPECIFIED", "MISMATCH"):  # never sent
+        assert type(error) is not vla_cpp.VlaError
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is type(error) and str(copy) == str(error) and copy.code == error.code
+
+
+def test_a_code_of_a_later_server_is_a_vla_error_that_tells_its_number(faulty, client):
+    faulty.on_act = lambda request: [response(request, error=wire.MESSAGES["Error"](code=99, found="f"))]
+    with pytest.raises(vla_cpp.VlaError) as caught:
+        client.act(**OBSERVATION)
+    assert caught.value.code == "code_99"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"\xff\xff garbage",
+        lambda r: wire.Response(protocol_version=2, request_id=r.request_id, chunk=chunk(0)),
+        lambda r: response(r, health=wire.MESSAGES["HealthReply"]()),
+        lambda r: response(r),
+        lambda r: response(r, chunk=chunk(0, horizon=5)),
+        lambda r: response(r, chunk=chunk(float("nan"))),
+        lambda r: response(r, chunk=chunk(0, horizon=0, d_action=0)),
+    ],
+)
+def test_an_answer_that_is_none_raises_and_the_next_request_is_served(faulty, client, answer):
+    faulty.on_act = lambda request: [answer(request) if callable(answer) else answer]
+    with pytest.raises((vla_cpp.Incompatible, vla_cpp.BadAction)):
+        client.act(**OBSERVATION)
+    faulty.on_act = lambda request: [response(request, chunk=chunk(3))]
+    assert client.act(**OBSERVATION)[0, 0] == 3
+
+
+def test_a_server_of_another_protocol_is_refused_by_the_hello(faulty):
+    told = error_message("INCOMPATIBLE", where="hello", expected="2 to 3", found="1 to 1")
+    faulty.on_hello = lambda request: [response(request, error=told)]
+    faulty.on_act = lambda request: []
+    with vla_cpp.Client(faulty.address, timeout=2) as client:
+        with pytest.raises(vla_cpp.Incompatible, match="expected 2 to 3, found 1 to 1"):
+            client.health()
+
+
+def test_other_weights_behind_the_same_address_are_refused(faulty, client):
+    client.act(**OBSERVATION)
+    other = chunk(1)
+    other.bundle.checksum = "xxh3:2"
+    faulty.on_act = lambda request: [response(request, chunk=other)]
+    with pytest.raises(vla_cpp.Incompatible, match="xxh3:2"):
+        client.act(**OBSERVATION)
+
+
+def test_an_error_that_names_no_request_ends_those_under_way(faulty, client):
+    told = error_message("BAD_REQUEST", where="message", found="bytes")
+    faulty.on_act = lambda request: [wire.Response(protocol_version=1, error=told)]
+    with pytest.raises(vla_cpp.BadRequest):
+        client.act(**OBSERVATION)
+
+
+def test_what_the_server_would_not_read_is_refused_before_it_is_sent(faulty, client):
+    with pytest.raises(vla_cpp.TooLarge, match=r'images\["top"\]'):
+        client.act(**{**OBSERVATION, "images": {"top": np.zeros((300, 300, 3), np.uint8)}})
+    jpeg = b"\xff\xd8\xff" + bytes(2 << 20)
+    with pytest.raises(vla_cpp.TooLarge, match="at most 1048576 bytes"):
+        client.act(**{**OBSERVATION, "images": {"top": jpeg}})
+    assert faulty.acts == []
+
+
+def test_a_closed_client_refuses_and_says_so(faulty):
+    client = vla_cpp.Client(faulty.address)
+    faulty.on_act = lambda request: []
+    pending = client.submit(**OBSERVATION)
+    client.close()
+    client.close()
+    with pytest.raises(vla_cpp.Disconnected, match="closed"):
+        pending.result()
+    with pytest.raises(vla_cpp.Disconnected, match="closed"):
+        client.act(**OBSERVATION)
+
+
+def test_a_child_process_is_refused_and_the_parent_goes_on(faulty, client):
+    client.act(**OBSERVATION)
+    child = os.fork()
+    if child == 0:
+        try:
+            client.health()
+        except vla_cpp.UsageError:
+            os._exit(7)
+        os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    assert client.health().ready
+    with pytest.raises(vla_cpp.UsageError):
+        pickle.dumps(client)
+
+
+def test_threads_may_share_a_client_and_each_gets_its_own_answer(faulty, client):
+    assert client.spec.horizon == 4
+    wrong = []
+
+    def work(seed):
+        for _ in range(20):
+            if client.act(**OBSERVATION, seed=seed)[0, 0] != seed:
+                wrong.append(seed)
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(1, 7)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    assert wrong == [] and len(faulty.acts) == 120
+
+
+def test_submitting_never_waits_once_the_policy_is_known(faulty, client):
+    assert client.spec.d_action == 2
+    faulty.on_act = lambda request: []
+    start = time.monotonic()
+    pending = client.submit(**OBSERVATION, timeout=0.5)
+    for _ in range(5):
+        assert not pending.done()
+    assert time.monotonic() - start < 0.2
+    with pytest.raises(vla_cpp.Timeout):
+        pending.result()
+    assert pending.done()
+
+
+@pytest.mark.parametrize("address", ["nonsense", "tcp://127.0.0.1", ""])
+def test_an_impossible_address_is_refused_at_once(address):
+    with pytest.raises(vla_cpp.UsageError):
+        vla_cpp.Client(address)
+
+
+@pytest.mark.parametrize("key", ["short", "x" * 39 + "\x7f", "é" * 40, "/nowhere/robot.secret", b"x" * 40, 7])
+def test_keys_that_are_none_are_refused_at_once_and_not_shown(key):
+    with pytest.raises(vla_cpp.UsageError) as caught:
+        vla_cpp.Client("tcp://127.0.0.1:5555", server_key="x" * 40, secret_key=key)
+    assert caught.value.where == "secret_key" and str(key) not in str(caught.value)
+
+
+def test_one_key_alone_is_refused():
+    with pytest.raises(vla_cpp.UsageError, match="server_key and secret_key"):
+        vla_cpp.Client("tcp://127.0.0.1:5555", server_key="x" * 40)

@@ -1,0 +1,133 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/queue.h"
+
+#include <doctest/doctest.h>
+
+#include <map>
+#include <random>
+#include <set>
+
+using namespace vla::serve;
+
+namespace {
+
+struct Item {
+  std::string client;
+  int number = 0;
+  std::size_t size = 1;
+  std::optional<Clock::time_point> deadline;
+};
+
+Clock::time_point at(int ms) { return Clock::time_point(std::chrono::milliseconds(ms)); }
+
+constexpr Queue<Item>::Limits kRoom = {100, 100};
+
+}  // namespace
+
+TEST_CASE("a client that waits keeps its place, and its newest act is the one that is computed") {
+  Queue<Item> queue(kRoom);
+  queue.push({"a", 1});
+  queue.push({"b", 2});
+  const auto pushed = queue.push({"a", 3});
+  REQUIRE(pushed.superseded);
+  CHECK(pushed.superseded->number == 1);
+  CHECK(queue.size() == 2);
+  CHECK(queue.pop()->number == 3);
+  CHECK(queue.pop()->number == 2);
+  CHECK_FALSE(queue.pop());
+}
+
+TEST_CASE("a full queue refuses a new client and still takes the newest act of one that waits") {
+  Queue<Item> queue({2, 100});
+  queue.push({"a", 1});
+  queue.push({"b", 2});
+  CHECK(queue.push({"c", 3}).refused->number == 3);
+  CHECK(queue.push({"a", 4}).superseded->number == 1);
+  CHECK(queue.size() == 2);
+}
+
+TEST_CASE("bytes are bounded, counting what a newer act frees") {
+  Queue<Item> queue({10, 10});
+  queue.push({"a", 1, 6});
+  CHECK(queue.push({"b", 2, 5}).refused);
+  CHECK(queue.push({"a", 3, 10}).superseded);
+  CHECK(queue.push({"a", 4, 11}).refused->number == 4);
+  CHECK(queue.pop()->number == 3);
+  CHECK_FALSE(queue.push({"b", 5, 10}).refused);
+}
+
+TEST_CASE("an act is late from its deadline on, not before") {
+  Queue<Item> queue(kRoom);
+  queue.push({"a", 1, 1, at(10)});
+  queue.push({"b", 2, 1});
+  CHECK(queue.take_late(at(9)).empty());
+  const auto late = queue.take_late(at(10));
+  REQUIRE(late.size() == 1);
+  CHECK(late[0].number == 1);
+  CHECK(queue.pop()->number == 2);
+}
+
+TEST_CASE("over random traffic every act comes out once, bounds hold, and nobody is passed over twice") {
+  for (unsigned seed = 0; seed < 200; ++seed) {
+    CAPTURE(seed);
+    std::mt19937 random(seed);
+    const auto draw = [&](int n) { return static_cast<int>(random() % static_cast<unsigned>(n)); };
+    const Queue<Item>::Limits limits = {static_cast<std::size_t>(1 + draw(8)), static_cast<std::size_t>(5 + draw(40))};
+    Queue<Item> queue(limits);
+    std::set<int> out;                     // numbers that came back, each once
+    std::map<std::string, int> newest;     // of the clients that wait
+    std::map<std::string, int> passed_by;  // how often others were served since the client began to wait
+    std::size_t bytes = 0;
+    std::map<int, std::size_t> sizes;
+    int n = 0;
+    const auto leaves = [&](const Item& item) {
+      CHECK(out.insert(item.number).second);
+      bytes -= sizes[item.number];
+    };
+    for (int now = 0; now < 400; ++now) {
+      if (draw(3) != 0) {
+        Item item{std::string(1, static_cast<char>('a' + draw(10))), n++, static_cast<std::size_t>(1 + draw(9))};
+        if (draw(4) == 0) item.deadline = at(now + 1 + draw(30));
+        bytes += sizes[item.number] = item.size;
+        const std::string client = item.client;
+        const int number = item.number;
+        const auto pushed = queue.push(std::move(item));
+        if (pushed.superseded) {
+          CHECK(pushed.superseded->number == newest.at(client));
+          leaves(*pushed.superseded);
+        }
+        if (pushed.refused) {
+          CHECK(pushed.refused->number == number);
+          leaves(*pushed.refused);
+        } else {
+          if (!newest.contains(client)) passed_by[client] = 0;
+          newest[client] = number;
+        }
+      }
+      for (const Item& late : queue.take_late(at(now))) {
+        CHECK(*late.deadline <= at(now));
+        CHECK(newest.at(late.client) == late.number);
+        leaves(late);
+        newest.erase(late.client);
+      }
+      if (draw(3) == 0) {
+        if (const auto item = queue.pop()) {
+          CHECK((!item->deadline || *item->deadline > at(now)));
+          CHECK(newest.at(item->client) == item->number);
+          leaves(*item);
+          newest.erase(item->client);
+          // Round robin: since a client began to wait, no more turns went to others than clients can stand before it.
+          CHECK(passed_by[item->client] < static_cast<int>(limits.jobs));
+          for (const auto& [client, number] : newest) ++passed_by[client];
+        }
+      }
+      CHECK(queue.size() == newest.size());
+      CHECK(queue.size() <= limits.jobs);
+      CHECK(bytes <= limits.bytes);
+    }
+    while (const auto item = queue.pop()) leaves(*item);
+    CHECK(out.size() == static_cast<std::size_t>(n));
+    CHECK(bytes == 0);
+  }
+}

@@ -1,0 +1,144 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <doctest/doctest.h>
+
+#include <condition_variable>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "serve/server.h"
+#include "support/editable_bundle.h"
+#include "support/golden_case.h"
+
+namespace vla::test {
+
+inline const std::string kGolden = source_path("tests/golden/smolvla/two_views");
+
+/// The act that a golden case is, with its frames as raw rows and its noise.
+inline v1::Request act_request(const GoldenCase& golden, std::uint64_t request_id) {
+  v1::Request request;
+  request.set_protocol_version(1);
+  request.set_request_id(request_id);
+  v1::Act& act = *request.mutable_act();
+  for (const auto& [name, frame] : golden.observation.views) {
+    v1::View& view = *act.add_views();
+    view.set_name(name);
+    if (!frame) {
+      view.mutable_absent();
+      continue;
+    }
+    const auto& rows = std::get<std::vector<std::uint8_t>>(frame->rgb);
+    view.mutable_rgb()->set_width(static_cast<std::uint32_t>(frame->width));
+    view.mutable_rgb()->set_height(static_cast<std::uint32_t>(frame->height));
+    view.mutable_rgb()->set_rows(rows.data(), rows.size());
+  }
+  for (const auto& [name, values] : golden.observation.states) {
+    v1::State& state = *act.add_states();
+    state.set_name(name);
+    state.mutable_values()->Add(values.begin(), values.end());
+  }
+  act.set_text(golden.observation.text);
+  act.set_seed(1);
+  return request;
+}
+
+inline v1::Request request_of(std::uint64_t request_id) {
+  v1::Request request;
+  request.set_protocol_version(1);
+  request.set_request_id(request_id);
+  return request;
+}
+
+/// A client without manners: it sends what it is told to.
+class Peer {
+ public:
+  explicit Peer(const std::string& address, zmq::socket_type type = zmq::socket_type::dealer) : socket(context, type) {
+    socket.set(zmq::sockopt::linger, 0);
+    socket.connect(address);
+  }
+  void send(const std::string& bytes) { socket.send(zmq::buffer(bytes)); }
+  void send(const v1::Request& request) { send(request.SerializeAsString()); }
+  /// The next answer, or none within the time.
+  std::optional<v1::Response> receive(int timeout_ms = 20'000) {
+    socket.set(zmq::sockopt::rcvtimeo, timeout_ms);
+    zmq::message_t message;
+    if (!socket.recv(message)) return std::nullopt;
+    REQUIRE(!message.more());
+    v1::Response response;
+    REQUIRE(response.ParseFromArray(message.data(), static_cast<int>(message.size())));
+    return response;
+  }
+  v1::Response ask(const std::string& bytes) {
+    send(bytes);
+    auto response = receive();
+    REQUIRE(response.has_value());
+    return *response;
+  }
+  v1::Response ask(const v1::Request& request) { return ask(request.SerializeAsString()); }
+
+  zmq::context_t context;
+  zmq::socket_t socket;
+};
+
+/// Holds the engine thread before each act until it is let go on, so that what waits is known.
+class Brake : public serve::Observer {
+ public:
+  void started(const serve::Received&) override {
+    std::unique_lock lock(mutex_);
+    ++n_started_;
+    changed_.notify_all();
+    changed_.wait(lock, [this] { return n_let_go_ >= n_started_; });
+  }
+  /// Waits until the n-th act is about to be computed.
+  void await(int n) {
+    std::unique_lock lock(mutex_);
+    changed_.wait(lock, [&] { return n_started_ >= n; });
+  }
+  void let_go(int n = 1) {
+    const std::lock_guard lock(mutex_);
+    n_let_go_ += n;
+    changed_.notify_all();
+  }
+
+ private:
+  std::mutex mutex_;
+  std::condition_variable changed_;
+  int n_started_ = 0, n_let_go_ = 0;
+};
+
+/// A server on a free port, with a thread of its own.
+class Running {
+ public:
+  explicit Running(serve::ServerOptions options = {}, std::vector<serve::Observer*> observers = {})
+      : engine(load_engine(kGolden + "/bundle.gguf")), observers_(std::move(observers)) {
+    if (options.bind == serve::ServerOptions().bind) options.bind = {"tcp://127.0.0.1:0"};
+    auto opened = serve::Server::open(options);
+    REQUIRE_MESSAGE(opened.ok(), (opened ? "" : opened.error().message()));
+    server = std::move(*opened);
+    thread_ = std::thread([this] { status_ = server->run(*engine, observers_); });
+  }
+  ~Running() {
+    server->stop();
+    CHECK(join().ok());
+  }
+  std::string address() const { return server->addresses().front(); }
+  Status join() {
+    if (thread_.joinable()) thread_.join();
+    return status_;
+  }
+
+  std::unique_ptr<Engine> engine;
+  std::unique_ptr<serve::Server> server;
+
+ private:
+  std::vector<serve::Observer*> observers_;
+  std::thread thread_;
+  Status status_;
+};
+
+}  // namespace vla::test
