@@ -33,7 +33,7 @@ class SmolVla final : public Policy {
  public:
   explicit SmolVla(const Scope& s)
       : vision_(s / "vision"),
-        lm_(s / "lm", Activation::silu),
+        lm_(s / "lm", kSmolLm),
         connector_(s / "connector", vision_.d_model(), lm_.d_model()),
         state_in_(s / "state_in", s.dim("d_state"), lm_.d_model(), Bias::yes),
         expert_(s / "expert", lm_),

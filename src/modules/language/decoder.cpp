@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 
 #include "nn/attention.h"
-#include "nn/rope.h"
 #include "nn/tokens.h"
 
 namespace vla {
@@ -29,8 +28,8 @@ KeyValue KeyValue::get(const Cache& cache, const std::string& path) {
   return {cache.get(path + ".k"), cache.get(path + ".v")};
 }
 
-Heads Heads::read(const Scope& s) {
-  const Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head"), s.number("rope_base")};
+Heads Heads::read(const Scope& s, RotaryAngle angle) {
+  const Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head"), s.number("rope_base"), angle};
   s.require(heads.n_head % heads.n_head_kv == 0, "n_head_kv", fmt::format("a divisor of n_head {}", heads.n_head),
             std::to_string(heads.n_head_kv));
   s.require(heads.d_head % 2 == 0, "d_head", "an even number, for the rotary pairs", std::to_string(heads.d_head));
@@ -44,7 +43,7 @@ KeyValueProjection::KeyValueProjection(const Scope& s, int d_model, const Heads&
       v_(s / "attn_v", d_model, heads.d_key(), Bias::no) {}
 
 KeyValue KeyValueProjection::operator()(Graph& g, Tensor h, int first) const {
-  const Tensor key = rope(g, split_heads(g, k_(g, h), heads_.n_head_kv), heads_.rope_base, first);
+  const Tensor key = heads_.turn(g, split_heads(g, k_(g, h), heads_.n_head_kv), first);
   return {key, split_heads(g, v_(g, h), heads_.n_head_kv)};
 }
 
@@ -54,7 +53,7 @@ QueryAttention::QueryAttention(const Scope& s, int d_model, const Heads& heads)
       out_(s / "attn_out", heads.d_query(), d_model, Bias::no) {}
 
 Tensor QueryAttention::operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
-  const Tensor query = rope(g, split_heads(g, q_(g, h), heads_.n_head), heads_.rope_base, first);
+  const Tensor query = heads_.turn(g, split_heads(g, q_(g, h), heads_.n_head), first);
   return out_(g, attention(g, query, seen.key, seen.value, mask));
 }
 
@@ -82,14 +81,15 @@ Tensor DecoderBlock::forward(Graph& g, Tensor x, Tensor mask, Cache& cache) cons
   return rest_(g, x, h, 0, kv, mask);
 }
 
-Decoder::Decoder(const Scope& s, Activation activation)
+Decoder::Decoder(const Scope& s, DecoderFamily family)
     : path_(s.path()),
       d_model_(s.dim("d_model")),
-      heads_(Heads::read(s)),
+      heads_(Heads::read(s, family.rope_angle)),
       token_embd_(s / "token_embd", d_model_, s.dim("n_vocab", 1 << 24)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
   const float eps = s.number("norm_eps");
-  for (int i = 0; i + 1 < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, activation, eps);
+  for (int i = 0; i + 1 < n_layer; ++i)
+    blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, family.activation, eps);
   const Scope last = s / "blk" / (n_layer - 1);
   last_norm_.emplace(last / "attn_norm", d_model_, eps);
   last_kv_.emplace(last, d_model_, heads_);

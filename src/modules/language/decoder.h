@@ -12,6 +12,7 @@
 #include "nn/linear.h"
 #include "nn/mlp.h"
 #include "nn/norm.h"
+#include "nn/rope.h"
 
 namespace vla {
 
@@ -19,11 +20,14 @@ namespace vla {
 struct Heads {
   int n_head, n_head_kv, d_head;
   float rope_base;
+  RotaryAngle rope_angle;
 
   int d_query() const { return n_head * d_head; }
   int d_key() const { return n_head_kv * d_head; }
   /// Reads n_head, n_head_kv, d_head and rope_base of `s`, and checks that they go together.
-  static Heads read(const Scope& s);
+  static Heads read(const Scope& s, RotaryAngle angle);
+  /// [d_head, n_head, n_token] -> the same shape, turned; token 0 stands at position `first`.
+  Tensor turn(Graph& g, Tensor x, int first) const { return rope(g, x, rope_base, rope_angle, first); }
 };
 
 /// What a layer attends to. Both [d_head, n_head_kv, n_token], keys after the rotary embedding.
@@ -35,8 +39,17 @@ struct KeyValue {
   static KeyValue get(const Cache& cache, const std::string& path);
 };
 
-/// The activation of a decoder's gated MLP: SiLU in the Llama family, GELU in Gemma.
+/// The activation of a decoder's gated MLP.
 enum class Activation { silu, gelu_tanh };
+
+/// What tells the families of decoders apart, as their references compute them.
+struct DecoderFamily {
+  Activation activation;
+  RotaryAngle rope_angle;
+};
+/// SmolVLA's own rotation beside a Llama; Gemma as transformers has it.
+constexpr DecoderFamily kSmolLm = {Activation::silu, RotaryAngle::quotient};
+constexpr DecoderFamily kGemma = {Activation::gelu_tanh, RotaryAngle::product};
 
 /// The key and value products of a layer.
 class KeyValueProjection {
@@ -92,7 +105,7 @@ class DecoderBlock : public Module<DecoderBlock> {
 /// values, layer by layer. Nothing reads the last layer's output, so that layer stops at its keys and values.
 class Decoder {
  public:
-  Decoder(const Scope& s, Activation activation);
+  Decoder(const Scope& s, DecoderFamily family);
 
   /// tokens [n] i32 -> [d_model, n], not scaled.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }

@@ -8,7 +8,7 @@ namespace vla {
 
 PaliGemma::PaliGemma(const Scope& s)
     : vision_(s / "vision"),
-      lm_(s / "lm", Activation::gelu_tanh),
+      lm_(s / "lm", kGemma),
       projector_(s / "projector", vision_.d_model(), lm_.d_model(), Bias::yes),
       text_scale_(s.number("text_scale")) {}
 
