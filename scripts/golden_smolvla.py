@@ -126,8 +126,7 @@ def write_bundle(folder):
     from vla_cpp.convert import cli
 
     checkpoint = folder / "checkpoint"
-    backbone = next(p for p in (checkpoint / "vlm", checkpoint / "tokenizer") if p.is_dir())
-    code = cli.main([str(checkpoint), "--backbone", str(backbone), "-o", str(folder / "bundle.gguf"),
+    code = cli.main([str(checkpoint), "--backbone", str(golden.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
                      "--dtype", "bf16", "--force", "--quiet"])
     if code:
         raise SystemExit(code)

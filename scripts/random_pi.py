@@ -39,6 +39,11 @@ class Description:
         return {"size": "tiny", "gemma_2b": self.lm, "gemma_300m": self.expert, "vision": self.vision, "vocab_size": n_vocab}
 
 
+def published(arch, views):
+    """The description of the published size: 3.2 G parameters that are used (pi0), and the expert's unused head."""
+    return Description(arch, {"dtype": "bfloat16"}, views=views, d_state=8)
+
+
 def tokenizer(n_piece):
     """BPE with byte fallback and a leading <bos>, digits alone, blanks as U+2581: the published tokenizer's form with
     other merges."""
@@ -115,13 +120,10 @@ def write_checkpoint(description, seed, folder):
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer(description.n_piece).save_pretrained(folder / "tokenizer")
     (folder / "dims.json").write_text(json.dumps(description.dims(), indent=1) + "\n")
-    golden_pi.set_sizes(description.arch, description.dims())
     config = policy_config(description)
-    policy = getattr(golden_pi.modeling(description.arch), golden_pi.NAMES[description.arch].split(".")[-1])(config)
+    policy = golden_pi.construct(config, description.dims())
     randomise(policy, seed), centre(policy)
-    tower = policy.model.paligemma_with_expert.paligemma  # published files hold one table, under the head's name
-    tower.model.language_model.embed_tokens.weight.data = tower.lm_head.weight.data
     before, after = pipelines(config, description, seed, folder / "tokenizer")
     policy.bfloat16().save_pretrained(folder)
     before.save_pretrained(folder), after.save_pretrained(folder)
-    return sum(p.numel() for p in {p.data_ptr(): p for p in policy.parameters()}.values())
+    return sum(p.numel() for p in policy.parameters())

@@ -93,6 +93,11 @@ def config_type(checkpoint) -> str:
     return json.loads((Path(checkpoint) / "config.json").read_text())["type"]
 
 
+def backbone_folder(checkpoint) -> Path:
+    """What the hub keeps in another repository: the backbone of SmolVLA, the tokenizer of pi0."""
+    return next(p for p in (Path(checkpoint) / "vlm", Path(checkpoint) / "tokenizer") if p.is_dir())
+
+
 def reference(arch):
     return importlib.import_module(f"vla_cpp.convert.{REFERENCES[arch]}")
 

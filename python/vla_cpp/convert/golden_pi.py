@@ -6,6 +6,7 @@ The classes know two sizes, by name.  `checkpoint/dims.json` states others: `gem
 the reference's GemmaConfig, `vision` with fields of SiglipVisionConfig, `vocab_size`.  `{"size": "full"}` is the published
 size.  `checkpoint/tokenizer` holds what the hub keeps in google/paligemma-3b-pt-224.
 """
+import contextlib
 import importlib
 import json
 import sys
@@ -49,20 +50,59 @@ def set_sizes(arch, dims):
     m.PiGemmaForCausalLM = expert if full else small_expert
 
 
+@contextlib.contextmanager
+def without_initial_values():
+    """Constructs modules without drawing weights: of 3.5 G parameters that alone takes minutes, and all their memory."""
+    import torch
+    import transformers
+
+    layers = (torch.nn.Linear, torch.nn.Embedding, torch.nn.Conv2d)
+    kept = [(layer, layer.reset_parameters) for layer in layers], transformers.PreTrainedModel.init_weights
+    for layer in layers:
+        layer.reset_parameters = lambda self: None
+    transformers.PreTrainedModel.init_weights = lambda self, *args, **kwargs: None
+    try:
+        yield
+    finally:
+        for layer, reset in kept[0]:
+            layer.reset_parameters = reset
+        transformers.PreTrainedModel.init_weights = kept[1]
+
+
+def construct(config, dims):
+    """The policy of a configuration at these sizes, with one table for embedding and head, as its loader leaves them."""
+    set_sizes(config.type, dims)
+    with without_initial_values():
+        policy = getattr(modeling(config.type), NAMES[config.type].split(".")[-1])(config)
+    tower = policy.model.paligemma_with_expert.paligemma
+    tower.model.language_model.embed_tokens.weight = tower.lm_head.weight
+    return policy
+
+
+def read_weights(policy, file):
+    """Every parameter from the file, one by one: from_pretrained goes on with random weights after a failure."""
+    import torch
+    from safetensors import safe_open
+
+    parameters = dict(policy.named_parameters(remove_duplicate=False))
+    with safe_open(file, "pt") as weights, torch.no_grad():
+        for name in weights.keys():
+            parameters[name].copy_(weights.get_tensor(name))
+        missing = set(parameters) - set(weights.keys()) - {f"{TOWER}model.language_model.embed_tokens.weight"}
+    if missing:
+        raise ValueError(f"{file} lacks {sorted(missing)}")
+
+
 def load(checkpoint, dtype="float32"):
     """(policy, preprocessor, postprocessor) of a folder in the hub layout; published: the class's own bfloat16 mix."""
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import make_pre_post_processors
-    from safetensors.torch import load_file
 
     folder = Path(checkpoint)
     config = PreTrainedConfig.from_pretrained(str(folder))
     config.dtype = "bfloat16" if dtype == "published" else "float32"
-    set_sizes(config.type, json.loads((folder / "dims.json").read_text()))
-    policy = getattr(modeling(config.type), NAMES[config.type].split(".")[-1])(config)
-    weights = load_file(folder / "model.safetensors")
-    weights.setdefault(f"{TOWER}model.language_model.embed_tokens.weight", weights[f"{TOWER}lm_head.weight"])
-    policy.load_state_dict(weights, strict=True)  # from_pretrained would go on with random weights after a failure
+    policy = construct(config, json.loads((folder / "dims.json").read_text()))
+    read_weights(policy, folder / "model.safetensors")
     tokenizer = {"tokenizer_processor": {"tokenizer_name": str(folder / "tokenizer")}}
     before, after = make_pre_post_processors(config, pretrained_path=str(folder), preprocessor_overrides=tokenizer)
     return policy.eval(), before, after
