@@ -8,6 +8,7 @@
 #include <string>
 
 #include "backend/isa.h"
+#include "backend/scratch.h"
 #include "base/result.h"
 
 namespace vla {
@@ -22,12 +23,14 @@ class Device {
   ggml_backend_t backend() const { return backend_.get(); }
   int n_thread() const { return n_thread_; }
   Isa isa() const { return isa_; }
+  const std::shared_ptr<Scratch>& scratch() const { return scratch_; }
   std::string name() const;
 
  private:
   ggml_backend_ptr backend_;
   int n_thread_ = 0;
   Isa isa_ = Isa::ggml;
+  std::shared_ptr<Scratch> scratch_;
 };
 
 }  // namespace vla

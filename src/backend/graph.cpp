@@ -40,7 +40,7 @@ Tensor Graph::constant(const std::string& key, const std::function<Tensor(Store&
 }
 
 Tensor Graph::name(const std::string& path, Tensor value) {
-  if (!keep_ || !keep_(path)) return value;
+  if (!keeps(path)) return value;
   // A view's memory belongs to another tensor, which may be overwritten later in the run: keep a copy.
   ggml_tensor* kept = value.node();
   if (kept->view_src != nullptr || !ggml_is_contiguous(kept)) kept = ggml_cont(context_.get(), kept);
@@ -62,12 +62,16 @@ Tensor Graph::stage(const std::string& name, Tensor value) {
   return stage.mark;
 }
 
+Work Graph::work_of_node(const ggml_tensor* node) const {
+  const auto noted = noted_work_.find(node);
+  return noted != noted_work_.end() ? noted->second : work_of(node);
+}
+
 std::vector<Work> Graph::work() const {
   std::vector<Work> parts(1);
   for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
     const ggml_tensor* node = ggml_graph_node(graph_, i);
-    const auto noted = noted_work_.find(node);
-    parts.back() += noted != noted_work_.end() ? noted->second : work_of(node);
+    parts.back() += work_of_node(node);
     if (parts.size() <= stages_.size() && node == stages_[parts.size() - 1].mark.node()) parts.emplace_back();
   }
   return parts;
@@ -79,15 +83,11 @@ Status Graph::allocate(ComputeMemory& memory) {
 }
 
 int Graph::n_thread(const Device& device) const {
-  double work = 0;
+  double flop = 0;
   int n_product = 0;
-  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
-    const ggml_tensor* node = ggml_graph_node(graph_, i);
-    if (node->op != GGML_OP_MUL_MAT) continue;
-    work += 2.0 * static_cast<double>(ggml_nelements(node)) * static_cast<double>(node->src[0]->ne[0]);
-    ++n_product;
-  }
-  return work < kLeastWork * n_product ? 1 : device.n_thread();
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i)
+    if (const double of_node = work_of_node(ggml_graph_node(graph_, i)).flop; of_node > 0) flop += of_node, ++n_product;
+  return flop < kLeastWork * n_product ? 1 : device.n_thread();
 }
 
 Status Graph::run(const Device& device) {

@@ -6,6 +6,8 @@
 
 #include <cmath>
 
+#include "kernels/linear_kernel.h"
+
 namespace vla {
 namespace {
 
@@ -38,7 +40,8 @@ Status Engine::load_policy(bool dry) {
   VLA_TRY(d_state_, keys.integer("policy.d_state"));
   if (horizon_ < 1 || horizon_ > kMaxHorizon)
     return Error{Code::bad_bundle, "policy.horizon", fmt::format("1 to {}", kMaxHorizon), std::to_string(horizon_)};
-  VLA_TRY(Weights weights, Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes));
+  VLA_TRY(Weights weights,
+          Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes, kernels::choose_linear));
   weights_ = std::make_unique<Weights>(std::move(weights));
   return {};
 }
@@ -150,7 +153,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
 }
 
 MemoryUse Engine::memory() const {
-  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size()};
+  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size() + device_.scratch()->size()};
 }
 
 }  // namespace vla
