@@ -8,7 +8,7 @@
 
 #include <cmath>
 
-#include "nn/gated_mlp.h"
+#include "nn/mlp.h"
 #include "support/editable_bundle.h"
 #include "support/graph_runner.h"
 
@@ -92,9 +92,9 @@ TEST_CASE("a GELU-gated MLP multiplies the activated gate with what goes up") {
   const std::vector<Piece> pieces = {{"m.ffn_gate.weight", {kWidth, kHidden}, gate},
                                      {"m.ffn_up.weight", {kWidth, kHidden}, up},
                                      {"m.ffn_down.weight", {kHidden, kWidth}, down}};
-  const auto got = run_module<GeluGatedMlp>(
-      pieces, [](const Scope& s) { return GeluGatedMlp(s, kWidth, kHidden); },
-      [&](const GeluGatedMlp& mlp, Graph& g) {
+  const auto got = run_module<GatedMlp>(
+      pieces, [](const Scope& s) { return GatedMlp(s, kWidth, kHidden, Activation::gelu_tanh); },
+      [&](const GatedMlp& mlp, Graph& g) {
         return mlp(g, g.store().add_constant(x, {kWidth, kToken}));
       });
   REQUIRE(got.size() == x.size());

@@ -33,7 +33,7 @@ GemmaExpertBlock::GemmaExpertBlock(const Scope& s, ExpertNorm kind, int d_model,
       kv_(s, d_model, heads),
       attention_(s, d_model, heads),
       ffn_norm_(s / "ffn_norm", kind, d_model, eps),
-      mlp_(s, d_model, d_ff) {}
+      mlp_(s, d_model, d_ff, Activation::gelu_tanh) {}
 
 KeyValue GemmaExpertBlock::append(Graph& g, Tensor h, const KeyValue& past) const {
   const KeyValue own = kv_(g, h, static_cast<int>(past.key.dim(2)));

@@ -55,7 +55,7 @@ class GemmaExpertBlock : public Module<GemmaExpertBlock> {
   KeyValueProjection kv_;
   QueryAttention attention_;
   TimedNorm ffn_norm_;
-  GeluGatedMlp mlp_;
+  GatedMlp mlp_;
 };
 
 /// The action expert of the π family: a narrower Gemma with as many layers and the same heads as the language model,

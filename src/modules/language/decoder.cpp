@@ -8,16 +8,6 @@
 #include "nn/tokens.h"
 
 namespace vla {
-namespace {
-
-using GatedMlp = std::variant<SiluGatedMlp, GeluGatedMlp>;
-
-GatedMlp make_mlp(const Scope& s, int d_model, int d_ff, Activation activation) {
-  if (activation == Activation::silu) return SiluGatedMlp(s, d_model, d_ff);
-  return GeluGatedMlp(s, d_model, d_ff);
-}
-
-}  // namespace
 
 void KeyValue::put(Graph& g, Cache& cache, const std::string& path) const {
   cache.put(g, path + ".k", key);
@@ -58,14 +48,11 @@ Tensor QueryAttention::operator()(Graph& g, Tensor h, int first, const KeyValue&
 }
 
 DecoderRest::DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps)
-    : attention_(s, d_model, heads),
-      ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(make_mlp(s, d_model, d_ff, activation)) {}
+    : attention_(s, d_model, heads), ffn_norm_(s / "ffn_norm", d_model, eps), mlp_(s, d_model, d_ff, activation) {}
 
 Tensor DecoderRest::operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
   x = add(g, x, attention_(g, h, first, seen, mask));
-  const Tensor f = ffn_norm_(g, x);
-  return add(g, x, std::visit([&](const auto& mlp) { return mlp(g, f); }, mlp_));
+  return add(g, x, mlp_(g, ffn_norm_(g, x)));
 }
 
 DecoderBlock::DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps)

@@ -3,12 +3,10 @@
 #pragma once
 
 #include <optional>
-#include <variant>
 #include <vector>
 
 #include "backend/cache.h"
 #include "nn/embedding.h"
-#include "nn/gated_mlp.h"
 #include "nn/linear.h"
 #include "nn/mlp.h"
 #include "nn/norm.h"
@@ -39,12 +37,9 @@ struct KeyValue {
   static KeyValue get(const Cache& cache, const std::string& path);
 };
 
-/// The activation of a decoder's gated MLP.
-enum class Activation { silu, gelu_tanh };
-
 /// What tells the families of decoders apart, as their references compute them.
 struct DecoderFamily {
-  Activation activation;
+  Activation activation;  // of the gated MLP
   RotaryAngle rope_angle;
 };
 /// SmolVLA's own rotation beside a Llama; Gemma as transformers has it.
@@ -86,7 +81,7 @@ class DecoderRest {
  private:
   QueryAttention attention_;
   RmsNorm ffn_norm_;
-  std::variant<SiluGatedMlp, GeluGatedMlp> mlp_;
+  GatedMlp mlp_;
 };
 
 /// One layer of the language model; it leaves its keys and values in the cache.
