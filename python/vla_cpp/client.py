@@ -53,7 +53,7 @@ class Client:
         if (server_key is None) != (secret_key is None):
             raise UsageError("CURVE", "server_key and secret_key", "one of them")
         self.address, self.timeout = address, timeout
-        self._curve = None if server_key is None else curve_keys(server_key, secret_key)
+        self._curve = curve_keys(server_key, secret_key) if server_key is not None and secret_key is not None else None
         self._pid = os.getpid()
         self._lock = threading.RLock()
         self._context: Optional[zmq.Context] = zmq.Context()
@@ -172,11 +172,11 @@ class Client:
     def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes]) -> Pending:
         """Sends a request that `write` completes. kind: the field of the Response that answers it."""
         with self._lock:
-            self._connect()
+            connection = self._connect()
             request = self._new_request()
             data = write(request)
             pending = Pending(self, request.request_id, kind, timeout)
-            self._connection.send(data)
+            connection.send(data)
             self._pending[pending._id] = pending
             return pending
 
@@ -184,13 +184,12 @@ class Client:
         self._last_id += 1
         return wire.new_request(self._last_id)
 
-    def _connect(self) -> None:
+    def _connect(self) -> Connection:
         """A connection that is alive as far as one can know, greeted. Does not wait for anything."""
         self._check_process()
         if self._context is None:
             raise Disconnected(self.address, "an open client", "one that was closed")
-        if self._connection is not None:
-            self._pump(0.0)
+        self._pump(0.0)
         if self._connection is None:
             self._connection = Connection(self._context, self.address, self._curve)
             hello = self._new_request()
@@ -199,6 +198,7 @@ class Client:
             self._connection.send(hello.SerializeToString())
             if self._spec is not None:  # the server may be another one by now
                 self._connection.send(_describe(self._new_request()))
+        return self._connection
 
     def _check_process(self) -> None:
         if os.getpid() != self._pid:
@@ -207,21 +207,21 @@ class Client:
     def _settle(self, pending: Pending, seconds: float) -> bool:
         """Whether the request is over, after waiting at most so long. Threads that wait take turns, in short slices."""
         with self._lock:
-            if not pending._is_over and self._connection is not None:
+            if not pending._is_over:
                 self._check_process()
                 self._pump(min(max(seconds, 0.0), 0.05))
             if not pending._is_over and time.monotonic() >= pending._until:
-                # A fresh socket for what comes next: this one may lead to a host that will never answer.
                 hint = "is the server up, and its address right? `health()` tells; or give more time"
                 pending._error = Timeout(self.address, f"an answer within {pending._timeout:g} s", "none", hint)
                 del self._pending[pending._id]
-                self._drop(
-                    Disconnected(self.address, "", "another request timed out, and with it the connection ended")
-                )
+                if not self._pending:  # a fresh socket for what comes next: this one may lead to a host that is gone
+                    self._drop(pending._error)
             return pending._is_over
 
     def _pump(self, seconds: float) -> None:
         """Takes what has come and hands it to those who asked."""
+        if self._connection is None:
+            return
         try:
             for frames in self._connection.receive(seconds):
                 self._take(frames)
@@ -233,10 +233,9 @@ class Client:
             if len(frames) != 1:
                 raise DecodeError(f"{len(frames)} frames")
             response = wire.Response.FromString(frames[0])
-        except DecodeError as error:
-            raise Incompatible(
-                self.address, "answers of vla serve", f"other bytes ({error})", "what listens there?"
-            ) from None
+        except DecodeError as problem:
+            found = f"other bytes ({problem})"
+            raise Incompatible(self.address, "answers of vla serve", found, "what listens there?") from None
         kind = response.WhichOneof("kind")
         error = wire.exception_of(response.error) if kind == "error" else None
         if isinstance(error, Incompatible) or (error and response.request_id == 0):
@@ -268,10 +267,8 @@ class Client:
     def _check_bundle(self, bundle: Any) -> None:
         known = self._spec.bundle if self._spec else bundle
         if bundle.checksum != known.checksum:
-            hint = "make a new Client, and read its spec"
-            raise Incompatible(
-                self.address, f"{known.name} ({known.checksum})", f"{bundle.name} ({bundle.checksum})", hint
-            )
+            expected, found = (f"{b.name} ({b.checksum})" for b in (known, bundle))
+            raise Incompatible(self.address, expected, found, "make a new Client, and read its spec")
 
     def _drop(self, error: VlaError) -> None:
         """Ends the connection, and with it every request under way."""

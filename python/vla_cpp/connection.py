@@ -8,6 +8,7 @@ earlier request can come out of it.
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from pathlib import Path
@@ -32,18 +33,15 @@ def curve_keys(server: Union[str, os.PathLike], secret: Union[str, os.PathLike])
 
 
 def _key(where: str, given: Union[str, os.PathLike]) -> bytes:
-    text = given
-    if not isinstance(given, str) or len(given) != 40:
-        try:
-            text = Path(given).read_text(encoding="ascii").strip()
-        except (OSError, ValueError, TypeError) as error:
-            raise UsageError(where, "a key of 40 characters, or the file of one", type(error).__name__) from None
     try:
+        is_key = isinstance(given, str) and len(given) == 40
+        text = str(given) if is_key else Path(given).read_text(encoding="ascii").strip()
         if len(text) != 40 or len(z85.decode(text)) != 32:
-            raise ValueError
+            raise ValueError("something else")
         return text.encode()
-    except (ValueError, KeyError, struct.error):
-        raise UsageError(where, "a key of 40 characters, or the file of one", "something else", "vla keygen") from None
+    except (OSError, ValueError, TypeError, KeyError, struct.error) as error:
+        hint = "vla keygen makes them"
+        raise UsageError(where, "a key of 40 characters, or the file of one", type(error).__name__, hint) from None
 
 
 class Connection:
@@ -80,25 +78,26 @@ class Connection:
 
         What arrived before the loss is returned first; the next call tells of the loss.
         """
-        self._poller.poll(max(0, int(seconds * 1000 + 0.999)))
-        messages = []
-        while self._socket.poll(0):
-            messages.append(self._socket.recv_multipart())
-        if not messages:
-            self._check()
+        events = dict(self._poller.poll(max(0, math.ceil(seconds * 1000))))
+        messages: List[List[bytes]] = []
+        while self._socket in events:
+            try:
+                messages.append(self._socket.recv_multipart(zmq.DONTWAIT))
+            except zmq.Again:
+                break
+        if self._monitor in events and not messages:
+            self._check(recv_monitor_message(self._monitor)["event"])
         return messages
 
-    def _check(self) -> None:
-        while self._monitor.poll(0):
-            event = recv_monitor_message(self._monitor)["event"]
-            if event & _REFUSED:
-                keys = (
-                    "check the keys, and that the server admits this client's"
-                    if self._curve
-                    else "does the server want CURVE keys?"
-                )
-                raise Disconnected(self._address, "a handshake", "a refusal", keys)
-            raise Disconnected(self._address, "", "the connection was lost", "the next call connects anew")
+    def _check(self, event: int) -> None:
+        if event & _REFUSED:
+            keys = (
+                "check the keys, and that the server admits this client's"
+                if self._curve
+                else "does the server want CURVE keys?"
+            )
+            raise Disconnected(self._address, "a handshake", "a refusal", keys)
+        raise Disconnected(self._address, "", "the connection was lost", "the next call connects anew")
 
     def close(self) -> None:
         self._socket.disable_monitor()

@@ -52,7 +52,7 @@ def noise_of(noise: object, horizon: int, d_noise: int) -> np.ndarray:
     """Float32 (horizon, d_noise); the reference's batch of one is taken off."""
     values = floats("noise", noise, 2)
     if values.shape != (horizon, d_noise):
-        raise BadObservation("noise", f"shape ({horizon}, {d_noise})", str(np.shape(noise)))
+        raise BadObservation("noise", f"shape ({horizon}, {d_noise})", str(values.shape))
     return values
 
 

@@ -67,7 +67,7 @@ def act_bytes(
     for name, image in _items("images", images):
         kind, data = picture_of(name, image)
         if kind == "rgb":
-            raw[name] = data
+            raw[name] = np.asarray(data)
         elif kind == "absent":
             act.views.add(name=name).absent.SetInParent()
         else:

@@ -14,7 +14,7 @@ namespace vla::cli {
 namespace {
 
 struct ServeOptions {
-  std::string bundle;
+  std::string bundle, kernels;
   int n_thread = 0;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
@@ -32,6 +32,13 @@ void stop_on_signals(serve::Server& server) {
   sigaction(SIGINT, &action, nullptr);
 }
 
+/// As a shell reads it back.
+std::string quoted(const std::string& text) {
+  std::string out = "'";
+  for (const char c : text) out += c == '\'' ? std::string("'\\''") : std::string(1, c);
+  return out + "'";
+}
+
 /// One line for people, and for programs that split it as a shell would.
 void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms) {
   const Processor& processor = engine.processor();
@@ -39,18 +46,19 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   features.insert(features.end(), processor.states().names().begin(), processor.states().names().end());
   const v1::Description description = serve::describe(engine, {});
   fmt::print(
-      "ready address={} bundle='{}' arch={} device='{}' precision={} kernels='{}' memory_mb={:.1f} features={} "
+      "ready address={} bundle={} arch={} device={} precision={} kernels={} memory_mb={:.1f} features={} "
       "warm_up_ms={:.1f}\n",
-      fmt::join(server.addresses(), ","), description.bundle().name(), description.bundle().arch(),
-      description.runtime().device(), description.runtime().precision(), description.runtime().kernels(),
-      static_cast<double>(engine.memory().total()) / 1e6, fmt::join(features, ","), warm_up_ms);
+      fmt::join(server.addresses(), ","), quoted(description.bundle().name()), description.bundle().arch(),
+      quoted(description.runtime().device()), description.runtime().precision(),
+      quoted(description.runtime().kernels()), static_cast<double>(engine.memory().total()) / 1e6,
+      fmt::join(features, ","), warm_up_ms);
   std::fflush(stdout);
 }
 
 Status serve(ServeOptions& options) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread}));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
   print_ready(*server, *engine, warm_up_ms);
@@ -76,6 +84,8 @@ Command add_serve(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
+  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best of this machine")
+      ->check([](const std::string& text) { return text.empty() ? "expected a value, found empty text" : ""; });
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();

@@ -95,7 +95,7 @@ v1::Description describe(const Engine& engine, const v1::Limits& limits) {
   runtime.set_server_version(VLA_VERSION);
   runtime.set_device(engine.device().name());
   runtime.set_precision("f32");  // matrices are widened at load, whatever the bundle holds
-  runtime.set_kernels("ggml");
+  runtime.set_kernels(isa_name(engine.device().isa()));
   return out;
 }
 

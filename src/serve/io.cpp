@@ -9,6 +9,7 @@
 #include <new>
 
 #include "serve/codec.h"
+#include "serve/fields.h"
 
 namespace vla::serve {
 namespace {
@@ -87,22 +88,19 @@ bool Io::receive() {
   job.at = Clock::now();
   job.client = hexadecimal(job.route);
   job.size = job.bytes.size();
+  const Status sound = is_one_frame ? read_envelope(bytes_of(job.bytes), job.envelope)
+                                    : Status(not_a_request("request", "one frame", "several"));
+  job.request_id = job.envelope.request_id;
+  job.kind = job.envelope.kind;
+  for (Observer* observer : observers_) observer->received(job);
   try {
-    if (is_one_frame) {
-      handle(std::move(job));
-    } else {
-      refuse(std::move(job), {Code::bad_request, "request", "one frame", "several", "see docs/protocol.md"});
-    }
+    handle(std::move(job), sound);
   } catch (const std::bad_alloc&) {  // this request is lost: an answer would take memory too
   }
   return true;
 }
 
-void Io::handle(Job job) {
-  const Status sound = read_envelope(bytes_of(job.bytes), job.envelope);
-  job.request_id = job.envelope.request_id;
-  job.kind = job.envelope.kind;
-  for (Observer* observer : observers_) observer->received(job);
+void Io::handle(Job job, const Status& sound) {
   if (!sound) return refuse(std::move(job), sound.error());
   if (job.kind == Kind::act) return queue(std::move(job));
   auto response = answer_now(job);

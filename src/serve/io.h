@@ -36,7 +36,7 @@ class Io {
 
  private:
   bool receive();
-  void handle(Job job);
+  void handle(Job job, const Status& sound);
   Result<v1::Response> answer_now(const Job& job) const;
   void queue(Job job);
   void refuse(Job job, const Error& error);

@@ -89,6 +89,19 @@ def test_silence_ends_with_a_timeout_and_the_next_call_has_a_fresh_socket(faulty
     assert len(faulty.peers) == 2 and faulty.kinds[-3:] == ["hello", "describe", "health"]
 
 
+def test_a_timeout_of_one_request_leaves_another_under_way(faulty, client):
+    kept = []
+    faulty.on_act = lambda request: (
+        kept.append(request)
+        or ([] if len(kept) < 3 else [response(kept[0], chunk=chunk(1)), response(request, chunk=chunk(3))])
+    )
+    first, second = client.submit(**OBSERVATION, seed=1), client.submit(**OBSERVATION, seed=2, timeout=0.1)
+    with pytest.raises(vla_cpp.Timeout):
+        second.result()
+    assert client.act(**OBSERVATION, seed=3)[0, 0] == 3
+    assert first.result()[0, 0] == 1 and len(faulty.peers) == 1
+
+
 def test_no_server_is_a_timeout_and_a_server_that_comes_later_is_found():
     with zmq.Context.instance().socket(zmq.ROUTER) as probe:
         port = probe.bind_to_random_port("tcp://127.0.0.1")
@@ -197,7 +210,7 @@ def test_a_child_process_is_refused_and_the_parent_goes_on(faulty, client):
         except vla_cpp.UsageError:
             os._exit(7)
         os._exit(1)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    assert os.WEXITSTATUS(os.waitpid(child, 0)[1]) == 7
     assert client.health().ready
     with pytest.raises(vla_cpp.UsageError):
         pickle.dumps(client)

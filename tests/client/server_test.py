@@ -3,41 +3,19 @@
 """The client and `vla serve` itself."""
 
 import io
-import os
 import re
 import signal
 import subprocess
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 from golden_cases import Golden
 from PIL import Image
+from server_process import SECONDS, VLA, Server, frames, ran
 
 import vla_cpp
-from vla_cpp.control import ChunkLoop
-
-ROOT = Path(__file__).resolve().parents[2]
-VLA = Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla"))
-SECONDS = 20  # for what takes milliseconds on a machine with nothing else to do
-
-
-class Server:
-    def __init__(self, case, *options, address="tcp://127.0.0.1:0"):
-        assert VLA.is_file(), f"{VLA} is not built: run `make build`, or set VLA_BINARY"
-        command = [VLA, "serve", case.bundle, "--bind", address, "--threads", "1", *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        line = self.process.stdout.readline()
-        assert line.startswith("ready "), line
-        self.address = re.search(r"address=(tcp://127\.0\.0\.1:\d+)", line)[1]
-
-    def stop(self, how=signal.SIGTERM):
-        self.process.send_signal(how)
-        self.process.wait(SECONDS)
-        self.process.stdout.close()
-        return self.process.returncode
 
 
 @pytest.fixture(scope="module")
@@ -58,24 +36,8 @@ def client(server):
         yield client
 
 
-def frames(case):
-    return {
-        view: None if file is None else np.asarray(Image.open(file).convert("RGB"))
-        for view, file in case.images.items()
-    }
-
-
 def observation(case, **changed):
     return {"images": frames(case), "state": case.state, "text": case.text, **changed}
-
-
-def ran(case, folder, *start):
-    """The chunk of `vla run`, which reads the same observation from files."""
-    arguments = case.arguments(options=("--out", folder / "run.npy"))
-    at = arguments.index("--noise")
-    arguments[at : at + 2] = start
-    subprocess.run([VLA, *map(str, arguments)], check=True, capture_output=True)
-    return np.load(folder / "run.npy")
 
 
 def test_the_spec_is_what_the_bundle_says(client):
@@ -280,17 +242,3 @@ def test_with_curve_a_listed_client_is_served_and_others_are_not(case, tmp_path)
                     client.health()
     finally:
         server.stop()
-
-
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_a_control_loop_runs_on_a_server(client, case, mode):
-    arguments = dict(rate_hz=50, replan_every=3, mode=mode, blend="ensemble", on_late="hold")
-    with ChunkLoop(client, **arguments) as loop:
-        loop.begin(observation(case))
-        actions = []
-        for _ in range(30):
-            actions.append(loop.step(observation(case)))
-            loop.pace()
-    assert all(a.values.shape == (7,) and np.isfinite(a.values).all() for a in actions)
-    assert loop.stats["chunks"] >= 3 and loop.last_error is None
-    assert {a.chunk.bundle.checksum for a in actions if not a.held} == {client.spec.bundle.checksum}

@@ -131,6 +131,15 @@ def test_periods_without_a_call_are_missed_and_chunks_grow_older_in_them(clock):
     assert loop.stats["missed"] == 10
 
 
+def test_a_call_belongs_to_the_period_whose_begin_is_nearest(clock):
+    loop = loop_of(Remote(clock), clock)
+    ticks = []
+    for now in (100.0, 100.14, 100.18, 100.36, 100.39):
+        clock.now = now
+        ticks.append(loop.step({"state": 0.0}).tick)
+    assert ticks == [0, 1, 2, 4, 5] and loop.stats["missed"] == 1
+
+
 def test_a_chunk_that_took_longer_than_max_age_is_never_commanded(clock):
     loop = loop_of(Remote(clock, latency=0.35), clock, max_age=0.3)
     assert all(a.held and a.values is None for a in run(loop, 20))

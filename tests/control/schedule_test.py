@@ -227,6 +227,28 @@ def test_a_fade_is_no_longer_than_what_is_left_of_the_old_chunk():
     assert [s.next(t).values[0] for t in range(8, 11)] == pytest.approx([1 / 3, 2 / 3, 1])
 
 
+def test_a_fade_is_done_when_the_old_chunk_becomes_too_old():
+    s = schedule_of(blend=CrossFade(6), max_age=6)
+    s.observe(0)
+    s.receive(np.zeros((10, 1)), 0)
+    for t in range(4):
+        s.next(t)
+    s.observe(4)
+    s.receive(np.ones((10, 1)), 4)
+    assert [s.next(t).values[0] for t in range(4, 8)] == pytest.approx([0.25, 0.5, 0.75, 1])
+
+
+def test_an_ensemble_trusts_the_oldest_most():
+    s = schedule_of(blend=Ensemble(1.0))
+    s.observe(0)
+    s.receive(np.zeros((10, 1)), 0)
+    for t in range(4):
+        s.next(t)
+    s.observe(4)
+    s.receive(np.ones((10, 1)), 4)
+    assert s.next(4).values[0] == pytest.approx(np.exp(-1) / (1 + np.exp(-1)))
+
+
 def test_after_a_hold_a_linear_fade_starts_from_the_command_that_was_held():
     s = schedule_of(blend=CrossFade(1), replan_every=10, on_late=lambda last, tick: np.array([5.0]))
     s.observe(0)

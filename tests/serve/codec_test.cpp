@@ -3,9 +3,9 @@
 #include "serve/codec.h"
 
 #include <doctest/doctest.h>
+#include <fmt/format.h>
 
-#include <cmath>
-#include <limits>
+#include <cctype>
 
 #include "serve/envelope.h"
 #include "support/editable_bundle.h"
@@ -272,4 +272,43 @@ TEST_CASE("codes on the wire are the exit codes of the program, in the same orde
     for (char& c : name) c = static_cast<char>(std::tolower(c));
     CHECK(name == code_name(code));
   }
+}
+
+TEST_CASE("the exchange in docs/protocol.md is what the schema makes of it, byte for byte") {
+  const std::string document = test::read_text(test::source_path("docs/protocol.md"));
+  const auto check = [&](const auto& message) {
+    std::string text;
+    for (const char byte : message.SerializeAsString())
+      text += fmt::format("{}{:02x}", text.empty() ? "" : " ", static_cast<unsigned char>(byte));
+    CHECK(document.find("\n" + text + "\n") != std::string::npos);
+  };
+  v1::Request request;
+  request.set_protocol_version(1);
+  request.set_request_id(1);
+  v1::Hello& hello = *request.mutable_hello();
+  hello.set_min_version(1);
+  hello.set_max_version(1);
+  hello.set_client_name("example");
+  check(request);
+  v1::Response response = response_to(1);
+  const std::string bytes = hello.SerializeAsString();
+  *response.mutable_hello() = *answer_hello(std::as_bytes(std::span(bytes)));
+  check(response);
+  request.set_request_id(2);
+  v1::Act& act = *request.mutable_act();
+  v1::View& view = *act.add_views();
+  view.set_name("top");
+  view.mutable_rgb()->set_width(2);
+  view.mutable_rgb()->set_height(1);
+  view.mutable_rgb()->set_rows(std::string("\xff\0\0\0\0\xff", 6));
+  act.add_states()->set_name("state");
+  act.mutable_states(0)->add_values(0.5f);
+  act.mutable_states(0)->add_values(-1.0f);
+  act.set_text("go");
+  act.set_seed(7);
+  act.set_deadline_ms(200);
+  check(request);
+  response = response_to(2);
+  *response.mutable_error() = encode_error({Code::bad_observation, "observation.state", "6 numbers", "2"});
+  check(response);
 }

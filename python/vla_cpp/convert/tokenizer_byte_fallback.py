@@ -85,13 +85,23 @@ def _check_characters(tokenizer: Tokenizer, problems: Problems) -> None:
 
 
 def _prefix(tokenizer: Tokenizer, problems: Problems) -> List[int]:
-    """The ids in front of every text. A config that states add_bos_token or add_eos_token makes transformers replace the
-    template of the file by one of its own (tokenization_utils_tokenizers.py, update_post_processor)."""
+    """The ids in front of every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
+    config and then keeps the template all the same; a config that contradicts it may mean another release."""
     config = tokenizer.config
+    ids = _template(tokenizer, problems)
     if config.get("add_eos_token", False) not in (False, None):
         problems.unsupported(CONFIG_FILE + ": add_eos_token", "False", repr(config["add_eos_token"]))
-    if "add_bos_token" in config or "add_eos_token" in config:
-        return _ids(tokenizer, [config.get("bos_token")], problems) if config.get("add_bos_token") else []
+    if config.get("add_bos_token") is not None and bool(config["add_bos_token"]) != bool(ids):
+        problems.add(
+            CONFIG_FILE + ": add_bos_token",
+            "{}, as the template of {} has it".format(bool(ids), JSON_FILE),
+            repr(config["add_bos_token"]),
+            "load the tokenizer with transformers and save it again",
+        )
+    return ids
+
+
+def _template(tokenizer: Tokenizer, problems: Problems) -> List[int]:
     post = tokenizer.spec.get("post_processor")
     if post is None:
         return []
@@ -111,12 +121,3 @@ def _prefix(tokenizer: Tokenizer, problems: Problems) -> List[int]:
     if not all(isinstance(i, int) and 0 <= i < tokenizer.n_vocab for i in ids):
         problems.add(JSON_FILE + ": post_processor.special_tokens", "ids below {}".format(tokenizer.n_vocab), str(ids))
     return ids
-
-
-def _ids(tokenizer: Tokenizer, contents: list, problems: Problems) -> List[int]:
-    by_content = {token["content"]: token["id"] for token in tokenizer.added}
-    texts = [content.get("content") if isinstance(content, dict) else content for content in contents]
-    for text in texts:
-        if text not in by_content:
-            problems.add(CONFIG_FILE + ": bos_token", "an added token of " + JSON_FILE, repr(text))
-    return [by_content[text] for text in texts if text in by_content]

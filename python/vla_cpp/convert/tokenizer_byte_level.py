@@ -19,6 +19,7 @@ from .tokenizer_parts import (
     JSON_FILE,
     Tokenizer,
     check_class,
+    check_ids,
     check_model,
     check_symbols,
     one_or_sequence,
@@ -89,14 +90,7 @@ def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
     for key in ("add_bos_token", "add_eos_token"):
         if config.get(key, False) not in (False, None):
             problems.unsupported("{}: {}".format(CONFIG_FILE, key), "False", repr(config[key]))
-    for token in tokenizer.added:
-        if token["id"] >= tokenizer.n_vocab:
-            problems.add(
-                JSON_FILE + ": ids",
-                "ids below vocab_size {}".format(tokenizer.n_vocab),
-                "{} ({!r})".format(token["id"], token["content"]),
-                "the tokenizer belongs to another backbone: check --backbone",
-            )
+    check_ids({token["content"]: token["id"] for token in tokenizer.added}, tokenizer.n_vocab, problems)
 
 
 def _adds_nothing(post) -> bool:

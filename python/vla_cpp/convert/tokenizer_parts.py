@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import json
-from typing import Dict, List, NamedTuple, Optional, Tuple
+from typing import Dict, Iterable, List, NamedTuple, Optional, Tuple
 
 from .errors import Problems, refuse
 from .files import member
@@ -137,11 +137,11 @@ def vocabulary(tokenizer: Tokenizer, problems: Problems) -> List[str]:
             problems.add(
                 "{}: id {}".format(JSON_FILE, number), "one token", "{!r} and {!r}".format(by_id[number], text)
             )
-    _check_ids(vocab, by_id, tokenizer.n_vocab, problems)
+    check_ids(vocab, tokenizer.n_vocab, problems)
+    _check_utf8(by_id.values(), problems)
     # A hole gets a text that no merge and no word can produce: symbols contain no blank.
-    return [
-        by_id.get(number, "<no token {}>".format(number)) for number in range(min(max(by_id) + 1, tokenizer.n_vocab))
-    ]
+    last = max((number for number in by_id if number < tokenizer.n_vocab), default=-1)
+    return [by_id.get(number, "<no token {}>".format(number)) for number in range(last + 1)]
 
 
 def check_symbols(model: dict, symbols: List[str], problems: Problems) -> None:
@@ -156,16 +156,19 @@ def check_symbols(model: dict, symbols: List[str], problems: Problems) -> None:
         )
 
 
-def _check_ids(vocab: Dict[str, int], by_id: Dict[int, str], n_vocab: int, problems: Problems) -> None:
-    above = sorted(number for text, number in vocab.items() if number >= n_vocab)
+def check_ids(ids: Dict[str, int], n_vocab: int, problems: Problems) -> None:
+    above = sorted((number, text) for text, number in ids.items() if number >= n_vocab)
     if above:
         problems.add(
             JSON_FILE + ": ids",
             "ids below vocab_size {}".format(n_vocab),
-            "{} above, the first is {} ({!r})".format(len(above), above[0], by_id[above[0]]),
+            "{} above, the first is {} ({!r})".format(len(above), *above[0]),
             "the tokenizer belongs to another backbone: check --backbone",
         )
-    for text in by_id.values():
+
+
+def _check_utf8(texts: Iterable[str], problems: Problems) -> None:
+    for text in texts:
         try:
             text.encode("utf-8")
         except UnicodeEncodeError:

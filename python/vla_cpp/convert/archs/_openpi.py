@@ -235,7 +235,8 @@ def _values(stats: dict, key: str, name: str, width: int, where: str, problems: 
             place, "{} numbers".format(width), found, "compute the data set's statistics again with openpi's script"
         )
         return np.zeros(width, np.float32)
-    chosen = np.asarray(values[:width], np.float32)
+    with np.errstate(over="ignore"):  # told below
+        chosen = np.asarray(values[:width], np.float32)
     if not np.isfinite(chosen).all():
         problems.add(place, "finite numbers", str(chosen[~np.isfinite(chosen)][0]))
     elif name == "std" and (chosen < 0).any():

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A policy at a server and the same policy in process are used alike: the example program and the control loop take either."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from golden_cases import Golden
+from server_process import SECONDS, Server, frames, ran
+
+import vla_cpp
+from vla_cpp.control import ChunkLoop
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Golden("two_views")
+
+
+@pytest.fixture(scope="module")
+def server(case):
+    server = Server(case)
+    yield server
+    server.stop()
+
+
+@pytest.fixture(params=["server", "process"])
+def where(request, case, server):
+    """What the example takes, and `vla_cpp` makes a policy of."""
+    return server.address if request.param == "server" else str(case.bundle)
+
+
+@pytest.fixture
+def policy(where):
+    with vla_cpp.Client(where, timeout=SECONDS) if "://" in where else vla_cpp.Policy(where, threads=1) as policy:
+        yield policy
+
+
+def test_the_specs_are_equal(case, server):
+    with vla_cpp.Client(server.address, timeout=SECONDS) as client, vla_cpp.Policy(case.bundle, threads=1) as policy:
+        assert client.spec == policy.spec
+
+
+def test_the_chunk_is_that_of_vla_run(policy, case, tmp_path):
+    chunk = policy.act(images=frames(case), state=case.state, text=case.text, seed=5)
+    assert np.asarray(chunk).tobytes() == ran(case, tmp_path, "--seed", "5").tobytes()
+
+
+def example(where, case, *more):
+    images = [a for view, file in case.images.items() for a in ("--image", f"{view}={file or ''}")]
+    state = ",".join(map(repr, case.state))
+    command = [sys.executable, ROOT / "examples/python/act.py", where, *images, "--state", state, "--text", case.text]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "python")}
+    return subprocess.run([*map(str, command), *more], capture_output=True, text=True, env=environment)
+
+
+def test_the_example_prints_and_writes_the_chunk(where, case, tmp_path):
+    result = example(where, case, "--seed", "5", "--out", str(tmp_path / "chunk.npy"))
+    assert result.returncode == 0 and "seed 5: 5 rows of action.0" in result.stdout, result.stderr
+    assert np.load(tmp_path / "chunk.npy").tobytes() == ran(case, tmp_path, "--seed", "5").tobytes()
+
+
+def test_the_example_says_what_is_wrong(where, case):
+    result = example(where, case, "--state", "1,2")
+    assert result.returncode == 1 and result.stdout == ""
+    assert result.stderr.startswith("error: observation.state: expected 6 ") and "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_a_control_loop_runs_on_it(policy, case, mode):
+    observation = dict(images=frames(case), state=case.state, text=case.text)
+    with ChunkLoop(policy, rate_hz=50, replan_every=3, mode=mode, blend="ensemble", on_late="hold") as loop:
+        loop.begin(observation)
+        actions = []
+        for _ in range(30):
+            actions.append(loop.step(observation))
+            loop.pace()
+    assert all(a.values.shape == (7,) and np.isfinite(a.values).all() for a in actions)
+    assert loop.stats["chunks"] >= 3 and loop.last_error is None
+    assert {a.chunk.bundle for a in actions if not a.held} == {policy.spec.bundle}
