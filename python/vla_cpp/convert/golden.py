@@ -171,6 +171,12 @@ class Recorder:
         for i, layer in enumerate(list(layers)[1:]):  # what enters a layer is what the one before it left
             self.before(layer.input_layernorm, lambda x, i=i: self.rows(f"lm.blk.{i}", x))
 
+    def expert_layers(self, expert):
+        norms = [layer.input_layernorm for layer in list(expert.layers)[1:]] + [expert.norm]
+        for j, norm in enumerate(norms):
+            self.before(norm, lambda x, j=j: self.at_step(f"expert.blk.{j}", x))
+        self.stepwise(expert.norm, "expert.norm")
+
     def on_prefix(self, images, image_masks, *args, **kwargs):
         embedded, pad_masks, att_masks = self.embed_prefix(images, image_masks, *args, **kwargs)
         self.valid, self.present = pad_masks[0], [bool(m[0]) for m in image_masks]

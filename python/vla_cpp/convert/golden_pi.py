@@ -120,10 +120,7 @@ class Recorder(golden.Recorder):
         if self.has_state:
             self.after(model.state_proj, lambda x: self.put("state_in", x[0]))
             self.stepwise(model.action_time_mlp_out, "action_time_out")
-        layers = list(expert.layers)
-        for j, norm in enumerate([layer.input_layernorm for layer in layers[1:]] + [expert.norm]):
-            self.before(norm, lambda x, j=j: self.at_step(f"expert.blk.{j}", x))
-        self.stepwise(expert.norm, "expert.norm")
+        self.expert_layers(expert)
         self.stepwise(model.action_out_proj, "action_out")
         module = sys.modules[type(model).__module__]
         self.clone, module.clone_past_key_values = module.clone_past_key_values, self.on_clone

@@ -52,12 +52,9 @@ class Recorder(golden.Recorder):
         self.language_layers(backbone.text_model.layers)
 
         self.stepwise(model.action_time_mlp_out, "action_time_out")
-        layers = list(expert.layers)
-        for j, norm in enumerate([layer.input_layernorm for layer in layers[1:]] + [expert.norm]):
-            self.before(norm, lambda x, j=j: self.at_step(f"expert.blk.{j}", x))
-        self.stepwise(expert.norm, "expert.norm")
+        self.expert_layers(expert)
         self.stepwise(model.action_out_proj, "action_out")
-        for j, layer in enumerate(layers):
+        for j, layer in enumerate(expert.layers):
             if is_cross(policy.config, j):
                 for name in ("k", "v"):
                     self.reprojected(getattr(layer.self_attn, f"{name}_proj"), f"expert.blk.{j}.{name}")
