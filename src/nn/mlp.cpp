@@ -19,6 +19,10 @@ GatedMlp::GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation)
 
 Tensor GatedMlp::operator()(Graph& g, Tensor x) const { return down_(g, Linear::gated(g, gate_, up_, x, activation_)); }
 
+Tensor GatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, Linear::gated(g, gate_, up_, x, activation_));
+}
+
 Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }
 
 }  // namespace vla

@@ -22,6 +22,8 @@ class GatedMlp {
  public:
   GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation);
   Tensor operator()(Graph& g, Tensor x) const;
+  /// residual + the same.
+  Tensor added_to(Graph& g, Tensor residual, Tensor x) const;
 
  private:
   Linear gate_, up_, down_;

@@ -33,8 +33,8 @@ KeyValueProjection::KeyValueProjection(const Scope& s, int d_model, const Heads&
       v_(s / "attn_v", d_model, heads.d_key(), Bias::no) {}
 
 KeyValue KeyValueProjection::operator()(Graph& g, Tensor h, int first) const {
-  const Tensor key = heads_.turn(g, split_heads(g, k_(g, h), heads_.n_head_kv), first);
-  return {key, split_heads(g, v_(g, h), heads_.n_head_kv)};
+  const auto kv = Linear::group(g, {&k_, &v_}, h);
+  return {heads_.turn(g, split_heads(g, kv[0], heads_.n_head_kv), first), split_heads(g, kv[1], heads_.n_head_kv)};
 }
 
 QueryAttention::QueryAttention(const Scope& s, int d_model, const Heads& heads)
@@ -42,17 +42,26 @@ QueryAttention::QueryAttention(const Scope& s, int d_model, const Heads& heads)
       q_(s / "attn_q", d_model, heads.d_query(), Bias::no),
       out_(s / "attn_out", heads.d_query(), d_model, Bias::no) {}
 
-Tensor QueryAttention::operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
+Tensor QueryAttention::mix(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
   const Tensor query = heads_.turn(g, split_heads(g, q_(g, h), heads_.n_head), first);
-  return out_(g, attention(g, query, seen.key, seen.value, mask));
+  return attention(g, query, seen.key, seen.value, mask);
+}
+
+Tensor QueryAttention::operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
+  return out_(g, mix(g, h, first, seen, mask));
+}
+
+Tensor QueryAttention::added_to(Graph& g, Tensor residual, Tensor h, int first, const KeyValue& seen,
+                                Tensor mask) const {
+  return out_.added_to(g, residual, mix(g, h, first, seen, mask));
 }
 
 DecoderRest::DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps)
     : attention_(s, d_model, heads), ffn_norm_(s / "ffn_norm", d_model, eps), mlp_(s, d_model, d_ff, activation) {}
 
 Tensor DecoderRest::operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
-  x = add(g, x, attention_(g, h, first, seen, mask));
-  return add(g, x, mlp_(g, ffn_norm_(g, x)));
+  x = attention_.added_to(g, x, h, first, seen, mask);
+  return mlp_.added_to(g, x, ffn_norm_(g, x));
 }
 
 DecoderBlock::DecoderBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, Activation activation, float eps)

@@ -64,8 +64,12 @@ class QueryAttention {
   QueryAttention(const Scope& s, int d_model, const Heads& heads);
   /// `h` [d_model, n_token], already normalized; token 0 stands at position `first`. -> the same shape.
   Tensor operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const;
+  /// residual + the same.
+  Tensor added_to(Graph& g, Tensor residual, Tensor h, int first, const KeyValue& seen, Tensor mask) const;
 
  private:
+  Tensor mix(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const;
+
   Heads heads_;
   Linear q_, out_;
 };
