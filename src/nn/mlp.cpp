@@ -11,6 +11,10 @@ GeluMlp::GeluMlp(const Scope& s, int d_model, int d_ff)
 
 Tensor GeluMlp::operator()(Graph& g, Tensor x) const { return down_(g, up_.activated(g, x, Activation::gelu_tanh)); }
 
+Tensor GeluMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, up_.activated(g, x, Activation::gelu_tanh));
+}
+
 GatedMlp::GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation)
     : gate_(s / "ffn_gate", d_model, d_ff, Bias::no),
       up_(s / "ffn_up", d_model, d_ff, Bias::no),
