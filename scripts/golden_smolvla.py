@@ -29,7 +29,8 @@ class Case:
     seed: int
     frames: dict  # view -> (height, width, suffix), or None: the view is absent
     text: str
-    checkpoint: Description
+    checkpoint: object  # the Description of random_smolvla or random_pi
+    state: tuple = ()  # instead of a random one
 
 
 def vision(d, layers, heads, ff, image, patch, eps=1e-6):
@@ -113,6 +114,7 @@ def write_observation(case, folder):
     state = torch.randn(d.d_state, generator=generator) * 0.4
     for i in d.zero_spread:  # what never moved in the data does not move here; otherwise eps would rule the chunk
         state[i] = random_smolvla.statistics(d, case.seed)["observation.state"]["mean"][i]
+    state = torch.tensor(case.state) if case.state else state
     observation = {"images": images, "state": state.tolist(), "text": case.text}
     (folder / "observation.json").write_text(json.dumps(observation, indent=1, ensure_ascii=False) + "\n")
     noise = torch.randn(d.policy["chunk_size"], d.policy["max_action_dim"], generator=generator)
@@ -124,15 +126,14 @@ def write_bundle(folder):
     from vla_cpp.convert import cli
 
     checkpoint = folder / "checkpoint"
-    code = cli.main([str(checkpoint), "--backbone", str(checkpoint / "vlm"), "-o", str(folder / "bundle.gguf"),
+    code = cli.main([str(checkpoint), "--backbone", str(golden.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
                      "--dtype", "bf16", "--force", "--quiet"])
     if code:
         raise SystemExit(code)
 
 
-def write_case(name, folder):
-    case = CASES[name]
-    n = random_smolvla.write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
+def write_case(name, case, folder, write_checkpoint):
+    n = write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
     write_observation(case, folder)
     taps = golden.write_expected(folder, case.seed)
     largest = np.abs(taps["chunk"]).max()
@@ -140,20 +141,21 @@ def write_case(name, folder):
           f"{np.abs(taps['chunk.bf16'] - taps['chunk']).max() / largest:.1e} away")
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", nargs="*", choices=[[], *CASES])
-    parser.add_argument("--out", type=Path, default=ROOT / "tests/golden/smolvla")
+def main(doc, cases, write_checkpoint, out):
+    """The command line of the scripts that write golden cases."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", nargs="*", choices=[[], *cases])
+    parser.add_argument("--out", type=Path, default=ROOT / out)
     parser.add_argument("--bundles", action="store_true", help="only convert the checkpoints that are there")
     args = parser.parse_args()
     if not args.bundles:
         golden.open_reference()
         warnings.filterwarnings("ignore")
-    for name in args.name or CASES:
+    for name in args.name or cases:
         if not args.bundles:
-            write_case(name, args.out / name)
+            write_case(name, cases[name], args.out / name, write_checkpoint)
         write_bundle(args.out / name)
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, CASES, random_smolvla.write_checkpoint, "tests/golden/smolvla")

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """One inference at full size, by PyTorch and by the runtime, from the same checkpoint, frames and noise.
 
-    python scripts/parity_full.py --case DIR [--vla build/cpu/bin/vla] [--blocks] [--threads N]
+    python scripts/parity_full.py --case DIR [--arch pi0] [--vla build/cpu/bin/vla] [--blocks] [--threads N]
 
 DIR is a case as vla_cpp.convert.golden describes it: checkpoint/, observation.json, frames, noise.npy.  Where it has no
-checkpoint, one of the published size with random weights is written (450 M parameters, two cameras; 0.9 GB).  Every program
-runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert, vla.  The
-table that is printed goes to docs/models.md.  Times are of one cold inference beside other work: no benchmark.
+checkpoint, one of the published size with random weights is written, for two cameras: smolvla 450 M parameters, 0.9 GB of
+disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 15 GB of memory while PyTorch runs in float32.  Every
+program runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert, vla.
+The table that is printed goes to docs/models.md.  Times are of one cold inference beside other work: no benchmark.
 """
 import argparse
 import json
@@ -28,18 +29,21 @@ SEED = 0
 FRAMES = {"camera1": (480, 640, "png"), "camera2": (480, 480, "png")}
 
 
-def write_case(case):
+def write_case(case, arch):
     """The published size with random weights, two smooth frames, a state, noise."""
     import golden_smolvla
+    import random_pi
     import random_smolvla
 
     golden.open_reference()
     warnings.filterwarnings("ignore")
     case.mkdir(parents=True, exist_ok=True)
-    description = random_smolvla.published({view: f[:2] for view, f in FRAMES.items()})
+    views = {view: f[:2] for view, f in FRAMES.items()}
+    maker = random_smolvla if arch == "smolvla" else random_pi
+    description = random_smolvla.published(views) if arch == "smolvla" else random_pi.published(arch, views)
     text = "pick up the red cube and place it in the basket"
     golden_smolvla.write_observation(golden_smolvla.Case(SEED, FRAMES, text, description), case)
-    n = random_smolvla.write_checkpoint(description, SEED, case / "checkpoint")
+    n = maker.write_checkpoint(description, SEED, case / "checkpoint")
     print(f"{n:,} random parameters")
 
 
@@ -52,7 +56,7 @@ def run_torch(case, dtype, blocks, threads):
     torch.set_num_threads(threads)
     policy, before, after = golden.load(case / "checkpoint", dtype)
     noise, batch = torch.from_numpy(np.load(case / "noise.npy"))[None], before(golden.read_observation(case))
-    recorder = golden.Recorder(policy) if blocks else None
+    recorder = golden.recorder(policy) if blocks else None
     start = time.perf_counter()
     with torch.inference_mode():
         chunk = None if blocks else policy.predict_action_chunk(dict(batch), noise=noise)[0].float().numpy()
@@ -120,6 +124,7 @@ def print_blocks(reference, taps):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", type=Path, required=True, help="folder of the case; written where it has no checkpoint")
+    parser.add_argument("--arch", default="smolvla", choices=sorted(golden.REFERENCES), help="of the checkpoint that is written")
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
     parser.add_argument("--dtype", default="bf16", choices=("f32", "bf16", "f16"), help="storage of the bundle's matrices")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
@@ -128,23 +133,24 @@ def main():
     args = parser.parse_args()
     case = args.case.resolve()
     if args.only == "write":
-        return write_case(case)
+        return write_case(case, args.arch)
     if args.only:
         return run_torch(case, args.only, args.blocks and args.only == "float32", args.threads)
     again = [sys.executable, __file__, "--case", case, "--threads", args.threads, *(["--blocks"] if args.blocks else [])]
     if not (case / "checkpoint").is_dir():
-        child([*again, "--only", "write"])
+        child([*again, "--arch", args.arch, "--only", "write"])
     peaks = {dtype: child([*again, "--only", dtype])[1] for dtype in ("float32", "published")}
     torch_runs = {dtype: np.load(case / f"torch_{dtype}.npz") for dtype in peaks}
     reference = torch_runs["float32"]
     checkpoint, bundle = case / "checkpoint", case / "bundle.gguf"
-    convert = [sys.executable, "-m", "vla_cpp.convert.cli", checkpoint, "--backbone", checkpoint / "vlm", "-o", bundle]
+    backbone = golden.backbone_folder(checkpoint)
+    convert = [sys.executable, "-m", "vla_cpp.convert.cli", checkpoint, "--backbone", backbone, "-o", bundle]
     os.environ["PYTHONPATH"] = str(ROOT / "python")
     start = time.perf_counter()
     _, convert_peak = child([*convert, "--dtype", args.dtype, "--force"])
     convert_seconds = time.perf_counter() - start
-    steps = json.loads((checkpoint / "config.json").read_text())["num_steps"]
-    last_step = f"step.{steps - 1}.x"
+    config = json.loads((checkpoint / "config.json").read_text())
+    last_step = f"step.{(config.get('num_steps') or config['num_inference_steps']) - 1}.x"
     pattern = "*" if args.blocks else last_step
     taps, timing, peak = run_vla(args.vla, case, bundle, pattern, case / "taps.gguf", args.threads)
     chunk = taps[last_step].reshape(reference["chunk"].shape[0], -1)[:, : reference["chunk"].shape[1]]

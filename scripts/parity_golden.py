@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The golden cases by the runtime, beside the reference's numbers: the rows of docs/models.md.
 
-    python scripts/parity_golden.py [--vla build/cpu/bin/vla]
+    python scripts/parity_golden.py ARCH [--vla build/cpu/bin/vla]
 
 Needs numpy and gguf, not torch: what the reference computed lies in expected.gguf.  Distances are relative to the largest
 magnitude of each tap.
@@ -29,7 +29,7 @@ def row(vla, case, taps_file):
     blocks = {n: d for n, d in shared.items() if n != "actions"}
     worst = max(blocks, key=blocks.get)
     published = distance(expected["chunk.bf16"], expected["chunk"])[1]
-    same_rows = np.array_equal(expected["position_ids"], expected["position_ids.bf16"])
+    same_rows = np.array_equal(expected.get("position_ids"), expected.get("position_ids.bf16"))
     note = "" if same_rows else " (reads other position rows)"
     return (f"| `{case.name}` | {len(blocks)} | {blocks[worst]:.1e} at `{worst}` | {shared['actions']:.1e} "
             f"| {published:.1e}{note} |")
@@ -37,12 +37,13 @@ def row(vla, case, taps_file):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("arch", help="folder of tests/golden")
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
     args = parser.parse_args()
     print("| case | blocks | largest distance of a block | actions | chunk of PyTorch in the published dtypes |")
     print("| --- | --- | --- | --- | --- |")
     with tempfile.TemporaryDirectory() as folder:
-        for expected in sorted((ROOT / "tests/golden/smolvla").glob("*/expected.gguf")):
+        for expected in sorted((ROOT / "tests/golden").glob(f"{args.arch}/*/expected.gguf")):
             print(row(args.vla, expected.parent, Path(folder) / "taps.gguf"))
 
 

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Random SmolVLA configurations, by the reference and by the runtime: what the golden cases do not happen to contain.
+"""Random configurations, by the reference and by the runtime: what the golden cases do not happen to contain.
 
-    python scripts/parity_random.py FIRST LAST [--vla build/cpu/bin/vla] [--keep DIR]
+    python scripts/parity_random.py ARCH FIRST LAST [--vla build/cpu/bin/vla] [--keep DIR]
 
 A seed draws everything: depths, heads, widths, patches, grid and table, views, frames, absent views, text, normalization, solver,
-attention mode.  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
+attention mode (of smolvla), relative actions (of pi0 and pi05).  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
 A configuration that the reference cannot run must be refused, with a reason, by vla-convert or by vla.  Ends with exit
 code 1 if a block differs by more than 1e-4 of its largest magnitude, or if only one side answers.
 """
@@ -19,8 +19,10 @@ import tempfile
 import warnings
 from pathlib import Path
 
+import golden_pi
 import golden_smolvla as cases
 import numpy as np
+import random_pi
 import random_smolvla
 from parity_full import ROOT, distance, run_vla
 from vla_cpp.convert import cli, golden
@@ -70,9 +72,29 @@ def draw(seed):
     return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
 
 
+def draw_pi(arch, seed):
+    """The same for pi0 and pi05; the patches of their tower have 14 pixels."""
+    r = random.Random(seed)
+    kv, vision_heads, depth, d_head = r.choice((1, 1, 2, 3)), r.choice((1, 2, 3, 5)), r.randint(1, 4), r.choice((4, 8, 12, 16, 32))
+    heads = kv * r.choice((1, 2, 4, 8))
+    n_empty, d_state, d_action = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14)
+    views, frames = draw_views(r, n_empty)
+    modes = {"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}
+    policy = golden_pi.policy(
+        r.randint(1, 12), r.choice((1, 2, 5, 10)), 14 * r.choice((1, 2, 2, 3, 4)),
+        (max(d_state, r.choice((8, 16, 32))), max(d_action, r.choice((8, 16, 32)))), r.choice((8, 24, 48, 200)),
+        empty_cameras=n_empty, normalization_mapping=modes, min_period=r.choice((4e-3, 1e-3)), max_period=r.choice((4.0, 2.0)),
+        use_relative_actions=d_state >= d_action and r.random() < 0.3)
+    lm, expert = (golden_pi.gemma(r.choice((16, 24, 36, 40)), depth, heads, kv, d_head, r.choice((32, 50))) for _ in range(2))
+    vision = golden_pi.vision(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
+    checkpoint = random_pi.Description(arch, policy, vision, lm, expert, views, d_state, d_action)
+    return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
 def run_reference(case, folder):
     """(taps, None), or (None, why the reference stops)."""
-    random_smolvla.write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
+    maker = random_smolvla if isinstance(case.checkpoint, random_smolvla.Description) else random_pi
+    maker.write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
     cases.write_observation(case, folder)
     try:
         return golden.run_case(folder), None
@@ -84,7 +106,7 @@ def run_runtime(vla, folder):
     """(taps, None), or (None, who refuses and why)."""
     checkpoint, message = folder / "checkpoint", io.StringIO()
     with contextlib.redirect_stderr(message):
-        code = cli.main([str(checkpoint), "--backbone", str(checkpoint / "vlm"), "-o", str(folder / "bundle.gguf"),
+        code = cli.main([str(checkpoint), "--backbone", str(golden.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
                          "--dtype", "f32", "--quiet"])
     if code:
         return None, f"vla-convert ({code}): {message.getvalue().strip()[:200]}"
@@ -107,9 +129,9 @@ def judge(expected, got):
     return far[worst] <= TOLERANCE, f"actions {far['actions']:.1e}, worst of {len(far)} blocks {far[worst]:.1e} at {worst}"
 
 
-def compare(seed, vla, folder):
+def compare(arch, seed, vla, folder):
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
-        expected, stopped = run_reference(draw(seed), folder)
+        expected, stopped = run_reference(draw(seed) if arch == "smolvla" else draw_pi(arch, seed), folder)
     got, refused = run_runtime(vla, folder)
     if expected is None or got is None:
         return expected is None and got is None, f"reference: {stopped or 'runs'}; {refused or 'the runtime runs'}"
@@ -118,6 +140,7 @@ def compare(seed, vla, folder):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("arch", choices=sorted(golden.REFERENCES))
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
@@ -130,7 +153,7 @@ def main():
         for seed in range(args.first, args.last + 1):
             folder = (args.keep or Path(scratch)) / str(seed)
             folder.mkdir(parents=True)
-            agree, what = compare(seed, args.vla, folder)
+            agree, what = compare(args.arch, seed, args.vla, folder)
             n_wrong += not agree
             print(f"seed {seed}: {'agree' if agree else 'DIFFER'}; {what}", flush=True)
     print(f"{args.last - args.first + 1 - n_wrong} of {args.last - args.first + 1} seeds agree")

@@ -136,7 +136,7 @@ def write_checkpoint(description, seed, folder):
     from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
     from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors
 
-    from vla_cpp.convert.golden import published_dtypes
+    from vla_cpp.convert.golden_smolvla import published_dtypes
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

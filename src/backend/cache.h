@@ -18,6 +18,7 @@ class Cache {
     g.write(g.name(path, value), kept);
     entries_[path] = kept;
   }
+  bool has(const std::string& path) const { return entries_.count(path) != 0; }
   /// What `put` kept; the prefix graph of the same plan must have put it.
   Tensor get(const std::string& path) const { return entries_.at(path); }
 

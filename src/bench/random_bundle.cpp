@@ -34,11 +34,13 @@ std::string recipe(int image_size, int max_tokens, int d_state, int d_robot) {
                           {"fill", 0.0}};
   const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
   const Json tokenize = {{"op", "tokenize"}, {"max_tokens", max_tokens}, {"truncate", "right"}};
-  const Json pad = {{"op", "pad"}, {"size", d_state}}, take = {{"op", "take"}, {"size", d_robot}};
+  // A network without a state vector sees none: what a robot sends is dropped.
+  const Json state = d_state > 0 ? Json::object({{"op", "pad"}, {"size", d_state}}) : Json::object({{"op", "drop"}});
+  const Json take = {{"op", "take"}, {"size", d_robot}};
   Json root;
   root["image"] = Json::array({letterbox, affine});
   root["text"] = Json::array({tokenize});
-  root["state"] = Json::array({pad});
+  root["state"] = Json::array({state});
   root["action"] = Json::array({take});
   return root.dump();
 }
@@ -61,7 +63,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const int image_size, keys.integer("vision.image_size"));
   VLA_TRY(const int d_state, keys.integer("policy.d_state"));
   VLA_TRY(const int d_action, keys.integer("policy.d_action"));
-  const int d_robot = std::min({kRobot, d_state, d_action});
+  const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
   const std::vector<std::string> views = numbered("observation.images.view", sizes.n_view);
   const std::vector<std::string> nothing(static_cast<std::size_t>(d_robot));
   const Keys added({

@@ -103,7 +103,7 @@ void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::i
 void Engine::record_inputs(std::vector<Tap>& taps) const {
   record(taps, "pixels", {inputs_.width, inputs_.height, 3, inputs_.n_view}, inputs_.pixels);
   record(taps, "tokens", {static_cast<std::int64_t>(inputs_.tokens.size())}, inputs_.tokens);
-  record(taps, "state", {d_state_}, inputs_.state);
+  if (d_state_ > 0) record(taps, "state", {d_state_}, inputs_.state);
 }
 
 /// `chunk` is what the network answers, cut to the robot's columns; `actions` is the same in world units.

@@ -39,7 +39,7 @@ Plan::Plan(const PlanContext& context, const InputShape& shape)
     : tap_pattern_(context.tap_pattern),
       store_(store_capacity(context.weights)),
       in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}), store_.add_i32({shape.n_text}),
-          store_.add_f32({shape.d_state, 1})},
+          shape.d_state > 0 ? store_.add_f32({shape.d_state, 1}) : Tensor()},
       x_(store_.add_f32({context.d_action, context.horizon})),
       k_(store_.add_i32({1})),
       prefix_(context.weights, store_, prefix_filter(tap_pattern_)),
@@ -70,7 +70,7 @@ void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_
                       std::span<const float> state) {
   Store::set(in_.images, pixels.data(), pixels.size_bytes());
   Store::set(in_.tokens, tokens.data(), tokens.size_bytes());
-  Store::set(in_.state, state.data(), state.size_bytes());
+  if (in_.state) Store::set(in_.state, state.data(), state.size_bytes());
 }
 
 void Plan::set_x(std::span<const float> x) { Store::set(x_, x.data(), x.size_bytes()); }

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "modules/time_embedding.h"
 
+#include <fmt/format.h>
+
 #include <cmath>
 #include <numbers>
 
@@ -21,6 +23,18 @@ std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d
     for (int i = 0; i < half; ++i) table.push_back(static_cast<float>(std::cos(angle(i))));
   }
   return table;
+}
+
+TimeEmbedding::TimeEmbedding(const Scope& s, int d)
+    : d_(d), min_period_(s.precise("min_period")), max_period_(s.precise("max_period")) {
+  s.require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period",
+            fmt::format("{}", min_period_));
+  s.require(d % 2 == 0, "width", "an even expert.d_model, for sines and cosines", std::to_string(d));
+}
+
+Tensor TimeEmbedding::operator()(Graph& g, std::span<const float> times) const {
+  return g.store().add_constant(sinusoidal_time_embedding(times, d_, min_period_, max_period_),
+                                {d_, static_cast<std::int64_t>(times.size())});
 }
 
 }  // namespace vla

@@ -5,11 +5,27 @@
 #include <span>
 #include <vector>
 
+#include "backend/graph.h"
+#include "bundle/params.h"
+
 namespace vla {
 
 /// Sines, then cosines, of times at geometrically spaced periods: values of [d, n_time], one column per time. `d` is
 /// even. The times are float32; everything after is double, as in the reference, since in float32 the shortest period
 /// alone would cost 1e-4. Source: lerobot policies/common/vla_utils.py create_sinusoidal_pos_embedding.
 std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period, double max_period);
+
+/// The solver's times as a policy embeds them, with the periods of `<path>.min_period` and `<path>.max_period`.
+class TimeEmbedding {
+ public:
+  /// `d`: width of an embedding, even.
+  TimeEmbedding(const Scope& s, int d);
+  /// Load rate: one column per time, [d, times.size()].
+  Tensor operator()(Graph& g, std::span<const float> times) const;
+
+ private:
+  int d_;
+  double min_period_, max_period_;
+};
 
 }  // namespace vla

@@ -15,17 +15,16 @@ Tensor GeluMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
   return down_.added_to(g, residual, up_.activated(g, x, Activation::gelu_tanh));
 }
 
-SiluGatedMlp::SiluGatedMlp(const Scope& s, int d_model, int d_ff)
+GatedMlp::GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation)
     : gate_(s / "ffn_gate", d_model, d_ff, Bias::no),
       up_(s / "ffn_up", d_model, d_ff, Bias::no),
-      down_(s / "ffn_down", d_ff, d_model, Bias::no) {}
+      down_(s / "ffn_down", d_ff, d_model, Bias::no),
+      activation_(activation) {}
 
-Tensor SiluGatedMlp::operator()(Graph& g, Tensor x) const {
-  return down_(g, Linear::gated(g, gate_, up_, x, Activation::silu));
-}
+Tensor GatedMlp::operator()(Graph& g, Tensor x) const { return down_(g, Linear::gated(g, gate_, up_, x, activation_)); }
 
-Tensor SiluGatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
-  return down_.added_to(g, residual, Linear::gated(g, gate_, up_, x, Activation::silu));
+Tensor GatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, Linear::gated(g, gate_, up_, x, activation_));
 }
 
 Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }

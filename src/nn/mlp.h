@@ -18,16 +18,18 @@ class GeluMlp {
   Linear up_, down_;
 };
 
-/// down(silu(gate(x)) * up(x)), without biases. x [d_model, n] -> the same shape. Source: transformers LlamaMLP.
-class SiluGatedMlp {
+/// down(activation(gate(x)) * up(x)), without biases. x [d_model, n] -> the same shape.
+/// Sources: transformers LlamaMLP (silu), GemmaMLP (gelu_tanh).
+class GatedMlp {
  public:
-  SiluGatedMlp(const Scope& s, int d_model, int d_ff);
+  GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation);
   Tensor operator()(Graph& g, Tensor x) const;
   /// residual + the same.
   Tensor added_to(Graph& g, Tensor residual, Tensor x) const;
 
  private:
   Linear gate_, up_, down_;
+  Activation activation_;
 };
 
 /// x / (1 + exp(-x)). Source: torch silu.

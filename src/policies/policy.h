@@ -17,7 +17,7 @@ namespace vla {
 struct PrefixInputs {
   Tensor images;  // [width, height, 3, n_view], in the range that the image recipe makes
   Tensor tokens;  // [n_text] i32
-  Tensor state;   // [d_state, 1], normalized and padded
+  Tensor state;   // [d_state, 1], normalized and padded; none where policy.d_state is 0
 };
 
 /// The sizes of PrefixInputs. A plan is built once for each.
@@ -44,6 +44,10 @@ class Policy {
   /// Step rate: the velocity at x_t, [d_action, horizon] -> the same shape. `condition` is this step's column, [d, 1].
   virtual Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const = 0;
 };
+
+/// Whether a prefix of `n_view` views of `n_token` tokens each and `n_other` other tokens is one that memory holds.
+/// Errors: unsupported.
+Status check_prefix(int n_view, int n_token, int n_other);
 
 /// A policy that the registry knows.
 struct PolicyEntry {

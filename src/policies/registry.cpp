@@ -12,6 +12,21 @@ namespace vla {
 #include "policies/registry.inc"
 #undef POLICY
 
+namespace {
+
+/// Memory of the prefix grows with the square of its tokens: 256 MB for the mask of this many, where published policies
+/// have at most about a thousand.
+constexpr int kMaxPrefix = 8192;
+
+}  // namespace
+
+Status check_prefix(int n_view, int n_token, int n_other) {
+  const std::int64_t n_prefix = std::int64_t{n_view} * n_token + n_other;
+  if (n_prefix <= kMaxPrefix) return {};
+  return Error{Code::unsupported, "prefix", fmt::format("at most {} tokens of views, text and state", kMaxPrefix),
+               std::to_string(n_prefix), "use smaller pictures or fewer views"};
+}
+
 const std::vector<PolicyEntry>& policy_registry() {
   static const std::vector<PolicyEntry> entries = {
 #define POLICY(name) name##_policy(),

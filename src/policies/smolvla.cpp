@@ -8,7 +8,7 @@
 #include <fmt/format.h>
 
 #include "modules/action/expert.h"
-#include "modules/language/smollm.h"
+#include "modules/language/decoder.h"
 #include "modules/time_embedding.h"
 #include "modules/vision/pixel_connector.h"
 #include "modules/vision/siglip.h"
@@ -20,24 +20,20 @@
 namespace vla {
 namespace {
 
-/// Memory of the prefix grows with the square of its tokens: 256 MB for the mask of this many, where published policies
-/// have about 200.
-constexpr int kMaxPrefix = 8192;
-
 class SmolVla final : public Policy {
   Siglip vision_;
-  SmolLm lm_;
+  Decoder lm_;
   PixelConnector connector_;
   Linear state_in_;  // observation rate
   Expert expert_;
   Linear action_in_, action_time_in_, action_time_out_, action_out_;  // step rate
   float image_scale_, text_scale_;
-  double min_period_, max_period_;
+  TimeEmbedding time_;  // load rate
 
  public:
   explicit SmolVla(const Scope& s)
       : vision_(s / "vision"),
-        lm_(s / "lm"),
+        lm_(s / "lm", kSmolLm),
         connector_(s / "connector", vision_.d_model(), lm_.d_model()),
         state_in_(s / "state_in", s.dim("d_state"), lm_.d_model(), Bias::yes),
         expert_(s / "expert", lm_),
@@ -47,30 +43,16 @@ class SmolVla final : public Policy {
         action_out_(s / "action_out", expert_.d_model(), s.dim("d_action"), Bias::yes),
         image_scale_(s.number("image_scale")),
         text_scale_(s.number("text_scale")),
-        min_period_((s / "time").precise("min_period")),
-        max_period_((s / "time").precise("max_period")) {
-    (s / "time")
-        .require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period",
-                 fmt::format("{}", min_period_));
-    (s / "expert")
-        .require(expert_.d_model() % 2 == 0, "d_model", "an even number, for sines and cosines",
-                 fmt::format("{}", expert_.d_model()));
-  }
+        time_(s / "time", expert_.d_model()) {}
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
     const int side = shape.width / vision_.patch_size();
     VLA_CHECK(connector_.check(side));
-    const std::int64_t n_prefix = std::int64_t{connector_.n_token(side)} * shape.n_view + shape.n_text + 1;
-    if (n_prefix <= kMaxPrefix) return {};
-    return Error{Code::unsupported, "prefix", fmt::format("at most {} tokens of views, text and state", kMaxPrefix),
-                 std::to_string(n_prefix), "use smaller pictures or fewer views"};
+    return check_prefix(shape.n_view, connector_.n_token(side), shape.n_text + 1);
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override {
-    return g.store().add_constant(sinusoidal_time_embedding(times, expert_.d_model(), min_period_, max_period_),
-                                  {expert_.d_model(), static_cast<std::int64_t>(times.size())});
-  }
+  Tensor condition(Graph& g, std::span<const float> times) const override { return time_(g, times); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
     const Tensor view = g.stage("vision", connector_(g, vision_(g, in.images)));  // [d_model, n_token, n_view]

@@ -10,8 +10,8 @@ import gguf
 import numpy as np
 import xxhash
 
-FOLDER = Path(__file__).resolve().parents[1] / "golden/smolvla"
-NAMES = sorted(path.parent.name for path in FOLDER.glob("*/observation.json"))
+FOLDER = Path(__file__).resolve().parents[1] / "golden"
+NAMES = sorted(str(path.parent.relative_to(FOLDER)) for path in FOLDER.glob("*/*/observation.json"))
 
 
 def tensors(path):
@@ -20,10 +20,12 @@ def tensors(path):
 
 
 class Golden:
-    """One case.  `arguments` is a sound call of `vla run`, of which a test changes one thing."""
+    """One case, `arch/name`, or the name alone of one of SmolVLA's.  `arguments` is a sound call of `vla run`, of which a
+    test changes one thing."""
 
     def __init__(self, name):
-        self.folder = FOLDER / name
+        self.folder = FOLDER / (name if "/" in name else f"smolvla/{name}")
+        self.arch = self.folder.parent.name
         self.bundle, self.noise, self.expected = (
             self.folder / f for f in ("bundle.gguf", "noise.npy", "expected.gguf")
         )

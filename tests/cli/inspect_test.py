@@ -75,18 +75,26 @@ def test_the_manifest_lists_the_parameters_of_the_published_size(vla):
     assert "lm.blk.15.attn_k.weight" in shapes and "lm.blk.15.attn_q.weight" not in shapes
 
 
+@pytest.mark.parametrize("arch, n_parameter", [("pi0", 3_128_992_528), ("pi05", 3_244_377_872)])
+def test_the_published_pi_policies_have_the_references_parameters_without_those_that_no_action_needs(vla, arch, n_parameter):
+    # Of 3,238,048,528 and 3,353,433,872: without the last language layer's queries, outputs and MLP, and the final norm.
+    root = json.loads(vla("inspect", "--manifest", arch).out)
+    assert sum(prod(p["shape"]) for p in root["parameters"]) == n_parameter
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
     def without_numbers(names):
         return {".".join("#" if part.isdigit() else part for part in name.split(".")) for name in names}
 
-    manifest = json.loads(vla("inspect", "--manifest", "smolvla").out)
-    bundle = [n for n in tensors(Golden(name).bundle) if not n.startswith("stats.")]
+    case = Golden(name)
+    manifest = json.loads(vla("inspect", "--manifest", case.arch).out)
+    bundle = [n for n in tensors(case.bundle) if not n.startswith("stats.")]
     assert without_numbers(bundle) == without_numbers(p["name"] for p in manifest["parameters"])
 
 
 def test_the_manifest_of_an_unknown_architecture_is_unsupported(vla):
-    vla("inspect", "--manifest", "octo").refused("unsupported", "expected one of smolvla, found octo")
+    vla("inspect", "--manifest", "octo").refused("unsupported", "smolvla, found octo")
 
 
 def test_inspect_takes_no_more_memory_for_weights_than_the_file_has(vla):

@@ -56,6 +56,17 @@ TEST_CASE(
   }
 }
 
+TEST_CASE("row_major gives patch i row i, and refuses a picture of another size than the table's") {
+  const auto ids = vision_position_ids("row_major", 3, 3);
+  REQUIRE(ids.ok());
+  CHECK(*ids == std::vector<std::int32_t>{0, 1, 2, 3, 4, 5, 6, 7, 8});
+  for (int grid : {2, 4}) {
+    const auto other = vision_position_ids("row_major", grid, 3);
+    REQUIRE_FALSE(other.ok());
+    CHECK(other.error().code == Code::unsupported);
+  }
+}
+
 TEST_CASE("an unknown position rule is a bad bundle") {
   const auto ids = vision_position_ids("nearest", 32, 32);
   REQUIRE_FALSE(ids.ok());

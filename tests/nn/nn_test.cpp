@@ -76,7 +76,7 @@ TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for
   constexpr int kHead = 64, kTokens = 3, kFirst = 200;
   const std::vector<float> x = ramp(kHead * 2 * kTokens, 1);
   const auto y = run_graph([&](Graph& g) {
-    return rope(g, g.store().add_constant(x, {kHead, 2, kTokens}), 10000.0f, kFirst);
+    return rope(g, g.store().add_constant(x, {kHead, 2, kTokens}), 10000.0f, RotaryAngle::quotient, kFirst);
   });
   double interleaved_difference = 0;
   for (int token = 0; token < kTokens; ++token)
@@ -92,6 +92,23 @@ TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for
             interleaved_difference, std::abs(y[even] - (x[even] * std::cos(angle) - x[even + 1] * std::sin(angle))));
       }
   CHECK(interleaved_difference > 0.1);
+}
+
+TEST_CASE("rotary angles are rounded as either reference rounds them, which differs at large positions") {
+  // Angles as transformers' GemmaRotaryEmbedding and SmolVLA's apply_rope make them with torch 2.13, for d_head = 256.
+  constexpr int kHead = 256, kPosition = 800, kPair = 15;
+  constexpr double kProductAngle = 271.8566589355469, kQuotientAngle = 271.856689453125;
+  std::vector<float> x(kHead, 0.0f);
+  x[kPair] = 1;
+  const auto turned = [&](RotaryAngle angle) {
+    return run_graph([&](Graph& g) {
+      return rope(g, g.store().add_constant(x, {kHead, 1, 1}), 10000.0f, angle, kPosition);
+    });
+  };
+  const auto product = turned(RotaryAngle::product), quotient = turned(RotaryAngle::quotient);
+  CHECK(product[kPair] == doctest::Approx(std::cos(kProductAngle)).epsilon(1e-6));
+  CHECK(quotient[kPair] == doctest::Approx(std::cos(kQuotientAngle)).epsilon(1e-6));
+  CHECK(std::abs(product[kPair] - quotient[kPair]) > 1e-5);
 }
 
 TEST_CASE("attention with grouped heads agrees with its definition, with and without a causal mask") {

@@ -11,13 +11,13 @@
 
 namespace vla::test {
 
-/// Builds a graph without weights, runs it, and returns the values of what `build` returns. An empty name takes the
+/// Builds a graph on these parameters, runs it, and returns the values of what `build` returns. An empty name takes the
 /// best kernels that the machine has.
-inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build, const std::string& kernels = "") {
+inline std::vector<float> run_graph(const ParamList& params, const std::function<Tensor(Graph&)>& build,
+                                    const std::string& kernels = "") {
   const auto device = Device::cpu(2, kernels);
   REQUIRE(device.ok());
-  const ParamList none(Keys(), nullptr);
-  const auto weights = Weights::load(none, *device, Weights::Fill::yes);
+  const auto weights = Weights::load(params, *device, Weights::Fill::yes);
   REQUIRE(weights.ok());
   Store store(256);
   Graph graph(*weights, store, [](const std::string& path) { return path == "result"; });
@@ -28,6 +28,11 @@ inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build, 
   REQUIRE(graph.allocate(memory).ok());
   REQUIRE(graph.run(*device).ok());
   return Store::get(graph.taps().front().second);
+}
+
+/// The same without parameters.
+inline std::vector<float> run_graph(const std::function<Tensor(Graph&)>& build, const std::string& kernels = "") {
+  return run_graph(ParamList(Keys(), nullptr), build, kernels);
 }
 
 /// Deterministic values in [-range, range].

@@ -4,14 +4,15 @@
 
     python -m vla_cpp.convert.golden CASE [CASE ...] --seed N
 
-A case is a folder with `checkpoint/` (the hub layout, the backbone's config and tokenizer in `checkpoint/vlm`),
-`observation.json`, its frames and `noise.npy`.  The result is `CASE/expected.gguf`: LeRobot's own SmolVLA class in
+A case is a folder with `checkpoint/` (the hub layout, with what the hub keeps in the backbone's repository in a folder
+of its own), `observation.json`, its frames and `noise.npy`.  The result is `CASE/expected.gguf`: LeRobot's own class in
 float32 on one thread, every tap in torch's row-major shape.  Only rows that carry something appear: padded text and
 absent views are dropped everywhere, since a runtime need not represent them.
 
 Run by hand, in an environment with torch, lerobot and gguf; nothing else of vla_cpp imports this file.
 """
 import argparse
+import importlib
 import importlib.machinery
 import importlib.metadata
 import json
@@ -84,37 +85,30 @@ def versions() -> str:
 
 # --- the reference, run on one case -------------------------------------------------------------------------------
 
-
-def published_dtypes(policy):
-    """The dtypes of published files: backbone and expert bfloat16; cross layers' k/v and the five projections float32."""
-    inner = policy.model.vlm_with_expert
-    inner.vlm.bfloat16(), inner.lm_expert.bfloat16()
-    for j, layer in enumerate(inner.lm_expert.layers):
-        if is_cross(policy.config, j):
-            layer.self_attn.k_proj.float(), layer.self_attn.v_proj.float()
-    return policy
+# For each architecture the module that knows its class: `load(checkpoint, dtype)` and a `Recorder`.
+REFERENCES = {"smolvla": "golden_smolvla", "pi0": "golden_pi", "pi05": "golden_pi"}
 
 
-def is_cross(config, j):
-    """Whether the reference builds layer j of the expert with keys and values projected from the backbone's."""
-    every = config.self_attn_every_n_layers
-    return "cross" in config.attention_mode and not (every > 0 and j % every == 0)
+def config_type(checkpoint) -> str:
+    return json.loads((Path(checkpoint) / "config.json").read_text())["type"]
+
+
+def backbone_folder(checkpoint) -> Path:
+    """What the hub keeps in another repository: the backbone of SmolVLA, the tokenizer of pi0."""
+    return next(p for p in (Path(checkpoint) / "vlm", Path(checkpoint) / "tokenizer") if p.is_dir())
+
+
+def reference(arch):
+    return importlib.import_module(f"vla_cpp.convert.{REFERENCES[arch]}")
 
 
 def load(checkpoint, dtype="float32"):
-    """(policy, preprocessor, postprocessor) of a folder in the hub layout with the backbone's files under `vlm/`."""
-    from lerobot.configs import PreTrainedConfig
-    from lerobot.policies.factory import make_pre_post_processors
-    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+    """(policy, preprocessor, postprocessor) of a folder in the hub layout; dtype: float32 or published."""
+    return reference(config_type(checkpoint)).load(checkpoint, dtype)
 
-    folder = str(checkpoint)
-    config = PreTrainedConfig.from_pretrained(folder)
-    config.vlm_model_name, config.load_vlm_weights = str(Path(checkpoint) / "vlm"), False
-    policy = SmolVLAPolicy.from_pretrained(folder, config=config, strict=True)
-    policy = (published_dtypes(policy) if dtype == "published" else policy.float()).eval()
-    tokenizer = {"tokenizer_processor": {"tokenizer_name": config.vlm_model_name}}
-    before, after = make_pre_post_processors(config, pretrained_path=folder, preprocessor_overrides=tokenizer)
-    return policy, before, after
+
+def recorder(policy):
+    return reference(policy.config.type).Recorder(policy)
 
 
 def read_observation(case):
@@ -132,37 +126,16 @@ def read_observation(case):
 
 
 class Recorder:
-    """Listens to one run of `predict_action_chunk`: hooks on modules, wrappers on the stage entry points."""
+    """Listens to one run of `predict_action_chunk`: hooks on modules, wrappers on the stage entry points.
 
-    def __init__(self, policy):
-        self.policy, self.step, self.views, self.taps = policy, -1, {}, {}
-        model = policy.model
-        backbone, self.expert = model.vlm_with_expert.get_vlm_model(), model.vlm_with_expert.lm_expert
-        vision, text = backbone.vision_model, backbone.text_model
+    A reference's own recorder derives from it: it places the hooks, tells `prefix_seen` which rows are valid and
+    `step_seen` what enters a step.
+    """
 
-        self.per_view(vision.embeddings.patch_embedding, "vision.patch_embed", lambda x: x.flatten(2).transpose(1, 2))
-        for i, block in enumerate(vision.encoder.layers):
-            self.per_view(block, f"vision.blk.{i}")
-        self.per_view(vision.post_layernorm, "vision.post_norm")
-        self.per_view(backbone.connector, "connector")
-        self.before(vision.embeddings, lambda x: self.views.setdefault("pixels", []).append(x))
-        self.before(vision.embeddings.position_embedding, lambda ids: self.put("position_ids", ids[0]))
-        for i, layer in enumerate(list(text.layers)[1:]):  # what enters a layer is what the one before it left
-            self.before(layer.input_layernorm, lambda x, i=i: self.rows(f"lm.blk.{i}", x))
-
-        self.stepwise(model.action_time_mlp_out, "action_time_out")
-        layers = list(self.expert.layers)
-        for j, norm in enumerate([layer.input_layernorm for layer in layers[1:]] + [self.expert.norm]):
-            self.before(norm, lambda x, j=j: self.at_step(f"expert.blk.{j}", x))
-        self.stepwise(self.expert.norm, "expert.norm")
-        self.stepwise(model.action_out_proj, "action_out")
-        for j, layer in enumerate(layers):
-            if is_cross(policy.config, j):
-                for name in ("k", "v"):
-                    self.reprojected(getattr(layer.self_attn, f"{name}_proj"), f"expert.blk.{j}.{name}")
-
-        self.embed_prefix, model.embed_prefix = model.embed_prefix, self.on_prefix
-        self.denoise_step, model.denoise_step = model.denoise_step, self.on_step
+    def __init__(self, policy, n_step):
+        self.policy, self.n_step, self.step, self.views, self.taps = policy, n_step, -1, {}, {}
+        self.embed_prefix, policy.model.embed_prefix = policy.model.embed_prefix, self.on_prefix
+        self.denoise_step, policy.model.denoise_step = policy.model.denoise_step, self.on_step
 
     def put(self, name, x):
         self.taps[name] = x.detach().float().numpy().copy()
@@ -171,7 +144,7 @@ class Recorder:
         self.put(name, x[0][self.valid])
 
     def at_step(self, name, x):
-        if self.step in (0, self.policy.config.num_steps - 1):
+        if self.step in (0, self.n_step - 1):
             self.put(f"step.{self.step}.{name}", x[0])
 
     def before(self, module, take):
@@ -186,9 +159,23 @@ class Recorder:
     def stepwise(self, module, name):
         self.after(module, lambda x: self.at_step(name, x))
 
-    def reprojected(self, module, name):
-        head = self.policy.model.vlm_with_expert.config.text_config.head_dim
-        self.after(module, lambda x: self.rows(name, x.unflatten(-1, (-1, head))) if self.step == 0 else None)
+    def vision_tower(self, vision):
+        """Hooks on a tower of the SigLIP family."""
+        self.per_view(vision.embeddings.patch_embedding, "vision.patch_embed", lambda x: x.flatten(2).transpose(1, 2))
+        for i, block in enumerate(vision.encoder.layers):
+            self.per_view(block, f"vision.blk.{i}")
+        self.per_view(vision.post_layernorm, "vision.post_norm")
+        self.before(vision.embeddings, lambda x: self.views.setdefault("pixels", []).append(x))
+
+    def language_layers(self, layers):
+        for i, layer in enumerate(list(layers)[1:]):  # what enters a layer is what the one before it left
+            self.before(layer.input_layernorm, lambda x, i=i: self.rows(f"lm.blk.{i}", x))
+
+    def expert_layers(self, expert):
+        norms = [layer.input_layernorm for layer in list(expert.layers)[1:]] + [expert.norm]
+        for j, norm in enumerate(norms):
+            self.before(norm, lambda x, j=j: self.at_step(f"expert.blk.{j}", x))
+        self.stepwise(expert.norm, "expert.norm")
 
     def on_prefix(self, images, image_masks, *args, **kwargs):
         embedded, pad_masks, att_masks = self.embed_prefix(images, image_masks, *args, **kwargs)
@@ -196,7 +183,7 @@ class Recorder:
         self.rows("prefix", embedded)
         return embedded, pad_masks, att_masks
 
-    def on_step(self, x_t, prefix_pad_masks, past_key_values, timestep):
+    def on_step(self, x_t, past_key_values, **kwargs):
         import torch
 
         self.step += 1
@@ -206,8 +193,7 @@ class Recorder:
                 self.rows(f"lm.blk.{i}.v", layer.values.transpose(1, 2))
         else:
             self.put(f"step.{self.step - 1}.x", x_t[0])
-        velocity = self.denoise_step(x_t=x_t, prefix_pad_masks=prefix_pad_masks, past_key_values=past_key_values,
-                                     timestep=timestep)
+        velocity = self.denoise_step(x_t=x_t, past_key_values=past_key_values, **kwargs)
         assert torch.isfinite(velocity).all()
         return velocity
 
@@ -230,13 +216,13 @@ class Recorder:
             self.put(name, torch.cat([x for x, here in zip(seen, self.present, strict=True) if here]))
         tokens = batch["observation.language.tokens"][0]
         self.put("tokens", tokens[batch["observation.language.attention_mask"][0].bool()])
-        self.put("state", self.policy.prepare_state(batch)[0])
         return self.taps
 
 
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
-    stages = ("pixels", "tokens", "state", "position_ids", "vision", "connector", "prefix", "lm", "expert", "step", "chunk")
+    stages = ("pixels", "tokens", "state", "position_ids", "vision", "connector", "projector", "prefix", "lm", "state_in",
+              "expert", "step", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)
     i = next((int(p) for p in parts if p.isdigit()), 1000 if name == "vision.post_norm" else -1)
@@ -250,8 +236,7 @@ def run_case(case, dtype="float32"):
     torch.set_num_threads(1)  # another number of threads sums in another order
     policy, before, after = load(case / "checkpoint", dtype)
     noise = torch.from_numpy(np.load(case / "noise.npy"))[None]
-    recorder = Recorder(policy)
-    taps = recorder.run(before(read_observation(case)), noise)
+    taps = recorder(policy).run(before(read_observation(case)), noise)
     taps = {name: taps[name] for name in sorted(taps, key=network_order)}
     taps["actions"] = after(torch.from_numpy(taps["chunk"])[None]).float().numpy()[0]
     return taps
@@ -263,11 +248,12 @@ def write_expected(case, seed):
 
     taps = run_case(case)
     published = run_case(case, "published")
-    taps |= {f"{name}.bf16": published[name] for name in ("position_ids", "chunk")}
+    taps |= {f"{name}.bf16": published[name] for name in ("position_ids", "chunk") if name in taps}
     writer = gguf.GGUFWriter(case / "expected.gguf", "golden")
-    writer.add_string("golden.arch", "smolvla")
+    arch = config_type(case / "checkpoint")
+    writer.add_string("golden.arch", arch)
     writer.add_string("golden.case", case.name)
-    writer.add_string("golden.reference", "lerobot.policies.smolvla.SmolVLAPolicy, float32, CPU, 1 thread")
+    writer.add_string("golden.reference", f"{reference(arch).NAMES[arch]}, float32, CPU, 1 thread")
     writer.add_string("golden.versions", versions())
     writer.add_uint32("golden.seed", seed)
     for name, value in taps.items():

@@ -10,11 +10,14 @@
 namespace vla {
 
 ExpertSelfBlock::ExpertSelfBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
-    : Module(s), kv_(s, d_model, heads, eps), rest_(s, d_model, d_ff, heads, eps) {}
+    : Module(s),
+      attn_norm_(s / "attn_norm", d_model, eps),
+      kv_(s, d_model, heads),
+      rest_(s, d_model, d_ff, heads, Activation::silu, eps) {}
 
 Tensor ExpertSelfBlock::forward(Graph& g, Tensor x, const KeyValue& prefix) const {
   const int n_prefix = static_cast<int>(prefix.key.dim(2)), horizon = static_cast<int>(x.dim(1));
-  const Tensor h = kv_.norm(g, x);
+  const Tensor h = attn_norm_(g, x);
   const KeyValue own = kv_(g, h, n_prefix);
   const KeyValue seen = {append_keys(g, prefix.key, own.key), append_keys(g, prefix.value, own.value)};
   return rest_(g, x, h, n_prefix, seen, causal_mask(g, n_prefix, horizon));
@@ -26,22 +29,22 @@ ExpertCrossBlock::ExpertCrossBlock(const Scope& s, int d_model, int d_ff, const 
       attn_norm_(s / "attn_norm", d_model, eps),
       k_(s / "attn_k", heads.d_key(), heads.d_key(), Bias::no),
       v_(s / "attn_v", heads.d_key(), heads.d_key(), Bias::no),
-      rest_(s, d_model, d_ff, heads, eps) {}
+      rest_(s, d_model, d_ff, heads, Activation::silu, eps) {}
 
 void ExpertCrossBlock::prepare(Graph& g, const KeyValue& prefix, Cache& cache) const {
   // The cached keys already carry their rotation, and the reference projects them as they are.
-  cache.put(g, path() + ".k", split_heads(g, k_(g, merge_heads(g, prefix.key)), heads_.n_head_kv));
-  cache.put(g, path() + ".v", split_heads(g, v_(g, merge_heads(g, prefix.value)), heads_.n_head_kv));
+  const KeyValue own = {split_heads(g, k_(g, merge_heads(g, prefix.key)), heads_.n_head_kv),
+                        split_heads(g, v_(g, merge_heads(g, prefix.value)), heads_.n_head_kv)};
+  own.put(g, cache, path());
 }
 
 Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
   // Positions of a cross layer's queries start at 0, not behind the prefix: forward_cross_attn_layer subtracts their
   // least.
-  const KeyValue prefix = {cache.get(path() + ".k"), cache.get(path() + ".v")};
-  return rest_(g, x, attn_norm_(g, x), 0, prefix, {});
+  return rest_(g, x, attn_norm_(g, x), 0, KeyValue::get(cache, path()), {});
 }
 
-Expert::Expert(const Scope& s, const SmolLm& lm)
+Expert::Expert(const Scope& s, const Decoder& lm)
     : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps")) {
   const std::vector<std::string> kinds = s.strings("layer_kinds");
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");

@@ -5,7 +5,7 @@
 #include <variant>
 #include <vector>
 
-#include "modules/language/smollm.h"
+#include "modules/language/decoder.h"
 
 namespace vla {
 
@@ -17,6 +17,7 @@ class ExpertSelfBlock : public Module<ExpertSelfBlock> {
   Tensor forward(Graph& g, Tensor x, const KeyValue& prefix) const;
 
  private:
+  RmsNorm attn_norm_;
   KeyValueProjection kv_;
   DecoderRest rest_;
 };
@@ -42,7 +43,7 @@ class ExpertCrossBlock : public Module<ExpertCrossBlock> {
 /// attention, or missing. Source: lerobot policies/smolvla/smolvlm_with_expert.py.
 class Expert {
  public:
-  Expert(const Scope& s, const SmolLm& lm);
+  Expert(const Scope& s, const Decoder& lm);
 
   /// Observation rate: whatever depends on the prefix alone.
   void prepare(Graph& g, Cache& cache) const;
@@ -57,7 +58,7 @@ class Expert {
     std::variant<ExpertSelfBlock, ExpertCrossBlock> block;
   };
 
-  const SmolLm& lm_;
+  const Decoder& lm_;
   int d_model_;
   std::vector<Layer> layers_;
   RmsNorm norm_;

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <bit>
 #include <cmath>
+#include <numeric>
 
 namespace vla {
 namespace {
@@ -50,12 +51,22 @@ std::vector<std::int32_t> axis_ids(const std::string& rule, int n_grid, const st
   return ids;
 }
 
+Result<std::vector<std::int32_t>> row_major_ids(int n_grid, int n_table) {
+  if (n_grid != n_table)
+    return Error{Code::unsupported, "vision.position_rule", fmt::format("{0} x {0} patches, as the table has", n_table),
+                 fmt::format("{0} x {0}", n_grid), "row_major is defined for pictures of vision.image_size only"};
+  std::vector<std::int32_t> ids(static_cast<std::size_t>(n_grid) * static_cast<std::size_t>(n_grid));
+  std::iota(ids.begin(), ids.end(), 0);
+  return ids;
+}
+
 }  // namespace
 
 Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, int n_grid, int n_table) {
+  if (rule == "row_major") return row_major_ids(n_grid, n_table);
   if (rule != "bucketize_float32" && rule != "bucketize_bfloat16" && rule != "bucketize_shifted")
-    return Error{Code::bad_bundle, "vision.position_rule", "bucketize_float32, bucketize_bfloat16 or bucketize_shifted",
-                 rule};
+    return Error{Code::bad_bundle, "vision.position_rule",
+                 "bucketize_float32, bucketize_bfloat16, bucketize_shifted or row_major", rule};
   const std::vector<std::int32_t> axis = axis_ids(rule, n_grid, boundaries(n_table, 1));
   for (int width : {4, 8, 16})
     if (axis_ids(rule, n_grid, boundaries(n_table, width)) != axis)

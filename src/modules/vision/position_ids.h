@@ -19,8 +19,12 @@ namespace vla {
 /// of the machine (its boundaries are made by torch.arange in blocks) has no right answer, and is refused. Source:
 /// transformers modeling_smolvlm.py SmolVLMVisionEmbeddings.forward.
 ///
-/// `rule`: bucketize_float32, bucketize_bfloat16 or bucketize_shifted; `n_table`: rows of the table per side.
-/// Errors: bad_bundle for another rule, unsupported for an ambiguous grid.
+/// Towers whose pictures have one size only have no fractions: `row_major` gives patch i row i. Source: transformers
+/// modeling_siglip.py SiglipVisionEmbeddings.forward.
+///
+/// `rule`: bucketize_float32, bucketize_bfloat16, bucketize_shifted or row_major; `n_table`: rows of the table per
+/// side. Errors: bad_bundle for another rule, unsupported for an ambiguous grid, or one that row_major has no table
+/// for.
 Result<std::vector<std::int32_t>> vision_position_ids(const std::string& rule, int n_grid, int n_table);
 
 }  // namespace vla

@@ -1,0 +1,93 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <variant>
+#include <vector>
+
+#include "modules/language/decoder.h"
+#include "nn/adaptive_norm.h"
+
+namespace vla {
+
+/// What an expert's norms multiply with: a weight of their own (π0), or what they make of the time (π0.5).
+enum class ExpertNorm { weighted, adaptive };
+
+/// One norm of the expert, of either kind. Source: lerobot policies/pi_gemma.py PiGemmaRMSNorm.
+class TimedNorm {
+ public:
+  TimedNorm(const Scope& s, ExpertNorm kind, int d, float eps);
+
+  /// The normalized x, and the gate of the residual that follows: none without modulation.
+  struct Result {
+    Tensor h, gate;
+  };
+  /// x [d, n], modulation [3 d, 1] or none.
+  Result operator()(Graph& g, Tensor x, Tensor modulation) const;
+  /// Load rate, of adaptive norms: [d, n_time] -> [3 d, n_time].
+  Tensor modulation(Graph& g, Tensor time) const { return std::get<AdaptiveRmsNorm>(norm_).modulation(g, time); }
+
+ private:
+  std::variant<RmsNorm, AdaptiveRmsNorm> norm_;
+};
+
+/// One layer of the expert: its tokens see those before them and each other, both ways.
+class GemmaExpertBlock : public Module<GemmaExpertBlock> {
+ public:
+  GemmaExpertBlock(const Scope& s, ExpertNorm kind, int d_model, int d_ff, const Heads& heads, float eps);
+  /// Modulations of the two norms, each [3 d_model, 1], or none.
+  struct Modulations {
+    Tensor attn, ffn;
+  };
+  /// x [d_model, n] -> the same shape; `past` holds the tokens before it.
+  Tensor forward(Graph& g, Tensor x, const KeyValue& past, const Modulations& modulations) const;
+  /// The same for tokens that join the past: it leaves keys and values of both in the cache. Without modulation.
+  Tensor prefill(Graph& g, Tensor x, const KeyValue& past, Cache& cache) const;
+
+  const TimedNorm& attn_norm() const { return attn_norm_; }
+  const TimedNorm& ffn_norm() const { return ffn_norm_; }
+
+ private:
+  KeyValue append(Graph& g, Tensor h, const KeyValue& past) const;
+  Tensor rest(Graph& g, Tensor x, const TimedNorm::Result& normed, int first, const KeyValue& seen, Tensor ffn) const;
+
+  TimedNorm attn_norm_;
+  KeyValueProjection kv_;
+  QueryAttention attention_;
+  TimedNorm ffn_norm_;
+  GatedMlp mlp_;
+};
+
+/// The action expert of the π family: a narrower Gemma with as many layers and the same heads as the language model,
+/// whose layer i attends to the cached layer i. Source: lerobot policies/pi0/modeling_pi0.py PaliGemmaWithExpertModel.
+class GemmaExpert {
+ public:
+  GemmaExpert(const Scope& s, const Decoder& lm, ExpertNorm kind);
+
+  /// Load rate, for adaptive norms: the embedded times [d_model, n_time] -> the modulations of all norms one above the
+  /// other, [3 d_model * (2 n_layer + 1), n_time].
+  Tensor modulations(Graph& g, Tensor time) const;
+  /// Observation rate: puts tokens behind the prefix that do not see the actions. x [d_model, n] -> cache
+  /// `<path>.blk.<i>.{k,v}`, the prefix's keys and values with those of x behind them.
+  void prefill(Graph& g, Tensor x, Cache& cache) const;
+  /// Step rate. x [d_model, horizon] -> the same shape, after the final norm. `modulations` is one column of the above,
+  /// or none.
+  Tensor operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cache) const;
+
+  int d_model() const { return d_model_; }
+
+ private:
+  /// In the order of their modulations: attention and MLP of every layer, then the final one.
+  std::vector<const TimedNorm*> norms() const;
+  /// What layer i attends to: the prefix, with the tokens of `prefill` where there are any.
+  KeyValue past(const Cache& cache, std::size_t i) const;
+  /// The part of norm number `i_norm` in a column of modulations: none for norms with weights.
+  Tensor part(Graph& g, Tensor modulations, std::size_t i_norm) const;
+
+  const Decoder& lm_;
+  int d_model_;
+  std::vector<GemmaExpertBlock> blocks_;
+  TimedNorm norm_;
+};
+
+}  // namespace vla

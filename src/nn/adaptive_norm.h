@@ -1,0 +1,34 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "nn/linear.h"
+
+namespace vla {
+
+/// RMS norm whose scale and shift, and the gate of the residual that follows, are linear in a condition.
+/// Source: lerobot policies/pi_gemma.py PiGemmaRMSNorm.
+class AdaptiveRmsNorm : public Module<AdaptiveRmsNorm> {
+ public:
+  AdaptiveRmsNorm(const Scope& s, int d, int d_condition, float eps);
+
+  /// Load rate, one column per condition: [d_condition, n] -> [3 d, n], the factors (1 + scale), shifts and gates.
+  Tensor modulation(Graph& g, Tensor condition) const;
+  /// x / sqrt(mean(x^2) + eps) * (1 + scale) + shift. x [d, n], modulation [3 d, 1] -> the shape of x.
+  Tensor forward(Graph& g, Tensor x, Tensor modulation) const;
+  /// The gate of a modulation [3 d, 1]: [d, 1].
+  Tensor gate(Graph& g, Tensor modulation) const;
+
+ private:
+  int d_;
+  float eps_;
+  Linear dense_;
+};
+
+/// x + y * gate. x and y [d, n], gate [d, 1] for every token. Source: lerobot policies/pi_gemma.py _gated_residual.
+Tensor gated_add(Graph& g, Tensor x, Tensor y, Tensor gate);
+
+/// Features first to first + count - 1 of one vector, without a copy: [d, 1] -> [count, 1].
+Tensor slice_features(Graph& g, Tensor x, int first, int count);
+
+}  // namespace vla

@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The mappings of pi0 and pi0.5 at the published size, against what the runtime declares."""
+
+import json
+import subprocess
+
+import pytest
+
+from manifest_test import vla
+from vla_cpp.convert.archs import _pi, pi0, pi05
+from vla_cpp.convert.archs._pi_sizes import network_keys, read_towers
+from vla_cpp.convert.checkpoint import Checkpoint
+from vla_cpp.convert.errors import Problems
+from vla_cpp.convert.section import Section
+
+CONFIG = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}  # what configurations say of sizes
+
+
+@pytest.fixture(params=[pi0, pi05], ids=["pi0", "pi05"])
+def family(request):
+    return request.param.FAMILY
+
+
+@pytest.fixture
+def sizes(family, tmp_path):
+    problems = Problems("published")
+    checkpoint = Checkpoint("published", str(tmp_path), "", {}, {}, {}, {}, None)
+    sizes = read_towers(Section("config.json", CONFIG, {}, problems), checkpoint, problems)
+    problems.raise_any()
+    sizes.image_size, sizes.horizon, sizes.n_step = 224, 50, 10
+    sizes.d_state, sizes.d_action = (32 if family.state_token else 0), 32
+    sizes.min_period, sizes.max_period = 4e-3, 4.0
+    return sizes
+
+
+@pytest.fixture
+def manifest(family):
+    answer = subprocess.run([vla(), "inspect", "--manifest", family.arch], capture_output=True, check=True)
+    return json.loads(answer.stdout)
+
+
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(family, sizes, manifest, tmp_path):
+    checkpoint = Checkpoint("published", str(tmp_path), "", {}, {}, {}, {}, None)
+    ours = {row.target: (list(row.shape), row.kind) for row in _pi._weights(family, sizes, checkpoint)}
+    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
+
+
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
+    ours = {name: value for group in network_keys(sizes).values() for name, value in group.items()}
+    for name, value in manifest["config"].items():
+        assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name

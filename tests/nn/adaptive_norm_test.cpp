@@ -1,0 +1,111 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Operations with weights of their own, against their definitions in double precision.
+#include "nn/adaptive_norm.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+#include "nn/mlp.h"
+#include "support/editable_bundle.h"
+#include "support/graph_runner.h"
+
+using namespace vla;
+using test::ramp;
+
+namespace {
+
+constexpr int kWidth = 6, kCondition = 4, kToken = 3, kHidden = 5;
+constexpr float kEps = 1e-3f;  // large enough to show
+
+/// A weight of a module under `m`, fastest dimension first.
+struct Piece {
+  std::string name;
+  std::vector<std::int64_t> shape;
+  std::vector<float> values;
+};
+
+/// Declares a `Made` on these weights, and returns the values of what `use` makes with it.
+template <class Made, class Make, class Use>
+std::vector<float> run_module(const std::vector<Piece>& pieces, const Make& make, const Use& use) {
+  test::EditableBundle bundle;
+  for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
+    bundle.set(key, Value(std::string("test")));
+  bundle.set("vla.dtype", Value(std::string("f32")));
+  bundle.set("vla.bundle_version", Value(std::int64_t{1}));
+  for (const Piece& piece : pieces) {
+    const auto bytes = std::as_bytes(std::span(piece.values));
+    bundle.tensors.push_back(
+        {piece.name, DType::f32, piece.shape, {reinterpret_cast<const char*>(bytes.data()), bytes.size()}});
+  }
+  const auto opened = Bundle::open(bundle.write("module.gguf"));
+  REQUIRE_MESSAGE(opened.ok(), (opened ? "" : opened.error().message()));
+  ParamList list(opened->keys(), &*opened);
+  const Made module = make(Scope(list, "m"));
+  const Status fits = list.report("m", [](const std::string&) { return false; });
+  REQUIRE_MESSAGE(fits.ok(), (fits ? "" : fits.error().message()));
+  return test::run_graph(list, [&](Graph& g) { return use(module, g); });
+}
+
+float at(const std::vector<float>& values, int i) { return values[static_cast<std::size_t>(i)]; }
+
+/// Row `row` of a matrix times column `column` of x, both with n numbers.
+template <class X>
+double dot(const std::vector<float>& w, int row, const std::vector<X>& x, int column, int n) {
+  double sum = 0;
+  for (int i = 0; i < n; ++i) sum += double{at(w, row * n + i)} * x[static_cast<std::size_t>(column * n + i)];
+  return sum;
+}
+
+}  // namespace
+
+TEST_CASE("an adaptive norm scales, shifts and gates by what its condition says") {
+  const auto weight = ramp(3 * kWidth * kCondition, 1), bias = ramp(3 * kWidth, 2), x = ramp(kWidth * kToken, 3),
+             y = ramp(kWidth * kToken, 1), condition = ramp(kCondition, 1.5f);
+  const std::vector<Piece> pieces = {{"m.dense.weight", {kCondition, 3 * kWidth}, weight},
+                                     {"m.dense.bias", {3 * kWidth}, bias}};
+  const auto got = run_module<AdaptiveRmsNorm>(
+      pieces, [](const Scope& s) { return AdaptiveRmsNorm(s, kWidth, kCondition, kEps); },
+      [&](const AdaptiveRmsNorm& norm, Graph& g) {
+        Store& store = g.store();
+        const Tensor m = norm.modulation(g, store.add_constant(condition, {kCondition, 1}));
+        const Tensor h = norm(g, store.add_constant(x, {kWidth, kToken}), m);
+        return gated_add(g, h, store.add_constant(y, {kWidth, kToken}), norm.gate(g, m));
+      });
+  REQUIRE(got.size() == x.size());
+  const auto modulation = [&](int row) { return dot(weight, row, condition, 0, kCondition) + at(bias, row); };
+  for (int token = 0; token < kToken; ++token)
+    for (int i = 0; i < kWidth; ++i) {
+      const std::vector<float> row(x.begin() + token * kWidth, x.begin() + (token + 1) * kWidth);
+      const double normed = at(row, i) / std::sqrt(dot(row, 0, row, 0, kWidth) / kWidth + double{kEps});
+      const double h = normed * (1 + modulation(i)) + modulation(kWidth + i);
+      CHECK(at(got, token * kWidth + i) ==
+            doctest::Approx(h + at(y, token * kWidth + i) * modulation(2 * kWidth + i)).epsilon(1e-5));
+    }
+}
+
+TEST_CASE("a GELU-gated MLP multiplies the activated gate with what goes up") {
+  const auto gate = ramp(kHidden * kWidth, 2), up = ramp(kHidden * kWidth, 1), down = ramp(kWidth * kHidden, 1.5f),
+             x = ramp(kWidth * kToken, 2);
+  const std::vector<Piece> pieces = {{"m.ffn_gate.weight", {kWidth, kHidden}, gate},
+                                     {"m.ffn_up.weight", {kWidth, kHidden}, up},
+                                     {"m.ffn_down.weight", {kHidden, kWidth}, down}};
+  const auto got = run_module<GatedMlp>(
+      pieces, [](const Scope& s) { return GatedMlp(s, kWidth, kHidden, Activation::gelu_tanh); },
+      [&](const GatedMlp& mlp, Graph& g) {
+        return mlp(g, g.store().add_constant(x, {kWidth, kToken}));
+      });
+  REQUIRE(got.size() == x.size());
+  for (int token = 0; token < kToken; ++token) {
+    std::vector<double> hidden;
+    for (int j = 0; j < kHidden; ++j) {
+      const double u = dot(gate, j, x, token, kWidth);
+      hidden.push_back(0.5 * u * (1 + std::tanh(std::sqrt(2 / M_PI) * (u + 0.044715 * u * u * u))) *
+                       dot(up, j, x, token, kWidth));
+    }
+    for (int i = 0; i < kWidth; ++i)
+      CHECK(at(got, token * kWidth + i) == doctest::Approx(dot(down, i, hidden, 0, kHidden)).epsilon(1e-5));
+  }
+}
