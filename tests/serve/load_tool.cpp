@@ -110,6 +110,7 @@ v1::Request make_act(const v1::Description& description, const Options& options,
 
 struct Client {
   zmq::socket_t socket;
+  std::string bytes;  // of the request under way
   std::uint64_t request_id = 0;
   std::size_t act = 0, n_answered = 0;
   bool waits = false;
@@ -125,8 +126,9 @@ struct Client {
     request_id = id;
     waits = true;
     request.set_request_id(id);
-    const std::string bytes = request.SerializeAsString();
-    socket.send(zmq::buffer(bytes));
+    request.SerializeToString(&bytes);
+    zmq::message_t message(bytes.data(), bytes.size(), nullptr);  // not copied: they stay until the answer has come
+    socket.send(message, zmq::send_flags::none);
   }
   v1::Response receive() {
     zmq::message_t message;
