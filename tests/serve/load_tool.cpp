@@ -198,7 +198,7 @@ class Load {
             {"queue_ms", quantiles(queue_)},
             {"decode_ms", quantiles(decode_)},
             {"plain_jpeg_ms", quantiles(plain_jpeg_)},
-            {"resident_mb", {{"warm", warm_mb_}, {"peak", peak_mb_}, {"end", resident_mb(options_.pid)}}}};
+            {"resident_mb", resident_mb_}};
   }
 
  private:
@@ -231,10 +231,7 @@ class Load {
     if (chunk.stages_size() > 0) decode_.push_back(chunk.stages(0).ms());
     if (!options_.jpeg.empty()) time_plain_jpeg();
     ++n_answered_;
-    if (options_.pid.empty() || n_answered_ % std::max<std::size_t>(1, options_.n_request / 100) != 0) return;
-    const double now = resident_mb(options_.pid);
-    if (n_answered_ <= options_.n_request / 10) warm_mb_ = now;
-    peak_mb_ = std::max(peak_mb_, now);
+    if (n_answered_ * 10 / options_.n_request > resident_mb_.size()) resident_mb_.push_back(resident_mb(options_.pid));
   }
 
   /// The same files, at the same moment of a busy machine.
@@ -250,7 +247,8 @@ class Load {
   std::vector<std::string> expected_;  // bytes of the actions of each act
   std::vector<Client> clients_;
   Clock::time_point start_;
-  double seconds_ = 0, warm_mb_ = 0, peak_mb_ = 0;
+  double seconds_ = 0;
+  std::vector<double> resident_mb_;  // of the server after each tenth of the requests
   std::size_t n_sent_ = 0, n_answered_ = 0, n_crossed_ = 0, n_error_ = 0;
   int n_unasked_ = 0;
   std::vector<double> round_trip_, overhead_, queue_, decode_, plain_jpeg_;
@@ -272,7 +270,7 @@ int main(int argc, char** argv) {
   app.add_option("--requests", options.n_request, "Of all clients together")->check(CLI::Range(1, 100'000'000));
   app.add_option("--side", options.side, "Raw frames are SIDE x SIDE")->check(CLI::Range(1, 4096));
   app.add_option("--jpeg", options.jpeg, "Files to send instead of raw frames")->check(CLI::ExistingFile);
-  app.add_option("--pid", options.pid, "Of the server, whose memory is watched from a tenth of the requests on");
+  app.add_option("--pid", options.pid, "Of the server, whose resident memory is told after each tenth of the requests");
   CLI11_PARSE(app, argc, argv);
   for (std::string& file : options.jpeg) file = read_file(file);
   Load load(options);
