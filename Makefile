@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo test build packages asan fuzz format clean
+.PHONY: help demo test build packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -14,6 +14,7 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
+	@echo "make tsan      build the server and run its tests under the thread sanitizer"
 	@echo "make fuzz      build the fuzz targets (clang) and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
 	@echo "make clean     remove what was built"
@@ -55,6 +56,12 @@ endif
 asan: packages $(STAMP)
 	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
 	cmake --build --preset asan
+
+# The server's threads: acts of many clients at once, and whatever else tests/serve does. A few minutes of building.
+tsan: packages
+	@test -f build/tsan/build.ninja || cmake --preset tsan $(CMAKE_ARGS)
+	cmake --build --preset tsan
+	ctest --preset tsan --no-tests=error
 
 test: build asan
 	$(VENV)/bin/python scripts/test.py

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_cases import Golden
+from golden_cases import NAMES, Golden
 from server_process import SECONDS, Server, frames, ran
 
 import vla_cpp
@@ -50,6 +50,20 @@ def test_the_specs_are_equal(case, server):
 def test_the_chunk_is_that_of_vla_run(policy, case, tmp_path):
     chunk = policy.act(images=frames(case), state=case.state, text=case.text, seed=5)
     assert np.asarray(chunk).tobytes() == ran(case, tmp_path, "--seed", "5").tobytes()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_server_library_and_program_give_the_same_bytes(name, tmp_path):
+    case = Golden(name)
+    observation = {"images": frames(case), "state": case.state, "text": case.text}
+    seed, noise = 2**64 - 5, np.load(case.noise)
+    server = Server(case)
+    with vla_cpp.Client(server.address, timeout=SECONDS) as client, vla_cpp.Policy(case.bundle, threads=1) as library:
+        for start, option in (({"seed": seed}, ("--seed", str(seed))), ({"noise": noise}, ("--noise", case.noise))):
+            expected = ran(case, tmp_path, *option)
+            for policy in (client, library):
+                assert np.asarray(policy.act(**observation, **start)).tobytes() == expected.tobytes()
+    assert server.stop() == 0
 
 
 def example(where, case, *more):

@@ -1,0 +1,170 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of `vla serve` under load, as rows of a Markdown table.
+
+scripts/serve_load.py overhead     one client, two raw views of 256 x 256: what the server and the network add to the engine
+scripts/serve_load.py jpeg         the same with JPEG files, and libjpeg-turbo's own time for them
+scripts/serve_load.py many         64 clients, 100,000 acts: lost and crossed answers, fairness, resident memory
+
+The server runs on this machine with a bundle of random weights; its engine takes about a millisecond, so that what is measured is not
+hidden. Needs build/cpu/bin/vla and build/cpu/bin/load_tool. Fails where an answer is lost, wrong, or another one's.
+"""
+
+import argparse
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "python"))
+SIDE = 256
+WARM = 3  # tenths of the acts of `many`, until the allocator holds what 64 clients need at the worst moment
+
+
+@contextmanager
+def serving(options):
+    """(address, process) of a server of its own."""
+    command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", str(options.threads)]
+    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
+    try:
+        line = process.stdout.readline()
+        yield re.search(r"address=(\S+)", line)[1], process
+    finally:
+        process.terminate()
+        process.communicate()
+
+
+def run_tool(options, address, *arguments):
+    """What tests/serve/load_tool.cpp reports."""
+    requests = ["--requests", str(options.requests)]
+    result = subprocess.run([options.tool, address, *requests, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
+    if not result.stdout:
+        sys.exit(result.returncode or 1)
+    return {**json.loads(result.stdout), "flawless": result.returncode == 0}
+
+
+def picture(seed):
+    """Something like a photograph: smooth shapes, edges and a little noise."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:SIDE, 0:SIDE] / SIDE
+    waves = [np.sin(2 * np.pi * (a * x + b * y + c)) for a, b, c in rng.uniform(-4, 4, (3, 3))]
+    image = 128 + 60 * np.stack(waves, -1) + 50 * ((x - 0.5) ** 2 + (y - 0.5) ** 2 < 0.1)[..., None]
+    return np.clip(image + rng.normal(0, 4, image.shape), 0, 255).astype(np.uint8)
+
+
+def jpeg(seed):
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(picture(seed)).save(data, "JPEG", quality=90)
+    return data.getvalue()
+
+
+def python_client(options, address):
+    """Round trip minus engine time of the package's own client, numpy in and numpy out."""
+    import vla_cpp
+
+    milliseconds = []
+    with vla_cpp.Client(address, timeout=60) as client:
+        images = {view.name: picture(i) for i, view in enumerate(client.spec.views)}
+        state = {s.name: np.full(s.width, 0.1, np.float32) for s in client.spec.states}
+        for i in range(options.requests):
+            start = time.perf_counter()
+            chunk = client.act(images=images, state=state, text="open the drawer", seed=i)
+            milliseconds.append(1e3 * (time.perf_counter() - start) - sum(chunk.timing.values()))
+    p50, p99 = np.quantile(milliseconds, [0.5, 0.99])
+    return {"overhead_ms": {"p50": p50, "p99": p99}, "requests": options.requests, "flawless": True}
+
+
+def overhead(options):
+    with serving(options) as (address, _):
+        tool, package = run_tool(options, address, "--side", SIDE), python_client(options, address)
+    rows = [
+        ("round trip minus engine, C++ client", spread(tool["overhead_ms"]), "p50 0.5, p99 2"),
+        ("of that, until the engine takes the act up", spread(tool["queue_ms"]), ""),
+        ("round trip minus engine, Python client", spread(package["overhead_ms"]), ""),
+        ("the server's copy of the frames, part of the engine time", spread(tool["decode_ms"]), ""),
+    ]
+    return {"cpp": tool, "python": package}, rows
+
+
+def jpegs(options):
+    with tempfile.TemporaryDirectory() as folder, serving(options) as (address, _):
+        files = [Path(folder) / f"{i}.jpg" for i in range(2)]
+        sizes = [file.write_bytes(jpeg(i)) for i, file in enumerate(files)]
+        tool = run_tool(options, address, "--jpeg", *files)
+    ratio = tool["decode_ms"]["p50"] / tool["plain_jpeg_ms"]["p50"]
+    rows = [
+        ("round trip minus engine, JPEG views of " + " and ".join(f"{s / 1024:.0f} KiB" for s in sizes),
+         spread(tool["overhead_ms"]), ""),
+        ("decode stage of the server, both views", spread(tool["decode_ms"]), ""),
+        ("libjpeg-turbo alone, both files", spread(tool["plain_jpeg_ms"]), ""),
+        ("decode stage over libjpeg-turbo, p50", f"{ratio:.2f}", "about 1"),
+    ]  # fmt: skip
+    return {"jpeg": tool, "ratio": ratio}, rows
+
+
+def many(options):
+    with serving(options) as (address, process):
+        load = ["--clients", options.clients, "--side", options.side, "--pid", process.pid]
+        tool = run_tool(options, address, *load)
+    served, memory = tool["served"], tool["resident_mb"]
+    growth = memory[-1] / memory[WARM - 1] - 1
+    rows = [
+        ("answers", f"{tool['answers']} of {tool['requests']}", "all"),
+        ("crossed, with an error, unasked", f"{tool['crossed']}, {tool['errors']}, {tool['unasked']}", "0, 0, 0"),
+        ("acts per second", f"{tool['per_second']:.0f}", ""),
+        ("acts of the client served least and most", f"{served['least']}, {served['most']}", "within 2x"),
+        ("resident MiB after each tenth", ", ".join(f"{mib:.1f}" for mib in memory), ""),
+        (f"growth of resident memory after {WARM} tenths", f"{100 * growth:.2f} %", "under 2 %"),
+    ]  # fmt: skip
+    return {"many": tool, "growth": growth}, rows
+
+
+def spread(quantiles):
+    return f"p50 {quantiles['p50']:.3f}, p99 {quantiles['p99']:.3f} ms"
+
+
+FIGURES = {"overhead": (overhead, 2000), "jpeg": (jpegs, 2000), "many": (many, 100_000)}
+
+
+def parse():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    binaries = Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla"))
+    parser.add_argument("figure", choices=FIGURES)
+    parser.add_argument("--bundle", type=Path, default=ROOT / "tests/golden/smolvla/two_views/bundle.gguf")
+    parser.add_argument("--vla", type=Path, default=binaries)
+    parser.add_argument("--tool", type=Path, default=os.environ.get("VLA_LOAD_TOOL", binaries.with_name("load_tool")))
+    parser.add_argument("--threads", type=int, default=1, help="of the engine; default: 1")
+    parser.add_argument("--clients", type=int, default=64, help="of `many`; default: 64")
+    parser.add_argument("--side", type=int, default=64, help="of the raw frames of `many`; default: 64 pixels")
+    parser.add_argument("--requests", type=int, help="default: 100,000 of `many`, 2,000 of the others")
+    parser.add_argument("--json", action="store_true")
+    return parser.parse_args()
+
+
+def main():
+    options = parse()
+    measure, requests = FIGURES[options.figure]
+    options.requests = options.requests or requests
+    report, rows = measure(options)
+    if options.json:
+        print(json.dumps(report))
+    else:
+        print("| | measured | to reach |\n| --- | --- | --- |")
+        print("\n".join(f"| {' | '.join(row)} |" for row in rows))
+    return 0 if all(part["flawless"] for part in report.values() if isinstance(part, dict)) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
