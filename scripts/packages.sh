@@ -7,7 +7,7 @@ set -euo pipefail
 
 packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
           libcli11-dev nlohmann-json3-dev libfmt-dev libpng-dev libjpeg-dev libxxhash-dev doctest-dev
-          libzmq3-dev cppzmq-dev libprotobuf-dev protobuf-compiler)
+          libzmq3-dev cppzmq-dev libprotobuf-dev protobuf-compiler prometheus-cpp-dev libcivetweb-dev)
 
 if ! command -v dpkg-query >/dev/null; then
   echo "packages: this is not Debian or Ubuntu; install what corresponds to: ${packages[*]}" >&2

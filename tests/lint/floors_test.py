@@ -37,7 +37,7 @@ LIBRARIES = [
     (re.compile(r"CLI/.*"), {"cli"}),
     (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve"}),
     (re.compile(r"(jpeglib|png)\.h"), {"processor"}),
-    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*"), {"serve"}),
+    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|prometheus/.*|civetweb\.h"), {"serve"}),
 ]
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 
