@@ -59,6 +59,7 @@ int run(int argc, char** argv) {
   choose("compare", vla::cli::add_compare(app));
   choose("serve", vla::cli::add_serve(app));
   choose("keygen", vla::cli::add_keygen(app));
+  choose("replay", vla::cli::add_replay(app));
 
   try {
     app.parse(argc, argv);
