@@ -39,7 +39,8 @@ Status read_request(std::span<const std::byte> request, Envelope& envelope) {
       if (envelope.kind != Kind::unknown)
         return not_a_request("request", "one of hello, describe, act, health", "a second one");
       envelope.kind = kind_of(field.number);
-      envelope.body = field.value;
+      envelope.body_at = static_cast<std::size_t>(field.value.data() - request.data());
+      envelope.body_size = field.value.size();
     } else {
       unknown = field.unknown();
     }
@@ -49,8 +50,8 @@ Status read_request(std::span<const std::byte> request, Envelope& envelope) {
   return unknown ? Status(*unknown) : Status();
 }
 
-Status read_act(Envelope& envelope) {
-  for (Fields field(envelope.body, "request.act");;) {
+Status read_act(std::span<const std::byte> act, Envelope& envelope) {
+  for (Fields field(act, "request.act");;) {
     VLA_TRY(const bool more, field.next());
     if (!more) return {};
     if (field.number != v1::Act::kDeadlineMsFieldNumber) continue;
@@ -72,7 +73,7 @@ Error incompatible(std::uint32_t min, std::uint32_t max) {
 Status read_envelope(std::span<const std::byte> request, Envelope& envelope) {
   VLA_CHECK(read_request(request, envelope));
   if (envelope.kind == Kind::unknown) return not_a_request("request", "one of hello, describe, act, health", "none");
-  return envelope.kind == Kind::act ? read_act(envelope) : Status();
+  return envelope.kind == Kind::act ? read_act(envelope.body(request), envelope) : Status();
 }
 
 }  // namespace vla::serve

@@ -22,8 +22,13 @@ struct Envelope {
   std::uint32_t version = 0;
   std::uint64_t request_id = 0;
   Kind kind = Kind::unknown;
-  std::span<const std::byte> body;  // the serialized Hello, Describe, Act or Health, inside the request's bytes
+  std::size_t body_at = 0, body_size = 0;    // where the serialized Hello, Describe, Act or Health lies in the request
   std::optional<std::uint64_t> deadline_ms;  // of an act
+
+  /// Not kept as a span: a message that ZeroMQ stores inside its own object moves with it.
+  std::span<const std::byte> body(std::span<const std::byte> request) const {
+    return request.subspan(body_at, body_size);
+  }
 };
 
 /// Walks over the fields of a serialized Request, and of an Act in it, without copying one. After an error `envelope`

@@ -19,8 +19,11 @@ struct Job : Received {
   zmq::message_t route;    // routing id of the connection
   bool delimiter = false;  // the client put an empty frame before the request, as REQ sockets do
   zmq::message_t bytes;    // the serialized Request
-  Envelope envelope;       // points into `bytes`
+  Envelope envelope;
   std::optional<Clock::time_point> deadline;
+
+  std::span<const std::byte> request() const { return {bytes.data<std::byte>(), bytes.size()}; }
+  std::span<const std::byte> body() const { return envelope.body(request()); }
 };
 
 /// A job with its answer.

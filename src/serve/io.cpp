@@ -88,7 +88,7 @@ bool Io::receive() {
   job.at = Clock::now();
   job.client = hexadecimal(job.route);
   job.size = job.bytes.size();
-  const Status sound = is_one_frame ? read_envelope(bytes_of(job.bytes), job.envelope)
+  const Status sound = is_one_frame ? read_envelope(job.request(), job.envelope)
                                     : Status(not_a_request("request", "one frame", "several"));
   job.request_id = job.envelope.request_id;
   job.kind = job.envelope.kind;
@@ -112,10 +112,10 @@ void Io::handle(Job job, const Status& sound) {
 Result<v1::Response> Io::answer_now(const Job& job) const {
   v1::Response response = response_to(job.request_id);
   if (job.kind == Kind::hello) {
-    VLA_TRY(*response.mutable_hello(), answer_hello(job.envelope.body));
+    VLA_TRY(*response.mutable_hello(), answer_hello(job.body()));
     return response;
   }
-  VLA_CHECK(check_empty(job.envelope.body));
+  VLA_CHECK(check_empty(job.body()));
   if (job.kind == Kind::describe) {
     *response.mutable_description() = description_;
     return response;
@@ -182,7 +182,7 @@ void Io::deliver(Answer answer) {
                           answer.finished,
                           Clock::now(),
                           std::move(answer.stages),
-                          bytes_of(job.bytes),
+                          job.request(),
                           bytes_of(answer.response)};
   for (Observer* observer : observers_) observer->answered(answered);
 }

@@ -203,7 +203,7 @@ Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Timing& stag
   const ActLimits limits{options_.max_pixels, options_.max_text, description_.limits().max_views(), engine.horizon(),
                          engine.d_action()};
   StageClock clock;
-  VLA_TRY(const ActRequest request, decode_act(job.envelope.body, limits));
+  VLA_TRY(const ActRequest request, decode_act(job.body(), limits));
   clock.lap(stages, "decode");
   VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise));
   stages.insert(stages.end(), chunk.timing.begin(), chunk.timing.end());

@@ -34,13 +34,13 @@ inline RequestFate check_request(std::span<const std::byte> bytes) {
   fate.kind = envelope.kind;
   if (!read) return refuse(read.error()), fate;
   if (envelope.kind == serve::Kind::hello) {
-    const auto reply = serve::answer_hello(envelope.body);
+    const auto reply = serve::answer_hello(envelope.body(bytes));
     if (!reply) return refuse(reply.error()), fate;
   } else if (envelope.kind != serve::Kind::act) {
-    const Status empty = serve::check_empty(envelope.body);
+    const Status empty = serve::check_empty(envelope.body(bytes));
     if (!empty) return refuse(empty.error()), fate;
   } else {
-    const auto act = serve::decode_act(envelope.body, kLimits);
+    const auto act = serve::decode_act(envelope.body(bytes), kLimits);
     if (!act) return refuse(act.error()), fate;
     if (act->observation.text.size() > kLimits.max_text || act->observation.views.size() > kLimits.max_views)
       std::abort();

@@ -219,7 +219,8 @@ TEST_CASE("an envelope tells number, kind, body and deadline of a request withou
   CHECK(envelope.request_id == 77);
   CHECK(envelope.kind == Kind::act);
   CHECK(envelope.deadline_ms == 7);
-  CHECK(envelope.body.size() == full_act().ByteSizeLong());
+  CHECK(envelope.body_size == full_act().ByteSizeLong());
+  CHECK(envelope.body_at + envelope.body_size == bytes.size());
 }
 
 TEST_CASE("an envelope of another version is refused with both versions, whatever else it holds, and with its number") {

@@ -227,6 +227,22 @@ TEST_CASE("of two acts of one client that wait, the older is answered superseded
   CHECK(newest->has_chunk());
 }
 
+TEST_CASE("an act of a few bytes waits in the queue as it came") {
+  Brake brake;
+  Running running({}, {&brake});
+  Peer first(running.address()), second(running.address());
+  first.send(act_request(golden(), 1));
+  brake.await(1);
+  v1::Request request = request_of(2);
+  request.mutable_act()->set_text("no views");
+  second.send(request);
+  brake.let_go(2);
+  CHECK(first.receive()->has_chunk());
+  const v1::Response refused = *second.receive();
+  CHECK(refused.request_id() == 2);
+  CHECK(refused.error().where() == "observation.images.camera1");
+}
+
 TEST_CASE("an act whose deadline passes while it waits is answered late, not computed") {
   Brake brake;
   Running running({}, {&brake});
