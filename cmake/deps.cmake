@@ -73,3 +73,8 @@ find_library(VLA_XXHASH_LIBRARY xxhash REQUIRED)
 # The wire: the schema is compiled at build time, and the server needs the small runtime of Protobuf only.
 find_package(Protobuf REQUIRED)
 find_package(cppzmq REQUIRED)
+# What watches the server: metrics and the HTTP that shows them.
+find_path(VLA_PROMETHEUS_DIR prometheus/registry.h REQUIRED)
+find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
+find_path(VLA_CIVETWEB_DIR civetweb.h REQUIRED)
+find_library(VLA_CIVETWEB_LIBRARY civetweb REQUIRED)

@@ -18,5 +18,6 @@ Command add_compare(CLI::App& app);
 Command add_serve(CLI::App& app);
 Command add_keygen(CLI::App& app);
 Command add_bench(CLI::App& app);
+Command add_replay(CLI::App& app);
 
 }  // namespace vla::cli

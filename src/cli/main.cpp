@@ -60,6 +60,7 @@ int run(int argc, char** argv) {
   choose("serve", vla::cli::add_serve(app));
   choose("keygen", vla::cli::add_keygen(app));
   choose("bench", vla::cli::add_bench(app));
+  choose("replay", vla::cli::add_replay(app));
 
   try {
     app.parse(argc, argv);

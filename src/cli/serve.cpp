@@ -7,6 +7,7 @@
 #include <cstdio>
 
 #include "cli/commands.h"
+#include "cli/watch.h"
 #include "serve/codec.h"
 #include "serve/server.h"
 
@@ -18,6 +19,7 @@ struct ServeOptions {
   int n_thread = 0;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
+  WatchOptions watch;
 };
 
 serve::Server* stopped_by_signals = nullptr;
@@ -40,29 +42,34 @@ std::string quoted(const std::string& text) {
 }
 
 /// One line for people, and for programs that split it as a shell would.
-void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms) {
+void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const std::string& metrics) {
   const Processor& processor = engine.processor();
   std::vector<std::string> features = processor.views().names();
   features.insert(features.end(), processor.states().names().begin(), processor.states().names().end());
   const v1::Description description = serve::describe(engine, {});
   fmt::print(
       "ready address={} bundle={} arch={} device={} precision={} kernels={} memory_mb={:.1f} features={} "
-      "warm_up_ms={:.1f}\n",
+      "warm_up_ms={:.1f}{}\n",
       fmt::join(server.addresses(), ","), quoted(description.bundle().name()), description.bundle().arch(),
       quoted(description.runtime().device()), description.runtime().precision(),
       quoted(description.runtime().kernels()), static_cast<double>(engine.memory().total()) / 1e6,
-      fmt::join(features, ","), warm_up_ms);
+      fmt::join(features, ","), warm_up_ms, metrics.empty() ? "" : " metrics=" + metrics);
   std::fflush(stdout);
 }
 
 Status serve(ServeOptions& options) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
+  VLA_TRY(const std::unique_ptr<Watch> watch, Watch::start(options.watch, *server, options.server.insecure));
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
+  watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
-  print_ready(*server, *engine, warm_up_ms);
-  return server->run(*engine);
+  watch->ready(warm_up_ms);
+  print_ready(*server, *engine, warm_up_ms, watch->metrics_address());
+  const Status status = server->run(*engine, watch->observers());
+  watch->ended(status);
+  return status;
 }
 
 }  // namespace
@@ -103,6 +110,7 @@ Command add_serve(CLI::App& app) {
       ->check(CLI::ExistingFile);
   command->add_option("--curve-clients", server.curve_clients, "Public keys of the clients that are let in, one a line")
       ->check(CLI::ExistingFile);
+  add_watch_options(*command, options->watch);
   return [options] { return serve(*options); };
 }
 

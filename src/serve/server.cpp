@@ -136,10 +136,14 @@ void Server::stop() noexcept {
   exchange_.wake();
 }
 
+v1::Description Server::describe(const Engine& engine) const {
+  return serve::describe(engine, limits_of(options_, engine));
+}
+
 /// Graphs run on the thread that calls this, since it has loaded the engine: OpenMP keeps a team of threads for each
 /// thread that computes.
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
-  description_ = describe(engine, limits_of(options_, engine));
+  description_ = describe(engine);
   vitals_.ready_since = Clock::now().time_since_epoch().count();
   vitals_.ready = true;
   sigset_t all, before;  // signals belong to the caller's threads

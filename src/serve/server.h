@@ -41,6 +41,8 @@ class Server {
   /// Serves on this thread, which computes, and a second one, which talks, until `stop`; then answers what waits and
   /// returns. Observers outlive the call. Once for each server. Errors: internal.
   Status run(Engine& engine, std::span<Observer* const> observers = {});
+  /// What `describe` is answered with once this engine is served.
+  v1::Description describe(const Engine& engine) const;
   /// From any thread or signal handler.
   void stop() noexcept;
   /// From any thread.

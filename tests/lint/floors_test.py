@@ -39,7 +39,7 @@ LIBRARIES = [
     (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve", "bench"}),
     (re.compile(r"jpeglib\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
-    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*"), {"serve"}),
+    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|prometheus/.*|civetweb\.h"), {"serve"}),
 ]
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 

@@ -1,0 +1,117 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/replay.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <optional>
+#include <thread>
+
+#include "cli/commands.h"
+#include "serve/server.h"
+
+namespace vla::cli {
+namespace {
+
+struct ReplayOptions {
+  std::string folder, bundle, kernels, connect;
+  int n_thread = 0;
+  serve::ReplayOptions replay;
+};
+
+/// Answers by another bundle or by other arithmetic may differ rightly; whoever reads the table must know.
+void announce(const v1::Description& recorded, const v1::Description& replayed) {
+  const auto row = [](const char* what, const std::string& before, const std::string& now) {
+    if (before != now) fmt::print("note: {} was {} when recorded, is {} now\n", what, before, now);
+  };
+  row("bundle", recorded.bundle().name() + " " + recorded.bundle().checksum(),
+      replayed.bundle().name() + " " + replayed.bundle().checksum());
+  row("server version", recorded.runtime().server_version(), replayed.runtime().server_version());
+  row("device", recorded.runtime().device(), replayed.runtime().device());
+  row("precision", recorded.runtime().precision(), replayed.runtime().precision());
+  row("kernels", recorded.runtime().kernels(), replayed.runtime().kernels());
+}
+
+/// What a difference says comes from the other side of a socket: nothing in it may move the cursor.
+std::string printable(std::string text) {
+  for (char& c : text)
+    if (static_cast<unsigned char>(c) < 0x20 || c == 0x7f) c = '?';
+  return text;
+}
+
+Status report(const serve::Recording& recording, const serve::ReplayReport& report) {
+  announce(recording.description(), report.replayed_by);
+  if (!report.differences.empty())
+    fmt::print("{:>8}  {:>20}  {:<15}  {}\n", "request", "id", "field", "recorded -> replayed");
+  for (const serve::Difference& d : report.differences)
+    fmt::print("{:>8}  {:>20}  {:<15}  {} -> {}\n", d.index, d.request_id, d.field, printable(d.recorded),
+               printable(d.replayed));
+  fmt::print("{} answers the same, {} different, {} not compared\n", report.n_same, report.n_different,
+             report.n_skipped);
+  if (report.differences.empty()) return {};
+  const serve::Difference& first = report.differences.front();
+  return Error{Code::mismatch, fmt::format("request {}: {}", first.index, first.field), printable(first.recorded),
+               printable(first.replayed), fmt::format("{} answers differ; this is the first", report.n_different)};
+}
+
+/// The limits that the requests were recorded under.
+serve::ServerOptions limits_of(const v1::Limits& limits) {
+  serve::ServerOptions options;
+  options.bind = {"tcp://127.0.0.1:0"};
+  options.max_message = limits.max_message_bytes();
+  options.max_pixels = static_cast<std::int64_t>(limits.max_pixels());
+  options.max_text = limits.max_text_bytes();
+  return options;
+}
+
+/// Serves the bundle in this process, as `vla serve` would, for the time of the replay.
+Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOptions& options) {
+  VLA_TRY(const std::unique_ptr<serve::Server> server,
+          serve::Server::open(limits_of(recording.description().limits())));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
+  options.replay.address = server->addresses().front();
+  std::optional<Result<serve::ReplayReport>> result;
+  std::thread client([&] {
+    result = serve::replay(recording, options.replay);
+    server->stop();
+  });
+  const Status served = server->run(*engine);
+  client.join();
+  VLA_CHECK(served);
+  return std::move(*result);
+}
+
+Status replay(ReplayOptions& options) {
+  VLA_TRY(serve::Recording recording, serve::Recording::open(options.folder));
+  if (!options.connect.empty()) options.replay.address = options.connect;
+  VLA_TRY(const serve::ReplayReport result,
+          options.bundle.empty() ? serve::replay(recording, options.replay) : replay_bundle(recording, options));
+  if (options.replay.first == 0 && !recording.is_whole())
+    fmt::print("note: the recording has no end: its server was killed, or the file was cut between two requests\n");
+  return report(recording, result);
+}
+
+}  // namespace
+
+Command add_replay(CLI::App& app) {
+  auto options = std::make_shared<ReplayOptions>();
+  CLI::App* command = app.add_subcommand("replay", "Send recorded requests again and compare the answers bit for bit");
+  command->footer(
+      "Recordings are made with vla serve --record (docs/serving.md). Exit code 10: an answer differed.\n"
+      "  vla replay recording --bundle policy.gguf\n"
+      "  vla replay recording --connect tcp://127.0.0.1:5555");
+  command->add_option("DIR", options->folder, "The recording")->required();
+  CLI::Option* connect = command->add_option("--connect", options->connect,
+                                             "Server to ask; not given, nor --bundle: tcp://127.0.0.1:5555");
+  CLI::Option* bundle = command->add_option("--bundle", options->bundle, "Serve this bundle for the replay instead");
+  bundle->excludes(connect);
+  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx, with --bundle")->needs(bundle);
+  command->add_option("--threads", options->n_thread, "CPU threads, with --bundle; 0 takes every core")
+      ->needs(bundle)
+      ->check(CLI::Range(0, 512));
+  command->add_option("--first", options->replay.first, "Only so many requests; 0: all")->capture_default_str();
+  return [options] { return replay(*options); };
+}
+
+}  // namespace vla::cli

@@ -1,0 +1,121 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cli/watch.h"
+
+#include <unistd.h>
+
+#include <algorithm>
+#include <iterator>
+
+#include "serve/codec.h"
+
+namespace vla::cli {
+namespace {
+
+using serve::Level;
+
+/// Whoever asks for a log gets the course of events; everybody else hears of trouble only.
+Level level_of(const WatchOptions& options) {
+  const auto found = std::find(std::begin(serve::kLevelNames), std::end(serve::kLevelNames), options.level);
+  if (found == std::end(serve::kLevelNames)) return options.log.empty() ? Level::warn : Level::info;
+  return static_cast<Level>(found - std::begin(serve::kLevelNames));
+}
+
+}  // namespace
+
+void add_watch_options(CLI::App& command, WatchOptions& options) {
+  command.add_option("--metrics", options.metrics,
+                     "ADDRESS:PORT (port 0: a free one) for HTTP: /metrics (Prometheus), /healthz, /readyz");
+  command.add_option("--log", options.log, "Form of the log on standard error: text or json")
+      ->check(CLI::IsMember({"text", "json"}));
+  command.add_option("--log-level", options.level, "debug (every request), info (default with --log), warn, error")
+      ->check(CLI::IsMember({"debug", "info", "warn", "error"}));
+  command.add_option("--trace", options.trace, "Write a trace of requests and stages for Perfetto, a .json file");
+  command.add_option("--record", options.record, "Keep requests and answers in this folder, for vla replay");
+  command.add_option("--record-limit", options.record_limit_mb, "Most that is kept, in MB")
+      ->check(CLI::Range(1, 1 << 20))
+      ->capture_default_str();
+}
+
+Watch::Watch(const WatchOptions& options, const serve::Server& server)
+    : server_(server),
+      log_(STDERR_FILENO, options.log == "json" ? serve::LogFormat::json : serve::LogFormat::text, level_of(options)) {}
+
+Result<std::unique_ptr<Watch>> Watch::start(const WatchOptions& options, const serve::Server& server, bool insecure) {
+  std::unique_ptr<Watch> watch(new Watch(options, server));
+  VLA_CHECK(watch->open(options, insecure));
+  watch->log_.event(Level::info, "start",
+                    {{"version", VLA_VERSION},
+                     {"pid", ::getpid()},
+                     {"address", server.addresses()},
+                     {"metrics", watch->metrics_address()}});
+  return watch;
+}
+
+Status Watch::open(const WatchOptions& options, bool insecure) {
+  if (!options.trace.empty()) {
+    VLA_TRY(trace_, serve::Trace::open(options.trace));
+  }
+  if (!options.metrics.empty()) {
+    metrics_ = std::make_unique<serve::Metrics>();
+    VLA_TRY(monitor_,
+            serve::Monitor::open(options.metrics, insecure,
+                                 {[this] { return metrics_->text(server_.health()); }, [this] { return obstacle(); }}));
+  }
+  if (!options.record.empty()) {  // last: it makes a file that must not be there
+    VLA_TRY(recorder_, serve::Recorder::open(options.record, options.record_limit_mb * 1'000'000));
+    recorder_->on_stop([this](const std::string& why, std::uint64_t n) {
+      log_.event(Level::warn, "record_stopped", {{"why", why}, {"requests", n}});
+    });
+  }
+  return {};
+}
+
+Watch::~Watch() {
+  if (trace_ && trace_->n_dropped() > 0) log_.event(Level::warn, "trace_dropped", {{"requests", trace_->n_dropped()}});
+}
+
+/// Requests that come between the ready line and the first turn of the server wait for it: it is ready.
+std::string Watch::obstacle() const {
+  if (const char* phase = phase_) return phase;
+  const serve::Health health = server_.health();
+  return health.ready || health.uptime_s == 0 ? "" : "draining";
+}
+
+void Watch::loaded(const Engine& engine) {
+  const v1::Description description = server_.describe(engine);
+  if (metrics_) metrics_->describe(description, engine.memory());
+  if (recorder_) recorder_->describe(description);
+  const v1::Bundle& bundle = description.bundle();
+  log_.event(Level::info, "loaded",
+             {{"bundle", bundle.name()},
+              {"arch", bundle.arch()},
+              {"checksum", bundle.checksum()},
+              {"device", description.runtime().device()},
+              {"precision", description.runtime().precision()},
+              {"kernels", description.runtime().kernels()},
+              {"memory_mb", static_cast<double>(engine.memory().total()) / 1e6}});
+  phase_ = "warming up";
+}
+
+void Watch::ready(double warm_up_ms) {
+  phase_ = nullptr;
+  log_.event(Level::info, "ready", {{"warm_up_ms", warm_up_ms}});
+}
+
+void Watch::ended(const Status& status) {
+  const serve::Health health = server_.health();
+  serve::Log::Fields fields = {{"chunks", health.n_chunk}, {"errors", health.n_error}, {"uptime_s", health.uptime_s}};
+  if (!status) fields["error"] = status.error().message();
+  log_.event(status ? Level::info : Level::error, "shutdown", fields);
+}
+
+std::vector<serve::Observer*> Watch::observers() {
+  std::vector<serve::Observer*> all;
+  for (serve::Observer* observer :
+       std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recorder_.get()})
+    if (observer != nullptr) all.push_back(observer);
+  return all;
+}
+
+}  // namespace vla::cli

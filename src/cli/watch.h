@@ -1,0 +1,59 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <CLI/CLI.hpp>
+#include <atomic>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "engine/engine.h"
+#include "serve/log.h"
+#include "serve/metrics.h"
+#include "serve/monitor.h"
+#include "serve/recording.h"
+#include "serve/server.h"
+#include "serve/trace.h"
+
+namespace vla::cli {
+
+struct WatchOptions {
+  std::string metrics, log, level, trace, record;
+  std::uint64_t record_limit_mb = 1024;
+};
+
+void add_watch_options(CLI::App& command, WatchOptions& options);
+
+/// Everything that watches a server: what the options ask for, and nothing else. It lives as long as the server runs.
+class Watch {
+ public:
+  /// Before the bundle is loaded, so that whoever waits for readiness can ask. Errors: usage, io.
+  static Result<std::unique_ptr<Watch>> start(const WatchOptions& options, const serve::Server& server, bool insecure);
+  ~Watch();
+
+  /// The bundle is loaded, or even warm.
+  void loaded(const Engine& engine);
+  void ready(double warm_up_ms);
+  /// How the server ended. The log says so.
+  void ended(const Status& status);
+
+  std::vector<serve::Observer*> observers();
+  /// Where HTTP listens; empty where it does not.
+  std::string metrics_address() const { return monitor_ ? monitor_->address() : std::string(); }
+
+ private:
+  Watch(const WatchOptions& options, const serve::Server& server);
+  Status open(const WatchOptions& options, bool insecure);
+  std::string obstacle() const;
+
+  const serve::Server& server_;
+  std::atomic<const char*> phase_ = "loading";  // null: serving
+  serve::Log log_;
+  std::unique_ptr<serve::Metrics> metrics_;
+  std::unique_ptr<serve::Trace> trace_;
+  std::unique_ptr<serve::Recorder> recorder_;
+  std::unique_ptr<serve::Monitor> monitor_;  // last: asks the others
+};
+
+}  // namespace vla::cli

@@ -1,0 +1,120 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/log.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cctype>
+#include <ctime>
+#include <exception>
+
+namespace vla::serve {
+namespace {
+
+constexpr std::size_t kMaxWaiting = 1 << 20;
+
+std::string now() {
+  const auto time = std::chrono::system_clock::now();
+  const std::time_t seconds = std::chrono::system_clock::to_time_t(time);
+  const auto ms = std::chrono::duration_cast<std::chrono::milliseconds>(time.time_since_epoch()).count() % 1000;
+  std::tm utc = {};
+  gmtime_r(&seconds, &utc);
+  return fmt::format("{:04}-{:02}-{:02}T{:02}:{:02}:{:02}.{:03}Z", utc.tm_year + 1900, utc.tm_mon + 1, utc.tm_mday,
+                     utc.tm_hour, utc.tm_min, utc.tm_sec, ms);
+}
+
+/// One line of ASCII, whatever the text holds: a terminal must not obey what a client sends.
+std::string dump(const Log::Fields& json) { return json.dump(-1, ' ', true, Log::Fields::error_handler_t::replace); }
+
+/// A word as it is, anything else in quotes.
+std::string plain(const Log::Fields& value) {
+  if (!value.is_string()) return dump(value);
+  const auto& text = value.get_ref<const std::string&>();
+  const auto is_plain = [](unsigned char c) {
+    return c < 0x80 && (std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-' || c == ':' || c == '/' || c == '[' ||
+                        c == ']' || c == ',');
+  };
+  return !text.empty() && std::all_of(text.begin(), text.end(), is_plain) ? text : dump(value);
+}
+
+Level level_of(const Error* error) {
+  if (error == nullptr) return Level::debug;
+  switch (error->code) {
+    case Code::busy:
+    case Code::superseded:
+    case Code::late:
+    case Code::shutting_down:
+      return Level::info;
+    case Code::bad_observation:
+    case Code::bad_request:
+    case Code::incompatible:
+    case Code::too_large:
+    case Code::unsupported:
+      return Level::warn;
+    default:
+      return Level::error;
+  }
+}
+
+double ms(Clock::duration time) { return std::chrono::duration<double, std::milli>(time).count(); }
+
+}  // namespace
+
+Log::Log(int fd, LogFormat format, Level least)
+    : format_(format), least_(least), writer_(fd, Writer::Owns::no, kMaxWaiting) {}
+
+Log::~Log() {
+  if (writer_.n_dropped() > n_told_)
+    writer_.set_tail(line(Level::warn, "log_dropped", {{"lines", writer_.n_dropped() - n_told_}}));
+}
+
+std::string Log::line(Level level, const char* name, const Fields& fields) const {
+  const char* level_name = kLevelNames[static_cast<int>(level)];
+  if (format_ == LogFormat::json) {
+    Fields object = {{"time", now()}, {"level", level_name}, {"event", name}};
+    for (const auto& [key, value] : fields.items()) object[key] = value;
+    return dump(object) + '\n';
+  }
+  std::string text = fmt::format("{} {:5} {}", now(), level_name, name);
+  for (const auto& [key, value] : fields.items()) text += fmt::format(" {}={}", key, plain(value));
+  return text + '\n';
+}
+
+void Log::event(Level level, const char* name, const Fields& fields) noexcept {
+  if (level < least_) return;
+  try {
+    const std::uint64_t dropped = writer_.n_dropped();
+    const std::uint64_t told = n_told_.exchange(dropped);
+    if (dropped > told) writer_.put(line(Level::warn, "log_dropped", {{"lines", dropped - told}}));
+    writer_.put(line(level, name, fields));
+  } catch (const std::exception&) {  // no memory for a line: the server goes on without it
+  }
+}
+
+void Log::answered(const Answered& answered) {
+  const Level level = level_of(answered.error);
+  if (level < least_) return;
+  const Received& request = answered.request;
+  try {
+    Fields fields = {{"client", request.client},
+                     {"request_id", request.request_id},
+                     {"kind", kind_name(request.kind)},
+                     {"code", answered.code()},
+                     {"bytes_in", answered.in.size()},
+                     {"bytes_out", answered.out.size()},
+                     {"queue_ms", ms(answered.started - request.at)},
+                     {"engine_ms", ms(answered.finished - answered.started)},
+                     {"total_ms", ms(answered.sent - request.at)}};
+    if (const Error* error = answered.error) {
+      fields["where"] = error->where;
+      fields["expected"] = error->expected;
+      fields["found"] = error->found;
+      fields["hint"] = error->hint;
+    }
+    event(level, "request", fields);
+  } catch (const std::exception&) {  // as above
+  }
+}
+
+}  // namespace vla::serve

@@ -1,0 +1,41 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <nlohmann/json.hpp>
+
+#include "serve/observer.h"
+#include "serve/writer.h"
+
+namespace vla::serve {
+
+enum class Level { debug, info, warn, error };
+constexpr const char* kLevelNames[] = {"debug", "info", "warn", "error"};
+
+enum class LogFormat { text, json };
+
+/// Events, one in a line: JSON objects with `time` (UTC), `level`, `event` and the fields of the event, or the same
+/// as text for people. Whatever a client sends stays inside its field. docs/serving.md lists events and fields.
+class Log final : public Observer {
+ public:
+  using Fields = nlohmann::ordered_json;
+  /// Writes events of at least `least` to `fd`, which stays open.
+  Log(int fd, LogFormat format, Level least);
+  ~Log() override;
+
+  /// From any thread. `fields` is an object.
+  void event(Level level, const char* name, const Fields& fields) noexcept;
+  /// A request: at level debug where it was answered with what it asked for, info where the queue refused it, warn
+  /// where the request was wrong, error where the server failed.
+  void answered(const Answered& answered) override;
+
+ private:
+  std::string line(Level level, const char* name, const Fields& fields) const;
+
+  LogFormat format_;
+  Level least_;
+  Writer writer_;
+  std::atomic<std::uint64_t> n_told_ = 0;  // of the lines that were dropped
+};
+
+}  // namespace vla::serve

@@ -1,0 +1,197 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/replay.h"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <zmq.hpp>
+
+#include "serve/envelope.h"
+
+namespace vla::serve {
+namespace {
+
+const char* name_of(v1::Response::KindCase kind) {
+  switch (kind) {
+    case v1::Response::kHello:
+      return "hello";
+    case v1::Response::kDescription:
+      return "description";
+    case v1::Response::kChunk:
+      return "chunk";
+    case v1::Response::kHealth:
+      return "health";
+    case v1::Response::kError:
+      return "error";
+    default:
+      return "nothing";
+  }
+}
+
+/// Collects what differs between two answers.
+struct Comparison {
+  std::vector<Difference> differences;
+
+  void field(const char* name, const std::string& recorded, const std::string& replayed) {
+    if (recorded != replayed) differences.push_back({0, 0, name, recorded, replayed});
+  }
+  void actions(const v1::ActionChunk& recorded, const v1::ActionChunk& replayed);
+  void chunk(const v1::ActionChunk& recorded, const v1::ActionChunk& replayed);
+};
+
+void Comparison::actions(const v1::ActionChunk& recorded, const v1::ActionChunk& replayed) {
+  const auto &a = recorded.actions(), &b = replayed.actions();
+  if (a.size() != b.size()) return field("actions", fmt::format("{} numbers", a.size()), fmt::format("{}", b.size()));
+  int n_different = 0, first = 0;
+  float largest = 0;
+  for (int i = 0; i < a.size(); ++i) {
+    if (std::memcmp(&a.Get(i), &b.Get(i), sizeof(float)) == 0) continue;
+    if (n_different++ == 0) first = i;
+    largest = std::max(largest, std::abs(a.Get(i) - b.Get(i)));
+  }
+  if (n_different > 0)
+    field("actions", fmt::format("[{}] = {:.9g}", first, a.Get(first)),
+          fmt::format("{:.9g}; {} of {} differ, by {:.3g} at most", b.Get(first), n_different, a.size(), largest));
+}
+
+void Comparison::chunk(const v1::ActionChunk& a, const v1::ActionChunk& b) {
+  field("shape", fmt::format("{} x {}", a.horizon(), a.d_action()), fmt::format("{} x {}", b.horizon(), b.d_action()));
+  field("names", fmt::format("{}", fmt::join(a.names(), ",")), fmt::format("{}", fmt::join(b.names(), ",")));
+  field("rate_hz", fmt::format("{}", a.rate_hz()), fmt::format("{}", b.rate_hz()));
+  field("seed", a.has_seed() ? std::to_string(a.seed()) : "none", b.has_seed() ? std::to_string(b.seed()) : "none");
+  field("notes", fmt::format("{}", fmt::join(a.notes(), "; ")), fmt::format("{}", fmt::join(b.notes(), "; ")));
+  field("capture_time_ns", std::to_string(a.capture_time_ns()), std::to_string(b.capture_time_ns()));
+  actions(a, b);
+}
+
+/// What a policy takes and gives, without who it is.
+std::string interface_of(v1::Description description) {
+  description.clear_bundle();
+  description.clear_runtime();
+  description.clear_limits();
+  return description.SerializeAsString();
+}
+
+/// Whether an answer tells of the moment in which it was given, and so cannot come again.
+bool is_of_the_moment(const v1::Response& answer) {
+  const v1::Error& error = answer.error();
+  switch (error.code()) {
+    case v1::Error::BUSY:
+    case v1::Error::SUPERSEDED:
+    case v1::Error::LATE:
+    case v1::Error::SHUTTING_DOWN:
+      return true;
+    case v1::Error::BAD_REQUEST:
+      return error.found() == "several";  // frames, of which one was kept
+    default:
+      return answer.has_health();
+  }
+}
+
+/// The request as it has to be sent to get the recorded answer again.
+std::string request_again(const std::string& request, const v1::Response& recorded) {
+  v1::Request again;
+  if (!recorded.has_chunk() || !again.ParseFromString(request) || !again.has_act()) return request;
+  const bool has_start = again.act().start_case() != v1::Act::START_NOT_SET;
+  if (has_start && !again.act().has_deadline_ms()) return request;
+  again.mutable_act()->clear_deadline_ms();
+  if (!has_start) again.mutable_act()->set_seed(recorded.chunk().seed());
+  return again.SerializeAsString();
+}
+
+/// One connection to a server, one request at a time.
+class Line {
+ public:
+  Line(const ReplayOptions& options) : options_(options), socket_(context_, zmq::socket_type::dealer) {
+    socket_.set(zmq::sockopt::linger, 0);
+    socket_.set(zmq::sockopt::rcvtimeo, options.timeout_ms);
+    socket_.set(zmq::sockopt::sndtimeo, options.timeout_ms);
+    socket_.connect(options.address);
+  }
+  Result<v1::Response> ask(const std::string& request) {
+    zmq::message_t message;
+    v1::Response response;
+    if (!socket_.send(zmq::buffer(request)) || !socket_.recv(message))
+      return Error{Code::io, options_.address, fmt::format("an answer within {} s", options_.timeout_ms / 1000), "none",
+                   "is a server running there?"};
+    if (!response.ParseFromArray(message.data(), static_cast<int>(message.size())))
+      return Error{Code::io, options_.address, "a Response", "bytes that are none"};
+    return response;
+  }
+
+ private:
+  const ReplayOptions& options_;
+  zmq::context_t context_;
+  zmq::socket_t socket_;
+};
+
+Result<v1::Description> describe(Line& line) {
+  v1::Request request;
+  request.set_protocol_version(kMaxVersion);
+  request.mutable_describe();
+  VLA_TRY(const v1::Response response, line.ask(request.SerializeAsString()));
+  return response.description();
+}
+
+Status compare(Line& line, const Recording::Piece& piece, ReplayReport& report) {
+  v1::Response recorded;
+  if (!recorded.ParseFromString(piece.response))
+    return Error{Code::bad_request, fmt::format("piece {}", piece.index), "a Response", "bytes that are none"};
+  if (is_of_the_moment(recorded)) {
+    ++report.n_skipped;
+    return {};
+  }
+  VLA_TRY(const v1::Response replayed, line.ask(request_again(piece.request, recorded)));
+  std::vector<Difference> differences = compare_answers(recorded, replayed);
+  ++(differences.empty() ? report.n_same : report.n_different);
+  for (Difference& difference : differences) {
+    difference.index = piece.index;
+    difference.request_id = recorded.request_id();
+    report.differences.push_back(std::move(difference));
+  }
+  return {};
+}
+
+}  // namespace
+
+std::vector<Difference> compare_answers(const v1::Response& recorded, const v1::Response& replayed) {
+  Comparison comparison;
+  comparison.field("request_id", std::to_string(recorded.request_id()), std::to_string(replayed.request_id()));
+  comparison.field("answer", name_of(recorded.kind_case()), name_of(replayed.kind_case()));
+  if (recorded.kind_case() != replayed.kind_case()) {
+    if (replayed.has_error())
+      comparison.field("code", "ok", v1::Error::Code_Name(replayed.error().code()) + ": " + replayed.error().where());
+  } else if (recorded.has_chunk()) {
+    comparison.chunk(recorded.chunk(), replayed.chunk());
+  } else if (recorded.has_error()) {
+    comparison.field("code", v1::Error::Code_Name(recorded.error().code()),
+                     v1::Error::Code_Name(replayed.error().code()));
+    comparison.field("where", recorded.error().where(), replayed.error().where());
+  } else if (recorded.has_description() &&
+             interface_of(recorded.description()) != interface_of(replayed.description())) {
+    comparison.field("description", "views, states and actions", "others");
+  }
+  return std::move(comparison.differences);
+}
+
+Result<ReplayReport> replay(Recording& recording, const ReplayOptions& options) {
+  try {
+    Line line(options);
+    ReplayReport report;
+    VLA_TRY(report.replayed_by, describe(line));
+    for (std::size_t n = 0; options.first == 0 || n < options.first; ++n) {
+      VLA_TRY(const std::optional<Recording::Piece> piece, recording.next());
+      if (!piece) break;
+      VLA_CHECK(compare(line, *piece, report));
+    }
+    return report;
+  } catch (const zmq::error_t& error) {
+    return Error{Code::io, options.address, "an address to connect to", error.what(), "tcp://127.0.0.1:5555 is one"};
+  }
+}
+
+}  // namespace vla::serve

@@ -1,0 +1,63 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <cstdint>
+#include <mutex>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla::serve {
+
+/// Opens a file to be written from its start, which must not exist yet where `fresh`. Errors: io.
+Result<int> open_to_write(const std::string& path, bool fresh);
+
+/// Writes to a file or a pipe from a thread of its own, so that whoever has something to write never waits for a disk
+/// or for a reader. Pieces are written whole and in order; one that finds the line full is dropped and counted.
+class Writer {
+ public:
+  enum class Owns { no, yes };
+  /// `fd` is closed at the end where it is owned. At most `max_waiting` bytes wait.
+  Writer(int fd, Owns owns, std::size_t max_waiting);
+  /// Writes what waits, then `tail`, for as long as somebody reads.
+  ~Writer();
+  Writer(const Writer&) = delete;
+  Writer& operator=(const Writer&) = delete;
+
+  /// From any thread. False where the piece was dropped.
+  bool put(std::string piece) noexcept;
+  /// What comes after every piece that was put, and is not dropped.
+  void set_tail(std::string tail) { tail_ = std::move(tail); }
+  std::uint64_t n_dropped() const { return n_dropped_; }
+  /// The system's number of what went wrong; from then on everything is dropped.
+  int failure() const { return failure_; }
+
+ private:
+  void run();
+  void write_all(const std::string& piece);
+  bool is_out_of_patience() const;
+
+  const int fd_;
+  const Owns owns_;
+  const std::size_t max_waiting_;
+  bool is_file_ = false;
+  std::int64_t position_ = 0;  // of a file: where the next whole piece goes
+  std::string tail_;
+  std::atomic<std::uint64_t> n_dropped_ = 0;
+  std::atomic<int> failure_ = 0;
+  mutable std::mutex mutex_;
+  std::condition_variable changed_;
+  std::vector<std::string> waiting_;
+  std::size_t waiting_bytes_ = 0;
+  bool closing_ = false;
+  std::chrono::steady_clock::time_point closing_since_;
+  std::thread thread_;
+};
+
+}  // namespace vla::serve

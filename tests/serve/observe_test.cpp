@@ -1,0 +1,304 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <array>
+#include <filesystem>
+#include <fstream>
+#include <nlohmann/json.hpp>
+#include <sstream>
+
+#include "serve/codec.h"
+#include "serve/log.h"
+#include "serve/metrics.h"
+#include "serve/monitor.h"
+#include "serve/replay.h"
+#include "serve/support.h"
+#include "serve/trace.h"
+
+using namespace vla;
+using namespace vla::test;
+using namespace vla::serve;
+
+namespace {
+
+/// A folder of its own, gone afterwards.
+struct Folder {
+  std::filesystem::path path;
+  Folder() {
+    std::string name = (std::filesystem::temp_directory_path() / "vla_observe_XXXXXX").string();
+    REQUIRE(mkdtemp(name.data()) != nullptr);
+    path = name;
+  }
+  ~Folder() { std::filesystem::remove_all(path); }
+  std::string operator/(const char* name) const { return (path / name).string(); }
+};
+
+struct Pipe {
+  std::array<int, 2> fd = {-1, -1};
+  Pipe() { REQUIRE(::pipe2(fd.data(), O_CLOEXEC) == 0); }
+  ~Pipe() {
+    ::close(fd[0]);
+    if (fd[1] >= 0) ::close(fd[1]);
+  }
+  std::string read_all() {
+    ::close(std::exchange(fd[1], -1));
+    std::string text;
+    std::array<char, 4096> part;
+    for (ssize_t n; (n = ::read(fd[0], part.data(), part.size())) > 0;)
+      text.append(part.data(), static_cast<size_t>(n));
+    return text;
+  }
+};
+
+std::string content(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  return (std::ostringstream() << file.rdbuf()).str();
+}
+
+/// A request that was answered after 10 ms, of which it waited 4 and was computed for 5.
+struct Sample {
+  Received request{"0a0b", 7, Kind::act, 3, Clock::now()};
+  Error error{Code::bad_observation, "where", "this", "that", "do"};
+  std::string in = "abc", out = "defgh";
+  Answered answered(bool with_error, std::size_t n_in = 3) {
+    using std::chrono::milliseconds;
+    in.resize(n_in, 'x');
+    const auto at = request.at;
+    Timing stages;
+    if (!with_error) stages = {{"decode", 1.0}, {"steps", 3.5}};
+    return {request,
+            with_error ? &error : nullptr,
+            at + milliseconds(4),
+            at + milliseconds(9),
+            at + milliseconds(10),
+            stages,
+            std::as_bytes(std::span(in)),
+            std::as_bytes(std::span(out))};
+  }
+};
+
+v1::Response chunk_of(std::vector<float> actions) {
+  v1::Response response = response_to(3);
+  v1::ActionChunk& chunk = *response.mutable_chunk();
+  chunk.set_horizon(1);
+  chunk.set_d_action(static_cast<std::uint32_t>(actions.size()));
+  chunk.mutable_actions()->Add(actions.begin(), actions.end());
+  chunk.add_names("x");
+  chunk.set_seed(4);
+  return response;
+}
+
+std::string fields_of(const std::vector<Difference>& differences) {
+  std::string fields;
+  for (const Difference& difference : differences) fields += difference.field + " ";
+  return fields;
+}
+
+}  // namespace
+
+TEST_CASE("a writer neither waits for a pipe that nobody reads nor cuts a piece: what does not fit is counted") {
+  Pipe pipe;
+  const auto start = Clock::now();
+  {
+    Writer writer(pipe.fd[1], Writer::Owns::no, 1 << 20);
+    int n_put = 0;
+    for (int i = 0; i < 4000; ++i) n_put += writer.put(std::string(999, 'a') + "\n");
+    CHECK(std::chrono::duration<double>(Clock::now() - start).count() < 1.0);
+    CHECK(n_put > 1000);
+    CHECK(n_put < 1300);
+    CHECK(writer.n_dropped() == static_cast<std::uint64_t>(4000 - n_put));
+  }
+  CHECK(std::chrono::duration<double>(Clock::now() - start).count() < 10.0);  // nor at the end
+}
+
+TEST_CASE("a writer whose reader went away goes on without a signal") {
+  Pipe pipe;
+  ::close(std::exchange(pipe.fd[0], ::open("/dev/null", O_RDONLY | O_CLOEXEC)));
+  Writer writer(pipe.fd[1], Writer::Owns::no, 1 << 20);
+  CHECK(writer.put("a"));
+  while (writer.failure() == 0) std::this_thread::yield();
+  CHECK(writer.failure() == EPIPE);
+  CHECK_FALSE(writer.put("b"));
+}
+
+TEST_CASE("a log line is one JSON object whatever its fields hold") {
+  Pipe pipe;
+  const std::string hostile = "a\n\x1b[2J\"\xff\xfe\x80{}";
+  {
+    Log log(pipe.fd[1], LogFormat::json, Level::info);
+    log.event(Level::debug, "left_out", Log::Fields::object());
+    log.event(Level::info, "event", {{"text", hostile}});
+    Sample sample;
+    sample.error.found = hostile;
+    log.answered(sample.answered(true));
+    log.answered(sample.answered(false));  // at level debug
+  }
+  std::istringstream lines(pipe.read_all());
+  std::vector<nlohmann::json> events;
+  for (std::string line; std::getline(lines, line);) events.push_back(nlohmann::json::parse(line));
+  REQUIRE(events.size() == 2);
+  CHECK(events[0]["text"].get<std::string>().starts_with("a\n\x1b[2J\""));
+  CHECK(events[1]["event"] == "request");
+  CHECK(events[1]["code"] == "bad_observation");
+  CHECK(events[1]["queue_ms"] == 4.0);
+  CHECK(events[1]["total_ms"] == 10.0);
+}
+
+TEST_CASE("metrics count a request once, and time only what the engine saw") {
+  Metrics metrics;
+  Sample sample;
+  metrics.received(sample.request);
+  metrics.received(sample.request);
+  metrics.answered(sample.answered(false));
+  metrics.answered(sample.answered(true));
+  const std::string text = metrics.text({true, 2, false, 1.5, 1, 1});
+  for (const char* line : {"vla_requests_total{code=\"ok\",kind=\"act\"} 1", "vla_received_bytes_total 6",
+                           "vla_requests_total{code=\"bad_observation\",kind=\"act\"} 1", "vla_sent_bytes_total 10",
+                           "vla_stage_seconds_count{stage=\"total\"} 1", "vla_clients_total 1", "vla_queue_depth 2",
+                           "vla_stage_seconds_bucket{stage=\"total\",le=\"0.01\"} 1",
+                           "vla_stage_seconds_bucket{stage=\"steps\",le=\"0.0025\"} 0"})
+    CHECK_MESSAGE(text.find(std::string(line) + "\n") != std::string::npos, line);
+}
+
+TEST_CASE("http is refused where others reach it, unless that was asked for") {
+  const Monitor::Sources sources = {[] { return std::string(); }, [] { return std::string(); }};
+  for (const char* address : {"0.0.0.0:0", "*:0", "[::]:0", "192.168.0.1:9090"}) {
+    const auto refused = Monitor::open(address, false, sources);
+    REQUIRE_FALSE(refused.ok());
+    CHECK(refused.error().code == Code::usage);
+    CHECK(refused.error().hint.find("--insecure") != std::string::npos);
+  }
+  const auto everywhere = Monitor::open("0.0.0.0:0", true, sources);
+  REQUIRE(everywhere.ok());
+  CHECK((*everywhere)->address() != "0.0.0.0:0");
+}
+
+TEST_CASE("a trace is valid JSON, and its stages end before their act does") {
+  Folder folder;
+  Sample sample;
+  {
+    auto trace = Trace::open(folder / "out.json");
+    REQUIRE(trace.ok());
+    sample.request.at = Clock::now();
+    Answered answered = sample.answered(false);
+    answered.stages = {{"decode", 2.0}, {"steps", 400.0}};  // more than there was time for
+    (*trace)->answered(answered);
+  }
+  const auto events = nlohmann::json::parse(content(folder / "out.json"));
+  double end_of_act = 0;
+  for (const auto& event : events) {
+    if (event["ph"] != "X") continue;
+    const double end = event["ts"].get<double>() + event["dur"].get<double>();
+    if (event["name"] == "act") end_of_act = end;
+    CHECK(end <= end_of_act + 1e-6);
+  }
+  CHECK(end_of_act > 0);
+}
+
+TEST_CASE("a recording gives back the bytes that went in, and says whether it is whole") {
+  Folder folder;
+  v1::Description description;
+  description.set_horizon(42);
+  Sample sample;
+  {
+    auto recorder = Recorder::open(folder / "r", 1 << 20);
+    REQUIRE(recorder.ok());
+    (*recorder)->describe(description);
+    (*recorder)->answered(sample.answered(false));
+    (*recorder)->answered(sample.answered(true, 0));
+    CHECK(Recorder::open(folder / "r", 1 << 20).error().code == Code::io);
+  }
+  auto recording = Recording::open(folder / "r");
+  REQUIRE(recording.ok());
+  CHECK(recording->description().horizon() == 42);
+  auto piece = recording->next();
+  REQUIRE((piece.ok() && piece->has_value()));
+  CHECK((*piece)->request == "abc");
+  CHECK((*piece)->response == "defgh");
+  piece = recording->next();
+  REQUIRE((piece.ok() && piece->has_value()));
+  CHECK((*piece)->request.empty());
+  CHECK_FALSE(recording->is_whole());
+  piece = recording->next();
+  REQUIRE(piece.ok());
+  CHECK_FALSE(piece->has_value());
+  CHECK(recording->is_whole());
+}
+
+TEST_CASE(
+    "whichever bit of a recording is flipped, or wherever it is cut, reading it ends in an error or is not whole") {
+  Folder folder;
+  Sample sample;
+  {
+    auto recorder = Recorder::open(folder / "r", 1 << 20);
+    REQUIRE(recorder.ok());
+    (*recorder)->describe({});
+    (*recorder)->answered(sample.answered(false));
+  }
+  const std::string path = folder / "r" + "/" + kRecordingFile, sound = content(path);
+  const auto is_refused = [&](const std::string& bytes) {
+    std::ofstream(path, std::ios::binary) << bytes;
+    auto recording = Recording::open(folder / "r");
+    if (!recording) return true;
+    for (;;) {
+      const auto piece = recording->next();
+      if (!piece) return true;
+      if (!*piece) return !recording->is_whole();
+    }
+  };
+  CHECK_FALSE(is_refused(sound));
+  for (std::size_t i = 0; i < sound.size(); ++i) {
+    std::string bad = sound;
+    bad[i] = static_cast<char>(bad[i] ^ (1 << (i % 8)));
+    CHECK_MESSAGE(is_refused(bad), i);
+    CHECK_MESSAGE(is_refused(sound.substr(0, i)), i);
+  }
+  CHECK(is_refused(sound + "x"));
+}
+
+TEST_CASE("a recorder stops at its limit, tells once, and what it has stays whole") {
+  Folder folder;
+  Sample sample;
+  int n_told = 0;
+  {
+    auto recorder = Recorder::open(folder / "r", 4000);
+    REQUIRE(recorder.ok());
+    (*recorder)->on_stop([&](const std::string&, std::uint64_t n) {
+      ++n_told;
+      CHECK(n == 3);
+    });
+    (*recorder)->describe({});
+    for (int i = 0; i < 9; ++i) (*recorder)->answered(sample.answered(false, i == 5 ? 1 : 1000));
+  }
+  CHECK(n_told == 1);
+  CHECK(std::filesystem::file_size(folder / "r" + "/" + kRecordingFile) <= 4000);
+  auto recording = Recording::open(folder / "r");
+  REQUIRE(recording.ok());
+  int n = 0;
+  for (auto piece = recording->next(); piece.ok() && *piece; piece = recording->next()) ++n;
+  CHECK(n == 3);
+  CHECK(recording->is_whole());
+}
+
+TEST_CASE("answers are compared by content: times, bundle and runtime may differ, one bit of an action may not") {
+  const v1::Response a = chunk_of({1, 2, 0.0f});
+  v1::Response b = a;
+  b.mutable_chunk()->set_queue_ms(9);
+  b.mutable_chunk()->set_engine_ms(9);
+  b.mutable_chunk()->add_stages();
+  b.mutable_chunk()->mutable_runtime()->set_kernels("others");
+  CHECK(compare_answers(a, b).empty());
+  b.mutable_chunk()->set_actions(2, -0.0f);  // equal, and another bit
+  CHECK(fields_of(compare_answers(a, b)) == "actions ");
+  b.mutable_chunk()->set_names(0, "y");
+  b.mutable_chunk()->clear_seed();
+  CHECK(fields_of(compare_answers(a, b)) == "names seed actions ");
+  v1::Response error = response_to(3);
+  error.mutable_error()->set_code(v1::Error::DEVICE);
+  CHECK(fields_of(compare_answers(a, error)) == "answer code ");
+  v1::Response other = error;
+  other.mutable_error()->set_code(v1::Error::BAD_ACTION);
+  CHECK(fields_of(compare_answers(error, other)) == "code ");
+}
