@@ -121,43 +121,48 @@ struct Avx2Tile {
     }
   }
 
-  template <int kCount>
-  static VLA_INLINE void step(const float* x, __m256 left, __m256 right, __m256 (&sum)[kCount][2]) {
-#pragma GCC unroll 6
-    for (int r = 0; r < kCount; ++r) {
-      const __m256 value = _mm256_broadcast_ss(x + r * kXStride);
-      sum[r][0] = _mm256_fmadd_ps(value, left, sum[r][0]);
-      sum[r][1] = _mm256_fmadd_ps(value, right, sum[r][1]);
-    }
-  }
-
   template <int kCount, bool kPairs>
   static void tile(const float* x, const std::byte* panel, std::int64_t depth, float* c, std::int64_t stride,
                    bool add) {
-    __m256 sum[kCount][2];
-    for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm256_setzero_ps();
+    __m256 left[kCount], right[kCount];  // sums
+#pragma GCC unroll 6
+    for (int r = 0; r < kCount; ++r) left[r] = right[r] = _mm256_setzero_ps();
+    const auto step = [&](const float* column, __m256 a, __m256 b) __attribute__((always_inline)) {
+#pragma GCC unroll 6
+      for (int r = 0; r < kCount; ++r) {
+        const __m256 value = _mm256_broadcast_ss(column + r * kXStride);
+        left[r] = multiply_add(value, a, left[r]);
+        right[r] = multiply_add(value, b, right[r]);
+      }
+    };
     if constexpr (kPairs) {
       const auto* word = reinterpret_cast<const __m256i*>(panel);
       const __m256i upper = _mm256_set1_epi32(static_cast<int>(0xffff0000U));
       for (std::int64_t k = 0; k < depth; k += 2, word += 2, x += 2) {
-        const __m256i left = _mm256_load_si256(word), right = _mm256_load_si256(word + 1);
-        step<kCount>(x, _mm256_castsi256_ps(_mm256_slli_epi32(left, 16)),
-                     _mm256_castsi256_ps(_mm256_slli_epi32(right, 16)), sum);
-        step<kCount>(x + 1, _mm256_castsi256_ps(_mm256_and_si256(left, upper)),
-                     _mm256_castsi256_ps(_mm256_and_si256(right, upper)), sum);
+        step(x, _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_load_si256(word), 16)),
+             _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_load_si256(word + 1), 16)));
+        const __m256i* again = word;
+        asm("" : "+r"(again));  // the words are read again: kept in registers, they would push sums out
+        step(x + 1, _mm256_castsi256_ps(_mm256_and_si256(_mm256_load_si256(again), upper)),
+             _mm256_castsi256_ps(_mm256_and_si256(_mm256_load_si256(again + 1), upper)));
       }
     } else {
       const auto* number = reinterpret_cast<const float*>(panel);
-#pragma GCC unroll 4
       for (std::int64_t k = 0; k < depth; ++k, number += kColumns, ++x)
-        step<kCount>(x, _mm256_load_ps(number), _mm256_load_ps(number + 8), sum);
+        step(x, _mm256_load_ps(number), _mm256_load_ps(number + 8));
     }
 #pragma GCC unroll 6
-    for (int r = 0; r < kCount; ++r)
-      for (int i = 0; i < 2; ++i) {
-        float* place = c + r * stride + 8 * i;
-        _mm256_storeu_ps(place, add ? _mm256_add_ps(sum[r][i], _mm256_loadu_ps(place)) : sum[r][i]);
-      }
+    for (int r = 0; r < kCount; ++r) {
+      float* place = c + r * stride;
+      _mm256_storeu_ps(place, add ? _mm256_add_ps(left[r], _mm256_loadu_ps(place)) : left[r]);
+      _mm256_storeu_ps(place + 8, add ? _mm256_add_ps(right[r], _mm256_loadu_ps(place + 8)) : right[r]);
+    }
+  }
+
+  /// a * b + sum. As an instruction, since GCC moves sums from register to register otherwise and runs out of them.
+  static VLA_INLINE __m256 multiply_add(__m256 a, __m256 b, __m256 sum) {
+    asm("vfmadd231ps %2, %1, %0" : "+x"(sum) : "x"(a), "x"(b));
+    return sum;
   }
 };
 
