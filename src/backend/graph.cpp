@@ -86,6 +86,9 @@ std::vector<Work> Graph::work() const {
 }
 
 Status Graph::allocate(ComputeMemory& memory) {
+  if (!scratch().ok())
+    return Error{Code::out_of_memory, "scratch memory of threads", "", "the system refused the allocation",
+                 "free memory or use fewer threads"};
   if (ggml_gallocr_alloc_graph(memory.allocator(), graph_)) return {};
   return Error{Code::out_of_memory, "working memory", "", "the graph does not fit into what was reserved for it"};
 }

@@ -14,14 +14,15 @@ class Scratch {
  public:
   explicit Scratch(int n_thread) : n_thread_(static_cast<std::size_t>(n_thread)) {}
 
-  /// At least `size` bytes for each thread from the next run on. False where there is no memory left.
-  bool reserve(std::size_t size) {
-    if (size <= size_) return true;
-    const std::size_t rounded = (size + kAlignment - 1) / kAlignment * kAlignment;
-    memory_.reset(static_cast<std::byte*>(std::aligned_alloc(kAlignment, rounded * n_thread_)));
-    size_ = memory_ ? rounded : 0;
-    return memory_ != nullptr;
+  /// At least `size` bytes for each thread from the next run on, where the system has them: see `ok`.
+  void reserve(std::size_t size) {
+    if (size <= size_) return;
+    size_ = (size + kAlignment - 1) / kAlignment * kAlignment;
+    memory_.reset();
+    memory_.reset(static_cast<std::byte*>(std::aligned_alloc(kAlignment, size_ * n_thread_)));
   }
+  /// Whether everything that was reserved is there.
+  bool ok() const { return size_ == 0 || memory_ != nullptr; }
   /// The piece of thread i, at a multiple of a page.
   std::byte* of(int i) const { return memory_.get() + static_cast<std::size_t>(i) * size_; }
   /// Bytes of all pieces.

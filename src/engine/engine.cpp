@@ -144,7 +144,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   }
   clock.lap(chunk.timing, "steps");
   const std::vector<float> result = plan->x();
-  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_));
+  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs_.raw_state));
   clock.lap(chunk.timing, "postprocess");
   chunk.horizon = horizon_;
   chunk.d_action = static_cast<int>(processor_.action_names().size());

@@ -81,6 +81,8 @@ Tensor ggml_linear(Graph& g, const LinearTerm& term, Tensor x) {
   return term.bias != nullptr ? ggml_add(g.context(), y, g.weight(term.bias).node()) : y;
 }
 
+}  // namespace
+
 Tensor activate(Graph& g, Activation activation, Tensor x) {
   switch (activation) {
     case Activation::gelu_tanh:
@@ -92,8 +94,6 @@ Tensor activate(Graph& g, Activation activation, Tensor x) {
   }
   return x;
 }
-
-}  // namespace
 
 Tensor linear(Graph& g, const LinearTerm& term, Tensor x, Activation activation, Tensor residual) {
   if (const LinearKernel* kernel = kernel_of(g, {&term, 1}))

@@ -23,6 +23,9 @@ Tensor linear(Graph& g, const LinearTerm& term, Tensor x, Activation activation 
 /// activation(gate(x)) * up(x) in one node. x [d_in, n, ...] -> [d_out, n, ...].
 Tensor gated_linear(Graph& g, const LinearTerm& gate, const LinearTerm& up, Tensor x, Activation activation);
 
+/// What an activation is as a node of its own.
+Tensor activate(Graph& g, Activation activation, Tensor x);
+
 /// Up to three products of the same x in one node. x [d_in, n, ...] -> [d_out, n, ...] for each term, contiguous.
 std::vector<Tensor> linear_group(Graph& g, std::span<const LinearTerm> terms, Tensor x);
 

@@ -2,32 +2,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "nn/linear.h"
 
-#include "kernels/elementwise.h"
-
 namespace vla {
-namespace {
-
-Tensor activate(Graph& g, Tensor x, Activation activation) {
-  switch (activation) {
-    case Activation::gelu_tanh:
-      return kernels::gelu_tanh(g, x);
-    case Activation::silu:
-      return ggml_silu(g.context(), x.node());
-    case Activation::none:
-      break;
-  }
-  return x;
-}
-
-}  // namespace
-
 Linear::Linear(const Scope& s, int d_in, int d_out, Bias bias)
     : Module(s), term_{s.matrix("weight", d_in, d_out), bias == Bias::yes ? s.vector("bias", d_out) : nullptr} {}
 
 Tensor Linear::forward(Graph& g, Tensor x) const { return kernels::linear(g, term_, x); }
 
 Tensor Linear::activated(Graph& g, Tensor x, Activation activation) const {
-  if (g.keeps(path())) return activate(g, (*this)(g, x), activation);
+  if (g.keeps(path())) return kernels::activate(g, activation, (*this)(g, x));
   return kernels::linear(g, term_, x, activation);
 }
 
@@ -38,7 +20,7 @@ Tensor Linear::added_to(Graph& g, Tensor residual, Tensor x) const {
 
 Tensor Linear::gated(Graph& g, const Linear& gate, const Linear& up, Tensor x, Activation activation) {
   if (g.keeps(gate.path()) || g.keeps(up.path()))
-    return ggml_mul(g.context(), activate(g, gate(g, x), activation).node(), up(g, x).node());
+    return ggml_mul(g.context(), kernels::activate(g, activation, gate(g, x)).node(), up(g, x).node());
   return kernels::gated_linear(g, gate.term_, up.term_, x, activation);
 }
 

@@ -11,6 +11,10 @@ GeluMlp::GeluMlp(const Scope& s, int d_model, int d_ff)
 
 Tensor GeluMlp::operator()(Graph& g, Tensor x) const { return down_(g, up_.activated(g, x, Activation::gelu_tanh)); }
 
+Tensor GeluMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, up_.activated(g, x, Activation::gelu_tanh));
+}
+
 SiluGatedMlp::SiluGatedMlp(const Scope& s, int d_model, int d_ff)
     : gate_(s / "ffn_gate", d_model, d_ff, Bias::no),
       up_(s / "ffn_up", d_model, d_ff, Bias::no),
@@ -18,6 +22,10 @@ SiluGatedMlp::SiluGatedMlp(const Scope& s, int d_model, int d_ff)
 
 Tensor SiluGatedMlp::operator()(Graph& g, Tensor x) const {
   return down_(g, Linear::gated(g, gate_, up_, x, Activation::silu));
+}
+
+Tensor SiluGatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, Linear::gated(g, gate_, up_, x, Activation::silu));
 }
 
 Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }

@@ -130,7 +130,7 @@ def test_a_picture_size_that_memory_cannot_hold_is_out_of_memory(vla, golden, so
     path = tmp_path / "policy.gguf"
     path.write_bytes(with_picture_size(sound, 960))
     for arguments in (golden.arguments(bundle=path), ["inspect", path]):
-        answer = vla(*arguments, memory=3 << 30)
+        answer = vla(*arguments, memory=1 << 28)
         assert answer.code == EXIT["out_of_memory"] and answer.out == ""
         assert answer.err.startswith("error: out_of_memory: ") and answer.err.count("\n") == 1, answer.err
 

@@ -30,6 +30,7 @@ def test_a_person_reads_features_statistics_recipe_sizes_and_memory(vla):
         "solver",
         *["recipe"] * 4,
         "modules",
+        "products",
         "memory",
     ]
     assert ["observation.images.base", "(also", "observation.images.left)"] in rows

@@ -26,7 +26,7 @@ Tensor SiglipBlock::forward(Graph& g, Tensor x) const {
   std::vector<Tensor> qkv = Linear::group(g, {&q_, &k_, &v_}, h);
   for (Tensor& part : qkv) part = split_heads(g, part, n_head_);
   x = out_.added_to(g, x, attention(g, qkv[0], qkv[1], qkv[2], {}));
-  return add(g, x, mlp_(g, ffn_norm_(g, x)));
+  return mlp_.added_to(g, x, ffn_norm_(g, x));
 }
 
 Siglip::Siglip(const Scope& s)
