@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
+#include "kernels/amx_tiles.h"
 #include "kernels/attention_tile.h"
 
 namespace vla::kernels {
@@ -8,24 +9,13 @@ namespace {
 
 /// 32 rows by 32 columns: four tiles of sums, two of rows and two of the panel.
 struct AmxTile {
-  /// The shapes of the eight tiles, all 16 lines of 64 bytes, which the processor keeps for a thread until released.
-  struct Session {
-    VLA_INLINE Session() {
-      struct alignas(64) {
-        std::uint8_t palette = 1, start_row = 0, reserved[14] = {};
-        std::uint16_t bytes[16] = {};
-        std::uint8_t lines[16] = {};
-      } config;
-      for (int i = 0; i < 8; ++i) config.bytes[i] = 64, config.lines[i] = 16;
-      _tile_loadconfig(&config);
-    }
-    VLA_INLINE ~Session() { _tile_release(); }
-  };
+  using Session = AmxSession;
 
   template <int kStrideA, int kStrideC, bool kAdd>
   static VLA_INLINE void multiply(const std::uint16_t* a, const std::uint16_t* panel, std::int64_t depth, float* c) {
     constexpr auto kLineA = kStrideA * sizeof(std::uint16_t), kLineC = kStrideC * sizeof(float);
     float* lower = c + 16 * kStrideC;
+    before_tile_loads();
     if constexpr (kAdd) {
       _tile_loadd(0, c, kLineC);
       _tile_loadd(1, c + 16, kLineC);

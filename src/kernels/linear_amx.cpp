@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
+#include "kernels/amx_tiles.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_pairs.h"
 
@@ -12,19 +13,7 @@ namespace {
 struct AmxTile : PairPanels {
   using V = Avx512;
 
-  /// The shapes of the eight tiles, all 16 lines of 64 bytes, which the processor keeps for a thread until released.
-  struct Session {
-    VLA_INLINE Session() {
-      struct alignas(64) {
-        std::uint8_t palette = 1, start_row = 0, reserved[14] = {};
-        std::uint16_t bytes[16] = {};
-        std::uint8_t lines[16] = {};
-      } config;
-      for (int i = 0; i < 8; ++i) config.bytes[i] = 64, config.lines[i] = 16;
-      _tile_loadconfig(&config);
-    }
-    VLA_INLINE ~Session() { _tile_release(); }
-  };
+  using Session = AmxSession;
 
   static void multiply(DType, int n_row, const std::uint16_t* x, const std::byte* panel, std::int64_t depth, float* c,
                        std::int64_t stride, bool add) {
@@ -49,6 +38,7 @@ struct AmxTile : PairPanels {
                                        std::int64_t stride, bool add) {
     const auto line = static_cast<std::size_t>(stride) * sizeof(float);
     float* lower = c + 16 * stride;
+    before_tile_loads();
     if (add) {
       _tile_loadd(0, c, line);
       _tile_loadd(1, c + 16, line);

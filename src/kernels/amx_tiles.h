@@ -1,0 +1,34 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <immintrin.h>
+
+#include <cstdint>
+
+#include "kernels/vec.h"
+
+/// What every product on AMX's tiles needs. Only files that are compiled for AMX may include this.
+namespace vla::kernels {
+
+/// All eight tiles as 16 lines of 64 bytes. Constant memory: GCC's intrinsic says that it reads eight bytes, and the
+/// stores to the rest of a variable could be removed.
+/// Source: Intel Architecture Instruction Set Extensions, chapter on AMX, LDTILECFG.
+struct alignas(64) TileConfig {
+  std::uint8_t palette = 1, start_row = 0, reserved[14] = {};
+  std::uint16_t bytes[16] = {64, 64, 64, 64, 64, 64, 64, 64};
+  std::uint8_t lines[16] = {16, 16, 16, 16, 16, 16, 16, 16};
+};
+inline constexpr TileConfig kTileConfig;
+
+/// The processor keeps the shapes for a thread until they are released.
+struct AmxSession {
+  VLA_INLINE AmxSession() { _tile_loadconfig(&kTileConfig); }
+  VLA_INLINE ~AmxSession() { _tile_release(); }
+};
+
+/// To be called before tiles are loaded: GCC's intrinsic does not say that it reads memory, so that the compiler could
+/// move stores of what is to be read behind it.
+VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }
+
+}  // namespace vla::kernels
