@@ -25,7 +25,7 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
           text("vla.source.name"),    workload.n_view(),
           workload.width(),           workload.height(),
           workload.n_text(),          n_step,
-          engine.device().n_thread(), isa_name(engine.device().isa())};
+          engine.device().n_thread(), engine.kernels()};
 }
 
 /// Rounds of every number of steps.

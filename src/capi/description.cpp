@@ -72,8 +72,8 @@ Description::Description(const Engine& engine)
   d.arch = text("vla.arch"), d.checksum = text("vla.checksum"), d.dtype = text("vla.dtype");
   d.source = text("vla.source.name"), d.revision = text("vla.source.revision");
   d.converter = text("vla.source.converter");
-  d.precision = "f32";
-  d.kernels = keep(isa_name(engine.device().isa()));
+  d.precision = keep(engine.precision());
+  d.kernels = keep(engine.kernels());
   d.device = keep(engine.device().name());
   d.memory_weights = memory.weights, d.memory_plan = memory.plan, d.memory_working = memory.working;
 }

@@ -65,6 +65,10 @@ class Engine {
   MemoryUse memory() const;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return weights_->kernels(); }
+  /// The kernels in use, as `--kernels` names them: those of the device, or fewer where the bundle's dtype needs fewer.
+  std::string kernels() const { return isa_name(weights_->isa()); }
+  /// Arithmetic of the large products: tiles round activations to bf16 and sum in float32, everything else is float32.
+  std::string precision() const { return weights_->isa() == Isa::amx ? "bf16" : "f32"; }
 
  private:
   Engine(Bundle bundle, Processor processor, Device device)

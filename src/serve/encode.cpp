@@ -94,8 +94,8 @@ v1::Description describe(const Engine& engine, const v1::Limits& limits) {
   v1::Runtime& runtime = *out.mutable_runtime();
   runtime.set_server_version(VLA_VERSION);
   runtime.set_device(engine.device().name());
-  runtime.set_precision("f32");  // matrices are widened at load, whatever the bundle holds
-  runtime.set_kernels(isa_name(engine.device().isa()));
+  runtime.set_precision(engine.precision());
+  runtime.set_kernels(engine.kernels());
   return out;
 }
 

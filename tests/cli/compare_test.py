@@ -4,6 +4,7 @@
 
 import struct
 
+import numpy as np
 import pytest
 from golden_cases import NAMES, Golden, data_offset, tensors
 from program import EXIT
@@ -84,12 +85,11 @@ def test_a_pattern_records_only_what_it_names(vla, golden, tmp_path):
     assert all(name.startswith("lm.blk.") or name == "chunk" for name in recorded)
 
 
-def test_recording_does_not_change_the_chunk(vla, golden, tmp_path):
-    plain = vla(*golden.arguments()).json()["actions"]
-    assert (
-        vla(*golden.arguments(options=["--json", "--tap", "*", "--taps-out", tmp_path / "t.gguf"])).json()["actions"]
-        == plain
-    )
+def test_recording_changes_the_chunk_by_rounding_at_most(vla, golden, tmp_path):
+    plain = np.array(vla(*golden.arguments()).json()["actions"])
+    recorded = vla(*golden.arguments(options=["--json", "--tap", "*", "--taps-out", tmp_path / "t.gguf"])).json()["actions"]
+    # A recorded value is computed apart from the one that it would be fused with: the same numbers, rounded once more.
+    assert np.abs(plain - recorded).max() <= 2e-6 * np.abs(plain).max()
 
 
 def test_files_without_a_common_tap_are_a_mismatch(vla, golden, tmp_path):
