@@ -154,13 +154,6 @@ def test_a_trace_that_cannot_be_written_is_refused_before_the_bundle_is_loaded(v
     vla("serve", "no.gguf", *LOCAL, "--trace", tmp_path / "no" / "out.json").refused("io", "out.json")
 
 
-def test_ipv6_is_local_too_and_the_ready_line_has_the_port(serve):
-    if not socket.has_ipv6:
-        pytest.skip("no IPv6 here")
-    address = serve("--metrics", "[::1]:0").ready["metrics"]
-    assert address.startswith("[::1]:") and get(address, "/readyz")[0] == 200
-
-
 def test_a_metrics_address_in_use_is_an_io_error(vla, golden):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = "127.0.0.1:%d" % taken.getsockname()[1]
