@@ -100,12 +100,12 @@ Gate::Gate(zmq::context_t& context, std::set<std::string> clients)
   socket_.bind("inproc://zeromq.zap.01");
 }
 
-void Gate::answer() {
+std::optional<std::string> Gate::answer() {
   // version, request id, domain, address, routing id, mechanism, credentials
   std::vector<zmq::message_t> frames;
   for (bool more = true; more;) {
     zmq::message_t frame;
-    if (!socket_.recv(frame, zmq::recv_flags::dontwait)) return;
+    if (!socket_.recv(frame, zmq::recv_flags::dontwait)) return std::nullopt;
     more = frame.more();
     frames.push_back(std::move(frame));
   }
@@ -120,6 +120,8 @@ void Gate::answer() {
                                   std::string(admitted ? "" : "no client of this server"), std::string()})
     socket_.send(zmq::buffer(part), zmq::send_flags::sndmore);
   socket_.send(zmq::message_t(), zmq::send_flags::none);
+  if (admitted) return std::nullopt;
+  return frames.size() > 3 ? frames[3].to_string() : std::string();
 }
 
 }  // namespace vla::serve

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <optional>
 #include <set>
 #include <string>
 #include <zmq.hpp>
@@ -29,8 +30,8 @@ class Gate {
   Gate(zmq::context_t& context, std::set<std::string> clients);
 
   zmq::socket_t& socket() { return socket_; }
-  /// Answers one question that `socket` has.
-  void answer();
+  /// Answers one question that `socket` has. The address of the client, where it is refused.
+  std::optional<std::string> answer();
 
  private:
   zmq::socket_t socket_;

@@ -63,7 +63,7 @@ void Io::run() {
     std::uint64_t signals;
     [[maybe_unused]] const auto drained = ::read(exchange_.fd(), &signals, sizeof(signals));
     deliver_waiting();
-    if (gate_ && (items[2].revents & ZMQ_POLLIN) != 0) gate_->answer();
+    if (gate_ && (items[2].revents & ZMQ_POLLIN) != 0) admit();
     for (int n = 0; n < kTurn && receive(); ++n) {
     }
     if (vitals_.stopping) {
@@ -72,6 +72,12 @@ void Io::run() {
       if (exchange_.drained()) return;
     }
   }
+}
+
+void Io::admit() {
+  const std::optional<std::string> refused = gate_->answer();
+  if (!refused) return;
+  for (Observer* observer : observers_) observer->refused(*refused);
 }
 
 /// Takes one message in: [routing id][empty delimiter, if any][request]. False where there is none.

@@ -35,6 +35,7 @@ class Io {
   void run();
 
  private:
+  void admit();
   bool receive();
   void handle(Job job, const Status& sound);
   Result<v1::Response> answer_now(const Job& job) const;

@@ -2,14 +2,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/metrics.h"
 
-#include <prometheus/counter.h>
 #include <prometheus/gauge.h>
-#include <prometheus/histogram.h>
 #include <prometheus/text_serializer.h>
 #include <unistd.h>
 
 #include <fstream>
 #include <functional>
+#include <new>
 
 namespace vla::serve {
 namespace {
@@ -51,7 +50,8 @@ Metrics::Metrics()
                   .Register(*registry_)),
       received_bytes_(counter(*registry_, "vla_received_bytes_total", "Bytes of requests")),
       sent_bytes_(counter(*registry_, "vla_sent_bytes_total", "Bytes of answers")),
-      clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")) {
+      clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")),
+      refused_(counter(*registry_, "vla_refused_clients_total", "Handshakes of clients whose key is not listed")) {
   info("vla_build_info", "Version of the server", {{"version", VLA_VERSION}});
 }
 
@@ -87,13 +87,14 @@ std::string Metrics::text(const Health& health) const {
 
 /// How many clients there were is counted by hashes of a bounded number; a client that comes back after so many others
 /// counts again.
-void Metrics::received(const Received& request) {
+void Metrics::received(const Received& request) try {
   received_bytes_.Increment(static_cast<double>(request.size));
   if (seen_.size() >= kMaxSeen) seen_.clear();
   if (seen_.insert(std::hash<std::string>()(request.client)).second) clients_.Increment();
+} catch (const std::bad_alloc&) {  // uncounted: the server goes on
 }
 
-void Metrics::answered(const Answered& answered) {
+void Metrics::answered(const Answered& answered) try {
   sent_bytes_.Increment(static_cast<double>(answered.out.size()));
   const Received& request = answered.request;
   const int code = answered.error == nullptr ? 0 : exit_code(answered.error->code);
@@ -104,6 +105,7 @@ void Metrics::answered(const Answered& answered) {
   observe("queue", seconds(answered.started - request.at));
   for (const auto& [stage, ms] : answered.stages) observe(stage, ms / 1e3);
   observe("total", seconds(answered.sent - request.at));
+} catch (const std::bad_alloc&) {  // as above
 }
 
 void Metrics::observe(const std::string& stage, double seconds) {

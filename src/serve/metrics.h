@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <prometheus/counter.h>
+#include <prometheus/histogram.h>
 #include <prometheus/registry.h>
 
 #include <map>
@@ -26,6 +28,7 @@ class Metrics final : public Observer {
   std::string text(const Health& health) const;
 
   void received(const Received& request) override;
+  void refused(const std::string&) override { refused_.Increment(); }
   void answered(const Answered& answered) override;
 
  private:
@@ -35,7 +38,7 @@ class Metrics final : public Observer {
   std::shared_ptr<prometheus::Registry> registry_ = std::make_shared<prometheus::Registry>();
   prometheus::Family<prometheus::Counter>& requests_;
   prometheus::Family<prometheus::Histogram>& stages_;
-  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_;
+  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_;
   // Of the I/O thread:
   std::map<std::string, prometheus::Histogram*> stage_;
   std::map<std::pair<Kind, int>, prometheus::Counter*> request_;

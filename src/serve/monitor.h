@@ -21,7 +21,8 @@ class Monitor {
     std::function<std::string()> metrics;   // text of the exposition format
     std::function<std::string()> obstacle;  // why no act is taken; empty: they are
   };
-  /// Listens at once, at HOST:PORT, HOST an IPv4 address, an IPv6 address in brackets, or `*`. An address that others
+  /// Listens at once, at HOST:PORT, HOST an IPv4 address, an IPv6 address in brackets (where CivetWeb was
+  /// built with IPv6; Debian's is not), or `*`. An address that others
   /// can reach needs `insecure`: nobody is asked for a key here. The functions are called from any thread.
   /// Errors: usage, io.
   static Result<std::unique_ptr<Monitor>> open(const std::string& address, bool insecure, Sources sources);

@@ -48,6 +48,9 @@ class Observer {
  public:
   virtual ~Observer() = default;
   virtual void received(const Received&) {}  // on the I/O thread
+  virtual void refused(const std::string& address) {
+    (void)address;
+  }                                          // on the I/O thread: a client whose key is not listed
   virtual void started(const Received&) {}   // on the engine thread, when an act leaves the queue to be computed
   virtual void answered(const Answered&) {}  // on the I/O thread
 };

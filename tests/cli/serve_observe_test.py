@@ -10,9 +10,11 @@ import subprocess
 import time
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import pytest
 import wire
+import zmq
 from prometheus_client.parser import text_string_to_metric_families
 from serve_test import Server
 
@@ -148,6 +150,10 @@ def test_http_that_others_reach_needs_insecure_and_an_address_that_is_one(vla, g
         vla("serve", golden.bundle, *LOCAL, f"--metrics={address}").refused("usage", "ADDRESS:PORT")
 
 
+def test_a_trace_that_cannot_be_written_is_refused_before_the_bundle_is_loaded(vla, tmp_path):
+    vla("serve", "no.gguf", *LOCAL, "--trace", tmp_path / "no" / "out.json").refused("io", "out.json")
+
+
 def test_a_metrics_address_in_use_is_an_io_error(vla, golden):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = "127.0.0.1:%d" % taken.getsockname()[1]
@@ -211,6 +217,24 @@ def test_without_log_only_trouble_is_told(serve, talk, golden):
     assert talk(server, wire.act(1, golden, seed=1), b"garbage") == ["chunk", "error"]
     (line,) = log_of(server)
     assert "warn" in line and "code=bad_request" in line
+
+
+def test_a_client_whose_key_is_not_listed_is_logged_and_counted(vla, serve, tmp_path):
+    secret, public = vla("keygen", tmp_path / "server").out.splitlines()
+    server = serve("--curve-secret", secret, "--curve-clients", public, "--log", "json", "--metrics", "127.0.0.1:0")
+    client = zmq.Context.instance().socket(zmq.DEALER)
+    client.linger = 0
+    client.curve_publickey, client.curve_secretkey = zmq.curve_keypair()
+    client.curve_serverkey = Path(public).read_bytes().split()[0]
+    client.connect(server.ready["address"])
+    for _ in range(200):
+        n = samples(get(server.ready["metrics"], "/metrics")[1])["vla_refused_clients_total", ()]
+        if n > 0:
+            break
+        time.sleep(0.05)
+    client.close()
+    refused = [event for event in map(json.loads, log_of(server)) if event["event"] == "refused"]
+    assert n >= 1 and refused[0] == {**refused[0], "level": "warn", "address": "127.0.0.1"}
 
 
 # --- trace -------------------------------------------------------------------------------------------------------------------
