@@ -11,7 +11,7 @@ STAMP  := $(VENV)/.complete
 CMAKE_ARGS ?=
 
 help:
-	@echo "make demo      install what is needed, build, and play the shipped policy on real camera frames"
+	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make tsan      build the server and run its tests under the thread sanitizer"
@@ -32,8 +32,26 @@ build: packages $(STAMP)
 	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
 	cmake --build --preset cpu
 
-demo: build
-	$(VENV)/bin/python examples/metaworld/play.py --vla build/cpu/bin/vla
+# The simulator has an environment of its own. RECORDED=1: recorded camera frames instead, where MuJoCo cannot draw.
+SIM       := .venv-sim
+SIM_STAMP := $(SIM)/.complete
+
+$(SIM_STAMP): python/pyproject.toml examples/metaworld/requirements-sim.txt
+	$(PYTHON) -m venv $(SIM)
+	$(SIM)/bin/pip install --quiet --disable-pip-version-check --no-deps -r examples/metaworld/requirements-sim.txt
+	$(SIM)/bin/pip install --quiet --disable-pip-version-check --no-deps -e python
+	@touch $(SIM_STAMP)
+
+demo:
+	@scripts/packages.sh demo
+	@$(MAKE) --no-print-directory $(SIM_STAMP)
+	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
+	cmake --build --preset cpu --target vla
+ifdef RECORDED
+	$(SIM)/bin/python examples/metaworld/play.py --vla build/cpu/bin/vla
+else
+	$(SIM)/bin/vla-eval demo --vla build/cpu/bin/vla
+endif
 
 asan: packages $(STAMP)
 	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
@@ -58,4 +76,4 @@ format:
 	clang-format -i $$(git ls-files '*.h' '*.c' '*.cpp')
 
 clean:
-	rm -rf build $(VENV)
+	rm -rf build $(VENV) $(SIM)

@@ -3,11 +3,19 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # Installs the Debian or Ubuntu packages that the build needs, or says which are missing where that takes a password.
+# `packages.sh demo` adds what the simulator draws with.
 set -euo pipefail
 
 packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
           libcli11-dev nlohmann-json3-dev libfmt-dev libpng-dev libjpeg-dev libxxhash-dev doctest-dev
           libzmq3-dev cppzmq-dev libprotobuf-dev protobuf-compiler)
+if [ "${1:-}" = demo ]; then
+  if apt-cache show libegl1 >/dev/null 2>&1 && ! apt-cache show libosmesa6 >/dev/null 2>&1; then
+    packages+=(libegl1 libgl1-mesa-dri)  # newer releases have no OSMesa any more
+  else
+    packages+=(libosmesa6)
+  fi
+fi
 
 if ! command -v dpkg-query >/dev/null; then
   echo "packages: this is not Debian or Ubuntu; install what corresponds to: ${packages[*]}" >&2

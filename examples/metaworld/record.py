@@ -21,13 +21,13 @@ import sys
 from pathlib import Path
 from typing import Any, Dict, List
 
-import reference  # before lerobot
+from vla_cpp.eval import lerobot_reference as reference  # before lerobot
 import numpy as np
 from PIL import Image
 
 from sim import ACTION_NAMES, CAMERA, EXECUTE, HORIZON, LIMIT, RATE_HZ, STATE_NAMES, TASKS, UNSEEN, Scene, noise
 
-FIRST = UNSEEN + 10000  # evaluate.py counts on the seeds below
+FIRST = UNSEEN + 10000  # vla-eval counts on the seeds below
 
 
 def drive(scene: Scene, predict: Any, seed: int) -> Dict[str, Any]:
@@ -71,7 +71,7 @@ def main() -> int:
     policy, before, after = reference.load(a.checkpoint)
 
     def predict(frame: np.ndarray, state: np.ndarray, text: str, draw: np.ndarray) -> np.ndarray:
-        return reference.predict(policy, before, after, frame, state, text, draw)
+        return reference.predict(policy, before, after, {CAMERA: frame}, {"observation.state": state}, text, draw)
 
     for task in track(TASKS, description="recording"):
         scene, missed = Scene(task), []

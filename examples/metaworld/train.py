@@ -22,18 +22,19 @@ import time
 from pathlib import Path
 from typing import Any, Dict, List, Tuple
 
-import reference  # before lerobot
+from vla_cpp.eval import lerobot_reference as reference  # before lerobot
 import numpy as np
 import torch
 
 from sim import ACTION_NAMES, CAMERA, EXECUTE, HORIZON, RATE_HZ, SIZE, STATE_NAMES, TASKS
 
+CAMERA_KEY = f"observation.images.{CAMERA}"
 FLOW_STEPS = 10  # Euler steps from noise to chunk
 VOCABULARY = 384  # 256 bytes, the special tokens and merges learned from the sentences
 SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
 IMAGE = {"image_token": "<image>", "fake_image_token": "<fake_token_around_image>", "global_image_token": "<global-img>"}
 END = "<end_of_utterance>"
-BACKBONE_NAME = "vlm"  # what config.json calls the backbone; load() in reference.py looks in the checkpoint's own folder
+BACKBONE_NAME = "vlm"  # what config.json calls the backbone; load() in lerobot_reference.py looks in the checkpoint's own folder
 
 
 def make_tokenizer() -> Any:
@@ -86,7 +87,7 @@ def make_policy(backbone: Path, statistics: Dict[str, Dict[str, torch.Tensor]]) 
 
     config = SmolVLAConfig(
         input_features={"observation.state": PolicyFeature(FeatureType.STATE, (4,)),
-                        reference.CAMERA_KEY: PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))},
+                        CAMERA_KEY: PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
         vlm_model_name=str(backbone), load_vlm_weights=False, num_vlm_layers=4, expert_width_multiplier=0.75,
         chunk_size=HORIZON, n_action_steps=EXECUTE, num_steps=FLOW_STEPS, max_state_dim=8, max_action_dim=8,
@@ -212,7 +213,7 @@ def main() -> int:
                 order, at = torch.randperm(len(sentences), generator=random), 0
             pick, at = order[at : at + a.batch], at + a.batch
             batch = before({
-                reference.CAMERA_KEY: light(data["frame"][pick].float() / 255, random), "observation.state": data["state"][pick],
+                CAMERA_KEY: light(data["frame"][pick].float() / 255, random), "observation.state": data["state"][pick],
                 "action": data["action"][pick], "action_is_pad": data["pad"][pick], "task": [sentences[i] for i in pick]})
             for group in optimizer.param_groups:
                 group["lr"] = a.rate * rate(progress, step, 100)
@@ -244,7 +245,7 @@ def main() -> int:
         assert torch.equal(one, other), f"{name} changed on its way through {a.out}"
     frame, state = data["frame"][0].permute(1, 2, 0).contiguous().numpy(), data["state"][0].numpy()
     noise = torch.randn(HORIZON, 8, generator=random).numpy()
-    chunk = reference.predict(loaded, before, after, frame, state, sentences[0], noise)
+    chunk = reference.predict(loaded, before, after, {CAMERA: frame}, {"observation.state": state}, sentences[0], noise)
     print(f"{a.out}: {step} steps in {spent / 60:.1f} min, loss {curve[-1]:.3f}; '{sentences[0]}' -> {chunk[0].round(3).tolist()}, "
           f"the expert: {data['action'][0, 0].numpy().round(3).tolist()}")
     return 0

@@ -23,8 +23,12 @@ Result<Device> Device::cpu(int n_thread, const std::string& kernels) {
   if (device.n_thread_ > GGML_MAX_N_THREADS)
     return Error{Code::device, "threads", fmt::format("at most {}", GGML_MAX_N_THREADS),
                  std::to_string(device.n_thread_)};
+  device.scratch_ = std::make_shared<Scratch>(device.n_thread_);
   device.backend_.reset(ggml_backend_cpu_init());
   if (!device.backend_) return Error{Code::device, "cpu", "a backend", "the system refused it"};
+  ggml_threadpool_params pool = ggml_threadpool_params_default(device.n_thread_);
+  device.pool_.reset(ggml_threadpool_new(&pool));
+  ggml_backend_cpu_set_threadpool(device.backend_.get(), device.pool_.get());
   ggml_backend_cpu_set_n_threads(device.backend_.get(), device.n_thread_);
   return device;
 }

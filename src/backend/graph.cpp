@@ -2,6 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "backend/graph.h"
 
+#include <sys/mman.h>
+#include <unistd.h>
+
+#include <set>
+
 namespace vla {
 namespace {
 
@@ -16,6 +21,9 @@ constexpr double kLeastWork = 4e6;
 void note_time(ggml_tensor*, const ggml_tensor*, int, int, void* stage) {
   static_cast<Stage*>(stage)->done = std::chrono::steady_clock::now();
 }
+
+/// MADV_POPULATE_WRITE, which headers older than Linux 5.14 lack.
+constexpr int kPopulateWrite = 23;
 
 }  // namespace
 
@@ -40,7 +48,7 @@ Tensor Graph::constant(const std::string& key, const std::function<Tensor(Store&
 }
 
 Tensor Graph::name(const std::string& path, Tensor value) {
-  if (!keep_ || !keep_(path)) return value;
+  if (!keeps(path)) return value;
   // A view's memory belongs to another tensor, which may be overwritten later in the run: keep a copy.
   ggml_tensor* kept = value.node();
   if (kept->view_src != nullptr || !ggml_is_contiguous(kept)) kept = ggml_cont(context_.get(), kept);
@@ -62,32 +70,51 @@ Tensor Graph::stage(const std::string& name, Tensor value) {
   return stage.mark;
 }
 
+Work Graph::work_of_node(const ggml_tensor* node) const {
+  const auto noted = noted_work_.find(node);
+  return noted != noted_work_.end() ? noted->second : work_of(node);
+}
+
 std::vector<Work> Graph::work() const {
   std::vector<Work> parts(1);
   for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
     const ggml_tensor* node = ggml_graph_node(graph_, i);
-    const auto noted = noted_work_.find(node);
-    parts.back() += noted != noted_work_.end() ? noted->second : work_of(node);
+    parts.back() += work_of_node(node);
     if (parts.size() <= stages_.size() && node == stages_[parts.size() - 1].mark.node()) parts.emplace_back();
   }
   return parts;
 }
 
 Status Graph::allocate(ComputeMemory& memory) {
+  if (!scratch().ok())
+    return Error{Code::out_of_memory, "scratch memory of threads", "", "the system refused the allocation",
+                 "free memory or use fewer threads"};
   if (ggml_gallocr_alloc_graph(memory.allocator(), graph_)) return {};
   return Error{Code::out_of_memory, "working memory", "", "the graph does not fit into what was reserved for it"};
 }
 
-int Graph::n_thread(const Device& device) const {
-  double work = 0;
-  int n_product = 0;
-  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) {
-    const ggml_tensor* node = ggml_graph_node(graph_, i);
-    if (node->op != GGML_OP_MUL_MAT) continue;
-    work += 2.0 * static_cast<double>(ggml_nelements(node)) * static_cast<double>(node->src[0]->ne[0]);
-    ++n_product;
+void Graph::touch() const {
+  std::set<ggml_backend_buffer_t> buffers;
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) buffers.insert(ggml_graph_node(graph_, i)->buffer);
+  buffers.erase(nullptr);
+  const std::uintptr_t page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
+  for (ggml_backend_buffer_t buffer : buffers) {
+    const auto first =
+        (reinterpret_cast<std::uintptr_t>(ggml_backend_buffer_get_base(buffer)) + page - 1) / page * page;
+    const auto end = first + ggml_backend_buffer_get_size(buffer) / page * page - page;
+    if (end <= first) continue;
+    // Hints both: a system without them gives the pages when they are first written.
+    madvise(reinterpret_cast<void*>(first), end - first, MADV_HUGEPAGE);
+    madvise(reinterpret_cast<void*>(first), end - first, kPopulateWrite);
   }
-  return work < kLeastWork * n_product ? 1 : device.n_thread();
+}
+
+int Graph::n_thread(const Device& device) const {
+  double flop = 0;
+  int n_product = 0;
+  for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i)
+    if (const double of_node = work_of_node(ggml_graph_node(graph_, i)).flop; of_node > 0) flop += of_node, ++n_product;
+  return flop < kLeastWork * n_product ? 1 : device.n_thread();
 }
 
 Status Graph::run(const Device& device) {

@@ -52,6 +52,10 @@ class Graph {
   ggml_context* context() const { return context_.get(); }
   Tensor weight(const Param* param) const { return weights_[param]; }
   Store& store() { return store_; }
+  /// How a matrix lies in memory, which says what kernel multiplies by it; null for ggml's product.
+  const MatrixFormat* format(const Param* matrix) const { return weights_.format(matrix); }
+  /// Memory that kernels work in, which belongs to the device.
+  Scratch& scratch() const { return weights_.scratch(); }
   /// Which kernels the operations are to be built from.
   Isa isa() const { return weights_.isa(); }
 
@@ -60,6 +64,8 @@ class Graph {
 
   /// Gives `value` its path; where the filter wants it, its values are kept for `taps`.
   Tensor name(const std::string& path, Tensor value);
+  /// Whether the filter wants a path: then what the path names must not be fused away.
+  bool keeps(const std::string& path) const { return keep_ && keep_(path); }
   /// Orders `value` into the graph: results, and writes into the store.
   void require(Tensor value);
   /// Writes `value` into `target`, a tensor of the store.
@@ -78,6 +84,8 @@ class Graph {
   /// then `allocate` for each. Errors: out_of_memory.
   Status reserve(ComputeMemory& memory) { return memory.reserve(graph_); }
   Status allocate(ComputeMemory& memory);
+  /// Has the system back everything that a run writes with memory now, so that no request waits for it.
+  void touch() const;
   /// Errors: device.
   Status run(const Device& device);
 
@@ -87,6 +95,8 @@ class Graph {
   const std::vector<std::pair<std::string, Tensor>>& taps() const { return taps_; }
 
  private:
+  Work work_of_node(const ggml_tensor* node) const;
+
   const Weights& weights_;
   Store& store_;
   TapFilter keep_;

@@ -9,6 +9,17 @@ namespace vla {
 std::int64_t Tensor::dim(int i) const { return node_->ne[i]; }
 std::vector<std::int64_t> Tensor::shape() const { return {node_->ne, node_->ne + ggml_n_dims(node_)}; }
 
+MappedStore::MappedStore(std::size_t capacity)
+    : context_(ggml_init({.mem_size = capacity * ggml_tensor_overhead(), .mem_buffer = nullptr, .no_alloc = true})) {}
+
+Tensor MappedStore::add(ggml_type type, std::span<const std::int64_t> shape, const std::byte* data) {
+  ggml_tensor* tensor = ggml_new_tensor(context_.get(), type, static_cast<int>(shape.size()), shape.data());
+  tensor->data = const_cast<std::byte*>(data);  // a tensor without a buffer: ggml's allocator leaves it alone
+  return tensor;
+}
+
+bool MappedStore::holds(Tensor tensor) { return tensor.node()->buffer == nullptr; }
+
 Store::Store(std::size_t capacity)
     : context_(ggml_init({.mem_size = capacity * ggml_tensor_overhead(), .mem_buffer = nullptr, .no_alloc = true})) {}
 

@@ -15,6 +15,17 @@
 
 namespace vla {
 
+/// Tensors over memory that belongs to somebody else, which must outlive them; nothing writes to it.
+class MappedStore {
+ public:
+  explicit MappedStore(std::size_t capacity);
+  Tensor add(ggml_type type, std::span<const std::int64_t> shape, const std::byte* data);
+  static bool holds(Tensor tensor);
+
+ private:
+  ggml_context_ptr context_;
+};
+
 /// Tensors that outlive the graphs which use them: weights, tables, inputs, the cache. First all are declared, then
 /// `allocate` gives them one buffer, then values are set.
 class Store {

@@ -2,11 +2,16 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "backend/weights.h"
 
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <algorithm>
+#include <map>
+
 namespace vla {
 namespace {
 
-ggml_type resident_type(const Param& param) {
-  if (param.storage != Storage::table || param.source == nullptr) return GGML_TYPE_F32;
+ggml_type stored_type(const Param& param) {
   switch (param.source->type) {
     case DType::bf16:
       return GGML_TYPE_BF16;
@@ -17,31 +22,84 @@ ggml_type resident_type(const Param& param) {
   }
 }
 
-void upload(Tensor tensor, const Param& param) {
-  const std::span<const std::byte> data = param.source->data;
-  const bool widen = tensor.node()->type == GGML_TYPE_F32 && param.source->type != DType::f32;
-  if (!widen) return Store::set(tensor, data.data(), data.size());
+MatrixDesc desc_of(const Param& param) { return {param.source->type, param.shape[0], param.shape[1]}; }
+
+void widen(Tensor tensor, const Param& param) {
+  const std::byte* data = param.source->data.data();
+  if (param.source->type == DType::f32) return Store::set(tensor, data, param.source->data.size());
   std::vector<float> values(static_cast<std::size_t>(param.count()));
   if (param.source->type == DType::bf16)
-    ggml_bf16_to_fp32_row(reinterpret_cast<const ggml_bf16_t*>(data.data()), values.data(), param.count());
+    ggml_bf16_to_fp32_row(reinterpret_cast<const ggml_bf16_t*>(data), values.data(), param.count());
   else
-    ggml_fp16_to_fp32_row(reinterpret_cast<const ggml_fp16_t*>(data.data()), values.data(), param.count());
+    ggml_fp16_to_fp32_row(reinterpret_cast<const ggml_fp16_t*>(data), values.data(), param.count());
   Store::set(tensor, values.data(), values.size() * sizeof(float));
 }
 
 }  // namespace
 
-Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill) {
-  Weights weights(list.params().size(), device.isa());
-  for (const Param& param : list.params())
-    weights.tensors_.push_back(weights.store_.add(resident_type(param), param.shape));
+Weights::Place Weights::declare(const Param& param, ChooseFormat choose) {
+  const bool is_matrix = param.storage == Storage::matrix;
+  const MatrixFormat* format = is_matrix && choose != nullptr ? choose(desc_of(param), isa_) : nullptr;
+  if (format != nullptr && format->packed_size != nullptr)
+    return {store_.add(GGML_TYPE_I8, std::vector{static_cast<std::int64_t>(format->packed_size(desc_of(param)))}),
+            format};
+  if (format != nullptr || param.storage == Storage::table) {
+    mapped_size_ += param.source->data.size();
+    return {mapped_.add(stored_type(param), param.shape, param.source->data.data()), format};
+  }
+  return {store_.add(GGML_TYPE_F32, param.shape), nullptr};
+}
+
+namespace {
+
+/// Tiles of bf16 round what they multiply. That is how a bundle of bf16 matrices is meant to be computed, and no other.
+Isa isa_for(const ParamList& list, Isa isa) {
+  const auto& all = list.params();
+  const bool has_bf16 = std::any_of(all.begin(), all.end(), [](const Param& param) {
+    return param.storage == Storage::matrix && param.source != nullptr && param.source->type == DType::bf16;
+  });
+  return isa == Isa::amx && !has_bf16 ? Isa::avx512 : isa;
+}
+
+}  // namespace
+
+Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill, ChooseFormat choose) {
+  Weights weights(list.params().size(), device);
+  weights.isa_ = isa_for(list, device.isa());
+  for (const Param& param : list.params()) weights.places_.push_back(weights.declare(param, choose));
+  weights.describe(list);
   VLA_CHECK(weights.store_.allocate(device));
-  if (fill == Fill::yes)
-    for (const Param& param : list.params()) {
-      upload(weights[&param], param);
-      list.bundle()->release_pages(param.source->data);  // so that file and weights do not stand in memory together
+  if (list.bundle() != nullptr) weights.file_ = list.bundle()->mapping();
+  if (fill == Fill::no) return weights;
+  for (const Param& param : list.params()) {
+    const auto& [tensor, format] = weights.places_[static_cast<std::size_t>(param.id)];
+    if (MappedStore::holds(tensor)) {
+      list.bundle()->keep_pages(param.source->data);
+      continue;
     }
+    if (format != nullptr)
+      format->pack(desc_of(param), param.source->data.data(), static_cast<std::byte*>(tensor.node()->data));
+    else
+      widen(tensor, param);
+    list.bundle()->release_pages(param.source->data);  // so that file and weights do not stand in memory together
+  }
   return weights;
+}
+
+void Weights::describe(const ParamList& list) {
+  std::map<std::string, std::map<std::string, int>> counts;
+  for (const Param& param : list.params())
+    if (param.storage == Storage::matrix) {
+      const MatrixFormat* chosen = format(&param);
+      ++counts[chosen != nullptr ? chosen->name : "ggml"][dtype_name(param.source->type)];
+    }
+  std::vector<std::string> parts;
+  for (const auto& [name, types] : counts) {
+    std::vector<std::string> of_type;
+    for (const auto& [type, count] : types) of_type.push_back(fmt::format("{} {}", count, type));
+    parts.push_back(fmt::format("{} ({})", name, fmt::join(of_type, ", ")));
+  }
+  kernels_ = fmt::format("{}", fmt::join(parts, ", "));
 }
 
 }  // namespace vla

@@ -9,8 +9,9 @@
 namespace vla::bench {
 namespace {
 
-Result<RandomBundle> make_random(const Request& request) {
+Result<RandomBundle> make_random(const Request& request, const Watcher& watcher) {
   VLA_TRY(const PolicyEntry entry, find_policy(request.arch));
+  watcher.tell(fmt::format("filling {} with random weights", request.arch));
   RandomSizes sizes;
   sizes.n_view = request.sizes.n_view.value_or(sizes.n_view);
   sizes.max_tokens = request.sizes.n_text.value_or(sizes.max_tokens);
@@ -29,12 +30,12 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
 
 /// Rounds of every number of steps.
 Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const std::vector<int>& steps,
-                                    const Request& request, const Progress& tell) {
+                                    const Request& request, const Watcher& watcher) {
   std::vector<Series> all;
   for (int n_step : steps) {
     if (n_step != engine.solver().n_step) VLA_CHECK(engine.set_steps(n_step));
-    tell(fmt::format("{} solver steps", n_step));
-    VLA_TRY(Series series, run_series(engine, workload, request.n_warmup, request.n_round, tell));
+    watcher.tell(fmt::format("{} solver steps", n_step));
+    VLA_TRY(Series series, run_series(engine, workload, request.n_warmup, request.n_round, watcher));
     all.push_back(std::move(series));
   }
   return all;
@@ -43,17 +44,16 @@ Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const st
 }  // namespace
 
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
-                       const Progress& tell) {
+                       const Watcher& watcher) {
   VLA_TRY(const Device device, Device::cpu(request.n_thread, request.kernels));
   std::optional<RandomBundle> random;
   if (request.bundle.empty()) {
-    tell(fmt::format("filling {} with random weights", request.arch));
-    VLA_TRY(RandomBundle made, make_random(request));
+    VLA_TRY(RandomBundle made, make_random(request, watcher));
     random.emplace(std::move(made));
   }
   Report report;
   report.cpu = cpu_name();
-  tell("measuring what the machine can do");
+  watcher.tell("measuring what the machine can do");
   report.before = measure_roofs(device.n_thread());
   forget_peak_memory();
   StageClock clock;
@@ -69,10 +69,10 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   if (steps.empty()) steps.push_back(engine->solver().n_step);
   report.conditions = conditions_of(*engine, workload, steps.back());
   VLA_CHECK(accept(report.conditions));
-  VLA_TRY(const std::vector<Series> all, run_all(*engine, workload, steps, request, tell));
+  VLA_TRY(const std::vector<Series> all, run_all(*engine, workload, steps, request, watcher));
   report.predicted = engine->memory();
   report.process = process_memory();
-  tell("measuring what the machine can do now");
+  watcher.tell("measuring what the machine can do now");
   report.after = measure_roofs(device.n_thread());
   summarize(all.back(), report);
   if (all.size() > 1) report.fit = fit_steps(all);

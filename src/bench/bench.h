@@ -22,6 +22,6 @@ struct Request {
 /// Measures the machine, then the policy, then the machine again. `accept` sees the conditions before the first round
 /// and may refuse them. Errors: usage, out_of_memory, and those of Engine.
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
-                       const Progress& tell);
+                       const Watcher& watcher);
 
 }  // namespace vla::bench

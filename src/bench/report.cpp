@@ -67,9 +67,10 @@ Json rounds_json(const Report& report) {
 
 }  // namespace
 
-double Report::peak() const {
-  double best = std::max(before.peak(peak_name), after.peak(peak_name));
-  for (const Round& round : rounds) best = std::max(best, round.peak);
+double Report::peak(const std::string& name) const {
+  double best = std::max(before.peak(name), after.peak(name));
+  if (name == peak_name)
+    for (const Round& round : rounds) best = std::max(best, round.peak);
   return best;
 }
 

@@ -44,9 +44,10 @@ struct Report {
   std::vector<StageRow> stages;  // in order of time, then `network` and `total`
   std::optional<StepFit> fit;
 
-  /// What the machine can do: the best that was measured before, between and after the runs. Operations and bytes per
-  /// second.
-  double peak() const;
+  /// What the machine can do, of a probe by name or of the one that shares refer to: the best that was measured before,
+  /// between and after the runs. Operations and bytes per second.
+  double peak(const std::string& name) const;
+  double peak() const { return peak(peak_name); }
   double bandwidth() const { return std::max(before.bandwidth, after.bandwidth); }
   /// Where the roofline bends: a stage with fewer operations per byte is bound by memory.
   double ridge() const { return peak() / bandwidth(); }

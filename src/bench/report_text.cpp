@@ -46,7 +46,7 @@ std::vector<std::string> around(const Report& report) {
   std::vector<double> cores, peaks;
   for (const Round& round : report.rounds) cores.push_back(round.cores), peaks.push_back(1e-9 * round.peak);
   lines.push_back(
-      fmt::format("{} rounds, each beside its own peak ({:.1f} to {:.1f} GFLOP/s), on {:.2f} cores (median)",
+      fmt::format("measured rounds: {}, each beside its own peak ({:.1f} to {:.1f} GFLOP/s), on {:.2f} cores (median)",
                   report.rounds.size(), quantile(peaks, 0), quantile(peaks, 1), quantile(cores, 0.5)));
   lines.push_back(fmt::format("loaded in {:.0f} ms; memory: {:.0f} MB predicted, {:.0f} MB at the most, {:.0f} MB now",
                               report.load, 1e-6 * static_cast<double>(report.predicted.total()),

@@ -55,7 +55,7 @@ class Drawing {
       x_low = std::min(x_low, row->intensity()), x_high = std::max(x_high, row->intensity());
       y_low = std::min(y_low, row->flop_rate), y_high = std::max(y_high, row->flop_rate);
     }
-    for (const Roofs::Peak& peak : report.before.peaks) y_high = std::max(y_high, peak.all);
+    for (const Roofs::Peak& peak : report.before.peaks) y_high = std::max(y_high, report.peak(peak.name));
     x_ = {x_low / 6, x_high * 6, kLeft, kRight};
     y_ = {y_low / 4, y_high * 2.2, kBottom, kTop};
     for (const StageRow* row : rows_) {  // nothing is written over a point
@@ -130,7 +130,7 @@ class Drawing {
   void roofs() {
     for (const Roofs::Peak& peak : report_.before.peaks) {
       const bool is_ours = peak.name == report_.peak_name;
-      const double rate = is_ours ? report_.peak() : peak.all;
+      const double rate = report_.peak(peak.name);
       flat_roof(rate, fmt::format("{}, all threads: {:.4g} G/s", peak.name, 1e-9 * rate),
                 is_ours ? "stroke=\"#000\" stroke-width=\"2.5\"" : "stroke=\"#888\"");
       if (is_ours && report_.conditions.n_thread > 1)
@@ -143,7 +143,7 @@ class Drawing {
   /// What memory allows: bytes per second times operations per byte, up to the highest roof.
   void slope() {
     double highest = report_.peak();
-    for (const Roofs::Peak& peak : report_.before.peaks) highest = std::max(highest, peak.all);
+    for (const Roofs::Peak& peak : report_.before.peaks) highest = std::max(highest, report_.peak(peak.name));
     const double left = std::max(x_.low, y_.low / report_.bandwidth());
     const double right = std::min(x_.high, highest / report_.bandwidth());
     const double x1 = x_.at(left), y1 = y_.at(left * report_.bandwidth());
@@ -194,13 +194,12 @@ class Drawing {
       const StageRow& row = *rows_[i];
       y += 30;
       svg_ += fmt::format("<circle cx=\"{:.1f}\" cy=\"{:.1f}\" r=\"6\" fill=\"{}\"/>\n", left + 6, y - 4, colour(i));
-      text(left + 20, y, fmt::format("{}: {:.4g} ms, {:.4g} GFLOP", row.name, row.p50, 1e-9 * row.work.flop),
+      text(left + 20, y, fmt::format("{}: {:.{}f} ms", row.name, row.p50, row.p50 < 100 ? 2 : 0),
            "font-weight=\"bold\"");
-      y += 18;
-      text(left + 20, y,
-           fmt::format("{:.4g} GFLOP/s, {:.0f} % of the peak,", 1e-9 * row.flop_rate, 100 * row.share_of_peak_p50));
-      y += 18;
-      text(left + 20, y, fmt::format("{:.3g} GB, bound by {}", 1e-9 * row.work.bytes, report_.regime(row)));
+      text(left + 20, y += 18,
+           fmt::format("{:.3g} GFLOP at {:.4g} GFLOP/s,", 1e-9 * row.work.flop, 1e-9 * row.flop_rate));
+      text(left + 20, y += 18, fmt::format("{:.0f} % of the peak beside it;", 100 * row.share_of_peak_p50));
+      text(left + 20, y += 18, fmt::format("{:.3g} GB, bound by {}", 1e-9 * row.work.bytes, report_.regime(row)));
     }
     y += 36;
     for (const char* note : {"Points: medians; bytes are what the", "operations read and write, of which",

@@ -45,22 +45,23 @@ double Round::total() const {
   return sum;
 }
 
-Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Progress& tell) {
+Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher) {
   const kernels::PeakProbe& probe = kernels::peak_probe_of(engine.device().isa());
   const auto measure_peak = [&] { return kernels::measure_peak(probe, engine.device().n_thread(), kProbeSeconds); };
   Series series{engine.solver().n_step, probe.name, {}, {}};
   for (int i = 0; i < n_warmup; ++i) {
+    VLA_CHECK(watcher.before_round());
     VLA_TRY(const Round round, run_round(engine, workload));
-    tell(fmt::format("warm-up {}/{}: {:.1f} ms", i + 1, n_warmup, round.total()));
+    watcher.tell(fmt::format("warm-up {}/{}: {:.1f} ms", i + 1, n_warmup, round.total()));
   }
-  double before = measure_peak();
   for (int i = 0; i < n_round; ++i) {
+    VLA_CHECK(watcher.before_round());
+    const double before = measure_peak();
     VLA_TRY(Round round, run_round(engine, workload));
     const double after = measure_peak();
     round.peak = (before + after) / 2;
-    before = after;
-    tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores, peak {:.1f} GFLOP/s", i + 1, n_round, round.total(),
-                     round.cores, 1e-9 * round.peak));
+    watcher.tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores, peak {:.1f} GFLOP/s", i + 1, n_round,
+                             round.total(), round.cores, 1e-9 * round.peak));
     series.rounds.push_back(std::move(round));
   }
   series.work = engine.work();

@@ -28,11 +28,14 @@ struct Series {
   StageWork work;  // of the network's stages
 };
 
-/// Told what happens, a line at a time.
-using Progress = std::function<void(const std::string& line)>;
+/// Who watches: told what happens, a line at a time, and asked before each round, which may wait or refuse.
+struct Watcher {
+  std::function<void(const std::string& line)> tell;
+  std::function<Status()> before_round;
+};
 
 /// Runs the loop: probe, observation, probe, ..., after rounds that are not counted. Errors: those of Engine::act.
-Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Progress& tell);
+Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher);
 
 /// total(T) = prefix + T * step, fitted by least squares to the median times of the network alone. In ms.
 struct StepFit {

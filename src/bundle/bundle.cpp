@@ -136,6 +136,18 @@ void Bundle::release_pages(std::span<const std::byte> part) const {
   if (first < last) ::madvise(const_cast<std::byte*>(bytes_.data()) + first, last - first, MADV_DONTNEED);
 }
 
+void Bundle::keep_pages(std::span<const std::byte> part) const {
+  if (!mapping_ || part.empty()) return;
+  const auto page = static_cast<std::size_t>(::sysconf(_SC_PAGESIZE));
+  const std::size_t first = static_cast<std::size_t>(part.data() - bytes_.data()) / page * page;
+  const std::size_t last = static_cast<std::size_t>(part.data() - bytes_.data()) + part.size();
+#ifdef MADV_POPULATE_READ
+  if (::madvise(const_cast<std::byte*>(bytes_.data()) + first, last - first, MADV_POPULATE_READ) == 0) return;
+#endif
+  for (std::size_t i = first; i < last; i += page)
+    static_cast<void>(*static_cast<const volatile std::byte*>(&bytes_[i]));
+}
+
 const TensorInfo* Bundle::find(std::string_view name) const {
   for (const TensorInfo& tensor : tensors_)
     if (tensor.name == name) return &tensor;

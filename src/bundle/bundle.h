@@ -47,6 +47,10 @@ class Bundle {
   std::size_t file_size() const { return bytes_.size(); }
   /// Gives whole pages of a part of a mapped file back to the system; they are read again where they are needed again.
   void release_pages(std::span<const std::byte> part) const;
+  /// Reads a part of a mapped file into memory now, instead of page by page when it is used.
+  void keep_pages(std::span<const std::byte> part) const;
+  /// Keeps the mapped file where it is for as long as somebody holds this; null for bytes in memory.
+  const std::shared_ptr<const void>& mapping() const { return mapping_; }
 
  private:
   std::string path_;

@@ -4,6 +4,7 @@
 
 #include <charconv>
 #include <fstream>
+#include <iostream>
 
 #include "bench/bench.h"
 #include "bench/roofline.h"
@@ -18,7 +19,7 @@ struct BenchOptions {
   std::optional<int> n_view, n_text;
   std::vector<int> steps;
   int n_thread = 0, n_round = 7, n_warmup = 1;
-  bool json = false, markdown = false;
+  bool json = false, markdown = false, paced = false;
 };
 
 Status check(const BenchOptions& options) {
@@ -56,6 +57,12 @@ Status write_text(const std::string& path, const std::string& text) {
   return Error{Code::io, path, "a file that can be written", "the system refused it"};
 }
 
+Status wait_for_line() {
+  std::string line;
+  if (std::getline(std::cin, line)) return {};
+  return Error{Code::usage, "--paced", "a line on standard input for each round", "its end"};
+}
+
 Status run_bench(const BenchOptions& options) {
   VLA_CHECK(check(options));
   bench::Request request{options.bundle, options.arch,    dtype_of(options.dtype), {},
@@ -68,8 +75,9 @@ Status run_bench(const BenchOptions& options) {
     VLA_TRY(earlier, bench::Earlier::read(options.vs));
   }
   const auto accept = [&](const bench::Conditions& now) { return earlier ? earlier->check(now) : Status(); };
-  const auto tell = [](const std::string& line) { fmt::print(stderr, "{}\n", line); };
-  VLA_TRY(const bench::Report report, bench::measure(request, accept, tell));
+  const bench::Watcher watcher = {[](const std::string& line) { fmt::print(stderr, "{}\n", line); },
+                                  [&] { return options.paced ? wait_for_line() : Status(); }};
+  VLA_TRY(const bench::Report report, bench::measure(request, accept, watcher));
   if (!options.plot.empty()) VLA_CHECK(write_text(options.plot, draw_roofline(report)));
   if (options.json) {
     if (earlier) fmt::print(stderr, "{}", earlier->compare(report));
@@ -134,6 +142,8 @@ Command add_bench(CLI::App& app) {
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");
   command->add_option("--plot", options->plot, "Also draw the roofline into this SVG file");
+  command->add_flag("--paced", options->paced,
+                    "Wait for a line on standard input before each round, so that programs can alternate");
   command->add_option("--vs", options->vs, "Compare with an earlier run's --json");
   return [options] { return run_bench(*options); };
 }

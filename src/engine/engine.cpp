@@ -6,6 +6,8 @@
 
 #include <cmath>
 
+#include "kernels/linear_kernel.h"
+
 namespace vla {
 namespace {
 
@@ -22,6 +24,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
   VLA_CHECK(engine->make_plans());
+  if (!options.dry) engine->plans_->touch();
   return engine;
 }
 
@@ -38,7 +41,8 @@ Status Engine::load_policy(bool dry) {
   VLA_TRY(d_state_, keys.integer("policy.d_state"));
   if (horizon_ < 1 || horizon_ > kMaxHorizon)
     return Error{Code::bad_bundle, "policy.horizon", fmt::format("1 to {}", kMaxHorizon), std::to_string(horizon_)};
-  VLA_TRY(Weights weights, Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes));
+  VLA_TRY(Weights weights,
+          Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes, kernels::choose_linear));
   weights_ = std::make_unique<Weights>(std::move(weights));
   return {};
 }
@@ -140,7 +144,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   }
   clock.lap(chunk.timing, "steps");
   const std::vector<float> result = plan->x();
-  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_));
+  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs_.raw_state));
   clock.lap(chunk.timing, "postprocess");
   chunk.horizon = horizon_;
   chunk.d_action = static_cast<int>(processor_.action_names().size());
@@ -150,7 +154,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
 }
 
 MemoryUse Engine::memory() const {
-  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size()};
+  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size() + device_.scratch()->size()};
 }
 
 }  // namespace vla

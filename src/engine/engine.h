@@ -63,6 +63,8 @@ class Engine {
   int horizon() const { return horizon_; }
   int d_action() const { return d_action_; }
   MemoryUse memory() const;
+  /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
+  const std::string& linear_kernels() const { return weights_->kernels(); }
 
  private:
   Engine(Bundle bundle, Processor processor, Device device)

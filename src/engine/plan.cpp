@@ -115,6 +115,10 @@ Result<Plan*> Plans::for_shape(const InputShape& shape) {
   return (plans_[shape] = std::move(*plan)).get();
 }
 
+void Plans::touch() const {
+  for (const auto& [shape, plan] : plans_) plan->touch();
+}
+
 std::size_t Plans::size() const {
   std::size_t bytes = 0;
   for (const auto& [shape, plan] : plans_) bytes += plan->size();

@@ -37,6 +37,8 @@ class Plan {
   void set_x(std::span<const float> x);
   std::vector<float> x() const;
 
+  /// Graph::touch for both graphs.
+  void touch() const { prefix_.touch(), step_.touch(); }
   Status run_prefix(const Device& device) { return prefix_.run(device); }
   /// Solver step k: x <- x + dt * velocity(x, t_k).
   Status run_step(const Device& device, int k);
@@ -71,6 +73,8 @@ class Plans {
  public:
   Plans(PlanContext context) : context_(std::move(context)), memory_(context_.device) {}
   Result<Plan*> for_shape(const InputShape& shape);
+  /// Has the system back the memory of every plan before the first request.
+  void touch() const;
   /// Bytes of inputs, caches and constants of all plans.
   std::size_t size() const;
   std::size_t working_size() const { return memory_.size(); }

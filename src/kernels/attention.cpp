@@ -31,6 +31,8 @@ AttentionJob make_job(const ggml_tensor* q, const ggml_tensor* k, const ggml_ten
   return job;
 }
 
+double bytes(Tensor x) { return static_cast<double>(ggml_nbytes(x.node())); }
+
 enum Source { kQ, kK, kV, kPacked, kMask };
 
 void pack_task(ggml_tensor* packed, int ith, int nth, void* kernel) {
@@ -58,10 +60,14 @@ Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) {
 }
 
 Tensor attention(Graph& g, const AttentionKernel& kernel, Tensor q, Tensor k, Tensor v, Tensor mask) {
-  const std::int64_t size = kernel.packed_size(make_job(q.node(), k.node(), v.node()));
+  const AttentionJob job = make_job(q.node(), k.node(), v.node());
   const auto user = const_cast<AttentionKernel*>(&kernel);  // ggml's type for user data; the tasks only read it
-  const Tensor packed = custom(g, {size}, {q, k, v}, pack_task, user);
-  return custom(g, {q.dim(0) * q.dim(1), q.dim(2), q.dim(3)}, {q, k, v, packed, mask}, run_task, user);
+  const Tensor packed = custom(g, {kernel.packed_size(job)}, {q, k, v}, pack_task, user);
+  const Tensor out = custom(g, {q.dim(0) * q.dim(1), q.dim(2), q.dim(3)}, {q, k, v, packed, mask}, run_task, user);
+  g.note_work(packed, {0, bytes(k) + bytes(v) + bytes(packed)});
+  g.note_work(out, {4.0 * static_cast<double>(ggml_nelements(q.node()) * job.n_key),
+                    bytes(q) + bytes(packed) + (mask ? bytes(mask) : 0) + bytes(out)});
+  return out;
 }
 
 }  // namespace vla::kernels

@@ -3,44 +3,65 @@
 #pragma once
 
 #include <limits>
+#include <type_traits>
 
 #include "kernels/attention_kernel.h"
+#include "kernels/attention_products.h"
 #include "kernels/math.h"
 
 /// Attention with an online softmax. Rows of a block (queries of every head that shares keys) meet the keys in chunks:
 /// a chunk's scores lie in the first cache, become weights there, and are mixed into the block's output, which is
-/// scaled down whenever a larger score turns up. Both products are the same register tile: kTile rows times two
-/// vectors, with one operand broadcast and the other from panels that `pack` lays out.
+/// scaled down whenever a larger score turns up.
 /// Source of the method: Dao et al., FlashAttention (2022); Milakov and Gimelshein, Online normalizer (2018).
 namespace vla::kernels {
 
-template <class V, int kTile>
+/// `P` is a type of attention_products.h.
+template <class P>
 class AttentionTile {
+  using V = typename P::Vector;
   using Float = typename V::Float;
-  static constexpr int kWidth = V::width, kPanel = 2 * kWidth;
-  static constexpr int kRows = 24;   // rows of a block, a multiple of kTile
-  static constexpr int kKeys = 128;  // keys of a chunk, a multiple of kPanel
+  using Number = typename P::Number;
+  static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
+  static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kTile
+  static constexpr int kKeys = 128;       // keys of a chunk, a multiple of kPanel
   // Rows lie a little apart from powers of two, so that they do not compete for the same lines of the cache.
-  static constexpr int kHeadStride = kMaxHead + 16, kKeyStride = kKeys + 16;
-  static_assert(kRows % kTile == 0 && kKeys % kPanel == 0);
+  static constexpr int kHeadStride = kMaxHead + 32, kKeyStride = kKeys + 32;
+  static constexpr float kNever = -std::numeric_limits<float>::infinity();
+  static_assert(kRows % kTile == 0 && kKeys % kPanel == 0 && kPanel % (2 * kWidth) == 0 && kPanel % P::kDepth == 0);
 
   static std::int64_t round_up(std::int64_t n, std::int64_t unit) { return (n + unit - 1) / unit * unit; }
   static std::int64_t n_key_padded(const AttentionJob& job) { return round_up(job.n_key, kPanel); }
-  static std::int64_t d_padded(const AttentionJob& job) { return round_up(job.d_head, kWidth); }
-  static std::int64_t unit_size(const AttentionJob& job) { return n_key_padded(job) * (job.d_head + d_padded(job)); }
+  static std::int64_t key_depth(const AttentionJob& job) { return round_up(job.d_head, P::kDepth); }
+  static std::int64_t d_padded(const AttentionJob& job) { return round_up(job.d_head, P::kLeastPanel); }
+  static std::int64_t unit_size(const AttentionJob& job) {
+    return n_key_padded(job) * (key_depth(job) + d_padded(job));
+  }
+  static Number* packed_keys(const AttentionJob& job, std::int64_t unit) {
+    return reinterpret_cast<Number*>(job.packed) + unit * unit_size(job);
+  }
+  static Number* packed_values(const AttentionJob& job, std::int64_t unit) {
+    return packed_keys(job, unit) + n_key_padded(job) * key_depth(job);
+  }
+  /// Columns of the panel of values that starts at feature i.
+  static std::int64_t panel_width(const AttentionJob& job, std::int64_t i) {
+    return d_padded(job) - i < kPanel ? P::kLeastPanel : kPanel;
+  }
 
  public:
-  static std::int64_t packed_size(const AttentionJob& job) { return job.n_unit() * unit_size(job); }
+  static std::int64_t packed_size(const AttentionJob& job) {
+    return job.n_unit() * unit_size(job) * static_cast<std::int64_t>(sizeof(Number)) / 4 + 1;
+  }
 
   static void pack(const AttentionJob& job, int ith, int nth) {
     const std::int64_t n_panel = n_key_padded(job) / kPanel, n = job.n_unit() * n_panel;
     for (std::int64_t i = n * ith / nth; i < n * (ith + 1) / nth; ++i) {
-      pack_keys(job, i / n_panel, i % n_panel);
-      pack_values(job, i / n_panel, i % n_panel);
+      pack_keys(job, i / n_panel, i % n_panel * kPanel);
+      pack_values(job, i / n_panel, i % n_panel * kPanel);
     }
   }
 
   static void run(const AttentionJob& job, int ith, int nth) {
+    [[maybe_unused]] typename P::Session session;
     // Blocks are made smaller where there would be too few of them to share out.
     const std::int64_t fair = round_up(job.n_row() * job.n_unit() / (4 * nth) + 1, kTile);
     const std::int64_t n_row = fair < kRows ? fair : kRows;
@@ -52,43 +73,33 @@ class AttentionTile {
   }
 
  private:
-  /// Keys as panels [kPanel, d_head]: element i of kPanel keys lies together. Missing keys are zeros.
-  static void pack_keys(const AttentionJob& job, std::int64_t unit, std::int64_t panel) {
-    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv, first = panel * kPanel;
-    float* out = job.packed + unit * unit_size(job) + first * job.d_head;
+  /// The d_head numbers of a row, or of none, and zeros up to `n_padded`.
+  static VLA_INLINE void copy_row(const AttentionJob& job, const float* from, std::int64_t n_padded, Number* to) {
+    for (std::int64_t i = 0; i < n_padded; i += kWidth)
+      P::store(to + i, from != nullptr && i < job.d_head ? load<V>(from + i, job.d_head - i) : Float{});
+  }
+
+  /// A panel of kPanel keys: its depth is the width of a head. Missing keys are zeros.
+  static void pack_keys(const AttentionJob& job, std::int64_t unit, std::int64_t first) {
+    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv, depth = key_depth(job);
+    Number* panel = packed_keys(job, unit) + first * depth;
+    Number row[kMaxHead + kWidth];
     for (std::int64_t j = 0; j < kPanel; ++j) {
-      const bool present = first + j < job.n_key;
-      const float* row = present ? job.k.at(head, first + j, batch) : nullptr;
-      for (std::int64_t i = 0; i < job.d_head; ++i) out[i * kPanel + j] = present ? row[i] : 0.0f;
+      copy_row(job, first + j < job.n_key ? job.k.at(head, first + j, batch) : nullptr, depth, row);
+      for (std::int64_t i = 0; i < depth; ++i) panel[P::place(i, j, kPanel)] = row[i];
     }
   }
 
-  /// Values as panels [kPanel, n_key_padded] of kPanel features, the last of kWidth where that is enough.
-  static void pack_values(const AttentionJob& job, std::int64_t unit, std::int64_t panel) {
-    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv, n_key = n_key_padded(job);
-    float* out = job.packed + unit * unit_size(job) + n_key * job.d_head;
-    for (std::int64_t key = panel * kPanel; key < (panel + 1) * kPanel; ++key)
-      for (std::int64_t i = 0; i < job.d_head; i += kWidth) {
-        const std::int64_t start = i / kPanel * kPanel, left = job.d_head - i;
-        const std::int64_t width = d_padded(job) - start < kPanel ? kWidth : kPanel;
-        V::store(out + start * n_key + key * width + i - start,
-                 load<V>(job.v.at(head, key, batch) + i, key < job.n_key ? left : 0));
-      }
-  }
-
-  /// sums[r][c] = sum over i of a[r * stride + i] * b[i * n_vec * width + c]
-  template <int kVectors, int kStride>
-  static VLA_INLINE void product(const float* a, const float* b, std::int64_t n, Float (&sums)[kTile][kVectors]) {
-    for (int r = 0; r < kTile; ++r)
-      for (int c = 0; c < kVectors; ++c) sums[r][c] = Float{};
-#pragma GCC unroll 4
-    for (std::int64_t i = 0; i < n; ++i) {
-      Float column[kVectors];
-      for (int c = 0; c < kVectors; ++c) column[c] = V::load(b + (i * kVectors + c) * kWidth);
-#pragma GCC unroll 16
-      for (int r = 0; r < kTile; ++r) {
-        const Float row = V::set(a[r * kStride + i]);
-        for (int c = 0; c < kVectors; ++c) sums[r][c] = V::fma(row, column[c], sums[r][c]);
+  /// kPanel keys of every panel of features: the depth of those is the number of keys.
+  static void pack_values(const AttentionJob& job, std::int64_t unit, std::int64_t first) {
+    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv, d = d_padded(job);
+    Number row[kMaxHead + kWidth];
+    for (std::int64_t key = first; key < first + kPanel; ++key) {
+      copy_row(job, key < job.n_key ? job.v.at(head, key, batch) : nullptr, d, row);
+      for (std::int64_t i = 0; i < d; i += kPanel) {
+        const std::int64_t width = panel_width(job, i);
+        Number* panel = packed_values(job, unit) + i * n_key_padded(job);
+        for (std::int64_t n = 0; n < width; ++n) panel[P::place(key, n, width)] = row[i + n];
       }
     }
   }
@@ -97,12 +108,15 @@ class AttentionTile {
   struct Block {
     const AttentionJob& job;
     const std::int64_t first_row, batch, first_head;
-    const float *keys, *values;
+    const Number *keys, *values;
     const int n_row;
     const int n_tiled = static_cast<int>(round_up(n_row, kTile));
-    alignas(64) float query[kRows * kHeadStride];
     alignas(64) float mixed[kRows * kHeadStride];
     alignas(64) float score[kRows * kKeyStride];
+    alignas(64) Number query[kRows * kHeadStride];
+    // Weights take the place of the scores, unless they are numbers of another kind.
+    static constexpr bool kInPlace = std::is_same_v<Number, float>;
+    alignas(64) Number rounded_weight[kInPlace ? 1 : kRows * kKeyStride];
     alignas(64) float sum[kRows * kWidth];  // of a row's weights, lane by lane
     // One number for each row, with room for whole vectors.
     static constexpr int kRowVectors = (kRows + kWidth - 1) / kWidth * kWidth;
@@ -113,12 +127,18 @@ class AttentionTile {
           first_row(first),
           batch(unit / j.n_head_kv),
           first_head(unit % j.n_head_kv * (j.n_head / j.n_head_kv)),
-          keys(j.packed + unit * unit_size(j)),
-          values(keys + n_key_padded(j) * j.d_head),
+          keys(packed_keys(j, unit)),
+          values(packed_values(j, unit)),
           n_row(n) {}
 
     std::int64_t query_of(int row) const { return (first_row + row) % job.n_query; }
     std::int64_t head_of(int row) const { return first_head + (first_row + row) / job.n_query; }
+    Number* weights() {
+      if constexpr (kInPlace)
+        return score;
+      else
+        return rounded_weight;
+    }
 
     void run() {
       start();
@@ -136,16 +156,14 @@ class AttentionTile {
 
     void start() {
       for (int r = 0; r < n_tiled; ++r) {
-        float* row = query + r * kHeadStride;
-        if (r < n_row)
-          std::memcpy(row, job.q.at(head_of(r), query_of(r), batch),
-                      static_cast<std::size_t>(job.d_head) * sizeof(float));
-        else
-          std::memset(row, 0, static_cast<std::size_t>(job.d_head) * sizeof(float));
+        copy_row(job, r < n_row ? job.q.at(head_of(r), query_of(r), batch) : nullptr, key_depth(job),
+                 query + r * kHeadStride);
         std::memset(mixed + r * kHeadStride, 0, static_cast<std::size_t>(d_padded(job)) * sizeof(float));
         V::store(sum + r * kWidth, Float{});
       }
-      for (int r = 0; r < kRowVectors; ++r) most[r] = top_score[r] = -std::numeric_limits<float>::infinity();
+      for (int r = 0; r < kRowVectors; ++r) most[r] = top_score[r] = kNever;
+      if constexpr (!kInPlace)  // rows beyond n_row are multiplied too
+        std::memset(rounded_weight, 0, sizeof(rounded_weight));
     }
 
     enum class Seen { none, some, all };
@@ -156,7 +174,7 @@ class AttentionTile {
         const float* mask = job.mask + query_of(r) * job.n_key + key;
         for (int i = 0; i < n; ++i) {
           all = all && mask[i] == 0.0f;
-          none = none && mask[i] == -std::numeric_limits<float>::infinity();
+          none = none && mask[i] == kNever;
         }
         if (!none && !all) return Seen::some;
       }
@@ -164,16 +182,13 @@ class AttentionTile {
     }
 
     void multiply_keys(std::int64_t key, int n) {
+      const std::int64_t depth = key_depth(job);
       for (int j = 0; j < n; j += kPanel)
-        for (int r = 0; r < n_tiled; r += kTile) {
-          Float sums[kTile][2];
-          product<2, kHeadStride>(query + r * kHeadStride, keys + (key + j) * job.d_head, job.d_head, sums);
-          for (int i = 0; i < kTile; ++i)
-            for (int c = 0; c < 2; ++c) V::store(score + (r + i) * kKeyStride + j + c * kWidth, sums[i][c]);
-        }
+        for (int r = 0; r < n_tiled; r += kTile)
+          P::template multiply<kHeadStride, kKeyStride, false>(query + r * kHeadStride, keys + (key + j) * depth, depth,
+                                                               kPanel, score + r * kKeyStride + j);
       for (int r = 0; r < n_row; ++r)
-        for (int j = n; j < round_up(n, kPanel); ++j)
-          score[r * kKeyStride + j] = -std::numeric_limits<float>::infinity();
+        for (int j = n; j < round_up(n, kPanel); ++j) score[r * kKeyStride + j] = kNever;
     }
 
     void apply_mask(std::int64_t key, int n) {
@@ -186,7 +201,7 @@ class AttentionTile {
       }
     }
 
-    /// Scores become weights relative to the greatest score so far; what was mixed before has to shrink.
+    /// Scores become weights relative to the greatest score so far; what was mixed before shrinks accordingly.
     void weigh(int n, float scale) {
       for (int r = 0; r < n_row; ++r) {
         const float* row = score + r * kKeyStride;
@@ -197,48 +212,44 @@ class AttentionTile {
       for (int r = 0; r < kRowVectors; r += kWidth) {
         const Float before = V::load(most + r), now = V::max(V::load(top_score + r), before);
         // A row that saw nothing yet has no greatest score; any finite one keeps its weights at zero.
-        const Float offset = now == -std::numeric_limits<float>::infinity() ? Float{} : now;
+        const Float offset = now == kNever ? Float{} : now;
         V::store(most + r, now);
         V::store(minus_offset + r, -offset);
         V::store(shrink + r, exp_of_negative<V>(before - offset));
       }
-      for (int r = 0; r < n_row; ++r) weigh_row(score + r * kKeyStride, n, scale, r);
+      for (int r = 0; r < n_row; ++r) {
+        weigh_row(score + r * kKeyStride, weights() + r * kKeyStride, n, scale, r);
+        if (shrink[r] != 1.0f) shrink_row(mixed + r * kHeadStride, shrink[r]);
+      }
     }
 
-    VLA_INLINE void weigh_row(float* row, int n, float scale, int r) {
+    VLA_INLINE void weigh_row(const float* row, Number* weight, int n, float scale, int r) {
       const Float factor = V::set(scale), offset = V::set(minus_offset[r]);
       Float even = V::load(sum + r * kWidth) * shrink[r], odd = {};
-      for (int j = 0; j < n; j += kPanel) {
+      for (int j = 0; j < round_up(n, kPanel); j += 2 * kWidth) {
         const Float a = exp_of_negative<V>(V::fma(V::load(row + j), factor, offset));
         const Float b = exp_of_negative<V>(V::fma(V::load(row + j + kWidth), factor, offset));
-        V::store(row + j, a);
-        V::store(row + j + kWidth, b);
+        P::store(weight + j, a);
+        P::store(weight + j + kWidth, b);
         even += a;
         odd += b;
       }
       V::store(sum + r * kWidth, even + odd);
     }
 
-    template <int kVectors>
-    VLA_INLINE void mix_panel(const float* panel, int n, float* out) {
-      for (int r = 0; r < n_tiled; r += kTile) {
-        Float sums[kTile][kVectors];
-        product<kVectors, kKeyStride>(score + r * kKeyStride, panel, n, sums);
-        for (int i = 0; i < kTile; ++i)
-          for (int c = 0; c < kVectors; ++c) {
-            float* place = out + (r + i) * kHeadStride + c * kWidth;
-            V::store(place, V::fma(V::load(place), V::set(shrink[r + i]), sums[i][c]));
-          }
-      }
+    VLA_INLINE void shrink_row(float* row, float factor) {
+      for (std::int64_t i = 0; i < d_padded(job); i += kWidth) V::store(row + i, V::load(row + i) * factor);
     }
 
     void mix_values(std::int64_t key, int n) {
-      const std::int64_t n_key = n_key_padded(job), d = d_padded(job);
-      for (std::int64_t i = 0; i < d; i += kPanel)
-        if (d - i < kPanel)
-          mix_panel<1>(values + i * n_key + key * kWidth, n, mixed + i);
-        else
-          mix_panel<2>(values + i * n_key + key * kPanel, n, mixed + i);
+      const std::int64_t depth = round_up(n, P::kDepth);
+      for (std::int64_t i = 0; i < d_padded(job); i += kPanel) {
+        const std::int64_t width = panel_width(job, i);
+        const Number* panel = values + i * n_key_padded(job) + key * width;
+        for (int r = 0; r < n_tiled; r += kTile)
+          P::template multiply<kKeyStride, kHeadStride, true>(weights() + r * kKeyStride, panel, depth, width,
+                                                              mixed + r * kHeadStride + i);
+      }
     }
 
     void finish() {

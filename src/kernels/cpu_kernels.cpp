@@ -7,15 +7,29 @@
 namespace vla::kernels {
 
 #if defined(__x86_64__)
-extern const CpuKernels kAvx2Kernels, kAvx512Kernels;  // each in the file of its name
+// Each in the file of its name.
+extern const CpuKernels kAvx2Kernels, kAvx512Kernels;
+extern const AttentionKernel kAttentionAmx;
+
+namespace {
+
+CpuKernels amx_kernels() {
+  CpuKernels kernels = kAvx512Kernels;
+  kernels.attention = kAttentionAmx;
+  return kernels;
+}
+
+}  // namespace
 
 const CpuKernels* cpu_kernels(Isa isa) {
+  static const CpuKernels amx = amx_kernels();
   switch (isa) {
     case Isa::avx2:
       return &kAvx2Kernels;
     case Isa::avx512:
-    case Isa::amx:
       return &kAvx512Kernels;
+    case Isa::amx:
+      return &amx;
     case Isa::ggml:
       break;
   }
@@ -28,6 +42,35 @@ const CpuKernels* cpu_kernels(Isa) { return nullptr; }
 const CpuKernels& portable_kernels() {
   static constexpr CpuKernels kernels = CpuKernelsMaker<Portable, 6>::make();
   return kernels;
+}
+
+namespace {
+
+/// A tile of attention_amx.cpp, number by number.
+struct EmulatedTile {
+  struct Session {};
+
+  static float widen(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
+
+  template <int kStrideA, int kStrideC, bool kAdd>
+  static void multiply(const std::uint16_t* a, const std::uint16_t* panel, std::int64_t depth, float* c) {
+    using Pairs = PairProducts<Portable, EmulatedTile>;
+    for (int r = 0; r < Pairs::kTile; ++r)
+      for (int n = 0; n < Pairs::kPanel; ++n) {
+        float sum = kAdd ? c[r * kStrideC + n] : 0.0f;
+        for (std::int64_t k = 0; k < depth; ++k)
+          sum += widen(a[r * kStrideA + k]) * widen(panel[Pairs::place(k, n, Pairs::kPanel)]);
+        c[r * kStrideC + n] = sum;
+      }
+  }
+};
+
+}  // namespace
+
+const AttentionKernel& emulated_amx_attention() {
+  using Attention = AttentionTile<PairProducts<Portable, EmulatedTile>>;
+  static constexpr AttentionKernel kernel = {Attention::packed_size, Attention::pack, Attention::run};
+  return kernel;
 }
 
 }  // namespace vla::kernels

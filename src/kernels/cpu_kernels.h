@@ -20,10 +20,13 @@ struct CpuKernels {
   AttentionKernel attention;
 };
 
-/// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used.
+/// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used. Those of `amx`
+/// multiply bf16 in attention, with sums in float32, as PyTorch does with a bf16 model.
 const CpuKernels* cpu_kernels(Isa isa);
 
 /// The same templates without any instruction set: slow, and there to test them at another width.
 const CpuKernels& portable_kernels();
+/// Attention with numbers rounded to bf16, as AMX multiplies them, in plain C++: for tests on machines without AMX.
+const AttentionKernel& emulated_amx_attention();
 
 }  // namespace vla::kernels

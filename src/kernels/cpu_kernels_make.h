@@ -15,7 +15,7 @@ class CpuKernelsMaker {
 
  public:
   static constexpr CpuKernels make() {
-    using Attention = AttentionTile<V, kTile>;
+    using Attention = AttentionTile<FloatProducts<V, kTile>>;
     return {map<Exp>,
             map<Silu>,
             map<GeluTanh>,

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "nn/embedding.h"
 
+#include "kernels/linear.h"
+
 namespace vla {
 
 Embedding::Embedding(const Scope& s, int d_model, int n_row) : Module(s), weight_(s.table("weight", d_model, n_row)) {}
@@ -19,11 +21,10 @@ PatchEmbed::PatchEmbed(const Scope& s, int patch_size, int d_model)
 Tensor PatchEmbed::forward(Graph& g, Tensor images) const {
   ggml_context* c = g.context();
   const int p = patch_size_;
-  ggml_tensor* weight = g.weight(weight_).node();
-  ggml_tensor* kernel = ggml_reshape_4d(c, weight, p, p, 3, weight->ne[1]);  // read for its shape only
+  ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, p, p, 3, 1);  // read for its shape only
   ggml_tensor* patches = ggml_im2col(c, kernel, images.node(), p, p, 0, 0, 1, 1, true, GGML_TYPE_F32);
   patches = ggml_reshape_3d(c, patches, patches->ne[0], patches->ne[1] * patches->ne[2], patches->ne[3]);
-  return ggml_add(c, ggml_mul_mat(c, weight, patches), g.weight(bias_).node());
+  return kernels::linear(g, {weight_, bias_}, patches);
 }
 
 }  // namespace vla

@@ -9,7 +9,11 @@ namespace vla {
 GeluMlp::GeluMlp(const Scope& s, int d_model, int d_ff)
     : up_(s / "ffn_up", d_model, d_ff, Bias::yes), down_(s / "ffn_down", d_ff, d_model, Bias::yes) {}
 
-Tensor GeluMlp::operator()(Graph& g, Tensor x) const { return down_(g, kernels::gelu_tanh(g, up_(g, x))); }
+Tensor GeluMlp::operator()(Graph& g, Tensor x) const { return down_(g, up_.activated(g, x, Activation::gelu_tanh)); }
+
+Tensor GeluMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, up_.activated(g, x, Activation::gelu_tanh));
+}
 
 SiluGatedMlp::SiluGatedMlp(const Scope& s, int d_model, int d_ff)
     : gate_(s / "ffn_gate", d_model, d_ff, Bias::no),
@@ -17,7 +21,11 @@ SiluGatedMlp::SiluGatedMlp(const Scope& s, int d_model, int d_ff)
       down_(s / "ffn_down", d_ff, d_model, Bias::no) {}
 
 Tensor SiluGatedMlp::operator()(Graph& g, Tensor x) const {
-  return down_(g, Tensor(ggml_swiglu_split(g.context(), gate_(g, x).node(), up_(g, x).node())));
+  return down_(g, Linear::gated(g, gate_, up_, x, Activation::silu));
+}
+
+Tensor SiluGatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, Linear::gated(g, gate_, up_, x, Activation::silu));
 }
 
 Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }

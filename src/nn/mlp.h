@@ -11,6 +11,8 @@ class GeluMlp {
  public:
   GeluMlp(const Scope& s, int d_model, int d_ff);
   Tensor operator()(Graph& g, Tensor x) const;
+  /// residual + the same.
+  Tensor added_to(Graph& g, Tensor residual, Tensor x) const;
 
  private:
   Linear up_, down_;
@@ -21,6 +23,8 @@ class SiluGatedMlp {
  public:
   SiluGatedMlp(const Scope& s, int d_model, int d_ff);
   Tensor operator()(Graph& g, Tensor x) const;
+  /// residual + the same.
+  Tensor added_to(Graph& g, Tensor residual, Tensor x) const;
 
  private:
   Linear gate_, up_, down_;

@@ -17,7 +17,7 @@ constexpr std::size_t kMaxContent = 256;  // bytes; bounds the work per place of
 Result<AddedToken> parse_added_token(const Json& item, std::string where, int n_vocab) {
   VLA_TRY(JsonFields fields, JsonFields::open(item, std::move(where)));
   AddedToken token;
-  VLA_TRY(token.id, fields.integer("id", 0, n_vocab - 1));
+  VLA_TRY(token.id, fields.integer("id", kNoRow, n_vocab - 1));
   VLA_TRY(token.content, fields.string("content"));
   VLA_TRY(token.single_word, fields.boolean("single_word"));
   VLA_TRY(token.lstrip, fields.boolean("lstrip"));
@@ -69,7 +69,7 @@ Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int 
   for (const Json& item : list) {
     const std::string where = std::string(kWhere) + "[" + std::to_string(tokens.size()) + "]";
     VLA_TRY(AddedToken token, parse_added_token(item, where, n_vocab));
-    if (!ids.insert(token.id).second)
+    if (token.id != kNoRow && !ids.insert(token.id).second)
       return Error{Code::bad_bundle, where + ".id", "one added token per id", std::to_string(token.id) + " again"};
     if (!contents.insert(token.content).second)
       return Error{Code::bad_bundle, where + ".content", "one added token per content", token.content + " again"};
@@ -78,14 +78,21 @@ Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int 
   return tokens;
 }
 
-AddedTokens::AddedTokens(std::vector<AddedToken> tokens) : tokens_(std::move(tokens)) {
-  for (int i = 0; i < static_cast<int>(tokens_.size()); ++i)
-    insert(tokens_[static_cast<std::size_t>(i)].normalized ? normalized_ : plain_, i);
+AddedTokens::AddedTokens(std::vector<AddedToken> tokens, Normalize normalize)
+    : tokens_(std::move(tokens)), normalize_(normalize) {
+  for (int i = 0; i < static_cast<int>(tokens_.size()); ++i) {
+    const AddedToken& token = tokens_[static_cast<std::size_t>(i)];
+    if (!token.normalized) {
+      insert(plain_, token.content, i);
+    } else {
+      insert(normalized_, normalize_ != nullptr ? normalize_(token.content) : token.content, i);
+    }
+  }
 }
 
-void AddedTokens::insert(Trie& trie, int token) {
+void AddedTokens::insert(Trie& trie, std::string_view content, int token) {
   std::size_t node = 0;
-  for (const char c : tokens_[static_cast<std::size_t>(token)].content) {
+  for (const char c : content) {
     const auto byte = static_cast<std::uint8_t>(c);
     auto& next = trie[node].next;
     const auto found = std::find_if(next.begin(), next.end(), [byte](const auto& edge) { return edge.first == byte; });
@@ -100,38 +107,41 @@ void AddedTokens::insert(Trie& trie, int token) {
   trie[node].token = token;
 }
 
-int AddedTokens::longest_at(const Trie& trie, std::string_view text) const {
-  int longest = -1;
+AddedTokens::Match AddedTokens::longest_at(const Trie& trie, std::string_view text) {
+  Match longest;
   std::size_t node = 0;
-  for (const char c : text) {
+  for (std::size_t i = 0; i < text.size(); ++i) {
     const auto& next = trie[node].next;
-    const auto byte = static_cast<std::uint8_t>(c);
+    const auto byte = static_cast<std::uint8_t>(text[i]);
     const auto found = std::find_if(next.begin(), next.end(), [byte](const auto& edge) { return edge.first == byte; });
     if (found == next.end()) break;
     node = static_cast<std::size_t>(found->second);
-    if (trie[node].token >= 0) longest = trie[node].token;
+    if (trie[node].token >= 0) longest = {trie[node].token, i + 1};
   }
   return longest;
 }
 
 void AddedTokens::split(std::string_view text, const std::function<void(std::string_view)>& on_text,
                         const std::function<void(std::int32_t)>& on_token) const {
-  split(
-      plain_, text, [&](std::string_view piece) { split(normalized_, piece, on_text, on_token); }, on_token);
+  const auto on_piece = [&](std::string_view piece) {
+    if (normalize_ == nullptr) return split(normalized_, piece, on_text, on_token);
+    split(normalized_, normalize_(piece), on_text, on_token);
+  };
+  split(plain_, text, on_piece, on_token);
 }
 
 void AddedTokens::split(const Trie& trie, std::string_view text, const std::function<void(std::string_view)>& on_text,
                         const std::function<void(std::int32_t)>& on_token) const {
   std::size_t done = 0;  // bytes already given to a callback
   for (std::size_t at = 0; at < text.size();) {
-    const int index = longest_at(trie, text.substr(at));
-    if (index < 0) {
+    const Match match = longest_at(trie, text.substr(at));
+    if (match.token < 0) {
       ++at;
       continue;
     }
-    const AddedToken& token = tokens_[static_cast<std::size_t>(index)];
+    const AddedToken& token = tokens_[static_cast<std::size_t>(match.token)];
     std::size_t start = at;
-    std::size_t stop = at + token.content.size();
+    std::size_t stop = at + match.size;
     at = stop;  // a rejected match is passed over as a whole, as the reference's search does
     if (token.single_word && !stands_alone(text.substr(0, start), text.substr(stop))) continue;
     // White space that the token before has already taken stays with it.

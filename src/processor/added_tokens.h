@@ -13,9 +13,12 @@
 
 namespace vla {
 
+/// The id of an added token that the embedding has no row for: text that holds it cannot be encoded.
+inline constexpr std::int32_t kNoRow = -1;
+
 /// A token that is cut out of the text before anything else looks at it, e.g. `<image>`.
 struct AddedToken {
-  std::int32_t id = 0;
+  std::int32_t id = 0;  // kNoRow: it has no row in the embedding
   std::string content;
   bool single_word = false;  // only where no word character stands next to it
   bool lstrip = false;       // takes the white space on its left with it
@@ -30,10 +33,15 @@ Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int 
 /// Source: tokenizers added_vocabulary.rs (extract_and_normalize, find_matches).
 class AddedTokens {
  public:
-  AddedTokens() = default;
-  explicit AddedTokens(std::vector<AddedToken> tokens);
+  /// What happens to text, and to the contents of `normalized` tokens, before those are looked for.
+  using Normalize = std::string (*)(std::string_view);
 
-  /// Calls `on_text` for each piece between added tokens (never empty) and `on_token` for each token, in text order.
+  AddedTokens() = default;
+  /// `normalize` may be null: text stays as it is.
+  explicit AddedTokens(std::vector<AddedToken> tokens, Normalize normalize = nullptr);
+
+  /// Calls `on_text` for each piece between added tokens, normalized and never empty, and `on_token` for the id of each
+  /// token, in text order.
   void split(std::string_view text, const std::function<void(std::string_view)>& on_text,
              const std::function<void(std::int32_t)>& on_token) const;
 
@@ -44,12 +52,17 @@ class AddedTokens {
   };
   using Trie = std::vector<Node>;
 
-  void insert(Trie& trie, int token);
-  int longest_at(const Trie& trie, std::string_view text) const;
+  void insert(Trie& trie, std::string_view content, int token);
+  struct Match {
+    int token = -1;        // index into tokens_; -1: none
+    std::size_t size = 0;  // bytes of the text
+  };
+  static Match longest_at(const Trie& trie, std::string_view text);
   void split(const Trie& trie, std::string_view text, const std::function<void(std::string_view)>& on_text,
              const std::function<void(std::int32_t)>& on_token) const;
 
   std::vector<AddedToken> tokens_;
+  Normalize normalize_ = nullptr;
   Trie plain_{1};  // tokens that are not `normalized`
   Trie normalized_{1};
 };

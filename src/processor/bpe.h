@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "base/result.h"
+#include "processor/merges.h"
 
 namespace vla {
 
@@ -17,8 +18,8 @@ namespace vla {
 /// is itself); -1 for every other character.
 int byte_of_symbol(std::uint32_t code_point);
 
-/// Byte-level byte-pair encoding of one word.
-/// Source: tokenizers models/bpe/model.rs and word.rs (merge_all).
+/// Byte-level byte-pair encoding of one word: its symbols are bytes.
+/// Source: tokenizers models/bpe/model.rs.
 class Bpe {
  public:
   /// `tokens` by id, `merges` as `left right` by rank, both in the byte-level alphabet. With `ignore_merges` a word
@@ -31,15 +32,8 @@ class Bpe {
   void encode(std::string_view word, std::vector<std::int32_t>& ids) const;
 
  private:
-  struct Merge {
-    std::int32_t rank;
-    std::int32_t id;  // of the token that the pair becomes
-  };
-
-  const Merge* find(std::int32_t left, std::int32_t right) const;
-
   std::array<std::int32_t, 256> byte_ids_{};
-  std::unordered_map<std::uint64_t, Merge> merges_;            // by the pair of ids
+  Merges merges_;
   std::unordered_map<std::string, std::int32_t> whole_words_;  // raw bytes to id; empty without ignore_merges
 };
 

@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 
 #include <cmath>
+#include <cstdint>
 
 namespace vla {
 namespace {
@@ -55,16 +56,30 @@ Result<const Json*> JsonFields::field(const std::string& name, const char* expec
   return &*found;
 }
 
+bool JsonFields::is_integer(const Json& value, int low, int high) {
+  if (!value.is_number_integer()) return false;
+  // An unsigned number beyond int64 would wrap when read as one.
+  if (value.is_number_unsigned() && value.get<std::uint64_t>() > static_cast<std::uint64_t>(INT64_MAX)) return false;
+  return value.get<std::int64_t>() >= low && value.get<std::int64_t>() <= high;
+}
+
 Result<int> JsonFields::integer(const std::string& name, int low, int high) {
   VLA_TRY(const Json* value, field(name, "an integer"));
-  const std::string expected = "an integer from " + std::to_string(low) + " to " + std::to_string(high);
-  if (!value->is_number_integer()) return wrong(name, expected);
-  // An unsigned number beyond int64 would wrap when read as one.
-  if (value->is_number_unsigned() && value->get<std::uint64_t>() > static_cast<std::uint64_t>(high))
-    return wrong(name, expected);
-  const auto wide = value->get<std::int64_t>();
-  if (wide < low || wide > high) return wrong(name, expected);
-  return static_cast<int>(wide);
+  if (!is_integer(*value, low, high)) return wrong(name, fmt::format("an integer from {} to {}", low, high));
+  return value->get<int>();
+}
+
+Result<std::vector<int>> JsonFields::integers(const std::string& name, int low, int high) {
+  VLA_TRY(const Json* value, field(name, "a list of integers"));
+  const std::string expected = fmt::format("a list of different integers from {} to {}", low, high);
+  if (!value->is_array()) return wrong(name, expected);
+  std::vector<int> list;
+  std::set<int> seen;
+  for (const Json& item : *value) {
+    if (!is_integer(item, low, high) || !seen.insert(item.get<int>()).second) return wrong(name, expected);
+    list.push_back(item.get<int>());
+  }
+  return list;
 }
 
 Result<float> JsonFields::number(const std::string& name) {
@@ -74,6 +89,12 @@ Result<float> JsonFields::number(const std::string& name) {
   if (!(std::abs(wide) <= static_cast<double>(std::numeric_limits<float>::max())))
     return wrong(name, "a float32 number");
   return static_cast<float>(wide);
+}
+
+Result<double> JsonFields::wide_number(const std::string& name) {
+  VLA_TRY(const Json* value, field(name, "a number"));
+  if (!value->is_number() || !std::isfinite(value->get<double>())) return wrong(name, "a number");
+  return value->get<double>();
 }
 
 Result<bool> JsonFields::boolean(const std::string& name) {

@@ -5,6 +5,7 @@
 #include <nlohmann/json.hpp>
 #include <set>
 #include <string>
+#include <vector>
 
 #include "base/result.h"
 
@@ -31,6 +32,10 @@ class JsonFields {
   Result<int> integer(const std::string& name, int low, int high);
   /// A number that is finite as float32.
   Result<float> number(const std::string& name);
+  /// A finite number in double precision.
+  Result<double> wide_number(const std::string& name);
+  /// A list of integers in [low, high], none of them twice.
+  Result<std::vector<int>> integers(const std::string& name, int low, int high);
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);
   /// One of the spellings; the result is its index.
@@ -41,6 +46,7 @@ class JsonFields {
 
  private:
   JsonFields(const Json& object, std::string where) : object_(&object), where_(std::move(where)) {}
+  static bool is_integer(const Json& value, int low, int high);
   Result<const Json*> field(const std::string& name, const char* expected);
 
   const Json* object_;

@@ -8,6 +8,8 @@
 #include <array>
 #include <cmath>
 
+#include "processor/resample.h"
+
 namespace vla {
 namespace {
 
@@ -117,6 +119,23 @@ void place(Source source, int source_width, int source_height, const Target& to)
 
 }  // namespace
 
+namespace {
+
+/// The frame in 8 bits at the size of the target.
+std::vector<std::uint8_t> resized_8bit(const Frame& frame, const Target& target) {
+  std::vector<std::uint8_t> bytes;
+  if (const auto* given = std::get_if<std::vector<std::uint8_t>>(&frame.rgb)) {
+    bytes = *given;
+  } else {
+    for (const float value : std::get<std::vector<float>>(frame.rgb))
+      bytes.push_back(static_cast<std::uint8_t>(255.0f * value));
+  }
+  if (frame.width == target.width && frame.height == target.height) return bytes;
+  return resample_8bit(bytes, frame.width, frame.height, target.width, target.height);
+}
+
+}  // namespace
+
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where) {
   const auto stride = static_cast<std::size_t>(to.width);
   Target target{out.data(), stride * static_cast<std::size_t>(to.height), stride, to.width, to.height};
@@ -131,9 +150,13 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
                    fmt::format("{} x {}, which leaves a side shorter than a pixel", frame.width, frame.height)};
     std::fill(out.begin(), out.end(), to.fill);
   }
-  target.out +=
-      static_cast<std::size_t>(to.height - target.height) * stride + static_cast<std::size_t>(to.width - target.width);
-  if (const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb)) {
+  const int share = to.align == Letterbox::Align::center ? 2 : 1;  // of the rest that lies at the left and at the top
+  target.out += static_cast<std::size_t>((to.height - target.height) / share) * stride +
+                static_cast<std::size_t>((to.width - target.width) / share);
+  if (to.antialias) {
+    const std::vector<std::uint8_t> bytes = resized_8bit(frame, target);
+    copy(ByteSource{bytes.data(), byte_table()}, target);
+  } else if (const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb)) {
     place(ByteSource{bytes->data(), byte_table()}, frame.width, frame.height, target);
   } else {
     place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target);
@@ -146,6 +169,10 @@ void affine(std::span<float> values, float scale, float shift) {
     const float scaled = value * scale;
     value = scaled + shift;
   }
+}
+
+void clip(std::span<float> values, float low, float high) {
+  for (float& value : values) value = std::clamp(value, low, high);
 }
 
 }  // namespace vla

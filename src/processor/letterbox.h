@@ -10,23 +10,35 @@
 
 namespace vla {
 
-/// A frame of any size into `width` x `height`: aspect kept, the picture at the bottom right, the rest `fill`.
+/// A frame of any size into `width` x `height`: aspect kept, the rest `fill`.
 struct Letterbox {
+  enum class Align { bottom_right, center };
+
   int width = 0;
   int height = 0;
   float fill = 0.0f;
+  Align align = Align::bottom_right;  // where the picture is; of an odd rest `center` leaves less at the left and top
+  bool antialias = false;             // as Pillow resamples 8-bit pictures, see below
 };
 
 /// Writes (3, height, width) float32 to `out`; 8-bit values are divided by 255. A frame that has the size already is
 /// copied. Otherwise it is resampled bilinearly, without antialiasing, to the largest size that fits.
 ///
 /// The result equals torch's bit for bit on machines where torch uses fused multiply-add: sizes are truncated from
-/// double, source positions are rounded once to float32, and the four taps are summed in torch's order. Errors:
-/// bad_observation when a side of the resized picture is shorter than a pixel. Source: lerobot
-/// policies/common/vla_utils.py resize_with_pad; torch F.interpolate(mode="bilinear", align_corners=False).
+/// double, source positions are rounded once to float32, and the four taps are summed in torch's order. Source: lerobot
+/// policies/common/vla_utils.py resize_with_pad, resize_with_pad_torch; torch F.interpolate(mode="bilinear",
+/// align_corners=False).
+///
+/// With `antialias` everything happens in 8 bits, and a float frame is first cut to them (255 x, without rounding); the
+/// result equals Pillow's. Source: openpi image_tools.py resize_with_pad; `resample_8bit`.
+///
+/// Errors: bad_observation when a side of the resized picture is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
 
 /// `x * scale + shift`, each rounded to float32, in place.
 void affine(std::span<float> values, float scale, float shift);
+
+/// Holds every value in [low, high], in place. Interpolation can leave the range of its inputs by a rounding error.
+void clip(std::span<float> values, float low, float high);
 
 }  // namespace vla

@@ -7,6 +7,10 @@
 #include <algorithm>
 #include <cmath>
 
+#include "processor/columns.h"
+#include "processor/text.h"
+#include "processor/unicode.h"
+
 namespace vla {
 namespace {
 
@@ -18,6 +22,11 @@ Error bad_observation(std::string where, std::string expected, std::string found
 std::size_t first_bad(std::span<const float> values) {
   const auto found = std::find_if(values.begin(), values.end(), [](float value) { return !std::isfinite(value); });
   return static_cast<std::size_t>(found - values.begin());
+}
+
+void apply(const ImageOp& op, std::span<float> pixels) {
+  if (const auto* scaled = std::get_if<AffineOp>(&op)) affine(pixels, scaled->scale, scaled->shift);
+  if (const auto* held = std::get_if<ClipOp>(&op)) clip(pixels, held->low, held->high);
 }
 
 /// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
@@ -39,8 +48,8 @@ Result<std::vector<const T*>> by_feature(const FeatureNames& features, const std
 Result<Inputs> Processor::encode(const Observation& observation) const {
   Inputs inputs;
   VLA_CHECK(encode_images(observation, inputs));
-  VLA_CHECK(encode_text(observation, inputs));
   VLA_CHECK(encode_state(observation, inputs));
+  VLA_CHECK(encode_text(observation, inputs));
   return inputs;
 }
 
@@ -74,26 +83,49 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
     const std::span<float> out(inputs.pixels.data() + i * size, size);
     VLA_CHECK(check_frame(*frame, *name));
     VLA_CHECK(letterbox(*frame, recipe_.letterbox, out, *name));
-    for (const AffineOp& op : recipe_.image) affine(out, op.scale, op.shift);
+    for (const ImageOp& op : recipe_.image) apply(op, out);
   }
   return {};
+}
+
+std::string Processor::fill_prompt(const std::string& instruction, std::span<const int> state_words) const {
+  std::string text = instruction;
+  for (const TextOp& op : recipe_.text) {
+    if (std::holds_alternative<StripOp>(op)) text = std::string(strip(text));
+    if (const auto* replace = std::get_if<ReplaceOp>(&op)) text = replace_all(text, replace->from, replace->to);
+    if (const auto* end = std::get_if<EnsureSuffixOp>(&op); end != nullptr && !text.ends_with(end->suffix))
+      text += end->suffix;
+    if (const auto* whole = std::get_if<TemplateOp>(&op)) text = fill_template(whole->text, text, state_words);
+  }
+  return text;
 }
 
 Status Processor::encode_text(const Observation& observation, Inputs& inputs) const {
   inputs.notes.clear();
   if (observation.text.empty()) return bad_observation("instruction", "a sentence", "empty text");
-  std::string text = observation.text;
-  for (const EnsureSuffixOp& op : recipe_.text)
-    if (!text.ends_with(op.suffix)) text += op.suffix;
-  VLA_TRY(inputs.tokens, tokenizer_.encode(text));
+  if (observation.text.size() > Tokenizer::kMaxText ||
+      unicode::valid_prefix(observation.text) < observation.text.size())
+    return tokenizer_.encode(observation.text).error();  // before anything reads it as characters
+  if (bins_ && inputs.state_words.size() != n_state_)
+    return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
+  VLA_TRY(inputs.tokens, tokenizer_.encode(fill_prompt(observation.text, inputs.state_words)));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
     inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the {} {}", inputs.tokens.size(),
                                        recipe_.keep_last ? "last" : "first", limit));
-    if (recipe_.keep_last) inputs.tokens.erase(inputs.tokens.begin(), inputs.tokens.end() - recipe_.max_tokens);
-    inputs.tokens.resize(limit);
+    cut_tokens(inputs.tokens);
   }
   return {};
+}
+
+/// Keeps as many tokens as the recipe says. What stands in front of every text is not part of it and stays.
+void Processor::cut_tokens(std::vector<std::int32_t>& tokens) const {
+  const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
+  if (recipe_.keep_last) {
+    const auto front = tokens.begin() + static_cast<std::ptrdiff_t>(std::min(tokenizer_.prefix().size(), limit));
+    tokens.erase(front, front + static_cast<std::ptrdiff_t>(tokens.size() - limit));
+  }
+  tokens.resize(limit);
 }
 
 Status Processor::gather_states(const Observation& observation, std::vector<float>& state) const {
@@ -117,19 +149,44 @@ Status Processor::gather_states(const Observation& observation, std::vector<floa
 Status Processor::encode_state(const Observation& observation, Inputs& inputs) const {
   VLA_CHECK(gather_states(observation, inputs.state));
   const std::span<float> state(inputs.state);
-  for (const StateStep& step : state_steps_) step.normalizer.apply(state.subspan(step.offset, step.width));
+  bool raw = true;
+  for (const StateStep& step : state_steps_) {
+    const std::span<float> columns = state.subspan(step.offset, step.width);
+    if (const auto* normalizer = std::get_if<Normalizer>(&step.op)) {
+      if (raw) inputs.raw_state = inputs.state;
+      raw = false;
+      normalizer->apply(columns);
+    }
+    if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, columns);
+    if (const auto* angle = std::get_if<HornAngleOp>(&step.op)) map_columns(*angle, columns);
+  }
+  if (raw) inputs.raw_state = inputs.state;
   if (const std::size_t bad = first_bad(state); bad < state.size())
     return bad_observation(fmt::format("state[{}]", bad), "a number that stays finite when normalized",
                            fmt::format("{}", state[bad]));
+  inputs.state_words = bins_ ? bins(*bins_, state) : std::vector<int>{};
   inputs.state.resize(d_state_, 0.0f);
   return {};
 }
 
-Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int horizon, int d_action) const {
-  if (d_action != d_action_ || horizon < 1 ||
+void Processor::decode_row(std::vector<float>& row, std::span<const float> raw_state) const {
+  for (const ActionStep& step : action_steps_) {
+    row.resize(step.width);
+    if (const auto* normalizer = std::get_if<Normalizer>(&step.op)) normalizer->apply(row);
+    if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, row);
+    if (const auto* add = std::get_if<AddStateOp>(&step.op))
+      for (const int column : add->columns)
+        row[static_cast<std::size_t>(column)] += raw_state[static_cast<std::size_t>(column)];
+  }
+  row.resize(action_names_.size());
+}
+
+Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int horizon, int d_action,
+                                             std::span<const float> raw_state) const {
+  if (d_action != d_action_ || horizon < 1 || raw_state.size() != n_state_ ||
       chunk.size() != static_cast<std::size_t>(horizon) * static_cast<std::size_t>(d_action))
-    return Error{Code::internal, "action chunk", fmt::format("({}, {})", horizon, d_action_),
-                 fmt::format("{} numbers in rows of {}", chunk.size(), d_action)};
+    return Error{Code::internal, "action chunk", fmt::format("({}, {}) and {} states", horizon, d_action_, n_state_),
+                 fmt::format("{} numbers in rows of {} and {} states", chunk.size(), d_action, raw_state.size())};
   const std::size_t width = action_names_.size();
   std::vector<float> actions, row;
   actions.reserve(static_cast<std::size_t>(horizon) * width);
@@ -137,11 +194,7 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
     const auto numbers = chunk.subspan(static_cast<std::size_t>(i) * static_cast<std::size_t>(d_action),
                                        static_cast<std::size_t>(d_action));
     row.assign(numbers.begin(), numbers.end());
-    for (const ActionStep& step : action_steps_) {
-      row.resize(step.width);
-      step.normalizer.apply(row);
-    }
-    row.resize(width);
+    decode_row(row, raw_state);
     if (const std::size_t bad = first_bad(row); bad < width)
       return Error{Code::bad_action, fmt::format("actions[{}][\"{}\"]", i, action_names_[bad]), "a finite number",
                    fmt::format("{}", row[bad])};

@@ -7,6 +7,7 @@
 #include <optional>
 #include <span>
 #include <string>
+#include <variant>
 #include <vector>
 
 #include "base/result.h"
@@ -32,7 +33,9 @@ struct Inputs {
   int height = 0, width = 0;
   std::vector<float> pixels;         // (n_view, 3, height, width), present views only, in the bundle's order
   std::vector<std::int32_t> tokens;  // at most `recipe().max_tokens`
-  std::vector<float> state;          // normalized, padded
+  std::vector<float> state;          // normalized, padded; empty where the network sees none
+  std::vector<int> state_words;      // the state in the words of the prompt, where the recipe puts it there
+  std::vector<float> raw_state;      // before its normalization, which actions may be relative to
   std::vector<std::string> notes;    // what the user must be told, e.g. that the instruction was cut
 };
 
@@ -46,14 +49,17 @@ class Processor {
   /// All three parts below. Errors: bad_observation.
   Result<Inputs> encode(const Observation& observation) const;
 
-  /// Each fills its own fields of `inputs`; they are apart so that they can be timed apart.
+  /// Each fills its own fields of `inputs`; they are apart so that they can be timed apart. A prompt may hold the
+  /// state: `encode_text` comes after `encode_state`.
   Status encode_images(const Observation& observation, Inputs& inputs) const;
   Status encode_text(const Observation& observation, Inputs& inputs) const;
   Status encode_state(const Observation& observation, Inputs& inputs) const;
 
-  /// chunk (horizon, d_action), in the network's units -> (horizon, action_names().size()) in world units.
-  /// Errors: bad_action for a number that is not finite, naming its row and column.
-  Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action) const;
+  /// chunk (horizon, d_action), in the network's units -> (horizon, action_names().size()) in world units. `raw_state`
+  /// is that of the observation which the chunk answers. Errors: bad_action for a number that is not finite, naming its
+  /// row and column.
+  Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action,
+                                    std::span<const float> raw_state) const;
 
   /// Whether a step of the recipe reads this tensor; any other statistics in a bundle are a mistake.
   bool reads(const std::string& tensor) const;
@@ -66,18 +72,20 @@ class Processor {
   const Recipe& recipe() const { return recipe_; }
 
  private:
-  /// A normalizer and the columns that it works on.
+  /// A step and the columns that it works on.
   struct StateStep {
-    Normalizer normalizer;
+    std::variant<ColumnAffineOp, HornAngleOp, Normalizer> op;
     std::size_t offset, width;
   };
   struct ActionStep {
-    Normalizer normalizer;
+    std::variant<Normalizer, AddStateOp, ColumnAffineOp> op;
     std::size_t width;
   };
 
   Status read_features(const Bundle& bundle);
   Status check_descriptions(const Keys& keys) const;
+  Status check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where) const;
+  Result<StateStep> read_normalize(const Bundle& bundle, const NormalizeOp& op, const std::string& where) const;
   Status read_state_steps(const Bundle& bundle);
   Status read_action_steps(const Bundle& bundle);
   struct PresentView {
@@ -85,6 +93,9 @@ class Processor {
     const Frame* frame;
   };
   Result<std::vector<PresentView>> present_views(const Observation& observation) const;
+  std::string fill_prompt(const std::string& instruction, std::span<const int> state_words) const;
+  void cut_tokens(std::vector<std::int32_t>& tokens) const;
+  void decode_row(std::vector<float>& row, std::span<const float> raw_state) const;
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;
@@ -96,8 +107,10 @@ class Processor {
   Tokenizer tokenizer_;
   std::vector<StateStep> state_steps_;
   std::vector<ActionStep> action_steps_;
-  std::size_t d_state_ = 0;  // after padding
-  int d_action_ = 0;         // of the network
+  std::optional<BinsOp> bins_;  // the state goes into the prompt
+  std::size_t n_state_ = 0;     // numbers of all states together
+  std::size_t d_state_ = 0;     // of the network, after padding
+  int d_action_ = 0;            // of the network
 };
 
 }  // namespace vla

@@ -100,38 +100,59 @@ Status Processor::check_descriptions(const Keys& keys) const {
   return {};
 }
 
+/// The columns that an op on the state names must exist in it.
+Status Processor::check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where) const {
+  for (const int column : columns)
+    if (static_cast<std::size_t>(column) >= width)
+      return misfit(where + ".columns", fmt::format("columns below {}", width), std::to_string(column));
+  return {};
+}
+
+Result<Processor::StateStep> Processor::read_normalize(const Bundle& bundle, const NormalizeOp& op,
+                                                       const std::string& where) const {
+  std::size_t offset = 0, n_column = n_state_;
+  if (!op.feature.empty() || states_.names().size() > 1) {
+    const auto& names = states_.names();
+    const auto index = static_cast<std::size_t>(std::find(names.begin(), names.end(), op.feature) - names.begin());
+    if (index == names.size())
+      return misfit(where + ".feature", "one of " + states_.listed(), "\"" + op.feature + "\"");
+    offset = static_cast<std::size_t>(total_dims(std::span(state_dims_).first(index)));
+    n_column = static_cast<std::size_t>(state_dims_[index]);
+  }
+  VLA_TRY(Normalizer normalizer,
+          Normalizer::create(bundle, op, Normalizer::Direction::normalize, static_cast<int>(n_column), where));
+  return StateStep{std::move(normalizer), offset, n_column};
+}
+
 Status Processor::read_state_steps(const Bundle& bundle) {
-  const auto total = static_cast<std::size_t>(total_dims(state_dims_));
-  std::size_t width = total;
+  n_state_ = static_cast<std::size_t>(total_dims(state_dims_));
+  d_state_ = n_state_;
   for (std::size_t i = 0; i < recipe_.state.size(); ++i) {
     const std::string where = fmt::format("processor.recipe.state[{}]", i);
-    if (const auto* pad = std::get_if<PadOp>(&recipe_.state[i])) {
-      if (static_cast<std::size_t>(pad->size) < width)
-        return misfit(where + ".size", fmt::format("at least the {} numbers of the state", width),
+    const StateOp& op = recipe_.state[i];
+    if (const auto* normalize = std::get_if<NormalizeOp>(&op)) {
+      VLA_TRY(StateStep step, read_normalize(bundle, *normalize, where));
+      state_steps_.push_back(std::move(step));
+    } else if (const auto* affine = std::get_if<ColumnAffineOp>(&op)) {
+      VLA_CHECK(check_columns(affine->columns, n_state_, where));
+      state_steps_.push_back({*affine, 0, n_state_});
+    } else if (const auto* angle = std::get_if<HornAngleOp>(&op)) {
+      VLA_CHECK(check_columns(angle->columns, n_state_, where));
+      state_steps_.push_back({*angle, 0, n_state_});
+    } else if (const auto* pad = std::get_if<PadOp>(&op)) {
+      if (static_cast<std::size_t>(pad->size) < n_state_)
+        return misfit(where + ".size", fmt::format("at least the {} numbers of the state", n_state_),
                       std::to_string(pad->size));
-      width = static_cast<std::size_t>(pad->size);
-      continue;
+      d_state_ = static_cast<std::size_t>(pad->size);
+    } else {  // bins or drop: nothing is left for the network
+      if (const auto* words = std::get_if<BinsOp>(&op)) bins_ = *words;
+      d_state_ = 0;
     }
-    const auto& op = std::get<NormalizeOp>(recipe_.state[i]);
-    std::size_t offset = 0, n_column = total;
-    if (!op.feature.empty() || states_.names().size() > 1) {
-      const auto& names = states_.names();
-      const auto index = static_cast<std::size_t>(std::find(names.begin(), names.end(), op.feature) - names.begin());
-      if (index == names.size())
-        return misfit(where + ".feature", "one of " + states_.listed(), "\"" + op.feature + "\"");
-      offset = static_cast<std::size_t>(total_dims(std::span(state_dims_).first(index)));
-      n_column = static_cast<std::size_t>(state_dims_[index]);
-    }
-    VLA_TRY(Normalizer normalizer,
-            Normalizer::create(bundle, op, Normalizer::Direction::normalize, static_cast<int>(n_column), where));
-    state_steps_.push_back({std::move(normalizer), offset, n_column});
   }
-  d_state_ = width;
   VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state"));
-  if (width != static_cast<std::size_t>(d_state))
-    return misfit("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
-                  std::to_string(width));
-  return {};
+  if (d_state_ == static_cast<std::size_t>(d_state)) return {};
+  return misfit("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
+                std::to_string(d_state_));
 }
 
 Status Processor::read_action_steps(const Bundle& bundle) {
@@ -139,20 +160,27 @@ Status Processor::read_action_steps(const Bundle& bundle) {
   int width = d_action_;
   for (std::size_t i = 0; i < recipe_.action.size(); ++i) {
     const std::string where = fmt::format("processor.recipe.action[{}]", i);
-    if (const auto* take = std::get_if<TakeOp>(&recipe_.action[i])) {
+    const ActionOp& op = recipe_.action[i];
+    const auto n_column = static_cast<std::size_t>(width);
+    if (const auto* take = std::get_if<TakeOp>(&op)) {
       if (take->size > width)
         return misfit(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
       width = take->size;
-      continue;
+    } else if (const auto* add = std::get_if<AddStateOp>(&op)) {
+      VLA_CHECK(check_columns(add->columns, std::min(n_column, n_state_), where));
+      action_steps_.push_back({*add, n_column});
+    } else if (const auto* affine = std::get_if<ColumnAffineOp>(&op)) {
+      VLA_CHECK(check_columns(affine->columns, n_column, where));
+      action_steps_.push_back({*affine, n_column});
+    } else {
+      VLA_TRY(Normalizer unnormalize,
+              Normalizer::create(bundle, std::get<NormalizeOp>(op), Normalizer::Direction::unnormalize, width, where));
+      action_steps_.push_back({std::move(unnormalize), n_column});
     }
-    const auto& op = std::get<NormalizeOp>(recipe_.action[i]);
-    VLA_TRY(Normalizer normalizer, Normalizer::create(bundle, op, Normalizer::Direction::unnormalize, width, where));
-    action_steps_.push_back({std::move(normalizer), static_cast<std::size_t>(width)});
   }
-  if (static_cast<std::size_t>(width) != action_names_.size())
-    return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", width),
-                  std::to_string(action_names_.size()));
-  return {};
+  if (static_cast<std::size_t>(width) == action_names_.size()) return {};
+  return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", width),
+                std::to_string(action_names_.size()));
 }
 
 }  // namespace vla

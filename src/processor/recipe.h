@@ -12,23 +12,67 @@
 namespace vla {
 
 /// How a normalize or unnormalize step uses statistics; `vector.h` has the formulas.
-enum class NormKind { mean_std, min_max, quantiles, quantile10, identity };
+enum class NormKind { mean_std, min_max, quantiles, quantile10, identity, openpi_mean_std, openpi_quantiles };
 
 struct AffineOp {
   float scale = 1.0f;
   float shift = 0.0f;
 };
 
+struct ClipOp {
+  float low = 0.0f;
+  float high = 0.0f;
+};
+
+struct StripOp {};
+
+struct ReplaceOp {
+  std::string from, to;
+};
+
 struct EnsureSuffixOp {
   std::string suffix;
+};
+
+/// `{instruction}` stands for the text so far, `{state}` for the numbers that `bins` made of the state.
+struct TemplateOp {
+  std::string text;
 };
 
 struct NormalizeOp {
   NormKind kind = NormKind::identity;
   std::string stats;  // prefix of the statistics' tensor names; empty for identity
-  float eps = 0.0f;
+  double eps = 0.0;
   std::string feature;  // full name of the state feature it works on; empty: the whole vector
 };
+
+/// `x * scale + shift` in the columns named.
+struct ColumnAffineOp {
+  std::vector<int> columns;
+  double scale = 1.0;
+  double shift = 0.0;
+};
+
+/// The opening of a gripper, `x * scale + shift`, as the angle of the servo horn that drives it, by the lengths of horn
+/// and arm. It is one op because the angle of a horn near its end depends on the last digit of the opening.
+struct HornAngleOp {
+  std::vector<int> columns;
+  double scale = 1.0;
+  double shift = 0.0;
+  double arm_length = 0.0;
+  double horn_radius = 0.0;
+};
+
+/// Numbers to whole numbers: how many of `count` evenly spaced edges from `low` on (`high` left out) are not above,
+/// less 1.
+struct BinsOp {
+  double low = 0.0;
+  double high = 0.0;
+  int count = 0;
+};
+
+/// The network sees no state.
+struct DropOp {};
 
 struct PadOp {
   int size = 0;
@@ -38,14 +82,21 @@ struct TakeOp {
   int size = 0;
 };
 
-using StateOp = std::variant<NormalizeOp, PadOp>;
-using ActionOp = std::variant<TakeOp, NormalizeOp>;
+/// Adds the state, as it is before its normalization, to the columns named.
+struct AddStateOp {
+  std::vector<int> columns;
+};
+
+using ImageOp = std::variant<AffineOp, ClipOp>;
+using TextOp = std::variant<StripOp, ReplaceOp, EnsureSuffixOp, TemplateOp>;
+using StateOp = std::variant<ColumnAffineOp, HornAngleOp, NormalizeOp, PadOp, BinsOp, DropOp>;
+using ActionOp = std::variant<TakeOp, NormalizeOp, AddStateOp, ColumnAffineOp>;
 
 /// `processor.recipe` of docs/bundle.md, checked and typed: what happens to each input and to the actions, in order.
 struct Recipe {
-  Letterbox letterbox;               // the first image op: what follows works on planes of one size
-  std::vector<AffineOp> image;       // the others
-  std::vector<EnsureSuffixOp> text;  // all but the last op, which is tokenize
+  Letterbox letterbox;         // the first image op: what follows works on planes of one size
+  std::vector<ImageOp> image;  // the others
+  std::vector<TextOp> text;    // all but the last op, which is tokenize
   int max_tokens = 0;
   bool keep_last = false;  // of more tokens the last are kept, else the first
   std::vector<StateOp> state;

@@ -7,24 +7,28 @@
 namespace vla {
 namespace {
 
-Status check_kind(const Keys& keys) {
+constexpr std::size_t kMaxPrefix = 8;  // no real tokenizer puts more than two ids in front
+
+Result<bool> is_byte_level(const Keys& keys) {
   VLA_TRY(const std::string kind, keys.string("tokenizer.kind"));
-  if (kind == "byte_level_bpe") return {};
-  return Error{Code::bad_bundle, "tokenizer.kind", "byte_level_bpe", kind, "this bundle needs a newer vla"};
+  if (kind == "byte_level_bpe" || kind == "byte_fallback_bpe") return kind == "byte_level_bpe";
+  return Error{Code::bad_bundle, "tokenizer.kind", "byte_level_bpe or byte_fallback_bpe", kind,
+               "this bundle needs a newer vla"};
 }
 
 /// The text of an added token stands at its id as well, so that a bundle's list of tokens is whole.
-Status check_added(const std::vector<AddedToken>& added, const std::vector<std::string>& tokens, bool ignore_merges) {
+/// `whole_words`: a single word token that is passed over could come back as a word of the model, and the bundle does
+/// not say whether the model's own vocabulary has it.
+Status check_added(const std::vector<AddedToken>& added, const std::vector<std::string>& tokens, bool whole_words) {
   for (std::size_t i = 0; i < added.size(); ++i) {
     const std::string where = "tokenizer.added[" + std::to_string(i) + "]";
+    if (whole_words && added[i].single_word)
+      return Error{Code::bad_bundle, where + ".single_word", "false, because words may be tokens as a whole", "true"};
+    if (added[i].id == kNoRow) continue;
     const auto id = static_cast<std::size_t>(added[i].id);
     if (id >= tokens.size() || tokens[id] != added[i].content)
       return Error{Code::bad_bundle, where + ".content", "the text of tokenizer.tokens[" + std::to_string(id) + "]",
                    added[i].content};
-    // A single word token that is passed over could come back as a whole word, and the bundle does not say whether the
-    // model's own vocabulary has it.
-    if (ignore_merges && added[i].single_word)
-      return Error{Code::bad_bundle, where + ".single_word", "false, because tokenizer.ignore_merges is set", "true"};
   }
   return {};
 }
@@ -32,25 +36,58 @@ Status check_added(const std::vector<AddedToken>& added, const std::vector<std::
 }  // namespace
 
 Result<Tokenizer> Tokenizer::create(const Keys& keys, int n_vocab) {
-  VLA_CHECK(check_kind(keys));
+  VLA_TRY(const bool byte_level, is_byte_level(keys));
   VLA_TRY(const std::vector<std::string> tokens, keys.strings("tokenizer.tokens"));
-  VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
-  VLA_TRY(const std::string pre, keys.string("tokenizer.pre"));
   VLA_TRY(const std::string added_json, keys.string("tokenizer.added"));
-  VLA_TRY(const bool ignore_merges, keys.boolean("tokenizer.ignore_merges"));
   if (n_vocab < 1 || tokens.size() > static_cast<std::size_t>(n_vocab))
     return Error{Code::bad_bundle, "tokenizer.tokens", "at most " + std::to_string(n_vocab) + " tokens (lm.n_vocab)",
                  std::to_string(tokens.size())};
   VLA_TRY(std::vector<AddedToken> added, parse_added_tokens(added_json, n_vocab));
-  VLA_CHECK(check_added(added, tokens, ignore_merges));
-  std::vector<bool> is_added(tokens.size());
-  for (const AddedToken& token : added) is_added[static_cast<std::size_t>(token.id)] = true;
 
   Tokenizer tokenizer;
-  VLA_TRY(tokenizer.pretokenizer_, Pretokenizer::parse(pre));
-  VLA_TRY(tokenizer.bpe_, Bpe::create(tokens, merges, ignore_merges, is_added));
-  tokenizer.added_ = AddedTokens(std::move(added));
+  if (byte_level) {
+    VLA_CHECK(tokenizer.read_byte_level(keys, tokens, added));
+  } else {
+    VLA_CHECK(check_added(added, tokens, false));
+    VLA_CHECK(tokenizer.read_byte_fallback(keys, tokens));
+  }
+  tokenizer.added_ = AddedTokens(std::move(added), byte_level ? nullptr : ByteFallbackBpe::mark_blanks);
   return tokenizer;
+}
+
+Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::string>& tokens,
+                                  const std::vector<AddedToken>& added) {
+  VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
+  VLA_TRY(const std::string pre, keys.string("tokenizer.pre"));
+  VLA_TRY(const bool ignore_merges, keys.boolean("tokenizer.ignore_merges"));
+  VLA_CHECK(check_added(added, tokens, ignore_merges));
+  std::vector<bool> is_added(tokens.size());
+  for (const AddedToken& token : added)
+    if (token.id != kNoRow) is_added[static_cast<std::size_t>(token.id)] = true;
+  ByteLevel model;
+  VLA_TRY(model.pretokenizer, Pretokenizer::parse(pre));
+  VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, is_added));
+  model_ = std::move(model);
+  return {};
+}
+
+Status Tokenizer::read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens) {
+  VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
+  VLA_TRY(prefix_, keys.integers("tokenizer.prefix_ids"));
+  if (prefix_.size() > kMaxPrefix)
+    return Error{Code::bad_bundle, "tokenizer.prefix_ids", "at most " + std::to_string(kMaxPrefix) + " ids",
+                 std::to_string(prefix_.size())};
+  for (const std::int32_t id : prefix_)
+    if (id < 0 || static_cast<std::size_t>(id) >= tokens.size())
+      return Error{Code::bad_bundle, "tokenizer.prefix_ids", "ids of tokenizer.tokens", std::to_string(id)};
+  VLA_TRY(model_, ByteFallbackBpe::create(tokens, merges));
+  return {};
+}
+
+void Tokenizer::encode_piece(std::string_view piece, Ids& ids) const {
+  if (const auto* fallback = std::get_if<ByteFallbackBpe>(&model_)) return fallback->encode(piece, ids);
+  const auto& byte_level = std::get<ByteLevel>(model_);
+  byte_level.pretokenizer.split(piece, [&](std::string_view word) { byte_level.bpe.encode(word, ids); });
 }
 
 Result<std::vector<std::int32_t>> Tokenizer::encode(std::string_view text) const {
@@ -60,13 +97,17 @@ Result<std::vector<std::int32_t>> Tokenizer::encode(std::string_view text) const
   if (const std::size_t valid = unicode::valid_prefix(text); valid < text.size())
     return Error{Code::bad_observation, "instruction", "UTF-8 text",
                  "a byte that is not UTF-8 at offset " + std::to_string(valid)};
-  std::vector<std::int32_t> ids;
+  Ids ids = prefix_;
+  bool no_row = false;
   added_.split(
-      text,
-      [&](std::string_view piece) {
-        pretokenizer_.split(piece, [&](std::string_view word) { bpe_.encode(word, ids); });
-      },
-      [&](std::int32_t id) { ids.push_back(id); });
+      text, [&](std::string_view piece) { encode_piece(piece, ids); },
+      [&](std::int32_t id) {
+        no_row |= id == kNoRow;
+        ids.push_back(id);
+      });
+  if (no_row)
+    return Error{Code::bad_observation, "instruction", "text without tokens that the embedding has no row for",
+                 "such a token, e.g. <image>", "remove it from the text"};
   return ids;
 }
 

@@ -5,18 +5,20 @@
 #include <cstdint>
 #include <string>
 #include <string_view>
+#include <variant>
 #include <vector>
 
 #include "base/result.h"
 #include "bundle/keys.h"
 #include "processor/added_tokens.h"
 #include "processor/bpe.h"
+#include "processor/byte_fallback_bpe.h"
 #include "processor/pretokenizer.h"
 
 namespace vla {
 
-/// Text to token ids by byte-level BPE, equal to the Hugging Face `tokenizers` library (0.22) on every string.
-/// The keys that describe it are in docs/bundle.md. No ids are added at either end and nothing is cut.
+/// Text to token ids, equal to the Hugging Face `tokenizers` library (0.22) on every string. There are two kinds,
+/// byte-level BPE and BPE with byte fallback; the keys that describe them are in docs/bundle.md. Nothing is cut.
 class Tokenizer {
  public:
   /// Longest text, in bytes. An instruction is a sentence; what is longer is a mistake or an attack.
@@ -25,14 +27,29 @@ class Tokenizer {
   /// Reads and checks `tokenizer.*`; every id must be below `n_vocab`, the rows of the embedding. Errors: bad_bundle.
   static Result<Tokenizer> create(const Keys& keys, int n_vocab);
 
-  /// Ids of `text`, which must be UTF-8 of at most `kMaxText` bytes; NUL is a character like any other.
-  /// Errors: bad_observation.
+  /// Ids of `text`, which must be UTF-8 of at most `kMaxText` bytes; NUL is a character like any other. The ids of
+  /// `prefix()` stand in front. Errors: bad_observation, also for an added token that the embedding has no row for.
   Result<std::vector<std::int32_t>> encode(std::string_view text) const;
 
+  /// The ids in front of every text (`<bos>`), where the tokenizer puts some.
+  const std::vector<std::int32_t>& prefix() const { return prefix_; }
+
  private:
+  struct ByteLevel {
+    Pretokenizer pretokenizer;
+    Bpe bpe;
+  };
+
+  using Ids = std::vector<std::int32_t>;
+
+  Status read_byte_level(const Keys& keys, const std::vector<std::string>& tokens,
+                         const std::vector<AddedToken>& added);
+  Status read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens);
+  void encode_piece(std::string_view piece, Ids& ids) const;
+
   AddedTokens added_;
-  Pretokenizer pretokenizer_;
-  Bpe bpe_;
+  std::variant<ByteLevel, ByteFallbackBpe> model_;
+  Ids prefix_;
 };
 
 }  // namespace vla

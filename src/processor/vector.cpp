@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 
 #include <cmath>
+#include <utility>
 
 namespace vla {
 namespace {
@@ -15,24 +16,38 @@ Result<std::vector<float>> read(const Bundle& bundle, const std::string& name, i
   return Error{Code::bad_bundle, name, fmt::format("{} numbers for {}", width, where), std::to_string(values.size())};
 }
 
+bool is_mean_std(NormKind kind) { return kind == NormKind::mean_std || kind == NormKind::openpi_mean_std; }
+
+bool is_openpi(NormKind kind) { return kind == NormKind::openpi_mean_std || kind == NormKind::openpi_quantiles; }
+
+std::pair<const char*, const char*> statistics_names(NormKind kind) {
+  if (is_mean_std(kind)) return {"mean", "std"};
+  if (kind == NormKind::min_max) return {"min", "max"};
+  return kind == NormKind::quantile10 ? std::pair("q10", "q90") : std::pair("q01", "q99");
+}
+
 }  // namespace
 
 std::vector<std::string> statistics_of(const NormalizeOp& op) {
-  constexpr const char* kLow[] = {"mean", "min", "q01", "q10"};
-  constexpr const char* kHigh[] = {"std", "max", "q99", "q90"};
   if (op.kind == NormKind::identity) return {};
-  const int kind = static_cast<int>(op.kind);
-  return {op.stats + "." + kLow[kind], op.stats + "." + kHigh[kind]};
+  const auto [low, high] = statistics_names(op.kind);
+  return {op.stats + "." + low, op.stats + "." + high};
 }
 
-Normalizer::Normalizer(NormKind kind, Direction direction, float eps, std::vector<float> low, std::vector<float> high)
+Normalizer::Normalizer(NormKind kind, Direction direction, double eps, std::vector<float> low, std::vector<float> high)
     : kind_(kind), direction_(direction), low_(std::move(low)), factor_(std::move(high)) {
   for (std::size_t i = 0; i < factor_.size(); ++i) {
+    if (is_openpi(kind_)) {
+      const double high_i = static_cast<double>(factor_[i]);
+      spread_.push_back((is_mean_std(kind_) ? high_i : high_i - static_cast<double>(low_[i])) + eps);
+      divisor_.push_back(static_cast<float>(spread_[i]));
+      continue;
+    }
     if (kind_ != NormKind::mean_std) {
       factor_[i] -= low_[i];
-      if (factor_[i] == 0.0f) factor_[i] = eps;
+      if (factor_[i] == 0.0f) factor_[i] = static_cast<float>(eps);
     }
-    divisor_.push_back(kind_ == NormKind::mean_std ? factor_[i] + eps : factor_[i]);
+    divisor_.push_back(kind_ == NormKind::mean_std ? factor_[i] + static_cast<float>(eps) : factor_[i]);
   }
 }
 
@@ -55,6 +70,13 @@ Status Normalizer::check_divisors(const NormalizeOp& op) const {
   return {};
 }
 
+double Normalizer::openpi(double x, std::size_t column) const {
+  const double low = static_cast<double>(low_[column]), spread = spread_[column];
+  const bool normalize = direction_ == Direction::normalize;
+  if (is_mean_std(kind_)) return normalize ? (x - low) / spread : x * spread + low;
+  return normalize ? (x - low) / spread * 2.0 - 1.0 : (x + 1.0) / 2.0 * spread + low;
+}
+
 float Normalizer::normalized(float x, std::size_t column) const {
   const float centred = x - low_[column];
   return kind_ == NormKind::mean_std ? centred / divisor_[column] : 2.0f * centred / divisor_[column] - 1.0f;
@@ -68,6 +90,11 @@ float Normalizer::unnormalized(float x, std::size_t column) const {
 
 void Normalizer::apply(std::span<float> values) const {
   if (kind_ == NormKind::identity) return;
+  if (is_openpi(kind_)) {
+    for (std::size_t i = 0; i < values.size(); ++i)
+      values[i] = static_cast<float>(openpi(static_cast<double>(values[i]), i));
+    return;
+  }
   for (std::size_t i = 0; i < values.size(); ++i)
     values[i] = direction_ == Direction::normalize ? normalized(values[i], i) : unnormalized(values[i], i);
 }

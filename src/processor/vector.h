@@ -27,6 +27,12 @@ std::vector<std::string> statistics_of(const NormalizeOp& op);
 ///
 /// A range (high - low) of exactly 0 is replaced by eps; mean_std un-normalizes without eps, though it normalizes with
 /// it. Source: lerobot processor/normalize_processor.py _apply_transform.
+///
+///   openpi_mean_std   (x - mean) / (std + eps)              x * (std + eps) + mean                   mean, std
+///   openpi_quantiles  (x - q01) / (range + eps) * 2 - 1     (x + 1) / 2 * (range + eps) + q01        q01, q99
+///
+/// These two are computed in double precision and rounded once, since that reference's statistics are doubles.
+/// Source: openpi transforms.py Normalize, Unnormalize.
 class Normalizer {
  public:
   enum class Direction { normalize, unnormalize };
@@ -36,12 +42,13 @@ class Normalizer {
   static Result<Normalizer> create(const Bundle& bundle, const NormalizeOp& op, Direction direction, int width,
                                    const std::string& where);
   /// The same with the two statistics given, of equal length.
-  Normalizer(NormKind kind, Direction direction, float eps, std::vector<float> low, std::vector<float> high);
+  Normalizer(NormKind kind, Direction direction, double eps, std::vector<float> low, std::vector<float> high);
 
   /// In place; as many values as columns.
   void apply(std::span<float> values) const;
 
  private:
+  double openpi(double x, std::size_t column) const;
   float normalized(float x, std::size_t column) const;
   float unnormalized(float x, std::size_t column) const;
   Status check_divisors(const NormalizeOp& op) const;
@@ -51,6 +58,7 @@ class Normalizer {
   std::vector<float> low_;      // mean, min or lower quantile
   std::vector<float> factor_;   // std, or the range
   std::vector<float> divisor_;  // std + eps, or the range
+  std::vector<double> spread_;  // of the openpi kinds: std or range, and eps
 };
 
 }  // namespace vla

@@ -85,11 +85,11 @@ def test_without_seed_and_noise_the_seed_that_was_drawn_gives_the_chunk_again(ac
     assert np.array_equal(act(seed=first.seed), first)
 
 
-def test_a_chunk_says_what_its_numbers_are(act, policy):
+def test_a_chunk_says_what_its_numbers_are(act, policy, vla, golden):
     chunk, spec = act(capture_time_ns=17), policy.spec
     assert np.asarray(chunk).dtype == np.float32 and np.shape(chunk) == (spec.horizon, spec.d_action) == (5, 7)
     assert chunk.names == spec.action_names and chunk.bundle == spec.bundle and chunk.rate_hz == spec.rate_hz
-    assert list(chunk.timing) == ["decode", "preprocess", "tokenize", "plan", "prefix", "steps", "postprocess"]
+    assert ["load", *chunk.timing] == list(vla(*golden.arguments()).json()["timing_ms"])
     assert (chunk.notes, chunk.capture_time_ns, chunk.seed) == ((), 17, 3)
     chunk.actions[:] = 0  # the caller's own memory
     assert np.asarray(act()).any()

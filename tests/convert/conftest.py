@@ -23,7 +23,7 @@ class Converter:
         return tiny.save(self.folder, **how)
 
     def bundle(self, tiny=None, **options):
-        how = {"shards": options.pop("shards", 0)}
+        how = {"shards": options.pop("shards")} if "shards" in options else {}
         if tiny is not None:
             self.save(tiny, **how)
         self.summary = convert_checkpoint(str(self.folder), self.out, Options(**options), force=True)

@@ -9,7 +9,7 @@ from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
 
 from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
 from vla_cpp.convert import Code
-from vla_cpp.convert.tokenizer import byte_symbols
+from vla_cpp.convert.tokenizer_byte_level import byte_symbols
 
 STRINGS = [
     "pick up the top\n",
@@ -181,7 +181,7 @@ UNSUPPORTED, BAD = Code.UNSUPPORTED, Code.BAD_BUNDLE
 CASES = {
     "model.type: expected 'BPE', found 'WordPiece'": (model(type="WordPiece"), UNSUPPORTED),
     "model.dropout: expected None, found 0.1": (model(dropout=0.1), UNSUPPORTED),
-    "model.byte_fallback: expected False, found True": (model(byte_fallback=True), UNSUPPORTED),
+    "model.byte_fallback: expected False, found 1": (model(byte_fallback=1), UNSUPPORTED),
     "model.continuing_subword_prefix: expected None, found '##'": (model(continuing_subword_prefix="##"), UNSUPPORTED),
     "model.end_of_word_suffix: expected None, found '</w>'": (model(end_of_word_suffix="</w>"), UNSUPPORTED),
     "normalizer: expected none, found": (spec(normalizer={"type": "NFC"}), UNSUPPORTED),

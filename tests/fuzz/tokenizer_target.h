@@ -23,22 +23,42 @@ inline Tokenizer load_tokenizer(const std::string& name) {
   for (const auto& item : document.items()) {
     if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
     if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (item.value().is_array()) keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    if (!item.value().is_array()) continue;
+    if (item.key() == "tokenizer.prefix_ids") {
+      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
+    } else {
+      keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    }
   }
   auto tokenizer = Tokenizer::create(keys, kVocab);
   if (!tokenizer) std::abort();
   return std::move(*tokenizer);
 }
 
+/// Text is refused exactly when it is not UTF-8 or too long; every id is of the vocabulary.
+inline void check_ids(const Tokenizer& tokenizer, const std::string& text) {
+  const auto ids = tokenizer.encode(text);
+  const bool sound = unicode::valid_prefix(text) == text.size() && text.size() <= Tokenizer::kMaxText;
+  if (ids.ok() != sound) std::abort();
+  if (!ids.ok()) return;
+  for (const std::int32_t id : *ids)
+    if (id < 0 || id >= kVocab) std::abort();
+}
+
 /// The first byte says what the others are: text for one of the tokenizers, or the JSON of a pre-tokenizer, of added
-/// tokens or of a recipe. Text is refused exactly when it is not UTF-8 or too long; every id is of the vocabulary.
+/// tokens or of a recipe. From 8 on it is text for a tokenizer with byte fallback.
 inline void check_tokenizer(std::string_view input) {
   static const Tokenizer tokenizers[] = {load_tokenizer("smol"), load_tokenizer("awkward"), load_tokenizer("whole"),
                                          load_tokenizer("tangled")};
+  static const Tokenizer fallback[] = {load_tokenizer("gemma"), load_tokenizer("gemma_awkward"),
+                                       load_tokenizer("gemma_tangled")};
   if (input.empty()) return;
   const int kind = input[0] & 7;
+  const int n_fallback = input[0] >> 3 & 3;
   const std::string text(input.substr(1));
-  if (kind == 4 || kind == 7) {
+  if (n_fallback > 0) {
+    check_ids(fallback[n_fallback - 1], text);
+  } else if (kind == 4 || kind == 7) {
     const auto pretokenizer = Pretokenizer::parse(text);
     if (pretokenizer) pretokenizer->split("one 2 three", [](std::string_view) {});
   } else if (kind == 5) {
@@ -46,12 +66,7 @@ inline void check_tokenizer(std::string_view input) {
   } else if (kind == 6) {
     (void)parse_recipe(text).ok();
   } else {
-    const auto ids = tokenizers[kind].encode(text);
-    const bool sound = unicode::valid_prefix(text) == text.size() && text.size() <= Tokenizer::kMaxText;
-    if (ids.ok() != sound) std::abort();
-    if (ids.ok())
-      for (const std::int32_t id : *ids)
-        if (id < 0 || id >= kVocab) std::abort();
+    check_ids(tokenizers[kind], text);
   }
 }
 

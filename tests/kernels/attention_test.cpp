@@ -11,6 +11,7 @@
 
 using namespace vla;
 using kernels::AttentionJob;
+using kernels::AttentionKernel;
 using kernels::CpuKernels;
 using test::ramp;
 
@@ -72,15 +73,15 @@ struct Case {
 };
 
 /// What the kernel answers when `n_thread` threads share the work. Memory holds NaNs before it is written.
-std::vector<float> run(const CpuKernels& kernels, const Case& c, int n_thread) {
+std::vector<float> run(const AttentionKernel& kernel, const Case& c, int n_thread) {
   AttentionJob job = c.job();
   const float nan = std::numeric_limits<float>::quiet_NaN();
-  std::vector<float> packed(static_cast<std::size_t>(kernels.attention.packed_size(job)), nan);
+  std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job)), nan);
   std::vector<float> out(static_cast<std::size_t>(job.d_head * job.n_head * job.n_query * job.n_batch), nan);
   job.packed = packed.data();
   job.out = out.data();
-  for (int i = 0; i < n_thread; ++i) kernels.attention.pack(job, i, n_thread);
-  for (int i = 0; i < n_thread; ++i) kernels.attention.run(job, i, n_thread);
+  for (int i = 0; i < n_thread; ++i) kernel.pack(job, i, n_thread);
+  for (int i = 0; i < n_thread; ++i) kernel.run(job, i, n_thread);
   return out;
 }
 
@@ -145,7 +146,7 @@ void check_against_plain(const CpuKernels& kernels, const Case& c, int n_thread)
   CAPTURE(s.n_query);
   CAPTURE(s.n_key);
   CAPTURE(n_thread);
-  CHECK(worst_error(c, run(kernels, c, n_thread)) <= 4 * worst_error(c, run_plain(c)) + 5e-7);
+  CHECK(worst_error(c, run(kernels.attention, c, n_thread)) <= 4 * worst_error(c, run_plain(c)) + 5e-7);
 }
 
 void check_shapes(const CpuKernels& kernels) {
@@ -167,26 +168,46 @@ void check_masks(const CpuKernels& kernels) {
   }
 }
 
+/// Numbers as bf16 holds them, so that nothing but the weights is rounded on the way.
+std::vector<float> as_bf16(std::vector<float> values) {
+  for (float& value : values) value = std::bit_cast<float>(std::bit_cast<std::uint32_t>(value) & 0xffff0000U);
+  return values;
+}
+
+/// A weight rounded to bf16 is off by 2^-9 of itself, and weights of one row have the sum 1.
+void check_pairs(const AttentionKernel& kernel) {
+  for (const Shape& shape : kShapes) {
+    CAPTURE(shape.d_head);
+    CAPTURE(shape.n_key);
+    for (bool masked : {false, true}) {
+      Case c(shape, 2, shape.n_key % 3);
+      if (masked) c.set_mask([](std::int64_t i, std::int64_t j) { return j <= i || j % 7 == 0 ? 0.0f : kHidden; });
+      c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
+      CHECK(worst_error(c, run(kernel, c, 2)) <= 3 * std::ldexp(1.0, -9) + 1e-5);
+    }
+  }
+}
+
 void check_threads(const CpuKernels& kernels) {
   for (const Shape& shape : {kShapes[1], kShapes[6]}) {
     const Case c(shape, 1, 0);
-    for (int n_thread : {1, 2, 7, 64}) CHECK(worst_error(c, run(kernels, c, n_thread)) <= 2e-6);
+    for (int n_thread : {1, 2, 7, 64}) CHECK(worst_error(c, run(kernels.attention, c, n_thread)) <= 2e-6);
   }
 }
 
 void check_not_finite(const CpuKernels& kernels) {
   Case unseen(kShapes[2], 1, 0);
   unseen.set_mask([](std::int64_t i, std::int64_t) { return i == 0 ? kHidden : 0.0f; });
-  const std::vector<float> out = run(kernels, unseen, 1);
+  const std::vector<float> out = run(kernels.attention, unseen, 1);
   CHECK(std::isnan(out.front()));
   CHECK(std::isfinite(out.back()));
   for (float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
     Case broken(kShapes[2], 1, 0);
     broken.k[3] = bad;
-    CHECK_FALSE(std::isfinite(run(kernels, broken, 1).front()));
+    CHECK_FALSE(std::isfinite(run(kernels.attention, broken, 1).front()));
     broken = Case(kShapes[2], 1, 0);
     broken.v[0] = bad;
-    CHECK_FALSE(std::isfinite(run(kernels, broken, 1).front()));
+    CHECK_FALSE(std::isfinite(run(kernels.attention, broken, 1).front()));
   }
 }
 
@@ -197,3 +218,10 @@ VLA_KERNEL_TEST("attention of awkward shapes and strides errs at most four times
 VLA_KERNEL_TEST("attention is exact under causal, speckled, late and additive masks", check_masks)
 VLA_KERNEL_TEST("attention is exact however many threads share it", check_threads)
 VLA_KERNEL_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_not_finite)
+
+TEST_CASE("emulated amx: attention errs by the rounding of its weights to bf16 alone") {
+  check_pairs(kernels::emulated_amx_attention());
+}
+TEST_CASE("amx: attention errs by the rounding of its weights to bf16 alone" * doctest::skip(test::lacks(Isa::amx))) {
+  check_pairs(kernels::cpu_kernels(Isa::amx)->attention);
+}

@@ -15,6 +15,7 @@ using Json = nlohmann::json;
 namespace {
 
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
+const std::vector<float> kRawState = {1.5f, 6.0f};
 constexpr float kInf = std::numeric_limits<float>::infinity();
 
 void add_stats(EditableBundle& bundle, const std::string& name, const std::vector<float>& values) {
@@ -307,7 +308,7 @@ TEST_CASE("instructions that are empty, too long or not UTF-8 are refused") {
 
 TEST_CASE("a chunk becomes actions in world units") {
   const std::vector<float> chunk = {0.5f, 9.0f, kNaN, kNaN, -1.0f, 3.0f, kNaN, kNaN};  // padded columns do not matter
-  const auto actions = make().decode(chunk, 2, 4);
+  const auto actions = make().decode(chunk, 2, 4, kRawState);
   REQUIRE_MESSAGE(actions.ok(), actions.error().message());
   CHECK(*actions == std::vector<float>{11.0f, 20.0f, 8.0f, 20.0f});
 }
@@ -315,17 +316,17 @@ TEST_CASE("a chunk becomes actions in world units") {
 TEST_CASE("an action that is not finite is refused by row and name") {
   std::vector<float> chunk(8, 0.0f);
   chunk[5] = kInf;
-  CHECK(contains(refusal(make().decode(chunk, 2, 4), Code::bad_action),
+  CHECK(contains(refusal(make().decode(chunk, 2, 4, kRawState), Code::bad_action),
                  "actions[1][\"gripper\"]: expected a finite number"));
   chunk[5] = 0.0f;
   chunk[0] = 3e38f;  // finite, but not in world units
-  CHECK(contains(refusal(make().decode(chunk, 2, 4), Code::bad_action), "actions[0][\"shoulder\"]"));
+  CHECK(contains(refusal(make().decode(chunk, 2, 4, kRawState), Code::bad_action), "actions[0][\"shoulder\"]"));
 }
 
 TEST_CASE("a chunk of another shape is our own mistake") {
   const std::vector<float> chunk(8);
   for (const auto& [horizon, d_action] : {std::pair{2, 3}, {3, 4}, {0, 4}, {-2, -4}, {4, 2}})
-    refusal(make().decode(chunk, horizon, d_action), Code::internal);
+    refusal(make().decode(chunk, horizon, d_action, kRawState), Code::internal);
 }
 
 TEST_CASE("every key that the processor reads or that describes its features is required") {
@@ -382,4 +383,89 @@ TEST_CASE("a spread of zero without eps is refused where it would divide") {
   bundle.set("processor.recipe", recipe.dump());
   CHECK(contains(refusal(create(bundle), Code::bad_bundle),
                  "stats.observation.state: expected a spread to divide by in column 0"));
+}
+
+namespace {
+
+/// The sample with the state in the prompt, relative actions, and a flipped and stretched second number.
+EditableBundle robot() {
+  EditableBundle bundle = sample();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["text"] = Json::parse(R"([{"op": "strip"}, {"op": "template", "text": "{instruction} {state}"},
+                                   {"op": "tokenize", "max_tokens": 32, "truncate": "right"}])");
+  bundle.set("observation.max_text_tokens", std::int64_t{32});
+  recipe["state"] = Json::parse(R"([{"op": "affine", "columns": [1], "scale": -2.0, "shift": 1.0},
+    {"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 0.5},
+    {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}])");
+  recipe["action"].push_back(Json::parse(R"({"op": "add_state", "columns": [1]})"));
+  recipe["action"].push_back(Json::parse(R"({"op": "affine", "columns": [0, 1], "scale": 2.0, "shift": 0.0})"));
+  bundle.set("processor.recipe", recipe.dump());
+  bundle.set("policy.d_state", std::int64_t{0});
+  return bundle;
+}
+
+std::string refused_robot(const char* pointer, const Json& value) {
+  EditableBundle bundle = robot();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe[Json::json_pointer(pointer)] = value;
+  bundle.set("processor.recipe", recipe.dump());
+  return refusal(create(bundle), Code::bad_bundle);
+}
+
+}  // namespace
+
+TEST_CASE("a state in words goes into the prompt and the network sees no other") {
+  Observation seen = observation();
+  seen.text = " go ";
+  seen.states["state"] = {1.0f, 0.0f};  // normalized: 0 and (1 - 2) / 2
+  const auto inputs = make(robot()).encode(seen);
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->state.empty());
+  CHECK(inputs->state_words == std::vector<int>{128, 64});
+  CHECK(inputs->raw_state == std::vector<float>{1.0f, 1.0f});
+  CHECK(inputs->tokens == *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode("go 128 64"));
+  Inputs empty;
+  refusal(make(robot()).encode_text(seen, empty), Code::internal);
+}
+
+TEST_CASE("relative actions are added to the state of their observation, in the robot's conventions") {
+  const std::vector<float> chunk = {1.0f, 5.0f, 0.0f, 0.0f};
+  const auto actions = make(robot()).decode(chunk, 1, 4, std::vector<float>{3.0f, 4.0f});
+  REQUIRE(actions.ok());
+  CHECK(*actions == std::vector<float>{2 * 12.0f, 2 * (20.0f + 4.0f)});
+  refusal(make(robot()).decode(chunk, 1, 4, std::vector<float>{3.0f}), Code::internal);
+}
+
+TEST_CASE("columns beyond the state or the action are refused") {
+  CHECK(contains(refused_robot("/state/0/columns", Json{2}), "processor.recipe.state[0].columns"));
+  CHECK(contains(refused_robot("/action/2/columns", Json{2}), "processor.recipe.action[2].columns"));
+  CHECK(contains(refused_robot("/action/3/columns", Json{2}), "processor.recipe.action[3].columns"));
+}
+
+TEST_CASE("a state that the network does not see leaves nothing for policy.d_state") {
+  EditableBundle bundle = robot();
+  bundle.set("policy.d_state", std::int64_t{2});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "policy.d_state"));
+}
+
+TEST_CASE("a text that is cut at its start keeps what stands in front of every text") {
+  EditableBundle bundle = sample();
+  const Keys gemma = tokenizer_keys("gemma");
+  for (const auto& [key, value] : gemma.all()) bundle.set(key, value);
+  for (const char* key : {"tokenizer.pre", "tokenizer.ignore_merges"}) bundle.remove_key(key);
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  Observation seen = observation();
+  seen.text = "pick up the red cube and place it in the bowl";
+  recipe["text"][1]["max_tokens"] = 4;
+  for (const char* side : {"right", "left"}) {
+    recipe["text"][1]["truncate"] = side;
+    bundle.set("processor.recipe", recipe.dump());
+    const auto inputs = make(bundle).encode(seen);
+    REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+    CHECK(inputs->tokens.size() == 4);
+    CHECK(inputs->tokens.front() == 2);
+    CHECK(inputs->notes.size() == 1);
+    const auto all = *Tokenizer::create(tokenizer_keys("gemma"), 4096)->encode(seen.text + "\n");
+    CHECK(inputs->tokens[1] == (std::string(side) == "right" ? all[1] : all[all.size() - 3]));
+  }
 }

@@ -40,15 +40,15 @@ TEST_CASE("the recipe of the document is read op by op") {
   CHECK(recipe->letterbox.height == 384);
   CHECK(recipe->letterbox.fill == 0.5f);
   REQUIRE(recipe->image.size() == 1);
-  CHECK(recipe->image[0].scale == 2.0f);
-  CHECK(recipe->image[0].shift == -1.0f);
+  CHECK(std::get<AffineOp>(recipe->image[0]).scale == 2.0f);
+  CHECK(std::get<AffineOp>(recipe->image[0]).shift == -1.0f);
   REQUIRE(recipe->text.size() == 1);
-  CHECK(recipe->text[0].suffix == "\n");
+  CHECK(std::get<EnsureSuffixOp>(recipe->text[0]).suffix == "\n");
   CHECK(recipe->max_tokens == 48);
   const auto& normalize = std::get<NormalizeOp>(recipe->state.at(0));
   CHECK(normalize.kind == NormKind::mean_std);
   CHECK(normalize.stats == "stats.observation.state");
-  CHECK(normalize.eps == 1e-8f);
+  CHECK(normalize.eps == 1e-8);
   CHECK(normalize.feature.empty());
   CHECK(std::get<PadOp>(recipe->state.at(1)).size == 32);
   CHECK(std::get<TakeOp>(recipe->action.at(0)).size == 7);
@@ -105,8 +105,8 @@ TEST_CASE("values that the document does not name are refused") {
   CHECK(contains(refused_at("/image/0/op", "crop"), "processor.recipe.image[0].op"));
   CHECK(contains(refused_at("/image/0/filter", "bicubic"),
                  "processor.recipe.image[0].filter: expected \"bilinear\", found \"bicubic\""));
-  CHECK(contains(refused_at("/image/0/antialias", true), "processor.recipe.image[0].antialias"));
-  CHECK(contains(refused_at("/image/0/align", "center"), "processor.recipe.image[0].align"));
+  CHECK(contains(refused_at("/image/0/antialias", 1), "processor.recipe.image[0].antialias"));
+  CHECK(contains(refused_at("/image/0/align", "top"), "processor.recipe.image[0].align"));
   CHECK(contains(refused_at("/image/0/width", 0), "processor.recipe.image[0].width"));
   CHECK(contains(refused_at("/image/0/width", 512.0), "processor.recipe.image[0].width"));
   CHECK(contains(refused_at("/image/0/height", 1000000), "an integer from 1 to 8192"));
@@ -155,4 +155,102 @@ TEST_CASE("an identity needs no statistics") {
   const auto parsed = parse_recipe(recipe.dump());
   REQUIRE(parsed.ok());
   CHECK(std::get<NormalizeOp>(parsed->state.at(0)).kind == NormKind::identity);
+}
+
+namespace {
+
+/// Every op that the sample lacks, in an order that has a meaning.
+Json robot() {
+  return Json::parse(R"({
+    "image":  [{"op": "letterbox", "width": 224, "height": 224, "filter": "bilinear", "antialias": true,
+                "align": "center", "fill": 0.0},
+               {"op": "clip", "low": 0.0, "high": 1.0}],
+    "text":   [{"op": "strip"}, {"op": "replace", "from": "_", "to": " "},
+               {"op": "template", "text": "Task: {instruction}, State: {state};"},
+               {"op": "tokenize", "max_tokens": 200, "truncate": "right"}],
+    "state":  [{"op": "affine", "columns": [1, 2], "scale": -1.0, "shift": 0.25},
+               {"op": "horn_angle", "columns": [6], "scale": 2.0, "shift": 0.5, "arm_length": 0.036, "horn_radius": 0.022},
+               {"op": "normalize", "kind": "openpi_quantiles", "stats": "stats.observation.state", "eps": 1e-06},
+               {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}],
+    "action": [{"op": "take", "size": 7}, {"op": "unnormalize", "kind": "openpi_mean_std", "stats": "stats.action", "eps": 1e-06},
+               {"op": "add_state", "columns": [0, 1]}, {"op": "affine", "columns": [6], "scale": 0.5, "shift": 1.5}]})");
+}
+
+/// The refusal after one value of it is replaced.
+std::string refused_robot(const char* pointer, const Json& value) {
+  Json recipe = robot();
+  recipe[Json::json_pointer(pointer)] = value;
+  return refused(recipe);
+}
+
+}  // namespace
+
+TEST_CASE("ops of robots and of prompts with a state are read") {
+  const auto recipe = parse_recipe(robot().dump());
+  REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
+  CHECK(recipe->letterbox.align == Letterbox::Align::center);
+  CHECK(recipe->letterbox.antialias);
+  CHECK(std::get<ClipOp>(recipe->image.at(0)).high == 1.0f);
+  CHECK(std::holds_alternative<StripOp>(recipe->text.at(0)));
+  CHECK(std::get<ReplaceOp>(recipe->text.at(1)).from == "_");
+  CHECK(std::get<TemplateOp>(recipe->text.at(2)).text == "Task: {instruction}, State: {state};");
+  const auto& affine = std::get<ColumnAffineOp>(recipe->state.at(0));
+  CHECK(affine.columns == std::vector<int>{1, 2});
+  CHECK(affine.scale == -1.0);
+  CHECK(affine.shift == 0.25);
+  CHECK(std::get<HornAngleOp>(recipe->state.at(1)).arm_length == 0.036);
+  CHECK(std::get<NormalizeOp>(recipe->state.at(2)).kind == NormKind::openpi_quantiles);
+  CHECK(std::get<BinsOp>(recipe->state.at(3)).count == 256);
+  CHECK(std::get<AddStateOp>(recipe->action.at(2)).columns == std::vector<int>{0, 1});
+  CHECK(std::get<ColumnAffineOp>(recipe->action.at(3)).shift == 1.5);
+}
+
+TEST_CASE("every field of the ops of robots is required") {
+  int removed = 0;
+  const Json whole = robot();
+  for (const auto& list : whole.items())
+    for (std::size_t i = 0; i < list.value().size(); ++i)
+      for (const auto& field : list.value()[i].items()) {
+        Json recipe = whole;
+        recipe[list.key()][i].erase(field.key());
+        CHECK(contains(refused(recipe), list.key() + "[" + std::to_string(i) + "]." + field.key()));
+        ++removed;
+      }
+  CHECK(removed == 49);
+}
+
+TEST_CASE("values that have no meaning to a robot's op are refused") {
+  for (const Json& columns :
+       {Json(3), Json{1, 1}, Json{-1}, Json{0.5}, Json{"a"}, Json{65536}, Json{18446744073709551615u}})
+    CHECK(contains(refused_robot("/state/0/columns", columns), "processor.recipe.state[0].columns"));
+  CHECK(contains(refused_robot("/state/0/scale", "1"), "processor.recipe.state[0].scale"));
+  CHECK(contains(refused_robot("/state/1/horn_radius", 0.0), "a length above 0"));
+  CHECK(contains(refused_robot("/state/3/high", -1.0), "processor.recipe.state[3].high"));
+  CHECK(contains(refused_robot("/state/3/count", 0), "processor.recipe.state[3].count"));
+  CHECK(contains(refused_robot("/image/1/low", 2.0), "processor.recipe.image[1].high"));
+  CHECK(contains(refused_robot("/text/1/from", ""), "processor.recipe.text[1].from"));
+}
+
+TEST_CASE("a template has its places once and no other braces") {
+  for (const char* text : {"", "{state}", "{instruction}{instruction}", "{instruction} {state} {state}",
+                           "{instruction} {task}", "{instruction} }", "{{instruction}"})
+    CHECK(contains(refused_robot("/text/2/text", text), "processor.recipe.text[2].text"));
+}
+
+TEST_CASE("a state in words needs a place in the text, and the place needs the words") {
+  CHECK(contains(refused_robot("/text/2/text", "Task: {instruction}"), "a template with {state}"));
+  CHECK(contains(refused_robot("/state/3", {{"op", "drop"}}), "no {state}"));
+  CHECK(contains(refused_robot("/state/3", {{"op", "pad"}, {"size", 32}}), "no {state}"));
+}
+
+TEST_CASE("a robot's conventions come before the normalization, and nothing after the network's form") {
+  Json recipe = robot();
+  std::swap(recipe["state"][1], recipe["state"][2]);
+  CHECK(contains(refused(recipe), "processor.recipe.state[2].op: expected the robot's conventions before normalize"));
+  for (const char* last : {"bins", "drop"}) {
+    recipe = robot();
+    if (std::string(last) == "drop") recipe["state"][3] = {{"op", "drop"}};
+    recipe["state"].push_back({{"op", "drop"}});
+    CHECK(contains(refused(recipe), "nothing after pad, bins or drop"));
+  }
 }

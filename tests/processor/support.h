@@ -33,7 +33,12 @@ inline Keys tokenizer_keys(const std::string& name) {
   for (const auto& item : document.items()) {
     if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
     if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (item.value().is_array()) keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    if (!item.value().is_array()) continue;
+    if (item.key() == "tokenizer.prefix_ids") {
+      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
+    } else {
+      keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    }
   }
   return keys;
 }

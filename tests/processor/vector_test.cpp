@@ -14,13 +14,15 @@ NormKind kind_of(const std::string& name) {
   const std::map<std::string, NormKind> kinds = {{"mean_std", NormKind::mean_std},
                                                  {"min_max", NormKind::min_max},
                                                  {"quantiles", NormKind::quantiles},
-                                                 {"quantile10", NormKind::quantile10}};
+                                                 {"quantile10", NormKind::quantile10},
+                                                 {"openpi_mean_std", NormKind::openpi_mean_std},
+                                                 {"openpi_quantiles", NormKind::openpi_quantiles}};
   return kinds.at(name);
 }
 
 std::vector<float> floats(const nlohmann::json& list) { return list.get<std::vector<float>>(); }
 
-float mapped(NormKind kind, Direction direction, float eps, float low, float high, float x) {
+float mapped(NormKind kind, Direction direction, double eps, float low, float high, float x) {
   std::vector<float> values = {x};
   Normalizer(kind, direction, eps, {low}, {high}).apply(values);
   return values[0];
@@ -39,12 +41,12 @@ TEST_CASE("normalize and unnormalize equal the reference bit for bit in every ki
     CHECK(values == floats(test["y"]));
     ++compared;
   }
-  CHECK(compared == 8);
+  CHECK(compared == 12);
 }
 
 TEST_CASE("a zero standard deviation divides by eps, and gives back the mean") {
-  CHECK(mapped(NormKind::mean_std, Direction::normalize, 1e-8f, 2.0f, 0.0f, 2.5f) == 0.5f / 1e-8f);
-  CHECK(mapped(NormKind::mean_std, Direction::normalize, 1e-8f, 2.0f, 0.0f, 2.0f) == 0.0f);
+  CHECK(mapped(NormKind::mean_std, Direction::normalize, 1e-8, 2.0f, 0.0f, 2.5f) == 0.5f / 1e-8f);
+  CHECK(mapped(NormKind::mean_std, Direction::normalize, 1e-8, 2.0f, 0.0f, 2.0f) == 0.0f);
   CHECK(mapped(NormKind::mean_std, Direction::unnormalize, 1e-8f, 2.0f, 0.0f, 123.0f) == 2.0f);
 }
 
@@ -63,4 +65,11 @@ TEST_CASE("identity changes nothing") {
   std::vector<float> values = {1.0f, -2.0f};
   Normalizer(NormKind::identity, Direction::normalize, 0.0f, {}, {}).apply(values);
   CHECK(values == std::vector<float>{1.0f, -2.0f});
+}
+
+TEST_CASE("openpi's kinds add eps in both directions") {
+  CHECK(mapped(NormKind::openpi_mean_std, Direction::normalize, 0.5, 1.0f, 1.5f, 3.0f) == 1.0f);
+  CHECK(mapped(NormKind::openpi_mean_std, Direction::unnormalize, 0.5, 1.0f, 1.5f, 3.0f) == 7.0f);
+  CHECK(mapped(NormKind::openpi_quantiles, Direction::normalize, 0.5, 3.0f, 3.0f, 3.25f) == 0.0f);
+  CHECK(mapped(NormKind::openpi_quantiles, Direction::unnormalize, 0.5, 3.0f, 3.0f, 0.0f) == 3.25f);
 }

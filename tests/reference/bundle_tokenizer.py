@@ -4,23 +4,45 @@
 
 import json
 
+ORDER = ["tokenizer." + name for name in ("kind", "tokens", "merges", "pre", "added", "ignore_merges", "prefix_ids")]
+
 
 def keys_of(tokenizer) -> dict:
     spec = json.loads(tokenizer.to_str())
-    model, pre = spec["model"], spec["pre_tokenizer"]
-    assert spec["normalizer"] is None and model["type"] == "BPE"
-    steps = pre["pretokenizers"] if pre["type"] == "Sequence" else [pre]
+    model = spec["model"]
+    assert model["type"] == "BPE"
     tokens = {id: text for text, id in model["vocab"].items()}
     tokens.update({token["id"]: token["content"] for token in spec["added_tokens"]})
     assert sorted(tokens) == list(range(len(tokens)))
-    return {
-        "tokenizer.kind": "byte_level_bpe",
+    common = {
         "tokenizer.tokens": [tokens[i] for i in range(len(tokens))],
         "tokenizer.merges": [merge if isinstance(merge, str) else " ".join(merge) for merge in model["merges"]],
-        "tokenizer.pre": json.dumps([step_of(step) for step in steps]),
         "tokenizer.added": json.dumps(spec["added_tokens"]),
-        "tokenizer.ignore_merges": model["ignore_merges"],
     }
+    keys = {**common, **(byte_fallback(spec) if model["byte_fallback"] else byte_level(spec))}
+    return {key: keys[key] for key in ORDER if key in keys}
+
+
+def byte_level(spec: dict) -> dict:
+    pre = spec["pre_tokenizer"]
+    steps = pre["pretokenizers"] if pre["type"] == "Sequence" else [pre]
+    assert spec["normalizer"] is None
+    return {
+        "tokenizer.kind": "byte_level_bpe",
+        "tokenizer.pre": json.dumps([step_of(step) for step in steps]),
+        "tokenizer.ignore_merges": spec["model"]["ignore_merges"],
+    }
+
+
+def byte_fallback(spec: dict) -> dict:
+    """The blank that the pre-tokenizer splits at is gone by then: the normalizer has replaced it."""
+    assert spec["normalizer"] == {"type": "Replace", "pattern": {"String": " "}, "content": "\u2581"}
+    assert spec["pre_tokenizer"] is None or spec["pre_tokenizer"]["pattern"] == {"String": " "}
+    front = []
+    if spec["post_processor"] is not None:
+        single, special = spec["post_processor"]["single"], spec["post_processor"]["special_tokens"]
+        front = [id for part in single if "SpecialToken" in part for id in special[part["SpecialToken"]["id"]]["ids"]]
+    return {"tokenizer.kind": "byte_fallback_bpe", "tokenizer.prefix_ids": front}
 
 
 def step_of(step: dict) -> dict:

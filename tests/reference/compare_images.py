@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compares decode + letterbox + affine with Pillow + torch on photographs, at many sizes, aspects and encodings.
+"""Compares decode + letterbox + affine with the references on photographs, at many sizes, aspects and encodings.
 
     cmake --build --preset cpu --target reference_tool
     python tests/reference/compare_images.py build/cpu/bin/reference_tool PHOTO ... [--variants 10] [--seed 0]
 
 Run in an environment with Pillow, torch and lerobot; the scikit-image wheel has photographs under skimage/data.  Each
 photograph is compared as it is and in `--variants` random crops, resizings and encodings (JPEG quality and subsampling,
-progressive, EXIF orientation; PNG with alpha, grey, palette).  Exit code 1 when any number differs by more than 1e-5.
+progressive, EXIF orientation; PNG with alpha, grey, palette), against SmolVLA's letterbox, the centred one of pi0, and
+Pillow's own resampling, which openpi uses.  Exit code 1 when any number differs by more than 1e-5.
 """
 
 import argparse
@@ -18,16 +19,16 @@ import subprocess
 
 import numpy as np
 import torch
-from lerobot.policies.common.vla_utils import resize_with_pad
+from lerobot.policies.common.vla_utils import resize_with_pad, resize_with_pad_torch
 from PIL import Image, ImageOps
 
 TARGETS = [(512, 512), (224, 224), (320, 240), (96, 160), (640, 64)]
 
 
 class Runtime:
-    def __init__(self, tool: str, width: int, height: int):
+    def __init__(self, tool: str, width: int, height: int, how: str):
         self.shape = (3, height, width)
-        self.process = subprocess.Popen([tool, "image", str(width), str(height)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.process = subprocess.Popen([tool, "image", str(width), str(height), *([how] if how else [])], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
 
     def planes(self, file: bytes) -> np.ndarray:
         self.process.stdin.write(struct.pack("<I", len(file)) + file)
@@ -37,11 +38,22 @@ class Runtime:
         return values.reshape(self.shape) if count else values
 
 
-def reference(file: bytes, width: int, height: int) -> np.ndarray:
-    """The pixels as LeRobot sees them: upright RGB, channels first, divided by 255."""
-    pixels = np.array(ImageOps.exif_transpose(Image.open(io.BytesIO(file))).convert("RGB"))
-    image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous().float().div(255)
-    return (resize_with_pad(image, height, width, pad_value=0) * 2.0 - 1.0)[0].numpy()
+def reference(file: bytes, width: int, height: int, how: str) -> np.ndarray:
+    """The pixels as LeRobot sees them: upright RGB, channels first, divided by 255; openpi resizes before it divides."""
+    upright = ImageOps.exif_transpose(Image.open(io.BytesIO(file))).convert("RGB")
+    if how == "pillow":
+        ratio = max(upright.width / width, upright.height / height)
+        size = (int(upright.width / ratio), int(upright.height / ratio))
+        # Columns first and then rows, as Pillow did in one call before release 12 and openpi's pinned one does.
+        small = upright.resize((size[0], upright.height), Image.BILINEAR).resize(size, Image.BILINEAR)
+        upright = Image.new("RGB", (width, height), 0)
+        upright.paste(small, ((width - small.width) // 2, (height - small.height) // 2))
+    image = torch.from_numpy(np.array(upright)).permute(2, 0, 1)[None].contiguous().float().div(255)
+    if how == "center":
+        image = resize_with_pad_torch(image, height, width)
+    elif not how:
+        image = resize_with_pad(image, height, width, pad_value=0)
+    return (image * 2.0 - 1.0)[0].numpy()
 
 
 def exif(orientation: int) -> bytes:
@@ -80,7 +92,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     rng, compared, equal, worst = random.Random(args.seed), 0, 0, 0.0
-    runtimes = [(target, Runtime(args.tool, *target)) for target in TARGETS]
+    runtimes = [((*target, how), Runtime(args.tool, *target, how)) for target in TARGETS for how in ("", "center", "pillow")]
     for photo in args.photos:
         whole = open(photo, "rb").read()
         files = [("as it is", whole)] + [variant(Image.open(photo), rng) for _ in range(args.variants)]

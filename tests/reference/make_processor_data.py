@@ -7,8 +7,11 @@
 Run in an environment with Pillow, torch, lerobot and tokenizers.  What the files hold:
   tokenizer_*.json, tokenizer_cases.json   tokenizers of tokenizer_zoo.py as bundle keys; texts and ids
   images/*.png, *.jpg and *.npy            image files and Pillow's pixels of them; images without .npy are to be refused
-  letterbox.json, letterbox.npy            frame and target sizes; the planes that torch makes of `frame_of`, one after another
-  vectors.json                             lerobot's normalize and unnormalize
+  letterbox.json, letterbox.npy            frame and target sizes and the kind of letterbox; the planes that the references
+                                           make of `frame_of`, one after another
+  vectors.json                             lerobot's and openpi's normalize and unnormalize
+  prompts.json                             lerobot's prompts with the state in words
+  aloha.json                               openpi's conventions for the ALOHA robot, both ways
 """
 
 import io
@@ -183,18 +186,37 @@ def frame_of(width: int, height: int) -> np.ndarray:
 
 
 def write_letterbox() -> None:
-    from lerobot.policies.common.vla_utils import resize_with_pad
+    from lerobot.policies.common.vla_utils import resize_with_pad, resize_with_pad_torch
 
     cases, planes = [], []
-    for width, height, to_width, to_height in [
+    sizes = [
         (64, 48, 20, 20), (48, 64, 20, 20), (7, 5, 16, 16), (5, 7, 19, 11), (24, 16, 24, 16), (24, 15, 24, 16), (131, 17, 24, 8),
         (641, 480, 20, 16), (1921, 1079, 20, 12), (3001, 9, 340, 2), (4099, 4001, 16, 16), (1, 1, 9, 5), (90, 1, 90, 3), (33, 100, 14, 23),
-    ]:  # fmt: skip
-        image = torch.from_numpy(frame_of(width, height)).permute(2, 0, 1)[None].float().div(255)
-        planes.append((resize_with_pad(image, to_height, to_width, pad_value=0) * 2.0 - 1.0).flatten().numpy())
-        cases.append([width, height, to_width, to_height])
+    ]  # fmt: skip
+    for kind in ("bottom_right", "center", "pillow"):
+        for width, height, to_width, to_height in sizes if kind == "bottom_right" else sizes[:10]:
+            image = torch.from_numpy(frame_of(width, height)).permute(2, 0, 1)[None].float().div(255)
+            if kind == "bottom_right":
+                image = resize_with_pad(image, to_height, to_width, pad_value=0)
+            elif kind == "center":
+                image = resize_with_pad_torch(image, to_height, to_width)
+            else:
+                image = pillow_letterbox(frame_of(width, height), to_width, to_height)
+            planes.append((image * 2.0 - 1.0).flatten().numpy())
+            cases.append([width, height, to_width, to_height, kind])
     (DATA / "letterbox.json").write_text(json.dumps(cases) + "\n")
     np.save(DATA / "letterbox.npy", np.concatenate(planes))
+
+
+def pillow_letterbox(frame: np.ndarray, width: int, height: int) -> torch.Tensor:
+    """openpi image_tools.py; columns before rows, as Pillow did in one call before release 12."""
+    image = Image.fromarray(frame)
+    ratio = max(image.width / width, image.height / height)
+    size = (int(image.width / ratio), int(image.height / ratio))
+    small = image.resize((size[0], image.height), Image.BILINEAR).resize(size, Image.BILINEAR)
+    canvas = Image.new("RGB", (width, height), 0)
+    canvas.paste(small, ((width - small.width) // 2, (height - small.height) // 2))
+    return torch.from_numpy(np.array(canvas)).permute(2, 0, 1).float().div(255)
 
 
 def short_json(value) -> str:
@@ -204,6 +226,48 @@ def short_json(value) -> str:
     if isinstance(value, list):
         return "[" + ",".join(short_json(item) for item in value) + "]"
     return format(value, ".9g") if isinstance(value, float) else json.dumps(value)
+
+
+def openpi_normalize(kind: str, inverse: bool, low, high, x):
+    """openpi transforms.py (Normalize, Unnormalize), whose epsilon is a literal."""
+    spread = (high if kind == "openpi_mean_std" else high - low) + 1e-6
+    if kind == "openpi_mean_std":
+        return x * spread + low if inverse else (x - low) / spread
+    return (x + 1.0) / 2.0 * spread + low if inverse else (x - low) / spread * 2.0 - 1.0
+
+
+def write_prompts() -> None:
+    """States at and around the edges of the bins, and texts with every kind of white space."""
+    from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
+
+    edges = (-1 + np.arange(0, 257, 5) / 128).astype(np.float32)
+    around = np.concatenate([np.nextafter(edges, np.float32(-9)), edges, np.nextafter(edges, np.float32(9))])
+    states = np.concatenate([around, [-1.5, -1.0, 1.0, 1.5, -0.0, 0.0, 1e-9, -1e-9, 0.9921874, 0.9921875, 3e38, -3e38]]).astype(np.float32)
+    rng, cases = np.random.default_rng(3), []
+    texts = ["put the cup", " \t put_the cup\n", "a\nb_c\n\n", "\x1c\x1f\x85\xa0\u2003\u3000go\u2028\u1680", "\u200bgo\ufeff", "{state} {instruction}", "   ", "_x_"]
+    for i, text in enumerate(texts):
+        state = states if i == 0 else rng.normal(size=i, scale=0.7).astype(np.float32)
+        transition = {"observation": {"observation.state": torch.from_numpy(state)[None]}, "complementary_data": {"task": [text]}}
+        prompt = Pi05PrepareStateTokenizerProcessorStep()(transition)["complementary_data"]["task"][0]
+        cases.append({"text": text, "state": [float(v) for v in state], "prompt": prompt})
+    (DATA / "prompts.json").write_text("[" + ",\n".join(short_json(case) for case in cases) + "]\n")
+
+
+def write_aloha() -> None:
+    """openpi policies/aloha_policy.py (_decode_state, _encode_actions) with its constants."""
+    flips = np.array([1, -1, -1, 1, 1, 1, 1, 1, -1, -1, 1, 1, 1, 1])
+    rng = np.random.default_rng(4)
+    cases = []
+    for opening in (0.0, 0.1, 0.37, 0.62, 1.0, 1.3):
+        x = rng.normal(size=14).astype(np.float32)
+        x[[6, 13]] = opening, 1 - opening
+        state, action = flips * x, flips * x
+        metres = state[[6, 13]] * (0.05800 - 0.01844) + 0.01844
+        radians = np.arcsin(np.clip((0.022**2 + metres**2 - 0.036**2) / (2 * 0.022 * metres), -1.0, 1.0))
+        state[[6, 13]] = (radians - 0.5476) / (1.6296 - 0.5476)
+        action[[6, 13]] = (action[[6, 13]] + 0.5476 + 0.6213) / (1.4910 + 0.6213)
+        cases.append({"x": [float(v) for v in x], "state": list(state), "action": list(action)})
+    (DATA / "aloha.json").write_text("[" + ",\n".join(short_json(case) for case in cases) + "]\n")
 
 
 def write_vectors() -> None:
@@ -229,6 +293,14 @@ def write_vectors() -> None:
             y = step._apply_transform(torch.from_numpy(x), "observation.state", FeatureType.STATE, inverse=inverse)
             columns = {"low": low, "high": high, "x": x, "y": y.numpy()}
             cases.append({"kind": mode.lower(), "inverse": inverse, "eps": 1e-8, **{k: [float(v) for v in column] for k, column in columns.items()}})
+    for kind in ("openpi_mean_std", "openpi_quantiles"):
+        low, x = rng.normal(size=(2, 12)).astype(np.float32)
+        high = (np.abs(low) if kind == "openpi_mean_std" else low + np.abs(rng.normal(size=12))).astype(np.float32)
+        high[3] = 0 if kind == "openpi_mean_std" else low[3]
+        for inverse in (False, True):
+            y = openpi_normalize(kind, inverse, *(column.astype(np.float64) for column in (low, high, x))).astype(np.float32)
+            columns = {"low": low, "high": high, "x": x, "y": y}
+            cases.append({"kind": kind, "inverse": inverse, "eps": 1e-6, **{k: [float(v) for v in column] for k, column in columns.items()}})
     (DATA / "vectors.json").write_text("[" + ",\n".join(short_json(case) for case in cases) + "]\n")
 
 
@@ -239,6 +311,8 @@ def main() -> None:
     write_images()
     write_letterbox()
     write_vectors()
+    write_prompts()
+    write_aloha()
     import lerobot
     import PIL
 

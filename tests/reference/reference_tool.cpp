@@ -3,7 +3,8 @@
 //
 // The processor's pure functions behind a pipe, for the comparison scripts of this folder.
 //   reference_tool tokenize KEYS.json      stdin: u32 length, text, ...         stdout: u32 count, i32 ids, ...
-//   reference_tool image WIDTH HEIGHT      stdin: u32 length, image file, ...   stdout: u32 count, f32 pixels, ...
+//   reference_tool image WIDTH HEIGHT [center | pillow]
+//                                          stdin: u32 length, image file, ...   stdout: u32 count, f32 pixels, ...
 // KEYS.json holds the tokenizer.* keys of a bundle as one JSON object. An input that is refused gives count 0 and a
 // line on stderr.
 #include <cstdio>
@@ -41,7 +42,12 @@ vla::Keys read_keys(const char* path) {
   for (const auto& item : object.items()) {
     if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
     if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (item.value().is_array()) keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    if (!item.value().is_array()) continue;
+    if (item.key() == "tokenizer.prefix_ids") {
+      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
+    } else {
+      keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    }
   }
   return keys;
 }
@@ -58,12 +64,17 @@ int tokenize(const char* path) {
   return 0;
 }
 
-int image(int width, int height) {
+int image(int width, int height, const std::string& how) {
+  vla::Letterbox box;
+  box.width = width;
+  box.height = height;
+  if (!how.empty()) box.align = vla::Letterbox::Align::center;
+  box.antialias = how == "pillow";
   std::string file;
   while (read_item(file)) {
     auto frame = vla::decode_image(std::as_bytes(std::span(file)), "stdin", {});
     std::vector<float> pixels(static_cast<std::size_t>(3) * width * height);
-    vla::Status status = frame ? vla::letterbox(*frame, {width, height, 0.0f}, pixels, "stdin") : frame.error();
+    vla::Status status = frame ? vla::letterbox(*frame, box, pixels, "stdin") : frame.error();
     if (!status) std::fprintf(stderr, "%s\n", status.error().message().c_str());
     if (!status) pixels.clear();
     vla::affine(pixels, 2.0f, -1.0f);
@@ -76,7 +87,8 @@ int image(int width, int height) {
 
 int main(int argc, char** argv) {
   if (argc == 3 && std::strcmp(argv[1], "tokenize") == 0) return tokenize(argv[2]);
-  if (argc == 4 && std::strcmp(argv[1], "image") == 0) return image(std::atoi(argv[2]), std::atoi(argv[3]));
-  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT\n", stderr);
+  if ((argc == 4 || argc == 5) && std::strcmp(argv[1], "image") == 0)
+    return image(std::atoi(argv[2]), std::atoi(argv[3]), argc == 5 ? argv[4] : "");
+  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow]\n", stderr);
   return 2;
 }

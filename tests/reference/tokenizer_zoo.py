@@ -133,7 +133,89 @@ def tangled() -> Tokenizer:
     return tokenizer
 
 
-ZOO = {"smol": smol, "awkward": awkward, "whole": whole, "tangled": tangled}
+BYTES = [f"<0x{byte:02X}>" for byte in range(256)]
+
+
+def byte_fallback(vocab: dict, merges: list, added: list[AddedToken], front: list[str]) -> Tokenizer:
+    """A tokenizer.json as the Gemma models publish it, around any vocabulary."""
+    import json
+
+    spec = json.loads(Tokenizer(models.BPE(vocab=vocab, merges=merges, unk_token="<unk>", fuse_unk=True, byte_fallback=True)).to_str())
+    spec["normalizer"] = {"type": "Replace", "pattern": {"String": " "}, "content": "\u2581"}
+    spec["pre_tokenizer"] = {"type": "Split", "pattern": {"String": " "}, "behavior": "MergedWithPrevious", "invert": False}
+    parts = [{"SpecialToken": {"id": token, "type_id": 0}} for token in front] + [{"Sequence": {"id": "A", "type_id": 0}}]
+    special = {token: {"id": token, "ids": [vocab[token]], "tokens": [token]} for token in front}
+    pair = [{"Sequence": {"id": "A", "type_id": 0}}, {"Sequence": {"id": "B", "type_id": 1}}]
+    spec["post_processor"] = {"type": "TemplateProcessing", "single": parts, "pair": pair, "special_tokens": special}
+    tokenizer = Tokenizer.from_str(json.dumps(spec))
+    for token in added:  # one by one, so that ids follow the order
+        (tokenizer.add_special_tokens if token.special else tokenizer.add_tokens)([token])
+    return tokenizer
+
+
+def sentence_pieces(vocab_size: int, sentences: list[str]) -> tuple[dict, list]:
+    """Vocabulary and merges of a trained BPE whose words carry their blank in front, with Gemma's special tokens and bytes."""
+    import json
+
+    from tokenizers import Regex, normalizers
+
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.normalizer = normalizers.Replace(" ", "\u2581")
+    tokenizer.pre_tokenizer = pre_tokenizers.Split(Regex("\\d|\n+|\u2581?[^\u2581\\d\n]+|\u2581+"), "isolated")
+    tokenizer.train_from_iterator(sentences, trainers.BpeTrainer(vocab_size=vocab_size, show_progress=False))
+    model = json.loads(tokenizer.to_str())["model"]
+    pieces = ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>", *BYTES, *sorted(model["vocab"], key=model["vocab"].get)]
+    return {piece: i for i, piece in enumerate(pieces)}, [tuple(merge) for merge in model["merges"]]
+
+
+def gemma() -> Tokenizer:
+    """The shape of Gemma's: runs of blanks and newlines are tokens by themselves, places and segments follow the vocabulary."""
+    vocab, merges = sentence_pieces(900, SENTENCES * 3)
+    for run in ["\n", "\n\n", "\n\n\n", "\u2581\u2581", "\u2581\u2581\u2581", "\t", "<table>"]:
+        vocab.setdefault(run, len(vocab))
+    runs = ["\n\n", "\n\n\n", "\u2581\u2581", "\u2581\u2581\u2581", "<table>"]
+    added = [AddedToken(text, normalized=False, special=True) for text in ["<pad>", "<eos>", "<bos>", "<unk>", "<mask>"]]
+    added += [AddedToken(text, normalized=False) for text in runs]
+    added += [AddedToken(f"<loc{i:04}>", normalized=False, special=True) for i in range(5)]
+    return byte_fallback(vocab, merges, added, ["<bos>"])
+
+
+def gemma_awkward() -> Tokenizer:
+    """Added tokens with every option beside a vocabulary of few characters, so that most text falls back to bytes."""
+    vocab, merges = sentence_pieces(60, ["pick up the red cube and place it in the bowl"] * 3)
+    options = [dict(lstrip=True), dict(rstrip=True), dict(lstrip=True, rstrip=True), dict(single_word=True), {}]
+    texts = ["<l>", "<r>", "<lr>", "cube", "cube bowl", "a b", "ab", "\u2581 \u2581", "  ", "\n<nl>", "größer", "🤖", "<<", "blue bowl", " the "]
+    added = [AddedToken("<unk>", normalized=False, special=True)]
+    added += [AddedToken(text, normalized=i % 2 == 0, **options[i % 5]) for i, text in enumerate(texts)]
+    return byte_fallback(vocab, merges, added, [])
+
+
+def gemma_tangled() -> Tokenizer:
+    """Random merges of characters, blanks and byte tokens: many ways to the same token at different ranks."""
+    rng = random.Random(8)
+    pool = [*"abc1\u2581\n", "<0xC3>", "<0xA9>", "<0xF0>", "<0x9F>"]
+    vocab = {piece: i for i, piece in enumerate(["<unk>", "<bos>", *BYTES, *pool[:6]])}
+    merges = []
+    while len(merges) < 600:
+        left, right = rng.choice(pool), rng.choice(pool)
+        if len(left + right) > 14 or (left, right) in merges:
+            continue
+        merges.append((left, right))
+        if left + right not in vocab:
+            vocab[left + right] = len(vocab)
+            pool.append(left + right)
+    return byte_fallback(vocab, merges, [AddedToken("<bos>", normalized=False, special=True)], ["<bos>", "<unk>"])
+
+
+ZOO = {
+    "smol": smol,
+    "awkward": awkward,
+    "whole": whole,
+    "tangled": tangled,
+    "gemma": gemma,
+    "gemma_awkward": gemma_awkward,
+    "gemma_tangled": gemma_tangled,
+}
 
 SPACES = [c for c in map(chr, range(0x110000)) if c.isspace()] + list("\u200b\u200c\u200d\u2060\ufeff\u180e\u00ad")
 DIGITS = [c for c in map(chr, range(0x110000)) if unicodedata.category(c) in ("Nd", "Nl", "No")]

@@ -25,7 +25,8 @@ struct GoldenCase {
 std::vector<std::string> golden_paths();
 
 /// A loaded engine; fails the test where loading fails.
-std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps = "");
+std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps = "",
+                                    const std::string& kernels = "");
 const Tap& find_tap(const std::vector<Tap>& taps, const std::string& path);
 
 }  // namespace vla::test

@@ -35,6 +35,7 @@ class Checkpoint:
     aliases: Dict[str, str]  # a tensor that was not stored because it shares memory -> the one that was
     old_statistics: Dict[str, Entry]
     processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
+    is_openpi: bool = False  # weights and assets/ as openpi writes them, without LeRobot's config
     notes: List[str] = field(default_factory=list)
 
     def path(self, name: str) -> str:
@@ -123,13 +124,17 @@ def open_checkpoint(source: str) -> Checkpoint:
     inner = os.path.join(folder, "pretrained_model")
     if not os.path.exists(os.path.join(folder, "config.json")) and os.path.isdir(inner):
         raise refuse(os.path.join(folder, "config.json"), "a policy", "none", "give " + inner, Code.IO)
-    config = read_json(os.path.join(folder, "config.json"))
+    # openpi's training writes no config.json, its converter from JAX one without a type.
+    has_assets = os.path.isdir(os.path.join(folder, "assets"))
+    has_config = os.path.exists(os.path.join(folder, "config.json"))
+    config = read_json(os.path.join(folder, "config.json")) if has_config or not has_assets else {}
     problems = Problems(name)
     tensors, aliases = _read_tensors(folder, problems)
     problems.raise_any()
     old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
     weights = {key: entry for key, entry in tensors.items() if key not in old}
-    return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder))
+    is_openpi = "type" not in config and (has_assets or "action_horizon" in config)
+    return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder), is_openpi)
 
 
 def find_backbone(checkpoint: Checkpoint, given: str, named) -> str:

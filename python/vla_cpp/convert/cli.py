@@ -76,6 +76,12 @@ def build_parser() -> argparse.ArgumentParser:
         default="",
         help="rule for the rows of the vision position table; see below",
     )
+    add(
+        "--variant",
+        metavar="NAME",
+        default="",
+        help="openpi's configuration that an openpi checkpoint was trained with, e.g. pi05_droid: its robot and recipe",
+    )
     add("--force", action="store_true", help="overwrite OUT.gguf")
     add("--quiet", action="store_true", help="no progress bar and no summary")
     add("--version", action="version", version="vla-convert " + __version__)
@@ -121,7 +127,7 @@ def report(summary: Summary) -> str:
 
 def main(argv=None) -> int:
     args = build_parser().parse_args(argv)
-    options = Options(args.backbone, args.dtype, args.dataset_info, args.identity_stats, args.position_precision)
+    options = Options(args.backbone, args.dtype, args.dataset_info, args.identity_stats, args.position_precision, args.variant)
     try:
         with _progress(args.quiet) as progress:
             summary = convert_checkpoint(args.checkpoint, args.out, options, args.force, progress)

@@ -9,6 +9,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Callable, Dict, List, Tuple
 
+import numpy as np
+
 from .. import __version__
 from . import archs
 from .archs import MATRIX, TABLE, Options, Plan, Weight
@@ -42,11 +44,12 @@ def convert_checkpoint(
     _check_out(out, force)
     checkpoint = open_checkpoint(source)
     problems = Problems(checkpoint.name)
-    plan = archs.load(checkpoint.config.get("type")).plan(checkpoint, options, problems)
+    arch = archs.arch_of(checkpoint.config, checkpoint.is_openpi, options.variant)
+    plan = archs.load(arch).plan(checkpoint, options, problems)
     dropped = _match(checkpoint, plan, problems)
     problems.raise_any()
     dtype = _choose_dtype(checkpoint, plan, options.dtype)
-    summary = Summary(out, checkpoint.config["type"], dtype, dropped=dropped, notes=checkpoint.notes)
+    summary = Summary(out, arch, dtype, dropped=dropped, notes=checkpoint.notes)
     _write(checkpoint, plan, summary, problems, progress)
     summary.n_bytes = os.path.getsize(out)
     return summary
@@ -132,7 +135,7 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
         with BundleWriter(summary.path, keys, tensors) as out:
             for weight, tensor in zip(plan.weights, tensors):
                 progress(weight.target, done, total)
-                _stream(checkpoint.tensors[weight.source], tensor, out, summary, problems)
+                _stream(checkpoint.tensors[weight.source], weight, tensor, out, summary, problems)
                 done += tensor.n_bytes
             for name, value in plan.statistics.items():
                 out.write(name, value)
@@ -143,13 +146,15 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
     summary.n_tensor = len(tensors)
 
 
-def _stream(entry: Entry, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems) -> None:
+def _stream(
+    entry: Entry, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems
+) -> None:
     finite, overflow = True, False
     for raw in entry.chunks():
         part = convert(raw, entry.dtype, tensor.dtype)
         finite, overflow = finite and part.finite, overflow or part.overflow
         summary.rounding = max(summary.rounding, (part.error, tensor.name))
-        out.write(tensor.name, part.data)
+        out.write(tensor.name, part.data + np.float32(1) if weight.plus_one else part.data)
     if not finite:
         problems.add(
             "tensor " + entry.name,

@@ -9,7 +9,7 @@ Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_proc
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Dict, List, Sequence
+from typing import Dict, List, Optional, Sequence
 
 import numpy as np
 
@@ -23,14 +23,15 @@ MAX_TOKENS = 1 << 16  # far above any instruction
 PRE, POST = "policy_preprocessor.json", "policy_postprocessor.json"
 
 # Fields of each step that this converter knows. A tuple of values: only these leave the numbers as the recipe has them.
+# An architecture adds the steps that are its own.
 ANY = object()
+Steps = Dict[str, Dict[str, Dict[str, object]]]
 DEVICE = {"device": ANY, "float_dtype": (None, "float32", "float")}
 NORMALIZER = {"eps": ANY, "features": ANY, "norm_map": ANY, "normalize_observation_keys": ANY}
-STEPS = {
+STEPS: Steps = {
     PRE: {
         "rename_observations_processor": {"rename_map": ANY},
         "to_batch_processor": {},
-        "smolvla_new_line_processor": {},
         "tokenizer_processor": {
             "max_length": ANY,
             "task_key": ("task",),
@@ -52,6 +53,9 @@ class Processors:
 
     rename: Dict[str, str] = field(default_factory=dict)  # accepted name -> the policy's name
     newline: bool = False
+    state_words: bool = False  # the state goes into the prompt as whole numbers
+    relative: bool = False  # actions are relative to the state
+    add_state: Sequence[int] = ()  # in these columns
     max_tokens: int = 0
     own_tokenizer: str = ""  # folder inside the checkpoint
     state: Normalization = field(default_factory=Normalization)
@@ -67,8 +71,9 @@ class _Reader:
     """Walks over both pipelines and collects what it cannot translate."""
 
     def __init__(
-        self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems
+        self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems, own: Steps
     ) -> None:
+        self.steps = {file: {**STEPS[file], **own.get(file, {})} for file in STEPS}
         self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
         self.context = Context(dims, identity, checkpoint.notes, problems)
         self.seen: List[str] = []
@@ -86,11 +91,11 @@ class _Reader:
 
     def step(self, file: str, where: str, step) -> None:
         name = step.get("registry_name", step.get("class")) if isinstance(step, dict) else None
-        known = STEPS[file].get(name) if isinstance(name, str) else None
+        known = self.steps[file].get(name) if isinstance(name, str) else None
         if known is None:
             self.problems.unsupported(
                 where,
-                "one of " + ", ".join(STEPS[file]),
+                "one of " + ", ".join(self.steps[file]),
                 str(name),
                 "this step changes what the policy sees or returns, and the recipe has no operation for it",
             )
@@ -128,6 +133,41 @@ class _Reader:
         if "tokenizer_processor" in self.seen:
             self.problems.unsupported(where, "the newline before tokenization", "the opposite order")
         self.result.newline = True
+
+    _pi0_new_line = _smolvla_new_line
+
+    def _pi05_prepare_state_tokenizer_step(self, where: str, config: dict, step: dict) -> None:
+        if "tokenizer_processor" in self.seen or "normalizer_processor" not in self.seen:
+            self.problems.unsupported(where, "normalization before it and tokenization after it", "another order")
+        self.result.state_words = True
+
+    def _relative_actions(self, where: str, config: dict, step: dict) -> None:
+        if "normalizer_processor" in self.seen:
+            self.problems.unsupported(where, "the state of the robot, before normalization", "the opposite order")
+        if config.get("enabled", False) is not True:
+            return
+        self.result.relative = True
+        exclude = member(config, "exclude_joints", list, where)
+        names = config.get("action_names")
+        width = self.context.dims[ACTION]
+        if names is not None and (not isinstance(names, list) or not all(isinstance(name, str) for name in names)):
+            self.problems.add(where + ": action_names", "names of the action's numbers", str(names)[:80])
+            return
+        self.result.add_state = relative_columns(width, names, [str(name).lower() for name in exclude if name])
+        if width > self.context.dims[STATE]:
+            self.problems.unsupported(
+                where, "a state with a number for each of the {} actions".format(width), str(self.context.dims[STATE])
+            )
+
+    def _absolute_actions(self, where: str, config: dict, step: dict) -> None:
+        if "unnormalizer_processor" not in self.seen:
+            self.problems.unsupported(where, "un-normalization before it", "the opposite order")
+        if bool(config.get("enabled", False)) != self.result.relative:
+            self.problems.add(
+                where + ": enabled",
+                "{} as the relative_actions_processor has it".format(self.result.relative),
+                str(config.get("enabled")),
+            )
 
     def _tokenizer(self, where: str, config: dict, step: dict) -> None:
         self.result.max_tokens = self.token_count(where + ": max_length", config.get("max_length", 512))
@@ -192,11 +232,19 @@ class _Reader:
                 self.problems.add("{}: steps".format(file), "a step " + name, "none")
 
 
+def relative_columns(width: int, names: Optional[Sequence[str]], exclude: Sequence[str]) -> List[int]:
+    """Columns whose name contains none of the excluded words; without names or words all of them
+    (relative_action_processor.py, _build_mask)."""
+    known = [name.lower() for name in (names or [])[:width]] if exclude else []
+    return [i for i in range(width) if i >= len(known) or not any(word in known[i] for word in exclude)]
+
+
 def read_processors(
-    checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems
+    checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems, own: Steps
 ) -> Processors:
-    """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights."""
-    reader = _Reader(checkpoint, dims, identity, problems)
+    """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights. `own`: the
+    steps that this architecture has beside those of all policies."""
+    reader = _Reader(checkpoint, dims, identity, problems, own)
     for feature in identity:
         if feature not in dims:
             problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
@@ -229,6 +277,12 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
         found = from_weights(checkpoint, feature, reader.problems)
         setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader.context))
     return result
+
+
+def letterbox(width: int, height: int, align: str, antialias: bool = False) -> dict:
+    """Into black: whatever the policy, the reference fills with 0 before it scales."""
+    size = {"width": width, "height": height}
+    return {"op": "letterbox", **size, "filter": "bilinear", "antialias": antialias, "align": align, "fill": 0.0}
 
 
 def text_ops(processors: Processors, truncate: str) -> List[dict]:

@@ -34,8 +34,9 @@ KeyValueProjection::KeyValueProjection(const Scope& s, int d_model, const Heads&
       v_(s / "attn_v", d_model, heads.d_key(), Bias::no) {}
 
 KeyValue KeyValueProjection::operator()(Graph& g, Tensor h, int first) const {
-  const Tensor key = rope(g, split_heads(g, k_(g, h), heads_.n_head_kv), heads_.rope_base, first);
-  return {key, split_heads(g, v_(g, h), heads_.n_head_kv)};
+  const auto kv = Linear::group(g, {&k_, &v_}, h);
+  const Tensor key = rope(g, split_heads(g, kv[0], heads_.n_head_kv), heads_.rope_base, first);
+  return {key, split_heads(g, kv[1], heads_.n_head_kv)};
 }
 
 DecoderRest::DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
@@ -47,8 +48,8 @@ DecoderRest::DecoderRest(const Scope& s, int d_model, int d_ff, const Heads& hea
 
 Tensor DecoderRest::operator()(Graph& g, Tensor x, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
   const Tensor query = rope(g, split_heads(g, q_(g, h), heads_.n_head), heads_.rope_base, first);
-  x = add(g, x, out_(g, attention(g, query, seen.key, seen.value, mask)));
-  return add(g, x, mlp_(g, ffn_norm_(g, x)));
+  x = out_.added_to(g, x, attention(g, query, seen.key, seen.value, mask));
+  return mlp_.added_to(g, x, ffn_norm_(g, x));
 }
 
 SmolLmBlock::SmolLmBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)

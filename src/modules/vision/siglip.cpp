@@ -23,10 +23,10 @@ SiglipBlock::SiglipBlock(const Scope& s, int d_model, int n_head, int d_ff, floa
 
 Tensor SiglipBlock::forward(Graph& g, Tensor x) const {
   const Tensor h = attn_norm_(g, x);
-  const Tensor q = split_heads(g, q_(g, h), n_head_), k = split_heads(g, k_(g, h), n_head_),
-               v = split_heads(g, v_(g, h), n_head_);
-  x = add(g, x, out_(g, attention(g, q, k, v, {})));
-  return add(g, x, mlp_(g, ffn_norm_(g, x)));
+  std::vector<Tensor> qkv = Linear::group(g, {&q_, &k_, &v_}, h);
+  for (Tensor& part : qkv) part = split_heads(g, part, n_head_);
+  x = out_.added_to(g, x, attention(g, qkv[0], qkv[1], qkv[2], {}));
+  return mlp_.added_to(g, x, ffn_norm_(g, x));
 }
 
 Siglip::Siglip(const Scope& s)

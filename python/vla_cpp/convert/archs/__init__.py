@@ -25,6 +25,7 @@ class Weight(NamedTuple):
     kind: str
     stored: Tuple[int, ...]
     shape: Tuple[int, ...]
+    plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
 
 
 class Dropped(NamedTuple):
@@ -44,6 +45,7 @@ class Options:
     dataset_info: str = ""
     identity_stats: Sequence[str] = ()
     position_precision: str = ""
+    variant: str = ""  # openpi's name of a training configuration, which its checkpoints do not state
 
 
 @dataclass
@@ -69,3 +71,28 @@ def load(name):
     if name not in names():
         raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), code=Code.UNSUPPORTED)
     return importlib.import_module("." + name, __name__)
+
+
+def arch_of(config: dict, is_openpi: bool, variant: str) -> str:
+    """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
+    was trained with. Errors: usage, unsupported."""
+    variants = {name: arch for arch in names() for name in getattr(load(arch), "VARIANTS", ())}
+    if not is_openpi:
+        if variant:
+            raise refuse(
+                "--variant " + variant,
+                "an openpi checkpoint",
+                "config.json of type {}, which states everything itself".format(config.get("type")),
+                "leave the option out",
+                Code.USAGE,
+            )
+        return config.get("type")
+    if variant in variants:
+        return variants[variant]
+    raise refuse(
+        "--variant",
+        "the name of the openpi configuration that the checkpoint was trained with: " + ", ".join(sorted(variants)),
+        variant or "none",
+        "an openpi checkpoint does not state its robot; other variants have recipes that are not known",
+        Code.UNSUPPORTED if variant else Code.USAGE,
+    )

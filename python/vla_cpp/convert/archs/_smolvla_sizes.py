@@ -17,6 +17,7 @@ from ..files import member, read_json
 from ..recipe import ACTION, STATE
 from ..section import ANY_INT, Section
 from . import Options
+from ._lerobot import check_keys, read_views, vector_dim
 from ._smolvla_expert import read_expert
 
 BACKBONE = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
@@ -43,23 +44,13 @@ POLICY = {
 }
 # Keys whose other values ask for something that the runtime does not do.
 FIXED = {
-    "n_obs_steps": (1, "the reference reads one observation"),
     "adapt_to_pi_aloha": (False, "joint flips and gripper maps of that robot are not in the recipe"),
     "use_delta_joint_actions_aloha": (False, "the reference refuses it too"),
     "use_cache": (True, "the reference cannot take steps without its cache"),
     "add_image_special_tokens": (False, "the prefix would hold further tokens"),
-    "use_peft": (False, "merge the adapter into the policy and save it again"),
 }
-# Keys that no number of an action chunk depends on.
-IGNORED = set(
-    """
-    type input_features output_features normalization_mapping rtc_config device use_amp push_to_hub repo_id
-    private tags license pretrained_path pretrained_revision pad_language_to freeze_vision_encoder
-    train_expert_only train_state_proj optimizer_lr optimizer_betas optimizer_eps optimizer_weight_decay
-    optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps scheduler_decay_lr compile_model
-    compile_mode
-    """.split()
-)
+# Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
+IGNORED = set("pad_language_to freeze_vision_encoder train_expert_only train_state_proj".split())
 # SmolVLMVisionConfig and LlamaConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
 VISION = {
     "hidden_size": 1152,
@@ -81,7 +72,7 @@ TEXT = {
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
 TEXT_NULLABLE = ("num_key_value_heads", "head_dim")
-MAX_LAYERS, MAX_DIM, MAX_EMPTY = 1024, 1 << 16, 64
+MAX_LAYERS = 1024
 
 
 @dataclass
@@ -134,7 +125,9 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     text = Section(where + ": text_config", member(config, "text_config", dict, where), TEXT, problems, TEXT_NULLABLE)
     backbone = Section(where, config, {"scale_factor": 2}, problems)
     backbone.fixed("model_type", "smolvlm", "--backbone needs the folder of the SmolVLM backbone")
-    _read_features(policy, checkpoint, sizes)
+    sizes.views, sizes.empty_cameras = read_views(policy, checkpoint)
+    sizes.state_dim = vector_dim(policy, "input_features", STATE, "STATE")
+    sizes.action_dim = vector_dim(policy, "output_features", ACTION, "ACTION")
     _read_policy(policy, sizes)
     _read_text(policy, text, sizes)
     _read_vision(vision, backbone, sizes)
@@ -145,57 +138,9 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
 
 
 def _check_policy(policy: Section) -> None:
-    for key in sorted(set(policy.values) - set(POLICY) - set(FIXED) - IGNORED):
-        policy.bad(
-            key,
-            "a key of SmolVLAConfig that this converter knows",
-            hint="it may change numbers; a newer vla-convert may know it",
-            unsupported=True,
-        )
-    for key, (value, hint) in FIXED.items():
-        policy.fixed(key, value, hint)
+    check_keys(policy, "SmolVLAConfig", set(POLICY) | IGNORED, FIXED)
     if not isinstance(policy.get("load_vlm_weights"), bool):
         policy.bad("load_vlm_weights", "true or false")
-    rtc = policy.get("rtc_config")
-    if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
-        policy.bad(
-            "rtc_config",
-            "none, or one that is not enabled",
-            hint="real-time chunking changes the velocity",
-            unsupported=True,
-        )
-
-
-def _read_features(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
-    inputs, outputs = (
-        policy.get(key) if isinstance(policy.get(key), dict) else {} for key in ("input_features", "output_features")
-    )
-    s.empty_cameras = policy.count("empty_cameras", 0, MAX_EMPTY)
-    views = []
-    for name, feature in inputs.items():
-        kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
-        if kind == "VISUAL":
-            views.append(name)
-            if not isinstance(shape, list) or len(shape) != 3 or shape[0] != 3:
-                policy.bad("input_features." + name, "a frame of shape [3, height, width]", str(shape))
-        elif name != STATE:
-            checkpoint.notes.append("input feature {} ({}): not read by this policy".format(name, kind))
-    # The reference adds these itself (SmolVLAConfig.validate_features), to whatever the file lists.
-    added = ["observation.images.empty_camera_{}".format(i) for i in range(s.empty_cameras)]
-    s.views = views + [name for name in added if name not in views]
-    if not views:
-        policy.bad("input_features", "a VISUAL feature or several", "none")
-    s.state_dim = _vector_dim(policy, "input_features", inputs, STATE, "STATE")
-    s.action_dim = _vector_dim(policy, "output_features", outputs, ACTION, "ACTION")
-
-
-def _vector_dim(policy: Section, key: str, features: dict, name: str, kind: str) -> int:
-    feature = features.get(name)
-    shape = feature.get("shape") if isinstance(feature, dict) and feature.get("type") == kind else None
-    if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int) and 0 < shape[0] <= MAX_DIM:
-        return shape[0]
-    policy.bad("{}.{}".format(key, name), "type {} and one dimension".format(kind), str(feature))
-    return 1
 
 
 def _read_policy(policy: Section, s: Sizes) -> None:

@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's SmolVLA on a CPU, from packages alone: import this before lerobot.
+"""LeRobot's policies on a CPU, from packages alone: import this before lerobot.
 
-    import reference
+    from vla_cpp.eval import lerobot_reference as reference
     policy, before, after = reference.load("checkpoint")
-    chunk = reference.predict(policy, before, after, frame, state, "open the faucet", noise)   # (16, 4)
+    chunk = reference.predict(policy, before, after, frames, state, "open the faucet", noise)   # (horizon, d_action)
 
-It changes nothing of what the policy computes.  It (1) lets Python 3.11 read the five files of lerobot 0.6 that use the
-generics syntax of 3.12, (2) lets the registry's torchvision, built for CUDA, load beside a torch without CUDA, and
-(3) keeps every lookup offline, so that a missing file fails at once instead of being sought on a hub.
+It changes nothing of what a policy computes. It (1) lets Python 3.11 read the five files of lerobot 0.6 that use the generics
+syntax of 3.12, (2) lets the registry's torchvision, built for CUDA, load beside a torch without CUDA, and (3) keeps every lookup
+offline, so that a missing file fails at once instead of being sought on a hub.
 """
+import hashlib
 import importlib.machinery
 import importlib.metadata
 import os
@@ -17,7 +18,7 @@ import re
 import sys
 import warnings
 from pathlib import Path
-from typing import Any, Tuple
+from typing import Any, Mapping, Tuple
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -25,9 +26,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads lose bad
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-
-CAMERA_KEY = "observation.images.corner4"
-
 
 def to_python_311(source: str) -> str:
     """Rewrites `type X = Y`, `class A[T](B):` and `def f[T](x):` to what Python 3.11 understands."""
@@ -98,14 +96,33 @@ def load(folder: "str | Path") -> Tuple[Any, Any, Any]:
     return policy, before, after
 
 
-def predict(policy: Any, before: Any, after: Any, frame: np.ndarray, state: np.ndarray, text: str, noise: np.ndarray) -> np.ndarray:
+def identity(folder: "str | Path") -> str:
+    """Which weights a checkpoint holds: the start of their SHA-256."""
+    digest = hashlib.sha256()
+    with open(Path(folder) / "model.safetensors", "rb") as file:
+        for block in iter(lambda: file.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()[:16]
+
+
+def predict(
+    policy: Any,
+    before: Any,
+    after: Any,
+    frames: Mapping[str, np.ndarray],
+    state: Mapping[str, np.ndarray],
+    text: str,
+    noise: np.ndarray,
+) -> np.ndarray:
     """One action chunk in the robot's units.
 
-    frame (height, width, 3) uint8, state (n_state,) float32, noise (horizon, max_action_dim) float32
-    -> (horizon, n_action) float32
+    frames: (height, width, 3) uint8 by view, named in full or by the part after observation.images; state: float32 vectors by
+    name; noise (horizon, max_action_dim) float32 -> (horizon, d_action) float32
     """
-    image = torch.from_numpy(frame).permute(2, 0, 1).float() / 255
-    batch = before({CAMERA_KEY: image, "observation.state": torch.from_numpy(state), "task": text})
+    batch = {name: torch.from_numpy(values) for name, values in state.items()}
+    for name, frame in frames.items():
+        key = name if name.startswith("observation.") else f"observation.images.{name}"
+        batch[key] = torch.from_numpy(np.ascontiguousarray(frame)).permute(2, 0, 1).float() / 255
     with torch.inference_mode():
-        chunk = policy.predict_action_chunk(dict(batch), noise=torch.from_numpy(noise)[None])
+        chunk = policy.predict_action_chunk(dict(before({**batch, "task": text})), noise=torch.from_numpy(noise)[None])
         return after(chunk)[0].float().numpy().copy()

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the checkpoints of all LeRobot policies have in common: keys of config.json, features, views, where the tokenizer is."""
+
+from __future__ import annotations
+
+import os
+from typing import Dict, List, Sequence, Set, Tuple
+
+from .. import recipe
+from ..bundle import Key
+from ..checkpoint import Checkpoint
+from ..errors import Problems
+from ..section import Section
+from . import Options
+
+EMPTY_CAMERA = "observation.images.empty_camera_"
+MAX_DIM, MAX_EMPTY = 1 << 16, 64
+# Keys that no number of an action chunk depends on.
+IGNORED = set(
+    """
+    type input_features output_features normalization_mapping rtc_config device use_amp push_to_hub repo_id
+    private tags license pretrained_path pretrained_revision optimizer_lr optimizer_betas optimizer_eps
+    optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps
+    scheduler_decay_lr compile_model compile_mode
+    """.split()
+)
+# Keys whose other values ask for something that the runtime does not do.
+FIXED = {
+    "n_obs_steps": (1, "the reference reads one observation"),
+    "use_peft": (False, "merge the adapter into the policy and save it again"),
+}
+
+
+def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tuple[object, str]]) -> None:
+    """Refuses every key of config.json that nobody has looked at, and values beyond the runtime. `name`: the reference's class."""
+    fixed = {**FIXED, **fixed}
+    for key in sorted(set(policy.values) - known - set(fixed) - IGNORED):
+        policy.bad(
+            key,
+            "a key of {} that this converter knows".format(name),
+            hint="it may change numbers; a newer vla-convert may know it",
+            unsupported=True,
+        )
+    for key, (value, hint) in fixed.items():
+        policy.fixed(key, value, hint)
+    rtc = policy.get("rtc_config")
+    if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
+        policy.bad(
+            "rtc_config",
+            "none, or one that is not enabled",
+            hint="real-time chunking changes the velocity",
+            unsupported=True,
+        )
+
+
+def _features(policy: Section, key: str) -> dict:
+    return policy.get(key) if isinstance(policy.get(key), dict) else {}
+
+
+def read_views(policy: Section, checkpoint: Checkpoint) -> Tuple[List[str], int]:
+    """Names of the cameras in their order, and how many of them `empty_cameras` adds."""
+    n_empty = policy.count("empty_cameras", 0, MAX_EMPTY)
+    views = []
+    for name, feature in _features(policy, "input_features").items():
+        kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
+        if kind == "VISUAL":
+            views.append(name)
+            if not isinstance(shape, list) or len(shape) != 3 or shape[0] != 3:
+                policy.bad("input_features." + name, "a frame of shape [3, height, width]", str(shape))
+        elif name != recipe.STATE:
+            checkpoint.notes.append("input feature {} ({}): not read by this policy".format(name, kind))
+    if not views:
+        policy.bad("input_features", "a VISUAL feature or several", "none")
+    # The reference's config class adds these itself (validate_features), to whatever the file lists.
+    added = [EMPTY_CAMERA + str(i) for i in range(n_empty)]
+    return views + [name for name in added if name not in views], n_empty
+
+
+def vector_dim(policy: Section, key: str, name: str, kind: str) -> int:
+    """Width of a state or action feature; `key`: input_features or output_features."""
+    feature = _features(policy, key).get(name)
+    shape = feature.get("shape") if isinstance(feature, dict) and feature.get("type") == kind else None
+    if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int) and 0 < shape[0] <= MAX_DIM:
+        return shape[0]
+    policy.bad("{}.{}".format(key, name), "type {} and one dimension".format(kind), str(feature))
+    return 1
+
+
+def view_keys(
+    checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems
+) -> List[Key]:
+    """One view must be present. The cameras that `empty_cameras` adds to the features stand in no data set, so nobody need declare
+    them absent."""
+    empty = [view for view in views if view.startswith(EMPTY_CAMERA)]
+    if empty:
+        checkpoint.notes.append("views that stay empty unless a frame is given: " + ", ".join(empty))
+    aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
+    return [
+        Key("observation.views", "string[]", views),
+        Key("observation.view_aliases", "string[]", aliases),
+        Key("observation.view_optional", "u32[]", [int(view in empty) for view in views]),
+        Key("observation.min_views", "u32", 1),
+    ]
+
+
+def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
+    """The tokenizer that the checkpoint brings: the one that its processor declares, or that lies there while --backbone names no
+    other; empty when there is none."""
+    own = processors.own_tokenizer or ("" if options.backbone else "tokenizer")
+    if not own or not (processors.own_tokenizer or os.path.exists(checkpoint.path(own))):
+        return ""
+    checkpoint.notes.append("tokenizer: from {}/ inside the checkpoint".format(own))
+    return checkpoint.path(own)

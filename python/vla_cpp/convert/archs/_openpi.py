@@ -1,0 +1,259 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""π0 and π0.5 as openpi's PyTorch code saves them: weights, and statistics under assets/. Everything else about a robot stands in
+openpi's own training configurations, so those with a published recipe stand here, by their names.
+
+Reference: openpi src/openpi/training/config.py, policies/{aloha,droid,libero}_policy.py, transforms.py, models/tokenizer.py.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Dict, List, NamedTuple, Sequence, Tuple
+
+import numpy as np
+
+from .. import recipe
+from ..bundle import Key
+from ..checkpoint import Checkpoint
+from ..errors import Problems
+from ..features import feature_keys
+from ..files import member, read_json
+from ..section import Section
+from . import Options
+from ._pi_lerobot import CLEAN, PROMPT, WORDS
+from ._pi_sizes import Sizes, check_image, read_towers
+from ._pi_source import Family, Source
+
+STATS_FILE = "norm_stats.json"
+SIDE = 224  # every configuration resizes to this (ModelTransformFactory)
+EPS = 1e-6
+NEWLINE = {"op": "ensure_suffix", "suffix": "\n"}
+# config.json, where openpi's converter from JAX wrote one. The defaults of models/pi0_config.py.
+CONFIG: Dict[str, object] = {
+    "action_dim": 32,
+    "paligemma_variant": "gemma_2b",
+    "action_expert_variant": "gemma_300m",
+    "precision": "bfloat16",
+}
+
+
+class Robot(NamedTuple):
+    """What a client sends and receives. Views: name, the name in openpi's observations, whether it may stay away unmentioned."""
+
+    views: Sequence[Tuple[str, str, bool]]
+    states: Sequence[Tuple[str, int]]
+    n_action: int
+    decode: Sequence[dict] = ()  # the state into the network's conventions, before normalization
+    encode: Sequence[dict] = ()  # actions back into the robot's, at the end
+
+
+# aloha_policy.py: four joints turn the other way, and grippers travel in metres outside and in turns of a servo inside.
+FLIP = {"op": "affine", "columns": [1, 2, 8, 9], "scale": -1.0, "shift": 0.0}
+GRIPPERS = [6, 13]
+ALOHA_VIEWS = (("cam_high", "", False), ("cam_left_wrist", "", True), ("cam_right_wrist", "", True))
+ALOHA = Robot(
+    views=ALOHA_VIEWS,
+    states=(("state", 14),),
+    n_action=14,
+    decode=(
+        FLIP,
+        {
+            "op": "horn_angle",
+            "columns": GRIPPERS,
+            "scale": 0.05800 - 0.01844,
+            "shift": 0.01844,
+            "arm_length": 0.036,
+            "horn_radius": 0.022,
+        },
+        {"op": "affine", "columns": GRIPPERS, "scale": 1 / (1.6296 - 0.5476), "shift": -0.5476 / (1.6296 - 0.5476)},
+    ),
+    encode=(
+        FLIP,
+        {
+            "op": "affine",
+            "columns": GRIPPERS,
+            "scale": 1 / (1.4910 + 0.6213),
+            "shift": (0.5476 + 0.6213) / (1.4910 + 0.6213),
+        },
+    ),
+)
+DROID = Robot(
+    views=(
+        ("exterior_image_1_left", "observation/exterior_image_1_left", False),
+        ("wrist_image_left", "observation/wrist_image_left", False),
+    ),
+    states=(("joint_position", 7), ("gripper_position", 1)),
+    n_action=8,
+)
+LIBERO = Robot(
+    views=(("image", "observation/image", False), ("wrist_image", "observation/wrist_image", False)),
+    states=(("state", 8),),
+    n_action=7,
+)
+# Joints that actions are relative to; grippers are absolute (make_bool_mask).
+ALOHA_JOINTS = [*range(6), *range(7, 13)]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One TrainConfig, as far as inference depends on it."""
+
+    arch: str
+    robot: Robot
+    asset: str
+    horizon: int = 50
+    relative: Sequence[int] = ()
+    state_words: bool = True  # of pi05: discrete_state_input
+
+
+LIBERO_ASSET = "physical-intelligence/libero"
+VARIANTS = {
+    "pi0_aloha": Variant("pi0", ALOHA, "trossen", relative=ALOHA_JOINTS),
+    "pi0_aloha_towel": Variant("pi0", ALOHA, "trossen", relative=ALOHA_JOINTS),
+    "pi0_aloha_tupperware": Variant("pi0", ALOHA, "trossen", relative=ALOHA_JOINTS),
+    "pi0_aloha_pen_uncap": Variant("pi0", ALOHA, "trossen", relative=ALOHA_JOINTS),
+    "pi0_aloha_sim": Variant("pi0", ALOHA, "lerobot/aloha_sim_transfer_cube_human"),
+    "pi0_droid": Variant("pi0", DROID, "droid", horizon=10),
+    "pi0_libero": Variant("pi0", LIBERO, LIBERO_ASSET, relative=range(6)),
+    "pi05_aloha": Variant("pi05", ALOHA, "trossen", relative=ALOHA_JOINTS),
+    "pi05_aloha_pen_uncap": Variant("pi05", ALOHA, "trossen", relative=ALOHA_JOINTS),
+    "pi05_droid": Variant("pi05", DROID, "droid", horizon=15),
+    "pi05_droid_finetune": Variant("pi05", DROID, "droid", horizon=16),
+    "pi05_full_droid_finetune": Variant("pi05", DROID, "droid", horizon=16, relative=range(7)),
+    "pi05_libero": Variant("pi05", LIBERO, LIBERO_ASSET, horizon=10, state_words=False),
+}
+
+
+def variants_of(arch: str) -> List[str]:
+    return [name for name, variant in VARIANTS.items() if variant.arch == arch]
+
+
+def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
+    variant = VARIANTS[options.variant]
+    robot = variant.robot
+    policy = Section("config.json", checkpoint.config, dict(CONFIG, action_horizon=variant.horizon), problems)
+    for key in sorted(set(policy.values) - set(policy.defaults)):
+        policy.bad(key, "a key that openpi writes", unsupported=True)
+    sizes = _sizes(family, policy, checkpoint, variant, problems)
+    statistics = _statistics(family, checkpoint, variant, options.identity_stats, problems)
+    problems.raise_any()
+    kind = "openpi_mean_std" if family.state_token else "openpi_quantiles"
+    state_names = ["observation." + name for name, _ in robot.states]
+    return Source(
+        sizes=sizes,
+        processors=recipe.Processors(),
+        image=[recipe.letterbox(sizes.image_size, sizes.image_size, "center", antialias=True), {"op": "affine", "scale": 2.0, "shift": -1.0}],
+        text=[*CLEAN, PROMPT] if _has_words(family, variant) else [*CLEAN, NEWLINE],
+        state=[*robot.decode, *(_normalize("normalize", kind, name, state_names) for name in state_names)]
+        + [_state_end(family, variant, sizes)],
+        action=[
+            {"op": "take", "size": robot.n_action},
+            _normalize("unnormalize", kind, recipe.ACTION, []),
+            *([{"op": "add_state", "columns": list(variant.relative)}] if variant.relative else []),
+            *robot.encode,
+        ],
+        features=_features(robot, state_names, sizes, checkpoint, options, problems),
+        statistics=statistics,
+        max_tokens=family.max_tokens,
+    )
+
+
+def _has_words(family: Family, variant: Variant) -> bool:
+    return not family.state_token and variant.state_words
+
+
+def _state_end(family: Family, variant: Variant, s: Sizes) -> dict:
+    if family.state_token:
+        return {"op": "pad", "size": s.d_state}
+    return WORDS if variant.state_words else {"op": "drop"}
+
+
+def _normalize(op: str, kind: str, feature: str, features: Sequence[str]) -> dict:
+    one_of_several = {"feature": feature} if len(features) > 1 else {}
+    return {"op": op, "kind": kind, "stats": "stats." + feature, "eps": EPS, **one_of_several}
+
+
+def _sizes(family: Family, policy: Section, checkpoint: Checkpoint, variant: Variant, problems: Problems) -> Sizes:
+    s = read_towers(policy, checkpoint, problems)
+    check_image(policy, "image size", s, [s.image_size or SIDE] * 2)
+    s.state_dim, s.action_dim = sum(width for _, width in variant.robot.states), variant.robot.n_action
+    s.d_action = policy.count("action_dim")
+    s.d_state = s.d_action if family.state_token else 0
+    if max(s.state_dim, s.action_dim) > s.d_action:
+        policy.bad("action_dim", "at least the robot's {} numbers".format(max(s.state_dim, s.action_dim)))
+    s.horizon, s.n_step = policy.count("action_horizon"), 10
+    s.min_period, s.max_period = 4e-3, 4.0
+    if policy.get("precision") not in ("bfloat16", "float32", "float16"):
+        policy.bad("precision", "bfloat16, float32 or float16", unsupported=True)
+    return s
+
+
+def _statistics(
+    family: Family, checkpoint: Checkpoint, variant: Variant, identity: Sequence[str], problems: Problems
+) -> Dict[str, np.ndarray]:
+    """By the name of the bundle's tensor, cut to the robot's widths (the files pad them). They are doubles in the file."""
+    for feature in identity:
+        problems.add("--identity-stats " + feature, "a checkpoint of LeRobot", "one of openpi, which always normalizes")
+    path = os.path.join(checkpoint.path("assets"), *variant.asset.split("/"), STATS_FILE)
+    where = os.path.relpath(path, checkpoint.folder)
+    if not os.path.exists(path):
+        problems.add(
+            where,
+            "the statistics of the embodiment that the variant names",
+            "none; there are some for " + (", ".join(_assets(checkpoint)) or "no embodiment"),
+            "choose the --variant of one of these, or copy the file from the training run's assets",
+        )
+        return {}
+    stats = member(read_json(path), "norm_stats", dict, where)
+    names = ("mean", "std") if family.state_token else ("q01", "q99")
+    result: Dict[str, np.ndarray] = {}
+    for key, parts in (("state", variant.robot.states), ("actions", [("action", variant.robot.n_action)])):
+        widths = [width for _, width in parts]
+        for name in names:
+            values = _values(stats, key, name, sum(widths), where, problems)
+            for (feature, _), part in zip(parts, np.split(values, np.cumsum(widths)[:-1])):
+                full = recipe.ACTION if feature == "action" else "observation." + feature
+                result["stats.{}.{}".format(full, name)] = part
+    return result
+
+
+def _assets(checkpoint: Checkpoint) -> List[str]:
+    root = checkpoint.path("assets")
+    found = [os.path.relpath(folder, root) for folder, _, files in os.walk(root) if STATS_FILE in files]
+    return sorted(name.replace(os.sep, "/") for name in found)
+
+
+def _values(stats: dict, key: str, name: str, width: int, where: str, problems: Problems) -> np.ndarray:
+    values = member(stats, key, dict, where + ": norm_stats").get(name)
+    place = "{}: norm_stats.{}.{}".format(where, key, name)
+    numbers = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
+    if not numbers or len(values) < width:
+        found = "none" if values is None else "{} numbers".format(len(values)) if numbers else repr(values)[:80]
+        problems.add(
+            place, "{} numbers".format(width), found, "compute the data set's statistics again with openpi's script"
+        )
+        return np.zeros(width, np.float32)
+    with np.errstate(over="ignore"):  # told below
+        chosen = np.asarray(values[:width], np.float32)
+    if not np.isfinite(chosen).all():
+        problems.add(place, "finite numbers", str(chosen[~np.isfinite(chosen)][0]))
+    elif name == "std" and (chosen < 0).any():
+        problems.add(place, "numbers >= 0", str(chosen.min()))
+    return chosen
+
+
+def _features(
+    robot: Robot, states: List[str], s: Sizes, checkpoint: Checkpoint, options: Options, problems: Problems
+) -> List[Key]:
+    dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
+    return [
+        Key("observation.views", "string[]", ["observation.images." + name for name, _, _ in robot.views]),
+        Key("observation.view_aliases", "string[]", [alias for _, alias, _ in robot.views]),
+        Key("observation.view_optional", "u32[]", [int(optional) for _, _, optional in robot.views]),
+        Key("observation.min_views", "u32", 1),
+        Key("observation.states", "string[]", states),
+        Key("observation.state_dims", "u32[]", [width for _, width in robot.states]),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+    ]

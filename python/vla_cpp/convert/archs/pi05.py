@@ -1,0 +1,28 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""π0.5: as π0, but the state stands in the prompt in words, and time enters the expert through its norms.
+
+Reference: lerobot src/lerobot/policies/pi05 and openpi src/openpi/models_pytorch; what π0 has too stands in _pi.py.
+"""
+
+from __future__ import annotations
+
+from ..checkpoint import Checkpoint
+from ..errors import Problems
+from . import Options, Plan
+from ._openpi import variants_of
+from ._pi import make_plan
+from ._pi_source import Family
+
+FAMILY = Family(
+    arch="pi05",
+    config_class="PI05Config",
+    max_tokens=200,
+    time_mlp="time_mlp",
+    other_time_mlp="action_time_mlp",
+)
+VARIANTS = variants_of("pi05")
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    return make_plan(FAMILY, checkpoint, options, problems)

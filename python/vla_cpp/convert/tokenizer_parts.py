@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a tokenizer.json that both kinds of tokenizers share: vocabulary, merges, added tokens, and the checks of them."""
+
+from __future__ import annotations
+
+import json
+from typing import Dict, Iterable, List, NamedTuple, Optional, Tuple
+
+from .errors import Problems, refuse
+from .files import member
+
+JSON_FILE, CONFIG_FILE = "tokenizer.json", "tokenizer_config.json"
+GENERIC = ("TokenizersBackend", "PreTrainedTokenizerFast", "PreTrainedTokenizer")
+FLAGS = ("single_word", "lstrip", "rstrip", "normalized", "special")
+NAMED = (
+    "bos_token",
+    "eos_token",
+    "unk_token",
+    "sep_token",
+    "pad_token",
+    "cls_token",
+    "mask_token",
+    "additional_special_tokens",
+    "extra_special_tokens",
+    "image_token",
+    "fake_image_token",
+    "global_image_token",
+    "end_of_utterance_token",
+    "video_token",
+)
+
+
+class Tokenizer(NamedTuple):
+    """What the files say, before any of it is judged."""
+
+    spec: dict  # tokenizer.json
+    config: dict  # tokenizer_config.json with the defaults of its class
+    model: dict  # the member of spec
+    added: List[dict]  # the bundle's form of added tokens
+    n_vocab: int
+
+
+def check_model(model: dict, allowed: Dict[str, tuple], what: str, problems: Problems) -> None:
+    for key, values in allowed.items():
+        found = model.get(key, "BPE" if key == "type" and "merges" in model else None)
+        if found not in values:
+            problems.unsupported(
+                "{}: model.{}".format(JSON_FILE, key), repr(values[0]), repr(found), "the runtime implements " + what
+            )
+
+
+def check_class(config: dict, names: Tuple[str, ...], problems: Problems) -> None:
+    name = config.get("tokenizer_class")
+    if name is not None and name not in names:
+        problems.unsupported(
+            CONFIG_FILE + ": tokenizer_class",
+            " or ".join(names),
+            str(name),
+            "other classes build a tokenizer of their own around the same file",
+        )
+    if config.get("split_special_tokens", False) not in (False, None):
+        problems.unsupported(CONFIG_FILE + ": split_special_tokens", "False", repr(config["split_special_tokens"]))
+
+
+def one_or_sequence(value, member_name: str) -> list:
+    """The steps of a normalizer or pre-tokenizer, which may stand alone."""
+    if isinstance(value, dict) and value.get("type") == "Sequence":
+        return member(value, member_name, list, JSON_FILE)
+    return [] if value is None else [value]
+
+
+def to_json(value) -> str:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+
+
+def added_tokens(spec: dict, problems: Problems) -> List[dict]:
+    added = []
+    for token in member(spec, "added_tokens", list, JSON_FILE):
+        content, number = (token.get("content"), token.get("id")) if isinstance(token, dict) else (None, None)
+        if not isinstance(content, str) or not content or type(number) is not int or number < 0:
+            problems.add(JSON_FILE + ": added_tokens", "tokens with id and content", to_json(token)[:80])
+            continue
+        added.append({"id": number, "content": content, **{flag: bool(token.get(flag, False)) for flag in FLAGS}})
+    return added
+
+
+def _content(token) -> Optional[str]:
+    return token.get("content") if isinstance(token, dict) else token
+
+
+def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> None:
+    """transformers adds every token that the config names and tokenizer.json lacks: text would then split differently."""
+    by_content = {token["content"]: token for token in added}
+    for key in NAMED:
+        value = config.get(key)
+        values = (
+            list(value.values())
+            if isinstance(value, dict) and "content" not in value
+            else value
+            if isinstance(value, list)
+            else [value]
+        )
+        for token in (_content(v) for v in values if v is not None):
+            if not isinstance(token, str) or token not in by_content:
+                problems.add(
+                    "{}: {}".format(CONFIG_FILE, key),
+                    "a token among the added tokens of " + JSON_FILE,
+                    repr(token),
+                    "load the tokenizer with transformers and save it again",
+                )
+    for number, token in member(config, "added_tokens_decoder", dict, CONFIG_FILE).items():
+        content = _content(token)
+        own = by_content.get(content) if isinstance(content, str) else None
+        stated = {flag: bool(token.get(flag, False)) for flag in FLAGS} if isinstance(token, dict) else {}
+        if own is None or str(own["id"]) != number or any(own[flag] != value for flag, value in stated.items()):
+            problems.add(
+                "{}: added_tokens_decoder.{}".format(CONFIG_FILE, number),
+                "the token as {} has it".format(JSON_FILE),
+                to_json(token)[:120],
+                "load the tokenizer with transformers and save it again",
+            )
+
+
+def vocabulary(tokenizer: Tokenizer, problems: Problems) -> List[str]:
+    """Token texts by id."""
+    vocab = tokenizer.model.get("vocab")
+    if (
+        not isinstance(vocab, dict)
+        or not vocab
+        or not all(isinstance(i, int) and not isinstance(i, bool) and i >= 0 for i in vocab.values())
+    ):
+        raise refuse(JSON_FILE + ": model.vocab", "tokens with ids", str(type(vocab).__name__))
+    by_id: Dict[int, str] = {}
+    for text, number in [*vocab.items(), *((token["content"], token["id"]) for token in tokenizer.added)]:
+        if by_id.setdefault(number, text) != text or vocab.get(text, number) != number:
+            problems.add(
+                "{}: id {}".format(JSON_FILE, number), "one token", "{!r} and {!r}".format(by_id[number], text)
+            )
+    check_ids(vocab, tokenizer.n_vocab, problems)
+    _check_utf8(by_id.values(), problems)
+    # A hole gets a text that no merge and no word can produce: symbols contain no blank.
+    last = max((number for number in by_id if number < tokenizer.n_vocab), default=-1)
+    return [by_id.get(number, "<no token {}>".format(number)) for number in range(last + 1)]
+
+
+def check_symbols(model: dict, symbols: List[str], problems: Problems) -> None:
+    """With a symbol for each of the 256 bytes in the vocabulary no text can reach the unknown token."""
+    vocab = member(model, "vocab", dict, JSON_FILE)
+    missing = [symbol for symbol in symbols if symbol not in vocab]
+    if missing:
+        problems.add(
+            JSON_FILE + ": model.vocab",
+            "all 256 byte symbols",
+            "{} missing, the first is {!r}".format(len(missing), missing[0]),
+        )
+
+
+def check_ids(ids: Dict[str, int], n_vocab: int, problems: Problems) -> None:
+    above = sorted((number, text) for text, number in ids.items() if number >= n_vocab)
+    if above:
+        problems.add(
+            JSON_FILE + ": ids",
+            "ids below vocab_size {}".format(n_vocab),
+            "{} above, the first is {} ({!r})".format(len(above), *above[0]),
+            "the tokenizer belongs to another backbone: check --backbone",
+        )
+
+
+def _check_utf8(texts: Iterable[str], problems: Problems) -> None:
+    for text in texts:
+        try:
+            text.encode("utf-8")
+        except UnicodeEncodeError:
+            problems.add(JSON_FILE + ": model.vocab", "UTF-8 text", ascii(text)[:80])
+
+
+def merges_of(merges, vocab: Dict[str, int], problems: Problems) -> List[str]:
+    """Merges in rank order as "left right", from either spelling of the file."""
+    result = []
+    for rank, merge in enumerate(merges if isinstance(merges, list) else []):
+        pair = merge.split(" ") if isinstance(merge, str) else merge
+        valid = (
+            isinstance(pair, list)
+            and len(pair) == 2
+            and all(isinstance(part, str) and part in vocab and " " not in part for part in pair)
+        )
+        if not valid or pair[0] + pair[1] not in vocab:
+            problems.add(
+                "{}: model.merges[{}]".format(JSON_FILE, rank), "two tokens whose union is a token", to_json(merge)[:80]
+            )
+            return result
+        result.append(" ".join(pair))
+    if not isinstance(merges, list):
+        problems.add(JSON_FILE + ": model.merges", "a list", type(merges).__name__)
+    return result

@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the subcommands of vla-eval share: policies from arguments, one run with its journal, films of its failures."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Callable, Dict, Iterator, List, Optional
+
+from . import report
+from .environment import Environment, Guard
+from .environments import find, make
+from .episode import Job, Outcome, run_episode
+from .journal import Journal
+from .policies import ServedPolicy, make_policy
+from .runner import Plan, RunFailed, run_jobs
+from .serving import Server
+
+TIMEOUT = 60.0  # seconds for an answer: a large policy on a small machine takes its time
+
+
+@dataclass
+class Driver:
+    """A policy under test: how a worker makes it, what people call it, and which weights it is."""
+
+    description: Dict[str, Any]
+    label: str
+    identity: str
+    spec: Any = None  # of a served one
+
+
+def no_fault() -> Optional[str]:
+    return None
+
+
+class Policies(contextlib.ExitStack):
+    """The policies of a run and the servers that were started for them. All end with the `with` block."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        super().__init__()
+        self._arguments, self._servers = arguments, []  # type: ignore[var-annotated]
+
+    def bundle(self, path: str) -> Driver:
+        """A server of our own."""
+        a = self._arguments
+        server = self.enter_context(Server(a.vla, Path(path), a.threads, a.kernels))
+        self._servers.append(server)
+        return self.served(server.address)
+
+    def served(self, address: str) -> Driver:
+        description = {"kind": "served", "address": address, "timeout": TIMEOUT}
+        policy = make_policy(description)
+        assert isinstance(policy, ServedPolicy)
+        spec = policy.spec
+        policy.close()
+        label = f"{spec.bundle.name} ({spec.precision}, {spec.kernels})"
+        return Driver(description, label, spec.bundle.checksum, spec)
+
+    def torch(self, checkpoint: str) -> Driver:
+        from . import lerobot_reference
+
+        identity = f"torch:{lerobot_reference.identity(checkpoint)}"
+        return Driver({"kind": "torch", "checkpoint": str(Path(checkpoint).resolve())}, "PyTorch float32", identity)
+
+    def named(self, text: str) -> Driver:
+        """bundle FILE, tcp://ADDRESS, torch:DIR, or random."""
+        if text == "random":
+            return Driver({"kind": "random", "horizon": 16, "d_action": 4}, "random actions", "random")
+        if text.startswith("torch:"):
+            return self.torch(text[len("torch:") :])
+        return self.served(text) if "://" in text else self.bundle(text)
+
+    def fault(self) -> Optional[str]:
+        """What became of a server of ours that is gone."""
+        return next(filter(None, (server.fault() for server in self._servers)), None)
+
+
+def options_of(kind: type, spec: Any) -> Dict[str, Any]:
+    """What the adapter wants to know of the policy."""
+    fit = getattr(kind, "fit", None)
+    return fit(spec) if fit and spec else {}
+
+
+def run(
+    name: str,
+    a: Driver,
+    jobs: List[Job],
+    folder: Path,
+    *,
+    b: Optional[Driver] = None,
+    replan_every: int = 0,
+    workers: int,
+    title: str,
+    fault: Callable[[], Optional[str]] = no_fault,
+    quiet: bool = False,
+) -> Dict[str, Any]:
+    """Runs the jobs that are not on disk yet and returns the summary of all. Errors: RunFailed, JournalMismatch."""
+    options = options_of(find(name), a.spec)
+    declaration = declaration_of(name, jobs[0].task, options)
+    replan_every = replan_every or declaration["replan_every"]
+    head = {
+        "environment": name, "a": a.label, "a_identity": a.identity, "b": b.label if b else "", "b_identity": b.identity if b else "",
+        "replan_every": replan_every, **{key: declaration[key] for key in ("limit", "rate_hz", "conventions")},
+    }  # fmt: skip
+    drivers = {"a": a.description, **({"b": b.description} if b else {})}
+    plan = Plan(name, options, drivers, "b" if b else None, replan_every)
+    journal = Journal(folder, head)
+    try:
+        with progress(title, len(jobs), journal.outcomes, quiet) as on_episode:
+            run_jobs(plan, jobs, journal, workers, on_episode, fault)
+    finally:
+        journal.close()
+    wanted = {job.key for job in jobs}
+    return report.summary([row for row in journal.outcomes if row.key in wanted], head)
+
+
+def declaration_of(name: str, task: str, options: Dict[str, Any]) -> Dict[str, Any]:
+    """The declaration, without starting a simulator in this process where the class already has it."""
+    kind = find(name)
+    declaration = getattr(kind, "declaration", None) or make(name, task, **options).declaration
+    return {key: getattr(declaration, key) for key in declaration.__dataclass_fields__}
+
+
+@contextlib.contextmanager
+def progress(title: str, total: int, before: List[Outcome], quiet: bool) -> Iterator[Callable[[Outcome], None]]:
+    """A bar on standard error, and lines where nobody watches."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    solved, count = sum(row.solved for row in before), len(before)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=quiet) as bar:
+        row = bar.add_task(title, total=total, completed=count)
+
+        def on_episode(outcome: Outcome) -> None:
+            nonlocal solved, count
+            solved, count = solved + outcome.solved, count + 1
+            bar.update(row, advance=1, description=f"{title}: {solved}/{count} solved, {outcome.engine_ms[-1]:.0f} ms a look")
+            if not console.is_terminal and not quiet and count % 10 == 0:
+                console.print(f"{title}: {count}/{total} episodes, {solved} solved")
+
+        yield on_episode
+
+
+def film_episodes(name: str, driver: Driver, rows: List[Outcome], folder: Path, names: List[str]) -> List[Path]:
+    """Runs these episodes again, which are the same again, and films them. Returns the files."""
+    from .film import Recorder, contact_sheet, film
+
+    paths: List[Path] = []
+    policy = make_policy(driver.description)
+    environments: Dict[str, Environment] = {}
+    for row in rows:
+        if row.task not in environments:
+            environments[row.task] = make(name, row.task, **options_of(find(name), driver.spec))
+        environment = environments[row.task]
+        view = next(iter(environment.declaration.views))
+        recorder = Recorder(view, lambda: environment.observe().frames[view])
+        job = Job(row.task, row.seed, "a", row.sentence if row.swapped else "")
+        outcome = run_episode(Guard(environment), policy, job, row.replan_every, watcher=recorder.watcher())
+        recorder.finish(outcome.steps)
+        stem = folder / f"{row.task.replace('/', '-')}-{row.seed}{'-swapped' if row.swapped else ''}"
+        title = f"{name} {row.task}, seed {row.seed}, {driver.label}"
+        paths.append(film(recorder, outcome, names, title, stem, environment.declaration.rate_hz))
+        contact_sheet(recorder, outcome, names, title, stem.with_suffix(".png"))
+    policy.close()
+    return paths
+
+
+def write_report(data: Dict[str, Any], folder: Path) -> None:
+    """summary.json, summary.md and, with matplotlib, summary.png."""
+    (folder / "summary.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    (folder / "summary.md").write_text(report.markdown(data), encoding="utf-8")
+    try:
+        from . import plots
+    except ImportError:
+        return
+    tables = {data["run"]["a"]: data["success"], **({data["run"]["b"]: data["success_b"]} if "success_b" in data else {})}
+    plots.success_bars(tables, f"{data['run']['environment']}: solved, with 95 % intervals", folder / "summary.png")
+    if "differences" in data:
+        plots.difference_curves(data["differences"], f"{data['run']['a']} against {data['run']['b']}", folder / "differences.png")
+
+
+__all__ = ["Policies", "RunFailed", "film_episodes", "run", "write_report"]

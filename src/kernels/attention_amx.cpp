@@ -1,0 +1,65 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#if defined(__x86_64__)
+#include "kernels/attention_tile.h"
+
+namespace vla::kernels {
+namespace {
+
+/// 32 rows by 32 columns: four tiles of sums, two of rows and two of the panel.
+struct AmxTile {
+  /// The shapes of the eight tiles, all 16 lines of 64 bytes, which the processor keeps for a thread until released.
+  struct Session {
+    VLA_INLINE Session() {
+      struct alignas(64) {
+        std::uint8_t palette = 1, start_row = 0, reserved[14] = {};
+        std::uint16_t bytes[16] = {};
+        std::uint8_t lines[16] = {};
+      } config;
+      for (int i = 0; i < 8; ++i) config.bytes[i] = 64, config.lines[i] = 16;
+      _tile_loadconfig(&config);
+    }
+    VLA_INLINE ~Session() { _tile_release(); }
+  };
+
+  template <int kStrideA, int kStrideC, bool kAdd>
+  static VLA_INLINE void multiply(const std::uint16_t* a, const std::uint16_t* panel, std::int64_t depth, float* c) {
+    constexpr auto kLineA = kStrideA * sizeof(std::uint16_t), kLineC = kStrideC * sizeof(float);
+    float* lower = c + 16 * kStrideC;
+    if constexpr (kAdd) {
+      _tile_loadd(0, c, kLineC);
+      _tile_loadd(1, c + 16, kLineC);
+      _tile_loadd(2, lower, kLineC);
+      _tile_loadd(3, lower + 16, kLineC);
+    } else {
+      _tile_zero(0);
+      _tile_zero(1);
+      _tile_zero(2);
+      _tile_zero(3);
+    }
+    for (std::int64_t k = 0; k < depth; k += 32) {
+      _tile_loadd(4, a + k, kLineA);
+      _tile_loadd(6, panel + k * 32, 64);
+      _tile_loadd(7, panel + k * 32 + 512, 64);
+      _tile_dpbf16ps(0, 4, 6);
+      _tile_dpbf16ps(1, 4, 7);
+      _tile_loadd(5, a + 16 * kStrideA + k, kLineA);
+      _tile_dpbf16ps(2, 5, 6);
+      _tile_dpbf16ps(3, 5, 7);
+    }
+    _tile_stored(0, c, kLineC);
+    _tile_stored(1, c + 16, kLineC);
+    _tile_stored(2, lower, kLineC);
+    _tile_stored(3, lower + 16, kLineC);
+  }
+};
+
+using Attention = AttentionTile<PairProducts<Avx512, AmxTile>>;
+
+}  // namespace
+
+extern const AttentionKernel kAttentionAmx;
+const AttentionKernel kAttentionAmx = {Attention::packed_size, Attention::pack, Attention::run};
+
+}  // namespace vla::kernels
+#endif

@@ -1,0 +1,37 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "bundle/bundle.h"
+
+namespace vla::kernels {
+
+enum class Activation { none, gelu_tanh, silu };
+
+/// One node of matrix products: what is multiplied, and where everything lies.
+struct LinearJob {
+  /// y = activation(W x + bias) + residual. y and residual are contiguous rows of d_out floats, one for each row of x;
+  /// bias and residual may be null.
+  struct Part {
+    DType type;               // of the stored weight
+    const std::byte* weight;  // as its kernel wants it
+    const float* bias;
+    const float* residual;
+    float* y;
+    std::int64_t d_out;
+  };
+  static constexpr int kMaxPart = 3;
+
+  const float* x;  // contiguous rows of d_in floats
+  std::int64_t n_row, d_in;
+  int n_part;
+  Part part[kMaxPart];
+  Activation activation;
+  /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
+  bool gated;
+};
+
+}  // namespace vla::kernels

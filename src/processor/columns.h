@@ -1,0 +1,28 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "processor/recipe.h"
+
+namespace vla {
+
+/// Conventions of robots and of prompts, on single columns of a state or of an action row. The reference computes them
+/// in double precision, and each result is rounded to float32 once. Columns must lie inside `values`.
+
+/// `x * scale + shift`, in place: a flipped joint is scale -1, a gripper's range is any two numbers.
+void map_columns(const ColumnAffineOp& op, std::span<float> values);
+
+/// The angle of a gripper's servo horn (radians) from the opening x (metres) that a value stands for, in place:
+/// asin((r^2 + x^2 - a^2) / (2 r x)) with the argument held in [-1, 1].
+/// Source: openpi policies/aloha_policy.py (_gripper_to_angular).
+void map_columns(const HornAngleOp& op, std::span<float> values);
+
+/// The whole number of each value: how many edges low + i * (high - low) / count, i in [0, count), are not above it,
+/// less 1. So it is -1 below `low` and count - 1 from the last edge on. Comparisons are exact. NaN must not come here.
+/// Source: numpy digitize and linspace, as in lerobot policies/pi05/processor_pi05.py.
+std::vector<int> bins(const BinsOp& op, std::span<const float> values);
+
+}  // namespace vla

@@ -1,0 +1,89 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/resample.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace vla {
+namespace {
+
+constexpr int kBits = 22;  // of a weight behind the point: 8 bits of a pixel and 2 of headroom make 32
+
+/// The source positions that one output position sums, and their weights.
+struct Window {
+  int first;
+  std::vector<int> weights;
+};
+
+std::vector<Window> make_windows(int n_in, int n_out) {
+  const double scale = static_cast<double>(n_in) / n_out;
+  const double support = std::max(scale, 1.0);  // half the width of the triangle
+  std::vector<Window> windows;
+  windows.reserve(static_cast<std::size_t>(n_out));
+  for (int i = 0; i < n_out; ++i) {
+    const double center = (i + 0.5) * scale;
+    const int first = std::max(static_cast<int>(center - support + 0.5), 0);
+    const int end = std::min(static_cast<int>(center + support + 0.5), n_in);
+    std::vector<double> exact;
+    double sum = 0.0;
+    for (int x = first; x < end; ++x) {
+      const double distance = std::abs((x - center + 0.5) * (1.0 / support));
+      exact.push_back(distance < 1.0 ? 1.0 - distance : 0.0);
+      sum += exact.back();
+    }
+    Window window{first, {}};
+    for (const double weight : exact)
+      window.weights.push_back(static_cast<int>(0.5 + (sum != 0.0 ? weight / sum : weight) * (1 << kBits)));
+    windows.push_back(std::move(window));
+  }
+  return windows;
+}
+
+std::uint8_t rounded(int sum) { return static_cast<std::uint8_t>(std::clamp(sum >> kBits, 0, 255)); }
+
+/// `n_line` lines of positions `step` bytes apart, lines `line_step` apart; three channels at each position.
+struct Layout {
+  int n_line;
+  std::size_t step, line_step;
+};
+
+void resample_axis(const std::uint8_t* in, Layout from, std::uint8_t* out, Layout to,
+                   const std::vector<Window>& windows) {
+  for (int line = 0; line < from.n_line; ++line) {
+    const std::uint8_t* source = in + static_cast<std::size_t>(line) * from.line_step;
+    std::uint8_t* target = out + static_cast<std::size_t>(line) * to.line_step;
+    for (const Window& window : windows) {
+      int sums[3] = {1 << (kBits - 1), 1 << (kBits - 1), 1 << (kBits - 1)};
+      const std::uint8_t* pixel = source + static_cast<std::size_t>(window.first) * from.step;
+      for (const int weight : window.weights) {
+        for (int c = 0; c < 3; ++c) sums[c] += pixel[c] * weight;
+        pixel += from.step;
+      }
+      for (int c = 0; c < 3; ++c) target[c] = rounded(sums[c]);
+      target += to.step;
+    }
+  }
+}
+
+}  // namespace
+
+std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                        int to_height) {
+  const auto bytes = [](int n_column, int n_row) {
+    return static_cast<std::size_t>(n_column) * static_cast<std::size_t>(n_row) * 3;
+  };
+  std::vector<std::uint8_t> wide(rgb.begin(), rgb.end());
+  if (to_width != width) {
+    wide.resize(bytes(to_width, height));
+    resample_axis(rgb.data(), {height, 3, bytes(width, 1)}, wide.data(), {height, 3, bytes(to_width, 1)},
+                  make_windows(width, to_width));
+  }
+  if (to_height == height) return wide;
+  std::vector<std::uint8_t> out(bytes(to_width, to_height));
+  resample_axis(wide.data(), {to_width, bytes(to_width, 1), 3}, out.data(), {to_width, bytes(to_width, 1), 3},
+                make_windows(height, to_height));
+  return out;
+}
+
+}  // namespace vla

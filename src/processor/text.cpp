@@ -1,0 +1,77 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/text.h"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "processor/unicode.h"
+
+namespace vla {
+namespace {
+
+constexpr std::string_view kInstruction = "{instruction}";
+constexpr std::string_view kState = "{state}";
+
+/// Python's str.isspace(): bidirectional class WS, B or S, or category Zs.
+bool is_python_space(std::uint32_t c) {
+  return (c >= 0x09 && c <= 0x0D) || (c >= 0x1C && c <= 0x20) || c == 0x85 || c == 0xA0 || c == 0x1680 ||
+         (c >= 0x2000 && c <= 0x200A) || c == 0x2028 || c == 0x2029 || c == 0x202F || c == 0x205F || c == 0x3000;
+}
+
+int occurrences(std::string_view text, std::string_view part) {
+  int count = 0;
+  for (std::size_t at = text.find(part); at != std::string_view::npos; at = text.find(part, at + part.size())) ++count;
+  return count;
+}
+
+}  // namespace
+
+std::string_view strip(std::string_view text) {
+  while (!text.empty()) {
+    const unicode::Char c = unicode::first(text);
+    if (!is_python_space(c.code_point)) break;
+    text.remove_prefix(c.size);
+  }
+  while (!text.empty()) {
+    const unicode::Char c = unicode::last(text);
+    if (!is_python_space(c.code_point)) break;
+    text.remove_suffix(c.size);
+  }
+  return text;
+}
+
+std::string replace_all(std::string_view text, std::string_view from, std::string_view to) {
+  std::string out;
+  std::size_t done = 0;
+  for (std::size_t at = text.find(from); at != std::string_view::npos; at = text.find(from, done)) {
+    out.append(text.substr(done, at - done)).append(to);
+    done = at + from.size();
+  }
+  return out.append(text.substr(done));
+}
+
+bool is_template(std::string_view text) {
+  const int n_state = occurrences(text, kState);
+  return occurrences(text, kInstruction) == 1 && n_state <= 1 && occurrences(text, "{") == 1 + n_state &&
+         occurrences(text, "}") == 1 + n_state;
+}
+
+std::string fill_template(std::string_view text, std::string_view instruction, std::span<const int> words) {
+  std::string out;
+  while (!text.empty()) {
+    if (text.starts_with(kInstruction)) {
+      out.append(instruction);
+      text.remove_prefix(kInstruction.size());
+    } else if (text.starts_with(kState)) {
+      out.append(fmt::format("{}", fmt::join(words, " ")));
+      text.remove_prefix(kState.size());
+    } else {
+      out.push_back(text.front());
+      text.remove_prefix(1);
+    }
+  }
+  return out;
+}
+
+}  // namespace vla

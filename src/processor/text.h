@@ -1,0 +1,25 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+#include <string_view>
+
+namespace vla {
+
+/// Valid UTF-8 without the white space at its ends, as Python's str.strip() sees white space: some control characters
+/// that other definitions leave out are among it.
+std::string_view strip(std::string_view text);
+
+/// Every occurrence of the non-empty `from` replaced, from left to right, as Python's str.replace does.
+std::string replace_all(std::string_view text, std::string_view from, std::string_view to);
+
+/// Whether a template names `{instruction}` once, `{state}` once at most, and has no other braces.
+bool is_template(std::string_view text);
+
+/// The template with its places filled; `words` with single blanks between them.
+/// Source: lerobot policies/pi05/processor_pi05.py (Pi05PrepareStateTokenizerProcessorStep).
+std::string fill_template(std::string_view text, std::string_view instruction, std::span<const int> words);
+
+}  // namespace vla

@@ -1,0 +1,150 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bench/bench.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+#include "bench/roofline.h"
+#include "bench/versus.h"
+#include "policies/policy.h"
+#include "support/editable_bundle.h"
+
+using namespace vla;
+using namespace vla::bench;
+
+namespace {
+
+/// A series whose network takes 5 ms and 2 ms for each step, with one slow round.
+Series series_of(int n_step) {
+  Series series;
+  series.n_step = n_step;
+  series.peak_name = "some f32";
+  series.work = {{"prefix", {4e9, 1e9}}, {"steps", {n_step * 1e9, n_step * 1e9}}};
+  for (double extra : {0.0, 0.0, 1.0})
+    series.rounds.push_back({{{"decode", 1.0}, {"prefix", 5.0 + extra}, {"steps", 2.0 * n_step}}, 2e12, 2.0});
+  return series;
+}
+
+Report report_of(int n_step) {
+  Report report;
+  report.conditions = {"smolvla", "bf16", "a <source> & more", 2, 512, 512, 48, n_step, 2, "avx2"};
+  report.cpu = "a processor";
+  report.before.peaks = {{"other f32", 1e11, 2e11}, {"some f32", 1e12, 2e12}};
+  report.before.bandwidth = 1e12;
+  report.after = report.before;
+  summarize(series_of(n_step), report);
+  return report;
+}
+
+/// The network of the small policy that comes with the project, as an architecture would publish it.
+Keys small_network() {
+  const auto bundle = Bundle::open(test::source_path("models/metaworld-tiny.gguf"));
+  REQUIRE(bundle.ok());
+  Keys keys;
+  for (const auto& [key, value] : bundle->keys().all())
+    for (const char* part : {"policy.", "vision.", "connector.", "lm.", "expert.", "time."})
+      if (key.starts_with(part)) keys.set(key, value);
+  return keys;
+}
+
+}  // namespace
+
+TEST_CASE("quantiles interpolate between neighbours") {
+  CHECK(quantile({4, 1, 3, 2}, 0.5) == 2.5);
+  CHECK(quantile({4, 1, 3, 2}, 0) == 1);
+  CHECK(quantile({4, 1, 3, 2}, 1) == 4);
+  CHECK(quantile({7}, 0.9) == 7);
+}
+
+TEST_CASE("a line through several numbers of steps separates the prefix from a step") {
+  const StepFit fit = fit_steps({series_of(1), series_of(5), series_of(10)});
+  CHECK(fit.prefix == doctest::Approx(5));
+  CHECK(fit.step == doctest::Approx(2));
+  CHECK(fit.worst == doctest::Approx(0));
+  CHECK(fit.points[1] == std::pair(5, 15.0));
+}
+
+TEST_CASE("rates and shares follow from work, time and the peak beside each round") {
+  const Report report = report_of(10);
+  const StageRow& prefix = *report.find("prefix");
+  CHECK(prefix.p50 == 5);
+  CHECK(prefix.flop_rate == doctest::Approx(4e9 / 5e-3));
+  CHECK(prefix.share_of_peak_p50 == doctest::Approx(0.4));
+  CHECK(prefix.share_of_bandwidth == doctest::Approx(0.2));
+  CHECK(report.regime(prefix) == "compute");                // 4 operations a byte, where 2 are the ridge
+  CHECK(report.regime(*report.find("steps")) == "memory");  // 1
+  CHECK(report.regime(*report.find("decode")) == "host");
+  CHECK(report.find("network")->p50 == 25);
+  CHECK(report.find("total")->p50 == 26);
+  CHECK(report.find("network")->work.flop == doctest::Approx(14e9));
+}
+
+TEST_CASE("the roofline names every roof and stage, and escapes what would end its markup") {
+  Report report = report_of(10);
+  report.cpu = "one < two & \"three\"";
+  const std::string svg = draw_roofline(report);
+  for (const char* text : {">prefix</text>", ">steps</text>", ">network</text>", "some f32, all threads: 2000 G/s",
+                           "some f32, one thread: 1000 G/s", "other f32, all threads", "memory: 1e+03 GB/s",
+                           "one &lt; two &amp;", "2 threads"})
+    CHECK_MESSAGE(svg.find(text) != std::string::npos, text);
+  CHECK(svg.find("nan") == std::string::npos);
+}
+
+TEST_CASE("an earlier report is compared stage by stage, and only with the same work") {
+  const std::string path = test::write_file("earlier.json", "first line\n" + to_json(report_of(10)) + "\n");
+  const auto earlier = Earlier::read(path);
+  REQUIRE(earlier.ok());
+  Report now = report_of(10);
+  CHECK(earlier->check(now.conditions).ok());
+  CHECK(earlier->compare(now).find("1.00 times as fast") != std::string::npos);
+  CHECK(earlier->compare(now).find("warning") == std::string::npos);
+  now.before.peaks[1].all *= 1.1;
+  CHECK(earlier->compare(now).find("warning: the machine's own peak was 2000.0 GFLOP/s") != std::string::npos);
+  CHECK(earlier->check(report_of(5).conditions).error().code == Code::usage);
+}
+
+TEST_CASE("what is no report is refused as one") {
+  for (const char* text : {"", "{}", "[1, 2]", "not JSON", "{\"conditions\": {\"policy\": 3}}"})
+    CHECK(Earlier::read(test::write_file("no_report.json", text)).error().code == Code::usage);
+  CHECK(Earlier::read("/nothing/here").error().code == Code::io);
+}
+
+TEST_CASE("a random bundle of every dtype passes every check of a bundle and answers with finite actions") {
+  for (DType type : {DType::bf16, DType::f16, DType::f32}) {
+    CAPTURE(dtype_name(type));
+    const auto random = RandomBundle::make("smolvla", small_network(), {3, 17, 2, type, 1});
+    REQUIRE(random.ok());
+    const auto engine = Engine::load(random->path(), {.n_thread = 1});
+    REQUIRE_MESSAGE(engine.ok(), engine.error().message());
+    const Engine& loaded = **engine;
+    CHECK(loaded.processor().views().names().size() == 3);
+    CHECK(loaded.solver().n_step == 2);
+    auto workload = Workload::make(loaded.processor(), {2, 40, 30, 17});
+    REQUIRE(workload.ok());
+    REQUIRE(workload->decode().ok());
+    CHECK(std::get<0>(workload->observation().views.at("observation.images.view1")->rgb).size() == 40 * 30 * 3);
+    const auto chunk = (*engine)->act(workload->observation(), std::uint64_t{1});
+    REQUIRE_MESSAGE(chunk.ok(), chunk.error().message());
+    bool moves = false;
+    for (float value : chunk->actions) moves = moves || value != chunk->actions.front();
+    CHECK(moves);
+  }
+}
+
+TEST_CASE("an instruction has exactly the tokens that were asked for") {
+  const auto bundle = Bundle::open(test::source_path("models/metaworld-tiny.gguf"));
+  REQUIRE(bundle.ok());
+  const auto processor = Processor::create(*bundle);
+  REQUIRE(processor.ok());
+  for (int n_text : {3, 7, processor->recipe().max_tokens}) {
+    const auto workload = Workload::make(*processor, {1, 0, 0, n_text});
+    REQUIRE(workload.ok());
+    Inputs inputs;
+    REQUIRE(processor->encode_text(workload->observation(), inputs).ok());
+    CHECK(static_cast<int>(inputs.tokens.size()) == n_text);
+  }
+  CHECK(Workload::make(*processor, {1, 0, 0, 4000}).error().code == Code::usage);
+  CHECK(Workload::make(*processor, {5, 0, 0, 7}).error().where == "--views");
+}

@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whole runs at a real server, in the world that needs no simulator."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from vla_cpp.eval.cli import main
+from vla_cpp.eval.serving import Server
+
+
+@pytest.fixture
+def call(bundle, binary, tmp_path):
+    """Arguments of a small run; more can be added."""
+
+    def arguments(out, *more, episodes=4):
+        given = ["--bundle", str(bundle), "--vla", str(binary)] if "--server" not in more else []
+        return ["null", *given, "--episodes", str(episodes), "--out", str(tmp_path / out), "--quiet", *more]
+
+    return arguments
+
+
+def rows_of(folder):
+    lines = (folder / "episodes.jsonl").read_text().splitlines()
+    assert "run" in json.loads(lines[0])
+    return [json.loads(line) for line in lines[1:]]
+
+
+def outcomes(folder):
+    """What a run found, without the times."""
+    rows = [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows_of(folder)]
+    return sorted(rows, key=lambda row: (row["driver"], row["task"], row["seed"]))
+
+
+def last_object(text):
+    return json.loads(text.strip().splitlines()[-1])
+
+
+def test_a_run_counts_each_task_and_writes_table_and_episodes(call, tmp_path, capsys):
+    assert main([*call("run"), "--json"]) == 0
+    data = last_object(capsys.readouterr().out)
+    assert data["success"]["drift"]["episodes"] == data["success"]["still"]["episodes"] == 4
+    assert data["success"]["drift"]["solved"] == 4 and data["success"]["still"]["solved"] == 0
+    assert data["success"]["all"]["rate"] == 0.5
+    rows = rows_of(tmp_path / "run")
+    assert len(rows) == 8 and {row["bundle"] for row in rows} == {data["run"]["a_identity"]}
+    assert all(len(row["engine_ms"]) == len(row["round_trip_ms"]) == -(-row["steps"] // 8) for row in rows)
+    assert all(trip >= engine for row in rows for trip, engine in zip(row["round_trip_ms"], row["engine_ms"]))
+    assert data["latency"]["replans"] == sum(len(row["engine_ms"]) for row in rows)
+    assert "| still | 0/4 | 0.0 % | 0.0 to 49.0 % |" in (tmp_path / "run/summary.md").read_text()
+
+
+def test_a_run_that_was_killed_goes_on_and_ends_with_the_same_table(call, tmp_path, capsys):
+    assert main([*call("whole", episodes=12), "--json"]) == 0
+    whole = last_object(capsys.readouterr().out)
+    command = [sys.executable, "-m", "vla_cpp.eval.cli", *call("cut", "--workers", "1", episodes=12)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    child = subprocess.Popen(command, env=environment)
+    journal = tmp_path / "cut/episodes.jsonl"
+    until = time.monotonic() + 120
+    while not journal.exists() or journal.read_bytes().count(b"\n") < 4:
+        assert child.poll() is None and time.monotonic() < until, "no episode was written"
+        time.sleep(0.01)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    kept = len(rows_of(tmp_path / "cut"))
+    assert 3 <= kept < 24
+    with journal.open("ab") as file:
+        file.write(b'{"task": "dri')  # what a kill in the middle of a write leaves
+    assert main([*call("cut", episodes=12), "--json"]) == 0
+    resumed = last_object(capsys.readouterr().out)
+    assert resumed["success"] == whole["success"]
+    assert outcomes(tmp_path / "cut") == outcomes(tmp_path / "whole")
+
+
+def test_a_server_that_dies_is_reported_and_its_episode_not_counted(call, bundle, binary, tmp_path, capsys):
+    with Server(str(binary), bundle, threads=1) as server:
+        command = [sys.executable, "-m", "vla_cpp.eval.cli", *call("died", "--server", server.address, "--workers", "1", episodes=30)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        child = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
+        journal = tmp_path / "died/episodes.jsonl"
+        until = time.monotonic() + 120
+        while not journal.exists() or journal.read_bytes().count(b"\n") < 3:
+            assert child.poll() is None and time.monotonic() < until, "no episode was written"
+            time.sleep(0.01)
+        os.kill(server.pid, signal.SIGKILL)
+        told = child.communicate(timeout=90)[1].decode()
+    assert child.returncode == 9, told
+    assert server.address in told and "the same command runs the missing ones" in told
+    kept = len(rows_of(tmp_path / "died"))
+    assert kept < 60
+    with Server(str(binary), bundle, threads=1) as server:
+        assert main(call("died", "--server", server.address, episodes=30)) == 0
+    assert main(call("whole", episodes=30)) == 0
+    assert outcomes(tmp_path / "died") == outcomes(tmp_path / "whole")
+
+
+def test_episodes_of_another_run_are_not_mixed_in(call, capsys):
+    assert main(call("one")) == 0
+    assert main(call("one", "--replan-every", "4")) == 9
+    assert "replan_every: there 8, now 4" in capsys.readouterr().err
+
+
+def test_a_bundle_paired_with_itself_agrees_in_every_chunk(call, bundle, tmp_path, capsys):
+    assert main([*call("pair", "--against", str(bundle), "--paired"), "--json"]) == 0
+    data = last_object(capsys.readouterr().out)
+    assert data["paired"]["both"] == 4 and data["paired"]["neither"] == 4
+    assert data["paired"]["only_a"] == data["paired"]["only_b"] == 0 and data["paired"]["mcnemar_p"] == 1
+    assert data["paired"]["same_length"] == 8 and data["paired"]["discordant"] == []
+    assert data["differences"] and all(row["max"] == 0 for row in data["differences"])
+
+
+def test_a_pair_that_differs_is_told_episode_by_episode(call, tmp_path, capsys):
+    assert main([*call("random", "--against", "random", "--paired"), "--json"]) == 0
+    data = last_object(capsys.readouterr().out)
+    assert data["paired"]["only_a"] == len([row for row in data["paired"]["discordant"] if row["a"]])
+    assert all(row["max"] > 0 for row in data["differences"])
+
+
+def test_the_replan_study_has_a_row_for_each_interval(bundle, binary, tmp_path, capsys):
+    call = ["replan", "--environment", "null", "--bundle", str(bundle), "--vla", str(binary), "--intervals", "4,16", "--task", "still"]
+    assert main([*call, "--episodes", "2", "--out", str(tmp_path), "--quiet", "--json"]) == 0
+    data = last_object(capsys.readouterr().out)
+    assert [row["replan_every"] for row in data["intervals"]] == [4, 16]
+    assert [row["latency"]["replans"] for row in data["intervals"]] == [2 * 10, 2 * 3]  # 40 steps an episode
+
+
+@pytest.mark.parametrize(
+    "more, told",
+    [
+        (["--task", "fly"], "no task 'fly' in null; there are: drift, still"),
+        (["--episodes", "0"], "take 1 or more"),
+        (["--against", "random"], "go together"),
+        (["--swap"], "has an opposite"),
+    ],
+)
+def test_a_wrong_call_says_what_is_wrong(call, more, told, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(call("wrong", *more))
+    assert ended.value.code == 2 and told in capsys.readouterr().err
+
+
+def test_a_bundle_that_is_none_is_reported_with_what_the_server_says(binary, tmp_path, capsys):
+    (tmp_path / "no.gguf").write_bytes(b"no")
+    assert main(["null", "--bundle", str(tmp_path / "no.gguf"), "--vla", str(binary), "--out", str(tmp_path), "--quiet"]) == 9
+    assert "bad_bundle" in capsys.readouterr().err

@@ -1,0 +1,298 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Every implementation of the matrix product against a sum in double precision, on one list of awkward shapes.
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "kernels/linear_kernel.h"
+#include "kernels/linear_pairs.h"
+#include "support/kernel_rows.h"
+
+using namespace vla;
+using namespace vla::kernels;
+
+namespace {
+
+struct Shape {
+  std::int64_t n_row, d_in, d_out;
+};
+
+// One row, a few, more than a block of rows; widths that no vector divides; depths beyond one block and of one number.
+constexpr Shape kShapes[] = {{1, 1, 1},     {1, 33, 17},   {2, 3, 31},     {3, 17, 1},    {5, 31, 33},  {6, 16, 16},
+                             {7, 64, 48},   {17, 100, 65}, {50, 72, 205},  {13, 1151, 3}, {4, 768, 32}, {33, 40, 70},
+                             {64, 96, 129}, {97, 35, 40},  {300, 33, 530}, {270, 5, 9},   {1, 1537, 70}};
+
+/// Numbers in [-1, 1] that differ from call to call.
+class Numbers {
+ public:
+  float next() {
+    state_ = state_ * 1664525u + 1013904223u;
+    return static_cast<float>(state_ >> 8) / 8388608.0f - 1.0f;
+  }
+  /// `count` numbers behind one that is skipped, so that the first is at no round address.
+  std::vector<float> some(std::int64_t count) {
+    std::vector<float> values(static_cast<std::size_t>(count) + 1);
+    for (float& value : values) value = next();
+    return values;
+  }
+
+ private:
+  std::uint32_t state_ = 12345;
+};
+
+/// x in the storage type, and what the type made of it.
+std::vector<std::byte> store_as(DType type, std::vector<float>& values) {
+  std::vector<std::byte> out(values.size() * (type == DType::f32 ? 4 : 2));
+  for (std::size_t i = 0; i < values.size(); ++i) {
+    if (type == DType::f32) {
+      std::memcpy(&out[4 * i], &values[i], 4);
+      continue;
+    }
+    std::uint16_t bits = to_bf16(values[i]);
+    if (type == DType::f16) {  // eleven bits, exponents from the smallest normal up
+      const float clear = std::abs(values[i]) < 0x1p-14f ? 0x1p-14f : values[i];
+      const auto word = std::bit_cast<std::uint32_t>(clear);
+      bits = static_cast<std::uint16_t>((word >> 16 & 0x8000U) | (((word >> 23 & 255U) - 112U) << 10) |
+                                        (word >> 13 & 1023U));
+    }
+    std::memcpy(&out[2 * i], &bits, 2);
+    values[i] = stored_number(type, out.data(), static_cast<std::int64_t>(i));
+  }
+  return out;
+}
+
+double activate(Activation activation, double x) {
+  if (activation == Activation::silu) return x / (1 + std::exp(-x));
+  if (activation == Activation::gelu_tanh)
+    return x / (1 + std::exp(-2 * std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x)));
+  return x;
+}
+
+/// One part of a job, with memory of its own.
+struct Part {
+  std::vector<float> weight, bias, residual, y;
+  std::vector<std::byte> stored;
+  std::vector<std::byte> packed;
+};
+
+struct Case {
+  Shape shape;
+  DType type = DType::bf16;
+  Activation activation = Activation::none;
+  int n_part = 1;
+  bool gated = false, with_bias = false, with_residual = false;
+  int n_thread = 1;
+};
+
+constexpr float kUntouched = 1234.5f;
+
+class Trial {
+ public:
+  Trial(const LinearKernel& kernel, const Case& c) : kernel_(kernel), case_(c) {
+    x_ = numbers_.some(c.shape.n_row * c.shape.d_in);
+    for (int i = 0; i < c.n_part; ++i) parts_.push_back(make_part(d_out(i)));
+  }
+
+  void run() {
+    const auto [n_row, d_in, unused] = case_.shape;
+    LinearJob job = {&x_[1], n_row, d_in, case_.n_part, {}, case_.activation, case_.gated};
+    for (int i = 0; i < case_.n_part; ++i) {
+      Part& part = parts_[static_cast<std::size_t>(i)];
+      const std::byte* weight = part.stored.data() + (case_.type == DType::f32 ? 4 : 2);
+      if (kernel_.packed_size != nullptr) {
+        const MatrixDesc desc = {case_.type, d_in, d_out(i)};
+        part.packed.resize(kernel_.packed_size(desc) + 64);
+        std::byte* place = part.packed.data() + (64 - reinterpret_cast<std::uintptr_t>(part.packed.data()) % 64);
+        kernel_.pack(desc, weight, place);
+        weight = place;
+      }
+      job.part[i] = {case_.type,
+                     weight,
+                     case_.with_bias ? &part.bias[1] : nullptr,
+                     case_.with_residual ? &part.residual[1] : nullptr,
+                     &part.y[1],
+                     d_out(i)};
+    }
+    // What a thread finds in its scratch memory must not matter: all ones are NaN.
+    std::unique_ptr<std::byte, decltype(&std::free)> scratch(
+        static_cast<std::byte*>(
+            std::aligned_alloc(4096, round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096))),
+        std::free);
+    for (int ith = 0; ith < case_.n_thread; ++ith) {
+      std::memset(scratch.get(), 0xff, kernel_.scratch_size);
+      kernel_.run(job, ith, case_.n_thread, scratch.get());
+    }
+  }
+
+  void check() const {
+    const bool rounds_x = std::strstr(kernel_.name, "amx") != nullptr;
+    for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
+      const Part& part = parts_[static_cast<std::size_t>(i)];
+      CHECK(part.y.front() == kUntouched);
+      CHECK(part.y.back() == kUntouched);
+      int wrong = 0;
+      for (std::int64_t row = 0; row < case_.shape.n_row; ++row)
+        for (std::int64_t n = 0; n < d_out(i); ++n) {
+          const auto place = static_cast<std::size_t>(row * d_out(i) + n + 1);
+          const auto [expected, tolerance] = reference(i, row, n, rounds_x);
+          wrong += !(std::abs(part.y[place] - expected) <= tolerance);
+        }
+      CHECK(wrong == 0);
+    }
+  }
+
+  const std::vector<float>& y(int i) const { return parts_[static_cast<std::size_t>(i)].y; }
+
+ private:
+  struct Expected {
+    double value, tolerance;
+  };
+
+  /// Parts differ in width, so that a thread's share crosses from one to the next; a gate and its up do not.
+  std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
+
+  Part make_part(std::int64_t width) {
+    Part part;
+    part.weight = numbers_.some(case_.shape.d_in * width);
+    part.stored = store_as(case_.type, part.weight);
+    part.bias = numbers_.some(width);
+    part.residual = numbers_.some(case_.shape.n_row * width);
+    part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, kUntouched);
+    return part;
+  }
+
+  /// W x + b. Every order of n float32 additions of the products is within n half-units of their absolute sum.
+  Expected product(int i, std::int64_t row, std::int64_t n, bool rounds_x) const {
+    const Part& part = parts_[static_cast<std::size_t>(i)];
+    const std::int64_t d_in = case_.shape.d_in;
+    double sum = case_.with_bias ? part.bias[static_cast<std::size_t>(n + 1)] : 0, size = std::abs(sum);
+    for (std::int64_t k = 0; k < d_in; ++k) {
+      float value = x_[static_cast<std::size_t>(row * d_in + k + 1)];
+      if (rounds_x) value = from_bf16(to_bf16(value));
+      const double term = double{value} * part.weight[static_cast<std::size_t>(n * d_in + k + 1)];
+      sum += term, size += std::abs(term);
+    }
+    return {sum, static_cast<double>(d_in + 2) * 0x1p-24 * size};
+  }
+
+  /// The activations are at most 1.13 steep and round twice; what follows rounds once each.
+  Expected reference(int i, std::int64_t row, std::int64_t n, bool rounds_x) const {
+    Expected y = product(i, row, n, rounds_x);
+    if (case_.gated) {
+      const Expected gate = product(0, row, n, rounds_x);
+      const double factor = activate(case_.activation, gate.value),
+                   slack = 1.13 * gate.tolerance + 0x1p-22 * std::abs(factor);
+      y = {y.value * factor, y.tolerance * (std::abs(factor) + slack) + slack * std::abs(y.value)};
+    } else {
+      y = {activate(case_.activation, y.value), 1.13 * y.tolerance};
+    }
+    if (case_.with_residual)
+      y.value += parts_[static_cast<std::size_t>(i)].residual[static_cast<std::size_t>(row * d_out(i) + n + 1)];
+    return {y.value, y.tolerance + 0x1p-21 * (1 + std::abs(y.value))};
+  }
+
+  const LinearKernel& kernel_;
+  Case case_;
+  Numbers numbers_;
+  std::vector<float> x_;
+  std::vector<Part> parts_;
+};
+
+void check(const LinearKernel& kernel, const Case& c) {
+  if (!kernel.supports({c.type, c.shape.d_in, c.shape.d_out}, Isa::amx)) return;  // amx machines have every instruction
+  CAPTURE(c.shape.n_row);
+  CAPTURE(c.shape.d_in);
+  CAPTURE(c.shape.d_out);
+  CAPTURE(dtype_name(c.type));
+  CAPTURE(c.n_thread);
+  Trial trial(kernel, c);
+  trial.run();
+  trial.check();
+}
+
+void check_shapes_and_types(const LinearKernel& kernel) {
+  for (const Shape& shape : kShapes)
+    for (DType type : {DType::bf16, DType::f16, DType::f32}) check(kernel, {.shape = shape, .type = type});
+}
+
+void check_epilogues(const LinearKernel& kernel) {
+  for (const Shape& shape : {Shape{1, 33, 17}, Shape{7, 64, 48}, Shape{50, 72, 205}})
+    for (Activation activation : {Activation::none, Activation::gelu_tanh, Activation::silu})
+      for (int options = 0; options < 4; ++options)
+        check(kernel, {.shape = shape,
+                       .activation = activation,
+                       .with_bias = (options & 1) != 0,
+                       .with_residual = (options & 2) != 0});
+}
+
+void check_gates_and_groups(const LinearKernel& kernel) {
+  for (const Shape& shape : kShapes) {
+    check(kernel, {.shape = shape, .activation = Activation::silu, .n_part = 2, .gated = true});
+    check(kernel, {.shape = shape, .activation = Activation::gelu_tanh, .n_part = 2, .gated = true, .with_bias = true});
+    check(kernel, {.shape = shape, .n_part = 3, .with_bias = true});
+  }
+}
+
+void check_threads(const LinearKernel& kernel) {
+  for (int n_thread : {2, 3, 7, 64})
+    for (const Shape& shape : {Shape{1, 33, 17}, Shape{50, 72, 205}, Shape{300, 33, 530}}) {
+      check(kernel, {.shape = shape, .with_bias = true, .n_thread = n_thread});
+      check(kernel, {.shape = shape, .activation = Activation::silu, .n_part = 2, .gated = true, .n_thread = n_thread});
+      check(kernel, {.shape = shape, .n_part = 3, .n_thread = n_thread});
+    }
+}
+
+/// Sums are made in the same order whoever makes them, so that a robot's answer does not depend on its cores.
+void check_bytes(const LinearKernel& kernel) {
+  Trial one(kernel, {.shape = {97, 1151, 205}}), many(kernel, {.shape = {97, 1151, 205}, .n_thread = 5});
+  one.run(), many.run();
+  CHECK(one.y(0) == many.y(0));
+}
+
+const LinearKernel& row(const std::string& name) {
+  for (const auto& rows : {linear_kernels(), emulated_linear_kernels()})
+    for (const LinearKernel* kernel : rows)
+      if (kernel->name == name) return *kernel;
+  FAIL("no row " << name);
+  return *emulated_linear_kernels().front();
+}
+
+}  // namespace
+
+#define VLA_LINEAR_TEST(sentence, check)                                                                 \
+  TEST_CASE("emulated: " sentence) { check(row("emulated")); }                                           \
+  TEST_CASE("emulated_amx: " sentence) { check(row("emulated_amx")); }                                   \
+  TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(Isa::avx2))) { check(row("avx2")); }       \
+  TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(Isa::avx512))) { check(row("avx512")); } \
+  TEST_CASE("amx: " sentence* doctest::skip(vla::test::lacks(Isa::amx))) { check(row("amx")); }
+
+VLA_LINEAR_TEST("products of any shape and storage type are within float32's rounding", check_shapes_and_types)
+VLA_LINEAR_TEST("bias, activation and residual follow the product", check_epilogues)
+VLA_LINEAR_TEST("a gate multiplies, and products of one x stand side by side", check_gates_and_groups)
+VLA_LINEAR_TEST("any number of threads computes every number once", check_threads)
+VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
+
+TEST_CASE("every machine takes the first row that it can run, and ggml where there is none") {
+  for (Isa isa : {Isa::ggml, Isa::avx2, Isa::avx512, Isa::amx})
+    for (DType type : {DType::bf16, DType::f16, DType::f32}) {
+      const MatrixFormat* chosen = choose_linear({type, 768, 3072}, isa);
+      const bool tiles = isa == Isa::amx && type == DType::bf16;
+      const std::string expected = tiles ? "amx" : isa == Isa::amx ? "avx512" : isa_name(isa);
+      CHECK((chosen == nullptr ? "ggml" : chosen->name) == expected);
+    }
+}
+
+TEST_CASE("x is rounded to the nearest bf16, ties to even, as PyTorch rounds it") {
+  CHECK(from_bf16(to_bf16(1.0f)) == 1.0f);
+  CHECK(from_bf16(to_bf16(1.0f + 0x1p-8f)) == 1.0f);                                // a tie: 1 is even
+  CHECK(from_bf16(to_bf16(1.0f + 3 * 0x1p-8f)) == 1.0f + 0x1p-6f);                  // a tie: the upper one is even
+  CHECK(from_bf16(to_bf16(1.0f + 0x1p-8f + 0x1p-20f)) == 1.0f + 0x1p-7f);           // nearer to the upper one
+  CHECK(from_bf16(to_bf16(-3.0e38f)) == doctest::Approx(-3.0e38).epsilon(0x1p-8));  // no overflow below the largest
+  CHECK(std::isinf(from_bf16(to_bf16(std::numeric_limits<float>::max()))));         // as torch.bfloat16
+  CHECK(std::isnan(from_bf16(to_bf16(std::numeric_limits<float>::quiet_NaN()))));
+  CHECK(std::isnan(from_bf16(to_bf16(std::bit_cast<float>(0x7f800001U)))));  // rounding would make it infinite
+}

@@ -1,0 +1,126 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Layers through the kernels of this machine against plain ggml operations on the same bundle.
+#include "nn/linear.h"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+
+#include "kernels/linear_kernel.h"
+#include "nn/mlp.h"
+#include "support/editable_bundle.h"
+#include "support/graph_runner.h"
+
+using namespace vla;
+using test::ramp;
+
+namespace {
+
+constexpr int kModel = 35, kFf = 67, kRows = 29;
+
+/// Layers `a` and `b` of kModel to kFf and `c` back, with biases and weights in a storage type.
+std::string make_bundle(DType type) {
+  test::EditableBundle bundle;
+  for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
+    bundle.set(key, std::string("test"));
+  bundle.set("vla.bundle_version", 1);
+  bundle.set("vla.dtype", std::string(dtype_name(type)));
+  const auto text = [](const auto& values) {
+    return std::string(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(values[0]));
+  };
+  for (const char* name : {"a", "b", "c"}) {
+    const std::int64_t d_in = *name == 'c' ? kFf : kModel, d_out = *name == 'c' ? kModel : kFf;
+    std::vector<float> weight =
+        ramp(static_cast<std::size_t>(d_in * d_out), 0.2f + 0.1f * static_cast<float>(*name - 'a'));
+    std::vector<std::uint16_t> halves(weight.size());
+    if (type == DType::bf16)
+      ggml_fp32_to_bf16_row(weight.data(), reinterpret_cast<ggml_bf16_t*>(halves.data()), d_in * d_out);
+    if (type == DType::f16) ggml_fp32_to_fp16_row(weight.data(), halves.data(), d_in * d_out);
+    bundle.tensors.push_back(
+        {std::string(name) + ".weight", type, {d_in, d_out}, type == DType::f32 ? text(weight) : text(halves)});
+    bundle.tensors.push_back(
+        {std::string(name) + ".bias", DType::f32, {d_out}, text(ramp(static_cast<std::size_t>(d_out), 1.0f))});
+  }
+  return bundle.bytes();
+}
+
+struct Layers {
+  Linear a, b, c;
+  explicit Layers(const Scope& s)
+      : a(s / "a", kModel, kFf, Bias::yes), b(s / "b", kModel, kFf, Bias::yes), c(s / "c", kFf, kModel, Bias::yes) {}
+};
+
+/// What `build` makes of x [kModel, kRows] with the kernels of one instruction set; `taps` are kept beside it.
+std::vector<float> run(Isa isa, DType type, const std::string& taps,
+                       const std::function<Tensor(Graph&, const Layers&, Tensor)>& build) {
+  const std::string bytes = make_bundle(type);
+  const auto bundle = Bundle::parse(std::as_bytes(std::span(bytes)), "test");
+  REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
+  ParamList list(bundle->keys(), &*bundle);
+  const Layers layers(Scope(list, ""));
+  const Status fits = list.report("test", {});
+  REQUIRE_MESSAGE(fits.ok(), (fits.ok() ? "" : fits.error().message()));
+  const auto device = Device::cpu(3, isa_name(isa));
+  REQUIRE(device.ok());
+  const auto weights = Weights::load(list, *device, Weights::Fill::yes, kernels::choose_linear);
+  REQUIRE(weights.ok());
+  Store store(64);
+  const Tensor x = store.add_constant(ramp(kModel * kRows, 1.0f), {kModel, kRows});
+  Graph graph(*weights, store, [&](const std::string& path) { return path == "result" || path == taps; });
+  graph.name("result", build(graph, layers, x));
+  ComputeMemory memory(*device);
+  REQUIRE(store.allocate(*device).ok());
+  REQUIRE(graph.reserve(memory).ok());
+  REQUIRE(graph.allocate(memory).ok());
+  REQUIRE(graph.run(*device).ok());
+  for (const auto& [path, value] : graph.taps())
+    if (path == "result") return Store::get(value);
+  FAIL("no result");
+  return {};
+}
+
+/// Every kernel of this machine and every storage type against widened weights and ggml; sums of at most 67 products
+/// of numbers below 1 differ by their order alone.
+void check_like_ggml(const std::function<Tensor(Graph&, const Layers&, Tensor)>& build) {
+  for (DType type : {DType::bf16, DType::f16, DType::f32})
+    for (Isa isa : usable_isas())
+      for (const char* tap : {"", "a", "c"}) {
+        CAPTURE(isa_name(isa));
+        CAPTURE(dtype_name(type));
+        CAPTURE(tap);
+        const std::vector<float> expected = run(Isa::ggml, type, "", build), got = run(isa, type, tap, build);
+        // Tiles of amx round x to bf16: 2^-9 of each product.
+        const double tolerance = isa == Isa::amx && type == DType::bf16 ? 0.1 : 1e-5;
+        double largest = 0;
+        REQUIRE(got.size() == expected.size());
+        for (std::size_t i = 0; i < got.size(); ++i)
+          largest = std::max(largest, std::abs(double{got[i]} - expected[i]));
+        CHECK(largest <= tolerance);
+      }
+}
+
+}  // namespace
+
+TEST_CASE("a layer gives what ggml's product of widened weights gives") {
+  check_like_ggml([](Graph& g, const Layers& l, Tensor x) { return l.c(g, l.a(g, x)); });
+}
+
+TEST_CASE("an activation and a residual in the product's node change nothing, nor does a tap between them") {
+  check_like_ggml([](Graph& g, const Layers& l, Tensor x) {
+    return l.c.added_to(g, x, l.b.activated(g, l.c(g, l.a.activated(g, x, Activation::gelu_tanh)), Activation::silu));
+  });
+}
+
+TEST_CASE("a gate in the product's node changes nothing, nor does a tap of the gate") {
+  check_like_ggml(
+      [](Graph& g, const Layers& l, Tensor x) { return l.c(g, Linear::gated(g, l.a, l.b, x, Activation::silu)); });
+}
+
+TEST_CASE("layers of one x as a group give what each gives alone") {
+  check_like_ggml([](Graph& g, const Layers& l, Tensor x) {
+    const std::vector<Tensor> both = Linear::group(g, {&l.a, &l.b}, x);
+    return l.c(g, Tensor(ggml_sub(g.context(), both[0].node(), both[1].node())));
+  });
+}

@@ -1,0 +1,51 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/columns.h"
+
+#include <cmath>
+
+#include "processor/support.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+const std::vector<int> kFlipped = {1, 2, 8, 9};
+const std::vector<int> kGrippers = {6, 13};
+
+/// Both are float32 results of a few operations whose reference runs in double throughout.
+void check_close(const std::vector<float>& found, const nlohmann::json& expected) {
+  REQUIRE(found.size() == expected.size());
+  for (std::size_t i = 0; i < found.size(); ++i)
+    CHECK(found[i] == doctest::Approx(expected[i].get<double>()).epsilon(1e-6));
+}
+
+}  // namespace
+
+TEST_CASE("an ALOHA state turns into joint angles and servo angles as the reference has them") {
+  for (const auto& test : data_json("aloha.json")) {
+    std::vector<float> state = test["x"].get<std::vector<float>>();
+    map_columns(ColumnAffineOp{kFlipped, -1.0, 0.0}, state);
+    map_columns(HornAngleOp{kGrippers, 0.058 - 0.01844, 0.01844, 0.036, 0.022}, state);
+    map_columns(ColumnAffineOp{kGrippers, 1 / (1.6296 - 0.5476), -0.5476 / (1.6296 - 0.5476)}, state);
+    check_close(state, test["state"]);
+  }
+}
+
+TEST_CASE("ALOHA actions come back to the robot's conventions as the reference has them") {
+  for (const auto& test : data_json("aloha.json")) {
+    std::vector<float> action = test["x"].get<std::vector<float>>();
+    map_columns(ColumnAffineOp{kFlipped, -1.0, 0.0}, action);
+    map_columns(ColumnAffineOp{kGrippers, 1 / (1.491 + 0.6213), (0.5476 + 0.6213) / (1.491 + 0.6213)}, action);
+    check_close(action, test["action"]);
+  }
+}
+
+TEST_CASE("a horn that cannot reach the opening stays at its end") {
+  std::vector<float> values = {1.0f, 0.0f, -1.0f};
+  map_columns(HornAngleOp{{0, 1, 2}, 1.0, 0.0, 0.036, 0.022}, values);
+  CHECK(values[0] == static_cast<float>(std::asin(1.0)));
+  CHECK(values[1] == static_cast<float>(std::asin(-1.0)));
+  CHECK(values[2] == static_cast<float>(std::asin(-1.0)));
+}
