@@ -3,12 +3,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figures of `vla serve` under load, as rows of a Markdown table.
 
-scripts/serve_load.py overhead     one client, two raw views of 256 x 256: what the server and the network add to the engine
+scripts/serve_load.py overhead     one client, two raw views of 256 x 256: what server and network add to the engine
 scripts/serve_load.py jpeg         the same with JPEG files, and libjpeg-turbo's own time for them
 scripts/serve_load.py many         64 clients, 100,000 acts: lost and crossed answers, fairness, resident memory
 
-The server runs on this machine with a bundle of random weights; its engine takes about a millisecond, so that what is measured is not
-hidden. Needs build/cpu/bin/vla and build/cpu/bin/load_tool. Fails where an answer is lost, wrong, or another one's.
+The server runs on this machine with a bundle of random weights; its engine takes about a millisecond, so that what is
+measured is not hidden. Needs build/cpu/bin/vla and build/cpu/bin/load_tool. Fails where an answer is lost, wrong, or
+another one's. docs/performance.md says what the rows mean.
 """
 
 import argparse

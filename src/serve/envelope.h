@@ -12,10 +12,8 @@
 
 namespace vla::serve {
 
-/// The protocol versions that this build speaks, and the most fields that a request or an act may have. A field takes
-/// two bytes on the wire and a hundred in memory, so their number is bounded before anything is parsed.
+/// The protocol versions that this build speaks.
 constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
-constexpr int kMaxFields = 1024;
 
 /// What the I/O thread knows of a request: enough to queue, answer or refuse it, without looking at a picture.
 struct Envelope {

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a peer that breaks the rules costs others: nothing. A client that behaves acts while it goes on, and each of its acts must be
-answered, with its own bytes, in about the time that it takes when nobody disturbs."""
+"""What a peer that breaks the rules costs others: nothing. A client that behaves acts while it goes on, and each of its
+acts must be answered, with its own bytes, in about the time that it takes when nobody disturbs."""
 
 import os
 import re
@@ -70,7 +70,7 @@ class Robot:
 
 
 def undisturbed(robot, quiet):
-    """Generous, since the machine may have other work by now; a server that waits for a peer stands still for seconds."""
+    """Generous: the machine may have other work by now. A server that waits for a peer stands still for seconds."""
     disturbed = robot.acts()
     assert disturbed < 5 * quiet + 0.2, f"{disturbed:.3f} s an act, {quiet:.3f} s when nobody disturbs"
 
@@ -106,7 +106,7 @@ def request(kind, version=1, number=1):
     return message.SerializeToString()
 
 
-@pytest.mark.parametrize("what", [pytest.param(hostile.HALF_SENT, id="half_sent"), pytest.param(hostile.GARBAGE, id="garbage")])
+@pytest.mark.parametrize("what", [hostile.HALF_SENT, hostile.GARBAGE], ids=["half_sent", "garbage"])
 def test_peers_that_send_what_is_not_zeromq_or_half_of_it_cost_others_nothing(server, robot, what):
     quiet, files = robot.acts(), n_files(server)
     peers = [hostile.connect(server.address, data) for data in what.values() for _ in range(4)]

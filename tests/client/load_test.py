@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""scripts/serve_load.py, which measures the server under load, on a small load. Times are not judged here: machines differ."""
+"""scripts/serve_load.py, which measures the server under load, on a small load. Times are not judged: machines differ."""
 
 import json
 import os
