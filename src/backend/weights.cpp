@@ -38,6 +38,7 @@ void widen(Tensor tensor, const Param& param) {
 }  // namespace
 
 Weights::Place Weights::declare(const Param& param, ChooseFormat choose) {
+  if (param.source == nullptr) return {store_.add(GGML_TYPE_F32, param.shape), nullptr};  // sizes alone are asked for
   const bool is_matrix = param.storage == Storage::matrix;
   const MatrixFormat* format = is_matrix && choose != nullptr ? choose(desc_of(param), isa_) : nullptr;
   if (format != nullptr && format->packed_size != nullptr)
@@ -89,7 +90,7 @@ Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill 
 void Weights::describe(const ParamList& list) {
   std::map<std::string, std::map<std::string, int>> counts;
   for (const Param& param : list.params())
-    if (param.storage == Storage::matrix) {
+    if (param.storage == Storage::matrix && param.source != nullptr) {
       const MatrixFormat* chosen = format(&param);
       ++counts[chosen != nullptr ? chosen->name : "ggml"][dtype_name(param.source->type)];
     }

@@ -21,10 +21,8 @@ Result<RandomBundle> make_random(const Request& request, const Watcher& watcher)
 
 Conditions conditions_of(const Engine& engine, const Workload& workload, int n_step) {
   const auto text = [&](const char* key) { return *engine.bundle().keys().string(key); };  // every bundle has them
-  return {text("vla.arch"),           text("vla.dtype"),
-          text("vla.source.name"),    workload.n_view(),
-          workload.width(),           workload.height(),
-          workload.n_text(),          n_step,
+  return {text("vla.arch"),           text("vla.dtype"), text("vla.source.name"), workload.n_view(),
+          workload.width(),           workload.height(), workload.n_text(),       n_step,
           engine.device().n_thread(), engine.kernels()};
 }
 
