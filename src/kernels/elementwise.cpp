@@ -10,7 +10,8 @@
 
 // One source, one clone per instruction set, chosen at run time by the loader. The sanitizers instrument the resolver
 // before they are ready, so their builds keep the baseline.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) && \
+    !defined(__SANITIZE_THREAD__)
 #define VLA_CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
 #else
 #define VLA_CLONES

@@ -97,6 +97,7 @@ def dealer(server):
     """A socket that sends what it is told to."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.linger, socket.rcvtimeo = 0, SECONDS * 1000
+        socket.sndhwm, socket.reconnect_ivl = 1, 10  # what is sent while there is no connection does not pile up
         socket.connect(server.address)
         yield socket
 
@@ -153,8 +154,10 @@ def test_messages_over_the_limit_cost_others_nothing_and_their_sender_only_the_c
 
     def send():
         while not stopped.is_set():
-            dealer.send(bytes((LIMIT_MIB << 20) + 1))
-            time.sleep(0.01)
+            try:
+                dealer.send(bytes((LIMIT_MIB << 20) + 1), zmq.NOBLOCK)
+            except zmq.Again:
+                time.sleep(0.01)
 
     thread = threading.Thread(target=send)
     thread.start()
