@@ -222,6 +222,8 @@ VLA_KERNEL_TEST("a query that sees nothing, and what is not finite, does not bec
 TEST_CASE("emulated amx: attention errs by the rounding of its weights to bf16 alone") {
   check_pairs(kernels::emulated_amx_attention());
 }
+VLA_EMULATED_TEST("amx", "attention errs by the rounding of its weights to bf16 alone",
+                  check_pairs(kernels::kEmulatedAttentionAmx))
 TEST_CASE("amx: attention errs by the rounding of its weights to bf16 alone" * doctest::skip(test::lacks(Isa::amx))) {
   check_pairs(kernels::cpu_kernels(Isa::amx)->attention);
 }

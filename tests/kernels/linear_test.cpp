@@ -267,6 +267,8 @@ const LinearKernel& row(const std::string& name) {
   TEST_CASE("emulated: " sentence) { check(row("emulated")); }                                           \
   TEST_CASE("emulated_amx: " sentence) { check(row("emulated_amx")); }                                   \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(Isa::avx2))) { check(row("avx2")); }       \
+  VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                    \
+  VLA_EMULATED_TEST("amx", sentence, check(kEmulatedLinearAmx))                                          \
   TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(Isa::avx512))) { check(row("avx512")); } \
   TEST_CASE("amx: " sentence* doctest::skip(vla::test::lacks(Isa::amx))) { check(row("amx")); }
 

@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "kernels/cpu_kernels.h"
+#include "kernels/linear_kernel.h"
 
 namespace vla::test {
 
@@ -13,12 +14,27 @@ inline bool lacks(Isa isa) { return std::find(usable_isas().begin(), usable_isas
 
 }  // namespace vla::test
 
+#if defined(__x86_64__)
+namespace vla::kernels {
+/// The sources of avx512 and amx with their instructions emulated, for machines that have AVX2 (avx512_emulation.h).
+extern const CpuKernels kEmulatedAvx512Kernels;
+extern const AttentionKernel kEmulatedAttentionAmx;
+extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAmx;
+}  // namespace vla::kernels
+
+#define VLA_EMULATED_TEST(isa, sentence, ...) \
+  TEST_CASE(isa " (emulated): " sentence* doctest::skip(vla::test::lacks(vla::Isa::avx2))) { __VA_ARGS__; }
+#else
+#define VLA_EMULATED_TEST(isa, sentence, ...)
+#endif
+
 /// The same test for every instruction set, and for the portable instance of the same templates.
 #define VLA_KERNEL_TEST(sentence, check)                                              \
   TEST_CASE("portable: " sentence) { check(vla::kernels::portable_kernels()); }       \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(vla::Isa::avx2))) {     \
     check(*vla::kernels::cpu_kernels(vla::Isa::avx2));                                \
   }                                                                                   \
+  VLA_EMULATED_TEST("avx512", sentence, check(vla::kernels::kEmulatedAvx512Kernels))  \
   TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(vla::Isa::avx512))) { \
     check(*vla::kernels::cpu_kernels(vla::Isa::avx512));                              \
   }

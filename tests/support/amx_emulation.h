@@ -1,0 +1,94 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+/// The tiles of AMX in plain C++, as avx512_emulation.h does the vectors.
+/// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, TDPBF16PS and its neighbours.
+#include "support/avx512_emulation.h"
+
+#include <doctest/doctest.h>
+
+#include <cstdint>
+
+namespace vla::test::amx {
+
+struct Config {
+  std::uint8_t palette, start_row, reserved[14];
+  std::uint16_t bytes[16];
+  std::uint8_t lines[16];
+};
+struct Tile {
+  std::byte line[16][64];
+};
+/// What the processor keeps for a thread.
+inline thread_local Config config;
+inline thread_local Tile tiles[8];
+
+inline int lines(int tile) { return config.lines[tile]; }
+inline std::size_t bytes(int tile) { return config.bytes[tile]; }
+
+inline void load_config(const void* p) {
+  std::memcpy(&config, p, sizeof(config));
+  REQUIRE(config.palette == 1);
+  for (std::uint8_t zero : config.reserved) REQUIRE(zero == 0);
+  for (int i = 0; i < 16; ++i) REQUIRE((i < 8 ? bytes(i) <= 64 && lines(i) <= 16 : bytes(i) == 0 && lines(i) == 0));
+}
+inline void release() { config = {}; }
+inline void zero(int tile) {
+  REQUIRE(config.palette == 1);
+  tiles[tile] = {};
+}
+inline void load(int tile, const void* base, std::size_t stride) {
+  zero(tile);
+  for (int i = 0; i < lines(tile); ++i)
+    std::memcpy(tiles[tile].line[i], static_cast<const std::byte*>(base) + static_cast<std::size_t>(i) * stride,
+                bytes(tile));
+}
+inline void store(int tile, void* base, std::size_t stride) {
+  REQUIRE(config.palette == 1);
+  for (int i = 0; i < lines(tile); ++i)
+    std::memcpy(static_cast<std::byte*>(base) + static_cast<std::size_t>(i) * stride, tiles[tile].line[i], bytes(tile));
+}
+
+/// Subnormal numbers are zero, in and out.
+inline float flush(float x) { return std::abs(x) < 0x1p-126f ? std::copysign(0.0f, x) : x; }
+inline float multiply_add(float a, float b, float c) { return flush(std::fma(flush(a), flush(b), flush(c))); }
+
+/// c += a * b, where a line of b holds a pair of numbers for every column of c: even and odd numbers are summed apart.
+inline void multiply(int c, int a, int b) {
+  const auto number = [](int tile, int line, int i) {
+    std::uint16_t bits;
+    std::memcpy(&bits, tiles[tile].line[line] + 2 * i, sizeof(bits));
+    return std::bit_cast<float>(std::uint32_t{bits} << 16);
+  };
+  REQUIRE(bytes(a) / 4 == static_cast<std::size_t>(lines(b)));
+  REQUIRE((lines(a) == lines(c) && bytes(b) == bytes(c)));
+  for (int m = 0; m < lines(c); ++m)
+    for (int n = 0; n < static_cast<int>(bytes(c)) / 4; ++n) {
+      float even = 0, odd = 0, sum;
+      for (int k = 0; k < lines(b); ++k) {
+        even = multiply_add(number(a, m, 2 * k), number(b, k, 2 * n), even);
+        odd = multiply_add(number(a, m, 2 * k + 1), number(b, k, 2 * n + 1), odd);
+      }
+      std::memcpy(&sum, tiles[c].line[m] + 4 * n, sizeof(sum));
+      sum = flush(flush(sum) + flush(even + odd));
+      std::memcpy(tiles[c].line[m] + 4 * n, &sum, sizeof(sum));
+    }
+}
+
+}  // namespace vla::test::amx
+
+#undef _tile_loadd
+#undef _tile_stored
+#undef _tile_zero
+#undef _tile_dpbf16ps
+#define _tile_loadconfig vla::test::amx::load_config
+#define _tile_release vla::test::amx::release
+#define _tile_loadd vla::test::amx::load
+#define _tile_stored vla::test::amx::store
+#define _tile_zero vla::test::amx::zero
+#define _tile_dpbf16ps vla::test::amx::multiply
+
+#define AmxSession EmulatedAmxSession
+#define kLinearAmx kEmulatedLinearAmx
+#define kAttentionAmx kEmulatedAttentionAmx

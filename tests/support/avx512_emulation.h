@@ -1,0 +1,121 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+/// The AVX-512 intrinsics that the kernels use, lane by lane in plain C++, so that a machine without those instructions
+/// compiles and checks the same kernels. For a file that includes the kernels' sources itself, after this header.
+/// Masks that the kernels always give as ones are not looked at.
+/// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2.
+#include <immintrin.h>
+
+#include <bit>
+#include <cmath>
+#include <cstring>
+
+namespace vla::test::avx512 {
+
+typedef int Words __attribute__((vector_size(64)));
+
+inline __m512 load(const void* p) {
+  __m512 x;
+  std::memcpy(&x, p, sizeof(x));
+  return x;
+}
+inline __m512i load_words(const void* p) { return std::bit_cast<__m512i>(load(p)); }
+inline void store(float* p, __m512 x) { std::memcpy(p, &x, sizeof(x)); }
+inline void store_words(void* p, __m512i x) { std::memcpy(p, &x, sizeof(x)); }
+/// A masked load does not touch what it leaves out.
+inline __m512 load_some(unsigned mask, const float* p) {
+  __m512 x = {};
+  for (int i = 0; i < 16; ++i)
+    if ((mask >> i & 1) != 0) x[i] = p[i];
+  return x;
+}
+inline void store_some(float* p, unsigned mask, __m512 x) {
+  for (int i = 0; i < 16; ++i)
+    if ((mask >> i & 1) != 0) p[i] = x[i];
+}
+
+inline __m512 set(float x) { return x - __m512{}; }
+inline __m512i set_word(int x) { return std::bit_cast<__m512i>(x - Words{}); }
+inline __m512 add(__m512 a, __m512 b) { return a + b; }
+inline __m512i both(__m512i a, __m512i b) { return a & b; }
+inline __m512 fma(__m512 a, __m512 b, __m512 c) {
+  __m512 y;
+  for (int i = 0; i < 16; ++i) y[i] = std::fma(a[i], b[i], c[i]);
+  return y;
+}
+/// Of a number and NaN the second, as of equal ones.
+inline __m512 max(unsigned, __m512 a, __m512 b) {
+  for (int i = 0; i < 16; ++i) a[i] = a[i] > b[i] ? a[i] : b[i];
+  return a;
+}
+inline __m512i shift_left(unsigned, __m512i x, int n) { return std::bit_cast<__m512i>(std::bit_cast<Words>(x) << n); }
+inline __m256 half(unsigned, __m512 x, int i) {
+  __m256 y;
+  std::memcpy(&y, reinterpret_cast<const float*>(&x) + 8 * i, sizeof(y));
+  return y;
+}
+inline __m512 widen(unsigned, __m256i x) {
+  const __m256 y[2] = {_mm256_cvtph_ps(_mm256_castsi256_si128(x)), _mm256_cvtph_ps(_mm256_extracti128_si256(x, 1))};
+  return load(y);
+}
+
+/// In each lane of four words the pairs of words `first` and `first + 1` of both.
+inline __m512i unpack_words(__m512i x, __m512i y, int first) {
+  const auto a = std::bit_cast<Words>(x), b = std::bit_cast<Words>(y);
+  Words out = {};
+  for (int i = 0; i < 16; ++i) out[i] = (i % 2 == 0 ? a : b)[i / 4 * 4 + first + i % 4 / 2];
+  return std::bit_cast<__m512i>(out);
+}
+inline __m512i low_words(unsigned, __m512i a, __m512i b) { return unpack_words(a, b, 0); }
+inline __m512i high_words(unsigned, __m512i a, __m512i b) { return unpack_words(a, b, 2); }
+/// In each lane of two 64-bit numbers number `which` of both.
+inline __m512i unpack_pairs(__m512i a, __m512i b, int which) {
+  __m512i out = {};
+  for (int i = 0; i < 8; ++i) out[i] = (i % 2 == 0 ? a : b)[i / 2 * 2 + which];
+  return out;
+}
+inline __m512i low_pairs(unsigned, __m512i a, __m512i b) { return unpack_pairs(a, b, 0); }
+inline __m512i high_pairs(unsigned, __m512i a, __m512i b) { return unpack_pairs(a, b, 1); }
+/// Two lanes of a and two of b, which two bits of `choice` name each.
+inline __m512i lanes(unsigned, __m512i a, __m512i b, int choice) {
+  __m512i out = {};
+  for (int i = 0; i < 8; ++i) out[i] = (i < 4 ? a : b)[(choice >> (i / 2 * 2) & 3) * 2 + i % 2];
+  return out;
+}
+
+}  // namespace vla::test::avx512
+
+#define _mm512_load_ps vla::test::avx512::load
+#define _mm512_loadu_ps vla::test::avx512::load
+#define _mm512_maskz_loadu_ps vla::test::avx512::load_some
+#define _mm512_loadu_si512 vla::test::avx512::load_words
+#define _mm512_storeu_ps vla::test::avx512::store
+#define _mm512_mask_storeu_ps vla::test::avx512::store_some
+#define _mm512_store_si512 vla::test::avx512::store_words
+#define _mm512_set1_ps vla::test::avx512::set
+#define _mm512_setzero_ps() vla::test::avx512::set(0)
+#define _mm512_set1_epi32 vla::test::avx512::set_word
+#define _mm512_add_ps vla::test::avx512::add
+#define _mm512_and_si512 vla::test::avx512::both
+#define _mm512_fmadd_ps vla::test::avx512::fma
+#define _mm512_maskz_max_ps vla::test::avx512::max
+#define _mm512_maskz_slli_epi32 vla::test::avx512::shift_left
+#define _mm512_maskz_extractf32x8_ps vla::test::avx512::half
+#define _mm512_maskz_cvtph_ps vla::test::avx512::widen
+#define _mm512_castps_si512 std::bit_cast<__m512i>
+#define _mm512_maskz_unpacklo_epi32 vla::test::avx512::low_words
+#define _mm512_maskz_unpackhi_epi32 vla::test::avx512::high_words
+#define _mm512_maskz_unpacklo_epi64 vla::test::avx512::low_pairs
+#define _mm512_maskz_unpackhi_epi64 vla::test::avx512::high_pairs
+#define _mm512_maskz_shuffle_i32x4 vla::test::avx512::lanes
+
+// What the sources ask the compiler for, and names of their own, so that the program holds the real kernels too.
+#if !defined(__AVX512F__)
+#define __AVX512F__ 1
+#define __AVX512DQ__ 1
+#endif
+#define Avx512 EmulatedAvx512
+#define kLinearAvx512 kEmulatedLinearAvx512
+#define kAvx512Kernels kEmulatedAvx512Kernels
