@@ -85,7 +85,7 @@ VLA_API const vla_error* vla_last_error(const vla_policy* policy);
 typedef struct vla_options {
   size_t struct_size;
   int32_t n_thread;    /* CPU threads, at most 512; 0: every core that the process may use */
-  const char* kernels; /* "ggml", "avx2", "avx512" or "amx"; NULL: the best that the machine has */
+  const char* kernels; /* "ggml", "avx2", "avx512" or "amx"; NULL: the best in float32 */
 } vla_options;
 #define VLA_OPTIONS_INIT \
   { sizeof(vla_options), 0, NULL }

@@ -82,7 +82,8 @@ const std::vector<Isa>& usable_isas() {
 
 Result<Isa> choose_isa(const std::string& name) {
   const std::vector<Isa>& usable = usable_isas();
-  if (name.empty()) return usable.back();
+  // Tiles round activations to bf16: what costs accuracy must be asked for.
+  if (name.empty()) return usable.back() == Isa::amx ? Isa::avx512 : usable.back();
   const auto known = std::find_if(std::begin(kAll), std::end(kAll), [&](Isa isa) { return isa_name(isa) == name; });
   if (known == std::end(kAll)) return Error{Code::usage, "kernels", "ggml, avx2, avx512 or amx", name};
   if (std::find(usable.begin(), usable.end(), *known) != usable.end()) return *known;

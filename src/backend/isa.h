@@ -23,7 +23,7 @@ std::string isa_name(Isa isa);
 /// What this machine can run, `ggml` first and the best last.
 const std::vector<Isa>& usable_isas();
 
-/// The kernels by name; an empty name takes the best that the machine has. Errors: usage for an unknown name,
+/// The kernels by name; an empty name takes the best in float32. Errors: usage for an unknown name,
 /// device for one that the machine cannot run.
 Result<Isa> choose_isa(const std::string& name);
 

@@ -232,7 +232,7 @@ Command add_run(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best of this machine")
+  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best in float32")
       ->check(CLI::Validator(check_given, ""));
   return [options] { return run(*options); };
 }
