@@ -78,10 +78,14 @@ inline __m512i unpack_pairs(__m512i a, __m512i b, int which) {
 }
 inline __m512i low_pairs(unsigned, __m512i a, __m512i b) { return unpack_pairs(a, b, 0); }
 inline __m512i high_pairs(unsigned, __m512i a, __m512i b) { return unpack_pairs(a, b, 1); }
-/// Two lanes of a and two of b, which two bits of `choice` name each.
+/// Two lanes of a and two of b, which two bits of `choice` name each. Copied as bytes: with the undefined-behaviour
+/// sanitizer GCC 12 reads the wrong element of a vector whose index is a shifted parameter.
 inline __m512i lanes(unsigned, __m512i a, __m512i b, int choice) {
-  __m512i out = {};
-  for (int i = 0; i < 8; ++i) out[i] = (i < 4 ? a : b)[(choice >> (i / 2 * 2) & 3) * 2 + i % 2];
+  __m512i out;
+  for (int i = 0; i < 4; ++i) {
+    const auto* from = reinterpret_cast<const char*>(i < 2 ? &a : &b);
+    std::memcpy(reinterpret_cast<char*>(&out) + 16 * i, from + 16 * (choice >> 2 * i & 3), 16);
+  }
   return out;
 }
 
