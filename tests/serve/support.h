@@ -47,6 +47,11 @@ inline v1::Request act_request(const GoldenCase& golden, std::uint64_t request_i
   return request;
 }
 
+inline const GoldenCase& golden() {
+  static const GoldenCase read = GoldenCase::read(kGolden);
+  return read;
+}
+
 inline v1::Request request_of(std::uint64_t request_id) {
   v1::Request request;
   request.set_protocol_version(1);
@@ -84,6 +89,16 @@ class Peer {
   zmq::context_t context;
   zmq::socket_t socket;
 };
+
+inline std::string code_of(const v1::Response& response) {
+  return response.has_error() ? v1::Error::Code_Name(response.error().code()) : "";
+}
+
+inline void check_serves(Peer& peer) {
+  const v1::Response response = peer.ask(act_request(golden(), 4242));
+  CHECK(response.request_id() == 4242);
+  CHECK(response.chunk().horizon() > 0);
+}
 
 /// Holds the engine thread before each act until it is let go on, so that what waits is known.
 class Brake : public serve::Observer {

@@ -1,0 +1,180 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Who is served when, where several acts wait, and what a client costs the others.
+#include <atomic>
+
+#include "serve/support.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+/// Comes back when an act waits in the queue.
+void await_queue(Peer& peer) {
+  v1::Request health = request_of(9);
+  health.mutable_health();
+  while (peer.ask(health).health().queue_depth() < 1) {
+  }
+}
+
+}  // namespace
+
+TEST_CASE("of two acts of one client that wait, the older is answered superseded and the newer is computed") {
+  Brake brake;
+  Running running({}, {&brake});
+  Peer peer(running.address());
+  peer.send(act_request(golden(), 1));
+  brake.await(1);
+  peer.send(act_request(golden(), 2));
+  peer.send(act_request(golden(), 3));
+  const auto superseded = peer.receive();
+  CHECK(superseded->request_id() == 2);
+  CHECK(code_of(*superseded) == "SUPERSEDED");
+  CHECK(superseded->error().found().find("request 3") != std::string::npos);
+  brake.let_go(2);
+  CHECK(peer.receive()->request_id() == 1);
+  const auto newest = peer.receive();
+  CHECK(newest->request_id() == 3);
+  CHECK(newest->has_chunk());
+}
+
+TEST_CASE("an act of a few bytes waits in the queue as it came") {
+  Brake brake;
+  Running running({}, {&brake});
+  Peer first(running.address()), second(running.address());
+  first.send(act_request(golden(), 1));
+  brake.await(1);
+  v1::Request request = request_of(2);
+  request.mutable_act()->set_text("no views");
+  second.send(request);
+  brake.let_go(2);
+  CHECK(first.receive()->has_chunk());
+  const v1::Response refused = *second.receive();
+  CHECK(refused.request_id() == 2);
+  CHECK(refused.error().where() == "observation.images.camera1");
+}
+
+TEST_CASE("an act whose deadline passes while it waits is answered late, not computed") {
+  Brake brake;
+  Running running({}, {&brake});
+  Peer first(running.address()), second(running.address());
+  first.send(act_request(golden(), 1));
+  brake.await(1);
+  v1::Request hurried = act_request(golden(), 2);
+  hurried.mutable_act()->set_deadline_ms(1);
+  second.send(hurried);
+  std::this_thread::sleep_for(std::chrono::milliseconds(50));
+  brake.let_go(1);
+  CHECK(first.receive()->has_chunk());
+  CHECK(code_of(*second.receive()) == "LATE");
+  hurried.mutable_act()->set_deadline_ms(60'000);
+  brake.let_go(1);
+  CHECK(second.ask(hurried).has_chunk());
+}
+
+TEST_CASE("a full queue answers busy to a further client, and those that wait are still served") {
+  Brake brake;
+  serve::ServerOptions options;
+  options.max_queue = 1;
+  Running running(options, {&brake});
+  Peer a(running.address()), b(running.address()), c(running.address());
+  a.send(act_request(golden(), 1));
+  brake.await(1);
+  b.send(act_request(golden(), 2));
+  await_queue(b);
+  CHECK(code_of(c.ask(act_request(golden(), 3))) == "BUSY");
+  brake.let_go(2);
+  CHECK(a.receive()->has_chunk());
+  CHECK(b.receive()->has_chunk());
+}
+
+TEST_CASE("health and describe are answered while the engine computes") {
+  Brake brake;
+  Running running({}, {&brake});
+  Peer busy(running.address()), other(running.address());
+  busy.send(act_request(golden(), 1));
+  brake.await(1);
+  v1::Request request = request_of(2);
+  request.mutable_health();
+  const v1::HealthReply health = other.ask(request).health();
+  CHECK(health.ready());
+  CHECK(health.computing());
+  CHECK(health.queue_depth() == 0);
+  request.mutable_describe();
+  CHECK(other.ask(request).has_description());
+  brake.let_go();
+  CHECK(busy.receive()->has_chunk());
+  request.mutable_health();
+  CHECK(other.ask(request).health().chunks_served() == 1);
+}
+
+TEST_CASE("a server that is told to stop answers what waits, takes nothing new, and ends without an error") {
+  Brake brake;
+  Running running({}, {&brake});
+  Peer a(running.address()), b(running.address()), c(running.address());
+  a.send(act_request(golden(), 1));
+  brake.await(1);
+  b.send(act_request(golden(), 2));
+  await_queue(b);
+  v1::Request health = request_of(9);
+  health.mutable_health();
+  CHECK(c.ask(health).health().ready());
+  running.server->stop();
+  while (c.ask(health).health().ready()) {
+  }
+  CHECK(code_of(c.ask(act_request(golden(), 3))) == "SHUTTING_DOWN");
+  brake.let_go(2);
+  CHECK(running.join().ok());
+  CHECK(a.receive()->has_chunk());
+  CHECK(b.receive()->has_chunk());
+}
+
+TEST_CASE("many clients at once get each their own answers, with the bytes that they get alone") {
+  Running running;
+  constexpr int kClients = 24, kRounds = 8;
+  std::vector<std::vector<float>> alone(kClients);
+  Peer peer(running.address());
+  for (int i = 0; i < kClients; ++i) {
+    v1::Request request = act_request(golden(), 1);
+    request.mutable_act()->set_seed(static_cast<std::uint64_t>(i));
+    const v1::ActionChunk chunk = peer.ask(request).chunk();
+    alone[static_cast<std::size_t>(i)].assign(chunk.actions().begin(), chunk.actions().end());
+  }
+  std::vector<std::thread> threads;
+  std::atomic<int> wrong = 0;
+  for (int i = 0; i < kClients; ++i)
+    threads.emplace_back([&, i] {
+      Peer client(running.address());
+      for (int round = 0; round < kRounds; ++round) {
+        const auto id = static_cast<std::uint64_t>(1000 * i + round);
+        v1::Request request = act_request(golden(), id);
+        request.mutable_act()->set_seed(static_cast<std::uint64_t>(i));
+        client.send(request);
+        const auto response = client.receive(120'000);
+        const auto& expected = alone[static_cast<std::size_t>(i)];
+        if (!response || response->request_id() != id ||
+            !std::equal(expected.begin(), expected.end(), response->chunk().actions().begin(),
+                        response->chunk().actions().end()))
+          ++wrong;
+      }
+    });
+  for (std::thread& thread : threads) thread.join();
+  CHECK(wrong == 0);
+}
+
+TEST_CASE("clients that never read, or that go away while their act waits, cost others nothing") {
+  Running running;
+  Peer deaf(running.address()), peer(running.address());
+  deaf.socket.set(zmq::sockopt::rcvhwm, 1);
+  v1::Request describe = request_of(1);
+  describe.mutable_describe();
+  const std::string bytes = describe.SerializeAsString();
+  for (int i = 0; i < 5000; ++i) deaf.socket.send(zmq::buffer(bytes), zmq::send_flags::dontwait);
+  for (int i = 0; i < 5; ++i) {
+    Peer gone(running.address());
+    gone.send(act_request(golden(), 1));
+  }
+  check_serves(peer);
+}
