@@ -79,11 +79,11 @@ def _count(a: argparse.Namespace, policies: Any, driver: Any, task: str, sentenc
     if journal.exists():
         journal.unlink()  # a demo is shown again, not continued
     data = runs.run("metaworld", driver, jobs, a.out, workers=a.workers, title=f"{a.episodes} more layouts", fault=policies.fault)
-    row = (data.get("swapped") if sentence else None) or data["success"]
+    row = data["swapped" if sentence else "success"]
     low, high = (100 * x for x in row["all"]["wilson95"])
-    t = data["latency"]["round_trip_ms"] if not sentence else None
+    t = data["latency"]["round_trip_ms"]
     what = f"solved the scene's task in {row['all']['solved']} of {row['all']['episodes']} layouts (95 % interval {low:.0f} to {high:.0f} %)"
-    console.print(what + (f"; a look takes {t['p50']:.0f} ms, p95 {t['p95']:.0f}" if t else ""), highlight=False)
+    console.print(f"{what}; a look takes {t['p50']:.0f} ms, p95 {t['p95']:.0f}", highlight=False)
 
 
 class _Teller(Watcher):
