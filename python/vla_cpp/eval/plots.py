@@ -37,7 +37,9 @@ def _figure(width: float, height: float, panels: int = 1) -> Any:
 def plain_log(axes: Any, values: Sequence[float]) -> None:
     """A logarithmic y axis around the values that is labelled in plain numbers: 1, 2, 5, 10, ..."""
     low, high = 0.85 * min(values), 1.18 * max(values)
-    steps = [m * 10.0**e for e in range(math.floor(math.log10(low)), math.ceil(math.log10(high))) for m in (1, 2, 5)]
+    steps = [m * 10.0**e for e in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1) for m in (1, 2, 5)]
+    if sum(low <= step <= high for step in steps) < 2:  # too narrow for two labels: from label to label
+        low, high = max(step for step in steps if step <= low), min(step for step in steps if step >= high)
     axes.set_yscale("log")
     axes.set_ylim(low, high)
     axes.yaxis.set_major_locator(FixedLocator([step for step in steps if low <= step <= high]))
