@@ -37,6 +37,7 @@ SIM       := .venv-sim
 SIM_STAMP := $(SIM)/.complete
 
 $(SIM_STAMP): python/pyproject.toml examples/metaworld/requirements-sim.txt
+	@echo "installing the simulator into $(SIM): a minute or two"
 	$(PYTHON) -m venv $(SIM)
 	$(SIM)/bin/pip install --quiet --disable-pip-version-check --no-deps -r examples/metaworld/requirements-sim.txt
 	$(SIM)/bin/pip install --quiet --disable-pip-version-check --no-deps -e python

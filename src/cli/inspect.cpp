@@ -135,7 +135,7 @@ void print_human(const Engine& engine) {
              text("vla.source.converter"));
   fmt::print("checksum     {}\n", text("vla.checksum"));
   print_features(engine);
-  fmt::print("solver       euler, {} steps from {:g}, {} noise\n", engine.solver().n_step,
+  fmt::print("solver       {}, {} steps from {:g}, {} noise\n", text("solver.kind"), engine.solver().n_step,
              engine.solver().times.front(), engine.solver().noise);
   const Json recipe = Json::parse(text("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {

@@ -100,6 +100,17 @@ def test_a_server_that_dies_is_reported_and_its_episode_not_counted(call, bundle
     assert outcomes(tmp_path / "died") == outcomes(tmp_path / "whole")
 
 
+def test_the_table_does_not_depend_on_the_order_in_which_episodes_ended(call, tmp_path, capsys):
+    assert main([*call("order"), "--json"]) == 0
+    told = last_object(capsys.readouterr().out)
+    journal = tmp_path / "order/episodes.jsonl"
+    head, *rows = journal.read_text().splitlines(keepends=True)
+    journal.write_text(head + "".join(reversed(rows)))
+    assert main([*call("order"), "--json"]) == 0
+    again = last_object(capsys.readouterr().out)
+    assert json.dumps(again["success"]) == json.dumps(told["success"])  # as text: the order of the tasks counts too
+
+
 def test_episodes_of_another_run_are_not_mixed_in(call, capsys):
     assert main(call("one")) == 0
     assert main(call("one", "--replan-every", "4")) == 9

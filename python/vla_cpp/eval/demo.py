@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any, List
 
-from .environments import make
+from .environments import MissingSimulator, make
 from .environments.metaworld import SENTENCES
 from .episode import Job, Look, Outcome, Watcher, run_episode
 from .environment import Guard
@@ -52,7 +52,7 @@ def play(a: argparse.Namespace) -> int:
         spec = driver.spec
         console.print(f"[bold]{spec.bundle.name}[/] ({spec.bundle.arch}) serves on {spec.device}, kernels: {spec.kernels}", highlight=False)
         console.print(f"MetaWorld [bold]{task}[/], layout {a.seed}. The robot hears: [bold yellow]“{a.text}”[/]", highlight=False)
-        environment = make("metaworld", task)
+        environment = _scene(task)
         policy = make_policy(driver.description)
         recorder = Recorder("corner4", environment.frame)  # type: ignore[attr-defined]
         told = _Teller(console, recorder.watcher(), spec.action_names)
@@ -71,6 +71,13 @@ def play(a: argparse.Namespace) -> int:
     return 0
 
 
+def _scene(task: str) -> Any:
+    try:
+        return make("metaworld", task)
+    except MissingSimulator as error:
+        raise MissingSimulator(f"{error}\nWithout a simulator, with recorded camera frames: make demo RECORDED=1") from error
+
+
 def _count(a: argparse.Namespace, policies: Any, driver: Any, task: str, sentence: str, console: Any) -> None:
     from . import run as runs
 
@@ -79,11 +86,11 @@ def _count(a: argparse.Namespace, policies: Any, driver: Any, task: str, sentenc
     if journal.exists():
         journal.unlink()  # a demo is shown again, not continued
     data = runs.run("metaworld", driver, jobs, a.out, workers=a.workers, title=f"{a.episodes} more layouts", fault=policies.fault)
-    row = (data.get("swapped") if sentence else None) or data["success"]
+    row = data["swapped" if sentence else "success"]
     low, high = (100 * x for x in row["all"]["wilson95"])
-    t = data["latency"]["round_trip_ms"] if not sentence else None
+    t = data["latency"]["round_trip_ms"]
     what = f"solved the scene's task in {row['all']['solved']} of {row['all']['episodes']} layouts (95 % interval {low:.0f} to {high:.0f} %)"
-    console.print(what + (f"; a look takes {t['p50']:.0f} ms, p95 {t['p95']:.0f}" if t else ""), highlight=False)
+    console.print(f"{what}; a look takes {t['p50']:.0f} ms, p95 {t['p95']:.0f}", highlight=False, soft_wrap=True)
 
 
 class _Teller(Watcher):

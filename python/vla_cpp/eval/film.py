@@ -66,7 +66,7 @@ def _curves(draw: ImageDraw.ImageDraw, box: Tuple[int, int, int, int], look: Loo
     x0, y0, x1, y1 = box
     actions = look.answer.actions
     horizon, d_action = actions.shape
-    reach = max(1.0, float(np.abs(actions).max()))
+    reach = 1.06 * max(1.0, float(np.abs(actions).max()))
     at = lambda k: x0 + (x1 - x0) * k / max(1, horizon - 1)  # noqa: E731
     up = lambda v: (y0 + y1) / 2 - (y1 - y0) / 2 * float(v) / reach  # noqa: E731
     draw.rectangle((at(min(executed, horizon) - 1), y0, x1, y1), fill=(246, 247, 249))
@@ -100,7 +100,7 @@ def draw_frame(shot: Shot, looks: Sequence[Look], outcome: Outcome, names: Seque
     draw = ImageDraw.Draw(page)
     page.paste(Image.fromarray(shot.frame).resize((PICTURE, PICTURE), Image.BICUBIC), (24, 56))
     draw.text((24, 16), f"“{outcome.sentence}”", font=_font(24), fill=INK)
-    draw.text((WIDTH - 24, 22), title, font=_font(13), fill=FAINT, anchor="ra")
+    draw.text((WIDTH - 24, HEIGHT - 8), title, font=_font(12), fill=FAINT, anchor="rs")
     right = PICTURE + 84
     draw.text((right, 56), f"step {shot.step}, look {looks.index(shot.look) + 1}", font=_font(15), fill=INK)
     if end:
@@ -108,9 +108,9 @@ def draw_frame(shot: Shot, looks: Sequence[Look], outcome: Outcome, names: Seque
         draw.text((WIDTH - 24, 56), told, font=_font(15), fill=GOOD if outcome.solved else BAD, anchor="ra")
     draw.text((right, 84), "the chunk that is being executed; grey: replaced by the next look", font=_font(12), fill=FAINT)
     _curves(draw, (right, 106, WIDTH - 24, 306), shot.look, shot.step, names, outcome.replan_every)
-    draw.text((right, 346), "inference per look, ms", font=_font(12), fill=FAINT)
+    draw.text((right, 340), "inference per look, ms", font=_font(12), fill=FAINT)
     most = max(look.answer.engine_ms for look in looks)
-    _latencies(draw, (right, 362, WIDTH - 24, 450), looks, shot.step, most, len(looks))
+    _latencies(draw, (right, 356, WIDTH - 24, 444), looks, shot.step, most, len(looks))
     return page
 
 

@@ -71,23 +71,23 @@ def differences(rows: Sequence[Outcome]) -> List[Dict[str, Any]]:
     table = []
     for look in range(max((len(row.difference) for row in rows), default=0)):
         values = [row.difference[look] for row in rows if len(row.difference) > look]
-        table.append({"look": look, "chunks": len(values), "p50": quantile(values, 0.5), "p95": quantile(values, 0.95), "max": max(values)})
+        table.append({"look": look + 1, "chunks": len(values), "p50": quantile(values, 0.5), "p95": quantile(values, 0.95), "max": max(values)})
     return table
 
 
 def summary(rows: Sequence[Outcome], head: Dict[str, Any]) -> Dict[str, Any]:
     """Everything above that these episodes allow, as one JSON object."""
-    own = [row for row in rows if row.driver == "a" and not row.swapped]
-    swapped = [row for row in rows if row.driver == "a" and row.swapped]
-    out: Dict[str, Any] = {"run": head, "success": by_task(own), "latency": latency(own, head["rate_hz"])}
-    out["clipped_share"] = sum(row.clipped for row in own) / max(1, sum(row.steps for row in own))
-    if swapped:
-        out["swapped"] = by_task(swapped)
-    if any(row.driver == "b" for row in rows):
-        out["success_b"] = by_task([row for row in rows if row.driver == "b" and not row.swapped])
+    of = {driver: [row for row in rows if row.driver == driver] for driver in ("a", "b")}
+    out: Dict[str, Any] = {"run": head}
+    for driver, suffix in (("a", ""), ("b", "_b")):
+        own, swapped = ([row for row in of[driver] if row.swapped == which] for which in (False, True))
+        out.update({key + suffix: by_task(part) for key, part in (("success", own), ("swapped", swapped)) if part})
+    out["latency"] = latency(of["a"], head["rate_hz"])
+    out["clipped_share"] = sum(row.clipped for row in of["a"]) / max(1, sum(row.steps for row in of["a"]))
+    if of["b"]:
         out["paired"] = pairs(rows)
     if any(row.difference for row in rows):
-        out["differences"] = differences([row for row in rows if row.driver == "a"])
+        out["differences"] = differences(of["a"])
     return out
 
 
@@ -97,7 +97,9 @@ def summary(rows: Sequence[Outcome], head: Dict[str, Any]) -> Dict[str, Any]:
 def markdown(data: Dict[str, Any]) -> str:
     """The summary for people."""
     head = data["run"]
-    lines = [f"# {head['environment']}: {head['a']}", "", *_success_table(data["success"], "task"), ""]
+    lines = [f"# {head['environment']}: {head['a']}", ""]
+    if "success" in data:
+        lines += [*_success_table(data["success"], "task"), ""]
     if "swapped" in data:
         lines += ["With the opposite task's sentence (solving the scene's own task is then a fault):", ""]
         lines += [*_success_table(data["swapped"], "scene"), ""]
@@ -138,8 +140,8 @@ def _difference_table(data: Dict[str, Any]) -> List[str]:
 
 
 def _latency_text(row: Dict[str, Any], head: Dict[str, Any]) -> List[str]:
-    if not row["replans"]:
-        return []
+    if not row["engine_ms"]["p95"] > 0:
+        return []  # nothing was inferred: random actions
     verdict = "keeps up with" if row["keeps_up"] else "is slower than"
     rate = f"{row['control_rate_hz']:.0f} steps per second, which {verdict} the robot's {head['rate_hz']:g}" if row["control_rate_hz"] else ""
     return [

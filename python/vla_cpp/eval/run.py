@@ -57,7 +57,8 @@ class Policies(contextlib.ExitStack):
         assert isinstance(policy, ServedPolicy)
         spec = policy.spec
         policy.close()
-        label = f"{spec.bundle.name} ({spec.precision}, {spec.kernels})"
+        precision = {"f32": "float32", "bf16": "bfloat16", "f16": "float16"}.get(spec.precision, spec.precision)
+        label = f"{spec.bundle.name}, computed in {precision} with {spec.kernels} kernels"
         return Driver(description, label, spec.bundle.checksum, spec)
 
     def torch(self, checkpoint: str) -> Driver:
@@ -114,8 +115,9 @@ def run(
             run_jobs(plan, jobs, journal, workers, on_episode, fault)
     finally:
         journal.close()
-    wanted = {job.key for job in jobs}
-    return report.summary([row for row in journal.outcomes if row.key in wanted], head)
+    # In the order of the jobs, not in that in which workers finished them: a table must not depend on who was faster.
+    finished = {row.key: row for row in journal.outcomes}
+    return report.summary([finished[job.key] for job in jobs], head)
 
 
 def declaration_of(name: str, task: str, options: Dict[str, Any]) -> Dict[str, Any]:
@@ -179,10 +181,13 @@ def write_report(data: Dict[str, Any], folder: Path) -> None:
         from . import plots
     except ImportError:
         return
-    tables = {data["run"]["a"]: data["success"], **({data["run"]["b"]: data["success_b"]} if "success_b" in data else {})}
-    plots.success_bars(tables, f"{data['run']['environment']}: solved, with 95 % intervals", folder / "summary.png")
+    head = data["run"]
+    kind, what = ("success", "solved") if "success" in data else ("swapped", "solved though the opposite was asked for")
+    tables = {head["a"]: data[kind], **({head["b"]: data[kind + "_b"]} if head["b"] else {})}
+    plots.success_bars(tables, f"{head['environment']}: {what}, with 95 % intervals", folder / "summary.png")
     if "differences" in data:
-        plots.difference_curves(data["differences"], f"{data['run']['a']} against {data['run']['b']}", folder / "differences.png")
+        title = f"{head['a']},\nagainst {head['b']}: largest difference of two chunks, action units"
+        plots.difference_curves(data["differences"], title, folder / "differences.png")
 
 
 __all__ = ["Policies", "RunFailed", "film_episodes", "run", "write_report"]

@@ -90,6 +90,7 @@ class MetaWorld(Environment):
         try:
             self._renderer = mujoco.Renderer(model, SIZE, SIZE)
         except Exception as error:
+            mujoco.Renderer.close = lambda renderer: None  # the destructor of the one that failed would print a traceback
             raise MissingSimulator(f"MuJoCo cannot draw with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}") from error
         _renderers.append(self._renderer)
         self._options = mujoco.MjvOption()
