@@ -7,8 +7,8 @@
 /// Transcendental functions of a vector of float32, within one unit in the last place of the exact value over the
 /// whole range, subnormal results included (tests/kernels/math_test.cpp). `V` is a type of vec.h.
 ///
-/// They are computed in double, one half of the vector after the other, and rounded once: float32 would need its
-/// rounding errors carried along and its range watched, which takes twice as long.
+/// They are computed in double, one half of the vector after the other, and rounded once: in float32, rounding errors
+/// would have to be carried along and ranges watched, which takes longer.
 namespace vla::kernels {
 
 /// e^x for |x| <= 700, with a relative error of 2^-29; of NaN anything.
