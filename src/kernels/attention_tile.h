@@ -79,29 +79,49 @@ class AttentionTile {
       P::store(to + i, from != nullptr && i < job.d_head ? load<V>(from + i, job.d_head - i) : Float{});
   }
 
-  /// A panel of kPanel keys: its depth is the width of a head. Missing keys are zeros.
-  static void pack_keys(const AttentionJob& job, std::int64_t unit, std::int64_t first) {
-    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv, depth = key_depth(job);
-    Number* panel = packed_keys(job, unit) + first * depth;
-    Number row[kMaxHead + kWidth];
+  static constexpr std::int64_t kRowStride = kMaxHead + kWidth;  // of rows on their way into panels
+
+  /// Keys or values of kPanel tokens from `first` on, as numbers and padded to `n_padded`; missing tokens are zeros.
+  /// The tokens after them are asked for: they are too far apart for the machine to foresee.
+  static VLA_INLINE void copy_rows(const AttentionJob& job, const AttentionJob::Rows& from, std::int64_t unit,
+                                   std::int64_t first, std::int64_t n_padded, Number* rows) {
+    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv;
     for (std::int64_t j = 0; j < kPanel; ++j) {
-      copy_row(job, first + j < job.n_key ? job.k.at(head, first + j, batch) : nullptr, depth, row);
-      for (std::int64_t i = 0; i < depth; ++i) panel[P::place(i, j, kPanel)] = row[i];
+      copy_row(job, first + j < job.n_key ? from.at(head, first + j, batch) : nullptr, n_padded, rows + j * kRowStride);
+      if (first + kPanel + j >= job.n_key) continue;
+      const float* next = from.at(head, first + kPanel + j, batch);
+      for (std::int64_t i = 0; i < job.d_head; i += 16) __builtin_prefetch(next + i);
     }
   }
 
-  /// kPanel keys of every panel of features: the depth of those is the number of keys.
+  /// A panel of kPanel keys: its depth is the width of a head.
+  static void pack_keys(const AttentionJob& job, std::int64_t unit, std::int64_t first) {
+    const std::int64_t depth = key_depth(job);
+    Number* panel = packed_keys(job, unit) + first * depth;
+    Number rows[kPanel * kRowStride];
+    copy_rows(job, job.k, unit, first, depth, rows);
+    for (std::int64_t i = 0; i < depth; ++i)
+      for (std::int64_t j = 0; j < kPanel; ++j) panel[P::place(i, j, kPanel)] = rows[j * kRowStride + i];
+  }
+
+  /// kPanel values of every panel of features: the depth of those is the number of keys.
   static void pack_values(const AttentionJob& job, std::int64_t unit, std::int64_t first) {
-    const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv, d = d_padded(job);
-    Number row[kMaxHead + kWidth];
-    for (std::int64_t key = first; key < first + kPanel; ++key) {
-      copy_row(job, key < job.n_key ? job.v.at(head, key, batch) : nullptr, d, row);
-      for (std::int64_t i = 0; i < d; i += kPanel) {
-        const std::int64_t width = panel_width(job, i);
-        Number* panel = packed_values(job, unit) + i * n_key_padded(job);
-        for (std::int64_t n = 0; n < width; ++n) panel[P::place(key, n, width)] = row[i + n];
-      }
+    const std::int64_t d = d_padded(job);
+    Number rows[kPanel * kRowStride];
+    copy_rows(job, job.v, unit, first, d, rows);
+    for (std::int64_t i = 0; i < d; i += kPanel) {
+      Number* panel = packed_values(job, unit) + i * n_key_padded(job);
+      if (panel_width(job, i) == kPanel)
+        put_values<kPanel>(rows + i, first, panel);
+      else
+        put_values<P::kLeastPanel>(rows + i, first, panel);
     }
+  }
+
+  template <int kColumns>
+  static VLA_INLINE void put_values(const Number* rows, std::int64_t first, Number* panel) {
+    for (std::int64_t j = 0; j < kPanel; ++j)
+      for (std::int64_t n = 0; n < kColumns; ++n) panel[P::place(first + j, n, kColumns)] = rows[j * kRowStride + n];
   }
 
   /// At most kRows rows of one unit.
@@ -170,15 +190,20 @@ class AttentionTile {
     /// What the block's queries see of a chunk.
     Seen look(std::int64_t key, int n) const {
       bool none = true, all = true;
-      for (int r = 0; r < n_row; ++r) {
+      for (int r = 0; r < n_row && (none || all); ++r) {
         const float* mask = job.mask + query_of(r) * job.n_key + key;
-        for (int i = 0; i < n; ++i) {
-          all = all && mask[i] == 0.0f;
-          none = none && mask[i] == kNever;
+        Float most_seen = V::set(mask[0]), least_seen = V::set(-mask[0]);
+        int j = 0;
+        for (; j + kWidth <= n; j += kWidth) {
+          most_seen = V::max(most_seen, V::load(mask + j));
+          least_seen = V::max(least_seen, -V::load(mask + j));
         }
-        if (!none && !all) return Seen::some;
+        float top = V::max(most_seen), bottom = -V::max(least_seen);
+        for (; j < n; ++j) top = mask[j] > top ? mask[j] : top, bottom = mask[j] < bottom ? mask[j] : bottom;
+        none = none && top == kNever;
+        all = all && top == 0.0f && bottom == 0.0f;
       }
-      return all ? Seen::all : Seen::none;
+      return all ? Seen::all : none ? Seen::none : Seen::some;
     }
 
     void multiply_keys(std::int64_t key, int n) {

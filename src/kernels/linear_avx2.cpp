@@ -14,7 +14,7 @@ struct Avx2Tile {
   using V = Avx2;
   using X = float;
   static constexpr int kRows = 6, kColumns = 16, kDepth = 16;
-  static constexpr int kMaxDepth = 384, kBlockRows = 96, kBlockColumns = 512;
+  static constexpr int kMaxDepth = 768, kBlockRows = 60, kBlockColumns = 512;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr int kPackCost = 3, kCopyCost = 1;
   static constexpr bool kPacked = false, kEven = true;

@@ -109,7 +109,7 @@ class LinearLoop {
   void columns(int i, std::int64_t begin, std::int64_t end, const Share& share) {
     end = least(end, job_.part[i].d_out);
     const std::int64_t n_row = job_.gated ? even_piece(share.row_end - share.row_begin, kGateRows, kRows) : job_.n_row;
-    const std::int64_t width = job_.gated ? kGateColumns : 2 * kGateColumns;
+    const std::int64_t width = even_piece(end - begin, job_.gated ? kGateColumns : most_columns(i), kColumns);
     for (std::int64_t row = share.row_begin; row < share.row_end; row += n_row)
       for (std::int64_t column = begin; column < end; column += width)
         block(i, column, least(column + width, end), row, least(row + n_row, share.row_end));
@@ -127,12 +127,27 @@ class LinearLoop {
         for (std::int64_t r = 0; r < rows; ++r)
           Tile::copy(job_.x + (row + r) * job_.d_in + k, depth, scratch_.x + r * Tile::kXStride);
         float* gates = scratch_.gate + (row - row_begin) * kGateColumns;
-        if (job_.gated) multiply(0, begin, end, rows, gate, k, gates, kGateColumns);
-        multiply(i, begin, end, rows, panel, k, job_.part[i].y + row * job_.part[i].d_out + begin, job_.part[i].d_out);
-        if (k + depth == job_.d_in)
-          for (std::int64_t r = 0; r < rows; ++r) finish(i, begin, end, row + r, gates + r * kGateColumns);
+        for (std::int64_t n = begin; n < end; n += kColumns) {
+          const std::int64_t i_panel = (n - begin) / kColumns;
+          const Stripe stripe = {i, n, least(kColumns, end - n), row, rows, k, depth, gates + (n - begin)};
+          if (job_.gated) multiply_gate(stripe, gate + i_panel * panel_stride(0, depth));
+          multiply(stripe, panel + i_panel * panel_stride(i, depth));
+        }
       }
     }
+  }
+
+  /// One panel's columns of part i by the rows of the block of x.
+  struct Stripe {
+    int i;
+    std::int64_t column, n_column, row, n_row, k, depth;
+    float* gates;  // [kGateColumns] x n_row
+  };
+
+  /// How many columns' panels there is room for: more than kBlockColumns where those are smaller than panels of floats.
+  std::int64_t most_columns(int i) const {
+    if (Tile::kPacked) return Tile::kBlockColumns;
+    return static_cast<std::int64_t>(sizeof(scratch_.panels)) / panel_stride(i, step_) * kColumns;
   }
 
   /// Bytes from one panel of part i to the next.
@@ -154,20 +169,50 @@ class LinearLoop {
     return first;
   }
 
-  /// c [stride] x rows (+)= the block of x times the panels; c starts at column `begin`.
-  void multiply(int i, std::int64_t begin, std::int64_t end, std::int64_t rows, const std::byte* panel, std::int64_t k,
-                float* c, std::int64_t stride) {
-    const std::int64_t depth = padded(least(step_, job_.d_in - k)), n_tile = pieces(rows, kRows);
-    const std::int64_t limit = least(end, job_.part[i].d_out);
-    for (std::int64_t n = begin; n < end; n += kColumns, c += kColumns, panel += panel_stride(i, depth))
-      for (std::int64_t t = 0; t < n_tile; ++t) {
-        const std::int64_t r = first_row(rows, t, n_tile), n_row = first_row(rows, t + 1, n_tile) - r;
-        const X* x = scratch_.x + r * Tile::kXStride;
-        if (limit - n >= kColumns)
-          Tile::multiply(job_.part[i].type, static_cast<int>(n_row), x, panel, depth, c + r * stride, stride, k > 0);
-        else
-          multiply_edge(job_.part[i].type, limit - n, n_row, x, panel, depth, c + r * stride, stride, k > 0);
-      }
+  void multiply_gate(const Stripe& s, const std::byte* panel) {
+    tiles(s.n_row, [&](std::int64_t r, std::int64_t n_row) {
+      multiply_tile(0, s, r, n_row, panel, s.gates + r * kGateColumns, kGateColumns);
+    });
+  }
+
+  /// y of the stripe (+)= the block of x times the panel. Whatever follows the product is done while a tile of y lies
+  /// in the first cache.
+  void multiply(const Stripe& s, const std::byte* panel) {
+    const LinearJob::Part& part = job_.part[s.i];
+    const bool last = s.k + s.depth == job_.d_in;
+    tiles(s.n_row, [&](std::int64_t r, std::int64_t n_row) {
+      const std::int64_t place = (s.row + r) * part.d_out + s.column;
+      fetch(part.y + place, n_row, part.d_out);
+      if (last && part.residual != nullptr) fetch(part.residual + place, n_row, part.d_out);
+      multiply_tile(s.i, s, r, n_row, panel, part.y + place, part.d_out);
+      if (last) finish(s, r, n_row);
+    });
+  }
+
+  /// Asks for the lines of a tile that will be read or written when the product over the panel's depth is there.
+  static VLA_INLINE void fetch(const float* tile, std::int64_t n_row, std::int64_t stride) {
+    for (std::int64_t r = 0; r < n_row; ++r)
+      for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + n);
+  }
+
+  template <class Do>
+  static VLA_INLINE void tiles(std::int64_t n_row, const Do& tile) {
+    const std::int64_t n_tile = pieces(n_row, kRows);
+    for (std::int64_t t = 0; t < n_tile; ++t) {
+      const std::int64_t r = first_row(n_row, t, n_tile);
+      tile(r, first_row(n_row, t + 1, n_tile) - r);
+    }
+  }
+
+  /// c [stride] x n_row (+)= rows r to r + n_row of the block of x times a panel of part i.
+  VLA_INLINE void multiply_tile(int i, const Stripe& s, std::int64_t r, std::int64_t n_row, const std::byte* panel,
+                                float* c, std::int64_t stride) {
+    const X* x = scratch_.x + r * Tile::kXStride;
+    const std::int64_t depth = padded(s.depth);
+    if (s.n_column == kColumns)
+      Tile::multiply(job_.part[i].type, static_cast<int>(n_row), x, panel, depth, c, stride, s.k > 0);
+    else
+      multiply_edge(job_.part[i].type, s.n_column, n_row, x, panel, depth, c, stride, s.k > 0);
   }
 
   /// Where tile t begins: tiles are of nearly equal height, or whole but for the last.
@@ -186,24 +231,18 @@ class LinearLoop {
       }
   }
 
-  /// The epilogue of columns [begin, end) of one row.
-  void finish(int i, std::int64_t begin, std::int64_t end, std::int64_t row, const float* gate) {
-    const LinearJob::Part& part = job_.part[i];
-    const std::int64_t offset = row * part.d_out + begin, n = end - begin;
-    const float* bias = part.bias == nullptr ? nullptr : part.bias + begin;
-    const float* residual = part.residual == nullptr ? nullptr : part.residual + offset;
-    if (job_.gated) {
-      const float* gate_bias = job_.part[0].bias == nullptr ? nullptr : job_.part[0].bias + begin;
-      return finish_gated(part.y + offset, bias, gate, gate_bias, residual, n);
-    }
+  /// The epilogue of a tile: rows r to r + n_row of the stripe.
+  void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) {
+    const LinearJob::Part& part = job_.part[s.i];
+    if (job_.gated) return finish_gated(s, r, n_row);
     switch (job_.activation) {
       case Activation::none:
-        if (bias != nullptr || residual != nullptr) finish_row<Activation::none>(part.y + offset, bias, residual, n);
+        if (part.bias != nullptr || part.residual != nullptr) finish_rows<Activation::none>(s, r, n_row);
         return;
       case Activation::gelu_tanh:
-        return finish_row<Activation::gelu_tanh>(part.y + offset, bias, residual, n);
+        return finish_rows<Activation::gelu_tanh>(s, r, n_row);
       case Activation::silu:
-        return finish_row<Activation::silu>(part.y + offset, bias, residual, n);
+        return finish_rows<Activation::silu>(s, r, n_row);
     }
   }
 
@@ -215,28 +254,33 @@ class LinearLoop {
   }
 
   template <Activation kActivation>
-  static void finish_row(float* y, const float* bias, const float* residual, std::int64_t n) {
-    for (std::int64_t i = 0; i < n; i += V::width) {
-      typename V::Float value = load<V>(y + i, n - i);
-      if (bias != nullptr) value += load<V>(bias + i, n - i);
-      value = activate<kActivation>(value);
-      if (residual != nullptr) value += load<V>(residual + i, n - i);
-      store<V>(y + i, value, n - i);
-    }
+  void finish_rows(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
+    const LinearJob::Part& part = job_.part[s.i];
+    for (std::int64_t r = first; r < first + n_row; ++r)
+      for (std::int64_t i = 0; i < s.n_column; i += V::width) {
+        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
+        typename V::Float value = load<V>(part.y + place, left);
+        if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
+        value = activate<kActivation>(value);
+        if (part.residual != nullptr) value += load<V>(part.residual + place, left);
+        store<V>(part.y + place, value, left);
+      }
   }
 
-  void finish_gated(float* y, const float* bias, const float* gate, const float* gate_bias, const float* residual,
-                    std::int64_t n) const {
-    for (std::int64_t i = 0; i < n; i += V::width) {
-      typename V::Float value = load<V>(y + i, n - i), factor = load<V>(gate + i, n - i);
-      if (bias != nullptr) value += load<V>(bias + i, n - i);
-      if (gate_bias != nullptr) factor += load<V>(gate_bias + i, n - i);
-      if (job_.activation == Activation::gelu_tanh) factor = gelu_tanh<V>(factor);
-      if (job_.activation == Activation::silu) factor = silu<V>(factor);
-      value *= factor;
-      if (residual != nullptr) value += load<V>(residual + i, n - i);
-      store<V>(y + i, value, n - i);
-    }
+  void finish_gated(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
+    const LinearJob::Part &part = job_.part[s.i], &gate = job_.part[0];
+    for (std::int64_t r = first; r < first + n_row; ++r)
+      for (std::int64_t i = 0; i < s.n_column; i += V::width) {
+        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
+        typename V::Float value = load<V>(part.y + place, left), factor = load<V>(s.gates + r * kGateColumns + i, left);
+        if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
+        if (gate.bias != nullptr) factor += load<V>(gate.bias + s.column + i, left);
+        if (job_.activation == Activation::gelu_tanh) factor = gelu_tanh<V>(factor);
+        if (job_.activation == Activation::silu) factor = silu<V>(factor);
+        value *= factor;
+        if (part.residual != nullptr) value += load<V>(part.residual + place, left);
+        store<V>(part.y + place, value, left);
+      }
   }
 
   const LinearJob& job_;

@@ -21,10 +21,12 @@ struct Shape {
   std::int64_t n_row, d_in, d_out;
 };
 
-// One row, a few, more than a block of rows; widths that no vector divides; depths beyond one block and of one number.
-constexpr Shape kShapes[] = {{1, 1, 1},     {1, 33, 17},   {2, 3, 31},     {3, 17, 1},    {5, 31, 33},  {6, 16, 16},
-                             {7, 64, 48},   {17, 100, 65}, {50, 72, 205},  {13, 1151, 3}, {4, 768, 32}, {33, 40, 70},
-                             {64, 96, 129}, {97, 35, 40},  {300, 33, 530}, {270, 5, 9},   {1, 1537, 70}};
+// One row, a few, more than a block of rows or of columns; widths that no vector divides; depths beyond one block and
+// of one number.
+constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},    {3, 17, 1},    {5, 31, 33},
+                             {6, 16, 16},  {7, 64, 48},   {17, 100, 65}, {50, 72, 205}, {13, 1151, 3},
+                             {4, 768, 32}, {33, 40, 70},  {64, 96, 129}, {97, 35, 40},  {300, 33, 530},
+                             {270, 5, 9},  {1, 1537, 70}, {7, 760, 1100}};
 
 /// Numbers in [-1, 1] that differ from call to call.
 class Numbers {
