@@ -81,7 +81,7 @@ def run_vla(vla, case, bundle, pattern, taps_file, threads):
     import gguf
 
     observation = json.loads((case / "observation.json").read_text())
-    command = [vla, "run", bundle, "--json", "--threads", threads, "--noise", case / "noise.npy"]
+    command = [vla, "run", bundle, "--json", "--kernels", "float32", "--threads", threads, "--noise", case / "noise.npy"]
     for view, file in observation["images"].items():
         command += ["--image", f"{view}={case / file if file else ''}"]
     command += ["--state", ",".join(map(repr, observation["state"])), "--text", observation["text"]]

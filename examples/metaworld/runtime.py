@@ -14,10 +14,10 @@ Name = Union[str, Path]
 
 def command(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, noise: Name, threads: int = 0) -> List[str]:
     """The command line.  frame: a PNG file; state (4,) in metres and gripper opening; noise: a .npy file (16, 8) float32;
-    threads: 0 takes every core."""
+    threads: 0 takes every core.  In float32, as PyTorch computed what the chunks are compared with."""
     values = ",".join(format(float(x), ".9g") for x in state)  # 9 digits bring a float32 back exactly
     return [str(vla), "run", str(bundle), "--image", f"corner4={frame}", "--state", values, "--text", text,
-            "--noise", str(noise), "--threads", str(threads), "--json"]
+            "--noise", str(noise), "--threads", str(threads), "--kernels", "float32", "--json"]
 
 
 def run(vla: Name, bundle: Name, frame: Name, state: np.ndarray, text: str, noise: Name, threads: int = 0) -> Dict[str, Any]:

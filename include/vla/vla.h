@@ -85,7 +85,8 @@ VLA_API const vla_error* vla_last_error(const vla_policy* policy);
 typedef struct vla_options {
   size_t struct_size;
   int32_t n_thread;    /* CPU threads, at most 512; 0: every core that the process may use */
-  const char* kernels; /* "ggml", "avx2", "avx512" or "amx"; NULL: the best in float32 */
+  const char* kernels; /* "ggml", "avx2", "avx512", "amx", or "float32": the best that does not round to bf16; NULL: the
+                          best for the bundle's dtype, which rounds to bf16 if the bundle and the machine have it */
 } vla_options;
 #define VLA_OPTIONS_INIT \
   { sizeof(vla_options), 0, NULL }
@@ -138,7 +139,7 @@ typedef struct vla_description {
   const char* revision;  /* its revision, or empty */
   const char* converter; /* what made the bundle */
   const char* dtype;     /* how matrices are stored: "f32", "bf16" or "f16" */
-  const char* precision; /* arithmetic of the large products: "f32" */
+  const char* precision; /* of the large products: "f32", or "bf16" with sums in float32 */
   const char* kernels;   /* what computes them: "ggml", "avx2", ... */
   const char* device;
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */

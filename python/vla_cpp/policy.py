@@ -27,7 +27,8 @@ class Policy:
 
     path     a bundle that vla-convert made
     threads  of the CPU; 0 takes every core that the process may use
-    kernels  "ggml", "avx2", "avx512" or "amx"; None: the best of this machine in float32
+    kernels  "ggml", "avx2", "avx512", "amx", or "float32": the best that does not round to bf16; None: the best for the
+             bundle's dtype
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
     of its parent, since the threads that compute stay behind, nor can it be pickled.

@@ -82,10 +82,10 @@ const std::vector<Isa>& usable_isas() {
 
 Result<Isa> choose_isa(const std::string& name) {
   const std::vector<Isa>& usable = usable_isas();
-  // Tiles round activations to bf16: what costs accuracy must be asked for.
-  if (name.empty()) return usable.back() == Isa::amx ? Isa::avx512 : usable.back();
+  if (name.empty()) return usable.back();
+  if (name == "float32") return usable.back() == Isa::amx ? Isa::avx512 : usable.back();
   const auto known = std::find_if(std::begin(kAll), std::end(kAll), [&](Isa isa) { return isa_name(isa) == name; });
-  if (known == std::end(kAll)) return Error{Code::usage, "kernels", "ggml, avx2, avx512 or amx", name};
+  if (known == std::end(kAll)) return Error{Code::usage, "kernels", "ggml, avx2, avx512, amx or float32", name};
   if (std::find(usable.begin(), usable.end(), *known) != usable.end()) return *known;
   std::vector<std::string> names;
   for (Isa isa : usable) names.push_back(isa_name(isa));

@@ -23,8 +23,8 @@ std::string isa_name(Isa isa);
 /// What this machine can run, `ggml` first and the best last.
 const std::vector<Isa>& usable_isas();
 
-/// The kernels by name; an empty name takes the best in float32. Errors: usage for an unknown name,
-/// device for one that the machine cannot run.
+/// The kernels by name: of an Isa, or "float32" for the best that round nothing to bf16. An empty name takes the best.
+/// Errors: usage for an unknown name, device for one that the machine cannot run.
 Result<Isa> choose_isa(const std::string& name);
 
 }  // namespace vla

@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include <algorithm>
 #include <map>
 
 namespace vla {
@@ -51,18 +50,16 @@ Weights::Place Weights::declare(const Param& param, ChooseFormat choose) {
   return {store_.add(GGML_TYPE_F32, param.shape), nullptr};
 }
 
-namespace {
-
-/// Tiles of bf16 round what they multiply. That is how a bundle of bf16 matrices is meant to be computed, and no other.
 Isa isa_for(const ParamList& list, Isa isa) {
-  const auto& all = list.params();
-  const bool has_bf16 = std::any_of(all.begin(), all.end(), [](const Param& param) {
-    return param.storage == Storage::matrix && param.source != nullptr && param.source->type == DType::bf16;
-  });
-  return isa == Isa::amx && !has_bf16 ? Isa::avx512 : isa;
+  int n_matrix = 0, n_bf16 = 0;
+  for (const Param& param : list.params())
+    if (param.storage == Storage::matrix) {
+      ++n_matrix;
+      n_bf16 += param.source != nullptr && param.source->type == DType::bf16;
+    }
+  const bool asks_for_bf16 = n_bf16 > 0 && n_bf16 == n_matrix;
+  return isa == Isa::amx && !asks_for_bf16 ? Isa::avx512 : isa;
 }
-
-}  // namespace
 
 Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill, ChooseFormat choose) {
   Weights weights(list.params().size(), device);

@@ -13,6 +13,11 @@
 
 namespace vla {
 
+/// The kernels that compute with these parameters on a device for `isa`. Tiles of bf16 round whatever they multiply,
+/// attention's operands too. A bundle asks for that by storing its matrices as bf16; one matrix of another dtype, or
+/// none at all, makes everything float32.
+Isa isa_for(const ParamList& list, Isa isa);
+
 /// The parameters of a policy, resident on a device. A matrix lies as the kernel that was chosen for it wants it:
 ///   as stored   rows in the bundle's dtype, in the mapped file itself, without a copy
 ///   packed      in panels, made at load

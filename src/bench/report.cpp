@@ -119,6 +119,7 @@ std::string to_json(const Report& report) {
   root["peak_name"] = report.peak_name;
   root["stages"] = std::move(stages);
   root["kernels"] = c.kernels;
+  root["precision"] = report.precision;
   root["threads"] = c.n_thread;
   root["cpu"] = report.cpu;
   root["conditions"] = {{"policy", c.policy}, {"weights", c.weights}, {"source", c.source}, {"views", c.n_view},

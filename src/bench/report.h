@@ -35,8 +35,9 @@ struct StageRow {
 
 struct Report {
   Conditions conditions;
-  std::string cpu, peak_name;  // the probe that shares refer to
-  double load = 0;             // ms, from opening the bundle to being ready
+  std::string cpu, peak_name;         // the probe that shares refer to
+  std::string precision, arithmetic;  // of the large products, for programs and in plain words
+  double load = 0;                    // ms, from opening the bundle to being ready
   Roofs before, after;
   MemoryUse predicted;
   ProcessMemory process;

@@ -33,7 +33,8 @@ std::vector<std::string> around(const Report& report) {
   std::vector<std::string> lines = {
       fmt::format("{}, {} weights ({}): {} view{} of {} x {}, {} tokens, {} steps, batch 1", c.policy, c.weights,
                   c.source, c.n_view, c.n_view == 1 ? "" : "s", c.width, c.height, c.n_text, c.n_step),
-      fmt::format("{}, {} thread{}, kernels: {}", report.cpu, c.n_thread, c.n_thread == 1 ? "" : "s", c.kernels)};
+      fmt::format("{}, {} thread{}, kernels: {}, {}", report.cpu, c.n_thread, c.n_thread == 1 ? "" : "s", c.kernels,
+                  report.arithmetic)};
   for (std::size_t i = 0; i < report.before.peaks.size(); ++i) {
     const Roofs::Peak &before = report.before.peaks[i], &after = report.after.peaks[i];
     lines.push_back(fmt::format("peak {}: {:.1f} G/s before the runs, {:.1f} after; one thread {:.1f}, {:.1f}{}",

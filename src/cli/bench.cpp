@@ -137,8 +137,7 @@ Command add_bench(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels,
-                      "Force the kernels: ggml, avx2, avx512 or amx; the best of the machine if not given");
+  command->add_option("--kernels", options->kernels, kKernelsHelp);
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");
   command->add_option("--plot", options->plot, "Also draw the roofline into this SVG file");

@@ -9,6 +9,11 @@
 
 namespace vla::cli {
 
+/// Of --kernels, wherever a policy is loaded.
+constexpr const char* kKernelsHelp =
+    "ggml, avx2, avx512, amx, or float32: the best that does not round to bf16; not given: the best for the bundle's "
+    "dtype, which multiplies bf16 on AMX tiles if the bundle is stored as bf16";
+
 /// Adds one subcommand. What it returns is run after parsing; its Status becomes the exit code (base/result.h).
 using Command = std::function<Status()>;
 

@@ -151,7 +151,7 @@ void print_human(const Engine& engine) {
   }
   const MemoryUse memory = engine.memory();
   fmt::print("             {:<18}  {:>14}\n", "all", n_param);
-  fmt::print("products     {}\n", engine.linear_kernels());
+  fmt::print("products     {}: {}\n", engine.linear_kernels(), engine.arithmetic());
   fmt::print("memory       {} in all: weights {}, inputs and cache {}, working memory {}\n",
              human_size(static_cast<double>(memory.total())), human_size(static_cast<double>(memory.weights)),
              human_size(static_cast<double>(memory.plan)), human_size(static_cast<double>(memory.working)));
@@ -172,6 +172,7 @@ void print_json(const Engine& engine) {
   for (const auto& [path, size] : module_sizes(engine.params()))
     root["modules"][path] = {{"parameters", size.n_param}, {"stored_bytes", size.stored}};
   root["linear_kernels"] = engine.linear_kernels();
+  root["precision"] = engine.precision();
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};

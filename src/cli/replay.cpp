@@ -106,7 +106,7 @@ Command add_replay(CLI::App& app) {
                                              "Server to ask; not given, nor --bundle: tcp://127.0.0.1:5555");
   CLI::Option* bundle = command->add_option("--bundle", options->bundle, "Serve this bundle for the replay instead");
   bundle->excludes(connect);
-  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx, with --bundle")->needs(bundle);
+  command->add_option("--kernels", options->kernels, std::string(kKernelsHelp) + "; with --bundle")->needs(bundle);
   command->add_option("--threads", options->n_thread, "CPU threads, with --bundle; 0 takes every core")
       ->needs(bundle)
       ->check(CLI::Range(0, 512));

@@ -111,10 +111,10 @@ void print_table(const ActionChunk& chunk, const Engine& engine) {
   }
 }
 
-void print_timing(const Timing& timing) {
+void print_timing(const Timing& timing, const Engine& engine) {
   std::vector<std::string> parts;
   for (const auto& [stage, ms] : timing) parts.push_back(fmt::format("{} {:.1f}", stage, ms));
-  fmt::print("ms: {}\n", fmt::join(parts, ", "));
+  fmt::print("ms: {}\nkernels: {}, {}\n", fmt::join(parts, ", "), engine.kernels(), engine.arithmetic());
 }
 
 void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions& options) {
@@ -130,6 +130,8 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   root["action_names"] = engine.processor().action_names();
   root["timing_ms"] = std::move(timing);
   root["bundle"] = identity_json(engine.bundle());
+  root["kernels"] = engine.kernels();
+  root["precision"] = engine.precision();
   root["notes"] = chunk.notes;
   if (options.seed && options.noise.empty()) root["seed"] = *options.seed;
   fmt::print("{}\n", text_of(root));
@@ -178,7 +180,7 @@ Status run(RunOptions& options) {
     return {};
   }
   print_table(chunk, *engine);
-  print_timing(chunk.timing);
+  print_timing(chunk.timing, *engine);
   return {};
 }
 
@@ -232,8 +234,7 @@ Command add_run(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best in float32")
-      ->check(CLI::Validator(check_given, ""));
+  command->add_option("--kernels", options->kernels, kKernelsHelp)->check(CLI::Validator(check_given, ""));
   return [options] { return run(*options); };
 }
 

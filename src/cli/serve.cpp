@@ -91,8 +91,9 @@ Command add_serve(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels, "ggml, avx2, avx512 or amx; not given: the best in float32")
-      ->check([](const std::string& text) { return text.empty() ? "expected a value, found empty text" : ""; });
+  command->add_option("--kernels", options->kernels, kKernelsHelp)->check([](const std::string& text) {
+    return text.empty() ? "expected a value, found empty text" : "";
+  });
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();

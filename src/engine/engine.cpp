@@ -153,6 +153,10 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   return chunk;
 }
 
+std::string Engine::arithmetic() const {
+  return isa() == Isa::amx ? "bf16 products on AMX tiles, sums in float32; --kernels float32 avoids them" : "float32";
+}
+
 MemoryUse Engine::memory() const {
   return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size() + device_.scratch()->size()};
 }

@@ -16,7 +16,7 @@ namespace vla {
 
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
-  std::string kernels;      // ggml, avx2, avx512 or amx; empty: the best that the machine has
+  std::string kernels;      // as choose_isa takes them; empty: the best that the machine has for the bundle's dtype
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
   bool dry = false;         // reserve memory without filling it: sizes are exact, and `act` must not be called
 };
@@ -65,10 +65,14 @@ class Engine {
   MemoryUse memory() const;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return weights_->kernels(); }
-  /// The kernels in use, as `--kernels` names them: those of the device, or fewer where the bundle's dtype needs fewer.
-  std::string kernels() const { return isa_name(weights_->isa()); }
-  /// Arithmetic of the large products: tiles round activations to bf16 and sum in float32, everything else is float32.
-  std::string precision() const { return weights_->isa() == Isa::amx ? "bf16" : "f32"; }
+  /// The kernels in use: those of the device, or others where the bundle's dtype asks for float32.
+  Isa isa() const { return weights_->isa(); }
+  /// The same, as `--kernels` names them.
+  std::string kernels() const { return isa_name(isa()); }
+  /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
+  std::string precision() const { return isa() == Isa::amx ? "bf16" : "f32"; }
+  /// The same in plain words, for people.
+  std::string arithmetic() const;
 
  private:
   Engine(Bundle bundle, Processor processor, Device device)

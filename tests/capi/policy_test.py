@@ -113,7 +113,7 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
         keys["solver.noise"],
     )
     assert (spec.bundle.name, spec.bundle.checksum) == (golden.bundle.name, told["bundle"]["checksum"])
-    assert spec.bundle.source == keys["vla.source.name"] and spec.precision == "f32"
+    assert spec.bundle.source == keys["vla.source.name"] and spec.precision == told["precision"]
 
 
 @pytest.mark.parametrize(

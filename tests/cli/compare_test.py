@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from golden_cases import NAMES, Golden, data_offset, tensors
+from golden_cases import FLOAT32, NAMES, Golden, data_offset, tensors
 from program import EXIT
 
 
@@ -14,7 +14,7 @@ from program import EXIT
 def taps(vla, tmp_path_factory):
     """Everything that a run of two_views computes."""
     path, case = tmp_path_factory.mktemp("taps") / "got.gguf", Golden("two_views")
-    assert vla(*case.arguments(options=["--json", "--tap", "*", "--taps-out", path])).code == 0
+    assert vla(*case.arguments(options=["--json", "--tap", "*", "--taps-out", path, *FLOAT32])).code == 0
     return path
 
 
@@ -35,7 +35,7 @@ def doctored(taps, tmp_path):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_block_of_a_golden_case_agrees_with_the_reference_within_1e_5(vla, tmp_path, name):
     case = Golden(name)
-    assert vla(*case.arguments(options=["--tap", "*", "--taps-out", tmp_path / "got.gguf"])).code == 0
+    assert vla(*case.arguments(options=["--tap", "*", "--taps-out", tmp_path / "got.gguf", *FLOAT32])).code == 0
     answer = vla("compare", case.expected, tmp_path / "got.gguf", "--tolerance", "1e-5")
     assert answer.code == 0 and answer.err == "", answer.out
     compared = [line.split()[0] for line in answer.out.splitlines()[1:-1]]
@@ -86,8 +86,9 @@ def test_a_pattern_records_only_what_it_names(vla, golden, tmp_path):
 
 
 def test_recording_changes_the_chunk_by_rounding_at_most(vla, golden, tmp_path):
-    plain = np.array(vla(*golden.arguments()).json()["actions"])
-    recorded = vla(*golden.arguments(options=["--json", "--tap", "*", "--taps-out", tmp_path / "t.gguf"])).json()["actions"]
+    plain = np.array(vla(*golden.arguments(options=["--json", *FLOAT32])).json()["actions"])
+    recording = ["--tap", "*", "--taps-out", tmp_path / "t.gguf"]
+    recorded = vla(*golden.arguments(options=["--json", *recording, *FLOAT32])).json()["actions"]
     # A recorded value is computed apart from the one that it would be fused with: the same numbers, rounded once more.
     assert np.abs(plain - recorded).max() <= 2e-6 * np.abs(plain).max()
 

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from conftest import ROOT
-from golden_cases import NAMES, Golden, tensors
+from golden_cases import FLOAT32, NAMES, Golden, tensors
 
 
 def convert(case, out, dtype):
@@ -43,7 +43,7 @@ def test_a_golden_checkpoint_becomes_the_committed_bundle_byte_for_byte(tmp_path
 def test_a_converted_checkpoint_gives_the_references_chunk_within_1e_5(vla, tmp_path, name, dtype):
     case, taps = Golden(name), tmp_path / "taps.gguf"
     bundle = convert(case, tmp_path / "policy.gguf", dtype)
-    answer = vla(*case.arguments(bundle=bundle, options=["--json", "--tap", "chunk", "--taps-out", taps])).json()
+    answer = vla(*case.arguments(bundle=bundle, options=["--json", "--tap", "chunk", "--taps-out", taps, *FLOAT32])).json()
     assert answer["bundle"]["dtype"] == dtype
     expected = tensors(case.expected)
     for got, name in ((tensors(taps)["chunk"], "chunk"), (np.array(answer["actions"]), "actions")):

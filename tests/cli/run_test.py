@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pictures
 import pytest
-from golden_cases import NAMES, Golden, tensors
+from golden_cases import FLOAT32, NAMES, Golden, tensors
 
 STAGES = ["load", "decode", "preprocess", "tokenize", "plan", "vision", "prefix", "steps", "postprocess"]
 
@@ -20,7 +20,7 @@ def actions(answer):
 @pytest.mark.parametrize("name", NAMES)
 def test_actions_of_a_golden_case_equal_the_references_within_1e_5(vla, name):
     case = Golden(name)
-    got, expected = actions(vla(*case.arguments())), tensors(case.expected)["actions"]
+    got, expected = actions(vla(*case.arguments(options=["--json", *FLOAT32]))), tensors(case.expected)["actions"]
     assert got.shape == expected.shape
     assert np.abs(got - expected).max() <= 1e-5 * np.abs(expected).max()
 
@@ -49,7 +49,17 @@ def test_the_table_shows_the_numbers_of_the_json_and_the_time_of_each_stage(vla,
     rows = np.array([line.split() for line in lines[1:6]], float)
     assert list(rows[:, 0]) == list(range(5))
     assert np.abs(rows[:, 1:] - actions(vla(*golden.arguments()))).max() <= 0.5001e-4
-    assert len(lines) == 7 and re.sub(r" [\d.]+(?=,|$)", "", lines[6]) == "ms: " + ", ".join(STAGES)
+    assert len(lines) == 8 and re.sub(r" [\d.]+(?=,|$)", "", lines[6]) == "ms: " + ", ".join(STAGES)
+
+
+def test_kernels_and_precision_are_told_in_the_json_and_in_plain_words(vla, golden):
+    for options in ([], FLOAT32, ["--kernels", "ggml"]):
+        told = vla(*golden.arguments(options=["--json", *options])).json()
+        words = "bf16 products on AMX tiles, sums in float32; --kernels float32 avoids them"
+        assert told["precision"] == ("bf16" if told["kernels"] == "amx" else "f32")
+        line = f"kernels: {told['kernels']}, {words if told['precision'] == 'bf16' else 'float32'}"
+        assert vla(*golden.arguments(options=options)).out.splitlines()[-1] == line
+    assert told["kernels"] == "ggml"
 
 
 def seeded(vla, golden, *options):

@@ -41,7 +41,7 @@ std::vector<float> our_chunk(const std::string& rule, int n_step) {
   bundle.set("vision.position_rule", Value(rule));
   bundle.set("solver.steps", Value(std::int64_t{n_step}));
   const GoldenCase golden = GoldenCase::read(case_path());
-  const auto chunk = load_engine(bundle.write("rule.gguf"), "chunk")->act(golden.observation, golden.noise);
+  const auto chunk = load_engine(bundle.write("rule.gguf"), "chunk", "float32")->act(golden.observation, golden.noise);
   REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
   return find_tap(chunk->taps, "chunk").values;
 }
