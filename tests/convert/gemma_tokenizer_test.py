@@ -45,6 +45,13 @@ def test_without_a_template_nothing_stands_in_front(converter):
     assert keys_of(converter, tiny)["tokenizer.prefix_ids"] == []
 
 
+def test_a_tab_in_the_place_of_its_byte_is_taken_as_published(converter):
+    tiny = TinyPi()
+    vocab = tiny.tokenizer["model"]["vocab"]
+    vocab["\t"] = vocab.pop("<0x09>")
+    assert keys_of(converter, tiny)["tokenizer.tokens"][vocab["\t"]] == "\t"
+
+
 def model(**values):
     return lambda tiny: tiny.tokenizer["model"].update(values)
 
@@ -71,6 +78,7 @@ REFUSED = {
     "model.ignore_merges: expected False, found True": model(ignore_merges=True),
     "model.dropout: expected None, found 0.5": model(dropout=0.5),
     "model.vocab: expected all 256 byte symbols, found 1 missing, the first is '<0x41>'": remove("<0x41>"),
+    "found 1 missing, the first is '<0xC3>'": remove("<0xC3>"),
     "normalizer: expected blanks replaced by U+2581 and nothing else, found null": spec(normalizer=None),
     "normalizer: expected blanks replaced by U+2581 and nothing else, found {": spec(
         normalizer={"type": "Sequence", "normalizers": [{"type": "Prepend", "prepend": BLANK}]}
