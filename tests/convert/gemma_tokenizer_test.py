@@ -7,7 +7,6 @@ import json
 import pytest
 
 from tiny_pi import BLANK, N_VOCAB, TinyPi
-from vla_cpp.convert import Code
 
 
 def keys_of(converter, tiny):
@@ -110,14 +109,6 @@ def test_a_tokenizer_that_the_runtime_does_not_follow_is_refused_by_field(conver
     tiny = TinyPi("pi0")
     REFUSED[message](tiny)
     assert message in converter.refusal(tiny).message()
-
-
-def test_a_sentencepiece_model_alone_is_refused_with_the_way_out(converter, tmp_path):
-    TinyPi("pi0").save(converter.folder)
-    folder = converter.folder / "tokenizer"
-    (folder / "tokenizer.json").rename(folder / "tokenizer.model")
-    error = converter.refusal()
-    assert error.code == Code.IO and "tokenizer.model alone" in error.message()
 
 
 def test_a_folder_without_a_tokenizer_names_the_option(converter, monkeypatch):

@@ -69,7 +69,7 @@ def _tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Proc
             "tokenizer " + TOKENIZER,
             "--backbone DIR, tokenizer/ inside the checkpoint, or a reachable hub",
             error.problems[0].found,
-            "give the folder with its tokenizer.json by --backbone",
+            "give the folder with its tokenizer.json or tokenizer.model by --backbone",
             Code.IO,
         )
     checkpoint.notes.append("tokenizer: {} at revision {}".format(TOKENIZER, revision))
