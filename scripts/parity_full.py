@@ -6,9 +6,10 @@
 
 DIR is a case as vla_cpp.convert.golden describes it: checkpoint/, observation.json, frames, noise.npy.  Where it has no
 checkpoint, one of the published size with random weights is written, for two cameras: smolvla 450 M parameters, 0.9 GB of
-disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 15 GB of memory while PyTorch runs in float32.  Every
-program runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert, vla.
-The table that is printed goes to docs/models.md.  Times are of one cold inference beside other work: no benchmark.
+disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 20 GB of memory while PyTorch runs in float32.
+Every program runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert,
+vla.  The table that is printed goes to docs/models.md; the memory of vla is that of its answer, with --blocks of every
+block beside it.  Times are of one cold inference beside other work: no benchmark.
 """
 import argparse
 import json

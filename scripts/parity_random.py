@@ -8,6 +8,9 @@ A seed draws everything: depths, heads, widths, patches, grid and table, views, 
 attention mode (of smolvla), relative actions (of pi0 and pi05).  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
 A configuration that the reference cannot run must be refused, with a reason, by vla-convert or by vla.  Ends with exit
 code 1 if a block differs by more than 1e-4 of its largest magnitude, or if only one side answers.
+
+With --bf16 the weights are float32 numbers that bfloat16 rounds and the bundle is in bf16: its actions must not lie further from
+the reference's in float32 than those of the reference in the dtypes of a published file.
 """
 import argparse
 import contextlib
@@ -91,23 +94,35 @@ def draw_pi(arch, seed):
     return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
 
 
-def run_reference(case, folder):
+def add_low_bits(file, seed):
+    """Moves every weight by up to half a percent, to float32 numbers such as training leaves."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {n: t.float() * (1 + 0.01 * (torch.rand(t.shape, generator=generator) - 0.5)) for n, t in load_file(file).items()}
+    save_file(tensors, file, metadata={"format": "pt"})
+
+
+def run_reference(case, folder, low_bits=False):
     """(taps, None), or (None, why the reference stops)."""
     maker = random_smolvla if isinstance(case.checkpoint, random_smolvla.Description) else random_pi
     maker.write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
     cases.write_observation(case, folder)
+    if low_bits:
+        add_low_bits(folder / "checkpoint" / "model.safetensors", case.seed)
     try:
         return golden.run_case(folder), None
     except (RuntimeError, ValueError, AssertionError) as error:
         return None, f"{type(error).__name__} {error}".splitlines()[0][:90]
 
 
-def run_runtime(vla, folder):
+def run_runtime(vla, folder, dtype="f32"):
     """(taps, None), or (None, who refuses and why)."""
     checkpoint, message = folder / "checkpoint", io.StringIO()
     with contextlib.redirect_stderr(message):
         code = cli.main([str(checkpoint), "--backbone", str(golden.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
-                         "--dtype", "f32", "--quiet"])
+                         "--dtype", dtype, "--quiet"])
     if code:
         return None, f"vla-convert ({code}): {message.getvalue().strip()[:200]}"
     try:
@@ -129,13 +144,19 @@ def judge(expected, got):
     return far[worst] <= TOLERANCE, f"actions {far['actions']:.1e}, worst of {len(far)} blocks {far[worst]:.1e} at {worst}"
 
 
-def compare(arch, seed, vla, folder):
+def judge_bf16(expected, got, published):
+    ours, theirs = (distance(run["actions"].ravel(), expected["actions"].ravel())[1] for run in (got, published))
+    return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
+
+
+def compare(arch, seed, vla, folder, bf16):
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
-        expected, stopped = run_reference(draw(seed) if arch == "smolvla" else draw_pi(arch, seed), folder)
-    got, refused = run_runtime(vla, folder)
+        expected, stopped = run_reference(draw(seed) if arch == "smolvla" else draw_pi(arch, seed), folder, bf16)
+        published = golden.run_case(folder, "published") if bf16 and expected else None
+    got, refused = run_runtime(vla, folder, "bf16" if bf16 else "f32")
     if expected is None or got is None:
         return expected is None and got is None, f"reference: {stopped or 'runs'}; {refused or 'the runtime runs'}"
-    return judge(expected, got)
+    return judge_bf16(expected, got, published) if bf16 else judge(expected, got)
 
 
 def main():
@@ -144,6 +165,7 @@ def main():
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
+    parser.add_argument("--bf16", action="store_true", help="what rounding the weights costs, instead of every block")
     parser.add_argument("--keep", type=Path, help="folder for the cases, instead of one that is removed")
     args = parser.parse_args()
     golden.open_reference()
@@ -153,7 +175,7 @@ def main():
         for seed in range(args.first, args.last + 1):
             folder = (args.keep or Path(scratch)) / str(seed)
             folder.mkdir(parents=True)
-            agree, what = compare(args.arch, seed, args.vla, folder)
+            agree, what = compare(args.arch, seed, args.vla, folder, args.bf16)
             n_wrong += not agree
             print(f"seed {seed}: {'agree' if agree else 'DIFFER'}; {what}", flush=True)
     print(f"{args.last - args.first + 1 - n_wrong} of {args.last - args.first + 1} seeds agree")

@@ -41,7 +41,8 @@ class Description:
 
 def published(arch, views):
     """The description of the published size: 3.2 G parameters that are used (pi0), and the expert's unused head."""
-    return Description(arch, {"dtype": "bfloat16"}, views=views, d_state=8)
+    policy = {"dtype": "bfloat16", "chunk_size": 50, "n_action_steps": 50, "max_state_dim": 32, "max_action_dim": 32}
+    return Description(arch, policy, views=views, d_state=8)
 
 
 def tokenizer(n_piece):

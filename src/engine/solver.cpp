@@ -6,7 +6,8 @@ namespace vla {
 
 Result<Solver> Solver::read(const Keys& keys) {
   VLA_TRY(const std::string kind, keys.string("solver.kind"));
-  if (kind != "euler") return Error{Code::bad_bundle, "solver.kind", "euler", kind};
+  if (kind != "euler" && kind != "euler_float32")
+    return Error{Code::bad_bundle, "solver.kind", "euler or euler_float32", kind, "this bundle needs a newer vla"};
   Solver solver;
   VLA_TRY(solver.n_step, keys.integer("solver.steps"));
   if (solver.n_step < 1 || solver.n_step > 1000)
@@ -18,7 +19,9 @@ Result<Solver> Solver::read(const Keys& keys) {
     return Error{Code::bad_bundle, "solver.noise", "normal or uniform", solver.noise};
   const double dt = (end - start) / solver.n_step;
   solver.dt = static_cast<float>(dt);
-  for (int k = 0; k < solver.n_step; ++k) solver.times.push_back(static_cast<float>(start + k * dt));
+  float accumulated = static_cast<float>(start);
+  for (int k = 0; k < solver.n_step; ++k, accumulated += solver.dt)
+    solver.times.push_back(kind == "euler" ? static_cast<float>(start + k * dt) : accumulated);
   return solver;
 }
 

@@ -12,16 +12,18 @@ Result<ByteFallbackBpe> ByteFallbackBpe::create(const std::vector<std::string>& 
                                                 const std::vector<std::string>& merges) {
   ByteFallbackBpe bpe;
   VLA_TRY(const TokenIds ids, index_tokens(tokens));
-  for (std::size_t byte = 0; byte < bpe.byte_ids_.size(); ++byte) {
-    const auto found = ids.find(fmt::format("<0x{:02X}>", byte));
-    if (found == ids.end())
-      return Error{Code::bad_bundle, "tokenizer.tokens", "a token for each of the 256 bytes",
-                   fmt::format("none for <0x{:02X}>", byte)};
-    bpe.byte_ids_[byte] = found->second;
-  }
   for (std::size_t i = 0; i < tokens.size(); ++i) {
     const unicode::Char c = unicode::first(tokens[i]);
     if (c.size > 0 && c.size == tokens[i].size()) bpe.char_ids_.emplace(c.code_point, static_cast<std::int32_t>(i));
+  }
+  for (std::uint32_t byte = 0; byte < bpe.byte_ids_.size(); ++byte) {
+    const auto found = ids.find(fmt::format("<0x{:02X}>", byte));
+    if (found != ids.end()) {
+      bpe.byte_ids_[byte] = found->second;
+    } else if (byte > 0x7F || bpe.char_ids_.count(byte) == 0) {  // a token that is the character itself comes first
+      return Error{Code::bad_bundle, "tokenizer.tokens", "a token for each of the 256 bytes",
+                   fmt::format("none for <0x{:02X}>", byte)};
+    }
   }
   VLA_TRY(bpe.merges_, Merges::create(ids, merges));
   return bpe;

@@ -19,8 +19,8 @@ namespace vla {
 /// Source: tokenizers models/bpe/model.rs (merge_word, byte_fallback).
 class ByteFallbackBpe {
  public:
-  /// `tokens` by id, `merges` as `left right` by rank. Errors: bad_bundle when a byte has no token, two ids share a
-  /// text, or a merge names what is not a token.
+  /// `tokens` by id, `merges` as `left right` by rank. Errors: bad_bundle when a byte has neither its own token nor,
+  /// as Gemma's tab, its character as one; when two ids share a text, or a merge names what is not a token.
   static Result<ByteFallbackBpe> create(const std::vector<std::string>& tokens, const std::vector<std::string>& merges);
 
   /// `text` with every blank written as U+2581.

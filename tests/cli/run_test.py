@@ -126,10 +126,10 @@ def test_blanks_exponents_and_numbers_too_small_for_float32_are_numbers_of_a_sta
     assert np.array_equal(actions(vla(*golden.arguments(state=plain))), actions(vla(*golden.arguments(state=tiny))))
 
 
-def test_an_instruction_beyond_the_bucket_is_cut_and_the_user_is_told(vla):
-    case = Golden("long_text")
-    result = vla(*case.arguments())
-    assert re.fullmatch(r"note: instruction: \d+ tokens, cut to the first 12\n", result.err)
+@pytest.mark.parametrize("name, bucket", [("smolvla/long_text", 12), ("pi0/long_text", 12), ("pi05/long_text", 24)])
+def test_an_instruction_beyond_the_bucket_is_cut_and_the_user_is_told(vla, name, bucket):
+    result = vla(*Golden(name).arguments())
+    assert re.fullmatch(rf"note: instruction: \d+ tokens, cut to the first {bucket}\n", result.err)
     assert result.json()["notes"] == [result.err.removeprefix("note: ").rstrip("\n")]
 
 

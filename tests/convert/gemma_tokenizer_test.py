@@ -7,7 +7,6 @@ import json
 import pytest
 
 from tiny_pi import BLANK, N_VOCAB, TinyPi
-from vla_cpp.convert import Code
 
 
 def keys_of(converter, tiny):
@@ -45,6 +44,13 @@ def test_without_a_template_nothing_stands_in_front(converter):
     assert keys_of(converter, tiny)["tokenizer.prefix_ids"] == []
 
 
+def test_a_tab_in_the_place_of_its_byte_is_taken_as_published(converter):
+    tiny = TinyPi()
+    vocab = tiny.tokenizer["model"]["vocab"]
+    vocab["\t"] = vocab.pop("<0x09>")
+    assert keys_of(converter, tiny)["tokenizer.tokens"][vocab["\t"]] == "\t"
+
+
 def model(**values):
     return lambda tiny: tiny.tokenizer["model"].update(values)
 
@@ -71,6 +77,7 @@ REFUSED = {
     "model.ignore_merges: expected False, found True": model(ignore_merges=True),
     "model.dropout: expected None, found 0.5": model(dropout=0.5),
     "model.vocab: expected all 256 byte symbols, found 1 missing, the first is '<0x41>'": remove("<0x41>"),
+    "found 1 missing, the first is '<0xC3>'": remove("<0xC3>"),
     "normalizer: expected blanks replaced by U+2581 and nothing else, found null": spec(normalizer=None),
     "normalizer: expected blanks replaced by U+2581 and nothing else, found {": spec(
         normalizer={"type": "Sequence", "normalizers": [{"type": "Prepend", "prepend": BLANK}]}
@@ -102,14 +109,6 @@ def test_a_tokenizer_that_the_runtime_does_not_follow_is_refused_by_field(conver
     tiny = TinyPi("pi0")
     REFUSED[message](tiny)
     assert message in converter.refusal(tiny).message()
-
-
-def test_a_sentencepiece_model_alone_is_refused_with_the_way_out(converter, tmp_path):
-    TinyPi("pi0").save(converter.folder)
-    folder = converter.folder / "tokenizer"
-    (folder / "tokenizer.json").rename(folder / "tokenizer.model")
-    error = converter.refusal()
-    assert error.code == Code.IO and "tokenizer.model alone" in error.message()
 
 
 def test_a_folder_without_a_tokenizer_names_the_option(converter, monkeypatch):

@@ -28,6 +28,7 @@ def test_libero_adds_the_state_to_six_relative_actions(converter):
     bundle = converter.bundle(tiny, variant="pi0_libero")
     found = recipe(bundle)
     assert bundle.keys["vla.arch"] == "pi0" and bundle.keys["policy.horizon"] == 7
+    assert bundle.keys["solver.kind"] == "euler_float32"
     assert found["image"][0] == {
         "op": "letterbox",
         "width": 224,

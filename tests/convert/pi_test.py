@@ -26,6 +26,7 @@ from tiny_pi import (
 )
 from vla_cpp.convert.archs import _pi, _pi_names, _pi_sizes, pi0, pi05
 from vla_cpp.convert.checkpoint import Checkpoint
+from vla_cpp.convert.dtypes import f32_to_bf16
 from vla_cpp.convert.errors import Code, Problems
 from vla_cpp.convert.section import Section
 
@@ -96,6 +97,42 @@ def test_norms_of_gemma_are_stored_as_the_factor_that_the_reference_computes(con
     np.testing.assert_array_equal(
         bundle.tensors["vision.post_norm.weight"], tiny.tensors[VISION + "post_layernorm.weight"]
     )
+
+
+def in_bf16(tiny, choose):
+    return {name: ("BF16", f32_to_bf16(value)) if choose(name) else value for name, value in tiny.tensors.items()}
+
+
+def is_rounded(name):
+    """As the reference decides in bfloat16, by the names of its parameters."""
+    kept = ("vision_tower", "multi_modal_projector", "input_layernorm", "post_attention_layernorm", "model.norm")
+    return name.startswith(PWE) and not any(part in name for part in kept)
+
+
+@KINDS
+def test_a_policy_that_the_reference_saved_in_bfloat16_loses_nothing(converter, kind):
+    tiny = TinyPi(kind)
+    tiny.tensors = in_bf16(tiny, is_rounded)
+    bundle = converter.bundle(tiny)
+    assert bundle.keys["vla.dtype"] == "bf16" and converter.summary.rounding[0] == 0
+    assert bundle.dtypes["lm.blk.0.attn_k.weight"] == bundle.dtypes["lm.token_embd.weight"] == "bf16"
+    assert bundle.dtypes["vision.blk.0.ffn_up.weight"] == bundle.dtypes["action_out.weight"] == "f32"
+
+
+@KINDS
+def test_bf16_rounds_what_the_reference_rounds(converter, kind):
+    bundle = converter.bundle(TinyPi(kind), dtype="bf16")
+    rounded = {name for name, dtype in bundle.dtypes.items() if dtype == "bf16"}
+    assert "expert.blk.1.ffn_down.weight" in rounded and all(name.startswith(("lm.", "expert.blk.")) for name in rounded)
+    assert not any("norm" in name for name in rounded)
+
+
+@KINDS
+def test_what_is_stored_in_bfloat16_stays_so(converter, kind):
+    tiny = TinyPi(kind)
+    tiny.tensors = in_bf16(tiny, lambda name: True)
+    dtypes = converter.bundle(tiny).dtypes
+    assert dtypes["action_out.weight"] == dtypes["vision.blk.0.ffn_up.weight"] == "bf16"
 
 
 @KINDS

@@ -171,6 +171,20 @@ TEST_CASE("a vocabulary without a byte, or with a text twice or empty, is refuse
   }
 }
 
+TEST_CASE("a byte may lack a token where its character is one, as the tab of Gemma's published file") {
+  const auto without = [](const char* symbol) {
+    Keys keys = tokenizer_keys("gemma");
+    auto tokens = *keys.strings("tokenizer.tokens");
+    *std::find(tokens.begin(), tokens.end(), symbol) = "no byte";
+    keys.set("tokenizer.tokens", tokens);
+    return keys;
+  };
+  const std::string text = "a\tb \t\tc";
+  CHECK(encode(make(without("<0x09>")), text) == encode(load("gemma"), text));
+  CHECK(contains(refused_keys(without("<0x01>")), "none for <0x01>"));
+  CHECK(contains(refused_keys(without("<0xC3>")), "none for <0xC3>"));
+}
+
 TEST_CASE("merges of what is not a token, or without two parts, are refused at their rank") {
   for (const char* merge : {"a", "a b c", "", " ", "a nothing", "nothing a", "Ā Ā"}) {
     Keys keys = tokenizer_keys("tangled");

@@ -104,11 +104,13 @@ def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> N
 
 
 def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
-    """As asked; else the stored one when all matrices share it; else f32, which holds every stored number exactly."""
+    """As asked; else the stored one when all matrices that it is for share it; else f32, which holds every stored number."""
     if wanted:
         return wanted
     stored = Counter(
-        checkpoint.tensors[weight.source].dtype for weight in plan.weights if weight.kind in (MATRIX, TABLE)
+        checkpoint.tensors[weight.source].dtype
+        for weight in plan.weights
+        if weight.kind in (MATRIX, TABLE) and not weight.keep_f32
     )
     if len(stored) == 1:
         return BUNDLE_NAME[next(iter(stored))]
@@ -121,13 +123,17 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
     return "f32"
 
 
-def _tensor_dtype(weight: Weight, dtype: str) -> str:
-    return dtype if weight.kind in (MATRIX, TABLE) else "f32"
+def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
+    exact = weight.kind not in (MATRIX, TABLE) or (weight.keep_f32 and stored == "F32")
+    return "f32" if exact else dtype
 
 
 def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
-    tensors = [TensorInfo(weight.target, weight.shape, _tensor_dtype(weight, summary.dtype)) for weight in plan.weights]
+    tensors = [
+        TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype))
+        for w in plan.weights
+    ]
     tensors += [TensorInfo(name, value.shape, "f32") for name, value in plan.statistics.items()]
     total = sum(tensor.n_bytes for tensor in tensors)
     done = 0

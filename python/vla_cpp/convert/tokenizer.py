@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""tokenizer.json as the keys of a bundle, after checking that it is a tokenizer that the runtime implements.
+"""tokenizer.json, or a SentencePiece model, as the keys of a bundle, after checking that it is a tokenizer that the runtime implements.
 
 Two kinds are known, each with a module of its own: byte-level BPE and BPE with byte fallback. What they share stands in
 tokenizer_parts.py.
@@ -9,9 +9,9 @@ tokenizer_parts.py.
 from __future__ import annotations
 
 import os
-from typing import List, NamedTuple
+from typing import List, NamedTuple, Tuple
 
-from . import tokenizer_byte_fallback, tokenizer_byte_level
+from . import tokenizer_byte_fallback, tokenizer_byte_level, tokenizer_sentencepiece
 from .bundle import Key
 from .errors import Code, Problems, refuse
 from .files import member, read_json
@@ -36,18 +36,7 @@ class TokenizerPlan(NamedTuple):
 
 def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> TokenizerPlan:
     """`n_vocab`: rows of the embedding table, which no id may reach."""
-    if not os.path.exists(os.path.join(folder, JSON_FILE)):
-        other = os.path.exists(os.path.join(folder, "tokenizer.model"))
-        raise refuse(
-            os.path.join(folder, JSON_FILE),
-            "the tokenizer in one file",
-            "tokenizer.model alone" if other else "none",
-            "load it with transformers and save it again, or give its folder by --backbone",
-            Code.IO,
-        )
-    spec = read_json(os.path.join(folder, JSON_FILE))
-    config_path = os.path.join(folder, CONFIG_FILE)
-    config = read_json(config_path) if os.path.exists(config_path) else {}
+    spec, config = _read_files(folder, problems, notes)
     model = member(spec, "model", dict, JSON_FILE)
     kind = tokenizer_byte_fallback if model.get("byte_fallback") is True else tokenizer_byte_level
     config = kind.with_defaults(config)
@@ -64,6 +53,25 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
         *own,
     ]
     return TokenizerPlan(keys, _truncation_side(spec, config, problems))
+
+
+def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict, dict]:
+    """tokenizer.json, or what it would say where there is a SentencePiece model alone, and tokenizer_config.json."""
+    path, config_path = os.path.join(folder, JSON_FILE), os.path.join(folder, CONFIG_FILE)
+    pieces = tokenizer_sentencepiece.find(folder)
+    config = read_json(config_path) if os.path.exists(config_path) else {}
+    if os.path.exists(path):
+        return read_json(path), config
+    if pieces is None:
+        raise refuse(
+            path,
+            "the tokenizer in one file",
+            "none, and no " + " or ".join(tokenizer_sentencepiece.FILES),
+            "load it with transformers and save it again, or give its folder by --backbone",
+            Code.IO,
+        )
+    notes.append("tokenizer: from {}, as transformers makes {} of it".format(os.path.basename(pieces), JSON_FILE))
+    return tokenizer_sentencepiece.read_spec(pieces, problems), config or tokenizer_sentencepiece.CONFIG
 
 
 def _with_rows(added: List[dict], n_vocab: int) -> List[dict]:

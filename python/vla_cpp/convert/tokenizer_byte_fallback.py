@@ -53,7 +53,7 @@ def with_defaults(config: dict) -> dict:
 
 def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key]:
     check_model(tokenizer.model, MODEL, "byte-level BPE and BPE with byte fallback", problems)
-    check_symbols(tokenizer.model, BYTES, problems)
+    check_symbols(tokenizer.model, _needed_bytes(member(tokenizer.model, "vocab", dict, JSON_FILE)), problems)
     check_class(tokenizer.config, GENERIC + GEMMA, problems)
     spec = tokenizer.spec
     if one_or_sequence(spec.get("normalizer"), "normalizers") != NORMALIZER:
@@ -70,6 +70,11 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
             )
     _check_characters(tokenizer, problems)
     return [Key("tokenizer.prefix_ids", "u32[]", _prefix(tokenizer, problems))]
+
+
+def _needed_bytes(vocab: dict) -> List[str]:
+    """A character that is a token never falls back to its byte: in Gemma's file the tab stands where <0x09> would be."""
+    return [symbol for byte, symbol in enumerate(BYTES) if byte > 0x7F or chr(byte) not in vocab]
 
 
 def _check_characters(tokenizer: Tokenizer, problems: Problems) -> None:

@@ -26,6 +26,7 @@ class Weight(NamedTuple):
     stored: Tuple[int, ...]
     shape: Tuple[int, ...]
     plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
+    keep_f32: bool = False  # a matrix that the reference keeps in float32 in bfloat16 too: not rounded if stored so
 
 
 class Dropped(NamedTuple):

@@ -185,6 +185,7 @@ def _sizes(family: Family, policy: Section, checkpoint: Checkpoint, variant: Var
         policy.bad("action_dim", "at least the robot's {} numbers".format(max(s.state_dim, s.action_dim)))
     s.horizon, s.n_step = policy.count("action_horizon"), 10
     s.min_period, s.max_period = 4e-3, 4.0
+    s.solver = "euler_float32"  # sample_actions adds up time in a tensor of float32
     if policy.get("precision") not in ("bfloat16", "float32", "float16"):
         policy.bad("precision", "bfloat16, float32 or float16", unsupported=True)
     return s

@@ -51,7 +51,7 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
         Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
     ]
     problems.raise_any()
-    weights = _weights(family, source.sizes, checkpoint)
+    weights = [row._replace(keep_f32=not _rounded(row)) for row in _weights(family, source.sizes, checkpoint)]
     return Plan(keys, weights, _dropped(family, source.sizes, checkpoint), source.statistics, _hints(source.sizes))
 
 
@@ -69,7 +69,7 @@ def _tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Proc
             "tokenizer " + TOKENIZER,
             "--backbone DIR, tokenizer/ inside the checkpoint, or a reachable hub",
             error.problems[0].found,
-            "give the folder with its tokenizer.json by --backbone",
+            "give the folder with its tokenizer.json or tokenizer.model by --backbone",
             Code.IO,
         )
     checkpoint.notes.append("tokenizer: {} at revision {}".format(TOKENIZER, revision))
@@ -84,6 +84,12 @@ def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problem
     spanning = next((token for token in tokens if token.endswith("\n") and token.strip("\n")), None)
     if spanning is not None:
         problems.unsupported("tokenizer.json: model.vocab", "a newline in no token but its own runs", repr(spanning))
+
+
+def _rounded(weight: Weight) -> bool:
+    """What LeRobot rounds in bfloat16: neither the vision tower nor norms, nor the projections outside the towers
+    (to_bfloat16_for_selected_params)."""
+    return weight.target.startswith(("lm.", "expert.blk.")) and ".dense." not in weight.target
 
 
 def _weights(family: Family, s: Sizes, checkpoint: Checkpoint) -> List[Weight]:

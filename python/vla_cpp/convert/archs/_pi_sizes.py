@@ -59,6 +59,7 @@ class Sizes:
     n_step: int = 0
     min_period: float = 0.0
     max_period: float = 0.0
+    solver: str = "euler"
 
     @property
     def n_position(self) -> int:
@@ -176,5 +177,5 @@ def network_keys(s: Sizes) -> Dict[str, Dict[str, object]]:
         "expert.rope_base": ROPE_BASE,
     }
     f64 = {"time.min_period": s.min_period, "time.max_period": s.max_period, "solver.t_start": 1.0, "solver.t_end": 0.0}
-    text = {"vision.position_rule": "row_major", "solver.kind": "euler", "solver.noise": "normal"}
+    text = {"vision.position_rule": "row_major", "solver.kind": s.solver, "solver.noise": "normal"}
     return {"u32": u32, "f32": f32, "f64": f64, "string": text}
