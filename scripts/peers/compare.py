@@ -132,7 +132,7 @@ def print_table(args, vla, results):
         cells += [f"{median(r[s] for r in rounds):.0f}" if s in rounds[0] else "" for s in STAGES]
         cells += [f"**{median(t / sum(o.values()) for t, o in zip(totals, ours)):.2f}**"]
         cells += [f"{median(r[s] / o[s] for r, o in zip(rounds, ours)):.2f}" if s in rounds[0] else "" for s in STAGES]
-        cells += [f"{100 * median(gflop / t * 1e3 / p for t, p in zip(totals, peaks)):.0f} %"]
+        cells += [f"{100 * median(gflop / t * 1e3 / max(p, median(peaks)) for t, p in zip(totals, peaks)):.0f} %"]
         print(f"| {name} | " + " | ".join(cells) + " |")
 
 

@@ -27,16 +27,18 @@ Series series_of(int n_step) {
   return series;
 }
 
-Report report_of(int n_step) {
+Report report_of(const Series& series) {
   Report report;
-  report.conditions = {"smolvla", "bf16", "a <source> & more", 2, 512, 512, 48, n_step, 2, "avx2"};
+  report.conditions = {"smolvla", "bf16", "a <source> & more", 2, 512, 512, 48, series.n_step, 2, "avx2"};
   report.cpu = "a processor";
   report.before.peaks = {{"other f32", 1e11, 2e11}, {"some f32", 1e12, 2e12}};
   report.before.bandwidth = 1e12;
   report.after = report.before;
-  summarize(series_of(n_step), report);
+  summarize(series, report);
   return report;
 }
+
+Report report_of(int n_step) { return report_of(series_of(n_step)); }
 
 /// The network of the small policy that comes with the project, as an architecture would publish it.
 Keys small_network() {
@@ -79,6 +81,12 @@ TEST_CASE("rates and shares follow from work, time and the peak beside each roun
   CHECK(report.find("network")->p50 == 25);
   CHECK(report.find("total")->p50 == 26);
   CHECK(report.find("network")->work.flop == doctest::Approx(14e9));
+}
+
+TEST_CASE("a peak that was disturbed does not flatter its round") {
+  Series series = series_of(10);
+  series.rounds[0].peak /= 2;
+  CHECK(report_of(series).find("prefix")->share_of_peak == doctest::Approx(0.4));
 }
 
 TEST_CASE("the roofline names every roof and stage, and escapes what would end its markup") {
