@@ -80,10 +80,12 @@ const std::vector<Isa>& usable_isas() {
   return usable;
 }
 
+Isa without_rounding(Isa isa) { return isa == Isa::amx ? Isa::avx512 : isa; }
+
 Result<Isa> choose_isa(const std::string& name) {
   const std::vector<Isa>& usable = usable_isas();
   if (name.empty()) return usable.back();
-  if (name == "float32") return usable.back() == Isa::amx ? Isa::avx512 : usable.back();
+  if (name == "float32") return without_rounding(usable.back());
   const auto known = std::find_if(std::begin(kAll), std::end(kAll), [&](Isa isa) { return isa_name(isa) == name; });
   if (known == std::end(kAll)) return Error{Code::usage, "kernels", "ggml, avx2, avx512, amx or float32", name};
   if (std::find(usable.begin(), usable.end(), *known) != usable.end()) return *known;

@@ -23,6 +23,9 @@ std::string isa_name(Isa isa);
 /// What this machine can run, `ggml` first and the best last.
 const std::vector<Isa>& usable_isas();
 
+/// The same, or what takes its place where nothing may be rounded to bf16, as the tiles of amx do.
+Isa without_rounding(Isa isa);
+
 /// The kernels by name: of an Isa, or "float32" for the best that round nothing to bf16. An empty name takes the best.
 /// Errors: usage for an unknown name, device for one that the machine cannot run.
 Result<Isa> choose_isa(const std::string& name);

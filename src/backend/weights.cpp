@@ -51,14 +51,13 @@ Weights::Place Weights::declare(const Param& param, ChooseFormat choose) {
 }
 
 Isa isa_for(const ParamList& list, Isa isa) {
-  int n_matrix = 0, n_bf16 = 0;
+  bool has_matrix = false;
   for (const Param& param : list.params())
     if (param.storage == Storage::matrix) {
-      ++n_matrix;
-      n_bf16 += param.source != nullptr && param.source->type == DType::bf16;
+      has_matrix = true;
+      if (param.source == nullptr || param.source->type != DType::bf16) return without_rounding(isa);
     }
-  const bool asks_for_bf16 = n_bf16 > 0 && n_bf16 == n_matrix;
-  return isa == Isa::amx && !asks_for_bf16 ? Isa::avx512 : isa;
+  return has_matrix ? isa : without_rounding(isa);
 }
 
 Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill fill, ChooseFormat choose) {
