@@ -11,6 +11,18 @@ using namespace vla::test;
 
 namespace {
 
+/// A server whose engine is held before act 1 of a first client, until the brake lets go.
+struct Held {
+  Brake brake;
+  Running running;
+  Peer first;
+
+  explicit Held(const serve::ServerOptions& options = {}) : running(options, {&brake}), first(running.address()) {
+    first.send(act_request(golden(), 1));
+    brake.await(1);
+  }
+};
+
 /// Comes back when an act waits in the queue.
 void await_queue(Peer& peer) {
   v1::Request health = request_of(9);
@@ -22,11 +34,8 @@ void await_queue(Peer& peer) {
 }  // namespace
 
 TEST_CASE("of two acts of one client that wait, the older is answered superseded and the newer is computed") {
-  Brake brake;
-  Running running({}, {&brake});
-  Peer peer(running.address());
-  peer.send(act_request(golden(), 1));
-  brake.await(1);
+  Held held;
+  auto& [brake, running, peer] = held;
   peer.send(act_request(golden(), 2));
   peer.send(act_request(golden(), 3));
   const auto superseded = peer.receive();
@@ -41,11 +50,9 @@ TEST_CASE("of two acts of one client that wait, the older is answered superseded
 }
 
 TEST_CASE("an act of a few bytes waits in the queue as it came") {
-  Brake brake;
-  Running running({}, {&brake});
-  Peer first(running.address()), second(running.address());
-  first.send(act_request(golden(), 1));
-  brake.await(1);
+  Held held;
+  auto& [brake, running, first] = held;
+  Peer second(running.address());
   v1::Request request = request_of(2);
   request.mutable_act()->set_text("no views");
   second.send(request);
@@ -57,11 +64,9 @@ TEST_CASE("an act of a few bytes waits in the queue as it came") {
 }
 
 TEST_CASE("an act whose deadline passes while it waits is answered late, not computed") {
-  Brake brake;
-  Running running({}, {&brake});
-  Peer first(running.address()), second(running.address());
-  first.send(act_request(golden(), 1));
-  brake.await(1);
+  Held held;
+  auto& [brake, running, first] = held;
+  Peer second(running.address());
   v1::Request hurried = act_request(golden(), 2);
   hurried.mutable_act()->set_deadline_ms(1);
   second.send(hurried);
@@ -75,13 +80,11 @@ TEST_CASE("an act whose deadline passes while it waits is answered late, not com
 }
 
 TEST_CASE("a full queue answers busy to a further client, and those that wait are still served") {
-  Brake brake;
   serve::ServerOptions options;
   options.max_queue = 1;
-  Running running(options, {&brake});
-  Peer a(running.address()), b(running.address()), c(running.address());
-  a.send(act_request(golden(), 1));
-  brake.await(1);
+  Held held(options);
+  auto& [brake, running, a] = held;
+  Peer b(running.address()), c(running.address());
   b.send(act_request(golden(), 2));
   await_queue(b);
   CHECK(code_of(c.ask(act_request(golden(), 3))) == "BUSY");
@@ -91,11 +94,9 @@ TEST_CASE("a full queue answers busy to a further client, and those that wait ar
 }
 
 TEST_CASE("health and describe are answered while the engine computes") {
-  Brake brake;
-  Running running({}, {&brake});
-  Peer busy(running.address()), other(running.address());
-  busy.send(act_request(golden(), 1));
-  brake.await(1);
+  Held held;
+  auto& [brake, running, busy] = held;
+  Peer other(running.address());
   v1::Request request = request_of(2);
   request.mutable_health();
   const v1::HealthReply health = other.ask(request).health();
@@ -111,11 +112,9 @@ TEST_CASE("health and describe are answered while the engine computes") {
 }
 
 TEST_CASE("a server that is told to stop answers what waits, takes nothing new, and ends without an error") {
-  Brake brake;
-  Running running({}, {&brake});
-  Peer a(running.address()), b(running.address()), c(running.address());
-  a.send(act_request(golden(), 1));
-  brake.await(1);
+  Held held;
+  auto& [brake, running, a] = held;
+  Peer b(running.address()), c(running.address());
   b.send(act_request(golden(), 2));
   await_queue(b);
   v1::Request health = request_of(9);
