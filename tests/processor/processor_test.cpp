@@ -6,7 +6,7 @@
 #include <cstring>
 #include <limits>
 
-#include "processor/support.h"
+#include "processor/sample.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -17,72 +17,6 @@ namespace {
 constexpr float kNaN = std::numeric_limits<float>::quiet_NaN();
 const std::vector<float> kRawState = {1.5f, 6.0f};
 constexpr float kInf = std::numeric_limits<float>::infinity();
-
-void add_stats(EditableBundle& bundle, const std::string& name, const std::vector<float>& values) {
-  const std::string data(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(float));
-  bundle.tensors.push_back({name, DType::f32, {static_cast<std::int64_t>(values.size())}, data});
-}
-
-/// Three views of which two are needed, one state of two numbers, two actions out of four columns.
-EditableBundle sample() {
-  EditableBundle bundle;
-  bundle.keys = tokenizer_keys("smol");
-  bundle.set("vla.bundle_version", std::int64_t{1});
-  for (const auto& [key, value] : {std::pair("vla.arch", "smolvla"),
-                                   {"vla.dtype", "f32"},
-                                   {"vla.source.name", "x"},
-                                   {"vla.source.revision", ""},
-                                   {"vla.source.converter", "test"}})
-    bundle.set(key, std::string(value));
-  bundle.set("observation.views",
-             std::vector<std::string>{"observation.images.top", "observation.images.wrist", "observation.images.side"});
-  bundle.set("observation.view_aliases", std::vector<std::string>{"", "observation.images.hand", ""});
-  bundle.set("observation.view_optional", std::vector<std::int64_t>{0, 0, 0});
-  bundle.set("observation.min_views", std::int64_t{2});
-  bundle.set("observation.states", std::vector<std::string>{"observation.state"});
-  bundle.set("observation.state_dims", std::vector<std::int64_t>{2});
-  bundle.set("observation.max_text_tokens", std::int64_t{8});
-  bundle.set("observation.state_names", std::vector<std::string>{"x", "y"});
-  bundle.set("observation.state_units", std::vector<std::string>{"m", ""});
-  bundle.set("action.names", std::vector<std::string>{"shoulder", "gripper"});
-  bundle.set("action.units", std::vector<std::string>{"rad", ""});
-  bundle.set("action.rate_hz", 0.0);
-  bundle.set("lm.n_vocab", std::int64_t{4096});
-  bundle.set("policy.d_state", std::int64_t{4});
-  bundle.set("policy.d_action", std::int64_t{4});
-  bundle.set("processor.recipe", std::string(R"({
-    "image":  [{"op": "letterbox", "width": 4, "height": 2, "filter": "bilinear", "antialias": false,
-                "align": "bottom_right", "fill": 0.0},
-               {"op": "affine", "scale": 2.0, "shift": -1.0}],
-    "text":   [{"op": "ensure_suffix", "suffix": "\n"}, {"op": "tokenize", "max_tokens": 8, "truncate": "right"}],
-    "state":  [{"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 0.5},
-               {"op": "pad", "size": 4}],
-    "action": [{"op": "take", "size": 2}, {"op": "unnormalize", "kind": "mean_std", "stats": "stats.action", "eps": 0.5}]})"));
-  add_stats(bundle, "stats.observation.state.mean", {1.0f, 2.0f});
-  add_stats(bundle, "stats.observation.state.std", {0.5f, 1.5f});
-  add_stats(bundle, "stats.action.mean", {10.0f, 20.0f});
-  add_stats(bundle, "stats.action.std", {2.0f, 0.0f});
-  return bundle;
-}
-
-Result<Processor> create(const EditableBundle& editable) {
-  const std::string bytes = editable.bytes();
-  const auto bundle = Bundle::parse(bytes_of(bytes), "test.gguf");
-  REQUIRE_MESSAGE(bundle.ok(), bundle.error().message());
-  return Processor::create(*bundle);
-}
-
-Processor make(const EditableBundle& bundle = sample()) {
-  auto processor = create(bundle);
-  REQUIRE_MESSAGE(processor.ok(), processor.error().message());
-  return std::move(*processor);
-}
-
-Frame grey(std::uint8_t value) { return {4, 2, std::vector<std::uint8_t>(24, value)}; }
-
-Observation observation() {
-  return {{{"top", grey(0)}, {"wrist", grey(255)}, {"side", std::nullopt}}, {{"state", {1.5f, 6.0f}}}, "pick up"};
-}
 
 std::string refused(const Observation& bad) { return refusal(make().encode(bad), Code::bad_observation); }
 
@@ -383,69 +317,6 @@ TEST_CASE("a spread of zero without eps is refused where it would divide") {
   bundle.set("processor.recipe", recipe.dump());
   CHECK(contains(refusal(create(bundle), Code::bad_bundle),
                  "stats.observation.state: expected a spread to divide by in column 0"));
-}
-
-namespace {
-
-/// The sample with the state in the prompt, relative actions, and a flipped and stretched second number.
-EditableBundle robot() {
-  EditableBundle bundle = sample();
-  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
-  recipe["text"] = Json::parse(R"([{"op": "strip"}, {"op": "template", "text": "{instruction} {state}"},
-                                   {"op": "tokenize", "max_tokens": 32, "truncate": "right"}])");
-  bundle.set("observation.max_text_tokens", std::int64_t{32});
-  recipe["state"] = Json::parse(R"([{"op": "affine", "columns": [1], "scale": -2.0, "shift": 1.0},
-    {"op": "normalize", "kind": "mean_std", "stats": "stats.observation.state", "eps": 0.5},
-    {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}])");
-  recipe["action"].push_back(Json::parse(R"({"op": "add_state", "columns": [1]})"));
-  recipe["action"].push_back(Json::parse(R"({"op": "affine", "columns": [0, 1], "scale": 2.0, "shift": 0.0})"));
-  bundle.set("processor.recipe", recipe.dump());
-  bundle.set("policy.d_state", std::int64_t{0});
-  return bundle;
-}
-
-std::string refused_robot(const char* pointer, const Json& value) {
-  EditableBundle bundle = robot();
-  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
-  recipe[Json::json_pointer(pointer)] = value;
-  bundle.set("processor.recipe", recipe.dump());
-  return refusal(create(bundle), Code::bad_bundle);
-}
-
-}  // namespace
-
-TEST_CASE("a state in words goes into the prompt and the network sees no other") {
-  Observation seen = observation();
-  seen.text = " go ";
-  seen.states["state"] = {1.0f, 0.0f};  // normalized: 0 and (1 - 2) / 2
-  const auto inputs = make(robot()).encode(seen);
-  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
-  CHECK(inputs->state.empty());
-  CHECK(inputs->state_words == std::vector<int>{128, 64});
-  CHECK(inputs->raw_state == std::vector<float>{1.0f, 1.0f});
-  CHECK(inputs->tokens == *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode("go 128 64"));
-  Inputs empty;
-  refusal(make(robot()).encode_text(seen, empty), Code::internal);
-}
-
-TEST_CASE("relative actions are added to the state of their observation, in the robot's conventions") {
-  const std::vector<float> chunk = {1.0f, 5.0f, 0.0f, 0.0f};
-  const auto actions = make(robot()).decode(chunk, 1, 4, std::vector<float>{3.0f, 4.0f});
-  REQUIRE(actions.ok());
-  CHECK(*actions == std::vector<float>{2 * 12.0f, 2 * (20.0f + 4.0f)});
-  refusal(make(robot()).decode(chunk, 1, 4, std::vector<float>{3.0f}), Code::internal);
-}
-
-TEST_CASE("columns beyond the state or the action are refused") {
-  CHECK(contains(refused_robot("/state/0/columns", Json{2}), "processor.recipe.state[0].columns"));
-  CHECK(contains(refused_robot("/action/2/columns", Json{2}), "processor.recipe.action[2].columns"));
-  CHECK(contains(refused_robot("/action/3/columns", Json{2}), "processor.recipe.action[3].columns"));
-}
-
-TEST_CASE("a state that the network does not see leaves nothing for policy.d_state") {
-  EditableBundle bundle = robot();
-  bundle.set("policy.d_state", std::int64_t{2});
-  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "policy.d_state"));
 }
 
 TEST_CASE("a text that is cut at its start keeps what stands in front of every text") {
