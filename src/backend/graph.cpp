@@ -2,10 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "backend/graph.h"
 
-#include <sys/mman.h>
-#include <unistd.h>
-
 #include <set>
+
+#include "backend/pages.h"
 
 namespace vla {
 namespace {
@@ -21,9 +20,6 @@ constexpr double kLeastWork = 4e6;
 void note_time(ggml_tensor*, const ggml_tensor*, int, int, void* stage) {
   static_cast<Stage*>(stage)->done = std::chrono::steady_clock::now();
 }
-
-/// MADV_POPULATE_WRITE, which headers older than Linux 5.14 lack.
-constexpr int kPopulateWrite = 23;
 
 }  // namespace
 
@@ -97,15 +93,10 @@ void Graph::touch() const {
   std::set<ggml_backend_buffer_t> buffers;
   for (int i = 0; i < ggml_graph_n_nodes(graph_); ++i) buffers.insert(ggml_graph_node(graph_, i)->buffer);
   buffers.erase(nullptr);
-  const std::uintptr_t page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
   for (ggml_backend_buffer_t buffer : buffers) {
-    const auto first =
-        (reinterpret_cast<std::uintptr_t>(ggml_backend_buffer_get_base(buffer)) + page - 1) / page * page;
-    const auto end = first + ggml_backend_buffer_get_size(buffer) / page * page - page;
-    if (end <= first) continue;
-    // Hints both: a system without them gives the pages when they are first written.
-    madvise(reinterpret_cast<void*>(first), end - first, MADV_HUGEPAGE);
-    madvise(reinterpret_cast<void*>(first), end - first, kPopulateWrite);
+    void* data = ggml_backend_buffer_get_base(buffer);
+    want_large_pages(data, ggml_backend_buffer_get_size(buffer));
+    want_memory_now(data, ggml_backend_buffer_get_size(buffer));
   }
 }
 

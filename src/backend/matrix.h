@@ -19,7 +19,7 @@ struct MatrixDesc {
 /// How a matrix lies in memory, which is what the kernel that multiplies by it wants.
 struct MatrixFormat {
   const char* name;  // of the kernel
-  /// Bytes of the packed matrix; null where the kernel reads rows as the bundle stores them.
+  /// Bytes of the packed matrix.
   std::size_t (*packed_size)(const MatrixDesc& desc);
   /// `stored` and `packed` start at multiples of 32 and 64 bytes.
   void (*pack)(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);

@@ -6,6 +6,8 @@
 #include <cstdlib>
 #include <memory>
 
+#include "backend/pages.h"
+
 namespace vla {
 
 /// Memory that a thread of a running graph works in, one piece for each thread. It grows while graphs are built, never
@@ -20,6 +22,7 @@ class Scratch {
     size_ = (size + kAlignment - 1) / kAlignment * kAlignment;
     memory_.reset();
     memory_.reset(static_cast<std::byte*>(std::aligned_alloc(kAlignment, size_ * n_thread_)));
+    if (ok()) want_large_pages(memory_.get(), this->size());
   }
   /// Whether everything that was reserved is there.
   bool ok() const { return size_ == 0 || memory_ != nullptr; }

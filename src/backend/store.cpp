@@ -4,6 +4,8 @@
 
 #include <algorithm>
 
+#include "backend/pages.h"
+
 namespace vla {
 
 std::int64_t Tensor::dim(int i) const { return node_->ne[i]; }
@@ -49,6 +51,7 @@ Status Store::allocate(const Device& device) {
   if (!buffer_)
     return Error{Code::out_of_memory, "buffer", "", "the device refused the allocation",
                  "free memory or use a smaller model"};
+  want_large_pages(ggml_backend_buffer_get_base(buffer_.get()), size());
   for (const Pending& pending : pending_) set(pending.tensor, pending.bytes.data(), pending.bytes.size());
   pending_.clear();
   return {};

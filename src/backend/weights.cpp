@@ -5,7 +5,9 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <atomic>
 #include <map>
+#include <thread>
 
 namespace vla {
 namespace {
@@ -34,18 +36,31 @@ void widen(Tensor tensor, const Param& param) {
   Store::set(tensor, values.data(), values.size() * sizeof(float));
 }
 
+/// work(i) for every i in [0, n), by several threads.
+template <class F>
+void side_by_side(int n_thread, std::size_t n, const F& work) {
+  std::atomic<std::size_t> next = 0;
+  const auto take = [&] {
+    for (std::size_t i; (i = next++) < n;) work(i);
+  };
+  std::vector<std::thread> others;
+  for (int i = 1; i < n_thread; ++i) others.emplace_back(take);
+  take();
+  for (std::thread& other : others) other.join();
+}
+
 }  // namespace
 
 Weights::Place Weights::declare(const Param& param, ChooseFormat choose) {
   if (param.source == nullptr) return {store_.add(GGML_TYPE_F32, param.shape), nullptr};  // sizes alone are asked for
   const bool is_matrix = param.storage == Storage::matrix;
   const MatrixFormat* format = is_matrix && choose != nullptr ? choose(desc_of(param), isa_) : nullptr;
-  if (format != nullptr && format->packed_size != nullptr)
+  if (format != nullptr)
     return {store_.add(GGML_TYPE_I8, std::vector{static_cast<std::int64_t>(format->packed_size(desc_of(param)))}),
             format};
-  if (format != nullptr || param.storage == Storage::table) {
+  if (param.storage == Storage::table) {
     mapped_size_ += param.source->data.size();
-    return {mapped_.add(stored_type(param), param.shape, param.source->data.data()), format};
+    return {mapped_.add(stored_type(param), param.shape, param.source->data.data()), nullptr};
   }
   return {store_.add(GGML_TYPE_F32, param.shape), nullptr};
 }
@@ -68,19 +83,19 @@ Result<Weights> Weights::load(const ParamList& list, const Device& device, Fill 
   VLA_CHECK(weights.store_.allocate(device));
   if (list.bundle() != nullptr) weights.file_ = list.bundle()->mapping();
   if (fill == Fill::no) return weights;
-  for (const Param& param : list.params()) {
-    const auto& [tensor, format] = weights.places_[static_cast<std::size_t>(param.id)];
-    if (MappedStore::holds(tensor)) {
-      list.bundle()->keep_pages(param.source->data);
-      continue;
-    }
-    if (format != nullptr)
-      format->pack(desc_of(param), param.source->data.data(), static_cast<std::byte*>(tensor.node()->data));
-    else
-      widen(tensor, param);
-    list.bundle()->release_pages(param.source->data);  // so that file and weights do not stand in memory together
-  }
+  const auto& params = list.params();
+  side_by_side(device.n_thread(), params.size(), [&](std::size_t i) { weights.fill(params[i], *list.bundle()); });
   return weights;
+}
+
+void Weights::fill(const Param& param, const Bundle& bundle) const {
+  const auto& [tensor, format] = places_[static_cast<std::size_t>(param.id)];
+  if (MappedStore::holds(tensor)) return bundle.keep_pages(param.source->data);
+  if (format != nullptr)
+    format->pack(desc_of(param), param.source->data.data(), static_cast<std::byte*>(tensor.node()->data));
+  else
+    widen(tensor, param);
+  bundle.release_pages(param.source->data);  // so that file and weights do not stand in memory together
 }
 
 void Weights::describe(const ParamList& list) {

@@ -19,12 +19,11 @@ namespace vla {
 Isa isa_for(const ParamList& list, Isa isa);
 
 /// The parameters of a policy, resident on a device. A matrix lies as the kernel that was chosen for it wants it:
-///   as stored   rows in the bundle's dtype, in the mapped file itself, without a copy
-///   packed      in panels, made at load
+///   packed      in the bundle's dtype, in panels that are made at load
 ///   widened     float32 for ggml's product, whose own bf16 and f16 products would round the activations first
-/// Tables stay in the file, since a row that is looked up is widened exactly. Vectors are copied.
+/// Tables stay in the mapped file, since a row that is looked up is widened exactly. Vectors are copied.
 ///
-/// The file was compared with its checksum when it was opened. Who changes it afterwards changes the weights, and who
+/// The file was compared with its checksum when it was opened. Who changes it afterwards changes the tables, and who
 /// makes it shorter ends the process (SIGBUS): replace a bundle by renaming a new file over it.
 class Weights {
  public:
@@ -56,6 +55,7 @@ class Weights {
   Weights(std::size_t n_param, const Device& device)
       : store_(n_param), mapped_(n_param), scratch_(device.scratch()), isa_(device.isa()) {}
   Place declare(const Param& param, ChooseFormat choose);
+  void fill(const Param& param, const Bundle& bundle) const;
   void describe(const ParamList& list);
 
   Store store_;

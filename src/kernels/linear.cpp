@@ -15,12 +15,14 @@ struct LinearNode {
   const LinearKernel* kernel;
   Scratch* scratch;
   LinearJob job;
+  Turns turns;
   bool has_bias[LinearJob::kMaxPart], has_residual;
 };
 
 void linear_task(ggml_tensor* y, int ith, int nth, void* user) {
-  const auto& node = *static_cast<const LinearNode*>(user);
+  auto& node = *static_cast<LinearNode*>(user);
   LinearJob job = node.job;
+  job.turns = &node.turns;
   job.x = values(y->src[0]);
   float* out = static_cast<float*>(y->data);
   int i_bias = 1 + job.n_part;
@@ -52,7 +54,7 @@ const LinearKernel* kernel_of(Graph& g, std::span<const LinearTerm> terms) {
 
 Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> terms, Tensor x, Activation activation,
             bool gated, Tensor residual) {
-  LinearNode node = {&kernel, &g.scratch(), {}, {}, static_cast<bool>(residual)};
+  LinearNode node = {&kernel, &g.scratch(), {}, {}, {}, static_cast<bool>(residual)};
   if (!ggml_is_contiguous(x.node())) x = ggml_cont(g.context(), x.node());
   std::vector<ggml_tensor*> sources = {x.node()};
   std::int64_t d_out = 0;

@@ -8,43 +8,39 @@
 namespace vla::kernels {
 namespace {
 
-/// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel. x is rounded to bf16, as PyTorch rounds
-/// the activations of a bf16 layer; sums are float32.
-struct AmxTile : PairPanels {
+/// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel; sums are float32.
+struct AmxTile : PairTile {
   using V = Avx512;
-
   using Session = AmxSession;
 
-  static void multiply(DType, int n_row, const std::uint16_t* x, const std::byte* panel, std::int64_t depth, float* c,
-                       std::int64_t stride, bool add) {
-    if (n_row == kRows) return multiply_rows<true>(x, panel, depth, c, stride, add);
-    alignas(64) float sums[kRows * kColumns];  // of rows that x does not have, too
-    if (n_row > 16)
-      multiply_rows<true>(x, panel, depth, sums, kColumns, false);
+  static void multiply(DType, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
+                       float* c, bool add, const std::byte* ahead) {
+    // Rows that x does not have are multiplied too; nobody looks at their sums.
+    if (rest != nullptr)
+      n_row > 16 ? product<true, true>(x, rest, panel, depth, c, add, ahead)
+                 : product<false, true>(x, rest, panel, depth, c, add, ahead);
     else
-      multiply_rows<false>(x, panel, depth, sums, kColumns, false);
-    for (int r = 0; r < n_row; ++r)
-      for (int n = 0; n < kColumns; n += V::width) {
-        float* place = c + r * stride + n;
-        const V::Float sum = V::load(sums + r * kColumns + n);
-        V::store(place, add ? V::load(place) + sum : sum);
-      }
+      n_row > 16 ? product<true, false>(x, rest, panel, depth, c, add, ahead)
+                 : product<false, false>(x, rest, panel, depth, c, add, ahead);
   }
 
  private:
-  /// All 32 rows, or the first 16.
-  template <bool kAll>
-  static VLA_INLINE void multiply_rows(const std::uint16_t* x, const std::byte* panel, std::int64_t depth, float* c,
-                                       std::int64_t stride, bool add) {
-    const auto line = static_cast<std::size_t>(stride) * sizeof(float);
-    float* lower = c + 16 * stride;
+  static constexpr std::size_t kLineX = kXStride * sizeof(X), kLineC = kColumns * sizeof(float);
+
+  /// All 32 rows, or the first 16; with what the rounding of x left, or without.
+  template <bool kAll, bool kFine>
+  static VLA_INLINE void product(const X* x, const X* rest, const std::byte* panel, std::int64_t depth, float* c,
+                                 bool add, const std::byte* ahead) {
+    // Blocks of the panel to ask for in each step: with few rows of x, all that come next.
+    constexpr int kAhead = kFine ? 1024 : 256;
+    float* lower = c + 16 * kColumns;
     before_tile_loads();
     if (add) {
-      _tile_loadd(0, c, line);
-      _tile_loadd(1, c + 16, line);
+      _tile_loadd(0, c, kLineC);
+      _tile_loadd(1, c + 16, kLineC);
       if constexpr (kAll) {
-        _tile_loadd(2, lower, line);
-        _tile_loadd(3, lower + 16, line);
+        _tile_loadd(2, lower, kLineC);
+        _tile_loadd(3, lower + 16, kLineC);
       }
     } else {
       _tile_zero(0);
@@ -52,23 +48,30 @@ struct AmxTile : PairPanels {
       _tile_zero(2);
       _tile_zero(3);
     }
-    for (std::int64_t k = 0; k < depth; k += kDepth, panel += 2048) {
-      _tile_loadd(4, x + k, kXStride * sizeof(std::uint16_t));
+    for (std::int64_t k = 0; k < depth; k += kPanelDepth, panel += 2 * kPanelBlock, ahead += kAhead) {
       _tile_loadd(6, panel, 64);
-      _tile_loadd(7, panel + 1024, 64);
-      _tile_dpbf16ps(0, 4, 6);
-      _tile_dpbf16ps(1, 4, 7);
-      if constexpr (kAll) {
-        _tile_loadd(5, x + 16 * kXStride + k, kXStride * sizeof(std::uint16_t));
-        _tile_dpbf16ps(2, 5, 6);
-        _tile_dpbf16ps(3, 5, 7);
-      }
+      _tile_loadd(7, panel + kPanelBlock, 64);
+      add_products<kAll>(x + k);
+      if constexpr (kFine) add_products<kAll>(rest + k);
+      for (int line = 0; line < kAhead; line += 64) __builtin_prefetch(ahead + line, 0, 2);  // to the second cache
     }
-    _tile_stored(0, c, line);
-    _tile_stored(1, c + 16, line);
+    _tile_stored(0, c, kLineC);
+    _tile_stored(1, c + 16, kLineC);
     if constexpr (kAll) {
-      _tile_stored(2, lower, line);
-      _tile_stored(3, lower + 16, line);
+      _tile_stored(2, lower, kLineC);
+      _tile_stored(3, lower + 16, kLineC);
+    }
+  }
+
+  template <bool kAll>
+  static VLA_INLINE void add_products(const X* x) {
+    _tile_loadd(4, x, kLineX);
+    _tile_dpbf16ps(0, 4, 6);
+    _tile_dpbf16ps(1, 4, 7);
+    if constexpr (kAll) {
+      _tile_loadd(5, x + 16 * kXStride, kLineX);
+      _tile_dpbf16ps(2, 5, 6);
+      _tile_dpbf16ps(3, 5, 7);
     }
   }
 };
@@ -78,7 +81,7 @@ bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::amx && desc.
 }  // namespace
 
 extern const LinearKernel kLinearAmx;
-const LinearKernel kLinearAmx = {{"amx", LinearLoop<AmxTile>::packed_size, LinearLoop<AmxTile>::pack},
+const LinearKernel kLinearAmx = {{"amx", Panels<32>::packed_size, Panels<32>::pack},
                                  supports,
                                  LinearLoop<AmxTile>::run,
                                  LinearLoop<AmxTile>::kScratchSize};

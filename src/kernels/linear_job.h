@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "bundle/bundle.h"
+#include "kernels/turns.h"
 
 namespace vla::kernels {
 
@@ -17,7 +18,7 @@ struct LinearJob {
   /// bias and residual may be null.
   struct Part {
     DType type;               // of the stored weight
-    const std::byte* weight;  // as its kernel wants it
+    const std::byte* weight;  // packed for its kernel
     const float* bias;
     const float* residual;
     float* y;
@@ -32,6 +33,7 @@ struct LinearJob {
   Activation activation;
   /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
   bool gated;
+  Turns* turns;  // of this node
 };
 
 }  // namespace vla::kernels

@@ -24,8 +24,8 @@ std::span<const LinearKernel* const> linear_kernels();
 /// The first row that takes a matrix on a machine, or null for ggml: a ChooseFormat.
 const MatrixFormat* choose_linear(const MatrixDesc& desc, Isa isa);
 
-/// The same templates with tiles in plain C++, slow and for every machine: their panels and edges stay tested where
-/// the instructions are missing.
+/// The same loop with tiles in plain C++, slow and for every machine: panels and edges stay tested where the
+/// instructions are missing.
 std::span<const LinearKernel* const> emulated_linear_kernels();
 
 }  // namespace vla::kernels

@@ -2,217 +2,161 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "backend/matrix.h"
 #include "kernels/linear_job.h"
+#include "kernels/linear_panels.h"
 #include "kernels/math.h"
 
 /// The loops around a tile: which thread does what, what lies in which cache, edges, and the epilogue.
 ///
-/// A tile multiplies a few rows of x by a few columns of the product (rows of W) over some depth of d_in. Columns are
-/// read from a *panel*, in which the tile's columns lie together for each step of the depth. Panels are made from the
-/// stored rows on the way (a transposition in registers, once for all rows of x) and live in the second cache; a block
-/// of x is copied to rows of a fixed stride, so that neither its addresses nor its width matter to the inner loop.
-/// Source of the method: Goto and van de Geijn, Anatomy of High-Performance Matrix Multiplication (2008).
+/// A tile multiplies a few rows of x by the columns of a panel (linear_panels.h) over some depth of d_in. A block of
+/// rows of x is copied to rows of a fixed stride in the second cache, so that neither their addresses nor their width
+/// matter to the inner loop; then one panel after the other passes by, a step of the depth at a time, which stays in
+/// the first cache while all rows of the block are multiplied by it. Source of the method: Goto and van de Geijn,
+/// Anatomy of High-Performance Matrix Multiplication (2008).
 namespace vla::kernels {
 
-constexpr VLA_INLINE std::int64_t least(std::int64_t a, std::int64_t b) { return a < b ? a : b; }
-constexpr VLA_INLINE std::int64_t pieces(std::int64_t n, std::int64_t size) { return (n + size - 1) / size; }
-constexpr VLA_INLINE std::int64_t round_up(std::int64_t n, std::int64_t unit) { return pieces(n, unit) * unit; }
-/// n cut into as few equal pieces as `most` allows, each a multiple of `unit`.
-constexpr VLA_INLINE std::int64_t even_piece(std::int64_t n, std::int64_t most, std::int64_t unit) {
-  return n == 0 ? unit : round_up(pieces(n, pieces(n, most)), unit);
-}
-
-/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kDepth (a panel's depth is
-/// a multiple of it), kMaxDepth, kBlockRows and kBlockColumns (of what stays in caches), kXStride (of the block of x),
-/// kPackCost (of making a panel, in rows that it is multiplied by), kCopyCost (of a row of x, in panels), kPacked
-/// (panels are made at load), kEven (tiles of equal height), Session (held while a thread works), and
-///   panel_size(type, depth)                         bytes of a panel
-///   pack(type, rows, d_in, n_column, depth, panel)  a panel from n_column <= kColumns stored rows, zeros around it
-///   copy(from, n, to)                               n numbers of x and zeros up to a multiple of kDepth
-///   multiply(type, n_row, x, panel, depth, c, stride, add)   c [kColumns] x n_row <= kRows, += where `add`
+/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kMaxDepth and kBlockRows
+/// (of the block of x), kXStride (from one of its rows to the next), kStep (of the depth, most), kFineRows (jobs of no
+/// more rows keep what the rounding of x leaves), kEven (tiles of equal height), kUnpacked (floats of a step that
+/// multiply wants instead of the stored one), Session (held while a thread works), and
+///   copy(from, n, to, rest)               n numbers of x and zeros up to a multiple of 32; what rounding leaves, or
+///   null unpack(type, panel, depth, floats)    what multiply reads multiply(type, n_row, x, rest, panel, depth, c,
+///   add, ahead)
+///                                         c [kColumns] x n_row <= kRows, += where `add`; asks for memory from `ahead`
+///                                         on
 template <class Tile>
 class LinearLoop {
   using V = typename Tile::V;
   using X = typename Tile::X;
-  static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kDepth = Tile::kDepth;
-  static constexpr std::int64_t kGateRows = round_up(256, kRows), kGateColumns = Tile::kBlockColumns / 2;
-  static_assert(Tile::kMaxDepth % kDepth == 0 && Tile::kBlockRows % kRows == 0 && kGateColumns % kColumns == 0);
+  using Layout = Panels<Tile::kColumns>;
+  static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
+  static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
+  static constexpr std::int64_t kLeastItems = 16;              // for each thread, where there are so many
+  static constexpr std::int64_t kRest = kBlockRows / 2 * Tile::kXStride;
+  static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0);
+  static_assert(Tile::kFineRows <= kBlockRows / 2);
 
   struct Scratch {
-    alignas(64) X x[(Tile::kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
-    alignas(64) std::byte panels[Tile::kPacked ? 64 : 2 * kGateColumns * Tile::kMaxDepth * sizeof(float)];
-    alignas(64) float gate[kGateRows * kGateColumns];
-    alignas(64) float edge[kRows * kColumns];
+    alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
+    alignas(64) float unpacked[Tile::kUnpacked + 1];
+    alignas(64) float sums[(kBlockRows + kRows) * kColumns];
+    alignas(64) float gates[(kBlockRows + kRows) * kGateColumns];
   };
 
  public:
   static constexpr std::size_t kScratchSize = sizeof(Scratch);
 
   static void run(const LinearJob& job, int ith, int nth, std::byte* scratch) {
-    LinearLoop loop(job, *reinterpret_cast<Scratch*>(scratch));
-    const Share share(job, ith, nth);
-    if (share.row_begin == share.row_end || share.panel_begin == share.panel_end) return;
+    LinearLoop loop(job, nth, *reinterpret_cast<Scratch*>(scratch));
     [[maybe_unused]] const typename Tile::Session session;
-    std::int64_t first = 0;  // panel of the part
-    for (int i = job.gated ? 1 : 0; i < job.n_part; ++i) {
-      const std::int64_t n = pieces(job.part[i].d_out, kColumns);
-      const std::int64_t begin = share.panel_begin - first, end = least(share.panel_end - first, n);
-      if (end > 0 && begin < n) loop.columns(i, (begin > 0 ? begin : 0) * kColumns, end * kColumns, share);
-      first += n;
-    }
-  }
-
-  static std::size_t packed_size(const MatrixDesc& desc) {
-    return static_cast<std::size_t>(pieces(desc.d_out, kColumns)) * Tile::panel_size(desc.type, padded(desc.d_in));
-  }
-
-  static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
-    for (std::int64_t n = 0; n < desc.d_out; n += kColumns) {
-      const auto offset = static_cast<std::size_t>(n * desc.d_in) * (desc.type == DType::f32 ? 4 : 2);
-      Tile::pack(desc.type, stored + offset, desc.d_in, least(desc.d_out - n, kColumns), desc.d_in, packed);
-      packed += Tile::panel_size(desc.type, padded(desc.d_in));
-    }
+    job.turns->share(ith, nth, loop.n_block_ * loop.n_group_, [&](std::int64_t i) { loop.item(i); });
   }
 
  private:
-  static std::int64_t padded(std::int64_t depth) { return round_up(depth, kDepth); }
-
-  /// What one thread computes: some rows of x by some panels of all parts, counted one after the other.
-  struct Share {
-    std::int64_t row_begin, row_end, panel_begin, panel_end;
-
-    Share(const LinearJob& job, std::int64_t ith, std::int64_t nth) {
-      std::int64_t n_panel = 0;
-      for (int i = job.gated ? 1 : 0; i < job.n_part; ++i) n_panel += pieces(job.part[i].d_out, kColumns);
-      const std::int64_t n_tile = pieces(job.n_row, kRows);
-      // Threads work in a grid, such that the slowest is done first. Every thread makes the panels of its columns and
-      // the copies of its rows.
-      std::int64_t n_side = nth, best = 0;
-      for (std::int64_t side = nth; side >= 1; --side) {
-        if (nth % side != 0) continue;
-        const std::int64_t n_row = least(pieces(n_tile, nth / side) * kRows, job.n_row), n = pieces(n_panel, side);
-        const std::int64_t cost = n * (n_row + Tile::kPackCost) + n_row * Tile::kCopyCost;
-        if (best == 0 || cost < best) best = cost, n_side = side;
-      }
-      const std::int64_t n_deep = nth / n_side, column = ith % n_side, row = ith / n_side;
-      panel_begin = n_panel * column / n_side, panel_end = n_panel * (column + 1) / n_side;
-      row_begin = least(n_tile * row / n_deep * kRows, job.n_row);
-      row_end = least(n_tile * (row + 1) / n_deep * kRows, job.n_row);
+  LinearLoop(const LinearJob& job, int nth, Scratch& scratch)
+      : job_(job),
+        scratch_(scratch),
+        block_rows_(even_piece(job.n_row, kBlockRows, kRows)),
+        n_block_(pieces(job.n_row, block_rows_)),
+        block_depth_(even_piece(job.d_in, Tile::kMaxDepth, kPanelDepth)) {
+    for (int i = first_part(); i < job.n_part; ++i) n_panel_ += pieces(job.part[i].d_out, kColumns);
+    n_group_ = nth == 1 ? 1 : least(pieces(kLeastItems * nth, n_block_), pieces(n_panel_, 2));
+    if (job.gated && block_depth_ < job.d_in) {
+      const std::int64_t least_groups = pieces(n_panel_, kGateColumns / kColumns);
+      n_group_ = n_group_ < least_groups ? least_groups : n_group_;
     }
-  };
-
-  LinearLoop(const LinearJob& job, Scratch& scratch)
-      : job_(job), scratch_(scratch), step_(even_piece(job.d_in, Tile::kMaxDepth, kDepth)) {}
-
-  /// Columns [begin, end) of part i for the share's rows.
-  void columns(int i, std::int64_t begin, std::int64_t end, const Share& share) {
-    end = least(end, job_.part[i].d_out);
-    const std::int64_t n_row = job_.gated ? even_piece(share.row_end - share.row_begin, kGateRows, kRows) : job_.n_row;
-    const std::int64_t width = even_piece(end - begin, job_.gated ? kGateColumns : most_columns(i), kColumns);
-    for (std::int64_t row = share.row_begin; row < share.row_end; row += n_row)
-      for (std::int64_t column = begin; column < end; column += width)
-        block(i, column, least(column + width, end), row, least(row + n_row, share.row_end));
   }
 
-  /// Columns [begin, end) of part i, few enough for their panels to be kept, by rows [row_begin, row_end).
-  void block(int i, std::int64_t begin, std::int64_t end, std::int64_t row_begin, std::int64_t row_end) {
-    const std::int64_t n_row = even_piece(row_end - row_begin, Tile::kBlockRows, kRows);
-    for (std::int64_t k = 0; k < job_.d_in; k += step_) {
-      const std::int64_t depth = least(step_, job_.d_in - k);
-      const std::byte* gate = job_.gated ? panels(0, begin, end, k, depth, 1) : nullptr;
-      const std::byte* panel = panels(i, begin, end, k, depth, 0);
-      for (std::int64_t row = row_begin; row < row_end; row += n_row) {
-        const std::int64_t rows = least(n_row, row_end - row);
-        for (std::int64_t r = 0; r < rows; ++r)
-          Tile::copy(job_.x + (row + r) * job_.d_in + k, depth, scratch_.x + r * Tile::kXStride);
-        float* gates = scratch_.gate + (row - row_begin) * kGateColumns;
-        for (std::int64_t n = begin; n < end; n += kColumns) {
-          const std::int64_t i_panel = (n - begin) / kColumns;
-          const Stripe stripe = {i, n, least(kColumns, end - n), row, rows, k, depth, gates + (n - begin)};
-          if (job_.gated) multiply_gate(stripe, gate + i_panel * panel_stride(0, depth));
-          multiply(stripe, panel + i_panel * panel_stride(i, depth));
-        }
+  /// The gate is no part of its own.
+  int first_part() const { return job_.gated ? 1 : 0; }
+
+  /// Some panels by a block of rows. Items of one block follow each other, so that a thread copies it once.
+  void item(std::int64_t i) {
+    const std::int64_t block = i / n_group_, group = i % n_group_;
+    const std::int64_t row = block * block_rows_, n_row = least(block_rows_, job_.n_row - row);
+    const std::int64_t begin = n_panel_ * group / n_group_, end = n_panel_ * (group + 1) / n_group_;
+    for (std::int64_t k = 0; k < job_.d_in; k += block_depth_) {
+      const std::int64_t depth = least(block_depth_, job_.d_in - k);
+      take_rows(row, n_row, k, depth);
+      for (std::int64_t panel = begin; panel < end; ++panel) {
+        int part = first_part();
+        std::int64_t i_panel = panel;  // of the part
+        for (; i_panel >= pieces(job_.part[part].d_out, kColumns); ++part)
+          i_panel -= pieces(job_.part[part].d_out, kColumns);
+        const std::int64_t column = i_panel * kColumns;
+        const bool all = block_depth_ >= job_.d_in;
+        multiply({part, column, least(kColumns, job_.part[part].d_out - column), row, n_row, k, depth,
+                  scratch_.gates + (all ? 0 : panel - begin) * (kBlockRows + kRows) * kColumns});
       }
     }
   }
 
-  /// One panel's columns of part i by the rows of the block of x.
+  /// Rows [row, row + n_row) of x from depth k on, unless the last item left them here.
+  void take_rows(std::int64_t row, std::int64_t n_row, std::int64_t k, std::int64_t depth) {
+    if (row == row_of_x_ && k == depth_of_x_) return;
+    row_of_x_ = row, depth_of_x_ = k;
+    for (std::int64_t r = 0; r < n_row; ++r) {
+      X* to = scratch_.x + r * Tile::kXStride;
+      Tile::copy(job_.x + (row + r) * job_.d_in + k, depth, to, fine() ? to + kRest : nullptr);
+    }
+  }
+
+  bool fine() const { return job_.n_row <= Tile::kFineRows; }
+
+  /// One panel's columns of a part by the rows of the block of x.
   struct Stripe {
-    int i;
+    int part;
     std::int64_t column, n_column, row, n_row, k, depth;
-    float* gates;  // [kGateColumns] x n_row
+    float* gates;  // [kColumns] x n_row
   };
 
-  /// How many columns' panels there is room for: more than kBlockColumns where those are smaller than panels of floats.
-  std::int64_t most_columns(int i) const {
-    if (Tile::kPacked) return Tile::kBlockColumns;
-    return static_cast<std::int64_t>(sizeof(scratch_.panels)) / panel_stride(i, step_) * kColumns;
-  }
-
-  /// Bytes from one panel of part i to the next.
-  std::int64_t panel_stride(int i, std::int64_t depth) const {
-    return static_cast<std::int64_t>(Tile::panel_size(job_.part[i].type, padded(Tile::kPacked ? job_.d_in : depth)));
-  }
-
-  /// The panels of columns [begin, end) of part i from depth k on; those of up and gate stand in two halves.
-  const std::byte* panels(int i, std::int64_t begin, std::int64_t end, std::int64_t k, std::int64_t depth, int half) {
-    const std::byte* weight = job_.part[i].weight;
-    if (Tile::kPacked)
-      return weight + begin / kColumns * panel_stride(i, depth) + Tile::panel_size(job_.part[i].type, k);
-    std::byte* first =
-        scratch_.panels + static_cast<std::size_t>(half * kGateColumns * Tile::kMaxDepth) * sizeof(float);
-    const std::int64_t size = job_.part[i].type == DType::f32 ? 4 : 2;
-    for (std::int64_t n = begin; n < end; n += kColumns)
-      Tile::pack(job_.part[i].type, weight + (n * job_.d_in + k) * size, job_.d_in, least(end - n, kColumns), depth,
-                 first + (n - begin) / kColumns * panel_stride(i, depth));
-    return first;
-  }
-
-  void multiply_gate(const Stripe& s, const std::byte* panel) {
-    tiles(s.n_row, [&](std::int64_t r, std::int64_t n_row) {
-      multiply_tile(0, s, r, n_row, panel, s.gates + r * kGateColumns, kGateColumns);
-    });
-  }
-
-  /// y of the stripe (+)= the block of x times the panel. Whatever follows the product is done while a tile of y lies
-  /// in the first cache.
-  void multiply(const Stripe& s, const std::byte* panel) {
-    const LinearJob::Part& part = job_.part[s.i];
+  /// y of the stripe (+)= the block of x times the panel. Whatever follows the product is done while a tile of sums
+  /// lies in the first cache.
+  void multiply(const Stripe& s) {
+    const LinearJob::Part& part = job_.part[s.part];
     const bool last = s.k + s.depth == job_.d_in;
-    tiles(s.n_row, [&](std::int64_t r, std::int64_t n_row) {
-      const std::int64_t place = (s.row + r) * part.d_out + s.column;
-      fetch(part.y + place, n_row, part.d_out);
-      if (last && part.residual != nullptr) fetch(part.residual + place, n_row, part.d_out);
-      multiply_tile(s.i, s, r, n_row, panel, part.y + place, part.d_out);
-      if (last) finish(s, r, n_row);
-    });
+    if (job_.gated)
+      sum(
+          job_.part[0], s, s.gates, s.k > 0, [](auto, auto) {}, [](auto, auto) {});
+    sum(
+        part, s, scratch_.sums, false,
+        [&](std::int64_t r, std::int64_t n_row) {
+          const std::int64_t place = (s.row + r) * part.d_out + s.column;
+          fetch(part.y + place, n_row, part.d_out);
+          if (last && part.residual != nullptr) fetch(part.residual + place, n_row, part.d_out);
+        },
+        [&](std::int64_t r, std::int64_t n_row) { last ? finish(s, r, n_row) : keep(s, r, n_row); });
   }
 
-  /// Asks for the lines of a tile that will be read or written when the product over the panel's depth is there.
+  /// Asks for the lines of a tile that will be read or written when the product is there.
   static VLA_INLINE void fetch(const float* tile, std::int64_t n_row, std::int64_t stride) {
     for (std::int64_t r = 0; r < n_row; ++r)
       for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + n);
   }
 
-  template <class Do>
-  static VLA_INLINE void tiles(std::int64_t n_row, const Do& tile) {
-    const std::int64_t n_tile = pieces(n_row, kRows);
-    for (std::int64_t t = 0; t < n_tile; ++t) {
-      const std::int64_t r = first_row(n_row, t, n_tile);
-      tile(r, first_row(n_row, t + 1, n_tile) - r);
+  /// sums [kColumns] x n_row (+)= the block of x times a panel. `before` and `after` are called around the last step of
+  /// each tile with its first row and their number.
+  template <class Before, class After>
+  VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, float* sums, bool add, const Before& before,
+                      const After& after) {
+    const std::int64_t depth = round_up(s.depth, kPanelDepth), step = even_piece(depth, Tile::kStep, kPanelDepth);
+    const std::int64_t n_tile = pieces(s.n_row, kRows);
+    const std::byte* panel = part.weight +
+                             s.column / kColumns * Layout::size(part.type, round_up(job_.d_in, kPanelDepth)) +
+                             Layout::size(part.type, s.k);
+    for (std::int64_t k = 0; k < depth; k += step) {
+      const std::int64_t d = least(step, depth - k), size = Layout::size(part.type, d);
+      const std::byte* ready = Tile::unpack(part.type, panel, d, scratch_.unpacked);
+      panel += size;  // what comes next is asked for while this is multiplied
+      for (std::int64_t t = 0; t < n_tile; ++t) {
+        const std::int64_t r = first_row(s.n_row, t, n_tile), n_row = first_row(s.n_row, t + 1, n_tile) - r;
+        if (k + d == depth) before(r, n_row);
+        const X* x = scratch_.x + r * Tile::kXStride + k;
+        Tile::multiply(part.type, static_cast<int>(n_row), x, fine() ? x + kRest : nullptr, ready, d,
+                       sums + r * kColumns, add || k > 0, panel + size * t / n_tile);
+        if (k + d == depth) after(r, n_row);
+      }
     }
-  }
-
-  /// c [stride] x n_row (+)= rows r to r + n_row of the block of x times a panel of part i.
-  VLA_INLINE void multiply_tile(int i, const Stripe& s, std::int64_t r, std::int64_t n_row, const std::byte* panel,
-                                float* c, std::int64_t stride) {
-    const X* x = scratch_.x + r * Tile::kXStride;
-    const std::int64_t depth = padded(s.depth);
-    if (s.n_column == kColumns)
-      Tile::multiply(job_.part[i].type, static_cast<int>(n_row), x, panel, depth, c, stride, s.k > 0);
-    else
-      multiply_edge(job_.part[i].type, s.n_column, n_row, x, panel, depth, c, stride, s.k > 0);
   }
 
   /// Where tile t begins: tiles are of nearly equal height, or whole but for the last.
@@ -220,25 +164,16 @@ class LinearLoop {
     return Tile::kEven ? n_row * t / n_tile : least(t * kRows, n_row);
   }
 
-  /// The last columns, fewer than a tile has.
-  void multiply_edge(DType type, std::int64_t n_column, std::int64_t n_row, const X* x, const std::byte* panel,
-                     std::int64_t depth, float* c, std::int64_t stride, bool add) {
-    Tile::multiply(type, static_cast<int>(n_row), x, panel, depth, scratch_.edge, kColumns, false);
-    for (std::int64_t r = 0; r < n_row; ++r)
-      for (std::int64_t n = 0; n < n_column; ++n) {
-        const float value = scratch_.edge[r * kColumns + n];
-        c[r * stride + n] = add ? c[r * stride + n] + value : value;
-      }
+  /// The sums of rows r to r + n_row of the stripe, until the next block of the depth adds to them.
+  void keep(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
+    each_vector(s, first, n_row, [](auto value, auto...) { return value; });
   }
 
   /// The epilogue of a tile: rows r to r + n_row of the stripe.
-  void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) {
-    const LinearJob::Part& part = job_.part[s.i];
-    if (job_.gated) return finish_gated(s, r, n_row);
+  void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
     switch (job_.activation) {
       case Activation::none:
-        if (part.bias != nullptr || part.residual != nullptr) finish_rows<Activation::none>(s, r, n_row);
-        return;
+        return finish_rows<Activation::none>(s, r, n_row);
       case Activation::gelu_tanh:
         return finish_rows<Activation::gelu_tanh>(s, r, n_row);
       case Activation::silu:
@@ -255,37 +190,39 @@ class LinearLoop {
 
   template <Activation kActivation>
   void finish_rows(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
-    const LinearJob::Part& part = job_.part[s.i];
-    for (std::int64_t r = first; r < first + n_row; ++r)
-      for (std::int64_t i = 0; i < s.n_column; i += V::width) {
-        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
-        typename V::Float value = load<V>(part.y + place, left);
-        if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
+    const LinearJob::Part &part = job_.part[s.part], &gate = job_.part[0];
+    each_vector(s, first, n_row, [&](typename V::Float value, std::int64_t r, std::int64_t i, std::int64_t left) {
+      if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
+      if (job_.gated) {
+        typename V::Float factor = V::load(s.gates + r * kColumns + i);
+        if (gate.bias != nullptr) factor += load<V>(gate.bias + s.column + i, left);
+        value *= activate<kActivation>(factor);
+      } else {
         value = activate<kActivation>(value);
-        if (part.residual != nullptr) value += load<V>(part.residual + place, left);
-        store<V>(part.y + place, value, left);
       }
+      if (part.residual != nullptr) value += load<V>(part.residual + (s.row + r) * part.d_out + s.column + i, left);
+      return value;
+    });
   }
 
-  void finish_gated(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
-    const LinearJob::Part &part = job_.part[s.i], &gate = job_.part[0];
+  /// y = f(sums, or y + sums behind the first block of the depth; row, column, how many columns are left)
+  template <class F>
+  VLA_INLINE void each_vector(const Stripe& s, std::int64_t first, std::int64_t n_row, const F& f) const {
+    const LinearJob::Part& part = job_.part[s.part];
     for (std::int64_t r = first; r < first + n_row; ++r)
       for (std::int64_t i = 0; i < s.n_column; i += V::width) {
-        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
-        typename V::Float value = load<V>(part.y + place, left), factor = load<V>(s.gates + r * kGateColumns + i, left);
-        if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
-        if (gate.bias != nullptr) factor += load<V>(gate.bias + s.column + i, left);
-        if (job_.activation == Activation::gelu_tanh) factor = gelu_tanh<V>(factor);
-        if (job_.activation == Activation::silu) factor = silu<V>(factor);
-        value *= factor;
-        if (part.residual != nullptr) value += load<V>(part.residual + place, left);
-        store<V>(part.y + place, value, left);
+        float* y = part.y + (s.row + r) * part.d_out + s.column + i;
+        typename V::Float value = V::load(scratch_.sums + r * kColumns + i);
+        if (s.k > 0) value += load<V>(y, s.n_column - i);
+        store<V>(y, f(value, r, i, s.n_column - i), s.n_column - i);
       }
   }
 
   const LinearJob& job_;
   Scratch& scratch_;
-  const std::int64_t step_;  // of the depth
+  const std::int64_t block_rows_, n_block_, block_depth_;
+  std::int64_t n_panel_ = 0, n_group_ = 0;        // groups of panels
+  std::int64_t row_of_x_ = -1, depth_of_x_ = -1;  // what the block of x holds
 };
 
 }  // namespace vla::kernels

@@ -16,7 +16,7 @@
 #include <thread>
 
 #include "kernels/linear_kernel.h"
-#include "kernels/linear_pairs.h"
+#include "kernels/linear_panels.h"
 #include "kernels/probe/probe.h"
 
 using namespace vla;
@@ -82,20 +82,13 @@ void measure(const LinearKernel& kernel, Isa isa, const Shape& s, int n_thread, 
     reinterpret_cast<std::uint16_t*>(stored.data)[i / 2] = to_bf16(1.0f / static_cast<float>(1 + i % 63));
   for (std::size_t i = 0; i < x.n; i += 4)
     reinterpret_cast<float*>(x.data)[i / 4] = 1.0f / static_cast<float>(1 + i % 61);
-  Block packed(kernel.packed_size != nullptr ? kernel.packed_size(desc) : 64);
-  double pack_seconds = 0;
-  if (kernel.packed_size != nullptr) {
-    const auto start = std::chrono::steady_clock::now();
-    kernel.pack(desc, stored.data, packed.data);
-    pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-  }
-  LinearJob job = {reinterpret_cast<const float*>(x.data), s.n_row, s.d_in, 1, {}, Activation::none, false};
-  job.part[0] = {DType::bf16,
-                 kernel.packed_size != nullptr ? packed.data : stored.data,
-                 nullptr,
-                 nullptr,
-                 reinterpret_cast<float*>(y.data),
-                 s.d_out};
+  Block packed(kernel.packed_size(desc));
+  const auto start = std::chrono::steady_clock::now();
+  kernel.pack(desc, stored.data, packed.data);
+  const double pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+  Turns turns;
+  LinearJob job = {reinterpret_cast<const float*>(x.data), s.n_row, s.d_in, 1, {}, Activation::none, false, &turns};
+  job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, reinterpret_cast<float*>(y.data), s.d_out};
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
   std::vector<double> rates, peaks, shares;
   for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
@@ -109,8 +102,7 @@ void measure(const LinearKernel& kernel, Isa isa, const Shape& s, int n_thread, 
   fmt::print("{:8} {:5} x {:5} x {:5}  {:8.1f} GFLOP/s  {:5.1f} % of {:8.1f}  median {:5.1f} %  reads {:6.1f} GB/s",
              kernel.name, s.n_row, s.d_in, s.d_out, best * 1e-9, 100 * best / peak, peak * 1e-9,
              100 * shares[shares.size() / 2], best / flop * static_cast<double>(stored.n) * 1e-9);
-  if (pack_seconds > 0) fmt::print("  packed at {:.1f} GB/s", static_cast<double>(stored.n) / pack_seconds * 1e-9);
-  fmt::print("\n");
+  fmt::print("  packed at {:.1f} GB/s\n", static_cast<double>(stored.n) / pack_seconds * 1e-9);
   std::fflush(stdout);
 }
 

@@ -7,9 +7,10 @@
 #include <cmath>
 #include <cstring>
 #include <limits>
+#include <thread>
 
 #include "kernels/linear_kernel.h"
-#include "kernels/linear_pairs.h"
+#include "kernels/linear_panels.h"
 #include "support/kernel_rows.h"
 
 using namespace vla;
@@ -81,6 +82,9 @@ struct Part {
   std::vector<std::byte> packed;
 };
 
+/// What the tiles of amx make of x: bf16, and in products of few rows a second bf16 of what that left.
+enum class Rounding { none, once, twice };
+
 struct Case {
   Shape shape;
   DType type = DType::bf16;
@@ -101,37 +105,27 @@ class Trial {
 
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
-    LinearJob job = {&x_[1], n_row, d_in, case_.n_part, {}, case_.activation, case_.gated};
+    Turns turns;
+    LinearJob job = {&x_[1], n_row, d_in, case_.n_part, {}, case_.activation, case_.gated, &turns};
     for (int i = 0; i < case_.n_part; ++i) {
       Part& part = parts_[static_cast<std::size_t>(i)];
-      const std::byte* weight = part.stored.data() + (case_.type == DType::f32 ? 4 : 2);
-      if (kernel_.packed_size != nullptr) {
-        const MatrixDesc desc = {case_.type, d_in, d_out(i)};
-        part.packed.resize(kernel_.packed_size(desc) + 64);
-        std::byte* place = part.packed.data() + (64 - reinterpret_cast<std::uintptr_t>(part.packed.data()) % 64);
-        kernel_.pack(desc, weight, place);
-        weight = place;
-      }
       job.part[i] = {case_.type,
-                     weight,
+                     packed(part, {case_.type, d_in, d_out(i)}),
                      case_.with_bias ? &part.bias[1] : nullptr,
                      case_.with_residual ? &part.residual[1] : nullptr,
                      &part.y[1],
                      d_out(i)};
     }
-    // What a thread finds in its scratch memory must not matter: all ones are NaN.
-    std::unique_ptr<std::byte, decltype(&std::free)> scratch(
-        static_cast<std::byte*>(
-            std::aligned_alloc(4096, round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096))),
-        std::free);
-    for (int ith = 0; ith < case_.n_thread; ++ith) {
-      std::memset(scratch.get(), 0xff, kernel_.scratch_size);
-      kernel_.run(job, ith, case_.n_thread, scratch.get());
-    }
+    std::vector<std::thread> threads;
+    for (int ith = 1; ith < case_.n_thread; ++ith) threads.emplace_back([&, ith] { run_thread(job, ith); });
+    run_thread(job, 0);
+    for (std::thread& thread : threads) thread.join();
   }
 
   void check() const {
-    const bool rounds_x = std::strstr(kernel_.name, "amx") != nullptr;
+    const Rounding rounding = std::strstr(kernel_.name, "amx") == nullptr ? Rounding::none
+                              : case_.shape.n_row <= 64                   ? Rounding::twice
+                                                                          : Rounding::once;
     for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
       const Part& part = parts_[static_cast<std::size_t>(i)];
       CHECK(part.y.front() == kUntouched);
@@ -140,7 +134,7 @@ class Trial {
       for (std::int64_t row = 0; row < case_.shape.n_row; ++row)
         for (std::int64_t n = 0; n < d_out(i); ++n) {
           const auto place = static_cast<std::size_t>(row * d_out(i) + n + 1);
-          const auto [expected, tolerance] = reference(i, row, n, rounds_x);
+          const auto [expected, tolerance] = reference(i, row, n, rounding);
           wrong += !(std::abs(part.y[place] - expected) <= tolerance);
         }
       CHECK(wrong == 0);
@@ -153,6 +147,23 @@ class Trial {
   struct Expected {
     double value, tolerance;
   };
+
+  /// The weight as the kernel wants it, at a multiple of 64 bytes; the stored one begins at no round address.
+  const std::byte* packed(Part& part, const MatrixDesc& desc) const {
+    part.packed.assign(kernel_.packed_size(desc) + 64, std::byte{0xff});
+    std::byte* place = part.packed.data() + (64 - reinterpret_cast<std::uintptr_t>(part.packed.data()) % 64);
+    kernel_.pack(desc, part.stored.data() + number_size(desc.type), place);
+    return place;
+  }
+
+  void run_thread(const LinearJob& job, int ith) const {
+    // What a thread finds in its scratch memory must not matter: all ones are NaN.
+    const std::int64_t size = round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096);
+    std::unique_ptr<std::byte, decltype(&std::free)> scratch(
+        static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(size))), std::free);
+    std::memset(scratch.get(), 0xff, kernel_.scratch_size);
+    kernel_.run(job, ith, case_.n_thread, scratch.get());
+  }
 
   /// Parts differ in width, so that a thread's share crosses from one to the next; a gate and its up do not.
   std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
@@ -168,24 +179,25 @@ class Trial {
   }
 
   /// W x + b. Every order of n float32 additions of the products is within n half-units of their absolute sum.
-  Expected product(int i, std::int64_t row, std::int64_t n, bool rounds_x) const {
+  Expected product(int i, std::int64_t row, std::int64_t n, Rounding rounding) const {
     const Part& part = parts_[static_cast<std::size_t>(i)];
     const std::int64_t d_in = case_.shape.d_in;
     double sum = case_.with_bias ? part.bias[static_cast<std::size_t>(n + 1)] : 0, size = std::abs(sum);
     for (std::int64_t k = 0; k < d_in; ++k) {
       float value = x_[static_cast<std::size_t>(row * d_in + k + 1)];
-      if (rounds_x) value = from_bf16(to_bf16(value));
+      if (rounding == Rounding::once) value = from_bf16(to_bf16(value));
       const double term = double{value} * part.weight[static_cast<std::size_t>(n * d_in + k + 1)];
       sum += term, size += std::abs(term);
     }
-    return {sum, static_cast<double>(d_in + 2) * 0x1p-24 * size};
+    const double of_x = rounding == Rounding::twice ? 0x1p-17 : 0;
+    return {sum, (static_cast<double>(d_in + 2) * 0x1p-24 + of_x) * size};
   }
 
   /// The activations are at most 1.13 steep and round twice; what follows rounds once each.
-  Expected reference(int i, std::int64_t row, std::int64_t n, bool rounds_x) const {
-    Expected y = product(i, row, n, rounds_x);
+  Expected reference(int i, std::int64_t row, std::int64_t n, Rounding rounding) const {
+    Expected y = product(i, row, n, rounding);
     if (case_.gated) {
-      const Expected gate = product(0, row, n, rounds_x);
+      const Expected gate = product(0, row, n, rounding);
       const double factor = activate(case_.activation, gate.value),
                    slack = 1.13 * gate.tolerance + 0x1p-22 * std::abs(factor);
       y = {y.value * factor, y.tolerance * (std::abs(factor) + slack) + slack * std::abs(y.value)};

@@ -1,0 +1,16 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+
+/// Wishes about memory, which a system may leave unheard. Pages that lie only partly in it are left alone.
+namespace vla {
+
+/// Large pages: fewer of them are looked up while weights and activations stream by, and fewer are made.
+void want_large_pages(void* data, std::size_t size);
+
+/// The memory itself now, not at the first write.
+void want_memory_now(void* data, std::size_t size);
+
+}  // namespace vla

@@ -1,0 +1,57 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "backend/matrix.h"
+#include "kernels/linear_numbers.h"
+
+/// How a matrix lies in memory for the kernels, from load on.
+///
+/// A *panel* holds some columns of the product (rows of W) over the whole depth (d_in), one block of 1 KiB after the
+/// other. A block has 16 columns, and lines across them: a line of 64 bytes is two consecutive bf16 of every column, or
+/// one f32; a line of 32 bytes one f16. So a block is 32 deep, or 16 for f32. Panels of 32 columns alternate between
+/// the blocks of their two halves. Zeros fill what the matrix does not: the last columns, and the depth up to 32.
+///
+/// Tiles of AMX read blocks as they are; vectors read lines.
+namespace vla::kernels {
+
+constexpr std::int64_t kPanelBlock = 1024, kPanelDepth = 32;
+
+constexpr VLA_INLINE std::int64_t least(std::int64_t a, std::int64_t b) { return a < b ? a : b; }
+constexpr VLA_INLINE std::int64_t pieces(std::int64_t n, std::int64_t size) { return (n + size - 1) / size; }
+constexpr VLA_INLINE std::int64_t round_up(std::int64_t n, std::int64_t unit) { return pieces(n, unit) * unit; }
+/// n cut into as few equal pieces as `most` allows, each a multiple of `unit`.
+constexpr VLA_INLINE std::int64_t even_piece(std::int64_t n, std::int64_t most, std::int64_t unit) {
+  return n == 0 ? unit : round_up(pieces(n, pieces(n, most)), unit);
+}
+
+/// Panels of kColumns, 16 or 32.
+template <int kColumns>
+struct Panels {
+  static_assert(kColumns == 16 || kColumns == 32);
+
+  /// Bytes over a depth that is a multiple of 32.
+  static VLA_INLINE std::int64_t size(DType type, std::int64_t depth) { return depth * kColumns * number_size(type); }
+
+  // A MatrixFormat's functions.
+  static std::size_t packed_size(const MatrixDesc& desc);
+  static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
+
+  /// Number k of column n of a panel.
+  static VLA_INLINE float number(DType type, const std::byte* panel, std::int64_t k, std::int64_t n) {
+    return stored_number(type, panel + place(type, k, n), 0);
+  }
+
+ private:
+  static constexpr std::int64_t block_depth(DType type) { return type == DType::f32 ? 16 : 32; }
+
+  /// Where number k of column n lies.
+  static VLA_INLINE std::int64_t place(DType type, std::int64_t k, std::int64_t n) {
+    const std::int64_t depth = block_depth(type), inner = k % depth, column = n % 16;
+    const std::int64_t block = (k / depth * (kColumns / 16) + n / 16) * kPanelBlock;
+    if (type == DType::bf16) return block + inner / 2 * 64 + column * 4 + inner % 2 * 2;
+    return block + (inner * 16 + column) * number_size(type);
+  }
+};
+
+}  // namespace vla::kernels
