@@ -4,6 +4,7 @@
 
 #include <bit>
 #include <cstdint>
+#include <cstring>
 
 #include "kernels/cpu_kernels.h"
 #include "kernels/custom.h"
@@ -78,6 +79,19 @@ void rotate_task(ggml_tensor* y, int ith, int nth, void* user) {
   }
 }
 
+/// Numbers [begin, end) of what `part` is in the whole, where it starts at `place`.
+void copy_part(const ggml_tensor* part, std::int64_t place, Range whole, float* out) {
+  const std::int64_t begin = std::max(whole.begin, place), end = std::min(whole.end, place + ggml_nelements(part));
+  if (begin < end)
+    std::memcpy(out + begin, values(part) + begin - place, static_cast<std::size_t>(end - begin) * sizeof(float));
+}
+
+void join_task(ggml_tensor* y, int ith, int nth, void*) {
+  const Range range(ggml_nelements(y), ith, nth);
+  copy_part(y->src[0], 0, range, static_cast<float*>(y->data));
+  copy_part(y->src[1], ggml_nelements(y->src[0]), range, static_cast<float*>(y->data));
+}
+
 }  // namespace
 
 Tensor gelu_tanh(Graph& g, Tensor x) {
@@ -90,6 +104,14 @@ Tensor rotate_half(Graph& g, Tensor x, Tensor table) {
   const CpuKernels* kernels = cpu_kernels(g.isa());
   return custom(g, {x.dim(0), x.dim(1), x.dim(2)}, {x, table}, rotate_task,
                 keep(g, RotateParams{kernels != nullptr ? kernels->rotate_half : rotate_head}));
+}
+
+Tensor join(Graph& g, Tensor first, Tensor second, int dim) {
+  if (!ggml_is_contiguous(first.node()) || !ggml_is_contiguous(second.node()))
+    return ggml_concat(g.context(), first.node(), second.node(), dim);
+  std::int64_t n[] = {first.dim(0), first.dim(1), first.dim(2), first.dim(3)};
+  n[dim] += second.dim(dim);
+  return custom(g, {n[0], n[1], n[2], n[3]}, {first, second}, join_task, nullptr);
 }
 
 }  // namespace vla::kernels

@@ -16,4 +16,8 @@ Tensor gelu_tanh(Graph& g, Tensor x);
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py apply_rope.
 Tensor rotate_half(Graph& g, Tensor x, Tensor table);
 
+/// Two tensors that differ only in their last dimension, one behind the other: [..., n_1], [..., n_2] -> [..., n_1 +
+/// n_2], with `dim` the index of that dimension. ggml's own concatenation goes number by number.
+Tensor join(Graph& g, Tensor first, Tensor second, int dim);
+
 }  // namespace vla::kernels

@@ -70,7 +70,7 @@ struct Avx512Tile {
     for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm512_setzero_ps();
     for (std::int64_t i = 0; i < depth; i += 4, panel += 4 * kColumns, x += 4, ahead += 64) {
       __builtin_prefetch(ahead, 0, 2);  // to the second cache
-#pragma GCC unroll 4
+#pragma GCC unroll 2
       for (int k = 0; k < 4; ++k) {
         const __m512 left = _mm512_load_ps(panel + k * kColumns), right = _mm512_load_ps(panel + k * kColumns + 16);
 #pragma GCC unroll 12

@@ -4,17 +4,17 @@
 
 #include <cmath>
 
+#include "kernels/elementwise.h"
+
 namespace vla {
 
 Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts) {
-  ggml_tensor* all = nullptr;
-  for (Tensor part : parts) all = all == nullptr ? part.node() : ggml_concat(g.context(), all, part.node(), 1);
+  Tensor all;
+  for (Tensor part : parts) all = all ? kernels::join(g, all, part, 1) : part;
   return all;
 }
 
-Tensor append_keys(Graph& g, Tensor past, Tensor present) {
-  return ggml_concat(g.context(), past.node(), present.node(), 2);
-}
+Tensor append_keys(Graph& g, Tensor past, Tensor present) { return kernels::join(g, past, present, 2); }
 
 Tensor concat_features(Graph& g, Tensor first, Tensor second) {
   return ggml_concat(g.context(), first.node(), second.node(), 0);
