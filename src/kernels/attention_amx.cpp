@@ -11,6 +11,13 @@ namespace {
 struct AmxTile {
   using Session = AmxSession;
 
+  /// To the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one. What bf16 holds only as a subnormal number
+  /// becomes zero, as it does in the tiles.
+  static VLA_INLINE void store(std::uint16_t* to, Avx512::Float a, Avx512::Float b) {
+    const __m512bh numbers = _mm512_cvtne2ps_pbh(b, a);
+    std::memcpy(to, &numbers, sizeof(numbers));
+  }
+
   template <int kStrideA, int kStrideC, bool kAdd>
   static VLA_INLINE void multiply(const std::uint16_t* a, const std::uint16_t* panel, std::int64_t depth, float* c) {
     constexpr auto kLineA = kStrideA * sizeof(std::uint16_t), kLineC = kStrideC * sizeof(float);

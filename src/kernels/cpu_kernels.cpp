@@ -50,6 +50,17 @@ namespace {
 struct EmulatedTile {
   struct Session {};
 
+  using Float = Portable::Float;
+
+  /// To the nearest bf16, ties to even; a NaN stays one.
+  static void store(std::uint16_t* to, Float a, Float b) {
+    for (Float x : {a, b})
+      for (int i = 0; i < Portable::width; ++i) {
+        const auto bits = std::bit_cast<std::uint32_t>(static_cast<float>(x[i]));
+        *to++ = static_cast<std::uint16_t>(x[i] == x[i] ? (bits + 0x7fff + (bits >> 16 & 1)) >> 16 : bits >> 16 | 64);
+      }
+  }
+
   static float widen(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
 
   template <int kStrideA, int kStrideC, bool kAdd>
@@ -58,8 +69,7 @@ struct EmulatedTile {
     for (int r = 0; r < Pairs::kTile; ++r)
       for (int n = 0; n < Pairs::kPanel; ++n) {
         float sum = kAdd ? c[r * kStrideC + n] : 0.0f;
-        for (std::int64_t k = 0; k < depth; ++k)
-          sum += widen(a[r * kStrideA + k]) * widen(panel[Pairs::place(k, n, Pairs::kPanel)]);
+        for (std::int64_t k = 0; k < depth; ++k) sum += widen(a[r * kStrideA + k]) * widen(panel[Pairs::place(k, n)]);
         c[r * kStrideC + n] = sum;
       }
   }

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <limits>
 
+#include "kernels/attention_products.h"
 #include "nn/attention.h"
 #include "support/graph_runner.h"
 #include "support/kernel_rows.h"
@@ -175,6 +176,8 @@ std::vector<float> as_bf16(std::vector<float> values) {
 }
 
 /// A weight rounded to bf16 is off by 2^-9 of itself, and weights of one row have the sum 1.
+constexpr double kPairBound = 3.0 / 512 + 1e-5;  // 3 is the greatest value
+
 void check_pairs(const AttentionKernel& kernel) {
   for (const Shape& shape : kShapes) {
     CAPTURE(shape.d_head);
@@ -183,9 +186,43 @@ void check_pairs(const AttentionKernel& kernel) {
       Case c(shape, 2, shape.n_key % 3);
       if (masked) c.set_mask([](std::int64_t i, std::int64_t j) { return j <= i || j % 7 == 0 ? 0.0f : kHidden; });
       c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
-      CHECK(worst_error(c, run(kernel, c, 2)) <= 3 * std::ldexp(1.0, -9) + 1e-5);
+      CHECK(worst_error(c, run(kernel, c, 2)) <= kPairBound);
     }
   }
+}
+
+/// Panels, chunks and vectors that end everywhere.
+template <class Check>
+void for_each_end(Check check) {
+  for (std::int64_t d_head : {8, 24, 40, 64, 72, 80, 96, 255, 256})
+    for (std::int64_t n_key : {1, 2, 15, 31, 32, 33, 100, 129, 257}) {
+      CAPTURE(d_head);
+      CAPTURE(n_key);
+      check(Case({d_head, 2, 1, 3, n_key, 1}, 1, d_head % 5));
+    }
+  for (std::int64_t n_key = 1; n_key <= 300; n_key += 3) {
+    CAPTURE(n_key);
+    check(Case({40, 1, 1, 2, n_key, 1}, 1, 0));
+  }
+}
+
+void check_ends(const CpuKernels& kernels) {
+  for_each_end([&](const Case& c) { CHECK(worst_error(c, run(kernels.attention, c, 1)) <= 5e-6); });
+}
+
+/// Every chunk of keys brings greater scores than those before it: by a little, which leaves weights above one, or by
+/// so much that what was mixed before has to become small.
+Case rising(double step) {
+  Case c({32, 1, 1, 40, 800, 1}, 2, 0);
+  for (std::size_t i = 0; i < c.q.size(); ++i) c.q[i] = i % 32 == 0 ? 4.0f : 0.0f;
+  for (std::size_t i = 0; i < c.k.size(); i += 32)
+    c.k[i] = static_cast<float>(step * static_cast<double>(i / 32 / 100)) + c.k[i] / 8;
+  return c;
+}
+
+void check_rising(const CpuKernels& kernels) {
+  for (double step : {0.5, 3.0, 40.0})
+    CHECK(worst_error(rising(step), run(kernels.attention, rising(step), 1)) <= 5e-6);
 }
 
 void check_threads(const CpuKernels& kernels) {
@@ -195,35 +232,83 @@ void check_threads(const CpuKernels& kernels) {
   }
 }
 
-void check_not_finite(const CpuKernels& kernels) {
+void check_pair_ends(const AttentionKernel& kernel) {
+  for_each_end([&](Case c) {
+    c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
+    CHECK(worst_error(c, run(kernel, c, 1)) <= kPairBound);
+  });
+}
+
+/// Values that single out one key each: the answers are the weights themselves.
+void check_pair_weights(const AttentionKernel& kernel) {
+  Case c({32, 1, 1, 1, 32, 1}, 1, 0);
+  for (std::size_t i = 0; i < c.q.size(); ++i) c.q[i] = i == 0 ? 1.0f : 0.0f;
+  for (std::size_t i = 0; i < c.k.size(); ++i) {
+    c.k[i] = i % 32 == 0 ? -15.5f * static_cast<float>(i / 32) : 0.0f;
+    c.v[i] = i % 33 == 0 ? 1.0f : 0.0f;
+  }
+  c.k = as_bf16(c.k);
+  const std::vector<float> out = run(kernel, c, 1);
+  const std::vector<double> exact = exact_row(c, 0, 0, 0);
+  for (std::size_t i = 0; i < out.size(); ++i) CHECK(std::abs(out[i] / exact[i] - 1) <= 1.0 / 256);
+  for (double step : {0.5, 3.0, 40.0}) {
+    Case rises = rising(step);
+    rises.k = as_bf16(rises.k), rises.v = as_bf16(rises.v);
+    CHECK(worst_error(rises, run(kernel, rises, 1)) <= kPairBound);
+  }
+}
+
+void check_not_finite(const AttentionKernel& attention) {
   Case unseen(kShapes[2], 1, 0);
   unseen.set_mask([](std::int64_t i, std::int64_t) { return i == 0 ? kHidden : 0.0f; });
-  const std::vector<float> out = run(kernels.attention, unseen, 1);
+  const std::vector<float> out = run(attention, unseen, 1);
   CHECK(std::isnan(out.front()));
   CHECK(std::isfinite(out.back()));
   for (float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
     Case broken(kShapes[2], 1, 0);
     broken.k[3] = bad;
-    CHECK_FALSE(std::isfinite(run(kernels.attention, broken, 1).front()));
+    CHECK_FALSE(std::isfinite(run(attention, broken, 1).front()));
     broken = Case(kShapes[2], 1, 0);
     broken.v[0] = bad;
-    CHECK_FALSE(std::isfinite(run(kernels.attention, broken, 1).front()));
+    CHECK_FALSE(std::isfinite(run(attention, broken, 1).front()));
   }
 }
 
+void check_not_finite(const CpuKernels& kernels) { check_not_finite(kernels.attention); }
+void check_pairs_not_finite(const AttentionKernel& kernel) { check_not_finite(kernel); }
+
 }  // namespace
+
+/// A test of kernels that round to bf16: the portable instance, the emulated one, and the machine's.
+#define VLA_PAIR_TEST(sentence, check)                                               \
+  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); } \
+  VLA_EMULATED_TEST("amx", sentence, check(kernels::kEmulatedAttentionAmx))          \
+  TEST_CASE("amx: " sentence* doctest::skip(test::lacks(Isa::amx))) {                \
+    check(kernels::cpu_kernels(Isa::amx)->attention);                                \
+  }
 
 VLA_KERNEL_TEST("attention of awkward shapes and strides errs at most four times as much as ggml's products",
                 check_shapes)
 VLA_KERNEL_TEST("attention is exact under causal, speckled, late and additive masks", check_masks)
 VLA_KERNEL_TEST("attention is exact however many threads share it", check_threads)
+VLA_KERNEL_TEST("attention is exact whatever the width of a head and the number of keys", check_ends)
+VLA_KERNEL_TEST("attention is exact where each chunk of keys brings greater scores", check_rising)
 VLA_KERNEL_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_not_finite)
 
-TEST_CASE("emulated amx: attention errs by the rounding of its weights to bf16 alone") {
-  check_pairs(kernels::emulated_amx_attention());
+TEST_CASE("a weight for bf16 errs by 2^-18 of itself at most") {
+  using V = kernels::Portable;
+  double worst = 0;
+  for (int i = -126 * 4096; i <= 10 * 4096; ++i) {
+    const float x = static_cast<float>(i) / 4096;
+    worst = std::max(worst, std::abs(kernels::exp2_for_bf16<V>(V::set(x))[0] / std::exp2(double{x}) - 1));
+  }
+  CHECK(worst <= std::ldexp(1.0, -18));
+  CHECK(kernels::exp2_for_bf16<V>(V::set(-3))[0] == 0.125f);
+  for (float far : {-200.0f, -3e38f, kHidden}) CHECK(kernels::exp2_for_bf16<V>(V::set(far))[0] == 0.0f);
+  CHECK(std::isnan(kernels::exp2_for_bf16<V>(V::set(std::numeric_limits<float>::quiet_NaN()))[0]));
 }
-VLA_EMULATED_TEST("amx", "attention errs by the rounding of its weights to bf16 alone",
-                  check_pairs(kernels::kEmulatedAttentionAmx))
-TEST_CASE("amx: attention errs by the rounding of its weights to bf16 alone" * doctest::skip(test::lacks(Isa::amx))) {
-  check_pairs(kernels::cpu_kernels(Isa::amx)->attention);
-}
+
+VLA_PAIR_TEST("attention errs by the rounding of its weights to bf16 alone", check_pairs)
+VLA_PAIR_TEST("attention is right whatever the width of a head and the number of keys", check_pair_ends)
+VLA_PAIR_TEST("attention keeps small weights, and greater scores make earlier ones smaller", check_pair_weights)
+VLA_PAIR_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_pairs_not_finite)
