@@ -51,14 +51,14 @@ class AttentionPanels {
   /// The d_head numbers of a row, or of none, and zeros up to `n_padded`. What follows them in steps of two vectors is
   /// written too.
   VLA_INLINE void copy_row(const float* from, std::int64_t n_padded, Number* to) const {
-    for (std::int64_t i = 0; i < n_padded; i += 2 * kWidth) P::store(to + i, part(from, i), part(from, i + kWidth));
+    const std::int64_t n = from != nullptr ? job.d_head : 0;
+    std::int64_t i = 0;
+    for (; i + 2 * kWidth <= n; i += 2 * kWidth) P::store(to + i, V::load(from + i), V::load(from + i + kWidth));
+    const auto part = [&](std::int64_t j) VLA_LAMBDA { return j < n ? load<V>(from + j, n - j) : Float{}; };
+    for (; i < n_padded; i += 2 * kWidth) P::store(to + i, part(i), part(i + kWidth));
   }
 
  private:
-  VLA_INLINE Float part(const float* row, std::int64_t i) const {
-    return row != nullptr && i < job.d_head ? load<V>(row + i, job.d_head - i) : Float{};
-  }
-
   /// Keys or values of kPanel tokens from `first` on, as numbers and padded to `n_padded`; missing tokens are zeros.
   /// The tokens after them are asked for: they are too far apart for the machine to foresee.
   VLA_INLINE void copy_rows(const AttentionJob::Rows& from, std::int64_t unit, std::int64_t first,

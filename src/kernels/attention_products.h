@@ -127,13 +127,15 @@ struct PairProducts {
         Float words[V::width];
         for (int i = 0; i < V::width; ++i) words[i] = load_words(rows + (n + i) * kStride + k);
         transpose<V>(words);
-        for (int i = 0; i < V::width; ++i) store_words(panel + place(k + 2 * i, n), words[i]);
+        Number* lines = panel + place(k, n);
+        for (int i = 0; i < V::width; ++i) store_words(lines + i * 32, words[i]);
       }
   }
 
   /// The pairs are numbers of consecutive rows here.
   template <int kStride>
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
+    panel += place(k, 0);
     for (int i = 0; i < kPanel; i += 2)
       for (int n = 0; n < kPanel; n += 2 * V::width) {
         using Int = typename V::Int;
@@ -141,8 +143,8 @@ struct PairProducts {
         const auto b = std::bit_cast<Int>(load_words(rows + (i + 1) * kStride + n));
         const auto even = std::bit_cast<Float>((a & 0xffff) | b << 16);
         const auto odd = std::bit_cast<Float>((a >> 16 & 0xffff) | (b & ~0xffff));
-        store_words(panel + place(k + i, n), V::interleave_low(even, odd));
-        store_words(panel + place(k + i, n + V::width), V::interleave_high(even, odd));
+        store_words(panel + place(i, n), V::interleave_low(even, odd));
+        store_words(panel + place(i, n + V::width), V::interleave_high(even, odd));
       }
   }
 

@@ -39,11 +39,12 @@ double now() {
 template <class Work>
 double best_time(double seconds, Work work) {
   double best = 1e9;
-  for (const double start = now(); now() - start < seconds;) {
+  const double start = now();
+  do {
     const double before = now();
     work();
     best = std::min(best, now() - before);
-  }
+  } while (now() - start < seconds);
   return best;
 }
 
