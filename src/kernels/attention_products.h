@@ -2,11 +2,17 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include "kernels/attention_kernel.h"
 #include "kernels/math.h"
 
 /// The two arithmetics that attention computes in. Both products of attention have the same form: rows of numbers
 /// times panels, which hold for each step of the depth one number of every column.
 namespace vla::kernels {
+
+/// From one row of `n` numbers to the next: a little apart from powers of two, so that rows do not compete for the same
+/// lines of the cache.
+template <int n>
+constexpr int kRowStride = n + 32;
 
 /// 2^x for a weight that is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
 template <class V>
@@ -29,6 +35,7 @@ struct FloatProducts {
   struct Session {};
   static constexpr int kTile = kRowsOfTile, kRows = 24, kKeys = 128;  // rows of a tile and of a block, keys of a chunk
   static constexpr int kPanel = 2 * V::width, kLeastPanel = V::width, kDepth = 1;  // columns; unit of the depth
+  static constexpr bool kBeside = false;
 
   /// Weights are e^x, and relative to the greatest score of their row.
   static constexpr float kLogOfE = 1, kSlack = 0;
@@ -64,19 +71,25 @@ struct FloatProducts {
     }
   }
 
-  /// c = a * panel, or c += where kAdd. a [depth, kTile] and c [width, kTile], rows `kStrideA` and `kStrideC` apart.
-  template <int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply(const float* a, const float* panel, std::int64_t depth, std::int64_t width,
-                                  float* c) {
-    if (width == kPanel)
-      multiply_vectors<2, kStrideA, kStrideC, kAdd>(a, panel, depth, c);
-    else
-      multiply_vectors<1, kStrideA, kStrideC, kAdd>(a, panel, depth, c);
-  }
+  /// Products, each done at once.
+  struct Work {
+    /// c = a * panel, or c += where `sum`. a [depth, kTile] and c [width, kTile], rows `kStrideA` and `kStrideC` apart.
+    template <int kStrideA, int kStrideC>
+    VLA_INLINE void add(const float* a, const float* panel, std::int64_t depth, std::int64_t width, float* c,
+                        bool sum) {
+      if (width == kPanel)
+        multiply<2, kStrideA, kStrideC>(a, panel, depth, c, sum);
+      else
+        multiply<1, kStrideA, kStrideC>(a, panel, depth, c, sum);
+    }
+    int n_step() const { return 0; }
+    void advance(int) const {}
+    void finish() const {}
+  };
 
  private:
-  template <int kVectors, int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply_vectors(const float* a, const float* panel, std::int64_t depth, float* c) {
+  template <int kVectors, int kStrideA, int kStrideC>
+  static VLA_INLINE void multiply(const float* a, const float* panel, std::int64_t depth, float* c, bool sum) {
     Float sums[kTile][kVectors] = {};
 #pragma GCC unroll 4
     for (std::int64_t i = 0; i < depth; ++i) {
@@ -91,13 +104,13 @@ struct FloatProducts {
     for (int r = 0; r < kTile; ++r)
       for (int n = 0; n < kVectors; ++n) {
         float* out = c + r * kStrideC + n * V::width;
-        V::store(out, kAdd ? V::load(out) + sums[r][n] : sums[r][n]);
+        V::store(out, sum ? V::load(out) + sums[r][n] : sums[r][n]);
       }
   }
 };
 
-/// Numbers rounded to bf16, sums in float32: 32 rows times 32 columns, through a tile type (AMX, or its emulation)
-/// that multiplies 16 x 16 words of two numbers each, and rounds.
+/// Numbers rounded to bf16, sums in float32: 32 rows times 32 columns, through a tile type (AMX, or its emulation) that
+/// holds the sums between `open` and `close`, adds 32 of the depth in each `step`, and rounds.
 template <class V, class Tile>
 struct PairProducts {
   using Vector = V;
@@ -105,6 +118,8 @@ struct PairProducts {
   using Number = std::uint16_t;
   using Session = typename Tile::Session;
   static constexpr int kTile = 32, kRows = 32, kKeys = 256, kPanel = 32, kLeastPanel = 32, kDepth = 32;
+  static constexpr bool kBeside = true;                 // products wait for other work to be done beside it
+  static constexpr int kStride = kRowStride<kMaxHead>;  // of all rows
 
   /// Weights are 2^x. Rounding errs by a share of a weight, so that weights may as well be up to 2^kSlack: then the
   /// greatest score of a row seldom moves far enough to scale down what was mixed before.
@@ -148,10 +163,47 @@ struct PairProducts {
       }
   }
 
-  template <int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c) {
-    Tile::template multiply<kStrideA, kStrideC, kAdd>(a, panel, depth, c);
-  }
+  /// Products that are done a step at a time between other work: while the vector instructions before and behind a
+  /// step wait for each other, the unit of the tiles, which is one of its own, computes. The processor looks some 500
+  /// instructions ahead, so that steps are short.
+  class Work {
+   public:
+    /// c = a * panel, or c += where `sum`.
+    template <int kStrideA, int kStrideC>
+    VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
+      static_assert(kStrideA == kStride && kStrideC == kStride);
+      waiting_[n_waiting_++] = {a, panel, c, static_cast<int>(depth / kDepth), sum};
+      n_step_ += static_cast<int>(depth / kDepth);
+    }
+    /// Steps of everything that was added since the last `finish`.
+    int n_step() const { return n_step_; }
+    /// Does the next n steps, or what there is.
+    VLA_INLINE void advance(int n) {
+      for (; n > 0 && first_ < n_waiting_; --n) {
+        const Product& product = waiting_[first_];
+        if (step_ == 0) tile_.template open<kStride>(product.c, product.sum);
+        tile_.template step<kStride>(product.a + step_ * kDepth, product.panel + step_ * kDepth * kPanel);
+        if (++step_ < product.n_step) continue;
+        tile_.template close<kStride>(product.c);
+        step_ = 0, ++first_;
+      }
+    }
+    VLA_INLINE void finish() {
+      advance(n_step_);
+      first_ = n_waiting_ = n_step_ = 0;
+    }
+
+   private:
+    struct Product {
+      const Number *a, *panel;
+      float* c;
+      int n_step;
+      bool sum;
+    };
+    Product waiting_[kKeys / kPanel + kMaxHead / kPanel];
+    int n_waiting_ = 0, n_step_ = 0, first_ = 0, step_ = 0;  // step_: of the first that waits
+    Tile tile_;
+  };
 
  private:
   static VLA_INLINE Float load_words(const Number* p) {

@@ -23,8 +23,7 @@ class AttentionTile {
   static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
   static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kTile
   static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
-  // Rows lie a little apart from powers of two, so that they do not compete for the same lines of the cache.
-  static constexpr int kHeadStride = kMaxHead + 32, kKeyStride = kKeys + 32;
+  static constexpr int kHeadStride = kRowStride<kMaxHead>, kKeyStride = kRowStride<kKeys>;
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
   static_assert(kRows % kTile == 0 && kKeys % kPanel == 0);
 
@@ -60,13 +59,16 @@ class AttentionTile {
     const int n_row;
     const int n_tiled = static_cast<int>(round_up(n_row, kTile));
     std::int64_t head[kRows], query[kRows];  // of each row
-    bool mixed_any = false;                  // `mixed` holds something
+    typename P::Work work;
+    bool mixed_any = false;  // `mixed` holds something
     alignas(64) float mixed[kRows * kHeadStride];
-    alignas(64) float score[kRows * kKeyStride];
+    // Of one chunk, or of two where the next one's products are computed beside the weights of one.
+    static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kRows * kKeyStride;
+    alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
     // Weights take the place of the scores, unless they are numbers of another kind.
     static constexpr bool kInPlace = std::is_same_v<Number, float>;
-    alignas(64) Number rounded_weight[kInPlace ? 1 : kRows * kKeyStride];
+    alignas(64) Number rounded_weight[kInPlace ? 1 : kBuffers * kBufferSize];
     static constexpr int kRowVectors = round_up(kRows, kWidth);  // room for whole vectors
     alignas(64) float sum[kRowVectors * kWidth];                 // of a row's weights, lane by lane
     // One number for each row; weights are relative to the score `base`.
@@ -82,28 +84,36 @@ class AttentionTile {
       }
     }
 
-    Number* weights() {
+    enum class Seen { none, some, all };
+    /// n keys from `key` on, and which of the buffers for scores and weights is theirs.
+    struct Chunk {
+      std::int64_t key = 0;
+      int n = 0, buffer = 0;
+      Seen seen = Seen::none;
+    };
+    float* scores(const Chunk& chunk) { return score + chunk.buffer * kBufferSize; }
+    Number* weights(const Chunk& chunk) {
       if constexpr (kInPlace)
-        return score;
+        return scores(chunk);
       else
-        return rounded_weight;
+        return rounded_weight + chunk.buffer * kBufferSize;
     }
 
     void run() {
       start();
-      for (std::int64_t key = 0; key < job.n_key; key += kKeys) {
-        const int n = static_cast<int>(job.n_key - key < kKeys ? job.n_key - key : kKeys);
-        const Seen seen = job.mask == nullptr ? Seen::all : look(key, n);
-        if (seen == Seen::none) continue;
-        multiply_keys(key, n);
-        if (seen == Seen::some) apply_mask(key, n);
-        for (int r = 0; r < n_row; r += kWidth) weigh(r, n, seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE);
-        if (mixed_any)
-          mix_values<true>(key, n);
-        else
-          mix_values<false>(key, n);
-        mixed_any = true;
+      Chunk before, now = chunk_from(0, 0);
+      multiply_keys(now);
+      work.finish();
+      while (now.n > 0) {
+        const Chunk next = chunk_from(now.key + kKeys, kBuffers - 1 - now.buffer);
+        if constexpr (P::kBeside) mix_values(before), multiply_keys(next);
+        weigh(now);
+        work.finish();
+        shrink_rows();
+        if constexpr (!P::kBeside) mix_values(now), multiply_keys(next);
+        before = now, now = next;
       }
+      if constexpr (P::kBeside) mix_values(before), work.finish();
       finish();
     }
 
@@ -113,11 +123,22 @@ class AttentionTile {
                         query_number + r * kHeadStride);
       for (int r = 0; r < kRowVectors; ++r) V::store(sum + r * kWidth, Float{});
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
-      for (int r = n_row; r < n_tiled; ++r)  // these rows are multiplied too
-        std::memset(weights() + r * kKeyStride, 0, kKeys * sizeof(Number));
+      if constexpr (!kInPlace)  // rows that no query has are multiplied too
+        for (int i = 0; i < kBuffers; ++i)
+          for (int r = n_row; r < n_tiled; ++r)
+            std::memset(rounded_weight + i * kBufferSize + r * kKeyStride, 0, kKeys * sizeof(Number));
     }
 
-    enum class Seen { none, some, all };
+    /// The first chunk at or behind `key` of which the block's queries see something, or none.
+    Chunk chunk_from(std::int64_t key, int buffer) const {
+      for (; key < job.n_key; key += kKeys) {
+        const int n = static_cast<int>(job.n_key - key < kKeys ? job.n_key - key : kKeys);
+        const Seen seen = job.mask == nullptr ? Seen::all : look(key, n);
+        if (seen != Seen::none) return {key, n, buffer, seen};
+      }
+      return {};
+    }
+
     /// What the block's queries see of a chunk.
     Seen look(std::int64_t key, int n) const {
       bool none = true, all = true;
@@ -137,32 +158,41 @@ class AttentionTile {
       return all ? Seen::all : none ? Seen::none : Seen::some;
     }
 
-    void multiply_keys(std::int64_t key, int n) {
+    void multiply_keys(const Chunk& chunk) {
       const std::int64_t depth = panels.key_depth;
-      for (int j = 0; j < n; j += kPanel)
+      for (int j = 0; j < chunk.n; j += kPanel)
         for (int r = 0; r < n_tiled; r += kTile)
-          P::template multiply<kHeadStride, kKeyStride, false>(query_number + r * kHeadStride, keys + (key + j) * depth,
-                                                               depth, kPanel, score + r * kKeyStride + j);
-      for (int r = 0; r < n_row; ++r)
-        for (int j = n; j < round_up(n, kPanel); ++j) score[r * kKeyStride + j] = kNever;
+          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (chunk.key + j) * depth,
+                                                     depth, kPanel, scores(chunk) + r * kKeyStride + j, false);
     }
 
-    void apply_mask(std::int64_t key, int n) {
-      const Float scale = V::set(job.scale);
+    /// Scores become weights, and steps of the products that wait are done between the rows.
+    void weigh(const Chunk& chunk) {
+      hide(chunk);
+      const float factor = chunk.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
+      const int n_step = (work.n_step() + n_row - 1) / n_row;
+      for (int r = 0; r < n_row; r += kWidth) weigh_rows(r, chunk, factor, n_step);
+    }
+
+    /// Keys that there are not, and what the mask says.
+    void hide(const Chunk& chunk) {
+      if (chunk.n % kPanel == 0 && chunk.seen == Seen::all) return;
       for (int r = 0; r < n_row; ++r) {
-        const float* mask = job.mask + query[r] * job.n_key + key;
-        float* row = score + r * kKeyStride;
-        for (int j = 0; j < n; j += kWidth)
-          V::store(row + j, V::fma(V::load(row + j), scale, load<V>(mask + j, n - j)));
+        float* row = scores(chunk) + r * kKeyStride;
+        for (int j = chunk.n; j < round_up(chunk.n, kPanel); ++j) row[j] = kNever;
+        if (chunk.seen == Seen::all) continue;
+        const float* mask = job.mask + query[r] * job.n_key + chunk.key;
+        for (int j = 0; j < chunk.n; j += kWidth)
+          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, chunk.n - j)));
       }
     }
 
     /// Scores times `factor` become the logarithms of weights, for at most kWidth rows from `first` on: relative to the
     /// greatest score so far, or to one that is nearly as great.
-    VLA_INLINE void weigh(int first, int n, float factor) {
+    VLA_INLINE void weigh_rows(int first, const Chunk& chunk, float factor, int n_step) {
       const int end = n_row - first < kWidth ? n_row : first + kWidth;
       Float tops[kWidth] = {};
-      for (int r = first; r < end; ++r) tops[r - first] = greatest(score + r * kKeyStride, n);
+      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(chunk) + r * kKeyStride, chunk.n);
       const Float top = factor * across<V>(tops, [](Float a, Float b) VLA_LAMBDA { return V::max(a, b); });
       const Float before = V::load(base + first), now = top > before + P::kSlack ? top : before;
       // A row that saw nothing yet has no greatest score; any finite one keeps its weights at zero.
@@ -171,8 +201,8 @@ class AttentionTile {
       V::store(minus_offset + first, -offset);
       V::store(shrink + first, P::power(before - offset));
       for (int r = first; r < end; ++r) {
-        weigh_row(score + r * kKeyStride, weights() + r * kKeyStride, n, factor, r);
-        if (mixed_any && shrink[r] != 1.0f) shrink_row(mixed + r * kHeadStride, shrink[r]);
+        work.advance(n_step);
+        weigh_row(scores(chunk) + r * kKeyStride, weights(chunk) + r * kKeyStride, chunk.n, factor, r);
       }
     }
 
@@ -198,20 +228,26 @@ class AttentionTile {
       V::store(sum + r * kWidth, even + odd);
     }
 
-    VLA_INLINE void shrink_row(float* row, float factor) {
-      for (std::int64_t i = 0; i < panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * factor);
+    /// What was mixed before becomes relative to the greatest scores of now.
+    void shrink_rows() {
+      for (int r = 0; mixed_any && r < n_row; ++r) {
+        if (shrink[r] == 1.0f) continue;
+        float* row = mixed + r * kHeadStride;
+        for (std::int64_t i = 0; i < panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * shrink[r]);
+      }
     }
 
-    template <bool kAdd>
-    void mix_values(std::int64_t key, int n) {
-      const std::int64_t depth = round_up(n, P::kDepth);
+    void mix_values(const Chunk& chunk) {
+      if (chunk.n == 0) return;
       for (std::int64_t i = 0; i < panels.d_value; i += kPanel) {
         const std::int64_t width = panels.width(i);
-        const Number* panel = values + i * panels.n_key + key * width;
+        const Number* panel = values + i * panels.n_key + chunk.key * width;
         for (int r = 0; r < n_tiled; r += kTile)
-          P::template multiply<kKeyStride, kHeadStride, kAdd>(weights() + r * kKeyStride, panel, depth, width,
-                                                              mixed + r * kHeadStride + i);
+          work.template add<kKeyStride, kHeadStride>(weights(chunk) + r * kKeyStride, panel,
+                                                     round_up(chunk.n, P::kDepth), width, mixed + r * kHeadStride + i,
+                                                     mixed_any);
       }
+      mixed_any = true;
     }
 
     void finish() {

@@ -239,6 +239,22 @@ void check_pair_ends(const AttentionKernel& kernel) {
   });
 }
 
+/// Chunks of keys that nobody sees, that some rows see nothing of, and that begin and end anywhere.
+void check_pair_masks(const AttentionKernel& kernel) {
+  for (std::int64_t n_key : {500, 900, 1100})
+    for (std::int64_t n_query : {1, 33}) {
+      CAPTURE(n_key);
+      CAPTURE(n_query);
+      Case c({32, 2, 1, n_query, n_key, 1}, 2, 0);
+      c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
+      CHECK(worst_error(c, run(kernel, c, 1)) <= kPairBound);
+      c.set_mask([&](std::int64_t i, std::int64_t j) {
+        return j / 256 == 1 || (j / 256 == 2 && i % 3 == 0) || (j + i) % 7 == 0 ? kHidden : 0.0f;
+      });
+      CHECK(worst_error(c, run(kernel, c, 1)) <= kPairBound);
+    }
+}
+
 /// Values that single out one key each: the answers are the weights themselves.
 void check_pair_weights(const AttentionKernel& kernel) {
   Case c({32, 1, 1, 1, 32, 1}, 1, 0);
@@ -311,4 +327,5 @@ TEST_CASE("a weight for bf16 errs by 2^-18 of itself at most") {
 VLA_PAIR_TEST("attention errs by the rounding of its weights to bf16 alone", check_pairs)
 VLA_PAIR_TEST("attention is right whatever the width of a head and the number of keys", check_pair_ends)
 VLA_PAIR_TEST("attention keeps small weights, and greater scores make earlier ones smaller", check_pair_weights)
+VLA_PAIR_TEST("attention skips what a mask hides, and chunks that it hides whole", check_pair_masks)
 VLA_PAIR_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_pairs_not_finite)
