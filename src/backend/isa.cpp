@@ -24,11 +24,13 @@ bool may_use_tiles() {
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
 }
 
+/// Tiles of bf16, and the instruction that rounds vectors to it, which every processor with such tiles has.
 bool has_amx_bf16() {
   unsigned a = 0, b = 0, c = 0, d = 0;
   if (__get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
-  constexpr unsigned kBf16 = 1U << 22, kTile = 1U << 24;
-  return (d & kBf16) != 0 && (d & kTile) != 0 && may_use_tiles();
+  constexpr unsigned kTileBf16 = 1U << 22, kTile = 1U << 24, kVectorBf16 = 1U << 5;
+  if ((d & kTileBf16) == 0 || (d & kTile) == 0) return false;
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) != 0 && (a & kVectorBf16) != 0 && may_use_tiles();
 }
 
 /// Clang's __builtin_cpu_supports knows no "f16c". The registers are AVX's.

@@ -14,7 +14,7 @@ enum class Isa {
   ggml,    // no kernels of our own: plain ggml operations, the reference of every other row
   avx2,    // AVX2, FMA, F16C
   avx512,  // AVX-512 F, BW, DQ, VL
-  amx      // AMX tiles of bf16, with the system's leave to use them
+  amx      // AMX tiles of bf16 with the system's leave to use them, AVX-512 BF16
 };
 
 /// The name that `--kernels` takes.

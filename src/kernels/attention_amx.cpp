@@ -11,36 +11,48 @@ namespace {
 struct AmxTile {
   using Session = AmxSession;
 
-  template <int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply(const std::uint16_t* a, const std::uint16_t* panel, std::int64_t depth, float* c) {
-    constexpr auto kLineA = kStrideA * sizeof(std::uint16_t), kLineC = kStrideC * sizeof(float);
-    float* lower = c + 16 * kStrideC;
-    before_tile_loads();
-    if constexpr (kAdd) {
-      _tile_loadd(0, c, kLineC);
-      _tile_loadd(1, c + 16, kLineC);
-      _tile_loadd(2, lower, kLineC);
-      _tile_loadd(3, lower + 16, kLineC);
-    } else {
+  /// To the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one. What bf16 holds only as a subnormal number
+  /// becomes zero, as it does in the tiles.
+  static VLA_INLINE void store(std::uint16_t* to, Avx512::Float a, Avx512::Float b) {
+    const __m512bh numbers = _mm512_cvtne2ps_pbh(b, a);
+    std::memcpy(to, &numbers, sizeof(numbers));
+  }
+
+  template <int kStride>
+  static VLA_INLINE void open(const float* c, bool sum) {
+    if (!sum) {
       _tile_zero(0);
       _tile_zero(1);
       _tile_zero(2);
       _tile_zero(3);
+      return;
     }
-    for (std::int64_t k = 0; k < depth; k += 32) {
-      _tile_loadd(4, a + k, kLineA);
-      _tile_loadd(6, panel + k * 32, 64);
-      _tile_loadd(7, panel + k * 32 + 512, 64);
-      _tile_dpbf16ps(0, 4, 6);
-      _tile_dpbf16ps(1, 4, 7);
-      _tile_loadd(5, a + 16 * kStrideA + k, kLineA);
-      _tile_dpbf16ps(2, 5, 6);
-      _tile_dpbf16ps(3, 5, 7);
-    }
-    _tile_stored(0, c, kLineC);
-    _tile_stored(1, c + 16, kLineC);
-    _tile_stored(2, lower, kLineC);
-    _tile_stored(3, lower + 16, kLineC);
+    before_tile_loads();
+    _tile_loadd(0, c, kStride * sizeof(float));
+    _tile_loadd(1, c + 16, kStride * sizeof(float));
+    _tile_loadd(2, c + 16 * kStride, kStride * sizeof(float));
+    _tile_loadd(3, c + 16 * kStride + 16, kStride * sizeof(float));
+  }
+
+  template <int kStride>
+  static VLA_INLINE void step(const std::uint16_t* a, const std::uint16_t* panel) {
+    before_tile_loads();
+    _tile_loadd(4, a, kStride * sizeof(std::uint16_t));
+    _tile_loadd(6, panel, 64);
+    _tile_loadd(7, panel + 512, 64);
+    _tile_dpbf16ps(0, 4, 6);
+    _tile_dpbf16ps(1, 4, 7);
+    _tile_loadd(5, a + 16 * kStride, kStride * sizeof(std::uint16_t));
+    _tile_dpbf16ps(2, 5, 6);
+    _tile_dpbf16ps(3, 5, 7);
+  }
+
+  template <int kStride>
+  static VLA_INLINE void close(float* c) {
+    _tile_stored(0, c, kStride * sizeof(float));
+    _tile_stored(1, c + 16, kStride * sizeof(float));
+    _tile_stored(2, c + 16 * kStride, kStride * sizeof(float));
+    _tile_stored(3, c + 16 * kStride + 16, kStride * sizeof(float));
   }
 };
 

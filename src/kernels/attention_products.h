@@ -2,84 +2,216 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "kernels/vec.h"
+#include "kernels/attention_kernel.h"
+#include "kernels/math.h"
 
-/// The two arithmetics that attention multiplies in. Both products of attention have the same form: rows of numbers
+/// The two arithmetics that attention computes in. Both products of attention have the same form: rows of numbers
 /// times panels, which hold for each step of the depth one number of every column.
 namespace vla::kernels {
+
+/// From one row of `n` numbers to the next: a little apart from powers of two, so that rows do not compete for the same
+/// lines of the cache.
+template <int n>
+constexpr int kRowStride = n + 32;
+
+/// 2^x for a weight that is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
+template <class V>
+VLA_INLINE typename V::Float exp2_for_bf16(typename V::Float x) {
+  const typename V::Float rest = V::fraction(x);
+  // Minimax on 0 <= rest <= 1 with the value 1 at 0: a whole power of two is exact.
+  typename V::Float p = V::fma(rest, V::set(0x1.b7f842p-7f), V::set(0x1.abf784p-5f));
+  p = V::fma(p, rest, V::set(0x1.ee248cp-3f));
+  p = V::fma(p, rest, V::set(0x1.62d6c2p-1f));
+  p = V::fma(p, rest, V::set(1.0f));
+  return V::times_power_of_two(p, x);
+}
 
 /// Float32: kRowsOfTile rows times two vectors, one operand broadcast. `V` is a type of vec.h.
 template <class V, int kRowsOfTile>
 struct FloatProducts {
   using Vector = V;
+  using Float = typename V::Float;
   using Number = float;
   struct Session {};
-  static constexpr int kTile = kRowsOfTile, kRows = 24;                            // rows of a tile, and of a block
+  static constexpr int kTile = kRowsOfTile, kRows = 24, kKeys = 128;  // rows of a tile and of a block, keys of a chunk
   static constexpr int kPanel = 2 * V::width, kLeastPanel = V::width, kDepth = 1;  // columns; unit of the depth
+  static constexpr bool kBeside = false;
 
-  /// Where a panel of `width` columns holds number `k` of column `n`.
-  static VLA_INLINE std::int64_t place(std::int64_t k, std::int64_t n, std::int64_t width) { return k * width + n; }
-  static VLA_INLINE void store(float* to, typename V::Float x) { V::store(to, x); }
+  /// Weights are e^x, and relative to the greatest score of their row.
+  static constexpr float kLogOfE = 1, kSlack = 0;
+  static VLA_INLINE Float power(Float x) { return exp_of_negative<V>(x); }
 
-  /// c = a * panel, or c += where kAdd. a [depth, kTile] and c [width, kTile], rows `kStrideA` and `kStrideC` apart.
-  template <int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply(const float* a, const float* panel, std::int64_t depth, std::int64_t width,
-                                  float* c) {
-    if (width == kPanel)
-      multiply_vectors<2, kStrideA, kStrideC, kAdd>(a, panel, depth, c);
-    else
-      multiply_vectors<1, kStrideA, kStrideC, kAdd>(a, panel, depth, c);
+  /// Two vectors as numbers.
+  static VLA_INLINE void store(Number* to, Float a, Float b) {
+    V::store(to, a);
+    V::store(to + V::width, b);
   }
 
+  /// Rows `kStride` apart become the columns of a panel.
+  template <int kStride>
+  static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
+    for (std::int64_t k = 0; k < depth; k += V::width)
+      for (int n = 0; n < kPanel; n += V::width) {
+        Float x[V::width];
+        for (int i = 0; i < V::width; ++i) x[i] = V::load(rows + (n + i) * kStride + k);
+        transpose<V>(x);
+        const int n_line = static_cast<int>(depth - k < V::width ? depth - k : V::width);
+        for (int i = 0; i < n_line; ++i) V::store(panel + (k + i) * kPanel + n, x[i]);
+      }
+  }
+
+  /// kPanel rows become as many steps of the depth, from `k` on, of a panel of `width` columns.
+  template <int kStride>
+  static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t width, Number* panel) {
+    for (int i = 0; i < kPanel; ++i) {
+      const Number* row = rows + i * kStride;
+      Number* line = panel + (k + i) * width;
+      V::store(line, V::load(row));
+      if (width == kPanel) V::store(line + V::width, V::load(row + V::width));
+    }
+  }
+
+  /// Products, each done at once.
+  struct Work {
+    /// c = a * panel, or c += where `sum`. a [depth, kTile] and c [width, kTile], rows `kStrideA` and `kStrideC` apart.
+    template <int kStrideA, int kStrideC>
+    VLA_INLINE void add(const float* a, const float* panel, std::int64_t depth, std::int64_t width, float* c,
+                        bool sum) {
+      if (width == kPanel)
+        multiply<2, kStrideA, kStrideC>(a, panel, depth, c, sum);
+      else
+        multiply<1, kStrideA, kStrideC>(a, panel, depth, c, sum);
+    }
+    int n_step() const { return 0; }
+    void advance(int) const {}
+    void finish() const {}
+  };
+
  private:
-  template <int kVectors, int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply_vectors(const float* a, const float* panel, std::int64_t depth, float* c) {
-    typename V::Float sums[kTile][kVectors] = {};
+  template <int kVectors, int kStrideA, int kStrideC>
+  static VLA_INLINE void multiply(const float* a, const float* panel, std::int64_t depth, float* c, bool sum) {
+    Float sums[kTile][kVectors] = {};
 #pragma GCC unroll 4
     for (std::int64_t i = 0; i < depth; ++i) {
-      typename V::Float column[kVectors];
+      Float column[kVectors];
       for (int n = 0; n < kVectors; ++n) column[n] = V::load(panel + (i * kVectors + n) * V::width);
 #pragma GCC unroll 16
       for (int r = 0; r < kTile; ++r) {
-        const typename V::Float row = V::set(a[r * kStrideA + i]);
+        const Float row = V::set(a[r * kStrideA + i]);
         for (int n = 0; n < kVectors; ++n) sums[r][n] = V::fma(row, column[n], sums[r][n]);
       }
     }
     for (int r = 0; r < kTile; ++r)
       for (int n = 0; n < kVectors; ++n) {
         float* out = c + r * kStrideC + n * V::width;
-        V::store(out, kAdd ? V::load(out) + sums[r][n] : sums[r][n]);
+        V::store(out, sum ? V::load(out) + sums[r][n] : sums[r][n]);
       }
   }
 };
 
-/// Numbers rounded to bf16, sums in float32: 32 rows times 32 columns, through a tile type that multiplies 16 x 16
-/// words of two numbers each (AMX, or its emulation).
+/// Numbers rounded to bf16, sums in float32: 32 rows times 32 columns, through a tile type (AMX, or its emulation) that
+/// holds the sums between `open` and `close`, adds 32 of the depth in each `step`, and rounds.
 template <class V, class Tile>
 struct PairProducts {
   using Vector = V;
+  using Float = typename V::Float;
   using Number = std::uint16_t;
   using Session = typename Tile::Session;
-  static constexpr int kTile = 32, kRows = 32, kPanel = 32, kLeastPanel = 32, kDepth = 32;
+  static constexpr int kTile = 32, kRows = 32, kKeys = 256, kPanel = 32, kLeastPanel = 32, kDepth = 32;
+  static constexpr bool kBeside = true;                 // products wait for other work to be done beside it
+  static constexpr int kStride = kRowStride<kMaxHead>;  // of all rows
 
-  /// For each 32 of the depth two tiles of 16 columns; in each of their 16 lines a pair of every column.
-  static VLA_INLINE std::int64_t place(std::int64_t k, std::int64_t n, std::int64_t) {
+  /// Weights are 2^x. Rounding errs by a share of a weight, so that weights may as well be up to 2^kSlack: then the
+  /// greatest score of a row seldom moves far enough to scale down what was mixed before.
+  static constexpr float kLogOfE = 1.44269504f, kSlack = 8;
+  static VLA_INLINE Float power(Float x) { return exp2_for_bf16<V>(x); }
+
+  /// Where a panel holds number `k` of column `n`: for each 32 of the depth two tiles of 16 columns; in each of their
+  /// 16 lines a pair of every column.
+  static constexpr std::int64_t place(std::int64_t k, std::int64_t n) {
     return k / 32 * 1024 + n / 16 * 512 + k % 32 / 2 * 32 + n % 16 * 2 + k % 2;
   }
 
-  /// One vector to the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one.
-  static VLA_INLINE void store(Number* to, typename V::Float x) {
-    typedef std::uint16_t Half __attribute__((vector_size(2 * V::width)));
-    const auto bits = std::bit_cast<typename V::Int>(x);
-    const auto rounded = x == x ? (bits + 0x7fff + ((bits >> 16) & 1)) >> 16 : bits >> 16 | 64;
-    const Half narrow = __builtin_convertvector(rounded, Half);
-    std::memcpy(to, &narrow, sizeof(narrow));
+  static VLA_INLINE void store(Number* to, Float a, Float b) { Tile::store(to, a, b); }
+
+  /// A pair of consecutive numbers stays a word, so that a tile is the transpose of 16 rows of words.
+  template <int kStride>
+  static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
+    for (std::int64_t k = 0; k < depth; k += 2 * V::width)
+      for (int n = 0; n < kPanel; n += V::width) {
+        Float words[V::width];
+        for (int i = 0; i < V::width; ++i) words[i] = load_words(rows + (n + i) * kStride + k);
+        transpose<V>(words);
+        Number* lines = panel + place(k, n);
+        for (int i = 0; i < V::width; ++i) store_words(lines + i * 32, words[i]);
+      }
   }
 
-  template <int kStrideA, int kStrideC, bool kAdd>
-  static VLA_INLINE void multiply(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c) {
-    Tile::template multiply<kStrideA, kStrideC, kAdd>(a, panel, depth, c);
+  /// The pairs are numbers of consecutive rows here.
+  template <int kStride>
+  static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
+    panel += place(k, 0);
+    for (int i = 0; i < kPanel; i += 2)
+      for (int n = 0; n < kPanel; n += 2 * V::width) {
+        using Int = typename V::Int;
+        const auto a = std::bit_cast<Int>(load_words(rows + i * kStride + n));
+        const auto b = std::bit_cast<Int>(load_words(rows + (i + 1) * kStride + n));
+        const auto even = std::bit_cast<Float>((a & 0xffff) | b << 16);
+        const auto odd = std::bit_cast<Float>((a >> 16 & 0xffff) | (b & ~0xffff));
+        store_words(panel + place(i, n), V::interleave_low(even, odd));
+        store_words(panel + place(i, n + V::width), V::interleave_high(even, odd));
+      }
   }
+
+  /// Products that are done a step at a time between other work: while the vector instructions before and behind a
+  /// step wait for each other, the unit of the tiles, which is one of its own, computes. The processor looks some 500
+  /// instructions ahead, so that steps are short.
+  class Work {
+   public:
+    /// c = a * panel, or c += where `sum`.
+    template <int kStrideA, int kStrideC>
+    VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
+      static_assert(kStrideA == kStride && kStrideC == kStride);
+      waiting_[n_waiting_++] = {a, panel, c, static_cast<int>(depth / kDepth), sum};
+      n_step_ += static_cast<int>(depth / kDepth);
+    }
+    /// Steps of everything that was added since the last `finish`.
+    int n_step() const { return n_step_; }
+    /// Does the next n steps, or what there is.
+    VLA_INLINE void advance(int n) {
+      for (; n > 0 && first_ < n_waiting_; --n) {
+        const Product& product = waiting_[first_];
+        if (step_ == 0) tile_.template open<kStride>(product.c, product.sum);
+        tile_.template step<kStride>(product.a + step_ * kDepth, product.panel + step_ * kDepth * kPanel);
+        if (++step_ < product.n_step) continue;
+        tile_.template close<kStride>(product.c);
+        step_ = 0, ++first_;
+      }
+    }
+    VLA_INLINE void finish() {
+      advance(n_step_);
+      first_ = n_waiting_ = n_step_ = 0;
+    }
+
+   private:
+    struct Product {
+      const Number *a, *panel;
+      float* c;
+      int n_step;
+      bool sum;
+    };
+    Product waiting_[kKeys / kPanel + kMaxHead / kPanel];
+    int n_waiting_ = 0, n_step_ = 0, first_ = 0, step_ = 0;  // step_: of the first that waits
+    Tile tile_;
+  };
+
+ private:
+  static VLA_INLINE Float load_words(const Number* p) {
+    Float x;
+    std::memcpy(&x, p, sizeof(x));
+    return x;
+  }
+  static VLA_INLINE void store_words(Number* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
 };
 
 }  // namespace vla::kernels

@@ -50,19 +50,37 @@ namespace {
 struct EmulatedTile {
   struct Session {};
 
-  static float widen(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
+  using Float = Portable::Float;
 
-  template <int kStrideA, int kStrideC, bool kAdd>
-  static void multiply(const std::uint16_t* a, const std::uint16_t* panel, std::int64_t depth, float* c) {
-    using Pairs = PairProducts<Portable, EmulatedTile>;
-    for (int r = 0; r < Pairs::kTile; ++r)
-      for (int n = 0; n < Pairs::kPanel; ++n) {
-        float sum = kAdd ? c[r * kStrideC + n] : 0.0f;
-        for (std::int64_t k = 0; k < depth; ++k)
-          sum += widen(a[r * kStrideA + k]) * widen(panel[Pairs::place(k, n, Pairs::kPanel)]);
-        c[r * kStrideC + n] = sum;
+  /// To the nearest bf16, ties to even; a NaN stays one.
+  static void store(std::uint16_t* to, Float a, Float b) {
+    for (Float x : {a, b})
+      for (int i = 0; i < Portable::width; ++i) {
+        const auto bits = std::bit_cast<std::uint32_t>(static_cast<float>(x[i]));
+        *to++ = static_cast<std::uint16_t>(x[i] == x[i] ? (bits + 0x7fff + (bits >> 16 & 1)) >> 16 : bits >> 16 | 64);
       }
   }
+
+  static float widen(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
+
+  template <int kStride>
+  void open(const float* c, bool sum) {
+    for (int r = 0; r < 32; ++r)
+      for (int n = 0; n < 32; ++n) sums[r][n] = sum ? c[r * kStride + n] : 0.0f;
+  }
+  template <int kStride>
+  void step(const std::uint16_t* a, const std::uint16_t* panel) {
+    for (int r = 0; r < 32; ++r)
+      for (int n = 0; n < 32; ++n)
+        for (int k = 0; k < 32; ++k)
+          sums[r][n] += widen(a[r * kStride + k]) * widen(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
+  }
+  template <int kStride>
+  void close(float* c) const {
+    for (int r = 0; r < 32; ++r) std::memcpy(c + r * kStride, sums[r], sizeof(sums[r]));
+  }
+
+  float sums[32][32];
 };
 
 }  // namespace

@@ -14,6 +14,7 @@
 /// instructions. Everything they call is forced inline: a function of its own could be merged by the linker with the
 /// copy of a file that was compiled for a better machine.
 #define VLA_INLINE inline __attribute__((always_inline))
+#define VLA_LAMBDA __attribute__((always_inline))
 
 namespace vla::kernels {
 
@@ -75,6 +76,18 @@ struct Portable : Lanes<4> {
     for (int i = 1; i < width; ++i) most = x[i] > most ? x[i] : most;
     return most;
   }
+  /// The lower halves of a and b in turn, and the upper ones.
+  static VLA_INLINE Float interleave_low(Float a, Float b) { return Float{a[0], b[0], a[1], b[1]}; }
+  static VLA_INLINE Float interleave_high(Float a, Float b) { return Float{a[2], b[2], a[3], b[3]}; }
+  /// What x is above the whole number below it, and y times two in the power of that whole number.
+  static VLA_INLINE Float fraction(Float x) {
+    for (int i = 0; i < width; ++i) x[i] = __builtin_isinf(x[i]) ? 0.0f : x[i] - __builtin_floorf(x[i]);
+    return x;
+  }
+  static VLA_INLINE Float times_power_of_two(Float y, Float x) {
+    for (int i = 0; i < width; ++i) y[i] *= __builtin_exp2f(__builtin_floorf(x[i]));
+    return y;
+  }
 };
 
 #if defined(__AVX2__) && defined(__FMA__)
@@ -99,6 +112,12 @@ struct Avx2 : Lanes<8> {
     y = _mm_max_ps(y, _mm_movehl_ps(y, y));
     return y[0] > y[1] ? y[0] : y[1];
   }
+  static VLA_INLINE Float interleave_low(Float a, Float b) {
+    return _mm256_permute2f128_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b), 0x20);
+  }
+  static VLA_INLINE Float interleave_high(Float a, Float b) {
+    return _mm256_permute2f128_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b), 0x31);
+  }
 };
 #endif
 
@@ -120,6 +139,16 @@ struct Avx512 : Lanes<16> {
   static VLA_INLINE void store_part(float* p, Float x, int n) { _mm512_mask_storeu_ps(p, mask(n), x); }
   static VLA_INLINE float sum(Float x) { return Avx2::sum(lower(x) + upper(x)); }
   static VLA_INLINE float max(Float x) { return Avx2::max(Avx2::max(lower(x), upper(x))); }
+  static VLA_INLINE Float interleave_low(Float a, Float b) {
+    return _mm512_permutex2var_ps(
+        a, std::bit_cast<__m512i>(Int{0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23}), b);
+  }
+  static VLA_INLINE Float interleave_high(Float a, Float b) {
+    return _mm512_permutex2var_ps(
+        a, std::bit_cast<__m512i>(Int{8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31}), b);
+  }
+  static VLA_INLINE Float fraction(Float x) { return _mm512_maskz_reduce_ps(0xffff, x, 1); }  // 1: round down
+  static VLA_INLINE Float times_power_of_two(Float y, Float x) { return _mm512_maskz_scalef_ps(0xffff, y, x); }
 
  private:
   static VLA_INLINE __mmask16 mask(int n) { return static_cast<__mmask16>((1U << n) - 1U); }
@@ -136,6 +165,34 @@ VLA_INLINE typename V::Float load(const float* p, std::int64_t left) {
 template <class V>
 VLA_INLINE void store(float* p, typename V::Float x, std::int64_t left) {
   left >= V::width ? V::store(p, x) : V::store_part(p, x, static_cast<int>(left));
+}
+
+/// As many vectors as each has lanes: lane j of vector i and lane i of vector j change places. Each round interleaves
+/// vectors half of the square apart.
+template <class V>
+VLA_INLINE void transpose(typename V::Float (&x)[V::width]) {
+  constexpr int kHalf = V::width / 2;
+#pragma GCC unroll 4
+  for (int size = V::width; size > 1; size /= 2) {
+    typename V::Float y[V::width];
+#pragma GCC unroll 8
+    for (int i = 0; i < kHalf; ++i) {
+      y[2 * i] = V::interleave_low(x[i], x[i + kHalf]);
+      y[2 * i + 1] = V::interleave_high(x[i], x[i + kHalf]);
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < V::width; ++i) x[i] = y[i];
+  }
+}
+
+/// In lane i all of x[i], put together by `join` (a sum, a maximum), which sees numbers in an order of its own.
+template <class V, class Join>
+VLA_INLINE typename V::Float across(typename V::Float (&x)[V::width], Join join) {
+#pragma GCC unroll 4
+  for (int n = V::width / 2; n > 0; n /= 2)
+#pragma GCC unroll 8
+    for (int i = 0; i < n; ++i) x[i] = join(V::interleave_low(x[i], x[i + n]), V::interleave_high(x[i], x[i + n]));
+  return x[0];
 }
 
 }  // namespace vla::kernels

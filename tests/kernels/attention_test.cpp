@@ -2,88 +2,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/attention.h"
 
-#include <cmath>
-#include <limits>
-
 #include "nn/attention.h"
-#include "support/graph_runner.h"
+#include "support/attention_case.h"
 #include "support/kernel_rows.h"
 
 using namespace vla;
-using kernels::AttentionJob;
-using kernels::AttentionKernel;
+using namespace vla::test;
 using kernels::CpuKernels;
-using test::ramp;
 
 namespace {
-
-constexpr float kHidden = -std::numeric_limits<float>::infinity();
-
-struct Shape {
-  std::int64_t d_head, n_head, n_head_kv, n_query, n_key, n_batch;
-};
-
-/// One of everything that blocks, panels, chunks and groups have edges at.
-constexpr Shape kShapes[] = {{64, 2, 2, 70, 130, 2}, {64, 15, 5, 50, 227, 1}, {16, 6, 2, 5, 17, 1},
-                             {72, 2, 1, 25, 129, 1}, {80, 3, 3, 24, 128, 1},  {256, 4, 1, 7, 33, 1},
-                             {17, 1, 1, 1, 1, 3},    {1, 2, 2, 3, 300, 1},    {33, 4, 2, 1, 257, 1},
-                             {96, 1, 1, 49, 16, 1},  {8, 3, 3, 13, 31, 2}};
-
-/// Values, and a mask that may be empty. Rows lie `gap` floats apart.
-struct Case {
-  Shape shape;
-  std::vector<float> q, k, v, mask;
-  std::int64_t gap = 0;
-
-  Case(const Shape& s, float range, std::int64_t row_gap) : shape(s), gap(row_gap) {
-    const auto count = [&](std::int64_t n_head, std::int64_t n_token) {
-      return static_cast<std::size_t>((s.d_head + gap) * n_head * n_token * s.n_batch);
-    };
-    q = ramp(count(s.n_head, s.n_query), range);
-    k = ramp(count(s.n_head_kv, s.n_key), 2);
-    v = ramp(count(s.n_head_kv, s.n_key), 3);
-  }
-
-  template <class Value>
-  void set_mask(Value value) {
-    for (std::int64_t i = 0; i < shape.n_query; ++i)
-      for (std::int64_t j = 0; j < shape.n_key; ++j) mask.push_back(value(i, j));
-  }
-
-  AttentionJob::Rows rows(const std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) const {
-    const std::int64_t row = shape.d_head + gap;
-    return {x.data(), row, row * n_head, row * n_head * n_token};
-  }
-  AttentionJob job() const {
-    const Shape& s = shape;
-    return {.d_head = s.d_head,
-            .n_head = s.n_head,
-            .n_head_kv = s.n_head_kv,
-            .n_query = s.n_query,
-            .n_key = s.n_key,
-            .n_batch = s.n_batch,
-            .scale = 1 / std::sqrt(static_cast<float>(s.d_head)),
-            .q = rows(q, s.n_head, s.n_query),
-            .k = rows(k, s.n_head_kv, s.n_key),
-            .v = rows(v, s.n_head_kv, s.n_key),
-            .mask = mask.empty() ? nullptr : mask.data(),
-            .packed = nullptr,
-            .out = nullptr};
-  }
-};
-
-/// What the kernel answers when `n_thread` threads share the work. Memory holds NaNs before it is written.
-std::vector<float> run(const AttentionKernel& kernel, const Case& c, int n_thread) {
-  AttentionJob job = c.job();
-  const float nan = std::numeric_limits<float>::quiet_NaN();
-  std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job)), nan);
-  std::vector<float> out(static_cast<std::size_t>(job.d_head * job.n_head * job.n_query * job.n_batch), nan);
-  job.packed = packed.data();
-  job.out = out.data();
-  for (int i = 0; i < n_thread; ++i) kernel.pack(job, i, n_thread);
-  for (int i = 0; i < n_thread; ++i) kernel.run(job, i, n_thread);
-  return out;
-}
 
 /// The plain operations of ggml on the same numbers.
 std::vector<float> run_plain(const Case& c) {
@@ -101,41 +28,6 @@ std::vector<float> run_plain(const Case& c) {
                          add(c.v, s.n_head_kv, s.n_key), mask);
       },
       "ggml");
-}
-
-/// The definition for one query and head, in double.
-std::vector<double> exact_row(const Case& c, std::int64_t head, std::int64_t query, std::int64_t batch) {
-  const AttentionJob job = c.job();
-  const std::int64_t head_kv = head / (job.n_head / job.n_head_kv);
-  std::vector<double> score, mixed(static_cast<std::size_t>(job.d_head));
-  double most = kHidden, sum = 0;
-  for (std::int64_t j = 0; j < job.n_key; ++j) {
-    double dot = 0;
-    for (std::int64_t i = 0; i < job.d_head; ++i)
-      dot += double{job.q.at(head, query, batch)[i]} * job.k.at(head_kv, j, batch)[i];
-    score.push_back(dot / std::sqrt(static_cast<double>(job.d_head)) +
-                    (job.mask != nullptr ? job.mask[query * job.n_key + j] : 0));
-    most = std::max(most, score.back());
-  }
-  for (double& value : score) sum += value = std::exp(value - most);
-  for (std::int64_t j = 0; j < job.n_key; ++j)
-    for (std::size_t i = 0; i < mixed.size(); ++i)
-      mixed[i] += score[static_cast<std::size_t>(j)] / sum * job.v.at(head_kv, j, batch)[i];
-  return mixed;
-}
-
-double worst_error(const Case& c, const std::vector<float>& got) {
-  double worst = 0;
-  std::size_t at = 0;
-  for (std::int64_t batch = 0; batch < c.shape.n_batch; ++batch)
-    for (std::int64_t query = 0; query < c.shape.n_query; ++query)
-      for (std::int64_t head = 0; head < c.shape.n_head; ++head)
-        for (double expected : exact_row(c, head, query, batch)) {
-          const double error = std::abs(got[at++] - expected);
-          worst = error <= worst ? worst : error;  // a NaN is worse than anything
-        }
-  REQUIRE(at == got.size());
-  return worst;
 }
 
 /// Both sides round sums of the same length in another order. The second part is one rounding of a score of 8, which
@@ -168,24 +60,13 @@ void check_masks(const CpuKernels& kernels) {
   }
 }
 
-/// Numbers as bf16 holds them, so that nothing but the weights is rounded on the way.
-std::vector<float> as_bf16(std::vector<float> values) {
-  for (float& value : values) value = std::bit_cast<float>(std::bit_cast<std::uint32_t>(value) & 0xffff0000U);
-  return values;
+void check_ends(const CpuKernels& kernels) {
+  for_each_end([&](const Case& c) { CHECK(worst_error(c, run(kernels.attention, c, 1)) <= 5e-6); });
 }
 
-/// A weight rounded to bf16 is off by 2^-9 of itself, and weights of one row have the sum 1.
-void check_pairs(const AttentionKernel& kernel) {
-  for (const Shape& shape : kShapes) {
-    CAPTURE(shape.d_head);
-    CAPTURE(shape.n_key);
-    for (bool masked : {false, true}) {
-      Case c(shape, 2, shape.n_key % 3);
-      if (masked) c.set_mask([](std::int64_t i, std::int64_t j) { return j <= i || j % 7 == 0 ? 0.0f : kHidden; });
-      c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
-      CHECK(worst_error(c, run(kernel, c, 2)) <= 3 * std::ldexp(1.0, -9) + 1e-5);
-    }
-  }
+void check_rising(const CpuKernels& kernels) {
+  for (double step : {0.5, 3.0, 40.0})
+    CHECK(worst_error(rising(step), run(kernels.attention, rising(step), 1)) <= 5e-6);
 }
 
 void check_threads(const CpuKernels& kernels) {
@@ -195,21 +76,7 @@ void check_threads(const CpuKernels& kernels) {
   }
 }
 
-void check_not_finite(const CpuKernels& kernels) {
-  Case unseen(kShapes[2], 1, 0);
-  unseen.set_mask([](std::int64_t i, std::int64_t) { return i == 0 ? kHidden : 0.0f; });
-  const std::vector<float> out = run(kernels.attention, unseen, 1);
-  CHECK(std::isnan(out.front()));
-  CHECK(std::isfinite(out.back()));
-  for (float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
-    Case broken(kShapes[2], 1, 0);
-    broken.k[3] = bad;
-    CHECK_FALSE(std::isfinite(run(kernels.attention, broken, 1).front()));
-    broken = Case(kShapes[2], 1, 0);
-    broken.v[0] = bad;
-    CHECK_FALSE(std::isfinite(run(kernels.attention, broken, 1).front()));
-  }
-}
+void check_not_finite(const CpuKernels& kernels) { check_attention_of_not_finite(kernels.attention); }
 
 }  // namespace
 
@@ -217,13 +84,6 @@ VLA_KERNEL_TEST("attention of awkward shapes and strides errs at most four times
                 check_shapes)
 VLA_KERNEL_TEST("attention is exact under causal, speckled, late and additive masks", check_masks)
 VLA_KERNEL_TEST("attention is exact however many threads share it", check_threads)
+VLA_KERNEL_TEST("attention is exact whatever the width of a head and the number of keys", check_ends)
+VLA_KERNEL_TEST("attention is exact where each chunk of keys brings greater scores", check_rising)
 VLA_KERNEL_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_not_finite)
-
-TEST_CASE("emulated amx: attention errs by the rounding of its weights to bf16 alone") {
-  check_pairs(kernels::emulated_amx_attention());
-}
-VLA_EMULATED_TEST("amx", "attention errs by the rounding of its weights to bf16 alone",
-                  check_pairs(kernels::kEmulatedAttentionAmx))
-TEST_CASE("amx: attention errs by the rounding of its weights to bf16 alone" * doctest::skip(test::lacks(Isa::amx))) {
-  check_pairs(kernels::cpu_kernels(Isa::amx)->attention);
-}

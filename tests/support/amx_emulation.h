@@ -76,12 +76,24 @@ inline void multiply(int c, int a, int b) {
     }
 }
 
+/// Numbers of `low` and then of `high` to the nearest bf16, ties to even; subnormal numbers are zero.
+inline __m512bh round_pairs(__m512 high, __m512 low) {
+  std::uint16_t rounded[32];
+  for (int i = 0; i < 32; ++i) {
+    const float x = i < 16 ? low[i] : high[i - 16];
+    const auto bits = std::bit_cast<std::uint32_t>(flush(x));
+    rounded[i] = static_cast<std::uint16_t>(std::isnan(x) ? bits >> 16 | 64 : (bits + 0x7fff + (bits >> 16 & 1)) >> 16);
+  }
+  return std::bit_cast<__m512bh>(rounded);
+}
+
 }  // namespace vla::test::amx
 
 #undef _tile_loadd
 #undef _tile_stored
 #undef _tile_zero
 #undef _tile_dpbf16ps
+#define _mm512_cvtne2ps_pbh vla::test::amx::round_pairs
 #define _tile_loadconfig vla::test::amx::load_config
 #define _tile_release vla::test::amx::release
 #define _tile_loadd vla::test::amx::load

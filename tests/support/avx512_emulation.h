@@ -10,6 +10,7 @@
 
 #include <bit>
 #include <cmath>
+#include <cstdlib>
 #include <cstring>
 
 namespace vla::test::avx512 {
@@ -63,6 +64,25 @@ inline __m512 with_half(unsigned, __m512 x, __m256 half, int i) {
 inline __m512 max(unsigned, __m512 a, __m512 b) {
   for (int i = 0; i < 16; ++i) a[i] = a[i] > b[i] ? a[i] : b[i];
   return a;
+}
+/// Of the 32 numbers of a and b the one that each number of `choice` names.
+inline __m512 choose(__m512 a, __m512i choice, __m512 b) {
+  const auto from = std::bit_cast<Words>(choice);
+  __m512 y;
+  for (int i = 0; i < 16; ++i) y[i] = (from[i] & 16) == 0 ? a[from[i] & 15] : b[from[i] & 15];
+  return y;
+}
+/// x less the whole number below it, and zero of infinity: what `how` = 1 asks for.
+inline __m512 reduce(unsigned, __m512 x, int how) {
+  if (how != 1) std::abort();
+  for (int i = 0; i < 16; ++i) x[i] = std::isinf(x[i]) ? 0.0f : x[i] - std::floor(x[i]);
+  return x;
+}
+/// y times two in the power of the whole number below x. An infinite x decides even where y is NaN.
+inline __m512 scale(unsigned, __m512 y, __m512 x) {
+  for (int i = 0; i < 16; ++i)
+    y[i] = std::isinf(x[i]) ? (x[i] > 0 ? x[i] : 0.0f) : static_cast<float>(y[i] * std::exp2(double{std::floor(x[i])}));
+  return y;
 }
 inline __m512i shift_left(unsigned, __m512i x, int n) { return std::bit_cast<__m512i>(std::bit_cast<Words>(x) << n); }
 inline __m256 half(unsigned, __m512 x, int i) {
@@ -124,6 +144,9 @@ inline __m512i lanes(unsigned, __m512i a, __m512i b, int choice) {
 #define _mm512_maskz_broadcast_f32x8 vla::test::avx512::twice
 #define _mm512_maskz_insertf32x8 vla::test::avx512::with_half
 #define _mm512_maskz_max_ps vla::test::avx512::max
+#define _mm512_permutex2var_ps vla::test::avx512::choose
+#define _mm512_maskz_reduce_ps vla::test::avx512::reduce
+#define _mm512_maskz_scalef_ps vla::test::avx512::scale
 #define _mm512_maskz_slli_epi32 vla::test::avx512::shift_left
 #define _mm512_maskz_extractf32x8_ps vla::test::avx512::half
 #define _mm512_maskz_cvtph_ps vla::test::avx512::widen

@@ -1,0 +1,107 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Attention of numbers rounded to bf16, as AMX's tiles multiply them.
+#include "kernels/attention_products.h"
+
+#include "support/attention_case.h"
+#include "support/kernel_rows.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+/// Numbers as bf16 holds them, so that nothing but the weights is rounded on the way.
+std::vector<float> as_bf16(std::vector<float> values) {
+  for (float& value : values) value = std::bit_cast<float>(std::bit_cast<std::uint32_t>(value) & 0xffff0000U);
+  return values;
+}
+
+/// A weight rounded to bf16 is off by 2^-9 of itself, and weights of one row have the sum 1.
+constexpr double kPairBound = 3.0 / 512 + 1e-5;  // 3 is the greatest value
+
+void check_pairs(const AttentionKernel& kernel) {
+  for (const Shape& shape : kShapes) {
+    CAPTURE(shape.d_head);
+    CAPTURE(shape.n_key);
+    for (bool masked : {false, true}) {
+      Case c(shape, 2, shape.n_key % 3);
+      if (masked) c.set_mask([](std::int64_t i, std::int64_t j) { return j <= i || j % 7 == 0 ? 0.0f : kHidden; });
+      c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
+      CHECK(worst_error(c, run(kernel, c, 2)) <= kPairBound);
+    }
+  }
+}
+
+void check_pair_ends(const AttentionKernel& kernel) {
+  for_each_end([&](Case c) {
+    c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
+    CHECK(worst_error(c, run(kernel, c, 1)) <= kPairBound);
+  });
+}
+
+/// Chunks of keys that nobody sees, that some rows see nothing of, and that begin and end anywhere.
+void check_pair_masks(const AttentionKernel& kernel) {
+  for (std::int64_t n_key : {500, 900, 1100})
+    for (std::int64_t n_query : {1, 33}) {
+      CAPTURE(n_key);
+      CAPTURE(n_query);
+      Case c({32, 2, 1, n_query, n_key, 1}, 2, 0);
+      c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
+      CHECK(worst_error(c, run(kernel, c, 1)) <= kPairBound);
+      c.set_mask([&](std::int64_t i, std::int64_t j) {
+        return j / 256 == 1 || (j / 256 == 2 && i % 3 == 0) || (j + i) % 7 == 0 ? kHidden : 0.0f;
+      });
+      CHECK(worst_error(c, run(kernel, c, 1)) <= kPairBound);
+    }
+}
+
+/// Values that single out one key each: the answers are the weights themselves.
+void check_pair_weights(const AttentionKernel& kernel) {
+  Case c({32, 1, 1, 1, 32, 1}, 1, 0);
+  for (std::size_t i = 0; i < c.q.size(); ++i) c.q[i] = i == 0 ? 1.0f : 0.0f;
+  for (std::size_t i = 0; i < c.k.size(); ++i) {
+    c.k[i] = i % 32 == 0 ? -15.5f * static_cast<float>(i / 32) : 0.0f;
+    c.v[i] = i % 33 == 0 ? 1.0f : 0.0f;
+  }
+  c.k = as_bf16(c.k);
+  const std::vector<float> out = run(kernel, c, 1);
+  const std::vector<double> exact = exact_row(c, 0, 0, 0);
+  for (std::size_t i = 0; i < out.size(); ++i) CHECK(std::abs(out[i] / exact[i] - 1) <= 1.0 / 256);
+  for (double step : {0.5, 3.0, 40.0}) {
+    Case rises = rising(step);
+    rises.k = as_bf16(rises.k), rises.v = as_bf16(rises.v);
+    CHECK(worst_error(rises, run(kernel, rises, 1)) <= kPairBound);
+  }
+}
+
+}  // namespace
+
+/// A test of kernels that round to bf16: the portable instance, the emulated one, and the machine's.
+#define VLA_PAIR_TEST(sentence, check)                                               \
+  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); } \
+  VLA_EMULATED_TEST("amx", sentence, check(kernels::kEmulatedAttentionAmx))          \
+  TEST_CASE("amx: " sentence* doctest::skip(test::lacks(Isa::amx))) {                \
+    check(kernels::cpu_kernels(Isa::amx)->attention);                                \
+  }
+
+TEST_CASE("a weight for bf16 errs by 2^-18 of itself at most") {
+  using V = kernels::Portable;
+  double worst = 0;
+  for (int i = -126 * 4096; i <= 10 * 4096; ++i) {
+    const float x = static_cast<float>(i) / 4096;
+    worst = std::max(worst, std::abs(kernels::exp2_for_bf16<V>(V::set(x))[0] / std::exp2(double{x}) - 1));
+  }
+  CHECK(worst <= std::ldexp(1.0, -18));
+  CHECK(kernels::exp2_for_bf16<V>(V::set(-3))[0] == 0.125f);
+  for (float far : {-200.0f, -3e38f, kHidden}) CHECK(kernels::exp2_for_bf16<V>(V::set(far))[0] == 0.0f);
+  CHECK(std::isnan(kernels::exp2_for_bf16<V>(V::set(std::numeric_limits<float>::quiet_NaN()))[0]));
+}
+
+VLA_PAIR_TEST("attention errs by the rounding of its weights to bf16 alone", check_pairs)
+VLA_PAIR_TEST("attention is right whatever the width of a head and the number of keys", check_pair_ends)
+VLA_PAIR_TEST("attention keeps small weights, and greater scores make earlier ones smaller", check_pair_weights)
+VLA_PAIR_TEST("attention skips what a mask hides, and chunks that it hides whole", check_pair_masks)
+VLA_PAIR_TEST("a query that sees nothing, and what is not finite, does not become an answer",
+              check_attention_of_not_finite)

@@ -1,0 +1,84 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// What attention's two operations take on one thread of this machine, for each kernel that it can run: microseconds of
+// the thread's own time, the best of several runs. Not a test: what it prints depends on what else the machine does.
+//
+//   bench_attention [seconds for each shape]
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <ctime>
+#include <vector>
+
+#include "kernels/cpu_kernels.h"
+
+using namespace vla;
+using namespace vla::kernels;
+
+namespace {
+
+struct Shape {
+  const char* what;
+  std::int64_t d_head, n_head, n_head_kv, n_query, n_key;
+};
+
+constexpr Shape kShapes[] = {{"tower", 64, 2, 2, 1024, 1024},
+                             {"prefix", 64, 15, 5, 177, 177},
+                             {"step", 64, 15, 5, 50, 227},
+                             {"wide heads", 256, 8, 1, 51, 867}};
+
+double now() {
+  timespec time;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &time);
+  return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
+}
+
+template <class Work>
+double best_time(double seconds, Work work) {
+  double best = 1e9;
+  const double start = now();
+  do {
+    const double before = now();
+    work();
+    best = std::min(best, now() - before);
+  } while (now() - start < seconds);
+  return best;
+}
+
+void measure(const AttentionKernel& kernel, const std::string& name, const Shape& s, double seconds) {
+  const auto numbers = [](std::int64_t n) {
+    std::vector<float> x(static_cast<std::size_t>(n));
+    for (std::size_t i = 0; i < x.size(); ++i) x[i] = std::sin(static_cast<float>(i * i % 7919));
+    return x;
+  };
+  const std::vector<float> q = numbers(s.d_head * s.n_head * s.n_query);
+  const std::vector<float> k = numbers(s.d_head * s.n_head_kv * s.n_key), v = numbers(s.d_head * s.n_head_kv * s.n_key);
+  const auto rows = [&](const std::vector<float>& x, std::int64_t n_head) {
+    return AttentionJob::Rows{x.data(), s.d_head, s.d_head * n_head, 0};
+  };
+  AttentionJob job = {};
+  job.d_head = s.d_head, job.n_head = s.n_head, job.n_head_kv = s.n_head_kv;
+  job.n_query = s.n_query, job.n_key = s.n_key, job.n_batch = 1;
+  job.scale = 1 / std::sqrt(static_cast<float>(s.d_head));
+  job.q = rows(q, s.n_head), job.k = rows(k, s.n_head_kv), job.v = rows(v, s.n_head_kv);
+  std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job))), out(q.size());
+  job.packed = packed.data(), job.out = out.data();
+  const double pack = best_time(seconds / 4, [&] { kernel.pack(job, 0, 1); });
+  const double run = best_time(seconds, [&] { kernel.run(job, 0, 1); });
+  const double flop = 4.0 * static_cast<double>(s.d_head * s.n_head * s.n_query * s.n_key);
+  fmt::print("{:8} {:12} pack {:8.1f} us  run {:9.1f} us  {:7.1f} GFLOP/s\n", name, s.what, 1e6 * pack, 1e6 * run,
+             1e-9 * flop / run);
+  std::fflush(stdout);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  const double seconds = argc > 1 ? std::atof(argv[1]) : 0.2;
+  for (Isa isa : usable_isas())
+    if (const CpuKernels* kernels = cpu_kernels(isa); kernels != nullptr)
+      for (const Shape& shape : kShapes) measure(kernels->attention, isa_name(isa), shape, seconds);
+}

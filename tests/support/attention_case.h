@@ -1,0 +1,165 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+/// Attentions of every size, what a kernel answers, and how far that is from the definition.
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "kernels/attention_kernel.h"
+#include "support/graph_runner.h"
+
+namespace vla::test {
+
+using kernels::AttentionJob;
+using kernels::AttentionKernel;
+
+/// What a mask holds for a key that is not seen.
+inline constexpr float kHidden = -std::numeric_limits<float>::infinity();
+
+struct Shape {
+  std::int64_t d_head, n_head, n_head_kv, n_query, n_key, n_batch;
+};
+
+/// One of everything that blocks, panels, chunks and groups have edges at.
+inline constexpr Shape kShapes[] = {{64, 2, 2, 70, 130, 2}, {64, 15, 5, 50, 227, 1}, {16, 6, 2, 5, 17, 1},
+                                    {72, 2, 1, 25, 129, 1}, {80, 3, 3, 24, 128, 1},  {256, 4, 1, 7, 33, 1},
+                                    {17, 1, 1, 1, 1, 3},    {1, 2, 2, 3, 300, 1},    {33, 4, 2, 1, 257, 1},
+                                    {96, 1, 1, 49, 16, 1},  {8, 3, 3, 13, 31, 2}};
+
+/// Values, and a mask that may be empty. Rows lie `gap` floats apart.
+struct Case {
+  Shape shape;
+  std::vector<float> q, k, v, mask;
+  std::int64_t gap = 0;
+
+  Case(const Shape& s, float range, std::int64_t row_gap) : shape(s), gap(row_gap) {
+    const auto count = [&](std::int64_t n_head, std::int64_t n_token) {
+      return static_cast<std::size_t>((s.d_head + gap) * n_head * n_token * s.n_batch);
+    };
+    q = ramp(count(s.n_head, s.n_query), range);
+    k = ramp(count(s.n_head_kv, s.n_key), 2);
+    v = ramp(count(s.n_head_kv, s.n_key), 3);
+  }
+
+  template <class Value>
+  void set_mask(Value value) {
+    for (std::int64_t i = 0; i < shape.n_query; ++i)
+      for (std::int64_t j = 0; j < shape.n_key; ++j) mask.push_back(value(i, j));
+  }
+
+  AttentionJob::Rows rows(const std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) const {
+    const std::int64_t row = shape.d_head + gap;
+    return {x.data(), row, row * n_head, row * n_head * n_token};
+  }
+  AttentionJob job() const {
+    const Shape& s = shape;
+    return {.d_head = s.d_head,
+            .n_head = s.n_head,
+            .n_head_kv = s.n_head_kv,
+            .n_query = s.n_query,
+            .n_key = s.n_key,
+            .n_batch = s.n_batch,
+            .scale = 1 / std::sqrt(static_cast<float>(s.d_head)),
+            .q = rows(q, s.n_head, s.n_query),
+            .k = rows(k, s.n_head_kv, s.n_key),
+            .v = rows(v, s.n_head_kv, s.n_key),
+            .mask = mask.empty() ? nullptr : mask.data(),
+            .packed = nullptr,
+            .out = nullptr};
+  }
+};
+
+/// What the kernel answers when `n_thread` threads share the work. Memory holds NaNs before it is written.
+inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int n_thread) {
+  AttentionJob job = c.job();
+  const float nan = std::numeric_limits<float>::quiet_NaN();
+  std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job)), nan);
+  std::vector<float> out(static_cast<std::size_t>(job.d_head * job.n_head * job.n_query * job.n_batch), nan);
+  job.packed = packed.data();
+  job.out = out.data();
+  for (int i = 0; i < n_thread; ++i) kernel.pack(job, i, n_thread);
+  for (int i = 0; i < n_thread; ++i) kernel.run(job, i, n_thread);
+  return out;
+}
+
+/// The definition for one query and head, in double.
+inline std::vector<double> exact_row(const Case& c, std::int64_t head, std::int64_t query, std::int64_t batch) {
+  const AttentionJob job = c.job();
+  const std::int64_t head_kv = head / (job.n_head / job.n_head_kv);
+  std::vector<double> score, mixed(static_cast<std::size_t>(job.d_head));
+  double most = kHidden, sum = 0;
+  for (std::int64_t j = 0; j < job.n_key; ++j) {
+    double dot = 0;
+    for (std::int64_t i = 0; i < job.d_head; ++i)
+      dot += double{job.q.at(head, query, batch)[i]} * job.k.at(head_kv, j, batch)[i];
+    score.push_back(dot / std::sqrt(static_cast<double>(job.d_head)) +
+                    (job.mask != nullptr ? job.mask[query * job.n_key + j] : 0));
+    most = std::max(most, score.back());
+  }
+  for (double& value : score) sum += value = std::exp(value - most);
+  for (std::int64_t j = 0; j < job.n_key; ++j)
+    for (std::size_t i = 0; i < mixed.size(); ++i)
+      mixed[i] += score[static_cast<std::size_t>(j)] / sum * job.v.at(head_kv, j, batch)[i];
+  return mixed;
+}
+
+inline double worst_error(const Case& c, const std::vector<float>& got) {
+  double worst = 0;
+  std::size_t at = 0;
+  for (std::int64_t batch = 0; batch < c.shape.n_batch; ++batch)
+    for (std::int64_t query = 0; query < c.shape.n_query; ++query)
+      for (std::int64_t head = 0; head < c.shape.n_head; ++head)
+        for (double expected : exact_row(c, head, query, batch)) {
+          const double error = std::abs(got[at++] - expected);
+          worst = error <= worst ? worst : error;  // a NaN is worse than anything
+        }
+  REQUIRE(at == got.size());
+  return worst;
+}
+
+/// Panels, chunks and vectors that end everywhere.
+template <class Check>
+void for_each_end(Check check) {
+  for (std::int64_t d_head : {8, 24, 40, 64, 72, 80, 96, 255, 256})
+    for (std::int64_t n_key : {1, 2, 15, 31, 32, 33, 100, 129, 257}) {
+      CAPTURE(d_head);
+      CAPTURE(n_key);
+      check(Case({d_head, 2, 1, 3, n_key, 1}, 1, d_head % 5));
+    }
+  for (std::int64_t n_key = 1; n_key <= 300; n_key += 3) {
+    CAPTURE(n_key);
+    check(Case({40, 1, 1, 2, n_key, 1}, 1, 0));
+  }
+}
+
+/// Every chunk of keys brings greater scores than those before it: by a little, which leaves weights above one, or by
+/// so much that what was mixed before has to become small.
+inline Case rising(double step) {
+  Case c({32, 1, 1, 40, 800, 1}, 2, 0);
+  for (std::size_t i = 0; i < c.q.size(); ++i) c.q[i] = i % 32 == 0 ? 4.0f : 0.0f;
+  for (std::size_t i = 0; i < c.k.size(); i += 32)
+    c.k[i] = static_cast<float>(step * static_cast<double>(i / 32 / 100)) + c.k[i] / 8;
+  return c;
+}
+
+inline void check_attention_of_not_finite(const AttentionKernel& attention) {
+  Case unseen(kShapes[2], 1, 0);
+  unseen.set_mask([](std::int64_t i, std::int64_t) { return i == 0 ? kHidden : 0.0f; });
+  const std::vector<float> out = run(attention, unseen, 1);
+  CHECK(std::isnan(out.front()));
+  CHECK(std::isfinite(out.back()));
+  for (float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
+    Case broken(kShapes[2], 1, 0);
+    broken.k[3] = bad;
+    CHECK_FALSE(std::isfinite(run(attention, broken, 1).front()));
+    broken = Case(kShapes[2], 1, 0);
+    broken.v[0] = bad;
+    CHECK_FALSE(std::isfinite(run(attention, broken, 1).front()));
+  }
+}
+
+}  // namespace vla::test
