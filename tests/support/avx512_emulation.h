@@ -45,24 +45,18 @@ inline __m512 fma(__m512 a, __m512 b, __m512 c) {
   for (int i = 0; i < 16; ++i) y[i] = std::fma(a[i], b[i], c[i]);
   return y;
 }
-inline __m512d fma(__m512d a, __m512d b, __m512d c) {
-  for (int i = 0; i < 8; ++i) c[i] = std::fma(a[i], b[i], c[i]);
-  return c;
-}
-inline __m512d to_double(unsigned, __m256 x) { return __builtin_convertvector(x, __m512d); }
-inline __m256 to_float(unsigned, __m512d x) { return __builtin_convertvector(x, __m256); }
-inline __m512 twice(unsigned, __m256 x) {
-  const __m256 y[2] = {x, x};
-  return load(y);
-}
-inline __m512 with_half(unsigned, __m512 x, __m256 half, int i) {
-  std::memcpy(reinterpret_cast<float*>(&x) + 8 * i, &half, sizeof(half));
-  return x;
-}
 /// Of a number and NaN the second, as of equal ones.
 inline __m512 max(unsigned, __m512 a, __m512 b) {
   for (int i = 0; i < 16; ++i) a[i] = a[i] > b[i] ? a[i] : b[i];
   return a;
+}
+inline __m512 min(unsigned, __m512 a, __m512 b) {
+  for (int i = 0; i < 16; ++i) a[i] = a[i] < b[i] ? a[i] : b[i];
+  return a;
+}
+/// 1 / x, cut off where the instruction may end: 2^-14 away, and exact for powers of two. For x and 1 / x normal.
+inline __m512 reciprocal(unsigned, __m512 x) {
+  return std::bit_cast<__m512>(std::bit_cast<Words>(1.0f / x) & static_cast<int>(0xfffffe00U));
 }
 inline __m512i shift_left(unsigned, __m512i x, int n) { return std::bit_cast<__m512i>(std::bit_cast<Words>(x) << n); }
 inline __m256 half(unsigned, __m512 x, int i) {
@@ -118,12 +112,9 @@ inline __m512i lanes(unsigned, __m512i a, __m512i b, int choice) {
 #define _mm512_add_ps vla::test::avx512::add
 #define _mm512_and_si512 vla::test::avx512::both
 #define _mm512_fmadd_ps vla::test::avx512::fma
-#define _mm512_fmadd_pd vla::test::avx512::fma
-#define _mm512_maskz_cvtps_pd vla::test::avx512::to_double
-#define _mm512_maskz_cvtpd_ps vla::test::avx512::to_float
-#define _mm512_maskz_broadcast_f32x8 vla::test::avx512::twice
-#define _mm512_maskz_insertf32x8 vla::test::avx512::with_half
 #define _mm512_maskz_max_ps vla::test::avx512::max
+#define _mm512_maskz_min_ps vla::test::avx512::min
+#define _mm512_maskz_rcp14_ps vla::test::avx512::reciprocal
 #define _mm512_maskz_slli_epi32 vla::test::avx512::shift_left
 #define _mm512_maskz_extractf32x8_ps vla::test::avx512::half
 #define _mm512_maskz_cvtph_ps vla::test::avx512::widen
