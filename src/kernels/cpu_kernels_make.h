@@ -16,19 +16,11 @@ class CpuKernelsMaker {
  public:
   static constexpr CpuKernels make() {
     using Attention = AttentionTile<FloatProducts<V, kTile>>;
-    return {map<Exp>,
-            map<Silu>,
-            map<GeluTanh>,
-            layer_norm,
-            rms_norm,
-            rotate_half,
-            {Attention::packed_size, Attention::pack, Attention::run}};
+    return {map<Silu>, map<GeluTanh>, layer_norm,
+            rms_norm,  rotate_half,   {Attention::packed_size, Attention::pack, Attention::run}};
   }
 
  private:
-  struct Exp {
-    static VLA_INLINE Float of(Float x) { return exp<V>(x); }
-  };
   struct Silu {
     static VLA_INLINE Float of(Float x) { return silu<V>(x); }
   };

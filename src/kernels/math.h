@@ -4,46 +4,8 @@
 
 #include "kernels/vec.h"
 
-/// Transcendental functions of a vector of float32, within one unit in the last place of the exact value over the
-/// whole range, subnormal results included (tests/kernels/math_test.cpp). `V` is a type of vec.h.
-///
-/// They are computed in double, one half of the vector after the other, and rounded once: in float32, rounding errors
-/// would have to be carried along and ranges watched, which takes longer.
+/// Transcendental functions of a vector of float32, in float32 throughout. `V` is a type of vec.h.
 namespace vla::kernels {
-
-/// e^x for |x| <= 700, with a relative error of 2^-29; of NaN anything.
-template <class V>
-VLA_INLINE typename V::Double exponential(typename V::Double x) {
-  using Double = typename V::Double;
-  using Long = typename V::Long;
-  constexpr double kShift = 0x1.8p52;  // adding it rounds to a whole number, in the low bits
-  const Double shifted = V::fma(x, V::set_double(1.4426950408889634), V::set_double(kShift));
-  const Double rest = V::fma(shifted - kShift, V::set_double(-0.69314718055994531), x);
-  // Minimax on |rest| <= ln2 / 2.
-  Double p = V::fma(rest, V::set_double(0x1.6ab96e80e518p-10), V::set_double(0x1.126d1df08560ep-7));
-  p = V::fma(p, rest, V::set_double(0x1.55589a99c6e2ep-5));
-  p = V::fma(p, rest, V::set_double(0x1.55540a5ba376ep-3));
-  p = V::fma(p, rest, V::set_double(0x1.fffffaae7fa8ep-2));
-  p = V::fma(p, rest, V::set_double(0x1.0000009c19c3ap+0));
-  p = V::fma(p, rest, V::set_double(0x1.0000000261cdfp+0));
-  return std::bit_cast<Double>(std::bit_cast<Long>(p) + (std::bit_cast<Long>(shifted) << 52));
-}
-
-/// x between -limit and limit; a NaN stays one.
-template <class V>
-VLA_INLINE typename V::Float within(typename V::Float x, float limit) {
-  const typename V::Float most = V::set(limit), least = V::set(-limit);
-  x = most < x ? most : x;
-  return least > x ? least : x;
-}
-
-/// e^x.
-template <class V>
-VLA_INLINE typename V::Float exp(typename V::Float x) {
-  const typename V::Float inner = within<V>(x, 200.0f);  // beyond it the result is infinite or zero
-  const typename V::Float e = V::narrow(exponential<V>(V::widen(inner, 0)), exponential<V>(V::widen(inner, 1)));
-  return x == x ? e : x;
-}
 
 /// Two in the power of the whole numbers n, -127 <= n <= 127; -127 gives zero.
 template <class V>
@@ -69,34 +31,74 @@ VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
   return (p + 1.0f) * power_of_two<V>(std::bit_cast<typename V::Int>(shifted) - std::bit_cast<std::int32_t>(kShift));
 }
 
-/// x / (1 + e^-s), |s| <= 700.
+/// SiLU and GELU are x / (1 + 2^-s) with s = x (a + b x^2). Of y = |x|, and of s at y, they are
+///     max(x, 0) - y / (1 + 2^s),
+/// whose last step rounds once, subnormal results included. For those 2^s grows to 2^158: the divisor is kept times
+/// kUnit, so that nothing leaves the normal numbers on the way.
+///
+/// An error of s is one of 2^s relative to it. So the whole part n of s is taken away before anything is rounded: the
+/// product that makes s meets -n in one fused step, and what its factors had lost is added to the small rest.
+namespace sigmoid {
+
+constexpr float kUnit = 0x1p-40f;
+/// Added to a small number it leaves that, rounded to a whole n, in the last bits, where it makes the exponent of
+/// 2^n kUnit.
+constexpr float kShift = 0x1.8p23f + 127 - 40;
+
+/// |x|, but at most `limit`. A NaN stays one.
 template <class V>
-VLA_INLINE typename V::Double times_sigmoid(typename V::Double x, typename V::Double s) {
-  return x / (exponential<V>(-s) + 1.0);
+VLA_INLINE typename V::Float size_within(typename V::Float x, float limit) {
+  using Int = typename V::Int;
+  return V::min(V::set(limit), std::bit_cast<typename V::Float>(std::bit_cast<Int>(x) & 0x7fffffff));
 }
 
-/// x / (1 + e^-x). Source: torch silu.
+/// max(x, 0) - y / (1 + 2^(n + rest)) with |rest| <= 0.53, 0 <= n <= 160 and `shifted` = n + kShift.
+template <class V>
+VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, typename V::Float shifted,
+                                      typename V::Float rest) {
+  using Float = typename V::Float;
+  // 2^rest = 1 + rest p, minimax: relative error 2^-27.
+  Float p = V::fma(rest, V::set(0x1.439136p-13f), V::set(0x1.5facf6p-10f));
+  p = V::fma(p, rest, V::set(0x1.3b296ap-7f));
+  p = V::fma(p, rest, V::set(0x1.c6adcp-5f));
+  p = V::fma(p, rest, V::set(0x1.ebfbe4p-3f));
+  p = V::fma(p, rest, V::set(0x1.62e432p-1f));
+  // From n = 24 on, the sum of 2^n and one loses the one. It comes back through p, whose inverse is 1.2 to 1.7.
+  const Float power = std::bit_cast<Float>(std::bit_cast<typename V::Int>(shifted) << 23), sum = power + kUnit;
+  const Float lost = V::fma(sum - power, V::set(-1.625f), V::set(1.625f * kUnit));
+  const Float divisor = V::fma(p, V::fma(rest, power, lost), sum);
+  const Float positive = V::max(x * 0.0f, x);  // x itself where it is not finite
+  return V::fma(V::divide(y, divisor), V::set(-kUnit), positive);
+}
+
+}  // namespace sigmoid
+
+/// x / (1 + e^-x), within two units in the last place over the whole range. Source: torch silu.
 template <class V>
 VLA_INLINE typename V::Float silu(typename V::Float x) {
-  const typename V::Float inner = within<V>(x, 200.0f);  // beyond it the result is x or zero
-  return V::narrow(times_sigmoid<V>(V::widen(x, 0), V::widen(inner, 0)),
-                   times_sigmoid<V>(V::widen(x, 1), V::widen(inner, 1)));
+  using Float = typename V::Float;
+  const Float y = sigmoid::size_within<V>(x, 109.0f);  // from there on the results are x and zero
+  const Float a = V::set(0x1.715476p+0f), low_a = V::set(0x1.4ae0cp-26f);
+  const Float shifted = V::fma(y, a, V::set(sigmoid::kShift));
+  const Float rest = V::fma(y, low_a, V::fma(y, a, sigmoid::kShift - shifted));
+  return sigmoid::multiply<V>(x, y, shifted, rest);
 }
 
-/// 2 sqrt(2/pi) (x + 0.044715 x^3)
-template <class V>
-VLA_INLINE typename V::Double gelu_slope(typename V::Double x) {
-  constexpr double kLinear = 1.5957691216057308;
-  return x * V::fma(x * x, V::set_double(kLinear * 0.044715), V::set_double(kLinear));
-}
-
-/// x / 2 * (1 + tanh(u)) with u = sqrt(2/pi) (x + 0.044715 x^3), which is x / (1 + e^-2u).
+/// x / 2 * (1 + tanh(u)) with u = sqrt(2/pi) (x + 0.044715 x^3), which is x / (1 + e^-2u); as exact as silu().
 /// Source: torch gelu(approximate="tanh").
 template <class V>
 VLA_INLINE typename V::Float gelu_tanh(typename V::Float x) {
-  const typename V::Float inner = within<V>(x, 20.0f);  // beyond it the result is x or zero
-  return V::narrow(times_sigmoid<V>(V::widen(x, 0), gelu_slope<V>(V::widen(inner, 0))),
-                   times_sigmoid<V>(V::widen(x, 1), gelu_slope<V>(V::widen(inner, 1))));
+  using Float = typename V::Float;
+  const Float y = sigmoid::size_within<V>(x, 10.8f);  // from there on the results are x and zero
+  // y^2, a and b in two parts each. The first ones have so few bits that their a + b y^2 is exact.
+  constexpr float kCoarse = 0x1.8p18f;  // adding it rounds to a multiple of 2^-5
+  const Float square = V::fma(y, y, V::set(kCoarse)) - kCoarse, low_square = V::fma(y, y, -square);
+  const Float factor = V::fma(square, V::set(0x1.a5ap-4f), V::set(0x1.26aecp+1f));
+  Float low_factor = V::fma(square, V::set(0x1.f3dd5cp-18f), V::set(0x1.0de73ap-22f));
+  low_factor = V::fma(low_square, V::set(0x1.a5a7dp-4f), low_factor);
+  const Float shifted = V::fma(y, factor, V::set(sigmoid::kShift));
+  const Float rest = V::fma(y, low_factor, V::fma(y, factor, sigmoid::kShift - shifted));
+  return sigmoid::multiply<V>(x, y, shifted, rest);
 }
 
 }  // namespace vla::kernels

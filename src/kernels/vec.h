@@ -24,12 +24,8 @@ struct Lanes {
   static constexpr int width = W;
   typedef float Float __attribute__((vector_size(4 * W)));
   typedef std::int32_t Int __attribute__((vector_size(4 * W)));
-  // Half as many numbers of twice the size.
-  typedef double Double __attribute__((vector_size(4 * W)));
-  typedef std::int64_t Long __attribute__((vector_size(4 * W)));
 
   static VLA_INLINE Float set(float x) { return x - Float{}; }
-  static VLA_INLINE Double set_double(double x) { return x - Double{}; }
   static VLA_INLINE Float load(const float* p) {
     Float x;
     std::memcpy(&x, p, sizeof(x));
@@ -45,6 +41,7 @@ struct Lanes {
   static VLA_INLINE void store_part(float* p, Float x, int n) {
     std::memcpy(p, &x, static_cast<std::size_t>(n) * sizeof(float));
   }
+  static VLA_INLINE Float divide(Float a, Float b) { return a / b; }
   static VLA_INLINE float sum(Float x) {
     float all[W];
     store(all, x);
@@ -62,14 +59,8 @@ struct Portable : Lanes<4> {
     for (int i = 0; i < width; ++i) y[i] = static_cast<float>(double{a[i]} * double{b[i]} + double{c[i]});
     return y;
   }
-  static VLA_INLINE Double fma(Double a, Double b, Double c) { return a * b + c; }
-  /// The lower half of the lanes (0) or the upper one (1), and back.
-  static VLA_INLINE Double widen(Float x, int half) { return Double{x[2 * half], x[2 * half + 1]}; }
-  static VLA_INLINE Float narrow(Double lower, Double upper) {
-    return Float{static_cast<float>(lower[0]), static_cast<float>(lower[1]), static_cast<float>(upper[0]),
-                 static_cast<float>(upper[1])};
-  }
-  /// Of a number and NaN, `max` is the second.
+  /// Of a number and NaN, `min` and `max` are the second.
+  static VLA_INLINE Float min(Float a, Float b) { return a < b ? a : b; }
   static VLA_INLINE Float max(Float a, Float b) { return a > b ? a : b; }
   static VLA_INLINE float max(Float x) {
     float most = x[0];
@@ -94,13 +85,7 @@ struct Portable : Lanes<4> {
 struct Avx2 : Lanes<8> {
   static VLA_INLINE Float set(float x) { return _mm256_set1_ps(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm256_fmadd_ps(a, b, c); }
-  static VLA_INLINE Double fma(Double a, Double b, Double c) { return _mm256_fmadd_pd(a, b, c); }
-  static VLA_INLINE Double widen(Float x, int half) {
-    return _mm256_cvtps_pd(half == 0 ? _mm256_castps256_ps128(x) : _mm256_extractf128_ps(x, 1));
-  }
-  static VLA_INLINE Float narrow(Double lower, Double upper) {
-    return _mm256_set_m128(_mm256_cvtpd_ps(upper), _mm256_cvtpd_ps(lower));
-  }
+  static VLA_INLINE Float min(Float a, Float b) { return _mm256_min_ps(a, b); }
   static VLA_INLINE Float max(Float a, Float b) { return _mm256_max_ps(a, b); }
   static VLA_INLINE float sum(Float x) {
     __m128 y = _mm256_castps256_ps128(x) + _mm256_extractf128_ps(x, 1);
@@ -126,14 +111,13 @@ struct Avx2 : Lanes<8> {
 struct Avx512 : Lanes<16> {
   static VLA_INLINE Float set(float x) { return _mm512_set1_ps(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm512_fmadd_ps(a, b, c); }
-  static VLA_INLINE Double fma(Double a, Double b, Double c) { return _mm512_fmadd_pd(a, b, c); }
-  static VLA_INLINE Double widen(Float x, int half) {
-    return _mm512_maskz_cvtps_pd(0xff, half == 0 ? lower(x) : upper(x));
+  /// For 1 / b among the normal numbers, with a relative error of 2^-23.9: the instruction's 2^-14 and one correction,
+  /// in a third of the time of a division.
+  static VLA_INLINE Float divide(Float a, Float b) {
+    const Float inverse = _mm512_maskz_rcp14_ps(0xffff, b), quotient = a * inverse;
+    return fma(fma(-quotient, b, a), inverse, quotient);
   }
-  static VLA_INLINE Float narrow(Double lower, Double upper) {
-    return _mm512_maskz_insertf32x8(0xffff, _mm512_maskz_broadcast_f32x8(0xffff, _mm512_maskz_cvtpd_ps(0xff, lower)),
-                                    _mm512_maskz_cvtpd_ps(0xff, upper), 1);
-  }
+  static VLA_INLINE Float min(Float a, Float b) { return _mm512_maskz_min_ps(0xffff, a, b); }
   static VLA_INLINE Float max(Float a, Float b) { return _mm512_maskz_max_ps(0xffff, a, b); }
   static VLA_INLINE Float load_part(const float* p, int n) { return _mm512_maskz_loadu_ps(mask(n), p); }
   static VLA_INLINE void store_part(float* p, Float x, int n) { _mm512_mask_storeu_ps(p, mask(n), x); }

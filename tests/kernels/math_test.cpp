@@ -38,54 +38,49 @@ std::vector<float> numbers(std::uint64_t stride) {
 }
 
 double worst_error(CpuKernels::Map map, Function exact) {
-  const std::vector<float> x = numbers(9973);
+  const std::vector<float> x = numbers(1999);
   std::vector<float> y(x.size());
   map(x.data(), y.data(), static_cast<std::int64_t>(x.size()));
   double worst = 0;
   for (std::size_t i = 0; i < x.size(); ++i) {
-    const double expected = exact(x[i]);
-    if (std::isinf(static_cast<float>(expected)))
-      REQUIRE(y[i] == static_cast<float>(expected));
-    else
-      worst = std::max(worst, std::abs(y[i] - expected) / unit(expected));
+    const double expected = exact(x[i]), error = std::abs(y[i] - expected) / unit(expected);
+    if (!(error <= worst)) worst = error;  // which a NaN is too
   }
   return worst;
 }
 
 void check_accuracy(const CpuKernels& kernels) {
-  CHECK(worst_error(kernels.exp, [](double x) { return std::exp(x); }) <= 1);
-  CHECK(worst_error(kernels.silu, silu) <= 1);
-  CHECK(worst_error(kernels.gelu_tanh, gelu) <= 1);
+  CHECK(worst_error(kernels.silu, silu) <= 2);
+  CHECK(worst_error(kernels.gelu_tanh, gelu) <= 2);
 }
 
 void check_not_finite(const CpuKernels& kernels) {
   const float infinity = std::numeric_limits<float>::infinity(), nan = std::numeric_limits<float>::quiet_NaN();
-  for (CpuKernels::Map map : {kernels.silu, kernels.gelu_tanh})
-    for (float x : {infinity, -infinity, nan}) {
-      float y = 0;
-      map(&x, &y, 1);
-      CHECK_FALSE(std::isfinite(y));
-    }
-  const float x[] = {infinity, -infinity, nan};
-  float y[3] = {};
-  kernels.exp(x, y, 3);
-  CHECK(y[0] == infinity);
-  CHECK(y[1] == 0);
-  CHECK(std::isnan(y[2]));
+  for (CpuKernels::Map map : {kernels.silu, kernels.gelu_tanh}) {
+    const float x[] = {infinity, -infinity, nan};
+    float y[3] = {};
+    map(x, y, 3);
+    CHECK(y[0] == infinity);
+    CHECK_FALSE(std::isfinite(y[1]));
+    CHECK(std::isnan(y[2]));
+  }
 }
 
 void check_ends(const CpuKernels& kernels) {
   const std::vector<float> x(70, 1.0f);
+  float expected = -1.0f;
+  kernels.silu(x.data(), &expected, 1);
+  CHECK(expected != -1.0f);
   for (std::int64_t n = 0; n <= 66; ++n) {
     std::vector<float> y(70, -1.0f);
-    kernels.exp(x.data() + 1, y.data() + 1, n);  // one number off, so that nothing is aligned
+    kernels.silu(x.data() + 1, y.data() + 1, n);  // one number off, so that nothing is aligned
     for (std::size_t i = 0; i < y.size(); ++i)
-      CHECK(y[i] == (i >= 1 && i < 1 + static_cast<std::size_t>(n) ? std::exp(1.0f) : -1.0f));
+      CHECK(y[i] == (i >= 1 && i < 1 + static_cast<std::size_t>(n) ? expected : -1.0f));
   }
 }
 
 }  // namespace
 
-VLA_KERNEL_TEST("exp, silu and gelu are within one unit in the last place over the whole range", check_accuracy)
-VLA_KERNEL_TEST("what is not finite stays so, but for the exponential of minus infinity", check_not_finite)
+VLA_KERNEL_TEST("silu and gelu are within two units in the last place over the whole range", check_accuracy)
+VLA_KERNEL_TEST("what is not finite stays so", check_not_finite)
 VLA_KERNEL_TEST("a row of any length is mapped from its first number to its last, and nothing beyond", check_ends)

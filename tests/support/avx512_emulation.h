@@ -46,20 +46,6 @@ inline __m512 fma(__m512 a, __m512 b, __m512 c) {
   for (int i = 0; i < 16; ++i) y[i] = std::fma(a[i], b[i], c[i]);
   return y;
 }
-inline __m512d fma(__m512d a, __m512d b, __m512d c) {
-  for (int i = 0; i < 8; ++i) c[i] = std::fma(a[i], b[i], c[i]);
-  return c;
-}
-inline __m512d to_double(unsigned, __m256 x) { return __builtin_convertvector(x, __m512d); }
-inline __m256 to_float(unsigned, __m512d x) { return __builtin_convertvector(x, __m256); }
-inline __m512 twice(unsigned, __m256 x) {
-  const __m256 y[2] = {x, x};
-  return load(y);
-}
-inline __m512 with_half(unsigned, __m512 x, __m256 half, int i) {
-  std::memcpy(reinterpret_cast<float*>(&x) + 8 * i, &half, sizeof(half));
-  return x;
-}
 /// Of a number and NaN the second, as of equal ones.
 inline __m512 max(unsigned, __m512 a, __m512 b) {
   for (int i = 0; i < 16; ++i) a[i] = a[i] > b[i] ? a[i] : b[i];
@@ -84,6 +70,14 @@ inline __m512 scale(unsigned, __m512 y, __m512 x) {
     y[i] = std::isinf(x[i]) ? (x[i] > 0 ? x[i] : 0.0f) : static_cast<float>(y[i] * std::exp2(double{std::floor(x[i])}));
   return y;
 }
+inline __m512 min(unsigned, __m512 a, __m512 b) {
+  for (int i = 0; i < 16; ++i) a[i] = a[i] < b[i] ? a[i] : b[i];
+  return a;
+}
+/// 1 / x, cut off where the instruction may end: 2^-14 away, and exact for powers of two. For x and 1 / x normal.
+inline __m512 reciprocal(unsigned, __m512 x) {
+  return std::bit_cast<__m512>(std::bit_cast<Words>(1.0f / x) & static_cast<int>(0xfffffe00U));
+}
 inline __m512i shift_left(unsigned, __m512i x, int n) { return std::bit_cast<__m512i>(std::bit_cast<Words>(x) << n); }
 inline __m256 half(unsigned, __m512 x, int i) {
   __m256 y;
@@ -93,34 +87,6 @@ inline __m256 half(unsigned, __m512 x, int i) {
 inline __m512 widen(unsigned, __m256i x) {
   const __m256 y[2] = {_mm256_cvtph_ps(_mm256_castsi256_si128(x)), _mm256_cvtph_ps(_mm256_extracti128_si256(x, 1))};
   return load(y);
-}
-
-/// In each lane of four words the pairs of words `first` and `first + 1` of both.
-inline __m512i unpack_words(__m512i x, __m512i y, int first) {
-  const auto a = std::bit_cast<Words>(x), b = std::bit_cast<Words>(y);
-  Words out = {};
-  for (int i = 0; i < 16; ++i) out[i] = (i % 2 == 0 ? a : b)[i / 4 * 4 + first + i % 4 / 2];
-  return std::bit_cast<__m512i>(out);
-}
-inline __m512i low_words(unsigned, __m512i a, __m512i b) { return unpack_words(a, b, 0); }
-inline __m512i high_words(unsigned, __m512i a, __m512i b) { return unpack_words(a, b, 2); }
-/// In each lane of two 64-bit numbers number `which` of both.
-inline __m512i unpack_pairs(__m512i a, __m512i b, int which) {
-  __m512i out = {};
-  for (int i = 0; i < 8; ++i) out[i] = (i % 2 == 0 ? a : b)[i / 2 * 2 + which];
-  return out;
-}
-inline __m512i low_pairs(unsigned, __m512i a, __m512i b) { return unpack_pairs(a, b, 0); }
-inline __m512i high_pairs(unsigned, __m512i a, __m512i b) { return unpack_pairs(a, b, 1); }
-/// Two lanes of a and two of b, which two bits of `choice` name each. Copied as bytes: with the undefined-behaviour
-/// sanitizer GCC 12 reads the wrong element of a vector whose index is a shifted parameter.
-inline __m512i lanes(unsigned, __m512i a, __m512i b, int choice) {
-  __m512i out;
-  for (int i = 0; i < 4; ++i) {
-    const auto* from = reinterpret_cast<const char*>(i < 2 ? &a : &b);
-    std::memcpy(reinterpret_cast<char*>(&out) + 16 * i, from + 16 * (choice >> 2 * i & 3), 16);
-  }
-  return out;
 }
 
 }  // namespace vla::test::avx512
@@ -138,24 +104,15 @@ inline __m512i lanes(unsigned, __m512i a, __m512i b, int choice) {
 #define _mm512_add_ps vla::test::avx512::add
 #define _mm512_and_si512 vla::test::avx512::both
 #define _mm512_fmadd_ps vla::test::avx512::fma
-#define _mm512_fmadd_pd vla::test::avx512::fma
-#define _mm512_maskz_cvtps_pd vla::test::avx512::to_double
-#define _mm512_maskz_cvtpd_ps vla::test::avx512::to_float
-#define _mm512_maskz_broadcast_f32x8 vla::test::avx512::twice
-#define _mm512_maskz_insertf32x8 vla::test::avx512::with_half
 #define _mm512_maskz_max_ps vla::test::avx512::max
 #define _mm512_permutex2var_ps vla::test::avx512::choose
 #define _mm512_maskz_reduce_ps vla::test::avx512::reduce
 #define _mm512_maskz_scalef_ps vla::test::avx512::scale
+#define _mm512_maskz_min_ps vla::test::avx512::min
+#define _mm512_maskz_rcp14_ps vla::test::avx512::reciprocal
 #define _mm512_maskz_slli_epi32 vla::test::avx512::shift_left
 #define _mm512_maskz_extractf32x8_ps vla::test::avx512::half
 #define _mm512_maskz_cvtph_ps vla::test::avx512::widen
-#define _mm512_castps_si512 std::bit_cast<__m512i>
-#define _mm512_maskz_unpacklo_epi32 vla::test::avx512::low_words
-#define _mm512_maskz_unpackhi_epi32 vla::test::avx512::high_words
-#define _mm512_maskz_unpacklo_epi64 vla::test::avx512::low_pairs
-#define _mm512_maskz_unpackhi_epi64 vla::test::avx512::high_pairs
-#define _mm512_maskz_shuffle_i32x4 vla::test::avx512::lanes
 
 // What the sources ask the compiler for, and names of their own, so that the program holds the real kernels too.
 #if !defined(__AVX512F__)
