@@ -31,4 +31,11 @@ struct AmxSession {
 /// move stores of what is to be read behind it.
 VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }
 
+/// Two vectors to the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one. What bf16 holds only as a
+/// subnormal number becomes zero, as it does in the tiles.
+VLA_INLINE void store_bf16(std::uint16_t* to, Avx512::Float a, Avx512::Float b) {
+  const __m512bh numbers = _mm512_cvtne2ps_pbh(b, a);
+  std::memcpy(to, &numbers, sizeof(numbers));
+}
+
 }  // namespace vla::kernels

@@ -11,12 +11,7 @@ namespace {
 struct AmxTile {
   using Session = AmxSession;
 
-  /// To the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one. What bf16 holds only as a subnormal number
-  /// becomes zero, as it does in the tiles.
-  static VLA_INLINE void store(std::uint16_t* to, Avx512::Float a, Avx512::Float b) {
-    const __m512bh numbers = _mm512_cvtne2ps_pbh(b, a);
-    std::memcpy(to, &numbers, sizeof(numbers));
-  }
+  static VLA_INLINE void store(std::uint16_t* to, Avx512::Float a, Avx512::Float b) { store_bf16(to, a, b); }
 
   template <int kStride>
   static VLA_INLINE void open(const float* c, bool sum) {

@@ -13,6 +13,14 @@ struct AmxTile : PairTile {
   using V = Avx512;
   using Session = AmxSession;
 
+  static VLA_INLINE void copy(const float* from, std::int64_t n, X* to, X* rest) {
+    for (std::int64_t i = 0; i < n; i += 32) {
+      const V::Float a = load<V>(from + i, n - i), b = n - i > 16 ? load<V>(from + i + 16, n - i - 16) : V::Float{};
+      store_bf16(to + i, a, b);
+      if (rest != nullptr) store_bf16(rest + i, a - rounded(a), b - rounded(b));
+    }
+  }
+
   static void multiply(DType, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
                        float* c, bool add, const std::byte* ahead) {
     // Rows that x does not have are multiplied too; nobody looks at their sums.
@@ -25,14 +33,20 @@ struct AmxTile : PairTile {
   }
 
  private:
+  /// To the nearest bf16, ties to even, as a float.
+  static VLA_INLINE V::Float rounded(V::Float x) {
+    const auto bits = std::bit_cast<V::Int>(x);
+    return std::bit_cast<V::Float>((bits + 0x7fff + ((bits >> 16) & 1)) & ~0xffff);
+  }
+
   static constexpr std::size_t kLineX = kXStride * sizeof(X), kLineC = kColumns * sizeof(float);
 
   /// All 32 rows, or the first 16; with what the rounding of x left, or without.
   template <bool kAll, bool kFine>
   static VLA_INLINE void product(const X* x, const X* rest, const std::byte* panel, std::int64_t depth, float* c,
                                  bool add, const std::byte* ahead) {
-    // Blocks of the panel to ask for in each step: with few rows of x, all that come next.
-    constexpr int kAhead = kFine ? 1024 : 256;
+    // Bytes of the panel's next step to ask for with each two blocks: the rows of x share them.
+    constexpr int kAhead = kFine ? 1024 : 512;
     float* lower = c + 16 * kColumns;
     before_tile_loads();
     if (add) {

@@ -38,6 +38,14 @@ struct EmulatedAmxTile : PairTile {
   using V = Portable;
   struct Session {};
 
+  static void copy(const float* from, std::int64_t n, X* to, X* rest) {
+    for (std::int64_t i = 0; i < n; ++i) to[i] = to_bf16(from[i]);
+    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
+    if (rest == nullptr) return;
+    for (std::int64_t i = 0; i < n; ++i) rest[i] = to_bf16(from[i] - from_bf16(to[i]));
+    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) rest[i] = 0;
+  }
+
   static void multiply(DType type, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
                        float* c, bool add, const std::byte*) {
     for (int r = 0; r < n_row; ++r)

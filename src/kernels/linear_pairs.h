@@ -17,14 +17,6 @@ struct PairTile {
   static constexpr int kXStride = kMaxDepth + 32;
   static constexpr bool kEven = false;
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, X* to, X* rest) {
-    for (std::int64_t i = 0; i < n; ++i) to[i] = to_bf16(from[i]);
-    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
-    if (rest == nullptr) return;
-    for (std::int64_t i = 0; i < n; ++i) rest[i] = to_bf16(from[i] - from_bf16(to[i]));
-    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) rest[i] = 0;
-  }
-
   static VLA_INLINE const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
 };
 
