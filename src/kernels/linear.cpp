@@ -5,6 +5,7 @@
 #include "kernels/custom.h"
 #include "kernels/elementwise.h"
 #include "kernels/linear_kernel.h"
+#include "kernels/linear_numbers.h"
 
 namespace vla::kernels {
 namespace {
@@ -23,15 +24,15 @@ void linear_task(ggml_tensor* y, int ith, int nth, void* user) {
   auto& node = *static_cast<LinearNode*>(user);
   LinearJob job = node.job;
   job.turns = &node.turns;
-  job.x = values(y->src[0]);
-  float* out = static_cast<float*>(y->data);
+  job.x = static_cast<const std::byte*>(y->src[0]->data);
+  auto* out = static_cast<std::byte*>(y->data);
   int i_bias = 1 + job.n_part;
   for (int i = 0; i < job.n_part; ++i) {
     LinearJob::Part& part = job.part[i];
     part.weight = static_cast<const std::byte*>(y->src[1 + i]->data);
     part.bias = node.has_bias[i] ? values(y->src[i_bias++]) : nullptr;
     part.y = out;
-    if (!job.gated) out += part.d_out * job.n_row;
+    if (!job.gated) out += part.d_out * job.n_row * number_size(job.y_type);
   }
   if (node.has_residual) job.part[job.n_part - 1].residual = values(y->src[i_bias]);
   node.kernel->run(job, ith, nth, node.scratch->of(ith));
@@ -53,7 +54,7 @@ const LinearKernel* kernel_of(Graph& g, std::span<const LinearTerm> terms) {
 }
 
 Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> terms, Tensor x, Activation activation,
-            bool gated, Tensor residual) {
+            bool gated, Tensor residual, Readers readers) {
   LinearNode node = {&kernel, &g.scratch(), {}, {}, {}, static_cast<bool>(residual)};
   if (!ggml_is_contiguous(x.node())) x = ggml_cont(g.context(), x.node());
   std::vector<ggml_tensor*> sources = {x.node()};
@@ -70,8 +71,12 @@ Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> te
   if (residual) sources.push_back(residual.node());
   node.job.d_in = x.dim(0), node.job.n_row = ggml_nrows(x.node());
   node.job.activation = activation, node.job.gated = gated;
+  const bool rounds = readers == Readers::products && kernel.rounds(node.job.n_row, node.job.d_in);
+  node.job.x_type = x.node()->type == GGML_TYPE_BF16 ? DType::bf16 : DType::f32;
+  node.job.y_type = rounds ? DType::bf16 : DType::f32;
   g.scratch().reserve(kernel.scratch_size);
-  ggml_tensor* y = ggml_custom_4d(g.context(), GGML_TYPE_F32, d_out, x.dim(1), x.dim(2), x.dim(3), sources.data(),
+  const ggml_type type = rounds ? GGML_TYPE_BF16 : GGML_TYPE_F32;
+  ggml_tensor* y = ggml_custom_4d(g.context(), type, d_out, x.dim(1), x.dim(2), x.dim(3), sources.data(),
                                   static_cast<int>(sources.size()), linear_task, GGML_N_TASKS_MAX, keep(g, node));
   g.note_work(y, work_of_job(node.job, y));
   return y;
@@ -97,16 +102,18 @@ Tensor activate(Graph& g, Activation activation, Tensor x) {
   return x;
 }
 
-Tensor linear(Graph& g, const LinearTerm& term, Tensor x, Activation activation, Tensor residual) {
+Tensor linear(Graph& g, const LinearTerm& term, Tensor x, Activation activation, Tensor residual, Readers readers) {
   if (const LinearKernel* kernel = kernel_of(g, {&term, 1}))
-    return emit(g, *kernel, {&term, 1}, x, activation, false, residual);
+    return emit(g, *kernel, {&term, 1}, x, activation, false, residual, readers);
   const Tensor y = activate(g, activation, ggml_linear(g, term, x));
   return residual ? ggml_add(g.context(), residual.node(), y.node()) : y;
 }
 
-Tensor gated_linear(Graph& g, const LinearTerm& gate, const LinearTerm& up, Tensor x, Activation activation) {
+Tensor gated_linear(Graph& g, const LinearTerm& gate, const LinearTerm& up, Tensor x, Activation activation,
+                    Readers readers) {
   const LinearTerm terms[] = {gate, up};
-  if (const LinearKernel* kernel = kernel_of(g, terms)) return emit(g, *kernel, terms, x, activation, true, {});
+  if (const LinearKernel* kernel = kernel_of(g, terms))
+    return emit(g, *kernel, terms, x, activation, true, {}, readers);
   const Tensor factor = activate(g, activation, linear(g, gate, x));
   return ggml_mul(g.context(), factor.node(), linear(g, up, x).node());
 }
@@ -118,7 +125,7 @@ std::vector<Tensor> linear_group(Graph& g, std::span<const LinearTerm> terms, Te
     for (const LinearTerm& term : terms) parts.push_back(linear(g, term, x));
     return parts;
   }
-  ggml_tensor* all = emit(g, *kernel, terms, x, Activation::none, false, {}).node();
+  ggml_tensor* all = emit(g, *kernel, terms, x, Activation::none, false, {}, Readers::any).node();
   const auto n_row = static_cast<std::size_t>(ggml_nrows(x.node()));
   std::size_t offset = 0;
   for (const LinearTerm& term : terms) {  // the results lie one after the other

@@ -16,12 +16,16 @@ struct LinearTerm {
   const Param* bias;
 };
 
+/// Who reads a result. Products that round their x round a hidden one no more, and it is stored as they want it.
+enum class Readers { any, products };
+
 /// activation(W x + bias) + residual in one node. x [d_in, n, ...] -> [d_out, n, ...], the shape of residual if any.
 Tensor linear(Graph& g, const LinearTerm& term, Tensor x, Activation activation = Activation::none,
-              Tensor residual = {});
+              Tensor residual = {}, Readers readers = Readers::any);
 
 /// activation(gate(x)) * up(x) in one node. x [d_in, n, ...] -> [d_out, n, ...].
-Tensor gated_linear(Graph& g, const LinearTerm& gate, const LinearTerm& up, Tensor x, Activation activation);
+Tensor gated_linear(Graph& g, const LinearTerm& gate, const LinearTerm& up, Tensor x, Activation activation,
+                    Readers readers = Readers::any);
 
 /// What an activation is as a node of its own.
 Tensor activate(Graph& g, Activation activation, Tensor x);

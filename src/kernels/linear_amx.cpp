@@ -13,6 +13,11 @@ struct AmxTile : PairTile {
   using V = Avx512;
   using Session = AmxSession;
 
+  static VLA_INLINE void store_rounded(X* to, V::Float x, std::int64_t left) {
+    const __m256bh numbers = _mm512_cvtneps_pbh(x);
+    std::memcpy(to, &numbers, left >= V::width ? sizeof(numbers) : static_cast<std::size_t>(left) * sizeof(X));
+  }
+
   static VLA_INLINE void copy(const float* from, std::int64_t n, X* to, X* rest) {
     for (std::int64_t i = 0; i < n; i += 32) {
       const V::Float a = load<V>(from + i, n - i), b = n - i > 16 ? load<V>(from + i + 16, n - i - 16) : V::Float{};
@@ -98,7 +103,8 @@ extern const LinearKernel kLinearAmx;
 const LinearKernel kLinearAmx = {{"amx", Panels<32>::packed_size, Panels<32>::pack},
                                  supports,
                                  LinearLoop<AmxTile>::run,
-                                 LinearLoop<AmxTile>::kScratchSize};
+                                 LinearLoop<AmxTile>::kScratchSize,
+                                 LinearLoop<AmxTile>::rounds};
 
 }  // namespace vla::kernels
 #endif

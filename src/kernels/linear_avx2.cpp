@@ -15,7 +15,7 @@ struct Avx2Tile {
   static constexpr int kRows = 6, kColumns = 16;
   static constexpr int kMaxDepth = 1536, kStep = 768, kBlockRows = 54, kFineRows = 0, kUnpacked = 0;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
-  static constexpr bool kEven = true;
+  static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) {
@@ -105,7 +105,8 @@ extern const LinearKernel kLinearAvx2;
 const LinearKernel kLinearAvx2 = {{"avx2", Panels<16>::packed_size, Panels<16>::pack},
                                   supports,
                                   LinearLoop<Avx2Tile>::run,
-                                  LinearLoop<Avx2Tile>::kScratchSize};
+                                  LinearLoop<Avx2Tile>::kScratchSize,
+                                  LinearLoop<Avx2Tile>::rounds};
 
 }  // namespace vla::kernels
 #endif

@@ -15,7 +15,7 @@ struct Avx512Tile {
   static constexpr int kRows = 12, kColumns = 32;
   static constexpr int kMaxDepth = 1024, kStep = 384, kBlockRows = 144, kFineRows = 0, kUnpacked = kStep * kColumns;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
-  static constexpr bool kEven = true;
+  static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) {
@@ -99,7 +99,8 @@ extern const LinearKernel kLinearAvx512;
 const LinearKernel kLinearAvx512 = {{"avx512", Panels<32>::packed_size, Panels<32>::pack},
                                     supports,
                                     LinearLoop<Avx512Tile>::run,
-                                    LinearLoop<Avx512Tile>::kScratchSize};
+                                    LinearLoop<Avx512Tile>::kScratchSize,
+                                    LinearLoop<Avx512Tile>::rounds};
 
 }  // namespace vla::kernels
 #endif

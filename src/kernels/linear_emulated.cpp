@@ -14,7 +14,7 @@ struct FloatTile {
   static constexpr int kRows = 5, kColumns = 16;
   static constexpr int kMaxDepth = 96, kStep = 64, kBlockRows = 10, kFineRows = 0, kUnpacked = 0;
   static constexpr int kXStride = kMaxDepth + 1;
-  static constexpr bool kEven = true;
+  static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
   static void copy(const float* from, std::int64_t n, float* to, float*) {
@@ -37,6 +37,10 @@ struct FloatTile {
 struct EmulatedAmxTile : PairTile {
   using V = Portable;
   struct Session {};
+
+  static void store_rounded(X* to, V::Float x, std::int64_t left) {
+    for (int i = 0; i < V::width && i < left; ++i) to[i] = to_bf16(x[i]);
+  }
 
   static void copy(const float* from, std::int64_t n, X* to, X* rest) {
     for (std::int64_t i = 0; i < n; ++i) to[i] = to_bf16(from[i]);
@@ -67,11 +71,13 @@ bool bf16_only(const MatrixDesc& desc, Isa) { return desc.type == DType::bf16; }
 constexpr LinearKernel kFloat = {{"emulated", Panels<16>::packed_size, Panels<16>::pack},
                                  any,
                                  LinearLoop<FloatTile>::run,
-                                 LinearLoop<FloatTile>::kScratchSize};
+                                 LinearLoop<FloatTile>::kScratchSize,
+                                 LinearLoop<FloatTile>::rounds};
 constexpr LinearKernel kPair = {{"emulated_amx", Panels<32>::packed_size, Panels<32>::pack},
                                 bf16_only,
                                 LinearLoop<EmulatedAmxTile>::run,
-                                LinearLoop<EmulatedAmxTile>::kScratchSize};
+                                LinearLoop<EmulatedAmxTile>::kScratchSize,
+                                LinearLoop<EmulatedAmxTile>::rounds};
 
 }  // namespace
 

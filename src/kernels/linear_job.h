@@ -14,25 +14,27 @@ enum class Activation { none, gelu_tanh, silu };
 
 /// One node of matrix products: what is multiplied, and where everything lies.
 struct LinearJob {
-  /// y = activation(W x + bias) + residual. y and residual are contiguous rows of d_out floats, one for each row of x;
+  /// y = activation(W x + bias) + residual. y and residual are contiguous rows of d_out numbers, one for each row of x;
   /// bias and residual may be null.
   struct Part {
     DType type;               // of the stored weight
     const std::byte* weight;  // packed for its kernel
     const float* bias;
     const float* residual;
-    float* y;
+    std::byte* y;
     std::int64_t d_out;
   };
   static constexpr int kMaxPart = 3;
 
-  const float* x;  // contiguous rows of d_in floats
+  const std::byte* x;  // contiguous rows of d_in numbers
   std::int64_t n_row, d_in;
   int n_part;
   Part part[kMaxPart];
   Activation activation;
   /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
   bool gated;
+  /// Of x and y: f32, or bf16 where the kernel rounds what it multiplies (LinearKernel::rounds).
+  DType x_type, y_type;
   Turns* turns;  // of this node
 };
 

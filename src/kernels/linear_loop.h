@@ -19,6 +19,7 @@ namespace vla::kernels {
 /// (of the block of x), kXStride (from one of its rows to the next), kStep (of the depth, most), kFineRows (jobs of no
 /// more rows keep what the rounding of x leaves), kEven (tiles of equal height), kUnpacked (floats of a step that
 /// multiply wants instead of the stored one), Session (held while a thread works), and
+///   store_rounded(to, vector, left)       y as bf16, where kRounds
 ///   copy(from, n, to, rest)               n numbers of x and zeros up to a multiple of 32; what rounding leaves, or
 ///   null unpack(type, panel, depth, floats)    what multiply reads multiply(type, n_row, x, rest, panel, depth, c,
 ///   add, ahead)
@@ -50,6 +51,10 @@ class LinearLoop {
     LinearLoop loop(job, nth, *reinterpret_cast<Scratch*>(scratch));
     [[maybe_unused]] const typename Tile::Session session;
     job.turns->share(ith, nth, loop.n_block_ * loop.n_group_, [&](std::int64_t i) { loop.item(i); });
+  }
+
+  static bool rounds(std::int64_t n_row, std::int64_t d_in) {
+    return Tile::kRounds && n_row > Tile::kFineRows && d_in <= Tile::kMaxDepth;
   }
 
  private:
@@ -97,8 +102,17 @@ class LinearLoop {
     row_of_x_ = row, depth_of_x_ = k;
     for (std::int64_t r = 0; r < n_row; ++r) {
       X* to = scratch_.x + r * Tile::kXStride;
-      Tile::copy(job_.x + (row + r) * job_.d_in + k, depth, to, fine() ? to + kRest : nullptr);
+      const std::int64_t place = (row + r) * job_.d_in + k;
+      if (Tile::kRounds && job_.x_type == DType::bf16)
+        copy_rounded(reinterpret_cast<const X*>(job_.x) + place, depth, to);
+      else
+        Tile::copy(reinterpret_cast<const float*>(job_.x) + place, depth, to, fine() ? to + kRest : nullptr);
     }
+  }
+
+  static VLA_INLINE void copy_rounded(const X* from, std::int64_t n, X* to) {
+    std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(X));
+    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
   }
 
   bool fine() const { return job_.n_row <= Tile::kFineRows; }
@@ -122,16 +136,19 @@ class LinearLoop {
         part, s, scratch_.sums, false,
         [&](std::int64_t r, std::int64_t n_row) {
           const std::int64_t place = (s.row + r) * part.d_out + s.column;
-          fetch(part.y + place, n_row, part.d_out);
-          if (last && part.residual != nullptr) fetch(part.residual + place, n_row, part.d_out);
+          fetch(part.y + place * y_size(), n_row, part.d_out * y_size());
+          if (last && part.residual != nullptr)
+            fetch(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
         },
         [&](std::int64_t r, std::int64_t n_row) { last ? finish(s, r, n_row) : keep(s, r, n_row); });
   }
 
+  std::int64_t y_size() const { return number_size(job_.y_type); }
+
   /// Asks for the lines of a tile that will be read or written when the product is there.
-  static VLA_INLINE void fetch(const float* tile, std::int64_t n_row, std::int64_t stride) {
+  static VLA_INLINE void fetch(const std::byte* tile, std::int64_t n_row, std::int64_t stride) {
     for (std::int64_t r = 0; r < n_row; ++r)
-      for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + n);
+      for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + 4 * n);
   }
 
   /// sums [kColumns] x n_row (+)= the block of x times a panel. `before` and `after` are called around the last step of
@@ -211,10 +228,17 @@ class LinearLoop {
     const LinearJob::Part& part = job_.part[s.part];
     for (std::int64_t r = first; r < first + n_row; ++r)
       for (std::int64_t i = 0; i < s.n_column; i += V::width) {
-        float* y = part.y + (s.row + r) * part.d_out + s.column + i;
+        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
+        float* y = reinterpret_cast<float*>(part.y) + place;
         typename V::Float value = V::load(scratch_.sums + r * kColumns + i);
-        if (s.k > 0) value += load<V>(y, s.n_column - i);
-        store<V>(y, f(value, r, i, s.n_column - i), s.n_column - i);
+        if (s.k > 0) value += load<V>(y, left);
+        value = f(value, r, i, left);
+        if constexpr (Tile::kRounds)
+          if (job_.y_type == DType::bf16) {
+            Tile::store_rounded(reinterpret_cast<X*>(part.y) + place, value, left);
+            continue;
+          }
+        store<V>(y, value, left);
       }
   }
 

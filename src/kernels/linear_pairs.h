@@ -15,7 +15,7 @@ struct PairTile {
   // A step of a panel is 24 KiB and stays in the first cache.
   static constexpr int kMaxDepth = 1536, kStep = 384, kBlockRows = 256, kFineRows = 64, kUnpacked = 0;
   static constexpr int kXStride = kMaxDepth + 32;
-  static constexpr bool kEven = false;
+  static constexpr bool kEven = false, kRounds = true;
 
   static VLA_INLINE const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
 };

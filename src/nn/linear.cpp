@@ -10,7 +10,7 @@ Tensor Linear::forward(Graph& g, Tensor x) const { return kernels::linear(g, ter
 
 Tensor Linear::activated(Graph& g, Tensor x, Activation activation) const {
   if (g.keeps(path())) return kernels::activate(g, activation, (*this)(g, x));
-  return kernels::linear(g, term_, x, activation);
+  return kernels::linear(g, term_, x, activation, {}, kernels::Readers::products);
 }
 
 Tensor Linear::added_to(Graph& g, Tensor residual, Tensor x) const {
@@ -21,7 +21,7 @@ Tensor Linear::added_to(Graph& g, Tensor residual, Tensor x) const {
 Tensor Linear::gated(Graph& g, const Linear& gate, const Linear& up, Tensor x, Activation activation) {
   if (g.keeps(gate.path()) || g.keeps(up.path()))
     return ggml_mul(g.context(), kernels::activate(g, activation, gate(g, x)).node(), up(g, x).node());
-  return kernels::gated_linear(g, gate.term_, up.term_, x, activation);
+  return kernels::gated_linear(g, gate.term_, up.term_, x, activation, kernels::Readers::products);
 }
 
 std::vector<Tensor> Linear::group(Graph& g, std::initializer_list<const Linear*> layers, Tensor x) {

@@ -21,12 +21,12 @@ class Linear : public Module<Linear> {
   Linear(const Scope& s, int d_in, int d_out, Bias bias);
   Tensor forward(Graph& g, Tensor x) const;
 
-  /// activation(W x + b)
+  /// activation(W x + b), for no one but another Linear: it may be rounded as that would round it.
   Tensor activated(Graph& g, Tensor x, Activation activation) const;
   /// residual + W x + b
   Tensor added_to(Graph& g, Tensor residual, Tensor x) const;
 
-  /// activation(gate(x)) * up(x)
+  /// activation(gate(x)) * up(x), likewise.
   static Tensor gated(Graph& g, const Linear& gate, const Linear& up, Tensor x, Activation activation);
   /// Up to three layers of the same x, each result [d_out, n, ...] and contiguous.
   static std::vector<Tensor> group(Graph& g, std::initializer_list<const Linear*> layers, Tensor x);

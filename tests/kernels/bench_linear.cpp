@@ -87,8 +87,8 @@ void measure(const LinearKernel& kernel, Isa isa, const Shape& s, int n_thread, 
   kernel.pack(desc, stored.data, packed.data);
   const double pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   Turns turns;
-  LinearJob job = {reinterpret_cast<const float*>(x.data), s.n_row, s.d_in, 1, {}, Activation::none, false, &turns};
-  job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, reinterpret_cast<float*>(y.data), s.d_out};
+  LinearJob job = {x.data, s.n_row, s.d_in, 1, {}, Activation::none, false, DType::f32, DType::f32, &turns};
+  job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, y.data, s.d_out};
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
   std::vector<double> rates, peaks, shares;
   for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time

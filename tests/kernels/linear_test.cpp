@@ -92,7 +92,11 @@ struct Case {
   int n_part = 1;
   bool gated = false, with_bias = false, with_residual = false;
   int n_thread = 1;
+  DType x_type = DType::f32, y_type = DType::f32;
 };
+
+/// From the second number on.
+std::byte* bytes(std::vector<float>& values) { return reinterpret_cast<std::byte*>(&values[1]); }
 
 constexpr float kUntouched = 1234.5f;
 
@@ -106,14 +110,25 @@ class Trial {
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
     Turns turns;
-    LinearJob job = {&x_[1], n_row, d_in, case_.n_part, {}, case_.activation, case_.gated, &turns};
+    std::vector<std::uint16_t> rounded;
+    for (float value : x_) rounded.push_back(to_bf16(value));
+    LinearJob job = {case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(&rounded[1]) : bytes(x_),
+                     n_row,
+                     d_in,
+                     case_.n_part,
+                     {},
+                     case_.activation,
+                     case_.gated,
+                     case_.x_type,
+                     case_.y_type,
+                     &turns};
     for (int i = 0; i < case_.n_part; ++i) {
       Part& part = parts_[static_cast<std::size_t>(i)];
       job.part[i] = {case_.type,
                      packed(part, {case_.type, d_in, d_out(i)}),
                      case_.with_bias ? &part.bias[1] : nullptr,
                      case_.with_residual ? &part.residual[1] : nullptr,
-                     &part.y[1],
+                     bytes(part.y),
                      d_out(i)};
     }
     std::vector<std::thread> threads;
@@ -267,6 +282,26 @@ void check_bytes(const LinearKernel& kernel) {
   CHECK(one.y(0) == many.y(0));
 }
 
+/// Who rounds x to bf16 takes it so, and gives y so: one product's y is the next one's x.
+void check_rounded(const LinearKernel& kernel) {
+  const Case plain = {.shape = {97, 72, 205}, .activation = Activation::silu, .with_bias = true, .n_thread = 2};
+  CHECK(!kernel.rounds(50, 72));  // few rows keep what rounding leaves
+  CHECK(kernel.rounds(97, 72) == (std::strstr(kernel.name, "amx") != nullptr));
+  if (!kernel.rounds(97, 72)) return;
+  Case from = plain, to = plain;
+  from.x_type = DType::bf16, to.y_type = DType::bf16;
+  Trial expected(kernel, plain), rounded_x(kernel, from), rounded_y(kernel, to);
+  expected.run(), rounded_x.run(), rounded_y.run();
+  CHECK(rounded_x.y(0) == expected.y(0));
+  int wrong = 0;
+  for (std::size_t i = 0; i < 97 * 205; ++i) {
+    std::uint16_t got;
+    std::memcpy(&got, reinterpret_cast<const std::byte*>(&rounded_y.y(0)[1]) + 2 * i, sizeof(got));
+    wrong += got != to_bf16(expected.y(0)[1 + i]);
+  }
+  CHECK(wrong == 0);
+}
+
 const LinearKernel& row(const std::string& name) {
   for (const auto& rows : {linear_kernels(), emulated_linear_kernels()})
     for (const LinearKernel* kernel : rows)
@@ -290,6 +325,7 @@ VLA_LINEAR_TEST("products of any shape and storage type are within float32's rou
 VLA_LINEAR_TEST("bias, activation and residual follow the product", check_epilogues)
 VLA_LINEAR_TEST("a gate multiplies, and products of one x stand side by side", check_gates_and_groups)
 VLA_LINEAR_TEST("any number of threads computes every number once", check_threads)
+VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_rounded)
 VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
 
 TEST_CASE("every machine takes the first row that it can run, and ggml where there is none") {

@@ -87,6 +87,13 @@ inline __m512bh round_pairs(__m512 high, __m512 low) {
   return std::bit_cast<__m512bh>(rounded);
 }
 
+inline __m256bh round_half_as_many(__m512 x) {
+  const __m512bh rounded = round_pairs(x, x);
+  __m256bh half;
+  std::memcpy(&half, &rounded, sizeof(half));
+  return half;
+}
+
 }  // namespace vla::test::amx
 
 #undef _tile_loadd
@@ -94,6 +101,7 @@ inline __m512bh round_pairs(__m512 high, __m512 low) {
 #undef _tile_zero
 #undef _tile_dpbf16ps
 #define _mm512_cvtne2ps_pbh vla::test::amx::round_pairs
+#define _mm512_cvtneps_pbh vla::test::amx::round_half_as_many
 #define _tile_loadconfig vla::test::amx::load_config
 #define _tile_release vla::test::amx::release
 #define _tile_loadd vla::test::amx::load
