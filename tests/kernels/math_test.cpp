@@ -29,16 +29,21 @@ double unit(double exact) {
   return std::ldexp(1.0, exponent - 24);
 }
 
-/// Finite numbers of every exponent and sign, one in `stride` of all that there are, and the edges of the range.
-std::vector<float> numbers(std::uint64_t stride) {
+/// Finite numbers of every exponent and sign, the edges of the range, and many where e^-x outgrows what float32 can add
+/// one to: there errors are largest.
+std::vector<float> numbers() {
   std::vector<float> all = {0.0f, -0.0f, 0x1p-149f, -0x1p-149f, 0x1p-126f, -0x1p-126f, 3.4028235e38f, -3.4028235e38f};
-  for (std::uint64_t bits = 0; bits < (std::uint64_t{1} << 32); bits += stride)
-    if (const float x = std::bit_cast<float>(static_cast<std::uint32_t>(bits)); std::isfinite(x)) all.push_back(x);
+  const auto add = [&](std::uint64_t begin, std::uint64_t end, std::uint64_t stride) {
+    for (std::uint64_t bits = begin; bits < end; bits += stride)
+      if (const float x = std::bit_cast<float>(static_cast<std::uint32_t>(bits)); std::isfinite(x)) all.push_back(x);
+  };
+  add(0, std::uint64_t{1} << 32, 1999);
+  add(std::bit_cast<std::uint32_t>(-4.0f), std::bit_cast<std::uint32_t>(-32.0f), 41);
   return all;
 }
 
 double worst_error(CpuKernels::Map map, Function exact) {
-  const std::vector<float> x = numbers(1999);
+  const std::vector<float> x = numbers();
   std::vector<float> y(x.size());
   map(x.data(), y.data(), static_cast<std::int64_t>(x.size()));
   double worst = 0;
