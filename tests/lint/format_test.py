@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""C++ sources are as clang-format writes them, and every source file starts with the two SPDX lines.
+"""C++ sources are as clang-format writes them, every source file starts with the two SPDX lines, and no text is half merged.
 
     python3 tests/lint/format_test.py
 
@@ -19,6 +19,8 @@ RELEASE = "14"
 SOURCES = {".h", ".c", ".cpp", ".inc", ".cu", ".cuh", ".py", ".sh", ".cmake"}
 NAMED = {"CMakeLists.txt", "Makefile"}
 COPYRIGHT, LICENCE = "SPDX-FileCopyrightText: The vla.cpp authors", "SPDX-License-Identifier: Apache-2.0"
+
+MERGE_MARK = re.compile(r"^(<{7}|>{7})( |$)", re.MULTILINE)
 
 
 def tracked(*folders):
@@ -60,6 +62,11 @@ class Format(unittest.TestCase):
         self.assertTrue(files, "no source files found")
         bare = [f.relative_to(ROOT).as_posix() for f in files if without_header(f)]
         self.assertFalse(bare, "\nfiles without the two SPDX lines:\n" + "\n".join(bare))
+
+    def test_no_text_holds_the_marks_of_an_unfinished_merge(self):
+        texts = [f for f in tracked() if f.suffix in SOURCES | {".md", ".txt", ".toml", ".json", ".proto"} or f.name in NAMED]
+        marked = [f.relative_to(ROOT).as_posix() for f in texts if MERGE_MARK.search(f.read_text(encoding="utf-8"))]
+        self.assertFalse(marked, "\nfiles with lines of <<<<<<< or >>>>>>>:\n" + "\n".join(marked))
 
     def test_cpp_sources_are_as_clang_format_writes_them(self):
         program, reason = wanted_clang_format()
