@@ -13,7 +13,8 @@ struct AmxTile {
 
   static VLA_INLINE void store(std::uint16_t* to, Avx512::Float a, Avx512::Float b) { store_bf16(to, a, b); }
 
-  template <int kStride>
+  static constexpr auto kLineOfSums = kHeadStride * sizeof(float), kLineOfRows = kHeadStride * sizeof(std::uint16_t);
+
   static VLA_INLINE void open(const float* c, bool sum) {
     if (!sum) {
       _tile_zero(0);
@@ -23,31 +24,29 @@ struct AmxTile {
       return;
     }
     before_tile_loads();
-    _tile_loadd(0, c, kStride * sizeof(float));
-    _tile_loadd(1, c + 16, kStride * sizeof(float));
-    _tile_loadd(2, c + 16 * kStride, kStride * sizeof(float));
-    _tile_loadd(3, c + 16 * kStride + 16, kStride * sizeof(float));
+    _tile_loadd(0, c, kLineOfSums);
+    _tile_loadd(1, c + 16, kLineOfSums);
+    _tile_loadd(2, c + 16 * kHeadStride, kLineOfSums);
+    _tile_loadd(3, c + 16 * kHeadStride + 16, kLineOfSums);
   }
 
-  template <int kStride>
   static VLA_INLINE void step(const std::uint16_t* a, const std::uint16_t* panel) {
     before_tile_loads();
-    _tile_loadd(4, a, kStride * sizeof(std::uint16_t));
+    _tile_loadd(4, a, kLineOfRows);
     _tile_loadd(6, panel, 64);
     _tile_loadd(7, panel + 512, 64);
     _tile_dpbf16ps(0, 4, 6);
     _tile_dpbf16ps(1, 4, 7);
-    _tile_loadd(5, a + 16 * kStride, kStride * sizeof(std::uint16_t));
+    _tile_loadd(5, a + 16 * kHeadStride, kLineOfRows);
     _tile_dpbf16ps(2, 5, 6);
     _tile_dpbf16ps(3, 5, 7);
   }
 
-  template <int kStride>
   static VLA_INLINE void close(float* c) {
-    _tile_stored(0, c, kStride * sizeof(float));
-    _tile_stored(1, c + 16, kStride * sizeof(float));
-    _tile_stored(2, c + 16 * kStride, kStride * sizeof(float));
-    _tile_stored(3, c + 16 * kStride + 16, kStride * sizeof(float));
+    _tile_stored(0, c, kLineOfSums);
+    _tile_stored(1, c + 16, kLineOfSums);
+    _tile_stored(2, c + 16 * kHeadStride, kLineOfSums);
+    _tile_stored(3, c + 16 * kHeadStride + 16, kLineOfSums);
   }
 };
 

@@ -15,7 +15,6 @@ class AttentionPanels {
   using Float = typename V::Float;
   using Number = typename P::Number;
   static constexpr int kWidth = V::width, kPanel = P::kPanel;
-  static constexpr int kStride = kRowStride<kMaxHead>;  // of rows on their way into panels
   static_assert(kPanel % (2 * kWidth) == 0 && kPanel % P::kDepth == 0);
 
  public:
@@ -64,7 +63,7 @@ class AttentionPanels {
                             std::int64_t n_padded, Number* rows) const {
     const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv;
     for (std::int64_t j = 0; j < kPanel; ++j) {
-      copy_row(first + j < job.n_key ? from.at(head, first + j, batch) : nullptr, n_padded, rows + j * kStride);
+      copy_row(first + j < job.n_key ? from.at(head, first + j, batch) : nullptr, n_padded, rows + j * kHeadStride);
       if (first + kPanel + j >= job.n_key) continue;
       const float* next = from.at(head, first + kPanel + j, batch);
       for (std::int64_t i = 0; i < job.d_head; i += 16) __builtin_prefetch(next + i);
@@ -72,16 +71,16 @@ class AttentionPanels {
   }
 
   void pack_keys(std::int64_t unit, std::int64_t first) const {
-    alignas(64) Number rows[kPanel * kStride];
+    alignas(64) Number rows[kPanel * kHeadStride];
     copy_rows(job.k, unit, first, key_depth, rows);
-    P::template put_keys<kStride>(rows, key_depth, keys(unit) + first * key_depth);
+    P::put_keys(rows, key_depth, keys(unit) + first * key_depth);
   }
 
   void pack_values(std::int64_t unit, std::int64_t first) const {
-    alignas(64) Number rows[kPanel * kStride];
+    alignas(64) Number rows[kPanel * kHeadStride];
     copy_rows(job.v, unit, first, d_value, rows);
     for (std::int64_t i = 0; i < d_value; i += kPanel)
-      P::template put_values<kStride>(rows + i, first, width(i), values(unit) + i * n_key);
+      P::put_values(rows + i, first, width(i), values(unit) + i * n_key);
   }
 };
 

@@ -9,10 +9,10 @@
 /// times panels, which hold for each step of the depth one number of every column.
 namespace vla::kernels {
 
-/// From one row of `n` numbers to the next: a little apart from powers of two, so that rows do not compete for the same
-/// lines of the cache.
-template <int n>
-constexpr int kRowStride = n + 32;
+/// From one row of a block to the next, where a row may have n numbers: a little apart from powers of two, so that rows
+/// do not compete for the same lines of the cache.
+constexpr int row_stride(int n) { return n + 32; }
+constexpr int kHeadStride = row_stride(kMaxHead);
 
 /// 2^x for a weight that is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
 template <class V>
@@ -47,13 +47,12 @@ struct FloatProducts {
     V::store(to + V::width, b);
   }
 
-  /// Rows `kStride` apart become the columns of a panel.
-  template <int kStride>
+  /// Rows become the columns of a panel.
   static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
     for (std::int64_t k = 0; k < depth; k += V::width)
       for (int n = 0; n < kPanel; n += V::width) {
         Float x[V::width];
-        for (int i = 0; i < V::width; ++i) x[i] = V::load(rows + (n + i) * kStride + k);
+        for (int i = 0; i < V::width; ++i) x[i] = V::load(rows + (n + i) * kHeadStride + k);
         transpose<V>(x);
         const int n_line = static_cast<int>(depth - k < V::width ? depth - k : V::width);
         for (int i = 0; i < n_line; ++i) V::store(panel + (k + i) * kPanel + n, x[i]);
@@ -61,10 +60,9 @@ struct FloatProducts {
   }
 
   /// kPanel rows become as many steps of the depth, from `k` on, of a panel of `width` columns.
-  template <int kStride>
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t width, Number* panel) {
     for (int i = 0; i < kPanel; ++i) {
-      const Number* row = rows + i * kStride;
+      const Number* row = rows + i * kHeadStride;
       Number* line = panel + (k + i) * width;
       V::store(line, V::load(row));
       if (width == kPanel) V::store(line + V::width, V::load(row + V::width));
@@ -110,7 +108,8 @@ struct FloatProducts {
 };
 
 /// Numbers rounded to bf16, sums in float32: 32 rows times 32 columns, through a tile type (AMX, or its emulation) that
-/// holds the sums between `open` and `close`, adds 32 of the depth in each `step`, and rounds.
+/// holds the sums between `open` and `close`, adds 32 of the depth in each `step`, and rounds. Rows of all operands
+/// are kHeadStride apart.
 template <class V, class Tile>
 struct PairProducts {
   using Vector = V;
@@ -118,8 +117,7 @@ struct PairProducts {
   using Number = std::uint16_t;
   using Session = typename Tile::Session;
   static constexpr int kTile = 32, kRows = 32, kKeys = 256, kPanel = 32, kLeastPanel = 32, kDepth = 32;
-  static constexpr bool kBeside = true;                 // products wait for other work to be done beside it
-  static constexpr int kStride = kRowStride<kMaxHead>;  // of all rows
+  static constexpr bool kBeside = true;  // products wait for other work to be done beside it
 
   /// Weights are 2^x. Rounding errs by a share of a weight, so that weights may as well be up to 2^kSlack: then the
   /// greatest score of a row seldom moves far enough to scale down what was mixed before.
@@ -135,12 +133,11 @@ struct PairProducts {
   static VLA_INLINE void store(Number* to, Float a, Float b) { Tile::store(to, a, b); }
 
   /// A pair of consecutive numbers stays a word, so that a tile is the transpose of 16 rows of words.
-  template <int kStride>
   static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
     for (std::int64_t k = 0; k < depth; k += 2 * V::width)
       for (int n = 0; n < kPanel; n += V::width) {
         Float words[V::width];
-        for (int i = 0; i < V::width; ++i) words[i] = load_words(rows + (n + i) * kStride + k);
+        for (int i = 0; i < V::width; ++i) words[i] = load_words(rows + (n + i) * kHeadStride + k);
         transpose<V>(words);
         Number* lines = panel + place(k, n);
         for (int i = 0; i < V::width; ++i) store_words(lines + i * 32, words[i]);
@@ -148,14 +145,13 @@ struct PairProducts {
   }
 
   /// The pairs are numbers of consecutive rows here.
-  template <int kStride>
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
     panel += place(k, 0);
     for (int i = 0; i < kPanel; i += 2)
       for (int n = 0; n < kPanel; n += 2 * V::width) {
         using Int = typename V::Int;
-        const auto a = std::bit_cast<Int>(load_words(rows + i * kStride + n));
-        const auto b = std::bit_cast<Int>(load_words(rows + (i + 1) * kStride + n));
+        const auto a = std::bit_cast<Int>(load_words(rows + i * kHeadStride + n));
+        const auto b = std::bit_cast<Int>(load_words(rows + (i + 1) * kHeadStride + n));
         const auto even = std::bit_cast<Float>((a & 0xffff) | b << 16);
         const auto odd = std::bit_cast<Float>((a >> 16 & 0xffff) | (b & ~0xffff));
         store_words(panel + place(i, n), V::interleave_low(even, odd));
@@ -171,7 +167,7 @@ struct PairProducts {
     /// c = a * panel, or c += where `sum`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
-      static_assert(kStrideA == kStride && kStrideC == kStride);
+      static_assert(kStrideA == kHeadStride && kStrideC == kHeadStride);
       waiting_[n_waiting_++] = {a, panel, c, static_cast<int>(depth / kDepth), sum};
       n_step_ += static_cast<int>(depth / kDepth);
     }
@@ -181,10 +177,10 @@ struct PairProducts {
     VLA_INLINE void advance(int n) {
       for (; n > 0 && first_ < n_waiting_; --n) {
         const Product& product = waiting_[first_];
-        if (step_ == 0) tile_.template open<kStride>(product.c, product.sum);
-        tile_.template step<kStride>(product.a + step_ * kDepth, product.panel + step_ * kDepth * kPanel);
+        if (step_ == 0) tile_.open(product.c, product.sum);
+        tile_.step(product.a + step_ * kDepth, product.panel + step_ * kDepth * kPanel);
         if (++step_ < product.n_step) continue;
-        tile_.template close<kStride>(product.c);
+        tile_.close(product.c);
         step_ = 0, ++first_;
       }
     }

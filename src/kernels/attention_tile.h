@@ -23,7 +23,7 @@ class AttentionTile {
   static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
   static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kTile
   static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
-  static constexpr int kHeadStride = kRowStride<kMaxHead>, kKeyStride = kRowStride<kKeys>;
+  static constexpr int kKeyStride = row_stride(kKeys);
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
   static_assert(kRows % kTile == 0 && kKeys % kPanel == 0);
 

@@ -63,21 +63,18 @@ struct EmulatedTile {
 
   static float widen(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
 
-  template <int kStride>
   void open(const float* c, bool sum) {
     for (int r = 0; r < 32; ++r)
-      for (int n = 0; n < 32; ++n) sums[r][n] = sum ? c[r * kStride + n] : 0.0f;
+      for (int n = 0; n < 32; ++n) sums[r][n] = sum ? c[r * kHeadStride + n] : 0.0f;
   }
-  template <int kStride>
   void step(const std::uint16_t* a, const std::uint16_t* panel) {
     for (int r = 0; r < 32; ++r)
       for (int n = 0; n < 32; ++n)
         for (int k = 0; k < 32; ++k)
-          sums[r][n] += widen(a[r * kStride + k]) * widen(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
+          sums[r][n] += widen(a[r * kHeadStride + k]) * widen(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
   }
-  template <int kStride>
   void close(float* c) const {
-    for (int r = 0; r < 32; ++r) std::memcpy(c + r * kStride, sums[r], sizeof(sums[r]));
+    for (int r = 0; r < 32; ++r) std::memcpy(c + r * kHeadStride, sums[r], sizeof(sums[r]));
   }
 
   float sums[32][32];

@@ -14,7 +14,7 @@
 /// instructions. Everything they call is forced inline: a function of its own could be merged by the linker with the
 /// copy of a file that was compiled for a better machine.
 #define VLA_INLINE inline __attribute__((always_inline))
-#define VLA_LAMBDA __attribute__((always_inline))
+#define VLA_LAMBDA __attribute__((always_inline))  // behind a lambda's parameters
 
 namespace vla::kernels {
 

@@ -4,7 +4,7 @@
 // What attention's two operations take on one thread of this machine, for each kernel that it can run: microseconds of
 // the thread's own time, the best of several runs. Not a test: what it prints depends on what else the machine does.
 //
-//   bench_attention [seconds for each shape]
+//   bench_attention [seconds for each shape] [kernel]
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -79,6 +79,7 @@ void measure(const AttentionKernel& kernel, const std::string& name, const Shape
 int main(int argc, char** argv) {
   const double seconds = argc > 1 ? std::atof(argv[1]) : 0.2;
   for (Isa isa : usable_isas())
-    if (const CpuKernels* kernels = cpu_kernels(isa); kernels != nullptr)
+    if (const CpuKernels* kernels = cpu_kernels(isa);
+        kernels != nullptr && (argc < 3 || isa_name(isa) == std::string(argv[2])))
       for (const Shape& shape : kShapes) measure(kernels->attention, isa_name(isa), shape, seconds);
 }
