@@ -188,24 +188,33 @@ class LinearLoop {
 
   /// The epilogue of a tile: rows r to r + n_row of the stripe.
   void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
+    if constexpr (Tile::kRounds)
+      if (job_.y_type == DType::bf16) return finish_as<true>(s, r, n_row);
+    finish_as<false>(s, r, n_row);
+  }
+
+  template <bool kRounded>
+  void finish_as(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
     switch (job_.activation) {
       case Activation::none:
-        return finish_rows<Activation::none>(s, r, n_row);
+        return finish_rows<kRounded, Activation::none>(s, r, n_row);
       case Activation::gelu_tanh:
-        return finish_rows<Activation::gelu_tanh>(s, r, n_row);
+        return finish_rows<kRounded, Activation::gelu_tanh>(s, r, n_row);
       case Activation::silu:
-        return finish_rows<Activation::silu>(s, r, n_row);
+        return finish_rows<kRounded, Activation::silu>(s, r, n_row);
     }
   }
 
-  template <Activation kActivation>
+  template <bool kRounded, Activation kActivation>
   static VLA_INLINE typename V::Float activate(typename V::Float x) {
+    if constexpr (kActivation == Activation::gelu_tanh && kRounded) return gelu_tanh_for_bf16<V>(x);
+    if constexpr (kActivation == Activation::silu && kRounded) return silu_for_bf16<V>(x);
     if constexpr (kActivation == Activation::gelu_tanh) return gelu_tanh<V>(x);
     if constexpr (kActivation == Activation::silu) return silu<V>(x);
     return x;
   }
 
-  template <Activation kActivation>
+  template <bool kRounded, Activation kActivation>
   void finish_rows(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
     const LinearJob::Part &part = job_.part[s.part], &gate = job_.part[0];
     each_vector(s, first, n_row, [&](typename V::Float value, std::int64_t r, std::int64_t i, std::int64_t left) {
@@ -213,9 +222,9 @@ class LinearLoop {
       if (job_.gated) {
         typename V::Float factor = V::load(s.gates + r * kColumns + i);
         if (gate.bias != nullptr) factor += load<V>(gate.bias + s.column + i, left);
-        value *= activate<kActivation>(factor);
+        value *= activate<kRounded, kActivation>(factor);
       } else {
-        value = activate<kActivation>(value);
+        value = activate<kRounded, kActivation>(value);
       }
       if (part.residual != nullptr) value += load<V>(part.residual + (s.row + r) * part.d_out + s.column + i, left);
       return value;
