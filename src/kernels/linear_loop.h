@@ -140,7 +140,9 @@ class LinearLoop {
           if (last && part.residual != nullptr)
             fetch(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
         },
-        [&](std::int64_t r, std::int64_t n_row) { last ? finish(s, r, n_row) : keep(s, r, n_row); });
+        [&](std::int64_t r, std::int64_t n_row) {
+          s.n_column == kColumns ? finish<true>(s, r, n_row) : finish<false>(s, r, n_row);
+        });
   }
 
   std::int64_t y_size() const { return number_size(job_.y_type); }
@@ -181,27 +183,34 @@ class LinearLoop {
     return Tile::kEven ? n_row * t / n_tile : least(t * kRows, n_row);
   }
 
-  /// The sums of rows r to r + n_row of the stripe, until the next block of the depth adds to them.
-  void keep(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
-    each_vector(s, first, n_row, [](auto value, auto...) { return value; });
-  }
-
-  /// The epilogue of a tile: rows r to r + n_row of the stripe.
+  /// What becomes of a tile's sums, rows r to r + n_row of the stripe: behind the last block of the depth everything
+  /// that follows the product, before it partial sums in y. kWhole: the stripe is kColumns wide.
+  template <bool kWhole>
   void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
+    if (s.k + s.depth < job_.d_in) return write<kWhole, false, Activation::none>(s, {}, r, n_row);
+    const LinearJob::Part &part = job_.part[s.part], &gate = job_.part[0];
+    const After after = {part.bias != nullptr ? part.bias + s.column : nullptr, part.residual,
+                         job_.gated ? s.gates : nullptr,
+                         job_.gated && gate.bias != nullptr ? gate.bias + s.column : nullptr};
     if constexpr (Tile::kRounds)
-      if (job_.y_type == DType::bf16) return finish_as<true>(s, r, n_row);
-    finish_as<false>(s, r, n_row);
+      if (job_.y_type == DType::bf16) return write_activated<kWhole, true>(s, after, r, n_row);
+    write_activated<kWhole, false>(s, after, r, n_row);
   }
 
-  template <bool kRounded>
-  void finish_as(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
+  /// What follows a product beside its activation; null where nothing does.
+  struct After {
+    const float *bias = nullptr, *residual = nullptr, *gates = nullptr, *gate_bias = nullptr;
+  };
+
+  template <bool kWhole, bool kRounded>
+  void write_activated(const Stripe& s, const After& after, std::int64_t r, std::int64_t n_row) const {
     switch (job_.activation) {
       case Activation::none:
-        return finish_rows<kRounded, Activation::none>(s, r, n_row);
+        return write<kWhole, kRounded, Activation::none>(s, after, r, n_row);
       case Activation::gelu_tanh:
-        return finish_rows<kRounded, Activation::gelu_tanh>(s, r, n_row);
+        return write<kWhole, kRounded, Activation::gelu_tanh>(s, after, r, n_row);
       case Activation::silu:
-        return finish_rows<kRounded, Activation::silu>(s, r, n_row);
+        return write<kWhole, kRounded, Activation::silu>(s, after, r, n_row);
     }
   }
 
@@ -214,41 +223,31 @@ class LinearLoop {
     return x;
   }
 
-  template <bool kRounded, Activation kActivation>
-  void finish_rows(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
-    const LinearJob::Part &part = job_.part[s.part], &gate = job_.part[0];
-    each_vector(s, first, n_row, [&](typename V::Float value, std::int64_t r, std::int64_t i, std::int64_t left) {
-      if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
-      if (job_.gated) {
-        typename V::Float factor = V::load(s.gates + r * kColumns + i);
-        if (gate.bias != nullptr) factor += load<V>(gate.bias + s.column + i, left);
-        value *= activate<kRounded, kActivation>(factor);
-      } else {
-        value = activate<kRounded, kActivation>(value);
-      }
-      if (part.residual != nullptr) value += load<V>(part.residual + (s.row + r) * part.d_out + s.column + i, left);
-      return value;
-    });
-  }
-
-  /// y = f(sums, or y + sums behind the first block of the depth; row, column, how many columns are left)
-  template <class F>
-  VLA_INLINE void each_vector(const Stripe& s, std::int64_t first, std::int64_t n_row, const F& f) const {
+  template <bool kWhole, bool kRounded, Activation kActivation>
+  void write(const Stripe& s, const After& after, std::int64_t first, std::int64_t n_row) const {
     const LinearJob::Part& part = job_.part[s.part];
-    for (std::int64_t r = first; r < first + n_row; ++r)
-      for (std::int64_t i = 0; i < s.n_column; i += V::width) {
-        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
-        float* y = reinterpret_cast<float*>(part.y) + place;
+    for (std::int64_t r = first; r < first + n_row; ++r) {
+      const std::int64_t row = (s.row + r) * part.d_out + s.column;
+      for (std::int64_t i = 0; i < (kWhole ? kColumns : s.n_column); i += V::width) {
+        const std::int64_t left = kWhole ? V::width : s.n_column - i;
+        float* y = reinterpret_cast<float*>(part.y) + row + i;
         typename V::Float value = V::load(scratch_.sums + r * kColumns + i);
         if (s.k > 0) value += load<V>(y, left);
-        value = f(value, r, i, left);
-        if constexpr (Tile::kRounds)
-          if (job_.y_type == DType::bf16) {
-            Tile::store_rounded(reinterpret_cast<X*>(part.y) + place, value, left);
-            continue;
-          }
-        store<V>(y, value, left);
+        if (after.bias != nullptr) value += load<V>(after.bias + i, left);
+        if (after.gates != nullptr) {
+          typename V::Float gate = V::load(after.gates + r * kColumns + i);
+          if (after.gate_bias != nullptr) gate += load<V>(after.gate_bias + i, left);
+          value *= activate<kRounded, kActivation>(gate);
+        } else {
+          value = activate<kRounded, kActivation>(value);
+        }
+        if (after.residual != nullptr) value += load<V>(after.residual + row + i, left);
+        if constexpr (kRounded)
+          Tile::store_rounded(reinterpret_cast<X*>(part.y) + row + i, value, left);
+        else
+          store<V>(y, value, left);
       }
+    }
   }
 
   const LinearJob& job_;
