@@ -15,16 +15,16 @@
 /// Anatomy of High-Performance Matrix Multiplication (2008).
 namespace vla::kernels {
 
-/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kMaxDepth and kBlockRows
-/// (of the block of x), kXStride (from one of its rows to the next), kStep (of the depth, most), kFineRows (jobs of no
-/// more rows keep what the rounding of x leaves), kEven (tiles of equal height), kUnpacked (floats of a step that
-/// multiply wants instead of the stored one), Session (held while a thread works), and
-///   store_rounded(to, vector, left)       y as bf16, where kRounds
-///   copy(from, n, to, rest)               n numbers of x and zeros up to a multiple of 32; what rounding leaves, or
-///   null unpack(type, panel, depth, floats)    what multiply reads multiply(type, n_row, x, rest, panel, depth, c,
-///   add, ahead)
-///                                         c [kColumns] x n_row <= kRows, += where `add`; asks for memory from `ahead`
-///                                         on
+/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
+/// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kManyDepth (the same where there
+/// is more than one block), kStep (of the depth, most), kFineRows (jobs of no more rows keep what the rounding of x
+/// leaves), kRounds (x becomes bf16), kEven (tiles of equal height), kUnpacked (floats of a step that multiply wants
+/// instead of the stored one), Session (held while a thread works), and
+///   copy(from, n, to, rest)           n numbers of x, zeros up to a multiple of 32; what rounding leaves, or null
+///   store_rounded(to, vector, left)   y as bf16, where kRounds
+///   unpack(type, panel, depth, to)    what multiply reads
+///   multiply(type, n_row, x, rest, panel, depth, c, add, ahead)
+///     c [kColumns] x n_row <= kRows, += where `add`; memory from `ahead` on is asked for meanwhile
 template <class Tile>
 class LinearLoop {
   using V = typename Tile::V;
@@ -34,8 +34,8 @@ class LinearLoop {
   static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
   static constexpr std::int64_t kLeastItems = 16;              // for each thread, where there are so many
   static constexpr std::int64_t kRest = kBlockRows / 2 * Tile::kXStride;
-  static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0);
-  static_assert(Tile::kFineRows <= kBlockRows / 2);
+  static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kManyDepth % kPanelDepth == 0);
+  static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0 && Tile::kFineRows <= kBlockRows / 2);
 
   struct Scratch {
     alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
@@ -54,7 +54,7 @@ class LinearLoop {
   }
 
   static bool rounds(std::int64_t n_row, std::int64_t d_in) {
-    return Tile::kRounds && n_row > Tile::kFineRows && d_in <= Tile::kMaxDepth;
+    return Tile::kRounds && n_row > Tile::kFineRows && d_in <= Tile::kManyDepth;
   }
 
  private:
@@ -63,14 +63,16 @@ class LinearLoop {
         scratch_(scratch),
         block_rows_(even_piece(job.n_row, kBlockRows, kRows)),
         n_block_(pieces(job.n_row, block_rows_)),
-        block_depth_(even_piece(job.d_in, Tile::kMaxDepth, kPanelDepth)) {
+        block_depth_(even_piece(job.d_in, n_block_ == 1 ? Tile::kMaxDepth : Tile::kManyDepth, kPanelDepth)) {
     for (int i = first_part(); i < job.n_part; ++i) n_panel_ += pieces(job.part[i].d_out, kColumns);
-    n_group_ = nth == 1 ? 1 : least(pieces(kLeastItems * nth, n_block_), pieces(n_panel_, 2));
-    if (job.gated && block_depth_ < job.d_in) {
-      const std::int64_t least_groups = pieces(n_panel_, kGateColumns / kColumns);
-      n_group_ = n_group_ < least_groups ? least_groups : n_group_;
-    }
+    // A group whose depth takes more than one block copies x anew, which several panels must pay for.
+    const std::int64_t least_panels = whole_depth() ? 2 : 16;
+    n_group_ = nth == 1 ? 1 : least(pieces(kLeastItems * nth, n_block_), pieces(n_panel_, least_panels));
+    const std::int64_t room = pieces(n_panel_, kGateColumns / kColumns);
+    if (job.gated && !whole_depth() && n_group_ < room) n_group_ = room;
   }
+
+  bool whole_depth() const { return block_depth_ >= job_.d_in; }
 
   /// The gate is no part of its own.
   int first_part() const { return job_.gated ? 1 : 0; }
@@ -89,9 +91,8 @@ class LinearLoop {
         for (; i_panel >= pieces(job_.part[part].d_out, kColumns); ++part)
           i_panel -= pieces(job_.part[part].d_out, kColumns);
         const std::int64_t column = i_panel * kColumns;
-        const bool all = block_depth_ >= job_.d_in;
         multiply({part, column, least(kColumns, job_.part[part].d_out - column), row, n_row, k, depth,
-                  scratch_.gates + (all ? 0 : panel - begin) * (kBlockRows + kRows) * kColumns});
+                  scratch_.gates + (whole_depth() ? 0 : panel - begin) * (kBlockRows + kRows) * kColumns});
       }
     }
   }
