@@ -77,6 +77,12 @@ class Graph {
 
   /// Says what a custom node does; ggml's own are counted by their shapes (backend/work.h).
   void note_work(Tensor node, Work work) { noted_work_[node.node()] = work; }
+  /// Remembers what a node of ours computes, for nodes built later that can do so on the way instead of reading it.
+  void note(Tensor node, const void* what) { notes_[node.node()] = what; }
+  const void* noted(Tensor node) const {
+    const auto found = notes_.find(node.node());
+    return found != notes_.end() ? found->second : nullptr;
+  }
   /// The work of a run: one entry for each stage, then one for all that follows the last.
   std::vector<Work> work() const;
 
@@ -107,6 +113,7 @@ class Graph {
   std::vector<std::pair<std::string, Tensor>> taps_;
   std::deque<Stage> stages_;  // a deque: the marks in the graph keep pointers to them
   std::unordered_map<const ggml_tensor*, Work> noted_work_;
+  std::unordered_map<const ggml_tensor*, const void*> notes_;
 };
 
 }  // namespace vla

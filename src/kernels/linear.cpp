@@ -6,18 +6,19 @@
 #include "kernels/elementwise.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_numbers.h"
+#include "kernels/norm.h"
 
 namespace vla::kernels {
 namespace {
 
 /// What a node keeps: the job without its addresses, which are known when it runs. The node's sources are x, all
-/// weights, the biases that there are, and the residual.
+/// weights, the biases that there are, the residual, and weight and bias of the norm.
 struct LinearNode {
   const LinearKernel* kernel;
   Scratch* scratch;
   LinearJob job;
   Turns turns;
-  bool has_bias[LinearJob::kMaxPart], has_residual;
+  bool has_bias[LinearJob::kMaxPart], has_residual, has_norm_bias;
 };
 
 void linear_task(ggml_tensor* y, int ith, int nth, void* user) {
@@ -34,7 +35,9 @@ void linear_task(ggml_tensor* y, int ith, int nth, void* user) {
     part.y = out;
     if (!job.gated) out += part.d_out * job.n_row * number_size(job.y_type);
   }
-  if (node.has_residual) job.part[job.n_part - 1].residual = values(y->src[i_bias]);
+  if (node.has_residual) job.part[job.n_part - 1].residual = values(y->src[i_bias++]);
+  if (job.norm.run != nullptr) job.norm.weight = values(y->src[i_bias++]);
+  if (node.has_norm_bias) job.norm.bias = values(y->src[i_bias]);
   node.kernel->run(job, ith, nth, node.scratch->of(ith));
 }
 
@@ -55,7 +58,13 @@ const LinearKernel* kernel_of(Graph& g, std::span<const LinearTerm> terms) {
 
 Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> terms, Tensor x, Activation activation,
             bool gated, Tensor residual, Readers readers) {
-  LinearNode node = {&kernel, &g.scratch(), {}, {}, {}, static_cast<bool>(residual)};
+  LinearNode node = {&kernel, &g.scratch(), {}, {}, {}, static_cast<bool>(residual), false};
+  const ggml_tensor* normed = nullptr;  // whose norm is computed here
+  if (const NormParams* norm = norm_of(g, x);
+      norm != nullptr && x.dim(0) <= kernel.max_norm && ggml_is_contiguous(x.node()->src[0])) {
+    normed = x.node(), x = normed->src[0];
+    node.job.norm = {norm->norm, nullptr, nullptr, norm->eps};
+  }
   if (!ggml_is_contiguous(x.node())) x = ggml_cont(g.context(), x.node());
   std::vector<ggml_tensor*> sources = {x.node()};
   std::int64_t d_out = 0;
@@ -69,6 +78,11 @@ Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> te
   for (const LinearTerm& term : terms)
     if (term.bias != nullptr) sources.push_back(g.weight(term.bias).node());
   if (residual) sources.push_back(residual.node());
+  if (normed != nullptr) {
+    sources.push_back(normed->src[1]);
+    node.has_norm_bias = normed->src[2] != nullptr;
+    if (node.has_norm_bias) sources.push_back(normed->src[2]);
+  }
   node.job.d_in = x.dim(0), node.job.n_row = ggml_nrows(x.node());
   node.job.activation = activation, node.job.gated = gated;
   const bool rounds = readers == Readers::products && kernel.rounds(node.job.n_row, node.job.d_in);

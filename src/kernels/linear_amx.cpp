@@ -104,6 +104,7 @@ const LinearKernel kLinearAmx = {{"amx", Panels<32>::packed_size, Panels<32>::pa
                                  supports,
                                  LinearLoop<AmxTile>::run,
                                  LinearLoop<AmxTile>::kScratchSize,
+                                 LinearLoop<AmxTile>::kMaxNorm,
                                  LinearLoop<AmxTile>::rounds};
 
 }  // namespace vla::kernels

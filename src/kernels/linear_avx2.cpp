@@ -106,6 +106,7 @@ const LinearKernel kLinearAvx2 = {{"avx2", Panels<16>::packed_size, Panels<16>::
                                   supports,
                                   LinearLoop<Avx2Tile>::run,
                                   LinearLoop<Avx2Tile>::kScratchSize,
+                                  LinearLoop<Avx2Tile>::kMaxNorm,
                                   LinearLoop<Avx2Tile>::rounds};
 
 }  // namespace vla::kernels

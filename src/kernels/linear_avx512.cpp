@@ -101,6 +101,7 @@ const LinearKernel kLinearAvx512 = {{"avx512", Panels<32>::packed_size, Panels<3
                                     supports,
                                     LinearLoop<Avx512Tile>::run,
                                     LinearLoop<Avx512Tile>::kScratchSize,
+                                    LinearLoop<Avx512Tile>::kMaxNorm,
                                     LinearLoop<Avx512Tile>::rounds};
 
 }  // namespace vla::kernels

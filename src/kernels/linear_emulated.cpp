@@ -72,11 +72,13 @@ constexpr LinearKernel kFloat = {{"emulated", Panels<16>::packed_size, Panels<16
                                  any,
                                  LinearLoop<FloatTile>::run,
                                  LinearLoop<FloatTile>::kScratchSize,
+                                 LinearLoop<FloatTile>::kMaxNorm,
                                  LinearLoop<FloatTile>::rounds};
 constexpr LinearKernel kPair = {{"emulated_amx", Panels<32>::packed_size, Panels<32>::pack},
                                 bf16_only,
                                 LinearLoop<EmulatedAmxTile>::run,
                                 LinearLoop<EmulatedAmxTile>::kScratchSize,
+                                LinearLoop<EmulatedAmxTile>::kMaxNorm,
                                 LinearLoop<EmulatedAmxTile>::rounds};
 
 }  // namespace

@@ -26,7 +26,15 @@ struct LinearJob {
   };
   static constexpr int kMaxPart = 3;
 
+  /// y = run(x), with CpuKernels::Norm; null where x is multiplied as it is.
+  struct Norm {
+    void (*run)(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n) = nullptr;
+    const float *weight = nullptr, *bias = nullptr;
+    float eps = 0;
+  };
+
   const std::byte* x;  // contiguous rows of d_in numbers
+  Norm norm;           // what is multiplied is the norm of each row
   std::int64_t n_row, d_in;
   int n_part;
   Part part[kMaxPart];

@@ -15,6 +15,7 @@ struct LinearKernel : MatrixFormat {
   /// Thread `ith` of `nth` does its part of the job, with scratch memory of its own at a multiple of 64 bytes.
   void (*run)(const LinearJob& job, int ith, int nth, std::byte* scratch);
   std::size_t scratch_size;
+  std::int64_t max_norm;  // the widest norm of x that it computes on the way
   /// Whether x of so many rows and this depth is rounded to bf16 once, so that it may come as bf16, and y may leave so.
   bool (*rounds)(std::int64_t n_row, std::int64_t d_in);
 };

@@ -39,6 +39,7 @@ class LinearLoop {
 
   struct Scratch {
     alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
+    alignas(64) float normed[Tile::kMaxDepth];
     alignas(64) float unpacked[Tile::kUnpacked + 1];
     alignas(64) float sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kGateColumns];
@@ -46,6 +47,7 @@ class LinearLoop {
 
  public:
   static constexpr std::size_t kScratchSize = sizeof(Scratch);
+  static constexpr std::int64_t kMaxNorm = Tile::kMaxDepth;
 
   static void run(const LinearJob& job, int ith, int nth, std::byte* scratch) {
     LinearLoop loop(job, nth, *reinterpret_cast<Scratch*>(scratch));
@@ -103,12 +105,20 @@ class LinearLoop {
     row_of_x_ = row, depth_of_x_ = k;
     for (std::int64_t r = 0; r < n_row; ++r) {
       X* to = scratch_.x + r * Tile::kXStride;
-      const std::int64_t place = (row + r) * job_.d_in + k;
+      const std::int64_t place = (row + r) * job_.d_in;
       if (Tile::kRounds && job_.x_type == DType::bf16)
-        copy_rounded(reinterpret_cast<const X*>(job_.x) + place, depth, to);
+        copy_rounded(reinterpret_cast<const X*>(job_.x) + place + k, depth, to);
       else
-        Tile::copy(reinterpret_cast<const float*>(job_.x) + place, depth, to, fine() ? to + kRest : nullptr);
+        Tile::copy(normed(reinterpret_cast<const float*>(job_.x) + place) + k, depth, to,
+                   fine() ? to + kRest : nullptr);
     }
+  }
+
+  const float* normed(const float* x) {
+    const LinearJob::Norm& norm = job_.norm;
+    if (norm.run == nullptr) return x;
+    norm.run(x, norm.weight, norm.bias, norm.eps, scratch_.normed, job_.d_in);
+    return scratch_.normed;
   }
 
   static VLA_INLINE void copy_rounded(const X* from, std::int64_t n, X* to) {

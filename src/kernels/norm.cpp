@@ -2,16 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/norm.h"
 
-#include "kernels/cpu_kernels.h"
 #include "kernels/custom.h"
 
 namespace vla::kernels {
 namespace {
-
-struct NormParams {
-  CpuKernels::Norm norm;
-  float eps;
-};
 
 void norm_task(ggml_tensor* y, int ith, int nth, void* user) {
   const auto& params = *static_cast<const NormParams*>(user);
@@ -24,8 +18,10 @@ void norm_task(ggml_tensor* y, int ith, int nth, void* user) {
 }
 
 Tensor norm(Graph& g, CpuKernels::Norm kernel, Tensor x, Tensor weight, Tensor bias, float eps) {
-  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x, weight, bias}, norm_task,
-                keep(g, NormParams{kernel, eps}));
+  NormParams* params = keep(g, NormParams{kernel, eps});
+  const Tensor y = custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x, weight, bias}, norm_task, params);
+  g.note(y, params);
+  return y;
 }
 
 /// The reference: ggml's operations, one after the other.

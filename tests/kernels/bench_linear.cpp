@@ -87,7 +87,7 @@ void measure(const LinearKernel& kernel, Isa isa, const Shape& s, int n_thread, 
   kernel.pack(desc, stored.data, packed.data);
   const double pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   Turns turns;
-  LinearJob job = {x.data, s.n_row, s.d_in, 1, {}, Activation::none, false, DType::f32, DType::f32, &turns};
+  LinearJob job = {x.data, {}, s.n_row, s.d_in, 1, {}, Activation::none, false, DType::f32, DType::f32, &turns};
   job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, y.data, s.d_out};
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
   std::vector<double> rates, peaks, shares;

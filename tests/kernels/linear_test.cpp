@@ -113,6 +113,7 @@ class Trial {
     std::vector<std::uint16_t> rounded;
     for (float value : x_) rounded.push_back(to_bf16(value));
     LinearJob job = {case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(&rounded[1]) : bytes(x_),
+                     {},
                      n_row,
                      d_in,
                      case_.n_part,

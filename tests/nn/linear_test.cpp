@@ -9,9 +9,11 @@
 #include <cmath>
 
 #include "kernels/linear_kernel.h"
+#include "kernels/norm.h"
 #include "nn/mlp.h"
 #include "support/editable_bundle.h"
 #include "support/graph_runner.h"
+#include "support/kernel_rows.h"
 
 using namespace vla;
 using test::ramp;
@@ -146,4 +148,34 @@ TEST_CASE("layers of one x as a group give what each gives alone") {
     const std::vector<Tensor> both = Linear::group(g, {&l.a, &l.b}, x);
     return l.c(g, Tensor(ggml_sub(g.context(), both[0].node(), both[1].node())));
   });
+}
+
+Tensor normed(Graph& g, Tensor x, bool centred) {
+  const Tensor weight = g.store().add_constant(ramp(kModel, 2), {kModel});
+  if (!centred) return kernels::rms_norm(g, x, weight, {}, 1e-5f);
+  return kernels::layer_norm(g, x, weight, g.store().add_constant(ramp(kModel, 1), {kModel}), 1e-5f);
+}
+
+TEST_CASE("a norm before products gives what the norm and the products give one after the other") {
+  for (bool centred : {false, true})
+    check_like_ggml([&](Graph& g, const Layers& l, Tensor x) {
+      const Tensor h = normed(g, x, centred);
+      return l.c(g, Linear::gated(g, l.a, l.b, h, Activation::silu));
+    });
+}
+
+TEST_CASE("a norm that only products read is no node of its own" * doctest::skip(test::lacks(Isa::avx2))) {
+  const auto n_node = [](bool with_reader) {
+    int n = 0;
+    run({"avx2", Isa::avx2, kernels::choose_linear}, DType::bf16, kFew, "", [&](Graph& g, const Layers& l, Tensor x) {
+      const Tensor h = normed(g, x, true), y = l.a(g, h);
+      if (with_reader) g.require(h);
+      g.require(y);
+      n = g.n_node();
+      return l.c(g, y);
+    });
+    return n;
+  };
+  CHECK(n_node(false) == 1);
+  CHECK(n_node(true) == 2);
 }
