@@ -25,7 +25,8 @@ class AttentionTile {
   static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
   static constexpr int kKeyStride = row_stride(kKeys);
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
-  static_assert(kRows % kTile == 0 && kKeys % kPanel == 0);
+  static constexpr int kPart = P::kPart;  // rows that meet a chunk in one turn, a multiple of kTile
+  static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
   static constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return Panels::round_up(n, unit); }
 
@@ -60,10 +61,9 @@ class AttentionTile {
     const int n_tiled = static_cast<int>(round_up(n_row, kTile));
     std::int64_t head[kRows], query[kRows];  // of each row
     typename P::Work work;
-    bool mixed_any = false;  // `mixed` holds something
     alignas(64) float mixed[kRows * kHeadStride];
-    // Of one chunk, or of two where the next one's products are computed beside the weights of one.
-    static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kRows * kKeyStride;
+    // Of one turn, or of two where the next one's products are computed beside the weights of one.
+    static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
     // Weights take the place of the scores, unless they are numbers of another kind.
@@ -85,31 +85,36 @@ class AttentionTile {
     }
 
     enum class Seen { none, some, all };
-    /// n keys from `key` on, and which of the buffers for scores and weights is theirs.
-    struct Chunk {
+    /// Some rows of the block meet a chunk: n keys from `key` on.
+    struct Turn {
       std::int64_t key = 0;
-      int n = 0, buffer = 0;
+      int n = 0;
       Seen seen = Seen::none;
+      bool sum = false;                    // what they see comes on top of earlier chunks
+      int first = 0, end = 0, buffer = 0;  // the rows, and whose scores and weights they are
     };
-    float* scores(const Chunk& chunk) { return score + chunk.buffer * kBufferSize; }
-    Number* weights(const Chunk& chunk) {
+    float* scores(const Turn& turn, int row) {
+      return score + turn.buffer * kBufferSize + (row - turn.first) * kKeyStride;
+    }
+    Number* weights(const Turn& turn, int row) {
       if constexpr (kInPlace)
-        return scores(chunk);
+        return scores(turn, row);
       else
-        return rounded_weight + chunk.buffer * kBufferSize;
+        return rounded_weight + turn.buffer * kBufferSize + (row - turn.first) * kKeyStride;
     }
 
     void run() {
       start();
-      Chunk before, now = chunk_from(0, 0);
+      Turn before, now = turn_from(0);
+      if (now.n == 0) std::memset(mixed, 0, sizeof(mixed));  // the rows see nothing, and become NaNs
       multiply_keys(now);
       work.finish();
       while (now.n > 0) {
-        const Chunk next = chunk_from(now.key + kKeys, kBuffers - 1 - now.buffer);
+        const Turn next = turn_behind(now);
         if constexpr (P::kBeside) mix_values(before), multiply_keys(next);
         weigh(now);
         work.finish();
-        shrink_rows();
+        shrink_rows(now);
         if constexpr (!P::kBeside) mix_values(now), multiply_keys(next);
         before = now, now = next;
       }
@@ -123,20 +128,30 @@ class AttentionTile {
                         query_number + r * kHeadStride);
       for (int r = 0; r < kRowVectors; ++r) V::store(sum + r * kWidth, Float{});
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
-      if constexpr (!kInPlace)  // rows that no query has are multiplied too
-        for (int i = 0; i < kBuffers; ++i)
-          for (int r = n_row; r < n_tiled; ++r)
-            std::memset(rounded_weight + i * kBufferSize + r * kKeyStride, 0, kKeys * sizeof(Number));
+      if (n_row != n_tiled) std::memset(rounded_weight, 0, sizeof(rounded_weight));  // all rows are multiplied
     }
 
-    /// The first chunk at or behind `key` of which the block's queries see something, or none.
-    Chunk chunk_from(std::int64_t key, int buffer) const {
+    /// The first turn with the first chunk at or behind `key` of which the block's queries see something, or none.
+    Turn turn_from(std::int64_t key) const {
       for (; key < job.n_key; key += kKeys) {
         const int n = static_cast<int>(job.n_key - key < kKeys ? job.n_key - key : kKeys);
         const Seen seen = job.mask == nullptr ? Seen::all : look(key, n);
-        if (seen != Seen::none) return {key, n, buffer, seen};
+        if (seen != Seen::none) return {key, n, seen, false, 0, n_row < kPart ? n_row : kPart, 0};
       }
       return {};
+    }
+
+    Turn turn_behind(const Turn& turn) const {
+      Turn next = turn;
+      if (turn.end < n_row) {
+        next.first = turn.end;
+        next.end = n_row - turn.end < kPart ? n_row : turn.end + kPart;
+      } else {
+        next = turn_from(turn.key + kKeys);
+        next.sum = true;
+      }
+      next.buffer = kBuffers - 1 - turn.buffer;
+      return next;
     }
 
     /// What the block's queries see of a chunk.
@@ -158,41 +173,41 @@ class AttentionTile {
       return all ? Seen::all : none ? Seen::none : Seen::some;
     }
 
-    void multiply_keys(const Chunk& chunk) {
+    void multiply_keys(const Turn& turn) {
       const std::int64_t depth = panels.key_depth;
-      for (int j = 0; j < chunk.n; j += kPanel)
-        for (int r = 0; r < n_tiled; r += kTile)
-          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (chunk.key + j) * depth,
-                                                     depth, kPanel, scores(chunk) + r * kKeyStride + j, false);
+      for (int j = 0; j < turn.n; j += kPanel)
+        for (int r = turn.first; r < turn.end; r += kTile)
+          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (turn.key + j) * depth,
+                                                     depth, kPanel, scores(turn, r) + j, false);
     }
 
     /// Scores become weights, and steps of the products that wait are done between the rows.
-    void weigh(const Chunk& chunk) {
-      hide(chunk);
-      const float factor = chunk.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
-      const int n_step = (work.n_step() + n_row - 1) / n_row;
-      for (int r = 0; r < n_row; r += kWidth) weigh_rows(r, chunk, factor, n_step);
+    void weigh(const Turn& turn) {
+      hide(turn);
+      const float factor = turn.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
+      const int n = turn.end - turn.first, n_step = (work.n_step() + n - 1) / n;
+      for (int r = turn.first; r < turn.end; r += kWidth) weigh_rows(r, turn, factor, n_step);
     }
 
     /// Keys that there are not, and what the mask says.
-    void hide(const Chunk& chunk) {
-      if (chunk.n % kPanel == 0 && chunk.seen == Seen::all) return;
-      for (int r = 0; r < n_row; ++r) {
-        float* row = scores(chunk) + r * kKeyStride;
-        for (int j = chunk.n; j < round_up(chunk.n, kPanel); ++j) row[j] = kNever;
-        if (chunk.seen == Seen::all) continue;
-        const float* mask = job.mask + query[r] * job.n_key + chunk.key;
-        for (int j = 0; j < chunk.n; j += kWidth)
-          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, chunk.n - j)));
+    void hide(const Turn& turn) {
+      if (turn.n % kPanel == 0 && turn.seen == Seen::all) return;
+      for (int r = turn.first; r < turn.end; ++r) {
+        float* row = scores(turn, r);
+        for (int j = turn.n; j < round_up(turn.n, kPanel); ++j) row[j] = kNever;
+        if (turn.seen == Seen::all) continue;
+        const float* mask = job.mask + query[r] * job.n_key + turn.key;
+        for (int j = 0; j < turn.n; j += kWidth)
+          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, turn.n - j)));
       }
     }
 
     /// Scores times `factor` become the logarithms of weights, for at most kWidth rows from `first` on: relative to the
     /// greatest score so far, or to one that is nearly as great.
-    VLA_INLINE void weigh_rows(int first, const Chunk& chunk, float factor, int n_step) {
-      const int end = n_row - first < kWidth ? n_row : first + kWidth;
+    VLA_INLINE void weigh_rows(int first, const Turn& turn, float factor, int n_step) {
+      const int end = turn.end - first < kWidth ? turn.end : first + kWidth;
       Float tops[kWidth] = {};
-      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(chunk) + r * kKeyStride, chunk.n);
+      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(turn, r), turn.n);
       const Float top = factor * across<V>(tops, [](Float a, Float b) VLA_LAMBDA { return V::max(a, b); });
       const Float before = V::load(base + first), now = top > before + P::kSlack ? top : before;
       // A row that saw nothing yet has no greatest score; any finite one keeps its weights at zero.
@@ -202,7 +217,7 @@ class AttentionTile {
       V::store(shrink + first, P::power(before - offset));
       for (int r = first; r < end; ++r) {
         work.advance(n_step);
-        weigh_row(scores(chunk) + r * kKeyStride, weights(chunk) + r * kKeyStride, chunk.n, factor, r);
+        weigh_row(scores(turn, r), weights(turn, r), turn.n, factor, r);
       }
     }
 
@@ -229,29 +244,26 @@ class AttentionTile {
     }
 
     /// What was mixed before becomes relative to the greatest scores of now.
-    void shrink_rows() {
-      for (int r = 0; mixed_any && r < n_row; ++r) {
+    void shrink_rows(const Turn& turn) {
+      for (int r = turn.first; turn.sum && r < turn.end; ++r) {
         if (shrink[r] == 1.0f) continue;
         float* row = mixed + r * kHeadStride;
         for (std::int64_t i = 0; i < panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * shrink[r]);
       }
     }
 
-    void mix_values(const Chunk& chunk) {
-      if (chunk.n == 0) return;
+    void mix_values(const Turn& turn) {
+      if (turn.n == 0) return;
       for (std::int64_t i = 0; i < panels.d_value; i += kPanel) {
         const std::int64_t width = panels.width(i);
-        const Number* panel = values + i * panels.n_key + chunk.key * width;
-        for (int r = 0; r < n_tiled; r += kTile)
-          work.template add<kKeyStride, kHeadStride>(weights(chunk) + r * kKeyStride, panel,
-                                                     round_up(chunk.n, P::kDepth), width, mixed + r * kHeadStride + i,
-                                                     mixed_any);
+        const Number* panel = values + i * panels.n_key + turn.key * width;
+        for (int r = turn.first; r < turn.end; r += kTile)
+          work.template add<kKeyStride, kHeadStride>(weights(turn, r), panel, round_up(turn.n, P::kDepth), width,
+                                                     mixed + r * kHeadStride + i, turn.sum);
       }
-      mixed_any = true;
     }
 
     void finish() {
-      if (!mixed_any) std::memset(mixed, 0, sizeof(mixed));  // its rows saw nothing, and become NaNs
       for (int first = 0; first < n_row; first += kWidth) {
         Float sums[kWidth];
         for (int i = 0; i < kWidth; ++i) sums[i] = V::load(sum + (first + i) * kWidth);
