@@ -10,6 +10,10 @@
 /// Attention with an online softmax. Rows of a block (queries of every head that shares keys) meet the keys in chunks:
 /// a chunk's scores lie in the first caches, become weights there, and are mixed into the block's output, which is
 /// scaled down whenever a much larger score turns up.
+///
+/// Parts of the rows take turns, chunk by chunk. Where the products have a unit of their own (P::kBeside), those of the
+/// turns before and behind are computed between the rows whose scores become weights.
+///
 /// Source of the method: Dao et al., FlashAttention (2022); Milakov and Gimelshein, Online normalizer (2018).
 namespace vla::kernels {
 
@@ -21,11 +25,11 @@ class AttentionTile {
   using Number = typename P::Number;
   using Panels = AttentionPanels<P>;
   static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
-  static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kTile
+  static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kPart
+  static constexpr int kPart = P::kPart;  // rows of a turn, a multiple of kTile
   static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
   static constexpr int kKeyStride = row_stride(kKeys);
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
-  static constexpr int kPart = P::kPart;  // rows that meet a chunk in one turn, a multiple of kTile
   static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
   static constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return Panels::round_up(n, unit); }
