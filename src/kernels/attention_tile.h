@@ -70,7 +70,8 @@ class AttentionTile {
     static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
-    // Weights take the place of the scores, unless they are numbers of another kind.
+    // Weights take the place of the scores, unless they are numbers of another kind. Those of rows that no query has
+    // are anything: they are multiplied too, into rows that nobody reads.
     static constexpr bool kInPlace = std::is_same_v<Number, float>;
     alignas(64) Number rounded_weight[kInPlace ? 1 : kBuffers * kBufferSize];
     static constexpr int kRowVectors = round_up(kRows, kWidth);  // room for whole vectors
@@ -132,7 +133,6 @@ class AttentionTile {
                         query_number + r * kHeadStride);
       for (int r = 0; r < kRowVectors; ++r) V::store(sum + r * kWidth, Float{});
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
-      if (n_row != n_tiled) std::memset(rounded_weight, 0, sizeof(rounded_weight));  // all rows are multiplied
     }
 
     /// The first turn with the first chunk at or behind `key` of which the block's queries see something, or none.
@@ -187,7 +187,7 @@ class AttentionTile {
 
     /// Scores become weights, and steps of the products that wait are done between the rows.
     void weigh(const Turn& turn) {
-      hide(turn);
+      if (turn.n % kPanel != 0 || turn.seen == Seen::some) hide(turn);
       const float factor = turn.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
       const int n = turn.end - turn.first, n_step = (work.n_step() + n - 1) / n;
       for (int r = turn.first; r < turn.end; r += kWidth) weigh_rows(r, turn, factor, n_step);
@@ -195,10 +195,13 @@ class AttentionTile {
 
     /// Keys that there are not, and what the mask says.
     void hide(const Turn& turn) {
-      if (turn.n % kPanel == 0 && turn.seen == Seen::all) return;
+      const int last = turn.n / kPanel * kPanel;  // of a panel that the keys do not fill
+      float missing[kPanel] = {};
+      for (int j = turn.n - last; j < kPanel; ++j) missing[j] = kNever;
       for (int r = turn.first; r < turn.end; ++r) {
         float* row = scores(turn, r);
-        for (int j = turn.n; j < round_up(turn.n, kPanel); ++j) row[j] = kNever;
+        for (int j = 0; last < turn.n && j < kPanel; j += kWidth)
+          V::store(row + last + j, V::load(row + last + j) + V::load(missing + j));
         if (turn.seen == Seen::all) continue;
         const float* mask = job.mask + query[r] * job.n_key + turn.key;
         for (int j = 0; j < turn.n; j += kWidth)
