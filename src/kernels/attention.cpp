@@ -33,20 +33,28 @@ AttentionJob make_job(const ggml_tensor* q, const ggml_tensor* k, const ggml_ten
 
 double bytes(Tensor x) { return static_cast<double>(ggml_nbytes(x.node())); }
 
+/// What a node keeps.
+struct AttentionNode {
+  const AttentionKernel* kernel;
+  Turns turns;
+};
+
 enum Source { kQ, kK, kV, kPacked, kMask };
 
-void pack_task(ggml_tensor* packed, int ith, int nth, void* kernel) {
+void pack_task(ggml_tensor* packed, int ith, int nth, void* node) {
   AttentionJob job = make_job(packed->src[kQ], packed->src[kK], packed->src[kV]);
   job.packed = static_cast<float*>(packed->data);
-  static_cast<const AttentionKernel*>(kernel)->pack(job, ith, nth);
+  static_cast<const AttentionNode*>(node)->kernel->pack(job, ith, nth);
 }
 
-void run_task(ggml_tensor* out, int ith, int nth, void* kernel) {
+void run_task(ggml_tensor* out, int ith, int nth, void* user) {
+  auto& node = *static_cast<AttentionNode*>(user);
   AttentionJob job = make_job(out->src[kQ], out->src[kK], out->src[kV]);
   job.packed = static_cast<float*>(out->src[kPacked]->data);
   job.mask = out->src[kMask] != nullptr ? values(out->src[kMask]) : nullptr;
   job.out = static_cast<float*>(out->data);
-  static_cast<const AttentionKernel*>(kernel)->run(job, ith, nth);
+  job.turns = &node.turns;
+  node.kernel->run(job, ith, nth);
 }
 
 }  // namespace
@@ -61,7 +69,7 @@ Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) {
 
 Tensor attention(Graph& g, const AttentionKernel& kernel, Tensor q, Tensor k, Tensor v, Tensor mask) {
   const AttentionJob job = make_job(q.node(), k.node(), v.node());
-  const auto user = const_cast<AttentionKernel*>(&kernel);  // ggml's type for user data; the tasks only read it
+  AttentionNode* user = keep(g, AttentionNode{&kernel, {}});
   const Tensor packed = custom(g, {kernel.packed_size(job)}, {q, k, v}, pack_task, user);
   const Tensor out = custom(g, {q.dim(0) * q.dim(1), q.dim(2), q.dim(3)}, {q, k, v, packed, mask}, run_task, user);
   g.note_work(packed, {0, bytes(k) + bytes(v) + bytes(packed)});

@@ -4,6 +4,8 @@
 
 #include <cstdint>
 
+#include "kernels/turns.h"
+
 namespace vla::kernels {
 
 /// One attention: sizes, and where everything lies.
@@ -23,6 +25,7 @@ struct AttentionJob {
   const float* mask;  // [n_key, n_query], or null
   float* packed;      // what `pack` writes and `run` reads
   float* out;         // [d_head, n_head, n_query, n_batch]
+  Turns* turns;       // of `run`
 
   /// Query heads that share keys and values: their queries are rows of one and the same product.
   std::int64_t n_row() const { return n_head / n_head_kv * n_query; }

@@ -14,18 +14,6 @@ namespace vla::kernels {
 constexpr int row_stride(int n) { return n + 32; }
 constexpr int kHeadStride = row_stride(kMaxHead);
 
-/// 2^x for a weight that is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
-template <class V>
-VLA_INLINE typename V::Float exp2_for_bf16(typename V::Float x) {
-  const typename V::Float rest = V::fraction(x);
-  // Minimax on 0 <= rest <= 1 with the value 1 at 0: a whole power of two is exact.
-  typename V::Float p = V::fma(rest, V::set(0x1.b7f842p-7f), V::set(0x1.abf784p-5f));
-  p = V::fma(p, rest, V::set(0x1.ee248cp-3f));
-  p = V::fma(p, rest, V::set(0x1.62d6c2p-1f));
-  p = V::fma(p, rest, V::set(1.0f));
-  return V::times_power_of_two(p, x);
-}
-
 /// Float32: kRowsOfTile rows times two vectors, one operand broadcast. `V` is a type of vec.h.
 template <class V, int kRowsOfTile>
 struct FloatProducts {

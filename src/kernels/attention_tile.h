@@ -48,10 +48,10 @@ class AttentionTile {
     const std::int64_t fair = round_up(job.n_row() * job.n_unit() / (4 * nth) + 1, kTile);
     const std::int64_t n_row = fair < kRows ? fair : kRows;
     const std::int64_t n_block = round_up(job.n_row(), n_row) / n_row, n = n_block * job.n_unit();
-    for (std::int64_t i = n * ith / nth; i < n * (ith + 1) / nth; ++i) {
+    job.turns->share(ith, nth, n, [&](std::int64_t i) {
       const std::int64_t row = i % n_block * n_row, left = job.n_row() - row;
       Block(panels, i / n_block, row, static_cast<int>(left < n_row ? left : n_row)).run();
-    }
+    });
   }
 
  private:

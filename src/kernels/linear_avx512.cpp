@@ -13,7 +13,8 @@ struct Avx512Tile {
   using V = Avx512;
   using X = float;
   static constexpr int kRows = 12, kColumns = 32;
-  static constexpr int kMaxDepth = 1024, kStep = 384, kBlockRows = 144, kFineRows = 0, kUnpacked = kStep * kColumns;
+  static constexpr int kMaxDepth = 2048, kManyDepth = 1024, kStep = 384, kBlockRows = 144, kFineRows = 0,
+                       kUnpacked = kStep * kColumns;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};

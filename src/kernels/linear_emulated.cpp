@@ -12,7 +12,7 @@ struct FloatTile {
   using V = Portable;
   using X = float;
   static constexpr int kRows = 5, kColumns = 16;
-  static constexpr int kMaxDepth = 96, kStep = 64, kBlockRows = 10, kFineRows = 0, kUnpacked = 0;
+  static constexpr int kMaxDepth = 96, kManyDepth = 64, kStep = 32, kBlockRows = 10, kFineRows = 0, kUnpacked = 0;
   static constexpr int kXStride = kMaxDepth + 1;
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};

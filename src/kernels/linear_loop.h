@@ -15,16 +15,16 @@
 /// Anatomy of High-Performance Matrix Multiplication (2008).
 namespace vla::kernels {
 
-/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kMaxDepth and kBlockRows
-/// (of the block of x), kXStride (from one of its rows to the next), kStep (of the depth, most), kFineRows (jobs of no
-/// more rows keep what the rounding of x leaves), kEven (tiles of equal height), kUnpacked (floats of a step that
-/// multiply wants instead of the stored one), Session (held while a thread works), and
-///   store_rounded(to, vector, left)       y as bf16, where kRounds
-///   copy(from, n, to, rest)               n numbers of x and zeros up to a multiple of 32; what rounding leaves, or
-///   null unpack(type, panel, depth, floats)    what multiply reads multiply(type, n_row, x, rest, panel, depth, c,
-///   add, ahead)
-///                                         c [kColumns] x n_row <= kRows, += where `add`; asks for memory from `ahead`
-///                                         on
+/// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
+/// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kManyDepth (the same where there
+/// is more than one block), kStep (of the depth, most), kFineRows (jobs of no more rows keep what the rounding of x
+/// leaves), kRounds (x becomes bf16), kEven (tiles of equal height), kUnpacked (floats of a step that multiply wants
+/// instead of the stored one), Session (held while a thread works), and
+///   copy(from, n, to, rest)           n numbers of x, zeros up to a multiple of 32; what rounding leaves, or null
+///   store_rounded(to, vector, left)   y as bf16, where kRounds
+///   unpack(type, panel, depth, to)    what multiply reads
+///   multiply(type, n_row, x, rest, panel, depth, c, add, ahead)
+///     c [kColumns] x n_row <= kRows, += where `add`; memory from `ahead` on is asked for meanwhile
 template <class Tile>
 class LinearLoop {
   using V = typename Tile::V;
@@ -34,8 +34,8 @@ class LinearLoop {
   static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
   static constexpr std::int64_t kLeastItems = 16;              // for each thread, where there are so many
   static constexpr std::int64_t kRest = kBlockRows / 2 * Tile::kXStride;
-  static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0);
-  static_assert(Tile::kFineRows <= kBlockRows / 2);
+  static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kManyDepth % kPanelDepth == 0);
+  static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0 && Tile::kFineRows <= kBlockRows / 2);
 
   struct Scratch {
     alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
@@ -54,7 +54,7 @@ class LinearLoop {
   }
 
   static bool rounds(std::int64_t n_row, std::int64_t d_in) {
-    return Tile::kRounds && n_row > Tile::kFineRows && d_in <= Tile::kMaxDepth;
+    return Tile::kRounds && n_row > Tile::kFineRows && d_in <= Tile::kManyDepth;
   }
 
  private:
@@ -63,14 +63,16 @@ class LinearLoop {
         scratch_(scratch),
         block_rows_(even_piece(job.n_row, kBlockRows, kRows)),
         n_block_(pieces(job.n_row, block_rows_)),
-        block_depth_(even_piece(job.d_in, Tile::kMaxDepth, kPanelDepth)) {
+        block_depth_(even_piece(job.d_in, n_block_ == 1 ? Tile::kMaxDepth : Tile::kManyDepth, kPanelDepth)) {
     for (int i = first_part(); i < job.n_part; ++i) n_panel_ += pieces(job.part[i].d_out, kColumns);
-    n_group_ = nth == 1 ? 1 : least(pieces(kLeastItems * nth, n_block_), pieces(n_panel_, 2));
-    if (job.gated && block_depth_ < job.d_in) {
-      const std::int64_t least_groups = pieces(n_panel_, kGateColumns / kColumns);
-      n_group_ = n_group_ < least_groups ? least_groups : n_group_;
-    }
+    // A group whose depth takes more than one block copies x anew, which several panels must pay for.
+    const std::int64_t least_panels = whole_depth() ? 2 : 16;
+    n_group_ = nth == 1 ? 1 : least(pieces(kLeastItems * nth, n_block_), pieces(n_panel_, least_panels));
+    const std::int64_t room = pieces(n_panel_, kGateColumns / kColumns);
+    if (job.gated && !whole_depth() && n_group_ < room) n_group_ = room;
   }
+
+  bool whole_depth() const { return block_depth_ >= job_.d_in; }
 
   /// The gate is no part of its own.
   int first_part() const { return job_.gated ? 1 : 0; }
@@ -89,9 +91,8 @@ class LinearLoop {
         for (; i_panel >= pieces(job_.part[part].d_out, kColumns); ++part)
           i_panel -= pieces(job_.part[part].d_out, kColumns);
         const std::int64_t column = i_panel * kColumns;
-        const bool all = block_depth_ >= job_.d_in;
         multiply({part, column, least(kColumns, job_.part[part].d_out - column), row, n_row, k, depth,
-                  scratch_.gates + (all ? 0 : panel - begin) * (kBlockRows + kRows) * kColumns});
+                  scratch_.gates + (whole_depth() ? 0 : panel - begin) * (kBlockRows + kRows) * kColumns});
       }
     }
   }
@@ -140,7 +141,9 @@ class LinearLoop {
           if (last && part.residual != nullptr)
             fetch(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
         },
-        [&](std::int64_t r, std::int64_t n_row) { last ? finish(s, r, n_row) : keep(s, r, n_row); });
+        [&](std::int64_t r, std::int64_t n_row) {
+          s.n_column == kColumns ? finish<true>(s, r, n_row) : finish<false>(s, r, n_row);
+        });
   }
 
   std::int64_t y_size() const { return number_size(job_.y_type); }
@@ -181,65 +184,71 @@ class LinearLoop {
     return Tile::kEven ? n_row * t / n_tile : least(t * kRows, n_row);
   }
 
-  /// The sums of rows r to r + n_row of the stripe, until the next block of the depth adds to them.
-  void keep(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
-    each_vector(s, first, n_row, [](auto value, auto...) { return value; });
+  /// What becomes of a tile's sums, rows r to r + n_row of the stripe: behind the last block of the depth everything
+  /// that follows the product, before it partial sums in y. kWhole: the stripe is kColumns wide.
+  template <bool kWhole>
+  void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
+    if (s.k + s.depth < job_.d_in) return write<kWhole, false, Activation::none>(s, {}, r, n_row);
+    const LinearJob::Part &part = job_.part[s.part], &gate = job_.part[0];
+    const After after = {part.bias != nullptr ? part.bias + s.column : nullptr, part.residual,
+                         job_.gated ? s.gates : nullptr,
+                         job_.gated && gate.bias != nullptr ? gate.bias + s.column : nullptr};
+    if constexpr (Tile::kRounds)
+      if (job_.y_type == DType::bf16) return write_activated<kWhole, true>(s, after, r, n_row);
+    write_activated<kWhole, false>(s, after, r, n_row);
   }
 
-  /// The epilogue of a tile: rows r to r + n_row of the stripe.
-  void finish(const Stripe& s, std::int64_t r, std::int64_t n_row) const {
+  /// What follows a product beside its activation; null where nothing does.
+  struct After {
+    const float *bias = nullptr, *residual = nullptr, *gates = nullptr, *gate_bias = nullptr;
+  };
+
+  template <bool kWhole, bool kRounded>
+  void write_activated(const Stripe& s, const After& after, std::int64_t r, std::int64_t n_row) const {
     switch (job_.activation) {
       case Activation::none:
-        return finish_rows<Activation::none>(s, r, n_row);
+        return write<kWhole, kRounded, Activation::none>(s, after, r, n_row);
       case Activation::gelu_tanh:
-        return finish_rows<Activation::gelu_tanh>(s, r, n_row);
+        return write<kWhole, kRounded, Activation::gelu_tanh>(s, after, r, n_row);
       case Activation::silu:
-        return finish_rows<Activation::silu>(s, r, n_row);
+        return write<kWhole, kRounded, Activation::silu>(s, after, r, n_row);
     }
   }
 
-  template <Activation kActivation>
+  template <bool kRounded, Activation kActivation>
   static VLA_INLINE typename V::Float activate(typename V::Float x) {
+    if constexpr (kActivation == Activation::gelu_tanh && kRounded) return gelu_tanh_for_bf16<V>(x);
+    if constexpr (kActivation == Activation::silu && kRounded) return silu_for_bf16<V>(x);
     if constexpr (kActivation == Activation::gelu_tanh) return gelu_tanh<V>(x);
     if constexpr (kActivation == Activation::silu) return silu<V>(x);
     return x;
   }
 
-  template <Activation kActivation>
-  void finish_rows(const Stripe& s, std::int64_t first, std::int64_t n_row) const {
-    const LinearJob::Part &part = job_.part[s.part], &gate = job_.part[0];
-    each_vector(s, first, n_row, [&](typename V::Float value, std::int64_t r, std::int64_t i, std::int64_t left) {
-      if (part.bias != nullptr) value += load<V>(part.bias + s.column + i, left);
-      if (job_.gated) {
-        typename V::Float factor = V::load(s.gates + r * kColumns + i);
-        if (gate.bias != nullptr) factor += load<V>(gate.bias + s.column + i, left);
-        value *= activate<kActivation>(factor);
-      } else {
-        value = activate<kActivation>(value);
-      }
-      if (part.residual != nullptr) value += load<V>(part.residual + (s.row + r) * part.d_out + s.column + i, left);
-      return value;
-    });
-  }
-
-  /// y = f(sums, or y + sums behind the first block of the depth; row, column, how many columns are left)
-  template <class F>
-  VLA_INLINE void each_vector(const Stripe& s, std::int64_t first, std::int64_t n_row, const F& f) const {
+  template <bool kWhole, bool kRounded, Activation kActivation>
+  void write(const Stripe& s, const After& after, std::int64_t first, std::int64_t n_row) const {
     const LinearJob::Part& part = job_.part[s.part];
-    for (std::int64_t r = first; r < first + n_row; ++r)
-      for (std::int64_t i = 0; i < s.n_column; i += V::width) {
-        const std::int64_t place = (s.row + r) * part.d_out + s.column + i, left = s.n_column - i;
-        float* y = reinterpret_cast<float*>(part.y) + place;
+    for (std::int64_t r = first; r < first + n_row; ++r) {
+      const std::int64_t row = (s.row + r) * part.d_out + s.column;
+      for (std::int64_t i = 0; i < (kWhole ? kColumns : s.n_column); i += V::width) {
+        const std::int64_t left = kWhole ? V::width : s.n_column - i;
+        float* y = reinterpret_cast<float*>(part.y) + row + i;
         typename V::Float value = V::load(scratch_.sums + r * kColumns + i);
         if (s.k > 0) value += load<V>(y, left);
-        value = f(value, r, i, left);
-        if constexpr (Tile::kRounds)
-          if (job_.y_type == DType::bf16) {
-            Tile::store_rounded(reinterpret_cast<X*>(part.y) + place, value, left);
-            continue;
-          }
-        store<V>(y, value, left);
+        if (after.bias != nullptr) value += load<V>(after.bias + i, left);
+        if (after.gates != nullptr) {
+          typename V::Float gate = V::load(after.gates + r * kColumns + i);
+          if (after.gate_bias != nullptr) gate += load<V>(after.gate_bias + i, left);
+          value *= activate<kRounded, kActivation>(gate);
+        } else {
+          value = activate<kRounded, kActivation>(value);
+        }
+        if (after.residual != nullptr) value += load<V>(after.residual + row + i, left);
+        if constexpr (kRounded)
+          Tile::store_rounded(reinterpret_cast<X*>(part.y) + row + i, value, left);
+        else
+          store<V>(y, value, left);
       }
+    }
   }
 
   const LinearJob& job_;

@@ -101,4 +101,28 @@ VLA_INLINE typename V::Float gelu_tanh(typename V::Float x) {
   return sigmoid::multiply<V>(x, y, shifted, rest);
 }
 
+/// 2^x for what is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
+template <class V>
+VLA_INLINE typename V::Float exp2_for_bf16(typename V::Float x) {
+  const typename V::Float rest = V::fraction(x);
+  // Minimax on 0 <= rest <= 1 with the value 1 at 0: a whole power of two is exact.
+  typename V::Float p = V::fma(rest, V::set(0x1.b7f842p-7f), V::set(0x1.abf784p-5f));
+  p = V::fma(p, rest, V::set(0x1.ee248cp-3f));
+  p = V::fma(p, rest, V::set(0x1.62d6c2p-1f));
+  p = V::fma(p, rest, V::set(1.0f));
+  return V::times_power_of_two(p, x);
+}
+
+/// silu() and gelu_tanh() for results that are then rounded to bf16: relative error 2^-13.
+template <class V>
+VLA_INLINE typename V::Float silu_for_bf16(typename V::Float x) {
+  return x * V::reciprocal(exp2_for_bf16<V>(x * -1.44269504f) + 1.0f);
+}
+template <class V>
+VLA_INLINE typename V::Float gelu_tanh_for_bf16(typename V::Float x) {
+  constexpr float kLinear = 2.3022082f;  // 2 sqrt(2/pi) / ln 2
+  const typename V::Float factor = V::fma(x * x, V::set(-0.044715f * kLinear), V::set(-kLinear));
+  return x * V::reciprocal(exp2_for_bf16<V>(x * factor) + 1.0f);
+}
+
 }  // namespace vla::kernels

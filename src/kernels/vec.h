@@ -70,6 +70,8 @@ struct Portable : Lanes<4> {
   /// The lower halves of a and b in turn, and the upper ones.
   static VLA_INLINE Float interleave_low(Float a, Float b) { return Float{a[0], b[0], a[1], b[1]}; }
   static VLA_INLINE Float interleave_high(Float a, Float b) { return Float{a[2], b[2], a[3], b[3]}; }
+  /// 1 / x with a relative error of at most 2^-14, zero for infinity.
+  static VLA_INLINE Float reciprocal(Float x) { return 1.0f / x; }
   /// What x is above the whole number below it, and y times two in the power of that whole number.
   static VLA_INLINE Float fraction(Float x) {
     for (int i = 0; i < width; ++i) x[i] = __builtin_isinf(x[i]) ? 0.0f : x[i] - __builtin_floorf(x[i]);
@@ -114,7 +116,7 @@ struct Avx512 : Lanes<16> {
   /// For 1 / b among the normal numbers, with a relative error of 2^-23.9: the instruction's 2^-14 and one correction,
   /// in a third of the time of a division.
   static VLA_INLINE Float divide(Float a, Float b) {
-    const Float inverse = _mm512_maskz_rcp14_ps(0xffff, b), quotient = a * inverse;
+    const Float inverse = reciprocal(b), quotient = a * inverse;
     return fma(fma(-quotient, b, a), inverse, quotient);
   }
   static VLA_INLINE Float min(Float a, Float b) { return _mm512_maskz_min_ps(0xffff, a, b); }
@@ -131,6 +133,7 @@ struct Avx512 : Lanes<16> {
     return _mm512_permutex2var_ps(
         a, std::bit_cast<__m512i>(Int{8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31}), b);
   }
+  static VLA_INLINE Float reciprocal(Float x) { return _mm512_maskz_rcp14_ps(0xffff, x); }
   static VLA_INLINE Float fraction(Float x) { return _mm512_maskz_reduce_ps(0xffff, x, 1); }  // 1: round down
   static VLA_INLINE Float times_power_of_two(Float y, Float x) { return _mm512_maskz_scalef_ps(0xffff, y, x); }
 

@@ -65,7 +65,8 @@ void measure(const AttentionKernel& kernel, const std::string& name, const Shape
   job.scale = 1 / std::sqrt(static_cast<float>(s.d_head));
   job.q = rows(q, s.n_head), job.k = rows(k, s.n_head_kv), job.v = rows(v, s.n_head_kv);
   std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job))), out(q.size());
-  job.packed = packed.data(), job.out = out.data();
+  Turns turns;
+  job.packed = packed.data(), job.out = out.data(), job.turns = &turns;
   const double pack = best_time(seconds / 4, [&] { kernel.pack(job, 0, 1); });
   const double run = best_time(seconds, [&] { kernel.run(job, 0, 1); });
   const double flop = 4.0 * static_cast<double>(s.d_head * s.n_head * s.n_query * s.n_key);

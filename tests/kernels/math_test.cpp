@@ -89,3 +89,11 @@ void check_ends(const CpuKernels& kernels) {
 VLA_KERNEL_TEST("silu and gelu are within two units in the last place over the whole range", check_accuracy)
 VLA_KERNEL_TEST("what is not finite stays so", check_not_finite)
 VLA_KERNEL_TEST("a row of any length is mapped from its first number to its last, and nothing beyond", check_ends)
+
+TEST_CASE("activations that are rounded to bf16 next err by 2^-13 of the result or by 2^-119") {
+  using V = kernels::Portable;
+  for (float x : numbers())
+    for (const auto& [got, exact] : {std::pair(kernels::silu_for_bf16<V>(V::set(x))[0], silu(x)),
+                                     std::pair(kernels::gelu_tanh_for_bf16<V>(V::set(x))[0], gelu(x))})
+      if (!(std::abs(got - exact) <= 0x1p-13 * std::abs(exact) + 0x1p-119)) FAIL_CHECK(x << ": " << got);
+}

@@ -7,6 +7,7 @@
 
 #include <cmath>
 #include <limits>
+#include <thread>
 #include <vector>
 
 #include "kernels/attention_kernel.h"
@@ -69,7 +70,8 @@ struct Case {
             .v = rows(v, s.n_head_kv, s.n_key),
             .mask = mask.empty() ? nullptr : mask.data(),
             .packed = nullptr,
-            .out = nullptr};
+            .out = nullptr,
+            .turns = nullptr};
   }
 };
 
@@ -82,7 +84,11 @@ inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int 
   job.packed = packed.data();
   job.out = out.data();
   for (int i = 0; i < n_thread; ++i) kernel.pack(job, i, n_thread);
-  for (int i = 0; i < n_thread; ++i) kernel.run(job, i, n_thread);
+  kernels::Turns turns;
+  job.turns = &turns;
+  std::vector<std::thread> threads;
+  for (int i = 0; i < n_thread; ++i) threads.emplace_back([&, i] { kernel.run(job, i, n_thread); });
+  for (std::thread& thread : threads) thread.join();
   return out;
 }
 
