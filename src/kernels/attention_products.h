@@ -21,7 +21,7 @@ struct FloatProducts {
   using Float = typename V::Float;
   using Number = float;
   struct Session {};
-  static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, of a block, of a turn
+  static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, of a block, of a pass
   static constexpr int kKeys = 128;                                     // of a chunk
   static constexpr int kPanel = 2 * V::width, kLeastPanel = V::width, kDepth = 1;  // columns; unit of the depth
   static constexpr bool kBeside = false;

@@ -11,8 +11,8 @@
 /// a chunk's scores lie in the first caches, become weights there, and are mixed into the block's output, which is
 /// scaled down whenever a much larger score turns up.
 ///
-/// Parts of the rows take turns, chunk by chunk. Where the products have a unit of their own (P::kBeside), those of the
-/// turns before and behind are computed between the rows whose scores become weights.
+/// In one pass a part of the rows meets one chunk. Where the products have a unit of their own (P::kBeside), those of
+/// the passes before and behind are computed between the rows whose scores become weights.
 ///
 /// Source of the method: Dao et al., FlashAttention (2022); Milakov and Gimelshein, Online normalizer (2018).
 namespace vla::kernels {
@@ -26,7 +26,7 @@ class AttentionTile {
   using Panels = AttentionPanels<P>;
   static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
   static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kPart
-  static constexpr int kPart = P::kPart;  // rows of a turn, a multiple of kTile
+  static constexpr int kPart = P::kPart;  // rows of a pass, a multiple of kTile
   static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
   static constexpr int kKeyStride = row_stride(kKeys);
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
@@ -66,7 +66,7 @@ class AttentionTile {
     std::int64_t head[kRows], query[kRows];  // of each row
     typename P::Work work;
     alignas(64) float mixed[kRows * kHeadStride];
-    // Of one turn, or of two where the next one's products are computed beside the weights of one.
+    // Of one pass, or of two where the next one's products are computed beside the weights of one.
     static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
@@ -91,31 +91,31 @@ class AttentionTile {
 
     enum class Seen { none, some, all };
     /// Some rows of the block meet a chunk: n keys from `key` on.
-    struct Turn {
+    struct Pass {
       std::int64_t key = 0;
       int n = 0;
       Seen seen = Seen::none;
       bool sum = false;                    // what they see comes on top of earlier chunks
       int first = 0, end = 0, buffer = 0;  // the rows, and whose scores and weights they are
     };
-    float* scores(const Turn& turn, int row) {
-      return score + turn.buffer * kBufferSize + (row - turn.first) * kKeyStride;
+    float* scores(const Pass& pass, int row) {
+      return score + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
     }
-    Number* weights(const Turn& turn, int row) {
+    Number* weights(const Pass& pass, int row) {
       if constexpr (kInPlace)
-        return scores(turn, row);
+        return scores(pass, row);
       else
-        return rounded_weight + turn.buffer * kBufferSize + (row - turn.first) * kKeyStride;
+        return rounded_weight + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
     }
 
     void run() {
       start();
-      Turn before, now = turn_from(0);
+      Pass before, now = pass_from(0);
       if (now.n == 0) std::memset(mixed, 0, sizeof(mixed));  // the rows see nothing, and become NaNs
       multiply_keys(now);
       work.finish();
       while (now.n > 0) {
-        const Turn next = turn_behind(now);
+        const Pass next = pass_behind(now);
         if constexpr (P::kBeside) mix_values(before), multiply_keys(next);
         weigh(now);
         work.finish();
@@ -135,8 +135,8 @@ class AttentionTile {
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
     }
 
-    /// The first turn with the first chunk at or behind `key` of which the block's queries see something, or none.
-    Turn turn_from(std::int64_t key) const {
+    /// The first pass with the first chunk at or behind `key` of which the block's queries see something, or none.
+    Pass pass_from(std::int64_t key) const {
       for (; key < job.n_key; key += kKeys) {
         const int n = static_cast<int>(job.n_key - key < kKeys ? job.n_key - key : kKeys);
         const Seen seen = job.mask == nullptr ? Seen::all : look(key, n);
@@ -145,16 +145,16 @@ class AttentionTile {
       return {};
     }
 
-    Turn turn_behind(const Turn& turn) const {
-      Turn next = turn;
-      if (turn.end < n_row) {
-        next.first = turn.end;
-        next.end = n_row - turn.end < kPart ? n_row : turn.end + kPart;
+    Pass pass_behind(const Pass& pass) const {
+      Pass next = pass;
+      if (pass.end < n_row) {
+        next.first = pass.end;
+        next.end = n_row - pass.end < kPart ? n_row : pass.end + kPart;
       } else {
-        next = turn_from(turn.key + kKeys);
+        next = pass_from(pass.key + kKeys);
         next.sum = true;
       }
-      next.buffer = kBuffers - 1 - turn.buffer;
+      next.buffer = kBuffers - 1 - pass.buffer;
       return next;
     }
 
@@ -177,44 +177,44 @@ class AttentionTile {
       return all ? Seen::all : none ? Seen::none : Seen::some;
     }
 
-    void multiply_keys(const Turn& turn) {
+    void multiply_keys(const Pass& pass) {
       const std::int64_t depth = panels.key_depth;
-      for (int j = 0; j < turn.n; j += kPanel)
-        for (int r = turn.first; r < turn.end; r += kTile)
-          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (turn.key + j) * depth,
-                                                     depth, kPanel, scores(turn, r) + j, false);
+      for (int j = 0; j < pass.n; j += kPanel)
+        for (int r = pass.first; r < pass.end; r += kTile)
+          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (pass.key + j) * depth,
+                                                     depth, kPanel, scores(pass, r) + j, false);
     }
 
     /// Scores become weights, and steps of the products that wait are done between the rows.
-    void weigh(const Turn& turn) {
-      if (turn.n % kPanel != 0 || turn.seen == Seen::some) hide(turn);
-      const float factor = turn.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
-      const int n = turn.end - turn.first, n_step = (work.n_step() + n - 1) / n;
-      for (int r = turn.first; r < turn.end; r += kWidth) weigh_rows(r, turn, factor, n_step);
+    void weigh(const Pass& pass) {
+      if (pass.n % kPanel != 0 || pass.seen == Seen::some) hide(pass);
+      const float factor = pass.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
+      const int n = pass.end - pass.first, n_step = (work.n_step() + n - 1) / n;
+      for (int r = pass.first; r < pass.end; r += kWidth) weigh_rows(r, pass, factor, n_step);
     }
 
     /// Keys that there are not, and what the mask says.
-    void hide(const Turn& turn) {
-      const int last = turn.n / kPanel * kPanel;  // of a panel that the keys do not fill
+    void hide(const Pass& pass) {
+      const int last = pass.n / kPanel * kPanel;  // of a panel that the keys do not fill
       float missing[kPanel] = {};
-      for (int j = turn.n - last; j < kPanel; ++j) missing[j] = kNever;
-      for (int r = turn.first; r < turn.end; ++r) {
-        float* row = scores(turn, r);
-        for (int j = 0; last < turn.n && j < kPanel; j += kWidth)
+      for (int j = pass.n - last; j < kPanel; ++j) missing[j] = kNever;
+      for (int r = pass.first; r < pass.end; ++r) {
+        float* row = scores(pass, r);
+        for (int j = 0; last < pass.n && j < kPanel; j += kWidth)
           V::store(row + last + j, V::load(row + last + j) + V::load(missing + j));
-        if (turn.seen == Seen::all) continue;
-        const float* mask = job.mask + query[r] * job.n_key + turn.key;
-        for (int j = 0; j < turn.n; j += kWidth)
-          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, turn.n - j)));
+        if (pass.seen == Seen::all) continue;
+        const float* mask = job.mask + query[r] * job.n_key + pass.key;
+        for (int j = 0; j < pass.n; j += kWidth)
+          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, pass.n - j)));
       }
     }
 
     /// Scores times `factor` become the logarithms of weights, for at most kWidth rows from `first` on: relative to the
     /// greatest score so far, or to one that is nearly as great.
-    VLA_INLINE void weigh_rows(int first, const Turn& turn, float factor, int n_step) {
-      const int end = turn.end - first < kWidth ? turn.end : first + kWidth;
+    VLA_INLINE void weigh_rows(int first, const Pass& pass, float factor, int n_step) {
+      const int end = pass.end - first < kWidth ? pass.end : first + kWidth;
       Float tops[kWidth] = {};
-      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(turn, r), turn.n);
+      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(pass, r), pass.n);
       const Float top = factor * across<V>(tops, [](Float a, Float b) VLA_LAMBDA { return V::max(a, b); });
       const Float before = V::load(base + first), now = top > before + P::kSlack ? top : before;
       // A row that saw nothing yet has no greatest score; any finite one keeps its weights at zero.
@@ -224,7 +224,7 @@ class AttentionTile {
       V::store(shrink + first, P::power(before - offset));
       for (int r = first; r < end; ++r) {
         work.advance(n_step);
-        weigh_row(scores(turn, r), weights(turn, r), turn.n, factor, r);
+        weigh_row(scores(pass, r), weights(pass, r), pass.n, factor, r);
       }
     }
 
@@ -251,22 +251,22 @@ class AttentionTile {
     }
 
     /// What was mixed before becomes relative to the greatest scores of now.
-    void shrink_rows(const Turn& turn) {
-      for (int r = turn.first; turn.sum && r < turn.end; ++r) {
+    void shrink_rows(const Pass& pass) {
+      for (int r = pass.first; pass.sum && r < pass.end; ++r) {
         if (shrink[r] == 1.0f) continue;
         float* row = mixed + r * kHeadStride;
         for (std::int64_t i = 0; i < panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * shrink[r]);
       }
     }
 
-    void mix_values(const Turn& turn) {
-      if (turn.n == 0) return;
+    void mix_values(const Pass& pass) {
+      if (pass.n == 0) return;
       for (std::int64_t i = 0; i < panels.d_value; i += kPanel) {
         const std::int64_t width = panels.width(i);
-        const Number* panel = values + i * panels.n_key + turn.key * width;
-        for (int r = turn.first; r < turn.end; r += kTile)
-          work.template add<kKeyStride, kHeadStride>(weights(turn, r), panel, round_up(turn.n, P::kDepth), width,
-                                                     mixed + r * kHeadStride + i, turn.sum);
+        const Number* panel = values + i * panels.n_key + pass.key * width;
+        for (int r = pass.first; r < pass.end; r += kTile)
+          work.template add<kKeyStride, kHeadStride>(weights(pass, r), panel, round_up(pass.n, P::kDepth), width,
+                                                     mixed + r * kHeadStride + i, pass.sum);
       }
     }
 
