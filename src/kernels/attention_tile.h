@@ -10,6 +10,10 @@
 /// Attention with an online softmax. Rows of a block (queries of every head that shares keys) meet the keys in chunks:
 /// a chunk's scores lie in the first caches, become weights there, and are mixed into the block's output, which is
 /// scaled down whenever a much larger score turns up.
+///
+/// In one pass a part of the rows meets one chunk. Where the products have a unit of their own (P::kBeside), those of
+/// the passes before and behind are computed between the rows whose scores become weights.
+///
 /// Source of the method: Dao et al., FlashAttention (2022); Milakov and Gimelshein, Online normalizer (2018).
 namespace vla::kernels {
 
@@ -21,11 +25,12 @@ class AttentionTile {
   using Number = typename P::Number;
   using Panels = AttentionPanels<P>;
   static constexpr int kWidth = V::width, kTile = P::kTile, kPanel = P::kPanel;
-  static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kTile
+  static constexpr int kRows = P::kRows;  // rows of a block, a multiple of kPart
+  static constexpr int kPart = P::kPart;  // rows of a pass, a multiple of kTile
   static constexpr int kKeys = P::kKeys;  // keys of a chunk, a multiple of kPanel
   static constexpr int kKeyStride = row_stride(kKeys);
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
-  static_assert(kRows % kTile == 0 && kKeys % kPanel == 0);
+  static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
   static constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return Panels::round_up(n, unit); }
 
@@ -60,13 +65,13 @@ class AttentionTile {
     const int n_tiled = static_cast<int>(round_up(n_row, kTile));
     std::int64_t head[kRows], query[kRows];  // of each row
     typename P::Work work;
-    bool mixed_any = false;  // `mixed` holds something
     alignas(64) float mixed[kRows * kHeadStride];
-    // Of one chunk, or of two where the next one's products are computed beside the weights of one.
-    static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kRows * kKeyStride;
+    // Of one pass, or of two where the next one's products are computed beside the weights of one.
+    static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
-    // Weights take the place of the scores, unless they are numbers of another kind.
+    // Weights take the place of the scores, unless they are numbers of another kind. Those of rows that no query has
+    // are anything: they are multiplied too, into rows that nobody reads.
     static constexpr bool kInPlace = std::is_same_v<Number, float>;
     alignas(64) Number rounded_weight[kInPlace ? 1 : kBuffers * kBufferSize];
     static constexpr int kRowVectors = round_up(kRows, kWidth);  // room for whole vectors
@@ -85,31 +90,36 @@ class AttentionTile {
     }
 
     enum class Seen { none, some, all };
-    /// n keys from `key` on, and which of the buffers for scores and weights is theirs.
-    struct Chunk {
+    /// Some rows of the block meet a chunk: n keys from `key` on.
+    struct Pass {
       std::int64_t key = 0;
-      int n = 0, buffer = 0;
+      int n = 0;
       Seen seen = Seen::none;
+      bool sum = false;                    // what they see comes on top of earlier chunks
+      int first = 0, end = 0, buffer = 0;  // the rows, and whose scores and weights they are
     };
-    float* scores(const Chunk& chunk) { return score + chunk.buffer * kBufferSize; }
-    Number* weights(const Chunk& chunk) {
+    float* scores(const Pass& pass, int row) {
+      return score + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
+    }
+    Number* weights(const Pass& pass, int row) {
       if constexpr (kInPlace)
-        return scores(chunk);
+        return scores(pass, row);
       else
-        return rounded_weight + chunk.buffer * kBufferSize;
+        return rounded_weight + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
     }
 
     void run() {
       start();
-      Chunk before, now = chunk_from(0, 0);
+      Pass before, now = pass_from(0);
+      if (now.n == 0) std::memset(mixed, 0, sizeof(mixed));  // the rows see nothing, and become NaNs
       multiply_keys(now);
       work.finish();
       while (now.n > 0) {
-        const Chunk next = chunk_from(now.key + kKeys, kBuffers - 1 - now.buffer);
+        const Pass next = pass_behind(now);
         if constexpr (P::kBeside) mix_values(before), multiply_keys(next);
         weigh(now);
         work.finish();
-        shrink_rows();
+        shrink_rows(now);
         if constexpr (!P::kBeside) mix_values(now), multiply_keys(next);
         before = now, now = next;
       }
@@ -123,20 +133,29 @@ class AttentionTile {
                         query_number + r * kHeadStride);
       for (int r = 0; r < kRowVectors; ++r) V::store(sum + r * kWidth, Float{});
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
-      if constexpr (!kInPlace)  // rows that no query has are multiplied too
-        for (int i = 0; i < kBuffers; ++i)
-          for (int r = n_row; r < n_tiled; ++r)
-            std::memset(rounded_weight + i * kBufferSize + r * kKeyStride, 0, kKeys * sizeof(Number));
     }
 
-    /// The first chunk at or behind `key` of which the block's queries see something, or none.
-    Chunk chunk_from(std::int64_t key, int buffer) const {
+    /// The first pass with the first chunk at or behind `key` of which the block's queries see something, or none.
+    Pass pass_from(std::int64_t key) const {
       for (; key < job.n_key; key += kKeys) {
         const int n = static_cast<int>(job.n_key - key < kKeys ? job.n_key - key : kKeys);
         const Seen seen = job.mask == nullptr ? Seen::all : look(key, n);
-        if (seen != Seen::none) return {key, n, buffer, seen};
+        if (seen != Seen::none) return {key, n, seen, false, 0, n_row < kPart ? n_row : kPart, 0};
       }
       return {};
+    }
+
+    Pass pass_behind(const Pass& pass) const {
+      Pass next = pass;
+      if (pass.end < n_row) {
+        next.first = pass.end;
+        next.end = n_row - pass.end < kPart ? n_row : pass.end + kPart;
+      } else {
+        next = pass_from(pass.key + kKeys);
+        next.sum = true;
+      }
+      next.buffer = kBuffers - 1 - pass.buffer;
+      return next;
     }
 
     /// What the block's queries see of a chunk.
@@ -158,41 +177,44 @@ class AttentionTile {
       return all ? Seen::all : none ? Seen::none : Seen::some;
     }
 
-    void multiply_keys(const Chunk& chunk) {
+    void multiply_keys(const Pass& pass) {
       const std::int64_t depth = panels.key_depth;
-      for (int j = 0; j < chunk.n; j += kPanel)
-        for (int r = 0; r < n_tiled; r += kTile)
-          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (chunk.key + j) * depth,
-                                                     depth, kPanel, scores(chunk) + r * kKeyStride + j, false);
+      for (int j = 0; j < pass.n; j += kPanel)
+        for (int r = pass.first; r < pass.end; r += kTile)
+          work.template add<kHeadStride, kKeyStride>(query_number + r * kHeadStride, keys + (pass.key + j) * depth,
+                                                     depth, kPanel, scores(pass, r) + j, false);
     }
 
     /// Scores become weights, and steps of the products that wait are done between the rows.
-    void weigh(const Chunk& chunk) {
-      hide(chunk);
-      const float factor = chunk.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
-      const int n_step = (work.n_step() + n_row - 1) / n_row;
-      for (int r = 0; r < n_row; r += kWidth) weigh_rows(r, chunk, factor, n_step);
+    void weigh(const Pass& pass) {
+      if (pass.n % kPanel != 0 || pass.seen == Seen::some) hide(pass);
+      const float factor = pass.seen == Seen::some ? P::kLogOfE : job.scale * P::kLogOfE;
+      const int n = pass.end - pass.first, n_step = (work.n_step() + n - 1) / n;
+      for (int r = pass.first; r < pass.end; r += kWidth) weigh_rows(r, pass, factor, n_step);
     }
 
     /// Keys that there are not, and what the mask says.
-    void hide(const Chunk& chunk) {
-      if (chunk.n % kPanel == 0 && chunk.seen == Seen::all) return;
-      for (int r = 0; r < n_row; ++r) {
-        float* row = scores(chunk) + r * kKeyStride;
-        for (int j = chunk.n; j < round_up(chunk.n, kPanel); ++j) row[j] = kNever;
-        if (chunk.seen == Seen::all) continue;
-        const float* mask = job.mask + query[r] * job.n_key + chunk.key;
-        for (int j = 0; j < chunk.n; j += kWidth)
-          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, chunk.n - j)));
+    void hide(const Pass& pass) {
+      const int last = pass.n / kPanel * kPanel;  // of a panel that the keys do not fill
+      float missing[kPanel] = {};
+      for (int j = pass.n - last; j < kPanel; ++j) missing[j] = kNever;
+      for (int r = pass.first; r < pass.end; ++r) {
+        float* row = scores(pass, r);
+        for (int j = 0; last < pass.n && j < kPanel; j += kWidth)
+          V::store(row + last + j, V::load(row + last + j) + V::load(missing + j));
+        if (pass.seen == Seen::all) continue;
+        const float* mask = job.mask + query[r] * job.n_key + pass.key;
+        for (int j = 0; j < pass.n; j += kWidth)
+          V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, pass.n - j)));
       }
     }
 
     /// Scores times `factor` become the logarithms of weights, for at most kWidth rows from `first` on: relative to the
     /// greatest score so far, or to one that is nearly as great.
-    VLA_INLINE void weigh_rows(int first, const Chunk& chunk, float factor, int n_step) {
-      const int end = n_row - first < kWidth ? n_row : first + kWidth;
+    VLA_INLINE void weigh_rows(int first, const Pass& pass, float factor, int n_step) {
+      const int end = pass.end - first < kWidth ? pass.end : first + kWidth;
       Float tops[kWidth] = {};
-      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(chunk) + r * kKeyStride, chunk.n);
+      for (int r = first; r < end; ++r) tops[r - first] = greatest(scores(pass, r), pass.n);
       const Float top = factor * across<V>(tops, [](Float a, Float b) VLA_LAMBDA { return V::max(a, b); });
       const Float before = V::load(base + first), now = top > before + P::kSlack ? top : before;
       // A row that saw nothing yet has no greatest score; any finite one keeps its weights at zero.
@@ -202,7 +224,7 @@ class AttentionTile {
       V::store(shrink + first, P::power(before - offset));
       for (int r = first; r < end; ++r) {
         work.advance(n_step);
-        weigh_row(scores(chunk) + r * kKeyStride, weights(chunk) + r * kKeyStride, chunk.n, factor, r);
+        weigh_row(scores(pass, r), weights(pass, r), pass.n, factor, r);
       }
     }
 
@@ -229,29 +251,26 @@ class AttentionTile {
     }
 
     /// What was mixed before becomes relative to the greatest scores of now.
-    void shrink_rows() {
-      for (int r = 0; mixed_any && r < n_row; ++r) {
+    void shrink_rows(const Pass& pass) {
+      for (int r = pass.first; pass.sum && r < pass.end; ++r) {
         if (shrink[r] == 1.0f) continue;
         float* row = mixed + r * kHeadStride;
         for (std::int64_t i = 0; i < panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * shrink[r]);
       }
     }
 
-    void mix_values(const Chunk& chunk) {
-      if (chunk.n == 0) return;
+    void mix_values(const Pass& pass) {
+      if (pass.n == 0) return;
       for (std::int64_t i = 0; i < panels.d_value; i += kPanel) {
         const std::int64_t width = panels.width(i);
-        const Number* panel = values + i * panels.n_key + chunk.key * width;
-        for (int r = 0; r < n_tiled; r += kTile)
-          work.template add<kKeyStride, kHeadStride>(weights(chunk) + r * kKeyStride, panel,
-                                                     round_up(chunk.n, P::kDepth), width, mixed + r * kHeadStride + i,
-                                                     mixed_any);
+        const Number* panel = values + i * panels.n_key + pass.key * width;
+        for (int r = pass.first; r < pass.end; r += kTile)
+          work.template add<kKeyStride, kHeadStride>(weights(pass, r), panel, round_up(pass.n, P::kDepth), width,
+                                                     mixed + r * kHeadStride + i, pass.sum);
       }
-      mixed_any = true;
     }
 
     void finish() {
-      if (!mixed_any) std::memset(mixed, 0, sizeof(mixed));  // its rows saw nothing, and become NaNs
       for (int first = 0; first < n_row; first += kWidth) {
         Float sums[kWidth];
         for (int i = 0; i < kWidth; ++i) sums[i] = V::load(sum + (first + i) * kWidth);

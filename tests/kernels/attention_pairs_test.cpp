@@ -44,7 +44,7 @@ void check_pair_ends(const AttentionKernel& kernel) {
 /// Chunks of keys that nobody sees, that some rows see nothing of, and that begin and end anywhere.
 void check_pair_masks(const AttentionKernel& kernel) {
   for (std::int64_t n_key : {500, 900, 1100})
-    for (std::int64_t n_query : {1, 33}) {
+    for (std::int64_t n_query : {1, 33, 100}) {
       CAPTURE(n_key);
       CAPTURE(n_query);
       Case c({32, 2, 1, n_query, n_key, 1}, 2, 0);
