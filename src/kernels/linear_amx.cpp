@@ -2,7 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
 #include "kernels/amx_tiles.h"
-#include "kernels/linear_kernel.h"
 #include "kernels/linear_pairs.h"
 
 namespace vla::kernels {
@@ -100,12 +99,7 @@ bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::amx && desc.
 }  // namespace
 
 extern const LinearKernel kLinearAmx;
-const LinearKernel kLinearAmx = {{"amx", Panels<32>::packed_size, Panels<32>::pack},
-                                 supports,
-                                 LinearLoop<AmxTile>::run,
-                                 LinearLoop<AmxTile>::kScratchSize,
-                                 LinearLoop<AmxTile>::kMaxNorm,
-                                 LinearLoop<AmxTile>::rounds};
+const LinearKernel kLinearAmx = LinearLoop<AmxTile>::kernel("amx", supports);
 
 }  // namespace vla::kernels
 #endif

@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
-#include "kernels/linear_kernel.h"
 #include "kernels/linear_loop.h"
 
 namespace vla::kernels {
@@ -102,12 +101,7 @@ bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx2 && desc
 }  // namespace
 
 extern const LinearKernel kLinearAvx2;
-const LinearKernel kLinearAvx2 = {{"avx2", Panels<16>::packed_size, Panels<16>::pack},
-                                  supports,
-                                  LinearLoop<Avx2Tile>::run,
-                                  LinearLoop<Avx2Tile>::kScratchSize,
-                                  LinearLoop<Avx2Tile>::kMaxNorm,
-                                  LinearLoop<Avx2Tile>::rounds};
+const LinearKernel kLinearAvx2 = LinearLoop<Avx2Tile>::kernel("avx2", supports);
 
 }  // namespace vla::kernels
 #endif

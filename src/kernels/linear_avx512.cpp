@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
-#include "kernels/linear_kernel.h"
 #include "kernels/linear_loop.h"
 
 namespace vla::kernels {
@@ -97,12 +96,7 @@ bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx512 && de
 }  // namespace
 
 extern const LinearKernel kLinearAvx512;
-const LinearKernel kLinearAvx512 = {{"avx512", Panels<32>::packed_size, Panels<32>::pack},
-                                    supports,
-                                    LinearLoop<Avx512Tile>::run,
-                                    LinearLoop<Avx512Tile>::kScratchSize,
-                                    LinearLoop<Avx512Tile>::kMaxNorm,
-                                    LinearLoop<Avx512Tile>::rounds};
+const LinearKernel kLinearAvx512 = LinearLoop<Avx512Tile>::kernel("avx512", supports);
 
 }  // namespace vla::kernels
 #endif

@@ -1,7 +1,5 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/linear_kernel.h"
-#include "kernels/linear_loop.h"
 #include "kernels/linear_pairs.h"
 
 namespace vla::kernels {
@@ -68,18 +66,8 @@ struct EmulatedAmxTile : PairTile {
 bool any(const MatrixDesc& desc, Isa) { return desc.type != DType::i32; }
 bool bf16_only(const MatrixDesc& desc, Isa) { return desc.type == DType::bf16; }
 
-constexpr LinearKernel kFloat = {{"emulated", Panels<16>::packed_size, Panels<16>::pack},
-                                 any,
-                                 LinearLoop<FloatTile>::run,
-                                 LinearLoop<FloatTile>::kScratchSize,
-                                 LinearLoop<FloatTile>::kMaxNorm,
-                                 LinearLoop<FloatTile>::rounds};
-constexpr LinearKernel kPair = {{"emulated_amx", Panels<32>::packed_size, Panels<32>::pack},
-                                bf16_only,
-                                LinearLoop<EmulatedAmxTile>::run,
-                                LinearLoop<EmulatedAmxTile>::kScratchSize,
-                                LinearLoop<EmulatedAmxTile>::kMaxNorm,
-                                LinearLoop<EmulatedAmxTile>::rounds};
+constexpr LinearKernel kFloat = LinearLoop<FloatTile>::kernel("emulated", any);
+constexpr LinearKernel kPair = LinearLoop<EmulatedAmxTile>::kernel("emulated_amx", bf16_only);
 
 }  // namespace
 

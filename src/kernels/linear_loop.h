@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "kernels/linear_job.h"
+#include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 #include "kernels/math.h"
 
@@ -46,9 +46,12 @@ class LinearLoop {
   };
 
  public:
-  static constexpr std::size_t kScratchSize = sizeof(Scratch);
-  static constexpr std::int64_t kMaxNorm = Tile::kMaxDepth;
+  /// The row of the table that this tile makes.
+  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
+    return {{name, Layout::packed_size, Layout::pack}, supports, run, sizeof(Scratch), Tile::kMaxDepth, rounds};
+  }
 
+ private:
   static void run(const LinearJob& job, int ith, int nth, std::byte* scratch) {
     LinearLoop loop(job, nth, *reinterpret_cast<Scratch*>(scratch));
     [[maybe_unused]] const typename Tile::Session session;
@@ -59,7 +62,6 @@ class LinearLoop {
     return Tile::kRounds && n_row > Tile::kFineRows && d_in <= Tile::kManyDepth;
   }
 
- private:
   LinearLoop(const LinearJob& job, int nth, Scratch& scratch)
       : job_(job),
         scratch_(scratch),
