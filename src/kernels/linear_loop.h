@@ -149,9 +149,9 @@ class LinearLoop {
         part, s, scratch_.sums, false,
         [&](std::int64_t r, std::int64_t n_row) {
           const std::int64_t place = (s.row + r) * part.d_out + s.column;
-          fetch(part.y + place * y_size(), n_row, part.d_out * y_size());
+          fetch<1>(part.y + place * y_size(), n_row, part.d_out * y_size());
           if (last && part.residual != nullptr)
-            fetch(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
+            fetch<0>(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
         },
         [&](std::int64_t r, std::int64_t n_row) {
           s.n_column == kColumns ? finish<true>(s, r, n_row) : finish<false>(s, r, n_row);
@@ -160,10 +160,11 @@ class LinearLoop {
 
   std::int64_t y_size() const { return number_size(job_.y_type); }
 
-  /// Asks for the lines of a tile that will be read or written when the product is there.
+  /// Asks for the lines of a tile that will be read, or written (kWrite = 1), when the product is there.
+  template <int kWrite>
   static VLA_INLINE void fetch(const std::byte* tile, std::int64_t n_row, std::int64_t stride) {
     for (std::int64_t r = 0; r < n_row; ++r)
-      for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + 4 * n);
+      for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + 4 * n, kWrite);
   }
 
   /// sums [kColumns] x n_row (+)= the block of x times a panel. `before` and `after` are called around the last step of
