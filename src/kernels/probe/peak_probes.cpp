@@ -17,7 +17,7 @@
 namespace vla::kernels {
 namespace {
 
-volatile float sink;  // what is stored here must be computed
+thread_local volatile float sink;  // what is stored here must be computed
 
 /// Factors that keep every sum finite and normal: x <- 0.999 x + 0.001 tends to 1.
 constexpr float kFactor = 0.999f, kTerm = 0.001f;
