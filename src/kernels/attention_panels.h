@@ -3,6 +3,7 @@
 #pragma once
 
 #include "kernels/attention_products.h"
+#include "kernels/pieces.h"
 
 namespace vla::kernels {
 
@@ -18,8 +19,6 @@ class AttentionPanels {
   static_assert(kPanel % (2 * kWidth) == 0 && kPanel % P::kDepth == 0);
 
  public:
-  static constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return (n + unit - 1) / unit * unit; }
-
   explicit AttentionPanels(const AttentionJob& j)
       : job(j),
         n_key(round_up(j.n_key, kPanel)),

@@ -32,8 +32,6 @@ class AttentionTile {
   static constexpr float kNever = -std::numeric_limits<float>::infinity();
   static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
-  static constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return Panels::round_up(n, unit); }
-
  public:
   static std::int64_t packed_size(const AttentionJob& job) {
     return job.n_unit() * Panels(job).unit_size() * static_cast<std::int64_t>(sizeof(Number)) / 4 + 1;
@@ -47,7 +45,7 @@ class AttentionTile {
     // Blocks are made smaller where there would be too few of them to share out.
     const std::int64_t fair = round_up(job.n_row() * job.n_unit() / (4 * nth) + 1, kTile);
     const std::int64_t n_row = fair < kRows ? fair : kRows;
-    const std::int64_t n_block = round_up(job.n_row(), n_row) / n_row, n = n_block * job.n_unit();
+    const std::int64_t n_block = pieces(job.n_row(), n_row), n = n_block * job.n_unit();
     job.turns->share(ith, nth, n, [&](std::int64_t i) {
       const std::int64_t row = i % n_block * n_row, left = job.n_row() - row;
       Block(panels, i / n_block, row, static_cast<int>(left < n_row ? left : n_row)).run();

@@ -3,6 +3,7 @@
 #include "kernels/cpu_kernels.h"
 
 #include "kernels/cpu_kernels_make.h"
+#include "kernels/numbers.h"
 
 namespace vla::kernels {
 
@@ -52,16 +53,10 @@ struct EmulatedTile {
 
   using Float = Portable::Float;
 
-  /// To the nearest bf16, ties to even; a NaN stays one.
   static void store(std::uint16_t* to, Float a, Float b) {
     for (Float x : {a, b})
-      for (int i = 0; i < Portable::width; ++i) {
-        const auto bits = std::bit_cast<std::uint32_t>(static_cast<float>(x[i]));
-        *to++ = static_cast<std::uint16_t>(x[i] == x[i] ? (bits + 0x7fff + (bits >> 16 & 1)) >> 16 : bits >> 16 | 64);
-      }
+      for (int i = 0; i < Portable::width; ++i) *to++ = to_bf16(x[i]);
   }
-
-  static float widen(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
 
   void open(const float* c, bool sum) {
     for (int r = 0; r < 32; ++r)
@@ -71,7 +66,8 @@ struct EmulatedTile {
     for (int r = 0; r < 32; ++r)
       for (int n = 0; n < 32; ++n)
         for (int k = 0; k < 32; ++k)
-          sums[r][n] += widen(a[r * kHeadStride + k]) * widen(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
+          sums[r][n] +=
+              from_bf16(a[r * kHeadStride + k]) * from_bf16(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
   }
   void close(float* c) const {
     for (int r = 0; r < 32; ++r) std::memcpy(c + r * kHeadStride, sums[r], sizeof(sums[r]));

@@ -5,8 +5,8 @@
 #include "kernels/custom.h"
 #include "kernels/elementwise.h"
 #include "kernels/linear_kernel.h"
-#include "kernels/linear_numbers.h"
 #include "kernels/norm.h"
+#include "kernels/numbers.h"
 
 namespace vla::kernels {
 namespace {

@@ -17,10 +17,7 @@ struct Avx2Tile {
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) {
-    std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(float));
-    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
-  }
+  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
 
   static VLA_INLINE const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
 

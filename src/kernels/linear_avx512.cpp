@@ -18,10 +18,7 @@ struct Avx512Tile {
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) {
-    std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(float));
-    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
-  }
+  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
 
   static const std::byte* unpack(DType type, const std::byte* panel, std::int64_t depth, float* floats) {
     // A block is as deep as it has lines of numbers; the two halves of a panel alternate.

@@ -15,9 +15,7 @@ struct FloatTile {
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
-  static void copy(const float* from, std::int64_t n, float* to, float*) {
-    for (std::int64_t i = 0; i < round_up(n, kPanelDepth); ++i) to[i] = i < n ? from[i] : 0;
-  }
+  static void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
   static const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
   static void multiply(DType type, int n_row, const float* x, const float*, const std::byte* panel, std::int64_t depth,
                        float* c, bool add, const std::byte*) {

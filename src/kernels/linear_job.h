@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "bundle/bundle.h"
+#include "kernels/cpu_kernels.h"
 #include "kernels/turns.h"
 
 namespace vla::kernels {
@@ -26,9 +27,9 @@ struct LinearJob {
   };
   static constexpr int kMaxPart = 3;
 
-  /// y = run(x), with CpuKernels::Norm; null where x is multiplied as it is.
+  /// y = run(x); null where x is multiplied as it is.
   struct Norm {
-    void (*run)(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n) = nullptr;
+    CpuKernels::Norm run = nullptr;
     const float *weight = nullptr, *bias = nullptr;
     float eps = 0;
   };

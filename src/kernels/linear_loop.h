@@ -109,7 +109,7 @@ class LinearLoop {
       X* to = scratch_.x + r * Tile::kXStride;
       const std::int64_t place = (row + r) * job_.d_in;
       if (Tile::kRounds && job_.x_type == DType::bf16)
-        copy_rounded(reinterpret_cast<const X*>(job_.x) + place + k, depth, to);
+        copy_padded(reinterpret_cast<const X*>(job_.x) + place + k, depth, to);
       else
         Tile::copy(normed(reinterpret_cast<const float*>(job_.x) + place) + k, depth, to,
                    fine() ? to + kRest : nullptr);
@@ -121,11 +121,6 @@ class LinearLoop {
     if (norm.run == nullptr) return x;
     norm.run(x, norm.weight, norm.bias, norm.eps, scratch_.normed, job_.d_in);
     return scratch_.normed;
-  }
-
-  static VLA_INLINE void copy_rounded(const X* from, std::int64_t n, X* to) {
-    std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(X));
-    for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
   }
 
   bool fine() const { return job_.n_row <= Tile::kFineRows; }

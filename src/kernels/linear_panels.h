@@ -3,7 +3,8 @@
 #pragma once
 
 #include "backend/matrix.h"
-#include "kernels/linear_numbers.h"
+#include "kernels/numbers.h"
+#include "kernels/pieces.h"
 
 /// How a matrix lies in memory for the kernels, from load on.
 ///
@@ -17,12 +18,11 @@ namespace vla::kernels {
 
 constexpr std::int64_t kPanelBlock = 1024, kPanelDepth = 32;
 
-constexpr VLA_INLINE std::int64_t least(std::int64_t a, std::int64_t b) { return a < b ? a : b; }
-constexpr VLA_INLINE std::int64_t pieces(std::int64_t n, std::int64_t size) { return (n + size - 1) / size; }
-constexpr VLA_INLINE std::int64_t round_up(std::int64_t n, std::int64_t unit) { return pieces(n, unit) * unit; }
-/// n cut into as few equal pieces as `most` allows, each a multiple of `unit`.
-constexpr VLA_INLINE std::int64_t even_piece(std::int64_t n, std::int64_t most, std::int64_t unit) {
-  return n == 0 ? unit : round_up(pieces(n, pieces(n, most)), unit);
+/// n numbers of a row of x, and zeros up to where a panel's depth may end.
+template <class X>
+VLA_INLINE void copy_padded(const X* from, std::int64_t n, X* to) {
+  std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(X));
+  for (std::int64_t i = n; i % kPanelDepth != 0; ++i) to[i] = 0;
 }
 
 /// Panels of kColumns, 16 or 32.
