@@ -13,7 +13,7 @@ struct CpuKernels {
   /// y = (x - mean) / deviation * weight + bias; weight and bias may be null.
   using Norm = void (*)(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n);
 
-  Map silu, gelu_tanh;  // math.h
+  Map silu, gelu_tanh, gelu_erf, relu;  // math.h, gelu_erf.h
   Norm layer_norm, rms_norm;
   /// Turns the pairs (x_i, x_{i + half}).
   void (*rotate_half)(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half);

@@ -4,6 +4,7 @@
 
 #include "kernels/attention_tile.h"
 #include "kernels/cpu_kernels.h"
+#include "kernels/gelu_erf.h"
 
 namespace vla::kernels {
 
@@ -16,8 +17,8 @@ class CpuKernelsMaker {
  public:
   static constexpr CpuKernels make() {
     using Attention = AttentionTile<FloatProducts<V, kTile>>;
-    return {map<Silu>, map<GeluTanh>, layer_norm,
-            rms_norm,  rotate_half,   {Attention::packed_size, Attention::pack, Attention::run}};
+    return {map<Silu>,  map<GeluTanh>, map<GeluErf>, map<Relu>,
+            layer_norm, rms_norm,      rotate_half,  {Attention::packed_size, Attention::pack, Attention::run}};
   }
 
  private:
@@ -26,6 +27,12 @@ class CpuKernelsMaker {
   };
   struct GeluTanh {
     static VLA_INLINE Float of(Float x) { return gelu_tanh<V>(x); }
+  };
+  struct GeluErf {
+    static VLA_INLINE Float of(Float x) { return gelu_erf<V>(x); }
+  };
+  struct Relu {
+    static VLA_INLINE Float of(Float x) { return relu<V>(x); }
   };
 
   template <class F>

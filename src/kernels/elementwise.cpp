@@ -51,10 +51,18 @@ VLA_CLONES void gelu_row(const float* x, float* y, std::int64_t count) {
   }
 }
 
+VLA_CLONES void relu_row(const float* x, float* y, std::int64_t count) {
+  for (std::int64_t i = 0; i < count; ++i) y[i] = x[i] < 0.0f ? 0.0f : x[i];
+}
+
 void map_task(ggml_tensor* y, int ith, int nth, void* user) {
   const Range range(ggml_nelements(y), ith, nth);
   static_cast<const MapParams*>(user)->map(values(y->src[0]) + range.begin, static_cast<float*>(y->data) + range.begin,
                                            range.end - range.begin);
+}
+
+Tensor map(Graph& g, Tensor x, CpuKernels::Map row) {
+  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x}, map_task, keep(g, MapParams{row}));
 }
 
 VLA_CLONES void rotate_head(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half) {
@@ -96,8 +104,17 @@ void join_task(ggml_tensor* y, int ith, int nth, void*) {
 
 Tensor gelu_tanh(Graph& g, Tensor x) {
   const CpuKernels* kernels = cpu_kernels(g.isa());
-  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x}, map_task,
-                keep(g, MapParams{kernels != nullptr ? kernels->gelu_tanh : gelu_row}));
+  return map(g, x, kernels != nullptr ? kernels->gelu_tanh : gelu_row);
+}
+
+Tensor gelu_erf(Graph& g, Tensor x) {
+  const CpuKernels* kernels = cpu_kernels(g.isa());
+  return kernels != nullptr ? map(g, x, kernels->gelu_erf) : Tensor(ggml_gelu_erf(g.context(), x.node()));
+}
+
+Tensor relu(Graph& g, Tensor x) {
+  const CpuKernels* kernels = cpu_kernels(g.isa());
+  return map(g, x, kernels != nullptr ? kernels->relu : relu_row);
 }
 
 Tensor rotate_half(Graph& g, Tensor x, Tensor table) {

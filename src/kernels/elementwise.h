@@ -11,6 +11,15 @@ namespace vla::kernels {
 /// Source: transformers activations.py NewGELU / torch gelu(approximate="tanh").
 Tensor gelu_tanh(Graph& g, Tensor x);
 
+/// GELU as it is defined: x * 0.5 * (1 + erf(x / sqrt(2))), within two units in the last place. With plain ggml
+/// operations the sum rounds to a multiple of 2^-24, as torch's does: the tail below -3 loses its digits, and ends at
+/// -5.5. Any contiguous shape -> the same shape. Source: torch gelu(approximate="none").
+Tensor gelu_erf(Graph& g, Tensor x);
+
+/// max(x, 0), and NaN for NaN, which ggml's own operation makes zero. Any contiguous shape -> the same shape.
+/// Source: torch relu.
+Tensor relu(Graph& g, Tensor x);
+
 /// Turns the pairs (x_i, x_{i + d/2}) of every head by the angles of its token.
 /// x [d_head, n_head, n_token], table [d_head, n_token] with d/2 cosines, then d/2 sines -> the shape of x.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py apply_rope.

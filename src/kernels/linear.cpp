@@ -108,8 +108,12 @@ Tensor activate(Graph& g, Activation activation, Tensor x) {
   switch (activation) {
     case Activation::gelu_tanh:
       return gelu_tanh(g, x);
+    case Activation::gelu_erf:
+      return gelu_erf(g, x);
     case Activation::silu:
       return ggml_silu(g.context(), x.node());
+    case Activation::relu:
+      return relu(g, x);
     case Activation::none:
       break;
   }

@@ -11,7 +11,7 @@
 
 namespace vla::kernels {
 
-enum class Activation { none, gelu_tanh, silu };
+enum class Activation { none, gelu_tanh, gelu_erf, silu, relu };
 
 /// One node of matrix products: what is multiplied, and where everything lies.
 struct LinearJob {

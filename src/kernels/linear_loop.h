@@ -2,9 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include "kernels/gelu_erf.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
-#include "kernels/math.h"
 
 /// The loops around a tile: which thread does what, what lies in which cache, edges, and the epilogue.
 ///
@@ -218,17 +218,24 @@ class LinearLoop {
         return write<kWhole, kRounded, Activation::none>(s, after, r, n_row);
       case Activation::gelu_tanh:
         return write<kWhole, kRounded, Activation::gelu_tanh>(s, after, r, n_row);
+      case Activation::gelu_erf:
+        return write<kWhole, kRounded, Activation::gelu_erf>(s, after, r, n_row);
       case Activation::silu:
         return write<kWhole, kRounded, Activation::silu>(s, after, r, n_row);
+      case Activation::relu:
+        return write<kWhole, kRounded, Activation::relu>(s, after, r, n_row);
     }
   }
 
   template <bool kRounded, Activation kActivation>
   static VLA_INLINE typename V::Float activate(typename V::Float x) {
     if constexpr (kActivation == Activation::gelu_tanh && kRounded) return gelu_tanh_for_bf16<V>(x);
+    if constexpr (kActivation == Activation::gelu_erf && kRounded) return gelu_erf_for_bf16<V>(x);
     if constexpr (kActivation == Activation::silu && kRounded) return silu_for_bf16<V>(x);
     if constexpr (kActivation == Activation::gelu_tanh) return gelu_tanh<V>(x);
+    if constexpr (kActivation == Activation::gelu_erf) return gelu_erf<V>(x);
     if constexpr (kActivation == Activation::silu) return silu<V>(x);
+    if constexpr (kActivation == Activation::relu) return relu<V>(x);
     return x;
   }
 

@@ -31,7 +31,13 @@ VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
   return (p + 1.0f) * power_of_two<V>(std::bit_cast<typename V::Int>(shifted) - std::bit_cast<std::int32_t>(kShift));
 }
 
-/// SiLU and GELU are x / (1 + 2^-s) with s = x (a + b x^2). Of y = |x|, and of s at y, they are
+/// |x|, of any x.
+template <class V>
+VLA_INLINE typename V::Float size_of(typename V::Float x) {
+  return std::bit_cast<typename V::Float>(std::bit_cast<typename V::Int>(x) & 0x7fffffff);
+}
+
+/// SiLU and GELU's tanh form are x / (1 + 2^-s) with s = x (a + b x^2). Of y = |x|, and of s at y, they are
 ///     max(x, 0) - y / (1 + 2^s),
 /// whose last step rounds once, subnormal results included. For those 2^s grows to 2^158: the divisor is kept times
 /// kUnit, so that nothing leaves the normal numbers on the way.
@@ -48,8 +54,17 @@ constexpr float kShift = 0x1.8p23f + 127 - 40;
 /// |x|, but at most `limit`. A NaN stays one.
 template <class V>
 VLA_INLINE typename V::Float size_within(typename V::Float x, float limit) {
-  using Int = typename V::Int;
-  return V::min(V::set(limit), std::bit_cast<typename V::Float>(std::bit_cast<Int>(x) & 0x7fffffff));
+  return V::min(V::set(limit), size_of<V>(x));
+}
+
+/// p of 2^rest = 1 + rest p for |rest| <= 0.53, minimax: relative error 2^-27 of the whole.
+template <class V>
+VLA_INLINE typename V::Float slope_of_power(typename V::Float rest) {
+  typename V::Float p = V::fma(rest, V::set(0x1.439136p-13f), V::set(0x1.5facf6p-10f));
+  p = V::fma(p, rest, V::set(0x1.3b296ap-7f));
+  p = V::fma(p, rest, V::set(0x1.c6adcp-5f));
+  p = V::fma(p, rest, V::set(0x1.ebfbe4p-3f));
+  return V::fma(p, rest, V::set(0x1.62e432p-1f));
 }
 
 /// max(x, 0) - y / (1 + 2^(n + rest)) with |rest| <= 0.53, 0 <= n <= 160 and `shifted` = n + kShift.
@@ -57,12 +72,7 @@ template <class V>
 VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, typename V::Float shifted,
                                       typename V::Float rest) {
   using Float = typename V::Float;
-  // 2^rest = 1 + rest p, minimax: relative error 2^-27.
-  Float p = V::fma(rest, V::set(0x1.439136p-13f), V::set(0x1.5facf6p-10f));
-  p = V::fma(p, rest, V::set(0x1.3b296ap-7f));
-  p = V::fma(p, rest, V::set(0x1.c6adcp-5f));
-  p = V::fma(p, rest, V::set(0x1.ebfbe4p-3f));
-  p = V::fma(p, rest, V::set(0x1.62e432p-1f));
+  const Float p = slope_of_power<V>(rest);
   // From n = 24 on, the sum of 2^n and one loses the one. It comes back through p, whose inverse is 1.2 to 1.7.
   const Float power = std::bit_cast<Float>(std::bit_cast<typename V::Int>(shifted) << 23), sum = power + kUnit;
   const Float lost = V::fma(sum - power, V::set(-1.625f), V::set(1.625f * kUnit));
@@ -72,6 +82,12 @@ VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, 
 }
 
 }  // namespace sigmoid
+
+/// max(x, 0), and NaN for NaN. Source: torch relu.
+template <class V>
+VLA_INLINE typename V::Float relu(typename V::Float x) {
+  return V::max(typename V::Float{}, x);
+}
 
 /// x / (1 + e^-x), within two units in the last place over the whole range. Source: torch silu.
 template <class V>

@@ -70,6 +70,12 @@ struct Portable : Lanes<4> {
   /// The lower halves of a and b in turn, and the upper ones.
   static VLA_INLINE Float interleave_low(Float a, Float b) { return Float{a[0], b[0], a[1], b[1]}; }
   static VLA_INLINE Float interleave_high(Float a, Float b) { return Float{a[2], b[2], a[3], b[3]}; }
+  /// Lane by lane the number of a table that the lowest three bits of an index say.
+  static VLA_INLINE Float look_up(const float (&table)[8], Int index) {
+    Float y;
+    for (int i = 0; i < width; ++i) y[i] = table[index[i] & 7];
+    return y;
+  }
   /// 1 / x with a relative error of at most 2^-14, zero for infinity.
   static VLA_INLINE Float reciprocal(Float x) { return 1.0f / x; }
   /// What x is above the whole number below it, and y times two in the power of that whole number.
@@ -98,6 +104,9 @@ struct Avx2 : Lanes<8> {
     __m128 y = _mm_max_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps(x, 1));
     y = _mm_max_ps(y, _mm_movehl_ps(y, y));
     return y[0] > y[1] ? y[0] : y[1];
+  }
+  static VLA_INLINE Float look_up(const float (&table)[8], Int index) {
+    return _mm256_permutevar8x32_ps(load(table), std::bit_cast<__m256i>(index));
   }
   static VLA_INLINE Float interleave_low(Float a, Float b) {
     return _mm256_permute2f128_ps(_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b), 0x20);
@@ -132,6 +141,11 @@ struct Avx512 : Lanes<16> {
   static VLA_INLINE Float interleave_high(Float a, Float b) {
     return _mm512_permutex2var_ps(
         a, std::bit_cast<__m512i>(Int{8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31}), b);
+  }
+  static VLA_INLINE Float look_up(const float (&t)[8], Int index) {
+    const Float twice = {t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7],
+                         t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7]};
+    return _mm512_permutex2var_ps(twice, std::bit_cast<__m512i>(index), twice);
   }
   static VLA_INLINE Float reciprocal(Float x) { return _mm512_maskz_rcp14_ps(0xffff, x); }
   static VLA_INLINE Float fraction(Float x) { return _mm512_maskz_reduce_ps(0xffff, x, 1); }  // 1: round down

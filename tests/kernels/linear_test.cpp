@@ -29,6 +29,9 @@ constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},    {3, 17,
                              {4, 768, 32}, {33, 40, 70},  {64, 96, 129}, {97, 35, 40},  {300, 33, 530},
                              {270, 5, 9},  {1, 1537, 70}, {7, 760, 1100}};
 
+constexpr Activation kActivations[] = {Activation::none, Activation::gelu_tanh, Activation::gelu_erf, Activation::silu,
+                                       Activation::relu};
+
 /// Numbers in [-1, 1] that differ from call to call.
 class Numbers {
  public:
@@ -72,6 +75,8 @@ double activate(Activation activation, double x) {
   if (activation == Activation::silu) return x / (1 + std::exp(-x));
   if (activation == Activation::gelu_tanh)
     return x / (1 + std::exp(-2 * std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x)));
+  if (activation == Activation::gelu_erf) return x / 2 * std::erfc(-x * M_SQRT1_2);
+  if (activation == Activation::relu) return std::max(x, 0.0);
   return x;
 }
 
@@ -251,7 +256,7 @@ void check_shapes_and_types(const LinearKernel& kernel) {
 
 void check_epilogues(const LinearKernel& kernel) {
   for (const Shape& shape : {Shape{1, 33, 17}, Shape{7, 64, 48}, Shape{50, 72, 205}})
-    for (Activation activation : {Activation::none, Activation::gelu_tanh, Activation::silu})
+    for (Activation activation : kActivations)
       for (int options = 0; options < 4; ++options)
         check(kernel, {.shape = shape,
                        .activation = activation,
@@ -263,6 +268,7 @@ void check_gates_and_groups(const LinearKernel& kernel) {
   for (const Shape& shape : kShapes) {
     check(kernel, {.shape = shape, .activation = Activation::silu, .n_part = 2, .gated = true});
     check(kernel, {.shape = shape, .activation = Activation::gelu_tanh, .n_part = 2, .gated = true, .with_bias = true});
+    check(kernel, {.shape = shape, .activation = Activation::gelu_erf, .n_part = 2, .gated = true});
     check(kernel, {.shape = shape, .n_part = 3, .with_bias = true});
   }
 }
@@ -284,11 +290,8 @@ void check_bytes(const LinearKernel& kernel) {
 }
 
 /// Who rounds x to bf16 takes it so, and gives y so: one product's y is the next one's x.
-void check_rounded(const LinearKernel& kernel) {
-  const Case plain = {.shape = {97, 72, 205}, .activation = Activation::silu, .with_bias = true, .n_thread = 2};
-  CHECK(!kernel.rounds(50, 72));  // few rows keep what rounding leaves
-  CHECK(kernel.rounds(97, 72) == (std::strstr(kernel.name, "amx") != nullptr));
-  if (!kernel.rounds(97, 72)) return;
+void check_rounded_after(Activation activation, const LinearKernel& kernel) {
+  const Case plain = {.shape = {97, 72, 205}, .activation = activation, .with_bias = true, .n_thread = 2};
   Case from = plain, to = plain;
   from.x_type = DType::bf16, to.y_type = DType::bf16;
   Trial expected(kernel, plain), rounded_x(kernel, from), rounded_y(kernel, to);
@@ -303,6 +306,13 @@ void check_rounded(const LinearKernel& kernel) {
     wrong += !(std::abs(from_bf16(got) - exact) <= (0x1p-8f + 0x1p-13f) * std::abs(exact) + 0x1p-119f);
   }
   CHECK(wrong == 0);
+}
+
+void check_rounded(const LinearKernel& kernel) {
+  CHECK(!kernel.rounds(50, 72));  // few rows keep what rounding leaves
+  CHECK(kernel.rounds(97, 72) == (std::strstr(kernel.name, "amx") != nullptr));
+  if (!kernel.rounds(97, 72)) return;
+  for (Activation activation : kActivations) check_rounded_after(activation, kernel);
 }
 
 const LinearKernel& row(const std::string& name) {

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/math.h"
+#include "kernels/gelu_erf.h"
 
 #include <doctest/doctest.h>
 
@@ -18,7 +18,8 @@ namespace {
 using Function = double (*)(double);
 
 double silu(double x) { return x / (1 + std::exp(-x)); }
-double gelu(double x) { return x / (1 + std::exp(-2 * std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x))); }
+double gelu_tanh(double x) { return x / (1 + std::exp(-2 * std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x))); }
+double gelu_erf(double x) { return x / 2 * std::erfc(-x * M_SQRT1_2); }
 
 /// The distance of neighbouring float32 numbers where `exact` lies.
 double unit(double exact) {
@@ -56,12 +57,13 @@ double worst_error(CpuKernels::Map map, Function exact) {
 
 void check_accuracy(const CpuKernels& kernels) {
   CHECK(worst_error(kernels.silu, silu) <= 2);
-  CHECK(worst_error(kernels.gelu_tanh, gelu) <= 2);
+  CHECK(worst_error(kernels.gelu_tanh, gelu_tanh) <= 2);
+  CHECK(worst_error(kernels.gelu_erf, gelu_erf) <= 2);
 }
 
 void check_not_finite(const CpuKernels& kernels) {
   const float infinity = std::numeric_limits<float>::infinity(), nan = std::numeric_limits<float>::quiet_NaN();
-  for (CpuKernels::Map map : {kernels.silu, kernels.gelu_tanh}) {
+  for (CpuKernels::Map map : {kernels.silu, kernels.gelu_tanh, kernels.gelu_erf}) {
     const float x[] = {infinity, -infinity, nan};
     float y[3] = {};
     map(x, y, 3);
@@ -69,6 +71,19 @@ void check_not_finite(const CpuKernels& kernels) {
     CHECK_FALSE(std::isfinite(y[1]));
     CHECK(std::isnan(y[2]));
   }
+}
+
+void check_relu(const CpuKernels& kernels) {
+  std::vector<float> x = numbers(), expected;
+  for (float edge : {std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::infinity()})
+    x.push_back(edge);
+  for (float value : x) expected.push_back(value > 0 ? value : 0);
+  x.push_back(std::numeric_limits<float>::quiet_NaN());
+  std::vector<float> y(x.size());
+  kernels.relu(x.data(), y.data(), static_cast<std::int64_t>(x.size()));
+  CHECK(std::isnan(y.back()));
+  y.pop_back();
+  CHECK(y == expected);
 }
 
 void check_ends(const CpuKernels& kernels) {
@@ -87,6 +102,7 @@ void check_ends(const CpuKernels& kernels) {
 }  // namespace
 
 VLA_KERNEL_TEST("silu and gelu are within two units in the last place over the whole range", check_accuracy)
+VLA_KERNEL_TEST("relu keeps what is above zero, and NaN", check_relu)
 VLA_KERNEL_TEST("what is not finite stays so", check_not_finite)
 VLA_KERNEL_TEST("a row of any length is mapped from its first number to its last, and nothing beyond", check_ends)
 
@@ -94,6 +110,7 @@ TEST_CASE("activations that are rounded to bf16 next err by 2^-13 of the result 
   using V = kernels::Portable;
   for (float x : numbers())
     for (const auto& [got, exact] : {std::pair(kernels::silu_for_bf16<V>(V::set(x))[0], silu(x)),
-                                     std::pair(kernels::gelu_tanh_for_bf16<V>(V::set(x))[0], gelu(x))})
+                                     std::pair(kernels::gelu_tanh_for_bf16<V>(V::set(x))[0], gelu_tanh(x)),
+                                     std::pair(kernels::gelu_erf_for_bf16<V>(V::set(x))[0], gelu_erf(x))})
       if (!(std::abs(got - exact) <= 0x1p-13 * std::abs(exact) + 0x1p-119)) FAIL_CHECK(x << ": " << got);
 }

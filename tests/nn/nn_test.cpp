@@ -72,6 +72,28 @@ TEST_CASE("gelu agrees with its definition over the whole range of float32") {
   }
 }
 
+TEST_CASE("gelu of erf and relu agree with their definitions on every choice of kernels") {
+  std::vector<float> x = ramp(4099, 12);
+  for (float edge : {0.0f, -0.0f, 1e-30f, -1e-30f, 100.0f, -100.0f, 1e30f, -1e30f, NAN}) x.push_back(edge);
+  for (Isa isa : usable_isas()) {
+    const auto run = [&](const std::function<Tensor(Graph&, Tensor)>& map) {
+      return run_graph(
+          [&](Graph& g) { return map(g, g.store().add_constant(x, {static_cast<std::int64_t>(x.size())})); },
+          isa_name(isa));
+    };
+    const auto gelu = run(kernels::gelu_erf), relu = run(kernels::relu);
+    CHECK(std::isnan(gelu.back()));
+    CHECK(std::isnan(relu.back()));
+    for (std::size_t i = 0; i + 1 < x.size(); ++i) {
+      const double expected = x[i] / 2.0 * std::erfc(-x[i] * M_SQRT1_2);
+      // ggml adds one to erf: 2^-24 of half of x, where x is above -6.
+      const double lost = isa == Isa::ggml ? 4e-7 : 0;
+      CHECK(std::abs(gelu[i] - expected) <= 0x1p-22 * std::abs(expected) + lost + 0x1p-148);
+      CHECK(relu[i] == std::max(x[i], 0.0f));
+    }
+  }
+}
+
 TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for d_head = 64") {
   constexpr int kHead = 64, kTokens = 3, kFirst = 200;
   const std::vector<float> x = ramp(kHead * 2 * kTokens, 1);
