@@ -6,13 +6,15 @@
 
 namespace vla {
 
-GeluMlp::GeluMlp(const Scope& s, int d_model, int d_ff)
-    : up_(s / "ffn_up", d_model, d_ff, Bias::yes), down_(s / "ffn_down", d_ff, d_model, Bias::yes) {}
+Mlp::Mlp(const Scope& s, int d_model, int d_ff, Activation activation)
+    : up_(s / "ffn_up", d_model, d_ff, Bias::yes),
+      down_(s / "ffn_down", d_ff, d_model, Bias::yes),
+      activation_(activation) {}
 
-Tensor GeluMlp::operator()(Graph& g, Tensor x) const { return down_(g, up_.activated(g, x, Activation::gelu_tanh)); }
+Tensor Mlp::operator()(Graph& g, Tensor x) const { return down_(g, up_.activated(g, x, activation_)); }
 
-Tensor GeluMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
-  return down_.added_to(g, residual, up_.activated(g, x, Activation::gelu_tanh));
+Tensor Mlp::added_to(Graph& g, Tensor residual, Tensor x) const {
+  return down_.added_to(g, residual, up_.activated(g, x, activation_));
 }
 
 GatedMlp::GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation)
@@ -28,5 +30,7 @@ Tensor GatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
 }
 
 Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }
+
+Tensor relu(Graph& g, Tensor x) { return kernels::relu(g, x); }
 
 }  // namespace vla

@@ -6,16 +6,18 @@
 
 namespace vla {
 
-/// down(gelu_tanh(up(x))), with biases. x [d_model, n, ...] -> the same shape. Source: transformers SiglipMLP.
-class GeluMlp {
+/// down(activation(up(x))), with biases. x [d_model, n, ...] -> the same shape.
+/// Sources: transformers SiglipMLP (gelu_tanh), InternVLVisionMLP (gelu_erf).
+class Mlp {
  public:
-  GeluMlp(const Scope& s, int d_model, int d_ff);
+  Mlp(const Scope& s, int d_model, int d_ff, Activation activation);
   Tensor operator()(Graph& g, Tensor x) const;
   /// residual + the same.
   Tensor added_to(Graph& g, Tensor residual, Tensor x) const;
 
  private:
   Linear up_, down_;
+  Activation activation_;
 };
 
 /// down(activation(gate(x)) * up(x)), without biases. x [d_model, n] -> the same shape.
@@ -34,5 +36,7 @@ class GatedMlp {
 
 /// x / (1 + exp(-x)). Source: torch silu.
 Tensor silu(Graph& g, Tensor x);
+/// max(x, 0). Source: torch relu.
+Tensor relu(Graph& g, Tensor x);
 
 }  // namespace vla

@@ -86,6 +86,34 @@ TEST_CASE("an adaptive norm scales, shifts and gates by what its condition says"
     }
 }
 
+TEST_CASE("an MLP activates what goes up by the activation it was given") {
+  const auto up = ramp(kHidden * kWidth, 1), up_bias = ramp(kHidden, 2), down = ramp(kWidth * kHidden, 1.5f),
+             down_bias = ramp(kWidth, 1), x = ramp(kWidth * kToken, 2);
+  const std::vector<Piece> pieces = {{"m.ffn_up.weight", {kWidth, kHidden}, up},
+                                     {"m.ffn_up.bias", {kHidden}, up_bias},
+                                     {"m.ffn_down.weight", {kHidden, kWidth}, down},
+                                     {"m.ffn_down.bias", {kWidth}, down_bias}};
+  using Function = double (*)(double);
+  const std::pair<Activation, Function> activations[] = {
+      {Activation::gelu_erf, [](double u) { return u / 2 * std::erfc(-u * M_SQRT1_2); }},
+      {Activation::relu, [](double u) { return std::max(u, 0.0); }}};
+  for (const auto& [activation, exact] : activations) {
+    const auto got = run_module<Mlp>(
+        pieces, [activation = activation](const Scope& s) { return Mlp(s, kWidth, kHidden, activation); },
+        [&](const Mlp& mlp, Graph& g) {
+          return mlp(g, g.store().add_constant(x, {kWidth, kToken}));
+        });
+    REQUIRE(got.size() == x.size());
+    for (int token = 0; token < kToken; ++token) {
+      std::vector<double> hidden;
+      for (int j = 0; j < kHidden; ++j) hidden.push_back(exact(dot(up, j, x, token, kWidth) + at(up_bias, j)));
+      for (int i = 0; i < kWidth; ++i)
+        CHECK(at(got, token * kWidth + i) ==
+              doctest::Approx(dot(down, i, hidden, 0, kHidden) + at(down_bias, i)).epsilon(1e-5));
+    }
+  }
+}
+
 TEST_CASE("a GELU-gated MLP multiplies the activated gate with what goes up") {
   const auto gate = ramp(kHidden * kWidth, 2), up = ramp(kHidden * kWidth, 1), down = ramp(kWidth * kHidden, 1.5f),
              x = ramp(kWidth * kToken, 2);

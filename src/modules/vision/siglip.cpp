@@ -19,7 +19,7 @@ SiglipBlock::SiglipBlock(const Scope& s, int d_model, int n_head, int d_ff, floa
       v_(s / "attn_v", d_model, d_model, Bias::yes),
       out_(s / "attn_out", d_model, d_model, Bias::yes),
       ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(s, d_model, d_ff) {}
+      mlp_(s, d_model, d_ff, Activation::gelu_tanh) {}
 
 Tensor SiglipBlock::forward(Graph& g, Tensor x) const {
   const Tensor h = attn_norm_(g, x);

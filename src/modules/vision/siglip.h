@@ -24,7 +24,7 @@ class SiglipBlock : public Module<SiglipBlock> {
   LayerNorm attn_norm_;
   Linear q_, k_, v_, out_;
   LayerNorm ffn_norm_;
-  GeluMlp mlp_;
+  Mlp mlp_;
 };
 
 /// The vision tower of the SigLIP family, every view in one batch. Source: transformers modeling_smolvlm.py
