@@ -12,7 +12,8 @@ bool has_attention(const Graph& g, std::int64_t d_head);
 
 /// softmax(q k / sqrt(d_head) + mask) v in float32, heads concatenated, without a matrix of scores in memory.
 /// q [d_head, n_head, n_query, n_batch], k and v [d_head, n_head_kv, n_key, n_batch], each with any strides but
-/// contiguous in d_head; mask [n_key, n_query], or none -> [d_head * n_head, n_query, n_batch].
+/// contiguous in d_head; mask [n_key, n_query] of any numbers but +infinity, or none -> [d_head * n_head, n_query,
+/// n_batch].
 /// Chunks of keys that a block of queries sees nothing of (-infinity all over) are skipped.
 Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
 

@@ -9,9 +9,10 @@
 namespace vla {
 
 /// softmax(q k / sqrt(d_head) + mask) v, float32 throughout, heads concatenated.
-/// q [d_head, n_head, n_query, n_batch], k and v [d_head, n_head_kv, n_key, n_batch], mask [n_key, n_query] of 0 and
-/// -infinity, or none -> [d_head * n_head, n_query, n_batch]. Query head h reads key head h / (n_head / n_head_kv).
-/// Every query must see at least one key.
+/// q [d_head, n_head, n_query, n_batch], k and v [d_head, n_head_kv, n_key, n_batch], mask [n_key, n_query] or none ->
+/// [d_head * n_head, n_query, n_batch]. Query head h reads key head h / (n_head / n_head_kv). The mask is 0 for a key
+/// that is seen, -infinity for one that is not, and ln(n) for one that stands for n equal ones with equal values. Every
+/// query must see at least one key.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
 Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
 

@@ -34,6 +34,17 @@ void check_pairs(const AttentionKernel& kernel) {
   }
 }
 
+void check_pair_repeated(const AttentionKernel& kernel) {
+  for (const Shape& shape : kRepeatedShapes)
+    for (int n : {2, 218, 512}) {
+      CAPTURE(shape.n_key);
+      CAPTURE(n);
+      Repeated r = repeated(shape, n);
+      for (Case* c : {&r.one, &r.all}) c->q = as_bf16(c->q), c->k = as_bf16(c->k), c->v = as_bf16(c->v);
+      CHECK(worst_error(r.all, run(kernel, r.one, 2)) <= kPairBound);
+    }
+}
+
 void check_pair_ends(const AttentionKernel& kernel) {
   for_each_end([&](Case c) {
     c.q = as_bf16(c.q), c.k = as_bf16(c.k), c.v = as_bf16(c.v);
@@ -100,6 +111,7 @@ TEST_CASE("a weight for bf16 errs by 2^-18 of itself at most") {
 }
 
 VLA_PAIR_TEST("attention errs by the rounding of its weights to bf16 alone", check_pairs)
+VLA_PAIR_TEST("a key with the logarithm of n in the mask is as n equal keys", check_pair_repeated)
 VLA_PAIR_TEST("attention is right whatever the width of a head and the number of keys", check_pair_ends)
 VLA_PAIR_TEST("attention keeps small weights, and greater scores make earlier ones smaller", check_pair_weights)
 VLA_PAIR_TEST("attention skips what a mask hides, and chunks that it hides whole", check_pair_masks)

@@ -60,6 +60,16 @@ void check_masks(const CpuKernels& kernels) {
   }
 }
 
+void check_repeated(const CpuKernels& kernels) {
+  for (const Shape& shape : kRepeatedShapes)
+    for (int n : {2, 218, 512}) {
+      CAPTURE(shape.n_key);
+      CAPTURE(n);
+      const Repeated r = repeated(shape, n);
+      CHECK(worst_error(r.all, run(kernels.attention, r.one, 2)) <= 1e-5);
+    }
+}
+
 void check_ends(const CpuKernels& kernels) {
   for_each_end([&](const Case& c) { CHECK(worst_error(c, run(kernels.attention, c, 1)) <= 5e-6); });
 }
@@ -83,7 +93,16 @@ void check_not_finite(const CpuKernels& kernels) { check_attention_of_not_finite
 VLA_KERNEL_TEST("attention of awkward shapes and strides errs at most four times as much as ggml's products",
                 check_shapes)
 VLA_KERNEL_TEST("attention is exact under causal, speckled, late and additive masks", check_masks)
+VLA_KERNEL_TEST("a key with the logarithm of n in the mask is as n equal keys", check_repeated)
 VLA_KERNEL_TEST("attention is exact however many threads share it", check_threads)
 VLA_KERNEL_TEST("attention is exact whatever the width of a head and the number of keys", check_ends)
 VLA_KERNEL_TEST("attention is exact where each chunk of keys brings greater scores", check_rising)
 VLA_KERNEL_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_not_finite)
+
+TEST_CASE("ggml: a key with the logarithm of n in the mask is as n equal keys") {
+  for (const Shape& shape : kRepeatedShapes)
+    for (int n : {2, 218, 512}) {
+      const Repeated r = repeated(shape, n);
+      CHECK(worst_error(r.all, run_plain(r.one)) <= 1e-5);
+    }
+}

@@ -8,6 +8,7 @@
 #include <cmath>
 #include <limits>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #include "kernels/attention_kernel.h"
@@ -151,6 +152,27 @@ inline Case rising(double step) {
     c.k[i] = static_cast<float>(step * static_cast<double>(i / 32 / 100)) + c.k[i] / 8;
   return c;
 }
+
+/// Keys of which the last stands for `n` equal ones, and the same with all of them.
+struct Repeated {
+  Case one, all;
+};
+inline Repeated repeated(const Shape& shape, int n) {
+  Shape longer = shape;
+  longer.n_key += n - 1;
+  Repeated r = {Case(shape, 2, 0), Case(longer, 2, 0)};
+  r.one.set_mask(
+      [&](std::int64_t, std::int64_t j) { return j + 1 == shape.n_key ? std::log(static_cast<float>(n)) : 0.0f; });
+  r.all.q = r.one.q;
+  for (auto [one, all] : {std::pair(&r.one.k, &r.all.k), std::pair(&r.one.v, &r.all.v)}) {
+    const auto token = static_cast<std::size_t>(shape.d_head * shape.n_head_kv);
+    for (std::size_t i = 0; i < all->size(); ++i)
+      (*all)[i] = (*one)[i < one->size() ? i : one->size() - token + i % token];
+  }
+  return r;
+}
+/// Vision towers, and the head of an action: a width and a number of keys that nothing divides.
+inline constexpr Shape kRepeatedShapes[] = {{112, 8, 8, 50, 1025, 1}, {112, 2, 1, 3, 2, 1}, {64, 2, 1, 7, 129, 1}};
 
 inline void check_attention_of_not_finite(const AttentionKernel& attention) {
   Case unseen(kShapes[2], 1, 0);
