@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <span>
+
 #include "backend/graph.h"
 
 namespace vla {
@@ -14,5 +16,7 @@ enum class RotaryAngle { quotient, product };
 /// Rotary embedding, half-split pairing: (x_i, x_{i + d/2}) turn by position / base^(2i/d). Token j of x stands at
 /// position `first` + j. x [d_head, n_head, n_token] -> the same shape; d_head must be even.
 Tensor rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first);
+/// The same where token j stands at positions[j], one for each.
+Tensor rope(Graph& g, Tensor x, float base, RotaryAngle angle, std::span<const int> positions);
 
 }  // namespace vla

@@ -133,6 +133,34 @@ TEST_CASE("rotary angles are rounded as either reference rounds them, which diff
   CHECK(std::abs(product[kPair] - quotient[kPair]) > 1e-5);
 }
 
+TEST_CASE("rope at given positions turns every token as rope of that position alone does") {
+  constexpr int kHead = 64;
+  const std::vector<int> apart = {7, 7, 0, 1023, 12}, in_order = {7, 8, 9, 10, 11}, beginning = {7, 8, 9};
+  const std::vector<float> x = ramp(kHead * 2 * apart.size(), 1);
+  const auto token = [&](std::size_t j) {
+    return std::vector<float>(x.begin() + static_cast<std::ptrdiff_t>(j * 2 * kHead),
+                              x.begin() + static_cast<std::ptrdiff_t>((j + 1) * 2 * kHead));
+  };
+  const auto turn = [](Graph& g, const std::vector<float>& values, auto place) {
+    const Tensor q = g.store().add_constant(values, {kHead, 2, static_cast<std::int64_t>(values.size()) / (2 * kHead)});
+    return rope(g, q, 1e6f, RotaryAngle::product, place);
+  };
+  for (const std::vector<int>& positions : {apart, in_order, beginning}) {
+    const std::vector<float> some(x.begin(), x.begin() + static_cast<std::ptrdiff_t>(positions.size() * 2 * kHead));
+    // A graph that already holds other tables takes none of those.
+    const auto got = run_graph([&](Graph& g) {
+      for (const std::vector<int>& other : {in_order, beginning, apart})
+        turn(g, std::vector<float>(other.size() * 2 * kHead, 1.0f), std::span<const int>(other));
+      return turn(g, some, std::span<const int>(positions));
+    });
+    std::vector<float> expected;
+    for (std::size_t j = 0; j < positions.size(); ++j)
+      for (float value : run_graph([&](Graph& g) { return turn(g, token(j), positions[j]); }))
+        expected.push_back(value);
+    CHECK(got == expected);
+  }
+}
+
 TEST_CASE("attention with grouped heads agrees with its definition, with and without a causal mask") {
   for (const Shape s : {Shape{16, 6, 2, 5, 17}, Shape{8, 3, 3, 1, 1}, Shape{64, 15, 5, 50, 177}})
     for (bool causal : {false, true}) {
