@@ -62,7 +62,7 @@ void map_task(ggml_tensor* y, int ith, int nth, void* user) {
 }
 
 Tensor map(Graph& g, Tensor x, CpuKernels::Map row) {
-  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x}, map_task, keep(g, MapParams{row}));
+  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {contiguous(g, x)}, map_task, keep(g, MapParams{row}));
 }
 
 VLA_CLONES void rotate_head(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half) {
@@ -117,6 +117,10 @@ Tensor relu(Graph& g, Tensor x) {
   return map(g, x, kernels != nullptr ? kernels->relu : relu_row);
 }
 
+Tensor contiguous(Graph& g, Tensor x) {
+  return ggml_is_contiguous(x.node()) ? x : Tensor(ggml_cont(g.context(), x.node()));
+}
+
 Tensor rotate_half(Graph& g, Tensor x, Tensor table) {
   const CpuKernels* kernels = cpu_kernels(g.isa());
   return custom(g, {x.dim(0), x.dim(1), x.dim(2)}, {x, table}, rotate_task,
@@ -124,7 +128,8 @@ Tensor rotate_half(Graph& g, Tensor x, Tensor table) {
 }
 
 Tensor join(Graph& g, Tensor first, Tensor second, int dim) {
-  if (!ggml_is_contiguous(first.node()) || !ggml_is_contiguous(second.node()))
+  const bool last = ggml_n_dims(first.node()) <= dim + 1;
+  if (!last || !ggml_is_contiguous(first.node()) || !ggml_is_contiguous(second.node()))
     return ggml_concat(g.context(), first.node(), second.node(), dim);
   std::int64_t n[] = {first.dim(0), first.dim(1), first.dim(2), first.dim(3)};
   n[dim] += second.dim(dim);

@@ -20,13 +20,17 @@ Tensor gelu_erf(Graph& g, Tensor x);
 /// Source: torch relu.
 Tensor relu(Graph& g, Tensor x);
 
+/// x, or a copy of it where it lies in pieces: a view of some tokens of several sequences.
+Tensor contiguous(Graph& g, Tensor x);
+
 /// Turns the pairs (x_i, x_{i + d/2}) of every head by the angles of its token.
 /// x [d_head, n_head, n_token], table [d_head, n_token] with d/2 cosines, then d/2 sines -> the shape of x.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py apply_rope.
 Tensor rotate_half(Graph& g, Tensor x, Tensor table);
 
-/// Two tensors that differ only in their last dimension, one behind the other: [..., n_1], [..., n_2] -> [..., n_1 +
-/// n_2], with `dim` the index of that dimension. ggml's own concatenation goes number by number.
+/// Two tensors that differ in one dimension only, one behind the other: [..., n_1, ...], [..., n_2, ...] -> [..., n_1 +
+/// n_2, ...], with `dim` the index of that dimension. ggml's own concatenation goes number by number; it is taken where
+/// the dimension is not the last one, or a tensor lies in pieces.
 Tensor join(Graph& g, Tensor first, Tensor second, int dim);
 
 }  // namespace vla::kernels

@@ -65,7 +65,7 @@ Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> te
     normed = x.node(), x = normed->src[0];
     node.job.norm = {norm->norm, nullptr, nullptr, norm->eps};
   }
-  if (!ggml_is_contiguous(x.node())) x = ggml_cont(g.context(), x.node());
+  x = contiguous(g, x);
   std::vector<ggml_tensor*> sources = {x.node()};
   std::int64_t d_out = 0;
   for (const LinearTerm& term : terms) {
@@ -77,7 +77,7 @@ Tensor emit(Graph& g, const LinearKernel& kernel, std::span<const LinearTerm> te
   }
   for (const LinearTerm& term : terms)
     if (term.bias != nullptr) sources.push_back(g.weight(term.bias).node());
-  if (residual) sources.push_back(residual.node());
+  if (residual) sources.push_back(contiguous(g, residual).node());
   if (normed != nullptr) {
     sources.push_back(normed->src[1]);
     node.has_norm_bias = normed->src[2] != nullptr;

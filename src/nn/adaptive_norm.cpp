@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 
 #include "kernels/norm.h"
+#include "nn/tokens.h"
 
 namespace vla {
 
@@ -28,9 +29,7 @@ Tensor AdaptiveRmsNorm::forward(Graph& g, Tensor x, Tensor modulation) const {
 
 Tensor AdaptiveRmsNorm::gate(Graph& g, Tensor modulation) const { return slice_features(g, modulation, 2 * d_, d_); }
 
-Tensor gated_add(Graph& g, Tensor x, Tensor y, Tensor gate) {
-  return ggml_add(g.context(), x.node(), ggml_mul(g.context(), y.node(), gate.node()));
-}
+Tensor gated_add(Graph& g, Tensor x, Tensor y, Tensor gate) { return add(g, x, multiply(g, y, gate)); }
 
 Tensor slice_features(Graph& g, Tensor x, int first, int count) {
   return ggml_view_1d(g.context(), x.node(), count, static_cast<std::size_t>(first) * sizeof(float));

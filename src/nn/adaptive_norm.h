@@ -25,7 +25,8 @@ class AdaptiveRmsNorm : public Module<AdaptiveRmsNorm> {
   Linear dense_;
 };
 
-/// x + y * gate. x and y [d, n], gate [d, 1] for every token. Source: lerobot policies/pi_gemma.py _gated_residual.
+/// x + y * gate. x and y [d, n, ...], gate [d] for every token.
+/// Sources: lerobot policies/pi_gemma.py _gated_residual; transformers modeling_internvl.py (LayerScale).
 Tensor gated_add(Graph& g, Tensor x, Tensor y, Tensor gate);
 
 /// Features first to first + count - 1 of one vector, without a copy: [d, 1] -> [count, 1].

@@ -20,6 +20,14 @@ Tensor concat_features(Graph& g, Tensor first, Tensor second) {
   return ggml_concat(g.context(), first.node(), second.node(), 0);
 }
 
+Tensor slice_tokens(Graph& g, Tensor x, int first, int count) {
+  const std::size_t token = x.node()->nb[1];
+  // Tokens of one view are in one piece, which some operations of ggml see by the stride of views that there are not.
+  const std::size_t view = x.dim(2) == 1 ? static_cast<std::size_t>(count) * token : x.node()->nb[2];
+  return ggml_view_3d(g.context(), x.node(), x.dim(0), count, x.dim(2), token, view,
+                      static_cast<std::size_t>(first) * token);
+}
+
 Tensor repeat_like(Graph& g, Tensor x, Tensor like) {
   return ggml_repeat_4d(g.context(), x.node(), x.dim(0), like.dim(1), 1, 1);
 }
@@ -28,10 +36,14 @@ Tensor column(Graph& g, Tensor table, Tensor index) { return ggml_get_rows(g.con
 
 Tensor add(Graph& g, Tensor a, Tensor b) { return ggml_add(g.context(), a.node(), b.node()); }
 
-Tensor scale(Graph& g, Tensor x, float factor) { return ggml_scale(g.context(), x.node(), factor); }
+Tensor scale(Graph& g, Tensor x, float factor) {
+  return ggml_scale(g.context(), kernels::contiguous(g, x).node(), factor);
+}
+
+Tensor multiply(Graph& g, Tensor x, Tensor factor) { return ggml_mul(g.context(), x.node(), factor.node()); }
 
 Tensor flatten_views(Graph& g, Tensor x) {
-  return ggml_reshape_2d(g.context(), x.node(), x.dim(0), x.dim(1) * x.dim(2));
+  return ggml_reshape_2d(g.context(), kernels::contiguous(g, x).node(), x.dim(0), x.dim(1) * x.dim(2));
 }
 
 Tensor pixel_shuffle(Graph& g, Tensor x, int factor) {
@@ -39,7 +51,7 @@ Tensor pixel_shuffle(Graph& g, Tensor x, int factor) {
   const std::int64_t d = x.dim(0), n_view = x.dim(2), side = std::llround(std::sqrt(static_cast<double>(x.dim(1))));
   const std::int64_t n = side / factor;
   // Patch (factor R + r, factor C + c): c is the fastest after the features, then C, r, R; C and r change places.
-  ggml_tensor* split = ggml_reshape_4d(c, x.node(), d * factor, n, factor, n * n_view);
+  ggml_tensor* split = ggml_reshape_4d(c, kernels::contiguous(g, x).node(), d * factor, n, factor, n * n_view);
   ggml_tensor* swapped = ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3));
   return ggml_reshape_3d(c, swapped, d * factor * factor, n * n, n_view);
 }

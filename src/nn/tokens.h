@@ -8,12 +8,15 @@
 
 namespace vla {
 
-/// Sequences one after the other: [d, n_1], [d, n_2], ... -> [d, n_1 + n_2 + ...].
+/// Sequences one after the other, in every view: [d, n_1, n_view], [d, n_2, n_view], ... -> [d, n_1 + n_2 + ...,
+/// n_view].
 Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts);
 /// Keys or values one after the other: [d_head, n_head, n_1], [d_head, n_head, n_2] -> [d_head, n_head, n_1 + n_2].
 Tensor append_keys(Graph& g, Tensor past, Tensor present);
 /// Two feature vectors per token, the first above the second: [d_1, n], [d_2, n] -> [d_1 + d_2, n].
 Tensor concat_features(Graph& g, Tensor first, Tensor second);
+/// Tokens first to first + count - 1, of every view, without a copy: [d, n, n_view] -> [d, count, n_view].
+Tensor slice_tokens(Graph& g, Tensor x, int first, int count);
 /// One vector for every token of `like`: [d, 1] -> [d, n].
 Tensor repeat_like(Graph& g, Tensor x, Tensor like);
 
@@ -22,6 +25,8 @@ Tensor column(Graph& g, Tensor table, Tensor index);
 
 Tensor add(Graph& g, Tensor a, Tensor b);
 Tensor scale(Graph& g, Tensor x, float factor);
+/// Every token times the same vector, number by number: x [d, n, ...], factor [d] -> the shape of x.
+Tensor multiply(Graph& g, Tensor x, Tensor factor);
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
 /// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2,

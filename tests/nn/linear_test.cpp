@@ -10,7 +10,7 @@
 
 #include "kernels/linear_kernel.h"
 #include "kernels/norm.h"
-#include "nn/mlp.h"
+#include "nn/tokens.h"
 #include "support/editable_bundle.h"
 #include "support/graph_runner.h"
 #include "support/kernel_rows.h"
@@ -135,6 +135,15 @@ TEST_CASE("a layer gives what ggml's product of widened weights gives") {
 TEST_CASE("an activation and a residual in the product's node change nothing, nor does a tap between them") {
   check_like_ggml([](Graph& g, const Layers& l, Tensor x) {
     return l.c.added_to(g, x, l.b.activated(g, l.c(g, l.a.activated(g, x, Activation::gelu_tanh)), Activation::silu));
+  });
+}
+
+TEST_CASE("tokens cut out of several sequences are multiplied and added to as any x is") {
+  check_like_ggml([](Graph& g, const Layers& l, Tensor x) {
+    const int half = static_cast<int>(x.dim(1)) / 2;
+    const Tensor two = ggml_reshape_3d(g.context(), slice_tokens(g, x, 0, 2 * half).node(), kModel, half, 2);
+    const Tensor some = slice_tokens(g, two, 1, half - 1);
+    return l.c.added_to(g, some, l.a.activated(g, some, Activation::gelu_erf));
   });
 }
 

@@ -5,6 +5,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <functional>
 
 #include "kernels/elementwise.h"
 #include "nn/attention.h"
@@ -194,6 +195,67 @@ TEST_CASE("pixel shuffle puts the patches of a square into one token, row by row
   const auto y = run_graph([&](Graph& g) { return pixel_shuffle(g, g.store().add_constant(x, {1, 16, 2}), 2); });
   CHECK(std::vector<float>(y.begin(), y.begin() + 8) == std::vector<float>{0, 1, 10, 11, 2, 3, 12, 13});
   CHECK(std::vector<float>(y.end() - 4, y.end()) == std::vector<float>{122, 123, 132, 133});
+}
+
+TEST_CASE("a slice holds the tokens of its range, and whatever takes tokens takes it") {
+  constexpr int kWidth = 3, kToken = 5, kView = 2;
+  const std::vector<float> x = ramp(kWidth * kToken * kView, 1);
+  const auto at = [&](int view, int token, int i) {
+    return x[static_cast<std::size_t>((view * kToken + token) * kWidth + i)];
+  };
+  using Use = std::function<Tensor(Graph&, Tensor)>;
+  const auto use_slice = [&](int n_view, const Use& use, const std::string& isa) {
+    return run_graph(
+        [&](Graph& g) {
+          const std::vector<float> some(x.begin(), x.begin() + kWidth * kToken * n_view);
+          return use(g, slice_tokens(g, g.store().add_constant(some, {kWidth, kToken, n_view}), 1, 3));
+        },
+        isa);
+  };
+  const auto tokens = [&](Graph& g, float value, int n_view) {
+    return g.store().add_constant(std::vector<float>(static_cast<std::size_t>(kWidth * n_view), value),
+                                  {kWidth, 1, n_view});
+  };
+  for (Isa isa : usable_isas())
+    for (int n_view : {1, kView}) {
+      std::vector<float> same, between, factored, positive;
+      for (int view = 0; view < n_view; ++view) {
+        for (int i = 0; i < kWidth; ++i) between.push_back(2);
+        for (int token = 1; token < 4; ++token)
+          for (int i = 0; i < kWidth; ++i) {
+            same.push_back(at(view, token, i));
+            between.push_back(at(view, token, i));
+            factored.push_back(at(view, token, i) * static_cast<float>(i + 1));
+            positive.push_back(std::max(at(view, token, i), 0.0f));
+          }
+      }
+      const auto run = [&](const Use& use) { return use_slice(n_view, use, isa_name(isa)); };
+      CHECK(run([](Graph& g, Tensor s) { return scale(g, s, 1); }) == same);
+      CHECK(run([](Graph& g, Tensor s) { return flatten_views(g, s); }) == same);
+      CHECK(run([&](Graph& g, Tensor s) { return concat_tokens(g, {tokens(g, 2, n_view), s}); }) == between);
+      CHECK(run([&](Graph& g, Tensor s) {
+              return concat_tokens(g, {tokens(g, 2, n_view), kernels::contiguous(g, s)});
+            }) == between);
+      CHECK(run([&](Graph& g, Tensor s) {
+              return slice_tokens(g, concat_tokens(g, {tokens(g, 2, n_view), s}), 1, 3);
+            }) == same);
+      CHECK(run([&](Graph& g, Tensor s) { return add(g, s, scale(g, s, -1)); }) ==
+            std::vector<float>(same.size(), 0.0f));
+      CHECK(run([](Graph& g, Tensor s) { return kernels::relu(g, s); }) == positive);
+      CHECK(run([](Graph& g, Tensor s) {
+              return multiply(g, s, g.store().add_constant(std::vector<float>{1, 2, 3}, {kWidth}));
+            }) == factored);
+    }
+}
+
+TEST_CASE("pixel shuffle takes the patches of every view behind a class token") {
+  std::vector<float> x;
+  for (int view = 0; view < 2; ++view)
+    for (int i = -1; i < 4; ++i) x.push_back(static_cast<float>(10 * view + i));
+  const auto y = run_graph([&](Graph& g) {
+    return pixel_shuffle(g, slice_tokens(g, g.store().add_constant(x, {1, 5, 2}), 1, 4), 2);
+  });
+  CHECK(y == std::vector<float>{0, 1, 2, 3, 10, 11, 12, 13});
 }
 
 TEST_CASE("a tap of a view keeps its values when later nodes reuse the memory") {
