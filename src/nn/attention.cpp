@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <numeric>
@@ -55,6 +56,23 @@ Tensor group_mask(Graph& g, std::span<const int> group_sizes) {
 Tensor causal_mask(Graph& g, int n_past, int n_query) {
   return make_mask(g, fmt::format("causal_mask/{}/{}", n_past, n_query), n_past + n_query, n_query,
                    [&](int i, int j) { return j <= n_past + i; });
+}
+
+Tensor causal_mask(Graph& g, const std::vector<bool>& seen) {
+  const int n = static_cast<int>(seen.size());
+  if (std::find(seen.begin(), seen.end(), false) == seen.end()) return causal_mask(g, 0, n);
+  return make_mask(g, fmt::format("causal_mask/{}", fmt::join(seen, "")), n, n,
+                   [&](int i, int j) { return j <= i && seen[static_cast<std::size_t>(j)]; });
+}
+
+Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query) {
+  if (std::all_of(copies.begin(), copies.end(), [](int n) { return n == 1; })) return {};
+  return g.constant(fmt::format("copies_mask/{}/{}", n_query, fmt::join(copies, "/")), [&](Store& store) {
+    std::vector<float> mask;
+    for (int i = 0; i < n_query; ++i)
+      for (const int n : copies) mask.push_back(static_cast<float>(std::log(static_cast<double>(n))));
+    return store.add_constant(std::move(mask), {static_cast<std::int64_t>(copies.size()), n_query});
+  });
 }
 
 Tensor split_heads(Graph& g, Tensor x, int n_head) {

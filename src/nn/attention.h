@@ -3,6 +3,7 @@
 #pragma once
 
 #include <span>
+#include <vector>
 
 #include "backend/graph.h"
 
@@ -23,6 +24,13 @@ Tensor group_mask(Graph& g, std::span<const int> group_sizes);
 /// The mask of `n_query` tokens that see `n_past` earlier tokens, themselves, and those before them: [n_past + n_query,
 /// n_query].
 Tensor causal_mask(Graph& g, int n_past, int n_query);
+
+/// The same for tokens of which some are never seen, not even by themselves: [n, n] for n of them. The first must be
+/// seen.
+Tensor causal_mask(Graph& g, const std::vector<bool>& seen);
+/// The mask of keys that stand for `copies[j]` equal ones each: the logarithm of that, since exp(score + ln n) is n
+/// times exp(score). [copies.size(), n_query], or none where all are 1.
+Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query);
 
 /// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...], without a copy.
 Tensor split_heads(Graph& g, Tensor x, int n_head);

@@ -2,9 +2,24 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "nn/embedding.h"
 
+#include <fmt/format.h>
+
+#include <numeric>
+
 #include "kernels/linear.h"
 
 namespace vla {
+
+Tensor constant_ids(Graph& g, const std::string& key, const std::vector<std::int32_t>& ids) {
+  return g.constant("ids/" + key,
+                    [&](Store& store) { return store.add_constant(ids, {static_cast<std::int64_t>(ids.size())}); });
+}
+
+Tensor counting_ids(Graph& g, int count) {
+  std::vector<std::int32_t> ids(static_cast<std::size_t>(count));
+  std::iota(ids.begin(), ids.end(), 0);
+  return constant_ids(g, fmt::format("counting/{}", count), ids);
+}
 
 Embedding::Embedding(const Scope& s, int d_model, int n_row) : Module(s), weight_(s.table("weight", d_model, n_row)) {}
 

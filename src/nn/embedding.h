@@ -2,9 +2,17 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <string>
+#include <vector>
+
 #include "nn/module.h"
 
 namespace vla {
+
+/// Ids that do not change from run to run, for a table: [ids.size()] i32. `key` tells lists of a graph apart.
+Tensor constant_ids(Graph& g, const std::string& key, const std::vector<std::int32_t>& ids);
+/// 0, 1, ... count - 1.
+Tensor counting_ids(Graph& g, int count);
 
 /// Rows of a table. ids [n] i32 -> [d_model, n]. Ids must be below n_row: whoever makes them checks.
 class Embedding : public Module<Embedding> {

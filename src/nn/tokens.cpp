@@ -2,16 +2,31 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "nn/tokens.h"
 
+#include <fmt/format.h>
+
+#include <algorithm>
 #include <cmath>
 
 #include "kernels/elementwise.h"
 
 namespace vla {
 
-Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts) {
+Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts) { return concat_tokens(g, std::vector(parts)); }
+
+Tensor concat_tokens(Graph& g, const std::vector<Tensor>& parts) {
   Tensor all;
   for (Tensor part : parts) all = all ? kernels::join(g, all, part, 1) : part;
   return all;
+}
+
+Tensor slice_ids(Graph& g, Tensor ids, int first, int count) {
+  return ggml_view_1d(g.context(), ids.node(), count, static_cast<std::size_t>(first) * ids.node()->nb[0]);
+}
+
+Tensor slice_keys(Graph& g, Tensor x, int first, int count) {
+  const ggml_tensor* node = x.node();
+  return ggml_view_3d(g.context(), x.node(), x.dim(0), x.dim(1), count, node->nb[1], node->nb[2],
+                      static_cast<std::size_t>(first) * node->nb[2]);
 }
 
 Tensor append_keys(Graph& g, Tensor past, Tensor present) { return kernels::join(g, past, present, 2); }
@@ -45,6 +60,38 @@ Tensor multiply(Graph& g, Tensor x, Tensor factor) { return ggml_mul(g.context()
 Tensor flatten_views(Graph& g, Tensor x) {
   return ggml_reshape_2d(g.context(), kernels::contiguous(g, x).node(), x.dim(0), x.dim(1) * x.dim(2));
 }
+
+Tensor one_view(Graph& g, Tensor x, int view) {
+  const ggml_tensor* node = x.node();
+  return ggml_view_2d(g.context(), x.node(), x.dim(0), x.dim(1), node->nb[1],
+                      static_cast<std::size_t>(view) * node->nb[2]);
+}
+
+Tensor prepend_token(Graph& g, Tensor token, Tensor x) {
+  ggml_tensor* each = ggml_repeat_4d(g.context(), token.node(), x.dim(0), 1, x.dim(2), 1);
+  return ggml_concat(g.context(), each, x.node(), 1);
+}
+
+Tensor drop_first_token(Graph& g, Tensor x) {
+  ggml_tensor* node = x.node();
+  ggml_tensor* rest =
+      ggml_view_3d(g.context(), node, x.dim(0), x.dim(1) - 1, x.dim(2), node->nb[1], node->nb[2], node->nb[1]);
+  return ggml_cont(g.context(), rest);
+}
+
+Tensor first_features(Graph& g, Tensor x, int count) {
+  const std::int64_t d = x.dim(0);
+  const Tensor keep = g.constant(fmt::format("first_features/{}/{}", d, count), [&](Store& store) {
+    std::vector<float> values(static_cast<std::size_t>(d), 0.0f);
+    std::fill_n(values.begin(), count, 1.0f);
+    return store.add_constant(std::move(values), {d});
+  });
+  return ggml_mul(g.context(), x.node(), keep.node());
+}
+
+Tensor one_column(Graph& g, Tensor x) { return ggml_reshape_2d(g.context(), x.node(), x.dim(0) * x.dim(1), 1); }
+
+Tensor columns(Graph& g, Tensor x, int d) { return ggml_reshape_2d(g.context(), x.node(), d, x.dim(0) / d); }
 
 Tensor pixel_shuffle(Graph& g, Tensor x, int factor) {
   ggml_context* c = g.context();

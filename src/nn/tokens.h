@@ -3,6 +3,7 @@
 #pragma once
 
 #include <initializer_list>
+#include <vector>
 
 #include "backend/graph.h"
 
@@ -11,6 +12,11 @@ namespace vla {
 /// Sequences one after the other, in every view: [d, n_1, n_view], [d, n_2, n_view], ... -> [d, n_1 + n_2 + ...,
 /// n_view].
 Tensor concat_tokens(Graph& g, std::initializer_list<Tensor> parts);
+Tensor concat_tokens(Graph& g, const std::vector<Tensor>& parts);
+/// Ids first to first + count - 1, without a copy: [n] i32 -> [count].
+Tensor slice_ids(Graph& g, Tensor ids, int first, int count);
+/// Keys or values first to first + count - 1, without a copy: [d_head, n_head, n] -> [d_head, n_head, count].
+Tensor slice_keys(Graph& g, Tensor x, int first, int count);
 /// Keys or values one after the other: [d_head, n_head, n_1], [d_head, n_head, n_2] -> [d_head, n_head, n_1 + n_2].
 Tensor append_keys(Graph& g, Tensor past, Tensor present);
 /// Two feature vectors per token, the first above the second: [d_1, n], [d_2, n] -> [d_1 + d_2, n].
@@ -29,6 +35,17 @@ Tensor scale(Graph& g, Tensor x, float factor);
 Tensor multiply(Graph& g, Tensor x, Tensor factor);
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
+/// One view's tokens, without a copy: [d, n, n_view] -> [d, n].
+Tensor one_view(Graph& g, Tensor x, int view);
+/// A token in front of every view's: token [d], x [d, n, n_view] -> [d, 1 + n, n_view].
+Tensor prepend_token(Graph& g, Tensor token, Tensor x);
+/// All tokens of every view but its first: [d, 1 + n, n_view] -> [d, n, n_view].
+Tensor drop_first_token(Graph& g, Tensor x);
+/// x with zeros in all features but the first `count`: [d, n] -> the same shape.
+Tensor first_features(Graph& g, Tensor x, int count);
+/// The columns of a matrix below each other, and back, without a copy: [d, n] -> [d * n, 1], [d * n, 1] -> [d, n].
+Tensor one_column(Graph& g, Tensor x);
+Tensor columns(Graph& g, Tensor x, int d);
 /// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2,
 /// n_view]. Within a token the patches follow each other row by row. Source: transformers modeling_smolvlm.py
 /// pixel_shuffle.

@@ -1,0 +1,96 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Sequences cut, joined and masked: numbers that say where they stood.
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <limits>
+
+#include "nn/attention.h"
+#include "nn/embedding.h"
+#include "nn/tokens.h"
+#include "support/graph_runner.h"
+
+using namespace vla;
+using test::run_graph;
+
+namespace {
+
+/// 0, 1, 2, ...
+std::vector<float> counted(int count) {
+  std::vector<float> values;
+  for (int i = 0; i < count; ++i) values.push_back(static_cast<float>(i));
+  return values;
+}
+
+Tensor numbers(Graph& g, std::initializer_list<std::int64_t> shape) {
+  std::int64_t count = 1;
+  for (const std::int64_t n : shape) count *= n;
+  return g.store().add_constant(counted(static_cast<int>(count)), shape);
+}
+
+using Values = std::vector<float>;
+constexpr float kHidden = -std::numeric_limits<float>::infinity();
+
+}  // namespace
+
+TEST_CASE("a token in front of every view's is dropped again without a trace") {
+  const auto with = [](Graph& g) {
+    return prepend_token(g, g.store().add_constant(Values{-1, -2}, {2}), numbers(g, {2, 3, 2}));
+  };
+  CHECK(run_graph(with) == Values{-1, -2, 0, 1, 2, 3, 4, 5, -1, -2, 6, 7, 8, 9, 10, 11});
+  CHECK(run_graph([&](Graph& g) { return drop_first_token(g, with(g)); }) == counted(12));
+}
+
+TEST_CASE("one view of several, and parts of any number in their order") {
+  const auto got = run_graph([](Graph& g) {
+    const Tensor x = numbers(g, {2, 2, 3});
+    return concat_tokens(g, std::vector<Tensor>{one_view(g, x, 2), one_view(g, x, 0), one_view(g, x, 1)});
+  });
+  CHECK(got == Values{8, 9, 10, 11, 0, 1, 2, 3, 4, 5, 6, 7});
+}
+
+TEST_CASE("keys are cut where their tokens stand, and joined behind others") {
+  const auto got = run_graph([](Graph& g) {
+    const Tensor x = numbers(g, {2, 2, 3});
+    return append_keys(g, slice_keys(g, x, 2, 1), slice_keys(g, x, 0, 1));
+  });
+  CHECK(got == Values{8, 9, 10, 11, 0, 1, 2, 3});
+}
+
+TEST_CASE("rows of a table by a part of a list of ids") {
+  const auto got = run_graph([](Graph& g) {
+    const Tensor ids = constant_ids(g, "some", {4, 0, 3, 1});
+    return column(g, numbers(g, {1, 5}), slice_ids(g, ids, 1, 2));
+  });
+  CHECK(got == Values{0, 3});
+}
+
+TEST_CASE("features beyond the first few become zero in every column") {
+  CHECK(run_graph([](Graph& g) { return first_features(g, numbers(g, {3, 2}), 2); }) == Values{0, 1, 0, 3, 4, 0});
+}
+
+TEST_CASE("a matrix as one column and back keeps the order of its columns") {
+  CHECK(run_graph([](Graph& g) { return columns(g, one_column(g, numbers(g, {3, 2})), 2); }) == counted(6));
+}
+
+TEST_CASE("a causal mask hides what comes later and what is never seen, from itself too") {
+  const auto got = run_graph([](Graph& g) { return causal_mask(g, std::vector<bool>{true, false, true}); });
+  CHECK(got == Values{0, kHidden, kHidden, 0, kHidden, kHidden, 0, kHidden, 0});
+}
+
+TEST_CASE("a key that stands for several weighs like that many") {
+  const Values q = {0.3f, -1.2f}, k = {0.5f, 0.1f, -0.7f, 2.0f, -0.7f, 2.0f, -0.7f, 2.0f},
+               v = {1, 2, 5, -4, 5, -4, 5, -4};
+  const auto attend = [&](int n_key, const std::vector<int>& copies) {
+    return run_graph([&](Graph& g) {
+      const auto part = [&](const Values& x, int n) {
+        return g.store().add_constant(Values(x.begin(), x.begin() + 2 * n), {2, 1, n});
+      };
+      return attention(g, part(q, 1), part(k, n_key), part(v, n_key), copies_mask(g, copies, 1));
+    });
+  };
+  const Values all = attend(4, {1, 1, 1, 1}), short_cut = attend(2, {1, 3});
+  for (std::size_t i = 0; i < all.size(); ++i) CHECK(short_cut[i] == doctest::Approx(all[i]).epsilon(1e-6));
+}
