@@ -5,6 +5,8 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
+
 namespace vla {
 namespace {
 
@@ -90,6 +92,23 @@ std::string Scope::string(const std::string& key) const {
 }
 std::vector<std::string> Scope::strings(const std::string& key) const {
   return take(list_->keys().strings(key_of(key)), std::vector<std::string>());
+}
+
+std::vector<int> Scope::integers(const std::string& key) const {
+  return take(list_->keys().integers(key_of(key)), std::vector<int>());
+}
+
+int Scope::index(const std::string& key, int count) const {
+  const int value = take(list_->keys().integer(key_of(key)), 0);
+  require(value < count, key, fmt::format("0 to {}", count - 1), std::to_string(value));
+  return value < count ? value : 0;
+}
+
+int Scope::choice(const std::string& key, std::initializer_list<std::string> words) const {
+  const std::string word = string(key);
+  const auto found = std::find(words.begin(), words.end(), word);
+  require(found != words.end(), key, fmt::format("{}", fmt::join(words, ", ")), word);
+  return found != words.end() ? static_cast<int>(found - words.begin()) : 0;
 }
 
 void Scope::require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const {

@@ -75,6 +75,11 @@ class Scope {
   double precise(const std::string& key) const;
   std::string string(const std::string& key) const;
   std::vector<std::string> strings(const std::string& key) const;
+  std::vector<int> integers(const std::string& key) const;
+  /// An index of something that there are `count` of: from 0 to count - 1.
+  int index(const std::string& key, int count) const;
+  /// Which of these words it is.
+  int choice(const std::string& key, std::initializer_list<std::string> words) const;
   /// Records a problem at `key` of this scope unless `holds`.
   void require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const;
 
