@@ -29,8 +29,14 @@ Tensor make_mask(Graph& g, const std::string& key, int n_key, int n_query, Sees 
 
 }  // namespace
 
-Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) {
-  if (kernels::has_attention(g, q.dim(0))) return kernels::attention(g, q, k, v, mask);
+Tensor pack_keys(Graph& g, Tensor k, Tensor v) {
+  return kernels::has_attention(g, k.dim(0)) ? kernels::pack_keys(g, k, v) : Tensor();
+}
+
+Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask) { return attention(g, q, k, v, mask, {}); }
+
+Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask, Tensor packed) {
+  if (kernels::has_attention(g, q.dim(0))) return kernels::attention(g, q, k, v, mask, packed);
   ggml_context* c = g.context();
   const float scale = 1.0f / std::sqrt(static_cast<float>(q.dim(0)));
   ggml_tensor* query = ggml_permute(c, q.node(), 0, 2, 1, 3);                // [d_head, n_query, n_head, n_batch]

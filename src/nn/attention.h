@@ -16,6 +16,11 @@ namespace vla {
 /// query must see at least one key.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
 Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
+/// The same for keys and values that do not change between runs: `packed` is what pack_keys made of them.
+Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask, Tensor packed);
+/// Keys and values laid out once for many runs, in the order that the graph's kernels read; none where they read them
+/// as they are.
+Tensor pack_keys(Graph& g, Tensor k, Tensor v);
 
 /// The mask of consecutive groups of tokens: a token sees its own group and every earlier one. Sizes in tokens; the
 /// mask is [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.

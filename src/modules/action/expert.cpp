@@ -35,7 +35,7 @@ void ExpertCrossBlock::prepare(Graph& g, const KeyValue& prefix, Cache& cache) c
   // The cached keys already carry their rotation, and the reference projects them as they are.
   const KeyValue own = {split_heads(g, k_(g, merge_heads(g, prefix.key)), heads_.n_head_kv),
                         split_heads(g, v_(g, merge_heads(g, prefix.value)), heads_.n_head_kv)};
-  own.put(g, cache, path());
+  own.put_packed(g, cache, path());
 }
 
 Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {

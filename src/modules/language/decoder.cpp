@@ -14,8 +14,14 @@ void KeyValue::put(Graph& g, Cache& cache, const std::string& path) const {
   cache.put(g, path + ".v", value);
 }
 
+void KeyValue::put_packed(Graph& g, Cache& cache, const std::string& path) const {
+  put(g, cache, path);
+  if (const Tensor numbers = pack_keys(g, key, value)) cache.put(g, path + ".packed", numbers);
+}
+
 KeyValue KeyValue::get(const Cache& cache, const std::string& path) {
-  return {cache.get(path + ".k"), cache.get(path + ".v")};
+  const std::string packed = path + ".packed";
+  return {cache.get(path + ".k"), cache.get(path + ".v"), cache.has(packed) ? cache.get(packed) : Tensor()};
 }
 
 Heads Heads::read(const Scope& s, RotaryAngle angle) {
@@ -44,7 +50,7 @@ QueryAttention::QueryAttention(const Scope& s, int d_model, const Heads& heads)
 
 Tensor QueryAttention::mix(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {
   const Tensor query = heads_.turn(g, split_heads(g, q_(g, h), heads_.n_head), first);
-  return attention(g, query, seen.key, seen.value, mask);
+  return attention(g, query, seen.key, seen.value, mask, seen.packed);
 }
 
 Tensor QueryAttention::operator()(Graph& g, Tensor h, int first, const KeyValue& seen, Tensor mask) const {

@@ -31,9 +31,12 @@ struct Heads {
 /// What a layer attends to. Both [d_head, n_head_kv, n_token], keys after the rotary embedding.
 struct KeyValue {
   Tensor key, value;
+  Tensor packed = {};  // both as kernels read them, or none
 
   /// Into the cache, as `<path>.k` and `<path>.v`.
   void put(Graph& g, Cache& cache, const std::string& path) const;
+  /// The same where steps read them as they are, with nothing appended: laid out for that as well.
+  void put_packed(Graph& g, Cache& cache, const std::string& path) const;
   static KeyValue get(const Cache& cache, const std::string& path);
 };
 
