@@ -23,6 +23,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   engine->tap_pattern_ = options.tap_pattern;
   VLA_CHECK(engine->load_policy(options.dry));
   VLA_CHECK(engine->make_conditions());
+  VLA_CHECK(engine->make_constants(options.dry));
   VLA_CHECK(engine->make_plans());
   if (!options.dry) engine->plans_->touch();
   return engine;
@@ -61,16 +62,43 @@ Status Engine::make_conditions() {
   return graph.run(device_);
 }
 
+InputShape Engine::largest_shape() const {
+  const Recipe& recipe = processor_.recipe();
+  const int n_view = static_cast<int>(processor_.views().names().size());
+  return {recipe.letterbox.width,
+          recipe.letterbox.height,
+          n_view,
+          recipe.max_tokens,
+          d_state_,
+          placed(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
+}
+
+/// The views of a shape: shapes that are the same for the policy must be equal.
+std::uint32_t Engine::placed(std::uint32_t views) const { return policy_->places_views() ? views : 0; }
+
+/// Load rate: what every prefix needs and the weights alone decide, for policies that have such a thing.
+Status Engine::make_constants(bool dry) {
+  const Recipe& recipe = processor_.recipe();
+  VLA_CHECK(policy_->check(largest_shape()));
+  constant_store_ = std::make_unique<Store>(64 + 2 * weights_->count());
+  Graph graph(*weights_, *constant_store_, {});
+  const Tensor absent =
+      constant_store_->add_constant(processor_.absent_view(), {recipe.letterbox.width, recipe.letterbox.height, 3, 1});
+  policy_->constants(graph, absent, constants_);
+  if (graph.n_node() == 0) return {};
+  VLA_CHECK(constant_store_->allocate(device_));
+  ComputeMemory memory(device_);
+  VLA_CHECK(graph.reserve(memory));
+  VLA_CHECK(graph.allocate(memory));
+  return dry ? Status() : graph.run(device_);
+}
+
 /// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
 Status Engine::make_plans() {
   last_plan_ = nullptr;
   plans_ = std::make_unique<Plans>(
-      PlanContext{*policy_, *weights_, device_, solver_, conditions_, d_action_, horizon_, tap_pattern_});
-  const Recipe& recipe = processor_.recipe();
-  const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
-                              static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
-  VLA_CHECK(policy_->check(largest));
-  const auto plan = plans_->for_shape(largest);
+      PlanContext{*policy_, *weights_, device_, solver_, conditions_, constants_, d_action_, horizon_, tap_pattern_});
+  const auto plan = plans_->for_shape(largest_shape());
   return plan ? Status() : Status(plan.error());
 }
 
@@ -128,7 +156,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   VLA_TRY(const std::vector<float> x, start(noise));
   last_plan_ = nullptr;  // a plan of another shape may take its place
   VLA_TRY(Plan * plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view,
-                                          static_cast<int>(inputs_.tokens.size()), d_state_}));
+                                          static_cast<int>(inputs_.tokens.size()), d_state_, placed(inputs_.views)}));
   last_plan_ = plan;
   plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
   plan->set_x(x);

@@ -79,7 +79,10 @@ class Engine {
       : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
   Status load_policy(bool dry);
   Status make_conditions();
+  Status make_constants(bool dry);
   Status make_plans();
+  InputShape largest_shape() const;
+  std::uint32_t placed(std::uint32_t views) const;
   Result<std::vector<float>> start(const Noise& noise) const;
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
@@ -98,6 +101,8 @@ class Engine {
   std::unique_ptr<Weights> weights_;
   std::unique_ptr<Store> tables_;
   Tensor conditions_;
+  std::unique_ptr<Store> constant_store_;
+  Cache constants_;  // in constant_store_
   std::unique_ptr<Plans> plans_;
   const Plan* last_plan_ = nullptr;
   Inputs inputs_;  // of the last observation; its vectors keep their memory

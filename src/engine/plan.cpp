@@ -39,9 +39,10 @@ Plan::Plan(const PlanContext& context, const InputShape& shape)
     : tap_pattern_(context.tap_pattern),
       store_(store_capacity(context.weights)),
       in_{store_.add_f32({shape.width, shape.height, 3, shape.n_view}), store_.add_i32({shape.n_text}),
-          shape.d_state > 0 ? store_.add_f32({shape.d_state, 1}) : Tensor()},
+          shape.d_state > 0 ? store_.add_f32({shape.d_state, 1}) : Tensor(), shape.views},
       x_(store_.add_f32({context.d_action, context.horizon})),
       k_(store_.add_i32({1})),
+      cache_(context.constants),
       prefix_(context.weights, store_, prefix_filter(tap_pattern_)),
       step_(context.weights, store_, step_filter(tap_pattern_, context.solver.n_step)) {}
 

@@ -20,7 +20,8 @@ struct PlanContext {
   const Weights& weights;
   const Device& device;
   const Solver& solver;
-  Tensor conditions;  // [d, n_step]: what depends on the time alone, one column per solver step
+  Tensor conditions;       // [d, n_step]: what depends on the time alone, one column per solver step
+  const Cache& constants;  // what depends on the weights alone
   int d_action, horizon;
   std::string tap_pattern;
 };

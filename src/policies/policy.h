@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <cstdint>
 #include <memory>
 #include <span>
 #include <string>
@@ -15,14 +16,16 @@ namespace vla {
 /// What the processor made of one observation, as the prefix graph reads it. Absent views and text padding do not
 /// appear.
 struct PrefixInputs {
-  Tensor images;  // [width, height, 3, n_view], in the range that the image recipe makes
-  Tensor tokens;  // [n_text] i32
-  Tensor state;   // [d_state, 1], normalized and padded; none where policy.d_state is 0
+  Tensor images;            // [width, height, 3, n_view], in the range that the image recipe makes
+  Tensor tokens;            // [n_text] i32
+  Tensor state;             // [d_state, 1], normalized and padded; none where policy.d_state is 0
+  std::uint32_t views = 0;  // bit i: view i of the bundle is among the images; 0 where only their number matters
 };
 
 /// The sizes of PrefixInputs. A plan is built once for each.
 struct InputShape {
   int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
+  std::uint32_t views = 0;  // as PrefixInputs::views
   auto operator<=>(const InputShape&) const = default;
 };
 
@@ -37,6 +40,15 @@ class Policy {
 
   /// Load rate: everything that depends on the time alone, one column per solver step: [d, times.size()].
   virtual Tensor condition(Graph& g, std::span<const float> times) const = 0;
+
+  /// Whether it matters which views are present, and not their number alone.
+  virtual bool places_views() const { return false; }
+
+  /// Load rate: what depends on the weights alone, put into the cache that every prefix starts from. `absent_view` is a
+  /// view that the robot does not have, as the image recipe makes it: [width, height, 3, 1].
+  virtual void constants(Graph& g, Tensor absent_view, Cache& cache) const {
+    static_cast<void>(g), static_cast<void>(absent_view), static_cast<void>(cache);
+  }
 
   /// Observation rate: encodes images, text and state into the cache.
   virtual void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const = 0;

@@ -1,0 +1,56 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+#include <vector>
+
+#include "modules/language/decoder.h"
+#include "nn/mlp.h"
+#include "nn/norm.h"
+
+namespace vla {
+
+/// One layer over action tokens: attention to the context, which does not change from step to step, then a GELU MLP
+/// whose input the time is added to. Tokens do not see each other.
+/// Source: Evo-1 Evo_1/model/action_head/flow_matching.py BasicTransformerBlock.
+class CrossBlock : public Module<CrossBlock> {
+ public:
+  CrossBlock(const Scope& s, int d_model, int d_ff, int n_head, float eps);
+  /// Keys and values of a context [d_model, n], which is not normalized: [d_head, n_head, n] each.
+  KeyValue project(Graph& g, Tensor context) const;
+  /// x [d_model, n], time [d_model, 1], mask [n_key, n] or none -> the shape of x.
+  Tensor forward(Graph& g, Tensor x, Tensor time, const KeyValue& seen, Tensor mask) const;
+
+ private:
+  int n_head_;
+  LayerNorm attn_norm_;
+  Linear q_, k_, v_, out_;
+  LayerNorm ffn_norm_;
+  Mlp mlp_;
+};
+
+/// A stack of cross layers and a final norm.
+class CrossHead {
+ public:
+  CrossHead(const Scope& s, int d_model);
+
+  /// Load rate: puts the keys and values of rows that every observation may need.
+  void keep(Graph& g, Tensor rows, Cache& cache) const;
+  /// `count` of the rows that `keep` got, from `first` on, each of which stands for `copies` equal ones.
+  struct Kept {
+    int first, count, copies;
+  };
+  /// Observation rate: puts keys and values of the context [d_model, n] and of kept rows behind it.
+  void prepare(Graph& g, Tensor context, std::span<const Kept> kept, int n_query, Cache& cache) const;
+  /// Step rate: x [d_model, n_query] -> the same shape, normalized.
+  Tensor operator()(Graph& g, Tensor x, Tensor time, const Cache& cache) const;
+
+ private:
+  std::string path_;
+  LayerNorm norm_;
+  std::vector<CrossBlock> blocks_;
+};
+
+}  // namespace vla

@@ -1,0 +1,57 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <vector>
+
+#include "nn/embedding.h"
+#include "nn/linear.h"
+#include "nn/mlp.h"
+#include "nn/norm.h"
+
+namespace vla {
+
+/// One pre-norm block: full attention and a GELU MLP, each scaled feature by feature before it is added.
+/// x [d_model, 1 + n_patch, n_view] -> the same shape.
+/// Source: InternVL internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionEncoderLayer.
+class InternVitBlock : public Module<InternVitBlock> {
+ public:
+  InternVitBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps);
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  int n_head_;
+  LayerNorm attn_norm_;
+  Linear q_, k_, v_, out_;
+  const Param* attn_scale_;
+  LayerNorm ffn_norm_;
+  Mlp mlp_;
+  const Param* ffn_scale_;
+};
+
+/// InternViT, the vision tower of InternVL, every view in one batch. A class token stands in front of the patches and
+/// is dropped at the end; there is no final norm. Source: the same file, InternVisionModel.
+class InternVit {
+ public:
+  explicit InternVit(const Scope& s);
+
+  /// images [side, side, 3, n_view], standardized -> [d_model, n_patch, n_view]. `check` must have accepted the size.
+  Tensor operator()(Graph& g, Tensor images) const;
+  /// Pictures have the size of the position table: what the reference makes of it for others is not implemented.
+  /// Errors: unsupported.
+  Status check(int width, int height) const;
+
+  int d_model() const { return d_model_; }
+  int image_size() const { return image_size_; }
+  /// Patches in a row of the picture.
+  int n_side() const { return n_side_; }
+
+ private:
+  int d_model_, image_size_, n_side_;
+  const Param* class_token_;
+  PatchEmbed patch_embed_;
+  Embedding position_;
+  std::vector<InternVitBlock> blocks_;
+};
+
+}  // namespace vla

@@ -1,0 +1,27 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "modules/vision/mlp_connector.h"
+
+#include <fmt/format.h>
+
+#include "nn/tokens.h"
+
+namespace vla {
+
+MlpConnector::MlpConnector(const Scope& s, int d_vision, int d_model, int n_side)
+    : Module(s),
+      factor_(s.dim("factor", 64)),
+      n_token_((n_side / factor_) * (n_side / factor_)),
+      norm_(s / "norm", d_vision * factor_ * factor_, s.number("norm_eps")),
+      up_(s / "up", d_vision * factor_ * factor_, d_model, Bias::yes),
+      down_(s / "down", d_model, d_model, Bias::yes) {
+  s.require(n_side % factor_ == 0, "factor", fmt::format("a divisor of the {0} x {0} patches of a view", n_side),
+            std::to_string(factor_));
+}
+
+Tensor MlpConnector::forward(Graph& g, Tensor x) const {
+  const Tensor h = norm_(g, pixel_shuffle(g, x, factor_));
+  return down_(g, up_.activated(g, h, Activation::gelu_erf));
+}
+
+}  // namespace vla
