@@ -68,8 +68,7 @@ Tensor one_view(Graph& g, Tensor x, int view) {
 }
 
 Tensor prepend_token(Graph& g, Tensor token, Tensor x) {
-  ggml_tensor* each = ggml_repeat_4d(g.context(), token.node(), x.dim(0), 1, x.dim(2), 1);
-  return ggml_concat(g.context(), each, x.node(), 1);
+  return concat_tokens(g, {ggml_repeat_4d(g.context(), token.node(), x.dim(0), 1, x.dim(2), 1), x});
 }
 
 Tensor drop_first_token(Graph& g, Tensor x) {
@@ -81,12 +80,12 @@ Tensor drop_first_token(Graph& g, Tensor x) {
 
 Tensor first_features(Graph& g, Tensor x, int count) {
   const std::int64_t d = x.dim(0);
-  const Tensor keep = g.constant(fmt::format("first_features/{}/{}", d, count), [&](Store& store) {
+  const Tensor kept = g.constant(fmt::format("first_features/{}/{}", d, count), [&](Store& store) {
     std::vector<float> values(static_cast<std::size_t>(d), 0.0f);
     std::fill_n(values.begin(), count, 1.0f);
     return store.add_constant(std::move(values), {d});
   });
-  return ggml_mul(g.context(), x.node(), keep.node());
+  return multiply(g, x, kept);
 }
 
 Tensor one_column(Graph& g, Tensor x) { return ggml_reshape_2d(g.context(), x.node(), x.dim(0) * x.dim(1), 1); }
