@@ -189,7 +189,7 @@ def _dims(checkpoint: Checkpoint, problems: Problems) -> Section:
 
 def _kind(policy: Section, variant: str) -> str:
     kind = policy.get("normalization_type")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         policy.bad("normalization_type", " or ".join(KINDS), unsupported=True)
         return "bounds"
     if variant == "r1" and kind != "bounds":
