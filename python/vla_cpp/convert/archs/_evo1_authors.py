@@ -28,7 +28,7 @@ from ._evo1_source import Source, image_ops, pad_op
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server
 EPS = 1e-8
-MAX_SLOTS = 64
+MAX_SLOTS = 32
 DIMS_FILE, DIMS = "dims.json", {"language_layers": 14, "prompt_tokens": 1024}  # literals of the embedder
 DOCS = "docs/converting.md, Evo-1"
 
