@@ -28,6 +28,8 @@ from tiny_evo1 import (
     TinyEvo1,
     TinyEvo1Lerobot,
 )
+from vla_cpp.convert import read_bundle
+from vla_cpp.convert.cli import main
 
 STATE, ACTION = "stats.observation.state", "stats.action"
 
@@ -236,6 +238,16 @@ def test_places_of_views_are_those_of_the_tokenizers_own_ids(converter):
     ids = judge.encode(prompt + "pick up", add_special_tokens=False).ids
     image = FIRST_ADDED + 5
     assert keys["policy.view_starts"] == [i for i, t in enumerate(ids) if t == image and ids[i - 1] != image]
+
+
+def test_the_command_takes_the_answers(converter, capsys):
+    folder = converter.save(TinyEvo1())
+    flags = "--variant r1 --views observation.images.front,wrist --view-slots 2 --dead-rows causal_attention"
+    assert main([folder, "-o", converter.out, "--stats", "{}/{}".format(ARM, DATASET), *flags.split()]) == 0
+    keys = read_bundle(converter.out).keys
+    assert keys["observation.views"] == ["observation.images.front", "observation.images.wrist"]
+    assert (keys["policy.n_slot"], keys["policy.dead_rows"], keys["solver.steps"]) == (2, "causal_attention", 32)
+    assert "the robot's {} action columns".format(ACTION_DIM) in capsys.readouterr().out
 
 
 def test_every_number_of_lerobots_tensors_is_in_the_bundle(converter):
