@@ -162,6 +162,15 @@ def test_the_first_revision_differs_in_steps_times_pixels_and_padding(converter)
     assert found["state"][-1] == {"op": "pad", "size": WIDTH, "value": -1.0}
 
 
+def test_a_config_of_the_first_revision_is_noted_where_the_second_is_asked_for(converter):
+    tiny = TinyEvo1()
+    tiny.config["action_dim"] = HORIZON * WIDTH
+    authors(converter, tiny, variant="r1")
+    assert not any("--variant" in note for note in converter.summary.notes)
+    authors(converter, tiny, variant="r2")
+    assert any("is it --variant r1?" in note for note in converter.summary.notes)
+
+
 @pytest.mark.parametrize(
     "name, kind, statistics, clipped",
     [
