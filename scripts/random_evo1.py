@@ -36,6 +36,7 @@ class Description:
     d_action: int = 7
     normalization: str = "bounds"  # authors: bounds, normal or bounds_q99; LeRobot's modes stand in `policy`
     keys: tuple = ("franka_ee_pose_delta", "libero_10_no_noops_lerobot")  # authors: where norm_stats.json has the statistics
+    other_keys: tuple = ()  # authors: data sets beside the last key, with statistics of their own
     zero_spread: tuple = ()
     n_merge: int = 60
     noise = "uniform"
@@ -65,7 +66,7 @@ def tokenizer(n_merge):
 
 
 def write_tokenizer(description, folder):
-    """tokenizer.json for LeRobot's backbone; vocabulary, merges and added tokens for the authors', whose class is the slow one."""
+    """tokenizer.json, and for the authors' layout the three files that their slow class reads."""
     words = tokenizer(description.n_merge)
     words.save_pretrained(folder)
     spec = json.loads(words.backend_tokenizer.to_str())
@@ -75,7 +76,6 @@ def write_tokenizer(description, folder):
     settings.pop("backend", None)
     (folder / "tokenizer_config.json").write_text(json.dumps(settings, indent=2) + "\n")
     if description.layout == "authors":
-        (folder / "tokenizer.json").unlink()
         (folder / "vocab.json").write_text(json.dumps(spec["model"]["vocab"], ensure_ascii=False))
         (folder / "merges.txt").write_text("#version: 0.2\n" + "".join(" ".join(m) + "\n" for m in spec["model"]["merges"]))
         (folder / "added_tokens.json").write_text(json.dumps({t["content"]: t["id"] for t in spec["added_tokens"]}, indent=2))
@@ -118,6 +118,16 @@ def near_one(modules):
             table.copy_(table.bfloat16())
 
 
+def norm_stats(description, seed):
+    """Statistics under a robot, or under arm and data set."""
+    def numbers(seed):
+        return {f: {k: v.tolist() for k, v in s.items()} for f, s in statistics(description, seed).items()}
+
+    *arm, last = description.keys
+    found = {key: numbers(seed + 1 + i) for i, key in enumerate(description.other_keys)} | {last: numbers(seed)}
+    return {arm[0]: found} if arm else found
+
+
 def as_deepspeed(state):
     """The trainer's file: parameters are views of one flat buffer, tables stand alone, and other things lie about."""
     import torch
@@ -149,10 +159,7 @@ def write_authors(description, seed, folder):
     randomise(modules, seed), near_one(modules)
     state = {name: torch.cat(parts).bfloat16() for name, parts in golden_evo1.authors_tensors(modules)}
     torch.save(as_deepspeed(state), folder / "mp_rank_00_model_states.pt")
-    numbers = {f: {k: v.tolist() for k, v in s.items()} for f, s in statistics(d, seed).items()}
-    for key in reversed(d.keys):
-        numbers = {key: numbers}
-    (folder / "norm_stats.json").write_text(json.dumps(numbers, indent=1) + "\n")
+    (folder / "norm_stats.json").write_text(json.dumps(norm_stats(d, seed), indent=1) + "\n")
     return sum(p.numel() for p in modules.parameters())
 
 

@@ -39,11 +39,17 @@ def read_options(checkpoint):
 
 
 def towers_from_config(config):
-    """transformers' InternVL without initial values from a file, eager."""
+    """transformers' InternVL, eager, with weights from no file."""
     import transformers
 
     config._attn_implementation = "eager"
     return transformers.InternVLModel._from_config(config)
+
+
+def in_bfloat16(towers):
+    """As from_pretrained leaves them: parameters alone, for the frequencies of the rotary embedding stay in float32."""
+    for p in towers.parameters():
+        p.data = p.data.bfloat16()
 
 
 def native_config(chat, image_token):
@@ -112,7 +118,7 @@ def construct_lerobot(config):
     from transformers import InternVLConfig
 
     def from_config(name, **options):
-        return towers_from_config(InternVLConfig.from_pretrained(name)).to(options["torch_dtype"])
+        return towers_from_config(InternVLConfig.from_pretrained(name))
 
     hub = internvl3_embedder.AutoModel
     internvl3_embedder.AutoModel = type("FromConfig", (), {"from_pretrained": staticmethod(from_config)})
@@ -130,7 +136,7 @@ def load(checkpoint, dtype="float32"):
     policy, before, after = (load_lerobot if is_lerobot(checkpoint) else load_authors)(Path(checkpoint))
     policy.published = dtype == "published"
     if policy.published:
-        policy.towers.bfloat16()
+        in_bfloat16(policy.towers)
     return policy, before, after
 
 
@@ -141,7 +147,7 @@ def load_lerobot(checkpoint):
 
     config = PreTrainedConfig.from_pretrained(str(checkpoint))
     config.vlm_model_name = str(checkpoint / "vlm")
-    policy = construct_lerobot(config).float()
+    policy = construct_lerobot(config)
     policy.load_state_dict(load_file(checkpoint / "model.safetensors"), strict=True)
     policy.config.empty_cameras = policy.config.max_views  # so many views it lets be absent; how is the same for all
     before, after = make_pre_post_processors(config, pretrained_path=str(checkpoint))
@@ -188,7 +194,9 @@ class Server:
         self.n_step, self.time_scale = REVISIONS[options["variant"]]
         self.tokenizer = AutoTokenizer.from_pretrained(checkpoint / "vlm")
         statistics = json.loads((checkpoint / "norm_stats.json").read_text())
-        while "action" not in statistics:  # under the robot, or under arm and data set
+        for key in filter(None, options.get("stats", "").split("/")):
+            statistics = statistics[key]
+        while "action" not in statistics:  # under the only robot, or the only arm and its only data set
             (statistics,) = statistics.values()
         self.statistics, self.normalization = statistics, config.get("normalization_type", "bounds")
         self.d_robot = len(statistics["action"]["min"])
@@ -198,6 +206,7 @@ class Server:
         import torch
 
         frames = [batch.get(f"observation.images.{v}") for v in self.options["views"]]
+        frames += [None] * (self.options["view_slots"] - len(frames))
         pixels = torch.stack([self.pixels(f) for f in frames])
         n_view, n_token = len(frames), self.towers.config.image_seq_length
         prompt = "".join(f"Image-{i + 1}: <img>{'<IMG_CONTEXT>' * n_token}</img>\n" for i in range(n_view)) + batch["task"].strip()
