@@ -30,7 +30,7 @@ class Description:
     text: dict  # fields of Qwen2Config, with the number of layers that the backbone has
     n_layer: int  # the first ones, which the policy keeps
     head: dict  # num_heads, num_layers, hidden_dim, state_hidden_dim
-    policy: dict  # chunk_size, max_state_dim, max_action_dim; for LeRobot any other field of its Evo1Config
+    policy: dict  # chunk_size, max_state_dim, max_action_dim, max_text_length; for LeRobot any other field of its Evo1Config
     views: dict  # view -> declared (height, width)
     d_state: int = 8
     d_action: int = 7
@@ -145,17 +145,22 @@ def as_deepspeed(state):
 
 
 def write_authors(description, seed, folder):
-    """The three files of the authors' trainer.  Returns the parameter count."""
+    """The three files of the authors' trainer, and dims.json for two literals of their code.  Returns the parameter count."""
     import torch
     from vla_cpp.convert import golden_evo1
 
     d = description
     head = d.head | {"embed_dim": d.text["hidden_size"], "horizon": d.policy["chunk_size"], "state_dim": d.policy["max_state_dim"],
                      "per_action_dim": d.policy["max_action_dim"], "num_categories": 1, "dropout": 0.2}
-    config = head | {"vlm_name": HUB_NAMES["authors"], "action_head": "flowmatching", "return_cls_only": False,
-                     "normalization_type": d.normalization}
+    config = head | {"vlm_name": HUB_NAMES["authors"], "action_head": "flowmatching", "return_cls_only": False}
+    if len(d.keys) == 1:  # the older files
+        config["action_dim"] = head["horizon"] * head["per_action_dim"]
+    else:
+        config["normalization_type"] = d.normalization
+    dims = {"language_layers": d.n_layer, "prompt_tokens": d.policy["max_text_length"]}
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
-    modules = golden_evo1.construct_authors(folder, d.n_layer)
+    (folder / "dims.json").write_text(json.dumps(dims) + "\n")
+    modules = golden_evo1.construct_authors(folder)
     randomise(modules, seed), near_one(modules)
     state = {name: torch.cat(parts).bfloat16() for name, parts in golden_evo1.authors_tensors(modules)}
     torch.save(as_deepspeed(state), folder / "mp_rank_00_model_states.pt")

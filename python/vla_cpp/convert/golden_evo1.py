@@ -35,6 +35,12 @@ def read_options(checkpoint):
     return json.loads((Path(checkpoint).parent / "convert.json").read_text())
 
 
+def read_dims(checkpoint):
+    """Two literals of the authors' code, which dims.json replaces for other sizes."""
+    file = checkpoint / "dims.json"
+    return {"language_layers": 14, "prompt_tokens": 1024} | (json.loads(file.read_text()) if file.is_file() else {})
+
+
 # --- construction -------------------------------------------------------------------------------------------------
 
 
@@ -66,8 +72,8 @@ def native_config(chat, image_token):
                           image_seq_length=int((side // patch * chat["downsample_ratio"]) ** 2), tie_word_embeddings=False)
 
 
-def construct_authors(checkpoint, n_layer):
-    """{towers, head} of a folder's configurations, with the first n_layer layers of the language model."""
+def construct_authors(checkpoint):
+    """{towers, head} of a folder's configurations."""
     import torch
     from lerobot.policies.evo1.flow_matching import FlowmatchingActionHead
     from transformers import AutoTokenizer
@@ -77,7 +83,7 @@ def construct_authors(checkpoint, n_layer):
     chat = json.loads((checkpoint / "vlm" / "config.json").read_text())
     token = AutoTokenizer.from_pretrained(checkpoint / "vlm").convert_tokens_to_ids("<IMG_CONTEXT>")
     towers = towers_from_config(native_config(chat, token))
-    towers.language_model.layers = towers.language_model.layers[:n_layer]
+    towers.language_model.layers = towers.language_model.layers[: read_dims(checkpoint)["language_layers"]]
     same = ("embed_dim", "hidden_dim", "horizon", "per_action_dim", "num_heads", "num_layers", "dropout", "num_categories", "state_dim",
             "state_hidden_dim")
     head = FlowmatchingActionHead(action_dim=config["horizon"] * config["per_action_dim"], **{k: config[k] for k in same})
@@ -168,9 +174,7 @@ def load_authors(checkpoint):
     import torch
 
     weights = torch.load(checkpoint / "mp_rank_00_model_states.pt", weights_only=True)["module"]
-    layer = "embedder.model.language_model.model.layers."
-    n_layer = 1 + max(int(n.removeprefix(layer).split(".")[0]) for n in weights if n.startswith(layer))
-    modules = construct_authors(checkpoint, n_layer)
+    modules = construct_authors(checkpoint)
     places = dict(authors_tensors(modules))
     if places.keys() != weights.keys():
         raise ValueError(f"{checkpoint}: names differ: {sorted(places.keys() ^ weights.keys())}")
@@ -192,6 +196,7 @@ class Server:
         self.towers, self.head, self.options = modules["towers"], modules["head"], options
         self.dead_rows, self.r1 = options["dead_rows"], options["variant"] == "r1"
         self.n_step, self.time_scale = REVISIONS[options["variant"]]
+        self.n_token = read_dims(checkpoint)["prompt_tokens"]
         self.tokenizer = AutoTokenizer.from_pretrained(checkpoint / "vlm")
         statistics = json.loads((checkpoint / "norm_stats.json").read_text())
         for key in filter(None, options.get("stats", "").split("/")):
@@ -210,7 +215,7 @@ class Server:
         pixels = torch.stack([self.pixels(f) for f in frames])
         n_view, n_token = len(frames), self.towers.config.image_seq_length
         prompt = "".join(f"Image-{i + 1}: <img>{'<IMG_CONTEXT>' * n_token}</img>\n" for i in range(n_view)) + batch["task"].strip()
-        words = self.tokenizer([prompt], return_tensors="pt", padding="max_length", truncation=True, max_length=self.options["n_token"])
+        words = self.tokenizer([prompt], return_tensors="pt", padding="max_length", truncation=True, max_length=self.n_token)
         ids, mask = words["input_ids"], words["attention_mask"].clone()
         context = (ids[0] == self.towers.config.image_token_id).nonzero()[:, 0].view(n_view, n_token)
         for rows, frame in zip(context, frames, strict=True):
