@@ -37,6 +37,7 @@ class Description:
     normalization: str = "bounds"  # authors: bounds, normal or bounds_q99; LeRobot's modes stand in `policy`
     keys: tuple = ("franka_ee_pose_delta", "libero_10_no_noops_lerobot")  # authors: where norm_stats.json has the statistics
     other_keys: tuple = ()  # authors: data sets beside the last key, with statistics of their own
+    faint: bool = False  # what enters the towers and the head is so small that every norm's eps shows
     zero_spread: tuple = ()
     n_merge: int = 60
     noise = "uniform"
@@ -108,11 +109,16 @@ def write_backbone(description, folder):
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
 
 
-def near_one(modules):
-    """Layer scales as trained ones are not: near 1, or the vision layers would hardly count."""
+FAINT = (".embeddings.", ".lambda_", "embed_tokens", ".W3.")
+
+
+def settle(modules, description):
+    """Layer scales as trained ones are not: near 1, or the vision layers would hardly count.  Tables as bfloat16 has them."""
     for name, p in modules.named_parameters():
         if ".lambda_" in name:
             p.data.add_(1).copy_(p.data.bfloat16())
+        if description.faint and any(part in name for part in FAINT):
+            p.data /= 64
     for name, table in modules.named_buffers():
         if name.endswith(".pe"):
             table.copy_(table.bfloat16())
@@ -161,7 +167,7 @@ def write_authors(description, seed, folder):
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
     (folder / "dims.json").write_text(json.dumps(dims) + "\n")
     modules = golden_evo1.construct_authors(folder)
-    randomise(modules, seed), near_one(modules)
+    randomise(modules, seed), settle(modules, d)
     state = {name: torch.cat(parts).bfloat16() for name, parts in golden_evo1.authors_tensors(modules)}
     torch.save(as_deepspeed(state), folder / "mp_rank_00_model_states.pt")
     (folder / "norm_stats.json").write_text(json.dumps(norm_stats(d, seed), indent=1) + "\n")
@@ -188,7 +194,7 @@ def write_lerobot(description, seed, folder):
 
     config = policy_config(description, folder / "vlm")
     policy = golden_evo1.construct_lerobot(config)
-    randomise(policy, seed), near_one(policy)
+    randomise(policy, seed), settle(policy, description)
     before, after = make_evo1_pre_post_processors(config, statistics(description, seed))
     config.vlm_model_name = HUB_NAMES["lerobot"]
     policy.bfloat16().save_pretrained(folder)

@@ -155,7 +155,6 @@ def load_lerobot(checkpoint):
     config.vlm_model_name = str(checkpoint / "vlm")
     policy = construct_lerobot(config)
     policy.load_state_dict(load_file(checkpoint / "model.safetensors"), strict=True)
-    policy.config.empty_cameras = policy.config.max_views  # so many views it lets be absent; how is the same for all
     before, after = make_pre_post_processors(config, pretrained_path=str(checkpoint))
     policy.towers, policy.head = policy.model.embedder.model, policy.model.action_head
     policy.dead_rows, policy.d_robot = "unseen", config.output_features["action"].shape[0]
