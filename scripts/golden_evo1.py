@@ -41,15 +41,16 @@ CASES = {
         options=said("r2", "zero_attention", ("agentview", "wrist"))),
     # The first revision: 32 steps, another scale of time, pixels normalised in float32, -1 where the state is filled up. The
     # slot in the middle is empty; 6 x 6 patches; many pads; a state number that never moved in the data.
-    "evo1/first_revision": Case(32, {"front": (70, 52, "png"), "left": None, "wrist": (84, 84, "png")}, "push the plate slowly", Description(
+    "evo1/first_revision": Case(32, {"front": (70, 52, "png"), "left": None, "wrist": (84, 84, "png")}, "push the plate slowly",
+        Description(
         "authors", 84, vision(30, 3, 5, 44, layer_norm_eps=1e-5), text(32, 3, 4, 1, 56, rope_theta=1e5, rms_norm_eps=1e-5), 2,
         head(3, 2, 24, 36), policy(7, 104), {"front": (70, 52), "left": (84, 84), "wrist": (84, 84)}, d_state=9, keys=("sawyer",),
         zero_spread=(2,)),
         options=said("r1", "zero_attention", ("front", "left", "wrist"))),
     # Rows that carry nothing take part: the first slot is empty and there are pads. Means instead of ranges, of one of two
     # data sets; as many heads of keys as of queries.
-    "evo1/causal_rows": Case(33, {"high": None, "left": (40, 64, "png"), "right": (56, 56, "png")}, "stack the green block on the yellow block",
-        Description(
+    "evo1/causal_rows": Case(33, {"high": None, "left": (40, 64, "png"), "right": (56, 56, "png")},
+        "stack the green block on the yellow block", Description(
         "authors", 56, vision(32, 2, 4, 40), text(40, 3, 5, 5, 48), 2, head(2, 5, 44, 20), policy(6, 60),
         {"high": (56, 56), "left": (40, 64), "right": (56, 56)}, d_state=14, d_action=14, normalization="normal",
         keys=("aloha_joint", "robotwin_stack"), other_keys=("robotwin_push",)),
@@ -62,15 +63,14 @@ CASES = {
     # Nothing is dead: every view present and an instruction beyond the limit, with capitals, digits, a letter in two parts
     # and lines around it; quantiles; a robot with as many numbers as the network.
     "evo1/long_text": Case(35, {"top": (56, 56, "png"), "left": (38, 50, "png"), "right": (90, 60, "png")},
-        "\n O\u0308ffne die Schublade 12: 开抽屉, THEN put the black bowl on top of the stove and close the bottom drawer of the cabinet\n",
-        Description(
+        "\n O\u0308ffne die Schublade 12: 开抽屉, THEN put the black bowl on top of the stove, and close the bottom drawer\n", Description(
         "authors", 56, vision(28, 2, 2, 44), text(32, 2, 4, 2, 72, rope_theta=1e4), 2, head(1, 4, 52, 40), policy(4, 72),
         {"top": (56, 56), "left": (38, 50), "right": (90, 60)}, d_state=24, d_action=24, normalization="bounds_q99"),
         options=said("r2", "zero_attention", ("top", "left", "right"))),
     # LeRobot's layout: the first of three cameras absent, so that the others move up; a JPEG file; the gripper made one of two
     # numbers. Absent may be as many as are declared as empty ones: one such is there instead.
-    "evo1/lerobot": Case(34, {"front": None, "wrist": (61, 97, "jpg"), "empty_camera_0": (90, 84, "png")}, "Put the black_bowl on top of the stove!",
-        Description(
+    "evo1/lerobot": Case(34, {"front": None, "wrist": (61, 97, "jpg"), "empty_camera_0": (90, 84, "png")},
+        "Put the black_bowl on top of the stove!", Description(
         "lerobot", 84, vision(40, 2, 5, 36), text(36, 4, 3, 1, 64), 3, head(2, 3, 30, 26),
         policy(6, 80, 10, 9, num_inference_timesteps=8, vlm_dtype="float32", max_views=3, binarize_gripper=True, empty_cameras=1),
         {"front": (52, 90), "wrist": (61, 97)})),

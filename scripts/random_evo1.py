@@ -104,8 +104,8 @@ def write_backbone(description, folder):
         "use_thumbnail": True, "template": "internvl2_5", "hidden_size": text["hidden_size"], "tie_word_embeddings": False,
         "vision_config": vision | {"model_type": "intern_vit_6b", "image_size": side, "hidden_act": "gelu", "qkv_bias": True,
                                    "qk_normalization": False},
-        "llm_config": text | {"model_type": "qwen2", "architectures": ["Qwen2ForCausalLM"], "hidden_act": "silu", "use_cache": False,
-                              "rope_scaling": {"factor": 2.0, "rope_type": "dynamic", "type": "dynamic"}}}
+        "llm_config": text | {"model_type": "qwen2", "architectures": ["Qwen2ForCausalLM"], "hidden_act": "silu",
+                              "use_cache": False, "rope_scaling": {"factor": 2.0, "rope_type": "dynamic", "type": "dynamic"}}}
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
 
 
@@ -126,6 +126,7 @@ def settle(modules, description):
 
 def norm_stats(description, seed):
     """Statistics under a robot, or under arm and data set."""
+
     def numbers(seed):
         return {f: {k: v.tolist() for k, v in s.items()} for f, s in statistics(description, seed).items()}
 
@@ -153,11 +154,11 @@ def as_deepspeed(state):
 def write_authors(description, seed, folder):
     """The three files of the authors' trainer, and dims.json for two literals of their code.  Returns the parameter count."""
     import torch
-    from vla_cpp.convert import golden_evo1
+    from vla_cpp.convert import golden_evo1_server as server
 
     d = description
-    head = d.head | {"embed_dim": d.text["hidden_size"], "horizon": d.policy["chunk_size"], "state_dim": d.policy["max_state_dim"],
-                     "per_action_dim": d.policy["max_action_dim"], "num_categories": 1, "dropout": 0.2}
+    head = d.head | {"embed_dim": d.text["hidden_size"], "horizon": d.policy["chunk_size"], "num_categories": 1, "dropout": 0.2,
+                     "state_dim": d.policy["max_state_dim"], "per_action_dim": d.policy["max_action_dim"]}
     config = head | {"vlm_name": HUB_NAMES["authors"], "action_head": "flowmatching", "return_cls_only": False}
     if len(d.keys) == 1:  # the older files
         config["action_dim"] = head["horizon"] * head["per_action_dim"]
@@ -166,9 +167,9 @@ def write_authors(description, seed, folder):
     dims = {"language_layers": d.n_layer, "prompt_tokens": d.policy["max_text_length"]}
     (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n")
     (folder / "dims.json").write_text(json.dumps(dims) + "\n")
-    modules = golden_evo1.construct_authors(folder)
+    modules = server.construct(folder)
     randomise(modules, seed), settle(modules, d)
-    state = {name: torch.cat(parts).bfloat16() for name, parts in golden_evo1.authors_tensors(modules)}
+    state = {name: torch.cat(parts).bfloat16() for name, parts in server.tensors(modules)}
     torch.save(as_deepspeed(state), folder / "mp_rank_00_model_states.pt")
     (folder / "norm_stats.json").write_text(json.dumps(norm_stats(d, seed), indent=1) + "\n")
     return sum(p.numel() for p in modules.parameters())
@@ -184,7 +185,8 @@ def policy_config(description, backbone):
     return Evo1Config(
         input_features=views | state, output_features={"action": PolicyFeature(FeatureType.ACTION, (d.d_action,))},
         vlm_model_name=str(backbone), vlm_num_layers=d.n_layer, image_resolution=(d.side, d.side), use_flash_attn=False,
-        embed_dim=d.text["hidden_size"], n_action_steps=d.policy["chunk_size"], device="cpu", push_to_hub=False, **d.head, **d.policy)
+        embed_dim=d.text["hidden_size"], n_action_steps=d.policy["chunk_size"], device="cpu", push_to_hub=False,
+        **d.head, **d.policy)
 
 
 def write_lerobot(description, seed, folder):
