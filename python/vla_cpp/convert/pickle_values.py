@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 import pickletools
-from typing import Callable, Dict, List, NamedTuple, Tuple
+from typing import Callable, Dict, Iterator, List, NamedTuple, Tuple
 
 from .errors import refuse
 
@@ -21,13 +21,20 @@ MAX_BYTES, MAX_STEPS = 16 << 20, 2_000_000
 ARGUMENTS = set(
     """
     BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT BINUNICODE SHORT_BINUNICODE BINUNICODE8
-    BINBYTES SHORT_BINBYTES BINBYTES8 BINSTRING SHORT_BINSTRING
+    BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 BINSTRING SHORT_BINSTRING
     """.split()
 )
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 EMPTY = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_TUPLE": tuple, "EMPTY_SET": set}
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 PUTS, GETS = ("BINPUT", "LONG_BINPUT"), ("BINGET", "LONG_BINGET")
+OTHERS = set(
+    """
+    PROTO FRAME STOP MARK TUPLE LIST DICT POP POP_MARK DUP MEMOIZE APPEND APPENDS SETITEM SETITEMS ADDITEMS FROZENSET GLOBAL
+    STACK_GLOBAL REDUCE NEWOBJ NEWOBJ_EX BUILD BINPERSID
+    """.split()
+)
+KNOWN = OTHERS.union(ARGUMENTS, CONSTANTS, EMPTY, TUPLES, PUTS, GETS)
 KEYS = (str, int, float, bytes, type(None))  # of dictionaries that are kept; whatever else is a key belongs to nobody here
 
 
@@ -46,7 +53,7 @@ class Inert:
 
 def describe(value) -> str:
     """A value in a refusal: never its content, which may be nested without end."""
-    return value.name.replace(" ", ".") if isinstance(value, (Global, Inert)) else type(value).__name__
+    return value.name.replace(" ", ".")[:100] if isinstance(value, (Global, Inert)) else type(value).__name__
 
 
 Calls = Dict[str, Callable[[tuple], object]]  # "module name" -> what a call of it with these arguments makes
@@ -104,7 +111,7 @@ class _Machine:
             self.since_mark()
         elif name == "DUP":
             stack.append(self.top())
-        elif name not in ("PROTO", "FRAME"):
+        else:
             self.build(name, argument)
 
     def build(self, name: str, argument) -> None:
@@ -137,8 +144,6 @@ class _Machine:
             self.top()
         elif name == "BINPERSID":
             stack.append(self.persistent(self.pop()))
-        else:
-            raise ValueError("the opcode {}".format(name))
 
     def extend(self, items: list) -> None:
         if isinstance(self.top(), list):
@@ -161,22 +166,31 @@ class _Machine:
         return Inert(target.name) if make is None else make(arguments)
 
 
+def _steps(data: bytes) -> Iterator[Tuple[str, object]]:
+    """Names of opcodes with their arguments. An argument is read after its opcode is known to be one that this machine has."""
+    file = io.BytesIO(data)
+    for _ in range(MAX_STEPS):
+        code = file.read(1)
+        opcode = pickletools.code2op.get(code.decode("latin-1"))
+        if opcode is None or opcode.name not in KNOWN:
+            raise ValueError("the opcode {}".format(opcode.name if opcode else repr(code)) if code else "no end")
+        yield opcode.name, None if opcode.arg is None else opcode.arg.reader(file)
+    raise ValueError("more than {} steps".format(MAX_STEPS))
+
+
 def read_pickle(data: bytes, where: str, calls: Calls, persistent: Callable[[object], object]):
     """The value that the pickle describes. `persistent`: what a persistent id stands for. Errors: bad_bundle."""
     machine = _Machine(calls, persistent)
-    hint = "the file is truncated or damaged: download or save it again"
     try:
-        for count, (opcode, argument, _) in enumerate(pickletools.genops(io.BytesIO(data))):
-            if opcode.name == "STOP":
-                return machine.pop()
-            if count >= MAX_STEPS:
-                raise ValueError("more than {} steps".format(MAX_STEPS))
-            machine.step(opcode.name, argument)
-    except (ValueError, IndexError, KeyError, OverflowError) as error:
-        # pickletools names damaged places by ValueError; an empty stack and an unknown memo are the other two.
-        reason = str(error) if isinstance(error, ValueError) else "a stack or memo that lacks a value"
-        raise refuse(where, "a well-formed pickle", reason[:200], hint)
-    raise refuse(where, "a well-formed pickle", "no end", hint)
+        for name, argument in _steps(data):
+            if name == "STOP":
+                break
+            machine.step(name, argument)
+        return machine.pop()
+    except (ValueError, IndexError, KeyError) as error:
+        # Damaged arguments are ValueErrors of pickletools; an empty stack and an unknown memo are the other two.
+        reason = str(error) if isinstance(error, ValueError) else "a stack or a memo that lacks a value"
+        raise refuse(where, "a well-formed pickle", reason[:200], "the file is truncated or damaged: download or save it again")
 
 
 def ordered_dict(arguments: tuple) -> dict:

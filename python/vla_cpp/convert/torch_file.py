@@ -14,7 +14,7 @@ import zipfile
 from typing import Dict, NamedTuple, Tuple
 
 from .dtypes import SIZES
-from .errors import refuse
+from .errors import Code, refuse
 from .pickle_values import MAX_BYTES, Global, describe, ordered_dict, read_pickle
 from .safetensors_file import Entry, open_file
 
@@ -111,6 +111,8 @@ def _entries(path: str) -> Dict[str, Stored]:
                 if info.filename in result:
                     raise refuse(where, "one entry of this name", "two")
                 result[info.filename] = _place(file, info, size, where)
+        except OSError as error:
+            raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
         except (zipfile.BadZipFile, ValueError, struct.error, RuntimeError, OverflowError, EOFError) as error:
             hint = "{}; files of torch before 1.6 are no archives: save them again with a later one".format(DAMAGED)
             raise refuse(path, "an archive of torch.save", str(error)[:200], hint)

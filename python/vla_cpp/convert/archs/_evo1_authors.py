@@ -28,7 +28,7 @@ from ._evo1_source import Source, image_ops, pad_op
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server
 EPS = 1e-8
-MAX_SLOTS = 64
+MAX_SLOTS = 32
 DIMS_FILE, DIMS = "dims.json", {"language_layers": 14, "prompt_tokens": 1024}  # literals of the embedder
 DOCS = "docs/converting.md, Evo-1"
 
@@ -189,7 +189,7 @@ def _dims(checkpoint: Checkpoint, problems: Problems) -> Section:
 
 def _kind(policy: Section, variant: str) -> str:
     kind = policy.get("normalization_type")
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         policy.bad("normalization_type", " or ".join(KINDS), unsupported=True)
         return "bounds"
     if variant == "r1" and kind != "bounds":

@@ -18,7 +18,7 @@ from ..bundle import Key
 from ..checkpoint import Checkpoint, find_backbone
 from ..errors import Code, Problems
 from ..features import feature_keys
-from ..files import read_json
+from ..files import member, read_json
 from ..normalization import Normalization
 from ..section import Section
 from . import Options
@@ -139,16 +139,16 @@ def _sizes(policy: Section) -> Sizes:
         d_state=policy.count("max_state_dim"),
         d_action=policy.count("max_action_dim"),
         horizon=policy.count("chunk_size"),
-        n_slot=policy.count("max_views", most=64),
+        n_slot=policy.count("max_views", most=32),
         n_step=policy.count("num_inference_timesteps"),
         time_scale=999.0,
         dead_rows="unseen",
         absent_views="last",
     )
     s.state_dim, s.d_robot = s.d_state, s.d_action
-    if recipe.STATE in (policy.get("input_features") or {}):
+    if recipe.STATE in member(policy.values, "input_features", dict, "config.json"):
         s.state_dim = vector_dim(policy, "input_features", recipe.STATE, "STATE")
-    if recipe.ACTION in (policy.get("output_features") or {}):
+    if recipe.ACTION in member(policy.values, "output_features", dict, "config.json"):
         s.d_robot = vector_dim(policy, "output_features", recipe.ACTION, "ACTION")
     for key, padded, real in (("max_state_dim", s.d_state, s.state_dim), ("max_action_dim", s.d_action, s.d_robot)):
         if real > padded:
@@ -173,7 +173,10 @@ def _read_pipelines(policy: Section, checkpoint: Checkpoint, options: Options, s
     least = {recipe.STATE: s.state_dim, recipe.ACTION: s.d_robot}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS, least)
     problems.raise_any()
-    pre, post = ([(step["registry_name"], step.get("config", {})) for step in file["steps"]] for file in checkpoint.processors)
+    pre, post = (
+        [(step.get("registry_name", step.get("class")), step.get("config", {})) for step in file["steps"]]
+        for file in checkpoint.processors
+    )
     order, configs = [name for name, _ in pre], dict(pre + post)
     if "tokenizer_processor" in order:
         problems.unsupported(recipe.PRE, "no tokenizer_processor: the policy builds its own prompt", "one")

@@ -147,7 +147,7 @@ def read_chat_backbone(config: dict, s: Sizes, problems: Problems) -> None:
     vision = Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), CHAT_VISION, problems)
     check_fixed(vision, CHAT_VISION_FIXED)
     text = Section(WHERE + ": llm_config", member(config, "llm_config", dict, WHERE), TEXT, problems)
-    if (text.get("architectures") or [None])[0] != "Qwen2ForCausalLM":
+    if text.get("architectures") != ["Qwen2ForCausalLM"]:
         text.bad("architectures", "['Qwen2ForCausalLM']", unsupported=True)
     s.image_size, s.patch_size = vision.count("image_size"), vision.count("patch_size")
     if (config.get("force_image_size") or s.image_size) != s.image_size:

@@ -8,6 +8,7 @@ Two layouts, the authors' and LeRobot's, with a module each; what they share sta
 from __future__ import annotations
 
 import json
+import os
 from typing import List
 
 from ..bundle import Key
@@ -15,7 +16,7 @@ from ..checkpoint import EVO1, Checkpoint
 from ..errors import Problems
 from ..files import read_json
 from ..tokenizer import TokenizerPlan, read_tokenizer
-from . import Dropped, Options, Plan
+from . import Options, Plan
 from ._evo1_authors import read_authors
 from ._evo1_lerobot import read_lerobot
 from ._evo1_names import weights
@@ -53,13 +54,13 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     problems.raise_any()
     lm = source.names.lm + "layers."
     hints = {lm: "the policy keeps {} language layers, 0 to {}".format(sizes.n_layer, sizes.n_layer - 1)}
-    return Plan(keys, weights(sizes, source.names), _dropped(source), source.statistics, hints)
+    return Plan(keys, weights(sizes, source.names), [], source.statistics, hints)
 
 
 def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Prompt:
     """The slots in the prompt, after checking that the tokenizer puts pads and cuts behind them."""
     s, where = source.sizes, "tokenizer_config.json"
-    config = read_json("{}/{}".format(source.tokenizer, where))
+    config = read_json(os.path.join(source.tokenizer, where))
     for key, found in (("truncation_side", tokenizer.truncate), ("padding_side", config.get("padding_side", "right"))):
         if found != "right":
             problems.unsupported("{}: {}".format(where, key), "'right'", repr(found), "the views stand in front")
@@ -120,7 +121,3 @@ def _network_keys(s: Sizes) -> List[Key]:
     groups = (("u32", u32), ("f32", f32), ("f64", f64), ("string", text))
     return [Key(name, kind, value) for kind, group in groups for name, value in group.items()]
 
-
-def _dropped(source: Source) -> List[Dropped]:
-    """LeRobot's class takes the language model without its head, the authors replace it by the identity: neither stores one."""
-    return []
