@@ -3,12 +3,13 @@
 """Byte-level BPE: what SmolLM2 and the other descendants of GPT-2 publish.
 
 Which pre-tokenizer counts follows the class that transformers 5.4 to 5.5 builds for `tokenizer_class`: the generic classes keep
-tokenizer.json as it is, GPT2Tokenizer takes vocabulary and merges from it and brings a ByteLevel pre-tokenizer of its own.
+tokenizer.json as it is, GPT2Tokenizer and Qwen2Tokenizer take vocabulary and merges from it and bring a pre-tokenizer of their own,
+Qwen2Tokenizer a normalizer too.
 """
 
 from __future__ import annotations
 
-from typing import List
+from typing import List, Optional
 
 from .bundle import Key
 from .errors import Problems
@@ -28,6 +29,13 @@ from .tokenizer_parts import (
 
 KIND = "byte_level_bpe"
 GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
+QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
+NFC = {"type": "NFC"}
+# The only expression that the runtime splits by (kQwen2Words of src/processor/pretokenizer.h).
+QWEN2_WORDS = (
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
+QWEN2_SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_WORDS}, "behavior": "Isolated", "invert": False}
 MODEL = {
     "type": ("BPE",),
     "dropout": (None, 0, 0.0),
@@ -46,9 +54,9 @@ def byte_symbols() -> List[str]:
 
 def with_defaults(config: dict) -> dict:
     """The class's own defaults, which it adds to the vocabulary like stated ones."""
-    if config.get("tokenizer_class") not in GPT2:
-        return config
-    return dict(dict.fromkeys(("unk_token", "bos_token", "eos_token"), "<|endoftext|>"), **config)
+    named = {GPT2: ("unk_token", "bos_token", "eos_token"), QWEN2: ("unk_token", "eos_token", "pad_token")}
+    own = next((tokens for names, tokens in named.items() if config.get("tokenizer_class") in names), ())
+    return dict(dict.fromkeys(own, "<|endoftext|>"), **config)
 
 
 def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key]:
@@ -56,29 +64,46 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     check_symbols(tokenizer.model, byte_symbols(), problems)
     _check_surroundings(tokenizer, problems)
     pre, config = _pre_tokenizer(tokenizer.spec.get("pre_tokenizer"), problems), tokenizer.config
-    gpt2 = config.get("tokenizer_class") in GPT2
-    if gpt2:
-        prefix_space = bool(config.get("add_prefix_space", False))
-        own = [{"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": True}]
-        if pre != own:
+    nfc, own = _normalizer(tokenizer.spec) == NFC, _own_steps(config)
+    if own is not None:
+        if (pre, nfc) != (own, config["tokenizer_class"] in QWEN2):
             notes.append(
-                "{} names {}: transformers 5 then replaces the pre-tokenizer of {} by a plain ByteLevel, and so does the bundle".format(
+                "{} names {}: transformers 5 then splits text as that class does, whatever {} says, and so does the bundle".format(
                     CONFIG_FILE, config["tokenizer_class"], JSON_FILE
                 )
             )
-        pre = own
+        pre, nfc = own, config["tokenizer_class"] in QWEN2
     return [
         Key("tokenizer.pre", "string", to_json(pre)),
-        Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and not gpt2),
+        *([Key("tokenizer.normalization", "string", "nfc")] if nfc else []),
+        Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and own is None),
     ]
+
+
+def _own_steps(config: dict) -> Optional[List[dict]]:
+    """The pre-tokenizer that a class brings; none where it keeps that of the file."""
+    prefix_space, name = bool(config.get("add_prefix_space", False)), config.get("tokenizer_class")
+    if name in QWEN2:
+        return [_split_step(), {"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": False}]
+    return [{"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": True}] if name in GPT2 else None
+
+
+def _split_step() -> dict:
+    return {"type": "split", "pattern": QWEN2_WORDS}
+
+
+def _normalizer(spec: dict):
+    """None where it does nothing."""
+    found = spec.get("normalizer")
+    return None if found == {"type": "Sequence", "normalizers": []} else found
 
 
 def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
     spec, config = tokenizer.spec, tokenizer.config
-    normalizer = spec.get("normalizer")
-    if normalizer is not None and normalizer != {"type": "Sequence", "normalizers": []}:
+    normalizer = _normalizer(spec)
+    if normalizer not in (None, NFC):
         problems.unsupported(
-            JSON_FILE + ": normalizer", "none", to_json(normalizer)[:80], "the runtime does not normalise text"
+            JSON_FILE + ": normalizer", "none or NFC", to_json(normalizer)[:80], "the runtime knows no other"
         )
     if not _adds_nothing(spec.get("post_processor")):
         problems.unsupported(
@@ -86,7 +111,7 @@ def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
             "none, ByteLevel, or a template of the text alone",
             to_json(spec["post_processor"])[:80],
         )
-    check_class(config, GENERIC + GPT2, problems)
+    check_class(config, GENERIC + GPT2 + QWEN2, problems)
     for key in ("add_bos_token", "add_eos_token"):
         if config.get(key, False) not in (False, None):
             problems.unsupported("{}: {}".format(CONFIG_FILE, key), "False", repr(config[key]))
@@ -113,6 +138,8 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
         kind = part.get("type") if isinstance(part, dict) else None
         if kind == "Digits" and set(part) <= {"type", "individual_digits"}:
             steps.append({"type": "digits", "individual": bool(part.get("individual_digits", False))})
+        elif part == QWEN2_SPLIT:
+            steps.append(_split_step())
         elif kind == "ByteLevel" and set(part) <= {"type", "add_prefix_space", "trim_offsets", "use_regex"}:
             steps.append(
                 {
@@ -124,9 +151,9 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
         else:
             problems.unsupported(
                 JSON_FILE + ": pre_tokenizer",
-                "Digits and ByteLevel",
+                "Digits, Qwen2's Split and ByteLevel",
                 to_json(part)[:80],
-                "the runtime implements these two",
+                "the runtime implements these",
             )
             return []
     if [step["type"] for step in steps].count("byte_level") != 1 or steps[-1]["type"] != "byte_level":
