@@ -16,6 +16,7 @@ from ..checkpoint import EVO1, Checkpoint
 from ..errors import Problems
 from ..files import read_json
 from ..tokenizer import TokenizerPlan, read_tokenizer
+from ..tokenizer_byte_level import with_defaults
 from . import Options, Plan
 from ._evo1_authors import read_authors
 from ._evo1_lerobot import read_lerobot
@@ -58,10 +59,14 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Prompt:
-    """The slots in the prompt, after checking that the tokenizer puts pads and cuts behind them."""
+    """The slots in the prompt, after checking that the tokenizer cuts, and where there are pads fills, behind them. LeRobot fills up
+    to the longest prompt of a batch, which for one is none."""
     s, where = source.sizes, "tokenizer_config.json"
-    config = read_json(os.path.join(source.tokenizer, where))
-    for key, found in (("truncation_side", tokenizer.truncate), ("padding_side", config.get("padding_side", "right"))):
+    config = with_defaults(read_json(os.path.join(source.tokenizer, where)))
+    sides = {"truncation_side": tokenizer.truncate}
+    if s.dead_rows != "unseen":
+        sides["padding_side"] = config.get("padding_side", "right")
+    for key, found in sides.items():
         if found != "right":
             problems.unsupported("{}: {}".format(where, key), "'right'", repr(found), "the views stand in front")
     pad = config.get("pad_token")
