@@ -32,6 +32,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     problems.raise_any()
     sizes = source.sizes
     tokenizer = read_tokenizer(source.tokenizer, sizes.n_vocab, problems, checkpoint.notes)
+    problems.raise_any()  # a prompt takes a sound tokenizer
     prompt = _prompt(source, tokenizer, problems)
     document = {
         "image": source.image,
@@ -71,7 +72,7 @@ def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Pro
             problems.unsupported("{}: {}".format(where, key), "'right'", repr(found), "the views stand in front")
     pad = config.get("pad_token")
     pad = pad.get("content") if isinstance(pad, dict) else pad
-    prompt = read_prompt(tokenizer, pad, s.n_slot, s.n_view_token, problems)
+    prompt = read_prompt(tokenizer, str(pad), s.n_slot, s.n_view_token, problems)
     if source.image_token not in (None, prompt.image_token):
         problems.add("backbone config.json: image_token_id", "{}, the tokenizer's".format(prompt.image_token), str(source.image_token))
     if prompt.view_starts[-1] + s.n_view_token > s.n_token:
