@@ -12,8 +12,7 @@ from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
 HUB_PATTERNS = ["*.json", "*.safetensors", "tokenizer/*", "vlm/*.json", "vlm/*.txt", "assets/*", "mp_rank_00_model_states.pt"]
-# Tokenizers of the slow classes have no tokenizer.json.
-BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json", "vocab.json", "merges.txt", "added_tokens.json"]
+BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json"]
 
 
 def _no_constant(name: str):
