@@ -67,8 +67,8 @@ Status Engine::make_plans() {
   plans_ = std::make_unique<Plans>(
       PlanContext{*policy_, *weights_, device_, solver_, conditions_, d_action_, horizon_, tap_pattern_});
   const Recipe& recipe = processor_.recipe();
-  const InputShape largest = {recipe.letterbox.width, recipe.letterbox.height,
-                              static_cast<int>(processor_.views().names().size()), recipe.max_tokens, d_state_};
+  const InputShape largest = {recipe.width, recipe.height, static_cast<int>(processor_.views().names().size()),
+                              recipe.max_tokens, d_state_};
   VLA_CHECK(policy_->check(largest));
   const auto plan = plans_->for_shape(largest);
   return plan ? Status() : Status(plan.error());

@@ -5,7 +5,7 @@
 import json
 
 import pytest
-from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
+from tokenizers import AddedToken, Regex, Tokenizer, models, normalizers, pre_tokenizers
 
 from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
 from vla_cpp.convert import Code
@@ -36,7 +36,11 @@ def rebuilt(keys):
         "byte_level": lambda s: pre_tokenizers.ByteLevel(
             add_prefix_space=s["add_prefix_space"], use_regex=s["use_regex"]
         ),
+        "split": lambda s: pre_tokenizers.Split(Regex(s["pattern"]), "isolated"),
     }
+    assert keys.get("tokenizer.normalization", "nfc") == "nfc"
+    if "tokenizer.normalization" in keys:
+        tokenizer.normalizer = normalizers.NFC()
     tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
         [make[step["type"]](step) for step in json.loads(keys["tokenizer.pre"])]
     )
@@ -184,12 +188,12 @@ CASES = {
     "model.byte_fallback: expected False, found 1": (model(byte_fallback=1), UNSUPPORTED),
     "model.continuing_subword_prefix: expected None, found '##'": (model(continuing_subword_prefix="##"), UNSUPPORTED),
     "model.end_of_word_suffix: expected None, found '</w>'": (model(end_of_word_suffix="</w>"), UNSUPPORTED),
-    "normalizer: expected none, found": (spec(normalizer={"type": "NFC"}), UNSUPPORTED),
-    'pre_tokenizer: expected Digits and ByteLevel, found {"type":"Metaspace"': (
+    "normalizer: expected none or NFC, found": (spec(normalizer={"type": "NFKC"}), UNSUPPORTED),
+    'pre_tokenizer: expected Digits, the Split of Qwen2 and ByteLevel, found {"type":"Metaspace"': (
         spec(pre_tokenizer={"type": "Metaspace"}),
         UNSUPPORTED,
     ),
-    "pre_tokenizer: expected Digits and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
+    "pre_tokenizer: expected Digits, the Split of Qwen2 and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
     "pre_tokenizer: expected ByteLevel once, as the last step": (spec(pre_tokenizer=SEQUENCE), UNSUPPORTED),
     "post_processor: expected none, ByteLevel, or a template of the text alone": (
         spec(post_processor={"type": "TemplateProcessing", "single": BOS}),
