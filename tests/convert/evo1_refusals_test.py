@@ -113,7 +113,7 @@ AUTHORS = {
     "llm_config: num_attention_heads: expected heads of an even width": dict(backbone__llm_config__num_attention_heads=4),
     "tokenizer_config.json: padding_side: expected 'right'": dict(tokenizer_config__padding_side="left"),
     "tokenizer_config.json: truncation_side: expected 'right'": dict(tokenizer_config__truncation_side="left"),
-    "tokenizer_config.json: pad_token: expected one of the added tokens, found None": dict(tokenizer_config__pad_token=REMOVED),
+    "tokenizer_config.json: pad_token: expected one of the added tokens, found 'None'": dict(tokenizer_config__pad_token=REMOVED),
 }
 
 

@@ -352,6 +352,12 @@ def test_cameras_that_may_be_missing_are_as_many_as_the_config_says(converter):
     assert keys["observation.views"][-1] == "observation.images.empty_camera_0" and keys["observation.min_views"] == 2
 
 
+def test_a_tokenizer_that_pads_on_the_left_does_for_single_prompts(converter):
+    tiny = TinyEvo1Lerobot()
+    tiny.tokenizer_config["padding_side"] = "left"
+    assert converter.bundle(tiny).keys["policy.pad_token"] == FIRST_ADDED
+
+
 def test_head_and_towers_of_other_precisions_are_written_as_f32(converter):
     tiny = TinyEvo1Lerobot()
     name = "model.embedder.model.language_model.layers.0.mlp.up_proj.weight"

@@ -11,9 +11,23 @@ from typing import Tuple
 from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
-HUB_PATTERNS = ["*.json", "*.safetensors", "tokenizer/*", "vlm/*.json", "vlm/*.txt", "assets/*", "mp_rank_00_model_states.pt"]
-# Tokenizers of the slow classes have no tokenizer.json.
-BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json", "vocab.json", "merges.txt", "added_tokens.json"]
+HUB_PATTERNS = [
+    "*.json",
+    "*.safetensors",
+    "mp_rank_00_model_states.pt",
+    "tokenizer/*",
+    "vlm/*.json",
+    "vlm/merges.txt",
+    "assets/*",
+]
+BACKBONE_PATTERNS = [
+    "config.json",
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "vocab.json",
+    "merges.txt",
+    "added_tokens.json",
+]
 
 
 def _no_constant(name: str):
