@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "processor/resample.h"
 
@@ -48,74 +49,96 @@ std::vector<Window> make_windows(int n_in, int n_out) {
   return windows;
 }
 
-/// Positions are `step` numbers apart. Behind the first product the compiler takes four at once and adds them one by
-/// one; what is left is fused.
-inline __attribute__((always_inline)) float sum_of(const float* x, std::size_t step,
-                                                   const std::vector<float>& weights) {
-  float sum = x[0] * weights[0];
-  const std::size_t n_plain = (weights.size() - 1) / 4 * 4;
-  for (std::size_t j = 1; j <= n_plain; ++j) {
-    const float product = x[j * step] * weights[j];
-    sum += product;
+/// `x * weight` added to each number of a row.
+inline __attribute__((always_inline)) void add_row(std::span<const float> x, float weight, bool fused, float* sums) {
+  if (fused) {
+    for (std::size_t k = 0; k < x.size(); ++k) sums[k] = std::fma(x[k], weight, sums[k]);
+    return;
   }
-  for (std::size_t j = n_plain + 1; j < weights.size(); ++j) sum = std::fma(x[j * step], weights[j], sum);
-  return sum;
+  for (std::size_t k = 0; k < x.size(); ++k) {
+    const float product = x[k] * weight;
+    sums[k] += product;
+  }
 }
 
-/// `n_line` lines of positions `step` numbers apart, lines `line_step` apart.
-struct Layout {
-  std::size_t n_line, step, line_step;
-};
-
-/// Three channels where pixels are the positions of a line, one where rows are.
-inline __attribute__((always_inline)) void resample_lines(const float* in, Layout from, float* out, Layout to,
-                                                          const std::vector<Window>& windows) {
-  for (std::size_t i = 0; i < windows.size(); ++i) {
-    const float* first = in + static_cast<std::size_t>(windows[i].first) * from.step;
-    for (std::size_t line = 0; line < from.n_line; ++line)
-      out[i * to.step + line * to.line_step] = sum_of(first + line * from.line_step, from.step, windows[i].weights);
+/// One row out of several. Behind the first product the reference's compiler multiplies four at once and adds them one
+/// by one; the products that are left are fused.
+inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in, const Window& window,
+                                                       std::span<float> out) {
+  const std::size_t n_plain = (window.weights.size() - 1) / 4 * 4;
+  std::fill(out.begin(), out.end(), 0.0f);
+  for (std::size_t j = 0; j < window.weights.size(); ++j) {
+    const std::size_t row = static_cast<std::size_t>(window.first) + j;
+    add_row(in.subspan(row * out.size(), out.size()), window.weights[j], j > n_plain, out.data());
   }
 }
 
 // As for the letterbox: without the instruction std::fma is a slow but equal library function.
 #if defined(__x86_64__)
-__attribute__((target("fma"))) void resample_lines_fused(const float* in, Layout from, float* out, Layout to,
-                                                         const std::vector<Window>& windows) {
-  resample_lines(in, from, out, to, windows);
+__attribute__((target("fma"))) void sum_of_rows_fused(std::span<const float> in, const Window& window,
+                                                      std::span<float> out) {
+  sum_of_rows(in, window, out);
 }
 #endif
 
-void resample_axis(const float* in, Layout from, float* out, Layout to, const std::vector<Window>& windows) {
+void sum_rows(std::span<const float> in, const Window& window, std::span<float> out) {
 #if defined(__x86_64__)
-  if (__builtin_cpu_supports("fma")) return resample_lines_fused(in, from, out, to, windows);
+  if (__builtin_cpu_supports("fma")) return sum_of_rows_fused(in, window, out);
 #endif
-  resample_lines(in, from, out, to, windows);
+  sum_of_rows(in, window, out);
 }
 
-std::uint8_t rounded(float x) { return static_cast<std::uint8_t>(std::nearbyint(std::clamp(x, 0.0f, 255.0f))); }
+/// Rows and columns of pixels exchanged.
+template <class T>
+void turn(std::span<const T> rgb, std::size_t width, float* out) {
+  const std::size_t height = rgb.size() / 3 / width;
+  for (std::size_t y = 0; y < height; ++y)
+    for (std::size_t x = 0; x < width; ++x)
+      for (std::size_t c = 0; c < 3; ++c)
+        out[(x * height + y) * 3 + c] = static_cast<float>(rgb[(y * width + x) * 3 + c]);
+}
+
+/// The picture at its new width. A band of rows is turned, so that one loop over whole rows serves columns as well; it
+/// is a narrow one that stays in the cache.
+std::vector<float> widened(std::span<const std::uint8_t> rgb, std::size_t width, std::size_t to_width) {
+  constexpr std::size_t kBand = 16;
+  const std::vector<Window> windows = make_windows(static_cast<int>(width), static_cast<int>(to_width));
+  const std::size_t height = rgb.size() / 3 / width;
+  std::vector<float> out(to_width * height * 3), columns(width * kBand * 3), sums(to_width * kBand * 3);
+  for (std::size_t top = 0; top < height; top += kBand) {
+    const std::size_t size = 3 * std::min(kBand, height - top);  // of a column of the band
+    const std::span<float> column_in(columns.data(), size * width), column_out(sums.data(), size * to_width);
+    turn(rgb.subspan(3 * top * width, size * width), width, column_in.data());
+    for (std::size_t x = 0; x < to_width; ++x) sum_rows(column_in, windows[x], column_out.subspan(x * size, size));
+    turn(std::span<const float>(column_out), size / 3, out.data() + 3 * top * to_width);
+  }
+  return out;
+}
+
+/// Half to even: in [0, 255] a sum with 2^23 leaves no digit behind the point. The library's function is a slow call.
+std::uint8_t rounded(float x) {
+  constexpr float kNoFraction = 0x1p23f;
+  return static_cast<std::uint8_t>(std::clamp(x, 0.0f, 255.0f) + kNoFraction - kNoFraction);
+}
 
 }  // namespace
 
 std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                          int to_height) {
-  const std::size_t in_row = static_cast<std::size_t>(width) * 3, out_row = static_cast<std::size_t>(to_width) * 3;
-  const auto n_in = static_cast<std::size_t>(height), n_out = static_cast<std::size_t>(to_height);
-  std::vector<float> planes(rgb.begin(), rgb.end());
-  if (to_width != width) {
-    std::vector<float> wide(out_row * n_in);
-    const std::vector<Window> windows = make_windows(width, to_width);
-    for (std::size_t y = 0; y < n_in; ++y)
-      resample_axis(planes.data() + y * in_row, {3, 3, 1}, wide.data() + y * out_row, {3, 3, 1}, windows);
-    planes = std::move(wide);
+  std::vector<float> pixels(rgb.begin(), to_width == width ? rgb.end() : rgb.begin());
+  if (to_width != width) pixels = widened(rgb, static_cast<std::size_t>(width), static_cast<std::size_t>(to_width));
+  const std::size_t row_size = static_cast<std::size_t>(to_width) * 3;
+  std::vector<std::uint8_t> out;
+  out.reserve(row_size * static_cast<std::size_t>(to_height));
+  if (to_height == height) {
+    std::transform(pixels.begin(), pixels.end(), std::back_inserter(out), rounded);
+    return out;
   }
-  if (to_height != height) {
-    std::vector<float> high(out_row * n_out);
-    resample_axis(planes.data(), {out_row, out_row, 1}, high.data(), {out_row, out_row, 1},
-                  make_windows(height, to_height));
-    planes = std::move(high);
+  std::vector<float> row(row_size);
+  for (const Window& window : make_windows(height, to_height)) {
+    sum_rows(pixels, window, row);
+    std::transform(row.begin(), row.end(), std::back_inserter(out), rounded);
   }
-  std::vector<std::uint8_t> out(planes.size());
-  std::transform(planes.begin(), planes.end(), out.begin(), rounded);
   return out;
 }
 
