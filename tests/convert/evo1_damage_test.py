@@ -28,7 +28,7 @@ def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, capsy
     path = converter.folder / file
     good = json.loads(path.read_text())
     codes = set()
-    for _ in range(40):
+    for _ in range(25):
         path.write_text(json.dumps(mutate(rng, good)))
         flags = FLAGS if layout is TinyEvo1 else []
         codes.add(main([str(converter.folder), "-o", converter.out, "--force", "--quiet", *flags]))
