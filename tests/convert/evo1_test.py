@@ -127,7 +127,7 @@ def test_keys_of_the_authors_second_revision(converter):
         "connector.factor": 2,
         "head.d_ff": 4 * D_MODEL,
         "observation.views": ["observation.images.front", "observation.images.wrist"],
-        "observation.view_optional": [1, 1],
+        "observation.view_optional": [0, 0],
         "observation.min_views": 1,
         "observation.state_dims": [STATE_DIM],
         "observation.max_text_tokens": N_TOKEN,

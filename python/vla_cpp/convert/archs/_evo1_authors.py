@@ -253,7 +253,8 @@ def _features(checkpoint: Checkpoint, options: Options, s: Sizes, problems: Prob
     return [
         Key("observation.views", "string[]", views),
         Key("observation.view_aliases", "string[]", [""] * len(views)),
-        Key("observation.view_optional", "u32[]", [1] * len(views)),
+        # The server gets an image for every slot, and the client says which of them are none: nothing is absent by silence.
+        Key("observation.view_optional", "u32[]", [0] * len(views)),
         Key("observation.min_views", "u32", 1),
         Key("observation.states", "string[]", [recipe.STATE]),
         Key("observation.state_dims", "u32[]", [s.state_dim]),
