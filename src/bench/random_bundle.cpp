@@ -27,19 +27,51 @@ std::vector<std::string> numbered(const std::string& name, int count) {
   return names;
 }
 
-std::string recipe(int image_size, int max_tokens, int d_state, int d_robot) {
+/// Places for views in front of the text, for a network that has them among its tokens.
+struct ViewPlaces {
+  int count = 0;   // none: the network takes images beside the text
+  int repeat = 0;  // tokens of a view
+
+  static constexpr std::string_view kOpen = "View {i}: ", kToken = "<view>", kClose = "\n";
+
+  /// Every byte is a token, and there are fewer than ten places: `{i}` stands for one.
+  int open_size() const { return static_cast<int>(kOpen.size()) - 2; }
+  int size() const { return open_size() + repeat + static_cast<int>(kClose.size()); }
+  std::vector<std::int64_t> starts() const {
+    std::vector<std::int64_t> starts;
+    for (int i = 0; i < count; ++i) starts.push_back(i * size() + open_size());
+    return starts;
+  }
+};
+
+/// Errors: bad_bundle.
+Result<ViewPlaces> view_places(const Keys& keys) {
+  ViewPlaces places;
+  if (!keys.has("policy.n_slot")) return places;
+  VLA_TRY(const int image_size, keys.integer("vision.image_size"));
+  VLA_TRY(const int patch_size, keys.integer("vision.patch_size"));
+  VLA_TRY(const int factor, keys.integer("connector.factor"));
+  VLA_TRY(places.count, keys.integer("policy.n_slot"));
+  const int side = image_size / patch_size / factor;
+  places.repeat = side * side;
+  return places;
+}
+
+std::string recipe(int image_size, const ViewPlaces& places, int max_tokens, int d_state, int d_robot) {
   using Json = nlohmann::ordered_json;
   const Json letterbox = {{"op", "letterbox"},    {"width", image_size}, {"height", image_size},
                           {"filter", "bilinear"}, {"antialias", false},  {"align", "bottom_right"},
                           {"fill", 0.0}};
   const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
+  const Json views = {{"op", "views"},          {"count", places.count},   {"open", places.kOpen},
+                      {"token", places.kToken}, {"repeat", places.repeat}, {"close", places.kClose}};
   const Json tokenize = {{"op", "tokenize"}, {"max_tokens", max_tokens}, {"truncate", "right"}};
   // A network without a state vector sees none: what a robot sends is dropped.
   const Json state = d_state > 0 ? Json::object({{"op", "pad"}, {"size", d_state}}) : Json::object({{"op", "drop"}});
   const Json take = {{"op", "take"}, {"size", d_robot}};
   Json root;
   root["image"] = Json::array({letterbox, affine});
-  root["text"] = Json::array({tokenize});
+  root["text"] = places.count > 0 ? Json::array({views, tokenize}) : Json::array({tokenize});
   root["state"] = Json::array({state});
   root["action"] = Json::array({take});
   return root.dump();
@@ -59,11 +91,23 @@ std::vector<std::string> byte_tokens() {
   return tokens;
 }
 
+/// A token beside those of bytes, found wherever it stands.
+std::string added_token(std::string_view content, std::size_t id) {
+  const nlohmann::ordered_json token = {{"id", id},        {"content", content}, {"single_word", false},
+                                        {"lstrip", false}, {"rstrip", false},    {"normalized", false},
+                                        {"special", true}};
+  return nlohmann::ordered_json::array({token}).dump();
+}
+
 Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const int image_size, keys.integer("vision.image_size"));
   VLA_TRY(const int d_state, keys.integer("policy.d_state"));
   VLA_TRY(const int d_action, keys.integer("policy.d_action"));
+  VLA_TRY(const ViewPlaces places, view_places(keys));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
+  const int max_tokens = places.count * places.size() + sizes.max_tokens;
+  std::vector<std::string> tokens = byte_tokens();
+  if (places.count > 0) tokens.emplace_back(ViewPlaces::kToken);
   const std::vector<std::string> views = numbered("observation.images.view", sizes.n_view);
   const std::vector<std::string> nothing(static_cast<std::size_t>(d_robot));
   const Keys added({
@@ -83,7 +127,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"observation.state_dims", std::vector<std::int64_t>{d_robot}},
       {"observation.state_names", numbered("state.", d_robot)},
       {"observation.state_units", nothing},
-      {"observation.max_text_tokens", std::int64_t{sizes.max_tokens}},
+      {"observation.max_text_tokens", std::int64_t{max_tokens}},
       {"action.names", numbered("action.", d_robot)},
       {"action.units", nothing},
       {"action.rate_hz", 0.0},
@@ -93,14 +137,15 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"solver.t_end", 0.0},
       {"solver.noise", "normal"},
       {"tokenizer.kind", "byte_level_bpe"},
-      {"tokenizer.tokens", byte_tokens()},
+      {"tokenizer.tokens", tokens},
       {"tokenizer.merges", std::vector<std::string>()},
       {"tokenizer.pre", R"([{"type":"byte_level","add_prefix_space":false,"use_regex":true}])"},
-      {"tokenizer.added", "[]"},
+      {"tokenizer.added", places.count > 0 ? added_token(ViewPlaces::kToken, tokens.size() - 1) : "[]"},
       {"tokenizer.ignore_merges", false},
-      {"processor.recipe", recipe(image_size, sizes.max_tokens, d_state, d_robot)},
+      {"processor.recipe", recipe(image_size, places, max_tokens, d_state, d_robot)},
   });
   for (const auto& [key, value] : added.all()) keys.set(key, value);
+  if (places.count > 0) keys.set("policy.view_starts", places.starts());
   return {};
 }
 

@@ -43,12 +43,15 @@ Result<int> count_tokens(const Processor& processor, const std::string& text) {
   observation.text = text;
   Inputs inputs;
   VLA_CHECK(processor.encode_text(observation, inputs));
-  return static_cast<int>(inputs.tokens.size());
+  return static_cast<int>(inputs.tokens.size()) - processor.n_front();
 }
+
+/// Tokens that the places for views leave for the instruction.
+int most_text(const Processor& processor) { return processor.recipe().max_tokens - processor.n_front(); }
 
 /// A text of exactly `n_token` tokens: the same word again and again, for a few words that tokenizers cut differently.
 Result<std::string> find_text(const Processor& processor, int n_token) {
-  const int most = processor.recipe().max_tokens;
+  const int most = most_text(processor);
   if (n_token > most)
     return Error{Code::usage, "--tokens", fmt::format("at most {}, which the bundle allows", most),
                  std::to_string(n_token)};
@@ -89,7 +92,7 @@ Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes&
   const std::vector<std::string>& states = processor.states().names();
   for (std::size_t i = 0; i < states.size(); ++i)
     workload.observation_.states[states[i]].assign(static_cast<std::size_t>(processor.state_dims()[i]), 0.0f);
-  workload.n_text_ = sizes.n_text.value_or(processor.recipe().max_tokens);
+  workload.n_text_ = sizes.n_text.value_or(most_text(processor));
   VLA_TRY(workload.observation_.text, find_text(processor, workload.n_text_));
   return workload;
 }

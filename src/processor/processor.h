@@ -74,6 +74,8 @@ class Processor {
   const FeatureNames& states() const { return states_; }
   const std::vector<int>& state_dims() const { return state_dims_; }
   const std::vector<std::string>& action_names() const { return action_names_; }
+  /// Tokens of every prompt up to its last place for a view; 0 where the text has no such places.
+  int n_front() const { return static_cast<int>(front_.size()); }
   const Recipe& recipe() const { return recipe_; }
 
  private:
