@@ -56,6 +56,7 @@ void Plan::build_step(const PlanContext& context) {
 }
 
 Result<std::unique_ptr<Plan>> Plan::build(const PlanContext& context, const InputShape& shape, ComputeMemory& memory) {
+  VLA_CHECK(context.policy.check(shape));
   std::unique_ptr<Plan> plan(new Plan(context, shape));
   plan->build_prefix(context);
   plan->build_step(context);
