@@ -69,6 +69,8 @@ find_package(Threads REQUIRED)
 find_path(VLA_CLI11_DIR CLI/CLI.hpp REQUIRED)
 find_path(VLA_XXHASH_DIR xxhash.h REQUIRED)
 find_library(VLA_XXHASH_LIBRARY xxhash REQUIRED)
+find_path(VLA_UTF8PROC_DIR utf8proc.h REQUIRED)
+find_library(VLA_UTF8PROC_LIBRARY utf8proc REQUIRED)
 
 # The wire: the schema is compiled at build time, and the server needs the small runtime of Protobuf only.
 find_package(Protobuf REQUIRED)

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/pretokenizer.h"
 
+#include <algorithm>
+
 #include "processor/json_fields.h"
 #include "processor/unicode.h"
 
@@ -26,10 +28,57 @@ std::size_t run(std::string_view text, std::uint8_t wanted) {
   return size;
 }
 
+constexpr std::string_view kContractions[] = {"'s", "'t", "'re", "'ve", "'m", "'ll", "'d"};
+
 std::size_t contraction(std::string_view text) {
-  for (const std::string_view end : {"'s", "'t", "'re", "'ve", "'m", "'ll", "'d"})
+  for (const std::string_view end : kContractions)
     if (text.starts_with(end)) return end.size();
   return 0;
+}
+
+/// The same in either case. To the reference's expressions the long s, U+017F, is a lower-case s as well.
+std::size_t contraction_of_any_case(std::string_view text) {
+  constexpr std::string_view kLongS = "'\u017F";
+  if (text.starts_with(kLongS)) return kLongS.size();
+  std::string lower(text.substr(0, 3));
+  for (char& c : lower)
+    if (c >= 'A' && c <= 'Z') c = static_cast<char>(c - 'A' + 'a');
+  return contraction(lower);
+}
+
+using OnPiece = std::function<void(std::string_view)>;
+
+void split_words(std::size_t (*word)(std::string_view), std::string_view text, const OnPiece& on_word) {
+  while (!text.empty()) {
+    const std::size_t size = word(text);
+    on_word(text.substr(0, size));
+    text.remove_prefix(size);
+  }
+}
+
+/// Into numbers and what is between them; `individual`: into single digits.
+void split_digits(bool individual, std::string_view text, const OnPiece& on_piece) {
+  std::size_t start = 0;
+  bool numeric = false;  // of the piece that begins at `start`
+  for (std::size_t at = 0; at < text.size();) {
+    const unicode::Char c = unicode::first(text.substr(at));
+    const bool digit = (unicode::classes(c.code_point) & unicode::kDigit) != 0;
+    if (at > start && (digit != numeric || (digit && individual))) {
+      on_piece(text.substr(start, at - start));
+      start = at;
+    }
+    numeric = digit;
+    at += c.size;
+  }
+  if (start < text.size()) on_piece(text.substr(start));
+}
+
+/// `\s+(?!\S)|\s+`, where there is white space: the last of it goes back to what follows, unless there is only one.
+std::size_t white_space(std::string_view text) {
+  const std::size_t spaces = run(text, unicode::kSpace);
+  if (spaces == text.size()) return spaces;
+  const std::size_t before_last = spaces - unicode::last(text.substr(0, spaces)).size;
+  return before_last > 0 ? before_last : spaces;
 }
 
 }  // namespace
@@ -41,11 +90,24 @@ std::size_t gpt2_word(std::string_view text) {
     const std::uint8_t next = kind(unicode::first(text.substr(blank)).code_point);
     if (next != unicode::kSpace) return blank + run(text.substr(blank), next);
   }
-  const std::size_t spaces = run(text, unicode::kSpace);
-  if (spaces == text.size()) return spaces;
-  // `\s+(?!\S)` gives the last white space back to what follows it, unless there is only one.
-  const std::size_t before_last = spaces - unicode::last(text.substr(0, spaces)).size;
-  return before_last > 0 ? before_last : spaces;
+  return white_space(text);
+}
+
+std::size_t qwen2_word(std::string_view text) {
+  constexpr std::string_view kLineEnds = "\r\n";
+  if (const std::size_t size = contraction_of_any_case(text)) return size;
+  const unicode::Char first = unicode::first(text);
+  const std::uint8_t first_kind = kind(first.code_point);
+  if (first_kind == unicode::kLetter) return run(text, unicode::kLetter);
+  if (first_kind == unicode::kNumber) return first.size;
+  if (kLineEnds.find(text[0]) == std::string_view::npos)
+    if (const std::size_t letters = run(text.substr(first.size), unicode::kLetter)) return first.size + letters;
+  const std::size_t blank = text[0] == ' ' ? 1 : 0;
+  if (const std::size_t others = run(text.substr(blank), 0))
+    return std::min(text.find_first_not_of(kLineEnds, blank + others), text.size());
+  const std::string_view spaces = text.substr(0, run(text, unicode::kSpace));
+  if (const std::size_t end = spaces.find_last_of(kLineEnds); end != std::string_view::npos) return end + 1;
+  return white_space(text);
 }
 
 Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
@@ -59,10 +121,13 @@ Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
     const std::string where = std::string(kWhere) + "[" + std::to_string(i) + "]";
     if (closed) return Error{Code::bad_bundle, where, "nothing after byte_level", "another step"};
     VLA_TRY(JsonFields fields, JsonFields::open(list[i], where));
-    VLA_TRY(const int type, fields.choice("type", {"digits", "byte_level"}));
+    VLA_TRY(const int type, fields.choice("type", {"digits", "split", "byte_level"}));
     if (type == 0) {
       VLA_TRY(const bool individual, fields.boolean("individual"));
-      pretokenizer.digits_.push_back(individual ? Digits::individual : Digits::together);
+      pretokenizer.steps_.push_back(individual ? Step::digits_individual : Step::digits_together);
+    } else if (type == 1) {
+      VLA_CHECK(fields.choice("pattern", {kQwen2Words}));
+      pretokenizer.steps_.push_back(Step::qwen2_words);
     } else {
       VLA_TRY(pretokenizer.add_prefix_space_, fields.boolean("add_prefix_space"));
       VLA_TRY(pretokenizer.use_regex_, fields.boolean("use_regex"));
@@ -75,28 +140,15 @@ Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
 }
 
 void Pretokenizer::split(std::string_view text, const std::function<void(std::string_view)>& on_word) const {
-  split_digits(0, text, on_word);
+  split_from(0, text, on_word);
 }
 
-void Pretokenizer::split_digits(std::size_t step, std::string_view text,
-                                const std::function<void(std::string_view)>& on_word) const {
-  if (step == digits_.size()) return split_bytes(text, on_word);
-  const auto emit = [&](std::size_t start, std::size_t end) {
-    if (end > start) split_digits(step + 1, text.substr(start, end - start), on_word);
-  };
-  std::size_t start = 0;
-  bool numeric = false;  // of the piece that begins at `start`
-  for (std::size_t at = 0; at < text.size();) {
-    const unicode::Char c = unicode::first(text.substr(at));
-    const bool digit = (unicode::classes(c.code_point) & unicode::kDigit) != 0;
-    if (digit != numeric || (digit && digits_[step] == Digits::individual)) {
-      emit(start, at);
-      start = at;
-      numeric = digit;
-    }
-    at += c.size;
-  }
-  emit(start, text.size());
+void Pretokenizer::split_from(std::size_t step, std::string_view text,
+                              const std::function<void(std::string_view)>& on_word) const {
+  if (step == steps_.size()) return split_bytes(text, on_word);
+  const auto emit = [&](std::string_view piece) { split_from(step + 1, piece, on_word); };
+  if (steps_[step] == Step::qwen2_words) return split_words(qwen2_word, text, emit);
+  split_digits(steps_[step] == Step::digits_individual, text, emit);
 }
 
 void Pretokenizer::split_bytes(std::string_view text, const std::function<void(std::string_view)>& on_word) const {
@@ -105,11 +157,8 @@ void Pretokenizer::split_bytes(std::string_view text, const std::function<void(s
     prefixed = std::string(1, ' ').append(text);
     text = prefixed;
   }
-  while (!text.empty()) {
-    const std::size_t size = use_regex_ ? gpt2_word(text) : text.size();
-    on_word(text.substr(0, size));
-    text.remove_prefix(size);
-  }
+  if (use_regex_) return split_words(gpt2_word, text, on_word);
+  if (!text.empty()) on_word(text);
 }
 
 }  // namespace vla

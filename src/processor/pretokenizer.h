@@ -12,10 +12,10 @@
 namespace vla {
 
 /// Splits text into the words inside which tokens are formed.
-/// Source: tokenizers pre_tokenizers/digits.rs and byte_level.rs.
+/// Source: tokenizers pre_tokenizers/digits.rs, split.rs and byte_level.rs.
 class Pretokenizer {
  public:
-  /// Reads `tokenizer.pre`: any number of digits steps, then one byte_level step. Errors: bad_bundle.
+  /// Reads `tokenizer.pre`: any number of digits and split steps, then one byte_level step. Errors: bad_bundle.
   static Result<Pretokenizer> parse(const std::string& json);
 
   /// Calls `on_word` for every word of valid UTF-8 `text`, in order; a word may start with a blank that the text does
@@ -23,13 +23,12 @@ class Pretokenizer {
   void split(std::string_view text, const std::function<void(std::string_view)>& on_word) const;
 
  private:
-  enum class Digits { together, individual };
+  enum class Step { digits_together, digits_individual, qwen2_words };
 
-  void split_digits(std::size_t step, std::string_view text,
-                    const std::function<void(std::string_view)>& on_word) const;
+  void split_from(std::size_t step, std::string_view text, const std::function<void(std::string_view)>& on_word) const;
   void split_bytes(std::string_view text, const std::function<void(std::string_view)>& on_word) const;
 
-  std::vector<Digits> digits_;
+  std::vector<Step> steps_;
   bool add_prefix_space_ = false;
   bool use_regex_ = true;
 };
@@ -37,5 +36,12 @@ class Pretokenizer {
 /// Bytes of the first match at the start of non-empty, valid UTF-8 of the GPT-2 splitting expression
 /// `'s|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+`, which matches everywhere.
 std::size_t gpt2_word(std::string_view text);
+
+/// The splitting expression of Qwen2, the only one that a split step may name.
+inline constexpr const char* kQwen2Words =
+    R"((?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+)";
+
+/// Bytes of its first match at the start of non-empty, valid UTF-8; it matches everywhere, too.
+std::size_t qwen2_word(std::string_view text);
 
 }  // namespace vla

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/tokenizer.h"
 
+#include "processor/nfc.h"
 #include "processor/unicode.h"
 
 namespace vla {
@@ -33,6 +34,16 @@ Status check_added(const std::vector<AddedToken>& added, const std::vector<std::
   return {};
 }
 
+/// Whether text between the added tokens is composed.
+Result<bool> is_composed(const Keys& keys, bool byte_level) {
+  constexpr const char* kKey = "tokenizer.normalization";
+  if (!keys.has(kKey)) return false;
+  VLA_TRY(const std::string form, keys.string(kKey));
+  if (byte_level && form == "nfc") return true;
+  return Error{Code::bad_bundle, kKey, byte_level ? "nfc, or no such key" : "no such key beside byte_fallback_bpe",
+               form};
+}
+
 }  // namespace
 
 Result<Tokenizer> Tokenizer::create(const Keys& keys, int n_vocab) {
@@ -51,7 +62,10 @@ Result<Tokenizer> Tokenizer::create(const Keys& keys, int n_vocab) {
     VLA_CHECK(check_added(added, tokens, false));
     VLA_CHECK(tokenizer.read_byte_fallback(keys, tokens));
   }
-  tokenizer.added_ = AddedTokens(std::move(added), byte_level ? nullptr : ByteFallbackBpe::mark_blanks);
+  VLA_TRY(const bool composed, is_composed(keys, byte_level));
+  AddedTokens::Normalize normalize = byte_level ? nullptr : ByteFallbackBpe::mark_blanks;
+  if (composed) normalize = nfc;
+  tokenizer.added_ = AddedTokens(std::move(added), normalize);
   return tokenizer;
 }
 
@@ -90,9 +104,9 @@ void Tokenizer::encode_piece(std::string_view piece, Ids& ids) const {
   byte_level.pretokenizer.split(piece, [&](std::string_view word) { byte_level.bpe.encode(word, ids); });
 }
 
-Result<std::vector<std::int32_t>> Tokenizer::encode(std::string_view text) const {
-  if (text.size() > kMaxText)
-    return Error{Code::bad_observation, "instruction", "at most " + std::to_string(kMaxText) + " bytes of text",
+Result<std::vector<std::int32_t>> Tokenizer::encode(std::string_view text, std::size_t max_bytes) const {
+  if (text.size() > max_bytes)
+    return Error{Code::bad_observation, "instruction", "at most " + std::to_string(max_bytes) + " bytes of text",
                  std::to_string(text.size()) + " bytes"};
   if (const std::size_t valid = unicode::valid_prefix(text); valid < text.size())
     return Error{Code::bad_observation, "instruction", "UTF-8 text",

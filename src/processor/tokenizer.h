@@ -27,9 +27,10 @@ class Tokenizer {
   /// Reads and checks `tokenizer.*`; every id must be below `n_vocab`, the rows of the embedding. Errors: bad_bundle.
   static Result<Tokenizer> create(const Keys& keys, int n_vocab);
 
-  /// Ids of `text`, which must be UTF-8 of at most `kMaxText` bytes; NUL is a character like any other. The ids of
-  /// `prefix()` stand in front. Errors: bad_observation, also for an added token that the embedding has no row for.
-  Result<std::vector<std::int32_t>> encode(std::string_view text) const;
+  /// Ids of `text`, which must be UTF-8 of at most `max_bytes` bytes, a prompt around an instruction being longer; NUL
+  /// is a character like any other. The ids of `prefix()` stand in front. Errors: bad_observation, also for an added
+  /// token that the embedding has no row for.
+  Result<std::vector<std::int32_t>> encode(std::string_view text, std::size_t max_bytes = kMaxText) const;
 
   /// The ids in front of every text (`<bos>`), where the tokenizer puts some.
   const std::vector<std::int32_t>& prefix() const { return prefix_; }

@@ -15,11 +15,12 @@ namespace vla::unicode {
 
 /// Bits of `classes`.
 enum Class : std::uint8_t {
-  kLetter = 1,  // \p{L} of the splitting expression
-  kNumber = 2,  // \p{N} of the splitting expression
-  kSpace = 4,   // \s of the splitting expression and of added tokens
-  kDigit = 8,   // what the digits step calls numeric; a few code points newer than kNumber
-  kWord = 16,   // \w of added tokens
+  kLetter = 1,   // \p{L} of the splitting expression
+  kNumber = 2,   // \p{N} of the splitting expression
+  kSpace = 4,    // \s of the splitting expression and of added tokens
+  kDigit = 8,    // what the digits step calls numeric; a few code points newer than kNumber
+  kWord = 16,    // \w of added tokens
+  kNormal = 32,  // takes part in the normalization NFC: composes, decomposes or is put in order
 };
 
 std::uint8_t classes(std::uint32_t code_point);

@@ -46,17 +46,22 @@ inline void check_ids(const Tokenizer& tokenizer, const std::string& text) {
 }
 
 /// The first byte says what the others are: text for one of the tokenizers, or the JSON of a pre-tokenizer, of added
-/// tokens or of a recipe. From 8 on it is text for a tokenizer with byte fallback.
+/// tokens or of a recipe. From 8 on it is text for a tokenizer with byte fallback, from 32
+/// on for one that composes characters.
 inline void check_tokenizer(std::string_view input) {
   static const Tokenizer tokenizers[] = {load_tokenizer("smol"), load_tokenizer("awkward"), load_tokenizer("whole"),
                                          load_tokenizer("tangled")};
   static const Tokenizer fallback[] = {load_tokenizer("gemma"), load_tokenizer("gemma_awkward"),
                                        load_tokenizer("gemma_tangled")};
+  static const Tokenizer composing[] = {load_tokenizer("qwen"), load_tokenizer("qwen_awkward")};
   if (input.empty()) return;
   const int kind = input[0] & 7;
   const int n_fallback = input[0] >> 3 & 3;
+  const int n_composing = input[0] >> 5 & 3;
   const std::string text(input.substr(1));
-  if (n_fallback > 0) {
+  if (n_composing > 0) {
+    check_ids(composing[n_composing & 1], text);
+  } else if (n_fallback > 0) {
     check_ids(fallback[n_fallback - 1], text);
   } else if (kind == 4 || kind == 7) {
     const auto pretokenizer = Pretokenizer::parse(text);

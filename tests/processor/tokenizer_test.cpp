@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <chrono>
 
+#include "processor/nfc.h"
 #include "processor/support.h"
 #include "processor/unicode.h"
 
@@ -51,7 +52,7 @@ std::string refused_added(const std::string& tokenizer, const char* field, const
 
 }  // namespace
 
-TEST_CASE("seven tokenizers give the reference's ids on three and a half thousand texts") {
+TEST_CASE("nine tokenizers give the reference's ids on four and a half thousand texts") {
   int compared = 0;
   const Json all = data_json("tokenizer_cases.json");
   for (const auto& item : all.items()) {
@@ -65,11 +66,11 @@ TEST_CASE("seven tokenizers give the reference's ids on three and a half thousan
       ++compared;
     }
   }
-  CHECK(compared == 3500);
+  CHECK(compared == 4500);
 }
 
 TEST_CASE("a word of 64 KiB takes milliseconds") {
-  for (const char* name : {"smol", "tangled", "gemma"}) {
+  for (const char* name : {"smol", "tangled", "qwen", "gemma"}) {
     const Keys keys = tokenizer_keys(name);
     std::string longest, word;  // repeated, the longest token of letters merges most
     const auto tokens = *keys.strings("tokenizer.tokens");
@@ -137,6 +138,7 @@ TEST_CASE("text that is not UTF-8 is refused at its first bad byte") {
 TEST_CASE("text beyond 64 KiB is refused and text of 64 KiB is not") {
   CHECK(contains(refused_text(std::string(Tokenizer::kMaxText + 1, 'a')), "65537 bytes"));
   CHECK(load("smol").encode(std::string(Tokenizer::kMaxText, 'a')).ok());
+  CHECK(load("smol").encode(std::string(Tokenizer::kMaxText + 1, 'a'), Tokenizer::kMaxText + 1).ok());
 }
 
 TEST_CASE("first and last agree on every code point") {
@@ -214,7 +216,9 @@ TEST_CASE("pre-tokenizer steps that the runtime does not know are refused") {
       {"{}", "a JSON list"},
       {"[]", "byte_level"},
       {R"([{"type":"digits","individual":true}])", "byte_level"},
-      {R"([{"type":"split"}])", "tokenizer.pre[0].type"},
+      {R"([{"type":"metaspace"}])", "tokenizer.pre[0].type"},
+      {R"([{"type":"split"}])", "tokenizer.pre[0].pattern"},
+      {R"([{"type":"split","pattern":"\\s+"}])", "tokenizer.pre[0].pattern"},
       {R"([{"type":"digits"}])", "tokenizer.pre[0].individual"},
       {R"([{"type":"byte_level","add_prefix_space":false}])", "tokenizer.pre[0].use_regex"},
       {R"([{"type":"byte_level","add_prefix_space":false,"use_regex":1}])", "true or false"},
@@ -228,6 +232,23 @@ TEST_CASE("pre-tokenizer steps that the runtime does not know are refused") {
     keys.set("tokenizer.pre", std::string(pre));
     CHECK(contains(refused_keys(keys), part));
   }
+}
+
+TEST_CASE("another normalization, or one beside byte fallback, is refused") {
+  Keys keys = tokenizer_keys("qwen");
+  keys.set("tokenizer.normalization", std::string("nfkc"));
+  CHECK(contains(refused_keys(keys), "tokenizer.normalization: expected nfc, or no such key, found nfkc"));
+  keys = tokenizer_keys("gemma");
+  keys.set("tokenizer.normalization", std::string("nfc"));
+  CHECK(contains(refused_keys(keys), "tokenizer.normalization"));
+}
+
+TEST_CASE("composing text is Unicode's, but for characters that the reference does not know") {
+  CHECK(nfc("cafe\u0301 A\u030a \u212b \u1100\u1161\u11a8") == "caf\u00e9 \u00c5 \u00c5 \uac01");
+  CHECK(nfc("a\u0327\u0301 a\u0301\u0327") == "\u00e1\u0327 \u00e1\u0327");
+  CHECK(nfc("\U00011935\U00011930") == "\U00011935\U00011930");  // one character since Unicode 13
+  CHECK(nfc(std::string("e\0\u0301", 4)) == std::string("e\0\u0301", 4));
+  CHECK(nfc("") == "");
 }
 
 TEST_CASE("another kind of tokenizer and a missing key are refused") {

@@ -4,7 +4,7 @@
 
 import json
 
-ORDER = ["tokenizer." + name for name in ("kind", "tokens", "merges", "pre", "added", "ignore_merges", "prefix_ids")]
+ORDER = ["tokenizer." + name for name in ("kind", "tokens", "merges", "pre", "normalization", "added", "ignore_merges", "prefix_ids")]
 
 
 def keys_of(tokenizer) -> dict:
@@ -26,8 +26,10 @@ def keys_of(tokenizer) -> dict:
 def byte_level(spec: dict) -> dict:
     pre = spec["pre_tokenizer"]
     steps = pre["pretokenizers"] if pre["type"] == "Sequence" else [pre]
-    assert spec["normalizer"] is None
+    assert spec["normalizer"] in (None, {"type": "NFC"})
+    normalization = {"tokenizer.normalization": "nfc"} if spec["normalizer"] else {}
     return {
+        **normalization,
         "tokenizer.kind": "byte_level_bpe",
         "tokenizer.pre": json.dumps([step_of(step) for step in steps]),
         "tokenizer.ignore_merges": spec["model"]["ignore_merges"],
@@ -48,5 +50,8 @@ def byte_fallback(spec: dict) -> dict:
 def step_of(step: dict) -> dict:
     if step["type"] == "Digits":
         return {"type": "digits", "individual": step["individual_digits"]}
+    if step["type"] == "Split":
+        assert step["behavior"] == "Isolated" and not step["invert"]
+        return {"type": "split", "pattern": step["pattern"]["Regex"]}
     assert step["type"] == "ByteLevel"
     return {"type": "byte_level", "add_prefix_space": step["add_prefix_space"], "use_regex": step["use_regex"]}

@@ -13,9 +13,9 @@ version is another.
 import sys
 
 import tokenizers
-from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
+from tokenizers import AddedToken, Tokenizer, models, normalizers, pre_tokenizers
 
-LETTER, NUMBER, SPACE, DIGIT, WORD = 1, 2, 4, 8, 16
+LETTER, NUMBER, SPACE, DIGIT, WORD, NORMAL = 1, 2, 4, 8, 16, 32
 CODE_POINTS = [c for c in range(0x110000) if not 0xD800 <= c <= 0xDFFF]
 
 
@@ -25,8 +25,23 @@ def added_token_tokenizer(**options) -> Tokenizer:
     return tokenizer
 
 
+def normal() -> set[int]:
+    """Code points that decompose, that decompositions are made of, and marks, which are put in the order of their classes."""
+    nfd, found = normalizers.NFD(), set()
+    for c in map(chr, CODE_POINTS):
+        parts = nfd.normalize_str(c)
+        low, high = "\u0327", "\u0345"  # marks of a low and of the highest class change places with others
+        if parts != c:
+            found.update([ord(c), *map(ord, parts)])
+        if nfd.normalize_str(c + low) != c + low or nfd.normalize_str(high + c) != high + c:
+            found.add(ord(c))
+    return found | {ord("\u0327"), ord("\u0345")}
+
+
 def classify() -> list[int]:
     flags = [0] * 0x110000
+    for c in normal():
+        flags[c] |= NORMAL
     pieces = pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=True)
     digits = pre_tokenizers.Digits(individual_digits=True)
     for c in CODE_POINTS:

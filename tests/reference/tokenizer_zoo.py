@@ -9,7 +9,7 @@ import random
 import sys
 import unicodedata
 
-from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers, trainers
+from tokenizers import AddedToken, Regex, Tokenizer, models, normalizers, pre_tokenizers, trainers
 
 SENTENCES = """
 pick up the red cube and place it in the bowl
@@ -133,6 +133,34 @@ def tangled() -> Tokenizer:
     return tokenizer
 
 
+QWEN2 = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+
+
+def qwen() -> Tokenizer:
+    """The shape of Qwen2's: composed characters, words with one mark in front, special tokens after the vocabulary."""
+    steps = [pre_tokenizers.Split(Regex(QWEN2), "isolated"), pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)]
+    tokenizer = train(pre_tokenizers.Sequence(steps), 700, [])
+    tokenizer.normalizer = normalizers.NFC()
+    specials = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>"]
+    tokenizer.add_special_tokens([AddedToken(text, normalized=False, special=True) for text in specials])
+    return tokenizer
+
+
+def qwen_awkward() -> Tokenizer:
+    """Every step one after another, and added tokens that change when they are composed, or are part of what does."""
+    steps = [
+        pre_tokenizers.Digits(individual_digits=False),
+        pre_tokenizers.Split(Regex(QWEN2), "isolated"),
+        pre_tokenizers.ByteLevel(add_prefix_space=True, use_regex=True),
+    ]
+    tokenizer = train(pre_tokenizers.Sequence(steps), 500, [])
+    tokenizer.normalizer = normalizers.NFC()
+    options = [dict(lstrip=True), dict(rstrip=True), dict(single_word=True), {}]
+    texts = ["e\u0301", "\u00e9t", "\u0301", "A\u030a\u0327", "\u212b", "\uac00", "\u1100\u1161\u11a8", "\u0f71\u0f72", "<\u0338", "cu", "\u2126 "]
+    tokenizer.add_tokens([AddedToken(text, normalized=i % 2 == 0, **options[i % 4]) for i, text in enumerate(texts)])
+    return tokenizer
+
+
 BYTES = [f"<0x{byte:02X}>" for byte in range(256)]
 
 
@@ -156,8 +184,6 @@ def byte_fallback(vocab: dict, merges: list, added: list[AddedToken], front: lis
 def sentence_pieces(vocab_size: int, sentences: list[str]) -> tuple[dict, list]:
     """Vocabulary and merges of a trained BPE whose words carry their blank in front, with Gemma's special tokens and bytes."""
     import json
-
-    from tokenizers import Regex, normalizers
 
     tokenizer = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Replace(" ", "\u2581")
@@ -212,6 +238,8 @@ ZOO = {
     "awkward": awkward,
     "whole": whole,
     "tangled": tangled,
+    "qwen": qwen,
+    "qwen_awkward": qwen_awkward,
     "gemma": gemma,
     "gemma_awkward": gemma_awkward,
     "gemma_tangled": gemma_tangled,
@@ -220,7 +248,9 @@ ZOO = {
 SPACES = [c for c in map(chr, range(0x110000)) if c.isspace()] + list("\u200b\u200c\u200d\u2060\ufeff\u180e\u00ad")
 DIGITS = [c for c in map(chr, range(0x110000)) if unicodedata.category(c) in ("Nd", "Nl", "No")]
 MARKS = [c for c in map(chr, range(0x110000)) if unicodedata.category(c).startswith("M")]
-CONTRACTIONS = ["'s", "'t", "'re", "'ve", "'m", "'ll", "'d", "'S", "'LL", "'", "''s", "’s", "'sx", "'r", "'l"]
+NORMAL = [c for c in map(chr, range(0x110000)) if not 0xD800 <= ord(c) <= 0xDFFF and unicodedata.normalize("NFD", c) != c and not 0xAC00 <= ord(c) <= 0xD7A3]
+JAMO = [chr(c) for c in (*range(0x1100, 0x1113), *range(0x1161, 0x1176), *range(0x11A7, 0x11C3), 0xAC00, 0xAC01, 0xD788, 0xD7A3)]
+CONTRACTIONS = ["'S", "'Re", "'lL", "'\u017f", "'\u017ft", "'D1", "'s", "'t", "'re", "'ve", "'m", "'ll", "'d", "'S", "'LL", "'", "''s", "’s", "'sx", "'r", "'l"]
 EMOJI = ["🤖", "👩🏽‍🔬", "🏳️‍🌈", "🇫🇷", "1️⃣", "☕️", "\u200d", "\ufe0f", "🏽"]
 PLANES = [(0, 0x7F), (0x80, 0x24F), (0x250, 0x7FF), (0x800, 0xD7FF), (0xE000, 0xFFFF), (0x10000, 0x1FFFF), (0x20000, 0x10FFFF)]
 
@@ -231,7 +261,7 @@ def any_char(rng: random.Random) -> str:
 
 
 def fuzz_piece(rng: random.Random, added: list[str]) -> str:
-    kind = rng.randrange(14)
+    kind = rng.randrange(17)
     if kind == 0:
         return any_char(rng)
     if kind == 1:
@@ -253,6 +283,13 @@ def fuzz_piece(rng: random.Random, added: list[str]) -> str:
         return rng.choice("abc1 <>\n") * rng.choice([1, 2, 5, 17, 60])
     if kind == 9:
         return "".join(rng.choice("abc1 ") for _ in range(rng.randint(1, 30)))
+    if kind == 10:  # what composes, taken apart and mixed with marks
+        composed = rng.choice(NORMAL) + rng.choice(["", rng.choice(MARKS)])
+        return unicodedata.normalize("NFD", composed) + rng.choice(["", rng.choice(MARKS)])
+    if kind == 11:
+        return "".join(rng.choice(JAMO) for _ in range(rng.randint(1, 5)))
+    if kind == 12:
+        return "".join(rng.choice(" \t\r\n.!a1\u00a0'") for _ in range(rng.randint(1, 8)))
     sentence = rng.choice(SENTENCES)
     start = rng.randrange(len(sentence))
     return sentence[start : start + rng.randint(1, 25)]

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The hub layout that LeRobot writes, opened without reading weights: configs, processors, tensor headers, statistics."""
+"""A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. What lies in the folder says
+whose layout it is: LeRobot's, openpi's, or that of Evo-1's authors."""
 
 from __future__ import annotations
 
@@ -14,9 +15,14 @@ from .dtypes import STATISTICS, to_f32
 from .errors import Code, ConvertError, Problems, refuse
 from .files import BACKBONE_PATTERNS, HUB_PATTERNS, download, is_hub_id, plain_name, read_json
 from .safetensors_file import Entry, read_safetensors
+from .torch_file import read_torch
 
+LEROBOT, OPENPI, EVO1 = "lerobot", "openpi", "evo1"  # layouts
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
+# What Evo-1's trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.
+TORCH_FILES = {"mp_rank_00_model_states.pt": "module", "checkpoint.pt": "model_state_dict"}
+NORM_STATS = "norm_stats.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 # Where releases without processor files kept statistics: "<group>.buffer_<feature, dots as underscores>.<statistic>".
 OLD_GROUPS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets.")
@@ -35,7 +41,7 @@ class Checkpoint:
     aliases: Dict[str, str]  # a tensor that was not stored because it shares memory -> the one that was
     old_statistics: Dict[str, Entry]
     processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
-    is_openpi: bool = False  # weights and assets/ as openpi writes them, without LeRobot's config
+    layout: str = LEROBOT
     notes: List[str] = field(default_factory=list)
 
     def path(self, name: str) -> str:
@@ -76,9 +82,20 @@ def _weight_files(folder: str, problems: Problems) -> List[str]:
     return [WEIGHTS] if single else _shards(folder, problems)
 
 
-def _read_tensors(folder: str, problems: Problems) -> Tuple[Dict[str, Entry], Dict[str, str]]:
+def _read_torch_file(folder: str) -> Dict[str, Entry]:
+    present = [name for name in TORCH_FILES if os.path.exists(os.path.join(folder, name))]
+    if len(present) != 1:
+        found, code = ("no such file", Code.IO) if not present else ("both", Code.BAD_BUNDLE)
+        raise refuse(folder, "either " + " or ".join(TORCH_FILES), found, "give the folder of one training step", code)
+    entries = read_torch(os.path.join(folder, present[0]), TORCH_FILES[present[0]])
+    return {clean(name): entry for name, entry in entries.items()}
+
+
+def _read_tensors(folder: str, layout: str, problems: Problems) -> Tuple[Dict[str, Entry], Dict[str, str]]:
     tensors: Dict[str, Entry] = {}
     aliases: Dict[str, str] = {}
+    if layout == EVO1:
+        return _read_torch_file(folder), aliases
     for file in _weight_files(folder, problems):
         content = read_safetensors(os.path.join(folder, file))
         # Every key of the metadata that names a stored tensor as its value is a shared tensor that was left out.
@@ -128,16 +145,25 @@ def open_checkpoint(source: str) -> Checkpoint:
     has_assets = os.path.isdir(os.path.join(folder, "assets"))
     has_config = os.path.exists(os.path.join(folder, "config.json"))
     config = read_json(os.path.join(folder, "config.json")) if has_config or not has_assets else {}
+    layout = _layout(folder, config, has_assets)
     problems = Problems(name)
-    tensors, aliases = _read_tensors(folder, problems)
+    tensors, aliases = _read_tensors(folder, layout, problems)
     problems.raise_any()
     old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
     weights = {key: entry for key, entry in tensors.items() if key not in old}
-    is_openpi = "type" not in config and (has_assets or "action_horizon" in config)
-    return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder), is_openpi)
+    return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder), layout)
 
 
-def find_backbone(checkpoint: Checkpoint, given: str, named) -> str:
+def _layout(folder: str, config: dict, has_assets: bool) -> str:
+    """LeRobot's config states a type, and neither of the others does."""
+    if "type" in config:
+        return LEROBOT
+    if any(os.path.exists(os.path.join(folder, name)) for name in (*TORCH_FILES, NORM_STATS)):
+        return EVO1
+    return OPENPI if has_assets or "action_horizon" in config else LEROBOT
+
+
+def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_model_name") -> str:
     """The folder with the backbone's config.json: as given, inside the checkpoint, or by the name that the policy's config states."""
     if given:
         if not os.path.isdir(given):
@@ -166,7 +192,7 @@ def find_backbone(checkpoint: Checkpoint, given: str, named) -> str:
         checkpoint.notes.append("backbone config and tokenizer: {} at revision {}".format(named, revision))
         return folder
     raise refuse(
-        "config.json: vlm_model_name", "the name of a backbone", str(named), "give its folder by --backbone", Code.IO
+        "config.json: " + key, "the name of a backbone", str(named), "give its folder by --backbone", Code.IO
     )
 
 

@@ -25,6 +25,11 @@ without --dtype the stored type is kept when all matrices share one; mixed types
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
 two agree for grids whose side is a power of two. 'shifted' reproduces transformers 4.55 to 4.57.
 
+--variant, --views, --view-slots and --dead-rows are asked for together where a checkpoint of Evo-1's authors is given: r1 is their
+code before 9 April 2026, r2 the code since (steps, time index, pixel rounding and state padding differ); --dead-rows is
+zero_attention where the policy ran with flash-attn installed, which is what the authors ask for. docs/converting.md says how
+to find out.
+
 exit codes: 0 done, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot be read or written."""
 
 
@@ -80,12 +85,28 @@ def build_parser() -> argparse.ArgumentParser:
         "--variant",
         metavar="NAME",
         default="",
-        help="openpi's configuration that an openpi checkpoint was trained with, e.g. pi05_droid: its robot and recipe",
+        help="openpi's configuration that an openpi checkpoint was trained with, e.g. pi05_droid: its robot and recipe; of a"
+        " checkpoint of Evo-1's authors the revision of their code, r1 or r2",
     )
+    _add_evo1(parser)
     add("--force", action="store_true", help="overwrite OUT.gguf")
     add("--quiet", action="store_true", help="no progress bar and no summary")
     add("--version", action="version", version="vla-convert " + __version__)
     return parser
+
+
+def _add_evo1(parser: argparse.ArgumentParser) -> None:
+    about = "what their folder (config.json, norm_stats.json, *.pt) does not state, so that it must be said; see below"
+    add = parser.add_argument_group("checkpoints of Evo-1's authors", about).add_argument
+    add("--stats", metavar="ARM/DATASET", default="", help="the entry of norm_stats.json to normalise with, where there are several")
+    add("--views", metavar="A,B,...", default="", help="names of the cameras in the order of the prompt's slots")
+    add("--view-slots", metavar="N", type=int, default=0, help="places for views in the prompt; the authors' server has 3")
+    add(
+        "--dead-rows",
+        choices=("zero_attention", "causal_attention"),
+        default="",
+        help="what attention leaves in rows that are masked, which the action head reads: zeros with flash-attn",
+    )
 
 
 @contextmanager
@@ -127,7 +148,18 @@ def report(summary: Summary) -> str:
 
 def main(argv=None) -> int:
     args = build_parser().parse_args(argv)
-    options = Options(args.backbone, args.dtype, args.dataset_info, args.identity_stats, args.position_precision, args.variant)
+    options = Options(
+        backbone=args.backbone,
+        dtype=args.dtype,
+        dataset_info=args.dataset_info,
+        identity_stats=args.identity_stats,
+        position_precision=args.position_precision,
+        variant=args.variant,
+        stats=args.stats,
+        views=args.views.split(",") if args.views else (),
+        view_slots=args.view_slots,
+        dead_rows=args.dead_rows,
+    )
     try:
         with _progress(args.quiet) as progress:
             summary = convert_checkpoint(args.checkpoint, args.out, options, args.force, progress)

@@ -44,7 +44,8 @@ def convert_checkpoint(
     _check_out(out, force)
     checkpoint = open_checkpoint(source)
     problems = Problems(checkpoint.name)
-    arch = archs.arch_of(checkpoint.config, checkpoint.is_openpi, options.variant)
+    archs.check_options(checkpoint.layout, checkpoint.config, options)
+    arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
     plan = archs.load(arch).plan(checkpoint, options, problems)
     dropped = _match(checkpoint, plan, problems)
     problems.raise_any()
@@ -141,7 +142,9 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
         with BundleWriter(summary.path, keys, tensors) as out:
             for weight, tensor in zip(plan.weights, tensors):
                 progress(weight.target, done, total)
-                _stream(checkpoint.tensors[weight.source], weight, tensor, out, summary, problems)
+                entry = checkpoint.tensors[weight.source]
+                entry = entry if weight.first is None else entry.rows(weight.first, weight.shape[0])
+                _stream(entry, weight, tensor, out, summary, problems)
                 done += tensor.n_bytes
             for name, value in plan.statistics.items():
                 out.write(name, value)

@@ -8,7 +8,7 @@ Reference: lerobot src/lerobot/processor/normalize_processor.py and migrate_poli
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Dict, List, NamedTuple, Sequence
+from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -48,12 +48,14 @@ class Found(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What is asked of statistics: widths by feature, and the features that may do without."""
+    """What is asked of statistics: widths by feature, and the features that may do without. `least`: widths of statistics that need
+    not reach the padded width."""
 
     dims: Dict[str, int]
     identity: Sequence[str]
     notes: List[str]
     problems: Problems
+    least: Dict[str, int]
 
 
 def choose(feature: str, mode: str, eps: float, found: Found, context: Context) -> Normalization:
@@ -83,7 +85,8 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
         )
     chosen = {name: found.values[name] for name in names if name in found.values}
     for name, value in chosen.items():
-        _check_statistic("statistics of {}: {}".format(feature, name), name, value, dim, context)
+        widths = (context.least.get(feature, dim), dim)
+        _check_statistic("statistics of {}: {}".format(feature, name), name, value, widths, context)
     return Normalization(kind, eps, chosen)
 
 
@@ -91,9 +94,10 @@ def _others(known: Sequence[str]) -> str:
     return " (there are some for {})".format(", ".join(known)) if known else ""
 
 
-def _check_statistic(where: str, name: str, value: np.ndarray, dim: int, context: Context) -> None:
-    if value.shape != (dim,):
-        context.problems.add(where, "shape ({},)".format(dim), str(value.shape))
+def _check_statistic(where: str, name: str, value: np.ndarray, widths: Tuple[int, int], context: Context) -> None:
+    if value.ndim != 1 or not widths[0] <= value.size <= widths[1]:
+        wanted = "shape " + " to ".join("({},)".format(width) for width in sorted(set(widths)))
+        context.problems.add(where, wanted, str(value.shape))
     elif not np.isfinite(value).all():
         context.problems.add(
             where,

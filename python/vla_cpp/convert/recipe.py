@@ -71,11 +71,17 @@ class _Reader:
     """Walks over both pipelines and collects what it cannot translate."""
 
     def __init__(
-        self, checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems, own: Steps
+        self,
+        checkpoint: Checkpoint,
+        dims: Dict[str, int],
+        identity: Sequence[str],
+        problems: Problems,
+        own: Steps,
+        least: Dict[str, int],
     ) -> None:
         self.steps = {file: {**STEPS[file], **own.get(file, {})} for file in STEPS}
         self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
-        self.context = Context(dims, identity, checkpoint.notes, problems)
+        self.context = Context(dims, identity, checkpoint.notes, problems, least)
         self.seen: List[str] = []
 
     def pipeline(self, file: str, content: dict) -> None:
@@ -188,7 +194,8 @@ class _Reader:
         if config.get("normalize_observation_keys") is not None and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
-        if stated.get("shape") != [self.context.dims[STATE]] or stated.get("type") != "STATE":
+        widths = (self.context.dims[STATE], self.context.least.get(STATE))
+        if stated.get("shape") not in [[width] for width in widths] or stated.get("type") != "STATE":
             self.problems.add(
                 "{}: features.{}".format(where, STATE),
                 "STATE of [{}] as in config.json".format(self.context.dims[STATE]),
@@ -240,21 +247,28 @@ def relative_columns(width: int, names: Optional[Sequence[str]], exclude: Sequen
 
 
 def read_processors(
-    checkpoint: Checkpoint, dims: Dict[str, int], identity: Sequence[str], problems: Problems, own: Steps
+    checkpoint: Checkpoint,
+    dims: Dict[str, int],
+    identity: Sequence[str],
+    problems: Problems,
+    own: Steps,
+    least: Optional[Dict[str, int]] = None,
 ) -> Processors:
     """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights. `own`: the
-    steps that this architecture has beside those of all policies."""
-    reader = _Reader(checkpoint, dims, identity, problems, own)
+    steps that this architecture has beside those of all policies. `least`: for a policy that pads before it normalizes and whose
+    `dims` are the padded widths, those of the robot; such a policy also builds its prompt itself."""
+    reader = _Reader(checkpoint, dims, identity, problems, own, least or {})
     for feature in identity:
         if feature not in dims:
             problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
     if checkpoint.processors is None:
         return _from_weights(checkpoint, reader)
+    required = {PRE: ["normalizer_processor"], POST: ["unnormalizer_processor"]}
+    if least is None:
+        required[PRE].insert(0, "tokenizer_processor")
     for file, content in zip((PRE, POST), checkpoint.processors):
         reader.pipeline(file, content)
-        reader.finish(
-            file, ("tokenizer_processor", "normalizer_processor") if file == PRE else ("unnormalizer_processor",)
-        )
+        reader.finish(file, required[file])
     if checkpoint.old_statistics:
         checkpoint.notes.append("dropped: statistics inside the weights, which the processor files supersede")
     return reader.result

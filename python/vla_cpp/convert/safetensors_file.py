@@ -39,6 +39,13 @@ class Entry(NamedTuple):
     offset: int
     n_bytes: int
 
+    def rows(self, first: int, count: int) -> "Entry":
+        """A run of rows, for a tensor that stacks several: `first` and `count` lie within its first dimension."""
+        row = self.n_bytes // self.shape[0]
+        return self._replace(
+            shape=(count, *self.shape[1:]), offset=self.offset + first * row, n_bytes=count * row
+        )
+
     def chunks(self, chunk_bytes: int = CHUNK_BYTES) -> Iterator[np.ndarray]:
         """The tensor's elements in order, as flat arrays of bounded size (BF16 as uint16 bits)."""
         kind = STATISTICS[self.dtype]

@@ -7,12 +7,13 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from dataclasses import dataclass, field
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
 from ..bundle import Key
-from ..errors import Code, refuse
+from ..checkpoint import EVO1, LEROBOT, OPENPI
+from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 
@@ -27,6 +28,7 @@ class Weight(NamedTuple):
     shape: Tuple[int, ...]
     plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
     keep_f32: bool = False  # a matrix that the reference keeps in float32 in bfloat16 too: not rounded if stored so
+    first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
 
 
 class Dropped(NamedTuple):
@@ -46,7 +48,11 @@ class Options:
     dataset_info: str = ""
     identity_stats: Sequence[str] = ()
     position_precision: str = ""
-    variant: str = ""  # openpi's name of a training configuration, which its checkpoints do not state
+    variant: str = ""  # openpi's name of a training configuration, or the revision of Evo-1's code: checkpoints do not state them
+    stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET
+    views: Sequence[str] = ()  # Evo-1: names of the cameras in the order of the prompt's slots
+    view_slots: int = 0  # Evo-1: places for views in the prompt
+    dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
 
 @dataclass
@@ -74,20 +80,40 @@ def load(name):
     return importlib.import_module("." + name, __name__)
 
 
-def arch_of(config: dict, is_openpi: bool, variant: str) -> str:
+# Options that only some layouts leave open, with what the other layouts do instead.
+LAYOUT_OPTIONS = {
+    "identity_stats": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
+    "position_precision": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
+    "variant": ((OPENPI, EVO1), "a checkpoint of openpi or of Evo-1's authors"),
+    "stats": ((EVO1,), "a checkpoint of Evo-1's authors"),
+    "views": ((EVO1,), "a checkpoint of Evo-1's authors"),
+    "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),
+    "dead_rows": ((EVO1,), "a checkpoint of Evo-1's authors"),
+}
+LAYOUT_NAMES = {
+    LEROBOT: "config.json of type {}, which states everything itself",
+    OPENPI: "one of openpi",
+    EVO1: "one of Evo-1's authors",
+}
+
+
+def check_options(layout: str, config: dict, options: Options) -> None:
+    """Refuses options that a layout does not leave open. Errors: usage."""
+    problems = Problems("arguments")
+    for name, (layouts, wanted) in LAYOUT_OPTIONS.items():
+        if getattr(options, name) and layout not in layouts:
+            flag = "--" + name.replace("_", "-")
+            found = LAYOUT_NAMES[layout].format(config.get("type"))
+            problems.add(flag, wanted, found, "leave the option out", Code.USAGE)
+    problems.raise_any()
+
+
+def arch_of(config: dict, layout: str, variant: str) -> str:
     """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
     was trained with. Errors: usage, unsupported."""
+    if layout != OPENPI:
+        return config.get("type") if layout == LEROBOT else layout
     variants = {name: arch for arch in names() for name in getattr(load(arch), "VARIANTS", ())}
-    if not is_openpi:
-        if variant:
-            raise refuse(
-                "--variant " + variant,
-                "an openpi checkpoint",
-                "config.json of type {}, which states everything itself".format(config.get("type")),
-                "leave the option out",
-                Code.USAGE,
-            )
-        return config.get("type")
     if variant in variants:
         return variants[variant]
     raise refuse(

@@ -10,7 +10,7 @@ from typing import Dict, List
 
 from .. import recipe
 from ..bundle import Key
-from ..checkpoint import Checkpoint
+from ..checkpoint import OPENPI, Checkpoint
 from ..errors import Code, ConvertError, Problems, refuse
 from ..files import BACKBONE_PATTERNS, download
 from ..tokenizer import TokenizerPlan, read_tokenizer
@@ -27,7 +27,7 @@ TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
 
 
 def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    read = read_openpi if checkpoint.is_openpi else read_lerobot
+    read = read_openpi if checkpoint.layout == OPENPI else read_lerobot
     source = read(family, checkpoint, options, problems)
     checkpoint.tensors = names.rename(
         checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems

@@ -1,0 +1,60 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/nfc.h"
+
+#include <utf8proc.h>
+
+#include <vector>
+
+#include "processor/unicode.h"
+
+namespace vla {
+namespace {
+
+constexpr std::size_t kMaxParts = 4;  // code points that one decomposes to at most
+
+/// Bytes at the start whose characters take part in normalization, or take no part in it, as `wanted` says.
+std::size_t run(std::string_view text, bool wanted) {
+  std::size_t size = 0;
+  while (size < text.size()) {
+    const unicode::Char c = unicode::first(text.substr(size));
+    if (((unicode::classes(c.code_point) & unicode::kNormal) != 0) != wanted) break;
+    size += c.size;
+  }
+  return size;
+}
+
+/// No function of the library fails here: the text is UTF-8, the buffer is large enough, and nothing else is taken.
+void append_composed(std::string_view text, std::string& out) {
+  constexpr auto kDecompose = static_cast<utf8proc_option_t>(UTF8PROC_STABLE | UTF8PROC_DECOMPOSE);
+  constexpr auto kCompose = static_cast<utf8proc_option_t>(UTF8PROC_STABLE | UTF8PROC_COMPOSE);
+  std::vector<utf8proc_int32_t> characters(text.size() * kMaxParts);
+  utf8proc_ssize_t count = utf8proc_decompose(reinterpret_cast<const utf8proc_uint8_t*>(text.data()),
+                                              static_cast<utf8proc_ssize_t>(text.size()), characters.data(),
+                                              static_cast<utf8proc_ssize_t>(characters.size()), kDecompose);
+  count = utf8proc_normalize_utf32(characters.data(), count, kCompose);
+  for (utf8proc_ssize_t i = 0; i < count; ++i) {
+    utf8proc_uint8_t bytes[4];
+    const utf8proc_ssize_t size = utf8proc_encode_char(characters[static_cast<std::size_t>(i)], bytes);
+    out.append(reinterpret_cast<const char*>(bytes), static_cast<std::size_t>(size));
+  }
+}
+
+}  // namespace
+
+std::string nfc(std::string_view text) {
+  std::string out;
+  out.reserve(text.size());
+  while (!text.empty()) {
+    // A character that takes no part is a wall: nothing composes with it or moves past it.
+    std::size_t size = run(text, false);
+    out.append(text.substr(0, size));
+    text.remove_prefix(size);
+    size = run(text, true);
+    if (size > 0) append_composed(text.substr(0, size), out);
+    text.remove_prefix(size);
+  }
+  return out;
+}
+
+}  // namespace vla
