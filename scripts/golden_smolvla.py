@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +29,9 @@ class Case:
     seed: int
     frames: dict  # view -> (height, width, suffix), or None: the view is absent
     text: str
-    checkpoint: object  # the Description of random_smolvla or random_pi
+    checkpoint: object  # the Description of random_smolvla, random_pi or random_evo1
     state: tuple = ()  # instead of a random one
+    options: dict = field(default_factory=dict)  # what the checkpoint does not say: kept as convert.json beside it
 
 
 def vision(d, layers, heads, ff, image, patch, eps=1e-6):
@@ -117,8 +118,20 @@ def write_observation(case, folder):
     state = torch.tensor(case.state) if case.state else state
     observation = {"images": images, "state": state.tolist(), "text": case.text}
     (folder / "observation.json").write_text(json.dumps(observation, indent=1, ensure_ascii=False) + "\n")
-    noise = torch.randn(d.policy["chunk_size"], d.policy["max_action_dim"], generator=generator)
+    shape = d.policy["chunk_size"], d.policy["max_action_dim"]
+    if getattr(d, "noise", "normal") == "uniform":  # multiples of 2^-20: they survive what a reference makes of a draw
+        noise = torch.randint(-(2**20), 2**20, shape, generator=generator) / 2**20
+    else:
+        noise = torch.randn(shape, generator=generator)
     np.save(folder / "noise.npy", noise.numpy())
+
+
+def conversion_options(folder):
+    """The options of vla-convert that a case's convert.json names."""
+    file = folder / "convert.json"
+    for name, value in (json.loads(file.read_text()) if file.is_file() else {}).items():
+        yield "--" + name.replace("_", "-")
+        yield ",".join(value) if isinstance(value, list) else str(value)
 
 
 def write_bundle(folder):
@@ -127,7 +140,7 @@ def write_bundle(folder):
 
     checkpoint = folder / "checkpoint"
     code = cli.main([str(checkpoint), "--backbone", str(golden.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
-                     "--dtype", "bf16", "--force", "--quiet"])
+                     "--dtype", "bf16", "--force", "--quiet", *conversion_options(folder)])
     if code:
         raise SystemExit(code)
 
@@ -135,6 +148,8 @@ def write_bundle(folder):
 def write_case(name, case, folder, write_checkpoint):
     n = write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
     write_observation(case, folder)
+    if case.options:
+        (folder / "convert.json").write_text(json.dumps(case.options) + "\n")
     taps = golden.write_expected(folder, case.seed)
     largest = np.abs(taps["chunk"]).max()
     print(f"{name}: {n:,} parameters, {len(taps)} taps, chunk up to {largest:.2f}, published dtypes "

@@ -26,6 +26,7 @@ def convert(case, out, dtype):
         out,
         "--dtype",
         dtype,
+        *case.conversion(),
     ]
     result = subprocess.run(command, cwd=ROOT / "python", capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr

@@ -34,6 +34,14 @@ class Golden:
         observation = json.loads((self.folder / "observation.json").read_text(encoding="utf-8"))
         self.images = {view: file and self.folder / file for view, file in observation["images"].items()}
         self.state, self.text = observation["state"], observation["text"]
+        said = self.folder / "convert.json"
+        self.said = json.loads(said.read_text(encoding="utf-8")) if said.is_file() else {}
+
+    def conversion(self):
+        """Options of vla-convert for what the checkpoint does not say."""
+        for name, value in self.said.items():
+            yield "--" + name.replace("_", "-")
+            yield ",".join(value) if isinstance(value, list) else str(value)
 
     def arguments(self, bundle=None, images=None, state=None, text=None, noise=None, options=("--json",)):
         images = self.images if images is None else images

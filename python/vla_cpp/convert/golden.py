@@ -86,11 +86,12 @@ def versions() -> str:
 # --- the reference, run on one case -------------------------------------------------------------------------------
 
 # For each architecture the module that knows its class: `load(checkpoint, dtype)` and a `Recorder`.
-REFERENCES = {"smolvla": "golden_smolvla", "pi0": "golden_pi", "pi05": "golden_pi"}
+REFERENCES = {"smolvla": "golden_smolvla", "pi0": "golden_pi", "pi05": "golden_pi", "evo1": "golden_evo1"}
 
 
 def config_type(checkpoint) -> str:
-    return json.loads((Path(checkpoint) / "config.json").read_text())["type"]
+    """The type that LeRobot's config.json names; the authors' files of Evo-1 name none."""
+    return json.loads((Path(checkpoint) / "config.json").read_text()).get("type", "evo1")
 
 
 def backbone_folder(checkpoint) -> Path:
@@ -100,6 +101,13 @@ def backbone_folder(checkpoint) -> Path:
 
 def reference(arch):
     return importlib.import_module(f"vla_cpp.convert.{REFERENCES[arch]}")
+
+
+def described(checkpoint) -> str:
+    """What computed the numbers, in the words of its module."""
+    arch = config_type(checkpoint)
+    module = reference(arch)
+    return module.described(checkpoint) if hasattr(module, "described") else module.NAMES[arch]
 
 
 def load(checkpoint, dtype="float32"):
@@ -125,17 +133,11 @@ def read_observation(case):
     return batch
 
 
-class Recorder:
-    """Listens to one run of `predict_action_chunk`: hooks on modules, wrappers on the stage entry points.
+class Taps:
+    """What hooks on modules and functions put down, by name."""
 
-    A reference's own recorder derives from it: it places the hooks, tells `prefix_seen` which rows are valid and
-    `step_seen` what enters a step.
-    """
-
-    def __init__(self, policy, n_step):
-        self.policy, self.n_step, self.step, self.views, self.taps = policy, n_step, -1, {}, {}
-        self.embed_prefix, policy.model.embed_prefix = policy.model.embed_prefix, self.on_prefix
-        self.denoise_step, policy.model.denoise_step = policy.model.denoise_step, self.on_step
+    def __init__(self, n_step):
+        self.n_step, self.step, self.taps = n_step, -1, {}
 
     def put(self, name, x):
         self.taps[name] = x.detach().float().numpy().copy()
@@ -153,11 +155,25 @@ class Recorder:
     def after(self, module, take):
         module.register_forward_hook(lambda m, args, out: take((out[0] if isinstance(out, tuple) else out).clone()))
 
-    def per_view(self, module, name, shape=lambda x: x):
-        self.after(module, lambda x: self.views.setdefault(name, []).append(shape(x)))
-
     def stepwise(self, module, name):
         self.after(module, lambda x: self.at_step(name, x))
+
+
+class Recorder(Taps):
+    """Listens to one run of `predict_action_chunk`: hooks on modules, wrappers on the stage entry points.
+
+    A reference's own recorder derives from it: it places the hooks, tells `prefix_seen` which rows are valid and
+    `step_seen` what enters a step.
+    """
+
+    def __init__(self, policy, n_step):
+        super().__init__(n_step)
+        self.policy, self.views = policy, {}
+        self.embed_prefix, policy.model.embed_prefix = policy.model.embed_prefix, self.on_prefix
+        self.denoise_step, policy.model.denoise_step = policy.model.denoise_step, self.on_step
+
+    def per_view(self, module, name, shape=lambda x: x):
+        self.after(module, lambda x: self.views.setdefault(name, []).append(shape(x)))
 
     def vision_tower(self, vision):
         """Hooks on a tower of the SigLIP family."""
@@ -222,10 +238,10 @@ class Recorder:
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
     stages = ("pixels", "tokens", "state", "position_ids", "vision", "connector", "projector", "prefix", "lm", "state_in",
-              "expert", "step", "chunk")
+              "state_out", "expert", "head", "step", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)
-    i = next((int(p) for p in parts if p.isdigit()), 1000 if name == "vision.post_norm" else -1)
+    i = next((int(p) for p in parts if p.isdigit()), 1000 if name in ("vision.post_norm", "lm.norm") else -1)
     return stage, i, parts[-1] not in ("k", "v") if parts[0] == "lm" else 0
 
 
@@ -253,7 +269,7 @@ def write_expected(case, seed):
     arch = config_type(case / "checkpoint")
     writer.add_string("golden.arch", arch)
     writer.add_string("golden.case", case.name)
-    writer.add_string("golden.reference", f"{reference(arch).NAMES[arch]}, float32, CPU, 1 thread")
+    writer.add_string("golden.reference", f"{described(case / 'checkpoint')}, float32, CPU, 1 thread")
     writer.add_string("golden.versions", versions())
     writer.add_uint32("golden.seed", seed)
     for name, value in taps.items():
