@@ -46,12 +46,11 @@ class Gr00tN17 final : public Policy {
         time_in_(s / "time_in", d_time_, dit_.d_model(), Bias::yes),
         time_out_(s / "time_out", dit_.d_model(), dit_.d_model(), Bias::yes) {
     const Scope vl = s / "vl";
-    const int n_layer = vl.index("n_layer", 513);  // a model may do without
+    const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may do without layers
     for (int i = 0; i < n_layer; ++i)
-      vl_blocks_.emplace_back(vl / "blk" / i, backbone_.d_model(), vl.dim("n_head", 1024), vl.dim("d_ff"),
-                              vl.number("norm_eps"));
-    vl.require(n_layer == 0 || backbone_.d_model() % vl.dim("n_head", 1024) == 0, "n_head",
-               fmt::format("a divisor of lm.d_model {}", backbone_.d_model()), std::to_string(vl.dim("n_head", 1024)));
+      vl_blocks_.emplace_back(vl / "blk" / i, backbone_.d_model(), n_head, vl.dim("d_ff"), vl.number("norm_eps"));
+    vl.require(n_layer == 0 || backbone_.d_model() % n_head == 0, "n_head",
+               fmt::format("a divisor of lm.d_model {}", backbone_.d_model()), std::to_string(n_head));
     s.require(horizon_ <= s.dim("n_position"), "n_position", fmt::format("at least the horizon {}", horizon_),
               std::to_string(s.dim("n_position")));
     (s / "dit").require(d_time_ % 2 == 0 && d_time_ > 2, "d_time", "an even number above 2", std::to_string(d_time_));
@@ -60,7 +59,7 @@ class Gr00tN17 final : public Policy {
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(backbone_.check(shape.width, shape.height, shape.n_view, shape.n_text));
-    return check_prefix(shape.n_view, backbone_.n_view_token(), shape.n_text);
+    return check_prefix(0, 0, shape.n_text);  // views are part of the text
   }
 
   Tensor condition(Graph& g, std::span<const float> times) const override {

@@ -25,9 +25,9 @@ KeyValue DitBlock::project(Graph& g, Tensor context) const {
   return {split_heads(g, kv[0], n_head_), split_heads(g, kv[1], n_head_)};
 }
 
-Tensor DitBlock::forward(Graph& g, Tensor x, Tensor modulation, const KeyValue* seen) const {
+Tensor DitBlock::forward(Graph& g, Tensor x, Tensor modulation, const KeyValue& seen) const {
   const Tensor h = norm_.forward(g, x, modulation);
-  const KeyValue kv = seen != nullptr ? *seen : project(g, h);
+  const KeyValue kv = seen.key ? seen : project(g, h);
   const Tensor mixed = attention(g, split_heads(g, q_(g, h), n_head_), kv.key, kv.value, {}, kv.packed);
   x = out_.added_to(g, x, mixed);
   return mlp_.added_to(g, x, layer_norm(g, x, eps_));
@@ -66,14 +66,8 @@ Tensor Dit::operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cach
   const auto part = [&](std::size_t i) {
     return slice_features(g, modulations, static_cast<int>(i) * 2 * d_model_, 2 * d_model_);
   };
-  for (std::size_t i = 0; i < blocks_.size(); ++i) {
-    if (i % 2 == 0) {
-      const KeyValue seen = KeyValue::get(cache, blocks_[i].path());
-      x = blocks_[i](g, x, part(i), &seen);
-    } else {
-      x = blocks_[i](g, x, part(i), nullptr);
-    }
-  }
+  for (std::size_t i = 0; i < blocks_.size(); ++i)
+    x = blocks_[i](g, x, part(i), i % 2 == 0 ? KeyValue::get(cache, blocks_[i].path()) : KeyValue());
   return out_(g, out_norm_.forward(g, x, part(blocks_.size())));
 }
 

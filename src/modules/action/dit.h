@@ -18,8 +18,8 @@ class DitBlock : public Module<DitBlock> {
   DitBlock(const Scope& s, int d_model, int d_context, int n_head, int d_ff, float eps);
   /// Keys and values of a context [d_context, n], which is not normalized: [d_head, n_head, n] each.
   KeyValue project(Graph& g, Tensor context) const;
-  /// x [d_model, n], modulation [2 d_model, 1] -> the shape of x. Without `seen` the tokens see each other.
-  Tensor forward(Graph& g, Tensor x, Tensor modulation, const KeyValue* seen) const;
+  /// x [d_model, n], modulation [2 d_model, 1] -> the shape of x. Where `seen` is empty the tokens see each other.
+  Tensor forward(Graph& g, Tensor x, Tensor modulation, const KeyValue& seen) const;
 
   const AdaptiveLayerNorm& norm() const { return norm_; }
 

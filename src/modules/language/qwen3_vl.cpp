@@ -42,7 +42,8 @@ Qwen3Vl::Qwen3Vl(const Scope& s)
 
   const std::vector<int> sections = (s / "lm").integers("rope_sections");
   const int n_pair = lm_.heads().d_head / 2;
-  const bool three = sections.size() == 3;
+  const bool three =
+      sections.size() == 3 && std::all_of(sections.begin(), sections.end(), [&](int n) { return n <= n_pair; });
   if (three) std::copy(sections.begin(), sections.end(), rope_sections_.begin());
   (s / "lm").require(
       three && sections[0] + sections[1] + sections[2] == n_pair && 3 * std::max(sections[1], sections[2]) <= n_pair,
@@ -53,7 +54,7 @@ Qwen3Vl::Qwen3Vl(const Scope& s)
   bool apart = static_cast<int>(view_starts_.size()) == s.dim("n_slot", 32);
   for (const int start : view_starts_) {
     apart = apart && start >= end && start < 1 << 16;
-    end = start + n_view_token();
+    end = std::min(start, 1 << 16) + n_view_token();
   }
   s.require(apart, "view_starts",
             fmt::format("n_slot places of {} tokens each, behind the first token", n_view_token()),
@@ -76,10 +77,11 @@ Tensor Qwen3Vl::operator()(Graph& g, Tensor images, Tensor tokens, const Cache& 
   const int n_token = static_cast<int>(tokens.dim(0));
   const std::vector<Tensor> seen = vision_(g, images, cache);
   std::vector<Tensor> added;
-  for (std::size_t k = 0; k < deepstack_.size(); ++k)
+  for (std::size_t k = 0; k < deepstack_.size(); ++k) {
     added.push_back(arrange(g, deepstack_[k](g, seen[k]), n_token,
                             [&](Range range) { return filled(g, 0, lm_.d_model(), range.count); }));
-  for (const Tensor rows : added) g.require(rows);  // before the stage ends
+    g.require(added.back());  // before the stage ends
+  }
   const Tensor image = g.stage("vision", connector_(g, seen.back()));
   const Tensor x = arrange(g, image, n_token,
                            [&](Range range) { return lm_.embed(g, slice_ids(g, tokens, range.first, range.count)); });

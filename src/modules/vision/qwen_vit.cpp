@@ -18,14 +18,13 @@ QwenVit::QwenVit(const Scope& s)
       width_(s.dim("image_width", 16384)),
       height_(s.dim("image_height", 16384)),
       patch_size_(s.dim("patch_size", 256)),
-      merge_(s.dim("merge", 16)),
+      merge_(s.dim("merge", 8)),
       n_row_(height_ / patch_size_),
       n_column_(width_ / patch_size_),
       n_side_(s.dim("n_position_side", 1024)),
       norm_eps_(s.number("norm_eps")),
       rope_base_(s.number("rope_base")),
       deepstack_layers_(s.integers("deepstack_layers")),
-      places_(merge_block_places(n_row_ / merge_ * merge_, n_column_ / merge_ * merge_, merge_)),
       patch_embed_(s / "patch_embed", 3 * patch_size_ * patch_size_, d_model_, Bias::yes),
       patch_embed_next_(s / "patch_embed_next", 3 * patch_size_ * patch_size_, d_model_, Bias::no),
       position_(s / "position", d_model_, n_side_ * n_side_) {
@@ -46,6 +45,8 @@ QwenVit::QwenVit(const Scope& s)
   for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, n_head_, d_ff, norm_eps_);
 }
 
+std::vector<Place> QwenVit::places() const { return merge_block_places(n_row_, n_column_, merge_); }
+
 Status QwenVit::check(int width, int height) const {
   if (width == width_ && height == height_) return {};
   return Error{Code::unsupported, "vision.image_width", fmt::format("pictures of {} x {}", width_, height_),
@@ -53,7 +54,7 @@ Status QwenVit::check(int width, int height) const {
 }
 
 void QwenVit::keep(Graph& g, Cache& cache) const {
-  const PositionBlend blend = blend_positions(places_, n_row_, n_column_, n_side_);
+  const PositionBlend blend = blend_positions(places(), n_row_, n_column_, n_side_);
   Tensor sum;
   for (int corner = 0; corner < 4; ++corner) {
     const Tensor rows = position_.forward(g, constant_ids(g, fmt::format("position/{}", corner), blend.ids[corner]));
@@ -69,7 +70,7 @@ std::vector<Tensor> QwenVit::operator()(Graph& g, Tensor images, const Cache& ca
   const Tensor ordered = columns(g, pixel_shuffle(g, pixels, n_column_, merge_), pixels.dim(0));
   Tensor x = patch_embed_next_.added_to(g, patch_embed_.forward(g, ordered), ordered);
   x = add(g, g.name(patch_embed_.path(), x), cache.get(position_.path()));
-  const Tensor rotary = grid_rotary_table(g, d_model_ / n_head_, rope_base_, places_);
+  const Tensor rotary = grid_rotary_table(g, d_model_ / n_head_, rope_base_, places());
   std::vector<Tensor> seen;
   for (std::size_t i = 0; i < blocks_.size(); ++i) {
     x = blocks_[i](g, x, rotary);

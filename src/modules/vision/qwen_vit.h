@@ -38,10 +38,11 @@ class QwenVit {
   int n_deepstack() const { return static_cast<int>(deepstack_layers_.size()); }
 
  private:
+  std::vector<Place> places() const;
+
   int d_model_, n_head_, width_, height_, patch_size_, merge_, n_row_, n_column_, n_side_;
   float norm_eps_, rope_base_;
   std::vector<int> deepstack_layers_;
-  std::vector<Place> places_;
   Linear patch_embed_, patch_embed_next_;
   Embedding position_;
   std::vector<EncoderBlock> blocks_;
