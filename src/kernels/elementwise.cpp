@@ -81,7 +81,7 @@ void rotate_task(ggml_tensor* y, int ith, int nth, void* user) {
   const std::int64_t d = x->ne[0];
   const Range rows(ggml_nrows(x), ith, nth);
   for (std::int64_t row = rows.begin; row < rows.end; ++row) {
-    const float* cosine = values(table) + row / x->ne[1] * d;
+    const float* cosine = values(table) + row / x->ne[1] % x->ne[2] * d;
     static_cast<const RotateParams*>(user)->rotate(row_of(x, row), cosine, cosine + d / 2,
                                                    static_cast<float*>(y->data) + row * d, d / 2);
   }
@@ -123,7 +123,7 @@ Tensor contiguous(Graph& g, Tensor x) {
 
 Tensor rotate_half(Graph& g, Tensor x, Tensor table) {
   const CpuKernels* kernels = cpu_kernels(g.isa());
-  return custom(g, {x.dim(0), x.dim(1), x.dim(2)}, {x, table}, rotate_task,
+  return custom(g, {x.dim(0), x.dim(1), x.dim(2), x.dim(3)}, {x, table}, rotate_task,
                 keep(g, RotateParams{kernels != nullptr ? kernels->rotate_half : rotate_head}));
 }
 

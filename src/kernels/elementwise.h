@@ -23,8 +23,8 @@ Tensor relu(Graph& g, Tensor x);
 /// x, or a copy of it where it lies in pieces: a view of some tokens of several sequences.
 Tensor contiguous(Graph& g, Tensor x);
 
-/// Turns the pairs (x_i, x_{i + d/2}) of every head by the angles of its token.
-/// x [d_head, n_head, n_token], table [d_head, n_token] with d/2 cosines, then d/2 sines -> the shape of x.
+/// Turns the pairs (x_i, x_{i + d/2}) of every head by the angles of its token, in every batch the same.
+/// x [d_head, n_head, n_token, n_batch], table [d_head, n_token] with d/2 cosines, then d/2 sines -> the shape of x.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py apply_rope.
 Tensor rotate_half(Graph& g, Tensor x, Tensor table);
 

@@ -37,4 +37,23 @@ Tensor TimeEmbedding::operator()(Graph& g, std::span<const float> times) const {
                                 {d_, static_cast<std::int64_t>(times.size())});
 }
 
+std::vector<float> bucket_embedding(std::span<const int> buckets, int d, BucketWaves waves) {
+  const int half = d / 2;
+  const auto ln = static_cast<float>(std::log(10000.0));
+  const auto frequency = [&](int i) {
+    const auto n = static_cast<float>(i), m = static_cast<float>(half);
+    const float exponent = waves == BucketWaves::cosines_first ? -ln * n / (m - 1) : -n * (ln / m);
+    return static_cast<float>(std::exp(double{exponent}));
+  };
+  std::vector<float> table;
+  for (const int bucket : buckets)
+    for (const bool first : {true, false})
+      for (int i = 0; i < half; ++i) {
+        const double angle = static_cast<float>(bucket) * frequency(i);
+        const bool cosine = first == (waves == BucketWaves::cosines_first);
+        table.push_back(static_cast<float>(cosine ? std::cos(angle) : std::sin(angle)));
+      }
+  return table;
+}
+
 }  // namespace vla

@@ -28,4 +28,13 @@ class TimeEmbedding {
   double min_period_, max_period_;
 };
 
+/// How a reference embeds a whole-numbered time t, with n = d/2 and float32 angles t * exp(-ln(10000) i / m):
+/// `cosines_first` with m = n - 1 (diffusers models/embeddings.py get_timestep_embedding, flip_sin_to_cos),
+/// `sines_first` with m = n (lerobot policies/groot/groot_n1_7.py SinusoidalPositionalEncoding). The exponents are
+/// rounded as each rounds them: at t = 750 an exponent's last bit turns an angle by 5e-5.
+enum class BucketWaves { cosines_first, sines_first };
+
+/// Values of [d, buckets.size()], one column per time; `d` is even and above 2.
+std::vector<float> bucket_embedding(std::span<const int> buckets, int d, BucketWaves waves);
+
 }  // namespace vla

@@ -25,6 +25,26 @@ class AdaptiveRmsNorm : public Module<AdaptiveRmsNorm> {
   Linear dense_;
 };
 
+/// LayerNorm without weights, whose scale and shift are linear in a condition by a matrix of the norm's own path.
+/// Sources: lerobot policies/groot/action_head/cross_attention_dit.py AdaLayerNorm (scale_shift), DiT.forward
+/// (shift_scale).
+class AdaptiveLayerNorm {
+ public:
+  /// Which of the two are the first `d` rows of the matrix.
+  enum class Order { scale_shift, shift_scale };
+  AdaptiveLayerNorm(const Scope& s, int d, float eps, Order order);
+
+  /// Load rate, one column per condition: [d, n] -> [2 d, n], with factors (1 + scale) in place of scales.
+  Tensor modulation(Graph& g, Tensor condition) const;
+  /// (x - mean) / sqrt(variance + eps) * (1 + scale) + shift. x [d, n], modulation [2 d, 1] -> the shape of x.
+  Tensor forward(Graph& g, Tensor x, Tensor modulation) const;
+
+ private:
+  int d_, first_scale_;
+  float eps_;
+  Linear dense_;
+};
+
 /// x + y * gate. x and y [d, n, ...], gate [d] for every token.
 /// Sources: lerobot policies/pi_gemma.py _gated_residual; transformers modeling_internvl.py (LayerScale).
 Tensor gated_add(Graph& g, Tensor x, Tensor y, Tensor gate);

@@ -27,6 +27,14 @@ Tensor Embedding::forward(Graph& g, Tensor ids) const {
   return ggml_get_rows(g.context(), g.weight(weight_).node(), ids.node());
 }
 
+Tensor patches(Graph& g, Tensor images, int patch_size) {
+  ggml_context* c = g.context();
+  const int p = patch_size;
+  ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, p, p, 3, 1);  // read for its shape only
+  ggml_tensor* rows = ggml_im2col(c, kernel, images.node(), p, p, 0, 0, 1, 1, true, GGML_TYPE_F32);
+  return ggml_reshape_3d(c, rows, rows->ne[0], rows->ne[1] * rows->ne[2], rows->ne[3]);
+}
+
 PatchEmbed::PatchEmbed(const Scope& s, int patch_size, int d_model)
     : Module(s),
       patch_size_(patch_size),
@@ -34,12 +42,7 @@ PatchEmbed::PatchEmbed(const Scope& s, int patch_size, int d_model)
       bias_(s.vector("bias", d_model)) {}
 
 Tensor PatchEmbed::forward(Graph& g, Tensor images) const {
-  ggml_context* c = g.context();
-  const int p = patch_size_;
-  ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, p, p, 3, 1);  // read for its shape only
-  ggml_tensor* patches = ggml_im2col(c, kernel, images.node(), p, p, 0, 0, 1, 1, true, GGML_TYPE_F32);
-  patches = ggml_reshape_3d(c, patches, patches->ne[0], patches->ne[1] * patches->ne[2], patches->ne[3]);
-  return kernels::linear(g, {weight_, bias_}, patches);
+  return kernels::linear(g, {weight_, bias_}, patches(g, images, patch_size_));
 }
 
 }  // namespace vla

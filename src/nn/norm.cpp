@@ -3,6 +3,7 @@
 #include "nn/norm.h"
 
 #include "kernels/norm.h"
+#include "nn/tokens.h"
 
 namespace vla {
 
@@ -16,5 +17,9 @@ Tensor LayerNorm::forward(Graph& g, Tensor x) const {
 RmsNorm::RmsNorm(const Scope& s, int d, float eps) : Module(s), weight_(s.vector("weight", d)), eps_(eps) {}
 
 Tensor RmsNorm::forward(Graph& g, Tensor x) const { return kernels::rms_norm(g, x, g.weight(weight_), {}, eps_); }
+
+Tensor layer_norm(Graph& g, Tensor x, float eps) {
+  return kernels::layer_norm(g, x, filled(g, 1, x.dim(0), 1), filled(g, 0, x.dim(0), 1), eps);
+}
 
 }  // namespace vla

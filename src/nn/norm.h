@@ -31,4 +31,8 @@ class RmsNorm : public Module<RmsNorm> {
   float eps_;
 };
 
+/// (x - mean) / sqrt(variance + eps), over the first dimension. x [d, n, ...] -> the same shape.
+/// Source: torch.nn.LayerNorm without affine weights.
+Tensor layer_norm(Graph& g, Tensor x, float eps);
+
 }  // namespace vla

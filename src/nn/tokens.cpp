@@ -43,6 +43,12 @@ Tensor slice_tokens(Graph& g, Tensor x, int first, int count) {
                       static_cast<std::size_t>(first) * token);
 }
 
+Tensor filled(Graph& g, float value, std::int64_t d, std::int64_t n) {
+  return g.constant(fmt::format("filled/{}/{}/{}", value, d, n), [&](Store& store) {
+    return store.add_constant(std::vector<float>(static_cast<std::size_t>(d * n), value), {d, n});
+  });
+}
+
 Tensor repeat_like(Graph& g, Tensor x, Tensor like) {
   return ggml_repeat_4d(g.context(), x.node(), x.dim(0), like.dim(1), 1, 1);
 }
@@ -90,16 +96,22 @@ Tensor first_features(Graph& g, Tensor x, int count) {
 
 Tensor one_column(Graph& g, Tensor x) { return ggml_reshape_2d(g.context(), x.node(), x.dim(0) * x.dim(1), 1); }
 
-Tensor columns(Graph& g, Tensor x, int d) { return ggml_reshape_2d(g.context(), x.node(), d, x.dim(0) / d); }
+Tensor columns(Graph& g, Tensor x, std::int64_t d) {
+  return ggml_reshape_3d(g.context(), x.node(), d, x.dim(1) * x.dim(0) / d, x.dim(2));
+}
 
 Tensor pixel_shuffle(Graph& g, Tensor x, int factor) {
+  return pixel_shuffle(g, x, static_cast<int>(std::lround(std::sqrt(static_cast<double>(x.dim(1))))), factor);
+}
+
+Tensor pixel_shuffle(Graph& g, Tensor x, int n_column, int factor) {
   ggml_context* c = g.context();
-  const std::int64_t d = x.dim(0), n_view = x.dim(2), side = std::llround(std::sqrt(static_cast<double>(x.dim(1))));
-  const std::int64_t n = side / factor;
+  const std::int64_t d = x.dim(0), n_view = x.dim(2), n_row = x.dim(1) / n_column;
   // Patch (factor R + r, factor C + c): c is the fastest after the features, then C, r, R; C and r change places.
-  ggml_tensor* split = ggml_reshape_4d(c, kernels::contiguous(g, x).node(), d * factor, n, factor, n * n_view);
+  ggml_tensor* split = ggml_reshape_4d(c, kernels::contiguous(g, x).node(), d * factor, n_column / factor, factor,
+                                       n_row / factor * n_view);
   ggml_tensor* swapped = ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3));
-  return ggml_reshape_3d(c, swapped, d * factor * factor, n * n, n_view);
+  return ggml_reshape_3d(c, swapped, d * factor * factor, x.dim(1) / (factor * factor), n_view);
 }
 
 }  // namespace vla

@@ -49,7 +49,7 @@ class Evo1 final : public Policy {
  public:
   explicit Evo1(const Scope& s)
       : vision_(s / "vision"),
-        lm_(s / "lm"),
+        lm_(s / "lm", QwenKind::qwen2),
         connector_(s / "connector", vision_.d_model(), lm_.d_model(), vision_.n_side()),
         state_in_(s / "state_in", s.dim("d_state"), (s / "head").dim("d_state_hidden"), Bias::yes),
         state_out_(s / "state_out", (s / "head").dim("d_state_hidden"), lm_.d_model(), Bias::yes),

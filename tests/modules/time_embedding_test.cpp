@@ -23,3 +23,24 @@ TEST_CASE("double precision keeps the shortest period exact where float32 would 
   const float in_float32 = std::sin(2 * static_cast<float>(M_PI) / 4e-3f * 1.0f);
   CHECK(std::abs(sinusoidal_time_embedding(times, 720, 4e-3, 4.0)[0] - in_float32) > 1e-5);
 }
+
+TEST_CASE("whole-numbered times are embedded as either reference rounds, which naive double precision does not") {
+  // Values of diffusers 0.35 and lerobot 0.6 with torch 2.13, at time 750.
+  const int buckets[] = {0, 750};
+  const auto cosines = bucket_embedding(buckets, 256, BucketWaves::cosines_first);
+  const auto sines = bucket_embedding(buckets, 1536, BucketWaves::sines_first);
+  REQUIRE(cosines.size() == 512);
+  REQUIRE(sines.size() == 3072);
+  CHECK(cosines[127] == 1);
+  CHECK(cosines[128] == 0);
+  CHECK(sines[0] == 0);
+  CHECK(sines[768] == 1);
+  const auto close = [](float got, double expected) { return std::abs(got - expected) <= 1.3e-7; };
+  CHECK(close(cosines[256 + 2], 0.0011510324));
+  CHECK(close(cosines[256 + 60], -0.970776081));
+  CHECK(close(cosines[256 + 128 + 5], 0.378294796));
+  CHECK(close(sines[1536 + 16], -0.15867433));
+  CHECK(close(sines[1536 + 300], 0.993069768));
+  CHECK(close(sines[1536 + 768 + 16], -0.987330973));
+  CHECK_FALSE(close(cosines[256 + 2], std::cos(750 * std::pow(1e4, -2.0 / 127))));
+}

@@ -9,6 +9,7 @@
 #include <cmath>
 
 #include "nn/mlp.h"
+#include "nn/norm.h"
 #include "support/editable_bundle.h"
 #include "support/graph_runner.h"
 
@@ -110,6 +111,54 @@ TEST_CASE("an MLP activates what goes up by the activation it was given") {
       for (int i = 0; i < kWidth; ++i)
         CHECK(at(got, token * kWidth + i) ==
               doctest::Approx(dot(down, i, hidden, 0, kHidden) + at(down_bias, i)).epsilon(1e-5));
+    }
+  }
+}
+
+TEST_CASE("an adaptive LayerNorm takes scale and shift in the order of its kind") {
+  using Order = AdaptiveLayerNorm::Order;
+  const auto weight = ramp(2 * kWidth * kWidth, 1), bias = ramp(2 * kWidth, 2), x = ramp(kWidth * kToken, 3),
+             condition = ramp(kWidth, 1.5f);
+  for (const Order order : {Order::scale_shift, Order::shift_scale}) {
+    const auto got = run_module<std::vector<AdaptiveLayerNorm>>(
+        {{"m.weight", {kWidth, 2 * kWidth}, weight}, {"m.bias", {2 * kWidth}, bias}},
+        [&](const Scope& s) { return std::vector{AdaptiveLayerNorm(s, kWidth, kEps, order)}; },
+        [&](const std::vector<AdaptiveLayerNorm>& norm, Graph& g) {
+          const Tensor m = norm[0].modulation(g, g.store().add_constant(condition, {kWidth, 1}));
+          return norm[0].forward(g, g.store().add_constant(x, {kWidth, kToken}), m);
+        });
+    REQUIRE(got.size() == x.size());
+    const auto modulation = [&](int row) { return dot(weight, row, condition, 0, kWidth) + at(bias, row); };
+    const int scale = order == Order::scale_shift ? 0 : kWidth, shift = kWidth - scale;
+    for (int token = 0; token < kToken; ++token) {
+      double mean = 0, variance = 0;
+      for (int i = 0; i < kWidth; ++i) mean += at(x, token * kWidth + i) / kWidth;
+      for (int i = 0; i < kWidth; ++i) variance += std::pow(at(x, token * kWidth + i) - mean, 2) / kWidth;
+      for (int i = 0; i < kWidth; ++i)
+        CHECK(at(got, token * kWidth + i) ==
+              doctest::Approx((at(x, token * kWidth + i) - mean) / std::sqrt(variance + kEps) *
+                                  (1 + modulation(scale + i)) +
+                              modulation(shift + i))
+                  .epsilon(1e-5));
+    }
+  }
+}
+
+TEST_CASE("a norm without weights has mean 0 and a variance just below 1") {
+  const auto x = ramp(kWidth * kToken, 3);
+  for (Isa isa : usable_isas()) {
+    const auto got = test::run_graph(
+        [&](Graph& g) {
+          return layer_norm(g, g.store().add_constant(x, {kWidth, kToken}), kEps);
+        },
+        isa_name(isa));
+    for (int token = 0; token < kToken; ++token) {
+      double mean = 0, square = 0;
+      for (int i = 0; i < kWidth; ++i) mean += at(got, token * kWidth + i) / double{kWidth};
+      for (int i = 0; i < kWidth; ++i) square += std::pow(at(got, token * kWidth + i), 2) / kWidth;
+      CHECK(mean == doctest::Approx(0).epsilon(1e-6));
+      CHECK(square < 1);
+      CHECK(square == doctest::Approx(1).epsilon(1e-2));
     }
   }
 }

@@ -9,7 +9,6 @@
 
 #include "kernels/elementwise.h"
 #include "nn/attention.h"
-#include "nn/rope.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
 
@@ -92,73 +91,6 @@ TEST_CASE("gelu of erf and relu agree with their definitions on every choice of 
       CHECK(std::abs(gelu[i] - expected) <= 0x1p-22 * std::abs(expected) + lost + 0x1p-148);
       CHECK(relu[i] == std::max(x[i], 0.0f));
     }
-  }
-}
-
-TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for d_head = 64") {
-  constexpr int kHead = 64, kTokens = 3, kFirst = 200;
-  const std::vector<float> x = ramp(kHead * 2 * kTokens, 1);
-  const auto y = run_graph([&](Graph& g) {
-    return rope(g, g.store().add_constant(x, {kHead, 2, kTokens}), 10000.0f, RotaryAngle::quotient, kFirst);
-  });
-  double interleaved_difference = 0;
-  for (int token = 0; token < kTokens; ++token)
-    for (int head = 0; head < 2; ++head)
-      for (int i = 0; i < kHead / 2; ++i) {
-        const std::size_t at = static_cast<std::size_t>((token * 2 + head) * kHead + i), other = at + kHead / 2;
-        const double angle = (kFirst + token) / std::pow(10000.0, 2.0 * i / kHead);
-        CHECK(std::abs(y[at] - (x[at] * std::cos(angle) - x[other] * std::sin(angle))) <=
-              3e-5);  // float32 angles up to 202
-        CHECK(std::abs(y[other] - (x[other] * std::cos(angle) + x[at] * std::sin(angle))) <= 3e-5);
-        const std::size_t even = at - static_cast<std::size_t>(i) + 2 * static_cast<std::size_t>(i);
-        interleaved_difference = std::max(
-            interleaved_difference, std::abs(y[even] - (x[even] * std::cos(angle) - x[even + 1] * std::sin(angle))));
-      }
-  CHECK(interleaved_difference > 0.1);
-}
-
-TEST_CASE("rotary angles are rounded as either reference rounds them, which differs at large positions") {
-  // Angles as transformers' GemmaRotaryEmbedding and SmolVLA's apply_rope make them with torch 2.13, for d_head = 256.
-  constexpr int kHead = 256, kPosition = 800, kPair = 15;
-  constexpr double kProductAngle = 271.8566589355469, kQuotientAngle = 271.856689453125;
-  std::vector<float> x(kHead, 0.0f);
-  x[kPair] = 1;
-  const auto turned = [&](RotaryAngle angle) {
-    return run_graph([&](Graph& g) {
-      return rope(g, g.store().add_constant(x, {kHead, 1, 1}), 10000.0f, angle, kPosition);
-    });
-  };
-  const auto product = turned(RotaryAngle::product), quotient = turned(RotaryAngle::quotient);
-  CHECK(product[kPair] == doctest::Approx(std::cos(kProductAngle)).epsilon(1e-6));
-  CHECK(quotient[kPair] == doctest::Approx(std::cos(kQuotientAngle)).epsilon(1e-6));
-  CHECK(std::abs(product[kPair] - quotient[kPair]) > 1e-5);
-}
-
-TEST_CASE("rope at given positions turns every token as rope of that position alone does") {
-  constexpr int kHead = 64;
-  const std::vector<int> apart = {7, 7, 0, 1023, 12}, in_order = {7, 8, 9, 10, 11}, beginning = {7, 8, 9};
-  const std::vector<float> x = ramp(kHead * 2 * apart.size(), 1);
-  const auto token = [&](std::size_t j) {
-    return std::vector<float>(x.begin() + static_cast<std::ptrdiff_t>(j * 2 * kHead),
-                              x.begin() + static_cast<std::ptrdiff_t>((j + 1) * 2 * kHead));
-  };
-  const auto turn = [](Graph& g, const std::vector<float>& values, auto place) {
-    const Tensor q = g.store().add_constant(values, {kHead, 2, static_cast<std::int64_t>(values.size()) / (2 * kHead)});
-    return rope(g, q, 1e6f, RotaryAngle::product, place);
-  };
-  for (const std::vector<int>& positions : {apart, in_order, beginning}) {
-    const std::vector<float> some(x.begin(), x.begin() + static_cast<std::ptrdiff_t>(positions.size() * 2 * kHead));
-    // A graph that already holds other tables takes none of those.
-    const auto got = run_graph([&](Graph& g) {
-      for (const std::vector<int>& other : {in_order, beginning, apart})
-        turn(g, std::vector<float>(other.size() * 2 * kHead, 1.0f), std::span<const int>(other));
-      return turn(g, some, std::span<const int>(positions));
-    });
-    std::vector<float> expected;
-    for (std::size_t j = 0; j < positions.size(); ++j)
-      for (float value : run_graph([&](Graph& g) { return turn(g, token(j), positions[j]); }))
-        expected.push_back(value);
-    CHECK(got == expected);
   }
 }
 

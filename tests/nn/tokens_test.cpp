@@ -94,3 +94,28 @@ TEST_CASE("a key that stands for several weighs like that many") {
   const Values all = attend(4, {1, 1, 1, 1}), short_cut = attend(2, {1, 3});
   for (std::size_t i = 0; i < all.size(); ++i) CHECK(short_cut[i] == doctest::Approx(all[i]).epsilon(1e-6));
 }
+
+TEST_CASE(
+    "pixel shuffle of an oblong picture puts squares row by row, and their patches apart again are in that order") {
+  // Two views of 2 rows of 4 patches with two features each.
+  const auto shuffled = [](Graph& g) { return pixel_shuffle(g, numbers(g, {2, 8, 2}), 4, 2); };
+  const Values first = {0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15};
+  Values both = first;
+  for (const float value : first) both.push_back(value + 16);
+  CHECK(run_graph(shuffled) == both);
+  CHECK(run_graph([&](Graph& g) { return columns(g, shuffled(g), 2); }) == both);
+  CHECK(run_graph([&](Graph& g) { return one_view(g, columns(g, shuffled(g), 2), 1); }) ==
+        Values(both.begin() + 16, both.end()));
+}
+
+TEST_CASE("a token's own factor scales all its numbers") {
+  const auto got = run_graph([](Graph& g) {
+    return multiply(g, numbers(g, {3, 2}), g.store().add_constant(Values{2, -1}, {1, 2}));
+  });
+  CHECK(got == Values{0, 2, 4, -3, -4, -5});
+}
+
+TEST_CASE("filled tokens hold their number, and others of the same shape another") {
+  const auto got = run_graph([](Graph& g) { return concat_tokens(g, {filled(g, 0, 2, 1), filled(g, 1.5f, 2, 1)}); });
+  CHECK(got == Values{0, 0, 1.5f, 1.5f});
+}

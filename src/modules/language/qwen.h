@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -9,13 +10,18 @@
 
 namespace vla {
 
-/// One layer of Qwen2: attention whose queries, keys and values have biases, then a gated MLP.
-/// Source: transformers modeling_qwen2.py Qwen2DecoderLayer.
+/// What tells the generations apart: queries, keys and values of Qwen2 have biases, and its features are read after a
+/// final norm; queries and keys of Qwen3 are normalized head by head, and its features are what the last layer gives.
+enum class QwenKind { qwen2, qwen3 };
+
+/// One layer: attention, then a gated MLP.
+/// Sources: transformers modeling_qwen2.py Qwen2DecoderLayer, modeling_qwen3_vl.py Qwen3VLTextDecoderLayer.
 class QwenBlock : public Module<QwenBlock> {
  public:
-  QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
-  /// x [d_model, n] of tokens at `positions`, mask [n, n] -> the shape of x.
-  Tensor forward(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
+  QwenBlock(const Scope& s, QwenKind kind, int d_model, int d_ff, const Heads& heads, float eps);
+  /// x [d_model, n], rotary [d_head, n], mask [n, n] -> the shape of x. `added` [d_model, n], or none, is added to the
+  /// layer's result.
+  Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added = {}) const;
   /// The same where attention adds nothing: a token for itself.
   Tensor alone(Graph& g, Tensor x) const;
 
@@ -23,31 +29,36 @@ class QwenBlock : public Module<QwenBlock> {
   Heads heads_;
   RmsNorm attn_norm_;
   Linear q_, k_, v_, out_;
+  std::optional<RmsNorm> q_norm_, k_norm_;
   RmsNorm ffn_norm_;
   GatedMlp mlp_;
 };
 
-/// Qwen2 as a policy uses it: it embeds tokens and turns a sequence into features, read after the final norm.
-/// Source: transformers modeling_qwen2.py Qwen2Model.
+/// Qwen as a policy uses it: it embeds tokens and turns a sequence into features.
+/// Sources: transformers modeling_qwen2.py Qwen2Model, modeling_qwen3_vl.py Qwen3VLTextModel.
 class Qwen {
  public:
-  explicit Qwen(const Scope& s);
+  Qwen(const Scope& s, QwenKind kind);
 
   /// tokens [n] i32 -> [d_model, n]. A prompt is embedded piece by piece, so the pieces are no taps.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_.forward(g, tokens); }
   /// x [d_model, n] of tokens at `positions`, mask [n, n] -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
+  /// The same for tokens that turn by a table [d_head, n]; `added[i]` [d_model, n] is added to the result of layer i.
+  Tensor operator()(Graph& g, Tensor x, Tensor rotary, Tensor mask, const std::vector<Tensor>& added) const;
   /// Features of tokens whose attention is cut out of every layer: [d_model, n] -> the same shape.
   Tensor alone(Graph& g, Tensor x) const;
 
   int d_model() const { return d_model_; }
+  int n_layer() const { return static_cast<int>(blocks_.size()); }
+  const Heads& heads() const { return heads_; }
 
  private:
   int d_model_;
   Heads heads_;
   Embedding token_embd_;
   std::vector<QwenBlock> blocks_;
-  RmsNorm norm_;
+  std::optional<RmsNorm> norm_;
 };
 
 }  // namespace vla

@@ -5,29 +5,9 @@
 #include <fmt/format.h>
 
 #include "modules/vision/position_ids.h"
-#include "nn/attention.h"
 #include "nn/tokens.h"
 
 namespace vla {
-
-SiglipBlock::SiglipBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps)
-    : Module(s),
-      n_head_(n_head),
-      attn_norm_(s / "attn_norm", d_model, eps),
-      q_(s / "attn_q", d_model, d_model, Bias::yes),
-      k_(s / "attn_k", d_model, d_model, Bias::yes),
-      v_(s / "attn_v", d_model, d_model, Bias::yes),
-      out_(s / "attn_out", d_model, d_model, Bias::yes),
-      ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(s, d_model, d_ff, Activation::gelu_tanh) {}
-
-Tensor SiglipBlock::forward(Graph& g, Tensor x) const {
-  const Tensor h = attn_norm_(g, x);
-  std::vector<Tensor> qkv = Linear::group(g, {&q_, &k_, &v_}, h);
-  for (Tensor& part : qkv) part = split_heads(g, part, n_head_);
-  x = out_.added_to(g, x, attention(g, qkv[0], qkv[1], qkv[2], {}));
-  return mlp_.added_to(g, x, ffn_norm_(g, x));
-}
 
 Siglip::Siglip(const Scope& s)
     : d_model_(s.dim("d_model")),
@@ -57,7 +37,7 @@ Tensor Siglip::operator()(Graph& g, Tensor images) const {
         *vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_), {x.dim(1)});
   });
   x = add(g, x, position_(g, ids));
-  for (const SiglipBlock& block : blocks_) x = block(g, x);
+  for (const EncoderBlock& block : blocks_) x = block(g, x);
   return post_norm_(g, x);
 }
 

@@ -5,27 +5,10 @@
 #include <string>
 #include <vector>
 
+#include "modules/encoder_block.h"
 #include "nn/embedding.h"
-#include "nn/linear.h"
-#include "nn/mlp.h"
-#include "nn/norm.h"
 
 namespace vla {
-
-/// One pre-norm block: full attention with biases, then a GELU MLP. x [d_model, n_patch, n_view] -> the same shape.
-/// Source: transformers modeling_smolvlm.py SmolVLMEncoderLayer.
-class SiglipBlock : public Module<SiglipBlock> {
- public:
-  SiglipBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps);
-  Tensor forward(Graph& g, Tensor x) const;
-
- private:
-  int n_head_;
-  LayerNorm attn_norm_;
-  Linear q_, k_, v_, out_;
-  LayerNorm ffn_norm_;
-  Mlp mlp_;
-};
 
 /// The vision tower of the SigLIP family, every view in one batch. Source: transformers modeling_smolvlm.py
 /// SmolVLMVisionTransformer.
@@ -48,7 +31,7 @@ class Siglip {
   std::string position_rule_;
   PatchEmbed patch_embed_;
   Embedding position_;
-  std::vector<SiglipBlock> blocks_;
+  std::vector<EncoderBlock> blocks_;
   LayerNorm post_norm_;
 };
 
