@@ -30,7 +30,10 @@ def changed(changes):
 def test_the_robot_is_asked_for_with_the_tags_and_cameras_that_there_are(converter, tag, found):
     error = converter.refusal(TinyGr00t(), embodiment=tag)
     assert error.code == Code.USAGE
-    assert "--embodiment: expected the tag of the robot, one of: " in error.message() and "found " + found in error.message()
+    assert (
+        "--embodiment: expected the tag of the robot, one of: " in error.message()
+        and "found " + found in error.message()
+    )
     assert "{} (cameras front, wrist); {} (cameras head)".format(TAG, OTHER) in error.message()
 
 
@@ -67,8 +70,12 @@ UNSUPPORTED = {
         "config/diffusion_model_cfg/interleave_self_attention": REMOVED
     },
     "diffusion_model_cfg: norm_eps: expected 1e-05": {"config/diffusion_model_cfg/norm_eps": 1e-6},
-    "vl_self_attention_cfg: activation_fn: expected 'gelu-approximate'": {"config/vl_self_attention_cfg/activation_fn": "geglu"},
-    "processor_config.json: processor_class: expected 'Gr00tN1d7Processor'": {"processor/processor_class": "Gr00tN1d6Processor"},
+    "vl_self_attention_cfg: activation_fn: expected 'gelu-approximate'": {
+        "config/vl_self_attention_cfg/activation_fn": "geglu"
+    },
+    "processor_config.json: processor_class: expected 'Gr00tN1d7Processor'": {
+        "processor/processor_class": "Gr00tN1d6Processor"
+    },
     "processor_config.json: use_albumentations: expected True": {"kwargs/use_albumentations": False},
     "processor_config.json: exclude_state: expected False": {"kwargs/exclude_state": True},
     "processor_config.json: new_thing: expected a key that this converter knows": {"kwargs/new_thing": 1},
@@ -94,18 +101,32 @@ UNSUPPORTED = {
 }
 BAD = {
     "config.json: select_layer: expected a whole number from 1": {"config/select_layer": -1},
-    "config.json: backbone_embedding_dim: expected the language model's width 12": {"config/backbone_embedding_dim": 13},
+    "config.json: backbone_embedding_dim: expected the language model's width 12": {
+        "config/backbone_embedding_dim": 13
+    },
     "config.json: input_embedding_dim: expected 6, the heads": {"config/input_embedding_dim": 8},
     "config.json: max_seq_len: expected a row for each of the 7": {"config/max_seq_len": HORIZON - 1},
     "diffusion_model_cfg: output_dim: expected hidden_size 5": {"config/diffusion_model_cfg/output_dim": 6},
-    "vl_self_attention_cfg: num_attention_heads: expected heads": {"config/vl_self_attention_cfg/num_attention_heads": 5},
+    "vl_self_attention_cfg: num_attention_heads: expected heads": {
+        "config/vl_self_attention_cfg/num_attention_heads": 5
+    },
     "processor_config.json: max_state_dim: expected 11 as in config.json, found 12": {"kwargs/max_state_dim": 12},
-    "processor_config.json: crop_fraction: expected a value, or null, found no such key": {"kwargs/crop_fraction": REMOVED},
+    "processor_config.json: crop_fraction: expected a value, or null, found no such key": {
+        "kwargs/crop_fraction": REMOVED
+    },
     "processor_config.json: image_target_size: expected a size": {"kwargs/image_target_size": None},
     "processor_config.json: image_crop_size: expected a size within": {"kwargs/image_crop_size": [13, 13]},
     "processor_config.json: clip_outliers: expected true or false": {"kwargs/clip_outliers": "yes"},
     "arm.state: modality_keys: expected different names": {ARM + "state/modality_keys": ["x", "x"]},
-    "arm.action: action_configs: expected one for each of 2 keys, found 1": {ARM + "action/action_configs": [{}]},
+    "arm.action: action_configs: expected a JSON object for each of 2 keys, found [{}]": {
+        ARM + "action/action_configs": [{}]
+    },
+    "arm.action: action_configs: expected a JSON object for each of 2 keys, found ['x', {}]": {
+        ARM + "action/action_configs": ["x", {}]
+    },
+    "video: modality_keys: expected cameras of different names": {
+        ARM + "video/modality_keys": ["a", "observation.images.a"]
+    },
     "arm.action: delta_indices: expected a list of steps": {ARM + "action/delta_indices": []},
     "statistics.json: arm: expected statistics, found none": {"statistics/" + TAG: REMOVED},
     "statistics.json: arm.state.x.q01: expected numbers, found none": {STATS + "state/x/q01": REMOVED},
@@ -116,14 +137,22 @@ BAD = {
         STATS + "state/gripper/q99": [1.0] * 12,
     },
     "embodiment_id.json: arm: expected an index below max_num_embodiments 3, found 3": {"embodiments/" + TAG: 3},
-    "embodiment_id.json: arm: expected an index below max_num_embodiments 3, found None": {"embodiments/" + TAG: REMOVED},
+    "embodiment_id.json: arm: expected an index below max_num_embodiments 3, found None": {
+        "embodiments/" + TAG: REMOVED
+    },
     "text_config: num_attention_heads: expected heads": {"backbone/text_config/num_key_value_heads": 3},
-    "rope_scaling: mrope_section: expected three counts": {"backbone/text_config/rope_scaling/mrope_section": [1, 1, 2]},
-    "vision_config: deepstack_visual_indexes: expected rising": {"backbone/vision_config/deepstack_visual_indexes": [0, 1, 2]},
+    "rope_scaling: mrope_section: expected three counts": {
+        "backbone/text_config/rope_scaling/mrope_section": [1, 1, 2]
+    },
+    "vision_config: deepstack_visual_indexes: expected rising": {
+        "backbone/vision_config/deepstack_visual_indexes": [0, 1, 2]
+    },
     "vision_config: num_position_embeddings: expected a square": {"backbone/vision_config/num_position_embeddings": 10},
     "vision_config: out_hidden_size: expected the language": {"backbone/vision_config/out_hidden_size": 13},
     "backbone config.json: image_token_id: expected 266": {"backbone/image_token_id": 1},
-    "max_position_embeddings: expected room for 2 views of 9 tokens": {"backbone/text_config/max_position_embeddings": 30},
+    "max_position_embeddings: expected room for 2 views of 9 tokens": {
+        "backbone/text_config/max_position_embeddings": 30
+    },
     "preprocessor_config.json: patch_size: expected 2 as in": {"images/patch_size": 3},
     "preprocessor_config.json: size: expected shortest_edge": {"images/size": {"height": 12, "width": 12}},
 }
@@ -141,6 +170,7 @@ def test_what_changes_numbers_is_refused_by_name(converter, message):
     "how, message",
     [
         (dict(type="EEF", format="XYZ_ROT6D"), "(x): type: expected NON_EEF, found 'EEF'"),
+        (dict(state_key=["x"]), "(x): state_key: expected a state of 1 numbers, found none"),
         (dict(state_key="nobody"), "(x): state_key: expected a state of 1 numbers, found none"),
         (dict(state_key="gripper"), "(x): state_key: expected a state of 1 numbers, found 2 numbers"),
     ],
@@ -169,7 +199,7 @@ def test_missing_extra_and_misplaced_tensors_are_refused(converter):
     message = converter.refusal(tiny, embodiment=TAG).message()
     assert "tensor action_head.vlln.weight: expected (12,), found none" in message
     assert "tensor action_head.more: expected no such tensor" in message
-    index = {"weight_map": {name: "model-00001-of-00002.safetensors" for name in TinyGr00t().tensors}}
+    index = {"weight_map": dict.fromkeys(TinyGr00t().tensors, "model-00001-of-00002.safetensors")}
     converter.save(TinyGr00t())
     write_json(str(converter.folder / "model.safetensors.index.json"), index)
     assert "as model.safetensors.index.json says, found none" in converter.refusal(embodiment=TAG).message()
@@ -202,7 +232,9 @@ def test_the_backbones_image_processor_is_needed(converter):
     assert converter.refusal(tiny, embodiment=TAG).code == Code.IO
 
 
-@pytest.mark.parametrize("template", ["{{ text }}", "You are a helpful assistant<|vision_start|><|image_pad|><|vision_end|>"])
+@pytest.mark.parametrize(
+    "template", ["{{ text }}", "You are a helpful assistant<|vision_start|><|image_pad|><|vision_end|>"]
+)
 def test_a_template_with_words_of_its_own_is_refused(converter, template):
     tiny = TinyGr00t()
     tiny.template = template

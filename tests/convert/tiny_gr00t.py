@@ -137,7 +137,11 @@ def norm(name, d):
 
 def merger(name, d_norm):
     d = 4 * D_VISION
-    return {**norm(name + ".norm", d_norm), **linear(name + ".linear_fc1", d, d), **linear(name + ".linear_fc2", D_MODEL, d)}
+    return {
+        **norm(name + ".norm", d_norm),
+        **linear(name + ".linear_fc1", d, d),
+        **linear(name + ".linear_fc2", D_MODEL, d),
+    }
 
 
 def attention(name, d, d_in):
@@ -166,7 +170,9 @@ def shapes():
     for i in range(N_VISION_LAYER):
         block = "{}blocks.{}.".format(visual, i)
         s.update({**norm(block + "norm1", D_VISION), **norm(block + "norm2", D_VISION)})
-        s.update({**linear(block + "attn.qkv", 3 * D_VISION, D_VISION), **linear(block + "attn.proj", D_VISION, D_VISION)})
+        s.update(
+            {**linear(block + "attn.qkv", 3 * D_VISION, D_VISION), **linear(block + "attn.proj", D_VISION, D_VISION)}
+        )
         s.update(linear(block + "mlp.linear_fc1", D_VISION_FF, D_VISION))
         s.update(linear(block + "mlp.linear_fc2", D_VISION, D_VISION_FF))
     for i in range(N_LAYER):
@@ -186,12 +192,19 @@ def shapes():
     s.update(norm(head + "vlln", D_MODEL))
     for i in range(N_VL_LAYER):
         block = "{}vl_self_attention.transformer_blocks.{}".format(head, i)
-        s.update({**norm(block + ".norm1", D_MODEL), **norm(block + ".norm3", D_MODEL), **attention(block, D_MODEL, D_MODEL)})
+        s.update(
+            {**norm(block + ".norm1", D_MODEL), **norm(block + ".norm3", D_MODEL), **attention(block, D_MODEL, D_MODEL)}
+        )
     time = head + "model.timestep_encoder.timestep_embedder."
     s.update({**linear(time + "linear_1", D_DIT, D_TIME), **linear(time + "linear_2", D_DIT, D_DIT)})
     for i in range(N_DIT_LAYER):
         block = "{}model.transformer_blocks.{}".format(head, i)
-        s.update({**linear(block + ".norm1.linear", 2 * D_DIT, D_DIT), **attention(block, D_DIT, D_DIT if i % 2 else D_MODEL)})
+        s.update(
+            {
+                **linear(block + ".norm1.linear", 2 * D_DIT, D_DIT),
+                **attention(block, D_DIT, D_DIT if i % 2 else D_MODEL),
+            }
+        )
     return {
         **s,
         **linear(head + "model.proj_out_1", 2 * D_DIT, D_DIT),
@@ -262,9 +275,17 @@ class TinyGr00t:
         os.makedirs(below, exist_ok=True)
         os.makedirs(vlm, exist_ok=True)
         write_json(os.path.join(folder, "config.json"), self.config)
-        for name, value in (("processor_config", self.processor), ("statistics", self.statistics), ("embodiment_id", self.embodiments)):
+        for name, value in (
+            ("processor_config", self.processor),
+            ("statistics", self.statistics),
+            ("embodiment_id", self.embodiments),
+        ):
             write_json(os.path.join(below, name + ".json"), value)
-        for name, value in (("config", self.backbone), ("tokenizer", self.tokenizer), ("tokenizer_config", self.tokenizer_config)):
+        for name, value in (
+            ("config", self.backbone),
+            ("tokenizer", self.tokenizer),
+            ("tokenizer_config", self.tokenizer_config),
+        ):
             write_json(os.path.join(vlm, name + ".json"), value)
         if self.images is not None:
             write_json(os.path.join(vlm, "preprocessor_config.json"), self.images)

@@ -159,7 +159,7 @@ def _layout(folder: str, config: dict, has_assets: bool) -> str:
     """LeRobot's config states a type, and none of the others does."""
     if "type" in config:
         return LEROBOT
-    if config.get("model_type") in GR00T_MODELS:
+    if str(config.get("model_type")) in GR00T_MODELS:
         return GR00T_MODELS[config["model_type"]]
     if any(os.path.exists(os.path.join(folder, name)) for name in (*TORCH_FILES, NORM_STATS)):
         return EVO1

@@ -15,8 +15,8 @@ from typing import List, NamedTuple, Tuple
 from ..errors import Code, Problems, refuse
 from ..files import read_json
 from ..section import Section
+from ._gr00t_backbone import Fixed, Sizes, check_fixed, refuse_unknown
 from ._gr00t_robot import DOCS
-from ._gr00t_sizes import Fixed, Sizes, check_fixed, refuse_unknown
 
 FILE = "preprocessor_config.json"
 # Qwen2VLImageProcessor of transformers. What is None there must be stated, since its own default is of another model.
@@ -54,7 +54,9 @@ class _Area(NamedTuple):
     most: int
 
 
-def read_pictures(processor: Section, folder: str, camera_size: str, s: Sizes, notes: List[str], problems: Problems) -> Pictures:
+def read_pictures(
+    processor: Section, folder: str, camera_size: str, s: Sizes, notes: List[str], problems: Problems
+) -> Pictures:
     """`processor`: the members of processor_kwargs. `folder`: the backbone's. `camera_size`: as asked for, or empty."""
     edge, fraction = _edge(processor), _fraction(processor)
     pad = processor.get("letter_box_transform") is True
@@ -69,7 +71,9 @@ def read_pictures(processor: Section, folder: str, camera_size: str, s: Sizes, n
         width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
     resized = _smart_resize(width, height, area)
     if resized != (width, height):
-        ops.append({"op": "qwen_smart_resize", "multiple": area.multiple, "min_pixels": area.least, "max_pixels": area.most})
+        ops.append(
+            {"op": "qwen_smart_resize", "multiple": area.multiple, "min_pixels": area.least, "max_pixels": area.most}
+        )
         notes.append("pictures of {}x{} become {}x{} in the backbone's image processor".format(width, height, *resized))
     ops.append({"op": "size", "width": resized[0], "height": resized[1]})
     ops.append({"op": "affine", "scale": 2.0, "shift": -1.0})
@@ -87,7 +91,13 @@ def _pair(processor: Section, key: str) -> int:
     value = processor.get(key)
     if value is None:
         return 0
-    if isinstance(value, list) and len(value) == 2 and value[0] == value[1] and type(value[0]) is int and 0 < value[0] <= MAX_SIDE:
+    if (
+        isinstance(value, list)
+        and len(value) == 2
+        and value[0] == value[1]
+        and type(value[0]) is int
+        and 0 < value[0] <= MAX_SIDE
+    ):
         return value[0]
     processor.bad(key, "[side, side] or null", unsupported=True)
     return 0

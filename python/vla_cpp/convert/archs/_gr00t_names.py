@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import List
 
 from . import MATRIX, TABLE, VECTOR, Dropped, Weight
-from ._gr00t_sizes import Sizes
+from ._gr00t_backbone import Sizes
 from ._rows import gated_block, linear, norm, vector
 
 BACKBONE, HEAD = "backbone.model.", "action_head."
@@ -20,7 +20,11 @@ def weights(s: Sizes) -> List[Weight]:
 
 def dropped(s: Sizes) -> List[Dropped]:
     return [
-        Dropped(LM + "norm.weight", (s.d_model,), "final language norm: the action head reads the last layer as it is before it"),
+        Dropped(
+            LM + "norm.weight",
+            (s.d_model,),
+            "final language norm: the action head reads the last layer as it is before it",
+        ),
         Dropped(BACKBONE + "lm_head.weight", (s.n_vocab, s.d_model), "language head"),
     ]
 
@@ -87,7 +91,12 @@ def _language(s: Sizes) -> List[Weight]:
 def _attention_and_ffn(target: str, block: str, d: int, d_in: int, d_ff: int) -> List[Weight]:
     """`d_in`: width of what keys and values are made from."""
     rows: List[Weight] = []
-    for ours, theirs, width in (("attn_q", "to_q", d), ("attn_k", "to_k", d_in), ("attn_v", "to_v", d_in), ("attn_out", "to_out.0", d)):
+    for ours, theirs, width in (
+        ("attn_q", "to_q", d),
+        ("attn_k", "to_k", d_in),
+        ("attn_v", "to_v", d_in),
+        ("attn_out", "to_out.0", d),
+    ):
         rows += linear(target + ours, block + "attn1." + theirs, d, width, bias=True)
     rows += linear(target + "ffn_up", block + "ff.net.0.proj", d_ff, d, bias=True)
     return rows + linear(target + "ffn_down", block + "ff.net.2", d, d_ff, bias=True)
@@ -105,7 +114,9 @@ def _features(s: Sizes) -> List[Weight]:
 def _transformer(s: Sizes) -> List[Weight]:
     d, source = s.d_dit, HEAD + "model."
     time = source + "timestep_encoder.timestep_embedder."
-    rows = linear("time_in", time + "linear_1", d, s.d_time, bias=True) + linear("time_out", time + "linear_2", d, d, bias=True)
+    rows = linear("time_in", time + "linear_1", d, s.d_time, bias=True) + linear(
+        "time_out", time + "linear_2", d, d, bias=True
+    )
     for i in range(s.n_dit_layer):
         target, block = "dit.blk.{}.".format(i), "{}transformer_blocks.{}.".format(source, i)
         rows += linear(target + "ada", block + "norm1.linear", 2 * d, d, bias=True)
@@ -119,7 +130,15 @@ def _of_robot(target: str, source: str, s: Sizes, d_out: int, d_in: int) -> List
     """The robot's part of a matrix that is stored for all of them, inputs before outputs."""
     pick = (0, s.embodiment)
     return [
-        Weight(target + ".weight", source + ".W", MATRIX, (s.n_embodiment, d_in, d_out), (d_out, d_in), pick=pick, transpose=True),
+        Weight(
+            target + ".weight",
+            source + ".W",
+            MATRIX,
+            (s.n_embodiment, d_in, d_out),
+            (d_out, d_in),
+            pick=pick,
+            transpose=True,
+        ),
         Weight(target + ".bias", source + ".b", VECTOR, (s.n_embodiment, d_out), (d_out,), pick=pick),
     ]
 

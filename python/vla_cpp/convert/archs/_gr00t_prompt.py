@@ -11,7 +11,7 @@ from ..errors import Problems
 from ..files import read_json
 from ..tokenizer import TokenizerPlan
 from ._ascii_bpe import Encoder, check_undivided, special_ids
-from ._gr00t_sizes import WHERE, Sizes
+from ._gr00t_backbone import WHERE, Sizes
 
 START, END, OPEN, CLOSE, IMAGE = "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"
 ROLE = "user\n"
@@ -55,7 +55,11 @@ def _check_backbone(folder: str, ids: dict, problems: Problems) -> None:
     config = read_json(os.path.join(folder, "config.json"))
     for key, default, text in (("image_token_id", 151655, IMAGE), ("vision_start_token_id", 151652, OPEN)):
         if config.get(key, default) != ids[text]:
-            problems.add("{}: {}".format(WHERE, key), "{}, the tokenizer's {}".format(ids[text], text), repr(config.get(key, default)))
+            problems.add(
+                "{}: {}".format(WHERE, key),
+                "{}, the tokenizer's {}".format(ids[text], text),
+                repr(config.get(key, default)),
+            )
 
 
 def _check_template(folder: str, problems: Problems) -> None:
@@ -70,4 +74,6 @@ def _check_template(folder: str, problems: Problems) -> None:
     if not isinstance(text, str):
         return
     if OPEN + IMAGE + CLOSE not in text or "You are a helpful assistant" in text:
-        problems.unsupported(name + ": chat_template", "Qwen3-VL's, which puts no words of its own before a user's", repr(text[:60]))
+        problems.unsupported(
+            name + ": chat_template", "Qwen3-VL's, which puts no words of its own before a user's", repr(text[:60])
+        )

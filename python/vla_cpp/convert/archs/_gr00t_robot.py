@@ -64,7 +64,9 @@ def processor_file(checkpoint: Checkpoint, name: str) -> str:
     """Beside the weights or below processor/. Errors: bad_bundle where both exist, io where none does."""
     places = [place for place in (name, os.path.join("processor", name)) if os.path.exists(checkpoint.path(place))]
     if len(places) > 1:
-        raise refuse(checkpoint.folder, "{} once".format(name), " and ".join(places), "remove the one that is not the policy's")
+        raise refuse(
+            checkpoint.folder, "{} once".format(name), " and ".join(places), "remove the one that is not the policy's"
+        )
     if not places:
         hint = "it lies beside the weights, or below processor/, of the published checkpoint"
         raise refuse(checkpoint.path(name), "a file", "none", hint, Code.IO)
@@ -81,7 +83,9 @@ def choose(configs: dict, tag: str) -> dict:
     """The modalities of a tag. Errors: usage, with the tags that there are."""
     if tag in configs and isinstance(configs[tag], dict):
         return configs[tag]
-    listed = "; ".join("{} (cameras {})".format(name, ", ".join(_keys(value, "video")) or "none") for name, value in configs.items())
+    listed = "; ".join(
+        "{} (cameras {})".format(name, ", ".join(_keys(value, "video")) or "none") for name, value in configs.items()
+    )
     raise refuse(
         "--embodiment",
         "the tag of the robot, one of: " + (listed or "none, since {} lists no robots".format(PROCESSOR)),
@@ -95,11 +99,15 @@ def embodiment_index(checkpoint: Checkpoint, tag: str, n_embodiment: int, proble
     """The row of the weights that belongs to a tag."""
     stated = read_json(processor_file(checkpoint, EMBODIMENTS))
     if tag not in stated and tag in BUILT_IN:
-        checkpoint.notes.append("{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, BUILT_IN[tag]))
+        checkpoint.notes.append(
+            "{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, BUILT_IN[tag])
+        )
     index = stated.get(tag, BUILT_IN.get(tag))
     if type(index) is int and 0 <= index < n_embodiment:
         return index
-    problems.add("{}: {}".format(EMBODIMENTS, tag), "an index below max_num_embodiments {}".format(n_embodiment), str(index))
+    problems.add(
+        "{}: {}".format(EMBODIMENTS, tag), "an index below max_num_embodiments {}".format(n_embodiment), str(index)
+    )
     return 0
 
 
@@ -109,7 +117,9 @@ class _Reader:
         self.percentiles, self.relative = processor.get("use_percentiles"), processor.get("use_relative_action")
         self.statistics = member(statistics, tag, dict, STATISTICS)
         if tag not in statistics:
-            problems.add("{}: {}".format(STATISTICS, tag), "statistics", "none", "the checkpoint was not trained for this robot")
+            problems.add(
+                "{}: {}".format(STATISTICS, tag), "statistics", "none", "the checkpoint was not trained for this robot"
+            )
 
     def modality(self, name: str) -> Section:
         where = "{}: {}.{}".format(PROCESSOR, self.tag, name)
@@ -118,21 +128,33 @@ class _Reader:
             if key not in MODALITY and value not in (None, False):
                 section.bad(key, "a key that this converter knows", hint="it may change numbers", unsupported=True)
         keys = section.get("modality_keys")
-        if not isinstance(keys, list) or not keys or not all(isinstance(k, str) and k for k in keys) or len(set(keys)) != len(keys):
+        if (
+            not isinstance(keys, list)
+            or not keys
+            or not all(isinstance(k, str) and k for k in keys)
+            or len(set(keys)) != len(keys)
+        ):
             section.bad("modality_keys", "different names")
             section.values = {**section.values, "modality_keys": []}
         return section
 
     def one_step(self, section: Section, what: str) -> None:
         if section.get("delta_indices") != [0]:
-            section.bad("delta_indices", "[0]", hint="{} of several moments are not supported yet".format(what), unsupported=True)
+            section.bad(
+                "delta_indices",
+                "[0]",
+                hint="{} of several moments are not supported yet".format(what),
+                unsupported=True,
+            )
 
     def listed(self, section: Section, name: str) -> List[str]:
         return [key for key in member(section.values, name, list, section.where) if isinstance(key, str)]
 
     def group(self, kind: str, key: str, mean_std: bool, reference: str = "", width: int = 0) -> Group:
         """`width`: of the same key's absolute actions, where these statistics are of relative ones."""
-        names = ("mean", "std") if mean_std else ("q01", "q99") if self.percentiles and not reference else ("min", "max")
+        names = (
+            ("mean", "std") if mean_std else ("q01", "q99") if self.percentiles and not reference else ("min", "max")
+        )
         where = "{}: {}.{}.{}".format(STATISTICS, self.tag, kind, key)
         stated = member(member(self.statistics, kind, dict, where), key, dict, where)
         if self.per_step(where, stated.get(names[0])):
@@ -153,7 +175,9 @@ class _Reader:
         return nested
 
     def numbers(self, where: str, values) -> np.ndarray:
-        numbers = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
+        numbers = isinstance(values, list) and all(
+            isinstance(v, (int, float)) and not isinstance(v, bool) for v in values
+        )
         if not numbers or not 1 <= len(values) <= MAX_WIDTH:
             self.problems.add(where, "numbers", "none" if not values else str(values)[:80])
             return np.zeros(1, np.float32)
@@ -167,7 +191,12 @@ class _Reader:
         section = self.modality("state")
         self.one_step(section, "states")
         if self.processor.get("apply_sincos_state_encoding") and self.listed(section, "sin_cos_embedding_keys"):
-            section.bad("sin_cos_embedding_keys", "none", hint="sines and cosines of states are not supported yet", unsupported=True)
+            section.bad(
+                "sin_cos_embedding_keys",
+                "none",
+                hint="sines and cosines of states are not supported yet",
+                unsupported=True,
+            )
         mean_std = self.listed(section, "mean_std_embedding_keys")
         groups = [self.group("state", key, key in mean_std) for key in section.get("modality_keys")]
         self.check_one_kind(section, groups)
@@ -182,16 +211,18 @@ class _Reader:
         section = self.modality("action")
         configs = member(section.values, "action_configs", list, section.where)
         keys, mean_std = section.get("modality_keys"), self.listed(section, "mean_std_embedding_keys")
-        if configs and len(configs) != len(keys):
-            section.bad("action_configs", "one for each of {} keys".format(len(keys)), "{}".format(len(configs)))
-            configs = []
+        if not configs:  # null: all of them absolute
+            configs = [{"rep": "ABSOLUTE"}] * len(keys)
+        if len(configs) != len(keys) or not all(isinstance(config, dict) for config in configs):
+            section.bad("action_configs", "a JSON object for each of {} keys".format(len(keys)), str(configs)[:80])
+            return []
         widths = {state.key: state.width for state in states}
         groups = []
         for i, key in enumerate(keys):
-            how = Section("{}: action_configs[{}] ({})".format(section.where, i, key), self.entry(configs, i), {}, self.problems)
+            how = Section("{}: action_configs[{}] ({})".format(section.where, i, key), configs[i], {}, self.problems)
             group = self.group("action", key, key in mean_std)
             if self.is_relative(how, key in mean_std):
-                reference = how.get("state_key") or key
+                reference = str(how.get("state_key") or key)
                 group = self.group("relative_action", key, False, reference, group.width)
                 if widths.get(reference) != group.width:
                     found = "none" if reference not in widths else "{} numbers".format(widths[reference])
@@ -199,11 +230,6 @@ class _Reader:
             groups.append(group)
         self.check_one_kind(section, groups)
         return groups
-
-    @staticmethod
-    def entry(configs: list, i: int) -> dict:
-        absolute = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT"}
-        return configs[i] if i < len(configs) and isinstance(configs[i], dict) else absolute
 
     def is_relative(self, how: Section, mean_std: bool) -> bool:
         for key in sorted(set(how.values) - {"rep", "type", "format", "state_key"}):
@@ -214,7 +240,9 @@ class _Reader:
         if rep != "RELATIVE" or not self.relative:
             return False
         if kind != "NON_EEF":
-            how.bad("type", "NON_EEF", hint="poses relative to the end effector's are not supported yet", unsupported=True)
+            how.bad(
+                "type", "NON_EEF", hint="poses relative to the end effector's are not supported yet", unsupported=True
+            )
         if mean_std:
             how.bad("rep", "ABSOLUTE where mean_std_embedding_keys names the key", unsupported=True)
         return True

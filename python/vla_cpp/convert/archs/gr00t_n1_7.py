@@ -22,6 +22,7 @@ from ..files import member, read_json
 from ..section import Section
 from ..tokenizer import read_tokenizer
 from . import Options, Plan
+from ._gr00t_backbone import Fixed, Sizes, check_fixed, refuse_unknown
 from ._gr00t_images import read_pictures
 from ._gr00t_names import LM, dropped, weights
 from ._gr00t_prompt import read_prompt, text_ops
@@ -36,7 +37,7 @@ from ._gr00t_robot import (
     read_robot,
     statistics_of,
 )
-from ._gr00t_sizes import Fixed, Sizes, check_fixed, read_sizes, refuse_unknown
+from ._gr00t_sizes import read_sizes
 
 # Gr00tN1d7Processor of Isaac-GR00T. LeRobot reads an absent size of pictures otherwise, so that these must be stated, if only as null.
 KWARGS = {
@@ -107,13 +108,17 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 def _processor(checkpoint: Checkpoint, problems: Problems) -> Section:
     config = read_json(processor_file(checkpoint, PROCESSOR))
     if config.get("processor_class") != "Gr00tN1d7Processor":
-        problems.unsupported(PROCESSOR + ": processor_class", "'Gr00tN1d7Processor'", repr(config.get("processor_class")))
+        problems.unsupported(
+            PROCESSOR + ": processor_class", "'Gr00tN1d7Processor'", repr(config.get("processor_class"))
+        )
     section = Section(PROCESSOR, member(config, "processor_kwargs", dict, PROCESSOR), KWARGS, problems)
     refuse_unknown(section, {*KWARGS, *STATED, *KWARGS_FIXED, *KWARGS_IGNORED})
     check_fixed(section, KWARGS_FIXED)
     for key in STATED:
         if key not in section.values:
-            section.bad(key, "a value, or null", "no such key", "the reference and LeRobot take different defaults for it")
+            section.bad(
+                key, "a value, or null", "no such key", "the reference and LeRobot take different defaults for it"
+            )
     for key in FLAGS:
         if not isinstance(section.get(key), bool):
             section.bad(key, "true or false")
@@ -133,7 +138,9 @@ def _state(robot: Robot, processor: Section, s: Sizes, problems: Problems) -> Li
     if processor.count("max_state_dim") != s.d_state:
         processor.bad("max_state_dim", "{} as in config.json".format(s.d_state))
     if _total(robot.states) > s.d_state:
-        problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(s.d_state), str(_total(robot.states)))
+        problems.add(
+            STATISTICS + ": state", "at most max_state_dim {} numbers".format(s.d_state), str(_total(robot.states))
+        )
     clip = processor.get("clip_outliers") and not robot.states[0].mean_std
     limits = [{"op": "clip", "low": -1.0, "high": 1.0}] if clip else []
     return [_op("normalize", recipe.STATE, robot.states), *limits, {"op": "pad", "size": s.d_state}]
@@ -163,7 +170,12 @@ def _relative_columns(robot: Robot, problems: Problems) -> List[int]:
         if group.reference and states[group.reference] != actions[group.key]:
             expected = "in the columns of the action, from {}".format(actions[group.key])
             hint = "actions relative to other columns of the state are not supported yet"
-            problems.unsupported("relative action {}: state {}".format(group.key, group.reference), expected, str(states[group.reference]), hint)
+            problems.unsupported(
+                "relative action {}: state {}".format(group.key, group.reference),
+                expected,
+                str(states[group.reference]),
+                hint,
+            )
         elif group.reference:
             columns += range(actions[group.key], actions[group.key] + group.width)
     return columns
@@ -180,6 +192,8 @@ def _names(groups: Sequence[Group]) -> List[str]:
 def _features(robot: Robot, options: Options, notes: List[str], problems: Problems) -> List[Key]:
     """All cameras are needed. Numbers are named by their keys where no data set names them."""
     views, n = [_view(key) for key in robot.cameras], len(robot.cameras)
+    if len(set(views)) != n:
+        problems.add(PROCESSOR + ": video: modality_keys", "cameras of different names", ", ".join(views))
     dims = {recipe.STATE: _total(robot.states), recipe.ACTION: _total(robot.actions)}
     keys = feature_keys(options.dataset_info, dims, notes if options.dataset_info else [], problems)
     if not options.dataset_info:
