@@ -4,6 +4,8 @@
 
     python scripts/golden_evo1.py [ARCH/NAME ...] [--out DIR]
     python scripts/golden_evo1.py --bundles [ARCH/NAME ...]       only convert the checkpoints again
+
+The cases in the authors' layout also need opencv-python-headless, which resizes their frames.
 """
 from golden_smolvla import Case, main
 from random_evo1 import Description, write_checkpoint

@@ -101,7 +101,7 @@ def smooth_frame(height, width, generator):
 
 
 def write_observation(case, folder):
-    """Frames, observation.json and noise.npy of a case."""
+    """Frames, observation.json, noise.npy and convert.json of a case."""
     import torch
     from PIL import Image
 
@@ -124,6 +124,8 @@ def write_observation(case, folder):
     else:
         noise = torch.randn(shape, generator=generator)
     np.save(folder / "noise.npy", noise.numpy())
+    if case.options:
+        (folder / "convert.json").write_text(json.dumps(case.options) + "\n")
 
 
 def conversion_options(folder):
@@ -148,8 +150,6 @@ def write_bundle(folder):
 def write_case(name, case, folder, write_checkpoint):
     n = write_checkpoint(case.checkpoint, case.seed, folder / "checkpoint")
     write_observation(case, folder)
-    if case.options:
-        (folder / "convert.json").write_text(json.dumps(case.options) + "\n")
     taps = golden.write_expected(folder, case.seed)
     largest = np.abs(taps["chunk"]).max()
     print(f"{name}: {n:,} parameters, {len(taps)} taps, chunk up to {largest:.2f}, published dtypes "

@@ -6,7 +6,8 @@
 
 DIR is a case as vla_cpp.convert.golden describes it: checkpoint/, observation.json, frames, noise.npy.  Where it has no
 checkpoint, one of the published size with random weights is written, for two cameras: smolvla 450 M parameters, 0.9 GB of
-disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 20 GB of memory while PyTorch runs in float32.
+disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 20 GB of memory while PyTorch runs in float32; evo1 775 M
+parameters in the authors' layout, the third slot of the prompt empty.
 Every program runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert,
 vla.  The table that is printed goes to docs/models.md; the memory of vla is that of its answer, with --blocks of every
 block beside it.  Times are of one cold inference beside other work: no benchmark.
@@ -24,6 +25,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "python"), str(ROOT / "scripts")]
+from golden_smolvla import conversion_options  # noqa: E402
 from vla_cpp.convert import golden  # noqa: E402
 
 SEED = 0
@@ -33,6 +35,7 @@ FRAMES = {"camera1": (480, 640, "png"), "camera2": (480, 480, "png")}
 def write_case(case, arch):
     """The published size with random weights, two smooth frames, a state, noise."""
     import golden_smolvla
+    import random_evo1
     import random_pi
     import random_smolvla
 
@@ -40,10 +43,10 @@ def write_case(case, arch):
     warnings.filterwarnings("ignore")
     case.mkdir(parents=True, exist_ok=True)
     views = {view: f[:2] for view, f in FRAMES.items()}
-    maker = random_smolvla if arch == "smolvla" else random_pi
-    description = random_smolvla.published(views) if arch == "smolvla" else random_pi.published(arch, views)
-    text = "pick up the red cube and place it in the basket"
-    golden_smolvla.write_observation(golden_smolvla.Case(SEED, FRAMES, text, description), case)
+    maker = {"smolvla": random_smolvla, "evo1": random_evo1}.get(arch, random_pi)
+    description = random_pi.published(arch, views) if maker is random_pi else maker.published(views)
+    text, options = "pick up the red cube and place it in the basket", getattr(maker, "OPTIONS", {})
+    golden_smolvla.write_observation(golden_smolvla.Case(SEED, FRAMES, text, description, options=options), case)
     n = maker.write_checkpoint(description, SEED, case / "checkpoint")
     print(f"{n:,} random parameters")
 
@@ -148,13 +151,10 @@ def main():
     convert = [sys.executable, "-m", "vla_cpp.convert.cli", checkpoint, "--backbone", backbone, "-o", bundle]
     os.environ["PYTHONPATH"] = str(ROOT / "python")
     start = time.perf_counter()
-    _, convert_peak = child([*convert, "--dtype", args.dtype, "--force"])
+    _, convert_peak = child([*convert, "--dtype", args.dtype, "--force", *conversion_options(case)])
     convert_seconds = time.perf_counter() - start
-    config = json.loads((checkpoint / "config.json").read_text())
-    last_step = f"step.{(config.get('num_steps') or config['num_inference_steps']) - 1}.x"
-    pattern = "*" if args.blocks else last_step
-    taps, timing, peak = run_vla(args.vla, case, bundle, pattern, case / "taps.gguf", args.threads)
-    chunk = taps[last_step].reshape(reference["chunk"].shape[0], -1)[:, : reference["chunk"].shape[1]]
+    taps, timing, peak = run_vla(args.vla, case, bundle, "*" if args.blocks else "chunk", case / "taps.gguf", args.threads)
+    chunk = taps["chunk"].reshape(reference["chunk"].shape[0], -1)[:, : reference["chunk"].shape[1]]
     rows = {f"PyTorch {d}": (r["chunk"], r["actions"], float(r["seconds"]), peaks[d]) for d, r in torch_runs.items()}
     rows[f"vla, {args.dtype} bundle"] = (chunk, taps["actions"], sum(timing.values()) / 1e3, peak)
     print_table(reference, rows)

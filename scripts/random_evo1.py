@@ -49,6 +49,20 @@ class Description:
         return 256 + self.n_merge + len(ADDED)
 
 
+# What the files of the authors do not say, for the published size.
+OPTIONS = {"variant": "r2", "dead_rows": "zero_attention", "views": ["camera1", "camera2"], "view_slots": 3}
+
+
+def published(views):
+    """The description of the published size in the authors' layout: 775 M parameters."""
+    return Description(
+        "authors", 448, {"hidden_size": 1024, "num_hidden_layers": 24, "num_attention_heads": 16, "intermediate_size": 4096},
+        {"hidden_size": 896, "num_hidden_layers": 24, "num_attention_heads": 14, "num_key_value_heads": 2, "vocab_size": 151674,
+         "intermediate_size": 4864, "max_position_embeddings": 32768}, 14,
+        {"num_layers": 8, "num_heads": 8, "hidden_dim": 1024, "state_hidden_dim": 1024},
+        {"chunk_size": 50, "max_state_dim": 24, "max_action_dim": 24, "max_text_length": 1024}, views)
+
+
 def tokenizer(n_merge):
     """Qwen2's own rules with other merges; the added tokens follow the vocabulary, in the published order."""
     from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers, trainers

@@ -75,9 +75,9 @@ Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes&
     return Error{Code::usage, "--views",
                  fmt::format("{} to {}, which the bundle allows", processor.min_views(), views.size()),
                  std::to_string(n_view)};
-  const auto& letterbox = processor.recipe().letterbox;
-  workload.width_ = sizes.width > 0 ? sizes.width : letterbox.width;
-  workload.height_ = sizes.height > 0 ? sizes.height : letterbox.height;
+  const Recipe& recipe = processor.recipe();
+  workload.width_ = sizes.width > 0 ? sizes.width : recipe.width;
+  workload.height_ = sizes.height > 0 ? sizes.height : recipe.height;
   for (int i = 0; i < static_cast<int>(views.size()); ++i) {
     const std::string& view = views[static_cast<std::size_t>(i)];
     workload.observation_.views[view] = std::nullopt;

@@ -25,10 +25,10 @@ void Description::add_views(const Engine& engine) {
   const Keys& keys = engine.bundle().keys();
   const auto names = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
   const auto optional = *keys.integers("observation.view_optional");
-  const Letterbox& size = engine.processor().recipe().letterbox;
+  const Recipe& recipe = engine.processor().recipe();
   for (std::size_t i = 0; i < names.size(); ++i)
     view_infos_.push_back(
-        {sizeof(vla_view_info), keep(names[i]), keep(aliases[i]), optional[i], size.width, size.height});
+        {sizeof(vla_view_info), keep(names[i]), keep(aliases[i]), optional[i], recipe.width, recipe.height});
   for (const vla_view_info& info : view_infos_) views_.push_back(&info);
 }
 

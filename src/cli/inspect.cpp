@@ -102,8 +102,9 @@ void print_numbers(const std::vector<std::string>& names, const std::vector<std:
 void print_features(const Engine& engine) {
   const Keys& keys = engine.bundle().keys();
   const auto views = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
-  fmt::print("views        any size, letterboxed to {} x {}; at least {} of {} must be present\n",
-             engine.processor().recipe().letterbox.width, engine.processor().recipe().letterbox.height,
+  const Recipe& recipe = engine.processor().recipe();
+  fmt::print("views        any size, {} to {} x {}; at least {} of {} must be present\n",
+             std::holds_alternative<Resize>(recipe.fit) ? "resized" : "letterboxed", recipe.width, recipe.height,
              *keys.integer("observation.min_views"), views.size());
   for (std::size_t i = 0; i < views.size(); ++i)
     fmt::print("    {}{}\n", views[i], aliases[i].empty() ? "" : fmt::format("  (also {})", aliases[i]));

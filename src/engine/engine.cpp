@@ -65,12 +65,8 @@ Status Engine::make_conditions() {
 InputShape Engine::largest_shape() const {
   const Recipe& recipe = processor_.recipe();
   const int n_view = static_cast<int>(processor_.views().names().size());
-  return {recipe.letterbox.width,
-          recipe.letterbox.height,
-          n_view,
-          recipe.max_tokens,
-          d_state_,
-          placed(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
+  return {recipe.width,      recipe.height, n_view,
+          recipe.max_tokens, d_state_,      placed(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
 }
 
 /// The views of a shape: shapes that are the same for the policy must be equal.
@@ -82,8 +78,7 @@ Status Engine::make_constants(bool dry) {
   VLA_CHECK(policy_->check(largest_shape()));
   constant_store_ = std::make_unique<Store>(64 + 2 * weights_->count());
   Graph graph(*weights_, *constant_store_, {});
-  const Tensor absent =
-      constant_store_->add_constant(processor_.absent_view(), {recipe.letterbox.width, recipe.letterbox.height, 3, 1});
+  const Tensor absent = constant_store_->add_constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
   policy_->constants(graph, absent, constants_);
   if (graph.n_node() == 0) return {};
   VLA_CHECK(constant_store_->allocate(device_));

@@ -5,20 +5,12 @@
 #include <bit>
 #include <cstring>
 
+#include "base/bf16.h"
 #include "bundle/bundle.h"
 #include "kernels/vec.h"
 
 /// The numbers that matrices are stored as.
 namespace vla::kernels {
-
-VLA_INLINE float from_bf16(std::uint16_t x) { return std::bit_cast<float>(std::uint32_t{x} << 16); }
-
-/// To the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one.
-VLA_INLINE std::uint16_t to_bf16(float x) {
-  const auto bits = std::bit_cast<std::uint32_t>(x);
-  if ((bits & 0x7fffffffU) > 0x7f800000U) return static_cast<std::uint16_t>(bits >> 16 | 64U);
-  return static_cast<std::uint16_t>((bits + 0x7fffU + (bits >> 16 & 1U)) >> 16);
-}
 
 VLA_INLINE float from_f16(std::uint16_t x) {
   const std::uint32_t sign = std::uint32_t{x & 0x8000U} << 16, exponent = x >> 10 & 31U, fraction = x & 1023U;

@@ -23,6 +23,13 @@ void map_columns(const HornAngleOp& op, std::span<float> values) {
   }
 }
 
+void map_columns(const ThresholdOp& op, std::span<float> values) {
+  for (const int column : op.columns) {
+    float& value = values[static_cast<std::size_t>(column)];
+    if (std::isfinite(value)) value = value > op.above ? op.then : op.otherwise;
+  }
+}
+
 std::vector<int> bins(const BinsOp& op, std::span<const float> values) {
   std::vector<double> edges;
   const double step = (op.high - op.low) / op.count;

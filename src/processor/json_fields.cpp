@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 
@@ -82,13 +83,25 @@ Result<std::vector<int>> JsonFields::integers(const std::string& name, int low, 
   return list;
 }
 
+bool JsonFields::is_float(const Json& value) {
+  return value.is_number() && std::abs(value.get<double>()) <= static_cast<double>(std::numeric_limits<float>::max());
+}
+
 Result<float> JsonFields::number(const std::string& name) {
   VLA_TRY(const Json* value, field(name, "a number"));
   if (!value->is_number()) return wrong(name, "a number");
-  const double wide = value->get<double>();
-  if (!(std::abs(wide) <= static_cast<double>(std::numeric_limits<float>::max())))
-    return wrong(name, "a float32 number");
-  return static_cast<float>(wide);
+  if (!is_float(*value)) return wrong(name, "a float32 number");
+  return static_cast<float>(value->get<double>());
+}
+
+Result<std::vector<float>> JsonFields::numbers(const std::string& name, std::size_t count) {
+  const std::string expected = fmt::format("a list of {} float32 numbers", count);
+  VLA_TRY(const Json* value, field(name, expected.c_str()));
+  if (!value->is_array() || value->size() != count || !std::all_of(value->begin(), value->end(), is_float))
+    return wrong(name, expected);
+  std::vector<float> list;
+  for (const Json& item : *value) list.push_back(static_cast<float>(item.get<double>()));
+  return list;
 }
 
 Result<double> JsonFields::wide_number(const std::string& name) {

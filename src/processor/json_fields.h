@@ -36,6 +36,8 @@ class JsonFields {
   Result<double> wide_number(const std::string& name);
   /// A list of integers in [low, high], none of them twice.
   Result<std::vector<int>> integers(const std::string& name, int low, int high);
+  /// A list of `count` numbers that are finite as float32.
+  Result<std::vector<float>> numbers(const std::string& name, std::size_t count);
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);
   /// One of the spellings; the result is its index.
@@ -46,6 +48,7 @@ class JsonFields {
 
  private:
   JsonFields(const Json& object, std::string where) : object_(&object), where_(std::move(where)) {}
+  static bool is_float(const Json& value);
   static bool is_integer(const Json& value, int low, int high);
   Result<const Json*> field(const std::string& name, const char* expected);
 

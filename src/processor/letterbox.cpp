@@ -5,9 +5,9 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 
+#include "processor/byte_pixels.h"
 #include "processor/resample.h"
 
 namespace vla {
@@ -44,15 +44,6 @@ struct FloatSource {
   const float* values;
   float operator()(std::size_t i) const { return values[i]; }
 };
-
-const float* byte_table() {
-  static const std::array<float, 256> table = [] {
-    std::array<float, 256> values{};
-    for (int i = 0; i < 256; ++i) values[static_cast<std::size_t>(i)] = static_cast<float>(i) / 255.0f;
-    return values;
-  }();
-  return table.data();
-}
 
 /// Where a picture of `width` x `height` lands in planes of `plane` floats whose rows are `stride` apart.
 struct Target {
@@ -123,13 +114,8 @@ namespace {
 
 /// The frame in 8 bits at the size of the target.
 std::vector<std::uint8_t> resized_8bit(const Frame& frame, const Target& target) {
-  std::vector<std::uint8_t> bytes;
-  if (const auto* given = std::get_if<std::vector<std::uint8_t>>(&frame.rgb)) {
-    bytes = *given;
-  } else {
-    for (const float value : std::get<std::vector<float>>(frame.rgb))
-      bytes.push_back(static_cast<std::uint8_t>(255.0f * value));
-  }
+  const auto* given = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
+  std::vector<std::uint8_t> bytes = given != nullptr ? *given : cut_to_bytes(std::get<std::vector<float>>(frame.rgb));
   if (frame.width == target.width && frame.height == target.height) return bytes;
   return resample_8bit(bytes, frame.width, frame.height, target.width, target.height);
 }
@@ -155,9 +141,9 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
                 static_cast<std::size_t>((to.width - target.width) / share);
   if (to.antialias) {
     const std::vector<std::uint8_t> bytes = resized_8bit(frame, target);
-    copy(ByteSource{bytes.data(), byte_table()}, target);
+    copy(ByteSource{bytes.data(), byte_table().data()}, target);
   } else if (const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb)) {
-    place(ByteSource{bytes->data(), byte_table()}, frame.width, frame.height, target);
+    place(ByteSource{bytes->data(), byte_table().data()}, frame.width, frame.height, target);
   } else {
     place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target);
   }

@@ -27,6 +27,11 @@ std::size_t first_bad(std::span<const float> values) {
 void apply(const ImageOp& op, std::span<float> pixels) {
   if (const auto* scaled = std::get_if<AffineOp>(&op)) affine(pixels, scaled->scale, scaled->shift);
   if (const auto* held = std::get_if<ClipOp>(&op)) clip(pixels, held->low, held->high);
+  if (const auto* by_channel = std::get_if<Standardize>(&op)) standardize(pixels, *by_channel);
+}
+
+std::size_t view_size(const Recipe& recipe) {
+  return std::size_t{3} * static_cast<std::size_t>(recipe.width) * static_cast<std::size_t>(recipe.height);
 }
 
 /// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
@@ -61,7 +66,7 @@ Result<std::vector<Processor::PresentView>> Processor::present_views(const Obser
     if (given[i] == nullptr && view_optional_[i] == 0)
       return bad_observation(name, "an image, or the view declared absent", "neither",
                              "the bundle's views are " + views_.listed());
-    if (given[i] != nullptr && *given[i]) present.push_back({&name, &**given[i]});
+    if (given[i] != nullptr && *given[i]) present.push_back({i, &name, &**given[i]});
   }
   if (present.size() < static_cast<std::size_t>(min_views_))
     return bad_observation("observation.images",
@@ -73,19 +78,32 @@ Result<std::vector<Processor::PresentView>> Processor::present_views(const Obser
 Status Processor::encode_images(const Observation& observation, Inputs& inputs) const {
   VLA_TRY(const std::vector<PresentView> present, present_views(observation));
   inputs.n_view = static_cast<int>(present.size());
-  inputs.width = recipe_.letterbox.width;
-  inputs.height = recipe_.letterbox.height;
-  const std::size_t size =
-      static_cast<std::size_t>(3) * static_cast<std::size_t>(inputs.width) * static_cast<std::size_t>(inputs.height);
+  inputs.views = 0;
+  inputs.width = recipe_.width;
+  inputs.height = recipe_.height;
+  const std::size_t size = view_size(recipe_);
   inputs.pixels.resize(present.size() * size);
   for (std::size_t i = 0; i < present.size(); ++i) {
-    const auto& [name, frame] = present[i];
-    const std::span<float> out(inputs.pixels.data() + i * size, size);
+    const auto& [index, name, frame] = present[i];
+    inputs.views |= 1U << index;
     VLA_CHECK(check_frame(*frame, *name));
-    VLA_CHECK(letterbox(*frame, recipe_.letterbox, out, *name));
-    for (const ImageOp& op : recipe_.image) apply(op, out);
+    VLA_CHECK(encode_view(*frame, *name, {inputs.pixels.data() + i * size, size}));
   }
   return {};
+}
+
+Status Processor::encode_view(const Frame& frame, const std::string& name, std::span<float> out) const {
+  if (const auto* box = std::get_if<Letterbox>(&recipe_.fit)) VLA_CHECK(letterbox(frame, *box, out, name));
+  if (const auto* stretched = std::get_if<Resize>(&recipe_.fit)) VLA_CHECK(resize(frame, *stretched, out, name));
+  for (const ImageOp& op : recipe_.image) apply(op, out);
+  return {};
+}
+
+std::vector<float> Processor::absent_view() const {
+  std::vector<float> pixels(view_size(recipe_));
+  const Frame black{recipe_.width, recipe_.height, std::vector<std::uint8_t>(pixels.size())};
+  (void)encode_view(black, "absent view", pixels);  // bytes of the size that is asked for are never refused
+  return pixels;
 }
 
 std::string Processor::fill_prompt(const std::string& instruction, std::span<const int> state_words) const {
@@ -96,6 +114,7 @@ std::string Processor::fill_prompt(const std::string& instruction, std::span<con
     if (const auto* end = std::get_if<EnsureSuffixOp>(&op); end != nullptr && !text.ends_with(end->suffix))
       text += end->suffix;
     if (const auto* whole = std::get_if<TemplateOp>(&op)) text = fill_template(whole->text, text, state_words);
+    if (const auto* views = std::get_if<ViewsOp>(&op)) text = view_places(*views) + text;
   }
   return text;
 }
@@ -108,14 +127,27 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
     return tokenizer_.encode(observation.text).error();  // before anything reads it as characters
   if (bins_ && inputs.state_words.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
-  VLA_TRY(inputs.tokens, tokenizer_.encode(fill_prompt(observation.text, inputs.state_words)));
+  const std::string prompt = fill_prompt(observation.text, inputs.state_words);
+  VLA_TRY(inputs.tokens, tokenizer_.encode(prompt, kMaxViewsText + Tokenizer::kMaxText));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
     inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the {} {}", inputs.tokens.size(),
                                        recipe_.keep_last ? "last" : "first", limit));
     cut_tokens(inputs.tokens);
   }
-  return {};
+  return front_.empty() ? Status() : check_view_places(inputs.tokens);
+}
+
+/// The network puts pictures where the bundle says that their places are, whatever the prompt says.
+Status Processor::check_view_places(std::span<const std::int32_t> tokens) const {
+  const bool whole = tokens.size() >= front_.size() && std::equal(front_.begin(), front_.end(), tokens.begin());
+  if (!whole)
+    return bad_observation("instruction", "text that leaves the places of the views in front of it",
+                           "text that changes or cuts them", "shorten the instruction");
+  const auto rest = tokens.subspan(front_.size());
+  if (std::find(rest.begin(), rest.end(), view_token_) == rest.end()) return {};
+  return bad_observation("instruction", "text without " + view_token_text_, "such a token",
+                         "the places of the views are made by the runtime; remove it from the text");
 }
 
 /// Keeps as many tokens as the recipe says. What stands in front of every text is not part of it and stays.
@@ -159,13 +191,14 @@ Status Processor::encode_state(const Observation& observation, Inputs& inputs) c
     }
     if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, columns);
     if (const auto* angle = std::get_if<HornAngleOp>(&step.op)) map_columns(*angle, columns);
+    if (const auto* held = std::get_if<ClipOp>(&step.op)) clip(columns, held->low, held->high);
   }
   if (raw) inputs.raw_state = inputs.state;
   if (const std::size_t bad = first_bad(state); bad < state.size())
     return bad_observation(fmt::format("state[{}]", bad), "a number that stays finite when normalized",
                            fmt::format("{}", state[bad]));
   inputs.state_words = bins_ ? bins(*bins_, state) : std::vector<int>{};
-  inputs.state.resize(d_state_, 0.0f);
+  inputs.state.resize(d_state_, padding_);
   return {};
 }
 
@@ -174,6 +207,7 @@ void Processor::decode_row(std::vector<float>& row, std::span<const float> raw_s
     row.resize(step.width);
     if (const auto* normalizer = std::get_if<Normalizer>(&step.op)) normalizer->apply(row);
     if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, row);
+    if (const auto* threshold = std::get_if<ThresholdOp>(&step.op)) map_columns(*threshold, row);
     if (const auto* add = std::get_if<AddStateOp>(&step.op))
       for (const int column : add->columns)
         row[static_cast<std::size_t>(column)] += raw_state[static_cast<std::size_t>(column)];

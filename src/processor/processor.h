@@ -30,6 +30,7 @@ struct Observation {
 /// The host side of one observation, as the network reads it. Vectors keep their memory when filled again.
 struct Inputs {
   int n_view = 0;
+  std::uint32_t views = 0;  // bit i: view i of the bundle's order is present
   int height = 0, width = 0;
   std::vector<float> pixels;         // (n_view, 3, height, width), present views only, in the bundle's order
   std::vector<std::int32_t> tokens;  // at most `recipe().max_tokens`
@@ -42,8 +43,9 @@ struct Inputs {
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
  public:
-  /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state` and
-  /// `policy.d_action`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
+  /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state`,
+  /// `policy.d_action` and, where the text has places for views, `policy.view_starts`, and checks that they fit each
+  /// other. The bundle may go afterwards. Errors: bad_bundle.
   static Result<Processor> create(const Bundle& bundle);
 
   /// All three parts below. Errors: bad_observation.
@@ -54,6 +56,9 @@ class Processor {
   Status encode_images(const Observation& observation, Inputs& inputs) const;
   Status encode_text(const Observation& observation, Inputs& inputs) const;
   Status encode_state(const Observation& observation, Inputs& inputs) const;
+
+  /// Pixels (3, height, width) of a black frame, which some references put in the place of an absent view.
+  std::vector<float> absent_view() const;
 
   /// chunk (horizon, d_action), in the network's units -> (horizon, action_names().size()) in world units. `raw_state`
   /// is that of the observation which the chunk answers. Errors: bad_action for a number that is not finite, naming its
@@ -74,11 +79,11 @@ class Processor {
  private:
   /// A step and the columns that it works on.
   struct StateStep {
-    std::variant<ColumnAffineOp, HornAngleOp, Normalizer> op;
+    std::variant<ColumnAffineOp, HornAngleOp, Normalizer, ClipOp> op;
     std::size_t offset, width;
   };
   struct ActionStep {
-    std::variant<Normalizer, AddStateOp, ColumnAffineOp> op;
+    std::variant<Normalizer, AddStateOp, ColumnAffineOp, ThresholdOp> op;
     std::size_t width;
   };
 
@@ -88,12 +93,16 @@ class Processor {
   Result<StateStep> read_normalize(const Bundle& bundle, const NormalizeOp& op, const std::string& where) const;
   Status read_state_steps(const Bundle& bundle);
   Status read_action_steps(const Bundle& bundle);
+  Status read_view_places(const Keys& keys);
   struct PresentView {
+    std::size_t index;
     const std::string* name;
     const Frame* frame;
   };
   Result<std::vector<PresentView>> present_views(const Observation& observation) const;
   std::string fill_prompt(const std::string& instruction, std::span<const int> state_words) const;
+  Status encode_view(const Frame& frame, const std::string& name, std::span<float> out) const;
+  Status check_view_places(std::span<const std::int32_t> tokens) const;
   void cut_tokens(std::vector<std::int32_t>& tokens) const;
   void decode_row(std::vector<float>& row, std::span<const float> raw_state) const;
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
@@ -108,9 +117,14 @@ class Processor {
   std::vector<StateStep> state_steps_;
   std::vector<ActionStep> action_steps_;
   std::optional<BinsOp> bins_;  // the state goes into the prompt
-  std::size_t n_state_ = 0;     // numbers of all states together
-  std::size_t d_state_ = 0;     // of the network, after padding
-  int d_action_ = 0;            // of the network
+  /// Where the text has places for views: the tokens of every prompt up to the last place, and the token of a place.
+  std::vector<std::int32_t> front_;
+  std::int32_t view_token_ = -1;
+  std::string view_token_text_;
+  std::size_t n_state_ = 0;  // numbers of all states together
+  std::size_t d_state_ = 0;  // of the network, after padding
+  float padding_ = 0.0f;
+  int d_action_ = 0;  // of the network
 };
 
 }  // namespace vla

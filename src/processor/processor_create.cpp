@@ -3,6 +3,7 @@
 //
 // The load-rate half of Processor: reading a bundle and checking that its parts fit each other.
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include <algorithm>
 #include <numeric>
@@ -34,6 +35,20 @@ std::int64_t total_dims(std::span<const int> dims) {
   return std::accumulate(dims.begin(), dims.end(), std::int64_t{0});
 }
 
+struct Run {
+  int start, size;
+};
+
+std::vector<Run> runs_of(std::int32_t token, std::span<const std::int32_t> tokens) {
+  std::vector<Run> runs;
+  for (std::size_t i = 0; i < tokens.size(); ++i) {
+    if (tokens[i] != token) continue;
+    if (i == 0 || tokens[i - 1] != token) runs.push_back({static_cast<int>(i), 0});
+    ++runs.back().size;
+  }
+  return runs;
+}
+
 }  // namespace
 
 Result<Processor> Processor::create(const Bundle& bundle) {
@@ -51,6 +66,7 @@ Result<Processor> Processor::create(const Bundle& bundle) {
     return misfit("processor.recipe.text",
                   fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
                   std::to_string(processor.recipe_.max_tokens));
+  VLA_CHECK(processor.read_view_places(keys));
   VLA_CHECK(processor.check_descriptions(keys));
   return processor;
 }
@@ -68,6 +84,8 @@ Status Processor::read_features(const Bundle& bundle) {
     if (flag != 0 && flag != 1) return misfit("observation.view_optional", "0 or 1", std::to_string(flag));
   if (min_views_ < 1 || static_cast<std::size_t>(min_views_) > views.size())
     return misfit("observation.min_views", fmt::format("1 to {}", views.size()), std::to_string(min_views_));
+  if (views.size() > static_cast<std::size_t>(kMaxViews))
+    return misfit("observation.views", fmt::format("at most {} views", kMaxViews), std::to_string(views.size()));
   views_ = FeatureNames("view", std::move(views), std::move(aliases));
 
   VLA_TRY(std::vector<std::string> states, keys.strings("observation.states"));
@@ -124,6 +142,36 @@ Result<Processor::StateStep> Processor::read_normalize(const Bundle& bundle, con
   return StateStep{std::move(normalizer), offset, n_column};
 }
 
+/// The prompt of an empty instruction shows where the places are; nothing that follows them may move them.
+Status Processor::read_view_places(const Keys& keys) {
+  const auto* views = recipe_.text.empty() ? nullptr : std::get_if<ViewsOp>(&recipe_.text.back());
+  if (views == nullptr) return {};
+  const std::string where = fmt::format("processor.recipe.text[{}]", recipe_.text.size() - 1);
+  VLA_TRY(const std::vector<int> starts, keys.integers("policy.view_starts"));
+  VLA_TRY(const std::vector<std::int32_t> prefixed, tokenizer_.encode(views->token));
+  const std::size_t n_prefix = tokenizer_.prefix().size();
+  if (prefixed.size() != n_prefix + 1)
+    return misfit(where + ".token", "the text of one token", fmt::format("{} tokens", prefixed.size() - n_prefix));
+  view_token_ = prefixed.back();
+  view_token_text_ = views->token;
+  const std::string prompt = fill_prompt({}, {});
+  VLA_TRY(const std::vector<std::int32_t> tokens, tokenizer_.encode(prompt, kMaxViewsText + Tokenizer::kMaxText));
+  const std::vector<Run> runs = runs_of(view_token_, tokens);
+  std::vector<int> found;
+  for (const Run& run : runs) found.push_back(run.start);
+  const auto is_whole = [views](const Run& run) { return run.size == views->repeat; };
+  if (found.size() != static_cast<std::size_t>(views->count) || !std::all_of(runs.begin(), runs.end(), is_whole))
+    return misfit(where, fmt::format("{} runs of {} tokens", views->count, views->repeat),
+                  fmt::format("{} runs in the tokens of the prompt", runs.size()));
+  if (found != starts)
+    return misfit("policy.view_starts", fmt::format("{}, where the prompt has them", fmt::join(found, ", ")),
+                  fmt::format("{}", fmt::join(starts, ", ")));
+  front_.assign(tokens.begin(), tokens.begin() + runs.back().start + runs.back().size);
+  if (front_.size() <= static_cast<std::size_t>(recipe_.max_tokens)) return {};
+  return misfit("processor.recipe.text", fmt::format("at least {} tokens, which the views need", front_.size()),
+                std::to_string(recipe_.max_tokens));
+}
+
 Status Processor::read_state_steps(const Bundle& bundle) {
   n_state_ = static_cast<std::size_t>(total_dims(state_dims_));
   d_state_ = n_state_;
@@ -144,6 +192,9 @@ Status Processor::read_state_steps(const Bundle& bundle) {
         return misfit(where + ".size", fmt::format("at least the {} numbers of the state", n_state_),
                       std::to_string(pad->size));
       d_state_ = static_cast<std::size_t>(pad->size);
+      padding_ = pad->value;
+    } else if (const auto* held = std::get_if<ClipOp>(&op)) {
+      state_steps_.push_back({*held, 0, n_state_});
     } else {  // bins or drop: nothing is left for the network
       if (const auto* words = std::get_if<BinsOp>(&op)) bins_ = *words;
       d_state_ = 0;
@@ -172,6 +223,9 @@ Status Processor::read_action_steps(const Bundle& bundle) {
     } else if (const auto* affine = std::get_if<ColumnAffineOp>(&op)) {
       VLA_CHECK(check_columns(affine->columns, n_column, where));
       action_steps_.push_back({*affine, n_column});
+    } else if (const auto* threshold = std::get_if<ThresholdOp>(&op)) {
+      VLA_CHECK(check_columns(threshold->columns, n_column, where));
+      action_steps_.push_back({*threshold, n_column});
     } else {
       VLA_TRY(Normalizer unnormalize,
               Normalizer::create(bundle, std::get<NormalizeOp>(op), Normalizer::Direction::unnormalize, width, where));

@@ -8,11 +8,24 @@
 
 #include "base/result.h"
 #include "processor/letterbox.h"
+#include "processor/resize.h"
+#include "processor/standardize.h"
 
 namespace vla {
 
 /// How a normalize or unnormalize step uses statistics; `vector.h` has the formulas.
-enum class NormKind { mean_std, min_max, quantiles, quantile10, identity, openpi_mean_std, openpi_quantiles };
+enum class NormKind {
+  mean_std,
+  min_max,
+  quantiles,
+  quantile10,
+  identity,
+  openpi_mean_std,
+  openpi_quantiles,
+  evo1_mean_std,
+  evo1_min_max,
+  evo1_quantiles
+};
 
 struct AffineOp {
   float scale = 1.0f;
@@ -37,6 +50,14 @@ struct EnsureSuffixOp {
 /// `{instruction}` stands for the text so far, `{state}` for the numbers that `bins` made of the state.
 struct TemplateOp {
   std::string text;
+};
+
+/// `count` pieces in front of the text so far, one for each view that the network has a place for: `open` with the
+/// number of the piece, from 1, for `{i}`, then `token` `repeat` times, then `close`.
+struct ViewsOp {
+  int count = 0;
+  int repeat = 0;
+  std::string open, token, close;
 };
 
 struct NormalizeOp {
@@ -76,6 +97,7 @@ struct DropOp {};
 
 struct PadOp {
   int size = 0;
+  float value = 0.0f;
 };
 
 struct TakeOp {
@@ -87,14 +109,24 @@ struct AddStateOp {
   std::vector<int> columns;
 };
 
-using ImageOp = std::variant<AffineOp, ClipOp>;
-using TextOp = std::variant<StripOp, ReplaceOp, EnsureSuffixOp, TemplateOp>;
-using StateOp = std::variant<ColumnAffineOp, HornAngleOp, NormalizeOp, PadOp, BinsOp, DropOp>;
-using ActionOp = std::variant<TakeOp, NormalizeOp, AddStateOp, ColumnAffineOp>;
+/// In the columns named, `then` for what is strictly above `above`, `otherwise` for the rest.
+struct ThresholdOp {
+  std::vector<int> columns;
+  float above = 0.0f;
+  float then = 0.0f;
+  float otherwise = 0.0f;
+};
+
+using Fit = std::variant<Letterbox, Resize>;
+using ImageOp = std::variant<AffineOp, ClipOp, Standardize>;
+using TextOp = std::variant<StripOp, ReplaceOp, EnsureSuffixOp, TemplateOp, ViewsOp>;
+using StateOp = std::variant<ColumnAffineOp, HornAngleOp, NormalizeOp, ClipOp, PadOp, BinsOp, DropOp>;
+using ActionOp = std::variant<TakeOp, NormalizeOp, AddStateOp, ColumnAffineOp, ThresholdOp>;
 
 /// `processor.recipe` of docs/bundle.md, checked and typed: what happens to each input and to the actions, in order.
 struct Recipe {
-  Letterbox letterbox;         // the first image op: what follows works on planes of one size
+  Fit fit;                     // the first image op: what follows works on planes of one size
+  int width = 0, height = 0;   // of those planes
   std::vector<ImageOp> image;  // the others
   std::vector<TextOp> text;    // all but the last op, which is tokenize
   int max_tokens = 0;
@@ -106,6 +138,8 @@ struct Recipe {
 /// Largest picture and vector that a recipe may ask for: a damaged number must not ask for all memory.
 inline constexpr int kMaxImageSide = 8192;
 inline constexpr int kMaxVector = 65536;
+inline constexpr int kMaxViews = 32;
+inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op puts in front
 
 /// Errors: bad_bundle, with a place like `processor.recipe.image[0].filter`, for anything the document does not name.
 Result<Recipe> parse_recipe(const std::string& json);

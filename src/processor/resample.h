@@ -15,4 +15,16 @@ namespace vla {
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                         int to_height);
 
+/// The same by OpenCV's cv::resize with INTER_LINEAR (4.10 and 5.0 agree): no antialiasing, weights of 11 binary
+/// digits, and the mean of four pixels where both sides are halved. Source: OpenCV modules/imgproc/src/resize.cpp.
+std::vector<std::uint8_t> resample_opencv(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                          int to_height);
+
+/// The same by torchvision's resize of an 8-bit tensor, bicubic with antialiasing: summed in float32, columns first,
+/// held in [0, 255] and rounded half to even. Equal to torch 2.13's CPU kernel for AVX2, in whose order numbers are
+/// summed; another machine's kernel differs by a rounding of float32 and so, rarely, in a byte.
+/// Source: torchvision transforms/_functional_tensor.py resize; torch aten/src/ATen/native/cpu/UpSampleKernel.cpp.
+std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                         int to_height);
+
 }  // namespace vla

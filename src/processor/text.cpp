@@ -11,6 +11,7 @@ namespace vla {
 namespace {
 
 constexpr std::string_view kInstruction = "{instruction}";
+constexpr std::string_view kNumber = "{i}";
 constexpr std::string_view kState = "{state}";
 
 /// Python's str.isspace(): bidirectional class WS, B or S, or category Zs.
@@ -55,6 +56,20 @@ bool is_template(std::string_view text) {
   const int n_state = occurrences(text, kState);
   return occurrences(text, kInstruction) == 1 && n_state <= 1 && occurrences(text, "{") == 1 + n_state &&
          occurrences(text, "}") == 1 + n_state;
+}
+
+bool is_numbered(std::string_view text) {
+  return occurrences(text, kNumber) == 1 && occurrences(text, "{") == 1 && occurrences(text, "}") == 1;
+}
+
+std::string view_places(const ViewsOp& op) {
+  std::string out;
+  for (int i = 1; i <= op.count; ++i) {
+    out += replace_all(op.open, kNumber, std::to_string(i));
+    for (int k = 0; k < op.repeat; ++k) out += op.token;
+    out += op.close;
+  }
+  return out;
 }
 
 std::string fill_template(std::string_view text, std::string_view instruction, std::span<const int> words) {

@@ -6,6 +6,8 @@
 #include <string>
 #include <string_view>
 
+#include "processor/recipe.h"
+
 namespace vla {
 
 /// Valid UTF-8 without the white space at its ends, as Python's str.strip() sees white space: some control characters
@@ -21,5 +23,11 @@ bool is_template(std::string_view text);
 /// The template with its places filled; `words` with single blanks between them.
 /// Source: lerobot policies/pi05/processor_pi05.py (Pi05PrepareStateTokenizerProcessorStep).
 std::string fill_template(std::string_view text, std::string_view instruction, std::span<const int> words);
+
+/// Whether a text names `{i}` once and has no other braces.
+bool is_numbered(std::string_view text);
+
+/// What a views op puts in front. Source: lerobot policies/evo1/internvl3_embedder.py (_build_multimodal_prompts).
+std::string view_places(const ViewsOp& op);
 
 }  // namespace vla

@@ -16,13 +16,21 @@ Result<std::vector<float>> read(const Bundle& bundle, const std::string& name, i
   return Error{Code::bad_bundle, name, fmt::format("{} numbers for {}", width, where), std::to_string(values.size())};
 }
 
-bool is_mean_std(NormKind kind) { return kind == NormKind::mean_std || kind == NormKind::openpi_mean_std; }
+bool is_mean_std(NormKind kind) {
+  return kind == NormKind::mean_std || kind == NormKind::openpi_mean_std || kind == NormKind::evo1_mean_std;
+}
+
+bool is_min_max(NormKind kind) { return kind == NormKind::min_max || kind == NormKind::evo1_min_max; }
 
 bool is_openpi(NormKind kind) { return kind == NormKind::openpi_mean_std || kind == NormKind::openpi_quantiles; }
 
+bool is_evo1(NormKind kind) {
+  return kind == NormKind::evo1_mean_std || kind == NormKind::evo1_min_max || kind == NormKind::evo1_quantiles;
+}
+
 std::pair<const char*, const char*> statistics_names(NormKind kind) {
   if (is_mean_std(kind)) return {"mean", "std"};
-  if (kind == NormKind::min_max) return {"min", "max"};
+  if (is_min_max(kind)) return {"min", "max"};
   return kind == NormKind::quantile10 ? std::pair("q10", "q90") : std::pair("q01", "q99");
 }
 
@@ -43,11 +51,14 @@ Normalizer::Normalizer(NormKind kind, Direction direction, double eps, std::vect
       divisor_.push_back(static_cast<float>(spread_[i]));
       continue;
     }
-    if (kind_ != NormKind::mean_std) {
-      factor_[i] -= low_[i];
-      if (factor_[i] == 0.0f) factor_[i] = static_cast<float>(eps);
+    const auto small = static_cast<float>(eps);
+    if (!is_mean_std(kind_)) factor_[i] -= low_[i];
+    if (is_evo1(kind_)) {
+      factor_[i] += small;
+    } else if (!is_mean_std(kind_) && factor_[i] == 0.0f) {
+      factor_[i] = small;
     }
-    divisor_.push_back(kind_ == NormKind::mean_std ? factor_[i] + static_cast<float>(eps) : factor_[i]);
+    divisor_.push_back(kind_ == NormKind::mean_std ? factor_[i] + small : factor_[i]);
   }
 }
 
@@ -79,12 +90,12 @@ double Normalizer::openpi(double x, std::size_t column) const {
 
 float Normalizer::normalized(float x, std::size_t column) const {
   const float centred = x - low_[column];
-  return kind_ == NormKind::mean_std ? centred / divisor_[column] : 2.0f * centred / divisor_[column] - 1.0f;
+  return is_mean_std(kind_) ? centred / divisor_[column] : 2.0f * centred / divisor_[column] - 1.0f;
 }
 
 float Normalizer::unnormalized(float x, std::size_t column) const {
-  if (kind_ == NormKind::mean_std) return x * factor_[column] + low_[column];
-  if (kind_ == NormKind::min_max) return (x + 1.0f) / 2.0f * factor_[column] + low_[column];
+  if (is_mean_std(kind_)) return x * factor_[column] + low_[column];
+  if (is_min_max(kind_) || is_evo1(kind_)) return (x + 1.0f) / 2.0f * factor_[column] + low_[column];
   return (x + 1.0f) * factor_[column] / 2.0f + low_[column];
 }
 

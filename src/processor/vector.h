@@ -33,6 +33,12 @@ std::vector<std::string> statistics_of(const NormalizeOp& op);
 ///
 /// These two are computed in double precision and rounded once, since that reference's statistics are doubles.
 /// Source: openpi transforms.py Normalize, Unnormalize.
+///
+///   evo1_mean_std     (x - mean) / (std + eps)              x * (std + eps) + mean                   mean, std
+///   evo1_min_max      2 * (x - min) / (range + eps) - 1     (x + 1) / 2 * (range + eps) + min        min, max
+///   evo1_quantiles    2 * (x - q01) / (range + eps) - 1     (x + 1) / 2 * (range + eps) + q01        q01, q99
+///
+/// In float32 again. Source: Evo-1 scripts/Evo1_server.py (Normalizer).
 class Normalizer {
  public:
   enum class Direction { normalize, unnormalize };
@@ -56,7 +62,7 @@ class Normalizer {
   NormKind kind_;
   Direction direction_;
   std::vector<float> low_;      // mean, min or lower quantile
-  std::vector<float> factor_;   // std, or the range
+  std::vector<float> factor_;   // std, or the range; with eps where un-normalizing has it
   std::vector<float> divisor_;  // std + eps, or the range
   std::vector<double> spread_;  // of the openpi kinds: std or range, and eps
 };

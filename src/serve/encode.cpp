@@ -36,8 +36,8 @@ void describe_views(const Engine& engine, v1::Description& out) {
     view.set_name(processor.views().names()[i]);
     if (!aliases[i].empty()) view.add_aliases(aliases[i]);
     view.set_optional((*optional)[i] != 0);
-    view.set_width(static_cast<std::uint32_t>(processor.recipe().letterbox.width));
-    view.set_height(static_cast<std::uint32_t>(processor.recipe().letterbox.height));
+    view.set_width(static_cast<std::uint32_t>(processor.recipe().width));
+    view.set_height(static_cast<std::uint32_t>(processor.recipe().height));
   }
   out.set_min_views(static_cast<std::uint32_t>(processor.min_views()));
 }

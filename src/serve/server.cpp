@@ -51,7 +51,7 @@ Error cannot_bind(const std::string& endpoint, const zmq::error_t& error) {
 
 Result<double> warm_up(Engine& engine) {
   const Recipe& recipe = engine.processor().recipe();
-  const int width = recipe.letterbox.width, height = recipe.letterbox.height;
+  const int width = recipe.width, height = recipe.height;
   const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
   Observation observation;
   for (const std::string& view : engine.processor().views().names())

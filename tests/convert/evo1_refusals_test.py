@@ -24,8 +24,11 @@ ANSWERS_THAT_DO_NOT_FIT = {
     "--variant: expected r1 or r2, a revision of the authors' code, found pi0_libero": dict(variant="pi0_libero"),
     "--views: expected different names, no more than there are slots, found a,a": dict(views=["a", "a"]),
     "--views: expected different names, no more than there are slots, found a,": dict(views=["a", ""]),
+    "--views: expected different names, no more than there are slots, found a,observation": dict(
+        views=["a", "observation.images.a"]
+    ),
     "--views: expected different names, no more than there are slots, found a,b,c,d": dict(views=list("abcd")),
-    "--view-slots: expected a count from 1 to 64, found -1": dict(view_slots=-1),
+    "--view-slots: expected a count from 1 to 32, found -1": dict(view_slots=-1),
     "--dead-rows: expected zero_attention or causal_attention, found unseen": dict(dead_rows="unseen"),
     "--stats: expected one of the entries": dict(stats="nobody/nothing"),
     "--identity-stats: expected a checkpoint of LeRobot, found one of Evo-1's authors": dict(identity_stats=["action"]),
@@ -110,7 +113,7 @@ AUTHORS = {
     "llm_config: num_attention_heads: expected heads of an even width": dict(backbone__llm_config__num_attention_heads=4),
     "tokenizer_config.json: padding_side: expected 'right'": dict(tokenizer_config__padding_side="left"),
     "tokenizer_config.json: truncation_side: expected 'right'": dict(tokenizer_config__truncation_side="left"),
-    "tokenizer_config.json: pad_token: expected one of the added tokens, found None": dict(tokenizer_config__pad_token=REMOVED),
+    "tokenizer_config.json: pad_token: expected one of the added tokens, found 'None'": dict(tokenizer_config__pad_token=REMOVED),
 }
 
 

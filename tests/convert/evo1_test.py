@@ -28,6 +28,8 @@ from tiny_evo1 import (
     TinyEvo1,
     TinyEvo1Lerobot,
 )
+from vla_cpp.convert import read_bundle
+from vla_cpp.convert.cli import main
 
 STATE, ACTION = "stats.observation.state", "stats.action"
 
@@ -125,7 +127,7 @@ def test_keys_of_the_authors_second_revision(converter):
         "connector.factor": 2,
         "head.d_ff": 4 * D_MODEL,
         "observation.views": ["observation.images.front", "observation.images.wrist"],
-        "observation.view_optional": [1, 1],
+        "observation.view_optional": [0, 0],
         "observation.min_views": 1,
         "observation.state_dims": [STATE_DIM],
         "observation.max_text_tokens": N_TOKEN,
@@ -158,6 +160,15 @@ def test_the_first_revision_differs_in_steps_times_pixels_and_padding(converter)
     assert (bundle.keys["solver.steps"], bundle.keys["policy.time_scale"]) == (32, 1000.0)
     assert found["image"][1]["arithmetic"] == "float32_then_bfloat16"
     assert found["state"][-1] == {"op": "pad", "size": WIDTH, "value": -1.0}
+
+
+def test_a_config_of_the_first_revision_is_noted_where_the_second_is_asked_for(converter):
+    tiny = TinyEvo1()
+    tiny.config["action_dim"] = HORIZON * WIDTH
+    authors(converter, tiny, variant="r1")
+    assert not any("--variant" in note for note in converter.summary.notes)
+    authors(converter, tiny, variant="r2")
+    assert any("is it --variant r1?" in note for note in converter.summary.notes)
 
 
 @pytest.mark.parametrize(
@@ -236,6 +247,16 @@ def test_places_of_views_are_those_of_the_tokenizers_own_ids(converter):
     ids = judge.encode(prompt + "pick up", add_special_tokens=False).ids
     image = FIRST_ADDED + 5
     assert keys["policy.view_starts"] == [i for i, t in enumerate(ids) if t == image and ids[i - 1] != image]
+
+
+def test_the_command_takes_the_answers(converter, capsys):
+    folder = converter.save(TinyEvo1())
+    flags = "--variant r1 --views observation.images.front,wrist --view-slots 2 --dead-rows causal_attention"
+    assert main([folder, "-o", converter.out, "--stats", "{}/{}".format(ARM, DATASET), *flags.split()]) == 0
+    keys = read_bundle(converter.out).keys
+    assert keys["observation.views"] == ["observation.images.front", "observation.images.wrist"]
+    assert (keys["policy.n_slot"], keys["policy.dead_rows"], keys["solver.steps"]) == (2, "causal_attention", 32)
+    assert "the robot's {} action columns".format(ACTION_DIM) in capsys.readouterr().out
 
 
 def test_every_number_of_lerobots_tensors_is_in_the_bundle(converter):
@@ -329,6 +350,12 @@ def test_cameras_that_may_be_missing_are_as_many_as_the_config_says(converter):
     tiny.config["empty_cameras"] = 1
     keys = converter.bundle(tiny).keys
     assert keys["observation.views"][-1] == "observation.images.empty_camera_0" and keys["observation.min_views"] == 2
+
+
+def test_a_tokenizer_that_pads_on_the_left_does_for_single_prompts(converter):
+    tiny = TinyEvo1Lerobot()
+    tiny.tokenizer_config["padding_side"] = "left"
+    assert converter.bundle(tiny).keys["policy.pad_token"] == FIRST_ADDED
 
 
 def test_head_and_towers_of_other_precisions_are_written_as_f32(converter):

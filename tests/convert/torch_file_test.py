@@ -122,9 +122,10 @@ HOSTILE = {
     "found a stack or a memo that lacks a value  ": b"t.",
     "found the opcode INST": b"(iposix\nsystem\n.",
     "found the opcode INT": b"I" + b"9" * 100000 + b"\n.",
-    "found the opcode BYTEARRAY8": b"\x96" + struct.pack("<Q", 1 << 62) + b".",
+    "found the opcode NEXT_BUFFER": b"\x97.",
+    "found expected 4611686018427387904 bytes in a bytearray8": b"\x96" + struct.pack("<Q", 1 << 62) + b".",
     "found the opcode b'\\xff'": b"\xff.",
-    "expected 4611686018427387904 bytes in a unicodestring8": b"\x8d" + struct.pack("<Q", 1 << 62) + b"x.",
+    "found expected 4611686018427387904 bytes in a unicodestring8": b"\x8d" + struct.pack("<Q", 1 << 62) + b"x.",
     "found a value where another kind": b"(\x85.",
     "found a value where another kind ": b"K\x01K\x02R.",
     "found items for what is no list": b"K\x01(K\x02e.",
@@ -141,8 +142,7 @@ HOSTILE = {
 @pytest.mark.parametrize("message", HOSTILE)
 def test_a_hostile_pickle_is_refused(tmp_path, message):
     text = refusal(of_pickle(tmp_path, HOSTILE[message]))
-    if "unicodestring8" not in message:
-        assert message.strip() in text
+    assert message.strip() in text
 
 
 def test_a_huge_index_of_the_memo_takes_one_place(tmp_path):

@@ -62,7 +62,8 @@ TEST_CASE("the published SmolVLA counts the operations of its configuration, und
     Store tables(4);
     const Tensor conditions = tables.add_f32({720, 10});
     REQUIRE(tables.allocate(*device).ok());
-    Plans plans(PlanContext{*policy, *weights, *device, solver, conditions, 32, 50, ""});
+    const Cache constants;
+    Plans plans(PlanContext{*policy, *weights, *device, solver, conditions, constants, 32, 50, ""});
     for (const auto& [n_view, n_text] : {std::pair(2, 48), std::pair(1, 5)}) {
       const auto plan = plans.for_shape({512, 512, n_view, n_text, 32});
       REQUIRE(plan.ok());

@@ -58,8 +58,8 @@ inline Depth check_load(const Bundle& bundle) {
   const bool is_solved = accepted(Solver::read(bundle.keys()));
   if (!is_processed || !is_declared || !is_solved) return Depth::parsed;
   const Recipe& recipe = processor->recipe();
-  const InputShape shape = {recipe.letterbox.width, recipe.letterbox.height,
-                            static_cast<int>(processor->views().names().size()), recipe.max_tokens, 1};
+  const InputShape shape = {recipe.width, recipe.height, static_cast<int>(processor->views().names().size()),
+                            recipe.max_tokens, 1};
   return accepted(policy->check(shape)) ? Depth::declared : Depth::parsed;
 }
 

@@ -38,6 +38,7 @@ LIBRARIES = [
     (re.compile(r"CLI/.*"), {"cli"}),
     (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve", "bench"}),
     (re.compile(r"jpeglib\.h"), {"processor"}),
+    (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
     (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|prometheus/.*|civetweb\.h"), {"serve"}),
 ]

@@ -49,3 +49,14 @@ TEST_CASE("a horn that cannot reach the opening stays at its end") {
   CHECK(values[1] == static_cast<float>(std::asin(-1.0)));
   CHECK(values[2] == static_cast<float>(std::asin(-1.0)));
 }
+
+TEST_CASE("a threshold gives one of two values, and leaves what is no number to be found") {
+  std::vector<float> values = {0.5f, std::nextafter(0.5f, 1.0f), -3.0f, NAN, INFINITY, 9.0f};
+  map_columns(ThresholdOp{{0, 1, 2, 3, 4}, 0.5f, -1.0f, 1.0f}, values);
+  CHECK(values[0] == 1.0f);
+  CHECK(values[1] == -1.0f);
+  CHECK(values[2] == 1.0f);
+  CHECK(std::isnan(values[3]));
+  CHECK(std::isinf(values[4]));
+  CHECK(values[5] == 9.0f);
+}

@@ -36,9 +36,9 @@ std::string refused_at(const char* pointer, const Json& value) {
 TEST_CASE("the recipe of the document is read op by op") {
   const auto recipe = parse_recipe(sample().dump());
   REQUIRE(recipe.ok());
-  CHECK(recipe->letterbox.width == 512);
-  CHECK(recipe->letterbox.height == 384);
-  CHECK(recipe->letterbox.fill == 0.5f);
+  CHECK(recipe->width == 512);
+  CHECK(recipe->height == 384);
+  CHECK(std::get<Letterbox>(recipe->fit).fill == 0.5f);
   REQUIRE(recipe->image.size() == 1);
   CHECK(std::get<AffineOp>(recipe->image[0]).scale == 2.0f);
   CHECK(std::get<AffineOp>(recipe->image[0]).shift == -1.0f);
@@ -129,7 +129,7 @@ TEST_CASE("fields and lists that the document does not name are refused") {
 TEST_CASE("ops in an order that has no meaning are refused") {
   Json recipe = sample();
   std::swap(recipe["image"][0], recipe["image"][1]);
-  CHECK(contains(refused(recipe), "processor.recipe.image[0].op: expected a letterbox first"));
+  CHECK(contains(refused(recipe), "processor.recipe.image[0].op: expected a letterbox or a resize first"));
   recipe = sample();
   recipe["image"][1] = recipe["image"][0];
   CHECK(contains(refused(recipe), "processor.recipe.image[1].op"));
@@ -188,8 +188,8 @@ std::string refused_robot(const char* pointer, const Json& value) {
 TEST_CASE("ops of robots and of prompts with a state are read") {
   const auto recipe = parse_recipe(robot().dump());
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
-  CHECK(recipe->letterbox.align == Letterbox::Align::center);
-  CHECK(recipe->letterbox.antialias);
+  CHECK(std::get<Letterbox>(recipe->fit).align == Letterbox::Align::center);
+  CHECK(std::get<Letterbox>(recipe->fit).antialias);
   CHECK(std::get<ClipOp>(recipe->image.at(0)).high == 1.0f);
   CHECK(std::holds_alternative<StripOp>(recipe->text.at(0)));
   CHECK(std::get<ReplaceOp>(recipe->text.at(1)).from == "_");

@@ -16,7 +16,10 @@ NormKind kind_of(const std::string& name) {
                                                  {"quantiles", NormKind::quantiles},
                                                  {"quantile10", NormKind::quantile10},
                                                  {"openpi_mean_std", NormKind::openpi_mean_std},
-                                                 {"openpi_quantiles", NormKind::openpi_quantiles}};
+                                                 {"openpi_quantiles", NormKind::openpi_quantiles},
+                                                 {"evo1_mean_std", NormKind::evo1_mean_std},
+                                                 {"evo1_min_max", NormKind::evo1_min_max},
+                                                 {"evo1_quantiles", NormKind::evo1_quantiles}};
   return kinds.at(name);
 }
 
@@ -41,7 +44,7 @@ TEST_CASE("normalize and unnormalize equal the reference bit for bit in every ki
     CHECK(values == floats(test["y"]));
     ++compared;
   }
-  CHECK(compared == 12);
+  CHECK(compared == 18);
 }
 
 TEST_CASE("a zero standard deviation divides by eps, and gives back the mean") {
@@ -72,4 +75,11 @@ TEST_CASE("openpi's kinds add eps in both directions") {
   CHECK(mapped(NormKind::openpi_mean_std, Direction::unnormalize, 0.5, 1.0f, 1.5f, 3.0f) == 7.0f);
   CHECK(mapped(NormKind::openpi_quantiles, Direction::normalize, 0.5, 3.0f, 3.0f, 3.25f) == 0.0f);
   CHECK(mapped(NormKind::openpi_quantiles, Direction::unnormalize, 0.5, 3.0f, 3.0f, 0.0f) == 3.25f);
+}
+
+TEST_CASE("evo1's kinds add eps in both directions") {
+  CHECK(mapped(NormKind::evo1_mean_std, Direction::normalize, 0.5, 1.0f, 1.5f, 3.0f) == 1.0f);
+  CHECK(mapped(NormKind::evo1_mean_std, Direction::unnormalize, 0.5, 1.0f, 1.5f, 3.0f) == 7.0f);
+  CHECK(mapped(NormKind::evo1_min_max, Direction::normalize, 0.5, 3.0f, 3.0f, 3.25f) == 0.0f);
+  CHECK(mapped(NormKind::evo1_quantiles, Direction::unnormalize, 0.5, 3.0f, 3.0f, 0.0f) == 3.25f);
 }

@@ -4,12 +4,15 @@
 
     python tests/reference/make_processor_data.py tests/processor/data
 
-Run in an environment with Pillow, torch, lerobot and tokenizers.  What the files hold:
+Run in an environment with Pillow, OpenCV, torch, lerobot and tokenizers.  What the files hold:
   tokenizer_*.json, tokenizer_cases.json   tokenizers of tokenizer_zoo.py as bundle keys; texts and ids
   images/*.png, *.jpg and *.npy            image files and Pillow's pixels of them; images without .npy are to be refused
   letterbox.json, letterbox.npy            frame and target sizes and the kind of letterbox; the planes that the references
                                            make of `frame_of`, one after another
-  vectors.json                             lerobot's and openpi's normalize and unnormalize
+  resize.json, resize.npy                  frame and target sizes and the filter; OpenCV's and torch's bytes
+  standardize.npy                          torch's (x - mean) / std of every byte / 255: arithmetic, channel, byte
+  views.json                               texts behind the places of views, and the ids of the tokenizer `qwen`
+  vectors.json                             lerobot's, openpi's and Evo-1's normalize and unnormalize
   prompts.json                             lerobot's prompts with the state in words
   aloha.json                               openpi's conventions for the ALOHA robot, both ways
 """
@@ -27,6 +30,7 @@ import tokenizers
 import torch
 from bundle_tokenizer import keys_of
 from PIL import Image, ImageOps, PngImagePlugin
+from resize_references import REFERENCES
 from tokenizer_zoo import SENTENCES, ZOO, fuzz_string
 
 DATA = pathlib.Path(sys.argv[1])
@@ -219,6 +223,45 @@ def pillow_letterbox(frame: np.ndarray, width: int, height: int) -> torch.Tensor
     return torch.from_numpy(np.array(canvas)).permute(2, 0, 1).float().div(255)
 
 
+def write_resize() -> None:
+    cases, planes = [], []
+    sizes = [
+        (64, 48, 20, 20), (48, 64, 20, 20), (7, 5, 16, 16), (16, 12, 8, 6), (16, 12, 8, 7), (40, 24, 8, 6), (9, 9, 9, 9), (1, 1, 5, 3),
+        (5, 1, 10, 3), (21, 30, 42, 60), (300, 9, 30, 2), (90, 52, 28, 28), (13, 40, 13, 20), (40, 13, 20, 13),
+    ]  # fmt: skip
+    for name, resize in REFERENCES.items():
+        for case in sizes:
+            planes.append(resize(frame_of(*case[:2]), *case[2:]).flatten())
+            cases.append([*case, name])
+    (DATA / "resize.json").write_text(json.dumps(cases) + "\n")
+    np.save(DATA / "resize.npy", np.concatenate(planes))
+
+
+def write_standardize() -> None:
+    """ImageNet's numbers, by lerobot policies/evo1/internvl3_embedder.py and by the first release of Evo-1."""
+    x = (torch.arange(256).float() / 255).expand(3, 256)
+    mean, std = torch.tensor([[0.485], [0.456], [0.406]]), torch.tensor([[0.229], [0.224], [0.225]])
+    bf16 = torch.bfloat16
+    rows = [(x - mean) / std, (x.to(bf16) - mean.to(bf16)) / std.to(bf16), ((x - mean) / std).to(bf16)]
+    np.save(DATA / "standardize.npy", torch.stack([row.float() for row in rows]).numpy())
+
+
+def write_views() -> None:
+    """The prompt as lerobot policies/evo1/internvl3_embedder.py builds it (_build_multimodal_prompts), with five tokens a view."""
+    tokenizer, cases = ZOO["qwen"](), []
+    for text in ["pick up the red cube", "  Cafe\u0301 'S 12\r\n\n", "   ", "\u0301accent first", ".", "\u1161", "'s"]:
+        prompt = "".join(f"Image-{i + 1}: <img>{'<IMG_CONTEXT>' * 5}</img>\n" for i in range(3)) + text.strip()
+        cases.append([text, *tokenizer.encode(prompt).ids])
+    (DATA / "views.json").write_text("[" + ",\n".join(json.dumps(case) for case in cases) + "]\n")
+
+
+def evo1_normalize(kind: str, inverse: bool, low, high, x, eps: float = 1e-8):
+    """Evo-1 scripts/Evo1_server.py (Normalizer._normalize_tensor, _denormalize_tensor) without its clamp."""
+    if kind == "evo1_mean_std":
+        return x * (high + eps) + low if inverse else (x - low) / (high + eps)
+    return (x + 1.0) / 2.0 * (high - low + eps) + low if inverse else 2 * (x - low) / (high - low + eps) - 1
+
+
 def short_json(value) -> str:
     """Nine digits give every float32 back."""
     if isinstance(value, dict):
@@ -301,6 +344,15 @@ def write_vectors() -> None:
             y = openpi_normalize(kind, inverse, *(column.astype(np.float64) for column in (low, high, x))).astype(np.float32)
             columns = {"low": low, "high": high, "x": x, "y": y}
             cases.append({"kind": kind, "inverse": inverse, "eps": 1e-6, **{k: [float(v) for v in column] for k, column in columns.items()}})
+    for kind in ("evo1_mean_std", "evo1_min_max", "evo1_quantiles"):
+        low, x = rng.normal(size=(2, 12)).astype(np.float32)
+        high = (np.abs(low) if kind == "evo1_mean_std" else low + np.abs(rng.normal(size=12))).astype(np.float32)
+        high[3] = 0 if kind == "evo1_mean_std" else low[3]
+        high[7] = 1e-7 if kind == "evo1_mean_std" else np.nextafter(low[7], np.float32(9))
+        for inverse in (False, True):
+            y = evo1_normalize(kind, inverse, *map(torch.from_numpy, (low, high, x))).numpy()
+            columns = {"low": low, "high": high, "x": x, "y": y}
+            cases.append({"kind": kind, "inverse": inverse, "eps": 1e-8, **{k: [float(v) for v in column] for k, column in columns.items()}})
     (DATA / "vectors.json").write_text("[" + ",\n".join(short_json(case) for case in cases) + "]\n")
 
 
@@ -310,13 +362,17 @@ def main() -> None:
     write_tokenizers()
     write_images()
     write_letterbox()
+    write_resize()
+    write_standardize()
+    write_views()
     write_vectors()
     write_prompts()
     write_aloha()
+    import cv2
     import lerobot
     import PIL
 
-    versions = {"tokenizers": tokenizers.__version__, "pillow": PIL.__version__, "torch": torch.__version__, "lerobot": lerobot.__version__}
+    versions = {"opencv": cv2.__version__, "tokenizers": tokenizers.__version__, "pillow": PIL.__version__, "torch": torch.__version__, "lerobot": lerobot.__version__}
     (DATA / "versions.json").write_text(json.dumps(versions) + "\n")
 
 

@@ -3,7 +3,7 @@
 //
 // The processor's pure functions behind a pipe, for the comparison scripts of this folder.
 //   reference_tool tokenize KEYS.json      stdin: u32 length, text, ...         stdout: u32 count, i32 ids, ...
-//   reference_tool image WIDTH HEIGHT [center | pillow]
+//   reference_tool image WIDTH HEIGHT [center | pillow | opencv | torch]
 //                                          stdin: u32 length, image file, ...   stdout: u32 count, f32 pixels, ...
 // KEYS.json holds the tokenizer.* keys of a bundle as one JSON object. An input that is refused gives count 0 and a
 // line on stderr.
@@ -16,6 +16,7 @@
 
 #include "processor/image.h"
 #include "processor/letterbox.h"
+#include "processor/resize.h"
 #include "processor/tokenizer.h"
 
 namespace {
@@ -64,20 +65,28 @@ int tokenize(const char* path) {
   return 0;
 }
 
-int image(int width, int height, const std::string& how) {
+vla::Status fit(const vla::Frame& frame, int width, int height, const std::string& how, std::span<float> out) {
+  using Filter = vla::Resize::Filter;
+  if (how == "opencv") return vla::resize(frame, {width, height, Filter::opencv_bilinear}, out, "stdin");
+  if (how == "torch") return vla::resize(frame, {width, height, Filter::torch_bicubic_8bit}, out, "stdin");
   vla::Letterbox box;
   box.width = width;
   box.height = height;
   if (!how.empty()) box.align = vla::Letterbox::Align::center;
   box.antialias = how == "pillow";
+  const vla::Status status = vla::letterbox(frame, box, out, "stdin");
+  vla::affine(out, 2.0f, -1.0f);
+  return status;
+}
+
+int image(int width, int height, const std::string& how) {
   std::string file;
   while (read_item(file)) {
     auto frame = vla::decode_image(std::as_bytes(std::span(file)), "stdin", {});
     std::vector<float> pixels(static_cast<std::size_t>(3) * width * height);
-    vla::Status status = frame ? vla::letterbox(*frame, box, pixels, "stdin") : frame.error();
+    vla::Status status = frame ? fit(*frame, width, height, how, pixels) : frame.error();
     if (!status) std::fprintf(stderr, "%s\n", status.error().message().c_str());
     if (!status) pixels.clear();
-    vla::affine(pixels, 2.0f, -1.0f);
     write_items(pixels);
   }
   return 0;
@@ -89,6 +98,7 @@ int main(int argc, char** argv) {
   if (argc == 3 && std::strcmp(argv[1], "tokenize") == 0) return tokenize(argv[2]);
   if ((argc == 4 || argc == 5) && std::strcmp(argv[1], "image") == 0)
     return image(std::atoi(argv[2]), std::atoi(argv[3]), argc == 5 ? argv[4] : "");
-  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow]\n", stderr);
+  std::fputs("usage: reference_tool tokenize KEYS.json | image WIDTH HEIGHT [center | pillow | opencv | torch]\n",
+             stderr);
   return 2;
 }

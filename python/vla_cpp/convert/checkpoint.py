@@ -88,8 +88,7 @@ def _read_torch_file(folder: str) -> Dict[str, Entry]:
     if len(present) != 1:
         found, code = ("no such file", Code.IO) if not present else ("both", Code.BAD_BUNDLE)
         raise refuse(folder, "either " + " or ".join(TORCH_FILES), found, "give the folder of one training step", code)
-    entries = read_torch(os.path.join(folder, present[0]), TORCH_FILES[present[0]])
-    return {clean(name): entry for name, entry in entries.items()}
+    return read_torch(os.path.join(folder, present[0]), TORCH_FILES[present[0]])
 
 
 def _read_tensors(folder: str, layout: str, problems: Problems) -> Tuple[Dict[str, Entry], Dict[str, str]]:

@@ -14,8 +14,8 @@ from .conversion import Summary, convert_checkpoint
 from .errors import Code, ConvertError
 
 DESCRIPTION = """\
-Converts a Vision-Language-Action policy as LeRobot saves it into one self-contained GGUF bundle for the vla runtime:
-weights, tokenizer, image recipe, statistics, feature names. Architectures: {archs}.
+Converts a Vision-Language-Action policy, as LeRobot, openpi or the authors of Evo-1 save it, into one self-contained GGUF
+bundle for the vla runtime: weights, tokenizer, image recipe, statistics, feature names. Architectures: {archs}.
 It refuses what it does not fully understand and then lists everything at once."""
 
 EPILOG = """\
@@ -47,7 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add(
-        "checkpoint", metavar="CHECKPOINT", help="folder with config.json and model.safetensors, or a hub id owner/name"
+        "checkpoint", metavar="CHECKPOINT", help="folder with config.json and weights, or a hub id owner/name"
     )
     add("-o", "--out", metavar="OUT.gguf", required=True, help="the bundle to write; appears only when it is complete")
     add(

@@ -11,8 +11,26 @@ from typing import Tuple
 from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
-HUB_PATTERNS = ["*.json", "*.safetensors", "tokenizer/*", "vlm/*.json", "vlm/*.txt", "processor/*.json", "assets/*", "mp_rank_00_model_states.pt"]
-BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", "chat_template.*"]
+HUB_PATTERNS = [
+    "*.json",
+    "*.safetensors",
+    "mp_rank_00_model_states.pt",
+    "tokenizer/*",
+    "vlm/*.json",
+    "vlm/merges.txt",
+    "processor/*.json",
+    "assets/*",
+]
+BACKBONE_PATTERNS = [
+    "config.json",
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "vocab.json",
+    "merges.txt",
+    "added_tokens.json",
+    "preprocessor_config.json",
+    "chat_template.*",
+]
 
 
 def _no_constant(name: str):

@@ -57,10 +57,11 @@ def load(checkpoint, dtype="float32"):
         in_bfloat16(policy.towers)
 
     def predict_from(batch, noise):
-        draw, torch.rand = torch.rand, lambda *shape, **options: (noise.reshape(shape) + 1) / 2  # the head makes 2 * rand - 1 of it
+        draw = torch.rand
+        torch.rand = lambda *shape, **options: (noise.reshape(shape) + 1) / 2  # the head makes 2 * rand - 1 of it
         try:
             with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=published):
-                return predict(batch)
+                return predict(batch)[..., : policy.d_robot]
         finally:
             torch.rand = draw
 
@@ -168,5 +169,5 @@ class Recorder(golden.Taps):
         chunk = self.policy.predict_action_chunk(dict(batch), noise=noise)[0]
         if self.whole:
             self.put(f"step.{self.step}.x", chunk)
-        self.put("chunk", chunk[:, : self.policy.d_robot])
+        self.put("chunk", chunk)
         return self.taps

@@ -194,11 +194,11 @@ class _Reader:
         if config.get("normalize_observation_keys") is not None and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
-        widths = (self.context.dims[STATE], self.context.least.get(STATE))
-        if stated.get("shape") not in [[width] for width in widths] or stated.get("type") != "STATE":
+        width = self.context.dims[STATE]
+        if stated.get("shape") not in ([width], [self.context.least.get(STATE, width)]) or stated.get("type") != "STATE":
             self.problems.add(
                 "{}: features.{}".format(where, STATE),
-                "STATE of [{}] as in config.json".format(self.context.dims[STATE]),
+                "STATE of [{}] as in config.json".format(width),
                 str(stated)[:80],
             )
         self.result.state = self.normalization(where, config, step, STATE, "STATE")

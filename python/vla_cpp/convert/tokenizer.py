@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""tokenizer.json, or a SentencePiece model, as the keys of a bundle, after checking that it is a tokenizer that the runtime implements.
+"""tokenizer.json, or the older files that stand in its place, as the keys of a bundle, after checking that it is a tokenizer that the runtime implements.
 
 Two kinds are known, each with a module of its own: byte-level BPE and BPE with byte fallback. What they share stands in
 tokenizer_parts.py.
@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from typing import List, NamedTuple, Tuple
 
-from . import tokenizer_byte_fallback, tokenizer_byte_level, tokenizer_sentencepiece
+from . import tokenizer_byte_fallback, tokenizer_byte_level, tokenizer_sentencepiece, tokenizer_vocab_files
 from .bundle import Key
 from .errors import Code, Problems, refuse
 from .files import member, read_json
@@ -56,17 +56,20 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
 
 
 def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict, dict]:
-    """tokenizer.json, or what it would say where there is a SentencePiece model alone, and tokenizer_config.json."""
+    """tokenizer.json, or what it would say where there are older files alone, and tokenizer_config.json."""
     path, config_path = os.path.join(folder, JSON_FILE), os.path.join(folder, CONFIG_FILE)
     pieces = tokenizer_sentencepiece.find(folder)
     config = read_json(config_path) if os.path.exists(config_path) else {}
     if os.path.exists(path):
         return read_json(path), config
+    if tokenizer_vocab_files.present(folder):
+        notes.append("tokenizer: from vocab.json and merges.txt, as transformers makes {} of them".format(JSON_FILE))
+        return tokenizer_vocab_files.read_spec(folder, config, problems), config
     if pieces is None:
         raise refuse(
             path,
             "the tokenizer in one file",
-            "none, and no " + " or ".join(tokenizer_sentencepiece.FILES),
+            "none, no {}, and no vocab.json with merges.txt".format(" or ".join(tokenizer_sentencepiece.FILES)),
             "load it with transformers and save it again, or give its folder by --backbone",
             Code.IO,
         )

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Byte-level BPE: what SmolLM2 and the other descendants of GPT-2 publish.
+"""Byte-level BPE: what SmolLM2, Qwen2 and the other descendants of GPT-2 publish.
 
-Which pre-tokenizer counts follows the class that transformers 5.4 to 5.5 builds for `tokenizer_class`: the generic classes keep
-tokenizer.json as it is, GPT2Tokenizer and Qwen2Tokenizer take vocabulary and merges from it and bring the rest themselves.
+Which pre-tokenizer and normalizer count follows the class that transformers 5.4 to 5.5 builds for `tokenizer_class`: the generic
+classes keep tokenizer.json as it is, GPT2Tokenizer and Qwen2Tokenizer take vocabulary and merges from it and bring their own.
 """
 
 from __future__ import annotations
 
-from typing import List, Tuple
+from typing import List, NamedTuple, Optional
 
 from .bundle import Key
 from .errors import Problems
@@ -29,10 +29,16 @@ from .tokenizer_parts import (
 KIND = "byte_level_bpe"
 GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
 QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
+# The splitting expression of Qwen2, as src/processor/pretokenizer.h has it.
 QWEN2_WORDS = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 )
-NFC = {"type": "NFC"}
+SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_WORDS}, "behavior": "Isolated", "invert": False}
+# What a class names where its config is silent.
+DEFAULTS = {
+    **dict.fromkeys(GPT2, ("unk_token", "bos_token", "eos_token")),
+    **dict.fromkeys(QWEN2, ("unk_token", "eos_token", "pad_token")),
+}
 MODEL = {
     "type": ("BPE",),
     "dropout": (None, 0, 0.0),
@@ -51,50 +57,61 @@ def byte_symbols() -> List[str]:
 
 def with_defaults(config: dict) -> dict:
     """The class's own defaults, which it adds to the vocabulary like stated ones."""
-    own = {GPT2: ("unk_token", "bos_token", "eos_token"), QWEN2: ("unk_token", "eos_token", "pad_token")}
-    for names, keys in own.items():
-        if config.get("tokenizer_class") in names:
-            return dict(dict.fromkeys(keys, "<|endoftext|>"), **config)
-    return config
+    names = DEFAULTS.get(str(config.get("tokenizer_class")), ())
+    return dict(dict.fromkeys(names, "<|endoftext|>"), **config)
+
+
+class _Splitting(NamedTuple):
+    pre: List[dict]  # the steps of `tokenizer.pre`
+    normalization: Optional[str]
 
 
 def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key]:
     check_model(tokenizer.model, MODEL, "byte-level BPE and BPE with byte fallback", problems)
     check_symbols(tokenizer.model, byte_symbols(), problems)
     _check_surroundings(tokenizer, problems)
-    pre, config = _pre_tokenizer(tokenizer.spec.get("pre_tokenizer"), problems), tokenizer.config
-    nfc, name = _normalization(tokenizer.spec.get("normalizer"), problems), config.get("tokenizer_class")
-    if name in GPT2 or name in QWEN2:
-        own = _of_class(name in QWEN2, bool(config.get("add_prefix_space") or False))
-        if (pre, nfc) != own:
-            notes.append(
-                "{} names {}: transformers 5 then replaces normalizer and pre-tokenizer of {} by the class's own, and so does the bundle".format(
-                    CONFIG_FILE, name, JSON_FILE
-                )
+    spec, config = tokenizer.spec, tokenizer.config
+    splitting = _Splitting(
+        _pre_tokenizer(spec.get("pre_tokenizer"), problems), _normalization(spec.get("normalizer"), problems)
+    )
+    own = _of_class(config)
+    if own is not None and own != splitting:
+        notes.append(
+            "{} names {}: transformers 5 then splits text as that class does and not as {} says, and so does the bundle".format(
+                CONFIG_FILE, config["tokenizer_class"], JSON_FILE
             )
-        pre, nfc = own
-    else:
-        own = None
+        )
+    splitting = own or splitting
+    normalization = (
+        [Key("tokenizer.normalization", "string", splitting.normalization)] if splitting.normalization else []
+    )
     return [
-        Key("tokenizer.pre", "string", to_json(pre)),
-        *([Key("tokenizer.normalization", "string", "nfc")] if nfc else []),
+        Key("tokenizer.pre", "string", to_json(splitting.pre)),
+        *normalization,
         Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and own is None),
     ]
 
 
-def _of_class(qwen2: bool, prefix_space: bool) -> Tuple[List[dict], bool]:
-    """The steps that a class brings, and whether it composes characters."""
-    split = [{"type": "split", "pattern": QWEN2_WORDS}] if qwen2 else []
-    return [*split, {"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": not qwen2}], qwen2
+def _of_class(config: dict) -> Optional[_Splitting]:
+    name, prefix_space = config.get("tokenizer_class"), bool(config.get("add_prefix_space") or False)
+    if name in GPT2:
+        return _Splitting([_byte_level(prefix_space, True)], None)
+    if name in QWEN2:
+        return _Splitting([{"type": "split", "pattern": QWEN2_WORDS}, _byte_level(prefix_space, False)], "nfc")
+    return None
 
 
-def _normalization(normalizer, problems: Problems) -> bool:
-    """Whether text is composed to NFC; other normalizers are refused."""
+def _byte_level(prefix_space: bool, use_regex: bool) -> dict:
+    return {"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": use_regex}
+
+
+def _normalization(normalizer, problems: Problems) -> Optional[str]:
     steps = one_or_sequence(normalizer, "normalizers")
-    if any(step != NFC for step in steps):
-        hint = "the runtime knows no other normalization"
-        problems.unsupported(JSON_FILE + ": normalizer", "none or NFC", to_json(normalizer)[:80], hint)
-    return bool(steps)
+    if steps not in ([], [{"type": "NFC"}]):
+        problems.unsupported(
+            JSON_FILE + ": normalizer", "none or NFC", to_json(normalizer)[:80], "the runtime implements these two"
+        )
+    return "nfc" if steps else None
 
 
 def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
@@ -132,22 +149,16 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
         kind = part.get("type") if isinstance(part, dict) else None
         if kind == "Digits" and set(part) <= {"type", "individual_digits"}:
             steps.append({"type": "digits", "individual": bool(part.get("individual_digits", False))})
-        elif part == {"type": "Split", "pattern": {"Regex": QWEN2_WORDS}, "behavior": "Isolated", "invert": False}:
-            steps.append({"type": "split", "pattern": QWEN2_WORDS})
         elif kind == "ByteLevel" and set(part) <= {"type", "add_prefix_space", "trim_offsets", "use_regex"}:
-            steps.append(
-                {
-                    "type": "byte_level",
-                    "add_prefix_space": bool(part.get("add_prefix_space", True)),
-                    "use_regex": bool(part.get("use_regex", True)),
-                }
-            )
+            steps.append(_byte_level(bool(part.get("add_prefix_space", True)), bool(part.get("use_regex", True))))
+        elif part == SPLIT:
+            steps.append({"type": "split", "pattern": QWEN2_WORDS})
         else:
             problems.unsupported(
                 JSON_FILE + ": pre_tokenizer",
-                "Digits, ByteLevel and the Split of Qwen2",
+                "Digits, the Split of Qwen2 and ByteLevel",
                 to_json(part)[:80],
-                "the runtime implements these",
+                "the runtime implements these three",
             )
             return []
     if [step["type"] for step in steps].count("byte_level") != 1 or steps[-1]["type"] != "byte_level":

@@ -33,8 +33,8 @@ class Qwen {
  public:
   explicit Qwen(const Scope& s);
 
-  /// tokens [n] i32 -> [d_model, n].
-  Tensor embed(Graph& g, Tensor tokens) const { return token_embd_(g, tokens); }
+  /// tokens [n] i32 -> [d_model, n]. A prompt is embedded piece by piece, so the pieces are no taps.
+  Tensor embed(Graph& g, Tensor tokens) const { return token_embd_.forward(g, tokens); }
   /// x [d_model, n] of tokens at `positions`, mask [n, n] -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
   /// Features of tokens whose attention is cut out of every layer: [d_model, n] -> the same shape.

@@ -28,9 +28,18 @@ from ._evo1_source import Source, image_ops, pad_op
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server
 EPS = 1e-8
-MAX_SLOTS = 64
+MAX_SLOTS = 32
 DIMS_FILE, DIMS = "dims.json", {"language_layers": 14, "prompt_tokens": 1024}  # literals of the embedder
 DOCS = "docs/converting.md, Evo-1"
+MEANINGS = {
+    "--variant": "the authors' code before 9 April 2026 takes other steps, times, pixels and paddings than the code since, and a policy"
+    " is served by the one that it was made for: go by the date of the upload, or by what config.json holds",
+    "--stats": "the robot and the data set whose numbers the policy sees; the authors' server gets both names from its client",
+    "--view-slots": "the prompt has a slot for every picture of a request, black ones too, and the authors' server takes exactly 3",
+    "--views": "names of the cameras in the order in which the client sends their pictures; slots behind them stay masked",
+    "--dead-rows": "the action head reads masked rows too, and flash-attention leaves zeros in them where other attention does not:"
+    " zero_attention where flash-attn was installed, as the authors ask for, causal_attention where it was not",
+}
 
 
 class Revision(NamedTuple):
@@ -98,6 +107,8 @@ def read_authors(checkpoint: Checkpoint, options: Options, problems: Problems) -
     action, _ = _normalization(recipe.ACTION, "unnormalize", kind, stats, checkpoint, problems)
     sizes.state_dim, sizes.action_dim = _width(state.statistics), _width(action.statistics)
     sizes.d_robot = sizes.action_dim
+    if options.variant == "r2" and "action_dim" in policy.values:
+        checkpoint.notes.append("config.json has action_dim, which the code of r1 writes and that of r2 does not: is it --variant r1?")
     checkpoint.notes.append("the robot's {} action columns are those that {} has numbers for".format(sizes.d_robot, NORM_STATS))
     return Source(
         sizes=sizes,
@@ -112,25 +123,20 @@ def read_authors(checkpoint: Checkpoint, options: Options, problems: Problems) -
     )
 
 
-def _check_answers(options: Options, problems: Problems) -> None:
-    def ask(flag: str, expected: str, found, meaning: str) -> None:
-        problems.add(flag, expected, found or "none", "{} ({})".format(meaning, DOCS), Code.USAGE)
+def _ask(problems: Problems, flag: str, expected: str, found: str) -> None:
+    problems.add(flag, expected, found or "none", "{} ({})".format(MEANINGS[flag], DOCS), Code.USAGE)
 
+
+def _check_answers(options: Options, problems: Problems) -> None:
     if options.variant not in REVISIONS:
-        meaning = "the authors' code before 9 April 2026 takes other steps, times, pixels and paddings than the code since, and a policy \
-is served by the one that it was trained for: go by the date of the upload, or by what config.json holds"
-        ask("--variant", "r1 or r2, a revision of the authors' code", options.variant, meaning)
-    n_slot, views = options.view_slots, options.views
+        _ask(problems, "--variant", "r1 or r2, a revision of the authors' code", options.variant)
+    n_slot, views = options.view_slots, [_view_name(name) for name in options.views]
     if not 1 <= n_slot <= MAX_SLOTS:
-        meaning = "the prompt has a slot for every picture that a request carries, black ones too, and the authors' server takes exactly 3"
-        ask("--view-slots", "a count from 1 to {}".format(MAX_SLOTS), str(n_slot or ""), meaning)
-    if not views or len(set(views)) != len(views) or not all(views) or (n_slot and len(views) > n_slot):
-        meaning = "names of the cameras in the order in which the client sends their pictures; slots behind them stay masked"
-        ask("--views", "different names, no more than there are slots", ",".join(views), meaning)
+        _ask(problems, "--view-slots", "a count from 1 to {}".format(MAX_SLOTS), str(n_slot or ""))
+    if not views or len(set(views)) != len(views) or "" in options.views or (n_slot and len(views) > n_slot):
+        _ask(problems, "--views", "different names, no more than there are slots", ",".join(options.views))
     if options.dead_rows not in ("zero_attention", "causal_attention"):
-        meaning = "the action head reads masked rows too, and flash-attention leaves zeros in them where other attention does not: \
-zero_attention where flash-attn was installed, as the authors ask for, causal_attention where it was not"
-        ask("--dead-rows", "zero_attention or causal_attention", options.dead_rows, meaning)
+        _ask(problems, "--dead-rows", "zero_attention or causal_attention", options.dead_rows)
 
 
 def _find_statistics(checkpoint: Checkpoint, options: Options, problems: Problems) -> dict:
@@ -146,9 +152,7 @@ def _find_statistics(checkpoint: Checkpoint, options: Options, problems: Problem
         return entries[options.stats]
     if len(entries) == 1 and not options.stats:
         return next(iter(entries.values()))
-    meaning = "the robot and the data set whose numbers the policy sees; the server of the authors gets both names from its client"
-    expected = "one of the entries of {}: {}".format(NORM_STATS, ", ".join(entries) or "there is none")
-    problems.add("--stats", expected, options.stats or "none", "{} ({})".format(meaning, DOCS), Code.USAGE)
+    _ask(problems, "--stats", "one of the entries of {}: {}".format(NORM_STATS, ", ".join(entries) or "none"), options.stats)
     return {}
 
 
@@ -249,7 +253,8 @@ def _features(checkpoint: Checkpoint, options: Options, s: Sizes, problems: Prob
     return [
         Key("observation.views", "string[]", views),
         Key("observation.view_aliases", "string[]", [""] * len(views)),
-        Key("observation.view_optional", "u32[]", [1] * len(views)),
+        # The server gets an image for every slot, and the client says which of them are none: nothing is absent by silence.
+        Key("observation.view_optional", "u32[]", [0] * len(views)),
         Key("observation.min_views", "u32", 1),
         Key("observation.states", "string[]", [recipe.STATE]),
         Key("observation.state_dims", "u32[]", [s.state_dim]),

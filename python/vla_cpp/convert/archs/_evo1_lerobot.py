@@ -139,7 +139,7 @@ def _sizes(policy: Section) -> Sizes:
         d_state=policy.count("max_state_dim"),
         d_action=policy.count("max_action_dim"),
         horizon=policy.count("chunk_size"),
-        n_slot=policy.count("max_views", most=64),
+        n_slot=policy.count("max_views", most=32),
         n_step=policy.count("num_inference_timesteps"),
         time_scale=999.0,
         dead_rows="unseen",

@@ -12,7 +12,8 @@ from ._rows import gated_block, linear, norm, vector
 
 
 class Names(NamedTuple):
-    """Modules of a tower by what they are. `qkv`: one name where q, k and v are stacked, else three."""
+    """Modules of a tower by what they are. `qkv`: one name where q, k and v are stacked, which ends before "weight" and "bias",
+    else three."""
 
     vision: str
     class_token: str
@@ -35,7 +36,7 @@ AUTHORS = Names(
     patch="embeddings.patch_embedding",
     block="encoder.layers.{}.",
     norms=("norm1", "norm2"),
-    qkv=("attn.qkv",),
+    qkv=("attn.qkv.",),
     out="attn.proj",
     scales=("ls1", "ls2"),
     connector=tuple("embedder.model.mlp1." + part for part in "013"),
@@ -62,21 +63,21 @@ def weights(s: Sizes, names: Names) -> List[Weight]:
     return [*_vision(s, names), *_connector(s, names), *_language(s, names), *_head(s, names.head)]
 
 
-def _stacked(target: str, sources: Sequence[str], d: int) -> List[Weight]:
-    """q, k and v of width d with biases: from three sources, or as thirds of the rows of one, whose weight and bias are named."""
+def _stacked(target: str, source: str, d: int) -> List[Weight]:
+    """q, k and v of width d as thirds of the rows of one matrix and one bias. `source`: their name up to "weight" and "bias"."""
     rows: List[Weight] = []
     for i, part in enumerate(("attn_q", "attn_k", "attn_v")):
-        pair = linear(target + part, sources[i], d, d, bias=True) if len(sources) == 3 else _third(target + part, sources[0], d, i)
-        rows += pair
+        rows += [
+            Weight(target + part + ".weight", source + "weight", MATRIX, (3 * d, d), (d, d), first=i * d),
+            Weight(target + part + ".bias", source + "bias", VECTOR, (3 * d,), (d,), first=i * d),
+        ]
     return rows
 
 
-def _third(target: str, source: str, d: int, i: int) -> List[Weight]:
-    weight, bias = (source + ".weight", source + ".bias") if not source.endswith("_") else (source + "weight", source + "bias")
-    return [
-        Weight(target + ".weight", weight, MATRIX, (3 * d, d), (d, d), first=i * d),
-        Weight(target + ".bias", bias, VECTOR, (3 * d,), (d,), first=i * d),
-    ]
+def _qkv(target: str, block: str, names: Sequence[str], d: int) -> List[Weight]:
+    if len(names) == 1:
+        return _stacked(target, block + names[0], d)
+    return [row for part, name in zip("qkv", names) for row in linear(target + "attn_" + part, block + name, d, d, bias=True)]
 
 
 def _vision(s: Sizes, names: Names) -> List[Weight]:
@@ -92,7 +93,7 @@ def _vision(s: Sizes, names: Names) -> List[Weight]:
     for i in range(s.n_vision_layer):
         target, block = "vision.blk.{}.".format(i), names.vision + names.block.format(i)
         rows += norm(target + "attn_norm", block + names.norms[0], d)
-        rows += _stacked(target, [block + name for name in names.qkv], d)
+        rows += _qkv(target, block, names.qkv, d)
         rows += linear(target + "attn_out", block + names.out, d, d, bias=True)
         rows += vector(target + "attn_scale.weight", block + names.scales[0], d)
         rows += norm(target + "ffn_norm", block + names.norms[1], d)
@@ -143,7 +144,7 @@ def _head(s: Sizes, head: str) -> List[Weight]:
     for i in range(s.n_head_layer):
         target, block = "head.blk.{}.".format(i), "{}transformer_blocks.{}.".format(head, i)
         rows += norm(target + "attn_norm", block + "norm1", d)
-        rows += _stacked(target, [block + "attn.in_proj_"], d)
+        rows += _stacked(target, block + "attn.in_proj_", d)
         rows += linear(target + "attn_out", block + "attn.out_proj", d, d, bias=True)
         rows += norm(target + "ffn_norm", block + "norm2", d)
         rows += linear(target + "ffn_up", block + "ff.0", 4 * d, d, bias=True)

@@ -146,7 +146,7 @@ def read_chat_backbone(config: dict, s: Sizes, problems: Problems) -> None:
     check_fixed(chat, CHAT_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B")
     vision = Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), CHAT_VISION, problems)
     check_fixed(vision, CHAT_VISION_FIXED)
-    text = Section(WHERE + ": llm_config", member(config, "llm_config", dict, WHERE), TEXT, problems)
+    text = _text_section(config, "llm_config", problems)
     if text.get("architectures") != ["Qwen2ForCausalLM"]:
         text.bad("architectures", "['Qwen2ForCausalLM']", unsupported=True)
     s.image_size, s.patch_size = vision.count("image_size"), vision.count("patch_size")
@@ -164,9 +164,14 @@ def read_hf_backbone(config: dict, s: Sizes, problems: Problems) -> None:
     check_fixed(vision, HF_VISION_FIXED)
     s.image_size, s.patch_size = _side(vision, "image_size"), _side(vision, "patch_size")
     _read_vision(vision, s)
-    _read_text(Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems), s)
+    _read_text(_text_section(config, "text_config", problems), s)
     if s.patch_size and whole.count("image_seq_length") != s.n_view_token:
         whole.bad("image_seq_length", "{}, the tokens of a view".format(s.n_view_token))
+
+
+def _text_section(config: dict, key: str, problems: Problems) -> Section:
+    where = "{}: {}".format(WHERE, key)
+    return Section(where, member(config, key, dict, WHERE), TEXT, problems, ("num_key_value_heads",))
 
 
 def _side(section: Section, key: str) -> int:
@@ -191,8 +196,8 @@ def _read_text(text: Section, s: Sizes) -> None:
     check_fixed(text, TEXT_FIXED)
     s.d_model, s.d_ff, s.n_vocab = text.count("hidden_size"), text.count("intermediate_size"), text.count("vocab_size")
     s.n_head = text.count("num_attention_heads")
-    text.nullable = ("num_key_value_heads",)
-    text.defaults["num_key_value_heads"] = s.n_head if text.values.get("num_key_value_heads", 0) is None else 32
+    if "num_key_value_heads" in text.values:
+        text.defaults["num_key_value_heads"] = s.n_head  # what null means
     s.n_head_kv, s.lm_eps = text.count("num_key_value_heads"), text.number("rms_norm_eps")
     s.n_backbone_layer, s.d_head = text.count("num_hidden_layers", most=MAX_LAYERS), s.d_model // s.n_head
     if s.d_model % s.n_head or s.n_head % s.n_head_kv or s.d_head % 2:

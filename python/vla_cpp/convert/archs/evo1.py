@@ -16,6 +16,7 @@ from ..checkpoint import EVO1, Checkpoint
 from ..errors import Problems
 from ..files import read_json
 from ..tokenizer import TokenizerPlan, read_tokenizer
+from ..tokenizer_byte_level import with_defaults
 from . import Options, Plan
 from ._evo1_authors import read_authors
 from ._evo1_lerobot import read_lerobot
@@ -31,6 +32,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     problems.raise_any()
     sizes = source.sizes
     tokenizer = read_tokenizer(source.tokenizer, sizes.n_vocab, problems, checkpoint.notes)
+    problems.raise_any()  # a prompt takes a sound tokenizer
     prompt = _prompt(source, tokenizer, problems)
     document = {
         "image": source.image,
@@ -58,15 +60,19 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 
 
 def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Prompt:
-    """The slots in the prompt, after checking that the tokenizer puts pads and cuts behind them."""
+    """The slots in the prompt, after checking that the tokenizer cuts, and where there are pads fills, behind them. LeRobot fills up
+    to the longest prompt of a batch, which for one is none."""
     s, where = source.sizes, "tokenizer_config.json"
-    config = read_json(os.path.join(source.tokenizer, where))
-    for key, found in (("truncation_side", tokenizer.truncate), ("padding_side", config.get("padding_side", "right"))):
+    config = with_defaults(read_json(os.path.join(source.tokenizer, where)))
+    sides = {"truncation_side": tokenizer.truncate}
+    if s.dead_rows != "unseen":
+        sides["padding_side"] = config.get("padding_side", "right")
+    for key, found in sides.items():
         if found != "right":
             problems.unsupported("{}: {}".format(where, key), "'right'", repr(found), "the views stand in front")
     pad = config.get("pad_token")
     pad = pad.get("content") if isinstance(pad, dict) else pad
-    prompt = read_prompt(tokenizer, pad, s.n_slot, s.n_view_token, problems)
+    prompt = read_prompt(tokenizer, str(pad), s.n_slot, s.n_view_token, problems)
     if source.image_token not in (None, prompt.image_token):
         problems.add("backbone config.json: image_token_id", "{}, the tokenizer's".format(prompt.image_token), str(source.image_token))
     if prompt.view_starts[-1] + s.n_view_token > s.n_token:

@@ -1,0 +1,30 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+namespace vla {
+
+/// byte / 255 of every byte.
+inline const std::array<float, 256>& byte_table() {
+  static const std::array<float, 256> table = [] {
+    std::array<float, 256> values{};
+    for (std::size_t i = 0; i < values.size(); ++i) values[i] = static_cast<float>(i) / 255.0f;
+    return values;
+  }();
+  return table;
+}
+
+/// 255 x of pixels in [0, 1], without rounding. A byte that was divided by 255 comes back.
+inline std::vector<std::uint8_t> cut_to_bytes(std::span<const float> pixels) {
+  std::vector<std::uint8_t> bytes;
+  bytes.reserve(pixels.size());
+  for (const float value : pixels) bytes.push_back(static_cast<std::uint8_t>(255.0f * value));
+  return bytes;
+}
+
+}  // namespace vla

@@ -1,0 +1,155 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The ops on what a robot sees and is told.
+#include <algorithm>
+
+#include "base/bf16.h"
+#include "processor/recipe_ops.h"
+#include "processor/text.h"
+
+namespace vla::recipe_ops {
+namespace {
+
+Result<Letterbox> parse_letterbox(JsonFields& fields) {
+  Letterbox op;
+  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
+  VLA_CHECK(fields.choice("filter", {"bilinear"}));
+  VLA_TRY(op.antialias, fields.boolean("antialias"));
+  VLA_TRY(const int align, fields.choice("align", {"bottom_right", "center"}));
+  op.align = static_cast<Letterbox::Align>(align);
+  VLA_TRY(op.fill, fields.number("fill"));
+  return op;
+}
+
+Result<Resize> parse_resize(JsonFields& fields) {
+  constexpr int kMinSide = 2;  // torch reads the wrong rows for a picture of one column
+  Resize op;
+  VLA_TRY(op.width, fields.integer("width", kMinSide, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", kMinSide, kMaxImageSide));
+  VLA_TRY(const int filter, fields.choice("filter", {"opencv_bilinear", "torch_bicubic_8bit"}));
+  op.filter = static_cast<Resize::Filter>(filter);
+  return op;
+}
+
+Result<AffineOp> parse_affine(JsonFields& fields) {
+  AffineOp op;
+  VLA_TRY(op.scale, fields.number("scale"));
+  VLA_TRY(op.shift, fields.number("shift"));
+  return op;
+}
+
+Result<Standardize> parse_standardize(JsonFields& fields) {
+  Standardize op;
+  VLA_TRY(const std::vector<float> mean, fields.numbers("mean", op.mean.size()));
+  VLA_TRY(const std::vector<float> std, fields.numbers("std", op.std.size()));
+  VLA_TRY(const int arithmetic, fields.choice("arithmetic", {"float32", "bfloat16", "float32_then_bfloat16"}));
+  op.arithmetic = static_cast<Standardize::Arithmetic>(arithmetic);
+  std::copy(mean.begin(), mean.end(), op.mean.begin());
+  std::copy(std.begin(), std.end(), op.std.begin());
+  for (const float divisor : std)
+    if (!(to_bf16(divisor) > 0.0f)) return fields.wrong("std", "numbers above 0, also in bfloat16");
+  return op;
+}
+
+Status parse_fit(JsonFields& fields, bool resize, Recipe& recipe) {
+  if (resize) {
+    VLA_TRY(const Resize op, parse_resize(fields));
+    recipe.fit = op;
+    recipe.width = op.width;
+    recipe.height = op.height;
+    return {};
+  }
+  VLA_TRY(const Letterbox op, parse_letterbox(fields));
+  recipe.fit = op;
+  recipe.width = op.width;
+  recipe.height = op.height;
+  return {};
+}
+
+Status parse_tokenize(JsonFields& fields, Recipe& recipe) {
+  VLA_TRY(recipe.max_tokens, fields.integer("max_tokens", 1, kMaxVector));
+  VLA_TRY(const int truncate, fields.choice("truncate", {"right", "left"}));
+  recipe.keep_last = truncate == 1;
+  return {};
+}
+
+Result<TextOp> parse_template(JsonFields& fields) {
+  TemplateOp op;
+  VLA_TRY(op.text, fields.string("text"));
+  if (!is_template(op.text))
+    return fields.wrong("text", "text with {instruction} once, {state} once at most and no other braces");
+  return TextOp(std::move(op));
+}
+
+Result<TextOp> parse_replace(JsonFields& fields) {
+  ReplaceOp op;
+  VLA_TRY(op.from, fields.string("from"));
+  VLA_TRY(op.to, fields.string("to"));
+  if (op.from.empty()) return fields.wrong("from", "text to look for");
+  return TextOp(std::move(op));
+}
+
+Result<TextOp> parse_ensure_suffix(JsonFields& fields) {
+  EnsureSuffixOp op;
+  VLA_TRY(op.suffix, fields.string("suffix"));
+  return TextOp(std::move(op));
+}
+
+Result<TextOp> parse_views(JsonFields& fields) {
+  ViewsOp op;
+  VLA_TRY(op.count, fields.integer("count", 1, kMaxViews));
+  VLA_TRY(op.open, fields.string("open"));
+  VLA_TRY(op.token, fields.string("token"));
+  VLA_TRY(op.repeat, fields.integer("repeat", 1, kMaxVector));
+  VLA_TRY(op.close, fields.string("close"));
+  if (op.token.empty()) return fields.wrong("token", "the text of a token");
+  if (!is_numbered(op.open)) return fields.wrong("open", "text with {i} once and no other braces");
+  const std::size_t longest = kMaxViewsText / static_cast<std::size_t>(op.count);
+  if (op.open.size() > longest || op.close.size() > longest ||
+      op.token.size() > longest / static_cast<std::size_t>(op.repeat))
+    return fields.wrong("repeat", "less than a mebibyte of text");
+  return TextOp(std::move(op));
+}
+
+}  // namespace
+
+Status parse_image_op(JsonFields& fields, int index, Recipe& recipe) {
+  VLA_TRY(const int op, fields.choice("op", {"letterbox", "resize", "affine", "clip", "standardize"}));
+  if (op < 2)
+    return index == 0 ? parse_fit(fields, op == 1, recipe) : misplaced(fields, "one letterbox or resize, first");
+  if (index == 0) return misplaced(fields, "a letterbox or a resize first");
+  ImageOp image;
+  if (op == 2) {
+    VLA_TRY(image, parse_affine(fields));
+  } else if (op == 3) {
+    VLA_TRY(image, parse_clip(fields));
+  } else {
+    VLA_TRY(image, parse_standardize(fields));
+  }
+  recipe.image.push_back(image);
+  return {};
+}
+
+Status parse_text_op(JsonFields& fields, int, Recipe& recipe) {
+  VLA_TRY(const int op, fields.choice("op", {"strip", "replace", "ensure_suffix", "template", "views", "tokenize"}));
+  if (recipe.max_tokens > 0) return misplaced(fields, "nothing after tokenize");
+  if (op == 5) return parse_tokenize(fields, recipe);
+  if (!recipe.text.empty() && std::holds_alternative<ViewsOp>(recipe.text.back()))
+    return misplaced(fields, "tokenize after views");
+  TextOp text = StripOp{};
+  if (op == 1) {
+    VLA_TRY(text, parse_replace(fields));
+  } else if (op == 2) {
+    VLA_TRY(text, parse_ensure_suffix(fields));
+  } else if (op == 3) {
+    VLA_TRY(text, parse_template(fields));
+  } else if (op == 4) {
+    VLA_TRY(text, parse_views(fields));
+  }
+  recipe.text.push_back(std::move(text));
+  return {};
+}
+
+}  // namespace vla::recipe_ops

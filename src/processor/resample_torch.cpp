@@ -1,0 +1,145 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <cmath>
+#include <iterator>
+
+#include "processor/resample.h"
+
+namespace vla {
+namespace {
+
+/// Keys' cubic with a = -0.5, as the compiler fuses it there.
+float cubic(float distance) {
+  const float x = std::abs(distance);
+  if (x < 1.0f) return std::fma(std::fma(1.5f, x, -2.5f) * x, x, 1.0f);
+  if (x < 2.0f) return std::fma(std::fma(x - 5.0f, x, 8.0f), x, -4.0f) * -0.5f;
+  return 0.0f;
+}
+
+/// The source positions that one output position sums, and their weights.
+struct Window {
+  int first;
+  std::vector<float> weights;
+};
+
+/// float and double are mixed as the reference mixes them.
+std::vector<Window> make_windows(int n_in, int n_out) {
+  const float scale = static_cast<float>(n_in) / static_cast<float>(n_out);
+  const double wide_scale = static_cast<double>(scale);
+  const float support = scale >= 1.0f ? static_cast<float>(2.0 * wide_scale) : 2.0f;
+  const float inverse = scale >= 1.0f ? static_cast<float>(1.0 / wide_scale) : 1.0f;
+  const int longest = static_cast<int>(std::ceil(support)) * 2 + 1;
+  std::vector<Window> windows;
+  windows.reserve(static_cast<std::size_t>(n_out));
+  for (int i = 0; i < n_out; ++i) {
+    const auto center = static_cast<float>(wide_scale * (i + 0.5));
+    const int first = std::max(static_cast<int>(static_cast<double>(center - support) + 0.5), 0);
+    const int end = std::min(static_cast<int>(static_cast<double>(center + support) + 0.5), n_in);
+    Window window{first, {}};
+    float sum = 0.0f;
+    for (int x = first; x < std::min(end, first + longest); ++x) {
+      const double distance = static_cast<double>(static_cast<float>(x) - center) + 0.5;
+      window.weights.push_back(cubic(static_cast<float>(distance * static_cast<double>(inverse))));
+      sum += window.weights.back();
+    }
+    for (float& weight : window.weights) weight = sum != 0.0f ? weight / sum : weight;
+    windows.push_back(std::move(window));
+  }
+  return windows;
+}
+
+/// `x * weight` added to each number of a row.
+inline __attribute__((always_inline)) void add_row(std::span<const float> x, float weight, bool fused, float* sums) {
+  if (fused) {
+    for (std::size_t k = 0; k < x.size(); ++k) sums[k] = std::fma(x[k], weight, sums[k]);
+    return;
+  }
+  for (std::size_t k = 0; k < x.size(); ++k) {
+    const float product = x[k] * weight;
+    sums[k] += product;
+  }
+}
+
+/// One row out of several. Behind the first product the reference's compiler multiplies four at once and adds them one
+/// by one; the products that are left are fused.
+inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in, const Window& window,
+                                                       std::span<float> out) {
+  const std::size_t n_plain = (window.weights.size() - 1) / 4 * 4;
+  std::fill(out.begin(), out.end(), 0.0f);
+  for (std::size_t j = 0; j < window.weights.size(); ++j) {
+    const std::size_t row = static_cast<std::size_t>(window.first) + j;
+    add_row(in.subspan(row * out.size(), out.size()), window.weights[j], j > n_plain, out.data());
+  }
+}
+
+// As for the letterbox: without the instruction std::fma is a slow but equal library function.
+#if defined(__x86_64__)
+__attribute__((target("fma"))) void sum_of_rows_fused(std::span<const float> in, const Window& window,
+                                                      std::span<float> out) {
+  sum_of_rows(in, window, out);
+}
+#endif
+
+void sum_rows(std::span<const float> in, const Window& window, std::span<float> out) {
+#if defined(__x86_64__)
+  if (__builtin_cpu_supports("fma")) return sum_of_rows_fused(in, window, out);
+#endif
+  sum_of_rows(in, window, out);
+}
+
+/// Rows and columns of pixels exchanged.
+template <class T>
+void turn(std::span<const T> rgb, std::size_t width, float* out) {
+  const std::size_t height = rgb.size() / 3 / width;
+  for (std::size_t y = 0; y < height; ++y)
+    for (std::size_t x = 0; x < width; ++x)
+      for (std::size_t c = 0; c < 3; ++c)
+        out[(x * height + y) * 3 + c] = static_cast<float>(rgb[(y * width + x) * 3 + c]);
+}
+
+/// The picture at its new width. A band of rows is turned, so that one loop over whole rows serves columns as well; it
+/// is a narrow one that stays in the cache.
+std::vector<float> widened(std::span<const std::uint8_t> rgb, std::size_t width, std::size_t to_width) {
+  constexpr std::size_t kBand = 16;
+  const std::vector<Window> windows = make_windows(static_cast<int>(width), static_cast<int>(to_width));
+  const std::size_t height = rgb.size() / 3 / width;
+  std::vector<float> out(to_width * height * 3), columns(width * kBand * 3), sums(to_width * kBand * 3);
+  for (std::size_t top = 0; top < height; top += kBand) {
+    const std::size_t size = 3 * std::min(kBand, height - top);  // of a column of the band
+    const std::span<float> column_in(columns.data(), size * width), column_out(sums.data(), size * to_width);
+    turn(rgb.subspan(3 * top * width, size * width), width, column_in.data());
+    for (std::size_t x = 0; x < to_width; ++x) sum_rows(column_in, windows[x], column_out.subspan(x * size, size));
+    turn(std::span<const float>(column_out), size / 3, out.data() + 3 * top * to_width);
+  }
+  return out;
+}
+
+/// Half to even: in [0, 255] a sum with 2^23 leaves no digit behind the point. The library's function is a slow call.
+std::uint8_t rounded(float x) {
+  constexpr float kNoFraction = 0x1p23f;
+  return static_cast<std::uint8_t>(std::clamp(x, 0.0f, 255.0f) + kNoFraction - kNoFraction);
+}
+
+}  // namespace
+
+std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                         int to_height) {
+  std::vector<float> pixels(rgb.begin(), to_width == width ? rgb.end() : rgb.begin());
+  if (to_width != width) pixels = widened(rgb, static_cast<std::size_t>(width), static_cast<std::size_t>(to_width));
+  const std::size_t row_size = static_cast<std::size_t>(to_width) * 3;
+  std::vector<std::uint8_t> out;
+  out.reserve(row_size * static_cast<std::size_t>(to_height));
+  if (to_height == height) {
+    std::transform(pixels.begin(), pixels.end(), std::back_inserter(out), rounded);
+    return out;
+  }
+  std::vector<float> row(row_size);
+  for (const Window& window : make_windows(height, to_height)) {
+    sum_rows(pixels, window, row);
+    std::transform(row.begin(), row.end(), std::back_inserter(out), rounded);
+  }
+  return out;
+}
+
+}  // namespace vla

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The mapping of Evo-1 at the published size: against the published inventory, and against what the runtime declares."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+
+from manifest_test import vla
+from vla_cpp.convert.archs import _evo1_names, evo1
+from vla_cpp.convert.archs._evo1_sizes import Sizes, read_chat_backbone, read_hf_backbone
+from vla_cpp.convert.errors import Problems
+
+TEXT = {
+    "model_type": "qwen2",
+    "hidden_size": 896,
+    "intermediate_size": 4864,
+    "num_hidden_layers": 24,
+    "num_attention_heads": 14,
+    "num_key_value_heads": 2,
+    "vocab_size": 151674,
+    "rms_norm_eps": 1e-6,
+    "rope_theta": 1000000.0,
+    "rope_scaling": {"factor": 2.0, "rope_type": "dynamic", "type": "dynamic"},
+    "max_position_embeddings": 32768,
+    "sliding_window": 32768,
+    "use_sliding_window": False,
+}
+CHAT = {  # of the published backbone OpenGVLab/InternVL3-1B
+    "model_type": "internvl_chat",
+    "downsample_ratio": 0.5,
+    "force_image_size": 448,
+    "ps_version": "v2",
+    "select_layer": -1,
+    "use_backbone_lora": 0,
+    "use_llm_lora": 0,
+    "vision_config": {
+        "hidden_size": 1024,
+        "intermediate_size": 4096,
+        "num_hidden_layers": 24,
+        "num_attention_heads": 16,
+        "image_size": 448,
+        "patch_size": 14,
+        "layer_norm_eps": 1e-6,
+        "norm_type": "layer_norm",
+        "qk_normalization": False,
+        "qkv_bias": True,
+        "drop_path_rate": 0.1,
+    },
+    "llm_config": {**TEXT, "architectures": ["Qwen2ForCausalLM"]},
+}
+HF = {  # and of OpenGVLab/InternVL3-1B-hf
+    "model_type": "internvl",
+    "image_seq_length": 256,
+    "image_token_id": 151667,
+    "vision_config": {"attention_bias": True, "image_size": [448, 448], "patch_size": [14, 14]},
+    "text_config": TEXT,
+}
+
+
+@pytest.fixture(params=[(read_chat_backbone, CHAT, "AUTHORS"), (read_hf_backbone, HF, "LEROBOT")], ids=["authors", "lerobot"])
+def published(request):
+    """Sizes, and the names of the layout."""
+    read, config, names = request.param
+    sizes = Sizes(
+        n_layer=14,
+        n_token=1024,
+        n_head_layer=8,
+        n_head_head=8,
+        d_hidden=1024,
+        d_state_hidden=1024,
+        d_state=24,
+        d_action=24,
+        d_robot=7,
+        horizon=50,
+        n_slot=3,
+        n_step=50,
+        time_scale=999.0,
+        dead_rows="zero_attention",
+        absent_views="in_place",
+    )
+    problems = Problems("published")
+    read(config, sizes, problems)
+    problems.raise_any()
+    return sizes, getattr(_evo1_names, names)
+
+
+def test_the_published_configs_ask_for_the_published_numbers(published):
+    rows = _evo1_names.weights(*published)
+    count = {}
+    for row in rows:
+        part = row.target.split(".")[0]
+        count[part] = count.get(part, 0) + int(np.prod(row.shape))
+    assert count["vision"] == 304_012_288 and count["connector"] == 4_482_816  # InternViT-300M and its mlp1
+    assert count["lm"] == 151674 * 896 + 14 * 14_912_384 + 896
+    assert sum(count.values()) == 776_139_440
+    stored = {row.source: int(np.prod(row.stored)) for row in rows}
+    assert sum(stored.values()) == sum(count.values())
+
+
+@pytest.fixture
+def manifest():
+    answer = subprocess.run([vla(), "inspect", "--manifest", "evo1"], capture_output=True)
+    if answer.returncode:
+        pytest.skip("this vla program has no evo1")
+    return json.loads(answer.stdout)
+
+
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(published, manifest):
+    ours = {row.target: (list(row.shape), row.kind) for row in _evo1_names.weights(*published)}
+    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
+
+
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(published, manifest):
+    ours = {key.name: key.value for key in evo1._network_keys(published[0])}
+    chosen = {"policy.pad_token", "policy.view_starts"}  # of the tokenizer
+    for name, value in manifest["config"].items():
+        if name not in chosen:
+            assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name

@@ -1,0 +1,86 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/resize.h"
+
+#include "base/npy.h"
+#include "processor/pictures.h"
+#include "processor/resample.h"
+#include "processor/standardize.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+using Filter = Resize::Filter;
+
+std::vector<float> resized(const Frame& frame, const Resize& to) {
+  std::vector<float> out(static_cast<std::size_t>(3 * to.width * to.height), NAN);
+  const Status status = resize(frame, to, out, "top");
+  REQUIRE_MESSAGE(status.ok(), status.error().message());
+  return out;
+}
+
+}  // namespace
+
+TEST_CASE("resize equals OpenCV and torch byte for byte, up, down and to half") {
+  const std::string file = read_text(data_path("resize.npy"));
+  const auto bytes = parse_npy(bytes_of(file), "resize.npy");
+  REQUIRE(bytes.ok());
+  std::span<const std::uint8_t> rest = std::get<std::vector<std::uint8_t>>(bytes->values);
+  int compared = 0;
+  for (const auto& sizes : data_json("resize.json")) {
+    CAPTURE(sizes.dump());
+    const bool torch = sizes[4] == "torch_bicubic_8bit";
+    const Frame frame = frame_of(sizes[0], sizes[1]);
+    const Resize to{sizes[2], sizes[3], torch ? Filter::torch_bicubic_8bit : Filter::opencv_bilinear};
+    const std::vector<float> found = resized(frame, to);
+    const std::size_t size = found.size() / 3;
+    bool equal = true;
+    for (std::size_t i = 0; i < size; ++i)
+      for (std::size_t c = 0; c < 3; ++c) equal &= found[c * size + i] == static_cast<float>(rest[3 * i + c]) / 255.0f;
+    CHECK(equal);
+    if (torch) CHECK(found == resized(as_floats(frame), to));
+    rest = rest.subspan(found.size());
+    ++compared;
+  }
+  CHECK(rest.empty());
+  CHECK(compared == 28);
+}
+
+TEST_CASE("pixels as floats are cut to bytes for torch's filter and refused for OpenCV's") {
+  const Frame frame{2, 2, std::vector<float>{0.999f, 0.5f, 0.0f, 1.0f, 0.25f, 0.002f, 0, 0, 0, 0, 0, 0}};
+  const std::vector<float> out = resized(frame, {2, 2, Filter::torch_bicubic_8bit});
+  CHECK(out[0] == 254.0f / 255.0f);
+  CHECK(out[1] == 1.0f);
+  CHECK(out[4] == 127.0f / 255.0f);
+  CHECK(out[9] == 0.0f);
+  std::vector<float> untouched(12);
+  CHECK(contains(refusal(resize(frame, {2, 2, Filter::opencv_bilinear}, untouched, "top"), Code::bad_observation),
+                 "top: expected pixels of 8 bits, found float pixels"));
+}
+
+TEST_CASE("a picture of the size keeps its bytes under both filters") {
+  const Frame frame = frame_of(5, 4);
+  const auto& rgb = std::get<std::vector<std::uint8_t>>(frame.rgb);
+  CHECK(resample_opencv(rgb, 5, 4, 5, 4) == rgb);
+  CHECK(resample_torch(rgb, 5, 4, 5, 4) == rgb);
+}
+
+TEST_CASE("standardize equals torch on every byte in each arithmetic") {
+  const std::string file = read_text(data_path("standardize.npy"));
+  const auto expected = parse_npy(bytes_of(file), "standardize.npy");
+  REQUIRE(expected.ok());
+  std::span<const float> rest = std::get<std::vector<float>>(expected->values);
+  REQUIRE(rest.size() == 3 * 3 * 256);
+  Standardize op{{0.485f, 0.456f, 0.406f}, {0.229f, 0.224f, 0.225f}, Standardize::Arithmetic::float32};
+  using Arithmetic = Standardize::Arithmetic;
+  for (const auto arithmetic : {Arithmetic::float32, Arithmetic::bfloat16, Arithmetic::float32_then_bfloat16}) {
+    std::vector<float> pixels;
+    for (int i = 0; i < 3 * 256; ++i) pixels.push_back(static_cast<float>(i % 256) / 255.0f);
+    op.arithmetic = arithmetic;
+    standardize(pixels, op);
+    CHECK(std::equal(pixels.begin(), pixels.end(), rest.begin()));
+    rest = rest.subspan(pixels.size());
+  }
+}
