@@ -215,6 +215,7 @@ def _network_keys(s: Sizes) -> List[Key]:
         "policy.d_state": s.d_state,
         "policy.d_action": s.d_action,
         "policy.horizon": s.horizon,
+        "policy.n_position": s.n_position,
         "policy.n_slot": s.n_slot,
         "vision.d_model": s.d_vision,
         "vision.n_layer": s.n_vision_layer,
