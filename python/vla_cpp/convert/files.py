@@ -18,6 +18,7 @@ HUB_PATTERNS = [
     "tokenizer/*",
     "vlm/*.json",
     "vlm/merges.txt",
+    "processor/*.json",
     "assets/*",
 ]
 BACKBONE_PATTERNS = [
@@ -27,6 +28,8 @@ BACKBONE_PATTERNS = [
     "vocab.json",
     "merges.txt",
     "added_tokens.json",
+    "preprocessor_config.json",
+    "chat_template.*",
 ]
 
 

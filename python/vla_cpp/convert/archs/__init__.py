@@ -12,7 +12,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import EVO1, LEROBOT, OPENPI
+from ..checkpoint import EVO1, GR00T_MODELS, GR00T_N1_7, LEROBOT, OPENPI
 from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
@@ -29,6 +29,8 @@ class Weight(NamedTuple):
     plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
     keep_f32: bool = False  # a matrix that the reference keeps in float32 in bfloat16 too: not rounded if stored so
     first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
+    pick: Optional[Tuple[int, int]] = None  # one index of one axis of the source: (axis, index)
+    transpose: bool = False  # what is left after `pick`, stored as (in, out)
 
 
 class Dropped(NamedTuple):
@@ -52,6 +54,8 @@ class Options:
     stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET
     views: Sequence[str] = ()  # Evo-1: names of the cameras in the order of the prompt's slots
     view_slots: int = 0  # Evo-1: places for views in the prompt
+    embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
+    camera_size: str = ""  # GR00T: WIDTHxHEIGHT of pictures whose aspect the pipeline keeps; they are square without it
     dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
 
@@ -73,10 +77,15 @@ def names() -> List[str]:
     return sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_"))
 
 
+# Types of LeRobot whose policies are read in another layout.
+OTHER_LAYOUTS = {"groot": "a fine-tune of GR00T as LeRobot saves it is not read yet, GR00T N1.7 as its authors publish it is"}
+
+
 def load(name):
     """The module of an architecture. Errors: unsupported."""
     if name not in names():
-        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), code=Code.UNSUPPORTED)
+        hint = OTHER_LAYOUTS.get(str(name), "")
+        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), hint, Code.UNSUPPORTED)
     return importlib.import_module("." + name, __name__)
 
 
@@ -89,11 +98,14 @@ LAYOUT_OPTIONS = {
     "views": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "dead_rows": ((EVO1,), "a checkpoint of Evo-1's authors"),
+    "embodiment": ((GR00T_N1_7,), "a checkpoint of GR00T"),
+    "camera_size": ((GR00T_N1_7,), "a checkpoint of GR00T"),
 }
 LAYOUT_NAMES = {
     LEROBOT: "config.json of type {}, which states everything itself",
     OPENPI: "one of openpi",
     EVO1: "one of Evo-1's authors",
+    GR00T_N1_7: "one of GR00T",
 }
 
 
@@ -111,6 +123,9 @@ def check_options(layout: str, config: dict, options: Options) -> None:
 def arch_of(config: dict, layout: str, variant: str) -> str:
     """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
     was trained with. Errors: usage, unsupported."""
+    if layout == LEROBOT and "type" not in config and str(config.get("model_type")).lower().startswith("gr00t"):
+        found = str(config["model_type"])
+        raise refuse("config.json: model_type", " or ".join(GR00T_MODELS), found, "another release of GR00T", Code.UNSUPPORTED)
     if layout != OPENPI:
         return config.get("type") if layout == LEROBOT else layout
     variants = {name: arch for arch in names() for name in getattr(load(arch), "VARIANTS", ())}

@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The mapping of GR00T N1.7 at the published size: against the published counts, and against what the runtime declares."""
+
+import json
+import subprocess
+
+import numpy as np
+import pytest
+
+from manifest_test import vla
+from vla_cpp.convert.archs import gr00t_n1_7
+from vla_cpp.convert.archs._gr00t_names import weights
+from vla_cpp.convert.archs._gr00t_sizes import read_sizes
+from vla_cpp.convert.errors import Problems
+
+CONFIG = {  # of the published checkpoint: what differs from the defaults of its class
+    "model_type": "Gr00tN1d7",
+    "select_layer": 16,
+    "diffusion_model_cfg": {
+        "positional_embeddings": None,
+        "num_layers": 32,
+        "num_attention_heads": 32,
+        "attention_head_dim": 48,
+        "norm_type": "ada_norm",
+        "dropout": 0.2,
+        "final_dropout": True,
+        "output_dim": 1024,
+        "interleave_self_attention": True,
+    },
+    "vl_self_attention_cfg": {
+        "positional_embeddings": None,
+        "num_layers": 4,
+        "num_attention_heads": 32,
+        "attention_head_dim": 64,
+        "dropout": 0.2,
+        "final_dropout": True,
+    },
+}
+BACKBONE = {  # of the published backbone
+    "model_type": "qwen3_vl",
+    "text_config": {
+        "hidden_size": 2048,
+        "intermediate_size": 6144,
+        "num_hidden_layers": 28,
+        "num_attention_heads": 16,
+        "num_key_value_heads": 8,
+        "head_dim": 128,
+        "vocab_size": 151936,
+        "max_position_embeddings": 262144,
+        "rms_norm_eps": 1e-6,
+        "rope_theta": 5000000,
+        "rope_scaling": {"mrope_interleaved": True, "mrope_section": [24, 20, 20], "rope_type": "default"},
+    },
+    "vision_config": {
+        "depth": 24,
+        "hidden_size": 1024,
+        "intermediate_size": 4096,
+        "num_heads": 16,
+        "num_position_embeddings": 2304,
+        "out_hidden_size": 2048,
+        "deepstack_visual_indexes": [5, 11, 17],
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def sizes():
+    problems = Problems("published")
+    sizes = read_sizes(CONFIG, BACKBONE, problems)
+    problems.raise_any()
+    sizes.n_slot, sizes.image_width, sizes.image_height = 2, 256, 256
+    return sizes
+
+
+@pytest.mark.parametrize(
+    "prefixes, millions",
+    [
+        (("vision.blk.",), 302.3),
+        (("connector.", "deepstack."), 100.7),
+        (("lm.blk.",), 805.4),
+        (("lm.token_embd.",), 311.2),
+        (("vl.",), 201.4),
+        (("dit.", "time_"), 1091.7),
+        (("state_", "action_", "decode_"), 11.8),
+    ],
+)
+def test_each_part_has_the_published_count_of_parameters(sizes, prefixes, millions):
+    rows = [row for row in weights(sizes) if row.target.startswith(prefixes)]
+    assert sum(int(np.prod(row.shape)) for row in rows) / 1e6 == pytest.approx(millions, abs=0.06)
+
+
+@pytest.fixture(scope="module")
+def manifest():
+    answer = subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_7"], capture_output=True, check=True)
+    return json.loads(answer.stdout)
+
+
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes, manifest):
+    ours = {row.target: (list(row.shape), row.kind) for row in weights(sizes)}
+    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
+
+
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
+    ours = {key.name: key.value for key in gr00t_n1_7._network_keys(sizes)}
+    ours["policy.view_starts"] = [4, 70]  # <|im_start|>, "user", a line's end, <|vision_start|>; 64 image tokens a view
+    for name, value in manifest["config"].items():
+        assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name

@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the bundle of a GR00T N1.7 checkpoint does to pictures, text, states and actions."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tiny_gr00t import CROP, D_STATE, EDGE, HORIZON, TAG, TinyGr00t
+
+STATE, ACTION = "stats.observation.state", "stats.action"
+CLIP = {"op": "clip", "low": -1.0, "high": 1.0}
+
+
+def convert(converter, tiny=None, **options):
+    return converter.bundle(tiny or TinyGr00t(), **{"embodiment": TAG, **options})
+
+
+def recipe(bundle):
+    return json.loads(bundle.keys["processor.recipe"])
+
+
+def test_the_recipe_is_the_authors_pipeline(converter):
+    found = recipe(convert(converter))
+    side = {"op": "smallest_side", "size": EDGE, "filter": "opencv_area"}
+    assert found["image"] == [
+        side,
+        {"op": "crop_fraction", "fraction": CROP / EDGE},
+        side,
+        {"op": "size", "width": EDGE, "height": EDGE},
+        {"op": "affine", "scale": 2.0, "shift": -1.0},
+    ]
+    view = {"open": "<|vision_start|>", "token": "<|image_pad|>", "repeat": 9, "close": "<|vision_end|>"}
+    assert found["text"] == [
+        {"op": "lower"},
+        {"op": "drop_punctuation"},
+        {"op": "views", "count": 2, **view},
+        {"op": "template", "text": "<|im_start|>user\n{instruction}<|im_end|>\n"},
+        {"op": "tokenize", "max_tokens": 541, "truncate": "right"},
+    ]
+    normalize = {"op": "normalize", "kind": "groot_min_max", "stats": STATE, "eps": 0.0}
+    assert found["state"] == [normalize, CLIP, {"op": "pad", "size": D_STATE}]
+    unnormalize = {"op": "unnormalize", "kind": "groot_min_max", "stats": ACTION, "eps": 0.0}
+    assert found["action"] == [{"op": "rows", "count": 4}, {"op": "take", "size": 2}, CLIP, unnormalize]
+
+
+@pytest.mark.parametrize("percentiles, low, high", [(True, "q01", "q99"), (False, "min", "max")])
+def test_statistics_stand_one_after_the_other_in_the_order_of_keys(converter, percentiles, low, high):
+    tiny = TinyGr00t()
+    tiny.kwargs["use_percentiles"] = percentiles
+    tiny.robots[TAG]["state"]["modality_keys"].reverse()
+    bundle = convert(converter, tiny)
+    for feature, kind, keys in ((STATE, "state", ("gripper", "x")), (ACTION, "action", ("x", "gripper"))):
+        for ours, theirs in (("min", low), ("max", high)):
+            stored = np.concatenate([tiny.statistics[TAG][kind][key][theirs] for key in keys]).astype(np.float32)
+            np.testing.assert_array_equal(bundle.tensors["{}.{}".format(feature, ours)], stored)
+
+
+def test_relative_actions_have_ranges_of_their_own_and_are_added_to_the_state(converter):
+    bundle = convert(converter, TinyGr00t().relative())
+    assert recipe(bundle)["action"][-1] == {"op": "add_state", "columns": [0]}
+    assert bundle.tensors[ACTION + ".min"][0] == -0.25 and bundle.tensors[ACTION + ".max"][0] == 0.5
+
+
+def test_relative_actions_of_a_checkpoint_without_them_are_as_good_as_absolute(converter):
+    tiny = TinyGr00t().relative()
+    tiny.kwargs["use_relative_action"] = False
+    bundle = convert(converter, tiny)
+    assert recipe(bundle)["action"][-1]["op"] == "unnormalize"
+    assert bundle.tensors[ACTION + ".min"][0] == np.float32(tiny.statistics[TAG]["action"]["x"]["q01"][0])
+
+
+def test_keys_of_means_and_deviations_are_not_clipped(converter):
+    tiny = TinyGr00t()
+    for kind in ("state", "action"):
+        tiny.robots[TAG][kind]["mean_std_embedding_keys"] = ["gripper", "x"]
+    bundle = convert(converter, tiny)
+    state, action = recipe(bundle)["state"], recipe(bundle)["action"]
+    assert [op["op"] for op in state] == ["normalize", "pad"] and state[0]["kind"] == "groot_mean_std"
+    assert [op["op"] for op in action] == ["rows", "take", "unnormalize"] and action[-1]["kind"] == "groot_mean_std"
+    assert bundle.tensors[STATE + ".std"].shape == (3,) and STATE + ".min" not in bundle.tensors
+
+
+def test_switches_of_the_processor_leave_their_steps_out(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs.update(clip_outliers=False, formalize_language=False, crop_fraction=1.0)
+    found = recipe(convert(converter, tiny))
+    assert [op["op"] for op in found["state"]] == ["normalize", "pad"] and CLIP in found["action"]
+    assert [op["op"] for op in found["text"]] == ["views", "template", "tokenize"]
+    assert [op["op"] for op in found["image"]] == ["smallest_side", "size", "affine"]
+
+
+def test_an_edge_and_a_fraction_count_before_sizes(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs.update(shortest_image_edge=16, crop_fraction=0.95, image_target_size=None, image_crop_size=None)
+    bundle = convert(converter, tiny)
+    assert recipe(bundle)["image"][:2] == [
+        {"op": "smallest_side", "size": 16, "filter": "opencv_area"},
+        {"op": "crop_fraction", "fraction": 0.95},
+    ]
+    assert bundle.keys["vision.image_width"] == 16 and recipe(bundle)["text"][2]["repeat"] == 16
+
+
+def test_letterboxed_pictures_are_square_whatever_the_camera(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs["letter_box_transform"] = True
+    bundle = convert(converter, tiny, camera_size="40x30")
+    assert recipe(bundle)["image"][0] == {"op": "square_pad"} and bundle.keys["vision.image_width"] == EDGE
+
+
+def test_a_cameras_aspect_is_kept_up_to_the_backbones_multiples(converter):
+    bundle = convert(converter, camera_size="40x30")
+    # 40x30 -> 16x12 -> crop 14x11 -> 15x12 -> multiples of 4
+    assert (bundle.keys["vision.image_width"], bundle.keys["vision.image_height"]) == (16, 12)
+    resize = {"op": "qwen_smart_resize", "multiple": 4, "min_pixels": 144, "max_pixels": 4096}
+    assert recipe(bundle)["image"][3:5] == [resize, {"op": "size", "width": 16, "height": 12}]
+    assert recipe(bundle)["text"][2]["repeat"] == 4 * 3
+
+
+@pytest.mark.parametrize("least, most, side", [(145, 4096, 16), (64, 143, 8)])
+def test_the_backbone_holds_pictures_between_two_areas(converter, least, most, side):
+    tiny = TinyGr00t()
+    tiny.images.update(min_pixels=least, max_pixels=most)
+    assert convert(converter, tiny).keys["vision.image_height"] == side
+
+
+def test_rows_are_no_more_than_the_networks(converter):
+    tiny = TinyGr00t()
+    tiny.robots[TAG]["action"]["delta_indices"] = list(range(HORIZON + 3))
+    assert recipe(convert(converter, tiny))["action"][0] == {"op": "rows", "count": HORIZON}
