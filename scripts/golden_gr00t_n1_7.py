@@ -33,7 +33,8 @@ def head(layers, dit, vl, d_hidden, d_state, d_action, horizon, **more):
 
 
 def case(seed, frames, instruction, description, **more):
-    return Case(seed, frames, instruction, description, options={"embodiment": description.tag, **more.pop("options", {})}, **more)
+    options = {"embodiment": description.tag} | more.pop("options", {})
+    return Case(seed, frames, instruction, description, options=options, **more)
 
 
 POSE = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1)
@@ -63,7 +64,8 @@ CASES = {
                                               {"right_arm": "right_arm_joints", "left_arm": None}),
         vision(32, 4, 2, 40, 7, (0, 1, 2)), text(40, 5, 5, 5, 8, 52, (2, 1, 1)),
         head(4, (6, 5, 6), (2, 4, 10), 22, 12, 10, 9),
-        {"image_target_size": [24, 24], "image_crop_size": [22, 22]}, 24, percentiles=True)),
+        {"image_target_size": [24, 24], "image_crop_size": [22, 22]}, 24, percentiles=True),
+        options={"camera_size": "48x36"}),
     # An instruction that has to be cleaned: capitals, punctuation, what looks like a special token, letters in two parts and in other
     # scripts, digits of several kinds; five steps; frames shrunk to a third; no crop; text blocks every third time; four
     # language layers that the policy cuts off.
