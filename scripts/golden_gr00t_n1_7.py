@@ -76,6 +76,12 @@ CASES = {
         vision(28, 4, 7, 32, 4, (0, 1, 2), 2), text(36, 8, 3, 1, 20, 40, (4, 3, 3)),
         head(4, (7, 2, 16), (3, 2, 18), 26, 8, 8, 5, num_inference_timesteps=5, attend_text_every_n_blocks=3),
         {"image_target_size": [16, 16]}, 16)),
+    # Numbers so small that every eps shows; a frame that is enlarged; two words.
+    "gr00t_n1_7/faint": case(45, {"camera": (12, 12, "png")}, "Go on", Description(
+        "simpler_env_google", 1, Robot(("camera",), {"x": 1, "hand": 3}, {"x": 1, "hand": 2}, 3),
+        vision(16, 3, 2, 24, 3, (0, 1, 2)), text(24, 5, 3, 1, 8, 32, (2, 1, 1)),
+        head(4, (6, 2, 10), (1, 3, 8), 14, 6, 5, 4),
+        {"image_target_size": [16, 16], "shortest_image_edge": 16, "crop_fraction": 0.9}, 16, faint=True)),
 }
 
 if __name__ == "__main__":
