@@ -184,12 +184,12 @@ CASES = {
     "model.byte_fallback: expected False, found 1": (model(byte_fallback=1), UNSUPPORTED),
     "model.continuing_subword_prefix: expected None, found '##'": (model(continuing_subword_prefix="##"), UNSUPPORTED),
     "model.end_of_word_suffix: expected None, found '</w>'": (model(end_of_word_suffix="</w>"), UNSUPPORTED),
-    "normalizer: expected none, found": (spec(normalizer={"type": "NFC"}), UNSUPPORTED),
-    'pre_tokenizer: expected Digits and ByteLevel, found {"type":"Metaspace"': (
+    "normalizer: expected none or NFC, found": (spec(normalizer={"type": "NFKC"}), UNSUPPORTED),
+    'pre_tokenizer: expected Digits, ByteLevel and the Split of Qwen2, found {"type":"Metaspace"': (
         spec(pre_tokenizer={"type": "Metaspace"}),
         UNSUPPORTED,
     ),
-    "pre_tokenizer: expected Digits and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
+    "pre_tokenizer: expected Digits, ByteLevel and the Split of Qwen2, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
     "pre_tokenizer: expected ByteLevel once, as the last step": (spec(pre_tokenizer=SEQUENCE), UNSUPPORTED),
     "post_processor: expected none, ByteLevel, or a template of the text alone": (
         spec(post_processor={"type": "TemplateProcessing", "single": BOS}),

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. What lies in the folder says
-whose layout it is: LeRobot's, openpi's, or that of Evo-1's authors."""
+whose layout it is: LeRobot's, openpi's, or that of the authors of Evo-1 or GR00T."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from .files import BACKBONE_PATTERNS, HUB_PATTERNS, download, is_hub_id, plain_n
 from .safetensors_file import Entry, read_safetensors
 from .torch_file import read_torch
 
-LEROBOT, OPENPI, EVO1 = "lerobot", "openpi", "evo1"  # layouts
+LEROBOT, OPENPI, EVO1, GR00T_N1_7 = "lerobot", "openpi", "evo1", "gr00t_n1_7"  # layouts
+GR00T_MODELS = {"Gr00tN1d7": GR00T_N1_7}  # what config.json states as model_type
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
 # What Evo-1's trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.
@@ -155,9 +156,11 @@ def open_checkpoint(source: str) -> Checkpoint:
 
 
 def _layout(folder: str, config: dict, has_assets: bool) -> str:
-    """LeRobot's config states a type, and neither of the others does."""
+    """LeRobot's config states a type, and none of the others does."""
     if "type" in config:
         return LEROBOT
+    if config.get("model_type") in GR00T_MODELS:
+        return GR00T_MODELS[config["model_type"]]
     if any(os.path.exists(os.path.join(folder, name)) for name in (*TORCH_FILES, NORM_STATS)):
         return EVO1
     return OPENPI if has_assets or "action_horizon" in config else LEROBOT

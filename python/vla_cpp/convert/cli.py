@@ -89,6 +89,7 @@ def build_parser() -> argparse.ArgumentParser:
         " checkpoint of Evo-1's authors the revision of their code, r1 or r2",
     )
     _add_evo1(parser)
+    _add_gr00t(parser)
     add("--force", action="store_true", help="overwrite OUT.gguf")
     add("--quiet", action="store_true", help="no progress bar and no summary")
     add("--version", action="version", version="vla-convert " + __version__)
@@ -106,6 +107,17 @@ def _add_evo1(parser: argparse.ArgumentParser) -> None:
         choices=("zero_attention", "causal_attention"),
         default="",
         help="what attention leaves in rows that are masked, which the action head reads: zeros with flash-attn",
+    )
+
+
+def _add_gr00t(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("checkpoints of GR00T", "which hold several robots; a bundle is for one").add_argument
+    add("--embodiment", metavar="TAG", default="", help="the robot, by its tag in processor_config.json; asked for always")
+    add(
+        "--camera-size",
+        metavar="WxH",
+        default="",
+        help="pixels of a camera, for a pipeline that keeps the aspect of pictures; they are square without it",
     )
 
 
@@ -159,6 +171,8 @@ def main(argv=None) -> int:
         views=args.views.split(",") if args.views else (),
         view_slots=args.view_slots,
         dead_rows=args.dead_rows,
+        embodiment=args.embodiment,
+        camera_size=args.camera_size,
     )
     try:
         with _progress(args.quiet) as progress:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Callable, Dict, List, Tuple
+from typing import Callable, Dict, Iterator, List, Tuple
 
 import numpy as np
 
@@ -142,9 +142,7 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
         with BundleWriter(summary.path, keys, tensors) as out:
             for weight, tensor in zip(plan.weights, tensors):
                 progress(weight.target, done, total)
-                entry = checkpoint.tensors[weight.source]
-                entry = entry if weight.first is None else entry.rows(weight.first, weight.shape[0])
-                _stream(entry, weight, tensor, out, summary, problems)
+                _stream(checkpoint.tensors[weight.source], weight, tensor, out, summary, problems)
                 done += tensor.n_bytes
             for name, value in plan.statistics.items():
                 out.write(name, value)
@@ -155,11 +153,27 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
     summary.n_tensor = len(tensors)
 
 
+def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
+    """The numbers of a row of the mapping in the bundle's order, in pieces; what is rearranged comes whole."""
+    if weight.first is not None:
+        entry = entry.rows(weight.first, weight.shape[0])
+    if weight.pick is None and not weight.transpose:
+        yield from entry.chunks()
+        return
+    axis, index = weight.pick or (0, 0)
+    if weight.pick and axis == 0:
+        entry, index = entry.rows(index, 1), 0
+    whole = np.concatenate([*entry.chunks()]).reshape(entry.shape)
+    if weight.pick:
+        whole = whole.take(index, axis)
+    yield (whole.T if weight.transpose else whole).ravel()
+
+
 def _stream(
     entry: Entry, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems
 ) -> None:
     finite, overflow = True, False
-    for raw in entry.chunks():
+    for raw in _pieces(entry, weight):
         part = convert(raw, entry.dtype, tensor.dtype)
         finite, overflow = finite and part.finite, overflow or part.overflow
         summary.rounding = max(summary.rounding, (part.error, tensor.name))

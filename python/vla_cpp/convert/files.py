@@ -11,8 +11,8 @@ from typing import Tuple
 from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
-HUB_PATTERNS = ["*.json", "*.safetensors", "tokenizer/*", "vlm/*.json", "vlm/*.txt", "assets/*", "mp_rank_00_model_states.pt"]
-BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json"]
+HUB_PATTERNS = ["*.json", "*.safetensors", "tokenizer/*", "vlm/*.json", "vlm/*.txt", "processor/*.json", "assets/*", "mp_rank_00_model_states.pt"]
+BACKBONE_PATTERNS = ["config.json", "tokenizer.json", "tokenizer_config.json", "preprocessor_config.json", "chat_template.*"]
 
 
 def _no_constant(name: str):

@@ -3,12 +3,12 @@
 """Byte-level BPE: what SmolLM2 and the other descendants of GPT-2 publish.
 
 Which pre-tokenizer counts follows the class that transformers 5.4 to 5.5 builds for `tokenizer_class`: the generic classes keep
-tokenizer.json as it is, GPT2Tokenizer takes vocabulary and merges from it and brings a ByteLevel pre-tokenizer of its own.
+tokenizer.json as it is, GPT2Tokenizer and Qwen2Tokenizer take vocabulary and merges from it and bring the rest themselves.
 """
 
 from __future__ import annotations
 
-from typing import List
+from typing import List, Tuple
 
 from .bundle import Key
 from .errors import Problems
@@ -28,6 +28,11 @@ from .tokenizer_parts import (
 
 KIND = "byte_level_bpe"
 GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
+QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
+QWEN2_WORDS = (
+    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+)
+NFC = {"type": "NFC"}
 MODEL = {
     "type": ("BPE",),
     "dropout": (None, 0, 0.0),
@@ -46,9 +51,11 @@ def byte_symbols() -> List[str]:
 
 def with_defaults(config: dict) -> dict:
     """The class's own defaults, which it adds to the vocabulary like stated ones."""
-    if config.get("tokenizer_class") not in GPT2:
-        return config
-    return dict(dict.fromkeys(("unk_token", "bos_token", "eos_token"), "<|endoftext|>"), **config)
+    own = {GPT2: ("unk_token", "bos_token", "eos_token"), QWEN2: ("unk_token", "eos_token", "pad_token")}
+    for names, keys in own.items():
+        if config.get("tokenizer_class") in names:
+            return dict(dict.fromkeys(keys, "<|endoftext|>"), **config)
+    return config
 
 
 def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key]:
@@ -56,37 +63,49 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     check_symbols(tokenizer.model, byte_symbols(), problems)
     _check_surroundings(tokenizer, problems)
     pre, config = _pre_tokenizer(tokenizer.spec.get("pre_tokenizer"), problems), tokenizer.config
-    gpt2 = config.get("tokenizer_class") in GPT2
-    if gpt2:
-        prefix_space = bool(config.get("add_prefix_space", False))
-        own = [{"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": True}]
-        if pre != own:
+    nfc, name = _normalization(tokenizer.spec.get("normalizer"), problems), config.get("tokenizer_class")
+    if name in GPT2 or name in QWEN2:
+        own = _of_class(name in QWEN2, bool(config.get("add_prefix_space") or False))
+        if (pre, nfc) != own:
             notes.append(
-                "{} names {}: transformers 5 then replaces the pre-tokenizer of {} by a plain ByteLevel, and so does the bundle".format(
-                    CONFIG_FILE, config["tokenizer_class"], JSON_FILE
+                "{} names {}: transformers 5 then replaces normalizer and pre-tokenizer of {} by the class's own, and so does the bundle".format(
+                    CONFIG_FILE, name, JSON_FILE
                 )
             )
-        pre = own
+        pre, nfc = own
+    else:
+        own = None
     return [
         Key("tokenizer.pre", "string", to_json(pre)),
-        Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and not gpt2),
+        *([Key("tokenizer.normalization", "string", "nfc")] if nfc else []),
+        Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and own is None),
     ]
+
+
+def _of_class(qwen2: bool, prefix_space: bool) -> Tuple[List[dict], bool]:
+    """The steps that a class brings, and whether it composes characters."""
+    split = [{"type": "split", "pattern": QWEN2_WORDS}] if qwen2 else []
+    return [*split, {"type": "byte_level", "add_prefix_space": prefix_space, "use_regex": not qwen2}], qwen2
+
+
+def _normalization(normalizer, problems: Problems) -> bool:
+    """Whether text is composed to NFC; other normalizers are refused."""
+    steps = one_or_sequence(normalizer, "normalizers")
+    if any(step != NFC for step in steps):
+        hint = "the runtime knows no other normalization"
+        problems.unsupported(JSON_FILE + ": normalizer", "none or NFC", to_json(normalizer)[:80], hint)
+    return bool(steps)
 
 
 def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
     spec, config = tokenizer.spec, tokenizer.config
-    normalizer = spec.get("normalizer")
-    if normalizer is not None and normalizer != {"type": "Sequence", "normalizers": []}:
-        problems.unsupported(
-            JSON_FILE + ": normalizer", "none", to_json(normalizer)[:80], "the runtime does not normalise text"
-        )
     if not _adds_nothing(spec.get("post_processor")):
         problems.unsupported(
             JSON_FILE + ": post_processor",
             "none, ByteLevel, or a template of the text alone",
             to_json(spec["post_processor"])[:80],
         )
-    check_class(config, GENERIC + GPT2, problems)
+    check_class(config, GENERIC + GPT2 + QWEN2, problems)
     for key in ("add_bos_token", "add_eos_token"):
         if config.get(key, False) not in (False, None):
             problems.unsupported("{}: {}".format(CONFIG_FILE, key), "False", repr(config[key]))
@@ -113,6 +132,8 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
         kind = part.get("type") if isinstance(part, dict) else None
         if kind == "Digits" and set(part) <= {"type", "individual_digits"}:
             steps.append({"type": "digits", "individual": bool(part.get("individual_digits", False))})
+        elif part == {"type": "Split", "pattern": {"Regex": QWEN2_WORDS}, "behavior": "Isolated", "invert": False}:
+            steps.append({"type": "split", "pattern": QWEN2_WORDS})
         elif kind == "ByteLevel" and set(part) <= {"type", "add_prefix_space", "trim_offsets", "use_regex"}:
             steps.append(
                 {
@@ -124,9 +145,9 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
         else:
             problems.unsupported(
                 JSON_FILE + ": pre_tokenizer",
-                "Digits and ByteLevel",
+                "Digits, ByteLevel and the Split of Qwen2",
                 to_json(part)[:80],
-                "the runtime implements these two",
+                "the runtime implements these",
             )
             return []
     if [step["type"] for step in steps].count("byte_level") != 1 or steps[-1]["type"] != "byte_level":

@@ -12,7 +12,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import EVO1, LEROBOT, OPENPI
+from ..checkpoint import EVO1, GR00T_N1_7, LEROBOT, OPENPI
 from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
@@ -29,6 +29,8 @@ class Weight(NamedTuple):
     plus_one: bool = False  # a norm of Gemma, which multiplies by 1 + w: the bundle holds the sum, a vector in float32
     keep_f32: bool = False  # a matrix that the reference keeps in float32 in bfloat16 too: not rounded if stored so
     first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
+    pick: Optional[Tuple[int, int]] = None  # one index of one axis of the source: (axis, index)
+    transpose: bool = False  # what is left after `pick`, stored as (in, out)
 
 
 class Dropped(NamedTuple):
@@ -52,6 +54,8 @@ class Options:
     stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET
     views: Sequence[str] = ()  # Evo-1: names of the cameras in the order of the prompt's slots
     view_slots: int = 0  # Evo-1: places for views in the prompt
+    embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
+    camera_size: str = ""  # GR00T: WIDTHxHEIGHT of pictures whose aspect the pipeline keeps; they are square without it
     dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
 
@@ -89,11 +93,14 @@ LAYOUT_OPTIONS = {
     "views": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "dead_rows": ((EVO1,), "a checkpoint of Evo-1's authors"),
+    "embodiment": ((GR00T_N1_7,), "a checkpoint of GR00T"),
+    "camera_size": ((GR00T_N1_7,), "a checkpoint of GR00T"),
 }
 LAYOUT_NAMES = {
     LEROBOT: "config.json of type {}, which states everything itself",
     OPENPI: "one of openpi",
     EVO1: "one of Evo-1's authors",
+    GR00T_N1_7: "one of GR00T",
 }
 
 

@@ -1,0 +1,167 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of GR00T N1.7: the pipeline of its processor, the image processor of its backbone behind it, and the size that comes out.
+
+Reference: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations), which equals the pipeline of
+Isaac-GR00T, and transformers models/qwen2_vl/image_processing_qwen2_vl.py.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import List, NamedTuple, Tuple
+
+from ..errors import Code, Problems, refuse
+from ..files import read_json
+from ..section import Section
+from ._gr00t_robot import DOCS
+from ._gr00t_sizes import Fixed, Sizes, check_fixed, refuse_unknown
+
+FILE = "preprocessor_config.json"
+# Qwen2VLImageProcessor of transformers. What is None there must be stated, since its own default is of another model.
+IMAGE = {"size": None, "min_pixels": None, "max_pixels": None}
+IMAGE_FIXED: Fixed = {
+    "do_resize": (True, True),
+    "do_rescale": (True, True),
+    "do_normalize": (True, True),
+    "do_convert_rgb": (True, True),
+    "resample": (3, 3),
+    "rescale_factor": (1 / 255, 1 / 255),
+    "image_mean": (None, [0.5, 0.5, 0.5]),
+    "image_std": (None, [0.5, 0.5, 0.5]),
+    "temporal_patch_size": (2, 2),
+    "merge_size": (2, 2),
+}
+IMAGE_IGNORED = set(
+    """image_processor_type processor_class data_format input_data_format disable_grouping return_tensors device default_to_square
+    feature_extractor_type do_center_crop crop_size do_pad pad_size""".split()
+)
+MAX_SIDE = 8192
+
+
+class Pictures(NamedTuple):
+    width: int
+    height: int
+    ops: List[dict]
+
+
+class _Area(NamedTuple):
+    """What smart_resize holds a picture to."""
+
+    multiple: int
+    least: int
+    most: int
+
+
+def read_pictures(processor: Section, folder: str, camera_size: str, s: Sizes, notes: List[str], problems: Problems) -> Pictures:
+    """`processor`: the members of processor_kwargs. `folder`: the backbone's. `camera_size`: as asked for, or empty."""
+    edge, fraction = _edge(processor), _fraction(processor)
+    pad = processor.get("letter_box_transform") is True
+    area = _area(folder, s, problems)
+    width, height = _camera(camera_size, edge, pad)
+    ops: List[dict] = [{"op": "square_pad"}] if pad else []
+    smallest = {"op": "smallest_side", "size": edge, "filter": "opencv_area"}
+    ops.append(smallest)
+    width, height = _smallest_side(width, height, edge)
+    if 0.0 < fraction < 1.0:
+        ops += [{"op": "crop_fraction", "fraction": fraction}, smallest]
+        width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
+    resized = _smart_resize(width, height, area)
+    if resized != (width, height):
+        ops.append({"op": "qwen_smart_resize", "multiple": area.multiple, "min_pixels": area.least, "max_pixels": area.most})
+        notes.append("pictures of {}x{} become {}x{} in the backbone's image processor".format(width, height, *resized))
+    ops.append({"op": "size", "width": resized[0], "height": resized[1]})
+    ops.append({"op": "affine", "scale": 2.0, "shift": -1.0})
+    if not pad:
+        notes.append(
+            "pictures keep their aspect, as letter_box_transform says: those of {} are taken, others are refused ({})".format(
+                camera_size or "square cameras", DOCS
+            )
+        )
+    return Pictures(*resized, ops)
+
+
+def _pair(processor: Section, key: str) -> int:
+    """The side of a square that stands as [height, width], 0 where there is none."""
+    value = processor.get(key)
+    if value is None:
+        return 0
+    if isinstance(value, list) and len(value) == 2 and value[0] == value[1] and type(value[0]) is int and 0 < value[0] <= MAX_SIDE:
+        return value[0]
+    processor.bad(key, "[side, side] or null", unsupported=True)
+    return 0
+
+
+def _edge(processor: Section) -> int:
+    if processor.get("shortest_image_edge") is not None:
+        return processor.count("shortest_image_edge", most=MAX_SIDE)
+    target = _pair(processor, "image_target_size")
+    if not target:
+        processor.bad("image_target_size", "a size, since shortest_image_edge is null too")
+    return target or 1
+
+
+def _fraction(processor: Section) -> float:
+    value = processor.get("crop_fraction")
+    if value is not None:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= 1:
+            return float(value)
+        processor.bad("crop_fraction", "a number above 0 and up to 1, or null")
+        return 1.0
+    crop, target = _pair(processor, "image_crop_size"), _pair(processor, "image_target_size")
+    if not crop or not target or crop > target:
+        processor.bad("image_crop_size", "a size within image_target_size, since crop_fraction is null")
+        return 1.0
+    return crop / target
+
+
+def _camera(given: str, edge: int, pad: bool) -> Tuple[int, int]:
+    """Width and height at which pictures come to the pipeline, all that matters of them being their aspect."""
+    if not given or pad:
+        return edge, edge
+    parts = given.lower().split("x")
+    if len(parts) == 2 and all(part.isdigit() and 0 < int(part) <= MAX_SIDE for part in parts):
+        return int(parts[0]), int(parts[1])
+    raise refuse("--camera-size", "WIDTHxHEIGHT in pixels, such as 640x480", given, code=Code.USAGE)
+
+
+def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
+    scale = edge / float(min(width, height))
+    if scale == 1:
+        return width, height
+    return max(1, int(round(width * scale))), max(1, int(round(height * scale)))
+
+
+def _smart_resize(width: int, height: int, area: _Area) -> Tuple[int, int]:
+    m = area.multiple
+    sides = (width, height)
+    out = [round(side / m) * m for side in sides]
+    if out[0] * out[1] > area.most:
+        beta = math.sqrt(width * height / area.most)
+        out = [max(m, math.floor(side / beta / m) * m) for side in sides]
+    elif out[0] * out[1] < area.least:
+        beta = math.sqrt(area.least / (width * height))
+        out = [math.ceil(side * beta / m) * m for side in sides]
+    return out[0], out[1]
+
+
+def _area(folder: str, s: Sizes, problems: Problems) -> _Area:
+    path = os.path.join(folder, FILE)
+    if not os.path.exists(path):
+        hint = "it lies beside the backbone's config.json, and says to which sizes pictures are held"
+        raise refuse(path, "the backbone's image processor", "none", hint, Code.IO)
+    section = Section("backbone " + FILE, read_json(path), IMAGE, problems)
+    refuse_unknown(section, {*IMAGE, *IMAGE_FIXED, *IMAGE_IGNORED, "patch_size"})
+    check_fixed(section, IMAGE_FIXED)
+    if section.get("patch_size") != s.patch_size:
+        section.bad("patch_size", "{} as in the backbone's vision_config".format(s.patch_size))
+    size = section.get("size") if isinstance(section.get("size"), dict) else {}
+    limits = []
+    for own, key in (("min_pixels", "shortest_edge"), ("max_pixels", "longest_edge")):
+        stated = size.get(key) if section.get(own) is None else section.get(own)
+        if type(stated) is not int or not 0 < stated < 1 << 31:
+            section.bad("size", "shortest_edge and longest_edge, counts of pixels")
+            stated = 1
+        limits.append(stated)
+    return _Area(2 * s.patch_size, *limits)
