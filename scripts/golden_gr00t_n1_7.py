@@ -55,13 +55,13 @@ CASES = {
         head(5, (8, 3, 8), (1, 3, 12), 18, 9, 7, 6),
         {"image_target_size": [32, 32], "image_crop_size": [28, 28], "letter_box_transform": True}, 32, percentiles=True),
         state=(0.5, -2.25, 0.1, 4.0, 0.03125, -3.5)),
-    # Joints that are predicted relative to the state, by statistics of each row, beside a gripper that is not; one part is relative to
-    # a state of another name. Three cameras whose aspect is kept: six by eight patches.
+    # Joints that are predicted relative to the state, by statistics of their own, beside a gripper that is not; one part is
+    # relative to a state of another name. Three cameras whose aspect is kept: six by eight patches.
     "gr00t_n1_7/relative": case(43, {"ego_view": (36, 48, "png"), "left": (36, 48, "png"), "right": (36, 48, "jpg")},
         "stack the green block on the yellow block", Description(
-        "real_arms_relative_joints", 1, Robot(("ego_view", "left", "right"), {"left_arm": 3, "waist": 2, "right_arm_joints": 4},
-                                              {"gripper": 1, "right_arm": 4, "left_arm": 3}, 7,
-                                              {"right_arm": "right_arm_joints", "left_arm": None}),
+        "real_arms_relative_joints", 1, Robot(
+            ("ego_view", "left", "right"), {"gripper": 1, "right_arm_joints": 4, "left_arm": 3, "waist": 2},
+            {"gripper": 1, "right_arm": 4, "left_arm": 3}, 7, {"right_arm": "right_arm_joints", "left_arm": None}),
         vision(32, 4, 2, 40, 7, (0, 1, 2)), text(40, 5, 5, 5, 8, 52, (2, 1, 1)),
         head(4, (6, 5, 6), (2, 4, 10), 22, 12, 10, 9),
         {"image_target_size": [24, 24], "image_crop_size": [22, 22]}, 24, percentiles=True),
@@ -75,7 +75,7 @@ CASES = {
         "my_robot.v2", 2, Robot(("top", "wrist"), {"joints": 6}, {"joints": 5, "hand": 2}, 4),
         vision(28, 4, 7, 32, 4, (0, 1, 2), 2), text(36, 8, 3, 1, 20, 40, (4, 3, 3)),
         head(4, (7, 2, 16), (3, 2, 18), 26, 8, 8, 5, num_inference_timesteps=5, attend_text_every_n_blocks=3),
-        {"image_target_size": [16, 16]}, 16)),
+        {"image_target_size": [16, 16], "image_crop_size": [16, 16]}, 16)),
     # Numbers so small that every eps shows; a frame that is enlarged; two words.
     "gr00t_n1_7/faint": case(45, {"camera": (12, 12, "png")}, "Go on", Description(
         "simpler_env_google", 1, Robot(("camera",), {"x": 1, "hand": 3}, {"x": 1, "hand": 2}, 3),

@@ -151,20 +151,12 @@ def per_key(numbers, groups):
 
 
 def all_statistics(description, seed):
-    import torch
-
     out = {}
     for i, (tag, (_, robot)) in enumerate(description.robots().items()):
-        flat, generator = statistics(robot, seed + i), torch.Generator().manual_seed(seed + 78)
-        relative = {}
-        for key in robot.relative:  # of its own for every row of a chunk
-            middle = torch.randn(robot.rows, robot.actions[key], generator=generator) * 0.1
-            spread = torch.rand(robot.rows, robot.actions[key], generator=generator) * 0.3 + 0.1
-            relative |= per_key({k: (middle + x * spread).T for k, x in (
-                ("min", -3), ("max", 3), ("mean", 0), ("q01", -2.2), ("q99", 2.2))} | {"std": spread.T}, {key: robot.actions[key]})
-            relative[key] = {k: [list(row) for row in zip(*v)] for k, v in relative[key].items()}
+        flat, changes = statistics(robot, seed + i), statistics(robot, seed + i + 1000)["action"]
+        relative = per_key(changes, robot.actions)
         out[tag] = {"state": per_key(flat["observation.state"], robot.states), "action": per_key(flat["action"], robot.actions),
-                    "relative_action": relative}
+                    "relative_action": {key: relative[key] for key in robot.relative}}
     return out
 
 
