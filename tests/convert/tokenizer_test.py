@@ -9,7 +9,7 @@ from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
 
 from tiny import N_VOCAB, SPECIAL, Tiny, byte_alphabet, write_json
 from vla_cpp.convert import Code
-from vla_cpp.convert.tokenizer_byte_level import byte_symbols
+from vla_cpp.convert.tokenizer_byte_level import QWEN2_WORDS, byte_symbols
 
 STRINGS = [
     "pick up the top\n",
@@ -236,6 +236,37 @@ def test_another_tokenizer_is_refused_by_field(converter, tiny, message):
     error = converter.refusal(tiny)
     assert message in error.message()
     assert error.code == code
+
+
+SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_WORDS}, "behavior": "Isolated", "invert": False}
+BYTES = {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": False, "use_regex": False}
+QWEN2_STEPS = [{"type": "split", "pattern": QWEN2_WORDS}, {"type": "byte_level", "add_prefix_space": False, "use_regex": False}]
+
+
+@pytest.mark.parametrize("normalizer", [{"type": "NFC"}, {"type": "Sequence", "normalizers": [{"type": "NFC"}]}])
+def test_the_words_and_the_normalization_of_qwen2_are_read(converter, tiny, normalizer):
+    tiny.tokenizer["normalizer"] = normalizer
+    tiny.tokenizer["pre_tokenizer"] = {"type": "Sequence", "pretokenizers": [SPLIT, BYTES]}
+    keys = converter.bundle(tiny).keys
+    assert keys["tokenizer.normalization"] == "nfc" and json.loads(keys["tokenizer.pre"]) == QWEN2_STEPS
+
+
+def test_qwen2s_class_brings_them_itself(converter, tiny):
+    tiny.tokenizer["added_tokens"].append({"id": N_VOCAB - 1, "content": "<|endoftext|>"})
+    tiny.tokenizer_config["tokenizer_class"] = "Qwen2TokenizerFast"
+    keys = converter.bundle(tiny).keys
+    assert keys["tokenizer.normalization"] == "nfc" and json.loads(keys["tokenizer.pre"]) == QWEN2_STEPS
+    assert any("names Qwen2TokenizerFast" in note for note in converter.summary.notes)
+
+
+def test_text_is_not_normalized_unless_the_tokenizer_says_so(converter, tiny):
+    assert "tokenizer.normalization" not in converter.bundle(tiny).keys
+
+
+@pytest.mark.parametrize("change", [{"behavior": "Removed"}, {"invert": True}, {"pattern": {"Regex": " "}}])
+def test_other_splits_are_refused(converter, tiny, change):
+    tiny.tokenizer["pre_tokenizer"] = {"type": "Sequence", "pretokenizers": [{**SPLIT, **change}, BYTES]}
+    assert "the Split of Qwen2, found" in converter.refusal(tiny).message()
 
 
 def test_an_unknown_token_is_no_obstacle_because_no_byte_is_unknown(converter, tiny):

@@ -12,7 +12,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import EVO1, GR00T_N1_7, LEROBOT, OPENPI
+from ..checkpoint import EVO1, GR00T_MODELS, GR00T_N1_7, LEROBOT, OPENPI
 from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
@@ -77,10 +77,15 @@ def names() -> List[str]:
     return sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_"))
 
 
+# Types of LeRobot whose policies are read in another layout.
+OTHER_LAYOUTS = {"groot": "a fine-tune of GR00T as LeRobot saves it is not read yet, GR00T N1.7 as its authors publish it is"}
+
+
 def load(name):
     """The module of an architecture. Errors: unsupported."""
     if name not in names():
-        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), code=Code.UNSUPPORTED)
+        hint = OTHER_LAYOUTS.get(str(name), "")
+        raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), hint, Code.UNSUPPORTED)
     return importlib.import_module("." + name, __name__)
 
 
@@ -118,6 +123,9 @@ def check_options(layout: str, config: dict, options: Options) -> None:
 def arch_of(config: dict, layout: str, variant: str) -> str:
     """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
     was trained with. Errors: usage, unsupported."""
+    if layout == LEROBOT and "type" not in config and str(config.get("model_type")).lower().startswith("gr00t"):
+        found = str(config["model_type"])
+        raise refuse("config.json: model_type", " or ".join(GR00T_MODELS), found, "another release of GR00T", Code.UNSUPPORTED)
     if layout != OPENPI:
         return config.get("type") if layout == LEROBOT else layout
     variants = {name: arch for arch in names() for name in getattr(load(arch), "VARIANTS", ())}

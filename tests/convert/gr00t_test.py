@@ -1,0 +1,371 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Conversion of GR00T N1.7 checkpoints."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tiny_gr00t import (
+    CROP,
+    D_ACTION,
+    D_DIT,
+    D_HIDDEN,
+    D_MODEL,
+    D_STATE,
+    D_VISION,
+    EDGE,
+    HORIZON,
+    IDS,
+    N_DIT_LAYER,
+    N_EMBODIMENT,
+    N_LAYER,
+    OTHER,
+    PATCH,
+    TAG,
+    TinyGr00t,
+)
+from vla_cpp.convert.archs._gr00t_names import weights
+from vla_cpp.convert.archs._gr00t_sizes import Sizes
+from vla_cpp.convert.errors import Problems
+
+STATE, ACTION = "stats.observation.state", "stats.action"
+VISUAL, LM, HEAD = "backbone.model.model.visual.", "backbone.model.model.language_model.", "action_head."
+CLIP = {"op": "clip", "low": -1.0, "high": 1.0}
+
+
+def convert(converter, tiny=None, **options):
+    return converter.bundle(tiny or TinyGr00t(), **{"embodiment": TAG, **options})
+
+
+def recipe(bundle):
+    return json.loads(bundle.keys["processor.recipe"])
+
+
+def test_every_number_that_a_robot_needs_is_in_its_bundle(converter):
+    tiny = TinyGr00t()
+    bundle = convert(converter, tiny)
+    own = [name for name in tiny.tensors if name.endswith((".W", ".b"))]
+    needed = sum(array.size // (N_EMBODIMENT if name in own else 1) for name, array in tiny.tensors.items())
+    found = sum(array.size for name, array in bundle.tensors.items() if not name.startswith("stats."))
+    assert found == needed - D_MODEL  # the final norm, which nothing reads
+    assert bundle.keys["vla.arch"] == "gr00t_n1_7" and bundle.keys["vla.dtype"] == "f32"
+    assert list(converter.summary.dropped.values()) == [[LM + "norm.weight"]]
+
+
+ONE = {
+    "vision.position.weight": VISUAL + "pos_embed.weight",
+    "vision.blk.2.ffn_norm.bias": VISUAL + "blocks.2.norm2.bias",
+    "vision.blk.1.attn_out.weight": VISUAL + "blocks.1.attn.proj.weight",
+    "vision.blk.0.ffn_down.weight": VISUAL + "blocks.0.mlp.linear_fc2.weight",
+    "connector.norm.weight": VISUAL + "merger.norm.weight",
+    "connector.down.bias": VISUAL + "merger.linear_fc2.bias",
+    "deepstack.1.norm.bias": VISUAL + "deepstack_merger_list.1.norm.bias",
+    "deepstack.1.up.weight": VISUAL + "deepstack_merger_list.1.linear_fc1.weight",
+    "lm.token_embd.weight": LM + "embed_tokens.weight",
+    "lm.blk.1.attn_q_norm.weight": LM + "layers.1.self_attn.q_norm.weight",
+    "lm.blk.1.attn_k_norm.weight": LM + "layers.1.self_attn.k_norm.weight",
+    "lm.blk.0.ffn_norm.weight": LM + "layers.0.post_attention_layernorm.weight",
+    "lm.blk.0.ffn_gate.weight": LM + "layers.0.mlp.gate_proj.weight",
+    "vl.norm.bias": HEAD + "vlln.bias",
+    "vl.blk.0.ffn_norm.weight": HEAD + "vl_self_attention.transformer_blocks.0.norm3.weight",
+    "vl.blk.0.attn_v.bias": HEAD + "vl_self_attention.transformer_blocks.0.attn1.to_v.bias",
+    "time_in.weight": HEAD + "model.timestep_encoder.timestep_embedder.linear_1.weight",
+    "time_out.bias": HEAD + "model.timestep_encoder.timestep_embedder.linear_2.bias",
+    "dit.blk.3.ada.weight": HEAD + "model.transformer_blocks.3.norm1.linear.weight",
+    "dit.blk.2.attn_k.weight": HEAD + "model.transformer_blocks.2.attn1.to_k.weight",
+    "dit.blk.1.attn_out.bias": HEAD + "model.transformer_blocks.1.attn1.to_out.0.bias",
+    "dit.blk.0.ffn_up.weight": HEAD + "model.transformer_blocks.0.ff.net.0.proj.weight",
+    "dit.out_ada.bias": HEAD + "model.proj_out_1.bias",
+    "dit.out.weight": HEAD + "model.proj_out_2.weight",
+    "action_position.weight": HEAD + "position_embedding.weight",
+}
+
+
+def test_tensors_come_from_where_the_mapping_says(converter):
+    tiny = TinyGr00t()
+    bundle = convert(converter, tiny)
+    for target, source in ONE.items():
+        np.testing.assert_array_equal(bundle.tensors[target], tiny.tensors[source], err_msg=target)
+
+
+@pytest.mark.parametrize("tag", [TAG, OTHER])
+def test_a_robots_weights_are_its_slices_turned_to_outputs_before_inputs(converter, tag):
+    tiny = TinyGr00t()
+    bundle = convert(converter, tiny, embodiment=tag)
+    for target, source in {
+        "state_in": "state_encoder.layer1",
+        "state_out": "state_encoder.layer2",
+        "action_in": "action_encoder.W1",
+        "action_mix": "action_encoder.W2",
+        "action_token": "action_encoder.W3",
+        "decode_in": "action_decoder.layer1",
+        "decode_out": "action_decoder.layer2",
+    }.items():
+        stored = {part: tiny.tensors["{}{}.{}".format(HEAD, source, part)][IDS[tag]] for part in "Wb"}
+        np.testing.assert_array_equal(bundle.tensors[target + ".weight"], stored["W"].T)
+        np.testing.assert_array_equal(bundle.tensors[target + ".bias"], stored["b"])
+
+
+def test_the_time_slices_of_the_patch_convolution_are_two_matrices(converter):
+    tiny = TinyGr00t()
+    bundle, stored = convert(converter, tiny), tiny.tensors[VISUAL + "patch_embed.proj.weight"]
+    for target, time in (("vision.patch_embed.weight", 0), ("vision.patch_embed_next.weight", 1)):
+        np.testing.assert_array_equal(bundle.tensors[target], stored[:, :, time].reshape(D_VISION, 3 * PATCH**2))
+
+
+@pytest.mark.parametrize("part, name", list(enumerate(("attn_q", "attn_k", "attn_v"))))
+def test_stacked_queries_keys_and_values_are_cut_apart(converter, part, name):
+    tiny = TinyGr00t()
+    bundle, rows = convert(converter, tiny), slice(part * D_VISION, (part + 1) * D_VISION)
+    for kind in ("weight", "bias"):
+        stored = tiny.tensors["{}blocks.1.attn.qkv.{}".format(VISUAL, kind)]
+        np.testing.assert_array_equal(bundle.tensors["vision.blk.1.{}.{}".format(name, kind)], stored[rows])
+
+
+def test_bf16_slices_are_rounded_like_all_matrices(converter):
+    bundle = convert(converter, dtype="bf16")
+    assert bundle.dtypes["action_mix.weight"] == "bf16" and bundle.tensors["action_mix.weight"].shape == (D_DIT, 2 * D_DIT)
+    assert bundle.dtypes["action_mix.bias"] == "f32"
+
+
+def test_keys_state_the_network(converter):
+    keys = convert(converter).keys
+    expected = {
+        "policy.d_state": D_STATE,
+        "policy.d_action": D_ACTION,
+        "policy.horizon": HORIZON,
+        "policy.n_slot": 2,
+        "vision.image_width": EDGE,
+        "vision.image_height": EDGE,
+        "vision.n_position_side": 3,
+        "vision.merge": 2,
+        "vision.deepstack_layers": [0, 2],
+        "lm.n_layer": N_LAYER,
+        "lm.rope_base": 5e6,
+        "lm.rope_sections": [2, 1, 1],
+        "vl.n_layer": 1,
+        "vl.n_head": 6,
+        "vl.d_ff": 4 * D_MODEL,
+        "dit.n_layer": N_DIT_LAYER,
+        "dit.d_ff": 4 * D_DIT,
+        "dit.d_out": D_HIDDEN,
+        "dit.text_every": 2,
+        "dit.d_time": 256,
+        "dit.n_bucket": 1000,
+        "dit.norm_eps": pytest.approx(1e-5),
+        "dit.out_eps": pytest.approx(1e-6),
+        "vision.norm_eps": pytest.approx(1e-6),
+        "solver.steps": 3,
+        "solver.kind": "euler",
+        "solver.noise": "normal",
+        "solver.t_start": 0.0,
+        "solver.t_end": 1.0,
+        "observation.views": ["observation.images.front", "observation.images.wrist"],
+        "observation.view_optional": [0, 0],
+        "observation.min_views": 2,
+        "observation.states": ["state.x", "state.gripper"],
+        "observation.state_dims": [1, 2],
+        "observation.state_names": ["x", "gripper.0", "gripper.1"],
+        "action.names": ["x", "gripper"],
+    }
+    assert {name: keys[name] for name in expected} == expected
+
+
+def test_views_start_behind_the_words_of_the_prompt(converter):
+    keys = convert(converter).keys
+    # <|im_start|>, five tokens of "user" and a line's end, <|vision_start|>, 9 image tokens, <|vision_end|>, <|vision_start|>
+    assert keys["policy.view_starts"] == [7, 7 + 9 + 2]
+    assert keys["observation.max_text_tokens"] == 6 + 2 * 11 + 1 + 512
+
+
+def test_the_recipe_is_the_authors_pipeline(converter):
+    found = recipe(convert(converter))
+    side = {"op": "smallest_side", "size": EDGE, "filter": "opencv_area"}
+    assert found["image"] == [
+        side,
+        {"op": "crop_fraction", "fraction": CROP / EDGE},
+        side,
+        {"op": "size", "width": EDGE, "height": EDGE},
+        {"op": "affine", "scale": 2.0, "shift": -1.0},
+    ]
+    view = {"open": "<|vision_start|>", "token": "<|image_pad|>", "repeat": 9, "close": "<|vision_end|>"}
+    assert found["text"] == [
+        {"op": "lower"},
+        {"op": "drop_punctuation"},
+        {"op": "views", "count": 2, **view},
+        {"op": "template", "text": "<|im_start|>user\n{instruction}<|im_end|>\n"},
+        {"op": "tokenize", "max_tokens": 541, "truncate": "right"},
+    ]
+    normalize = {"op": "normalize", "kind": "groot_min_max", "stats": STATE, "eps": 0.0}
+    assert found["state"] == [normalize, CLIP, {"op": "pad", "size": D_STATE}]
+    unnormalize = {"op": "unnormalize", "kind": "groot_min_max", "stats": ACTION, "eps": 0.0}
+    assert found["action"] == [{"op": "rows", "count": 4}, {"op": "take", "size": 2}, CLIP, unnormalize]
+
+
+@pytest.mark.parametrize("percentiles, low, high", [(True, "q01", "q99"), (False, "min", "max")])
+def test_statistics_stand_one_after_the_other_in_the_order_of_keys(converter, percentiles, low, high):
+    tiny = TinyGr00t()
+    tiny.kwargs["use_percentiles"] = percentiles
+    tiny.robots[TAG]["state"]["modality_keys"].reverse()
+    bundle = convert(converter, tiny)
+    for feature, kind, keys in ((STATE, "state", ("gripper", "x")), (ACTION, "action", ("x", "gripper"))):
+        for ours, theirs in (("min", low), ("max", high)):
+            stored = np.concatenate([tiny.statistics[TAG][kind][key][theirs] for key in keys]).astype(np.float32)
+            np.testing.assert_array_equal(bundle.tensors["{}.{}".format(feature, ours)], stored)
+
+
+def test_relative_actions_have_ranges_of_their_own_and_are_added_to_the_state(converter):
+    bundle = convert(converter, TinyGr00t().relative())
+    assert recipe(bundle)["action"][-1] == {"op": "add_state", "columns": [0]}
+    assert bundle.tensors[ACTION + ".min"][0] == -0.25 and bundle.tensors[ACTION + ".max"][0] == 0.5
+
+
+def test_relative_actions_of_a_checkpoint_without_them_are_as_good_as_absolute(converter):
+    tiny = TinyGr00t().relative()
+    tiny.kwargs["use_relative_action"] = False
+    bundle = convert(converter, tiny)
+    assert recipe(bundle)["action"][-1]["op"] == "unnormalize"
+    assert bundle.tensors[ACTION + ".min"][0] == np.float32(tiny.statistics[TAG]["action"]["x"]["q01"][0])
+
+
+def test_keys_of_means_and_deviations_are_not_clipped(converter):
+    tiny = TinyGr00t()
+    for kind in ("state", "action"):
+        tiny.robots[TAG][kind]["mean_std_embedding_keys"] = ["gripper", "x"]
+    bundle = convert(converter, tiny)
+    state, action = recipe(bundle)["state"], recipe(bundle)["action"]
+    assert [op["op"] for op in state] == ["normalize", "pad"] and state[0]["kind"] == "groot_mean_std"
+    assert [op["op"] for op in action] == ["rows", "take", "unnormalize"] and action[-1]["kind"] == "groot_mean_std"
+    assert bundle.tensors[STATE + ".std"].shape == (3,) and STATE + ".min" not in bundle.tensors
+
+
+def test_switches_of_the_processor_leave_their_steps_out(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs.update(clip_outliers=False, formalize_language=False, crop_fraction=1.0)
+    found = recipe(convert(converter, tiny))
+    assert [op["op"] for op in found["state"]] == ["normalize", "pad"] and CLIP in found["action"]
+    assert [op["op"] for op in found["text"]] == ["views", "template", "tokenize"]
+    assert [op["op"] for op in found["image"]] == ["smallest_side", "size", "affine"]
+
+
+def test_an_edge_and_a_fraction_count_before_sizes(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs.update(shortest_image_edge=16, crop_fraction=0.95, image_target_size=None, image_crop_size=None)
+    bundle = convert(converter, tiny)
+    assert recipe(bundle)["image"][:2] == [
+        {"op": "smallest_side", "size": 16, "filter": "opencv_area"},
+        {"op": "crop_fraction", "fraction": 0.95},
+    ]
+    assert bundle.keys["vision.image_width"] == 16 and recipe(bundle)["text"][2]["repeat"] == 16
+
+
+def test_letterboxed_pictures_are_square_whatever_the_camera(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs["letter_box_transform"] = True
+    bundle = convert(converter, tiny, camera_size="40x30")
+    assert recipe(bundle)["image"][0] == {"op": "square_pad"} and bundle.keys["vision.image_width"] == EDGE
+
+
+def test_a_cameras_aspect_is_kept_up_to_the_backbones_multiples(converter):
+    bundle = convert(converter, camera_size="40x30")
+    # 40x30 -> 16x12 -> crop 14x11 -> 15x12 -> multiples of 4
+    assert (bundle.keys["vision.image_width"], bundle.keys["vision.image_height"]) == (16, 12)
+    resize = {"op": "qwen_smart_resize", "multiple": 4, "min_pixels": 144, "max_pixels": 4096}
+    assert recipe(bundle)["image"][3:5] == [resize, {"op": "size", "width": 16, "height": 12}]
+    assert recipe(bundle)["text"][2]["repeat"] == 4 * 3
+
+
+@pytest.mark.parametrize("least, most, side", [(145, 4096, 16), (64, 143, 8)])
+def test_the_backbone_holds_pictures_between_two_areas(converter, least, most, side):
+    tiny = TinyGr00t()
+    tiny.images.update(min_pixels=least, max_pixels=most)
+    assert convert(converter, tiny).keys["vision.image_height"] == side
+
+
+def test_the_processors_files_may_lie_below_a_folder(converter):
+    tiny = TinyGr00t()
+    tiny.below = "processor"
+    assert convert(converter, tiny).keys["observation.min_views"] == 2
+
+
+def test_a_tag_without_an_index_has_that_of_the_authors_table(converter):
+    tiny = TinyGr00t()
+    tiny.robots["libero_sim"], tiny.statistics["libero_sim"] = tiny.robots[TAG], tiny.statistics[TAG]
+    bundle = convert(converter, tiny, embodiment="libero_sim")
+    stored = tiny.tensors[HEAD + "state_encoder.layer1.b"][2]
+    np.testing.assert_array_equal(bundle.tensors["state_in.bias"], stored)
+    assert any("authors' table" in note for note in converter.summary.notes)
+
+
+def test_a_checkpoint_without_attention_over_its_features_has_no_layers_of_it(converter):
+    tiny = TinyGr00t()
+    del tiny.config["vl_self_attention_cfg"]
+    tiny.tensors = {name: array for name, array in tiny.tensors.items() if "vl_self_attention" not in name}
+    bundle = convert(converter, tiny)
+    assert bundle.keys["vl.n_layer"] == 0 and not any(name.startswith("vl.blk") for name in bundle.tensors)
+
+
+def test_rows_are_no_more_than_the_networks(converter):
+    tiny = TinyGr00t()
+    tiny.robots[TAG]["action"]["delta_indices"] = list(range(HORIZON + 3))
+    assert recipe(convert(converter, tiny))["action"][0] == {"op": "rows", "count": HORIZON}
+
+
+def test_cameras_may_bear_full_names(converter):
+    tiny = TinyGr00t()
+    tiny.robots[TAG]["video"]["modality_keys"][0] = "observation.images.front"
+    assert convert(converter, tiny).keys["observation.views"][0] == "observation.images.front"
+
+
+def test_both_spellings_of_the_rotary_embedding_are_read(converter):
+    tiny = TinyGr00t()
+    text = tiny.backbone["text_config"]
+    text["rope_parameters"] = {**text.pop("rope_scaling"), "rope_theta": text.pop("rope_theta")}
+    assert convert(converter, tiny).keys["lm.rope_base"] == 5e6
+
+
+PUBLISHED = Sizes(
+    d_vision=1024,
+    n_vision_layer=24,
+    n_vision_head=16,
+    d_vision_ff=4096,
+    patch_size=16,
+    n_position_side=48,
+    deepstack_layers=[5, 11, 17],
+    d_model=2048,
+    n_layer=16,
+    n_head=16,
+    n_head_kv=8,
+    d_head=128,
+    d_ff=6144,
+    n_vocab=151936,
+    n_vl_layer=4,
+    d_dit=1536,
+    n_dit_layer=32,
+    d_out=1024,
+    d_hidden=1024,
+    d_state=132,
+    d_action=132,
+    n_position=1024,
+    n_embodiment=32,
+    embodiment=2,
+)
+
+
+@pytest.mark.parametrize(
+    "prefixes, millions",
+    [
+        (("vision.blk.",), 302.3),
+        (("connector.", "deepstack."), 100.7),
+        (("lm.blk.",), 805.4),
+        (("lm.token_embd.",), 311.2),
+        (("vl.",), 201.4),
+        (("dit.", "time_"), 1091.7),
+        (("state_", "action_", "decode_"), 10.2 + 1.6),
+    ],
+)
+def test_the_published_size_has_the_published_counts_of_parameters(prefixes, millions):
+    rows = [row for row in weights(PUBLISHED) if row.target.startswith(prefixes)]
+    assert sum(int(np.prod(row.shape)) for row in rows) / 1e6 == pytest.approx(millions, abs=0.06)
