@@ -29,7 +29,7 @@ class Case:
     seed: int
     frames: dict  # view -> (height, width, suffix), or None: the view is absent
     text: str
-    checkpoint: object  # the Description of random_smolvla, random_pi or random_evo1
+    checkpoint: object  # the Description of random_smolvla, random_pi, random_evo1 or random_gr00t_n1_7
     state: tuple = ()  # instead of a random one
     options: dict = field(default_factory=dict)  # what the checkpoint does not say: kept as convert.json beside it
 
@@ -116,7 +116,11 @@ def write_observation(case, folder):
     for i in d.zero_spread:  # what never moved in the data does not move here; otherwise eps would rule the chunk
         state[i] = random_smolvla.statistics(d, case.seed)["observation.state"]["mean"][i]
     state = torch.tensor(case.state) if case.state else state
-    observation = {"images": images, "state": state.tolist(), "text": case.text}
+    state = state.tolist()
+    if hasattr(d, "states"):  # feature -> width
+        numbers = iter(state)
+        state = {name: [next(numbers) for _ in range(n)] for name, n in d.states.items()}
+    observation = {"images": images, "state": state, "text": case.text}
     (folder / "observation.json").write_text(json.dumps(observation, indent=1, ensure_ascii=False) + "\n")
     shape = d.policy["chunk_size"], d.policy["max_action_dim"]
     if getattr(d, "noise", "normal") == "uniform":  # multiples of 2^-20: they survive what a reference makes of a draw

@@ -88,8 +88,10 @@ def run_vla(vla, case, bundle, pattern, taps_file, threads):
     command = [vla, "run", bundle, "--json", "--kernels", "float32", "--threads", threads, "--noise", case / "noise.npy"]
     for view, file in observation["images"].items():
         command += ["--image", f"{view}={case / file if file else ''}"]
-    command += ["--state", ",".join(map(repr, observation["state"])), "--text", observation["text"]]
-    command += ["--tap", pattern, "--taps-out", taps_file]
+    states = observation["state"]
+    for name, numbers in (states if isinstance(states, dict) else {"state": states}).items():
+        command += ["--state", f"{name}={','.join(map(repr, numbers))}"]
+    command += ["--text", observation["text"], "--tap", pattern, "--taps-out", taps_file]
     out, peak = child(command)
     answer = json.loads(out.splitlines()[-1])
     taps = {t.name: np.array(t.data) for t in gguf.GGUFReader(str(taps_file)).tensors}

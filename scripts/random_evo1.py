@@ -63,26 +63,26 @@ def published(views):
         {"chunk_size": 50, "max_state_dim": 24, "max_action_dim": 24, "max_text_length": 1024}, views)
 
 
-def tokenizer(n_merge):
-    """Qwen2's own rules with other merges; the added tokens follow the vocabulary, in the published order."""
+def tokenizer(n_merge, added=ADDED, frames=tuple(f"Image-{i}: <\n{{}}\n" for i in (1, 2, 3)), **more):
+    """Qwen2's own rules with other merges; the added tokens follow the vocabulary, in the published order.  frames: what stands
+    around an instruction."""
     from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers, trainers
     from transformers import PreTrainedTokenizerFast, Qwen2Tokenizer
 
     published, fast = Qwen2Tokenizer().backend_tokenizer, Tokenizer(models.BPE())
     fast.normalizer, fast.pre_tokenizer, fast.decoder = published.normalizer, published.pre_tokenizer, published.decoder
-    corpus = [f"Image-{i}: <\n{task}\n" for task in TASKS for i in (1, 2, 3)]
+    corpus = [frame.format(task) for task in TASKS for frame in frames]
     fast.train_from_iterator(corpus, trainers.BpeTrainer(
         vocab_size=256 + n_merge, initial_alphabet=pre_tokenizers.ByteLevel.alphabet(), show_progress=False))
     if fast.get_vocab_size() != 256 + n_merge:
         raise ValueError(f"the corpus gives {fast.get_vocab_size() - 256} merges, not {n_merge}")
-    fast.add_tokens([AddedToken(t, special=True, normalized=False) for t in ADDED])
+    fast.add_tokens([AddedToken(t, special=True, normalized=False) for t in added])
     return PreTrainedTokenizerFast(tokenizer_object=fast, pad_token="<|endoftext|>", eos_token="<|im_end|>", padding_side="right",
-                                   model_max_length=12288, clean_up_tokenization_spaces=False)
+                                   model_max_length=12288, clean_up_tokenization_spaces=False, **more)
 
 
-def write_tokenizer(description, folder):
-    """tokenizer.json, and for the authors' layout the three files that their slow class reads."""
-    words = tokenizer(description.n_merge)
+def save_tokenizer(words, folder):
+    """tokenizer.json and tokenizer_config.json as published: Qwen2's class, added tokens in both.  Returns the former."""
     words.save_pretrained(folder)
     spec = json.loads(words.backend_tokenizer.to_str())
     settings = json.loads((folder / "tokenizer_config.json").read_text())
@@ -90,6 +90,12 @@ def write_tokenizer(description, folder):
         str(t["id"]): {k: v for k, v in t.items() if k != "id"} for t in spec["added_tokens"]}}
     settings.pop("backend", None)
     (folder / "tokenizer_config.json").write_text(json.dumps(settings, indent=2) + "\n")
+    return spec
+
+
+def write_tokenizer(description, folder):
+    """tokenizer.json, and for the authors' layout the three files that their slow class reads."""
+    spec = save_tokenizer(tokenizer(description.n_merge), folder)
     if description.layout == "authors":
         (folder / "vocab.json").write_text(json.dumps(spec["model"]["vocab"], ensure_ascii=False))
         (folder / "merges.txt").write_text("#version: 0.2\n" + "".join(" ".join(m) + "\n" for m in spec["model"]["merges"]))

@@ -21,6 +21,13 @@ def tensors(path):
     return {t.name: np.array(t.data) for t in gguf.GGUFReader(path).tensors}
 
 
+def _states(state):
+    """Arguments of --state: the numbers of the only feature, or those of each by name."""
+    if not isinstance(state, dict):
+        return [",".join(map(repr, state))]
+    return [f"{name}={','.join(map(repr, numbers))}" for name, numbers in state.items()]
+
+
 class Golden:
     """One case, `arch/name`, or the name alone of one of SmolVLA's.  `arguments` is a sound call of `vla run`, of which a
     test changes one thing."""
@@ -45,13 +52,12 @@ class Golden:
 
     def arguments(self, bundle=None, images=None, state=None, text=None, noise=None, options=("--json",)):
         images = self.images if images is None else images
-        state = ",".join(map(repr, self.state)) if state is None else state
+        states = _states(self.state) if state is None else [state]
         return [
             "run",
             bundle or self.bundle,
             *(a for v, f in images.items() for a in ("--image", f"{v}={f or ''}")),
-            "--state",
-            state,
+            *(a for s in states for a in ("--state", s)),
             "--text",
             self.text if text is None else text,
             "--noise",

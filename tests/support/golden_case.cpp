@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <filesystem>
+#include <map>
 #include <nlohmann/json.hpp>
 
 #include "base/file.h"
@@ -19,7 +20,11 @@ GoldenCase GoldenCase::read(const std::string& path) {
   golden.path = path;
   const auto json = nlohmann::json::parse(read_text(path + "/observation.json"));
   golden.observation.text = json.at("text");
-  golden.observation.states["state"] = json.at("state").get<std::vector<float>>();
+  const auto& state = json.at("state");  // numbers, or several features by name
+  if (state.is_object())
+    golden.observation.states = state.get<std::map<std::string, std::vector<float>>>();
+  else
+    golden.observation.states["state"] = state.get<std::vector<float>>();
   for (const auto& [name, file] : json.at("images").items()) {
     std::optional<Frame> frame;
     if (!file.is_null()) {

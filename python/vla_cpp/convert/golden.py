@@ -86,12 +86,14 @@ def versions() -> str:
 # --- the reference, run on one case -------------------------------------------------------------------------------
 
 # For each architecture the module that knows its class: `load(checkpoint, dtype)` and a `Recorder`.
-REFERENCES = {"smolvla": "golden_smolvla", "pi0": "golden_pi", "pi05": "golden_pi", "evo1": "golden_evo1"}
+REFERENCES = {"smolvla": "golden_smolvla", "pi0": "golden_pi", "pi05": "golden_pi", "evo1": "golden_evo1",
+              "gr00t_n1_7": "golden_gr00t_n1_7"}
 
 
 def config_type(checkpoint) -> str:
-    """The type that LeRobot's config.json names; the authors' files of Evo-1 name none."""
-    return json.loads((Path(checkpoint) / "config.json").read_text()).get("type", "evo1")
+    """The type that LeRobot's config.json names.  Authors' files have none: GR00T's give the model, Evo-1's nothing."""
+    config = json.loads((Path(checkpoint) / "config.json").read_text())
+    return config.get("type") or {"Gr00tN1d7": "gr00t_n1_7"}.get(config.get("model_type"), "evo1")
 
 
 def backbone_folder(checkpoint) -> Path:
@@ -125,7 +127,10 @@ def read_observation(case):
     from PIL import Image
 
     observation = json.loads((case / "observation.json").read_text())
-    batch = {"task": observation["text"], "observation.state": torch.tensor(observation["state"], dtype=torch.float32)}
+    state = observation["state"]
+    if isinstance(state, dict):  # several features, in the order in which the network sees them
+        state = [x for part in state.values() for x in part]
+    batch = {"task": observation["text"], "observation.state": torch.tensor(state, dtype=torch.float32)}
     for view, file in observation["images"].items():
         if file is not None:
             pixels = np.asarray(Image.open(case / file).convert("RGB"))
@@ -237,8 +242,8 @@ class Recorder(Taps):
 
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
-    stages = ("pixels", "tokens", "state", "position_ids", "vision", "connector", "projector", "prefix", "lm", "state_in",
-              "state_out", "expert", "head", "step", "chunk")
+    stages = ("pixels", "tokens", "state", "position_ids", "vision", "deepstack", "connector", "projector", "prefix", "lm",
+              "vl", "state_in", "state_out", "expert", "head", "dit", "step", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)
     i = next((int(p) for p in parts if p.isdigit()), 1000 if name in ("vision.post_norm", "lm.norm") else -1)
