@@ -103,9 +103,9 @@ void print_features(const Engine& engine) {
   const Keys& keys = engine.bundle().keys();
   const auto views = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
   const Recipe& recipe = engine.processor().recipe();
-  fmt::print("views        any size, {} to {} x {}; at least {} of {} must be present\n",
-             std::holds_alternative<Resize>(recipe.fit) ? "resized" : "letterboxed", recipe.width, recipe.height,
-             *keys.integer("observation.min_views"), views.size());
+  constexpr const char* kFits[] = {"letterboxed", "resized", "padded, scaled and cropped as the recipe says"};
+  fmt::print("views        any size, {} to {} x {}; at least {} of {} must be present\n", kFits[recipe.fit.index()],
+             recipe.width, recipe.height, *keys.integer("observation.min_views"), views.size());
   for (std::size_t i = 0; i < views.size(); ++i)
     fmt::print("    {}{}\n", views[i], aliases[i].empty() ? "" : fmt::format("  (also {})", aliases[i]));
 

@@ -30,6 +30,11 @@ void map_columns(const ThresholdOp& op, std::span<float> values) {
   }
 }
 
+void hold(const ClipOp& op, std::span<float> values) {
+  for (float& value : values)
+    if (std::isfinite(value)) value = std::clamp(value, op.low, op.high);
+}
+
 std::vector<int> bins(const BinsOp& op, std::span<const float> values) {
   std::vector<double> edges;
   const double step = (op.high - op.low) / op.count;

@@ -25,6 +25,9 @@ void map_columns(const HornAngleOp& op, std::span<float> values);
 /// Source: lerobot policies/evo1/processor_evo1.py (Evo1ActionProcessorStep).
 void map_columns(const ThresholdOp& op, std::span<float> values);
 
+/// Every value held between the two of a clip, in place. What is not a finite number stays, so that it is still found.
+void hold(const ClipOp& op, std::span<float> values);
+
 /// The whole number of each value: how many edges low + i * (high - low) / count, i in [0, count), are not above it,
 /// less 1. So it is -1 below `low` and count - 1 from the last edge on. Comparisons are exact. NaN must not come here.
 /// Source: numpy digitize and linspace, as in lerobot policies/pi05/processor_pi05.py.

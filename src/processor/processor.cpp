@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "processor/columns.h"
+#include "processor/python_text.h"
 #include "processor/text.h"
 #include "processor/unicode.h"
 
@@ -32,6 +33,11 @@ void apply(const ImageOp& op, std::span<float> pixels) {
 
 std::size_t view_size(const Recipe& recipe) {
   return std::size_t{3} * static_cast<std::size_t>(recipe.width) * static_cast<std::size_t>(recipe.height);
+}
+
+bool drops_text(const Recipe& recipe) {
+  return std::any_of(recipe.text.begin(), recipe.text.end(),
+                     [](const TextOp& op) { return std::holds_alternative<DropPunctuationOp>(op); });
 }
 
 /// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
@@ -95,6 +101,7 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
 Status Processor::encode_view(const Frame& frame, const std::string& name, std::span<float> out) const {
   if (const auto* box = std::get_if<Letterbox>(&recipe_.fit)) VLA_CHECK(letterbox(frame, *box, out, name));
   if (const auto* stretched = std::get_if<Resize>(&recipe_.fit)) VLA_CHECK(resize(frame, *stretched, out, name));
+  if (const auto* ops = std::get_if<Pipeline>(&recipe_.fit)) VLA_CHECK(run_pipeline(frame, *ops, out, name));
   for (const ImageOp& op : recipe_.image) apply(op, out);
   return {};
 }
@@ -110,6 +117,8 @@ std::string Processor::fill_prompt(const std::string& instruction, std::span<con
   std::string text = instruction;
   for (const TextOp& op : recipe_.text) {
     if (std::holds_alternative<StripOp>(op)) text = std::string(strip(text));
+    if (std::holds_alternative<LowerOp>(op)) text = python::lower(text);
+    if (std::holds_alternative<DropPunctuationOp>(op)) text = python::drop_punctuation(text);
     if (const auto* replace = std::get_if<ReplaceOp>(&op)) text = replace_all(text, replace->from, replace->to);
     if (const auto* end = std::get_if<EnsureSuffixOp>(&op); end != nullptr && !text.ends_with(end->suffix))
       text += end->suffix;
@@ -128,6 +137,9 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   if (bins_ && inputs.state_words.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
   const std::string prompt = fill_prompt(observation.text, inputs.state_words);
+  if (drops_text(recipe_) && prompt == fill_prompt({}, inputs.state_words))
+    return bad_observation("instruction", "a letter, digit or white space",
+                           "nothing but punctuation, which is dropped");
   VLA_TRY(inputs.tokens, tokenizer_.encode(prompt, kMaxViewsText + Tokenizer::kMaxText));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
@@ -208,6 +220,7 @@ void Processor::decode_row(std::vector<float>& row, std::span<const float> raw_s
     if (const auto* normalizer = std::get_if<Normalizer>(&step.op)) normalizer->apply(row);
     if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, row);
     if (const auto* threshold = std::get_if<ThresholdOp>(&step.op)) map_columns(*threshold, row);
+    if (const auto* held = std::get_if<ClipOp>(&step.op)) hold(*held, row);
     if (const auto* add = std::get_if<AddStateOp>(&step.op))
       for (const int column : add->columns)
         row[static_cast<std::size_t>(column)] += raw_state[static_cast<std::size_t>(column)];
@@ -217,14 +230,14 @@ void Processor::decode_row(std::vector<float>& row, std::span<const float> raw_s
 
 Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int horizon, int d_action,
                                              std::span<const float> raw_state) const {
-  if (d_action != d_action_ || horizon < 1 || raw_state.size() != n_state_ ||
+  if (d_action != d_action_ || horizon < std::max(1, n_row_) || raw_state.size() != n_state_ ||
       chunk.size() != static_cast<std::size_t>(horizon) * static_cast<std::size_t>(d_action))
     return Error{Code::internal, "action chunk", fmt::format("({}, {}) and {} states", horizon, d_action_, n_state_),
                  fmt::format("{} numbers in rows of {} and {} states", chunk.size(), d_action, raw_state.size())};
   const std::size_t width = action_names_.size();
   std::vector<float> actions, row;
-  actions.reserve(static_cast<std::size_t>(horizon) * width);
-  for (int i = 0; i < horizon; ++i) {
+  actions.reserve(static_cast<std::size_t>(n_row(horizon)) * width);
+  for (int i = 0; i < n_row(horizon); ++i) {
     const auto numbers = chunk.subspan(static_cast<std::size_t>(i) * static_cast<std::size_t>(d_action),
                                        static_cast<std::size_t>(d_action));
     row.assign(numbers.begin(), numbers.end());

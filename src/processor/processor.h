@@ -44,8 +44,8 @@ struct Inputs {
 class Processor {
  public:
   /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state`,
-  /// `policy.d_action` and, where the text has places for views, `policy.view_starts`, and checks that they fit each
-  /// other. The bundle may go afterwards. Errors: bad_bundle.
+  /// `policy.d_action`, where the text has places for views `policy.view_starts`, and where rows are cut off
+  /// `policy.horizon`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
   static Result<Processor> create(const Bundle& bundle);
 
   /// All three parts below. Errors: bad_observation.
@@ -60,9 +60,12 @@ class Processor {
   /// Pixels (3, height, width) of a black frame, which some references put in the place of an absent view.
   std::vector<float> absent_view() const;
 
-  /// chunk (horizon, d_action), in the network's units -> (horizon, action_names().size()) in world units. `raw_state`
-  /// is that of the observation which the chunk answers. Errors: bad_action for a number that is not finite, naming its
-  /// row and column.
+  /// How many rows of a chunk of `horizon` rows are actions: all of them, or the first that the recipe keeps.
+  int n_row(int horizon) const { return n_row_ > 0 ? n_row_ : horizon; }
+
+  /// chunk (horizon, d_action), in the network's units -> (n_row(horizon), action_names().size()) in world units.
+  /// `raw_state` is that of the observation which the chunk answers. Errors: bad_action for a number that is not
+  /// finite, naming its row and column.
   Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action,
                                     std::span<const float> raw_state) const;
 
@@ -85,7 +88,7 @@ class Processor {
     std::size_t offset, width;
   };
   struct ActionStep {
-    std::variant<Normalizer, AddStateOp, ColumnAffineOp, ThresholdOp> op;
+    std::variant<Normalizer, ClipOp, AddStateOp, ColumnAffineOp, ThresholdOp> op;
     std::size_t width;
   };
 
@@ -127,6 +130,7 @@ class Processor {
   std::size_t d_state_ = 0;  // of the network, after padding
   float padding_ = 0.0f;
   int d_action_ = 0;  // of the network
+  int n_row_ = 0;     // that the recipe keeps; 0: all
 };
 
 }  // namespace vla

@@ -129,7 +129,7 @@ Status Processor::check_columns(const std::vector<int>& columns, std::size_t wid
 Result<Processor::StateStep> Processor::read_normalize(const Bundle& bundle, const NormalizeOp& op,
                                                        const std::string& where) const {
   std::size_t offset = 0, n_column = n_state_;
-  if (!op.feature.empty() || states_.names().size() > 1) {
+  if (!op.feature.empty() || (states_.names().size() > 1 && !is_groot(op.kind))) {
     const auto& names = states_.names();
     const auto index = static_cast<std::size_t>(std::find(names.begin(), names.end(), op.feature) - names.begin());
     if (index == names.size())
@@ -144,9 +144,11 @@ Result<Processor::StateStep> Processor::read_normalize(const Bundle& bundle, con
 
 /// The prompt of an empty instruction shows where the places are; nothing that follows them may move them.
 Status Processor::read_view_places(const Keys& keys) {
-  const auto* views = recipe_.text.empty() ? nullptr : std::get_if<ViewsOp>(&recipe_.text.back());
-  if (views == nullptr) return {};
-  const std::string where = fmt::format("processor.recipe.text[{}]", recipe_.text.size() - 1);
+  const auto op = std::find_if(recipe_.text.begin(), recipe_.text.end(),
+                               [](const TextOp& text) { return std::holds_alternative<ViewsOp>(text); });
+  if (op == recipe_.text.end()) return {};
+  const auto* views = std::get_if<ViewsOp>(&*op);
+  const std::string where = fmt::format("processor.recipe.text[{}]", op - recipe_.text.begin());
   VLA_TRY(const std::vector<int> starts, keys.integers("policy.view_starts"));
   VLA_TRY(const std::vector<std::int32_t> prefixed, tokenizer_.encode(views->token));
   const std::size_t n_prefix = tokenizer_.prefix().size();
@@ -217,6 +219,14 @@ Status Processor::read_action_steps(const Bundle& bundle) {
       if (take->size > width)
         return misfit(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
       width = take->size;
+    } else if (const auto* rows = std::get_if<RowsOp>(&op)) {
+      VLA_TRY(const int horizon, bundle.keys().integer("policy.horizon"));
+      if (rows->count > horizon)
+        return misfit(where + ".count", fmt::format("at most the {} rows of a chunk (policy.horizon)", horizon),
+                      std::to_string(rows->count));
+      n_row_ = rows->count;
+    } else if (const auto* held = std::get_if<ClipOp>(&op)) {
+      action_steps_.push_back({*held, n_column});
     } else if (const auto* add = std::get_if<AddStateOp>(&op)) {
       VLA_CHECK(check_columns(add->columns, std::min(n_column, n_state_), where));
       action_steps_.push_back({*add, n_column});

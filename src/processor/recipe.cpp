@@ -58,7 +58,7 @@ Result<Recipe> parse_recipe(const std::string& json) {
       return Error{Code::bad_bundle, std::string(kWhere) + "." + item.key(), "", "unknown field",
                    "this bundle needs a newer vla"};
   if (recipe.width == 0)
-    return Error{Code::bad_bundle, std::string(kWhere) + ".image", "a letterbox or a resize", "no op"};
+    return Error{Code::bad_bundle, std::string(kWhere) + ".image", "a letterbox, a resize or a size", "none"};
   if (recipe.max_tokens == 0)
     return Error{Code::bad_bundle, std::string(kWhere) + ".text", "tokenize as the last op", "none"};
   VLA_CHECK(check_words(recipe));

@@ -8,6 +8,7 @@
 
 #include "base/result.h"
 #include "processor/letterbox.h"
+#include "processor/pipeline.h"
 #include "processor/resize.h"
 #include "processor/standardize.h"
 
@@ -24,8 +25,13 @@ enum class NormKind {
   openpi_quantiles,
   evo1_mean_std,
   evo1_min_max,
-  evo1_quantiles
+  evo1_quantiles,
+  groot_min_max,
+  groot_mean_std
 };
+
+/// The kinds of GR00T, whose statistics are those of all features together, as they follow each other.
+inline bool is_groot(NormKind kind) { return kind == NormKind::groot_min_max || kind == NormKind::groot_mean_std; }
 
 struct AffineOp {
   float scale = 1.0f;
@@ -38,6 +44,10 @@ struct ClipOp {
 };
 
 struct StripOp {};
+
+/// Small letters for capitals, and nothing but letters, digits, white space and underscores: see `python_text.h`.
+struct LowerOp {};
+struct DropPunctuationOp {};
 
 struct ReplaceOp {
   std::string from, to;
@@ -53,7 +63,7 @@ struct TemplateOp {
 };
 
 /// `count` pieces in front of the text so far, one for each view that the network has a place for: `open` with the
-/// number of the piece, from 1, for `{i}`, then `token` `repeat` times, then `close`.
+/// number of the piece, from 1, for `{i}` where it stands, then `token` `repeat` times, then `close`.
 struct ViewsOp {
   int count = 0;
   int repeat = 0;
@@ -100,6 +110,11 @@ struct PadOp {
   float value = 0.0f;
 };
 
+/// The first rows of a chunk, which are what the robot is meant to do.
+struct RowsOp {
+  int count = 0;
+};
+
 struct TakeOp {
   int size = 0;
 };
@@ -117,15 +132,15 @@ struct ThresholdOp {
   float otherwise = 0.0f;
 };
 
-using Fit = std::variant<Letterbox, Resize>;
+using Fit = std::variant<Letterbox, Resize, Pipeline>;
 using ImageOp = std::variant<AffineOp, ClipOp, Standardize>;
-using TextOp = std::variant<StripOp, ReplaceOp, EnsureSuffixOp, TemplateOp, ViewsOp>;
+using TextOp = std::variant<StripOp, LowerOp, DropPunctuationOp, ReplaceOp, EnsureSuffixOp, TemplateOp, ViewsOp>;
 using StateOp = std::variant<ColumnAffineOp, HornAngleOp, NormalizeOp, ClipOp, PadOp, BinsOp, DropOp>;
-using ActionOp = std::variant<TakeOp, NormalizeOp, AddStateOp, ColumnAffineOp, ThresholdOp>;
+using ActionOp = std::variant<RowsOp, TakeOp, ClipOp, NormalizeOp, AddStateOp, ColumnAffineOp, ThresholdOp>;
 
 /// `processor.recipe` of docs/bundle.md, checked and typed: what happens to each input and to the actions, in order.
 struct Recipe {
-  Fit fit;                     // the first image op: what follows works on planes of one size
+  Fit fit;                     // the first image op or ops: what follows works on planes of one size
   int width = 0, height = 0;   // of those planes
   std::vector<ImageOp> image;  // the others
   std::vector<TextOp> text;    // all but the last op, which is tokenize
@@ -138,6 +153,7 @@ struct Recipe {
 /// Largest picture and vector that a recipe may ask for: a damaged number must not ask for all memory.
 inline constexpr int kMaxImageSide = 8192;
 inline constexpr int kMaxVector = 65536;
+inline constexpr std::size_t kMaxPictureOps = 16;
 inline constexpr int kMaxViews = 32;
 inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op puts in front
 

@@ -44,7 +44,8 @@ Result<Standardize> parse_standardize(JsonFields& fields) {
   Standardize op;
   VLA_TRY(const std::vector<float> mean, fields.numbers("mean", op.mean.size()));
   VLA_TRY(const std::vector<float> std, fields.numbers("std", op.std.size()));
-  VLA_TRY(const int arithmetic, fields.choice("arithmetic", {"float32", "bfloat16", "float32_then_bfloat16"}));
+  VLA_TRY(const int arithmetic,
+          fields.choice("arithmetic", {"float32", "bfloat16", "float32_then_bfloat16", "float32_in_bytes"}));
   op.arithmetic = static_cast<Standardize::Arithmetic>(arithmetic);
   std::copy(mean.begin(), mean.end(), op.mean.begin());
   std::copy(std.begin(), std.end(), op.std.begin());
@@ -53,18 +54,51 @@ Result<Standardize> parse_standardize(JsonFields& fields) {
   return op;
 }
 
-Status parse_fit(JsonFields& fields, bool resize, Recipe& recipe) {
-  if (resize) {
-    VLA_TRY(const Resize op, parse_resize(fields));
-    recipe.fit = op;
-    recipe.width = op.width;
-    recipe.height = op.height;
-    return {};
+Result<PictureOp> parse_picture_op(JsonFields& fields, int op) {
+  if (op == 0) return PictureOp(SquarePad{});
+  if (op == 1) {
+    SmallestSide smallest;
+    VLA_TRY(smallest.size, fields.integer("size", 1, kMaxImageSide));
+    VLA_CHECK(fields.choice("filter", {"opencv_area"}));
+    return PictureOp(smallest);
   }
-  VLA_TRY(const Letterbox op, parse_letterbox(fields));
-  recipe.fit = op;
-  recipe.width = op.width;
-  recipe.height = op.height;
+  CropFraction crop;
+  VLA_TRY(crop.fraction, fields.wide_number("fraction"));
+  if (crop.fraction <= 0.0 || crop.fraction > 1.0) return fields.wrong("fraction", "a number above 0 and up to 1");
+  return PictureOp(crop);
+}
+
+/// The end of a pipeline: the size that the pictures must have.
+Status parse_size(JsonFields& fields, Pipeline& pipeline, Recipe& recipe) {
+  VLA_TRY(pipeline.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(pipeline.height, fields.integer("height", 1, kMaxImageSide));
+  recipe.width = pipeline.width;
+  recipe.height = pipeline.height;
+  return {};
+}
+
+template <class Op>
+Status set_fit(Result<Op> op, Recipe& recipe) {
+  if (!op) return op.error();
+  recipe.fit = *op;
+  recipe.width = op->width;
+  recipe.height = op->height;
+  return {};
+}
+
+/// `op`: of the ops that make planes of one size, which letterbox and resize do alone and a pipeline in several.
+Status parse_fit(JsonFields& fields, int op, bool first, Recipe& recipe) {
+  constexpr int kAlone = 2, kSize = 5;
+  if (op < kAlone && !first) return misplaced(fields, "a letterbox or resize as the first and only op on pictures");
+  if (op == 0) return set_fit(parse_letterbox(fields), recipe);
+  if (op == 1) return set_fit(parse_resize(fields), recipe);
+  if (recipe.width > 0) return misplaced(fields, "pictures of any size before size, letterbox or resize");
+  if (first) recipe.fit = Pipeline{};
+  auto& pipeline = std::get<Pipeline>(recipe.fit);
+  if (op == kSize) return parse_size(fields, pipeline, recipe);
+  if (pipeline.ops.size() == kMaxPictureOps) return misplaced(fields, "fewer ops on pictures");
+  VLA_TRY(PictureOp picture, parse_picture_op(fields, op - kAlone));
+  pipeline.ops.push_back(picture);
   return {};
 }
 
@@ -105,7 +139,7 @@ Result<TextOp> parse_views(JsonFields& fields) {
   VLA_TRY(op.repeat, fields.integer("repeat", 1, kMaxVector));
   VLA_TRY(op.close, fields.string("close"));
   if (op.token.empty()) return fields.wrong("token", "the text of a token");
-  if (!is_numbered(op.open)) return fields.wrong("open", "text with {i} once and no other braces");
+  if (!is_numbered(op.open)) return fields.wrong("open", "text with {i} once at most and no other braces");
   const std::size_t longest = kMaxViewsText / static_cast<std::size_t>(op.count);
   if (op.open.size() > longest || op.close.size() > longest ||
       op.token.size() > longest / static_cast<std::size_t>(op.repeat))
@@ -116,14 +150,15 @@ Result<TextOp> parse_views(JsonFields& fields) {
 }  // namespace
 
 Status parse_image_op(JsonFields& fields, int index, Recipe& recipe) {
-  VLA_TRY(const int op, fields.choice("op", {"letterbox", "resize", "affine", "clip", "standardize"}));
-  if (op < 2)
-    return index == 0 ? parse_fit(fields, op == 1, recipe) : misplaced(fields, "one letterbox or resize, first");
-  if (index == 0) return misplaced(fields, "a letterbox or a resize first");
+  VLA_TRY(const int op, fields.choice("op", {"letterbox", "resize", "square_pad", "smallest_side", "crop_fraction",
+                                             "size", "affine", "clip", "standardize"}));
+  constexpr int kFits = 6;
+  if (op < kFits) return parse_fit(fields, op, index == 0, recipe);
+  if (recipe.width == 0) return misplaced(fields, "a letterbox or a resize first, or ops that end in size");
   ImageOp image;
-  if (op == 2) {
+  if (op == kFits) {
     VLA_TRY(image, parse_affine(fields));
-  } else if (op == 3) {
+  } else if (op == kFits + 1) {
     VLA_TRY(image, parse_clip(fields));
   } else {
     VLA_TRY(image, parse_standardize(fields));
@@ -132,12 +167,23 @@ Status parse_image_op(JsonFields& fields, int index, Recipe& recipe) {
   return {};
 }
 
+namespace {
+
+bool has_views(const Recipe& recipe) {
+  return std::any_of(recipe.text.begin(), recipe.text.end(),
+                     [](const TextOp& op) { return std::holds_alternative<ViewsOp>(op); });
+}
+
+}  // namespace
+
 Status parse_text_op(JsonFields& fields, int, Recipe& recipe) {
-  VLA_TRY(const int op, fields.choice("op", {"strip", "replace", "ensure_suffix", "template", "views", "tokenize"}));
+  VLA_TRY(const int op, fields.choice("op", {"strip", "replace", "ensure_suffix", "template", "views", "tokenize",
+                                             "lower", "drop_punctuation"}));
   if (recipe.max_tokens > 0) return misplaced(fields, "nothing after tokenize");
   if (op == 5) return parse_tokenize(fields, recipe);
-  if (!recipe.text.empty() && std::holds_alternative<ViewsOp>(recipe.text.back()))
-    return misplaced(fields, "tokenize after views");
+  const bool framed = has_views(recipe);
+  if (framed && (op != 3 || !std::holds_alternative<ViewsOp>(recipe.text.back())))
+    return misplaced(fields, "tokenize after views, or one template and tokenize");
   TextOp text = StripOp{};
   if (op == 1) {
     VLA_TRY(text, parse_replace(fields));
@@ -147,6 +193,10 @@ Status parse_text_op(JsonFields& fields, int, Recipe& recipe) {
     VLA_TRY(text, parse_template(fields));
   } else if (op == 4) {
     VLA_TRY(text, parse_views(fields));
+  } else if (op == 6) {
+    text = LowerOp{};
+  } else if (op == 7) {
+    text = DropPunctuationOp{};
   }
   recipe.text.push_back(std::move(text));
   return {};

@@ -9,9 +9,9 @@ namespace {
 
 Result<NormalizeOp> parse_normalize(JsonFields& fields) {
   NormalizeOp op;
-  VLA_TRY(const int kind,
-          fields.choice("kind", {"mean_std", "min_max", "quantiles", "quantile10", "identity", "openpi_mean_std",
-                                 "openpi_quantiles", "evo1_mean_std", "evo1_min_max", "evo1_quantiles"}));
+  VLA_TRY(const int kind, fields.choice("kind", {"mean_std", "min_max", "quantiles", "quantile10", "identity",
+                                                 "openpi_mean_std", "openpi_quantiles", "evo1_mean_std", "evo1_min_max",
+                                                 "evo1_quantiles", "groot_min_max", "groot_mean_std"}));
   op.kind = static_cast<NormKind>(kind);
   const bool identity = op.kind == NormKind::identity;
   if (!identity || fields.has("stats")) {
@@ -20,6 +20,7 @@ Result<NormalizeOp> parse_normalize(JsonFields& fields) {
   if (!identity || fields.has("eps")) {
     VLA_TRY(op.eps, fields.wide_number("eps"));
   }
+  if (is_groot(op.kind) && op.eps != 0.0) return fields.wrong("eps", "0, since these kinds have none");
   if (op.eps < 0.0) return fields.wrong("eps", "a number that is not negative");
   if (fields.has("feature")) {
     VLA_TRY(op.feature, fields.string("feature"));
@@ -116,8 +117,9 @@ Status parse_state_op(JsonFields& fields, int, Recipe& recipe) {
   return {};
 }
 
-Status parse_action_op(JsonFields& fields, int, Recipe& recipe) {
-  VLA_TRY(const int op, fields.choice("op", {"take", "unnormalize", "add_state", "affine", "threshold"}));
+Status parse_action_op(JsonFields& fields, int index, Recipe& recipe) {
+  VLA_TRY(const int op,
+          fields.choice("op", {"take", "unnormalize", "add_state", "affine", "threshold", "clip", "rows"}));
   ActionOp action = TakeOp{};
   if (op == 0) {
     VLA_TRY(const int size, fields.integer("size", 1, kMaxVector));
@@ -132,8 +134,14 @@ Status parse_action_op(JsonFields& fields, int, Recipe& recipe) {
     action = std::move(add);
   } else if (op == 3) {
     VLA_TRY(action, parse_column_affine(fields));
-  } else {
+  } else if (op == 4) {
     VLA_TRY(action, parse_threshold(fields));
+  } else if (op == 5) {
+    VLA_TRY(action, parse_clip(fields));
+  } else {
+    if (index != 0) return misplaced(fields, "rows as the first op");
+    VLA_TRY(const int count, fields.integer("count", 1, kMaxVector));
+    action = RowsOp{count};
   }
   recipe.action.push_back(std::move(action));
   return {};

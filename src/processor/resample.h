@@ -20,6 +20,12 @@ std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int w
 std::vector<std::uint8_t> resample_opencv(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                           int to_height);
 
+/// The same with INTER_AREA, for pictures of three channels: the mean of the part of the picture that an output pixel
+/// covers, in integers where both sides shrink by whole numbers and else in float32; where a side grows, two pixels are
+/// blended with weights of 11 binary digits. Source: as above.
+std::vector<std::uint8_t> resample_opencv_area(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                               int to_height);
+
 /// The same by torchvision's resize of an 8-bit tensor, bicubic with antialiasing: summed in float32, columns first,
 /// held in [0, 255] and rounded half to even. Equal to torch 2.13's CPU kernel for AVX2, in whose order numbers are
 /// summed; another machine's kernel differs by a rounding of float32 and so, rarely, in a byte.

@@ -6,17 +6,6 @@
 #include "processor/resample.h"
 
 namespace vla {
-namespace {
-
-/// Interleaved bytes as planes of bytes / 255.
-void spread(std::span<const std::uint8_t> rgb, std::span<float> out) {
-  const auto& table = byte_table();
-  const std::size_t size = rgb.size() / 3;
-  for (std::size_t i = 0; i < size; ++i)
-    for (std::size_t c = 0; c < 3; ++c) out[c * size + i] = table[rgb[3 * i + c]];
-}
-
-}  // namespace
 
 Status resize(const Frame& frame, const Resize& to, std::span<float> out, const std::string& where) {
   const bool opencv = to.filter == Resize::Filter::opencv_bilinear;
@@ -30,11 +19,11 @@ Status resize(const Frame& frame, const Resize& to, std::span<float> out, const 
     bytes = &cut;
   }
   if (frame.width == to.width && frame.height == to.height) {
-    spread(*bytes, out);
+    spread_bytes(*bytes, out);
     return {};
   }
   const auto resample = opencv ? resample_opencv : resample_torch;
-  spread(resample(*bytes, frame.width, frame.height, to.width, to.height), out);
+  spread_bytes(resample(*bytes, frame.width, frame.height, to.width, to.height), out);
   return {};
 }
 

@@ -23,7 +23,9 @@ void standardize(std::span<float> pixels, const Standardize& op) {
       standardize_in_bf16(plane, rounded(op.mean[c]), rounded(op.std[c]));
       continue;
     }
-    for (float& x : plane) x = (x - op.mean[c]) / op.std[c];
+    const float unit = op.arithmetic == Standardize::Arithmetic::float32_in_bytes ? 255.0f : 1.0f;
+    const float mean = unit * op.mean[c], divisor = unit * op.std[c];
+    for (float& x : plane) x = (unit * x - mean) / divisor;
     if (op.arithmetic == Standardize::Arithmetic::float32_then_bfloat16)
       for (float& x : plane) x = rounded(x);
   }

@@ -9,15 +9,17 @@ namespace vla {
 
 /// `(x - mean) / std` of each channel of a picture.
 struct Standardize {
-  /// float32; every number and result rounded to bfloat16; or only the last result of float32.
-  enum class Arithmetic { float32, bfloat16, float32_then_bfloat16 };
+  /// float32; every number and result rounded to bfloat16; only the last result of float32; or float32 in bytes, where
+  /// x, mean and std are 255 times as large, so that the division by 255 rounds nothing.
+  enum class Arithmetic { float32, bfloat16, float32_then_bfloat16, float32_in_bytes };
 
   std::array<float, 3> mean{}, std{};  // red, green, blue
   Arithmetic arithmetic = Arithmetic::float32;
 };
 
 /// In place, on planes (3, height, width). Source: lerobot policies/evo1/internvl3_embedder.py
-/// (_batched_pixel_values), torch's element-wise arithmetic.
+/// (_batched_pixel_values), torch's element-wise arithmetic; in bytes transformers image_processing_utils_fast.py
+/// (_fuse_mean_std_and_rescale_factor).
 void standardize(std::span<float> pixels, const Standardize& op);
 
 }  // namespace vla

@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "processor/python_text.h"
 #include "processor/unicode.h"
 
 namespace vla {
@@ -13,12 +14,6 @@ namespace {
 constexpr std::string_view kInstruction = "{instruction}";
 constexpr std::string_view kNumber = "{i}";
 constexpr std::string_view kState = "{state}";
-
-/// Python's str.isspace(): bidirectional class WS, B or S, or category Zs.
-bool is_python_space(std::uint32_t c) {
-  return (c >= 0x09 && c <= 0x0D) || (c >= 0x1C && c <= 0x20) || c == 0x85 || c == 0xA0 || c == 0x1680 ||
-         (c >= 0x2000 && c <= 0x200A) || c == 0x2028 || c == 0x2029 || c == 0x202F || c == 0x205F || c == 0x3000;
-}
 
 int occurrences(std::string_view text, std::string_view part) {
   int count = 0;
@@ -31,12 +26,12 @@ int occurrences(std::string_view text, std::string_view part) {
 std::string_view strip(std::string_view text) {
   while (!text.empty()) {
     const unicode::Char c = unicode::first(text);
-    if (!is_python_space(c.code_point)) break;
+    if (!python::is_space(c.code_point)) break;
     text.remove_prefix(c.size);
   }
   while (!text.empty()) {
     const unicode::Char c = unicode::last(text);
-    if (!is_python_space(c.code_point)) break;
+    if (!python::is_space(c.code_point)) break;
     text.remove_suffix(c.size);
   }
   return text;
@@ -59,7 +54,8 @@ bool is_template(std::string_view text) {
 }
 
 bool is_numbered(std::string_view text) {
-  return occurrences(text, kNumber) == 1 && occurrences(text, "{") == 1 && occurrences(text, "}") == 1;
+  const int n_number = occurrences(text, kNumber);
+  return n_number <= 1 && occurrences(text, "{") == n_number && occurrences(text, "}") == n_number;
 }
 
 std::string view_places(const ViewsOp& op) {

@@ -24,7 +24,7 @@ bool is_template(std::string_view text);
 /// Source: lerobot policies/pi05/processor_pi05.py (Pi05PrepareStateTokenizerProcessorStep).
 std::string fill_template(std::string_view text, std::string_view instruction, std::span<const int> words);
 
-/// Whether a text names `{i}` once and has no other braces.
+/// Whether a text names `{i}` once at most and has no other braces.
 bool is_numbered(std::string_view text);
 
 /// What a views op puts in front. Source: lerobot policies/evo1/internvl3_embedder.py (_build_multimodal_prompts).

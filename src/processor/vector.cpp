@@ -17,10 +17,13 @@ Result<std::vector<float>> read(const Bundle& bundle, const std::string& name, i
 }
 
 bool is_mean_std(NormKind kind) {
-  return kind == NormKind::mean_std || kind == NormKind::openpi_mean_std || kind == NormKind::evo1_mean_std;
+  return kind == NormKind::mean_std || kind == NormKind::openpi_mean_std || kind == NormKind::evo1_mean_std ||
+         kind == NormKind::groot_mean_std;
 }
 
-bool is_min_max(NormKind kind) { return kind == NormKind::min_max || kind == NormKind::evo1_min_max; }
+bool is_min_max(NormKind kind) {
+  return kind == NormKind::min_max || kind == NormKind::evo1_min_max || kind == NormKind::groot_min_max;
+}
 
 bool is_openpi(NormKind kind) { return kind == NormKind::openpi_mean_std || kind == NormKind::openpi_quantiles; }
 
@@ -55,7 +58,7 @@ Normalizer::Normalizer(NormKind kind, Direction direction, double eps, std::vect
     if (!is_mean_std(kind_)) factor_[i] -= low_[i];
     if (is_evo1(kind_)) {
       factor_[i] += small;
-    } else if (!is_mean_std(kind_) && factor_[i] == 0.0f) {
+    } else if (!is_mean_std(kind_) && !is_groot(kind_) && factor_[i] == 0.0f) {
       factor_[i] = small;
     }
     divisor_.push_back(kind_ == NormKind::mean_std ? factor_[i] + small : factor_[i]);
@@ -75,7 +78,7 @@ Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormalizeOp& o
 
 Status Normalizer::check_divisors(const NormalizeOp& op) const {
   for (std::size_t i = 0; i < divisor_.size(); ++i)
-    if (divisor_[i] == 0.0f || !std::isfinite(divisor_[i]))
+    if ((divisor_[i] == 0.0f && !is_groot(kind_)) || !std::isfinite(divisor_[i]))
       return Error{Code::bad_bundle, op.stats, fmt::format("a spread to divide by in column {}", i),
                    fmt::format("{} with eps {}", divisor_[i], op.eps)};
   return {};
@@ -86,6 +89,18 @@ double Normalizer::openpi(double x, std::size_t column) const {
   const bool normalize = direction_ == Direction::normalize;
   if (is_mean_std(kind_)) return normalize ? (x - low) / spread : x * spread + low;
   return normalize ? (x - low) / spread * 2.0 - 1.0 : (x + 1.0) / 2.0 * spread + low;
+}
+
+float Normalizer::groot(float x, std::size_t column) const {
+  const bool normalize = direction_ == Direction::normalize;
+  if (kind_ == NormKind::groot_min_max) {
+    if (!normalize) return (x + 1.0f) * 0.5f * factor_[column] + low_[column];
+    return factor_[column] == 0.0f ? 0.0f : 2.0f * (x - low_[column]) / factor_[column] - 1.0f;
+  }
+  const double wide = static_cast<double>(x), mean = static_cast<double>(low_[column]);
+  const double std = static_cast<double>(factor_[column]);
+  if (std == 0.0) return x;
+  return static_cast<float>(normalize ? (wide - mean) / std : wide * std + mean);
 }
 
 float Normalizer::normalized(float x, std::size_t column) const {
@@ -104,6 +119,10 @@ void Normalizer::apply(std::span<float> values) const {
   if (is_openpi(kind_)) {
     for (std::size_t i = 0; i < values.size(); ++i)
       values[i] = static_cast<float>(openpi(static_cast<double>(values[i]), i));
+    return;
+  }
+  if (is_groot(kind_)) {
+    for (std::size_t i = 0; i < values.size(); ++i) values[i] = groot(values[i], i);
     return;
   }
   for (std::size_t i = 0; i < values.size(); ++i)

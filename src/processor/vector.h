@@ -39,6 +39,13 @@ std::vector<std::string> statistics_of(const NormalizeOp& op);
 ///   evo1_quantiles    2 * (x - q01) / (range + eps) - 1     (x + 1) / 2 * (range + eps) + q01        q01, q99
 ///
 /// In float32 again. Source: Evo-1 scripts/Evo1_server.py (Normalizer).
+///
+///   groot_min_max     2 * (x - min) / range - 1             (x + 1) / 2 * range + min                min, max
+///   groot_mean_std    (x - mean) / std                      x * std + mean                           mean, std
+///
+/// Without eps: a range of exactly 0 gives 0, and min on the way back; a std of 0 leaves x as it is, both ways. The
+/// first is computed in float32, the second in double precision and rounded once. Source: lerobot
+/// policies/groot/processor_groot.py (_min_max_norm, _unnormalize_min_max); Isaac-GR00T gr00t/data/utils.py.
 class Normalizer {
  public:
   enum class Direction { normalize, unnormalize };
@@ -55,6 +62,7 @@ class Normalizer {
 
  private:
   double openpi(double x, std::size_t column) const;
+  float groot(float x, std::size_t column) const;
   float normalized(float x, std::size_t column) const;
   float unnormalized(float x, std::size_t column) const;
   Status check_divisors(const NormalizeOp& op) const;

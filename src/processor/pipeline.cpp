@@ -1,0 +1,89 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/pipeline.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "processor/byte_pixels.h"
+#include "processor/resample.h"
+
+namespace vla {
+namespace {
+
+/// Sides in double precision, in which the reference scales them: those of a sliver of a picture may be out of reach.
+struct Size {
+  double width, height;
+  bool operator==(const Size&) const = default;
+};
+
+struct Picture {
+  int width, height;
+  std::vector<std::uint8_t> rgb;
+};
+
+Size size_after(const SquarePad&, const Size& from) {
+  const double side = std::max(from.width, from.height);
+  return {side, side};
+}
+
+Size size_after(const SmallestSide& op, const Size& from) {
+  const double scale = op.size / std::min(from.width, from.height);
+  return {std::max(1.0, std::nearbyint(from.width * scale)), std::max(1.0, std::nearbyint(from.height * scale))};
+}
+
+Size size_after(const CropFraction& op, const Size& from) {
+  return {std::max(1.0, std::floor(from.width * op.fraction)), std::max(1.0, std::floor(from.height * op.fraction))};
+}
+
+/// The picture in the middle of another size: what is beyond it is cut off, what it does not reach is black.
+Picture centred(const Picture& from, int width, int height) {
+  Picture to{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
+  const int left = (width - from.width) / 2, top = (height - from.height) / 2;
+  const int n_column = std::min(width, from.width), n_row = std::min(height, from.height);
+  for (int y = 0; y < n_row; ++y) {
+    const std::size_t in_row = static_cast<std::size_t>(y + std::max(0, (from.height - height) / 2)) * from.width;
+    const std::size_t out_row = static_cast<std::size_t>(y + std::max(0, top)) * width;
+    const auto start = static_cast<std::ptrdiff_t>(3 * (in_row + std::max(0, (from.width - width) / 2)));
+    std::copy_n(from.rgb.begin() + start, 3 * n_column,
+                to.rgb.begin() + static_cast<std::ptrdiff_t>(3 * (out_row + std::max(0, left))));
+  }
+  return to;
+}
+
+Picture applied(const PictureOp& op, const Picture& from, int width, int height) {
+  if (!std::holds_alternative<SmallestSide>(op)) return centred(from, width, height);
+  return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
+}
+
+}  // namespace
+
+Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where) {
+  const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
+  if (bytes == nullptr)
+    return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
+                 "send the camera's bytes: this policy's pictures are resized as bytes"};
+  // All sizes come before any picture, so that none is made which nothing needs or no memory holds.
+  std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
+  bool fits = true;
+  for (const PictureOp& op : pipeline.ops) {
+    sizes.push_back(std::visit([&](const auto& o) { return size_after(o, sizes.back()); }, op));
+    fits &= sizes.back().width * sizes.back().height <= static_cast<double>(ImageLimits().max_pixels);
+  }
+  if (!fits || sizes.back() != Size{static_cast<double>(pipeline.width), static_cast<double>(pipeline.height)})
+    return Error{Code::bad_observation, where,
+                 fmt::format("a picture with the aspect of {} x {}", pipeline.width, pipeline.height),
+                 fmt::format("{} x {}, which becomes {} x {}", frame.width, frame.height, sizes.back().width,
+                             sizes.back().height),
+                 "this policy's pictures keep their aspect; send those of the camera that the bundle was made for"};
+  Picture picture{frame.width, frame.height, *bytes};
+  for (std::size_t i = 0; i < pipeline.ops.size(); ++i)
+    picture =
+        applied(pipeline.ops[i], picture, static_cast<int>(sizes[i + 1].width), static_cast<int>(sizes[i + 1].height));
+  spread_bytes(picture.rgb, out);
+  return {};
+}
+
+}  // namespace vla

@@ -1,0 +1,43 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+#include <variant>
+#include <vector>
+
+#include "base/result.h"
+#include "processor/image.h"
+
+namespace vla {
+
+/// Black on both sides of a picture that is not square, until it is; of an odd rest less at the left and at the top.
+struct SquarePad {};
+
+/// Both sides scaled so that the shorter one is `size`, as cv2.resize does with INTER_AREA.
+struct SmallestSide {
+  int size = 0;
+};
+
+/// The middle of a picture: this fraction of each side, cut to whole pixels, but one pixel at least.
+struct CropFraction {
+  double fraction = 0.0;
+};
+
+using PictureOp = std::variant<SquarePad, SmallestSide, CropFraction>;
+
+/// Ops on 8-bit pictures one after the other, and the size at which they must come out.
+struct Pipeline {
+  int width = 0;
+  int height = 0;
+  std::vector<PictureOp> ops;
+};
+
+/// Writes (3, height, width) float32 to `out`: the bytes that come out, divided by 255. A frame of floats is refused,
+/// since the reference gets bytes, and so is one whose aspect leads to another size than the network takes.
+/// Source: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations).
+/// Errors: bad_observation.
+Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
+
+}  // namespace vla

@@ -1,0 +1,117 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/python_text.h"
+
+#include <algorithm>
+#include <iterator>
+
+#include "processor/unicode.h"
+
+namespace vla::python {
+namespace {
+
+/// Bits of a run of code points. A cased character takes part in words of capitals and small letters; an ignorable
+/// one, as an apostrophe, does not end such a word.
+enum Class : std::uint8_t { kAlnum = 1, kCased = 2, kIgnorable = 4 };
+
+struct Run {
+  std::uint32_t start;
+  std::uint8_t classes;
+};
+
+constexpr Run kRuns[] = {
+#include "processor/python_classes.inc"
+};
+
+/// Every `step`-th code point from `first` to `last` has its small letter `distance` away.
+struct Capitals {
+  std::uint32_t first, last, step;
+  std::int32_t distance;
+};
+
+constexpr Capitals kCapitals[] = {
+#include "processor/python_lower.inc"
+};
+
+constexpr std::uint32_t kSigma = 0x3A3, kDottedI = 0x130;
+
+std::uint8_t classes(std::uint32_t c) {
+  const auto after = std::upper_bound(std::begin(kRuns), std::end(kRuns), c,
+                                      [](std::uint32_t code_point, const Run& run) { return code_point < run.start; });
+  return std::prev(after)->classes;  // the first run starts at 0
+}
+
+std::uint32_t small(std::uint32_t c) {
+  const auto after =
+      std::upper_bound(std::begin(kCapitals), std::end(kCapitals), c,
+                       [](std::uint32_t code_point, const Capitals& run) { return code_point < run.first; });
+  if (after == std::begin(kCapitals)) return c;
+  const Capitals& run = *std::prev(after);
+  if (c > run.last || (c - run.first) % run.step != 0) return c;
+  return static_cast<std::uint32_t>(static_cast<std::int32_t>(c) + run.distance);
+}
+
+void append(std::string& out, std::uint32_t c) {
+  const auto tail = [&](int shift) { out.push_back(static_cast<char>(0x80 | ((c >> shift) & 0x3F))); };
+  if (c < 0x80) {
+    out.push_back(static_cast<char>(c));
+  } else if (c < 0x800) {
+    out.push_back(static_cast<char>(0xC0 | c >> 6)), tail(0);
+  } else if (c < 0x10000) {
+    out.push_back(static_cast<char>(0xE0 | c >> 12)), tail(6), tail(0);
+  } else {
+    out.push_back(static_cast<char>(0xF0 | c >> 18)), tail(12), tail(6), tail(0);
+  }
+}
+
+/// Whether the first character that is not ignorable is cased. `before`: of the end of the text, looking back.
+bool meets_cased(std::string_view text, bool before) {
+  while (!text.empty()) {
+    const unicode::Char c = before ? unicode::last(text) : unicode::first(text);
+    const std::uint8_t found = classes(c.code_point);
+    if ((found & kIgnorable) == 0) return (found & kCased) != 0;
+    before ? text.remove_suffix(c.size) : text.remove_prefix(c.size);
+  }
+  return false;
+}
+
+}  // namespace
+
+bool is_space(std::uint32_t c) {
+  return (c >= 0x09 && c <= 0x0D) || (c >= 0x1C && c <= 0x20) || c == 0x85 || c == 0xA0 || c == 0x1680 ||
+         (c >= 0x2000 && c <= 0x200A) || c == 0x2028 || c == 0x2029 || c == 0x202F || c == 0x205F || c == 0x3000;
+}
+
+bool is_alnum(std::uint32_t c) { return (classes(c) & kAlnum) != 0; }
+
+std::string lower(std::string_view text) {
+  std::string out;
+  out.reserve(text.size());
+  for (std::size_t at = 0; at < text.size();) {
+    const unicode::Char c = unicode::first(text.substr(at));
+    const std::size_t next = at + c.size;
+    if (c.code_point == kDottedI) {
+      out += "i\u0307";
+    } else if (c.code_point == kSigma) {
+      const bool ends_word = meets_cased(text.substr(0, at), true) && !meets_cased(text.substr(next), false);
+      out += ends_word ? "\u03c2" : "\u03c3";
+    } else {
+      append(out, small(c.code_point));
+    }
+    at = next;
+  }
+  return out;
+}
+
+std::string drop_punctuation(std::string_view text) {
+  std::string out;
+  out.reserve(text.size());
+  while (!text.empty()) {
+    const unicode::Char c = unicode::first(text);
+    if (is_alnum(c.code_point) || is_space(c.code_point) || c.code_point == '_') out.append(text.substr(0, c.size));
+    text.remove_prefix(c.size);
+  }
+  return out;
+}
+
+}  // namespace vla::python
