@@ -24,6 +24,23 @@ constexpr const char* kRecipe = R"({
   "action": [{"op": "rows", "count": 2}, {"op": "take", "size": 2}, {"op": "clip", "low": -1.0, "high": 1.0},
              {"op": "unnormalize", "kind": "groot_min_max", "stats": "stats.action", "eps": 0.0}]})";
 
+EditableBundle groot() {
+  EditableBundle bundle = sample();
+  const Keys qwen = tokenizer_keys("qwen");
+  for (const auto& [key, value] : qwen.all()) bundle.set(key, value);
+  bundle.set("processor.recipe", std::string(kRecipe));
+  bundle.set("observation.max_text_tokens", std::int64_t{64});
+  bundle.set("policy.horizon", std::int64_t{3});
+  bundle.set("policy.view_starts", std::vector<std::int64_t>{5, 12, 19});
+  for (const char* name : {"stats.observation.state", "stats.action"}) {
+    bundle.erase(std::string(name) + ".mean");
+    bundle.erase(std::string(name) + ".std");
+    add_stats(bundle, std::string(name) + ".min", {-1.0f, 0.0f});
+    add_stats(bundle, std::string(name) + ".max", {3.0f, 0.0f});
+  }
+  return bundle;
+}
+
 Json with(const char* pointer, const Json& value) {
   Json recipe = Json::parse(kRecipe);
   recipe[Json::json_pointer(pointer)] = value;
@@ -83,4 +100,34 @@ TEST_CASE("a pipeline keeps the aspect, refuses another and takes bytes only") {
       refusal(run_pipeline(sliver, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top"), Code::bad_observation), "top"));
   const Frame floats{2, 2, std::vector<float>(12)};
   CHECK(contains(refusal(run_pipeline(floats, {2, 2, {}}, out, "top"), Code::bad_observation), "8 bits"));
+}
+
+TEST_CASE("a chunk has the rows that the recipe keeps, and a clip hides nothing") {
+  const Processor processor = make(groot());
+  CHECK(processor.n_row(3) == 2);
+  const std::vector<float> raw = {0.0f, 0.0f};
+  std::vector<float> chunk = {0, 0, 9, 9, 5, 5, 9, 9, NAN, NAN, 9, 9};
+  CHECK(*processor.decode(chunk, 3, 4, raw) == std::vector<float>{1, 0, 3, 0});
+  chunk[4] = INFINITY;
+  CHECK(contains(refusal(processor.decode(chunk, 3, 4, raw), Code::bad_action), "actions[1][\"shoulder\"]"));
+  EditableBundle bundle = groot();
+  bundle.set("policy.horizon", std::int64_t{1});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.action[0].count"));
+}
+
+TEST_CASE("a template stands around the places for views, and words must be left of an instruction") {
+  const Processor processor = make(groot());
+  Observation seen = observation();
+  seen.states["state"] = {0.0f, 5.0f};
+  seen.views["top"] = seen.views["wrist"] = seen.views["side"] = Frame{4, 4, std::vector<std::uint8_t>(48, 255)};
+  seen.text = "PICK, up!";
+  const auto inputs = processor.encode(seen);
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->pixels == std::vector<float>(36, 1.0f));
+  CHECK(inputs->state == std::vector<float>{-0.5f, 0.0f, 0.0f, 0.0f});
+  const std::vector<std::int32_t> tokens = inputs->tokens;
+  seen.text = "pick up";
+  CHECK(processor.encode(seen)->tokens == tokens);
+  seen.text = "?!";
+  CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "nothing but punctuation"));
 }
