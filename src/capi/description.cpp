@@ -62,7 +62,7 @@ Description::Description(const Engine& engine)
   d.min_views = size_of(engine.processor().min_views());
   d.n_state = states_.size(), d.states = states_.data();
   d.max_text_tokens = size_of(engine.processor().recipe().max_tokens);
-  d.horizon = size_of(engine.horizon());
+  d.horizon = size_of(engine.n_row());
   d.d_action = action_names_.strings.size();
   d.action_names = action_names_.pointers.data(), d.action_units = action_units_.pointers.data();
   d.rate_hz = *keys.number("action.rate_hz");

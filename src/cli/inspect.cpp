@@ -119,7 +119,7 @@ void print_features(const Engine& engine) {
     print_numbers({name, name + dims[i]}, {unit, unit + dims[i]}, read_stats(engine.bundle(), states[i]));
   }
   const double rate = *keys.number("action.rate_hz");
-  fmt::print("action       {} rows of {} numbers{}\n", engine.horizon(), keys.strings("action.names")->size(),
+  fmt::print("action       {} rows of {} numbers{}\n", engine.n_row(), keys.strings("action.names")->size(),
              rate > 0 ? fmt::format(", {:g} rows a second", rate) : ", control rate unstated");
   print_numbers(*keys.strings("action.names"), *keys.strings("action.units"), read_stats(engine.bundle(), "action"));
   fmt::print("instruction  at most {} tokens\n", engine.processor().recipe().max_tokens);

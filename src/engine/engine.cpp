@@ -133,10 +133,10 @@ void Engine::record_inputs(std::vector<Tap>& taps) const {
 void Engine::record_chunk(const std::vector<float>& x, ActionChunk& chunk) const {
   if (tap_pattern_.empty()) return;
   std::vector<float> cut;
-  for (int row = 0; row < horizon_; ++row)
+  for (int row = 0; row < chunk.horizon; ++row)
     cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + chunk.d_action);
-  record(chunk.taps, "chunk", {chunk.d_action, horizon_}, cut);
-  record(chunk.taps, "actions", {chunk.d_action, horizon_}, chunk.actions);
+  record(chunk.taps, "chunk", {chunk.d_action, chunk.horizon}, cut);
+  record(chunk.taps, "actions", {chunk.d_action, chunk.horizon}, chunk.actions);
 }
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) {
@@ -169,7 +169,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   const std::vector<float> result = plan->x();
   VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs_.raw_state));
   clock.lap(chunk.timing, "postprocess");
-  chunk.horizon = horizon_;
+  chunk.horizon = n_row();
   chunk.d_action = static_cast<int>(processor_.action_names().size());
   chunk.notes = inputs_.notes;
   record_chunk(result, chunk);

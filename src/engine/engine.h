@@ -23,7 +23,7 @@ struct EngineOptions {
 
 /// What a policy answers to one observation.
 struct ActionChunk {
-  int horizon = 0;
+  int horizon = 0;  // rows
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
   std::vector<std::string> notes;  // what the user must be told about this answer
@@ -60,7 +60,10 @@ class Engine {
   const Device& device() const { return device_; }
   const Solver& solver() const { return solver_; }
   const ParamList& params() const { return *params_; }
+  /// Rows of the solver's start, of which `n_row` are answered.
   int horizon() const { return horizon_; }
+  /// Rows of a chunk.
+  int n_row() const { return processor_.n_row(horizon_); }
   int d_action() const { return d_action_; }
   MemoryUse memory() const;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.

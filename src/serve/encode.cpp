@@ -64,7 +64,7 @@ void describe_actions(const Engine& engine, v1::Description& out) {
     dimension.set_name(engine.processor().action_names()[i]);
     dimension.set_unit(units[i]);
   }
-  out.set_horizon(static_cast<std::uint32_t>(engine.horizon()));
+  out.set_horizon(static_cast<std::uint32_t>(engine.n_row()));
   out.set_rate_hz(*engine.bundle().keys().number("action.rate_hz"));
 }
 

@@ -1,0 +1,133 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Ops of a policy whose pictures keep their aspect and whose instruction is cleaned: GR00T N1.7.
+#include "processor/python_text.h"
+#include "processor/resample.h"
+#include "processor/sample.h"
+
+using namespace vla;
+using namespace vla::test;
+using Json = nlohmann::json;
+
+namespace {
+
+constexpr const char* kRecipe = R"({
+  "image":  [{"op": "square_pad"}, {"op": "smallest_side", "size": 4, "filter": "opencv_area"},
+             {"op": "crop_fraction", "fraction": 0.5}, {"op": "size", "width": 2, "height": 2},
+             {"op": "standardize", "mean": [0.5, 0.5, 0.5], "std": [0.5, 0.5, 0.5], "arithmetic": "float32_in_bytes"}],
+  "text":   [{"op": "lower"}, {"op": "drop_punctuation"},
+             {"op": "views", "count": 3, "open": "<img>", "token": "<IMG_CONTEXT>", "repeat": 5, "close": "</img>"},
+             {"op": "template", "text": "user {instruction}\n"}, {"op": "tokenize", "max_tokens": 64, "truncate": "right"}],
+  "state":  [{"op": "normalize", "kind": "groot_min_max", "stats": "stats.observation.state", "eps": 0.0},
+             {"op": "clip", "low": -1.0, "high": 1.0}, {"op": "pad", "size": 4}],
+  "action": [{"op": "rows", "count": 2}, {"op": "take", "size": 2}, {"op": "clip", "low": -1.0, "high": 1.0},
+             {"op": "unnormalize", "kind": "groot_min_max", "stats": "stats.action", "eps": 0.0}]})";
+
+EditableBundle groot() {
+  EditableBundle bundle = sample();
+  const Keys qwen = tokenizer_keys("qwen");
+  for (const auto& [key, value] : qwen.all()) bundle.set(key, value);
+  bundle.set("processor.recipe", std::string(kRecipe));
+  bundle.set("observation.max_text_tokens", std::int64_t{64});
+  bundle.set("policy.horizon", std::int64_t{3});
+  bundle.set("policy.view_starts", std::vector<std::int64_t>{5, 12, 19});
+  for (const char* name : {"stats.observation.state", "stats.action"}) {
+    bundle.erase(std::string(name) + ".mean");
+    bundle.erase(std::string(name) + ".std");
+    add_stats(bundle, std::string(name) + ".min", {-1.0f, 0.0f});
+    add_stats(bundle, std::string(name) + ".max", {3.0f, 0.0f});
+  }
+  return bundle;
+}
+
+Json with(const char* pointer, const Json& value) {
+  Json recipe = Json::parse(kRecipe);
+  recipe[Json::json_pointer(pointer)] = value;
+  return recipe;
+}
+
+std::string refused(const Json& recipe) { return refusal(parse_recipe(recipe.dump()), Code::bad_bundle); }
+
+}  // namespace
+
+TEST_CASE("a mean over parts of pixels has the bytes of OpenCV") {
+  const std::vector<std::uint8_t> row = {0, 0, 0, 90, 10, 1, 255, 0, 2};
+  CHECK(resample_opencv_area(row, 3, 1, 2, 1) == std::vector<std::uint8_t>{30, 3, 0, 200, 3, 2});
+  CHECK(resample_opencv_area(row, 3, 1, 1, 1) == std::vector<std::uint8_t>{115, 3, 1});
+}
+
+TEST_CASE("text is lower-cased and cleaned as Python does it") {
+  CHECK(python::lower("\u0130\u039f\u0394\u039f\u03a3 \u03a3 \u03a3A") ==
+        "i\u0307\u03bf\u03b4\u03bf\u03c2 \u03c3 \u03c3a");
+  CHECK(python::drop_punctuation("don't_stop -- n\u00b0 3\u00bd\u3002\u5f00\n") == "dont_stop  n 3\u00bd\u5f00\n");
+}
+
+TEST_CASE("the kinds of GR00T have no epsilon and leave what has no spread") {
+  using Direction = Normalizer::Direction;
+  std::vector<float> x = {2.0f, 5.0f};
+  Normalizer(NormKind::groot_min_max, Direction::normalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
+  CHECK(x == std::vector<float>{-0.5f, 0.0f});
+  Normalizer(NormKind::groot_min_max, Direction::unnormalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
+  CHECK(x == std::vector<float>{2.0f, 1.0f});
+  Normalizer(NormKind::groot_mean_std, Direction::normalize, 0.0, {1.0f, 7.0f}, {2.0f, 0.0f}).apply(x);
+  CHECK(x == std::vector<float>{0.5f, 1.0f});
+}
+
+TEST_CASE("ops on pictures end in size, and rows come first") {
+  CHECK(parse_recipe(kRecipe).ok());
+  Json recipe = Json::parse(kRecipe);
+  recipe["image"].erase(3);
+  CHECK(contains(refused(recipe), "processor.recipe.image[3].op"));
+  recipe = Json::parse(kRecipe);
+  std::swap(recipe["action"][0], recipe["action"][1]);
+  CHECK(contains(refused(recipe), "processor.recipe.action[1].op: expected rows as the first op"));
+  CHECK(contains(refused(with("/image/1/filter", "lanczos")), "processor.recipe.image[1].filter"));
+  CHECK(contains(refused(with("/image/2/fraction", 1.5)), "processor.recipe.image[2].fraction"));
+  CHECK(contains(refused(with("/state/0/eps", 1e-8)), "processor.recipe.state[0].eps"));
+  CHECK(contains(refused(with("/text/3/op", "lower")), "processor.recipe.text[3].op"));
+}
+
+TEST_CASE("a pipeline keeps the aspect, refuses another and takes bytes only") {
+  std::vector<float> out(12);
+  const Frame wide{4, 2, std::vector<std::uint8_t>(24, 255)};
+  CHECK(run_pipeline(wide, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top").ok());
+  CHECK(out == std::vector<float>(12, 128.0f / 255.0f));
+  const std::string message = refusal(run_pipeline(wide, {2, 2, {SmallestSide{2}}}, out, "top"), Code::bad_observation);
+  CHECK(contains(message, "top: expected a picture with the aspect of 2 x 2, found 4 x 2, which becomes 4 x 2"));
+  const Frame sliver{1, 60000, std::vector<std::uint8_t>(180000)};
+  CHECK(contains(
+      refusal(run_pipeline(sliver, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top"), Code::bad_observation), "top"));
+  const Frame floats{2, 2, std::vector<float>(12)};
+  CHECK(contains(refusal(run_pipeline(floats, {2, 2, {}}, out, "top"), Code::bad_observation), "8 bits"));
+}
+
+TEST_CASE("a chunk has the rows that the recipe keeps, and a clip hides nothing") {
+  const Processor processor = make(groot());
+  CHECK(processor.n_row(3) == 2);
+  const std::vector<float> raw = {0.0f, 0.0f};
+  std::vector<float> chunk = {0, 0, 9, 9, 5, 5, 9, 9, NAN, NAN, 9, 9};
+  CHECK(*processor.decode(chunk, 3, 4, raw) == std::vector<float>{1, 0, 3, 0});
+  chunk[4] = INFINITY;
+  CHECK(contains(refusal(processor.decode(chunk, 3, 4, raw), Code::bad_action), "actions[1][\"shoulder\"]"));
+  EditableBundle bundle = groot();
+  bundle.set("policy.horizon", std::int64_t{1});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.action[0].count"));
+}
+
+TEST_CASE("a template stands around the places for views, and words must be left of an instruction") {
+  const Processor processor = make(groot());
+  Observation seen = observation();
+  seen.states["state"] = {0.0f, 5.0f};
+  seen.views["top"] = seen.views["wrist"] = seen.views["side"] = Frame{4, 4, std::vector<std::uint8_t>(48, 255)};
+  seen.text = "PICK, up!";
+  const auto inputs = processor.encode(seen);
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->pixels == std::vector<float>(36, 1.0f));
+  CHECK(inputs->state == std::vector<float>{-0.5f, 0.0f, 0.0f, 0.0f});
+  const std::vector<std::int32_t> tokens = inputs->tokens;
+  seen.text = "pick up";
+  CHECK(processor.encode(seen)->tokens == tokens);
+  seen.text = "?!";
+  CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "nothing but punctuation"));
+}
