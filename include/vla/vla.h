@@ -129,7 +129,7 @@ typedef struct vla_description {
   const char* const* action_names; /* d_action of each */
   const char* const* action_units; /* empty where the bundle does not state it */
   double rate_hz;                  /* rows a second; 0 where the bundle does not state it */
-  size_t d_noise;                  /* noise has `horizon` rows of d_noise numbers */
+  size_t d_noise;                  /* noise has `noise_rows` rows, see below, of d_noise numbers */
   const char* noise;               /* how a seed draws them: "normal" or "uniform" */
 
   const char* bundle_path;
@@ -143,6 +143,8 @@ typedef struct vla_description {
   const char* kernels;   /* what computes them: "ggml", "avx2", ... */
   const char* device;
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */
+
+  size_t noise_rows; /* `horizon`, or more where the robot gets the first rows only of what the network computes */
 } vla_description;
 
 /* NULL only when `policy` is NULL. */
@@ -184,8 +186,8 @@ typedef struct vla_observation {
   size_t n_state;
   const char* text;   /* the instruction, UTF-8; a NUL at the end is not needed and not counted */
   size_t text_size;   /* bytes */
-  const float* noise; /* the solver's start, (horizon, d_noise) row by row, or NULL */
-  size_t n_noise;     /* horizon * d_noise */
+  const float* noise; /* the solver's start, (noise_rows, d_noise) row by row, or NULL */
+  size_t n_noise;     /* noise_rows * d_noise */
   uint32_t has_seed;  /* 1: the noise is drawn from `seed`, the same bytes on every machine */
   uint64_t seed;
 } vla_observation;

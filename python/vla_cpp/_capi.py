@@ -90,6 +90,7 @@ class Description(_Struct):
         ("memory_weights", c_uint64),
         ("memory_plan", c_uint64),
         ("memory_working", c_uint64),
+        ("noise_rows", c_size_t),
     ]
 
 

@@ -48,11 +48,11 @@ def states_of(state: State, specs: Sequence[StateSpec]) -> Dict[str, np.ndarray]
     return {specs[0].name: floats("state", state, 1)}
 
 
-def noise_of(noise: object, horizon: int, d_noise: int) -> np.ndarray:
-    """Float32 (horizon, d_noise); the reference's batch of one is taken off."""
+def noise_of(noise: object, n_row: int, d_noise: int) -> np.ndarray:
+    """Float32 (n_row, d_noise); the reference's batch of one is taken off."""
     values = floats("noise", noise, 2)
-    if values.shape != (horizon, d_noise):
-        raise BadObservation("noise", f"shape ({horizon}, {d_noise})", str(values.shape))
+    if values.shape != (n_row, d_noise):
+        raise BadObservation("noise", f"shape ({n_row}, {d_noise})", str(values.shape))
     return values
 
 

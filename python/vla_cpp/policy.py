@@ -71,7 +71,7 @@ class Policy:
                          camera that the robot does not have
         state            world units: vectors by name, or one vector where the policy has one state
         text             the instruction, as a person says it
-        seed, noise      where the solver starts: a number, or float32 (horizon, d_noise); with neither a seed is drawn and the chunk
+        seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn and the chunk
                          tells it
         capture_time_ns  when the frames were taken; comes back in the chunk
 
@@ -165,7 +165,7 @@ class _Call:
             seed=0 if seed is None else int(seed),
         )
         if noise is not None:
-            values = noise_of(noise, spec.horizon, spec.d_noise)
+            values = noise_of(noise, spec.noise_rows, spec.d_noise)
             self.observation.noise, self.observation.n_noise = self._address(values), values.size
 
     def _view(self, name: str, image: Image) -> _capi.View:
@@ -237,6 +237,7 @@ def _spec_of(d: _capi.Description) -> Spec:
         horizon=d.horizon,
         d_action=d.d_action,
         d_noise=d.d_noise,
+        noise_rows=d.noise_rows,
         noise=_text(d.noise),
         rate_hz=d.rate_hz,
         bundle=BundleInfo(

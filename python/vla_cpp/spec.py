@@ -55,7 +55,8 @@ class Spec:
     action_units  one text per action, empty where the bundle does not say
     horizon       rows of a chunk
     d_action      columns of a chunk
-    d_noise       columns of the noise, which has `horizon` rows
+    d_noise       columns of the noise
+    noise_rows    its rows: `horizon`, or more where the robot gets the first rows only of what the network computes
     noise         its distribution, e.g. "normal"
     rate_hz       rows per second that the policy was trained for; 0 where the bundle does not say
     """
@@ -68,6 +69,7 @@ class Spec:
     horizon: int
     d_action: int
     d_noise: int
+    noise_rows: int
     noise: str
     rate_hz: float
     bundle: BundleInfo

@@ -81,7 +81,7 @@ def act_bytes(
     except (ValueError, UnicodeError):
         raise BadObservation("text", "characters that UTF-8 can write", repr(text)[:80]) from None
     if noise is not None:
-        values = noise_of(noise, spec.horizon, spec.d_noise)
+        values = noise_of(noise, spec.noise_rows, spec.d_noise)
         act.noise.horizon, act.noise.d_action = values.shape
         act.noise.values.extend(values.ravel().tolist())
     elif seed is not None:
@@ -166,6 +166,7 @@ def spec_of(description: Any) -> Spec:
         horizon=description.horizon,
         d_action=len(description.actions),
         d_noise=description.d_noise,
+        noise_rows=description.noise_rows,
         noise=description.noise_kind,
         rate_hz=description.rate_hz,
         bundle=bundle_of(description.bundle),

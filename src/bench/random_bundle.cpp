@@ -44,23 +44,35 @@ struct ViewPlaces {
   }
 };
 
+/// Pixels of a view.
+struct PictureSize {
+  int width = 0, height = 0;
+};
+
 /// Errors: bad_bundle.
-Result<ViewPlaces> view_places(const Keys& keys) {
+Result<PictureSize> picture_size(const Keys& keys) {
+  const bool oblong = keys.has("vision.image_width");
+  PictureSize size;
+  VLA_TRY(size.width, keys.integer(oblong ? "vision.image_width" : "vision.image_size"));
+  VLA_TRY(size.height, keys.integer(oblong ? "vision.image_height" : "vision.image_size"));
+  return size;
+}
+
+/// Errors: bad_bundle.
+Result<ViewPlaces> view_places(const Keys& keys, const PictureSize& picture) {
   ViewPlaces places;
   if (!keys.has("policy.n_slot")) return places;
-  VLA_TRY(const int image_size, keys.integer("vision.image_size"));
   VLA_TRY(const int patch_size, keys.integer("vision.patch_size"));
-  VLA_TRY(const int factor, keys.integer("connector.factor"));
+  VLA_TRY(const int factor, keys.integer(keys.has("vision.merge") ? "vision.merge" : "connector.factor"));
   VLA_TRY(places.count, keys.integer("policy.n_slot"));
-  const int side = image_size / patch_size / factor;
-  places.repeat = side * side;
+  places.repeat = (picture.width / patch_size / factor) * (picture.height / patch_size / factor);
   return places;
 }
 
-std::string recipe(int image_size, const ViewPlaces& places, int max_tokens, int d_state, int d_robot) {
+std::string recipe(const PictureSize& picture, const ViewPlaces& places, int max_tokens, int d_state, int d_robot) {
   using Json = nlohmann::ordered_json;
-  const Json letterbox = {{"op", "letterbox"},    {"width", image_size}, {"height", image_size},
-                          {"filter", "bilinear"}, {"antialias", false},  {"align", "bottom_right"},
+  const Json letterbox = {{"op", "letterbox"},    {"width", picture.width}, {"height", picture.height},
+                          {"filter", "bilinear"}, {"antialias", false},     {"align", "bottom_right"},
                           {"fill", 0.0}};
   const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
   const Json views = {{"op", "views"},          {"count", places.count},   {"open", places.kOpen},
@@ -100,10 +112,10 @@ std::string added_token(std::string_view content, std::size_t id) {
 }
 
 Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
-  VLA_TRY(const int image_size, keys.integer("vision.image_size"));
+  VLA_TRY(const PictureSize picture, picture_size(keys));
   VLA_TRY(const int d_state, keys.integer("policy.d_state"));
   VLA_TRY(const int d_action, keys.integer("policy.d_action"));
-  VLA_TRY(const ViewPlaces places, view_places(keys));
+  VLA_TRY(const ViewPlaces places, view_places(keys, picture));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
   const int max_tokens = places.count * places.size() + sizes.max_tokens;
   std::vector<std::string> tokens = byte_tokens();
@@ -142,7 +154,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"tokenizer.pre", R"([{"type":"byte_level","add_prefix_space":false,"use_regex":true}])"},
       {"tokenizer.added", places.count > 0 ? added_token(ViewPlaces::kToken, tokens.size() - 1) : "[]"},
       {"tokenizer.ignore_merges", false},
-      {"processor.recipe", recipe(image_size, places, max_tokens, d_state, d_robot)},
+      {"processor.recipe", recipe(picture, places, max_tokens, d_state, d_robot)},
   });
   for (const auto& [key, value] : added.all()) keys.set(key, value);
   if (places.count > 0) keys.set("policy.view_starts", places.starts());

@@ -75,6 +75,7 @@ Description::Description(const Engine& engine)
   d.precision = keep(engine.precision());
   d.kernels = keep(engine.kernels());
   d.device = keep(engine.device().name());
+  d.noise_rows = size_of(engine.horizon());
   d.memory_weights = memory.weights, d.memory_plan = memory.plan, d.memory_working = memory.working;
 }
 

@@ -87,6 +87,7 @@ v1::Description describe(const Engine& engine, const v1::Limits& limits) {
   describe_states(engine, out);
   describe_actions(engine, out);
   out.set_d_noise(static_cast<std::uint32_t>(engine.d_action()));
+  out.set_noise_rows(static_cast<std::uint32_t>(engine.horizon()));
   out.set_noise_kind(engine.solver().noise);
   out.set_max_text_tokens(static_cast<std::uint32_t>(engine.processor().recipe().max_tokens));
   *out.mutable_limits() = limits;

@@ -75,7 +75,7 @@ TEST_CASE("a description tells what the bundle says") {
   CHECK(d.states[0]->width == call.golden.observation.states.begin()->second.size());
   CHECK(std::string(d.states[0]->number_names[0]) != "");
   CHECK(std::string(d.states[0]->units[d.states[0]->width - 1]) == "");
-  CHECK(d.horizon * d.d_noise == call.golden.noise.size());
+  CHECK(d.noise_rows * d.d_noise == call.golden.noise.size());
   CHECK(d.d_action == 7);
   CHECK(std::string(d.action_names[6]) == "action.6");
   CHECK(std::string(d.action_units[6]) == "");

@@ -107,7 +107,8 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
     assert [n for s in spec.states for n in s.names] == keys["observation.state_names"]
     assert [u for s in spec.states for u in s.units] == keys["observation.state_units"]
     assert list(spec.action_names) == keys["action.names"] and list(spec.action_units) == keys["action.units"]
-    assert (spec.horizon, spec.d_noise, spec.noise) == (
+    assert 1 <= spec.horizon <= spec.noise_rows
+    assert (spec.noise_rows, spec.d_noise, spec.noise) == (
         keys["policy.horizon"],
         keys["policy.d_action"],
         keys["solver.noise"],

@@ -12,7 +12,7 @@ HORIZON, D_ACTION = 4, 2
 
 
 def description():
-    message = wire.MESSAGES["Description"](horizon=HORIZON, d_noise=3, noise_kind="normal", rate_hz=20)
+    message = wire.MESSAGES["Description"](horizon=HORIZON, noise_rows=HORIZON, d_noise=3, noise_kind="normal", rate_hz=20)
     message.views.add(name="observation.images.top", width=64, height=64)
     state = message.states.add(name="observation.state")
     for name in ("a", "b"):

@@ -14,7 +14,7 @@ from vla_cpp.control import ChunkLoop, CrossFade
 
 HORIZON = 10
 SPEC = Spec(
-    views=(), min_views=0, states=(), action_names=("x",), action_units=("",), horizon=HORIZON, d_action=1, d_noise=1,
+    views=(), min_views=0, states=(), action_names=("x",), action_units=("",), horizon=HORIZON, d_action=1, d_noise=1, noise_rows=HORIZON,
     noise="normal", rate_hz=10.0, bundle=BundleInfo("b", "a", "c", "s"), precision="", kernels="", device="",
 )  # fmt: skip
 ARGUMENTS = dict(rate_hz=10, replan_every=4, mode="async", blend="replace", on_late="hold")

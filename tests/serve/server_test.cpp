@@ -76,7 +76,7 @@ TEST_CASE("describe tells everything that a client needs to build an act") {
   const v1::Description& description = response.description();
   CHECK(description.views_size() == 2);
   CHECK(description.states(0).dimensions_size() == 6);
-  CHECK(description.horizon() * description.d_noise() == golden().noise.size());
+  CHECK(description.noise_rows() * description.d_noise() == golden().noise.size());
   CHECK(description.noise_kind() == "normal");
   CHECK(description.limits().max_views() == 2);
   CHECK(description.bundle().name() == "bundle.gguf");

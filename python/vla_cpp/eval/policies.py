@@ -23,7 +23,7 @@ class Answer:
 
 class EvalPolicy:
     """identity     which weights: a checksum or a name
-    noise_shape  (horizon, d_noise) of the noise that `act` wants
+    noise_shape  (noise_rows, d_noise) of the noise that `act` wants
     """
 
     identity = ""
@@ -45,7 +45,7 @@ class ServedPolicy(EvalPolicy):
         self._client = vla_cpp.Client(address, timeout=timeout)
         self.spec = self._client.spec
         self.identity = self.spec.bundle.checksum
-        self.noise_shape = (self.spec.horizon, self.spec.d_noise)
+        self.noise_shape = (self.spec.noise_rows, self.spec.d_noise)
 
     def act(self, observation: Observation, text: str, noise: np.ndarray) -> Answer:
         chunk = self._client.act(images=observation.frames, state=observation.state, text=text, noise=noise)
