@@ -43,6 +43,18 @@ def test_a_camera_has_a_width_and_a_height(converter, size):
     assert "--camera-size: expected WIDTHxHEIGHT in pixels" in error.message() and error.code == Code.USAGE
 
 
+# 40x30 -> 16x12 -> crop 14x11 -> 15x12
+@pytest.mark.parametrize(
+    "camera, least, most, found", [("40x30", 144, 4096, "15x12"), ("", 145, 4096, "12x12"), ("", 64, 143, "12x12")]
+)
+def test_pictures_that_the_backbone_would_resize_once_more_are_refused(converter, camera, least, most, found):
+    tiny = TinyGr00t()
+    tiny.images.update(min_pixels=least, max_pixels=most)
+    error = converter.refusal(tiny, embodiment=TAG, camera_size=camera)
+    expected = "sides are multiples of 4 and whose area is {} to {} pixels, found {};".format(least, most, found)
+    assert expected in error.message() and error.code == Code.UNSUPPORTED
+
+
 @pytest.mark.parametrize("options", [dict(variant="r1"), dict(views=["a"]), dict(identity_stats=["action"])])
 def test_options_of_other_layouts_are_refused(converter, options):
     assert "found one of GR00T" in converter.refusal(TinyGr00t(), embodiment=TAG, **options).message()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of GR00T N1.7: the pipeline of its processor, the image processor of its backbone behind it, and the size that comes out.
+"""Pictures of GR00T N1.7: the pipeline of its processor, the size that comes out, and the image processor of its backbone behind it.
 
 Reference: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations), which equals the pipeline of
 Isaac-GR00T, and transformers models/qwen2_vl/image_processing_qwen2_vl.py.
@@ -8,7 +8,6 @@ Isaac-GR00T, and transformers models/qwen2_vl/image_processing_qwen2_vl.py.
 
 from __future__ import annotations
 
-import math
 import os
 from typing import List, NamedTuple, Tuple
 
@@ -37,6 +36,8 @@ IMAGE_IGNORED = set(
     """image_processor_type processor_class data_format input_data_format disable_grouping return_tensors device default_to_square
     feature_extractor_type do_center_crop crop_size do_pad pad_size""".split()
 )
+# In bytes: the reference folds the rescaling by 1 / 255 into mean and std, which then are exact.
+STANDARDIZE = {"op": "standardize", "mean": [0.5] * 3, "std": [0.5] * 3, "arithmetic": "float32_in_bytes"}
 MAX_SIDE = 8192
 
 
@@ -47,7 +48,7 @@ class Pictures(NamedTuple):
 
 
 class _Area(NamedTuple):
-    """What smart_resize holds a picture to."""
+    """The sides and areas of pictures that smart_resize leaves alone."""
 
     multiple: int
     least: int
@@ -69,21 +70,15 @@ def read_pictures(
     if 0.0 < fraction < 1.0:
         ops += [{"op": "crop_fraction", "fraction": fraction}, smallest]
         width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
-    resized = _smart_resize(width, height, area)
-    if resized != (width, height):
-        ops.append(
-            {"op": "qwen_smart_resize", "multiple": area.multiple, "min_pixels": area.least, "max_pixels": area.most}
-        )
-        notes.append("pictures of {}x{} become {}x{} in the backbone's image processor".format(width, height, *resized))
-    ops.append({"op": "size", "width": resized[0], "height": resized[1]})
-    ops.append({"op": "affine", "scale": 2.0, "shift": -1.0})
+    ops += [{"op": "size", "width": width, "height": height}, STANDARDIZE]
+    _check_area(width, height, area, problems)
     if not pad:
         notes.append(
             "pictures keep their aspect, as letter_box_transform says: those of {} are taken, others are refused ({})".format(
                 camera_size or "square cameras", DOCS
             )
         )
-    return Pictures(*resized, ops)
+    return Pictures(width, height, ops)
 
 
 def _pair(processor: Section, key: str) -> int:
@@ -143,17 +138,18 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
     return max(1, int(round(width * scale))), max(1, int(round(height * scale)))
 
 
-def _smart_resize(width: int, height: int, area: _Area) -> Tuple[int, int]:
-    m = area.multiple
-    sides = (width, height)
-    out = [round(side / m) * m for side in sides]
-    if out[0] * out[1] > area.most:
-        beta = math.sqrt(width * height / area.most)
-        out = [max(m, math.floor(side / beta / m) * m) for side in sides]
-    elif out[0] * out[1] < area.least:
-        beta = math.sqrt(area.least / (width * height))
-        out = [math.ceil(side * beta / m) * m for side in sides]
-    return out[0], out[1]
+def _check_area(width: int, height: int, area: _Area, problems: Problems) -> None:
+    if problems.list:
+        return  # of the sizes themselves
+    if width % area.multiple == height % area.multiple == 0 and area.least <= width * height <= area.most:
+        return
+    problems.unsupported(
+        "backbone " + FILE,
+        "pictures whose sides are multiples of {} and whose area is {} to {} pixels".format(*area),
+        "{}x{}".format(width, height),
+        "the image processor of the backbone would resize them once more, which is not supported yet; their size follows from "
+        "--camera-size and the sizes in processor_config.json",
+    )
 
 
 def _area(folder: str, s: Sizes, problems: Problems) -> _Area:
