@@ -44,7 +44,7 @@ def act(policy, golden):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_golden_case_gives_the_bytes_of_vla_run_from_a_seed_and_from_noise(name, chunk_of_run):
     case = Golden(name)
-    observation = dict(images=frames(case), state={"state": case.state}, text=case.text)
+    observation = dict(images=frames(case), state=case.state if isinstance(case.state, dict) else {"state": case.state}, text=case.text)
     with vla_cpp.Policy(case.bundle, threads=2) as policy:
         for seed in (0, 2**64 - 1):
             chunk = policy.act(**observation, seed=seed)
