@@ -36,7 +36,8 @@ N_SEED = 4
 BLENDS = ("replace", "linear", "ensemble")
 SPEC = Spec(
     views=(), min_views=0, states=(), action_names=("x", "y"), action_units=("m", "m"), horizon=HORIZON, d_action=2,
-    d_noise=2, noise="normal", rate_hz=RATE_HZ, bundle=BundleInfo("toy", "toy", "", ""), precision="", kernels="", device="",
+    d_noise=2, noise_rows=HORIZON, noise="normal", rate_hz=RATE_HZ, bundle=BundleInfo("toy", "toy", "", ""), precision="",
+    kernels="", device="",
 )  # fmt: skip
 
 

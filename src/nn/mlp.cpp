@@ -31,6 +31,4 @@ Tensor GatedMlp::added_to(Graph& g, Tensor residual, Tensor x) const {
 
 Tensor silu(Graph& g, Tensor x) { return ggml_silu(g.context(), x.node()); }
 
-Tensor relu(Graph& g, Tensor x) { return kernels::relu(g, x); }
-
 }  // namespace vla

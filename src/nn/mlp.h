@@ -36,7 +36,5 @@ class GatedMlp {
 
 /// x / (1 + exp(-x)). Source: torch silu.
 Tensor silu(Graph& g, Tensor x);
-/// max(x, 0). Source: torch relu.
-Tensor relu(Graph& g, Tensor x);
 
 }  // namespace vla
