@@ -7,12 +7,21 @@
 
 namespace vla {
 
+/// What tells the families of encoders apart.
+struct EncoderFamily {
+  Activation activation;  // of the MLP
+  bool scaled;            // attention and MLP are multiplied feature by feature before they are added (LayerScale)
+};
+constexpr EncoderFamily kPlainEncoder = {Activation::gelu_tanh, false};
+constexpr EncoderFamily kInternEncoder = {Activation::gelu_erf, true};
+
 /// One pre-norm encoder layer: attention in which all tokens of a view see each other, then a GELU MLP.
-/// Sources: transformers modeling_siglip.py SiglipEncoderLayer, modeling_qwen3_vl.py Qwen3VLVisionBlock; lerobot
+/// Sources: transformers modeling_siglip.py SiglipEncoderLayer, modeling_qwen3_vl.py Qwen3VLVisionBlock; InternVL
+/// internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionEncoderLayer; lerobot
 /// policies/groot/action_head/cross_attention_dit.py BasicTransformerBlock (layer_norm).
 class EncoderBlock : public Module<EncoderBlock> {
  public:
-  EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps);
+  EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family = kPlainEncoder);
   /// x [d_model, n, n_view] -> the same shape; `rotary` turns queries and keys [d_head, n], or none.
   Tensor forward(Graph& g, Tensor x, Tensor rotary = {}) const;
 
@@ -22,6 +31,8 @@ class EncoderBlock : public Module<EncoderBlock> {
   Linear q_, k_, v_, out_;
   LayerNorm ffn_norm_;
   Mlp mlp_;
+  const Param* attn_scale_ = nullptr;  // of scaled families
+  const Param* ffn_scale_ = nullptr;
 };
 
 }  // namespace vla

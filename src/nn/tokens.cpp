@@ -77,13 +77,6 @@ Tensor prepend_token(Graph& g, Tensor token, Tensor x) {
   return concat_tokens(g, {ggml_repeat_4d(g.context(), token.node(), x.dim(0), 1, x.dim(2), 1), x});
 }
 
-Tensor drop_first_token(Graph& g, Tensor x) {
-  ggml_tensor* node = x.node();
-  ggml_tensor* rest =
-      ggml_view_3d(g.context(), node, x.dim(0), x.dim(1) - 1, x.dim(2), node->nb[1], node->nb[2], node->nb[1]);
-  return ggml_cont(g.context(), rest);
-}
-
 Tensor first_features(Graph& g, Tensor x, int count) {
   const std::int64_t d = x.dim(0);
   const Tensor kept = g.constant(fmt::format("first_features/{}/{}", d, count), [&](Store& store) {

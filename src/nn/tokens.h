@@ -42,8 +42,6 @@ Tensor flatten_views(Graph& g, Tensor x);
 Tensor one_view(Graph& g, Tensor x, int view);
 /// A token in front of every view's: token [d], x [d, n, n_view] -> [d, 1 + n, n_view].
 Tensor prepend_token(Graph& g, Tensor token, Tensor x);
-/// All tokens of every view but its first: [d, 1 + n, n_view] -> [d, n, n_view].
-Tensor drop_first_token(Graph& g, Tensor x);
 /// x with zeros in all features but the first `count`: [d, n] -> the same shape.
 Tensor first_features(Graph& g, Tensor x, int count);
 /// The columns of a matrix below each other, without a copy: [d, n] -> [d * n, 1].

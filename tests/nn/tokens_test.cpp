@@ -40,7 +40,7 @@ TEST_CASE("a token in front of every view's is dropped again without a trace") {
     return prepend_token(g, g.store().add_constant(Values{-1, -2}, {2}), numbers(g, {2, 3, 2}));
   };
   CHECK(run_graph(with) == Values{-1, -2, 0, 1, 2, 3, 4, 5, -1, -2, 6, 7, 8, 9, 10, 11});
-  CHECK(run_graph([&](Graph& g) { return drop_first_token(g, with(g)); }) == counted(12));
+  CHECK(run_graph([&](Graph& g) { return slice_tokens(g, with(g), 1, 3); }) == counted(12));
 }
 
 TEST_CASE("one view of several, and parts of any number in their order") {

@@ -4,33 +4,14 @@
 
 #include <vector>
 
+#include "modules/encoder_block.h"
 #include "nn/embedding.h"
-#include "nn/linear.h"
-#include "nn/mlp.h"
-#include "nn/norm.h"
 
 namespace vla {
 
-/// One pre-norm block: full attention and a GELU MLP, each scaled feature by feature before it is added.
-/// x [d_model, 1 + n_patch, n_view] -> the same shape.
-/// Source: InternVL internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionEncoderLayer.
-class InternVitBlock : public Module<InternVitBlock> {
- public:
-  InternVitBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps);
-  Tensor forward(Graph& g, Tensor x) const;
-
- private:
-  int n_head_;
-  LayerNorm attn_norm_;
-  Linear q_, k_, v_, out_;
-  const Param* attn_scale_;
-  LayerNorm ffn_norm_;
-  Mlp mlp_;
-  const Param* ffn_scale_;
-};
-
 /// InternViT, the vision tower of InternVL, every view in one batch. A class token stands in front of the patches and
-/// is dropped at the end; there is no final norm. Source: the same file, InternVisionModel.
+/// is dropped at the end; there is no final norm. Source: InternVL
+/// internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionModel.
 class InternVit {
  public:
   explicit InternVit(const Scope& s);
@@ -51,7 +32,7 @@ class InternVit {
   const Param* class_token_;
   PatchEmbed patch_embed_;
   Embedding position_;
-  std::vector<InternVitBlock> blocks_;
+  std::vector<EncoderBlock> blocks_;
 };
 
 }  // namespace vla
