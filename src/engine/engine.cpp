@@ -78,8 +78,10 @@ Status Engine::make_constants(bool dry) {
   VLA_CHECK(policy_->check(largest_shape()));
   constant_store_ = std::make_unique<Store>(64 + 2 * weights_->count());
   Graph graph(*weights_, *constant_store_, {});
-  const Tensor absent = constant_store_->add_constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
-  policy_->constants(graph, absent, constants_);
+  const auto absent_view = [&] {
+    return constant_store_->add_constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
+  };
+  policy_->constants(graph, absent_view, constants_);
   if (graph.n_node() == 0) return {};
   VLA_CHECK(constant_store_->allocate(device_));
   ComputeMemory memory(device_);

@@ -98,9 +98,9 @@ class Evo1 final : public Policy {
     return time_(g, constant_ids(g, "time_rows", rows));  // [d_model, n_time]
   }
 
-  void constants(Graph& g, Tensor absent_view, Cache& cache) const override {
+  void constants(Graph& g, const std::function<Tensor()>& absent_view, Cache& cache) const override {
     if (dead_rows_ == DeadRows::unseen) return;
-    const Tensor image = flatten_views(g, connector_(g, vision_(g, absent_view)));  // [d_model, n_view_token]
+    const Tensor image = flatten_views(g, connector_(g, vision_(g, absent_view())));  // [d_model, n_view_token]
     if (dead_rows_ == DeadRows::causal_attention) return cache.put(g, "absent", image);
     head_.keep(g, lm_.alone(g, concat_tokens(g, {image, pads(g, 1)})), cache);
   }

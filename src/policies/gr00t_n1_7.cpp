@@ -76,7 +76,7 @@ class Gr00tN17 final : public Policy {
     return concat_features(g, modulations, embedded(dit_.d_model(), BucketWaves::sines_first));
   }
 
-  void constants(Graph& g, Tensor, Cache& cache) const override { backbone_.keep(g, cache); }
+  void constants(Graph& g, const std::function<Tensor()>&, Cache& cache) const override { backbone_.keep(g, cache); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
     Tensor x = vl_norm_(g, backbone_(g, in.images, in.tokens, cache));  // [d_model, n_text]

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <span>
 #include <string>
@@ -44,9 +45,9 @@ class Policy {
   /// Whether it matters which views are present, and not their number alone.
   virtual bool places_views() const { return false; }
 
-  /// Load rate: what depends on the weights alone, put into the cache that every prefix starts from. `absent_view` is a
-  /// view that the robot does not have, as the image recipe makes it: [width, height, 3, 1].
-  virtual void constants(Graph& g, Tensor absent_view, Cache& cache) const {
+  /// Load rate: what depends on the weights alone, put into the cache that every prefix starts from. `absent_view`
+  /// makes a view that the robot does not have, as the image recipe does: [width, height, 3, 1].
+  virtual void constants(Graph& g, const std::function<Tensor()>& absent_view, Cache& cache) const {
     static_cast<void>(g), static_cast<void>(absent_view), static_cast<void>(cache);
   }
 
