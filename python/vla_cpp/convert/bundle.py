@@ -36,6 +36,11 @@ class Key(NamedTuple):
     value: object
 
 
+def keys_by_type(groups: Dict[str, Dict[str, object]]) -> List[Key]:
+    """{type: {name: value}} as keys, in that order."""
+    return [Key(name, kind, value) for kind, group in groups.items() for name, value in group.items()]
+
+
 class TensorInfo(NamedTuple):
     """A tensor of the bundle: shape as torch has it, dtype f32, bf16 or f16."""
 

@@ -9,7 +9,7 @@ import os
 from typing import Dict, List
 
 from .. import recipe
-from ..bundle import Key
+from ..bundle import Key, keys_by_type
 from ..checkpoint import OPENPI, Checkpoint
 from ..errors import Code, ConvertError, Problems, refuse
 from ..files import BACKBONE_PATTERNS, download
@@ -44,7 +44,7 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
         "action": source.action,
     }
     keys = [
-        *(Key(name, kind, value) for kind, group in network_keys(source.sizes).items() for name, value in group.items()),
+        *keys_by_type(network_keys(source.sizes)),
         *source.features,
         Key("observation.max_text_tokens", "u32", source.max_tokens),
         *tokenizer.keys,

@@ -11,7 +11,7 @@ import json
 import os
 from typing import List
 
-from ..bundle import Key
+from ..bundle import Key, keys_by_type
 from ..checkpoint import EVO1, Checkpoint
 from ..errors import Problems
 from ..files import read_json
@@ -124,6 +124,5 @@ def _network_keys(s: Sizes) -> List[Key]:
         "solver.kind": "euler",
         "solver.noise": "uniform",
     }
-    groups = (("u32", u32), ("f32", f32), ("f64", f64), ("string", text))
-    return [Key(name, kind, value) for kind, group in groups for name, value in group.items()]
+    return keys_by_type({"u32": u32, "f32": f32, "f64": f64, "string": text})
 

@@ -14,7 +14,7 @@ from typing import Dict, List, Sequence
 import numpy as np
 
 from .. import recipe
-from ..bundle import Key
+from ..bundle import Key, keys_by_type
 from ..checkpoint import Checkpoint, find_backbone
 from ..errors import Problems
 from ..features import feature_keys
@@ -259,7 +259,5 @@ def _network_keys(s: Sizes) -> List[Key]:
     }
     f64 = {"solver.t_start": 0.0, "solver.t_end": 1.0}
     text = {"solver.kind": "euler", "solver.noise": "normal"}
-    groups = (("u32", u32), ("f32", f32), ("f64", f64), ("string", text))
-    keys = [Key(name, kind, value) for kind, group in groups for name, value in group.items()]
     lists = {"vision.deepstack_layers": s.deepstack_layers, "lm.rope_sections": s.rope_sections}
-    return keys + [Key(name, "u32[]", value) for name, value in lists.items()]
+    return keys_by_type({"u32": u32, "f32": f32, "f64": f64, "string": text, "u32[]": lists})

@@ -13,7 +13,7 @@ import math
 from typing import Dict, List
 
 from .. import recipe
-from ..bundle import Key
+from ..bundle import Key, keys_by_type
 from ..checkpoint import Checkpoint
 from ..errors import Problems
 from ..features import feature_keys
@@ -119,11 +119,7 @@ def _network_keys(s: Sizes) -> List[Key]:
         "solver.kind": "euler",
         "solver.noise": "normal",
     }
-    keys = [
-        Key(name, kind, value)
-        for kind, group in (("u32", u32), ("f32", f32), ("f64", f64), ("string", text))
-        for name, value in group.items()
-    ]
+    keys = keys_by_type({"u32": u32, "f32": f32, "f64": f64, "string": text})
     return keys + [Key("expert.layer_kinds", "string[]", s.layer_kinds)]
 
 
