@@ -10,8 +10,7 @@ import pytest
 
 from manifest_test import vla
 from vla_cpp.convert.archs import gr00t_n1_7
-from vla_cpp.convert.archs._gr00t_names import weights
-from vla_cpp.convert.archs._gr00t_sizes import read_sizes
+from vla_cpp.convert.archs.gr00t.plan import network_keys, read_sizes, weights
 from vla_cpp.convert.errors import Problems
 
 CONFIG = {  # of the published checkpoint: what differs from the defaults of its class
@@ -64,10 +63,15 @@ BACKBONE = {  # of the published backbone
 }
 
 
+RELEASE = gr00t_n1_7.RELEASE
+
+
 @pytest.fixture(scope="module")
-def sizes():
+def sizes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("backbone")
+    (folder / "config.json").write_text(json.dumps(BACKBONE))
     problems = Problems("published")
-    sizes = read_sizes(CONFIG, BACKBONE, problems)
+    sizes = read_sizes(RELEASE, CONFIG, str(folder), problems)
     problems.raise_any()
     sizes.n_slot, sizes.image_width, sizes.image_height = 2, 256, 256
     return sizes
@@ -86,7 +90,7 @@ def sizes():
     ],
 )
 def test_each_part_has_the_published_count_of_parameters(sizes, prefixes, millions):
-    rows = [row for row in weights(sizes) if row.target.startswith(prefixes)]
+    rows = [row for row in weights(RELEASE, sizes) if row.target.startswith(prefixes)]
     assert sum(int(np.prod(row.shape)) for row in rows) / 1e6 == pytest.approx(millions, abs=0.06)
 
 
@@ -97,12 +101,12 @@ def manifest():
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes, manifest):
-    ours = {row.target: (list(row.shape), row.kind) for row in weights(sizes)}
+    ours = {row.target: (list(row.shape), row.kind) for row in weights(RELEASE, sizes)}
     assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
-    ours = {key.name: key.value for key in gr00t_n1_7._network_keys(sizes)}
+    ours = {key.name: key.value for key in network_keys(RELEASE, sizes)}
     ours["policy.view_starts"] = [4, 70]  # <|im_start|>, "user", a line's end, <|vision_start|>; 64 image tokens a view
     for name, value in manifest["config"].items():
         assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name

@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-from typing import Dict
+from typing import Collection, Dict, Tuple
 
 from .errors import Problems
 
 # Far above any policy: a hostile config must not make the converter plan without end.
 MAX_SIZE = 1 << 24
 ANY_INT = -1 << 31
+Fixed = Dict[str, Tuple[object, object]]  # key -> the class's default, the value that the runtime implements
 
 
 class Section:
@@ -46,3 +47,15 @@ class Section:
     def fixed(self, key: str, value, hint: str = "") -> None:
         if self.values.get(key, value) != value:
             self.bad(key, repr(value), hint=hint, unsupported=True)
+
+    def check_fixed(self, fixed: Fixed, hint: str = "") -> None:
+        """Refuses what the runtime does not implement, by the class's default where a key is absent."""
+        for key, (default, value) in fixed.items():
+            self.defaults[key] = default
+            if self.get(key) != value:
+                self.bad(key, repr(value), hint=hint, unsupported=True)
+
+    def refuse_unknown(self, known: Collection[str]) -> None:
+        for key in sorted(set(self.values) - set(known)):
+            hint = "it may change numbers; a newer vla-convert may know it"
+            self.bad(key, "a key that this converter knows", hint=hint, unsupported=True)

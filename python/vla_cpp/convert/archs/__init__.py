@@ -73,8 +73,9 @@ class Plan:
 
 
 def names() -> List[str]:
-    """Modules with a leading underscore are parts of an architecture's."""
-    return sorted(module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_"))
+    """Packages, and modules with a leading underscore, are parts of an architecture's."""
+    modules = [module for module in pkgutil.iter_modules(__path__) if not module.ispkg]
+    return sorted(module.name for module in modules if not module.name.startswith("_"))
 
 
 # Types of LeRobot whose policies are read in another layout.

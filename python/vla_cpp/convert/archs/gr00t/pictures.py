@@ -1,41 +1,19 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of GR00T N1.7: the pipeline of its processor, the size that comes out, and the image processor of its backbone behind it.
+"""Pictures of GR00T N1.6 and N1.7: the pipeline of their processor, and the size that comes out.
 
-Reference: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations), which equals the pipeline of
-Isaac-GR00T, and transformers models/qwen2_vl/image_processing_qwen2_vl.py.
+Reference: Isaac-GR00T gr00t/model/gr00t_n1d7/image_augmentations.py, which lerobot policies/groot/processor_groot.py
+(_transform_n1_7_image_for_vlm_albumentations) equals.
 """
 
 from __future__ import annotations
 
-import os
 from typing import List, NamedTuple, Tuple
 
-from ..errors import Code, Problems, refuse
-from ..files import read_json
-from ..section import Section
-from ._gr00t_backbone import Fixed, Sizes, check_fixed, refuse_unknown
-from ._gr00t_robot import DOCS
+from ...errors import Code, Problems, refuse
+from ...section import Section
+from .robot import DOCS
 
-FILE = "preprocessor_config.json"
-# Qwen2VLImageProcessor of transformers. What is None there must be stated, since its own default is of another model.
-IMAGE = {"size": None, "min_pixels": None, "max_pixels": None}
-IMAGE_FIXED: Fixed = {
-    "do_resize": (True, True),
-    "do_rescale": (True, True),
-    "do_normalize": (True, True),
-    "do_convert_rgb": (True, True),
-    "resample": (3, 3),
-    "rescale_factor": (1 / 255, 1 / 255),
-    "image_mean": (None, [0.5, 0.5, 0.5]),
-    "image_std": (None, [0.5, 0.5, 0.5]),
-    "temporal_patch_size": (2, 2),
-    "merge_size": (2, 2),
-}
-IMAGE_IGNORED = set(
-    """image_processor_type processor_class data_format input_data_format disable_grouping return_tensors device default_to_square
-    feature_extractor_type do_center_crop crop_size do_pad pad_size""".split()
-)
 # In bytes: the reference folds the rescaling by 1 / 255 into mean and std, which then are exact.
 STANDARDIZE = {"op": "standardize", "mean": [0.5] * 3, "std": [0.5] * 3, "arithmetic": "float32_in_bytes"}
 MAX_SIDE = 8192
@@ -47,21 +25,19 @@ class Pictures(NamedTuple):
     ops: List[dict]
 
 
-class _Area(NamedTuple):
-    """The sides and areas of pictures that smart_resize leaves alone."""
+class Area(NamedTuple):
+    """The sides and areas of pictures that the backbone's image processor leaves alone."""
 
+    file: str  # that states them
     multiple: int
     least: int
     most: int
 
 
-def read_pictures(
-    processor: Section, folder: str, camera_size: str, s: Sizes, notes: List[str], problems: Problems
-) -> Pictures:
-    """`processor`: the members of processor_kwargs. `folder`: the backbone's. `camera_size`: as asked for, or empty."""
+def read_pictures(processor: Section, area: Area, camera_size: str, notes: List[str], problems: Problems) -> Pictures:
+    """`processor`: the members of processor_kwargs. `camera_size`: as asked for, or empty."""
     edge, fraction = _edge(processor), _fraction(processor)
     pad = processor.get("letter_box_transform") is True
-    area = _area(folder, s, problems)
     width, height = _camera(camera_size, edge, pad)
     ops: List[dict] = [{"op": "square_pad"}] if pad else []
     smallest = {"op": "smallest_side", "size": edge, "filter": "opencv_area"}
@@ -138,36 +114,15 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
     return max(1, int(round(width * scale))), max(1, int(round(height * scale)))
 
 
-def _check_area(width: int, height: int, area: _Area, problems: Problems) -> None:
+def _check_area(width: int, height: int, area: Area, problems: Problems) -> None:
     if problems.list:
         return  # of the sizes themselves
     if width % area.multiple == height % area.multiple == 0 and area.least <= width * height <= area.most:
         return
     problems.unsupported(
-        "backbone " + FILE,
-        "pictures whose sides are multiples of {} and whose area is {} to {} pixels".format(*area),
+        "backbone " + area.file,
+        "pictures whose sides are multiples of {} and whose area is {} to {} pixels".format(*area[1:]),
         "{}x{}".format(width, height),
         "the image processor of the backbone would resize them once more, which is not supported yet; their size follows from "
         "--camera-size and the sizes in processor_config.json",
     )
-
-
-def _area(folder: str, s: Sizes, problems: Problems) -> _Area:
-    path = os.path.join(folder, FILE)
-    if not os.path.exists(path):
-        hint = "it lies beside the backbone's config.json, and says to which sizes pictures are held"
-        raise refuse(path, "the backbone's image processor", "none", hint, Code.IO)
-    section = Section("backbone " + FILE, read_json(path), IMAGE, problems)
-    refuse_unknown(section, {*IMAGE, *IMAGE_FIXED, *IMAGE_IGNORED, "patch_size"})
-    check_fixed(section, IMAGE_FIXED)
-    if section.get("patch_size") != s.patch_size:
-        section.bad("patch_size", "{} as in the backbone's vision_config".format(s.patch_size))
-    size = section.get("size") if isinstance(section.get("size"), dict) else {}
-    limits = []
-    for own, key in (("min_pixels", "shortest_edge"), ("max_pixels", "longest_edge")):
-        stated = size.get(key) if section.get(own) is None else section.get(own)
-        if type(stated) is not int or not 0 < stated < 1 << 31:
-            section.bad("size", "shortest_edge and longest_edge, counts of pixels")
-            stated = 1
-        limits.append(stated)
-    return _Area(2 * s.patch_size, *limits)

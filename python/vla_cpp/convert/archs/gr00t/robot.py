@@ -8,14 +8,14 @@ Reference: Isaac-GR00T gr00t/data/state_action/state_action_processor.py, gr00t/
 from __future__ import annotations
 
 import os
-from typing import Dict, List, NamedTuple, Sequence
+from typing import List, NamedTuple, Sequence
 
 import numpy as np
 
-from ..checkpoint import Checkpoint
-from ..errors import Code, Problems, refuse
-from ..files import member, read_json
-from ..section import Section
+from ...checkpoint import Checkpoint
+from ...errors import Code, Problems, refuse
+from ...files import member, read_json
+from ...section import Section
 
 PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json", "embodiment_id.json"
 DOCS = "docs/converting.md, GR00T"
@@ -260,10 +260,3 @@ def read_robot(tag: str, config: dict, statistics: dict, processor: Section, hor
         problems.add("{}: {}.action: delta_indices".format(PROCESSOR, tag), "a list of steps", repr(steps)[:80])
         steps = [0]
     return Robot(video.get("modality_keys"), states, actions, min(len(steps), horizon))
-
-
-def statistics_of(feature: str, groups: Sequence[Group]) -> Dict[str, np.ndarray]:
-    """Of all keys, one after the other, by the name of the bundle's tensor."""
-    names = ("mean", "std") if groups[0].mean_std else ("min", "max")
-    columns = ([group.low for group in groups], [group.high for group in groups])
-    return {"stats.{}.{}".format(feature, name): np.concatenate(parts) for name, parts in zip(names, columns)}

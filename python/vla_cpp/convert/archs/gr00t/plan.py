@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The bundle of one robot of a checkpoint with processor_config.json, which N1.6 and N1.7 have.
+
+The two differ in their backbone and in what their configs may say: that is a `Release`.
+"""
+
+from __future__ import annotations
+
+import json
+from types import ModuleType
+from typing import Collection, Dict, List, NamedTuple
+
+from ... import recipe
+from ...bundle import Key, keys_by_type
+from ...checkpoint import Checkpoint, find_backbone
+from ...errors import Problems
+from ...files import member, read_json
+from ...section import Fixed, Section
+from ...tokenizer import read_tokenizer
+from .. import Options, Plan, Weight
+from . import head, language
+from .pictures import read_pictures
+from .prompt import text_ops
+from .robot import PROCESSOR, STATISTICS, choose, embodiment_index, processor_file, read_robot
+from .sizes import MAX_LAYERS, Sizes
+from .vectors import action_ops, feature_description, state_ops, statistics_of
+
+POLICY = "config.json"
+# Gr00tN1d7Processor of Isaac-GR00T. LeRobot reads an absent size of pictures otherwise, so that these must be stated, if only as null.
+KWARGS = {
+    "modality_configs": None,
+    "use_percentiles": False,
+    "clip_outliers": True,
+    "formalize_language": True,
+    "max_state_dim": 29,
+    "apply_sincos_state_encoding": False,
+    "use_relative_action": False,
+    "letter_box_transform": False,
+}
+STATED = ("image_crop_size", "image_target_size", "shortest_image_edge", "crop_fraction")
+FLAGS = [key for key, value in KWARGS.items() if isinstance(value, bool)]
+KWARGS_FIXED: Fixed = {
+    "use_albumentations": (False, True),
+    "exclude_state": (False, False),
+    "use_mean_std": (False, False),
+    "use_tactile": (False, False),
+    "statistics": (None, None),
+    "embodiment_id_mapping": (None, None),
+}
+KWARGS_IGNORED = set(
+    """random_rotation_angle color_jitter_params model_name max_action_dim max_action_horizon extra_augmentation_config
+    state_dropout_prob transformers_loading_kwargs tactile_state_keys tactile_input_shape tactile_embed_dim""".split()
+)
+
+
+# Keys of training, of precision and of transformers, and those of pictures, text and statistics, which processor_config.json states for
+# the processor: that is where the reference reads them.
+IGNORED = set(
+    """
+    architectures model_dtype dtype torch_dtype transformers_version _name_or_path model_revision tune_top_llm_layers tune_llm
+    tune_visual tune_projector tune_diffusion_model tune_vlln use_flash_attention load_bf16 backbone_trainable_params_fp32
+    attn_dropout noise_beta_alpha noise_beta_beta noise_s state_dropout_prob rtc_ramp_rate image_crop_size image_target_size
+    shortest_image_edge crop_fraction random_rotation_angle color_jitter_params use_albumentations_transforms letter_box_transform
+    extra_augmentation_config formalize_language apply_sincos_state_encoding use_percentiles use_relative_action use_mean_std
+    tactile_state_keys tactile_input_shape tactile_embed_dim return_dict output_hidden_states id2label label2id problem_type
+    chunk_size_feed_forward is_encoder_decoder output_attentions
+    """.split()
+)
+
+
+class Release(NamedTuple):
+    """What a release has of its own."""
+
+    config: Dict[str, object]  # keys of config.json with their defaults
+    fixed: Fixed
+    ignored: Collection[str]
+    processor_class: str
+    kwargs_fixed: Fixed
+    backbone: ModuleType  # read, read_area, read_prompt, weights, keys, dropped, TEMPLATE
+
+
+def make_plan(release: Release, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    processor = _processor(release, checkpoint, problems)
+    robot_config = choose(member(processor.values, "modality_configs", dict, PROCESSOR), options.embodiment)
+    backbone = release.backbone
+    folder = find_backbone(checkpoint, options.backbone, checkpoint.config.get("model_name"), "model_name")
+    s = read_sizes(release, checkpoint.config, folder, problems)
+    s.embodiment = embodiment_index(checkpoint, options.embodiment, s.n_embodiment, problems)
+    statistics = read_json(processor_file(checkpoint, STATISTICS))
+    robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
+    problems.raise_any()
+    s.n_slot = len(robot.cameras)
+    area = backbone.read_area(folder, s, problems)
+    pictures = read_pictures(processor, area, options.camera_size, checkpoint.notes, problems)
+    s.image_width, s.image_height = pictures.width, pictures.height
+    tokenizer = read_tokenizer(folder, s.n_vocab, problems, checkpoint.notes)
+    problems.raise_any()  # a prompt takes a sound tokenizer
+    prompt = backbone.read_prompt(tokenizer, folder, s, problems)
+    if processor.count("max_state_dim") != s.d_state:
+        processor.bad("max_state_dim", "{} as in config.json".format(s.d_state))
+    document = {
+        "image": pictures.ops,
+        "text": text_ops(backbone.TEMPLATE, processor.get("formalize_language"), prompt, s),
+        "state": state_ops(robot, processor.get("clip_outliers"), s, problems),
+        "action": action_ops(robot, s, problems),
+    }
+    keys = [
+        *network_keys(release, s),
+        *prompt.keys(),
+        *feature_description(robot, options, checkpoint.notes, problems),
+        *tokenizer.keys,
+        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+    ]
+    problems.raise_any()
+    tensors = {**statistics_of(recipe.STATE, robot.states), **statistics_of(recipe.ACTION, robot.actions)}
+    return Plan(keys, weights(release, s), backbone.dropped(s), tensors, _hints(backbone, s))
+
+
+def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> Section:
+    config = read_json(processor_file(checkpoint, PROCESSOR))
+    if config.get("processor_class") != release.processor_class:
+        problems.unsupported(
+            PROCESSOR + ": processor_class", repr(release.processor_class), repr(config.get("processor_class"))
+        )
+    section = Section(PROCESSOR, member(config, "processor_kwargs", dict, PROCESSOR), KWARGS, problems)
+    fixed = {**KWARGS_FIXED, **release.kwargs_fixed}
+    section.refuse_unknown({*KWARGS, *STATED, *fixed, *KWARGS_IGNORED})
+    section.check_fixed(fixed)
+    for key in STATED:
+        if key not in section.values:
+            section.bad(
+                key, "a value, or null", "no such key", "the reference and LeRobot take different defaults for it"
+            )
+    for key in FLAGS:
+        if not isinstance(section.get(key), bool):
+            section.bad(key, "true or false")
+    return section
+
+
+def read_sizes(release: Release, config: dict, folder: str, problems: Problems) -> Sizes:
+    """`folder`: the backbone's."""
+    s, policy = Sizes(), Section(POLICY, config, release.config, problems, nullable=("diffusion_model_cfg",))
+    policy.refuse_unknown({*release.config, *release.fixed, *IGNORED, *release.ignored})
+    policy.check_fixed(release.fixed)
+    release.backbone.read(folder, policy.count("select_layer", most=MAX_LAYERS), s, problems)
+    s.d_action, s.text_every = policy.count("max_action_dim"), policy.count("attend_text_every_n_blocks")
+    head.read(policy, s)
+    return s
+
+
+def network_keys(release: Release, s: Sizes) -> List[Key]:
+    groups: Dict[str, Dict[str, object]] = {"u32": {"dit.text_every": s.text_every}}
+    for part in (head.keys(s), release.backbone.keys(s), language.keys(s)):
+        for kind, values in part.items():
+            groups[kind] = {**groups.get(kind, {}), **values}
+    return keys_by_type(groups)
+
+
+def weights(release: Release, s: Sizes) -> List[Weight]:
+    return [*release.backbone.weights(s), *head.weights(s)]
+
+
+def _hints(backbone: ModuleType, s: Sizes) -> Dict[str, str]:
+    return {
+        backbone.LM + "layers.": "select_layer keeps {} language layers, 0 to {}".format(s.n_layer, s.n_layer - 1),
+        "action_head.vl_self_attention.": "vl_self_attention_cfg of config.json has {} layers".format(s.n_vl_layer),
+    }

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The prompt of a chat template around pictures and an instruction, and where the image tokens stand in it."""
+
+from __future__ import annotations
+
+import re
+from typing import List, NamedTuple, Sequence
+
+from ...bundle import Key
+from ...errors import Problems
+from ...tokenizer import TokenizerPlan
+from .._ascii_bpe import Encoder, check_undivided, special_ids
+from .sizes import WHERE, Sizes
+
+START, END = "<|im_start|>", "<|im_end|>"
+# The reference cuts no instruction. The bundle states a longest prompt, far above any instruction.
+N_INSTRUCTION = 512
+
+
+class Template(NamedTuple):
+    """Text around an instruction, views before it. `open` may hold {i}, the number of the view from 1."""
+
+    before: str
+    after: str
+    open: str
+    token: str
+    close: str
+
+    @property
+    def special(self) -> List[str]:
+        """The tokens that stand for themselves, in the order in which they are first met."""
+        found = re.findall(r"<[^< ]+>", self.before + self.open + self.token + self.close + self.after)
+        return list(dict.fromkeys(found))
+
+
+class Prompt(NamedTuple):
+    view_starts: List[int]  # index of the first image token of every view
+    n_token: int  # the longest prompt
+
+    def keys(self) -> List[Key]:
+        return [
+            Key("policy.view_starts", "u32[]", self.view_starts),
+            Key("observation.max_text_tokens", "u32", self.n_token),
+        ]
+
+
+def text_ops(template: Template, formalize: bool, prompt: Prompt, s: Sizes) -> List[dict]:
+    clean = [{"op": "lower"}, {"op": "drop_punctuation"}] if formalize else []
+    view = {"open": template.open, "token": template.token, "repeat": s.n_view_token, "close": template.close}
+    return [
+        *clean,
+        {"op": "views", "count": s.n_slot, **view},
+        {"op": "template", "text": template.before + "{instruction}" + template.after},
+        {"op": "tokenize", "max_tokens": prompt.n_token, "truncate": "right"},
+    ]
+
+
+def count_tokens(text: str, special: Sequence[str], encoder: Encoder) -> int:
+    parts = re.split("({})".format("|".join(map(re.escape, special))), text)
+    return sum(1 if part in special else len(encoder.ids(part)) for part in parts)
+
+
+def read_prompt(template: Template, tokenizer: TokenizerPlan, hint: str, s: Sizes, problems: Problems) -> Prompt:
+    special = template.special
+    special_ids(tokenizer.keys, special, hint, problems)
+    words = re.split("|".join(map(re.escape, special)), template.before + template.open + template.after)
+    check_undivided(tokenizer.keys, special, [word for word in words if word], problems)
+    encoder, text, starts = Encoder(tokenizer.keys), template.before, []
+    for i in range(s.n_slot):
+        text += template.open.replace("{i}", str(i + 1))
+        starts.append(count_tokens(text, special, encoder))
+        text += template.token * s.n_view_token + template.close
+    end = starts[-1] + s.n_view_token + 2
+    if end + 2 > s.n_context:
+        expected = "room for {} views of {} tokens".format(s.n_slot, s.n_view_token)
+        problems.add(WHERE + ": text_config: max_position_embeddings", expected, "{} tokens".format(s.n_context))
+    return Prompt(starts, min(end + N_INSTRUCTION, s.n_context))

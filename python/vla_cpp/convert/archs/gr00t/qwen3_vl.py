@@ -1,0 +1,266 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The backbone of GR00T N1.7, a Qwen3-VL: its config.json, its tensors, its keys, and the areas of the pictures that it takes.
+
+Keys of the config that its classes do not read stay without effect there too.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Dict, List
+
+from ...errors import Code, Problems, refuse
+from ...files import member, read_json
+from ...section import Fixed, Section
+from ...tokenizer import TokenizerPlan
+from .. import MATRIX, TABLE, VECTOR, Dropped, Weight
+from .._ascii_bpe import special_ids
+from .._rows import linear, norm, vector
+from . import language
+from . import prompt as prompts
+from .pictures import Area
+from .prompt import END, START, Prompt, Template
+from .sizes import MAX_LAYERS, WHERE, Sizes
+
+VISUAL, LM = "backbone.model.model.visual.", "backbone.model.model.language_model."
+OPEN, CLOSE, IMAGE = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"
+# One turn without a system turn, the pictures before the instruction.
+TEMPLATE = Template(START + "user\n", END + "\n", OPEN, IMAGE, CLOSE)
+FOLDER = "--backbone needs the folder of nvidia/Cosmos-Reason2-2B"
+# Qwen3VLVisionConfig, Qwen3VLTextConfig and Qwen3VLConfig of transformers.
+VISION = {
+    "depth": 27,
+    "hidden_size": 1152,
+    "intermediate_size": 4304,
+    "num_heads": 16,
+    "patch_size": 16,
+    "out_hidden_size": 3584,
+    "num_position_embeddings": 2304,
+    "deepstack_visual_indexes": [8, 16, 24],
+}
+VISION_FIXED: Fixed = {
+    "hidden_act": ("gelu_pytorch_tanh", "gelu_pytorch_tanh"),
+    "in_channels": (3, 3),
+    "spatial_merge_size": (2, 2),
+    "temporal_patch_size": (2, 2),
+}
+TEXT = {
+    "vocab_size": 151936,
+    "hidden_size": 4096,
+    "intermediate_size": 22016,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "num_key_value_heads": 32,
+    "head_dim": 128,
+    "max_position_embeddings": 128000,
+    "rms_norm_eps": 1e-6,
+    "rope_theta": 500000.0,
+}
+FILE = "preprocessor_config.json"
+# Qwen2VLImageProcessor of transformers. What is None there must be stated, since its own default is of another model.
+SIZES = {"size": None, "min_pixels": None, "max_pixels": None}
+IMAGE_FIXED: Fixed = {
+    "do_resize": (True, True),
+    "do_rescale": (True, True),
+    "do_normalize": (True, True),
+    "do_convert_rgb": (True, True),
+    "resample": (3, 3),
+    "rescale_factor": (1 / 255, 1 / 255),
+    "image_mean": (None, [0.5, 0.5, 0.5]),
+    "image_std": (None, [0.5, 0.5, 0.5]),
+    "temporal_patch_size": (2, 2),
+    "merge_size": (2, 2),
+}
+IMAGE_IGNORED = set(
+    """image_processor_type processor_class data_format input_data_format disable_grouping return_tensors device default_to_square
+    feature_extractor_type do_center_crop crop_size do_pad pad_size""".split()
+)
+
+
+def read(folder: str, kept: int, s: Sizes, problems: Problems) -> None:
+    config = read_json(os.path.join(folder, "config.json"))
+    Section(WHERE, config, {}, problems).check_fixed({"model_type": (None, "qwen3_vl")}, FOLDER)
+    text = Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems)
+    language.read(text, kept, s)
+    _read_rope(text, s)
+    _read_vision(Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s)
+
+
+def _read_vision(vision: Section, s: Sizes) -> None:
+    vision.check_fixed(VISION_FIXED)
+    side = vision.get("patch_size")
+    if isinstance(side, list) and len(side) == 2 and side[0] == side[1]:
+        vision.values = {**vision.values, "patch_size": side[0]}
+    s.patch_size, s.n_vision_layer = vision.count("patch_size"), vision.count("depth", most=MAX_LAYERS)
+    s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
+    s.n_vision_head = vision.count("num_heads")
+    s.n_position_side = math.isqrt(vision.count("num_position_embeddings"))
+    if s.d_vision % s.n_vision_head or s.d_vision // s.n_vision_head % 4:
+        vision.bad("num_heads", "heads of a multiple of 4, which divide hidden_size {}".format(s.d_vision))
+    if s.n_position_side**2 != vision.get("num_position_embeddings"):
+        vision.bad("num_position_embeddings", "a square")
+    if vision.count("out_hidden_size") != s.d_model:
+        vision.bad("out_hidden_size", "the language model's width {}".format(s.d_model))
+    layers = vision.get("deepstack_visual_indexes")
+    if (
+        not isinstance(layers, list)
+        or any(type(i) is not int or not 0 <= i < s.n_vision_layer for i in layers)
+        or sorted(set(layers)) != layers
+        or not 1 <= len(layers) <= s.n_layer
+    ):
+        expected = "rising numbers of layers below {}, no more than the {} language layers".format(
+            s.n_vision_layer, s.n_layer
+        )
+        vision.bad("deepstack_visual_indexes", expected)
+        layers = []
+    s.deepstack_layers = layers
+
+
+def _read_rope(text: Section, s: Sizes) -> None:
+    rope = language.rope_section(text, {"mrope_section": [24, 20, 20]})
+    rope.refuse_unknown({"mrope_section", "mrope_interleaved", "rope_type", "type", "rope_theta"})
+    if rope.get("rope_type") not in (None, "default") or rope.get("type") not in (None, "default", "mrope"):
+        rope.bad("rope_type", "'default'", unsupported=True)
+    rope.check_fixed({"mrope_interleaved": (True, True)})
+    s.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
+    sections = rope.get("mrope_section")
+    counts = isinstance(sections, list) and len(sections) == 3 and all(type(n) is int and n > 0 for n in sections)
+    if not counts or sum(sections) != s.d_head // 2 or 3 * max(sections[1:]) > s.d_head // 2:
+        expected = "three counts for time, height and width that make {}, half a head's width".format(s.d_head // 2)
+        rope.bad("mrope_section", expected)
+        sections = [1, 1, 1]
+    s.rope_sections = sections
+
+
+def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
+    """What smart_resize of its image processor leaves alone."""
+    path = os.path.join(folder, FILE)
+    if not os.path.exists(path):
+        hint = "it lies beside the backbone's config.json, and says to which sizes pictures are held"
+        raise refuse(path, "the backbone's image processor", "none", hint, Code.IO)
+    section = Section("backbone " + FILE, read_json(path), SIZES, problems)
+    section.refuse_unknown({*SIZES, *IMAGE_FIXED, *IMAGE_IGNORED, "patch_size"})
+    section.check_fixed(IMAGE_FIXED)
+    if section.get("patch_size") != s.patch_size:
+        section.bad("patch_size", "{} as in the backbone's vision_config".format(s.patch_size))
+    size = section.get("size") if isinstance(section.get("size"), dict) else {}
+    limits = []
+    for own, key in (("min_pixels", "shortest_edge"), ("max_pixels", "longest_edge")):
+        stated = size.get(key) if section.get(own) is None else section.get(own)
+        if type(stated) is not int or not 0 < stated < 1 << 31:
+            section.bad("size", "shortest_edge and longest_edge, counts of pixels")
+            stated = 1
+        limits.append(stated)
+    return Area(FILE, 2 * s.patch_size, *limits)
+
+
+def weights(s: Sizes) -> List[Weight]:
+    return [*_vision(s), *language.weights(s, LM)]
+
+
+def _patch(target: str, s: Sizes, time: int) -> Weight:
+    """One time slice of the convolution, whose stride is its kernel: a matrix over channel, row, column."""
+    side, source = s.patch_size, VISUAL + "patch_embed.proj.weight"
+    return Weight(target, source, MATRIX, (s.d_vision, 3, 2, side, side), (s.d_vision, 3 * side**2), pick=(2, time))
+
+
+def _third(target: str, source: str, d: int, i: int) -> List[Weight]:
+    """The i-th of q, k and v, which are stacked."""
+    return [
+        Weight(target + ".weight", source + ".weight", MATRIX, (3 * d, d), (d, d), first=i * d),
+        Weight(target + ".bias", source + ".bias", VECTOR, (3 * d,), (d,), first=i * d),
+    ]
+
+
+def _merger(target: str, source: str, s: Sizes, d_norm: int) -> List[Weight]:
+    d = 4 * s.d_vision
+    return [
+        *norm(target + "norm", source + "norm", d_norm),
+        *linear(target + "up", source + "linear_fc1", d, d, bias=True),
+        *linear(target + "down", source + "linear_fc2", s.d_model, d, bias=True),
+    ]
+
+
+def _vision(s: Sizes) -> List[Weight]:
+    d, table = s.d_vision, (s.n_position_side**2, s.d_vision)
+    rows = [
+        _patch("vision.patch_embed.weight", s, 0),
+        _patch("vision.patch_embed_next.weight", s, 1),
+        *vector("vision.patch_embed.bias", VISUAL + "patch_embed.proj.bias", d),
+        Weight("vision.position.weight", VISUAL + "pos_embed.weight", TABLE, table, table),
+    ]
+    for i in range(s.n_vision_layer):
+        target, block = "vision.blk.{}.".format(i), "{}blocks.{}.".format(VISUAL, i)
+        rows += norm(target + "attn_norm", block + "norm1", d)
+        for part, name in enumerate(("attn_q", "attn_k", "attn_v")):
+            rows += _third(target + name, block + "attn.qkv", d, part)
+        rows += linear(target + "attn_out", block + "attn.proj", d, d, bias=True)
+        rows += norm(target + "ffn_norm", block + "norm2", d)
+        rows += linear(target + "ffn_up", block + "mlp.linear_fc1", s.d_vision_ff, d, bias=True)
+        rows += linear(target + "ffn_down", block + "mlp.linear_fc2", d, s.d_vision_ff, bias=True)
+    rows += _merger("connector.", VISUAL + "merger.", s, d)
+    for k in range(len(s.deepstack_layers)):
+        rows += _merger("deepstack.{}.".format(k), "{}deepstack_merger_list.{}.".format(VISUAL, k), s, 4 * d)
+    return rows
+
+
+def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
+    u32 = {
+        "vision.d_model": s.d_vision,
+        "vision.n_layer": s.n_vision_layer,
+        "vision.n_head": s.n_vision_head,
+        "vision.d_ff": s.d_vision_ff,
+        "vision.patch_size": s.patch_size,
+        "vision.image_width": s.image_width,
+        "vision.image_height": s.image_height,
+        "vision.n_position_side": s.n_position_side,
+        "vision.merge": s.merge,
+    }
+    f32 = {"vision.norm_eps": 1e-6, "vision.rope_base": 1e4}  # literals of the reference
+    lists = {"vision.deepstack_layers": s.deepstack_layers, "lm.rope_sections": s.rope_sections}
+    return {"u32": u32, "f32": f32, "u32[]": lists}
+
+
+def read_prompt(tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems) -> Prompt:
+    prompt = prompts.read_prompt(TEMPLATE, tokenizer, FOLDER, s, problems)
+    own = (OPEN, CLOSE, IMAGE)
+    _check_ids(folder, dict(zip(own, special_ids(tokenizer.keys, own, "", Problems("")))), problems)
+    _check_template(folder, problems)
+    return prompt
+
+
+def _check_ids(folder: str, ids: dict, problems: Problems) -> None:
+    """The network finds image tokens by the config's number, the prompt makes them by the tokenizer's."""
+    config = read_json(os.path.join(folder, "config.json"))
+    for key, default, text in (("image_token_id", 151655, IMAGE), ("vision_start_token_id", 151652, OPEN)):
+        if config.get(key, default) != ids[text]:
+            problems.add(
+                "{}: {}".format(WHERE, key),
+                "{}, the tokenizer's {}".format(ids[text], text),
+                repr(config.get(key, default)),
+            )
+
+
+def _check_template(folder: str, problems: Problems) -> None:
+    """The template is a program of its own; what is looked for here is what would make another prompt of one user's turn."""
+    name, text = "chat_template.jinja", None
+    if os.path.exists(os.path.join(folder, name)):
+        with open(os.path.join(folder, name), encoding="utf-8", errors="replace") as file:
+            text = file.read()
+    for name in ("chat_template.json", "tokenizer_config.json"):
+        if text is None and os.path.exists(os.path.join(folder, name)):
+            text = read_json(os.path.join(folder, name)).get("chat_template")
+    if not isinstance(text, str):
+        return
+    if OPEN + IMAGE + CLOSE not in text or "You are a helpful assistant" in text:
+        problems.unsupported(
+            name + ": chat_template", "Qwen3-VL's, which puts no words of its own before a user's", repr(text[:60])
+        )
+
+
+def dropped(s: Sizes) -> List[Dropped]:
+    reason = "final language norm: the action head reads the last layer as it is before it"
+    head = Dropped("backbone.model.lm_head.weight", (s.n_vocab, s.d_model), "language head")
+    return [Dropped(LM + "norm.weight", (s.d_model,), reason), head]

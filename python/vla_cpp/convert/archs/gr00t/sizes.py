@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Widths and counts of GR00T, which the configs of the policy and of its backbone state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import List
+
+WHERE = "backbone config.json"
+MAX_LAYERS = 1024
+
+
+@dataclass
+class Sizes:
+    """Widths and counts; the names are those of the bundle's keys."""
+
+    d_vision: int = 0
+    n_vision_layer: int = 0
+    n_vision_head: int = 0
+    d_vision_ff: int = 0
+    patch_size: int = 0
+    image_width: int = 0
+    image_height: int = 0
+    n_position_side: int = 0
+    merge: int = 2  # patches on a side of what becomes one token
+    deepstack_layers: List[int] = field(default_factory=list)
+    d_model: int = 0
+    n_layer: int = 0
+    n_head: int = 0
+    n_head_kv: int = 0
+    d_head: int = 0
+    d_ff: int = 0
+    n_vocab: int = 0
+    n_context: int = 0
+    lm_eps: float = 0.0
+    rope_base: float = 0.0
+    rope_sections: List[int] = field(default_factory=list)
+    n_vl_layer: int = 0
+    n_vl_head: int = 1
+    d_dit: int = 0
+    n_dit_layer: int = 0
+    n_dit_head: int = 0
+    d_out: int = 0
+    text_every: int = 0
+    n_bucket: int = 0
+    d_hidden: int = 0
+    d_state: int = 0
+    d_action: int = 0
+    horizon: int = 0
+    n_position: int = 0
+    n_step: int = 0
+    n_embodiment: int = 0
+    embodiment: int = 0  # index among them
+    n_slot: int = 0
+    d_time: int = 256  # a literal of the reference, as is the factor 4 of the feed-forward parts
+
+    @property
+    def d_vl_ff(self) -> int:
+        return 4 * self.d_model
+
+    @property
+    def d_dit_ff(self) -> int:
+        return 4 * self.d_dit
+
+    @property
+    def n_view_token(self) -> int:
+        side = self.merge * self.patch_size
+        return self.image_width // side * (self.image_height // side)
