@@ -78,5 +78,4 @@ find_package(cppzmq REQUIRED)
 # What watches the server: metrics and the HTTP that shows them.
 find_path(VLA_PROMETHEUS_DIR prometheus/registry.h REQUIRED)
 find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
-find_path(VLA_CIVETWEB_DIR civetweb.h REQUIRED)
-find_library(VLA_CIVETWEB_LIBRARY civetweb REQUIRED)
+find_path(VLA_BOOST_DIR boost/beast/http.hpp REQUIRED)  # Asio and Beast, headers only

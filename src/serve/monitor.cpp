@@ -2,107 +2,203 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/monitor.h"
 
-#include <arpa/inet.h>
-#include <civetweb.h>
 #include <fmt/format.h>
-#include <pthread.h>
 
-#include <csignal>
+#include <boost/asio/io_context.hpp>
+#include <boost/asio/ip/tcp.hpp>
+#include <boost/asio/steady_timer.hpp>
+#include <boost/beast/core/flat_buffer.hpp>
+#include <boost/beast/core/tcp_stream.hpp>
+#include <boost/beast/http/empty_body.hpp>
+#include <boost/beast/http/parser.hpp>
+#include <boost/beast/http/read.hpp>
+#include <boost/beast/http/string_body.hpp>
+#include <boost/beast/http/write.hpp>
+#include <charconv>
 #include <exception>
-#include <string_view>
+#include <list>
 
+#include "base/thread.h"
 #include "serve/endpoint.h"
 
 namespace vla::serve {
 namespace {
 
-struct Reply {
-  int status;
-  const char* reason;
-  std::string body;
-  const char* type = "text/plain; charset=utf-8";
+namespace beast = boost::beast;
+namespace http = boost::beast::http;
+using boost::asio::ip::tcp;
+using boost::system::error_code;
+using Request = http::request<http::empty_body>;
+using Response = http::response<http::string_body>;
+
+constexpr std::size_t kMaxConnections = 64;
+constexpr std::size_t kMaxHeader = 4096;
+constexpr auto kPatience = std::chrono::seconds(2);      // from the connection to the last byte of its answer
+constexpr auto kRetry = std::chrono::milliseconds(100);  // after the system had no descriptor or memory left
+
+Response text(const Request& request, http::status status, std::string body) {
+  Response response(status, request.version());
+  response.set(http::field::content_type, "text/plain; charset=utf-8");
+  response.body() = std::move(body);
+  return response;
+}
+
+Response reply_to(const Monitor::Sources& sources, const Request& request) {
+  if (request.method() != http::verb::get && request.method() != http::verb::head)
+    return text(request, http::status::method_not_allowed, "GET only\n");
+  const std::string path(request.target().substr(0, request.target().find('?')));
+  if (path == "/healthz") return text(request, http::status::ok, "ok\n");
+  if (path == "/metrics") {
+    Response response = text(request, http::status::ok, sources.metrics());
+    response.set(http::field::content_type, "text/plain; version=0.0.4; charset=utf-8");
+    return response;
+  }
+  if (path != "/readyz") return text(request, http::status::not_found, "/metrics, /healthz and /readyz are here\n");
+  const std::string obstacle = sources.obstacle();
+  if (obstacle.empty()) return text(request, http::status::ok, "ready\n");
+  return text(request, http::status::service_unavailable, obstacle + "\n");
+}
+
+/// One request and its answer. Whoever holds the shared pointer last, the pending operation as a rule, closes it.
+class Connection : public std::enable_shared_from_this<Connection> {
+ public:
+  Connection(tcp::socket socket, const Monitor::Sources& sources) : stream_(std::move(socket)), sources_(sources) {
+    parser_.header_limit(kMaxHeader);
+  }
+
+  void start() {
+    stream_.expires_after(kPatience);
+    http::async_read_header(stream_, buffer_, parser_, [self = shared_from_this()](error_code error, std::size_t) {
+      if (!error) self->answer();
+    });
+  }
+  void close() { stream_.close(); }
+
+ private:
+  void answer() {
+    response_ = reply_to(sources_, parser_.get());
+    response_.set(http::field::cache_control, "no-store");
+    response_.keep_alive(false);
+    response_.content_length(response_.body().size());
+    if (parser_.get().method() == http::verb::head) response_.body().clear();
+    http::async_write(stream_, response_, [self = shared_from_this()](error_code, std::size_t) {
+      error_code ignored;
+      self->stream_.socket().shutdown(tcp::socket::shutdown_send, ignored);
+    });
+  }
+
+  beast::tcp_stream stream_;
+  const Monitor::Sources& sources_;
+  beast::flat_buffer buffer_{2 * kMaxHeader};
+  http::request_parser<http::empty_body> parser_;
+  Response response_;
 };
 
-Reply reply_to(const Monitor::Sources& sources, std::string_view method, std::string_view path) {
-  if (method != "GET" && method != "HEAD") return {405, "Method Not Allowed", "GET only\n"};
-  if (path == "/healthz") return {200, "OK", "ok\n"};
-  if (path == "/metrics") return {200, "OK", sources.metrics(), "text/plain; version=0.0.4; charset=utf-8"};
-  if (path != "/readyz") return {404, "Not Found", "/metrics, /healthz and /readyz are here\n"};
-  const std::string obstacle = sources.obstacle();
-  return obstacle.empty() ? Reply{200, "OK", "ready\n"} : Reply{503, "Service Unavailable", obstacle + "\n"};
-}
-
-int answer(mg_connection* connection) noexcept {
-  const mg_request_info& request = *mg_get_request_info(connection);
-  const auto& monitor = *static_cast<const Monitor*>(request.user_data);
-  Reply reply = {};
-  try {
-    reply = reply_to(monitor.sources(), request.request_method, request.local_uri ? request.local_uri : "");
-  } catch (const std::exception&) {  // no memory: this one asks again later
-    reply = {500, "Internal Server Error", ""};
-  }
-  const bool has_body = std::string_view(request.request_method) != "HEAD";
-  mg_printf(connection,
-            "HTTP/1.1 %d %s\r\nContent-Type: %s\r\nContent-Length: %zu\r\nCache-Control: no-store\r\n"
-            "Connection: close\r\n\r\n",
-            reply.status, reply.reason, reply.type, reply.body.size());
-  if (has_body) mg_write(connection, reply.body.data(), reply.body.size());
-  return reply.status;
-}
-
-/// What the library has to say is said by the answer or by `start`.
-int say_nothing(const mg_connection*, const char*) noexcept { return 1; }
-
 /// Names are not looked up: what is bound is what stands there.
-bool is_number(const std::string& host) {
-  in6_addr ignored;
-  if (host == "*") return true;
-  if (host.size() > 2 && host.front() == '[' && host.back() == ']')
-    return inet_pton(AF_INET6, host.substr(1, host.size() - 2).c_str(), &ignored) == 1;
-  return inet_pton(AF_INET, host.c_str(), &ignored) == 1;
-}
-
-}  // namespace
-
-Result<std::unique_ptr<Monitor>> Monitor::open(const std::string& address, bool insecure, Sources sources) {
-  const std::size_t colon = address.rfind(':');
+Result<tcp::endpoint> endpoint_of(const std::string& address, bool insecure) {
   const auto reach = reach_of("tcp://" + address);
-  if (!reach || address.ends_with(":*") || !is_number(address.substr(0, colon)))
+  const std::size_t colon = address.rfind(':');
+  std::string host = address.substr(0, colon);
+  if (host == "*") host = "0.0.0.0";
+  if (host.starts_with('[') && host.ends_with(']')) host = host.substr(1, host.size() - 2);
+  error_code not_an_address;
+  const auto ip = boost::asio::ip::make_address(host, not_an_address);
+  if (!reach || address.ends_with(":*") || not_an_address)
     return Error{Code::usage, "--metrics", "ADDRESS:PORT", "'" + address + "'", "for example 127.0.0.1:9090"};
   if (*reach == Reach::remote && !insecure)
     return Error{Code::usage, "--metrics", "an address of this machine's own, such as 127.0.0.1:9090",
                  address + ", which other machines can reach", "--insecure lets everybody in"};
-  std::unique_ptr<Monitor> monitor(new Monitor(std::move(sources)));
-  VLA_CHECK(monitor->start(address));
-  return monitor;
+  unsigned short port = 0;
+  std::from_chars(address.data() + colon + 1, address.data() + address.size(), port);
+  return tcp::endpoint(ip, port);
 }
 
-Status Monitor::start(const std::string& address) {
-  const std::size_t colon = address.rfind(':');
-  const std::string host = address.substr(0, colon), listen = host == "*" ? address.substr(colon + 1) : address;
-  const char* options[] = {
-      "listening_ports",   listen.c_str(), "num_threads", "4", "request_timeout_ms", "2000", "max_request_size", "4096",
-      "enable_keep_alive", "no",           nullptr};
-  mg_callbacks callbacks = {};
-  callbacks.begin_request = answer;
-  callbacks.log_message = say_nothing;
-  sigset_t all, before;  // signals belong to the caller's threads
-  sigfillset(&all);
-  pthread_sigmask(SIG_SETMASK, &all, &before);
-  mg_init_library(0);
-  context_ = mg_start(&callbacks, this, options);
-  pthread_sigmask(SIG_SETMASK, &before, nullptr);
-  mg_server_port port = {};
-  if (context_ == nullptr || mg_get_server_ports(context_, 1, &port) != 1)
-    return Error{Code::io, address, "a free address of this machine", "one that cannot be bound",
-                 "choose another with --metrics; port 0 takes a free one"};
-  address_ = fmt::format("{}:{}", host, port.port);
-  return {};
-}
+}  // namespace
 
-Monitor::~Monitor() {
-  if (context_ != nullptr) mg_stop(context_);
-  mg_exit_library();
+class Monitor::Http {
+ public:
+  explicit Http(Sources sources) : sources_(std::move(sources)) {}
+  ~Http() {
+    context_.stop();
+    if (thread_.joinable()) thread_.join();
+  }
+
+  Status start(const std::string& address, bool insecure) {
+    VLA_TRY(const tcp::endpoint endpoint, endpoint_of(address, insecure));
+    try {
+      acceptor_.open(endpoint.protocol());
+      acceptor_.set_option(tcp::acceptor::reuse_address(true));
+      acceptor_.bind(endpoint);
+      acceptor_.listen();
+      address_ = fmt::format("{}:{}", address.substr(0, address.rfind(':')), acceptor_.local_endpoint().port());
+    } catch (const boost::system::system_error& error) {
+      return Error{Code::io, address, "a free address of this machine", error.code().message(),
+                   "choose another with --metrics; port 0 takes a free one"};
+    }
+    VLA_TRY(thread_, start_thread("--metrics", [this] { run(); }));
+    return {};
+  }
+
+  const std::string& address() const { return address_; }
+
+ private:
+  /// Whatever a library throws costs the connection that it happened to.
+  void run() noexcept {
+    while (!context_.stopped()) {
+      try {
+        if (!accepting_) accept();
+        context_.run();
+      } catch (const std::exception&) {
+        std::this_thread::sleep_for(kRetry);
+      }
+    }
+  }
+
+  void accept() {
+    acceptor_.async_accept([this](error_code error, tcp::socket socket) {
+      accepting_ = false;
+      if (error) return accept_later();
+      add(std::move(socket));
+      accept();
+    });
+    accepting_ = true;
+  }
+
+  void accept_later() {
+    retry_.expires_after(kRetry);
+    retry_.async_wait([this](error_code) { accept(); });
+    accepting_ = true;
+  }
+
+  void add(tcp::socket socket) {
+    open_.remove_if([](const std::weak_ptr<Connection>& connection) { return connection.expired(); });
+    if (open_.size() >= kMaxConnections) {
+      if (const auto oldest = open_.front().lock()) oldest->close();
+      open_.pop_front();
+    }
+    const auto connection = std::make_shared<Connection>(std::move(socket), sources_);
+    open_.push_back(connection);
+    connection->start();
+  }
+
+  const Sources sources_;
+  std::string address_;
+  boost::asio::io_context context_{1};
+  tcp::acceptor acceptor_{context_};
+  boost::asio::steady_timer retry_{context_};
+  std::list<std::weak_ptr<Connection>> open_;  // oldest first
+  bool accepting_ = false;
+  std::thread thread_;
+};
+
+Monitor::Monitor(std::unique_ptr<Http> http) : http_(std::move(http)) {}
+Monitor::~Monitor() = default;
+const std::string& Monitor::address() const { return http_->address(); }
+
+Result<std::unique_ptr<Monitor>> Monitor::open(const std::string& address, bool insecure, Sources sources) {
+  auto http = std::make_unique<Http>(std::move(sources));
+  VLA_CHECK(http->start(address, insecure));
+  return std::unique_ptr<Monitor>(new Monitor(std::move(http)));
 }
 
 }  // namespace vla::serve

@@ -8,36 +8,31 @@
 
 #include "base/result.h"
 
-struct mg_context;
-
 namespace vla::serve {
 
 /// HTTP for those who watch the server: `/metrics`, `/healthz` (200 while the process lives) and `/readyz` (200 while
-/// acts are taken, else 503 and why not). A few threads of its own, with limits on time and size, so that whoever asks
-/// slowly or badly disturbs nobody but others who ask here.
+/// acts are taken, else 503 and why not). One thread serves all connections and waits for none of them. A connection
+/// has a time to ask and take its answer, and the oldest one makes room where there are too many, so that whoever asks
+/// slowly or badly keeps nobody from an answer.
 class Monitor {
  public:
   struct Sources {
     std::function<std::string()> metrics;   // text of the exposition format
     std::function<std::string()> obstacle;  // why no act is taken; empty: they are
   };
-  /// Listens at once, at HOST:PORT, HOST an IPv4 address, an IPv6 address in brackets (where CivetWeb was
-  /// built with IPv6; Debian's is not), or `*`. An address that others
-  /// can reach needs `insecure`: nobody is asked for a key here. The functions are called from any thread.
-  /// Errors: usage, io.
+  /// Listens at once, at HOST:PORT, HOST an IPv4 address, an IPv6 address in brackets, or `*`. An address that others
+  /// can reach needs `insecure`: nobody is asked for a key here. The functions are called on the monitor's thread.
+  /// Errors: usage, io, out_of_memory.
   static Result<std::unique_ptr<Monitor>> open(const std::string& address, bool insecure, Sources sources);
   ~Monitor();
 
   /// What was bound, the port filled in.
-  const std::string& address() const { return address_; }
-  const Sources& sources() const { return sources_; }
+  const std::string& address() const;
 
  private:
-  explicit Monitor(Sources sources) : sources_(std::move(sources)) {}
-  Status start(const std::string& address);
-  Sources sources_;
-  std::string address_;
-  mg_context* context_ = nullptr;
+  class Http;
+  explicit Monitor(std::unique_ptr<Http> http);
+  std::unique_ptr<Http> http_;
 };
 
 }  // namespace vla::serve

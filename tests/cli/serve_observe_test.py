@@ -161,6 +161,38 @@ def test_a_metrics_address_in_use_is_an_io_error(vla, golden):
         vla("serve", golden.bundle, *LOCAL, "--metrics", address).refused("io", address, "--metrics")
 
 
+def stack_left(process, task):
+    """Bytes between a waiting thread's stack pointer and the end of its stack; None while it runs."""
+    numbers = (task / "syscall").read_text().split()
+    if len(numbers) < 3:
+        return None
+    pointer = int(numbers[-2], 16)
+    for line in (process / "maps").read_text().splitlines():
+        low, high = (int(end, 16) for end in line.split()[0].split("-"))
+        if low <= pointer < high:
+            return pointer - low
+    raise AssertionError(f"no memory at {pointer:#x}")
+
+
+def test_every_thread_of_a_server_has_a_stack_of_megabytes(serve, talk, golden, tmp_path):
+    server = serve("--metrics", "127.0.0.1:0", "--log", "json", "--trace", tmp_path / "t.json", "--record", tmp_path / "r")
+    talk(server, wire.act(1, golden, seed=1))
+    get(server.ready["metrics"], "/metrics")
+    process = Path("/proc", str(server.process.pid))
+    tasks = [task for task in (process / "task").iterdir() if task.name != process.name]  # the first one's grows by itself
+    assert len(tasks) >= 8  # two of ours, three writers, the monitor and ZeroMQ's
+    left = dict.fromkeys(tasks)
+    for _ in range(200):
+        try:
+            left |= {task: stack_left(process, task) for task in tasks if left[task] is None}
+        except PermissionError:
+            pytest.skip("this system lets nobody look at the stack pointers of a child process")
+        if None not in left.values():
+            break
+        time.sleep(0.05)
+    assert min(left.values()) >= 1 << 20, {(task / "comm").read_text(): n for task, n in left.items()}
+
+
 def test_slow_and_broken_http_clients_disturb_neither_acts_nor_later_scrapes(serve, talk, golden):
     server = serve("--metrics", "127.0.0.1:0")
     host, port = server.ready["metrics"].rsplit(":", 1)

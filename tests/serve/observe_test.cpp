@@ -1,6 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include <arpa/inet.h>
 #include <fcntl.h>
+#include <pthread.h>
+#include <sys/socket.h>
 #include <unistd.h>
 
 #include <array>
@@ -77,6 +80,50 @@ struct Sample {
             std::as_bytes(std::span(in)),
             std::as_bytes(std::span(out))};
   }
+};
+
+/// One request of HTTP to a monitor of this machine; what comes back until the connection is closed.
+std::string ask_http(const std::string& address, const std::string& request) {
+  sockaddr_in at = {};
+  at.sin_family = AF_INET;
+  at.sin_port = htons(static_cast<std::uint16_t>(std::stoi(address.substr(address.rfind(':') + 1))));
+  at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  const int fd = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  REQUIRE(::connect(fd, reinterpret_cast<const sockaddr*>(&at), sizeof(at)) == 0);
+  CHECK(::send(fd, request.data(), request.size(), MSG_NOSIGNAL) == static_cast<ssize_t>(request.size()));
+  std::string answer;
+  std::array<char, 4096> part;
+  for (ssize_t n; (n = ::read(fd, part.data(), part.size())) > 0;) answer.append(part.data(), static_cast<size_t>(n));
+  ::close(fd);
+  return answer;
+}
+
+/// The unused part of a thread's stack, which is filled with a pattern in order to see later how much was never used.
+class Stack {
+ public:
+  /// Of the thread that calls this.
+  [[gnu::noinline, gnu::no_sanitize_address]] void paint() {
+    pthread_attr_t attributes;
+    if (pthread_getattr_np(pthread_self(), &attributes) != 0) return;
+    void* low = nullptr;
+    std::size_t size = 0;
+    pthread_attr_getstack(&attributes, &low, &size);
+    pthread_attr_destroy(&attributes);
+    low_ = static_cast<volatile char*>(low);
+    end_ = static_cast<char*>(__builtin_frame_address(0)) - kMargin;
+    for (volatile char* at = low_; at < end_; ++at) *at = kPaint;
+  }
+  /// Bytes from the lowest address on that nobody has written to since.
+  [[gnu::noinline, gnu::no_sanitize_address]] std::size_t unused() const {
+    volatile char* at = low_;
+    while (at < end_ && *at == kPaint) ++at;
+    return static_cast<std::size_t>(at - low_);
+  }
+
+ private:
+  static constexpr std::ptrdiff_t kMargin = 4096;  // below the frame of `paint` itself
+  static constexpr char kPaint = 0x5a;
+  volatile char *low_ = nullptr, *end_ = nullptr;
 };
 
 v1::Response chunk_of(std::vector<float> actions) {
@@ -173,6 +220,23 @@ TEST_CASE("http is refused where others reach it, unless that was asked for") {
   const auto everywhere = Monitor::open("0.0.0.0:0", true, sources);
   REQUIRE(everywhere.ok());
   CHECK((*everywhere)->address() != "0.0.0.0:0");
+}
+
+TEST_CASE("a scrape leaves at least a megabyte of its thread's stack unused") {
+  Metrics metrics;
+  Stack stack;
+  std::size_t unused = 0;
+  const auto monitor = Monitor::open("127.0.0.1:0", false,
+                                     {[&] {
+                                        unused = stack.unused();
+                                        stack.paint();
+                                        return metrics.text({});
+                                      },
+                                      [] { return std::string(); }});
+  REQUIRE(monitor.ok());
+  for (int i = 0; i < 20; ++i)  // a server of several threads would take turns
+    CHECK(ask_http((*monitor)->address(), "GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n").starts_with("HTTP/1.1 200"));
+  CHECK(unused >= std::size_t{1} << 20);
 }
 
 TEST_CASE("a trace is valid JSON, and its stages end before their act does") {
