@@ -27,7 +27,9 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "python"))
+sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tools")]
+from goldens.build import make  # noqa: E402
+
 SIDE = 256
 WARM = 3  # tenths of the acts of `many`, until the allocator holds what 64 clients need at the worst moment
 
@@ -143,7 +145,7 @@ def parse():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     binaries = Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla"))
     parser.add_argument("figure", choices=FIGURES)
-    parser.add_argument("--bundle", type=Path, default=ROOT / "tests/golden/smolvla/two_views/bundle.gguf")
+    parser.add_argument("--bundle", type=Path, help="default: that of a golden case")
     parser.add_argument("--vla", type=Path, default=binaries)
     parser.add_argument("--tool", type=Path, default=os.environ.get("VLA_LOAD_TOOL", binaries.with_name("load_tool")))
     parser.add_argument("--threads", type=int, default=1, help="of the engine; default: 1")
@@ -156,6 +158,7 @@ def parse():
 
 def main():
     options = parse()
+    options.bundle = options.bundle or make() / "smolvla/two_views/bundle.gguf"
     measure, requests = FIGURES[options.figure]
     options.requests = options.requests or requests
     report, rows = measure(options)

@@ -89,7 +89,7 @@ TEST_CASE("a description tells what the bundle says") {
 }
 
 TEST_CASE("a chunk outlives its policy and has notes and stages, and nothing beyond the last of them") {
-  Call call(source_path("tests/golden/smolvla/long_text"));
+  Call call(golden_path("smolvla/long_text"));
   PolicyHandle policy = open_policy(call.golden.bundle());
   vla_chunk* made = nullptr;
   REQUIRE(vla_act(policy.get(), &call.observation, &made) == VLA_OK);

@@ -30,7 +30,7 @@ inline PolicyHandle open_policy(const std::string& bundle) {
   return PolicyHandle(policy);
 }
 
-inline const std::string kTwoViews = source_path("tests/golden/smolvla/two_views");
+inline const std::string kTwoViews = golden_path("smolvla/two_views");
 
 /// A golden case as a C caller has it; tests change one thing of `observation`, `states` or `views`.
 struct Call {

@@ -4,6 +4,7 @@
 
 import json
 import struct
+import sys
 from pathlib import Path
 
 import gguf
@@ -12,7 +13,11 @@ import xxhash
 
 FLOAT32 = ["--kernels", "float32"]  # for what is held to the reference's float32, on machines that multiply bf16 too
 
-FOLDER = Path(__file__).resolve().parents[1] / "golden"
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "tools"))
+from goldens.build import make  # noqa: E402
+
+FOLDER = make()
 NAMES = sorted(str(path.parent.relative_to(FOLDER)) for path in FOLDER.glob("*/*/observation.json"))
 
 

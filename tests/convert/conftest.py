@@ -7,7 +7,8 @@ import pytest
 
 sys.path.insert(0, os.path.dirname(__file__))
 # The package under test is the one beside these tests, installed or not.
-sys.path.insert(0, os.path.join(os.path.dirname(__file__), "..", "..", "python"))
+ROOT = os.path.join(os.path.dirname(__file__), "..", "..")
+sys.path[:0] = [os.path.join(ROOT, "python"), os.path.join(ROOT, "tools")]
 
 from tiny import Tiny  # noqa: E402
 from vla_cpp.convert import ConvertError, Options, convert_checkpoint, read_bundle  # noqa: E402

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-import tiny_torch
+from goldens import files
 from tiny_evo1 import (
     ACTION_DIM,
     ANSWERS,
@@ -361,6 +361,6 @@ def test_a_tokenizer_that_pads_on_the_left_does_for_single_prompts(converter):
 def test_head_and_towers_of_other_precisions_are_written_as_f32(converter):
     tiny = TinyEvo1Lerobot()
     name = "model.embedder.model.language_model.layers.0.mlp.up_proj.weight"
-    tiny.tensors[name] = ("BF16", tiny_torch.bf16(np.ones(tiny.tensors[name].shape)))
+    tiny.tensors[name] = ("BF16", files.bfloat16_bits(np.ones(tiny.tensors[name].shape)))
     assert converter.bundle(tiny).keys["vla.dtype"] == "f32"
     assert any("mixed types" in note for note in converter.summary.notes)

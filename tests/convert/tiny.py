@@ -6,10 +6,11 @@ Its shapes are written down here a second time, independently of the converter, 
 """
 
 import copy
-import json
 import os
 
 import numpy as np
+
+from goldens.files import write_json, write_safetensors
 
 VLM = "model.vlm_with_expert.vlm.model."
 EXPERT = "model.vlm_with_expert.lm_expert."
@@ -162,26 +163,6 @@ def llama_block(prefix, d, d_ff, d_kv_in):
         prefix + "mlp.up_proj.weight": (d_ff, d),
         prefix + "mlp.down_proj.weight": (d, d_ff),
     }
-
-
-def write_safetensors(path, tensors, metadata=None):
-    """tensors: name -> array, or (dtype name, array) for what numpy has no type for."""
-    header, offset, blobs = {} if metadata is None else {"__metadata__": metadata}, 0, []
-    names = {"<f4": "F32", "<f2": "F16", "<f8": "F64", "<i8": "I64"}
-    for name, value in tensors.items():
-        dtype, array = value if isinstance(value, tuple) else (names[value.dtype.str], value)
-        data = np.ascontiguousarray(array).tobytes()
-        header[name] = {"dtype": dtype, "shape": list(array.shape), "data_offsets": [offset, offset + len(data)]}
-        offset += len(data)
-        blobs.append(data)
-    text = json.dumps(header).encode()
-    with open(path, "wb") as file:
-        file.write(len(text).to_bytes(8, "little") + text + b"".join(blobs))
-
-
-def write_json(path, value):
-    with open(path, "w", encoding="utf-8") as file:
-        json.dump(value, file)
 
 
 class Tiny:

@@ -10,7 +10,7 @@ import os
 
 import numpy as np
 
-import tiny_torch
+from goldens import files
 from tiny import byte_alphabet, write_json, write_safetensors
 
 D_VISION, D_VISION_FF, IMAGE, PATCH, N_VIEW_TOKEN = 6, 10, 56, 14, 4
@@ -280,10 +280,10 @@ class TinyEvo1:
         self.tokenizer, self.tokenizer_config = tokenizer(), dict(TOKENIZER_CONFIG)
         self.dims = {"language_layers": N_LAYER, "prompt_tokens": N_TOKEN}
         self.tensors = {
-            name: tiny_torch.bf16(rng.integers(-64, 64, shape) / np.float32(16)) for name, shape in authors_shapes().items()
+            name: files.bfloat16_bits(rng.integers(-64, 64, shape) / np.float32(16)) for name, shape in authors_shapes().items()
         }
         self.norm_stats = {ARM: {DATASET: self.entry(rng)}}
-        self.others = {"ds_version": "0.14", "args": tiny_torch.Call("argparse Namespace")}
+        self.others = {"ds_version": "0.14", "args": files.Call("argparse Namespace")}
 
     @staticmethod
     def entry(rng):
@@ -300,7 +300,7 @@ class TinyEvo1:
         if self.dims is not None:
             write_json(os.path.join(str(folder), "dims.json"), self.dims)
         if self.weights:
-            tiny_torch.write_torch(os.path.join(str(folder), self.weights), self.tensors, self.member, **self.others)
+            files.write_torch(os.path.join(str(folder), self.weights), self.tensors, self.member, **self.others)
         return str(folder)
 
     def save_backbone(self, folder):

@@ -9,14 +9,14 @@ import zipfile
 import numpy as np
 import pytest
 
-import tiny_torch
-from tiny_torch import Call, Name, Persistent, Raw, bf16, pickled, state_dict, tensor, write_archive, write_torch
+from goldens import files
+from goldens.files import Call, Name, Persistent, Raw, bfloat16_bits, pickled, state_dict, tensor, write_archive, write_torch
 from vla_cpp.convert import ConvertError
 from vla_cpp.convert.errors import Code
 from vla_cpp.convert.pickle_values import MAX_BYTES, MAX_STEPS
 from vla_cpp.convert.torch_file import read_torch
 
-GOOD = {"x": np.arange(6, dtype="<f4").reshape(2, 3), "y": bf16([1.5, -2.0]), "z": np.ones(3, "<f2")}
+GOOD = {"x": np.arange(6, dtype="<f4").reshape(2, 3), "y": bfloat16_bits([1.5, -2.0]), "z": np.ones(3, "<f2")}
 
 
 def numbers(entry):
@@ -60,13 +60,13 @@ def test_parameters_are_their_data(tmp_path):
 
 def test_a_state_dictionary_may_be_an_ordered_one_with_attributes(tmp_path):
     pairs = [("a", tensor("0", (2,)))]
-    built = Raw(tiny_torch.emit(Call("collections OrderedDict", pairs)) + tiny_torch.emit({"_metadata": {"": {"version": 1}}}) + b"b")
+    built = Raw(files.emit(Call("collections OrderedDict", pairs)) + files.emit({"_metadata": {"": {"version": 1}}}) + b"b")
     assert set(read_torch(write_archive(tmp_path / "f", {"module": built}, {"0": bytes(8)}), "module")) == {"a"}
 
 
 def test_what_lies_beside_the_tensors_is_not_executed(tmp_path):
     values, data = state_dict(GOOD)
-    namespace = Raw(tiny_torch.emit(Name("argparse Namespace")) + b")\x81" + tiny_torch.emit({"lr": 1e-5}) + b"b")
+    namespace = Raw(files.emit(Name("argparse Namespace")) + b")\x81" + files.emit({"lr": 1e-5}) + b"b")
     scalar = Call("numpy.core.multiarray scalar", Call("numpy dtype", "f8", False, True), Raw(b"U\x08" + bytes(8)))
     others = {
         "ds_config": {("tuple", "key"): 1, "args": namespace},
@@ -146,7 +146,7 @@ def test_a_hostile_pickle_is_refused(tmp_path, message):
 
 
 def test_a_huge_index_of_the_memo_takes_one_place(tmp_path):
-    data = b"\x80\x02}r\xff\xff\xff\xff(" + tiny_torch.emit("module") + tiny_torch.emit({"w": tensor("0", (6,))}) + b"u."
+    data = b"\x80\x02}r\xff\xff\xff\xff(" + files.emit("module") + files.emit({"w": tensor("0", (6,))}) + b"u."
     assert set(read_torch(of_pickle(tmp_path, data), "module")) == {"w"}
 
 

@@ -21,7 +21,7 @@ Depth depth(const std::string& bytes) { return fuzz::check_bundle(std::as_bytes(
 
 /// A golden bundle with every size as small as the architecture allows: a fuzzer reads little and changes much.
 EditableBundle smallest_bundle() {
-  EditableBundle bundle = EditableBundle::read(source_path("tests/golden/smolvla/absent_view/bundle.gguf"));
+  EditableBundle bundle = EditableBundle::read(golden_path("smolvla/absent_view/bundle.gguf"));
   for (const char* key : {"vision.d_model", "vision.d_ff", "vision.image_size", "lm.d_model", "lm.d_head", "lm.d_ff",
                           "expert.d_model", "expert.d_ff", "connector.factor"})
     bundle.set(key, Value(std::int64_t{2}));
@@ -40,7 +40,7 @@ EditableBundle smallest_bundle() {
 }  // namespace
 
 TEST_CASE("the fuzz target follows a golden bundle through every check before memory is taken") {
-  std::string bytes = read_text(source_path("tests/golden/smolvla/two_views/bundle.gguf"));
+  std::string bytes = read_text(golden_path("smolvla/two_views/bundle.gguf"));
   CHECK(depth(bytes) == Depth::declared);
   bytes.back() = static_cast<char>(bytes.back() ^ 1);  // a damaged weight, whose checksum the target makes fit
   CHECK(depth(bytes) == Depth::declared);

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Every golden case end to end, block by block, against what the reference computed (python/vla_cpp/convert/golden.py).
+// Every golden case end to end, block by block, against what the reference computed (tools/goldens/recorder.py).
 #include <doctest/doctest.h>
 
 #include <algorithm>

@@ -23,9 +23,9 @@ namespace {
 constexpr int kSteps[] = {1, 2, 4, 8, 16};
 const char* const kRules[] = {"bucketize_float32", "bucketize_bfloat16", "bucketize_shifted"};
 
-std::string case_path() { return source_path("tests/golden/smolvla/one_view"); }
+std::string case_path() { return golden_path("smolvla/one_view"); }
 
-/// What the reference computes under each rule and number of steps (scripts/position_rules.py).
+/// What the reference computes under each rule and number of steps (tools/position_rules.py).
 const std::vector<Tap>& reference() {
   static const std::vector<Tap> taps = *read_taps(case_path() + "/position_rules.gguf");
   return taps;

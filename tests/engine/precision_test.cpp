@@ -15,7 +15,7 @@ using namespace vla::test;
 
 namespace {
 
-const std::string kBundle = source_path("tests/golden/smolvla/two_views/bundle.gguf");
+const std::string kBundle = golden_path("smolvla/two_views/bundle.gguf");
 
 /// The kernels for a bundle on a machine for `isa`.
 Isa isa_of(const std::string& path, Isa isa) {

@@ -16,7 +16,7 @@ using namespace vla::test;
 
 namespace {
 
-const std::string kCase = source_path("tests/golden/smolvla/two_views");
+const std::string kCase = golden_path("smolvla/two_views");
 
 EditableBundle sound_bundle() { return EditableBundle::read(kCase + "/bundle.gguf"); }
 

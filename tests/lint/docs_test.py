@@ -22,7 +22,7 @@ PROGRAMS = {  # program -> files in whose text its flags are written
     "vla": ("src/cli/*.cpp",),
     "vla-convert": ("python/vla_cpp/**/*.py",),
 }
-ANY_OF_OURS = ("src/cli/*.cpp", "python/**/*.py", "scripts/*", "examples/**/*.py", "tests/lint/*.py")
+ANY_OF_OURS = ("src/cli/*.cpp", "python/**/*.py", "scripts/*", "tools/**/*.py", "examples/**/*.py", "tests/lint/*.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 

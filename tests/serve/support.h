@@ -17,7 +17,7 @@
 
 namespace vla::test {
 
-inline const std::string kGolden = source_path("tests/golden/smolvla/two_views");
+inline const std::string kGolden = golden_path("smolvla/two_views");
 
 /// The act that a golden case is, with its frames as raw rows and its noise.
 inline v1::Request act_request(const GoldenCase& golden, std::uint64_t request_id) {

@@ -7,6 +7,7 @@
 #include <unistd.h>
 #include <xxhash.h>
 
+#include <cstdlib>
 #include <filesystem>
 #include <fstream>
 
@@ -59,6 +60,12 @@ std::string EditableBundle::bytes() const {
 std::string EditableBundle::write(const std::string& file_name) const { return write_file(file_name, bytes()); }
 
 std::string source_path(const std::string& path) { return std::string(VLA_SOURCE_DIR) + "/" + path; }
+
+std::string golden_path(const std::string& name) {
+  static const bool made = std::system((source_path("scripts/goldens.sh")).c_str()) == 0;
+  if (!made) std::exit(1);  // the script has said why
+  return source_path("build/goldens/") + name;
+}
 
 std::string scratch_path(const std::string& file_name) {
   const auto folder = std::filesystem::temp_directory_path() / fmt::format("vla-test-{}", ::getpid());

@@ -36,6 +36,9 @@ struct EditableBundle {
 
 /// A file of the repository.
 std::string source_path(const std::string& path);
+/// The folder of a golden case, `arch/name`, with its checkpoint and bundle; of all cases without a name. The first
+/// call makes what is not there yet (tools/goldens).
+std::string golden_path(const std::string& name = "");
 /// A place for files that a test writes.
 std::string scratch_path(const std::string& file_name);
 std::string write_file(const std::string& file_name, const std::string& bytes);

@@ -49,7 +49,7 @@ std::vector<Tap> GoldenCase::expected() const {
 
 std::vector<std::string> golden_paths() {
   std::vector<std::string> paths;
-  for (const auto& arch : std::filesystem::directory_iterator(source_path("tests/golden")))
+  for (const auto& arch : std::filesystem::directory_iterator(golden_path()))
     if (arch.is_directory())
       for (const auto& name : std::filesystem::directory_iterator(arch.path()))
         if (std::filesystem::exists(name.path() / "observation.json")) paths.push_back(name.path().string());

@@ -9,7 +9,7 @@
 
 namespace vla::test {
 
-/// One folder of tests/golden/<arch>/: a bundle, an observation, the solver's noise, and what the reference computes on
+/// One case: a bundle, an observation, the solver's noise, and what the reference computes on
 /// them.
 struct GoldenCase {
   std::string path;

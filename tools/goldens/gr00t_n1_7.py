@@ -1,0 +1,529 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""GR00T N1.7: golden cases, random checkpoints in the authors' layout, and LeRobot's class as the reference.
+
+The layout: config.json, two shards of safetensors with their index, processor_config.json, statistics.json, embodiment_id.json, and
+`vlm/`, which is what the hub keeps in the backbone's repository, without weights.  A checkpoint serves several robots, with cameras, keys
+and statistics of their own; `convert.json` beside it says for which one the case is.  LeRobot turns LIBERO's gripper into the
+simulator's sign: the authors' server does not, and so nothing is done to it here.
+"""
+
+import contextlib
+import json
+import math
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from . import lerobot_layout as layout
+from .cases import Case, backbone_folder, copy_tokenizer
+from .draw import bfloat16
+from .files import bfloat16_bits, write_json, write_stream
+from .parameters import decoder_layer, linear, norm, parameter, rms_norm, statistics
+from .recorder import Taps
+from .train_tokenizer import QWEN_VL
+
+HUB_NAME = "nvidia/Cosmos-Reason2-2B"
+N_MERGE = 60
+TOKENS = {name: 256 + N_MERGE + i for i, name in enumerate(QWEN_VL)}
+N_DEAD = 5  # rows of the embedding behind the last token
+CONFIG = {
+    "model_dtype": "bfloat16", "model_name": HUB_NAME, "backbone_model_type": "qwen", "model_revision": None, "tune_top_llm_layers": 0,
+    "tune_llm": False, "tune_visual": False, "reproject_vision": False, "use_flash_attention": False, "load_bf16": False,
+    "backbone_trainable_params_fp32": True, "random_rotation_angle": None, "color_jitter_params": None,
+    "use_albumentations_transforms": True, "extra_augmentation_config": None, "formalize_language": True,
+    "apply_sincos_state_encoding": False, "state_history_length": 1, "add_pos_embed": True, "attn_dropout": 0.2, "use_vlln": True,
+    "use_alternate_vl_dit": True, "attend_text_every_n_blocks": 2, "num_inference_timesteps": 4, "noise_beta_alpha": 1.5,
+    "noise_beta_beta": 1.0, "noise_s": 0.999, "num_timestep_buckets": 1000, "tune_projector": True, "tune_diffusion_model": True,
+    "tune_vlln": True, "state_dropout_prob": 0.2, "exclude_state": False, "use_mean_std": False, "rtc_ramp_rate": 6.0,
+    "model_type": "Gr00tN1d7", "architectures": ["Gr00tN1d7"], "torch_dtype": "bfloat16", "dtype": "bfloat16"}
+ABSOLUTE = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
+RELATIVE = ABSOLUTE | {"rep": "RELATIVE"}
+# Where residual streams begin, and what is added to them.
+FAINT = ("patch_embed", "pos_embed", "attn.proj", "linear_fc2", "embed_tokens", "o_proj", "down_proj", "vlln", "to_out", "ff.net.2",
+         "state_encoder.layer2", "W3", "position_embedding")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What a checkpoint knows of one embodiment."""
+
+    views: tuple
+    states: dict  # key -> width
+    actions: dict  # key -> width
+    rows: int  # of the head's horizon, which the robot gets
+    relative: dict = field(default_factory=dict)  # action key -> the state key that it is added to, None: of the same name
+    zero_spread: tuple = ()
+
+    def statistics(self, seed):
+        return statistics(sum(self.states.values()), sum(self.actions.values()), seed, self.zero_spread)
+
+
+OTHER = "new_embodiment", 0, Robot(("ego_view",), {"arm": 3}, {"hand": 1, "arm": 3}, 4)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Sizes of towers and head, robots, how a frame becomes an image."""
+
+    tag: str
+    index: int  # of the embodiment
+    robot: Robot
+    vision: dict  # fields of Qwen3VLVisionConfig
+    text: dict  # fields of Qwen3VLTextConfig, with the number of layers that the backbone has
+    head: dict  # fields of config.json
+    image: dict  # fields of processor_kwargs: how a frame becomes an image
+    side: int  # of the smallest square image that the backbone's processor leaves alone
+    percentiles: bool = False
+    faint: bool = False  # what enters a residual stream is so small that every norm's eps shows
+
+    @property
+    def d_state(self):
+        return sum(self.states.values())
+
+    @property
+    def d_action(self):
+        return sum(self.robot.actions.values())
+
+    @property
+    def states(self):
+        return self.robot.states
+
+    @property
+    def zero_spread(self):
+        return self.robot.zero_spread
+
+    @property
+    def policy(self):
+        return {"chunk_size": self.head["action_horizon"], "max_action_dim": self.head["max_action_dim"]}
+
+    @property
+    def robots(self):
+        other, index, robot = OTHER
+        return {self.tag: (self.index, self.robot), other: (index, robot)}
+
+    def backbone_shapes(self):
+        v, t = self.vision, self.text
+        d, d_model, side = v["hidden_size"], t["hidden_size"], v["patch_size"]
+        at = "backbone.model.model.visual."
+        out = {f"{at}patch_embed.proj.weight": (d, 3, 2, side, side), f"{at}patch_embed.proj.bias": (d,),
+               f"{at}pos_embed.weight": (v["num_position_embeddings"], d)}
+        for i in range(v["depth"]):
+            block = f"{at}blocks.{i}."
+            out |= norm(f"{block}norm1", d) | norm(f"{block}norm2", d) | linear(f"{block}attn.qkv", 3 * d, d) | linear(f"{block}attn.proj", d, d)
+            out |= linear(f"{block}mlp.linear_fc1", v["intermediate_size"], d) | linear(f"{block}mlp.linear_fc2", d, v["intermediate_size"])
+        mergers = {"merger": d} | {f"deepstack_merger_list.{k}": 4 * d for k in range(len(v["deepstack_visual_indexes"]))}
+        for merger, d_norm in mergers.items():
+            out |= norm(f"{at}{merger}.norm", d_norm) | linear(f"{at}{merger}.linear_fc1", 4 * d, 4 * d)
+            out |= linear(f"{at}{merger}.linear_fc2", d_model, 4 * d)
+        at, d_head = "backbone.model.model.language_model.", t["head_dim"]
+        out |= {f"{at}embed_tokens.weight": (max(TOKENS.values()) + 1 + N_DEAD, d_model)} | rms_norm(f"{at}norm", d_model)
+        for i in range(self.head["select_layer"]):
+            layer = f"{at}layers.{i}."
+            out |= decoder_layer(layer, d_model, t["intermediate_size"], t["num_attention_heads"], t["num_key_value_heads"], d_head)
+            out |= rms_norm(f"{layer}self_attn.q_norm", d_head) | rms_norm(f"{layer}self_attn.k_norm", d_head)
+        return out
+
+    def head_shapes(self):
+        h, d_model = self.head, self.text["hidden_size"]
+        d, d_hidden, d_state, d_action = h["input_embedding_dim"], h["hidden_size"], h["max_state_dim"], h["max_action_dim"]
+        n, dit = h["max_num_embodiments"], h["diffusion_model_cfg"]
+
+        def attention(at, d, d_context):
+            parts = (("to_q", d), ("to_k", d_context), ("to_v", d_context), ("to_out.0", d))
+            out = {k: v for part, d_in in parts for k, v in linear(f"{at}.attn1.{part}", d, d_in).items()}
+            return out | linear(f"{at}.ff.net.0.proj", 4 * d, d) | linear(f"{at}.ff.net.2", d, 4 * d)
+
+        def per_robot(name, d_in, d_out):
+            return {f"action_head.{name}.W": (n, d_in, d_out), f"action_head.{name}.b": (n, d_out)}
+
+        out = norm("action_head.vlln", d_model) | {"action_head.position_embedding.weight": (h["max_seq_len"], d)}
+        for i in range(h["vl_self_attention_cfg"]["num_layers"]):
+            at = f"action_head.vl_self_attention.transformer_blocks.{i}"
+            out |= norm(f"{at}.norm1", d_model) | norm(f"{at}.norm3", d_model) | attention(at, d_model, d_model)
+        at = "action_head.model."
+        for i in range(dit["num_layers"]):
+            block = f"{at}transformer_blocks.{i}"
+            out |= linear(f"{block}.norm1.linear", 2 * d, d) | attention(block, d, d if i % 2 else d_model)
+        time = f"{at}timestep_encoder.timestep_embedder."
+        out |= linear(f"{time}linear_1", d, 256) | linear(f"{time}linear_2", d, d)
+        out |= linear(f"{at}proj_out_1", 2 * d, d) | linear(f"{at}proj_out_2", dit["output_dim"], d)
+        out |= per_robot("state_encoder.layer1", d_state, d_hidden) | per_robot("state_encoder.layer2", d_hidden, d)
+        out |= per_robot("action_encoder.W1", d_action, d) | per_robot("action_encoder.W2", 2 * d, d) | per_robot("action_encoder.W3", d, d)
+        return out | per_robot("action_decoder.layer1", d_hidden, d_hidden) | per_robot("action_decoder.layer2", d_hidden, d_action)
+
+    def value(self, name, shape, seed):
+        x = parameter(name, shape, seed)
+        if name == "action_head.vlln.weight":  # a norm by another name
+            x = bfloat16(x + 1)
+        if name.startswith("action_head.") and len(shape) == 3:  # [embodiment, in, out], which parameter() leaves too small
+            x = x * 2.0 ** round(math.log2(shape[2]) / 2)
+        return x / 16 if self.faint and any(part in name for part in FAINT) else x
+
+    def write(self, seed, folder):
+        """Returns the parameter count."""
+        folder = Path(folder)
+        self.write_backbone(folder / "vlm")
+        settings = self.processor_config()
+        same = ("image_crop_size", "image_target_size", "shortest_image_edge", "crop_fraction", "use_percentiles", "use_relative_action")
+        config = CONFIG | {"backbone_embedding_dim": self.text["hidden_size"]} | {k: settings["processor_kwargs"][k] for k in same} | self.head
+        ids = {tag: index for tag, (index, _) in self.robots.items()}
+        for file, value in (("config", config), ("processor_config", settings), ("statistics", self.statistics(seed)), ("embodiment_id", ids)):
+            write_json(folder / f"{file}.json", value, indent=1)
+        index = {}
+        for i, shapes in enumerate((self.backbone_shapes(), self.head_shapes())):
+            file = f"model-{i + 1:05d}-of-00002.safetensors"
+            write_stream(folder / file, {n: ("BF16", s) for n, s in sorted(shapes.items())},
+                         lambda name, shapes=shapes: bfloat16_bits(self.value(name, shapes[name], seed)), {"format": "pt"})
+            index |= {name: (file, layout.count(shape)) for name, shape in shapes.items()}
+        n = sum(count for _, count in index.values())
+        write_json(folder / "model.safetensors.index.json", {
+            "metadata": {"total_size": 2 * n}, "weight_map": {name: file for name, (file, _) in sorted(index.items())}}, indent=1)
+        return n
+
+    def write_backbone(self, folder):
+        """What the hub keeps in the backbone's repository, without weights."""
+        copy_tokenizer("gr00t", folder)
+        text = {"model_type": "qwen3_vl_text", "vocab_size": max(TOKENS.values()) + 1 + N_DEAD, "rms_norm_eps": 1e-6,
+                "rope_theta": 5000000, "max_position_embeddings": 512, "hidden_act": "silu", "attention_bias": False,
+                "attention_dropout": 0.0, "bos_token_id": TOKENS["<|endoftext|>"], "eos_token_id": TOKENS["<|im_end|>"],
+                "tie_word_embeddings": True} | self.text
+        vision = {"model_type": "qwen3_vl", "in_channels": 3, "temporal_patch_size": 2, "spatial_merge_size": 2,
+                  "hidden_act": "gelu_pytorch_tanh", "out_hidden_size": text["hidden_size"]} | self.vision
+        ids = {"image_token_id": "image_pad", "video_token_id": "video_pad", "vision_start_token_id": "vision_start",
+               "vision_end_token_id": "vision_end"}
+        write_json(folder / "config.json", {
+            "architectures": ["Qwen3VLForConditionalGeneration"], "model_type": "qwen3_vl", "tie_word_embeddings": True,
+            "text_config": text, "vision_config": vision} | {k: TOKENS[f"<|{token}|>"] for k, token in ids.items()}, indent=2)
+        images = {"size": {"longest_edge": 1 << 20, "shortest_edge": self.side**2}, "patch_size": vision["patch_size"],
+                  "temporal_patch_size": 2, "merge_size": 2, "image_mean": [0.5] * 3, "image_std": [0.5] * 3,
+                  "processor_class": "Qwen3VLProcessor"}
+        for file, kind in (("preprocessor_config", {"image_processor_type": "Qwen2VLImageProcessorFast"}),
+                           ("video_preprocessor_config", {"video_processor_type": "Qwen3VLVideoProcessor"})):
+            write_json(folder / f"{file}.json", images | kind, indent=2)
+
+    def processor_config(self):
+        settings = {
+            "modality_configs": {tag: modalities(robot) for tag, (_, robot) in self.robots.items()},
+            "image_crop_size": None, "image_target_size": None, "use_albumentations": True, "random_rotation_angle": None,
+            "color_jitter_params": None, "shortest_image_edge": None, "crop_fraction": None, "letter_box_transform": False,
+            "model_name": HUB_NAME, "model_type": "qwen", "formalize_language": True, "max_state_dim": self.head["max_state_dim"],
+            "max_action_dim": self.head["max_action_dim"], "max_action_horizon": self.head["action_horizon"],
+            "use_percentiles": self.percentiles, "use_mean_std": False, "clip_outliers": True, "apply_sincos_state_encoding": False,
+            "use_relative_action": any(robot.relative for _, robot in self.robots.values()), "exclude_state": False,
+            "state_dropout_prob": 0.2}
+        return {"processor_class": "Gr00tN1d7Processor", "processor_kwargs": settings | self.image}
+
+    def statistics(self, seed):
+        out = {}
+        for i, (tag, (_, robot)) in enumerate(self.robots.items()):
+            flat, changes = robot.statistics(seed + i), robot.statistics(seed + i + 1000)["action"]
+            relative = per_key(changes, robot.actions)
+            out[tag] = {"state": per_key(flat["observation.state"], robot.states), "action": per_key(flat["action"], robot.actions),
+                        "relative_action": {key: relative[key] for key in robot.relative}}
+        return out
+
+
+def modalities(robot):
+    def part(keys, deltas, actions=None):
+        return {"delta_indices": deltas, "modality_keys": list(keys), "sin_cos_embedding_keys": None, "mean_std_embedding_keys": None,
+                "action_configs": actions}
+
+    configs = [RELATIVE | {"state_key": robot.relative[k]} if k in robot.relative else ABSOLUTE for k in robot.actions]
+    return {"video": part(robot.views, [0]), "state": part(robot.states, [0]),
+            "action": part(robot.actions, list(range(robot.rows)), configs),
+            "language": part(["annotation.human.action.task_description"], [0])}
+
+
+def per_key(numbers, groups):
+    """Statistics of a whole vector -> those of its parts."""
+    out, start = {}, 0
+    for key, n in groups.items():
+        out[key] = {k: numbers[k][start : start + n].tolist() for k in ("min", "max", "mean", "std", "q01", "q99")}
+        start += n
+    return out
+
+
+# --- cases -----------------------------------------------------------------------------------------------------------
+
+
+def vision(d, layers, heads, ff, side, deepstack, patch=4):
+    """side: of the square table of positions."""
+    return {"hidden_size": d, "depth": layers, "num_heads": heads, "intermediate_size": ff, "num_position_embeddings": side * side,
+            "deepstack_visual_indexes": list(deepstack), "patch_size": patch}
+
+
+def text(d, layers, heads, kv, d_head, ff, sections):
+    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "num_key_value_heads": kv,
+            "head_dim": d_head, "intermediate_size": ff,
+            "rope_scaling": {"mrope_interleaved": True, "mrope_section": list(sections), "rope_type": "default"}}
+
+
+def head(layers, dit, vl, d_hidden, d_state, d_action, horizon, **more):
+    """layers: of the language model, which the policy keeps; dit, vl: (layers, heads, width of a head)."""
+    same = {"positional_embeddings": None, "dropout": 0.2, "final_dropout": True}
+    sizes = ("num_layers", "num_attention_heads", "attention_head_dim")
+    return {"select_layer": layers, "input_embedding_dim": dit[1] * dit[2], "hidden_size": d_hidden, "max_state_dim": d_state,
+            "max_action_dim": d_action, "action_horizon": horizon, "max_seq_len": horizon + 4, "max_num_embodiments": 3,
+            "diffusion_model_cfg": same | dict(zip(sizes, dit)) | {
+                "norm_type": "ada_norm", "output_dim": d_hidden, "interleave_self_attention": True},
+            "vl_self_attention_cfg": same | dict(zip(sizes, vl)), **more}
+
+
+def case(seed, frames, instruction, description, **more):
+    options = {"embodiment": description.tag} | more.pop("options", {})
+    return Case(seed, frames, instruction, description, options=options, **more)
+
+
+POSE = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1)
+
+CASES = {
+    # Two square cameras, shrunk by a fraction, cropped and enlarged again; ranges instead of percentiles; a robot that gets
+    # five of eight rows; its state and its actions are of different widths.
+    "gr00t_n1_7/libero": case(41, {"image": (45, 45, "png"), "wrist_image": (45, 45, "png")}, "open the middle drawer", Checkpoint(
+        "libero_sim", 2, Robot(("image", "wrist_image"), POSE | {"gripper": 2}, POSE | {"gripper": 1}, 5),
+        vision(24, 5, 3, 44, 5, (0, 2, 3)), text(40, 6, 6, 2, 12, 56, (2, 2, 2)),
+        head(4, (6, 4, 9), (2, 5, 8), 20, 14, 11, 8),
+        {"image_target_size": [32, 32], "shortest_image_edge": 32, "crop_fraction": 0.95}, 32)),
+    # Percentiles, with numbers beyond them and one that never moved; one camera, padded to a square and halved; the last vision
+    # layer feeds DeepStack as well as the connector; one key-value head; eight DiT blocks; the whole horizon.
+    "gr00t_n1_7/percentiles": case(42, {"front": (40, 64, "png")}, "push the plate slowly", Checkpoint(
+        "simpler_env_widowx", 1, Robot(("front",), {"pose": 4, "pad": 1, "gripper": 1}, {"gripper": 1, "pose": 4}, 6, zero_spread=(2,)),
+        vision(24, 4, 2, 36, 6, (0, 1, 3)), text(36, 7, 4, 1, 16, 48, (4, 2, 2)),
+        head(5, (8, 3, 8), (1, 3, 12), 18, 9, 7, 6),
+        {"image_target_size": [32, 32], "image_crop_size": [28, 28], "letter_box_transform": True}, 32, percentiles=True),
+        state=(0.5, -2.25, 0.1, 4.0, 0.03125, -3.5)),
+    # Joints that are predicted relative to the state, by statistics of their own, beside a gripper that is not; one part is
+    # relative to a state of another name. Three cameras whose aspect is kept: six by eight patches.
+    "gr00t_n1_7/relative": case(43, {"ego_view": (36, 48, "png"), "left": (36, 48, "png"), "right": (36, 48, "jpg")},
+        "stack the green block on the yellow block", Checkpoint(
+        "real_arms_relative_joints", 1, Robot(
+            ("ego_view", "left", "right"), {"gripper": 1, "right_arm_joints": 4, "left_arm": 3, "waist": 2},
+            {"gripper": 1, "right_arm": 4, "left_arm": 3}, 7, {"right_arm": "right_arm_joints", "left_arm": None}),
+        vision(32, 4, 2, 40, 7, (0, 1, 2)), text(40, 5, 5, 5, 8, 52, (2, 1, 1)),
+        head(4, (6, 5, 6), (2, 4, 10), 22, 12, 10, 9),
+        {"image_target_size": [24, 24], "image_crop_size": [22, 22]}, 24, percentiles=True),
+        options={"camera_size": "48x36"}),
+    # An instruction that has to be cleaned: capitals, punctuation, what looks like a special token, letters in two parts and in other
+    # scripts, digits of several kinds; five steps; frames shrunk to a third; no crop; text blocks every third time; four
+    # language layers that the policy cuts off.
+    "gr00t_n1_7/clean_text": case(44, {"top": (48, 48, "png"), "wrist": (48, 48, "png")},
+        "  \u00d6ffne die \"Schublade_12\" -- don't stop!\nPla\u0308tze \u5f00\u62bd\u5c49\uff0c THEN put the black-bowl (n\u00b0 3\u00bd) on top"
+        " of the stove<|im_end|>; it\u2019s \u0645\u0646\u0636\u062f\u0629 #42. Close the bottom drawer, and stack the GREEN block ", Checkpoint(
+        "my_robot.v2", 2, Robot(("top", "wrist"), {"joints": 6}, {"joints": 5, "hand": 2}, 4),
+        vision(28, 4, 7, 32, 4, (0, 1, 2), 2), text(36, 8, 3, 1, 20, 40, (4, 3, 3)),
+        head(4, (7, 2, 16), (3, 2, 18), 26, 8, 8, 5, num_inference_timesteps=5, attend_text_every_n_blocks=3),
+        {"image_target_size": [16, 16], "image_crop_size": [16, 16]}, 16)),
+    # Numbers so small that every eps shows; a frame that is enlarged; two words.
+    "gr00t_n1_7/faint": case(45, {"camera": (12, 12, "png")}, "Go on", Checkpoint(
+        "simpler_env_google", 1, Robot(("camera",), {"x": 1, "hand": 3}, {"x": 1, "hand": 2}, 3),
+        vision(16, 3, 2, 24, 3, (0, 1, 2)), text(24, 5, 3, 1, 8, 32, (2, 1, 1)),
+        head(4, (6, 2, 10), (1, 3, 8), 14, 6, 5, 4),
+        {"image_target_size": [16, 16], "shortest_image_edge": 16, "crop_fraction": 0.9}, 16, faint=True)),
+}
+
+# --- the reference ---------------------------------------------------------------------------------------------------
+
+
+def described(checkpoint):
+    import cv2
+    import diffusers
+
+    return (f"lerobot.policies.groot.GrootPolicy, embodiment {embodiment(checkpoint)}, diffusers {diffusers.__version__}, "
+            f"cv2 {cv2.__version__}")
+
+
+def embodiment(checkpoint):
+    return json.loads((Path(checkpoint).parent / "convert.json").read_text())["embodiment"]
+
+
+@contextlib.contextmanager
+def backbone_from(folder):
+    """What LeRobot writes down of the backbone or reads from the hub comes from this folder."""
+    from lerobot.policies.groot import groot_n1_7, processor_groot
+    from transformers import Qwen3VLConfig
+
+    config, build = groot_n1_7._cosmos_reason2_qwen3_vl_config, processor_groot._build_n1_7_processor
+    groot_n1_7._cosmos_reason2_qwen3_vl_config = lambda: Qwen3VLConfig.from_pretrained(folder)
+    processor_groot._build_n1_7_processor = lambda name="": build(str(folder))
+    try:
+        yield
+    finally:
+        groot_n1_7._cosmos_reason2_qwen3_vl_config, processor_groot._build_n1_7_processor = config, build
+
+
+def widths(statistics, keys):
+    return {key: len(statistics[key]["min"]) for key in keys}
+
+
+def policy_config(checkpoint, tag):
+    """LeRobot's configuration for one robot of the checkpoint, wide and long enough to cut nothing off."""
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.policies.groot.configuration_groot import GrootConfig
+
+    head = json.loads((checkpoint / "config.json").read_text())
+    settings = json.loads((checkpoint / "processor_config.json").read_text())["processor_kwargs"]
+    numbers = json.loads((checkpoint / "statistics.json").read_text())[tag]
+    robot = settings["modality_configs"][tag]
+    d_state, d_action = (sum(widths(numbers[m], robot[m]["modality_keys"]).values()) for m in ("state", "action"))
+    views = {f"observation.images.{v}": PolicyFeature(FeatureType.VISUAL, (3, 1, 1)) for v in robot["video"]["modality_keys"]}
+    return GrootConfig(
+        base_model_path=str(checkpoint), embodiment_tag=tag, use_bf16=False, action_decode_transform="none", device="cpu",
+        chunk_size=head["action_horizon"], n_action_steps=head["action_horizon"], max_state_dim=head["max_state_dim"],
+        max_action_dim=head["max_action_dim"], push_to_hub=False,
+        input_features=views | {"observation.state": PolicyFeature(FeatureType.STATE, (d_state,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (d_action,))})
+
+
+def check_weights(model, checkpoint):
+    """LeRobot's loader warns of a tensor that it misses and goes on."""
+    import torch
+    from safetensors.torch import load_file
+
+    stored = {}
+    for shard in sorted(checkpoint.glob("model-*.safetensors")):
+        stored |= load_file(shard)
+    for name, p in model.named_parameters():
+        if not torch.equal(p, stored[name].float()):
+            raise ValueError(f"{checkpoint}: {name} was not read")
+    for name, table in model.named_buffers():
+        if table.is_floating_point() and table.dtype != torch.float32:
+            raise ValueError(f"{name} is {table.dtype}")
+
+
+def load(checkpoint, dtype="float32", tag=None):
+    """(reference, preprocessor, postprocessor); published: everything in bfloat16, frequencies and noise included, as the
+    authors' policy has it.  tag: instead of the one that convert.json names."""
+    import torch
+    from lerobot.policies.groot.modeling_groot import GrootPolicy
+    from lerobot.policies.groot.processor_groot import make_groot_pre_post_processors
+
+    checkpoint = Path(checkpoint).resolve()  # a relative path would be taken for the name of a repository
+    config = policy_config(checkpoint, tag or embodiment(checkpoint))
+    with backbone_from(backbone_folder(checkpoint)):
+        policy = GrootPolicy(config).eval()
+        before, after = make_groot_pre_post_processors(config)
+        for step in before.steps:
+            getattr(step, "proc", None)  # built on first use
+    check_weights(policy._groot_model, checkpoint)
+    if dtype == "published":
+        policy._groot_model.to(torch.bfloat16)
+
+    def from_bytes(batch):
+        return before({k: (v * 255).round().byte() if k.startswith("observation.images.") else v for k, v in batch.items()})
+
+    return Reference(policy), from_bytes, after
+
+
+class Reference:
+    """LeRobot's policy, with the noise given to it."""
+
+    def __init__(self, policy):
+        self.config, self.policy, self.model = types.SimpleNamespace(type="gr00t_n1_7"), policy, policy._groot_model
+
+    def predict_action_chunk(self, batch, noise):
+        import torch
+
+        def given(size, dtype, device):
+            return noise.reshape(size).to(dtype)
+
+        draw, torch.randn = torch.randn, given
+        try:
+            with torch.inference_mode():
+                return self.policy.predict_action_chunk(dict(batch))
+        finally:
+            torch.randn = draw
+
+
+# --- recording ----------------------------------------------------------------------------------------------------
+
+
+class Recorder(Taps):
+    """One request without pads; every view has the same size."""
+
+    def __init__(self, reference):
+        self.reference, model = reference, reference.model
+        head, visual, lm = model.action_head, model.backbone.visual, model.backbone.language_model
+        super().__init__(head.num_inference_timesteps)
+        self.after(visual.patch_embed, lambda x: self.views("vision.patch_embed", x))
+        for i, block in enumerate(visual.blocks):
+            self.after(block, lambda x, i=i: self.views(f"vision.blk.{i}", x))
+        for k, merger in enumerate(visual.deepstack_merger_list):
+            self.after(merger, lambda x, k=k: self.views(f"deepstack.{k}", x))
+        self.after(visual.merger, lambda x: self.views("connector", x))
+        self.language(lm, len(visual.deepstack_merger_list))
+        self.after(head.vlln, lambda x: self.put("vl.norm", x[0]))
+        for i, block in enumerate(getattr(head.vl_self_attention, "transformer_blocks", [])):
+            self.after(block, lambda x, i=i: self.put(f"vl.blk.{i}", x[0]))
+        self.action_head(head)
+
+    def views(self, name, x):
+        self.put(name, x.unflatten(0, (self.n_view, -1)))
+
+    def language(self, lm, n_deepstack):
+        """What enters a layer is what the one before it left and what DeepStack added; nothing is added to the last one."""
+        if len(lm.layers) <= n_deepstack:
+            raise ValueError(f"{n_deepstack} DeepStack features for {len(lm.layers)} layers")
+        lm.register_forward_pre_hook(lambda m, args, kw: self.put("position_ids", kw["position_ids"][-3:, 0]), with_kwargs=True)
+        for i, layer in enumerate(lm.layers):
+            name = f"lm.blk.{i - 1}" if i else "prefix"
+            self.before(layer, lambda x, name=name: self.put(name, x[0]))
+        self.after(lm.layers[-1], lambda x: self.put(f"lm.blk.{len(lm.layers) - 1}", x[0]))
+
+    def action_head(self, head):
+        self.before(head.state_encoder, lambda x: self.put("state", x[0, 0]))
+        self.after(head.state_encoder, lambda x: self.put("state_out", x[0]))
+        self.before(head.action_encoder, self.on_step)
+        dit = head.model
+        dit.register_forward_pre_hook(lambda m, args, kw: self.at_step("action_token", kw["hidden_states"][:, 1:]), with_kwargs=True)
+        for i, block in enumerate(dit.transformer_blocks):
+            self.stepwise(block, f"dit.blk.{i}")
+            if i % 2 == 0:
+                of_text = i % (2 * dit.attend_text_every_n_blocks) == 0
+                for leaf, module in (("k", block.attn1.to_k), ("v", block.attn1.to_v)):
+                    self.after(module, lambda x, name=f"dit.blk.{i}.{leaf}", a=block.attn1, t=of_text: self.seen(name, x, a.heads, t))
+        self.stepwise(dit, "dit.out")
+
+    def seen(self, name, x, n_head, of_text):
+        """Keys or values of the rows that a cross block looks at: those of the text or those of the images."""
+        if self.step == 0:
+            self.put(name, x[0][self.image != of_text].unflatten(-1, (n_head, -1)))
+
+    def on_step(self, x):
+        if self.step >= 0:
+            self.put(f"step.{self.step}.x", x[0])
+        self.step += 1
+
+    def on_batch(self, batch):
+        """Tokens, where the images are among them, and the pixels of the patches' rows."""
+        grid, ids = batch["image_grid_thw"], batch["input_ids"][0]
+        vision = self.reference.model.backbone.visual.config
+        if not bool(batch["attention_mask"].all()) or not bool((grid == grid[:1]).all()):
+            raise ValueError("a golden case has no pads, and views of one size")
+        self.n_view, (_, rows, columns) = len(grid), grid[0].tolist()
+        self.image = ids == self.reference.model.backbone.model.config.image_token_id
+        self.put("tokens", ids)
+        p, m = vision.patch_size, vision.spatial_merge_size
+        x = batch["pixel_values"].view(self.n_view, rows // m, columns // m, m, m, 3, vision.temporal_patch_size, p, p)
+        if not bool((x == x[:, :, :, :, :, :, :1]).all()):
+            raise ValueError("an image differs from its copy in time")
+        x = x[:, :, :, :, :, :, 0].permute(0, 5, 1, 3, 6, 2, 4, 7)  # view, channel, then block, row or column in it, pixel
+        self.put("pixels", x.reshape(self.n_view, 3, rows * p, columns * p))
+
+    def run(self, batch, noise):
+        """Every tap of one inference."""
+        model = self.reference.model
+        self.on_batch(batch)
+        get_action = model.get_action
+
+        def keep_whole(*args, **kwargs):
+            out = get_action(*args, **kwargs)
+            self.put(f"step.{self.step}.x", out["action_pred"][0])
+            return out
+
+        model.get_action = keep_whole
+        chunk = self.reference.predict_action_chunk(batch, noise)[0]
+        if not bool(chunk.isfinite().all()):
+            raise ValueError("the chunk is not finite")
+        self.put("chunk", chunk)
+        return self.taps

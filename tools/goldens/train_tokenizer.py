@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Small tokenizers in the published forms, trained on robot sentences: tests/golden/tokenizers/.
+
+    python tools/goldens/train_tokenizer.py FAMILY FOLDER
+
+Needs tokenizers and transformers.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+TASKS = [
+    "pick up the red cube and place it in the basket", "open the middle drawer of the cabinet", "push the plate slowly",
+    "put the black bowl on top of the stove", "close the bottom drawer", "stack the green block on the yellow block",
+]
+SMOLLM_SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
+GEMMA_SPECIAL = ["<pad>", "<eos>", "<bos>", "<unk>"]
+INTERNVL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>", "<quad>", "</quad>"]
+QWEN_VL = [f"<|{name}|>" for name in (
+    "endoftext", "im_start", "im_end", "object_ref_start", "object_ref_end", "box_start", "box_end", "quad_start", "quad_end",
+    "vision_start", "vision_end", "vision_pad", "image_pad", "video_pad")]
+QWEN_TEMPLATE = (
+    "{% for message in messages %}<|im_start|>{{ message.role }}\n{% for part in message.content %}{% if part.type == 'image' %}"
+    "<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part.text }}{% endif %}{% endfor %}<|im_end|>\n{% endfor %}"
+    "{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}")
+
+
+def smolvla(folder, n_merge=40):
+    """A byte-level BPE like SmolLM2's (single digits split off), with the processor of SmolVLM."""
+    from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast, SmolVLMImageProcessor, SmolVLMProcessor, SmolVLMVideoProcessor
+
+    fast = Tokenizer(models.BPE())
+    steps = [pre_tokenizers.Digits(individual_digits=True), pre_tokenizers.ByteLevel(add_prefix_space=False)]
+    fast.pre_tokenizer, fast.decoder = pre_tokenizers.Sequence(steps), decoders.ByteLevel()
+    alphabet = pre_tokenizers.ByteLevel.alphabet()
+    fast.train_from_iterator([t + "\n" for t in TASKS], trainers.BpeTrainer(
+        vocab_size=len(SMOLLM_SPECIAL) + len(alphabet) + n_merge, special_tokens=SMOLLM_SPECIAL, initial_alphabet=alphabet,
+        show_progress=False))
+    images = {"global_image_token": "<global-img>", "fake_image_token": "<fake_token_around_image>", "image_token": "<image>"}
+    fast.add_special_tokens([AddedToken(t, special=True, normalized=False) for t in [*images.values(), "<end_of_utterance>"]])
+    words = PreTrainedTokenizerFast(
+        tokenizer_object=fast, bos_token="<|im_start|>", eos_token="<end_of_utterance>", unk_token="<|endoftext|>",
+        pad_token="<|im_end|>", model_max_length=8192, extra_special_tokens=images)
+    SmolVLMProcessor(SmolVLMImageProcessor(), words, SmolVLMVideoProcessor(), image_seq_len=4,
+                     chat_template="{{ messages }}").save_pretrained(folder)
+
+
+def pi(folder, n_piece=150):
+    """BPE with byte fallback and a leading <bos>, digits alone, blanks as U+2581: Gemma's form with other merges."""
+    from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast
+
+    fast = Tokenizer(models.BPE(unk_token="<unk>"))
+    fast.normalizer = normalizers.Replace(" ", "▁")
+    fast.pre_tokenizer = pre_tokenizers.Split(Regex(r"\d|\n|▁?[^▁\d\n]+|▁"), "isolated")
+    corpus = [f"Task: {t}, State: 0 1 2 3 4 5 6 7 8 9 -1;\nAction: " for t in TASKS]
+    fast.train_from_iterator(corpus, trainers.BpeTrainer(
+        vocab_size=len(GEMMA_SPECIAL) + n_piece, special_tokens=GEMMA_SPECIAL, show_progress=False))
+    spec = json.loads(fast.to_str())
+    pieces = sorted(spec["model"]["vocab"], key=spec["model"]["vocab"].get)[len(GEMMA_SPECIAL) :]
+    order = GEMMA_SPECIAL + [f"<0x{b:02X}>" for b in range(256)] + pieces
+    spec["model"] |= {"vocab": {t: i for i, t in enumerate(order)}, "byte_fallback": True, "fuse_unk": True}
+    spec["pre_tokenizer"] = {"type": "Split", "pattern": {"String": " "}, "behavior": "MergedWithPrevious", "invert": False}
+    start, text = {"SpecialToken": {"id": "<bos>", "type_id": 0}}, {"Sequence": {"id": "A", "type_id": 0}}
+    other = {"Sequence": {"id": "B", "type_id": 1}}
+    spec["post_processor"] = {"type": "TemplateProcessing", "single": [start, text], "pair": [start, text, other],
+                              "special_tokens": {"<bos>": {"id": "<bos>", "ids": [2], "tokens": ["<bos>"]}}}
+    PreTrainedTokenizerFast(tokenizer_object=Tokenizer.from_str(json.dumps(spec)), bos_token="<bos>", eos_token="<eos>",
+                            unk_token="<unk>", pad_token="<pad>", model_max_length=8192).save_pretrained(folder)
+
+
+def qwen(folder, added, frames, n_merge=60, **more):
+    """Qwen2's own rules with other merges; the added tokens follow the vocabulary, in the published order.  frames: what stands
+    around an instruction."""
+    from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast, Qwen2Tokenizer
+
+    published, fast = Qwen2Tokenizer().backend_tokenizer, Tokenizer(models.BPE())
+    fast.normalizer, fast.pre_tokenizer, fast.decoder = published.normalizer, published.pre_tokenizer, published.decoder
+    corpus = [frame.format(task) for task in TASKS for frame in frames]
+    fast.train_from_iterator(corpus, trainers.BpeTrainer(
+        vocab_size=256 + n_merge, initial_alphabet=pre_tokenizers.ByteLevel.alphabet(), show_progress=False))
+    fast.add_tokens([AddedToken(t, special=True, normalized=False) for t in added])
+    words = PreTrainedTokenizerFast(tokenizer_object=fast, pad_token="<|endoftext|>", eos_token="<|im_end|>", padding_side="right",
+                                    model_max_length=12288, clean_up_tokenization_spaces=False, **more)
+    words.save_pretrained(folder)
+    spec, file = json.loads(words.backend_tokenizer.to_str()), folder / "tokenizer_config.json"
+    settings = json.loads(file.read_text()) | {"tokenizer_class": "Qwen2Tokenizer", "added_tokens_decoder": {
+        str(t["id"]): {k: v for k, v in t.items() if k != "id"} for t in spec["added_tokens"]}}
+    settings.pop("backend", None)
+    file.write_text(json.dumps(settings, indent=2) + "\n")
+    return spec
+
+
+def evo1(folder):
+    """With the three files that the slow class of the authors' layout reads."""
+    spec = qwen(folder, INTERNVL, tuple(f"Image-{i}: <\n{{}}\n" for i in (1, 2, 3)))
+    (folder / "vocab.json").write_text(json.dumps(spec["model"]["vocab"], ensure_ascii=False))
+    (folder / "merges.txt").write_text("#version: 0.2\n" + "".join(" ".join(m) + "\n" for m in spec["model"]["merges"]))
+    (folder / "added_tokens.json").write_text(json.dumps({t["content"]: t["id"] for t in spec["added_tokens"]}, indent=2))
+
+
+def gr00t(folder):
+    qwen(folder, QWEN_VL, ("<|im_start|>user\n{}<|im_end|>\n",), chat_template=QWEN_TEMPLATE)
+
+
+if __name__ == "__main__":
+    {"smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))

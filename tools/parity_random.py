@@ -1,0 +1,182 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Random configurations, by the reference and by the runtime: what the golden cases do not happen to contain.
+
+    python tools/parity_random.py ARCH FIRST LAST [--vla build/cpu/bin/vla] [--keep DIR]
+
+A seed draws everything: depths, heads, widths, patches, grid and table, views, frames, absent views, text, normalization, solver,
+attention mode (of smolvla), relative actions (of pi0 and pi05).  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
+A configuration that the reference cannot run must be refused, with a reason, by vla-convert or by vla.  Ends with exit
+code 1 if a block differs by more than 1e-4 of its largest magnitude, or if only one side answers.
+
+With --bf16 the weights are float32 numbers that bfloat16 rounds and the bundle is in bf16: its actions must not lie further from
+the reference's in float32 than those of the reference in the dtypes of a published file.
+"""
+import argparse
+import contextlib
+import io
+import random
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+from goldens import cases, pi, recorder, smolvla
+from parity_full import ROOT, distance, run_vla
+from vla_cpp.convert import cli
+
+TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
+MODES = ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY")
+TEXTS = ("a", "pick up the red cube\n", "  two  spaces ", "don't 12345 stop!", "naïve café 漢字 🙂 ok", "word " * 40, "\n\n",
+         "<image> <|im_end|> hi", "tab\tand\r\nline")
+
+
+def draw_views(r, n_empty):
+    """({view: declared size}, {view: frame or None}) with at most as many absent as the reference fills in."""
+    frames = {f"cam{i}": (r.randint(12, 90), r.randint(12, 90), r.choice(("png", "png", "jpg"))) for i in range(r.randint(1, 3))}
+    views = {view: frame[:2] for view, frame in frames.items()}
+    if n_empty and len(frames) > 1 and r.random() < 0.7:
+        frames[r.choice(list(frames))] = None
+    return views, frames | {f"empty_camera_{i}": None for i in range(n_empty)}
+
+
+def draw(seed):
+    """A case whose every size comes from the seed."""
+    r = random.Random(seed)
+    factor, patch = r.choice((1, 2, 2, 3)), r.choice((4, 5, 6, 8, 14))
+    grid = factor * r.choice((1, 2, 2, 3))
+    table = grid if r.random() < 0.7 else grid + r.choice((1, 2))
+    vision_heads, kv = r.choice((1, 2, 3, 5)), r.choice((1, 2, 3))
+    heads = kv * r.choice((1, 2, 3))
+    d_model = heads * r.choice((8, 12, 16) if heads % 2 == 0 else (8, 16, 24))
+    n_layer, n_cut = r.choice((1, 2, 3, 4, 6)), r.choice((0, 0, 1))
+    n_expert, every = -1, r.choice((2, 2, 2, 3, 4, 1, 0, -1))
+    if n_layer % 2 == 0 and r.random() < 0.3:
+        n_expert, every = n_layer // 2, n_layer if r.random() < 0.5 else 2
+    width = r.choice((0.5, 0.75, 1.0, 0.25))
+    n_empty, d_state, d_action = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14)
+    views, frames = draw_views(r, n_empty)
+    policy = smolvla.policy(
+        r.randint(1, 12), r.choice((1, 2, 5, 10)), (grid * patch, grid * patch), width if d_model * width % 2 == 0 else 1.0,
+        num_vlm_layers=n_layer, num_expert_layers=n_expert, self_attn_every_n_layers=every, empty_cameras=n_empty,
+        max_state_dim=max(d_state, r.choice((8, 16, 32))), max_action_dim=max(d_action, r.choice((8, 16, 32))),
+        tokenizer_max_length=r.choice((8, 24, 48)), pad_language_to=r.choice(("longest", "max_length")),
+        prefix_length=r.choice((-1, 0, 90)), attention_mode=r.choice(("cross_attn",) * 5 + ("self_attn",)),
+        normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)},
+        min_period=r.choice((4e-3, 1e-3)), max_period=r.choice((4.0, 2.0)))
+    vision = smolvla.vision(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)), table * patch, patch)
+    text = smolvla.text(d_model, n_layer + n_cut, heads, kv, r.choice((4, 6, 8, 16, 32)), r.choice((32, 50)))
+    checkpoint = smolvla.Checkpoint(vision, text, factor, policy, views, d_state, d_action)
+    return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
+def draw_pi(arch, seed):
+    """The same for pi0 and pi05; the patches of their tower have 14 pixels."""
+    r = random.Random(seed)
+    kv, vision_heads, depth, d_head = r.choice((1, 1, 2, 3)), r.choice((1, 2, 3, 5)), r.randint(1, 4), r.choice((4, 8, 12, 16, 32))
+    heads = kv * r.choice((1, 2, 4, 8))
+    n_empty, d_state, d_action = r.choice((0, 0, 1)), r.randint(1, 14), r.randint(1, 14)
+    views, frames = draw_views(r, n_empty)
+    modes = {"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}
+    policy = pi.policy(
+        r.randint(1, 12), r.choice((1, 2, 5, 10)), 14 * r.choice((1, 2, 2, 3, 4)),
+        (max(d_state, r.choice((8, 16, 32))), max(d_action, r.choice((8, 16, 32)))), r.choice((8, 24, 48, 200)),
+        empty_cameras=n_empty, normalization_mapping=modes, min_period=r.choice((4e-3, 1e-3)), max_period=r.choice((4.0, 2.0)),
+        use_relative_actions=d_state >= d_action and r.random() < 0.3)
+    lm, expert = (pi.gemma(r.choice((16, 24, 36, 40)), depth, heads, kv, d_head, r.choice((32, 50))) for _ in range(2))
+    vision = pi.vision(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
+    checkpoint = pi.Checkpoint(arch, policy, vision, lm, expert, views, d_state, d_action)
+    return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
+def add_low_bits(file, seed):
+    """Moves every weight by up to half a percent, to float32 numbers such as training leaves."""
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    generator = torch.Generator().manual_seed(seed)
+    tensors = {n: t.float() * (1 + 0.01 * (torch.rand(t.shape, generator=generator) - 0.5)) for n, t in load_file(file).items()}
+    save_file(tensors, file, metadata={"format": "pt"})
+
+
+def run_reference(case, folder, low_bits=False):
+    """(taps, None), or (None, why the reference stops)."""
+    cases.write_checkpoint(case, folder)
+    cases.write_observation(case, folder)
+    if low_bits:
+        add_low_bits(folder / "checkpoint" / "model.safetensors", case.seed)
+    try:
+        return recorder.run_case(folder), None
+    except (RuntimeError, ValueError, AssertionError) as error:
+        return None, f"{type(error).__name__} {error}".splitlines()[0][:90]
+
+
+def run_runtime(vla, folder, dtype="f32"):
+    """(taps, None), or (None, who refuses and why)."""
+    checkpoint, message = folder / "checkpoint", io.StringIO()
+    with contextlib.redirect_stderr(message):
+        code = cli.main([str(checkpoint), "--backbone", str(cases.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
+                         "--dtype", dtype, "--quiet"])
+    if code:
+        return None, f"vla-convert ({code}): {message.getvalue().strip()[:200]}"
+    try:
+        return run_vla(vla, folder, folder / "bundle.gguf", "*", folder / "taps.gguf", threads=1)[0], None
+    except subprocess.CalledProcessError as error:
+        if error.returncode < 0:  # a signal is a crash, not a refusal
+            raise
+        return None, f"vla ({error.returncode})"
+
+
+def judge(expected, got):
+    """(whether they agree, worst block and its distance)."""
+    shared = [n for n, x in expected.items() if n in got and np.abs(x).max() > 0]
+    misshapen = [n for n in shared if got[n].size != expected[n].size]
+    if misshapen or not {"actions", "prefix"} <= set(shared):
+        return False, f"shapes differ at {', '.join(misshapen) or 'too few blocks'}"
+    far = {n: distance(got[n].ravel(), expected[n].ravel())[1] for n in shared}
+    worst = max(far, key=far.get)
+    return far[worst] <= TOLERANCE, f"actions {far['actions']:.1e}, worst of {len(far)} blocks {far[worst]:.1e} at {worst}"
+
+
+def judge_bf16(expected, got, published):
+    ours, theirs = (distance(run["actions"].ravel(), expected["actions"].ravel())[1] for run in (got, published))
+    return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
+
+
+def compare(arch, seed, vla, folder, bf16):
+    with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
+        expected, stopped = run_reference(draw(seed) if arch == "smolvla" else draw_pi(arch, seed), folder, bf16)
+        published = recorder.run_case(folder, "published") if bf16 and expected else None
+    got, refused = run_runtime(vla, folder, "bf16" if bf16 else "f32")
+    if expected is None or got is None:
+        return expected is None and got is None, f"reference: {stopped or 'runs'}; {refused or 'the runtime runs'}"
+    return judge_bf16(expected, got, published) if bf16 else judge(expected, got)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05"))
+    parser.add_argument("first", type=int)
+    parser.add_argument("last", type=int)
+    parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
+    parser.add_argument("--bf16", action="store_true", help="what rounding the weights costs, instead of every block")
+    parser.add_argument("--keep", type=Path, help="folder for the cases, instead of one that is removed")
+    args = parser.parse_args()
+    recorder.open_reference()
+    warnings.filterwarnings("ignore")
+    n_wrong = 0
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed in range(args.first, args.last + 1):
+            folder = (args.keep or Path(scratch)) / str(seed)
+            folder.mkdir(parents=True)
+            agree, what = compare(args.arch, seed, args.vla, folder, args.bf16)
+            n_wrong += not agree
+            print(f"seed {seed}: {'agree' if agree else 'DIFFER'}; {what}", flush=True)
+    print(f"{args.last - args.first + 1 - n_wrong} of {args.last - args.first + 1} seeds agree")
+    sys.exit(1 if n_wrong else 0)
+
+
+if __name__ == "__main__":
+    main()
