@@ -14,23 +14,22 @@ namespace vla::codecs {
 namespace {
 
 constexpr std::string_view kSignature = "\x89PNG\r\n\x1A\n";
+constexpr std::string_view kXmp = "XML:com.adobe.xmp", kExif = "Raw profile type exif";
 
 /// libpng reports errors by longjmp, which destroys nothing. So everything that owns memory lives here, outside the
 /// functions that a jump leaves, and those functions (`guarded_*`) hold only plain values.
 struct PngReader {
   png_structp png = nullptr;
   png_infop info = nullptr;
-  png_infop end = nullptr;
   Bytes file;
   std::size_t position = 0;
   char message[128] = {};
   std::vector<std::uint8_t> pixels;
-  std::vector<png_bytep> rows;
 
   explicit PngReader(Bytes bytes) : file(bytes) {}
   PngReader(const PngReader&) = delete;
   PngReader& operator=(const PngReader&) = delete;
-  ~PngReader() { png_destroy_read_struct(&png, &info, &end); }
+  ~PngReader() { png_destroy_read_struct(&png, &info, nullptr); }
 };
 
 void on_error(png_structp png, png_const_charp message) {
@@ -39,7 +38,7 @@ void on_error(png_structp png, png_const_charp message) {
   png_longjmp(png, 1);
 }
 
-// Warnings are about ancillary chunks, such as a known but odd colour profile: nothing that reaches the pixels.
+// Nothing that libpng warns of reaches the pixels.
 void on_warning(png_structp, png_const_charp) {}
 
 void on_read(png_structp png, png_bytep data, std::size_t size) {
@@ -53,14 +52,15 @@ bool open(PngReader& reader) {
   reader.png = png_create_read_struct(PNG_LIBPNG_VER_STRING, &reader, on_error, on_warning);
   if (reader.png == nullptr) return false;
   reader.info = png_create_info_struct(reader.png);
-  reader.end = png_create_info_struct(reader.png);
-  return reader.info != nullptr && reader.end != nullptr;
+  return reader.info != nullptr;
 }
 
 bool guarded_header(PngReader& reader) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;
   png_set_read_fn(reader.png, &reader, on_read);
   png_set_user_limits(reader.png, PNG_UINT_31_MAX, PNG_UINT_31_MAX);  // `check_size` is the limit
+  // Texts, profiles and the like are passed over unread: libpng would unpack a thousand of them, of 8 MB each.
+  png_set_keep_unknown_chunks(reader.png, PNG_HANDLE_CHUNK_NEVER, nullptr, -1);
   png_read_info(reader.png, reader.info);
   return true;
 }
@@ -83,8 +83,11 @@ bool guarded_layout(PngReader& reader) {
 
 bool guarded_pixels(PngReader& reader) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;
-  png_read_image(reader.png, reader.rows.data());
-  png_read_end(reader.png, reader.end);
+  const std::size_t row_size = png_get_rowbytes(reader.png, reader.info);
+  for (int pass = png_set_interlace_handling(reader.png); pass > 0; --pass)
+    for (png_bytep row = reader.pixels.data(); row != reader.pixels.data() + reader.pixels.size(); row += row_size)
+      png_read_row(reader.png, row, nullptr);
+  png_read_end(reader.png, nullptr);
   return true;
 }
 
@@ -124,17 +127,51 @@ std::vector<std::uint8_t> from_raw_profile(std::string_view text) {
   return bytes;
 }
 
-void read_metadata(PngReader& reader, png_infop info, Picture& picture) {
-  png_textp texts = nullptr;
-  int count = 0;
-  png_get_text(reader.png, info, &texts, &count);
-  for (int i = 0; i < count; ++i) {
-    const bool international = texts[i].compression > 0;
-    const std::string_view text(texts[i].text, international ? texts[i].itxt_length : texts[i].text_length);
-    if (std::strcmp(texts[i].key, "XML:com.adobe.xmp") == 0) picture.xmp = text;
-    if (std::strcmp(texts[i].key, "Raw profile type exif") == 0 && picture.exif.empty())
-      picture.exif = from_raw_profile(text);
-  }
+/// The two texts among a file's chunks that may say how a picture is to be turned.
+struct Texts {
+  static constexpr std::size_t kMost = 1 << 20;  // bytes of both and of all their repetitions, unpacked
+  static constexpr std::size_t kEach = 1 << 12;  // what each of them counts at least
+  std::size_t left = kMost;
+  std::vector<std::uint8_t> exif;
+  std::string xmp;
+};
+
+/// Takes everything up to a zero byte from the front of `text`, and the zero byte.
+std::string_view take_word(std::string_view& text) {
+  const std::string_view word = text.substr(0, text.find('\0'));
+  text.remove_prefix(std::min(text.size(), word.size() + 1));
+  return word;
+}
+
+/// What a zlib stream holds; nothing where it is damaged or longer than `left`, from which what was unpacked is taken.
+std::string unpacked(std::string_view packed, std::size_t& left) {
+  std::string text(left, '\0');
+  uLongf size = left;
+  const int found = uncompress(reinterpret_cast<Bytef*>(text.data()), &size,
+                               reinterpret_cast<const Bytef*>(packed.data()), packed.size());
+  left -= std::min<std::size_t>(left, size);
+  text.resize(found == Z_OK ? size : 0);
+  return text;
+}
+
+/// The text of a tEXt, zTXt or iTXt chunk whose keyword was taken off: PNG specification, 11.3.4.
+std::string text_of(std::string_view type, std::string_view content, std::size_t& left) {
+  const bool packed = type == "zTXt" || (type == "iTXt" && content.starts_with('\1'));
+  if (type != "tEXt") content.remove_prefix(std::min<std::size_t>(content.size(), type == "zTXt" ? 1 : 2));
+  for (int i = 0; i < 2 && type == "iTXt"; ++i) take_word(content);  // the language, and the keyword in it
+  if (packed) return unpacked(content, left);
+  left -= std::min(left, content.size());
+  return std::string(content);
+}
+
+void read_text(std::string_view type, std::string_view content, Texts& texts) {
+  if (type != "tEXt" && type != "zTXt" && type != "iTXt") return;
+  const std::string_view keyword = take_word(content);
+  if (keyword != kXmp && keyword != kExif) return;
+  texts.left -= std::min(texts.left, Texts::kEach);
+  std::string text = text_of(type, content, texts.left);
+  if (keyword == kExif && texts.exif.empty()) texts.exif = from_raw_profile(text);
+  if (keyword == kXmp && !text.empty()) texts.xmp = std::move(text);
 }
 
 void drop_exif_name(std::vector<std::uint8_t>& exif) {
@@ -146,7 +183,7 @@ void drop_exif_name(std::vector<std::uint8_t>& exif) {
 /// Walks the chunks up to the end before libpng does: it would take memory for the length that a chunk states, up to
 /// 2 GiB, before it reads, and would go on without an orientation whose chunk is damaged. `exif` is the last eXIf
 /// chunk.
-const char* damage(Bytes file, Bytes& exif) {
+const char* damage(Bytes file, Bytes& exif, Texts& texts) {
   constexpr std::size_t kAround = 12;  // length, type and checksum
   const auto number = [&](std::size_t at) {
     std::uint32_t value = 0;
@@ -159,8 +196,11 @@ const char* damage(Bytes file, Bytes& exif) {
     const Bytes content = file.subspan(at + 4, length + 4);  // the type belongs to the checksum
     const auto checksum = crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
     if (checksum != number(at + 8 + length)) return "a chunk with another checksum";
-    if (std::memcmp(content.data(), "IEND", 4) == 0) return nullptr;
-    if (std::memcmp(content.data(), "eXIf", 4) == 0) exif = content.subspan(4);
+    const std::string_view text(reinterpret_cast<const char*>(content.data()), content.size());
+    if (text.starts_with("IEND")) return nullptr;
+    if (text.starts_with("eXIf")) exif = content.subspan(4);
+    read_text(text.substr(0, 4), text.substr(4), texts);
+    if (texts.left == 0) return "more than a mebibyte of texts about its orientation";
     at += length + kAround;
   }
   return "a truncated one";
@@ -178,7 +218,8 @@ bool is_png(Bytes file) {
 
 Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {
   Bytes exif;
-  if (const char* found = damage(file, exif)) return refused(where, "a whole PNG image", found);
+  Texts texts;
+  if (const char* found = damage(file, exif, texts)) return refused(where, "a whole PNG image", found);
   PngReader reader(file);
   if (!open(reader)) return Error{Code::out_of_memory, where, "", "no memory for the PNG decoder"};
   if (!guarded_header(reader)) return corrupt(reader, where);
@@ -195,14 +236,13 @@ Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimi
   const std::size_t row_size = png_get_rowbytes(reader.png, reader.info);
   if (row_size != width * (palette ? 1 : 3)) return corrupt(reader, where);
   reader.pixels.resize(row_size * height);
-  for (std::size_t y = 0; y < height; ++y) reader.rows.push_back(reader.pixels.data() + y * row_size);
   if (!guarded_pixels(reader)) return corrupt(reader, where);
   if (palette && !expand_palette(reader)) return refused(where, "a whole PNG image", "a pixel beyond its palette");
 
-  Picture picture{static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, {}};
+  Picture picture{
+      static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, std::move(texts.xmp)};
   for (const std::byte byte : exif) picture.exif.push_back(std::to_integer<std::uint8_t>(byte));
-  read_metadata(reader, reader.info, picture);
-  read_metadata(reader, reader.end, picture);
+  if (exif.empty()) picture.exif = std::move(texts.exif);
   drop_exif_name(picture.exif);
   return picture;
 }

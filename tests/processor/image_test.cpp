@@ -2,6 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/image.h"
 
+#include <sys/resource.h>
+#include <zlib.h>
+
 #include <filesystem>
 
 #include "processor/support.h"
@@ -26,7 +29,106 @@ std::string float_npy(const std::vector<float>& values) {
              data);
 }
 
+std::string big_endian(std::size_t value) {
+  std::string text;
+  for (int shift = 24; shift >= 0; shift -= 8) text += static_cast<char>(value >> shift & 0xFF);
+  return text;
+}
+
+/// A chunk of a PNG file: `type` and what it holds.
+std::string chunk(const std::string& content) {
+  const auto checksum = crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
+  return big_endian(content.size() - 4) + content + big_endian(checksum);
+}
+
+std::string packed(const std::string& text) {
+  std::string out(compressBound(text.size()), '\0');
+  uLongf size = out.size();
+  REQUIRE(compress(reinterpret_cast<Bytef*>(out.data()), &size, reinterpret_cast<const Bytef*>(text.data()),
+                   text.size()) == Z_OK);
+  return out.substr(0, size);
+}
+
+/// A small picture with these chunks behind its header.
+std::string png_with(const std::string& chunks) {
+  constexpr std::size_t kHeader = 8 + 25;
+  return read_text(data_path("images/rgb.png")).insert(kHeader, chunks);
+}
+
+/// The most memory that this process has had, in bytes.
+std::size_t peak_memory() {
+  rusage usage = {};
+  getrusage(RUSAGE_SELF, &usage);
+  return static_cast<std::size_t>(usage.ru_maxrss) * 1024;
+}
+
+std::string repeated(const std::string& text, int count) {
+  std::string out;
+  for (int i = 0; i < count; ++i) out += text;
+  return out;
+}
+
+const std::string kXmp = "XML:com.adobe.xmp";
+
 }  // namespace
+
+TEST_CASE("a thousand packed texts of 8 MB each cost a PNG nothing") {
+  const std::string text = packed(std::string(8 << 20, 'x')), zero(1, '\0');
+  for (const std::string& bomb :
+       {chunk("zTXtcomment" + zero + zero + text), chunk("iTXtcomment" + zero + '\1' + zero + zero + zero + text),
+        chunk("iCCPprofile" + zero + zero + text)}) {
+    const std::string file = png_with(repeated(bomb, 1000));
+    const std::size_t before = peak_memory();
+    const auto frame = decode_image(bytes_of(file), "top");
+    REQUIRE_MESSAGE(frame.ok(), frame.error().message());
+    CHECK(pixels(*frame) == pixels(*decode_data("rgb.png")));
+    CHECK(peak_memory() - before < std::size_t{64} << 20);
+  }
+}
+
+TEST_CASE("texts about a PNG's orientation are read up to a mebibyte in all") {
+  const std::string zero(1, '\0'), upright = "<x tiff:Orientation=\"6\"/>";
+  const auto itxt = [&](const std::string& text) {
+    return chunk("iTXt" + kXmp + zero + '\1' + zero + "en" + zero + "key" + zero + packed(text));
+  };
+  const auto turned = decode_data("rgb.png");
+  for (const std::string& text :
+       {itxt(upright), chunk("tEXt" + kXmp + zero + upright), chunk("zTXt" + kXmp + zero + zero + packed(upright)),
+        chunk("iTXt" + kXmp + zero + zero + zero + zero + zero + upright)}) {
+    const std::string file = png_with(text);
+    const auto frame = decode_image(bytes_of(file), "top");
+    REQUIRE_MESSAGE(frame.ok(), frame.error().message());
+    CHECK(frame->width == turned->height);
+  }
+  for (const std::string& bomb : {itxt(std::string(8 << 20, 'x')), repeated(itxt(std::string(8 << 10, 'x')), 1000),
+                                  repeated(itxt(""), 1000), chunk("tEXt" + kXmp + zero + std::string(2 << 20, 'x'))}) {
+    const std::string file = png_with(bomb);
+    CHECK(contains(refusal(decode_image(bytes_of(file), "top"), Code::bad_observation), "more than a mebibyte"));
+  }
+}
+
+TEST_CASE("a damaged text is passed over") {
+  const std::string zero(1, '\0');
+  for (const std::string& content :
+       {"zTXt" + kXmp, "zTXt" + kXmp + zero, "zTXt" + kXmp + zero + zero + "junk", "iTXt" + kXmp + zero + '\1',
+        "iTXt" + kXmp + zero + '\1' + zero + "en", std::string("tEXt"), "iTXt" + kXmp + zero}) {
+    const std::string file = png_with(chunk(content));
+    CHECK(decode_image(bytes_of(file), "top").ok());
+  }
+}
+
+TEST_CASE("a PNG of many short rows takes no memory beside its pixels") {
+  const std::string zero(1, '\0');
+  constexpr std::size_t kHeight = 4 << 20;
+  std::string head("IHDR");
+  head += big_endian(1) + big_endian(kHeight) + std::string("\x08\0\0\0\0", 5);  // grey
+  const std::string file =
+      "\x89PNG\r\n\x1A\n" + chunk(head) + chunk("IDAT" + packed(std::string(2 * kHeight, '\0'))) + chunk("IEND");
+  const std::size_t before = peak_memory();
+  const auto frame = decode_image(bytes_of(file), "top");
+  REQUIRE_MESSAGE(frame.ok(), frame.error().message());
+  CHECK(peak_memory() - before < 2 * 3 * kHeight);
+}
 
 TEST_CASE("every readable PNG and JPEG decodes to Pillow's pixels") {
   int compared = 0;
