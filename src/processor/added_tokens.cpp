@@ -145,8 +145,8 @@ void AddedTokens::split(const Trie& trie, std::string_view text, const std::func
     at = stop;  // a rejected match is passed over as a whole, as the reference's search does
     if (token.single_word && !stands_alone(text.substr(0, start), text.substr(stop))) continue;
     // White space that the token before has already taken stays with it.
-    if (token.lstrip) start = std::max(start - trailing_space(text.substr(0, start)), done);
-    if (token.rstrip) stop += leading_space(text.substr(stop));
+    if (token.lstrip && start > done) start -= trailing_space(text.substr(done, start - done));
+    if (token.rstrip) stop = std::max(stop, done), stop += leading_space(text.substr(stop));
     if (start > done) on_text(text.substr(done, start - done));
     on_token(token.id);
     done = stop;

@@ -4,6 +4,7 @@
 
 #include <utf8proc.h>
 
+#include <algorithm>
 #include <vector>
 
 #include "processor/unicode.h"
@@ -11,7 +12,7 @@
 namespace vla {
 namespace {
 
-constexpr std::size_t kMaxParts = 4;  // code points that one decomposes to at most
+constexpr int kMaxParts = 4;  // code points that one decomposes to at most
 
 /// Bytes at the start whose characters take part in normalization, or take no part in it, as `wanted` says.
 std::size_t run(std::string_view text, bool wanted) {
@@ -24,15 +25,41 @@ std::size_t run(std::string_view text, bool wanted) {
   return size;
 }
 
+using Characters = std::vector<utf8proc_int32_t>;
+
+Characters decomposed(std::string_view text) {
+  constexpr auto kDecompose = static_cast<utf8proc_option_t>(UTF8PROC_STABLE | UTF8PROC_DECOMPOSE);
+  Characters characters;
+  for (unicode::Char c; !text.empty(); text.remove_prefix(c.size)) {
+    c = unicode::first(text);
+    utf8proc_int32_t parts[kMaxParts];
+    int boundary = 0;
+    const utf8proc_ssize_t count =
+        utf8proc_decompose_char(static_cast<utf8proc_int32_t>(c.code_point), parts, kMaxParts, kDecompose, &boundary);
+    characters.insert(characters.end(), parts, parts + count);
+  }
+  return characters;
+}
+
+/// The canonical order: marks between two characters that are none, by their class. The library's own sorting takes
+/// quadratic time, seconds for an instruction of nothing but marks.
+void put_in_order(Characters& characters) {
+  const auto mark_class = [](utf8proc_int32_t c) { return utf8proc_get_property(c)->combining_class; };
+  const auto is_mark = [&](utf8proc_int32_t c) { return mark_class(c) != 0; };
+  for (auto at = characters.begin(); at != characters.end();) {
+    const auto first = std::find_if(at, characters.end(), is_mark);
+    at = std::find_if_not(first, characters.end(), is_mark);
+    std::stable_sort(first, at, [&](auto a, auto b) { return mark_class(a) < mark_class(b); });
+  }
+}
+
 /// No function of the library fails here: the text is UTF-8, the buffer is large enough, and nothing else is taken.
 void append_composed(std::string_view text, std::string& out) {
-  constexpr auto kDecompose = static_cast<utf8proc_option_t>(UTF8PROC_STABLE | UTF8PROC_DECOMPOSE);
   constexpr auto kCompose = static_cast<utf8proc_option_t>(UTF8PROC_STABLE | UTF8PROC_COMPOSE);
-  std::vector<utf8proc_int32_t> characters(text.size() * kMaxParts);
-  utf8proc_ssize_t count = utf8proc_decompose(reinterpret_cast<const utf8proc_uint8_t*>(text.data()),
-                                              static_cast<utf8proc_ssize_t>(text.size()), characters.data(),
-                                              static_cast<utf8proc_ssize_t>(characters.size()), kDecompose);
-  count = utf8proc_normalize_utf32(characters.data(), count, kCompose);
+  Characters characters = decomposed(text);
+  put_in_order(characters);
+  const utf8proc_ssize_t count =
+      utf8proc_normalize_utf32(characters.data(), static_cast<utf8proc_ssize_t>(characters.size()), kCompose);
   for (utf8proc_ssize_t i = 0; i < count; ++i) {
     utf8proc_uint8_t bytes[4];
     const utf8proc_ssize_t size = utf8proc_encode_char(characters[static_cast<std::size_t>(i)], bytes);

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <ctime>
 
 #include "processor/nfc.h"
 #include "processor/support.h"
@@ -241,6 +242,37 @@ TEST_CASE("another normalization, or one beside byte fallback, is refused") {
   keys = tokenizer_keys("gemma");
   keys.set("tokenizer.normalization", std::string("nfc"));
   CHECK(contains(refused_keys(keys), "tokenizer.normalization"));
+}
+
+TEST_CASE("composing a text of nothing but marks takes no quadratic time") {
+  std::string marks = "e", ordered = "\u1eb9";  // a mark below sorts before one above, and composes with the letter
+  for (int i = 0; i < 16000; ++i) marks += "\u0301\u0323";
+  for (int i = 0; i < 15999; ++i) ordered += "\u0323";
+  for (int i = 0; i < 16000; ++i) ordered += "\u0301";
+  const std::clock_t start = std::clock();  // of this process alone, however busy the machine is
+  CHECK(nfc(marks) == ordered);
+  CHECK(std::clock() - start < CLOCKS_PER_SEC);
+}
+
+TEST_CASE("added tokens of white space take no quadratic time") {
+  Keys keys = tokenizer_keys("smol");
+  auto tokens = *keys.strings("tokenizer.tokens");
+  Json added = Json::parse(*keys.string("tokenizer.added"));
+  added.push_back({{"id", tokens.size()},
+                   {"content", "\t"},
+                   {"single_word", false},
+                   {"lstrip", true},
+                   {"rstrip", true},
+                   {"normalized", false},
+                   {"special", true}});
+  tokens.push_back("\t");
+  keys.set("tokenizer.tokens", tokens);
+  keys.set("tokenizer.added", added.dump());
+  const auto tokenizer = Tokenizer::create(keys, 4096);
+  REQUIRE_MESSAGE(tokenizer.ok(), tokenizer.error().message());
+  const std::clock_t start = std::clock();
+  CHECK(tokenizer->encode(std::string(Tokenizer::kMaxText, '\t')).ok());
+  CHECK(std::clock() - start < CLOCKS_PER_SEC);
 }
 
 TEST_CASE("composing text is Unicode's, but for characters that the reference does not know") {
