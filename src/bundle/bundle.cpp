@@ -125,6 +125,7 @@ Result<Bundle> Bundle::parse(std::span<const std::byte> bytes, std::string name)
   bundle.bytes_ = bytes;
   bundle.keys_ = std::move(content.keys);
   bundle.tensors_ = std::move(content.tensors);
+  for (std::size_t i = 0; i < bundle.tensors_.size(); ++i) bundle.index_.emplace(bundle.tensors_[i].name, i);
   return bundle;
 }
 
@@ -149,9 +150,8 @@ void Bundle::keep_pages(std::span<const std::byte> part) const {
 }
 
 const TensorInfo* Bundle::find(std::string_view name) const {
-  for (const TensorInfo& tensor : tensors_)
-    if (tensor.name == name) return &tensor;
-  return nullptr;
+  const auto found = index_.find(std::string(name));
+  return found != index_.end() ? &tensors_[found->second] : nullptr;
 }
 
 Result<std::vector<float>> Bundle::stats(std::string_view name) const {

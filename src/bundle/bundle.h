@@ -7,6 +7,7 @@
 #include <span>
 #include <string>
 #include <string_view>
+#include <unordered_map>
 #include <vector>
 
 #include "base/result.h"
@@ -58,6 +59,7 @@ class Bundle {
   std::span<const std::byte> bytes_;
   Keys keys_;
   std::vector<TensorInfo> tensors_;
+  std::unordered_map<std::string, std::size_t> index_;  // of tensors_, by name
 };
 
 }  // namespace vla

@@ -10,6 +10,8 @@
 namespace vla {
 namespace {
 
+constexpr std::size_t kMaxLines = 50;  // of a report: who has more problems than these has the wrong bundle
+
 std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
 
 }  // namespace
@@ -60,14 +62,19 @@ void ParamList::problem(const Error& error) {
 
 Status ParamList::report(const std::string& policy, const std::function<bool(const std::string&)>& is_used) const {
   std::vector<std::string> lines = problems_;
+  std::size_t n_line = lines.size();
   if (bundle_ != nullptr)
     for (const TensorInfo& tensor : bundle_->tensors())
-      if (names_.count(tensor.name) == 0 && !is_used(tensor.name))
+      if (names_.count(tensor.name) == 0 && !is_used(tensor.name) && ++n_line <= kMaxLines)
         lines.push_back(fmt::format("unused tensor   {:<40} no module of {} declares it", tensor.name, policy));
-  if (lines.empty()) return {};
+  if (n_line == 0) return {};
+  if (n_line > kMaxLines) {
+    lines.resize(kMaxLines);
+    lines.push_back(fmt::format("and {} more", n_line - kMaxLines));
+  }
   return Error{Code::bad_bundle, bundle_ != nullptr ? bundle_->path() : policy, "",
-               fmt::format("does not fit policy {}: {} problem{}\n  {}", policy, lines.size(),
-                           lines.size() == 1 ? "" : "s", fmt::join(lines, "\n  ")),
+               fmt::format("does not fit policy {}: {} problem{}\n  {}", policy, n_line, n_line == 1 ? "" : "s",
+                           fmt::join(lines, "\n  ")),
                "convert the checkpoint again with the vla-convert of this version"};
 }
 

@@ -29,6 +29,11 @@ Result<int> FeatureNames::find(std::string_view given) const {
                "give the full name"};
 }
 
-std::string FeatureNames::listed() const { return fmt::format("{}", fmt::join(names_, ", ")); }
+std::string FeatureNames::listed() const {
+  constexpr std::size_t kShown = 50;
+  if (names_.size() <= kShown) return fmt::format("{}", fmt::join(names_, ", "));
+  return fmt::format("{} and {} more", fmt::join(names_.begin(), names_.begin() + kShown, ", "),
+                     names_.size() - kShown);
+}
 
 }  // namespace vla

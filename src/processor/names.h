@@ -22,7 +22,7 @@ class FeatureNames {
   /// Index of the feature. A whole name goes before a last part. Errors: bad_observation for a name that the bundle
   /// does not have or that several features share.
   Result<int> find(std::string_view given) const;
-  /// `observation.images.top`, in words for a message: all names that the bundle has.
+  /// `observation.images.top`, in words for a message: the first 50 names that the bundle has.
   std::string listed() const;
 
  private:
