@@ -53,8 +53,8 @@ struct PictureSize {
 Result<PictureSize> picture_size(const Keys& keys) {
   const bool oblong = keys.has("vision.image_width");
   PictureSize size;
-  VLA_TRY(size.width, keys.integer(oblong ? "vision.image_width" : "vision.image_size"));
-  VLA_TRY(size.height, keys.integer(oblong ? "vision.image_height" : "vision.image_size"));
+  VLA_TRY(size.width, keys.integer(oblong ? "vision.image_width" : "vision.image_size", kAnySize));
+  VLA_TRY(size.height, keys.integer(oblong ? "vision.image_height" : "vision.image_size", kAnySize));
   return size;
 }
 
@@ -62,9 +62,9 @@ Result<PictureSize> picture_size(const Keys& keys) {
 Result<ViewPlaces> view_places(const Keys& keys, const PictureSize& picture) {
   ViewPlaces places;
   if (!keys.has("policy.n_slot")) return places;
-  VLA_TRY(const int patch_size, keys.integer("vision.patch_size"));
-  VLA_TRY(const int factor, keys.integer(keys.has("vision.merge") ? "vision.merge" : "connector.factor"));
-  VLA_TRY(places.count, keys.integer("policy.n_slot"));
+  VLA_TRY(const int patch_size, keys.integer("vision.patch_size", kAnySize));
+  VLA_TRY(const int factor, keys.integer(keys.has("vision.merge") ? "vision.merge" : "connector.factor", kAnySize));
+  VLA_TRY(places.count, keys.integer("policy.n_slot", kAnySize));
   places.repeat = (picture.width / patch_size / factor) * (picture.height / patch_size / factor);
   return places;
 }
@@ -113,8 +113,8 @@ std::string added_token(std::string_view content, std::size_t id) {
 
 Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const PictureSize picture, picture_size(keys));
-  VLA_TRY(const int d_state, keys.integer("policy.d_state"));
-  VLA_TRY(const int d_action, keys.integer("policy.d_action"));
+  VLA_TRY(const int d_state, keys.integer("policy.d_state", kAnySize));
+  VLA_TRY(const int d_action, keys.integer("policy.d_action", kAnySize));
   VLA_TRY(const ViewPlaces places, view_places(keys, picture));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
   const int max_tokens = places.count * places.size() + sizes.max_tokens;

@@ -74,7 +74,7 @@ Status check_sum(std::span<const std::byte> bytes, const Keys& keys, const std::
 }
 
 Status check_version(const Keys& keys, const std::string& name) {
-  VLA_TRY(const int version, keys.integer("vla.bundle_version"));
+  VLA_TRY(const int version, keys.integer("vla.bundle_version", kAnySize));
   if (version == kBundleVersion) return {};
   return Error{Code::bad_bundle, name + ": vla.bundle_version", std::to_string(kBundleVersion), std::to_string(version),
                version < kBundleVersion ? "run vla-convert again" : "this bundle needs a newer vla"};

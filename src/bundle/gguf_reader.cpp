@@ -208,8 +208,8 @@ Result<PlacedTensor> read_tensor(Cursor& cursor, std::uint64_t file_size, const 
 Result<std::uint64_t> read_alignment(const Cursor& cursor, const Keys& keys) {
   constexpr const char* kKey = "general.alignment";
   if (!keys.has(kKey)) return std::uint64_t{32};  // the format's own default
-  VLA_TRY(const int alignment, keys.integer(kKey));
-  if (alignment < 8 || alignment > 65536 || (alignment & (alignment - 1)) != 0)
+  VLA_TRY(const int alignment, keys.integer(kKey, {8, 65536}));
+  if ((alignment & (alignment - 1)) != 0)
     return cursor.bad(kKey, "a power of two from 8 to 65536", std::to_string(alignment));
   return static_cast<std::uint64_t>(alignment);
 }

@@ -2,8 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bundle/keys.h"
 
-#include <cmath>
-#include <limits>
+#include <fmt/format.h>
 
 namespace vla {
 namespace {
@@ -25,10 +24,8 @@ Result<T> get(const std::map<std::string, Value, std::less<>>& values, std::stri
   return Error{Code::bad_bundle, std::string(key), kTypeNames[index], kTypeNames[found->second.index()]};
 }
 
-bool fits_int(std::int64_t value) { return value >= 0 && value <= std::numeric_limits<int>::max(); }
-
-Error not_a_size(std::string_view key, std::int64_t value) {
-  return {Code::bad_bundle, std::string(key), "an integer from 0 to 2^31 - 1", std::to_string(value)};
+Error out_of_range(std::string_view key, Range range, const std::string& found) {
+  return {Code::bad_bundle, std::string(key), fmt::format("{} to {}", range.low, range.high), found};
 }
 
 }  // namespace
@@ -41,23 +38,23 @@ Result<std::vector<std::string>> Keys::strings(std::string_view key) const {
   return get<std::vector<std::string>>(values_, key);
 }
 
-Result<int> Keys::integer(std::string_view key) const {
+Result<int> Keys::integer(std::string_view key, Range range) const {
   VLA_TRY(const std::int64_t value, get<std::int64_t>(values_, key));
-  if (!fits_int(value)) return not_a_size(key, value);
+  if (!range.holds(static_cast<double>(value))) return out_of_range(key, range, std::to_string(value));
   return static_cast<int>(value);
 }
 
-Result<double> Keys::number(std::string_view key) const {
+Result<double> Keys::number(std::string_view key, Range range) const {
   VLA_TRY(const double value, get<double>(values_, key));
-  if (!std::isfinite(value)) return Error{Code::bad_bundle, std::string(key), "a finite number", std::to_string(value)};
+  if (!range.holds(value)) return out_of_range(key, range, fmt::format("{}", value));
   return value;
 }
 
-Result<std::vector<int>> Keys::integers(std::string_view key) const {
+Result<std::vector<int>> Keys::integers(std::string_view key, Range range) const {
   VLA_TRY(const std::vector<std::int64_t> wide, get<std::vector<std::int64_t>>(values_, key));
   std::vector<int> narrow;
   for (std::int64_t value : wide) {
-    if (!fits_int(value)) return not_a_size(key, value);
+    if (!range.holds(static_cast<double>(value))) return out_of_range(key, range, std::to_string(value));
     narrow.push_back(static_cast<int>(value));
   }
   return narrow;

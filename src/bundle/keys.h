@@ -17,7 +17,26 @@ namespace vla {
 using Value = std::variant<bool, std::int64_t, double, std::string, std::vector<std::int64_t>, std::vector<double>,
                            std::vector<std::string>>;
 
-/// Typed access to the metadata of a bundle. A missing key or another type is `bad_bundle` with the key as `where`.
+/// The values that a number may have, both ends included. Whoever reads a number says them: what nobody has tried is
+/// refused at load, not found out by a robot.
+struct Range {
+  double low, high;
+  bool holds(double value) const { return value >= low && value <= high; }
+};
+
+inline constexpr Range kAnySize = {0, 2147483647};
+
+/// Ranges of numbers that are read in several places.
+inline constexpr Range kNormEps = {1e-12, 0.01};
+inline constexpr Range kRopeBase = {1, 1e9};
+inline constexpr Range kTokenScale = {1e-4, 1e4};
+inline constexpr Range kTokenIndex = {0, 65535};
+inline constexpr Range kPeriod = {1e-6, 1e6};
+inline constexpr Range kRateHz = {0, 1e5};
+inline constexpr Range kFlag = {0, 1};
+
+/// Typed access to the metadata of a bundle. A missing key, another type or a number out of range is `bad_bundle`
+/// with the key as `where`.
 class Keys {
  public:
   Keys() = default;
@@ -28,12 +47,11 @@ class Keys {
   void set(std::string key, Value value) { values_.insert_or_assign(std::move(key), std::move(value)); }
 
   Result<bool> boolean(std::string_view key) const;
-  /// A size or count: an integer from 0 to 2^31 - 1.
-  Result<int> integer(std::string_view key) const;
-  /// A finite floating-point number.
-  Result<double> number(std::string_view key) const;
+  /// `range` must lie within kAnySize.
+  Result<int> integer(std::string_view key, Range range) const;
+  Result<double> number(std::string_view key, Range range) const;
   Result<std::string> string(std::string_view key) const;
-  Result<std::vector<int>> integers(std::string_view key) const;
+  Result<std::vector<int>> integers(std::string_view key, Range range) const;
   Result<std::vector<std::string>> strings(std::string_view key) const;
 
  private:

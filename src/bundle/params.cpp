@@ -86,14 +86,13 @@ T Scope::take(Result<T> result, T otherwise) const {
 }
 
 int Scope::dim(const std::string& key, int max) const {
-  const int value = take(list_->keys().integer(key_of(key)), 1);
-  const bool in_range = value >= 1 && value <= max;
-  require(in_range, key, fmt::format("1 to {}", max), std::to_string(value));
-  return in_range ? value : 1;
+  return take(list_->keys().integer(key_of(key), {1, static_cast<double>(max)}), 1);
 }
 
-double Scope::precise(const std::string& key) const { return take(list_->keys().number(key_of(key)), 1.0); }
-float Scope::number(const std::string& key) const { return static_cast<float>(precise(key)); }
+double Scope::precise(const std::string& key, Range range) const {
+  return take(list_->keys().number(key_of(key), range), range.low);
+}
+
 std::string Scope::string(const std::string& key) const {
   return take(list_->keys().string(key_of(key)), std::string());
 }
@@ -101,14 +100,12 @@ std::vector<std::string> Scope::strings(const std::string& key) const {
   return take(list_->keys().strings(key_of(key)), std::vector<std::string>());
 }
 
-std::vector<int> Scope::integers(const std::string& key) const {
-  return take(list_->keys().integers(key_of(key)), std::vector<int>());
+std::vector<int> Scope::integers(const std::string& key, Range range) const {
+  return take(list_->keys().integers(key_of(key), range), std::vector<int>());
 }
 
 int Scope::index(const std::string& key, int count) const {
-  const int value = take(list_->keys().integer(key_of(key)), 0);
-  require(value < count, key, fmt::format("0 to {}", count - 1), std::to_string(value));
-  return value < count ? value : 0;
+  return take(list_->keys().integer(key_of(key), {0, count - 1.0}), 0);
 }
 
 int Scope::choice(const std::string& key, std::initializer_list<std::string> words) const {

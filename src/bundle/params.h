@@ -72,11 +72,12 @@ class Scope {
   int dim(const std::string& key, int max = 1 << 16) const;
   /// A number of layers or blocks, from 1 to 512, so that a damaged bundle cannot ask for endless work.
   int n_layer(const std::string& key) const { return dim(key, 512); }
-  float number(const std::string& key) const;
-  double precise(const std::string& key) const;
+  /// A number in `range`; where it is not, a problem is recorded and the lower end returned.
+  float number(const std::string& key, Range range) const { return static_cast<float>(precise(key, range)); }
+  double precise(const std::string& key, Range range) const;
   std::string string(const std::string& key) const;
   std::vector<std::string> strings(const std::string& key) const;
-  std::vector<int> integers(const std::string& key) const;
+  std::vector<int> integers(const std::string& key, Range range) const;
   /// An index of something that there are `count` of: from 0 to count - 1.
   int index(const std::string& key, int count) const;
   /// Which of these words it is.

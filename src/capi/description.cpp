@@ -24,7 +24,7 @@ const char* Description::keep(std::string text) { return kept_.emplace_back(std:
 void Description::add_views(const Engine& engine) {
   const Keys& keys = engine.bundle().keys();
   const auto names = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
-  const auto optional = *keys.integers("observation.view_optional");
+  const auto optional = *keys.integers("observation.view_optional", kFlag);
   const Recipe& recipe = engine.processor().recipe();
   for (std::size_t i = 0; i < names.size(); ++i)
     view_infos_.push_back(
@@ -65,7 +65,7 @@ Description::Description(const Engine& engine)
   d.horizon = size_of(engine.n_row());
   d.d_action = action_names_.strings.size();
   d.action_names = action_names_.pointers.data(), d.action_units = action_units_.pointers.data();
-  d.rate_hz = *keys.number("action.rate_hz");
+  d.rate_hz = *keys.number("action.rate_hz", kRateHz);
   d.d_noise = size_of(engine.d_action());
   d.noise = keep(engine.solver().noise);
   d.bundle_path = keep(engine.bundle().path());

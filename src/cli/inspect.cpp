@@ -105,12 +105,12 @@ void print_features(const Engine& engine) {
   const Recipe& recipe = engine.processor().recipe();
   constexpr const char* kFits[] = {"letterboxed", "resized", "padded, scaled and cropped as the recipe says"};
   fmt::print("views        any size, {} to {} x {}; at least {} of {} must be present\n", kFits[recipe.fit.index()],
-             recipe.width, recipe.height, *keys.integer("observation.min_views"), views.size());
+             recipe.width, recipe.height, engine.processor().min_views(), views.size());
   for (std::size_t i = 0; i < views.size(); ++i)
     fmt::print("    {}{}\n", views[i], aliases[i].empty() ? "" : fmt::format("  (also {})", aliases[i]));
 
   const auto states = *keys.strings("observation.states");
-  const auto dims = *keys.integers("observation.state_dims");
+  const auto dims = engine.processor().state_dims();
   const auto names = *keys.strings("observation.state_names"), units = *keys.strings("observation.state_units");
   auto name = names.begin();
   auto unit = units.begin();
@@ -118,7 +118,7 @@ void print_features(const Engine& engine) {
     fmt::print("state        {}, {} numbers\n", states[i], dims[i]);
     print_numbers({name, name + dims[i]}, {unit, unit + dims[i]}, read_stats(engine.bundle(), states[i]));
   }
-  const double rate = *keys.number("action.rate_hz");
+  const double rate = *keys.number("action.rate_hz", kRateHz);
   fmt::print("action       {} rows of {} numbers{}\n", engine.n_row(), keys.strings("action.names")->size(),
              rate > 0 ? fmt::format(", {:g} rows a second", rate) : ", control rate unstated");
   print_numbers(*keys.strings("action.names"), *keys.strings("action.units"), read_stats(engine.bundle(), "action"));

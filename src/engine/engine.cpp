@@ -37,11 +37,9 @@ Status Engine::load_policy(bool dry) {
   policy_ = entry.make(*params_);
   VLA_CHECK(params_->report(arch, [this](const std::string& tensor) { return processor_.reads(tensor); }));
   VLA_TRY(solver_, Solver::read(keys));
-  VLA_TRY(horizon_, keys.integer("policy.horizon"));
-  VLA_TRY(d_action_, keys.integer("policy.d_action"));
-  VLA_TRY(d_state_, keys.integer("policy.d_state"));
-  if (horizon_ < 1 || horizon_ > kMaxHorizon)
-    return Error{Code::bad_bundle, "policy.horizon", fmt::format("1 to {}", kMaxHorizon), std::to_string(horizon_)};
+  VLA_TRY(horizon_, keys.integer("policy.horizon", {1, kMaxHorizon}));
+  VLA_TRY(d_action_, keys.integer("policy.d_action", {1, kMaxVector}));
+  VLA_TRY(d_state_, keys.integer("policy.d_state", {0, kMaxVector}));
   VLA_TRY(Weights weights,
           Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes, kernels::choose_linear));
   weights_ = std::make_unique<Weights>(std::move(weights));

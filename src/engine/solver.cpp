@@ -9,11 +9,9 @@ Result<Solver> Solver::read(const Keys& keys) {
   if (kind != "euler" && kind != "euler_float32")
     return Error{Code::bad_bundle, "solver.kind", "euler or euler_float32", kind, "this bundle needs a newer vla"};
   Solver solver;
-  VLA_TRY(solver.n_step, keys.integer("solver.steps"));
-  if (solver.n_step < 1 || solver.n_step > 1000)
-    return Error{Code::bad_bundle, "solver.steps", "1 to 1000", std::to_string(solver.n_step)};
-  VLA_TRY(const double start, keys.number("solver.t_start"));
-  VLA_TRY(const double end, keys.number("solver.t_end"));
+  VLA_TRY(solver.n_step, keys.integer("solver.steps", {1, 1000}));
+  VLA_TRY(const double start, keys.number("solver.t_start", {0, 1}));
+  VLA_TRY(const double end, keys.number("solver.t_end", {0, 1}));
   VLA_TRY(solver.noise, keys.string("solver.noise"));
   if (solver.noise != "normal" && solver.noise != "uniform")
     return Error{Code::bad_bundle, "solver.noise", "normal or uniform", solver.noise};

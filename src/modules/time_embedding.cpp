@@ -26,9 +26,8 @@ std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d
 }
 
 TimeEmbedding::TimeEmbedding(const Scope& s, int d)
-    : d_(d), min_period_(s.precise("min_period")), max_period_(s.precise("max_period")) {
-  s.require(min_period_ > 0 && max_period_ >= min_period_, "min_period", "above 0 and at most max_period",
-            fmt::format("{}", min_period_));
+    : d_(d), min_period_(s.precise("min_period", kPeriod)), max_period_(s.precise("max_period", kPeriod)) {
+  s.require(max_period_ >= min_period_, "min_period", "at most max_period", fmt::format("{}", min_period_));
   s.require(d % 2 == 0, "width", "an even expert.d_model, for sines and cosines", std::to_string(d));
 }
 

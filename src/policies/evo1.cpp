@@ -69,10 +69,10 @@ class Evo1 final : public Policy {
         n_slot_(s.dim("n_slot", 32)),
         n_token_(s.dim("n_token", 8192)),
         pad_token_(s.index("pad_token", (s / "lm").dim("n_vocab", 1 << 24))),
-        view_starts_(s.integers("view_starts")),
+        view_starts_(s.integers("view_starts", kTokenIndex)),
         in_place_(s.choice("absent_views", {"last", "in_place"}) == 1),
         dead_rows_(static_cast<DeadRows>(s.choice("dead_rows", {"zero_attention", "causal_attention", "unseen"}))),
-        time_scale_(s.precise("time_scale")) {
+        time_scale_(s.precise("time_scale", {1, 1e6})) {
     check_layout(s);
   }
 

@@ -30,7 +30,7 @@ class Gr00tN17 final : public Policy {
  public:
   explicit Gr00tN17(const Scope& s)
       : backbone_(s),
-        vl_norm_(s / "vl" / "norm", backbone_.d_model(), (s / "vl").number("norm_eps")),
+        vl_norm_(s / "vl" / "norm", backbone_.d_model(), (s / "vl").number("norm_eps", kNormEps)),
         state_in_(s / "state_in", s.dim("d_state"), (s / "dit").dim("d_hidden"), Bias::yes),
         state_out_(s / "state_out", (s / "dit").dim("d_hidden"), (s / "dit").dim("d_model"), Bias::yes),
         dit_(s / "dit", backbone_.d_model()),
@@ -48,7 +48,8 @@ class Gr00tN17 final : public Policy {
     const Scope vl = s / "vl";
     const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may do without layers
     for (int i = 0; i < n_layer; ++i)
-      vl_blocks_.emplace_back(vl / "blk" / i, backbone_.d_model(), n_head, vl.dim("d_ff"), vl.number("norm_eps"));
+      vl_blocks_.emplace_back(vl / "blk" / i, backbone_.d_model(), n_head, vl.dim("d_ff"),
+                              vl.number("norm_eps", kNormEps));
     vl.require(n_layer == 0 || backbone_.d_model() % n_head == 0, "n_head",
                fmt::format("a divisor of lm.d_model {}", backbone_.d_model()), std::to_string(n_head));
     s.require(horizon_ <= s.dim("n_position"), "n_position", fmt::format("at least the horizon {}", horizon_),

@@ -41,8 +41,8 @@ class SmolVla final : public Policy {
         action_time_in_(s / "action_time_in", 2 * expert_.d_model(), expert_.d_model(), Bias::yes),
         action_time_out_(s / "action_time_out", expert_.d_model(), expert_.d_model(), Bias::yes),
         action_out_(s / "action_out", expert_.d_model(), s.dim("d_action"), Bias::yes),
-        image_scale_(s.number("image_scale")),
-        text_scale_(s.number("text_scale")),
+        image_scale_(s.number("image_scale", kTokenScale)),
+        text_scale_(s.number("text_scale", kTokenScale)),
         time_(s / "time", expert_.d_model()) {}
 
   Status check(const InputShape& shape) const override {

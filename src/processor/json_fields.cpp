@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
 
 namespace vla {
@@ -83,31 +82,28 @@ Result<std::vector<int>> JsonFields::integers(const std::string& name, int low, 
   return list;
 }
 
-bool JsonFields::is_float(const Json& value) {
-  return value.is_number() && std::abs(value.get<double>()) <= static_cast<double>(std::numeric_limits<float>::max());
-}
-
-Result<float> JsonFields::number(const std::string& name) {
+Result<double> JsonFields::wide_number(const std::string& name, Range range) {
   VLA_TRY(const Json* value, field(name, "a number"));
-  if (!value->is_number()) return wrong(name, "a number");
-  if (!is_float(*value)) return wrong(name, "a float32 number");
-  return static_cast<float>(value->get<double>());
-}
-
-Result<std::vector<float>> JsonFields::numbers(const std::string& name, std::size_t count) {
-  const std::string expected = fmt::format("a list of {} float32 numbers", count);
-  VLA_TRY(const Json* value, field(name, expected.c_str()));
-  if (!value->is_array() || value->size() != count || !std::all_of(value->begin(), value->end(), is_float))
-    return wrong(name, expected);
-  std::vector<float> list;
-  for (const Json& item : *value) list.push_back(static_cast<float>(item.get<double>()));
-  return list;
-}
-
-Result<double> JsonFields::wide_number(const std::string& name) {
-  VLA_TRY(const Json* value, field(name, "a number"));
-  if (!value->is_number() || !std::isfinite(value->get<double>())) return wrong(name, "a number");
+  if (!value->is_number() || !range.holds(value->get<double>()))
+    return wrong(name, fmt::format("a number from {} to {}", range.low, range.high));
   return value->get<double>();
+}
+
+Result<float> JsonFields::number(const std::string& name, Range range) {
+  VLA_TRY(const double value, wide_number(name, range));
+  return static_cast<float>(value);
+}
+
+Result<std::vector<float>> JsonFields::numbers(const std::string& name, std::size_t count, Range range) {
+  const std::string expected = fmt::format("a list of {} numbers from {} to {}", count, range.low, range.high);
+  VLA_TRY(const Json* value, field(name, expected.c_str()));
+  if (!value->is_array() || value->size() != count) return wrong(name, expected);
+  std::vector<float> list;
+  for (const Json& item : *value) {
+    if (!item.is_number() || !range.holds(item.get<double>())) return wrong(name, expected);
+    list.push_back(static_cast<float>(item.get<double>()));
+  }
+  return list;
 }
 
 Result<bool> JsonFields::boolean(const std::string& name) {

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "base/result.h"
+#include "bundle/keys.h"
 
 namespace vla {
 
@@ -30,14 +31,13 @@ class JsonFields {
 
   /// An integer in [low, high].
   Result<int> integer(const std::string& name, int low, int high);
-  /// A number that is finite as float32.
-  Result<float> number(const std::string& name);
-  /// A finite number in double precision.
-  Result<double> wide_number(const std::string& name);
+  /// A number in `range`, as float32 or in double precision.
+  Result<float> number(const std::string& name, Range range);
+  Result<double> wide_number(const std::string& name, Range range);
   /// A list of integers in [low, high], none of them twice.
   Result<std::vector<int>> integers(const std::string& name, int low, int high);
-  /// A list of `count` numbers that are finite as float32.
-  Result<std::vector<float>> numbers(const std::string& name, std::size_t count);
+  /// A list of `count` numbers in `range`.
+  Result<std::vector<float>> numbers(const std::string& name, std::size_t count, Range range);
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);
   /// One of the spellings; the result is its index.
@@ -48,7 +48,6 @@ class JsonFields {
 
  private:
   JsonFields(const Json& object, std::string where) : object_(&object), where_(std::move(where)) {}
-  static bool is_float(const Json& value);
   static bool is_integer(const Json& value, int low, int high);
   Result<const Json*> field(const std::string& name, const char* expected);
 

@@ -40,6 +40,13 @@ bool drops_text(const Recipe& recipe) {
                      [](const TextOp& op) { return std::holds_alternative<DropPunctuationOp>(op); });
 }
 
+/// Bounds what ops may make of a sentence: four that replace a letter by a thousand make a terabyte of one.
+Status check_prompt(std::size_t size) {
+  if (size <= kMaxPrompt) return {};
+  return bad_observation("instruction", fmt::format("text that makes a prompt of at most {} bytes", kMaxPrompt),
+                         std::to_string(size));
+}
+
 /// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
 template <class T>
 Result<std::vector<const T*>> by_feature(const FeatureNames& features, const std::map<std::string, T>& given) {
@@ -113,17 +120,22 @@ std::vector<float> Processor::absent_view() const {
   return pixels;
 }
 
-std::string Processor::fill_prompt(const std::string& instruction, std::span<const int> state_words) const {
+Result<std::string> Processor::fill_prompt(const std::string& instruction, std::span<const int> state_words) const {
   std::string text = instruction;
   for (const TextOp& op : recipe_.text) {
     if (std::holds_alternative<StripOp>(op)) text = std::string(strip(text));
     if (std::holds_alternative<LowerOp>(op)) text = python::lower(text);
     if (std::holds_alternative<DropPunctuationOp>(op)) text = python::drop_punctuation(text);
-    if (const auto* replace = std::get_if<ReplaceOp>(&op)) text = replace_all(text, replace->from, replace->to);
+    if (const auto* replace = std::get_if<ReplaceOp>(&op)) {
+      const std::size_t n = occurrences(text, replace->from);
+      VLA_CHECK(check_prompt(text.size() + n * replace->to.size() - n * replace->from.size()));
+      text = replace_all(text, replace->from, replace->to);
+    }
     if (const auto* end = std::get_if<EnsureSuffixOp>(&op); end != nullptr && !text.ends_with(end->suffix))
       text += end->suffix;
     if (const auto* whole = std::get_if<TemplateOp>(&op)) text = fill_template(whole->text, text, state_words);
     if (const auto* views = std::get_if<ViewsOp>(&op)) text = view_places(*views) + text;
+    VLA_CHECK(check_prompt(text.size()));
   }
   return text;
 }
@@ -136,11 +148,11 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
     return tokenizer_.encode(observation.text).error();  // before anything reads it as characters
   if (bins_ && inputs.state_words.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
-  const std::string prompt = fill_prompt(observation.text, inputs.state_words);
-  if (drops_text(recipe_) && prompt == fill_prompt({}, inputs.state_words))
+  VLA_TRY(const std::string prompt, fill_prompt(observation.text, inputs.state_words));
+  if (drops_text(recipe_) && prompt == *fill_prompt({}, inputs.state_words))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");
-  VLA_TRY(inputs.tokens, tokenizer_.encode(prompt, kMaxViewsText + Tokenizer::kMaxText));
+  VLA_TRY(inputs.tokens, tokenizer_.encode(prompt, kMaxPrompt));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
     inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the {} {}", inputs.tokens.size(),

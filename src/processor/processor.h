@@ -40,6 +40,9 @@ struct Inputs {
   std::vector<std::string> notes;    // what the user must be told, e.g. that the instruction was cut
 };
 
+/// Bytes of the longest prompt: the places for views and an instruction.
+inline constexpr std::size_t kMaxPrompt = kMaxViewsText + Tokenizer::kMaxText;
+
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
  public:
@@ -105,7 +108,7 @@ class Processor {
     const Frame* frame;
   };
   Result<std::vector<PresentView>> present_views(const Observation& observation) const;
-  std::string fill_prompt(const std::string& instruction, std::span<const int> state_words) const;
+  Result<std::string> fill_prompt(const std::string& instruction, std::span<const int> state_words) const;
   Status encode_view(const Frame& frame, const std::string& name, std::span<float> out) const;
   Status check_view_places(std::span<const std::int32_t> tokens) const;
   void cut_tokens(std::vector<std::int32_t>& tokens) const;

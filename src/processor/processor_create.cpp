@@ -59,9 +59,9 @@ Result<Processor> Processor::create(const Bundle& bundle) {
   VLA_CHECK(processor.read_features(bundle));
   VLA_CHECK(processor.read_state_steps(bundle));
   VLA_CHECK(processor.read_action_steps(bundle));
-  VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab"));
+  VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
   VLA_TRY(processor.tokenizer_, Tokenizer::create(keys, n_vocab));
-  VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens"));
+  VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens", {1, kMaxVector}));
   if (processor.recipe_.max_tokens > max_text_tokens)
     return misfit("processor.recipe.text",
                   fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
@@ -75,26 +75,19 @@ Status Processor::read_features(const Bundle& bundle) {
   const Keys& keys = bundle.keys();
   VLA_TRY(std::vector<std::string> views, keys.strings("observation.views"));
   VLA_TRY(std::vector<std::string> aliases, keys.strings("observation.view_aliases"));
-  VLA_TRY(view_optional_, keys.integers("observation.view_optional"));
-  VLA_TRY(min_views_, keys.integer("observation.min_views"));
+  VLA_TRY(view_optional_, keys.integers("observation.view_optional", kFlag));
+  VLA_TRY(min_views_, keys.integer("observation.min_views", {1, static_cast<double>(views.size())}));
   VLA_CHECK(check_names("observation.views", views));
   VLA_CHECK(check_size("observation.view_aliases", aliases, views.size()));
   VLA_CHECK(check_size("observation.view_optional", view_optional_, views.size()));
-  for (const int flag : view_optional_)
-    if (flag != 0 && flag != 1) return misfit("observation.view_optional", "0 or 1", std::to_string(flag));
-  if (min_views_ < 1 || static_cast<std::size_t>(min_views_) > views.size())
-    return misfit("observation.min_views", fmt::format("1 to {}", views.size()), std::to_string(min_views_));
   if (views.size() > static_cast<std::size_t>(kMaxViews))
     return misfit("observation.views", fmt::format("at most {} views", kMaxViews), std::to_string(views.size()));
   views_ = FeatureNames("view", std::move(views), std::move(aliases));
 
   VLA_TRY(std::vector<std::string> states, keys.strings("observation.states"));
-  VLA_TRY(state_dims_, keys.integers("observation.state_dims"));
+  VLA_TRY(state_dims_, keys.integers("observation.state_dims", {1, kMaxVector}));
   VLA_CHECK(check_names("observation.states", states));
   VLA_CHECK(check_size("observation.state_dims", state_dims_, states.size()));
-  for (const int dim : state_dims_)
-    if (dim < 1 || dim > kMaxVector)
-      return misfit("observation.state_dims", fmt::format("1 to {}", kMaxVector), std::to_string(dim));
   if (total_dims(state_dims_) > kMaxVector)
     return misfit("observation.state_dims", fmt::format("at most {} numbers in all", kMaxVector), "more");
   std::vector<std::string> no_aliases(states.size());
@@ -113,9 +106,8 @@ Status Processor::check_descriptions(const Keys& keys) const {
   VLA_CHECK(check_size("action.units", action_units, action_names_.size()));
   VLA_CHECK(check_size("observation.state_names", state_names, n_state));
   VLA_CHECK(check_size("observation.state_units", state_units, n_state));
-  VLA_TRY(const double rate, keys.number("action.rate_hz"));
-  if (rate < 0) return misfit("action.rate_hz", "0 or more", fmt::format("{}", rate));
-  return {};
+  const auto rate = keys.number("action.rate_hz", kRateHz);
+  return rate ? Status() : Status(rate.error());
 }
 
 /// The columns that an op on the state names must exist in it.
@@ -149,15 +141,16 @@ Status Processor::read_view_places(const Keys& keys) {
   if (op == recipe_.text.end()) return {};
   const auto* views = std::get_if<ViewsOp>(&*op);
   const std::string where = fmt::format("processor.recipe.text[{}]", op - recipe_.text.begin());
-  VLA_TRY(const std::vector<int> starts, keys.integers("policy.view_starts"));
+  VLA_TRY(const std::vector<int> starts, keys.integers("policy.view_starts", kTokenIndex));
   VLA_TRY(const std::vector<std::int32_t> prefixed, tokenizer_.encode(views->token));
   const std::size_t n_prefix = tokenizer_.prefix().size();
   if (prefixed.size() != n_prefix + 1)
     return misfit(where + ".token", "the text of one token", fmt::format("{} tokens", prefixed.size() - n_prefix));
   view_token_ = prefixed.back();
   view_token_text_ = views->token;
-  const std::string prompt = fill_prompt({}, {});
-  VLA_TRY(const std::vector<std::int32_t> tokens, tokenizer_.encode(prompt, kMaxViewsText + Tokenizer::kMaxText));
+  const auto prompt = fill_prompt({}, {});
+  if (!prompt) return misfit("processor.recipe.text", prompt.error().expected, prompt.error().found);
+  VLA_TRY(const std::vector<std::int32_t> tokens, tokenizer_.encode(*prompt, kMaxPrompt));
   const std::vector<Run> runs = runs_of(view_token_, tokens);
   std::vector<int> found;
   for (const Run& run : runs) found.push_back(run.start);
@@ -202,14 +195,14 @@ Status Processor::read_state_steps(const Bundle& bundle) {
       d_state_ = 0;
     }
   }
-  VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state"));
+  VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state", {0, kMaxVector}));
   if (d_state_ == static_cast<std::size_t>(d_state)) return {};
   return misfit("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
                 std::to_string(d_state_));
 }
 
 Status Processor::read_action_steps(const Bundle& bundle) {
-  VLA_TRY(d_action_, bundle.keys().integer("policy.d_action"));
+  VLA_TRY(d_action_, bundle.keys().integer("policy.d_action", {1, kMaxVector}));
   int width = d_action_;
   for (std::size_t i = 0; i < recipe_.action.size(); ++i) {
     const std::string where = fmt::format("processor.recipe.action[{}]", i);
@@ -220,7 +213,7 @@ Status Processor::read_action_steps(const Bundle& bundle) {
         return misfit(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
       width = take->size;
     } else if (const auto* rows = std::get_if<RowsOp>(&op)) {
-      VLA_TRY(const int horizon, bundle.keys().integer("policy.horizon"));
+      VLA_TRY(const int horizon, bundle.keys().integer("policy.horizon", kAnySize));
       if (rows->count > horizon)
         return misfit(where + ".count", fmt::format("at most the {} rows of a chunk (policy.horizon)", horizon),
                       std::to_string(rows->count));

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/recipe.h"
 
+#include <fmt/format.h>
+
 #include <map>
 
 #include "processor/recipe_ops.h"
@@ -36,6 +38,8 @@ Status parse_list(const Json& document, const char* name, ParseOp parse_op, Reci
   if (list == document.end())
     return Error{Code::bad_bundle, where, "a list of ops", "no such field", "convert the checkpoint again"};
   if (!list->is_array()) return Error{Code::bad_bundle, where, "a list of ops", "another type"};
+  if (list->size() > kMaxOps)
+    return Error{Code::bad_bundle, where, fmt::format("at most {} ops", kMaxOps), std::to_string(list->size())};
   for (std::size_t i = 0; i < list->size(); ++i) {
     VLA_TRY(JsonFields fields, JsonFields::open((*list)[i], where + "[" + std::to_string(i) + "]"));
     VLA_CHECK(parse_op(fields, static_cast<int>(i), recipe));

@@ -154,6 +154,8 @@ struct Recipe {
 inline constexpr int kMaxImageSide = 8192;
 inline constexpr int kMaxVector = 65536;
 inline constexpr std::size_t kMaxPictureOps = 16;
+inline constexpr std::size_t kMaxOps = 64;          // of one list
+inline constexpr std::size_t kMaxOpText = 1 << 12;  // bytes of a text that an op looks for or writes
 inline constexpr int kMaxViews = 32;
 inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op puts in front
 

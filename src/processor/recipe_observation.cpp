@@ -2,9 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The ops on what a robot sees and is told.
+#include <fmt/format.h>
+
 #include <algorithm>
 
-#include "base/bf16.h"
 #include "processor/recipe_ops.h"
 #include "processor/text.h"
 
@@ -19,7 +20,7 @@ Result<Letterbox> parse_letterbox(JsonFields& fields) {
   VLA_TRY(op.antialias, fields.boolean("antialias"));
   VLA_TRY(const int align, fields.choice("align", {"bottom_right", "center"}));
   op.align = static_cast<Letterbox::Align>(align);
-  VLA_TRY(op.fill, fields.number("fill"));
+  VLA_TRY(op.fill, fields.number("fill", {0, 1}));
   return op;
 }
 
@@ -35,22 +36,20 @@ Result<Resize> parse_resize(JsonFields& fields) {
 
 Result<AffineOp> parse_affine(JsonFields& fields) {
   AffineOp op;
-  VLA_TRY(op.scale, fields.number("scale"));
-  VLA_TRY(op.shift, fields.number("shift"));
+  VLA_TRY(op.scale, fields.number("scale", kPlain));
+  VLA_TRY(op.shift, fields.number("shift", kPlain));
   return op;
 }
 
 Result<Standardize> parse_standardize(JsonFields& fields) {
   Standardize op;
-  VLA_TRY(const std::vector<float> mean, fields.numbers("mean", op.mean.size()));
-  VLA_TRY(const std::vector<float> std, fields.numbers("std", op.std.size()));
+  VLA_TRY(const std::vector<float> mean, fields.numbers("mean", op.mean.size(), kPlain));
+  VLA_TRY(const std::vector<float> std, fields.numbers("std", op.std.size(), {1e-6, kPlain.high}));
   VLA_TRY(const int arithmetic,
           fields.choice("arithmetic", {"float32", "bfloat16", "float32_then_bfloat16", "float32_in_bytes"}));
   op.arithmetic = static_cast<Standardize::Arithmetic>(arithmetic);
   std::copy(mean.begin(), mean.end(), op.mean.begin());
   std::copy(std.begin(), std.end(), op.std.begin());
-  for (const float divisor : std)
-    if (!(to_bf16(divisor) > 0.0f)) return fields.wrong("std", "numbers above 0, also in bfloat16");
   return op;
 }
 
@@ -63,8 +62,7 @@ Result<PictureOp> parse_picture_op(JsonFields& fields, int op) {
     return PictureOp(smallest);
   }
   CropFraction crop;
-  VLA_TRY(crop.fraction, fields.wide_number("fraction"));
-  if (crop.fraction <= 0.0 || crop.fraction > 1.0) return fields.wrong("fraction", "a number above 0 and up to 1");
+  VLA_TRY(crop.fraction, fields.wide_number("fraction", {1e-6, 1}));
   return PictureOp(crop);
 }
 
@@ -109,9 +107,15 @@ Status parse_tokenize(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
+Result<std::string> parse_text(JsonFields& fields, const char* name) {
+  VLA_TRY(std::string text, fields.string(name));
+  if (text.size() <= kMaxOpText) return text;
+  return fields.wrong(name, fmt::format("at most {} bytes of text", kMaxOpText));
+}
+
 Result<TextOp> parse_template(JsonFields& fields) {
   TemplateOp op;
-  VLA_TRY(op.text, fields.string("text"));
+  VLA_TRY(op.text, parse_text(fields, "text"));
   if (!is_template(op.text))
     return fields.wrong("text", "text with {instruction} once, {state} once at most and no other braces");
   return TextOp(std::move(op));
@@ -119,15 +123,15 @@ Result<TextOp> parse_template(JsonFields& fields) {
 
 Result<TextOp> parse_replace(JsonFields& fields) {
   ReplaceOp op;
-  VLA_TRY(op.from, fields.string("from"));
-  VLA_TRY(op.to, fields.string("to"));
+  VLA_TRY(op.from, parse_text(fields, "from"));
+  VLA_TRY(op.to, parse_text(fields, "to"));
   if (op.from.empty()) return fields.wrong("from", "text to look for");
   return TextOp(std::move(op));
 }
 
 Result<TextOp> parse_ensure_suffix(JsonFields& fields) {
   EnsureSuffixOp op;
-  VLA_TRY(op.suffix, fields.string("suffix"));
+  VLA_TRY(op.suffix, parse_text(fields, "suffix"));
   return TextOp(std::move(op));
 }
 

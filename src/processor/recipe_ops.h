@@ -14,11 +14,14 @@ Status parse_text_op(JsonFields& fields, int index, Recipe& recipe);
 Status parse_state_op(JsonFields& fields, int index, Recipe& recipe);
 Status parse_action_op(JsonFields& fields, int index, Recipe& recipe);
 
+/// Numbers of pixels, states and actions: far beyond any of them, and far from the end of float32.
+inline constexpr Range kPlain = {-1e9, 1e9};
+
 /// The fields of a clip, which pictures and states share.
 inline Result<ClipOp> parse_clip(JsonFields& fields) {
   ClipOp op;
-  VLA_TRY(op.low, fields.number("low"));
-  VLA_TRY(op.high, fields.number("high"));
+  VLA_TRY(op.low, fields.number("low", kPlain));
+  VLA_TRY(op.high, fields.number("high", kPlain));
   if (op.low > op.high) return fields.wrong("high", "a number that is not below low");
   return op;
 }

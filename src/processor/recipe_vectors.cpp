@@ -18,10 +18,9 @@ Result<NormalizeOp> parse_normalize(JsonFields& fields) {
     VLA_TRY(op.stats, fields.string("stats"));
   }
   if (!identity || fields.has("eps")) {
-    VLA_TRY(op.eps, fields.wide_number("eps"));
+    VLA_TRY(op.eps, fields.wide_number("eps", {0, 1}));
   }
   if (is_groot(op.kind) && op.eps != 0.0) return fields.wrong("eps", "0, since these kinds have none");
-  if (op.eps < 0.0) return fields.wrong("eps", "a number that is not negative");
   if (fields.has("feature")) {
     VLA_TRY(op.feature, fields.string("feature"));
   }
@@ -31,26 +30,25 @@ Result<NormalizeOp> parse_normalize(JsonFields& fields) {
 Result<ColumnAffineOp> parse_column_affine(JsonFields& fields) {
   ColumnAffineOp op;
   VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
-  VLA_TRY(op.scale, fields.wide_number("scale"));
-  VLA_TRY(op.shift, fields.wide_number("shift"));
+  VLA_TRY(op.scale, fields.wide_number("scale", kPlain));
+  VLA_TRY(op.shift, fields.wide_number("shift", kPlain));
   return op;
 }
 
 Result<HornAngleOp> parse_horn_angle(JsonFields& fields) {
   HornAngleOp op;
   VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
-  VLA_TRY(op.scale, fields.wide_number("scale"));
-  VLA_TRY(op.shift, fields.wide_number("shift"));
-  VLA_TRY(op.arm_length, fields.wide_number("arm_length"));
-  VLA_TRY(op.horn_radius, fields.wide_number("horn_radius"));
-  if (op.horn_radius <= 0.0) return fields.wrong("horn_radius", "a length above 0");
+  VLA_TRY(op.scale, fields.wide_number("scale", kPlain));
+  VLA_TRY(op.shift, fields.wide_number("shift", kPlain));
+  VLA_TRY(op.arm_length, fields.wide_number("arm_length", kPlain));
+  VLA_TRY(op.horn_radius, fields.wide_number("horn_radius", {1e-9, kPlain.high}));
   return op;
 }
 
 Result<BinsOp> parse_bins(JsonFields& fields) {
   BinsOp op;
-  VLA_TRY(op.low, fields.wide_number("low"));
-  VLA_TRY(op.high, fields.wide_number("high"));
+  VLA_TRY(op.low, fields.wide_number("low", kPlain));
+  VLA_TRY(op.high, fields.wide_number("high", kPlain));
   VLA_TRY(op.count, fields.integer("count", 1, kMaxVector));
   if (op.low >= op.high) return fields.wrong("high", "a number above low");
   return op;
@@ -65,7 +63,7 @@ Result<PadOp> parse_pad(JsonFields& fields) {
   PadOp op;
   VLA_TRY(op.size, fields.integer("size", 1, kMaxVector));
   if (fields.has("value")) {
-    VLA_TRY(op.value, fields.number("value"));
+    VLA_TRY(op.value, fields.number("value", kPlain));
   }
   return op;
 }
@@ -73,9 +71,9 @@ Result<PadOp> parse_pad(JsonFields& fields) {
 Result<ThresholdOp> parse_threshold(JsonFields& fields) {
   ThresholdOp op;
   VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
-  VLA_TRY(op.above, fields.number("above"));
-  VLA_TRY(op.then, fields.number("then"));
-  VLA_TRY(op.otherwise, fields.number("else"));
+  VLA_TRY(op.above, fields.number("above", kPlain));
+  VLA_TRY(op.then, fields.number("then", kPlain));
+  VLA_TRY(op.otherwise, fields.number("else", kPlain));
   return op;
 }
 

@@ -15,13 +15,13 @@ constexpr std::string_view kInstruction = "{instruction}";
 constexpr std::string_view kNumber = "{i}";
 constexpr std::string_view kState = "{state}";
 
-int occurrences(std::string_view text, std::string_view part) {
-  int count = 0;
+}  // namespace
+
+std::size_t occurrences(std::string_view text, std::string_view part) {
+  std::size_t count = 0;
   for (std::size_t at = text.find(part); at != std::string_view::npos; at = text.find(part, at + part.size())) ++count;
   return count;
 }
-
-}  // namespace
 
 std::string_view strip(std::string_view text) {
   while (!text.empty()) {
@@ -48,13 +48,13 @@ std::string replace_all(std::string_view text, std::string_view from, std::strin
 }
 
 bool is_template(std::string_view text) {
-  const int n_state = occurrences(text, kState);
+  const std::size_t n_state = occurrences(text, kState);
   return occurrences(text, kInstruction) == 1 && n_state <= 1 && occurrences(text, "{") == 1 + n_state &&
          occurrences(text, "}") == 1 + n_state;
 }
 
 bool is_numbered(std::string_view text) {
-  const int n_number = occurrences(text, kNumber);
+  const std::size_t n_number = occurrences(text, kNumber);
   return n_number <= 1 && occurrences(text, "{") == n_number && occurrences(text, "}") == n_number;
 }
 

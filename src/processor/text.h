@@ -14,6 +14,9 @@ namespace vla {
 /// that other definitions leave out are among it.
 std::string_view strip(std::string_view text);
 
+/// How often the non-empty `part` is found in `text` from left to right, without overlaps.
+std::size_t occurrences(std::string_view text, std::string_view part);
+
 /// Every occurrence of the non-empty `from` replaced, from left to right, as Python's str.replace does.
 std::string replace_all(std::string_view text, std::string_view from, std::string_view to);
 

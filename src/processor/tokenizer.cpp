@@ -87,13 +87,10 @@ Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::strin
 
 Status Tokenizer::read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens) {
   VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
-  VLA_TRY(prefix_, keys.integers("tokenizer.prefix_ids"));
+  VLA_TRY(prefix_, keys.integers("tokenizer.prefix_ids", {0, tokens.size() - 1.0}));
   if (prefix_.size() > kMaxPrefix)
     return Error{Code::bad_bundle, "tokenizer.prefix_ids", "at most " + std::to_string(kMaxPrefix) + " ids",
                  std::to_string(prefix_.size())};
-  for (const std::int32_t id : prefix_)
-    if (id < 0 || static_cast<std::size_t>(id) >= tokens.size())
-      return Error{Code::bad_bundle, "tokenizer.prefix_ids", "ids of tokenizer.tokens", std::to_string(id)};
   VLA_TRY(model_, ByteFallbackBpe::create(tokens, merges));
   return {};
 }

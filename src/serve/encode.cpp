@@ -29,7 +29,7 @@ std::string utf8(std::string bytes) {
 
 void describe_views(const Engine& engine, v1::Description& out) {
   const auto aliases = texts(engine, "observation.view_aliases");
-  const auto optional = engine.bundle().keys().integers("observation.view_optional");
+  const auto optional = engine.bundle().keys().integers("observation.view_optional", kFlag);
   const Processor& processor = engine.processor();
   for (std::size_t i = 0; i < processor.views().names().size(); ++i) {
     v1::ViewSpec& view = *out.add_views();
@@ -65,7 +65,7 @@ void describe_actions(const Engine& engine, v1::Description& out) {
     dimension.set_unit(units[i]);
   }
   out.set_horizon(static_cast<std::uint32_t>(engine.n_row()));
-  out.set_rate_hz(*engine.bundle().keys().number("action.rate_hz"));
+  out.set_rate_hz(*engine.bundle().keys().number("action.rate_hz", kRateHz));
 }
 
 void describe_bundle(const Engine& engine, v1::Bundle& out) {

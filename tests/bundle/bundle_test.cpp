@@ -5,6 +5,7 @@
 #include <doctest/doctest.h>
 
 #include <cstring>
+#include <ctime>
 #include <limits>
 #include <random>
 
@@ -49,7 +50,7 @@ TEST_CASE("a sound bundle gives back its keys and tensors") {
   const std::string bytes = small_bundle().bytes();
   const auto bundle = parse(bytes);
   REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
-  CHECK(*bundle->keys().integer("lm.d_model") == 4);
+  CHECK(*bundle->keys().integer("lm.d_model", kAnySize) == 4);
   CHECK(bundle->keys().strings("lm.names")->at(1) == "b");
   REQUIRE(bundle->find("lm.weight") != nullptr);
   CHECK(bundle->find("lm.weight")->shape == std::vector<std::int64_t>{4, 2});
@@ -174,4 +175,32 @@ TEST_CASE("a size out of range is a problem and never a loop without end") {
   ParamList list(keys, nullptr);
   CHECK((Scope(list, "") / "lm").n_layer("n_layer") == 1);
   CHECK_FALSE(list.report("smolvla", {}).ok());
+}
+
+TEST_CASE("a number out of its range names the range, and one of another type both types") {
+  Keys keys;
+  keys.set("lm.norm_eps", 1e30);
+  keys.set("lm.n_layer", std::int64_t{1} << 40);
+  keys.set("lm.sections", std::vector<std::int64_t>{1, -1});
+  CHECK(keys.number("lm.norm_eps", kNormEps).error().message() == "lm.norm_eps: expected 1e-12 to 0.01, found 1e+30");
+  CHECK(keys.integer("lm.n_layer", {1, 512}).error().message() == "lm.n_layer: expected 1 to 512, found 1099511627776");
+  CHECK(contains(keys.integers("lm.sections", kAnySize).error().message(), "expected 0 to 2147483647, found -1"));
+  keys.set("lm.norm_eps", std::numeric_limits<double>::quiet_NaN());
+  CHECK(contains(keys.number("lm.norm_eps", kNormEps).error().message(), "found nan"));
+}
+
+TEST_CASE("a report of very many problems names the first fifty and counts the others, in no quadratic time") {
+  EditableBundle bundle = small_bundle();
+  for (int i = 0; i < 100000; ++i) bundle.tensors.push_back({"unknown." + std::to_string(i), DType::f32, {1}, "abcd"});
+  const std::string bytes = bundle.bytes();
+  const auto parsed = parse(bytes);
+  REQUIRE_MESSAGE(parsed.ok(), (parsed ? "" : parsed.error().message()));
+  const std::clock_t start = std::clock();
+  ParamList list(parsed->keys(), &*parsed);
+  for (int i = 0; i < 50000; ++i) list.declare("unknown." + std::to_string(2 * i), Storage::vector, {1});
+  CHECK(std::clock() - start < 2 * CLOCKS_PER_SEC);
+  const std::string message = list.report("smolvla", [](const std::string&) { return false; }).error().message();
+  CHECK(contains(message, "50002 problems"));
+  CHECK(contains(message, "and 49952 more"));
+  CHECK(message.size() < 10000);
 }

@@ -46,6 +46,16 @@ void check_observation_refused(const Observation& bad, const Noise& noise, Code 
   CHECK(engine->act(golden.observation, golden.noise).ok());
 }
 
+/// Values that no key of this type may have.
+std::vector<Value> absurd(const Value& value) {
+  constexpr std::int64_t kLargest = std::numeric_limits<std::int64_t>::max();
+  if (std::holds_alternative<std::int64_t>(value)) return {std::int64_t{-1}, std::int64_t{INT32_MAX}, kLargest};
+  if (std::holds_alternative<std::vector<std::int64_t>>(value))
+    return {std::vector<std::int64_t>{-1}, std::vector<std::int64_t>{INT32_MAX}};
+  if (std::holds_alternative<double>(value)) return {-1e30, -1000.0, 1e30, std::nan("")};
+  return {};
+}
+
 }  // namespace
 
 TEST_CASE("a bundle of an architecture that this build does not know is unsupported") {
@@ -107,6 +117,26 @@ TEST_CASE("sizes that do not go together are refused before memory is taken") {
     bundle.set(key, Value(value));
     CHECK_FALSE(Engine::load(bundle.write("changed.gguf"), {.n_thread = 1}).ok());
   }
+}
+
+TEST_CASE("every number of every architecture has a range, and one beyond it is refused by its key") {
+  std::string arch;
+  int n_checked = 0;
+  for (const std::string& path : golden_paths()) {  // those of one architecture follow each other
+    const EditableBundle sound = EditableBundle::read(GoldenCase::read(path).bundle());
+    if (arch == *sound.keys.string("vla.arch")) continue;
+    arch = *sound.keys.string("vla.arch");
+    for (const auto& [key, value] : sound.keys.all())
+      for (const Value& wrong : absurd(value)) {
+        EditableBundle bundle = sound;
+        bundle.set(key, wrong);
+        const auto engine = Engine::load(bundle.write("changed.gguf"), {.n_thread = 1, .dry = true});
+        CHECK_MESSAGE(!engine.ok(), arch << " " << key << " value " << n_checked);
+        if (!engine) CHECK_MESSAGE(engine.error().message().find(key) != std::string::npos, engine.error().message());
+        ++n_checked;
+      }
+  }
+  CHECK(n_checked > 500);
 }
 
 TEST_CASE("statistics that the recipe does not read are an unused tensor") {

@@ -280,7 +280,7 @@ TEST_CASE("features that do not fit each other are refused") {
   CHECK(contains(refused_with("observation.views", std::vector<std::string>{"a", "", "b"}), "observation.views"));
   CHECK(contains(refused_with("observation.view_aliases", std::vector<std::string>{"a"}), "3 entries"));
   CHECK(contains(refused_with("observation.view_optional", std::vector<std::int64_t>{0}), "3 entries"));
-  CHECK(contains(refused_with("observation.view_optional", std::vector<std::int64_t>{0, 0, 2}), "0 or 1"));
+  CHECK(contains(refused_with("observation.view_optional", std::vector<std::int64_t>{0, 0, 2}), "0 to 1"));
   CHECK(contains(refused_with("observation.min_views", std::int64_t{0}), "1 to 3"));
   CHECK(contains(refused_with("observation.min_views", std::int64_t{4}), "1 to 3"));
   CHECK(contains(refused_with("observation.state_dims", std::vector<std::int64_t>{2, 1}), "observation.state_dims"));
@@ -339,4 +339,35 @@ TEST_CASE("a text that is cut at its start keeps what stands in front of every t
     const auto all = *Tokenizer::create(tokenizer_keys("gemma"), 4096)->encode(seen.text + "\n");
     CHECK(inputs->tokens[1] == (std::string(side) == "right" ? all[1] : all[all.size() - 3]));
   }
+}
+
+TEST_CASE("a prompt that ops would blow up is refused before it is made") {
+  EditableBundle bundle = sample();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  const std::string thousand(1000, 'a');
+  const Json replace = {{"op", "replace"}, {"from", "a"}, {"to", thousand}};
+  for (int i = 0; i < 4; ++i) recipe["text"].insert(recipe["text"].begin(), replace);
+  bundle.set("processor.recipe", recipe.dump());
+  Observation seen = observation();
+  const Processor processor = make(bundle);
+  seen.text = "a";
+  CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "bytes, found 1000000000"));
+  seen.text = "pick up";
+  CHECK(processor.encode(seen).ok());
+}
+
+TEST_CASE("of very many names a message lists the first fifty") {
+  EditableBundle bundle = sample();
+  std::vector<std::string> names, units;
+  for (int i = 0; i < 20000; ++i) names.push_back("state.number_" + std::to_string(i)), units.emplace_back();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["state"] = {{{"op", "pad"}, {"size", 20000}}};
+  bundle.set("processor.recipe", recipe.dump());
+  for (const char* key : {"observation.states", "observation.state_names"}) bundle.set(key, names);
+  bundle.set("observation.state_units", units);
+  bundle.set("observation.state_dims", std::vector<std::int64_t>(names.size(), 1));
+  bundle.set("policy.d_state", std::int64_t{20000});
+  const std::string message = refusal(make(bundle).encode(observation()), Code::bad_observation);
+  CHECK(contains(message, "state.number_49 and 19950 more"));
+  CHECK(message.size() < 4096);
 }

@@ -55,6 +55,15 @@ TEST_CASE("the recipe of the document is read op by op") {
   CHECK(std::get<NormalizeOp>(recipe->action.at(1)).kind == NormKind::min_max);
 }
 
+TEST_CASE("the ops of a list, and the text in them, are bounded") {
+  Json recipe = sample();
+  for (int i = 0; i < 64; ++i) recipe["text"].insert(recipe["text"].begin(), {{"op", "strip"}});
+  CHECK(contains(refused(recipe), "processor.recipe.text: expected at most 64 ops, found 66"));
+  const std::string longest(4096, 'x');
+  CHECK(parse_recipe((recipe = sample(), recipe["text"][0]["suffix"] = longest, recipe.dump())).ok());
+  CHECK(contains(refused_at("/text/0/suffix", longest + "x"), "at most 4096 bytes of text"));
+}
+
 TEST_CASE("every field that is missing is refused by its place") {
   const Json whole = sample();
   int removed = 0;
@@ -224,7 +233,7 @@ TEST_CASE("values that have no meaning to a robot's op are refused") {
        {Json(3), Json{1, 1}, Json{-1}, Json{0.5}, Json{"a"}, Json{65536}, Json{18446744073709551615u}})
     CHECK(contains(refused_robot("/state/0/columns", columns), "processor.recipe.state[0].columns"));
   CHECK(contains(refused_robot("/state/0/scale", "1"), "processor.recipe.state[0].scale"));
-  CHECK(contains(refused_robot("/state/1/horn_radius", 0.0), "a length above 0"));
+  CHECK(contains(refused_robot("/state/1/horn_radius", 0.0), "a number from 1e-09"));
   CHECK(contains(refused_robot("/state/3/high", -1.0), "processor.recipe.state[3].high"));
   CHECK(contains(refused_robot("/state/3/count", 0), "processor.recipe.state[3].count"));
   CHECK(contains(refused_robot("/image/1/low", 2.0), "processor.recipe.image[1].high"));

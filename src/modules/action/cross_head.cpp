@@ -31,11 +31,13 @@ Tensor CrossBlock::forward(Graph& g, Tensor x, Tensor time, const KeyValue& seen
   return mlp_.added_to(g, x, add(g, ffn_norm_(g, x), time));
 }
 
-CrossHead::CrossHead(const Scope& s, int d_model) : path_(s.path()), norm_(s / "norm", d_model, s.number("norm_eps")) {
+CrossHead::CrossHead(const Scope& s, int d_model)
+    : path_(s.path()), norm_(s / "norm", d_model, s.number("norm_eps", kNormEps)) {
   const int n_layer = s.n_layer("n_layer"), n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff");
   s.require(d_model % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_model),
             std::to_string(n_head));
-  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model, d_ff, n_head, s.number("norm_eps"));
+  for (int i = 0; i < n_layer; ++i)
+    blocks_.emplace_back(s / "blk" / i, d_model, d_ff, n_head, s.number("norm_eps", kNormEps));
 }
 
 void CrossHead::keep(Graph& g, Tensor rows, Cache& cache) const {

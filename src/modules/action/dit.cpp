@@ -37,13 +37,13 @@ Dit::Dit(const Scope& s, int d_context)
     : d_model_(s.dim("d_model")),
       d_out_(s.dim("d_out")),
       text_every_(s.dim("text_every", 512)),
-      out_norm_(s / "out_ada", d_model_, s.number("out_eps"), AdaptiveLayerNorm::Order::shift_scale),
+      out_norm_(s / "out_ada", d_model_, s.number("out_eps", kNormEps), AdaptiveLayerNorm::Order::shift_scale),
       out_(s / "out", d_model_, d_out_, Bias::yes) {
   const int n_layer = s.n_layer("n_layer"), n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff");
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
   for (int i = 0; i < n_layer; ++i)
     blocks_.emplace_back(s / "blk" / i, d_model_, i % 2 == 0 ? d_context : d_model_, n_head, d_ff,
-                         s.number("norm_eps"));
+                         s.number("norm_eps", kNormEps));
 }
 
 Tensor Dit::modulations(Graph& g, Tensor time) const {

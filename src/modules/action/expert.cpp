@@ -45,12 +45,12 @@ Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
 }
 
 Expert::Expert(const Scope& s, const Decoder& lm)
-    : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps")) {
+    : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", d_model_, s.number("norm_eps", kNormEps)) {
   const std::vector<std::string> kinds = s.strings("layer_kinds");
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
-  const float eps = s.number("norm_eps");
+  const float eps = s.number("norm_eps", kNormEps);
   Heads heads = lm.heads();
-  heads.rope_base = s.number("rope_base");
+  heads.rope_base = s.number("rope_base", kRopeBase);
   s.require(static_cast<int>(kinds.size()) == lm.n_layer(), "layer_kinds",
             fmt::format("{} entries, one per language layer", lm.n_layer()), std::to_string(kinds.size()));
   for (int i = 0; i < std::min(lm.n_layer(), static_cast<int>(kinds.size())); ++i) {

@@ -60,14 +60,14 @@ Tensor GemmaExpertBlock::prefill(Graph& g, Tensor x, const KeyValue& past, Cache
 }
 
 GemmaExpert::GemmaExpert(const Scope& s, const Decoder& lm, ExpertNorm kind)
-    : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", kind, d_model_, s.number("norm_eps")) {
+    : lm_(lm), d_model_(s.dim("d_model")), norm_(s / "norm", kind, d_model_, s.number("norm_eps", kNormEps)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
   s.require(n_layer == lm.n_layer(), "n_layer", fmt::format("{}, as lm.n_layer", lm.n_layer()),
             std::to_string(n_layer));
   Heads heads = lm.heads();
-  heads.rope_base = s.number("rope_base");
+  heads.rope_base = s.number("rope_base", kRopeBase);
   for (int i = 0; i < lm.n_layer(); ++i)
-    blocks_.emplace_back(s / "blk" / i, kind, d_model_, d_ff, heads, s.number("norm_eps"));
+    blocks_.emplace_back(s / "blk" / i, kind, d_model_, d_ff, heads, s.number("norm_eps", kNormEps));
 }
 
 KeyValue GemmaExpert::past(const Cache& cache, std::size_t i) const {

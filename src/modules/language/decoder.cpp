@@ -25,11 +25,11 @@ KeyValue KeyValue::get(const Cache& cache, const std::string& path) {
 }
 
 Heads Heads::read(const Scope& s, RotaryAngle angle) {
-  const Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head"), s.number("rope_base"), angle};
+  const Heads heads = {s.dim("n_head", 1024), s.dim("n_head_kv", 1024), s.dim("d_head"),
+                       s.number("rope_base", kRopeBase), angle};
   s.require(heads.n_head % heads.n_head_kv == 0, "n_head_kv", fmt::format("a divisor of n_head {}", heads.n_head),
             std::to_string(heads.n_head_kv));
   s.require(heads.d_head % 2 == 0, "d_head", "an even number, for the rotary pairs", std::to_string(heads.d_head));
-  s.require(heads.rope_base > 0, "rope_base", "a positive number", std::to_string(heads.rope_base));
   return heads;
 }
 
@@ -89,7 +89,7 @@ Decoder::Decoder(const Scope& s, DecoderFamily family)
       heads_(Heads::read(s, family.rope_angle)),
       token_embd_(s / "token_embd", d_model_, s.dim("n_vocab", 1 << 24)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
-  const float eps = s.number("norm_eps");
+  const float eps = s.number("norm_eps", kNormEps);
   for (int i = 0; i + 1 < n_layer; ++i)
     blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, family.activation, eps);
   const Scope last = s / "blk" / (n_layer - 1);

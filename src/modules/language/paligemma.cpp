@@ -10,7 +10,7 @@ PaliGemma::PaliGemma(const Scope& s)
     : vision_(s / "vision"),
       lm_(s / "lm", kGemma),
       projector_(s / "projector", vision_.d_model(), lm_.d_model(), Bias::yes),
-      text_scale_(s.number("text_scale")) {}
+      text_scale_(s.number("text_scale", kTokenScale)) {}
 
 void PaliGemma::prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const {
   // Only embedding rows are scaled: Gemma was trained with sqrt(d_model) on them, and the projector without.

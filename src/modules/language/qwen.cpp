@@ -46,7 +46,7 @@ Qwen::Qwen(const Scope& s, QwenKind kind)
       heads_(Heads::read(s, RotaryAngle::product)),
       token_embd_(s / "token_embd", d_model_, s.dim("n_vocab", 1 << 24)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
-  const float eps = s.number("norm_eps");
+  const float eps = s.number("norm_eps", kNormEps);
   for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, kind, d_model_, d_ff, heads_, eps);
   if (kind == QwenKind::qwen2) norm_.emplace(s / "norm", d_model_, eps);
 }

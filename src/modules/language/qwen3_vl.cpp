@@ -32,7 +32,7 @@ Qwen3Vl::Qwen3Vl(const Scope& s)
       lm_(s / "lm", QwenKind::qwen3),
       connector_(s / "connector", PatchMerger::Norm::patch, vision_.d_model(), vision_.n_merged(), lm_.d_model(),
                  vision_.norm_eps()),
-      view_starts_(s.integers("view_starts")) {
+      view_starts_(s.integers("view_starts", kTokenIndex)) {
   for (int k = 0; k < vision_.n_deepstack(); ++k)
     deepstack_.emplace_back(s / "deepstack" / k, PatchMerger::Norm::token, vision_.d_model(), vision_.n_merged(),
                             lm_.d_model(), vision_.norm_eps());
@@ -40,7 +40,7 @@ Qwen3Vl::Qwen3Vl(const Scope& s)
       .require(vision_.n_deepstack() <= lm_.n_layer(), "deepstack_layers",
                fmt::format("at most lm.n_layer {}", lm_.n_layer()), std::to_string(vision_.n_deepstack()));
 
-  const std::vector<int> sections = (s / "lm").integers("rope_sections");
+  const std::vector<int> sections = (s / "lm").integers("rope_sections", {0, 1 << 16});
   const int n_pair = lm_.heads().d_head / 2;
   const bool three =
       sections.size() == 3 && std::all_of(sections.begin(), sections.end(), [&](int n) { return n <= n_pair; });
@@ -53,8 +53,8 @@ Qwen3Vl::Qwen3Vl(const Scope& s)
   int end = 1;  // text sees text: the first token is no picture's
   bool apart = static_cast<int>(view_starts_.size()) == s.dim("n_slot", 32);
   for (const int start : view_starts_) {
-    apart = apart && start >= end && start < 1 << 16;
-    end = std::min(start, 1 << 16) + n_view_token();
+    apart = apart && start >= end;
+    end = start + n_view_token();
   }
   s.require(apart, "view_starts",
             fmt::format("n_slot places of {} tokens each, behind the first token", n_view_token()),

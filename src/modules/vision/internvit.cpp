@@ -20,7 +20,7 @@ InternVit::InternVit(const Scope& s)
   const int n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff"), n_layer = s.n_layer("n_layer");
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
   for (int i = 0; i < n_layer; ++i)
-    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps"), kInternEncoder);
+    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps), kInternEncoder);
 }
 
 Status InternVit::check(int width, int height) const {

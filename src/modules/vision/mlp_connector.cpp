@@ -12,7 +12,7 @@ MlpConnector::MlpConnector(const Scope& s, int d_vision, int d_model, int n_side
     : Module(s),
       factor_(s.dim("factor", 64)),
       n_token_((n_side / factor_) * (n_side / factor_)),
-      norm_(s / "norm", d_vision * factor_ * factor_, s.number("norm_eps")),
+      norm_(s / "norm", d_vision * factor_ * factor_, s.number("norm_eps", kNormEps)),
       up_(s / "up", d_vision * factor_ * factor_, d_model, Bias::yes),
       down_(s / "down", d_model, d_model, Bias::yes) {
   s.require(n_side % factor_ == 0, "factor", fmt::format("a divisor of the {0} x {0} patches of a view", n_side),

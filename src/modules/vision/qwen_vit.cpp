@@ -22,9 +22,9 @@ QwenVit::QwenVit(const Scope& s)
       n_row_(height_ / patch_size_),
       n_column_(width_ / patch_size_),
       n_side_(s.dim("n_position_side", 1024)),
-      norm_eps_(s.number("norm_eps")),
-      rope_base_(s.number("rope_base")),
-      deepstack_layers_(s.integers("deepstack_layers")),
+      norm_eps_(s.number("norm_eps", kNormEps)),
+      rope_base_(s.number("rope_base", kRopeBase)),
+      deepstack_layers_(s.integers("deepstack_layers", {0, 511})),
       patch_embed_(s / "patch_embed", 3 * patch_size_ * patch_size_, d_model_, Bias::yes),
       patch_embed_next_(s / "patch_embed_next", 3 * patch_size_ * patch_size_, d_model_, Bias::no),
       position_(s / "position", d_model_, n_side_ * n_side_) {
@@ -32,7 +32,6 @@ QwenVit::QwenVit(const Scope& s)
   s.require(d_model_ % (4 * n_head_) == 0, "n_head",
             fmt::format("a divisor of d_model {} that leaves heads of a multiple of 4", d_model_),
             std::to_string(n_head_));
-  s.require(rope_base_ > 0, "rope_base", "a positive number", std::to_string(rope_base_));
   s.require(width_ % unit == 0, "image_width", fmt::format("a multiple of patch_size * merge {}", unit),
             std::to_string(width_));
   s.require(height_ % unit == 0, "image_height", fmt::format("a multiple of patch_size * merge {}", unit),

@@ -16,10 +16,11 @@ Siglip::Siglip(const Scope& s)
       position_rule_(s.string("position_rule")),
       patch_embed_(s / "patch_embed", patch_size_, d_model_),
       position_(s / "position", d_model_, n_position()),
-      post_norm_(s / "post_norm", d_model_, s.number("norm_eps")) {
+      post_norm_(s / "post_norm", d_model_, s.number("norm_eps", kNormEps)) {
   const int n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff"), n_layer = s.n_layer("n_layer");
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
-  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps"));
+  for (int i = 0; i < n_layer; ++i)
+    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps));
 }
 
 Status Siglip::check(int width, int height) const {
