@@ -33,7 +33,7 @@ from goldens import pi, recorder  # noqa: E402
 from goldens.cases import smooth_frame  # noqa: E402
 from goldens.draw import Generator  # noqa: E402
 from goldens.train_tokenizer import TASKS  # noqa: E402
-from vla_cpp.convert.archs._openpi import VARIANTS  # noqa: E402
+from vla_cpp.convert.archs.pi0.layouts import VARIANTS  # noqa: E402
 
 LM, EXPERT = pi.gemma(40, 3, 8, 1, 8, 72), pi.gemma(32, 3, 8, 1, 8, 48)
 VISION = pi.vision(36, 2, 3, 52)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from manifest_test import vla
-from vla_cpp.convert.archs import _evo1_names, evo1
-from vla_cpp.convert.archs._evo1_sizes import Sizes, read_chat_backbone, read_hf_backbone
+from vla_cpp.convert.archs.evo1 import mapping
+from vla_cpp.convert.archs.evo1.mapping import Sizes, read_chat_backbone, read_hf_backbone
 from vla_cpp.convert.errors import Problems
 
 TEXT = {
@@ -84,11 +84,11 @@ def published(request):
     problems = Problems("published")
     read(config, sizes, problems)
     problems.raise_any()
-    return sizes, getattr(_evo1_names, names)
+    return sizes, getattr(mapping, names)
 
 
 def test_the_published_configs_ask_for_the_published_numbers(published):
-    rows = _evo1_names.weights(*published)
+    rows = mapping.weights(*published)
     count = {}
     for row in rows:
         part = row.target.split(".")[0]
@@ -109,12 +109,12 @@ def manifest():
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares(published, manifest):
-    ours = {row.target: (list(row.shape), row.kind) for row in _evo1_names.weights(*published)}
+    ours = {row.target: (list(row.shape), row.kind) for row in mapping.weights(*published)}
     assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(published, manifest):
-    ours = {key.name: key.value for key in evo1._network_keys(published[0])}
+    ours = {key.name: key.value for key in mapping.network_keys(published[0])}
     chosen = {"policy.pad_token", "policy.view_starts"}  # of the tokenizer
     for name, value in manifest["config"].items():
         if name not in chosen:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from tiny import write_json
-from vla_cpp.convert.archs import Options, smolvla
-from vla_cpp.convert.archs._smolvla_sizes import read_sizes
+from vla_cpp.convert.archs import Options
+from vla_cpp.convert.archs.smolvla import mapping
+from vla_cpp.convert.archs.smolvla.config import read_sizes
 from vla_cpp.convert.checkpoint import Checkpoint
 from vla_cpp.convert.errors import Problems
 
@@ -68,7 +69,7 @@ def sizes(tmp_path):
 
 
 def test_the_published_configs_ask_for_the_published_tensors(sizes):
-    weights, dropped = smolvla._weights(sizes), smolvla._dropped(sizes)
+    weights, dropped = mapping.weights(sizes), mapping.dropped(sizes)
     assert len(weights) + len(dropped) == 500
     assert sum(int(np.prod(row.stored)) for row in [*weights, *dropped]) == 450_046_176
     assert len({row.source for row in [*weights, *dropped]}) == 500
@@ -91,18 +92,18 @@ def manifest():
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes, manifest):
-    ours = {row.target: (list(row.shape), row.kind) for row in smolvla._weights(sizes)}
+    ours = {row.target: (list(row.shape), row.kind) for row in mapping.weights(sizes)}
     theirs = {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
     assert ours == theirs
 
 
 def test_every_config_key_that_the_runtime_reads_is_written(sizes, manifest):
-    ours = {key.name for key in smolvla._network_keys(sizes)}
+    ours = {key.name for key in mapping.network_keys(sizes)}
     assert set(manifest["config"]) - ours == set()
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
-    ours = {key.name: key.value for key in smolvla._network_keys(sizes)}
+    ours = {key.name: key.value for key in mapping.network_keys(sizes)}
     for name, value in manifest["config"].items():
         if name != "vision.position_rule":  # the policy's own precision decides it
             assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tiny_pi import HEAD, LM, TinyOpenpi, TinyPi
-from vla_cpp.convert.archs._openpi import VARIANTS
+from vla_cpp.convert.archs.pi0.layouts import VARIANTS
 from vla_cpp.convert.errors import Code
 
 GRIPPERS = [6, 13]

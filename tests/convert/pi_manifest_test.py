@@ -8,8 +8,9 @@ import subprocess
 import pytest
 
 from manifest_test import vla
-from vla_cpp.convert.archs import _pi, pi0, pi05
-from vla_cpp.convert.archs._pi_sizes import network_keys, read_towers
+from vla_cpp.convert.archs import pi0, pi05
+from vla_cpp.convert.archs.pi0 import mapping
+from vla_cpp.convert.archs.pi0.mapping import network_keys, read_towers
 from vla_cpp.convert.checkpoint import Checkpoint
 from vla_cpp.convert.errors import Problems
 from vla_cpp.convert.section import Section
@@ -42,7 +43,7 @@ def manifest(family):
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares(family, sizes, manifest, tmp_path):
     checkpoint = Checkpoint("published", str(tmp_path), "", {}, {}, {}, {}, None)
-    ours = {row.target: (list(row.shape), row.kind) for row in _pi._weights(family, sizes, checkpoint)}
+    ours = {row.target: (list(row.shape), row.kind) for row in mapping.weights(family, sizes, checkpoint)}
     assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
 
 

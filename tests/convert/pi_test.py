@@ -24,7 +24,8 @@ from tiny_pi import (
     VISION,
     TinyPi,
 )
-from vla_cpp.convert.archs import _pi, _pi_names, _pi_sizes, pi0, pi05
+from vla_cpp.convert.archs import pi0, pi05
+from vla_cpp.convert.archs.pi0 import mapping
 from vla_cpp.convert.checkpoint import Checkpoint
 from vla_cpp.convert.dtypes import f32_to_bf16
 from vla_cpp.convert.errors import Problems
@@ -275,16 +276,16 @@ def test_the_published_size_asks_for_the_published_tensors(tmp_path, family, tot
     checkpoint = Checkpoint("published", str(tmp_path), "", {}, {}, {}, {}, None)
     problems = Problems("published")
     policy = Section("config.json", {}, {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}, problems)
-    sizes = _pi_sizes.read_towers(policy, checkpoint, problems)
+    sizes = mapping.read_towers(policy, checkpoint, problems)
     problems.raise_any()
     sizes.image_size, sizes.d_state, sizes.d_action = 224, 32, 32
     unused = ("gemma_expert.lm_head", "state_proj") if family is pi05.FAMILY else ("gemma_expert.lm_head",)
     dropped = [
         row
-        for row in _pi._dropped(family, sizes, checkpoint)
+        for row in mapping.dropped(family, sizes, checkpoint)
         if not any(part in row.source for part in unused) and (family is pi0.FAMILY or EXPERT not in row.source)
     ]
-    rows = [*_pi._weights(family, sizes, checkpoint), *dropped]
+    rows = [*mapping.weights(family, sizes, checkpoint), *dropped]
     assert len({row.source for row in rows}) == len(rows) == count
     assert sum(int(np.prod(row.stored)) for row in rows) == total
 
@@ -293,4 +294,4 @@ def test_every_name_of_today_is_its_own_canonical_name():
     for kind in ("pi0", "pi05"):
         family = pi0.FAMILY if kind == "pi0" else pi05.FAMILY
         for name in TinyPi(kind).tensors:
-            assert _pi_names.canonical(name, family.time_mlp, family.other_time_mlp) == name
+            assert mapping.canonical(name, family.time_mlp, family.other_time_mlp) == name

@@ -23,9 +23,10 @@ def problems(root):
     found, models = [], root / "docs/models.md"
     rows = models.read_text(encoding="utf-8") if models.is_file() else ""
     for name in registered(root):
-        for path in (f"src/policies/{name}.cpp", f"python/vla_cpp/convert/archs/{name}.py"):
-            if not (root / path).is_file():
-                found.append(f"{name}: missing {path}")
+        mapping = f"python/vla_cpp/convert/archs/{name}"
+        for paths in ((f"src/policies/{name}.cpp",), (f"{mapping}/__init__.py", f"{mapping}.py")):
+            if not any((root / path).is_file() for path in paths):
+                found.append(f"{name}: missing {paths[0]}")
         if not list((root / "tests/golden" / name).glob("*/expected.gguf")):
             found.append(f"{name}: missing a case with expected.gguf under tests/golden/{name}/")
         if not re.search(rf"^\|\s*`{name}`\s*\|", rows, re.M):

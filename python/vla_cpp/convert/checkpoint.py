@@ -13,7 +13,14 @@ import numpy as np
 
 from .dtypes import STATISTICS, to_f32
 from .errors import Code, ConvertError, Problems, refuse
-from .files import BACKBONE_PATTERNS, HUB_PATTERNS, download, is_hub_id, plain_name, read_json
+from .files import (
+    BACKBONE_PATTERNS,
+    HUB_PATTERNS,
+    download,
+    is_hub_id,
+    plain_name,
+    read_json,
+)
 from .safetensors_file import Entry, read_safetensors
 from .torch_file import read_torch
 

@@ -16,7 +16,14 @@ import numpy as np
 from .checkpoint import Checkpoint
 from .errors import Code, Problems
 from .files import member, plain_name
-from .normalization import Context, Found, Normalization, choose, from_file, from_weights
+from .normalization import (
+    Context,
+    Found,
+    Normalization,
+    choose,
+    from_file,
+    from_weights,
+)
 
 STATE, ACTION = "observation.state", "action"
 MAX_TOKENS = 1 << 16  # far above any instruction

@@ -11,7 +11,12 @@ from __future__ import annotations
 import os
 from typing import List, NamedTuple, Tuple
 
-from . import tokenizer_byte_fallback, tokenizer_byte_level, tokenizer_sentencepiece, tokenizer_vocab_files
+from . import (
+    tokenizer_byte_fallback,
+    tokenizer_byte_level,
+    tokenizer_sentencepiece,
+    tokenizer_vocab_files,
+)
 from .bundle import Key
 from .errors import Code, Problems, refuse
 from .files import member, read_json

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""One module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`."""
+"""One package or module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`."""
 
 from __future__ import annotations
 
@@ -73,9 +73,13 @@ class Plan:
 
 
 def names() -> List[str]:
-    """Packages, and modules with a leading underscore, are parts of an architecture's."""
-    modules = [module for module in pkgutil.iter_modules(__path__) if not module.ispkg]
-    return sorted(module.name for module in modules if not module.name.startswith("_"))
+    """What has a function `plan`; a package without one holds parts of several architectures."""
+    found = (module.name for module in pkgutil.iter_modules(__path__))
+    return sorted(name for name in found if callable(getattr(_module(name), "plan", None)))
+
+
+def _module(name):
+    return importlib.import_module("." + name, __name__)
 
 
 # Types of LeRobot whose policies are read in another layout.
@@ -87,7 +91,7 @@ def load(name):
     if name not in names():
         hint = OTHER_LAYOUTS.get(str(name), "")
         raise refuse("config.json: type", "one of " + ", ".join(names()), str(name), hint, Code.UNSUPPORTED)
-    return importlib.import_module("." + name, __name__)
+    return _module(name)
 
 
 # Options that only some layouts leave open, with what the other layouts do instead.

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """π0.5: as π0, but the state stands in the prompt in words, and time enters the expert through its norms.
 
-Reference: lerobot src/lerobot/policies/pi05 and openpi src/openpi/models_pytorch; what π0 has too stands in _pi.py.
+Reference: lerobot src/lerobot/policies/pi05 and openpi src/openpi/models_pytorch; what π0 has too stands in pi0/.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 from ..checkpoint import Checkpoint
 from ..errors import Problems
 from . import Options, Plan
-from ._openpi import variants_of
-from ._pi import make_plan
-from ._pi_source import Family
+from .pi0 import make_plan
+from .pi0.layouts import variants_of
+from .pi0.mapping import Family
 
 FAMILY = Family(
     arch="pi05",

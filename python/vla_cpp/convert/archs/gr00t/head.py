@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Dict, List
 
 from ...files import member
+from ...layers import linear, norm
 from ...section import Fixed, Section
 from .. import MATRIX, TABLE, VECTOR, Weight
-from .._rows import linear, norm
 from .sizes import MAX_LAYERS, Sizes
 
 HEAD = "action_head."

@@ -7,9 +7,9 @@ from __future__ import annotations
 from typing import Dict, List
 
 from ...files import member
+from ...layers import gated_block, vector
 from ...section import Fixed, Section
 from .. import TABLE, Weight
-from .._rows import gated_block, vector
 from .sizes import MAX_LAYERS, Sizes
 
 TEXT_FIXED: Fixed = {"hidden_act": ("silu", "silu"), "attention_bias": (False, False)}

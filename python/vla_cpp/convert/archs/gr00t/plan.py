@@ -22,7 +22,14 @@ from .. import Options, Plan, Weight
 from . import head, language
 from .pictures import read_pictures
 from .prompt import text_ops
-from .robot import PROCESSOR, STATISTICS, choose, embodiment_index, processor_file, read_robot
+from .robot import (
+    PROCESSOR,
+    STATISTICS,
+    choose,
+    embodiment_index,
+    processor_file,
+    read_robot,
+)
 from .sizes import MAX_LAYERS, Sizes
 from .vectors import action_ops, feature_description, state_ops, statistics_of
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 import re
 from typing import List, NamedTuple, Sequence
 
+from ...ascii_bpe import Encoder, check_undivided, special_ids
 from ...bundle import Key
 from ...errors import Problems
 from ...tokenizer import TokenizerPlan
-from .._ascii_bpe import Encoder, check_undivided, special_ids
 from .sizes import WHERE, Sizes
 
 START, END = "<|im_start|>", "<|im_end|>"

@@ -11,13 +11,13 @@ import math
 import os
 from typing import Dict, List
 
+from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
 from ...files import member, read_json
+from ...layers import linear, norm, vector
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
 from .. import MATRIX, TABLE, VECTOR, Dropped, Weight
-from .._ascii_bpe import special_ids
-from .._rows import linear, norm, vector
 from . import language
 from . import prompt as prompts
 from .pictures import Area

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Dict, List
 
-from . import MATRIX, TABLE, VECTOR, Weight
+from .archs import MATRIX, TABLE, VECTOR, Weight
 
 
 def linear(target: str, source: str, d_out: int, d_in: int, bias: bool = False) -> List[Weight]:

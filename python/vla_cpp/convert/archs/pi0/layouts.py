@@ -1,6 +1,13 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""π0 and π0.5 as openpi's PyTorch code saves them: weights, and statistics under assets/. Everything else about a robot stands in
+"""The two layouts of π0 and π0.5.
+
+π0 and π0.5 as LeRobot saves them: config.json and the two processor pipelines.
+
+Reference: lerobot src/lerobot/policies/{pi0,pi05}/{configuration,processor,modeling}_*.py. An absent key means the default of the
+reference's own class, which is stated here beside the key.
+
+π0 and π0.5 as openpi's PyTorch code saves them: weights, and statistics under assets/. Everything else about a robot stands in
 openpi's own training configurations, so those with a published recipe stand here, by their names.
 
 Reference: openpi src/openpi/training/config.py, policies/{aloha,droid,libero}_policy.py, transforms.py, models/tokenizer.py.
@@ -14,24 +21,172 @@ from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
-from .. import recipe
-from ..bundle import Key
-from ..checkpoint import Checkpoint
-from ..errors import Problems
-from ..features import feature_keys
-from ..files import member, read_json
-from ..section import Section
-from . import Options
-from ._pi_lerobot import CLEAN, PROMPT, WORDS
-from ._pi_sizes import Sizes, check_image, read_towers
-from ._pi_source import Family, Source
+from ... import recipe
+from ...bundle import Key
+from ...checkpoint import Checkpoint
+from ...errors import Problems
+from ...features import feature_keys
+from ...files import member, read_json
+from ...lerobot import check_keys, read_views, vector_dim, view_keys
+from ...section import Section
+from .. import Options
+from .mapping import Family, Sizes, check_image, read_towers
+
+
+class Source(NamedTuple):
+    """What the layout of the checkpoint contributes: sizes, recipe, features, statistics."""
+
+    sizes: Sizes
+    processors: recipe.Processors  # empty for openpi, which has none
+    image: List[dict]
+    text: List[dict]  # without the last op
+    state: List[dict]
+    action: List[dict]
+    features: List[Key]
+    statistics: Dict[str, np.ndarray]
+    max_tokens: int
+
+
+# --- LeRobot's layout ------------------------------------------------------------------------------------------------------------------
+
+LEROBOT_CONFIG: Dict[str, object] = {
+    "paligemma_variant": "gemma_2b",
+    "action_expert_variant": "gemma_300m",
+    "dtype": "float32",
+    "chunk_size": 50,
+    "n_action_steps": 50,
+    "max_state_dim": 32,
+    "max_action_dim": 32,
+    "num_inference_steps": 10,
+    "min_period": 4e-3,
+    "max_period": 4.0,
+    "image_resolution": [224, 224],
+    "empty_cameras": 0,
+    "use_relative_actions": False,
+    "relative_exclude_joints": ["gripper"],
+    "action_feature_names": None,
+}
+LEROBOT_FIXED = {
+    "use_visual_memory": (False, "the runtime keeps no memory of frames"),
+    "use_proprioceptive_memory": (False, "the runtime keeps no memory of states"),
+}
+# Keys that no number of an action chunk depends on.
+LEROBOT_IGNORED = set(
+    """
+    tokenizer_max_length time_sampling_beta_alpha time_sampling_beta_beta time_sampling_scale time_sampling_offset
+    freeze_vision_encoder train_expert_only gradient_checkpointing rtc_training_max_delay
+    """.split()
+)
+STEPS: recipe.Steps = {
+    recipe.PRE: {
+        "pi0_new_line_processor": {},
+        "pi05_prepare_state_tokenizer_processor_step": {"max_state_dim": recipe.ANY, "task_key": ("task",)},
+        "relative_actions_processor": {"enabled": (True, False), "exclude_joints": recipe.ANY, "action_names": recipe.ANY},
+    },
+    recipe.POST: {"absolute_actions_processor": {"enabled": (True, False)}},
+}
+CLEAN = [{"op": "strip"}, {"op": "replace", "from": "_", "to": " "}, {"op": "replace", "from": "\n", "to": " "}]
+PROMPT = {"op": "template", "text": "Task: {instruction}, State: {state};\nAction: "}
+WORDS = {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}
+
+
+def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
+    policy = Section("config.json", checkpoint.config, LEROBOT_CONFIG, problems)
+    memory = {key for key in policy.values if key.startswith("memory_")}  # of the two kinds that LEROBOT_FIXED refuses
+    check_keys(policy, family.config_class, set(LEROBOT_CONFIG) | LEROBOT_IGNORED | memory, LEROBOT_FIXED)
+    sizes = read_towers(policy, checkpoint, problems)
+    check_image(policy, "image_resolution", sizes, policy.get("image_resolution"))
+    views, _ = read_views(policy, checkpoint)
+    _read_policy(family, policy, sizes)
+    problems.raise_any()
+    if checkpoint.processors is None:
+        problems.unsupported(
+            recipe.PRE,
+            "the pipelines of LeRobot, with statistics",
+            "none: a layout of before September 2025",
+            "load the policy with a current LeRobot and save it again",
+        )
+        problems.raise_any()
+    dims = {recipe.STATE: sizes.state_dim, recipe.ACTION: sizes.action_dim}
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
+    _check_pipelines(family, policy, processors)
+    features = [
+        *view_keys(checkpoint, views, processors, problems),
+        Key("observation.states", "string[]", [recipe.STATE]),
+        Key("observation.state_dims", "u32[]", [sizes.state_dim]),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+    ]
+    return Source(
+        sizes=sizes,
+        processors=processors,
+        image=[
+            recipe.letterbox(sizes.image_size, sizes.image_size, "center"),
+            {"op": "clip", "low": 0.0, "high": 1.0},
+            {"op": "affine", "scale": 2.0, "shift": -1.0},
+        ],
+        text=_text(processors),
+        state=_state(family, sizes, processors),
+        action=_action(sizes, processors),
+        features=features,
+        statistics=processors.statistics(),
+        max_tokens=processors.max_tokens,
+    )
+
+
+def _read_policy(family: Family, policy: Section, s: Sizes) -> None:
+    """A state or an action that the config does not list has the padded width (PI0Config.validate_features)."""
+    d_state, s.d_action = policy.count("max_state_dim"), policy.count("max_action_dim")
+    s.state_dim, s.action_dim = d_state, s.d_action
+    if recipe.STATE in (policy.get("input_features") or {}):
+        s.state_dim = vector_dim(policy, "input_features", recipe.STATE, "STATE")
+    if recipe.ACTION in (policy.get("output_features") or {}):
+        s.action_dim = vector_dim(policy, "output_features", recipe.ACTION, "ACTION")
+    s.d_state = d_state if family.state_token else 0
+    for key, padded, real in (("max_state_dim", d_state, s.state_dim), ("max_action_dim", s.d_action, s.action_dim)):
+        if real > padded and (family.state_token or key != "max_state_dim"):
+            policy.bad(key, "at least the feature's width {}".format(real))
+    s.horizon, s.n_step = policy.count("chunk_size"), policy.count("num_inference_steps")
+    if policy.count("n_action_steps") > s.horizon:
+        policy.bad("n_action_steps", "at most chunk_size {}".format(s.horizon), hint="the reference refuses it too")
+    s.min_period, s.max_period = policy.number("min_period"), policy.number("max_period")
+    if policy.get("dtype") not in ("float32", "bfloat16"):
+        policy.bad("dtype", "float32 or bfloat16", hint="the reference refuses it too", unsupported=True)
+
+
+def _check_pipelines(family: Family, policy: Section, processors: recipe.Processors) -> None:
+    wanted, found = ("pi0_new_line_processor", processors.newline) if family.state_token else (
+        "pi05_prepare_state_tokenizer_processor_step",
+        processors.state_words,
+    )
+    if not found or (processors.newline and processors.state_words):
+        policy.problems.add(recipe.PRE + ": steps", "{}, and not the other family's".format(wanted), "other steps")
+    if processors.relative != bool(policy.get("use_relative_actions")):
+        policy.bad("use_relative_actions", "{} as the pipelines have it".format(processors.relative))
+
+
+def _text(processors: recipe.Processors) -> List[dict]:
+    return [*CLEAN, PROMPT] if processors.state_words else [{"op": "ensure_suffix", "suffix": "\n"}]
+
+
+def _state(family: Family, s: Sizes, processors: recipe.Processors) -> List[dict]:
+    last = {"op": "pad", "size": s.d_state} if family.state_token else WORDS
+    return [*processors.state.op("normalize", recipe.STATE), last]
+
+
+def _action(s: Sizes, processors: recipe.Processors) -> List[dict]:
+    relative = [{"op": "add_state", "columns": list(processors.add_state)}] if processors.add_state else []
+    take = {"op": "take", "size": s.action_dim}
+    return [take, *processors.action.op("unnormalize", recipe.ACTION), *relative]
+
+
+# --- openpi's layout -------------------------------------------------------------------------------------------------------------------
 
 STATS_FILE = "norm_stats.json"
 SIDE = 224  # every configuration resizes to this (ModelTransformFactory)
 EPS = 1e-6
 NEWLINE = {"op": "ensure_suffix", "suffix": "\n"}
 # config.json, where openpi's converter from JAX wrote one. The defaults of models/pi0_config.py.
-CONFIG: Dict[str, object] = {
+OPENPI_CONFIG: Dict[str, object] = {
     "action_dim": 32,
     "paligemma_variant": "gemma_2b",
     "action_expert_variant": "gemma_300m",
@@ -133,10 +288,10 @@ def variants_of(arch: str) -> List[str]:
 def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
     variant = VARIANTS[options.variant]
     robot = variant.robot
-    policy = Section("config.json", checkpoint.config, dict(CONFIG, action_horizon=variant.horizon), problems)
+    policy = Section("config.json", checkpoint.config, dict(OPENPI_CONFIG, action_horizon=variant.horizon), problems)
     for key in sorted(set(policy.values) - set(policy.defaults)):
         policy.bad(key, "a key that openpi writes", unsupported=True)
-    sizes = _sizes(family, policy, checkpoint, variant, problems)
+    sizes = _openpi_sizes(family, policy, checkpoint, variant, problems)
     statistics = _statistics(family, checkpoint, variant, options.identity_stats, problems)
     problems.raise_any()
     kind = "openpi_mean_std" if family.state_token else "openpi_quantiles"
@@ -154,7 +309,7 @@ def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, proble
             *([{"op": "add_state", "columns": list(variant.relative)}] if variant.relative else []),
             *robot.encode,
         ],
-        features=_features(robot, state_names, sizes, checkpoint, options, problems),
+        features=_openpi_features(robot, state_names, sizes, checkpoint, options, problems),
         statistics=statistics,
         max_tokens=family.max_tokens,
     )
@@ -175,7 +330,7 @@ def _normalize(op: str, kind: str, feature: str, features: Sequence[str]) -> dic
     return {"op": op, "kind": kind, "stats": "stats." + feature, "eps": EPS, **one_of_several}
 
 
-def _sizes(family: Family, policy: Section, checkpoint: Checkpoint, variant: Variant, problems: Problems) -> Sizes:
+def _openpi_sizes(family: Family, policy: Section, checkpoint: Checkpoint, variant: Variant, problems: Problems) -> Sizes:
     s = read_towers(policy, checkpoint, problems)
     check_image(policy, "image size", s, [s.image_size or SIDE] * 2)
     s.state_dim, s.action_dim = sum(width for _, width in variant.robot.states), variant.robot.n_action
@@ -245,7 +400,7 @@ def _values(stats: dict, key: str, name: str, width: int, where: str, problems: 
     return chosen
 
 
-def _features(
+def _openpi_features(
     robot: Robot, states: List[str], s: Sizes, checkpoint: Checkpoint, options: Options, problems: Problems
 ) -> List[Key]:
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}

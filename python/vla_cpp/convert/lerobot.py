@@ -7,12 +7,12 @@ from __future__ import annotations
 import os
 from typing import Dict, List, Sequence, Set, Tuple
 
-from .. import recipe
-from ..bundle import Key
-from ..checkpoint import Checkpoint
-from ..errors import Problems
-from ..section import Section
-from . import Options
+from . import recipe
+from .archs import Options
+from .bundle import Key
+from .checkpoint import Checkpoint
+from .errors import Problems
+from .section import Section
 
 EMPTY_CAMERA = "observation.images.empty_camera_"
 MAX_DIM, MAX_EMPTY = 1 << 16, 64

@@ -2,28 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evo-1: InternVL3 as the prefix, a flow-matching head that reads the whole prompt by cross-attention.
 
-Two layouts, the authors' and LeRobot's, with a module each; what they share stands here.
+Two layouts, the authors' and LeRobot's (layouts.py); keys and tensors stand in mapping.py.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from typing import List
+from typing import List, NamedTuple
 
-from ..bundle import Key, keys_by_type
-from ..checkpoint import EVO1, Checkpoint
-from ..errors import Problems
-from ..files import read_json
-from ..tokenizer import TokenizerPlan, read_tokenizer
-from ..tokenizer_byte_level import with_defaults
-from . import Options, Plan
-from ._evo1_authors import read_authors
-from ._evo1_lerobot import read_lerobot
-from ._evo1_names import weights
-from ._evo1_prompt import Prompt, read_prompt, view_op
-from ._evo1_sizes import Sizes
-from ._evo1_source import Source
+from ...ascii_bpe import Encoder, check_undivided, special_ids
+from ...bundle import Key
+from ...checkpoint import EVO1, Checkpoint
+from ...errors import Problems
+from ...files import read_json
+from ...tokenizer import TokenizerPlan, read_tokenizer
+from ...tokenizer_byte_level import with_defaults
+from .. import Options, Plan
+from .layouts import Source, read_authors, read_lerobot
+from .mapping import network_keys, weights
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
@@ -45,7 +42,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         "action": source.action,
     }
     keys = [
-        *_network_keys(sizes),
+        *network_keys(sizes),
         Key("policy.pad_token", "u32", prompt.pad_token),
         Key("policy.view_starts", "u32[]", prompt.view_starts),
         *source.features,
@@ -81,48 +78,38 @@ def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Pro
     return prompt
 
 
-def _network_keys(s: Sizes) -> List[Key]:
-    u32 = {
-        "policy.d_state": s.d_state,
-        "policy.d_action": s.d_action,
-        "policy.horizon": s.horizon,
-        "policy.d_robot": s.d_robot,
-        "policy.n_slot": s.n_slot,
-        "policy.n_token": s.n_token,
-        "vision.d_model": s.d_vision,
-        "vision.n_layer": s.n_vision_layer,
-        "vision.n_head": s.n_vision_head,
-        "vision.d_ff": s.d_vision_ff,
-        "vision.image_size": s.image_size,
-        "vision.patch_size": s.patch_size,
-        "connector.factor": 2,
-        "lm.d_model": s.d_model,
-        "lm.n_layer": s.n_layer,
-        "lm.n_head": s.n_head,
-        "lm.n_head_kv": s.n_head_kv,
-        "lm.d_head": s.d_head,
-        "lm.d_ff": s.d_ff,
-        "lm.n_vocab": s.n_vocab,
-        "head.n_layer": s.n_head_layer,
-        "head.n_head": s.n_head_head,
-        "head.d_ff": 4 * s.d_model,
-        "head.d_hidden": s.d_hidden,
-        "head.d_state_hidden": s.d_state_hidden,
-        "solver.steps": s.n_step,
-    }
-    f32 = {
-        "vision.norm_eps": s.vision_eps,
-        "connector.norm_eps": 1e-5,  # torch's default, which the reference leaves as it is
-        "lm.norm_eps": s.lm_eps,
-        "lm.rope_base": s.rope_base,
-        "head.norm_eps": 1e-5,
-    }
-    f64 = {"policy.time_scale": s.time_scale, "solver.t_start": 0.0, "solver.t_end": 1.0}
-    text = {
-        "policy.dead_rows": s.dead_rows,
-        "policy.absent_views": s.absent_views,
-        "solver.kind": "euler",
-        "solver.noise": "uniform",
-    }
-    return keys_by_type({"u32": u32, "f32": f32, "f64": f64, "string": text})
+# --- the front of a prompt, which no instruction changes: where its image tokens stand -------------------------------------------------
 
+IMAGE, OPEN, CLOSE = "<IMG_CONTEXT>", "<img>", "</img>"
+OP = {"op": "views", "open": "Image-{i}: " + OPEN, "token": IMAGE, "close": CLOSE + "\n"}
+PAD_HINT = "the prompt is filled with it: load the tokenizer with transformers and save it again"
+
+
+class Prompt(NamedTuple):
+    view_starts: List[int]  # index of the first image token of every slot
+    pad_token: int
+    image_token: int
+
+
+def view_op(n_slot: int, n_token: int) -> dict:
+    """`n_token`: image tokens of a view."""
+    return {"op": "views", "count": n_slot, **{k: OP[k] for k in ("open", "token")}, "repeat": n_token, "close": OP["close"]}
+
+
+def read_prompt(tokenizer: TokenizerPlan, pad_token: str, n_slot: int, n_token: int, problems: Problems) -> Prompt:
+    keys = tokenizer.keys
+    image = special_ids(keys, (IMAGE, OPEN, CLOSE), "--backbone needs the folder of the InternVL3 backbone", problems)[0]
+    added = next(key.value for key in keys if key.name == "tokenizer.added")
+    pad = next((token["id"] for token in json.loads(added) if token["content"] == pad_token), -1)
+    if pad < 0:
+        problems.add("tokenizer_config.json: pad_token", "one of the added tokens", repr(pad_token), PAD_HINT)
+    texts = [("\n" if i else "") + OP["open"].replace("{i}", str(i + 1))[: -len(OPEN)] for i in range(n_slot)]
+    check_undivided(keys, (IMAGE, OPEN, CLOSE), (*texts, IMAGE + OPEN + CLOSE), problems)
+    encoder = Encoder(keys)
+    starts: List[int] = []
+    position = 0
+    for text in texts:
+        position += len(encoder.ids(text)) + 1  # <img>
+        starts.append(position)
+        position += n_token + 1  # </img>
+    return Prompt(starts, max(pad, 0), image)

@@ -1,83 +1,22 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""SmolVLA: what its checkpoint states, as keys and tensors of a bundle.
-
-Reference: lerobot src/lerobot/policies/smolvla (configuration_smolvla.py, smolvlm_with_expert.py, modeling_smolvla.py) and
-transformers models/smolvlm. Shapes come from the configs alone; a tensor of another shape is refused, not adopted.
-"""
+"""Keys of the network and names, storage and shapes of every tensor of SmolVLA."""
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Dict, List
 
-from .. import recipe
-from ..bundle import Key, keys_by_type
-from ..checkpoint import Checkpoint
-from ..errors import Problems
-from ..features import feature_keys
-from ..tokenizer import read_tokenizer
-from . import TABLE, Dropped, Options, Plan, Weight
-from ._lerobot import tokenizer_folder, view_keys
-from ._rows import KEPT_OF_LAST, gated_block, linear, siglip, vector
-from ._smolvla_sizes import Sizes, read_sizes
+from ...bundle import Key, keys_by_type
+from ...layers import KEPT_OF_LAST, gated_block, linear, siglip, vector
+from .. import TABLE, Dropped, Weight
+from .config import Sizes
 
 VLM = "model.vlm_with_expert.vlm.model."
 EXPERT = "model.vlm_with_expert.lm_expert."
-STEPS: recipe.Steps = {recipe.PRE: {"smolvla_new_line_processor": {}}}
 
 
-def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    sizes = read_sizes(checkpoint, options, problems)
-    problems.raise_any()
-    dims = {recipe.STATE: sizes.state_dim, recipe.ACTION: sizes.action_dim}
-    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
-    folder = tokenizer_folder(checkpoint, options, processors) or sizes.backbone
-    tokenizer = read_tokenizer(folder, sizes.n_vocab, problems, checkpoint.notes)
-    document = json.dumps(_recipe(sizes, processors, tokenizer.truncate), ensure_ascii=False)
-    keys = [
-        *_network_keys(sizes),
-        *_feature_keys(checkpoint, options, sizes, processors, problems),
-        *tokenizer.keys,
-        Key("processor.recipe", "string", document),
-    ]
-    problems.raise_any()
-    return Plan(keys, _weights(sizes), _dropped(sizes), processors.statistics(), _hints(sizes))
-
-
-def _hints(s: Sizes) -> Dict[str, str]:
-    return {
-        VLM + "text_model.layers.": "num_vlm_layers is {}: text layers are 0 to {}".format(s.n_layer, s.n_layer - 1),
-        EXPERT + "layers.": "the expert's layers are 0 to {}".format(s.n_expert_layer - 1),
-    }
-
-
-def _recipe(s: Sizes, processors: recipe.Processors, truncate: str) -> Dict[str, List[dict]]:
-    return {
-        "image": [recipe.letterbox(*s.frame, "bottom_right"), {"op": "affine", "scale": 2.0, "shift": -1.0}],
-        "text": recipe.text_ops(processors, truncate),
-        "state": [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}],
-        "action": [{"op": "take", "size": s.action_dim}, *processors.action.op("unnormalize", recipe.ACTION)],
-    }
-
-
-def _feature_keys(
-    checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems
-) -> List[Key]:
-    """One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same."""
-    return [
-        *view_keys(checkpoint, s.views, processors, problems),
-        Key("observation.states", "string[]", [recipe.STATE]),
-        Key("observation.state_dims", "u32[]", [s.state_dim]),
-        Key("observation.max_text_tokens", "u32", processors.max_tokens),
-        *feature_keys(
-            options.dataset_info, {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}, checkpoint.notes, problems
-        ),
-    ]
-
-
-def _network_keys(s: Sizes) -> List[Key]:
+def network_keys(s: Sizes) -> List[Key]:
     """RoPE has base 10000 whatever the backbone's config says: the reference rotates with a function of its own
     (smolvlm_with_expert.py: apply_rope) and reads neither rope_theta nor rope_scaling."""
     u32 = {
@@ -123,7 +62,7 @@ def _network_keys(s: Sizes) -> List[Key]:
     return keys + [Key("expert.layer_kinds", "string[]", s.layer_kinds)]
 
 
-def _weights(s: Sizes) -> List[Weight]:
+def weights(s: Sizes) -> List[Weight]:
     n_position = (s.image_size // s.patch_size) ** 2
     return [
         *siglip(VLM + "vision_model.", s.d_vision, s.d_vision_ff, s.n_vision_layer, s.patch_size, n_position),
@@ -185,7 +124,7 @@ def _expert(s: Sizes) -> List[Weight]:
     return rows + linear("action_out", "model.action_out_proj", s.d_action, s.d_expert, bias=True)
 
 
-def _dropped(s: Sizes) -> List[Dropped]:
+def dropped(s: Sizes) -> List[Dropped]:
     last = [
         weight
         for part, weights in _language_block(s, s.n_layer - 1).items()
@@ -202,3 +141,10 @@ def _dropped(s: Sizes) -> List[Dropped]:
             for weight in last
         ),
     ]
+
+
+def hints(s: Sizes) -> Dict[str, str]:
+    return {
+        VLM + "text_model.layers.": "num_vlm_layers is {}: text layers are 0 to {}".format(s.n_layer, s.n_layer - 1),
+        EXPERT + "layers.": "the expert's layers are 0 to {}".format(s.n_expert_layer - 1),
+    }

@@ -11,9 +11,9 @@ import json
 import re
 from typing import Dict, List, Sequence, Tuple
 
-from ..bundle import Key
-from ..errors import Problems
-from ..tokenizer_byte_level import byte_symbols
+from .bundle import Key
+from .errors import Problems
+from .tokenizer_byte_level import byte_symbols
 
 WORDS = re.compile(
     r"'(?:[sS]|[tT]|[rR][eE]|[vV][eE]|[mM]|[lL][lL]|[dD])|[^\r\nA-Za-z0-9]?[A-Za-z]+|[0-9]"

@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""π0: PaliGemma prefix, joint-attention action expert, the state as a token of its own.
+
+Reference: lerobot src/lerobot/policies/pi0 and openpi src/openpi/models_pytorch; π0.5 (pi05.py) has the same plan.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import List
+
+from ... import recipe
+from ...bundle import Key, keys_by_type
+from ...checkpoint import OPENPI, Checkpoint
+from ...errors import Code, ConvertError, Problems, refuse
+from ...files import BACKBONE_PATTERNS, download
+from ...lerobot import tokenizer_folder
+from ...tokenizer import TokenizerPlan, read_tokenizer
+from .. import Options, Plan
+from .layouts import read_lerobot, read_openpi, variants_of
+from .mapping import Family, dropped, hints, network_keys, rename, rounded, weights
+
+TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
+
+
+def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    read = read_openpi if checkpoint.layout == OPENPI else read_lerobot
+    source = read(family, checkpoint, options, problems)
+    checkpoint.tensors = rename(
+        checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems
+    )
+    tokenizer = read_tokenizer(
+        _tokenizer(checkpoint, options, source.processors), source.sizes.n_vocab, problems, checkpoint.notes
+    )
+    _check_newline(source.text, tokenizer, problems)
+    tokenize = {"op": "tokenize", "max_tokens": source.max_tokens, "truncate": tokenizer.truncate}
+    document = {
+        "image": source.image,
+        "text": [*source.text, tokenize],
+        "state": source.state,
+        "action": source.action,
+    }
+    keys = [
+        *keys_by_type(network_keys(source.sizes)),
+        *source.features,
+        Key("observation.max_text_tokens", "u32", source.max_tokens),
+        *tokenizer.keys,
+        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+    ]
+    problems.raise_any()
+    rows = [row._replace(keep_f32=not rounded(row)) for row in weights(family, source.sizes, checkpoint)]
+    return Plan(keys, rows, dropped(family, source.sizes, checkpoint), source.statistics, hints(source.sizes))
+
+
+def _tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
+    """The folder with the tokenizer: the checkpoint's own, --backbone, or the one that the reference """
+    own = tokenizer_folder(checkpoint, options, processors) or options.backbone
+    if own:
+        if not os.path.isdir(own):
+            raise refuse("--backbone " + own, "a folder", "none", code=Code.IO)
+        return own
+    try:
+        folder, revision = download(TOKENIZER, BACKBONE_PATTERNS)
+    except ConvertError as error:
+        raise refuse(
+            "tokenizer " + TOKENIZER,
+            "--backbone DIR, tokenizer/ inside the checkpoint, or a reachable hub",
+            error.problems[0].found,
+            "give the folder with its tokenizer.json or tokenizer.model by --backbone",
+            Code.IO,
+        )
+    checkpoint.notes.append("tokenizer: {} at revision {}".format(TOKENIZER, revision))
+    return folder
+
+
+def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problems) -> None:
+    """openpi encodes the newline apart from the text. The same ids come out of both together unless a token spans them."""
+    if not any(op["op"] == "ensure_suffix" for op in text):
+        return
+    tokens = next(key.value for key in tokenizer.keys if key.name == "tokenizer.tokens")
+    spanning = next((token for token in tokens if token.endswith("\n") and token.strip("\n")), None)
+    if spanning is not None:
+        problems.unsupported("tokenizer.json: model.vocab", "a newline in no token but its own runs", repr(spanning))
+
+
+FAMILY = Family(
+    arch="pi0",
+    config_class="PI0Config",
+    max_tokens=48,
+    time_mlp="action_time_mlp",
+    other_time_mlp="time_mlp",
+)
+VARIANTS = variants_of("pi0")
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    return make_plan(FAMILY, checkpoint, options, problems)
