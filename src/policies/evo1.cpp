@@ -6,12 +6,12 @@
 // (internvl3_embedder.py, flow_matching.py) and Evo_1/scripts/Evo1_server.py; lerobot src/lerobot/policies/evo1.
 
 #include <fmt/format.h>
-#include <fmt/ranges.h>
 
 #include <algorithm>
 
 #include "modules/action/cross_head.h"
 #include "modules/language/qwen.h"
+#include "modules/language/view_places.h"
 #include "modules/vision/internvit.h"
 #include "modules/vision/mlp_connector.h"
 #include "nn/attention.h"
@@ -40,8 +40,8 @@ class Evo1 final : public Policy {
   Linear action_in_, action_mix_, action_token_, pool_, velocity_in_, velocity_out_;  // step rate
   Embedding action_position_;
   Embedding time_;  // load rate
-  int d_action_, d_robot_, horizon_, n_slot_, n_token_, pad_token_;
-  std::vector<int> view_starts_;
+  ViewPlaces places_;
+  int d_action_, d_robot_, horizon_, n_token_, pad_token_;
   bool in_place_;
   DeadRows dead_rows_;
   double time_scale_;
@@ -63,27 +63,29 @@ class Evo1 final : public Policy {
                       Bias::yes),
         action_position_(s / "action_position", lm_.d_model(), s.dim("horizon", 4096)),
         time_(s / "time", lm_.d_model(), kTimes),
+        places_(s, connector_.n_token()),
         d_action_(s.dim("d_action")),
         d_robot_(s.dim("d_robot")),
         horizon_(s.dim("horizon", 4096)),
-        n_slot_(s.dim("n_slot", 32)),
         n_token_(s.dim("n_token", 8192)),
         pad_token_(s.index("pad_token", (s / "lm").dim("n_vocab", 1 << 24))),
-        view_starts_(s.integers("view_starts", kTokenIndex)),
         in_place_(s.choice("absent_views", {"last", "in_place"}) == 1),
         dead_rows_(static_cast<DeadRows>(s.choice("dead_rows", {"zero_attention", "causal_attention", "unseen"}))),
         time_scale_(s.precise("time_scale", {1, 1e6})) {
-    check_layout(s);
+    s.require(places_.n_least() <= n_token_, "view_starts", fmt::format("places within {} tokens", n_token_),
+              std::to_string(places_.n_least()));
+    s.require(d_robot_ <= d_action_, "d_robot", fmt::format("at most d_action {}", d_action_),
+              std::to_string(d_robot_));
   }
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
-    if (shape.n_view > n_slot_)
+    if (shape.n_view > places_.n_slot())
       return Error{Code::bad_bundle, "policy.n_slot", fmt::format("{} or more, one for each view", shape.n_view),
-                   std::to_string(n_slot_)};
-    if (shape.n_text < prompt_front() || shape.n_text > n_token_)
-      return Error{Code::bad_bundle, "processor.recipe.text", fmt::format("{} to {} tokens", prompt_front(), n_token_),
-                   std::to_string(shape.n_text)};
+                   std::to_string(places_.n_slot())};
+    if (shape.n_text < places_.n_least() || shape.n_text > n_token_)
+      return Error{Code::bad_bundle, "processor.recipe.text",
+                   fmt::format("{} to {} tokens", places_.n_least(), n_token_), std::to_string(shape.n_text)};
     return check_prefix(1, n_token_, 1);
   }
 
@@ -137,24 +139,6 @@ class Evo1 final : public Policy {
     }
   };
 
-  /// Tokens up to the end of the last slot.
-  int prompt_front() const { return view_starts_.empty() ? 1 : view_starts_.back() + connector_.n_token(); }
-
-  void check_layout(const Scope& s) const {
-    bool sound = static_cast<int>(view_starts_.size()) == n_slot_;
-    int end = 1;  // the first token is no image's: every row sees one
-    for (const int start : view_starts_) {
-      sound = sound && start >= end && start <= n_token_;
-      end = start + connector_.n_token();
-    }
-    s.require(sound && end <= n_token_, "view_starts",
-              fmt::format("{} places of {} tokens each, behind the first and within {}", n_slot_, connector_.n_token(),
-                          n_token_),
-              fmt::format("{}", fmt::join(view_starts_, " ")));
-    s.require(d_robot_ <= d_action_, "d_robot", fmt::format("at most d_action {}", d_action_),
-              std::to_string(d_robot_));
-  }
-
   Tensor pads(Graph& g, int count) const {
     const std::vector<std::int32_t> ids(static_cast<std::size_t>(count), pad_token_);
     return lm_.embed(g, constant_ids(g, "pads", ids));
@@ -162,10 +146,10 @@ class Evo1 final : public Policy {
 
   /// For every slot the view that fills it, as an index of the views that are present, or kAbsent.
   std::vector<int> fill_slots(const PrefixInputs& in) const {
-    std::vector<int> slots(static_cast<std::size_t>(n_slot_), kAbsent);
+    std::vector<int> slots(static_cast<std::size_t>(places_.n_slot()), kAbsent);
     int next = 0;
     const int n_view = static_cast<int>(in.images.dim(3));
-    for (int slot = 0; slot < n_slot_ && next < n_view; ++slot)
+    for (int slot = 0; slot < places_.n_slot() && next < n_view; ++slot)
       if (!in_place_ || (in.views >> slot & 1) != 0) slots[static_cast<std::size_t>(slot)] = next++;
     return slots;
   }
@@ -173,29 +157,26 @@ class Evo1 final : public Policy {
   /// Tokens keep the positions that they have in the whole prompt, whatever is left out of it.
   Rows arrange(Graph& g, Tensor image, const PrefixInputs& in, const Cache& cache) const {
     Rows rows;
-    int at = 0, n_absent = 0;
-    const int n_view_token = connector_.n_token(), n_text = static_cast<int>(in.tokens.dim(0));
-    const auto text_until = [&](int end) {
-      if (at < end) rows.add(lm_.embed(g, slice_ids(g, in.tokens, at, end - at)), at, true);
-      at = end;
-    };
+    int n_absent = 0;
+    const int n_text = static_cast<int>(in.tokens.dim(0));
     const std::vector<int> slots = fill_slots(in);
-    for (std::size_t i = 0; i < slots.size(); ++i) {
-      text_until(view_starts_[i]);
-      if (slots[i] != kAbsent)
-        rows.add(one_view(g, image, slots[i]), at, true);
+    for (const PromptPiece& piece : places_.pieces(n_text)) {
+      const bool is_text = piece.slot == PromptPiece::kText;
+      const int view = is_text ? kAbsent : slots[static_cast<std::size_t>(piece.slot)];
+      if (is_text)
+        rows.add(lm_.embed(g, slice_ids(g, in.tokens, piece.first, piece.count)), piece.first, true);
+      else if (view != kAbsent)
+        rows.add(one_view(g, image, view), piece.first, true);
       else if (dead_rows_ == DeadRows::causal_attention)
-        rows.add(cache.get("absent"), at, false);
+        rows.add(cache.get("absent"), piece.first, false);
       else
         ++n_absent;
-      at += n_view_token;
     }
-    text_until(n_text);
     const int n_pad = n_token_ - n_text;
-    if (dead_rows_ == DeadRows::causal_attention && n_pad > 0) rows.add(pads(g, n_pad), at, false);
+    if (dead_rows_ == DeadRows::causal_attention && n_pad > 0) rows.add(pads(g, n_pad), n_text, false);
     if (dead_rows_ == DeadRows::zero_attention) {
-      if (n_absent > 0) rows.kept.push_back({0, n_view_token, n_absent});
-      if (n_pad > 0) rows.kept.push_back({n_view_token, 1, n_pad});
+      if (n_absent > 0) rows.kept.push_back({0, places_.n_view_token(), n_absent});
+      if (n_pad > 0) rows.kept.push_back({places_.n_view_token(), 1, n_pad});
     }
     return rows;
   }

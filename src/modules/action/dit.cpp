@@ -33,10 +33,10 @@ Tensor DitBlock::forward(Graph& g, Tensor x, Tensor modulation, const KeyValue& 
   return mlp_.added_to(g, x, layer_norm(g, x, eps_));
 }
 
-Dit::Dit(const Scope& s, int d_context)
+Dit::Dit(const Scope& s, int d_context, bool alternating)
     : d_model_(s.dim("d_model")),
       d_out_(s.dim("d_out")),
-      text_every_(s.dim("text_every", 512)),
+      text_every_(alternating ? s.dim("text_every", 512) : 1),
       out_norm_(s / "out_ada", d_model_, s.number("out_eps", kNormEps), AdaptiveLayerNorm::Order::shift_scale),
       out_(s / "out", d_model_, d_out_, Bias::yes) {
   const int n_layer = s.n_layer("n_layer"), n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff");

@@ -31,16 +31,18 @@ class DitBlock : public Module<DitBlock> {
   Mlp mlp_;
 };
 
-/// A diffusion transformer whose even layers look at a context, in turn at its text and at its images, and whose odd
-/// layers look at their own tokens. Source: the same file, AlternateVLDiT.
+/// A diffusion transformer whose even layers look at a context and whose odd layers look at their own tokens. An
+/// alternating one looks in turn at the text and at the images of its context. Source: the same file, DiT and
+/// AlternateVLDiT.
 class Dit {
  public:
-  Dit(const Scope& s, int d_context);
+  Dit(const Scope& s, int d_context, bool alternating);
 
   /// Load rate: the embedded times [d_model, n_time] -> the modulations of all norms one above the other, [2 d_model *
   /// (n_layer + 1), n_time].
   Tensor modulations(Graph& g, Tensor time) const;
-  /// Observation rate: keys and values of every even layer, of the rows that it looks at, [d_context, n] each.
+  /// Observation rate: keys and values of every even layer, of the rows that it looks at, [d_context, n] each. Where
+  /// layers do not alternate, `text` is the whole context.
   void prepare(Graph& g, Tensor text, Tensor image, Cache& cache) const;
   /// Step rate: x [d_model, n] -> [d_out, n]. `modulations` begins with one column of the above.
   Tensor operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cache) const;

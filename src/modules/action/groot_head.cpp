@@ -1,0 +1,82 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "modules/action/groot_head.h"
+
+#include <fmt/format.h>
+
+#include "modules/time_embedding.h"
+#include "nn/tokens.h"
+
+namespace vla {
+
+GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
+    : vl_norm_(s / "vl" / "norm", d_context, (s / "vl").number("norm_eps", kNormEps)),
+      state_in_(s / "state_in", s.dim("d_state"), (s / "dit").dim("d_hidden"), Bias::yes),
+      state_out_(s / "state_out", (s / "dit").dim("d_hidden"), (s / "dit").dim("d_model"), Bias::yes),
+      n_future_(family.future_tokens ? s.dim("n_future", 4096) : 0),
+      dit_(s / "dit", d_context, family.alternating),
+      action_in_(s / "action_in", s.dim("d_action"), dit_.d_model(), Bias::yes),
+      action_mix_(s / "action_mix", 2 * dit_.d_model(), dit_.d_model(), Bias::yes),
+      action_token_(s / "action_token", dit_.d_model(), dit_.d_model(), Bias::yes),
+      decode_in_(s / "decode_in", dit_.d_out(), (s / "dit").dim("d_hidden"), Bias::yes),
+      decode_out_(s / "decode_out", (s / "dit").dim("d_hidden"), s.dim("d_action"), Bias::yes),
+      action_position_(s / "action_position", dit_.d_model(), s.dim("n_position")),
+      d_time_((s / "dit").dim("d_time")),
+      n_bucket_((s / "dit").dim("n_bucket")),
+      horizon_(s.dim("horizon", 4096)),
+      time_in_(s / "time_in", d_time_, dit_.d_model(), Bias::yes),
+      time_out_(s / "time_out", dit_.d_model(), dit_.d_model(), Bias::yes) {
+  if (family.future_tokens) future_.emplace(s / "future", dit_.d_model(), n_future_);
+  const Scope vl = s / "vl";
+  const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may do without layers
+  for (int i = 0; i < n_layer; ++i)
+    vl_blocks_.emplace_back(vl / "blk" / i, d_context, n_head, vl.dim("d_ff"), vl.number("norm_eps", kNormEps));
+  vl.require(n_layer == 0 || d_context % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_context),
+             std::to_string(n_head));
+  s.require(horizon_ <= s.dim("n_position"), "n_position", fmt::format("at least the horizon {}", horizon_),
+            std::to_string(s.dim("n_position")));
+  (s / "dit").require(d_time_ % 2 == 0 && d_time_ > 2, "d_time", "an even number above 2", std::to_string(d_time_));
+  (s / "dit").require(dit_.d_model() % 2 == 0, "d_model", "an even number", std::to_string(dit_.d_model()));
+}
+
+Tensor GrootHead::condition(Graph& g, std::span<const float> times) const {
+  // The reference makes a whole number of i / N in double, whatever the times are.
+  std::vector<int> buckets;
+  for (std::size_t k = 0; k < times.size(); ++k)
+    buckets.push_back(static_cast<int>(static_cast<double>(k) / static_cast<double>(times.size()) * n_bucket_));
+  const auto embedded = [&](int d, BucketWaves waves) {
+    return g.store().add_constant(bucket_embedding(buckets, d, waves), {d, static_cast<std::int64_t>(buckets.size())});
+  };
+  const Tensor hidden = silu(g, time_in_(g, embedded(d_time_, BucketWaves::cosines_first)));
+  const Tensor modulations = dit_.modulations(g, silu(g, time_out_(g, hidden)));
+  return concat_features(g, modulations, embedded(dit_.d_model(), BucketWaves::sines_first));
+}
+
+Tensor GrootHead::context(Graph& g, Tensor features) const {
+  Tensor x = vl_norm_(g, features);
+  for (const EncoderBlock& block : vl_blocks_) x = block(g, x);
+  return x;
+}
+
+void GrootHead::prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const {
+  dit_.prepare(g, text, image, cache);
+  const Tensor hidden = state_in_.activated(g, state, Activation::relu);
+  cache.put(g, state_out_.path(), state_out_.forward(g, hidden));  // [d_dit, 1]
+  if (future_) cache.put(g, future_->path(), future_->forward(g, counting_ids(g, n_future_)));
+}
+
+Tensor GrootHead::velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const {
+  const Tensor action = action_in_(g, x_t);  // [d_dit, horizon]
+  const Tensor time = slice_features(g, condition, dit_.d_modulations(), dit_.d_model());
+  const Tensor timed = concat_features(g, action, repeat_like(g, time, action));
+  const Tensor token = action_token_.forward(g, action_mix_.activated(g, timed, Activation::silu));
+  const Tensor placed = add(g, token, action_position_(g, counting_ids(g, horizon_)));
+  std::vector<Tensor> tokens = {cache.get(state_out_.path())};
+  if (future_) tokens.push_back(cache.get(future_->path()));
+  tokens.push_back(g.name(action_token_.path(), placed));
+  const Tensor x = dit_(g, concat_tokens(g, tokens), condition, cache);
+  const Tensor out = slice_tokens(g, x, 1 + n_future_, horizon_);         // [d_out, horizon]
+  return decode_out_(g, decode_in_.activated(g, out, Activation::relu));  // [d_action, horizon]
+}
+
+}  // namespace vla

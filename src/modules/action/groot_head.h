@@ -1,0 +1,52 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <optional>
+#include <span>
+#include <vector>
+
+#include "modules/action/dit.h"
+#include "modules/encoder_block.h"
+#include "nn/embedding.h"
+
+namespace vla {
+
+/// What tells the releases' heads apart.
+struct GrootFamily {
+  bool future_tokens;  // `policy.n_future` learned tokens between the state's and those of the actions
+  bool alternating;    // even layers look at the text or at the images (`dit.text_every`), else at all rows
+};
+
+/// The action head of GR00T: self-attention over the features, a diffusion transformer over tokens of state and
+/// actions, and around it layers that each robot has of its own. Flow matching from noise (t = 0) to actions (t = 1).
+/// Reads `vl.*`, `dit.*` and `policy.*`. Source: lerobot policies/groot/groot_n1_7.py GR00TN17ActionHead; before it
+/// Isaac-GR00T gr00t/model/action_head/flow_matching_action_head.py (future tokens).
+class GrootHead {
+ public:
+  /// `s` is the root of the tree; `d_context`: width of the features.
+  GrootHead(const Scope& s, int d_context, GrootFamily family);
+
+  /// Load rate: modulations of all norms and the actions' time, one column per time.
+  Tensor condition(Graph& g, std::span<const float> times) const;
+  /// Observation rate: features [d_context, n] -> the same shape, normalized and mixed.
+  Tensor context(Graph& g, Tensor features) const;
+  /// Observation rate: keys and values of the context's rows, and the tokens that stand before those of the actions.
+  void prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const;
+  /// Step rate: x_t [d_action, horizon] -> the velocity, the same shape. `condition` is one column of the above.
+  Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const;
+
+ private:
+  LayerNorm vl_norm_;  // observation rate
+  std::vector<EncoderBlock> vl_blocks_;
+  Linear state_in_, state_out_;
+  std::optional<Embedding> future_;
+  int n_future_;
+  Dit dit_;
+  Linear action_in_, action_mix_, action_token_, decode_in_, decode_out_;  // step rate
+  Embedding action_position_;
+  int d_time_, n_bucket_, horizon_;
+  Linear time_in_, time_out_;  // load rate
+};
+
+}  // namespace vla

@@ -1,0 +1,55 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <functional>
+#include <vector>
+
+#include "backend/graph.h"
+#include "bundle/params.h"
+
+namespace vla {
+
+/// A stretch of a prompt: text, or the image tokens of one view.
+struct PromptPiece {
+  static constexpr int kText = -1;
+  int first, count;
+  int slot;  // the view's number, or kText
+};
+
+/// Where the views stand among the tokens of a prompt: `policy.n_slot` of them, in order. Where the instruction follows
+/// them, `policy.view_starts` counts from the first token; where it stands before them, `policy.view_starts_from_end`
+/// counts back from the end.
+class ViewPlaces {
+ public:
+  enum class Count { from_start, from_end };
+  /// `s` is the root of the tree; `n_view_token`: image tokens of a view.
+  ViewPlaces(const Scope& s, int n_view_token, Count count = Count::from_start);
+
+  /// Whether a prompt of `n_token` tokens holds all views. Errors: bad_bundle.
+  Status check(int n_token) const;
+  /// Text and views in the order of the prompt; no piece is empty.
+  std::vector<PromptPiece> pieces(int n_token) const;
+
+  /// Views [d, n_view_token, n_slot] at their places among the rows [d, count] that `text` makes: [d, n_token].
+  Tensor arrange(Graph& g, Tensor views, int n_token, const std::function<Tensor(const PromptPiece&)>& text) const;
+  /// The rows of the views, and all others.
+  struct Rows {
+    Tensor image, text;
+  };
+  Rows split(Graph& g, Tensor rows) const;
+
+  int n_slot() const { return static_cast<int>(counts_.size()); }
+  int n_view_token() const { return n_view_token_; }
+  /// Index of the first token of every view.
+  std::vector<int> starts(int n_token) const;
+  /// Tokens of the shortest prompt.
+  int n_least() const { return n_least_; }
+
+ private:
+  int n_view_token_, n_least_ = 1;
+  Count count_;
+  std::vector<int> counts_;  // as the key has them
+};
+
+}  // namespace vla
