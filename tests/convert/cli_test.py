@@ -61,13 +61,13 @@ def test_each_class_of_refusal_has_its_exit_code(converter, tiny, capsys, code, 
 
 def test_a_checkpoint_that_is_not_there_is_an_io_error(tmp_path, capsys):
     assert main([str(tmp_path / "nothing"), "-o", str(tmp_path / "o.gguf")]) == 9
-    assert "expected a checkpoint folder or a hub id" in capsys.readouterr().err
+    assert "expected a checkpoint folder or hub:OWNER/NAME@REVISION" in capsys.readouterr().err
 
 
-def test_a_hub_id_without_a_network_is_an_io_error_that_says_what_to_do(tmp_path):
-    result = run("nobody/nothing", "-o", tmp_path / "o.gguf", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
+def test_a_hub_without_a_network_is_an_io_error_that_says_what_to_do(tmp_path):
+    result = run("hub:nobody/nothing@main", "-o", tmp_path / "o.gguf", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
     assert result.returncode == 9
-    assert result.stderr.startswith("error: nobody/nothing: expected a folder or a reachable hub repository")
+    assert result.stderr.startswith("error: hub:nobody/nothing@main: expected a reachable hub repository")
     assert "download it and give the folder" in result.stderr
 
 
@@ -100,7 +100,7 @@ def test_a_full_disk_is_an_io_error_that_leaves_nothing(converter, tiny, monkeyp
     monkeypatch.setattr(bundle.os, "fsync", full)
     assert main([converter.save(tiny), "-o", converter.out]) == 9
     assert "found No space left on device" in capsys.readouterr().err
-    assert not os.path.exists(converter.out) and not os.path.exists(converter.out + ".part")
+    assert os.listdir(os.path.dirname(converter.out)) == ["policy"]
 
 
 def test_help_names_every_architecture_and_exit_code():
@@ -179,30 +179,69 @@ def test_damaged_json_is_converted_or_refused_but_never_a_fault(converter, tiny,
     assert codes & {3, 6}
 
 
-def test_a_hub_id_is_downloaded_and_recorded_with_its_revision(converter, tiny, monkeypatch, tmp_path):
-    """The hub's cache keeps a snapshot in a folder that is named by its revision."""
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    """A hub of two repositories, whose cache keeps a snapshot in a folder that is named by its commit. The list has what was asked."""
     import huggingface_hub
 
-    snapshot = tmp_path / "snapshots" / "0123abc"
-    tiny.save(snapshot)
     asked = []
 
-    def download(repo, allow_patterns):
-        asked.append((repo, tuple(allow_patterns)))
-        return str(snapshot)
+    def download(repo, revision, allow_patterns):
+        asked.append((repo, revision, tuple(allow_patterns)))
+        return str(tmp_path / repo.replace("/", "--") / "0123abc")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
-    assert main(["someone/policy", "-o", converter.out, "--quiet"]) == 0
+    return asked
+
+
+def test_a_repository_of_the_hub_is_recorded_with_the_commit_that_its_revision_was(converter, tiny, hub, tmp_path):
+    tiny.save(tmp_path / "someone--policy" / "0123abc")
+    assert main(["hub:someone/policy@main", "-o", converter.out, "--quiet"]) == 0
     keys = read_bundle(converter.out).keys
     assert (keys["vla.source.name"], keys["vla.source.revision"]) == ("someone/policy", "0123abc")
-    assert asked[0][0] == "someone/policy" and "*.safetensors" in asked[0][1]
+    assert [ask[:2] for ask in hub] == [("someone/policy", "main")] and "*.safetensors" in hub[0][2]
 
 
-def test_the_backbone_is_downloaded_by_the_name_in_the_config(converter, tiny, monkeypatch, tmp_path):
-    import huggingface_hub
+@pytest.mark.parametrize("source", ["runs/last", "someone/policy", "hub:someone/policy", "hub:policy@main", "hub:a/b/c@d", "hub:../x@d", "hub:"])
+def test_nothing_is_fetched_that_does_not_say_hub_and_revision(converter, hub, capsys, source):
+    code = main([source, "-o", converter.out, "--quiet"])
+    assert code == (2 if source.startswith("hub:") else 9)
+    assert "hub:OWNER/NAME@REVISION" in capsys.readouterr().err
+    assert hub == []
 
+
+def test_a_backbone_that_only_the_checkpoint_names_is_not_fetched(converter, tiny, hub, capsys, tmp_path):
     folder = converter.save(tiny)
-    (converter.folder / "vlm").rename(tmp_path / "hub")
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo, allow_patterns: str(tmp_path / "hub"))
-    assert main([folder, "-o", converter.out, "--quiet"]) == 0
-    assert read_bundle(converter.out).keys["lm.n_vocab"] == 300
+    (converter.folder / "vlm").rename(tmp_path / "vlm")
+    assert main([folder, "-o", converter.out, "--quiet"]) == 9
+    assert "--backbone hub:" in capsys.readouterr().err
+    assert hub == []
+    (tmp_path / "their--vlm").mkdir()
+    (tmp_path / "vlm").rename(tmp_path / "their--vlm" / "0123abc")
+    assert main([folder, "-o", converter.out, "--quiet", "--backbone", "hub:their/vlm@v1"]) == 0
+    keys = read_bundle(converter.out).keys
+    assert keys["lm.n_vocab"] == 300
+    assert keys["vla.source.backbone"] == "their/vlm@0123abc"
+    assert [ask[:2] for ask in hub] == [("their/vlm", "v1")]
+
+
+@pytest.mark.parametrize("limit", [0, 1000, 20_000, 60_000])
+def test_a_full_disk_leaves_nothing_behind_wherever_it_strikes(converter, tiny, limit):
+    """A limit on the size of files stands for the disk: writes beyond it fail as they do there."""
+    folder = converter.save(tiny)
+    os.mkdir(os.path.dirname(converter.out) + "/disk")
+    script = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0})); from vla_cpp.convert.cli import main; sys.exit(main())"
+    out = os.path.dirname(converter.out) + "/disk/out.gguf"
+    arguments = [sys.executable, "-c", script.format(limit), folder, "-o", out, "--quiet"]
+    result = subprocess.run(arguments, capture_output=True, text=True, env=dict(os.environ, PYTHONPATH=PACKAGE))
+    assert (result.returncode, os.listdir(os.path.dirname(out))) == (9, []), result.stderr
+    assert "expected a file that can be written" in result.stderr
+
+
+def test_a_file_or_link_beside_the_bundle_is_not_written_through(converter, tiny, tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("kept")
+    os.symlink(precious, converter.out + ".part")
+    converter.bundle(tiny)
+    assert precious.read_text() == "kept"
+    assert sorted(os.listdir(os.path.dirname(converter.out))) == ["out.gguf", "out.gguf.part", "policy", "precious"]

@@ -4,12 +4,14 @@
 
 import json
 import struct
+import time
 
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
 from vla_cpp.convert import Code, ConvertError
+from vla_cpp.convert.errors import Problems
 from vla_cpp.convert.safetensors_file import MAX_HEADER, read_safetensors
 
 GOOD = {
@@ -120,3 +122,21 @@ def test_random_damage_to_a_header_never_escapes_as_another_exception(tmp_path):
         except ConvertError:
             refused += 1
     assert refused > 300
+
+
+def test_a_name_that_stands_twice_among_many_is_found_at_once(tmp_path):
+    names = ['"{}":1'.format(i) for i in range(50_000)] + ['"49999":1']
+    start = time.process_time()  # of this process alone, however busy the machine is
+    with pytest.raises(ConvertError, match="the name 49999 stands twice"):
+        read_safetensors(write(tmp_path / "x.safetensors", ("{" + ",".join(names) + "}").encode()))
+    assert time.process_time() - start < 5
+
+
+def test_a_report_of_very_many_problems_has_fifty_lines_and_a_count():
+    problems = Problems("policy")
+    for i in range(20_000):
+        problems.add("tensor {}".format(i), "no such tensor", "one")
+    with pytest.raises(ConvertError) as info:
+        problems.raise_any()
+    lines = info.value.message().splitlines()
+    assert (lines[0], lines[-1], len(lines)) == ("policy: 20000 problems", "  and 19950 more", 52)

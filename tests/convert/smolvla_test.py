@@ -277,6 +277,7 @@ def test_missing_statistics_pass_only_when_a_person_says_so_and_loudly(converter
     assert recipe(bundle)["state"] == [{"op": "pad", "size": 4}]
     assert recipe(bundle)["action"][1]["op"] == "unnormalize"
     assert any(note.startswith("DEGRADED: observation.state") for note in converter.summary.notes)
+    assert bundle.keys["vla.degraded"] == ["observation.state"]
 
 
 def test_a_standard_deviation_of_zero_is_kept_and_noted(converter, tiny):

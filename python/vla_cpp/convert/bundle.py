@@ -3,13 +3,16 @@
 """A streaming writer of bundles (docs/bundle.md) and a reader for tests and tools.
 
 The header states every tensor before the first byte of data is written, so the file grows in one pass and never lies in
-memory. It carries a temporary name until the checksum is in place: a bundle that exists is complete.
+memory. It carries a temporary name until the checksum is in place: a bundle that exists is complete. That name is free and of its own, so
+that nobody's file or link is written through.
 """
 
 from __future__ import annotations
 
 import os
 import struct
+import tempfile
+from contextlib import suppress
 from typing import BinaryIO, Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
@@ -90,12 +93,18 @@ def _header(keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> bytes:
     return header + _padding(len(header))
 
 
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
 class BundleWriter:
     """`with BundleWriter(path, keys, tensors) as out:` and then `out.write(name, array)` in the order of `tensors`, in pieces
     if one likes. Leaving the block completes the file; an exception removes it."""
 
     def __init__(self, path: str, keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> None:
-        self.path, self.part = path, path + ".part"
+        self.path = path
         self.tensors: List[TensorInfo] = list(tensors)
         checksum = Key(CHECKSUM_KEY, "string", CHECKSUM_ZERO)
         # The checksum stands first, so that the text of its key is found before any vocabulary could contain it.
@@ -104,9 +113,23 @@ class BundleWriter:
         self.next = 0
 
     def __enter__(self) -> "BundleWriter":
-        self.file: BinaryIO = open(self.part, "w+b")
-        self.file.write(self.header)
+        folder, name = os.path.split(self.path)
+        descriptor, self.part = tempfile.mkstemp(".part", name + ".", folder or ".")
+        self.file: BinaryIO = os.fdopen(descriptor, "w+b")
+        try:
+            os.chmod(self.part, 0o666 & ~_umask())
+            self.file.write(self.header)
+        except BaseException:
+            self._drop()
+            raise
         return self
+
+    def _drop(self) -> None:
+        """What a full disk did not take is lost with the file."""
+        with suppress(OSError):
+            self.file.close()
+        with suppress(FileNotFoundError):
+            os.remove(self.part)
 
     def write(self, name: str, data: np.ndarray) -> None:
         if self.left == 0:
@@ -121,17 +144,13 @@ class BundleWriter:
             self.file.write(_padding(tensor.n_bytes))
 
     def __exit__(self, kind, error, trace) -> None:
-        complete = False
         try:
             if kind is None:
                 self._finish()
-                complete = True
-        finally:
-            self.file.close()
-            if complete:
+                self.file.close()
                 os.replace(self.part, self.path)
-            else:
-                os.remove(self.part)
+        finally:
+            self._drop()
 
     def _finish(self) -> None:
         if self.left or self.next != len(self.tensors):

@@ -12,15 +12,8 @@ from typing import Dict, List, Optional, Tuple
 import numpy as np
 
 from .dtypes import STATISTICS, to_f32
-from .errors import Code, ConvertError, Problems, refuse
-from .files import (
-    BACKBONE_PATTERNS,
-    HUB_PATTERNS,
-    download,
-    is_hub_id,
-    plain_name,
-    read_json,
-)
+from .errors import Code, Problems, refuse
+from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_name, read_json
 from .safetensors_file import Entry, read_safetensors
 from .torch_file import read_torch
 
@@ -51,6 +44,8 @@ class Checkpoint:
     processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
     layout: str = LEROBOT
     notes: List[str] = field(default_factory=list)
+    backbone: str = ""  # the repository and commit that --backbone fetched
+    degraded: List[str] = field(default_factory=list)  # features that pass unnormalised because --identity-stats allows it
 
     def path(self, name: str) -> str:
         return os.path.join(self.folder, name)
@@ -137,14 +132,12 @@ def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
 
 
 def open_checkpoint(source: str) -> Checkpoint:
-    """A folder or a hub id. Errors: io, bad_bundle."""
-    revision = ""
-    folder = source
-    if not os.path.isdir(source):
-        if os.path.exists(source) or not is_hub_id(source):
-            raise refuse(source, "a checkpoint folder or a hub id like owner/name", "neither", code=Code.IO)
-        folder, revision = download(source, HUB_PATTERNS)
-    name = source if revision else os.path.basename(os.path.abspath(folder))
+    """A folder, or a repository as hub_folder() reads it. Errors: io, bad_bundle."""
+    hub = hub_folder(source, HUB_PATTERNS)
+    if hub is None and not os.path.isdir(source):
+        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", code=Code.IO)
+    folder, revision = (hub.folder, hub.commit) if hub else (source, "")
+    name = hub.repo if hub else os.path.basename(os.path.abspath(folder))
     inner = os.path.join(folder, "pretrained_model")
     if not os.path.exists(os.path.join(folder, "config.json")) and os.path.isdir(inner):
         raise refuse(os.path.join(folder, "config.json"), "a policy", "none", "give " + inner, Code.IO)
@@ -172,11 +165,21 @@ def _layout(folder: str, config: dict, has_assets: bool) -> str:
     return OPENPI if has_assets or "action_horizon" in config else LEROBOT
 
 
+def given_backbone(checkpoint: Checkpoint, given: str) -> str:
+    """The folder that --backbone means, empty without one. Errors: io."""
+    hub = hub_folder(given, BACKBONE_PATTERNS)
+    if hub:
+        checkpoint.backbone = "{}@{}".format(hub.repo, hub.commit)
+        checkpoint.notes.append("backbone config and tokenizer: {} at revision {}".format(hub.repo, hub.commit))
+        return hub.folder
+    if given and not os.path.isdir(given):
+        raise refuse("--backbone " + given, "a folder or " + HUB_FORM, "neither", code=Code.IO)
+    return given
+
+
 def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_model_name") -> str:
-    """The folder with the backbone's config.json: as given, inside the checkpoint, or by the name that the policy's config states."""
+    """The folder with the backbone's config.json: as given, inside the checkpoint, or the one that the policy's config states."""
     if given:
-        if not os.path.isdir(given):
-            raise refuse("--backbone " + given, "a folder", "none", code=Code.IO)
         return given
     inside = checkpoint.path("vlm")
     if os.path.exists(os.path.join(inside, "config.json")):
@@ -187,21 +190,12 @@ def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_mod
             "backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named))
         )
         return named
-    if isinstance(named, str) and is_hub_id(named):
-        try:
-            folder, revision = download(named, BACKBONE_PATTERNS)
-        except ConvertError as error:
-            raise refuse(
-                "backbone " + named,
-                "--backbone DIR, vlm/ inside the checkpoint, or a reachable hub",
-                error.problems[0].found,
-                "give the folder with the backbone's config.json and tokenizer.json by --backbone",
-                Code.IO,
-            )
-        checkpoint.notes.append("backbone config and tokenizer: {} at revision {}".format(named, revision))
-        return folder
     raise refuse(
-        "config.json: " + key, "the name of a backbone", str(named), "give its folder by --backbone", Code.IO
+        "backbone {}, which config.json: {} names".format(str(named)[:100], key),
+        "--backbone DIR, or vlm/ inside the checkpoint",
+        "neither",
+        "--backbone {} fetches it from the hub".format(HUB_FORM),
+        Code.IO,
     )
 
 

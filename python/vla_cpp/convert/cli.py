@@ -47,14 +47,14 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add(
-        "checkpoint", metavar="CHECKPOINT", help="folder with config.json and weights, or a hub id owner/name"
+        "checkpoint", metavar="CHECKPOINT", help="folder with config.json and weights, or hub:OWNER/NAME@REVISION"
     )
     add("-o", "--out", metavar="OUT.gguf", required=True, help="the bundle to write; appears only when it is complete")
     add(
         "--backbone",
         metavar="DIR",
         default="",
-        help="folder with the backbone's config.json and tokenizer.json, where they live elsewhere",
+        help="folder with the backbone's config.json and tokenizer.json, where they live elsewhere, or hub:OWNER/NAME@REVISION",
     )
     add(
         "--dtype",

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Callable, Dict, Iterator, List, Tuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from .. import __version__
 from . import archs
 from .archs import MATRIX, TABLE, Options, Plan, Weight
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
-from .checkpoint import Checkpoint, open_checkpoint
+from .checkpoint import Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert
 from .errors import Code, Problems, refuse
 from .safetensors_file import Entry
@@ -43,6 +43,7 @@ def convert_checkpoint(
     """Writes `out` or raises ConvertError and leaves nothing behind."""
     _check_out(out, force)
     checkpoint = open_checkpoint(source)
+    options = replace(options, backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
@@ -204,4 +205,6 @@ def _identity_keys(checkpoint: Checkpoint, summary: Summary) -> List[Key]:
         Key("vla.source.name", "string", checkpoint.name),
         Key("vla.source.revision", "string", checkpoint.revision),
         Key("vla.source.converter", "string", "vla-cpp " + __version__),
+        *([Key("vla.source.backbone", "string", checkpoint.backbone)] if checkpoint.backbone else []),
+        *([Key("vla.degraded", "string[]", checkpoint.degraded)] if checkpoint.degraded else []),
     ]

@@ -8,6 +8,9 @@ import enum
 from typing import List, NamedTuple
 
 
+MAX_LINES = 50  # of a report: who has more problems than these gave the wrong checkpoint
+
+
 class Code(enum.IntEnum):
     """Error classes that a conversion can end in; the value is the exit code of the process."""
 
@@ -47,8 +50,11 @@ class ConvertError(Exception):
     def message(self) -> str:
         if len(self.problems) == 1:
             return self.problems[0].message()
-        head = "{}: {} problems".format(self.subject or "checkpoint", len(self.problems))
-        return "\n".join([head] + ["  " + problem.message() for problem in self.problems])
+        lines = ["{}: {} problems".format(self.subject or "checkpoint", len(self.problems))]
+        lines += ["  " + problem.message() for problem in self.problems[:MAX_LINES]]
+        if len(self.problems) > MAX_LINES:
+            lines.append("  and {} more".format(len(self.problems) - MAX_LINES))
+        return "\n".join(lines)
 
 
 def refuse(where: str, expected: str, found: str, hint: str = "", code: Code = Code.BAD_BUNDLE) -> ConvertError:

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Tuple
+import re
+from typing import NamedTuple, Optional
 
 from .errors import Code, ConvertError, refuse
 
@@ -73,25 +74,42 @@ def plain_name(name) -> bool:
     return isinstance(name, str) and bool(name) and name not in (".", "..") and not set(name) & set("/\\\0")
 
 
-def is_hub_id(source: str) -> bool:
-    parts = source.split("/")
-    return len(parts) == 2 and all(parts) and not source.startswith((".", "~"))
+HUB = "hub:"
+HUB_FORM = "hub:OWNER/NAME@REVISION"
 
 
-def download(repo: str, patterns) -> Tuple[str, str]:
-    """Folder and revision of a hub repository, from the local cache where it is complete. Errors: io."""
+class HubFolder(NamedTuple):
+    """A repository of the hub in the local cache, and the commit that its revision was when it was asked for."""
+
+    folder: str
+    repo: str
+    commit: str
+
+
+def hub_folder(source: str, patterns) -> Optional[HubFolder]:
+    """None for a source that is a folder. Nothing is ever downloaded that does not say so, revision included. Errors: usage, io."""
+    if not source.startswith(HUB):
+        return None
+    found = re.fullmatch(r"(\w[\w.-]*/\w[\w.-]*)@(\w[\w./-]*)", source[len(HUB) :])
+    if not found:
+        hint = "a revision is a commit, tag or branch; the bundle records the commit"
+        raise refuse(source, HUB_FORM, "another form", hint, Code.USAGE)
+    folder = _download(source, found[1], found[2], patterns)
+    return HubFolder(folder, found[1], os.path.basename(folder))
+
+
+def _download(source: str, repo: str, revision: str, patterns) -> str:
     try:
         from huggingface_hub import snapshot_download
 
-        folder = snapshot_download(repo, allow_patterns=patterns)
+        return snapshot_download(repo, revision=revision, allow_patterns=patterns)
     except ImportError:
         raise missing_extra("huggingface_hub")
     except Exception as error:  # noqa: BLE001 - the library has a class for every kind of failure
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise refuse(
-            repo, "a folder or a reachable hub repository", reason[:200], "download it and give the folder", Code.IO
+            source, "a reachable hub repository", reason[:200], "download it and give the folder", Code.IO
         )
-    return folder, os.path.basename(folder)
 
 
 def missing_extra(package: str) -> ConvertError:

@@ -49,11 +49,12 @@ class Found(NamedTuple):
 
 class Context(NamedTuple):
     """What is asked of statistics: widths by feature, and the features that may do without. `least`: widths of statistics that need
-    not reach the padded width."""
+    not reach the padded width. `degraded`: of the latter those that need it."""
 
     dims: Dict[str, int]
     identity: Sequence[str]
     notes: List[str]
+    degraded: List[str]
     problems: Problems
     least: Dict[str, int]
 
@@ -69,6 +70,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
         return Normalization()
     missing = [name for name in names if name not in found.values]
     if missing and feature in context.identity:
+        context.degraded.append(feature)
         context.notes.append(
             "DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(
                 feature, ", ".join(missing)

@@ -88,7 +88,7 @@ class _Reader:
     ) -> None:
         self.steps = {file: {**STEPS[file], **own.get(file, {})} for file in STEPS}
         self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
-        self.context = Context(dims, identity, checkpoint.notes, problems, least)
+        self.context = Context(dims, identity, checkpoint.notes, checkpoint.degraded, problems, least)
         self.seen: List[str] = []
 
     def pipeline(self, file: str, content: dict) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from typing import BinaryIO, Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
@@ -70,9 +71,9 @@ class SafetensorsFile(NamedTuple):
 
 
 def _unique(pairs):
-    keys = [key for key, _ in pairs]
-    if len(set(keys)) != len(keys):
-        raise ValueError("the name {} stands twice".format(next(key for key in keys if keys.count(key) > 1)))
+    (key, count), *_ = Counter(key for key, _ in pairs).most_common(1) or [("", 0)]
+    if count > 1:
+        raise ValueError("the name {} stands twice".format(key))
     return dict(pairs)
 
 

@@ -8,14 +8,13 @@ Reference: lerobot src/lerobot/policies/pi0 and openpi src/openpi/models_pytorch
 from __future__ import annotations
 
 import json
-import os
 from typing import List
 
 from ... import recipe
 from ...bundle import Key, keys_by_type
 from ...checkpoint import OPENPI, Checkpoint
-from ...errors import Code, ConvertError, Problems, refuse
-from ...files import BACKBONE_PATTERNS, download
+from ...errors import Code, Problems, refuse
+from ...files import HUB_FORM
 from ...lerobot import tokenizer_folder
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from .. import Options, Plan
@@ -55,24 +54,17 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
 
 
 def _tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
-    """The folder with the tokenizer: the checkpoint's own, --backbone, or the one that the reference """
+    """The folder with the tokenizer: the checkpoint's own, or --backbone."""
     own = tokenizer_folder(checkpoint, options, processors) or options.backbone
     if own:
-        if not os.path.isdir(own):
-            raise refuse("--backbone " + own, "a folder", "none", code=Code.IO)
         return own
-    try:
-        folder, revision = download(TOKENIZER, BACKBONE_PATTERNS)
-    except ConvertError as error:
-        raise refuse(
-            "tokenizer " + TOKENIZER,
-            "--backbone DIR, tokenizer/ inside the checkpoint, or a reachable hub",
-            error.problems[0].found,
-            "give the folder with its tokenizer.json or tokenizer.model by --backbone",
-            Code.IO,
-        )
-    checkpoint.notes.append("tokenizer: {} at revision {}".format(TOKENIZER, revision))
-    return folder
+    raise refuse(
+        "tokenizer",
+        "--backbone DIR, or tokenizer/ inside the checkpoint",
+        "neither",
+        "the reference takes {}, which --backbone {} fetches".format(TOKENIZER, HUB_FORM),
+        Code.IO,
+    )
 
 
 def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problems) -> None:
