@@ -98,7 +98,8 @@ Result<Noise> read_noise(const vla_observation& given, const Engine& engine) {
     if (given.n_noise != 0) return usage("observation.noise", fmt::format("{} numbers", given.n_noise), "NULL");
     return Noise(given.seed);
   }
-  const auto horizon = static_cast<std::size_t>(engine.horizon()), width = static_cast<std::size_t>(engine.d_action());
+  const auto horizon = static_cast<std::size_t>(engine.solver_horizon()),
+             width = static_cast<std::size_t>(engine.d_action_padded());
   if (given.n_noise != horizon * width)
     return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon, width),
                  fmt::format("{} numbers", given.n_noise)};

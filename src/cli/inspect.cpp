@@ -7,7 +7,7 @@
 
 #include "cli/commands.h"
 #include "cli/json.h"
-#include "engine/engine.h"
+#include "engine/description.h"
 
 namespace vla::cli {
 namespace {
@@ -85,64 +85,37 @@ StatsColumns read_stats(const Bundle& bundle, const std::string& feature) {
   return columns;
 }
 
-void print_numbers(const std::vector<std::string>& names, const std::vector<std::string>& units,
-                   const StatsColumns& stats) {
+void print_numbers(const std::vector<Description::Number>& numbers, const StatsColumns& stats) {
   std::size_t width = 4;
-  for (const std::string& name : names) width = std::max(width, name.size());
+  for (const auto& number : numbers) width = std::max(width, number.name.size());
   fmt::print("    {:<{}}  {:<10}", "name", width, "unit");
   for (const std::string& column : stats.names) fmt::print("  {:>12}", column);
   fmt::print("\n");
-  for (std::size_t i = 0; i < names.size(); ++i) {
-    fmt::print("    {:<{}}  {:<10}", names[i], width, i < units.size() && !units[i].empty() ? units[i] : "unstated");
+  for (std::size_t i = 0; i < numbers.size(); ++i) {
+    fmt::print("    {:<{}}  {:<10}", numbers[i].name, width, numbers[i].unit.empty() ? "unstated" : numbers[i].unit);
     for (const auto& column : stats.values) fmt::print("  {:>12.6g}", i < column.size() ? column[i] : 0.0f);
     fmt::print("\n");
   }
 }
 
-void print_features(const Engine& engine) {
-  const Keys& keys = engine.bundle().keys();
-  const auto views = *keys.strings("observation.views"), aliases = *keys.strings("observation.view_aliases");
-  const Recipe& recipe = engine.processor().recipe();
+void print_features(const Description& d, const Engine& engine) {
   constexpr const char* kFits[] = {"letterboxed", "resized", "padded, scaled and cropped as the recipe says"};
+  const Recipe& recipe = engine.processor().recipe();
   fmt::print("views        any size, {} to {} x {}; at least {} of {} must be present\n", kFits[recipe.fit.index()],
-             recipe.width, recipe.height, engine.processor().min_views(), views.size());
-  for (std::size_t i = 0; i < views.size(); ++i)
-    fmt::print("    {}{}\n", views[i], aliases[i].empty() ? "" : fmt::format("  (also {})", aliases[i]));
-
-  const auto states = *keys.strings("observation.states");
-  const auto dims = engine.processor().state_dims();
-  const auto names = *keys.strings("observation.state_names"), units = *keys.strings("observation.state_units");
-  auto name = names.begin();
-  auto unit = units.begin();
-  for (std::size_t i = 0; i < states.size(); name += dims[i], unit += dims[i], ++i) {
-    fmt::print("state        {}, {} numbers\n", states[i], dims[i]);
-    print_numbers({name, name + dims[i]}, {unit, unit + dims[i]}, read_stats(engine.bundle(), states[i]));
+             recipe.width, recipe.height, d.min_views, d.views.size());
+  for (const auto& view : d.views)
+    fmt::print("    {}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias));
+  for (const auto& state : d.states) {
+    fmt::print("state        {}, {} numbers\n", state.name, state.numbers.size());
+    print_numbers(state.numbers, read_stats(engine.bundle(), state.name));
   }
-  const double rate = *keys.number("action.rate_hz", kRateHz);
-  fmt::print("action       {} rows of {} numbers{}\n", engine.n_row(), keys.strings("action.names")->size(),
-             rate > 0 ? fmt::format(", {:g} rows a second", rate) : ", control rate unstated");
-  print_numbers(*keys.strings("action.names"), *keys.strings("action.units"), read_stats(engine.bundle(), "action"));
-  fmt::print("instruction  at most {} tokens\n", engine.processor().recipe().max_tokens);
+  fmt::print("action       {} rows of {} numbers{}\n", d.horizon, d.actions.size(),
+             d.rate_hz > 0 ? fmt::format(", {:g} rows a second", d.rate_hz) : ", control rate unstated");
+  print_numbers(d.actions, read_stats(engine.bundle(), "action"));
+  fmt::print("instruction  at most {} tokens\n", d.max_text_tokens);
 }
 
-void print_human(const Engine& engine) {
-  const Bundle& bundle = engine.bundle();
-  const auto text = [&](const char* key) { return *bundle.keys().string(key); };
-  fmt::print("bundle       {}\n", bundle.path());
-  fmt::print("policy       {}, stored as {}, {}\n", text("vla.arch"), text("vla.dtype"),
-             human_size(static_cast<double>(bundle.file_size())));
-  fmt::print("source       {}{}, converted by {}\n", text("vla.source.name"),
-             text("vla.source.revision").empty() ? "" : " at " + text("vla.source.revision"),
-             text("vla.source.converter"));
-  fmt::print("checksum     {}\n", text("vla.checksum"));
-  print_features(engine);
-  fmt::print("solver       {}, {} steps from {:g}, {} noise\n", text("solver.kind"), engine.solver().n_step,
-             engine.solver().times.front(), engine.solver().noise);
-  const Json recipe = Json::parse(text("processor.recipe"), nullptr, false);
-  for (const auto& [list, ops] : recipe.items()) {
-    fmt::print("recipe       {}\n", list);
-    for (const Json& op : ops) fmt::print("    {}\n", text_of(op));
-  }
+void print_modules(const Engine& engine) {
   fmt::print("modules      {:<18}  {:>14}  {:>10}\n", "path", "parameters", "stored");
   std::int64_t n_param = 0;
   for (const auto& [path, size] : module_sizes(engine.params())) {
@@ -150,12 +123,28 @@ void print_human(const Engine& engine) {
                human_size(static_cast<double>(size.stored)));
     n_param += size.n_param;
   }
-  const MemoryUse memory = engine.memory();
   fmt::print("             {:<18}  {:>14}\n", "all", n_param);
+}
+
+void print_human(const Engine& engine) {
+  const Description d = describe(engine);
+  const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
+  fmt::print("bundle       {}\n", d.path);
+  fmt::print("policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(engine.bundle().file_size()));
+  fmt::print("source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
+             d.converter);
+  fmt::print("checksum     {}\n", d.checksum);
+  print_features(d, engine);
+  fmt::print("solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
+  const Json recipe = Json::parse(*engine.bundle().keys().string("processor.recipe"), nullptr, false);
+  for (const auto& [list, ops] : recipe.items()) {
+    fmt::print("recipe       {}\n", list);
+    for (const Json& op : ops) fmt::print("    {}\n", text_of(op));
+  }
+  print_modules(engine);
   fmt::print("products     {}: {}\n", engine.linear_kernels(), engine.arithmetic());
-  fmt::print("memory       {} in all: weights {}, inputs and cache {}, working memory {}\n",
-             human_size(static_cast<double>(memory.total())), human_size(static_cast<double>(memory.weights)),
-             human_size(static_cast<double>(memory.plan)), human_size(static_cast<double>(memory.working)));
+  fmt::print("memory       {} in all: weights {}, inputs and cache {}, working memory {}\n", size(d.memory.total()),
+             size(d.memory.weights), size(d.memory.plan), size(d.memory.working));
 }
 
 void print_json(const Engine& engine) {

@@ -87,8 +87,8 @@ Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
   VLA_TRY(NpyArray array, parse_npy(bytes, options.noise));
   auto* values = std::get_if<std::vector<float>>(&array.values);
   if (values == nullptr) return Error{Code::bad_observation, options.noise, "float32 noise", "uint8"};
-  const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.horizon()),
-                                          static_cast<std::size_t>(engine.d_action())};
+  const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.solver_horizon()),
+                                          static_cast<std::size_t>(engine.d_action_padded())};
   if (array.shape.size() == 3 && array.shape.front() == 1) array.shape.erase(array.shape.begin());
   if (array.shape != shape)
     return Error{Code::bad_observation, options.noise, fmt::format("noise of shape ({})", fmt::join(shape, ", ")),

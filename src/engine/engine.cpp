@@ -169,7 +169,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   const std::vector<float> result = plan->x();
   VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs_.raw_state));
   clock.lap(chunk.timing, "postprocess");
-  chunk.horizon = n_row();
+  chunk.horizon = horizon();
   chunk.d_action = static_cast<int>(processor_.action_names().size());
   chunk.notes = inputs_.notes;
   record_chunk(result, chunk);

@@ -60,11 +60,11 @@ class Engine {
   const Device& device() const { return device_; }
   const Solver& solver() const { return solver_; }
   const ParamList& params() const { return *params_; }
-  /// Rows of the solver's start, of which `n_row` are answered.
-  int horizon() const { return horizon_; }
   /// Rows of a chunk.
-  int n_row() const { return processor_.n_row(horizon_); }
-  int d_action() const { return d_action_; }
+  int horizon() const { return processor_.n_row(horizon_); }
+  /// Rows and columns of the solver's start: those of a chunk, or more.
+  int solver_horizon() const { return horizon_; }
+  int d_action_padded() const { return d_action_; }
   MemoryUse memory() const;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return weights_->kernels(); }

@@ -2,23 +2,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Answers, from what the engine gives to their messages.
+#include "engine/description.h"
 #include "processor/unicode.h"
 #include "serve/codec.h"
 #include "serve/envelope.h"
 
 namespace vla::serve {
 namespace {
-
-/// A key that every bundle which the engine opened has: Processor::create and Engine::load have checked it.
-std::string text(const Engine& engine, const char* key) {
-  const auto value = engine.bundle().keys().string(key);
-  return value ? *value : std::string();
-}
-
-std::vector<std::string> texts(const Engine& engine, const char* key) {
-  const auto value = engine.bundle().keys().strings(key);
-  return value ? *value : std::vector<std::string>();
-}
 
 /// Protobuf's text is UTF-8, which a file name need not be.
 std::string utf8(std::string bytes) {
@@ -27,76 +17,60 @@ std::string utf8(std::string bytes) {
   return bytes;
 }
 
-void describe_views(const Engine& engine, v1::Description& out) {
-  const auto aliases = texts(engine, "observation.view_aliases");
-  const auto optional = engine.bundle().keys().integers("observation.view_optional", kFlag);
-  const Processor& processor = engine.processor();
-  for (std::size_t i = 0; i < processor.views().names().size(); ++i) {
-    v1::ViewSpec& view = *out.add_views();
-    view.set_name(processor.views().names()[i]);
-    if (!aliases[i].empty()) view.add_aliases(aliases[i]);
-    view.set_optional((*optional)[i] != 0);
-    view.set_width(static_cast<std::uint32_t>(processor.recipe().width));
-    view.set_height(static_cast<std::uint32_t>(processor.recipe().height));
-  }
-  out.set_min_views(static_cast<std::uint32_t>(processor.min_views()));
+std::uint32_t u32(int count) { return static_cast<std::uint32_t>(count); }
+
+void add_number(const Description::Number& number, v1::Dimension& out) {
+  out.set_name(number.name);
+  out.set_unit(number.unit);
 }
 
-void describe_states(const Engine& engine, v1::Description& out) {
-  const auto names = texts(engine, "observation.state_names"), units = texts(engine, "observation.state_units");
-  const Processor& processor = engine.processor();
-  std::size_t at = 0;
-  for (std::size_t i = 0; i < processor.states().names().size(); ++i) {
-    v1::StateSpec& state = *out.add_states();
-    state.set_name(processor.states().names()[i]);
-    for (int k = 0; k < processor.state_dims()[i]; ++k, ++at) {
-      v1::Dimension& dimension = *state.add_dimensions();
-      dimension.set_name(names[at]);
-      dimension.set_unit(units[at]);
-    }
+void write_features(const Description& d, v1::Description& out) {
+  for (const Description::View& view : d.views) {
+    v1::ViewSpec& spec = *out.add_views();
+    spec.set_name(view.name);
+    if (!view.alias.empty()) spec.add_aliases(view.alias);
+    spec.set_optional(view.optional);
+    spec.set_width(u32(view.width));
+    spec.set_height(u32(view.height));
   }
+  out.set_min_views(u32(d.min_views));
+  for (const Description::State& state : d.states) {
+    v1::StateSpec& spec = *out.add_states();
+    spec.set_name(state.name);
+    for (const Description::Number& number : state.numbers) add_number(number, *spec.add_dimensions());
+  }
+  for (const Description::Number& action : d.actions) add_number(action, *out.add_actions());
 }
 
-void describe_actions(const Engine& engine, v1::Description& out) {
-  const auto units = texts(engine, "action.units");
-  for (std::size_t i = 0; i < engine.processor().action_names().size(); ++i) {
-    v1::Dimension& dimension = *out.add_actions();
-    dimension.set_name(engine.processor().action_names()[i]);
-    dimension.set_unit(units[i]);
-  }
-  out.set_horizon(static_cast<std::uint32_t>(engine.n_row()));
-  out.set_rate_hz(*engine.bundle().keys().number("action.rate_hz", kRateHz));
-}
-
-void describe_bundle(const Engine& engine, v1::Bundle& out) {
-  const std::string& path = engine.bundle().path();
-  out.set_name(utf8(path.substr(path.rfind('/') + 1)));
-  out.set_arch(text(engine, "vla.arch"));
-  out.set_checksum(text(engine, "vla.checksum"));
-  out.set_dtype(text(engine, "vla.dtype"));
-  out.set_source_name(text(engine, "vla.source.name"));
-  out.set_source_revision(text(engine, "vla.source.revision"));
-  out.set_converter(text(engine, "vla.source.converter"));
+void write_bundle(const Description& d, v1::Bundle& out) {
+  out.set_name(utf8(d.path.substr(d.path.rfind('/') + 1)));
+  out.set_arch(d.arch);
+  out.set_checksum(d.checksum);
+  out.set_dtype(d.dtype);
+  out.set_source_name(d.source);
+  out.set_source_revision(d.revision);
+  out.set_converter(d.converter);
 }
 
 }  // namespace
 
 v1::Description describe(const Engine& engine, const v1::Limits& limits) {
+  const Description d = vla::describe(engine);
   v1::Description out;
-  describe_views(engine, out);
-  describe_states(engine, out);
-  describe_actions(engine, out);
-  out.set_d_noise(static_cast<std::uint32_t>(engine.d_action()));
-  out.set_noise_rows(static_cast<std::uint32_t>(engine.horizon()));
-  out.set_noise_kind(engine.solver().noise);
-  out.set_max_text_tokens(static_cast<std::uint32_t>(engine.processor().recipe().max_tokens));
+  write_features(d, out);
+  out.set_horizon(u32(d.horizon));
+  out.set_rate_hz(d.rate_hz);
+  out.set_d_noise(u32(d.d_action_padded));
+  out.set_noise_rows(u32(d.solver_horizon));
+  out.set_noise_kind(d.noise);
+  out.set_max_text_tokens(u32(d.max_text_tokens));
   *out.mutable_limits() = limits;
-  describe_bundle(engine, *out.mutable_bundle());
+  write_bundle(d, *out.mutable_bundle());
   v1::Runtime& runtime = *out.mutable_runtime();
   runtime.set_server_version(VLA_VERSION);
-  runtime.set_device(engine.device().name());
-  runtime.set_precision(engine.precision());
-  runtime.set_kernels(engine.kernels());
+  runtime.set_device(d.device);
+  runtime.set_precision(d.precision);
+  runtime.set_kernels(d.kernels);
   return out;
 }
 

@@ -200,8 +200,8 @@ Answer Server::compute(Engine& engine, Job job) const {
 }
 
 Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Timing& stages) const {
-  const ActLimits limits{options_.max_pixels, options_.max_text, description_.limits().max_views(), engine.horizon(),
-                         engine.d_action()};
+  const ActLimits limits{options_.max_pixels, options_.max_text, description_.limits().max_views(),
+                         engine.solver_horizon(), engine.d_action_padded()};
   StageClock clock;
   VLA_TRY(const ActRequest request, decode_act(job.body(), limits));
   clock.lap(stages, "decode");

@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "engine/description.h"
+
+#include <fmt/format.h>
+
+namespace vla {
+namespace {
+
+std::vector<Description::Number> numbers(const std::vector<std::string>& names, const std::vector<std::string>& units,
+                                         std::size_t first, std::size_t count) {
+  std::vector<Description::Number> out;
+  for (std::size_t i = first; i < first + count; ++i) out.push_back({names[i], units[i]});
+  return out;
+}
+
+}  // namespace
+
+/// Processor::create and Engine::load have checked every key that is read here.
+Description describe(const Engine& engine) {
+  const Keys& keys = engine.bundle().keys();
+  const Processor& processor = engine.processor();
+  const auto texts = [&](const char* key) { return *keys.strings(key); };
+  Description out;
+
+  const auto aliases = texts("observation.view_aliases");
+  const auto optional = *keys.integers("observation.view_optional", kFlag);
+  const Recipe& recipe = processor.recipe();
+  for (std::size_t i = 0; i < aliases.size(); ++i)
+    out.views.push_back({processor.views().names()[i], aliases[i], optional[i] != 0, recipe.width, recipe.height});
+  out.min_views = processor.min_views();
+
+  const auto names = texts("observation.state_names"), units = texts("observation.state_units");
+  std::size_t first = 0;
+  for (std::size_t i = 0; i < processor.states().names().size(); ++i) {
+    const auto width = static_cast<std::size_t>(processor.state_dims()[i]);
+    out.states.push_back({processor.states().names()[i], numbers(names, units, first, width)});
+    first += width;
+  }
+  out.max_text_tokens = recipe.max_tokens;
+
+  out.horizon = engine.horizon();
+  out.actions = numbers(processor.action_names(), texts("action.units"), 0, processor.action_names().size());
+  out.rate_hz = *keys.number("action.rate_hz", kRateHz);
+  out.solver_horizon = engine.solver_horizon();
+  out.d_action_padded = engine.d_action_padded();
+  out.solver = *keys.string("solver.kind");
+  out.noise = engine.solver().noise;
+  out.n_step = engine.solver().n_step;
+  out.t_start = engine.solver().times.front();
+
+  out.path = engine.bundle().path();
+  for (const auto& [key, text] : {std::pair{"arch", &out.arch},
+                                  {"dtype", &out.dtype},
+                                  {"checksum", &out.checksum},
+                                  {"source.name", &out.source},
+                                  {"source.revision", &out.revision},
+                                  {"source.converter", &out.converter}})
+    *text = *keys.string(fmt::format("vla.{}", key));
+  out.precision = engine.precision();
+  out.kernels = engine.kernels();
+  out.device = engine.device().name();
+  out.memory = engine.memory();
+  return out;
+}
+
+}  // namespace vla

@@ -1,0 +1,47 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "engine/engine.h"
+
+namespace vla {
+
+/// What a loaded policy takes and gives, for whoever prints or sends it.
+struct Description {
+  struct View {
+    std::string name, alias;  // the alias is empty where there is none
+    bool optional;            // leaving it out of an observation declares it absent
+    int width, height;        // pixels of the network; frames of any size are fitted into it
+  };
+  struct Number {
+    std::string name, unit;  // the unit is empty where the bundle does not state it
+  };
+  struct State {
+    std::string name;
+    std::vector<Number> numbers;
+  };
+
+  std::vector<View> views;  // in the order in which the network sees them
+  int min_views;
+  std::vector<State> states;
+  int max_text_tokens;
+
+  int horizon;  // rows of a chunk
+  std::vector<Number> actions;
+  double rate_hz;                       // rows a second, 0 where the bundle does not state it
+  int solver_horizon, d_action_padded;  // rows and columns of the solver's start, of which a chunk has the first
+  std::string solver, noise;            // kinds
+  int n_step;
+  double t_start;
+
+  std::string path, arch, dtype, checksum, source, revision, converter;
+  std::string precision, kernels, device;
+  MemoryUse memory;
+};
+
+Description describe(const Engine& engine);
+
+}  // namespace vla
