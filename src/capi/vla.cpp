@@ -13,7 +13,8 @@
 #include "engine/engine.h"
 
 struct vla_policy {
-  explicit vla_policy(std::unique_ptr<vla::Engine> loaded) : engine(std::move(loaded)), description(vla::describe(*engine)) {}
+  explicit vla_policy(std::unique_ptr<vla::Engine> loaded)
+      : engine(std::move(loaded)), description(vla::describe(*engine)) {}
   std::unique_ptr<vla::Engine> engine;
   vla::capi::Description description;
   std::mutex mutex;  // the engine answers one observation at a time
