@@ -27,10 +27,13 @@ std::vector<std::string> numbered(const std::string& name, int count) {
   return names;
 }
 
-/// Places for views in front of the text, for a network that has them among its tokens.
+/// Places for views in front of the text or behind it, for a network that has them among its tokens.
 struct ViewPlaces {
   int count = 0;   // none: the network takes images beside the text
   int repeat = 0;  // tokens of a view
+  bool behind = false;
+
+  static constexpr const char *kStarts = "policy.view_starts", *kStartsFromEnd = "policy.view_starts_from_end";
 
   static constexpr std::string_view kOpen = "View {i}: ", kToken = "<view>", kClose = "\n";
 
@@ -39,7 +42,8 @@ struct ViewPlaces {
   int size() const { return open_size() + repeat + static_cast<int>(kClose.size()); }
   std::vector<std::int64_t> starts() const {
     std::vector<std::int64_t> starts;
-    for (int i = 0; i < count; ++i) starts.push_back(i * size() + open_size());
+    for (int i = 0; i < count; ++i)
+      starts.push_back(behind ? (count - i) * size() - open_size() : i * size() + open_size());
     return starts;
   }
 };
@@ -63,8 +67,13 @@ Result<ViewPlaces> view_places(const Keys& keys, const PictureSize& picture) {
   ViewPlaces places;
   if (!keys.has("policy.n_slot")) return places;
   VLA_TRY(const int patch_size, keys.integer("vision.patch_size", kAnySize));
-  VLA_TRY(const int factor, keys.integer(keys.has("vision.merge") ? "vision.merge" : "connector.factor", kAnySize));
+  int factor = 1;
+  for (const char* key : {"vision.merge", "connector.factor"})
+    if (keys.has(key)) {
+      VLA_TRY(factor, keys.integer(key, kAnySize));
+    }
   VLA_TRY(places.count, keys.integer("policy.n_slot", kAnySize));
+  places.behind = keys.has(ViewPlaces::kStartsFromEnd);
   places.repeat = (picture.width / patch_size / factor) * (picture.height / patch_size / factor);
   return places;
 }
@@ -75,8 +84,13 @@ std::string recipe(const PictureSize& picture, const ViewPlaces& places, int max
                           {"filter", "bilinear"}, {"antialias", false},     {"align", "bottom_right"},
                           {"fill", 0.0}};
   const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
-  const Json views = {{"op", "views"},          {"count", places.count},   {"open", places.kOpen},
-                      {"token", places.kToken}, {"repeat", places.repeat}, {"close", places.kClose}};
+  const Json views = {{"op", "views"},
+                      {"count", places.count},
+                      {"open", places.kOpen},
+                      {"token", places.kToken},
+                      {"repeat", places.repeat},
+                      {"close", places.kClose},
+                      {"place", places.behind ? "back" : "front"}};
   const Json tokenize = {{"op", "tokenize"}, {"max_tokens", max_tokens}, {"truncate", "right"}};
   // A network without a state vector sees none: what a robot sends is dropped.
   const Json state = d_state > 0 ? Json::object({{"op", "pad"}, {"size", d_state}}) : Json::object({{"op", "drop"}});
@@ -157,7 +171,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"processor.recipe", recipe(picture, places, max_tokens, d_state, d_robot)},
   });
   for (const auto& [key, value] : added.all()) keys.set(key, value);
-  if (places.count > 0) keys.set("policy.view_starts", places.starts());
+  if (places.count > 0) keys.set(places.behind ? ViewPlaces::kStartsFromEnd : ViewPlaces::kStarts, places.starts());
   return {};
 }
 

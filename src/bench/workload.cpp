@@ -43,11 +43,11 @@ Result<int> count_tokens(const Processor& processor, const std::string& text) {
   observation.text = text;
   Inputs inputs;
   VLA_CHECK(processor.encode_text(observation, inputs));
-  return static_cast<int>(inputs.tokens.size()) - processor.n_front();
+  return static_cast<int>(inputs.tokens.size()) - processor.n_view_tokens();
 }
 
 /// Tokens that the places for views leave for the instruction.
-int most_text(const Processor& processor) { return processor.recipe().max_tokens - processor.n_front(); }
+int most_text(const Processor& processor) { return processor.recipe().max_tokens - processor.n_view_tokens(); }
 
 /// A text of exactly `n_token` tokens: the same word again and again, for a few words that tokenizers cut differently.
 Result<std::string> find_text(const Processor& processor, int n_token) {

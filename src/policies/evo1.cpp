@@ -49,8 +49,8 @@ class Evo1 final : public Policy {
  public:
   explicit Evo1(const Scope& s)
       : vision_(s / "vision"),
-        lm_(s / "lm", QwenKind::qwen2),
-        connector_(s / "connector", vision_.d_model(), lm_.d_model(), vision_.n_side()),
+        lm_(s / "lm", kQwen2),
+        connector_(s / "connector", vision_.d_model(), lm_.d_model(), vision_.n_side(), vision_.n_side()),
         state_in_(s / "state_in", s.dim("d_state"), (s / "head").dim("d_state_hidden"), Bias::yes),
         state_out_(s / "state_out", (s / "head").dim("d_state_hidden"), lm_.d_model(), Bias::yes),
         head_(s / "head", lm_.d_model()),

@@ -38,6 +38,10 @@ Size size_after(const CropFraction& op, const Size& from) {
   return {std::max(1.0, std::floor(from.width * op.fraction)), std::max(1.0, std::floor(from.height * op.fraction))};
 }
 
+Size size_after(const PillowResize& op, const Size&) {
+  return {static_cast<double>(op.width), static_cast<double>(op.height)};
+}
+
 /// The picture in the middle of another size: what is beyond it is cut off, what it does not reach is black.
 Picture centred(const Picture& from, int width, int height) {
   Picture to{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
@@ -54,8 +58,11 @@ Picture centred(const Picture& from, int width, int height) {
 }
 
 Picture applied(const PictureOp& op, const Picture& from, int width, int height) {
-  if (!std::holds_alternative<SmallestSide>(op)) return centred(from, width, height);
-  return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
+  if (std::holds_alternative<SmallestSide>(op))
+    return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
+  if (std::holds_alternative<PillowResize>(op))
+    return {width, height, resample_8bit(from.rgb, from.width, from.height, width, height, PillowFilter::bicubic)};
+  return centred(from, width, height);
 }
 
 }  // namespace

@@ -25,7 +25,13 @@ struct CropFraction {
   double fraction = 0.0;
 };
 
-using PictureOp = std::variant<SquarePad, SmallestSide, CropFraction>;
+/// A size whatever the aspect, by Pillow's bicubic filter.
+struct PillowResize {
+  int width = 0;
+  int height = 0;
+};
+
+using PictureOp = std::variant<SquarePad, SmallestSide, CropFraction, PillowResize>;
 
 /// Ops on 8-bit pictures one after the other, and the size at which they must come out.
 struct Pipeline {

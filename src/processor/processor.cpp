@@ -134,7 +134,8 @@ Result<std::string> Processor::fill_prompt(const std::string& instruction, std::
     if (const auto* end = std::get_if<EnsureSuffixOp>(&op); end != nullptr && !text.ends_with(end->suffix))
       text += end->suffix;
     if (const auto* whole = std::get_if<TemplateOp>(&op)) text = fill_template(whole->text, text, state_words);
-    if (const auto* views = std::get_if<ViewsOp>(&op)) text = view_places(*views) + text;
+    if (const auto* views = std::get_if<ViewsOp>(&op))
+      text = views->behind ? text + view_places(*views) : view_places(*views) + text;
     VLA_CHECK(check_prompt(text.size()));
   }
   return text;
@@ -159,16 +160,17 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
                                        recipe_.keep_last ? "last" : "first", limit));
     cut_tokens(inputs.tokens);
   }
-  return front_.empty() ? Status() : check_view_places(inputs.tokens);
+  return view_tokens_.empty() ? Status() : check_view_places(inputs.tokens);
 }
 
 /// The network puts pictures where the bundle says that their places are, whatever the prompt says.
 Status Processor::check_view_places(std::span<const std::int32_t> tokens) const {
-  const bool whole = tokens.size() >= front_.size() && std::equal(front_.begin(), front_.end(), tokens.begin());
-  if (!whole)
-    return bad_observation("instruction", "text that leaves the places of the views in front of it",
+  const std::size_t n = view_tokens_.size(), n_rest = tokens.size() - std::min(n, tokens.size());
+  const auto placed = views_behind_ ? tokens.subspan(n_rest) : tokens.first(tokens.size() - n_rest);
+  if (!std::equal(placed.begin(), placed.end(), view_tokens_.begin(), view_tokens_.end()))
+    return bad_observation("instruction", "text that leaves the places of the views as they are",
                            "text that changes or cuts them", "shorten the instruction");
-  const auto rest = tokens.subspan(front_.size());
+  const auto rest = views_behind_ ? tokens.first(n_rest) : tokens.subspan(n);
   if (std::find(rest.begin(), rest.end(), view_token_) == rest.end()) return {};
   return bad_observation("instruction", "text without " + view_token_text_, "such a token",
                          "the places of the views are made by the runtime; remove it from the text");

@@ -47,7 +47,7 @@ inline constexpr std::size_t kMaxPrompt = kMaxViewsText + Tokenizer::kMaxText;
 class Processor {
  public:
   /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state`,
-  /// `policy.d_action`, where the text has places for views `policy.view_starts`, and where rows are cut off
+  /// `policy.d_action`, where the text has places for views where they are, and where rows are cut off
   /// `policy.horizon`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
   static Result<Processor> create(const Bundle& bundle);
 
@@ -80,8 +80,8 @@ class Processor {
   const FeatureNames& states() const { return states_; }
   const std::vector<int>& state_dims() const { return state_dims_; }
   const std::vector<std::string>& action_names() const { return action_names_; }
-  /// Tokens of every prompt up to its last place for a view; 0 where the text has no such places.
-  int n_front() const { return static_cast<int>(front_.size()); }
+  /// Tokens that every prompt has around its places for views; 0 where the text has no such places.
+  int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
 
  private:
@@ -125,8 +125,10 @@ class Processor {
   std::vector<StateStep> state_steps_;
   std::vector<ActionStep> action_steps_;
   std::optional<BinsOp> bins_;  // the state goes into the prompt
-  /// Where the text has places for views: the tokens of every prompt up to the last place, and the token of a place.
-  std::vector<std::int32_t> front_;
+  /// Where the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
+  /// and the token of a place.
+  std::vector<std::int32_t> view_tokens_;
+  bool views_behind_ = false;
   std::int32_t view_token_ = -1;
   std::string view_token_text_;
   std::size_t n_state_ = 0;  // numbers of all states together

@@ -141,7 +141,9 @@ Status Processor::read_view_places(const Keys& keys) {
   if (op == recipe_.text.end()) return {};
   const auto* views = std::get_if<ViewsOp>(&*op);
   const std::string where = fmt::format("processor.recipe.text[{}]", op - recipe_.text.begin());
-  VLA_TRY(const std::vector<int> starts, keys.integers("policy.view_starts", kTokenIndex));
+  views_behind_ = views->behind;
+  const std::string key = views_behind_ ? "policy.view_starts_from_end" : "policy.view_starts";
+  VLA_TRY(const std::vector<int> starts, keys.integers(key, kTokenIndex));
   VLA_TRY(const std::vector<std::int32_t> prefixed, tokenizer_.encode(views->token));
   const std::size_t n_prefix = tokenizer_.prefix().size();
   if (prefixed.size() != n_prefix + 1)
@@ -153,17 +155,20 @@ Status Processor::read_view_places(const Keys& keys) {
   VLA_TRY(const std::vector<std::int32_t> tokens, tokenizer_.encode(*prompt, kMaxPrompt));
   const std::vector<Run> runs = runs_of(view_token_, tokens);
   std::vector<int> found;
-  for (const Run& run : runs) found.push_back(run.start);
+  const int n_token = static_cast<int>(tokens.size());
+  for (const Run& run : runs) found.push_back(views_behind_ ? n_token - run.start : run.start);
   const auto is_whole = [views](const Run& run) { return run.size == views->repeat; };
   if (found.size() != static_cast<std::size_t>(views->count) || !std::all_of(runs.begin(), runs.end(), is_whole))
     return misfit(where, fmt::format("{} runs of {} tokens", views->count, views->repeat),
                   fmt::format("{} runs in the tokens of the prompt", runs.size()));
   if (found != starts)
-    return misfit("policy.view_starts", fmt::format("{}, where the prompt has them", fmt::join(found, ", ")),
+    return misfit(key, fmt::format("{}, where the prompt has them", fmt::join(found, ", ")),
                   fmt::format("{}", fmt::join(starts, ", ")));
-  front_.assign(tokens.begin(), tokens.begin() + runs.back().start + runs.back().size);
-  if (front_.size() <= static_cast<std::size_t>(recipe_.max_tokens)) return {};
-  return misfit("processor.recipe.text", fmt::format("at least {} tokens, which the views need", front_.size()),
+  const auto first = tokens.begin() + (views_behind_ ? runs.front().start : 0);
+  const auto last = views_behind_ ? tokens.end() : tokens.begin() + runs.back().start + runs.back().size;
+  view_tokens_.assign(first, last);
+  if (view_tokens_.size() <= static_cast<std::size_t>(recipe_.max_tokens)) return {};
+  return misfit("processor.recipe.text", fmt::format("at least {} tokens, which the views need", view_tokens_.size()),
                 std::to_string(recipe_.max_tokens));
 }
 

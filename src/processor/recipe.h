@@ -62,11 +62,12 @@ struct TemplateOp {
   std::string text;
 };
 
-/// `count` pieces in front of the text so far, one for each view that the network has a place for: `open` with the
-/// number of the piece, from 1, for `{i}` where it stands, then `token` `repeat` times, then `close`.
+/// `count` pieces in front of the text so far, or behind it, one for each view that the network has a place for: `open`
+/// with the number of the piece, from 1, for `{i}` where it stands, then `token` `repeat` times, then `close`.
 struct ViewsOp {
   int count = 0;
   int repeat = 0;
+  bool behind = false;
   std::string open, token, close;
 };
 

@@ -54,8 +54,15 @@ Result<Standardize> parse_standardize(JsonFields& fields) {
 }
 
 Result<PictureOp> parse_picture_op(JsonFields& fields, int op) {
-  if (op == 0) return PictureOp(SquarePad{});
-  if (op == 1) {
+  if (op == 0) {
+    PillowResize resize;
+    VLA_TRY(resize.width, fields.integer("width", 1, kMaxImageSide));
+    VLA_TRY(resize.height, fields.integer("height", 1, kMaxImageSide));
+    VLA_CHECK(fields.choice("filter", {"pillow_bicubic"}));
+    return PictureOp(resize);
+  }
+  if (op == 1) return PictureOp(SquarePad{});
+  if (op == 2) {
     SmallestSide smallest;
     VLA_TRY(smallest.size, fields.integer("size", 1, kMaxImageSide));
     VLA_CHECK(fields.choice("filter", {"opencv_area"}));
@@ -84,18 +91,19 @@ Status set_fit(Result<Op> op, Recipe& recipe) {
   return {};
 }
 
-/// `op`: of the ops that make planes of one size, which letterbox and resize do alone and a pipeline in several.
+/// `op`: of the ops that make planes of one size, which letterbox and a resize in first place do alone and a pipeline
+/// in several.
 Status parse_fit(JsonFields& fields, int op, bool first, Recipe& recipe) {
-  constexpr int kAlone = 2, kSize = 5;
-  if (op < kAlone && !first) return misplaced(fields, "a letterbox or resize as the first and only op on pictures");
+  constexpr int kResize = 1, kSize = 5;
+  if (op == 0 && !first) return misplaced(fields, "a letterbox as the first and only op on pictures");
   if (op == 0) return set_fit(parse_letterbox(fields), recipe);
-  if (op == 1) return set_fit(parse_resize(fields), recipe);
+  if (op == kResize && first) return set_fit(parse_resize(fields), recipe);
   if (recipe.width > 0) return misplaced(fields, "pictures of any size before size, letterbox or resize");
   if (first) recipe.fit = Pipeline{};
   auto& pipeline = std::get<Pipeline>(recipe.fit);
   if (op == kSize) return parse_size(fields, pipeline, recipe);
   if (pipeline.ops.size() == kMaxPictureOps) return misplaced(fields, "fewer ops on pictures");
-  VLA_TRY(PictureOp picture, parse_picture_op(fields, op - kAlone));
+  VLA_TRY(PictureOp picture, parse_picture_op(fields, op - kResize));
   pipeline.ops.push_back(picture);
   return {};
 }
@@ -142,6 +150,10 @@ Result<TextOp> parse_views(JsonFields& fields) {
   VLA_TRY(op.token, fields.string("token"));
   VLA_TRY(op.repeat, fields.integer("repeat", 1, kMaxVector));
   VLA_TRY(op.close, fields.string("close"));
+  if (fields.has("place")) {
+    VLA_TRY(const int place, fields.choice("place", {"front", "back"}));
+    op.behind = place == 1;
+  }
   if (op.token.empty()) return fields.wrong("token", "the text of a token");
   if (!is_numbered(op.open)) return fields.wrong("open", "text with {i} once at most and no other braces");
   const std::size_t longest = kMaxViewsText / static_cast<std::size_t>(op.count);

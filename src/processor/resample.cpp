@@ -16,9 +16,20 @@ struct Window {
   std::vector<int> weights;
 };
 
-std::vector<Window> make_windows(int n_in, int n_out) {
-  const double scale = static_cast<double>(n_in) / n_out;
-  const double support = std::max(scale, 1.0);  // half the width of the triangle
+double triangle(double distance) { return distance < 1.0 ? 1.0 - distance : 0.0; }
+
+double cubic(double x) {
+  constexpr double a = -0.5;
+  if (x < 1.0) return ((a + 2.0) * x - (a + 3.0)) * x * x + 1.0;
+  return x < 2.0 ? (((x - 5.0) * x + 8.0) * x - 4.0) * a : 0.0;
+}
+
+int rounded_weight(double weight) { return static_cast<int>((weight < 0.0 ? -0.5 : 0.5) + weight * (1 << kBits)); }
+
+std::vector<Window> make_windows(int n_in, int n_out, PillowFilter filter) {
+  const bool wide = filter == PillowFilter::bicubic;
+  const double scale = static_cast<double>(n_in) / n_out, widened = std::max(scale, 1.0);
+  const double support = (wide ? 2.0 : 1.0) * widened;  // half the width of the filter
   std::vector<Window> windows;
   windows.reserve(static_cast<std::size_t>(n_out));
   for (int i = 0; i < n_out; ++i) {
@@ -28,13 +39,12 @@ std::vector<Window> make_windows(int n_in, int n_out) {
     std::vector<double> exact;
     double sum = 0.0;
     for (int x = first; x < end; ++x) {
-      const double distance = std::abs((x - center + 0.5) * (1.0 / support));
-      exact.push_back(distance < 1.0 ? 1.0 - distance : 0.0);
+      const double distance = std::abs((x - center + 0.5) * (1.0 / widened));
+      exact.push_back(wide ? cubic(distance) : triangle(distance));
       sum += exact.back();
     }
     Window window{first, {}};
-    for (const double weight : exact)
-      window.weights.push_back(static_cast<int>(0.5 + (sum != 0.0 ? weight / sum : weight) * (1 << kBits)));
+    for (const double weight : exact) window.weights.push_back(rounded_weight(sum != 0.0 ? weight / sum : weight));
     windows.push_back(std::move(window));
   }
   return windows;
@@ -69,7 +79,7 @@ void resample_axis(const std::uint8_t* in, Layout from, std::uint8_t* out, Layou
 }  // namespace
 
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                        int to_height) {
+                                        int to_height, PillowFilter filter) {
   const auto bytes = [](int n_column, int n_row) {
     return static_cast<std::size_t>(n_column) * static_cast<std::size_t>(n_row) * 3;
   };
@@ -77,12 +87,12 @@ std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int w
   if (to_width != width) {
     wide.resize(bytes(to_width, height));
     resample_axis(rgb.data(), {height, 3, bytes(width, 1)}, wide.data(), {height, 3, bytes(to_width, 1)},
-                  make_windows(width, to_width));
+                  make_windows(width, to_width, filter));
   }
   if (to_height == height) return wide;
   std::vector<std::uint8_t> out(bytes(to_width, to_height));
   resample_axis(wide.data(), {to_width, bytes(to_width, 1), 3}, out.data(), {to_width, bytes(to_width, 1), 3},
-                make_windows(height, to_height));
+                make_windows(height, to_height, filter));
   return out;
 }
 

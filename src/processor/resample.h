@@ -8,12 +8,14 @@
 
 namespace vla {
 
-/// An RGB picture of interleaved bytes at another size, by a triangle filter that widens when it shrinks
-/// (antialiasing). The result equals Pillow's to the bit: weights are rounded to 22 binary digits, and rows are rounded
-/// to bytes before columns are summed. All sizes must be at least 1. Source: Pillow src/libImaging/Resample.c, filter
-/// BILINEAR.
+/// Filters of Pillow: a triangle, or Keys' cubic with a = -0.5.
+enum class PillowFilter { bilinear, bicubic };
+
+/// An RGB picture of interleaved bytes at another size, by a filter that widens when it shrinks (antialiasing). The
+/// result equals Pillow's to the bit: weights are rounded to 22 binary digits, and rows are rounded to bytes before
+/// columns are summed. All sizes must be at least 1. Source: Pillow src/libImaging/Resample.c.
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                        int to_height);
+                                        int to_height, PillowFilter filter = PillowFilter::bilinear);
 
 /// The same by OpenCV's cv::resize with INTER_LINEAR (4.10 and 5.0 agree): no antialiasing, weights of 11 binary
 /// digits, and the mean of four pixels where both sides are halved. Source: OpenCV modules/imgproc/src/resize.cpp.

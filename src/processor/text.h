@@ -30,7 +30,7 @@ std::string fill_template(std::string_view text, std::string_view instruction, s
 /// Whether a text names `{i}` once at most and has no other braces.
 bool is_numbered(std::string_view text);
 
-/// What a views op puts in front. Source: lerobot policies/evo1/internvl3_embedder.py (_build_multimodal_prompts).
+/// What a views op adds. Source: lerobot policies/evo1/internvl3_embedder.py (_build_multimodal_prompts).
 std::string view_places(const ViewsOp& op);
 
 }  // namespace vla

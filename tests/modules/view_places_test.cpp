@@ -39,8 +39,9 @@ TEST_CASE("views in front of the instruction stay where they are, whatever its l
   using Pieces = std::vector<std::tuple<int, int, int>>;
   CHECK(pieces(places, 10) == Pieces{{0, 2, kText}, {2, 3, 0}, {5, 3, 1}, {8, 2, kText}});
   CHECK(pieces(places, 8) == Pieces{{0, 2, kText}, {2, 3, 0}, {5, 3, 1}});
-  CHECK(places.check(8).ok());
-  CHECK_FALSE(places.check(7).ok());
+  CHECK(places.check(2, 8).ok());
+  CHECK_FALSE(places.check(2, 7).ok());
+  CHECK_FALSE(places.check(1, 8).ok());
 }
 
 TEST_CASE("views behind the instruction are counted from the end of the prompt") {
@@ -49,8 +50,8 @@ TEST_CASE("views behind the instruction are counted from the end of the prompt")
   using Pieces = std::vector<std::tuple<int, int, int>>;
   CHECK(places.starts(12) == std::vector<int>{3, 7});
   CHECK(pieces(places, 12) == Pieces{{0, 3, kText}, {3, 3, 0}, {6, 1, kText}, {7, 3, 1}, {10, 2, kText}});
-  CHECK(places.check(10).ok());
-  CHECK_FALSE(places.check(9).ok());  // the first token would be a picture's
+  CHECK(places.check(2, 10).ok());
+  CHECK_FALSE(places.check(2, 9).ok());  // the first token would be a picture's
 }
 
 TEST_CASE("views that overlap, or stand where no text is in front of them, are refused") {

@@ -119,6 +119,11 @@ def _add_gr00t(parser: argparse.ArgumentParser) -> None:
         default="",
         help="pixels of a camera, for a pipeline that keeps the aspect of pictures; they are square without it",
     )
+    add(
+        "--letterbox",
+        action="store_true",
+        help="pad pictures to squares whatever the checkpoint says, as the authors' servers have done since March 2026",
+    )
 
 
 @contextmanager
@@ -179,6 +184,7 @@ def main(argv=None) -> int:
         dead_rows=args.dead_rows,
         embodiment=args.embodiment,
         camera_size=args.camera_size,
+        letterbox=args.letterbox,
     )
     try:
         with _progress(args.quiet) as progress:

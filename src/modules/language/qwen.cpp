@@ -2,27 +2,23 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "modules/language/qwen.h"
 
+#include <numeric>
+
 #include "nn/attention.h"
 #include "nn/tokens.h"
 
 namespace vla {
-namespace {
-
-Bias bias_of(QwenKind kind) { return kind == QwenKind::qwen2 ? Bias::yes : Bias::no; }
-
-}  // namespace
-
-QwenBlock::QwenBlock(const Scope& s, QwenKind kind, int d_model, int d_ff, const Heads& heads, float eps)
+QwenBlock::QwenBlock(const Scope& s, QwenFamily family, int d_model, int d_ff, const Heads& heads, float eps)
     : Module(s),
       heads_(heads),
       attn_norm_(s / "attn_norm", d_model, eps),
-      q_(s / "attn_q", d_model, heads.d_query(), bias_of(kind)),
-      k_(s / "attn_k", d_model, heads.d_key(), bias_of(kind)),
-      v_(s / "attn_v", d_model, heads.d_key(), bias_of(kind)),
+      q_(s / "attn_q", d_model, heads.d_query(), family.bias),
+      k_(s / "attn_k", d_model, heads.d_key(), family.bias),
+      v_(s / "attn_v", d_model, heads.d_key(), family.bias),
       out_(s / "attn_out", heads.d_query(), d_model, Bias::no),
       ffn_norm_(s / "ffn_norm", d_model, eps),
       mlp_(s, d_model, d_ff, Activation::silu) {
-  if (kind != QwenKind::qwen3) return;
+  if (!family.head_norms) return;
   q_norm_.emplace(s / "attn_q_norm", heads.d_head, eps);
   k_norm_.emplace(s / "attn_k_norm", heads.d_head, eps);
 }
@@ -41,14 +37,26 @@ Tensor QwenBlock::forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor
 
 Tensor QwenBlock::alone(Graph& g, Tensor x) const { return mlp_.added_to(g, x, ffn_norm_(g, x)); }
 
-Qwen::Qwen(const Scope& s, QwenKind kind)
+Qwen::Qwen(const Scope& s, QwenFamily family)
     : d_model_(s.dim("d_model")),
       heads_(Heads::read(s, RotaryAngle::product)),
       token_embd_(s / "token_embd", d_model_, s.dim("n_vocab", 1 << 24)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
   const float eps = s.number("norm_eps", kNormEps);
-  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, kind, d_model_, d_ff, heads_, eps);
-  if (kind == QwenKind::qwen2) norm_.emplace(s / "norm", d_model_, eps);
+  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, family, d_model_, d_ff, heads_, eps);
+  if (family.final_norm) norm_.emplace(s / "norm", d_model_, eps);
+}
+
+Tensor Qwen::embed(Graph& g, Tensor tokens, Tensor views, const ViewPlaces& places) const {
+  return places.arrange(g, views, static_cast<int>(tokens.dim(0)), [&](const PromptPiece& piece) {
+    return embed(g, slice_ids(g, tokens, piece.first, piece.count));
+  });
+}
+
+Tensor Qwen::operator()(Graph& g, Tensor x) const {
+  std::vector<int> positions(static_cast<std::size_t>(x.dim(1)));
+  std::iota(positions.begin(), positions.end(), 0);
+  return (*this)(g, x, positions, causal_mask(g, 0, static_cast<int>(positions.size())));
 }
 
 Tensor Qwen::operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const {

@@ -7,18 +7,25 @@
 #include <vector>
 
 #include "modules/language/decoder.h"
+#include "modules/language/view_places.h"
 
 namespace vla {
 
-/// What tells the generations apart: queries, keys and values of Qwen2 have biases, and its features are read after a
-/// final norm; queries and keys of Qwen3 are normalized head by head, and its features are what the last layer gives.
-enum class QwenKind { qwen2, qwen3 };
+/// What tells the generations apart, and where features are read.
+struct QwenFamily {
+  Bias bias;        // of queries, keys and values
+  bool head_norms;  // queries and keys are normalized head by head
+  bool final_norm;  // features are read behind it, else they are what the last layer gives
+};
+constexpr QwenFamily kQwen2 = {Bias::yes, false, true};
+constexpr QwenFamily kQwen3 = {Bias::no, true, true};
+constexpr QwenFamily kQwen3Inner = {Bias::no, true, false};
 
 /// One layer: attention, then a gated MLP.
-/// Sources: transformers modeling_qwen2.py Qwen2DecoderLayer, modeling_qwen3_vl.py Qwen3VLTextDecoderLayer.
+/// Sources: transformers modeling_qwen2.py Qwen2DecoderLayer, modeling_qwen3.py Qwen3DecoderLayer.
 class QwenBlock : public Module<QwenBlock> {
  public:
-  QwenBlock(const Scope& s, QwenKind kind, int d_model, int d_ff, const Heads& heads, float eps);
+  QwenBlock(const Scope& s, QwenFamily family, int d_model, int d_ff, const Heads& heads, float eps);
   /// x [d_model, n], rotary [d_head, n], mask [n, n] -> the shape of x. `added` [d_model, n], or none, is added to the
   /// layer's result.
   Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added = {}) const;
@@ -35,14 +42,19 @@ class QwenBlock : public Module<QwenBlock> {
 };
 
 /// Qwen as a policy uses it: it embeds tokens and turns a sequence into features.
-/// Sources: transformers modeling_qwen2.py Qwen2Model, modeling_qwen3_vl.py Qwen3VLTextModel.
+/// Sources: transformers modeling_qwen2.py Qwen2Model, modeling_qwen3.py Qwen3Model, modeling_qwen3_vl.py
+/// Qwen3VLTextModel.
 class Qwen {
  public:
-  Qwen(const Scope& s, QwenKind kind);
+  Qwen(const Scope& s, QwenFamily family);
 
   /// tokens [n] i32 -> [d_model, n]. A prompt is embedded piece by piece, so the pieces are no taps.
   Tensor embed(Graph& g, Tensor tokens) const { return token_embd_.forward(g, tokens); }
-  /// x [d_model, n] of tokens at `positions`, mask [n, n] -> features [d_model, n].
+  /// The same with views [d_model, n_view_token, n_view] at their places, whatever the ids there.
+  Tensor embed(Graph& g, Tensor tokens, Tensor views, const ViewPlaces& places) const;
+  /// x [d_model, n] of tokens at 0 to n - 1, each of which sees those before it -> features [d_model, n].
+  Tensor operator()(Graph& g, Tensor x) const;
+  /// The same for tokens at `positions`, mask [n, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
   /// The same for tokens that turn by a table [d_head, n]; `added[i]` [d_model, n] is added to the result of layer i.
   Tensor operator()(Graph& g, Tensor x, Tensor rotary, Tensor mask, const std::vector<Tensor>& added) const;

@@ -29,7 +29,7 @@ std::vector<Place> prompt_places(std::span<const int> view_starts, int n_row, in
 
 Qwen3Vl::Qwen3Vl(const Scope& s)
     : vision_(s / "vision"),
-      lm_(s / "lm", QwenKind::qwen3),
+      lm_(s / "lm", kQwen3Inner),
       connector_(s / "connector", PatchMerger::Norm::patch, vision_.d_model(), vision_.n_merged(), lm_.d_model(),
                  vision_.norm_eps()),
       places_(s, vision_.n_token_row() * vision_.n_token_column()) {
@@ -53,9 +53,7 @@ Qwen3Vl::Qwen3Vl(const Scope& s)
 
 Status Qwen3Vl::check(int width, int height, int n_view, int n_token) const {
   VLA_CHECK(vision_.check(width, height));
-  if (n_view == places_.n_slot()) return places_.check(n_token);
-  return Error{Code::bad_bundle, "policy.n_slot", fmt::format("{}, one for each view", n_view),
-               std::to_string(places_.n_slot())};
+  return places_.check(n_view, n_token);
 }
 
 Tensor Qwen3Vl::operator()(Graph& g, Tensor images, Tensor tokens, const Cache& cache) const {
@@ -69,9 +67,7 @@ Tensor Qwen3Vl::operator()(Graph& g, Tensor images, Tensor tokens, const Cache& 
     g.require(added.back());  // before the stage ends
   }
   const Tensor image = g.stage("vision", connector_(g, seen.back()));
-  const Tensor x = places_.arrange(g, image, n_token, [&](const PromptPiece& piece) {
-    return lm_.embed(g, slice_ids(g, tokens, piece.first, piece.count));
-  });
+  const Tensor x = lm_.embed(g, tokens, image, places_);
   const Tensor rotary = interleaved_rotary_table(
       g, lm_.heads().d_head, lm_.heads().rope_base, rope_sections_,
       prompt_places(places_.starts(n_token), vision_.n_token_row(), vision_.n_token_column(), n_token));

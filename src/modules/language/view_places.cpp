@@ -38,7 +38,10 @@ std::vector<int> ViewPlaces::starts(int n_token) const {
   return starts;
 }
 
-Status ViewPlaces::check(int n_token) const {
+Status ViewPlaces::check(int n_view, int n_token) const {
+  if (n_view != n_slot())
+    return Error{Code::bad_bundle, "policy.n_slot", fmt::format("{}, one for each view", n_view),
+                 std::to_string(n_slot())};
   if (n_token >= n_least_) return {};
   return Error{Code::bad_bundle, "processor.recipe.text", fmt::format("{} tokens or more, for the views", n_least_),
                std::to_string(n_token)};

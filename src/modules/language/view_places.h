@@ -26,8 +26,8 @@ class ViewPlaces {
   /// `s` is the root of the tree; `n_view_token`: image tokens of a view.
   ViewPlaces(const Scope& s, int n_view_token, Count count = Count::from_start);
 
-  /// Whether a prompt of `n_token` tokens holds all views. Errors: bad_bundle.
-  Status check(int n_token) const;
+  /// Whether a prompt of `n_token` tokens has a place for each of `n_view` views and no other. Errors: bad_bundle.
+  Status check(int n_view, int n_token) const;
   /// Text and views in the order of the prompt; no piece is empty.
   std::vector<PromptPiece> pieces(int n_token) const;
 

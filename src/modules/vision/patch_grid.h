@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "nn/embedding.h"
 #include "nn/rope.h"
 
 namespace vla {
@@ -14,15 +15,23 @@ namespace vla {
 /// Qwen3VLVisionModel.rot_pos_emb.
 std::vector<Place> merge_block_places(int n_row, int n_column, int merge);
 
-/// Which rows of a square position table each patch reads, and with which weights: four lists of a number per patch.
+/// Rows of a square position table that patches read, and with which weights: `ids[k]` and `weights[k]` have a number
+/// for each patch, and a patch's position is the sum over k.
 struct PositionBlend {
-  std::vector<std::int32_t> ids[4];
-  std::vector<float> weights[4];
+  std::vector<std::vector<std::int32_t>> ids;
+  std::vector<std::vector<float>> weights;
 };
 
 /// The position table of `n_side`^2 rows stretched over n_row x n_column patches, so that its corners are those of the
 /// picture, for patches at `places`. Weights are float32, as the reference makes them. Source: the same class,
 /// fast_pos_embed_interpolate.
 PositionBlend blend_positions(const std::vector<Place>& places, int n_row, int n_column, int n_side);
+
+/// The same table resized as a picture is: bilinear, with antialiasing where it shrinks, for patches row by row.
+/// Source: transformers modeling_siglip2.py Siglip2VisionEmbeddings.resize_positional_embeddings.
+PositionBlend resize_positions(int n_row, int n_column, int n_side);
+
+/// Positions [d, n_patch] of a table.
+Tensor blended(Graph& g, const Embedding& table, const PositionBlend& blend);
 
 }  // namespace vla

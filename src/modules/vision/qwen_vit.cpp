@@ -53,15 +53,7 @@ Status QwenVit::check(int width, int height) const {
 }
 
 void QwenVit::keep(Graph& g, Cache& cache) const {
-  const PositionBlend blend = blend_positions(places(), n_row_, n_column_, n_side_);
-  Tensor sum;
-  for (int corner = 0; corner < 4; ++corner) {
-    const Tensor rows = position_.forward(g, constant_ids(g, fmt::format("position/{}", corner), blend.ids[corner]));
-    const Tensor weights = g.store().add_constant(blend.weights[corner], {1, rows.dim(1)});
-    const Tensor part = multiply(g, rows, weights);
-    sum = sum ? add(g, sum, part) : part;
-  }
-  cache.put(g, position_.path(), sum);
+  cache.put(g, position_.path(), blended(g, position_, blend_positions(places(), n_row_, n_column_, n_side_)));
 }
 
 std::vector<Tensor> QwenVit::operator()(Graph& g, Tensor images, const Cache& cache) const {

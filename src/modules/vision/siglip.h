@@ -23,10 +23,10 @@ class Siglip {
 
   int d_model() const { return d_model_; }
   int patch_size() const { return patch_size_; }
-
- private:
+  /// Rows of the position table: patches of a picture of `image_size`.
   int n_position() const { return n_table_ * n_table_; }
 
+ private:
   int d_model_, patch_size_, n_table_;
   std::string position_rule_;
   PatchEmbed patch_embed_;

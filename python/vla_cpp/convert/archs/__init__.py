@@ -12,7 +12,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import EVO1, GR00T_MODELS, GR00T_N1_7, LEROBOT, OPENPI
+from ..checkpoint import EVO1, GR00T_MODELS, LEROBOT, OPENPI
 from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
@@ -31,6 +31,7 @@ class Weight(NamedTuple):
     first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
     pick: Optional[Tuple[int, int]] = None  # one index of one axis of the source: (axis, index)
     transpose: bool = False  # what is left after `pick`, stored as (in, out)
+    regroup: int = 0  # the last axis is stored as groups of this many numbers: the bundle has all first ones, all second ones, ...
 
 
 class Dropped(NamedTuple):
@@ -56,6 +57,7 @@ class Options:
     view_slots: int = 0  # Evo-1: places for views in the prompt
     embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
     camera_size: str = ""  # GR00T: WIDTHxHEIGHT of pictures whose aspect the pipeline keeps; they are square without it
+    letterbox: bool = False  # GR00T: pictures are padded to squares, as the authors' later servers do
     dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
 
@@ -83,7 +85,7 @@ def _module(name):
 
 
 # Types of LeRobot whose policies are read in another layout.
-OTHER_LAYOUTS = {"groot": "a fine-tune of GR00T as LeRobot saves it is not read yet, GR00T N1.7 as its authors publish it is"}
+OTHER_LAYOUTS = {"groot": "a fine-tune of GR00T as LeRobot saves it is not read yet, GR00T as its authors publish it is"}
 
 
 def load(name):
@@ -94,6 +96,7 @@ def load(name):
     return _module(name)
 
 
+GR00T = tuple(GR00T_MODELS.values())
 # Options that only some layouts leave open, with what the other layouts do instead.
 LAYOUT_OPTIONS = {
     "identity_stats": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
@@ -103,14 +106,15 @@ LAYOUT_OPTIONS = {
     "views": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "dead_rows": ((EVO1,), "a checkpoint of Evo-1's authors"),
-    "embodiment": ((GR00T_N1_7,), "a checkpoint of GR00T"),
-    "camera_size": ((GR00T_N1_7,), "a checkpoint of GR00T"),
+    "embodiment": (GR00T, "a checkpoint of GR00T"),
+    "camera_size": (GR00T, "a checkpoint of GR00T"),
+    "letterbox": (GR00T, "a checkpoint of GR00T"),
 }
 LAYOUT_NAMES = {
     LEROBOT: "config.json of type {}, which states everything itself",
     OPENPI: "one of openpi",
     EVO1: "one of Evo-1's authors",
-    GR00T_N1_7: "one of GR00T",
+    **dict.fromkeys(GR00T, "one of GR00T"),
 }
 
 

@@ -59,7 +59,25 @@ FIXED: Fixed = {
 }
 IGNORED = {"rtc_ramp_rate", "use_mean_std", "tactile_state_keys", "tactile_input_shape", "tactile_embed_dim"}
 KWARGS_FIXED: Fixed = {"model_type": ("qwen", "qwen")}
-RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d7Processor", KWARGS_FIXED, qwen3_vl)
+EMBODIMENTS = {
+    "simpler_env_google": 0,
+    "simpler_env_widowx": 1,
+    "libero_sim": 2,
+    "new_embodiment": 10,
+    "robocasa_panda_omron": 10,
+    "robocasa_gr1_tabletop": 10,
+    "unitree_g1_sonic": 11,
+    "oxe_droid_relative_eef_relative_joint": 24,
+    "real_g1_relative_eef_relative_joints": 25,
+    "unitree_g1_full_body_with_waist_height_nav_cmd": 25,
+    "real_r1_pro_sharpa_relative_eef": 26,
+    "real_r1_pro_sharpa_relative_eef_human": 26,
+    "real_r1_pro_sharpa_relative_eef_maxinsights": 26,
+    "real_r1_pro_sharpa_relative_eef_mecka": 26,
+    "xdof_relative_eef_relative_joint": 27,
+    "xdof_relative_eef_relative_joint_subtask": 27,
+}
+RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d7Processor", KWARGS_FIXED, EMBODIMENTS, qwen3_vl)
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:

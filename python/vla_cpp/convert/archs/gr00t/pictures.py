@@ -8,10 +8,12 @@ Reference: Isaac-GR00T gr00t/model/gr00t_n1d7/image_augmentations.py, which lero
 
 from __future__ import annotations
 
+import math
 from typing import List, NamedTuple, Tuple
 
 from ...errors import Code, Problems, refuse
 from ...section import Section
+from .. import Options
 from .robot import DOCS
 
 # In bytes: the reference folds the rescaling by 1 / 255 into mean and std, which then are exact.
@@ -29,15 +31,16 @@ class Area(NamedTuple):
     """The sides and areas of pictures that the backbone's image processor leaves alone."""
 
     file: str  # that states them
+    filter: str  # by which it resizes others
     multiple: int
     least: int
     most: int
 
 
-def read_pictures(processor: Section, area: Area, camera_size: str, notes: List[str], problems: Problems) -> Pictures:
-    """`processor`: the members of processor_kwargs. `camera_size`: as asked for, or empty."""
+def read_pictures(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Pictures:
+    """`processor`: the members of processor_kwargs."""
     edge, fraction = _edge(processor), _fraction(processor)
-    pad = processor.get("letter_box_transform") is True
+    pad, camera_size = options.letterbox or processor.get("letter_box_transform") is True, options.camera_size
     width, height = _camera(camera_size, edge, pad)
     ops: List[dict] = [{"op": "square_pad"}] if pad else []
     smallest = {"op": "smallest_side", "size": edge, "filter": "opencv_area"}
@@ -46,11 +49,14 @@ def read_pictures(processor: Section, area: Area, camera_size: str, notes: List[
     if 0.0 < fraction < 1.0:
         ops += [{"op": "crop_fraction", "fraction": fraction}, smallest]
         width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
+    held = _held(width, height, area, problems)
+    if held != (width, height):
+        ops.append({"op": "resize", "width": held[0], "height": held[1], "filter": area.filter})
+    width, height = held
     ops += [{"op": "size", "width": width, "height": height}, STANDARDIZE]
-    _check_area(width, height, area, problems)
     if not pad:
         notes.append(
-            "pictures keep their aspect, as letter_box_transform says: those of {} are taken, others are refused ({})".format(
+            "pictures keep their aspect: those of {} are taken, others are refused ({})".format(
                 camera_size or "square cameras", DOCS
             )
         )
@@ -114,15 +120,17 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
     return max(1, int(round(width * scale))), max(1, int(round(height * scale)))
 
 
-def _check_area(width: int, height: int, area: Area, problems: Problems) -> None:
-    if problems.list:
-        return  # of the sizes themselves
-    if width % area.multiple == height % area.multiple == 0 and area.least <= width * height <= area.most:
-        return
-    problems.unsupported(
-        "backbone " + area.file,
-        "pictures whose sides are multiples of {} and whose area is {} to {} pixels".format(*area[1:]),
-        "{}x{}".format(width, height),
-        "the image processor of the backbone would resize them once more, which is not supported yet; their size follows from "
-        "--camera-size and the sizes in processor_config.json",
-    )
+def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int, int]:
+    """The size that the backbone's image processor makes of a picture (smart_resize)."""
+    unit = area.multiple
+    sides = [max(unit, round(side / unit) * unit) for side in (width, height)]
+    size = sides[0] * sides[1]
+    if size > area.most:
+        shrink = math.sqrt(width * height / area.most)
+        sides = [max(unit, math.floor(side / shrink / unit) * unit) for side in (width, height)]
+    elif size < area.least:
+        grow = math.sqrt(area.least / (width * height))
+        sides = [math.ceil(side * grow / unit) * unit for side in (width, height)]
+    if max(width, height) > 200 * min(width, height) or max(sides) > MAX_SIDE:
+        problems.unsupported("--camera-size", "pictures of at most 200 times the other side", "{}x{}".format(width, height))
+    return sides[0], sides[1]

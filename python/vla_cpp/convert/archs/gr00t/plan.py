@@ -8,8 +8,7 @@ The two differ in their backbone and in what their configs may say: that is a `R
 from __future__ import annotations
 
 import json
-from types import ModuleType
-from typing import Collection, Dict, List, NamedTuple
+from typing import Any, Collection, Dict, List, NamedTuple
 
 from ... import recipe
 from ...bundle import Key, keys_by_type
@@ -84,7 +83,8 @@ class Release(NamedTuple):
     ignored: Collection[str]
     processor_class: str
     kwargs_fixed: Fixed
-    backbone: ModuleType  # read, read_area, read_prompt, weights, keys, dropped, TEMPLATE
+    embodiments: Dict[str, int]  # indices of tags that embodiment_id.json does not have
+    backbone: Any  # read, read_area, read_prompt, weights, keys, dropped, LM, TEMPLATE
 
 
 def make_plan(release: Release, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
@@ -93,13 +93,13 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     backbone = release.backbone
     folder = find_backbone(checkpoint, options.backbone, checkpoint.config.get("model_name"), "model_name")
     s = read_sizes(release, checkpoint.config, folder, problems)
-    s.embodiment = embodiment_index(checkpoint, options.embodiment, s.n_embodiment, problems)
+    s.embodiment = embodiment_index(checkpoint, options.embodiment, release.embodiments, s.n_embodiment, problems)
     statistics = read_json(processor_file(checkpoint, STATISTICS))
     robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
     problems.raise_any()
     s.n_slot = len(robot.cameras)
     area = backbone.read_area(folder, s, problems)
-    pictures = read_pictures(processor, area, options.camera_size, checkpoint.notes, problems)
+    pictures = read_pictures(processor, area, options, checkpoint.notes, problems)
     s.image_width, s.image_height = pictures.width, pictures.height
     tokenizer = read_tokenizer(folder, s.n_vocab, problems, checkpoint.notes)
     problems.raise_any()  # a prompt takes a sound tokenizer
@@ -168,7 +168,7 @@ def weights(release: Release, s: Sizes) -> List[Weight]:
     return [*release.backbone.weights(s), *head.weights(s)]
 
 
-def _hints(backbone: ModuleType, s: Sizes) -> Dict[str, str]:
+def _hints(backbone: Any, s: Sizes) -> Dict[str, str]:
     return {
         backbone.LM + "layers.": "select_layer keeps {} language layers, 0 to {}".format(s.n_layer, s.n_layer - 1),
         "action_head.vl_self_attention.": "vl_self_attention_cfg of config.json has {} layers".format(s.n_vl_layer),

@@ -19,13 +19,14 @@ N_INSTRUCTION = 512
 
 
 class Template(NamedTuple):
-    """Text around an instruction, views before it. `open` may hold {i}, the number of the view from 1."""
+    """Text around an instruction and its views. `open` may hold {i}, the number of the view from 1."""
 
     before: str
     after: str
     open: str
     token: str
     close: str
+    behind: bool = False  # the views stand behind the instruction
 
     @property
     def special(self) -> List[str]:
@@ -35,12 +36,13 @@ class Template(NamedTuple):
 
 
 class Prompt(NamedTuple):
-    view_starts: List[int]  # index of the first image token of every view
+    view_starts: List[int]  # index of the first image token of every view, from the end where views stand behind
+    behind: bool
     n_token: int  # the longest prompt
 
     def keys(self) -> List[Key]:
         return [
-            Key("policy.view_starts", "u32[]", self.view_starts),
+            Key("policy.view_starts" + ("_from_end" if self.behind else ""), "u32[]", self.view_starts),
             Key("observation.max_text_tokens", "u32", self.n_token),
         ]
 
@@ -48,9 +50,10 @@ class Prompt(NamedTuple):
 def text_ops(template: Template, formalize: bool, prompt: Prompt, s: Sizes) -> List[dict]:
     clean = [{"op": "lower"}, {"op": "drop_punctuation"}] if formalize else []
     view = {"open": template.open, "token": template.token, "repeat": s.n_view_token, "close": template.close}
+    place = {"place": "back"} if template.behind else {}
     return [
         *clean,
-        {"op": "views", "count": s.n_slot, **view},
+        {"op": "views", "count": s.n_slot, **view, **place},
         {"op": "template", "text": template.before + "{instruction}" + template.after},
         {"op": "tokenize", "max_tokens": prompt.n_token, "truncate": "right"},
     ]
@@ -66,13 +69,20 @@ def read_prompt(template: Template, tokenizer: TokenizerPlan, hint: str, s: Size
     special_ids(tokenizer.keys, special, hint, problems)
     words = re.split("|".join(map(re.escape, special)), template.before + template.open + template.after)
     check_undivided(tokenizer.keys, special, [word for word in words if word], problems)
-    encoder, text, starts = Encoder(tokenizer.keys), template.before, []
+    encoder = Encoder(tokenizer.keys)
+
+    def count(text: str) -> int:
+        return count_tokens(text, special, encoder)
+
+    opens = [template.open.replace("{i}", str(i + 1)) for i in range(s.n_slot)]
+    view, starts = template.token * s.n_view_token + template.close, []
     for i in range(s.n_slot):
-        text += template.open.replace("{i}", str(i + 1))
-        starts.append(count_tokens(text, special, encoder))
-        text += template.token * s.n_view_token + template.close
-    end = starts[-1] + s.n_view_token + 2
-    if end + 2 > s.n_context:
+        if template.behind:
+            starts.append(count(view + "".join(part + view for part in opens[i + 1 :]) + template.after))
+        else:
+            starts.append(count(template.before + "".join(part + view for part in opens[:i]) + opens[i]))
+    end = count(template.before) + starts[0] if template.behind else starts[-1] + s.n_view_token
+    if end + 4 > s.n_context:
         expected = "room for {} views of {} tokens".format(s.n_slot, s.n_view_token)
         problems.add(WHERE + ": text_config: max_position_embeddings", expected, "{} tokens".format(s.n_context))
-    return Prompt(starts, min(end + N_INSTRUCTION, s.n_context))
+    return Prompt(starts, template.behind, min(end + 2 + N_INSTRUCTION, s.n_context))

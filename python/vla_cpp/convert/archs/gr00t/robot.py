@@ -8,7 +8,7 @@ Reference: Isaac-GR00T gr00t/data/state_action/state_action_processor.py, gr00t/
 from __future__ import annotations
 
 import os
-from typing import List, NamedTuple, Sequence
+from typing import Dict, List, NamedTuple, Sequence
 
 import numpy as np
 
@@ -19,25 +19,6 @@ from ...section import Section
 
 PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json", "embodiment_id.json"
 DOCS = "docs/converting.md, GR00T"
-# Indices that the authors' processor gives to tags that embodiment_id.json does not have.
-BUILT_IN = {
-    "simpler_env_google": 0,
-    "simpler_env_widowx": 1,
-    "libero_sim": 2,
-    "new_embodiment": 10,
-    "robocasa_panda_omron": 10,
-    "robocasa_gr1_tabletop": 10,
-    "unitree_g1_sonic": 11,
-    "oxe_droid_relative_eef_relative_joint": 24,
-    "real_g1_relative_eef_relative_joints": 25,
-    "unitree_g1_full_body_with_waist_height_nav_cmd": 25,
-    "real_r1_pro_sharpa_relative_eef": 26,
-    "real_r1_pro_sharpa_relative_eef_human": 26,
-    "real_r1_pro_sharpa_relative_eef_maxinsights": 26,
-    "real_r1_pro_sharpa_relative_eef_mecka": 26,
-    "xdof_relative_eef_relative_joint": 27,
-    "xdof_relative_eef_relative_joint_subtask": 27,
-}
 MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"}
 MAX_WIDTH = 1 << 16
 
@@ -95,14 +76,17 @@ def choose(configs: dict, tag: str) -> dict:
     )
 
 
-def embodiment_index(checkpoint: Checkpoint, tag: str, n_embodiment: int, problems: Problems) -> int:
-    """The row of the weights that belongs to a tag."""
+def embodiment_index(
+    checkpoint: Checkpoint, tag: str, built_in: Dict[str, int], n_embodiment: int, problems: Problems
+) -> int:
+    """The row of the weights that belongs to a tag. `built_in`: what the authors' processor gives to tags that
+    embodiment_id.json does not have."""
     stated = read_json(processor_file(checkpoint, EMBODIMENTS))
-    if tag not in stated and tag in BUILT_IN:
+    if tag not in stated and tag in built_in:
         checkpoint.notes.append(
-            "{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, BUILT_IN[tag])
+            "{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, built_in[tag])
         )
-    index = stated.get(tag, BUILT_IN.get(tag))
+    index = stated.get(tag, built_in.get(tag))
     if type(index) is int and 0 <= index < n_embodiment:
         return index
     problems.add(

@@ -33,6 +33,7 @@ class Sizes:
     d_ff: int = 0
     n_vocab: int = 0
     n_context: int = 0
+    vision_eps: float = 0.0
     lm_eps: float = 0.0
     rope_base: float = 0.0
     rope_sections: List[int] = field(default_factory=list)

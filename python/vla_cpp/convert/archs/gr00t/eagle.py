@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The backbones of GR00T N1.5 and N1.6, Eagle 2.5 and Eagle 3: a tower of the SigLIP family, a connector, the first layers of Qwen3.
+
+Their configs, tokenizers and processors lie in the authors' code tree and not beside the weights.
+References: Isaac-GR00T gr00t/model/backbone/eagle2_hg_model (N1.5), gr00t/model/modules/nvidia/Eagle-Block2A-2B-v2 (N1.6).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Dict, List
+
+from ...errors import Problems
+from ...files import member, read_json
+from ...section import Fixed, Section
+from ...tokenizer import TokenizerPlan
+from .. import MATRIX, Dropped, Weight
+from ...ascii_bpe import special_ids
+from ...layers import linear, norm, siglip, vector
+from . import language
+from . import prompt as prompts
+from .pictures import Area
+from .prompt import END, START, Prompt, Template
+from .sizes import MAX_LAYERS, WHERE, Sizes
+
+IMAGE = "<IMG_CONTEXT>"
+SYSTEM = START + "system\nYou are a helpful assistant." + END + "\n" + START + "user\n"
+OPEN, CLOSE = "<image {i}><img>", "</img>"
+# SiglipVisionConfig, Siglip2VisionConfig and Qwen3Config of transformers.
+VISION = {
+    "hidden_size": 768,
+    "intermediate_size": 3072,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 12,
+    "image_size": 224,
+    "num_patches": 256,
+    "patch_size": 16,
+    "layer_norm_eps": 1e-6,
+}
+VISION_FIXED: Fixed = {
+    "hidden_act": ("gelu_pytorch_tanh", "gelu_pytorch_tanh"),
+    "num_channels": (3, 3),
+    "use_rope": (False, False),
+    "use_windows_attn": (False, False),
+}
+TEXT = {
+    "vocab_size": 151936,
+    "hidden_size": 4096,
+    "intermediate_size": 22016,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "num_key_value_heads": 32,
+    "head_dim": 128,
+    "max_position_embeddings": 32768,
+    "rms_norm_eps": 1e-6,
+    "rope_theta": 10000.0,
+}
+TEXT_FIXED: Fixed = {"use_sliding_window": (False, False)}
+IMAGE_FIXED: Fixed = {
+    "do_resize": (None, False),
+    "do_rescale": (None, True),
+    "do_normalize": (None, True),
+    "rescale_factor": (None, 1 / 255),
+    "image_mean": (None, [0.5, 0.5, 0.5]),
+    "image_std": (None, [0.5, 0.5, 0.5]),
+}
+FILE = "preprocessor_config.json"
+
+
+class Eagle:
+    """One of the two. `root`: where its tensors stand, up to the dot. `merge`: patches on a side of a token."""
+
+    def __init__(self, model_type: str, root: str, merge: int, template: Template, folder: str) -> None:
+        self.model_type, self.root, self.merge, self.TEMPLATE, self.folder = model_type, root, merge, template, folder
+        self.LM = root + "language_model.model."
+
+    def read(self, folder: str, kept: int, s: Sizes, problems: Problems) -> None:
+        config = read_json(os.path.join(folder, "config.json"))
+        whole = Section(WHERE, config, {}, problems)
+        fixed: Fixed = {
+            "model_type": (None, self.model_type),
+            "select_layer": (-1, -1),
+            "use_pixel_shuffle": (None, self.merge > 1),
+            "mlp_connector_layers": (None, self.merge),
+            "downsample_ratio": (0.5, 0.5),
+        }
+        whole.check_fixed(fixed, self.folder)
+        text = Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems)
+        language.read(text, kept, s)
+        text.check_fixed(TEXT_FIXED)
+        rope = language.rope_section(text, {})
+        rope.refuse_unknown({"rope_type", "type", "rope_theta"})
+        if rope.get("rope_type") not in (None, "default") or rope.get("type") not in (None, "default"):
+            rope.bad("rope_type", "'default'", unsupported=True)
+        s.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
+        s.merge = self.merge
+        self._read_vision(Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s)
+
+    def _read_vision(self, vision: Section, s: Sizes) -> None:
+        vision.check_fixed(VISION_FIXED)
+        s.patch_size, s.n_vision_layer = vision.count("patch_size"), vision.count("num_hidden_layers", most=MAX_LAYERS)
+        s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
+        s.n_vision_head, s.vision_eps = vision.count("num_attention_heads"), vision.number("layer_norm_eps")
+        if s.d_vision % s.n_vision_head:
+            vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(s.d_vision))
+        if self.merge == 1:
+            side = vision.count("image_size")
+            s.image_width = s.image_height = side
+            s.n_position_side = side // s.patch_size
+            if side % s.patch_size:
+                vision.bad("image_size", "a multiple of patch_size {}".format(s.patch_size))
+            return
+        s.n_position_side = math.isqrt(vision.count("num_patches"))
+        if s.n_position_side**2 != vision.get("num_patches"):
+            vision.bad("num_patches", "a square")
+
+    def read_area(self, folder: str, s: Sizes, problems: Problems) -> Area:
+        """What smart_resize of its processor leaves alone, and what it makes of other sizes."""
+        path = os.path.join(folder, FILE)
+        Section("backbone " + FILE, read_json(path), {}, problems).check_fixed(IMAGE_FIXED)
+        side = self.merge * s.patch_size
+        return Area(FILE, "pillow_bicubic", side, 4 * side**2, 4096 * side**2)
+
+    def read_prompt(self, tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems) -> Prompt:
+        prompt = prompts.read_prompt(self.TEMPLATE, tokenizer, self.folder, s, problems)
+        (image,) = special_ids(tokenizer.keys, (IMAGE,), "", Problems(""))
+        config = read_json(os.path.join(folder, "config.json"))
+        if config.get("image_token_index") != image:
+            expected = "{}, the tokenizer's {}".format(image, IMAGE)
+            problems.add(WHERE + ": image_token_index", expected, repr(config.get("image_token_index")))
+        return prompt
+
+    def weights(self, s: Sizes) -> List[Weight]:
+        vision = self.root + "vision_model.vision_model."
+        rows = siglip(vision, s.d_vision, s.d_vision_ff, s.n_vision_layer, s.patch_size, s.n_position_side**2)
+        if self.merge > 1:
+            # Patches are flattened pixel by pixel there, channel by channel here.
+            source, shape = vision + "embeddings.patch_embedding.weight", (s.d_vision, 3 * s.patch_size**2)
+            rows[0] = Weight("vision.patch_embed.weight", source, MATRIX, shape, shape, regroup=3)
+        return [*rows, *self._connector(s), *language.weights(s, self.LM), *vector("lm.norm.weight", self.LM + "norm.weight", s.d_model)]
+
+    def _connector(self, s: Sizes) -> List[Weight]:
+        source = self.root + "mlp1."
+        if self.merge == 1:
+            return linear("projector", source + "0", s.d_model, s.d_vision, bias=True)
+        # The patches of a square stand side by side for each feature there, the features of each patch here.
+        n_patch, d = self.merge**2, self.merge**2 * s.d_vision
+        up = linear("connector.up", source + "1", s.d_model, d, bias=True)
+        return [
+            *(row._replace(regroup=n_patch) for row in norm("connector.norm", source + "0", d)),
+            up[0]._replace(regroup=n_patch),
+            up[1],
+            *linear("connector.down", source + "3", s.d_model, s.d_model, bias=True),
+        ]
+
+    def dropped(self, s: Sizes) -> List[Dropped]:
+        head, d = self.root + "vision_model.vision_model.head.", s.d_vision
+        pool = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
+        for name, d_out, d_in in (("attention.out_proj", d, d), ("mlp.fc1", s.d_vision_ff, d), ("mlp.fc2", d, s.d_vision_ff)):
+            pool.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
+        pool.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
+        rows = [Dropped(head + name, shape, "pooling head of the tower") for name, shape in pool.items()]
+        lm_head = Dropped(self.root + "language_model.lm_head.weight", (s.n_vocab, s.d_model), "language head")
+        mask = Dropped("action_head.mask_token", (1, 1, s.d_dit), "stands for the state in training")
+        return [*rows, lm_head, mask]
+
+    def keys(self, s: Sizes) -> Dict[str, Dict[str, object]]:
+        u32 = {
+            "vision.d_model": s.d_vision,
+            "vision.n_layer": s.n_vision_layer,
+            "vision.n_head": s.n_vision_head,
+            "vision.d_ff": s.d_vision_ff,
+            "vision.patch_size": s.patch_size,
+        }
+        if self.merge == 1:
+            u32["vision.image_size"] = s.image_width
+            return {"u32": u32, "f32": {"vision.norm_eps": s.vision_eps}, "string": {"vision.position_rule": "row_major"}}
+        u32.update(
+            {
+                "vision.image_width": s.image_width,
+                "vision.image_height": s.image_height,
+                "vision.n_position_side": s.n_position_side,
+                "connector.factor": self.merge,
+            }
+        )
+        return {"u32": u32, "f32": {"vision.norm_eps": s.vision_eps, "connector.norm_eps": 1e-5}}
+
+
+EAGLE_2_5 = Eagle(
+    "eagle_2_5_vl",
+    "backbone.eagle_model.",
+    1,
+    Template(SYSTEM, END + "\n" + START + "assistant\n", OPEN, IMAGE, CLOSE),
+    "--backbone needs the folder eagle2_hg_model of the authors' code",
+)
+EAGLE_3 = Eagle(
+    "eagle_3_vl",
+    "backbone.model.",
+    2,
+    Template(SYSTEM, END + "\n", OPEN, IMAGE, CLOSE, behind=True),
+    "--backbone needs the folder Eagle-Block2A-2B-v2 of the authors' code",
+)
