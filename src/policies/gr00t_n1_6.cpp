@@ -29,7 +29,7 @@ class Gr00tN16 final : public Policy {
         lm_(s / "lm", kQwen3),
         connector_(s / "connector", vision_.d_model(), lm_.d_model(), vision_.n_row(), vision_.n_column()),
         places_(s, connector_.n_token(), ViewPlaces::Count::from_end),
-        head_(s, lm_.d_model(), {.future_tokens = false, .alternating = true}) {}
+        head_(s, lm_.d_model(), {.future_tokens = false, .mixing = false, .alternating = true}) {}
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
@@ -65,7 +65,7 @@ Keys published() {
       {"vision.n_position_side", 16}, {"vision.norm_eps", 1e-6}, {"connector.factor", 2}, {"connector.norm_eps", 1e-5},
       {"lm.d_model", 2048}, {"lm.n_layer", 16}, {"lm.n_head", 16}, {"lm.n_head_kv", 8}, {"lm.d_head", 128},
       {"lm.d_ff", 6144}, {"lm.n_vocab", 151680}, {"lm.norm_eps", 1e-6}, {"lm.rope_base", 1e6},
-      {"vl.n_layer", 0}, {"vl.n_head", 1}, {"vl.d_ff", 8192}, {"vl.norm_eps", 1e-5},
+      {"vl.norm_eps", 1e-5},
       {"dit.d_model", 1536}, {"dit.n_layer", 32}, {"dit.n_head", 32}, {"dit.d_ff", 6144}, {"dit.d_out", 1024},
       {"dit.text_every", 2}, {"dit.d_time", 256}, {"dit.n_bucket", 1000}, {"dit.d_hidden", 1024},
       {"dit.norm_eps", 1e-5}, {"dit.out_eps", 1e-6}});

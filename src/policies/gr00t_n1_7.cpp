@@ -18,7 +18,7 @@ class Gr00tN17 final : public Policy {
 
  public:
   explicit Gr00tN17(const Scope& s)
-      : backbone_(s), head_(s, backbone_.d_model(), {.future_tokens = false, .alternating = true}) {}
+      : backbone_(s), head_(s, backbone_.d_model(), {.future_tokens = false, .mixing = true, .alternating = true}) {}
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(backbone_.check(shape.width, shape.height, shape.n_view, shape.n_text));

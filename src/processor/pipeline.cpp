@@ -38,8 +38,35 @@ Size size_after(const CropFraction& op, const Size& from) {
   return {std::max(1.0, std::floor(from.width * op.fraction)), std::max(1.0, std::floor(from.height * op.fraction))};
 }
 
-Size size_after(const PillowResize& op, const Size&) {
+/// Of the ops that state a size.
+template <class Op>
+Size size_after(const Op& op, const Size&) {
   return {static_cast<double>(op.width), static_cast<double>(op.height)};
+}
+
+/// As Python rounds a half.
+int half_to_even(int whole) { return whole / 2 + (whole % 4 == 3 ? 1 : 0); }
+
+Picture cropped(const Picture& from, const CenterCrop& op) {
+  Picture to{op.width, op.height, {}};
+  const int left = half_to_even(from.width - op.width), top = half_to_even(from.height - op.height);
+  for (int y = 0; y < op.height; ++y) {
+    const auto start = from.rgb.begin() + 3 * (static_cast<std::ptrdiff_t>(top + y) * from.width + left);
+    to.rgb.insert(to.rgb.end(), start, start + 3 * static_cast<std::ptrdiff_t>(op.width));
+  }
+  return to;
+}
+
+std::vector<std::uint8_t> resized(const Picture& from, const ByteResize& op) {
+  switch (op.filter) {
+    case ByteResize::Filter::pillow_bicubic:
+      return resample_8bit(from.rgb, from.width, from.height, op.width, op.height, ByteFilter::pillow_bicubic);
+    case ByteResize::Filter::torch_bicubic_16bit:
+      return resample_8bit(from.rgb, from.width, from.height, op.width, op.height, ByteFilter::torch_bicubic);
+    case ByteResize::Filter::torch_bilinear_cut:
+      break;
+  }
+  return resample_torch_linear(from.rgb, from.width, from.height, op.width, op.height);
 }
 
 /// The picture in the middle of another size: what is beyond it is cut off, what it does not reach is black.
@@ -60,8 +87,8 @@ Picture centred(const Picture& from, int width, int height) {
 Picture applied(const PictureOp& op, const Picture& from, int width, int height) {
   if (std::holds_alternative<SmallestSide>(op))
     return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
-  if (std::holds_alternative<PillowResize>(op))
-    return {width, height, resample_8bit(from.rgb, from.width, from.height, width, height, PillowFilter::bicubic)};
+  if (const auto* resize = std::get_if<ByteResize>(&op)) return {width, height, resized(from, *resize)};
+  if (const auto* crop = std::get_if<CenterCrop>(&op)) return cropped(from, *crop);
   return centred(from, width, height);
 }
 
@@ -72,10 +99,19 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   if (bytes == nullptr)
     return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
                  "send the camera's bytes: this policy's pictures are resized as bytes"};
+  for (const PictureOp& op : pipeline.ops) {
+    const auto* camera = std::get_if<CameraSize>(&op);
+    if (camera != nullptr && (camera->width != frame.width || camera->height != frame.height))
+      return Error{Code::bad_observation, where, fmt::format("a picture of {} x {}", camera->width, camera->height),
+                   fmt::format("{} x {}", frame.width, frame.height),
+                   "this policy takes the pictures of the cameras that it was trained with"};
+  }
   // All sizes come before any picture, so that none is made which nothing needs or no memory holds.
   std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
   bool fits = true;
   for (const PictureOp& op : pipeline.ops) {
+    if (const auto* crop = std::get_if<CenterCrop>(&op))
+      fits &= crop->width <= sizes.back().width && crop->height <= sizes.back().height;
     sizes.push_back(std::visit([&](const auto& o) { return size_after(o, sizes.back()); }, op));
     fits &= sizes.back().width * sizes.back().height <= static_cast<double>(ImageLimits().max_pixels);
   }

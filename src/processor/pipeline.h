@@ -25,13 +25,28 @@ struct CropFraction {
   double fraction = 0.0;
 };
 
-/// A size whatever the aspect, by Pillow's bicubic filter.
-struct PillowResize {
+/// A size whatever the aspect.
+struct ByteResize {
+  enum class Filter { pillow_bicubic, torch_bicubic_16bit, torch_bilinear_cut };
+
+  int width = 0;
+  int height = 0;
+  Filter filter = Filter::pillow_bicubic;
+};
+
+/// Frames of one size only.
+struct CameraSize {
   int width = 0;
   int height = 0;
 };
 
-using PictureOp = std::variant<SquarePad, SmallestSide, CropFraction, PillowResize>;
+/// The middle of a picture, no larger than it; of an odd rest that is cut off the half is rounded to even.
+struct CenterCrop {
+  int width = 0;
+  int height = 0;
+};
+
+using PictureOp = std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop>;
 
 /// Ops on 8-bit pictures one after the other, and the size at which they must come out.
 struct Pipeline {

@@ -53,12 +53,21 @@ Result<Standardize> parse_standardize(JsonFields& fields) {
   return op;
 }
 
+template <class Op>
+Result<PictureOp> parse_stated_size(JsonFields& fields) {
+  Op op;
+  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
+  return PictureOp(op);
+}
+
 Result<PictureOp> parse_picture_op(JsonFields& fields, int op) {
   if (op == 0) {
-    PillowResize resize;
+    ByteResize resize;
     VLA_TRY(resize.width, fields.integer("width", 1, kMaxImageSide));
     VLA_TRY(resize.height, fields.integer("height", 1, kMaxImageSide));
-    VLA_CHECK(fields.choice("filter", {"pillow_bicubic"}));
+    VLA_TRY(const int filter, fields.choice("filter", {"pillow_bicubic", "torch_bicubic_16bit", "torch_bilinear_cut"}));
+    resize.filter = static_cast<ByteResize::Filter>(filter);
     return PictureOp(resize);
   }
   if (op == 1) return PictureOp(SquarePad{});
@@ -68,6 +77,8 @@ Result<PictureOp> parse_picture_op(JsonFields& fields, int op) {
     VLA_CHECK(fields.choice("filter", {"opencv_area"}));
     return PictureOp(smallest);
   }
+  if (op == 4) return parse_stated_size<CameraSize>(fields);
+  if (op == 5) return parse_stated_size<CenterCrop>(fields);
   CropFraction crop;
   VLA_TRY(crop.fraction, fields.wide_number("fraction", {1e-6, 1}));
   return PictureOp(crop);
@@ -94,7 +105,7 @@ Status set_fit(Result<Op> op, Recipe& recipe) {
 /// `op`: of the ops that make planes of one size, which letterbox and a resize in first place do alone and a pipeline
 /// in several.
 Status parse_fit(JsonFields& fields, int op, bool first, Recipe& recipe) {
-  constexpr int kResize = 1, kSize = 5;
+  constexpr int kResize = 1, kSize = 7;
   if (op == 0 && !first) return misplaced(fields, "a letterbox as the first and only op on pictures");
   if (op == 0) return set_fit(parse_letterbox(fields), recipe);
   if (op == kResize && first) return set_fit(parse_resize(fields), recipe);
@@ -167,8 +178,8 @@ Result<TextOp> parse_views(JsonFields& fields) {
 
 Status parse_image_op(JsonFields& fields, int index, Recipe& recipe) {
   VLA_TRY(const int op, fields.choice("op", {"letterbox", "resize", "square_pad", "smallest_side", "crop_fraction",
-                                             "size", "affine", "clip", "standardize"}));
-  constexpr int kFits = 6;
+                                             "camera_size", "center_crop", "size", "affine", "clip", "standardize"}));
+  constexpr int kFits = 8;
   if (op < kFits) return parse_fit(fields, op, index == 0, recipe);
   if (recipe.width == 0) return misplaced(fields, "a letterbox or a resize first, or ops that end in size");
   ImageOp image;

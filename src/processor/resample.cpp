@@ -8,12 +8,15 @@
 namespace vla {
 namespace {
 
-constexpr int kBits = 22;  // of a weight behind the point: 8 bits of a pixel and 2 of headroom make 32
-
-/// The source positions that one output position sums, and their weights.
+/// The source positions that one output position sums, and their weights times 2^bits.
 struct Window {
   int first;
   std::vector<int> weights;
+};
+
+struct Windows {
+  int bits;
+  std::vector<Window> list;
 };
 
 double triangle(double distance) { return distance < 1.0 ? 1.0 - distance : 0.0; }
@@ -24,33 +27,49 @@ double cubic(double x) {
   return x < 2.0 ? (((x - 5.0) * x + 8.0) * x - 4.0) * a : 0.0;
 }
 
-int rounded_weight(double weight) { return static_cast<int>((weight < 0.0 ? -0.5 : 0.5) + weight * (1 << kBits)); }
+int rounded_weight(double weight, int bits) {
+  return static_cast<int>((weight < 0.0 ? -0.5 : 0.5) + weight * (1 << bits));
+}
 
-std::vector<Window> make_windows(int n_in, int n_out, PillowFilter filter) {
-  const bool wide = filter == PillowFilter::bicubic;
+/// Digits behind the point: of 32 bits a pixel takes 8 and headroom 2. torch keeps weights in 16 bits.
+int weight_bits(double largest, ByteFilter filter) {
+  constexpr int kBits = 22;
+  if (filter != ByteFilter::torch_bicubic) return kBits;
+  int bits = 0;
+  while (bits < kBits && rounded_weight(largest, bits + 1) < 1 << 15) ++bits;
+  return bits;
+}
+
+Windows make_windows(int n_in, int n_out, ByteFilter filter) {
+  const bool wide = filter != ByteFilter::pillow_bilinear;
   const double scale = static_cast<double>(n_in) / n_out, widened = std::max(scale, 1.0);
   const double support = (wide ? 2.0 : 1.0) * widened;  // half the width of the filter
-  std::vector<Window> windows;
-  windows.reserve(static_cast<std::size_t>(n_out));
+  std::vector<std::vector<double>> exact;
+  Windows windows{0, {}};
+  double largest = 0.0;
   for (int i = 0; i < n_out; ++i) {
     const double center = (i + 0.5) * scale;
     const int first = std::max(static_cast<int>(center - support + 0.5), 0);
     const int end = std::min(static_cast<int>(center + support + 0.5), n_in);
-    std::vector<double> exact;
+    std::vector<double> weights;
     double sum = 0.0;
     for (int x = first; x < end; ++x) {
       const double distance = std::abs((x - center + 0.5) * (1.0 / widened));
-      exact.push_back(wide ? cubic(distance) : triangle(distance));
-      sum += exact.back();
+      weights.push_back(wide ? cubic(distance) : triangle(distance));
+      sum += weights.back();
     }
-    Window window{first, {}};
-    for (const double weight : exact) window.weights.push_back(rounded_weight(sum != 0.0 ? weight / sum : weight));
-    windows.push_back(std::move(window));
+    for (double& weight : weights) {
+      weight = sum != 0.0 ? weight / sum : weight;
+      largest = std::max(largest, weight);
+    }
+    windows.list.push_back({first, {}});
+    exact.push_back(std::move(weights));
   }
+  windows.bits = weight_bits(largest, filter);
+  for (std::size_t i = 0; i < exact.size(); ++i)
+    for (const double weight : exact[i]) windows.list[i].weights.push_back(rounded_weight(weight, windows.bits));
   return windows;
 }
-
-std::uint8_t rounded(int sum) { return static_cast<std::uint8_t>(std::clamp(sum >> kBits, 0, 255)); }
 
 /// `n_line` lines of positions `step` bytes apart, lines `line_step` apart; three channels at each position.
 struct Layout {
@@ -58,19 +77,19 @@ struct Layout {
   std::size_t step, line_step;
 };
 
-void resample_axis(const std::uint8_t* in, Layout from, std::uint8_t* out, Layout to,
-                   const std::vector<Window>& windows) {
+void resample_axis(const std::uint8_t* in, Layout from, std::uint8_t* out, Layout to, const Windows& windows) {
   for (int line = 0; line < from.n_line; ++line) {
     const std::uint8_t* source = in + static_cast<std::size_t>(line) * from.line_step;
     std::uint8_t* target = out + static_cast<std::size_t>(line) * to.line_step;
-    for (const Window& window : windows) {
-      int sums[3] = {1 << (kBits - 1), 1 << (kBits - 1), 1 << (kBits - 1)};
+    for (const Window& window : windows.list) {
+      const int half = 1 << (windows.bits - 1);
+      int sums[3] = {half, half, half};
       const std::uint8_t* pixel = source + static_cast<std::size_t>(window.first) * from.step;
       for (const int weight : window.weights) {
         for (int c = 0; c < 3; ++c) sums[c] += pixel[c] * weight;
         pixel += from.step;
       }
-      for (int c = 0; c < 3; ++c) target[c] = rounded(sums[c]);
+      for (int c = 0; c < 3; ++c) target[c] = static_cast<std::uint8_t>(std::clamp(sums[c] >> windows.bits, 0, 255));
       target += to.step;
     }
   }
@@ -79,7 +98,7 @@ void resample_axis(const std::uint8_t* in, Layout from, std::uint8_t* out, Layou
 }  // namespace
 
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                        int to_height, PillowFilter filter) {
+                                        int to_height, ByteFilter filter) {
   const auto bytes = [](int n_column, int n_row) {
     return static_cast<std::size_t>(n_column) * static_cast<std::size_t>(n_row) * 3;
   };

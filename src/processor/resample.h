@@ -8,14 +8,15 @@
 
 namespace vla {
 
-/// Filters of Pillow: a triangle, or Keys' cubic with a = -0.5.
-enum class PillowFilter { bilinear, bicubic };
+/// How bytes are resized in integers, by a filter that widens when a picture shrinks (antialiasing): a triangle or
+/// Keys' cubic with a = -0.5, with weights of 22 binary digits, or of as many as 16 bits hold.
+enum class ByteFilter { pillow_bilinear, pillow_bicubic, torch_bicubic };
 
-/// An RGB picture of interleaved bytes at another size, by a filter that widens when it shrinks (antialiasing). The
-/// result equals Pillow's to the bit: weights are rounded to 22 binary digits, and rows are rounded to bytes before
-/// columns are summed. All sizes must be at least 1. Source: Pillow src/libImaging/Resample.c.
+/// An RGB picture of interleaved bytes at another size, equal to the bit to Pillow's or to torchvision's resize of an
+/// 8-bit tensor (transforms.v2, torch 2.13). Rows are rounded to bytes before columns are summed. All sizes must be at
+/// least 1. Sources: Pillow src/libImaging/Resample.c; torch aten/src/ATen/native/cpu/UpSampleKernelAVXAntialias.h.
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                        int to_height, PillowFilter filter = PillowFilter::bilinear);
+                                        int to_height, ByteFilter filter = ByteFilter::pillow_bilinear);
 
 /// The same by OpenCV's cv::resize with INTER_LINEAR (4.10 and 5.0 agree): no antialiasing, weights of 11 binary
 /// digits, and the mean of four pixels where both sides are halved. Source: OpenCV modules/imgproc/src/resize.cpp.
@@ -34,5 +35,10 @@ std::vector<std::uint8_t> resample_opencv_area(std::span<const std::uint8_t> rgb
 /// Source: torchvision transforms/_functional_tensor.py resize; torch aten/src/ATen/native/cpu/UpSampleKernel.cpp.
 std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                          int to_height);
+
+/// The same of pixels in [0, 1], byte / 255, bilinear with antialiasing in float32; 255 times the result loses what is
+/// behind the point. Source: Isaac-GR00T gr00t/data/transform/video.py (VideoToTensor, VideoResize, VideoToNumpy).
+std::vector<std::uint8_t> resample_torch_linear(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                                int to_height);
 
 }  // namespace vla

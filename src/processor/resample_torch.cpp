@@ -4,10 +4,16 @@
 #include <cmath>
 #include <iterator>
 
+#include "processor/byte_pixels.h"
 #include "processor/resample.h"
 
 namespace vla {
 namespace {
+
+float triangle(float distance) {
+  const float x = std::abs(distance);
+  return x < 1.0f ? 1.0f - x : 0.0f;
+}
 
 /// Keys' cubic with a = -0.5, as the compiler fuses it there.
 float cubic(float distance) {
@@ -23,11 +29,18 @@ struct Window {
   std::vector<float> weights;
 };
 
+/// A filter and half its width.
+struct Filter {
+  float (*weight)(float distance);
+  double support;
+};
+constexpr Filter kCubic = {cubic, 2.0}, kTriangle = {triangle, 1.0};
+
 /// float and double are mixed as the reference mixes them.
-std::vector<Window> make_windows(int n_in, int n_out) {
+std::vector<Window> make_windows(int n_in, int n_out, const Filter& filter) {
   const float scale = static_cast<float>(n_in) / static_cast<float>(n_out);
   const double wide_scale = static_cast<double>(scale);
-  const float support = scale >= 1.0f ? static_cast<float>(2.0 * wide_scale) : 2.0f;
+  const float support = static_cast<float>(scale >= 1.0f ? filter.support * wide_scale : filter.support);
   const float inverse = scale >= 1.0f ? static_cast<float>(1.0 / wide_scale) : 1.0f;
   const int longest = static_cast<int>(std::ceil(support)) * 2 + 1;
   std::vector<Window> windows;
@@ -40,7 +53,7 @@ std::vector<Window> make_windows(int n_in, int n_out) {
     float sum = 0.0f;
     for (int x = first; x < std::min(end, first + longest); ++x) {
       const double distance = static_cast<double>(static_cast<float>(x) - center) + 0.5;
-      window.weights.push_back(cubic(static_cast<float>(distance * static_cast<double>(inverse))));
+      window.weights.push_back(filter.weight(static_cast<float>(distance * static_cast<double>(inverse))));
       sum += window.weights.back();
     }
     for (float& weight : window.weights) weight = sum != 0.0f ? weight / sum : weight;
@@ -89,20 +102,18 @@ void sum_rows(std::span<const float> in, const Window& window, std::span<float> 
 }
 
 /// Rows and columns of pixels exchanged.
-template <class T>
-void turn(std::span<const T> rgb, std::size_t width, float* out) {
+void turn(std::span<const float> rgb, std::size_t width, float* out) {
   const std::size_t height = rgb.size() / 3 / width;
   for (std::size_t y = 0; y < height; ++y)
     for (std::size_t x = 0; x < width; ++x)
-      for (std::size_t c = 0; c < 3; ++c)
-        out[(x * height + y) * 3 + c] = static_cast<float>(rgb[(y * width + x) * 3 + c]);
+      for (std::size_t c = 0; c < 3; ++c) out[(x * height + y) * 3 + c] = rgb[(y * width + x) * 3 + c];
 }
 
 /// The picture at its new width. A band of rows is turned, so that one loop over whole rows serves columns as well; it
 /// is a narrow one that stays in the cache.
-std::vector<float> widened(std::span<const std::uint8_t> rgb, std::size_t width, std::size_t to_width) {
+std::vector<float> widened(std::span<const float> rgb, std::size_t width, std::size_t to_width, const Filter& filter) {
   constexpr std::size_t kBand = 16;
-  const std::vector<Window> windows = make_windows(static_cast<int>(width), static_cast<int>(to_width));
+  const std::vector<Window> windows = make_windows(static_cast<int>(width), static_cast<int>(to_width), filter);
   const std::size_t height = rgb.size() / 3 / width;
   std::vector<float> out(to_width * height * 3), columns(width * kBand * 3), sums(to_width * kBand * 3);
   for (std::size_t top = 0; top < height; top += kBand) {
@@ -110,7 +121,7 @@ std::vector<float> widened(std::span<const std::uint8_t> rgb, std::size_t width,
     const std::span<float> column_in(columns.data(), size * width), column_out(sums.data(), size * to_width);
     turn(rgb.subspan(3 * top * width, size * width), width, column_in.data());
     for (std::size_t x = 0; x < to_width; ++x) sum_rows(column_in, windows[x], column_out.subspan(x * size, size));
-    turn(std::span<const float>(column_out), size / 3, out.data() + 3 * top * to_width);
+    turn(column_out, size / 3, out.data() + 3 * top * to_width);
   }
   return out;
 }
@@ -121,25 +132,41 @@ std::uint8_t rounded(float x) {
   return static_cast<std::uint8_t>(std::clamp(x, 0.0f, 255.0f) + kNoFraction - kNoFraction);
 }
 
-}  // namespace
-
-std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
-                                         int to_height) {
-  std::vector<float> pixels(rgb.begin(), to_width == width ? rgb.end() : rgb.begin());
-  if (to_width != width) pixels = widened(rgb, static_cast<std::size_t>(width), static_cast<std::size_t>(to_width));
+/// Columns first. `finish` makes a byte of a sum.
+template <class Finish>
+std::vector<std::uint8_t> resample(std::vector<float> pixels, int width, int height, int to_width, int to_height,
+                                   const Filter& filter, Finish finish) {
+  if (to_width != width)
+    pixels = widened(pixels, static_cast<std::size_t>(width), static_cast<std::size_t>(to_width), filter);
   const std::size_t row_size = static_cast<std::size_t>(to_width) * 3;
   std::vector<std::uint8_t> out;
   out.reserve(row_size * static_cast<std::size_t>(to_height));
   if (to_height == height) {
-    std::transform(pixels.begin(), pixels.end(), std::back_inserter(out), rounded);
+    std::transform(pixels.begin(), pixels.end(), std::back_inserter(out), finish);
     return out;
   }
   std::vector<float> row(row_size);
-  for (const Window& window : make_windows(height, to_height)) {
+  for (const Window& window : make_windows(height, to_height, filter)) {
     sum_rows(pixels, window, row);
-    std::transform(row.begin(), row.end(), std::back_inserter(out), rounded);
+    std::transform(row.begin(), row.end(), std::back_inserter(out), finish);
   }
   return out;
+}
+
+}  // namespace
+
+std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                         int to_height) {
+  return resample({rgb.begin(), rgb.end()}, width, height, to_width, to_height, kCubic, rounded);
+}
+
+std::vector<std::uint8_t> resample_torch_linear(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
+                                                int to_height) {
+  std::vector<float> pixels;
+  pixels.reserve(rgb.size());
+  for (const std::uint8_t byte : rgb) pixels.push_back(byte_table()[byte]);
+  return resample(std::move(pixels), width, height, to_width, to_height, kTriangle,
+                  [](float x) { return static_cast<std::uint8_t>(std::clamp(255.0f * x, 0.0f, 255.0f)); });
 }
 
 }  // namespace vla

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The mapping of GR00T N1.7 at the published size: against the published counts, and against what the runtime declares."""
+"""The mappings of GR00T at the published sizes: against the published counts, and against what the runtime declares."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from manifest_test import vla
-from vla_cpp.convert.archs import gr00t_n1_7
+from vla_cpp.convert.archs import gr00t_n1_6, gr00t_n1_7
 from vla_cpp.convert.archs.gr00t.plan import network_keys, read_sizes, weights
 from vla_cpp.convert.errors import Problems
 
@@ -110,3 +110,48 @@ def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes,
     ours["policy.view_starts"] = [4, 70]  # <|im_start|>, "user", a line's end, <|vision_start|>; 64 image tokens a view
     for name, value in manifest["config"].items():
         assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+
+
+EAGLE_3 = {
+    "model_type": "eagle_3_vl",
+    "use_pixel_shuffle": True,
+    "mlp_connector_layers": 2,
+    "select_layer": -1,
+    "text_config": {
+        "hidden_size": 2048,
+        "intermediate_size": 6144,
+        "num_hidden_layers": 28,
+        "num_attention_heads": 16,
+        "num_key_value_heads": 8,
+        "vocab_size": 151680,
+        "max_position_embeddings": 40960,
+        "rope_theta": 1000000,
+    },
+    "vision_config": {
+        "hidden_size": 1152,
+        "intermediate_size": 4304,
+        "num_hidden_layers": 27,
+        "num_attention_heads": 16,
+        "patch_size": 14,
+    },
+}
+
+
+def test_n1_6_declares_what_its_checkpoint_has(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps(EAGLE_3))
+    release, problems = gr00t_n1_6.RELEASE, Problems("published")
+    config = {"model_type": "Gr00tN1d6", "max_state_dim": 128, "max_action_dim": 128, "action_horizon": 50}
+    sizes = read_sizes(release, config, str(tmp_path), problems)
+    problems.raise_any()
+    sizes.n_slot, sizes.image_width, sizes.image_height = 2, 252, 252
+    declared = json.loads(
+        subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_6"], capture_output=True, check=True).stdout
+    )
+    ours = {row.target: (list(row.shape), row.kind) for row in weights(release, sizes)}
+    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in declared["parameters"]}
+    keys = {key.name: key.value for key in network_keys(release, sizes)}
+    keys["policy.view_starts_from_end"] = [172, 84]  # 81 tokens a view, its mark and its number; two marks at the end
+    for name, value in declared["config"].items():
+        assert keys[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+    tower = sum(int(np.prod(row.shape)) for row in weights(release, sizes) if row.target.startswith("vision."))
+    assert tower / 1e6 == pytest.approx(412.4, abs=0.1)

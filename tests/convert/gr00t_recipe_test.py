@@ -117,10 +117,28 @@ def test_a_cameras_aspect_is_kept(converter):
     assert recipe(bundle)["text"][2]["repeat"] == 4 * 3
 
 
-def test_pictures_may_have_the_least_and_the_largest_area_of_the_backbone(converter):
+# 40x30 -> 16x12 -> crop 14x11 -> 15x12, held to multiples of 4 and to an area
+@pytest.mark.parametrize(
+    "least, most, width, height",
+    [(144, 4096, 16, 12), (12 * 12, 12 * 12, 12, 8), (20 * 20, 4096, 24, 20), (12 * 16, 12 * 16, 16, 12)],
+)
+def test_the_backbones_image_processor_resizes_what_its_limits_do_not_hold(converter, least, most, width, height):
+    tiny = TinyGr00t()
+    tiny.images.update(min_pixels=least, max_pixels=most)
+    bundle = convert(converter, tiny, camera_size="40x30")
+    resize = {"op": "resize", "width": width, "height": height, "filter": "torch_bicubic_16bit"}
+    assert recipe(bundle)["image"][3:5] == [resize, {"op": "size", "width": width, "height": height}]
+    assert (bundle.keys["vision.image_width"], bundle.keys["vision.image_height"]) == (width, height)
+
+
+def test_pictures_within_the_limits_are_not_resized_again(converter):
     tiny = TinyGr00t()
     tiny.images.update(min_pixels=EDGE * EDGE, max_pixels=EDGE * EDGE)
-    assert convert(converter, tiny).keys["vision.image_height"] == EDGE
+    assert [op["op"] for op in recipe(convert(converter, tiny))["image"]].count("resize") == 0
+
+
+def test_letterbox_pads_whatever_the_checkpoint_says(converter):
+    assert recipe(convert(converter, letterbox=True))["image"][0] == {"op": "square_pad"}
 
 
 def test_rows_are_no_more_than_the_networks(converter):

@@ -131,3 +131,80 @@ TEST_CASE("a template stands around the places for views, and words must be left
   seen.text = "?!";
   CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "nothing but punctuation"));
 }
+
+namespace {
+
+/// 6 x 4 pixels.
+std::vector<std::uint8_t> colours() {
+  std::vector<std::uint8_t> rgb;
+  for (int y = 0; y < 4; ++y)
+    for (int x = 0; x < 6; ++x)
+      for (int c = 0; c < 3; ++c) rgb.push_back(static_cast<std::uint8_t>(x * 38 + y * 91 + c * 53));
+  return rgb;
+}
+
+}  // namespace
+
+TEST_CASE("bicubic resizes of bytes are those of Pillow and of torchvision, whose weights have 16 bits") {
+  std::vector<std::uint8_t> expected = {17,  70, 127, 91,  150, 186, 170, 230, 35,  81,  153, 190, 178, 125, 86,
+                                        152, 87, 81,  163, 157, 124, 120, 79,  79,  109, 87,  167, 148, 107, 69,
+                                        50,  92, 152, 115, 148, 167, 32,  90,  151, 115, 179, 201, 190, 119, 49};
+  CHECK(resample_8bit(colours(), 6, 4, 3, 5, ByteFilter::pillow_bicubic) == expected);
+  expected[1] = 69;
+  CHECK(resample_8bit(colours(), 6, 4, 3, 5, ByteFilter::torch_bicubic) == expected);
+}
+
+TEST_CASE("a frame of another camera than the policy was trained with is refused, and a crop takes the middle") {
+  const Json crop = {{"op", "center_crop"}, {"width", 3}, {"height", 1}};
+  Json recipe = Json::parse(kRecipe);
+  recipe["image"] = Json::array(
+      {{{"op", "camera_size"}, {"width", 6}, {"height", 4}}, crop, {{"op", "size"}, {"width", 3}, {"height", 1}}});
+  const auto parsed = parse_recipe(recipe.dump());
+  REQUIRE(parsed.ok());
+  std::vector<float> out(9);
+  const auto& pipeline = std::get<Pipeline>(parsed->fit);
+  CHECK(run_pipeline({6, 4, colours()}, pipeline, out, "view").ok());
+  // 3 of 6 columns leave 1.5 on each side, 1 of 4 rows the same: both are rounded to 2, the even number.
+  CHECK(out[0] == doctest::Approx((2 * 38 + 2 * 91) % 256 / 255.0));
+  CHECK_FALSE(run_pipeline({4, 6, colours()}, pipeline, out, "view").ok());
+  recipe["image"][1]["width"] = 7;
+  recipe["image"][2]["width"] = 7;
+  const auto wide = parse_recipe(recipe.dump());
+  REQUIRE(wide.ok());
+  std::vector<float> row(21);
+  CHECK_FALSE(run_pipeline({6, 4, colours()}, std::get<Pipeline>(wide->fit), row, "view").ok());
+}
+
+TEST_CASE("views behind the instruction are found from the end of the prompt, whatever its length") {
+  EditableBundle bundle = groot();
+  Json recipe = with("/text/2/place", "back");
+  recipe["text"][2]["open"] = "view {i}<img>";
+  bundle.set("processor.recipe", recipe.dump());
+  bundle.remove_key("policy.view_starts");
+  const std::string refusal_of_none = refusal(create(bundle), Code::bad_bundle);
+  CHECK(contains(refusal_of_none, "policy.view_starts_from_end"));
+  // The line's end, then from the back 5 tokens and the mark behind them, and the number and mark in front.
+  bundle.set("policy.view_starts_from_end", std::vector<std::int64_t>{1, 2, 3});
+  const std::string told = refusal(create(bundle), Code::bad_bundle);
+  const auto at = told.find("expected ") + 9;
+  std::vector<std::int64_t> starts;
+  for (std::size_t i = at; starts.size() < 3; i = told.find(", ", i) + 2) starts.push_back(std::stoi(told.substr(i)));
+  CHECK(starts[2] > 6);
+  bundle.set("policy.view_starts_from_end", starts);
+  const Processor processor = make(bundle);
+  Observation seen = observation();
+  seen.views["top"] = seen.views["wrist"] = seen.views["side"] = Frame{4, 4, std::vector<std::uint8_t>(48, 255)};
+  for (const char* text : {"pick", "pick up the cube and put it down"}) {
+    seen.text = text;
+    const auto inputs = processor.encode(seen);
+    REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+    const std::vector<std::int32_t>& tokens = inputs->tokens;
+    for (const std::int64_t start : starts) {
+      const auto first = tokens.end() - start;
+      CHECK(std::count(first, first + 5, *first) == 5);
+      CHECK(*(first - 1) != *first);
+    }
+  }
+  seen.text = std::string(200, 'x');
+  CHECK(contains(refusal(processor.encode(seen), Code::bad_observation), "shorten the instruction"));
+}

@@ -74,7 +74,8 @@ def conversion_options(folder):
     file = folder / "convert.json"
     for name, value in (json.loads(file.read_text()) if file.is_file() else {}).items():
         yield "--" + name.replace("_", "-")
-        yield ",".join(value) if isinstance(value, list) else str(value)
+        if value is not True:  # a flag
+            yield ",".join(value) if isinstance(value, list) else str(value)
 
 
 def backbone_folder(checkpoint):

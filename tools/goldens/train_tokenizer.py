@@ -21,6 +21,7 @@ INTERNVL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<
 QWEN_VL = [f"<|{name}|>" for name in (
     "endoftext", "im_start", "im_end", "object_ref_start", "object_ref_end", "box_start", "box_end", "quad_start", "quad_end",
     "vision_start", "vision_end", "vision_pad", "image_pad", "video_pad")]
+EAGLE = [*QWEN_VL, "<IMG_CONTEXT>", "<img>", "</img>"]
 QWEN_TEMPLATE = (
     "{% for message in messages %}<|im_start|>{{ message.role }}\n{% for part in message.content %}{% if part.type == 'image' %}"
     "<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part.text }}{% endif %}{% endfor %}<|im_end|>\n{% endfor %}"
@@ -98,6 +99,11 @@ def qwen(folder, added, frames, n_merge=60, **more):
 def evo1(folder):
     """With the three files that the slow class of the authors' layout reads."""
     spec = qwen(folder, INTERNVL, tuple(f"Image-{i}: <\n{{}}\n" for i in (1, 2, 3)))
+    write_slow(spec, folder)
+
+
+def write_slow(spec, folder):
+    """What the slow class reads."""
     (folder / "vocab.json").write_text(json.dumps(spec["model"]["vocab"], ensure_ascii=False))
     (folder / "merges.txt").write_text("#version: 0.2\n" + "".join(" ".join(m) + "\n" for m in spec["model"]["merges"]))
     (folder / "added_tokens.json").write_text(json.dumps({t["content"]: t["id"] for t in spec["added_tokens"]}, indent=2))
@@ -107,5 +113,11 @@ def gr00t(folder):
     qwen(folder, QWEN_VL, ("<|im_start|>user\n{}<|im_end|>\n",), chat_template=QWEN_TEMPLATE)
 
 
+def eagle(folder):
+    """Of GR00T N1.5 and N1.6, whose code has the slow class's files."""
+    spec = qwen(folder, EAGLE, ("<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n<|im_start|>user\n{}<image 1><|im_end|>\n",))
+    write_slow(spec, folder)
+
+
 if __name__ == "__main__":
-    {"smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))
+    {"eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))

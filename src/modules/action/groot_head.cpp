@@ -27,12 +27,14 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
       time_in_(s / "time_in", d_time_, dit_.d_model(), Bias::yes),
       time_out_(s / "time_out", dit_.d_model(), dit_.d_model(), Bias::yes) {
   if (family.future_tokens) future_.emplace(s / "future", dit_.d_model(), n_future_);
-  const Scope vl = s / "vl";
-  const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may do without layers
-  for (int i = 0; i < n_layer; ++i)
-    vl_blocks_.emplace_back(vl / "blk" / i, d_context, n_head, vl.dim("d_ff"), vl.number("norm_eps", kNormEps));
-  vl.require(n_layer == 0 || d_context % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_context),
-             std::to_string(n_head));
+  if (family.mixing) {
+    const Scope vl = s / "vl";
+    const int n_layer = vl.index("n_layer", 513), n_head = vl.dim("n_head", 1024);  // a model may do without layers
+    for (int i = 0; i < n_layer; ++i)
+      vl_blocks_.emplace_back(vl / "blk" / i, d_context, n_head, vl.dim("d_ff"), vl.number("norm_eps", kNormEps));
+    vl.require(n_layer == 0 || d_context % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_context),
+               std::to_string(n_head));
+  }
   s.require(horizon_ <= s.dim("n_position"), "n_position", fmt::format("at least the horizon {}", horizon_),
             std::to_string(s.dim("n_position")));
   (s / "dit").require(d_time_ % 2 == 0 && d_time_ > 2, "d_time", "an even number above 2", std::to_string(d_time_));

@@ -15,6 +15,7 @@ namespace vla {
 /// What tells the releases' heads apart.
 struct GrootFamily {
   bool future_tokens;  // `policy.n_future` learned tokens between the state's and those of the actions
+  bool mixing;         // `vl.n_layer` layers of self-attention over the features
   bool alternating;    // even layers look at the text or at the images (`dit.text_every`), else at all rows
 };
 

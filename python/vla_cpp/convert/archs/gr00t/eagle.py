@@ -121,7 +121,7 @@ class Eagle:
         path = os.path.join(folder, FILE)
         Section("backbone " + FILE, read_json(path), {}, problems).check_fixed(IMAGE_FIXED)
         side = self.merge * s.patch_size
-        return Area(FILE, "pillow_bicubic", side, 4 * side**2, 4096 * side**2)
+        return Area(FILE, "pillow_bicubic", side, side, 4 * side**2, 4096 * side**2)
 
     def read_prompt(self, tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems) -> Prompt:
         prompt = prompts.read_prompt(self.TEMPLATE, tokenizer, self.folder, s, problems)

@@ -32,6 +32,7 @@ class Area(NamedTuple):
 
     file: str  # that states them
     filter: str  # by which it resizes others
+    shortest: int  # side of a picture
     multiple: int
     least: int
     most: int
@@ -123,7 +124,7 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
 def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int, int]:
     """The size that the backbone's image processor makes of a picture (smart_resize)."""
     unit = area.multiple
-    sides = [max(unit, round(side / unit) * unit) for side in (width, height)]
+    sides = [max(area.shortest, round(side / unit) * unit) for side in (width, height)]
     size = sides[0] * sides[1]
     if size > area.most:
         shrink = math.sqrt(width * height / area.most)

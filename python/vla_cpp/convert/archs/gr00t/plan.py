@@ -161,6 +161,8 @@ def network_keys(release: Release, s: Sizes) -> List[Key]:
     for part in (head.keys(s), release.backbone.keys(s), language.keys(s)):
         for kind, values in part.items():
             groups[kind] = {**groups.get(kind, {}), **values}
+    if "vl_self_attention_cfg" not in release.config:
+        groups["u32"] = {k: v for k, v in groups["u32"].items() if not k.startswith("vl.")}
     return keys_by_type(groups)
 
 

@@ -153,7 +153,7 @@ def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
             section.bad("size", "shortest_edge and longest_edge, counts of pixels")
             stated = 1
         limits.append(stated)
-    return Area(FILE, "torch_bicubic_native", 2 * s.patch_size, *limits)
+    return Area(FILE, "torch_bicubic_16bit", 0, 2 * s.patch_size, *limits)
 
 
 def weights(s: Sizes) -> List[Weight]:

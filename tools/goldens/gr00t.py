@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the golden cases of GR00T share: robots, the action head's shapes, files in the authors' layout, hooks on LeRobot's head.
+
+A checkpoint serves several robots, with cameras, keys and statistics of their own; `convert.json` beside it says for which one the
+case is.
+"""
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from . import lerobot_layout as layout
+from .cases import Case
+from .draw import bfloat16
+from .files import bfloat16_bits, write_json, write_stream
+from .parameters import linear, norm, parameter, statistics
+from .recorder import Taps
+
+ABSOLUTE = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
+RELATIVE = ABSOLUTE | {"rep": "RELATIVE"}
+# Where residual streams begin, and what is added to them.
+FAINT = ("patch_embed", "pos_embed", "attn.proj", "linear_fc2", "embed_tokens", "o_proj", "down_proj", "vlln", "to_out", "ff.net.2",
+         "state_encoder.layer2", "W3", "position_embedding")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What a checkpoint knows of one embodiment."""
+
+    views: tuple
+    states: dict  # key -> width
+    actions: dict  # key -> width
+    rows: int  # of the head's horizon, which the robot gets
+    relative: dict = field(default_factory=dict)  # action key -> the state key that it is added to, None: of the same name
+    zero_spread: tuple = ()
+
+    def statistics(self, seed):
+        return statistics(sum(self.states.values()), sum(self.actions.values()), seed, self.zero_spread)
+
+
+OTHER = "new_embodiment", 0, Robot(("ego_view",), {"arm": 3}, {"hand": 1, "arm": 3}, 4)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Sizes of towers and head, robots, how a frame becomes an image.  A release adds CONFIG, PROCESSOR_CLASS, SETTINGS,
+    backbone_shapes() and write_backbone()."""
+
+    tag: str
+    index: int  # of the embodiment
+    robot: Robot
+    vision: dict  # fields of the tower's config
+    text: dict  # fields of the language model's, with the number of layers that the backbone has
+    head: dict  # fields of config.json
+    image: dict  # fields of processor_kwargs: how a frame becomes an image
+    side: int = 0  # of the smallest square image that the backbone's processor leaves alone
+    percentiles: bool = False
+    faint: bool = False  # what enters a residual stream is so small that every norm's eps shows
+
+    @property
+    def d_state(self):
+        return sum(self.states.values())
+
+    @property
+    def d_action(self):
+        return sum(self.robot.actions.values())
+
+    @property
+    def states(self):
+        return self.robot.states
+
+    @property
+    def zero_spread(self):
+        return self.robot.zero_spread
+
+    @property
+    def policy(self):
+        return {"chunk_size": self.head["action_horizon"], "max_action_dim": self.head["max_action_dim"]}
+
+    @property
+    def robots(self):
+        other, index, robot = OTHER
+        return {self.tag: (self.index, self.robot), other: (index, robot)}
+
+    def head_shapes(self):
+        h, d_model = self.head, self.text["hidden_size"]
+        d, d_hidden, d_state, d_action = h["input_embedding_dim"], h["hidden_size"], h["max_state_dim"], h["max_action_dim"]
+        n, dit = h["max_num_embodiments"], h["diffusion_model_cfg"]
+
+        def attention(at, d, d_context):
+            parts = (("to_q", d), ("to_k", d_context), ("to_v", d_context), ("to_out.0", d))
+            out = {k: v for part, d_in in parts for k, v in linear(f"{at}.attn1.{part}", d, d_in).items()}
+            return out | linear(f"{at}.ff.net.0.proj", 4 * d, d) | linear(f"{at}.ff.net.2", d, 4 * d)
+
+        def per_robot(name, d_in, d_out):
+            return {f"action_head.{name}.W": (n, d_in, d_out), f"action_head.{name}.b": (n, d_out)}
+
+        out = norm("action_head.vlln", d_model) | {"action_head.position_embedding.weight": (h["max_seq_len"], d)}
+        for i in range((h.get("vl_self_attention_cfg") or {"num_layers": 0})["num_layers"]):
+            at = f"action_head.vl_self_attention.transformer_blocks.{i}"
+            out |= norm(f"{at}.norm1", d_model) | norm(f"{at}.norm3", d_model) | attention(at, d_model, d_model)
+        at = "action_head.model."
+        for i in range(dit["num_layers"]):
+            block = f"{at}transformer_blocks.{i}"
+            out |= linear(f"{block}.norm1.linear", 2 * d, d) | attention(block, d, d if i % 2 else d_model)
+        time = f"{at}timestep_encoder.timestep_embedder."
+        out |= linear(f"{time}linear_1", d, 256) | linear(f"{time}linear_2", d, d)
+        out |= linear(f"{at}proj_out_1", 2 * d, d) | linear(f"{at}proj_out_2", dit["output_dim"], d)
+        out |= per_robot("state_encoder.layer1", d_state, d_hidden) | per_robot("state_encoder.layer2", d_hidden, d)
+        out |= per_robot("action_encoder.W1", d_action, d) | per_robot("action_encoder.W2", 2 * d, d) | per_robot("action_encoder.W3", d, d)
+        return out | per_robot("action_decoder.layer1", d_hidden, d_hidden) | per_robot("action_decoder.layer2", d_hidden, d_action)
+
+    def value(self, name, shape, seed):
+        x = parameter(name, shape, seed)
+        if name == "action_head.vlln.weight":  # a norm by another name
+            x = bfloat16(x + 1)
+        if name.startswith("action_head.") and len(shape) == 3:  # [embodiment, in, out], which parameter() leaves too small
+            x = x * 2.0 ** round(math.log2(shape[2]) / 2)
+        return x / 16 if self.faint and any(part in name for part in FAINT) else x
+
+    def write(self, seed, folder):
+        """Returns the parameter count."""
+        folder = Path(folder)
+        self.write_backbone(folder / "vlm")
+        settings = self.processor_config()
+        same = ("image_crop_size", "image_target_size", "shortest_image_edge", "crop_fraction", "use_percentiles", "use_relative_action")
+        config = self.CONFIG | {"backbone_embedding_dim": self.text["hidden_size"]} | {k: settings["processor_kwargs"][k] for k in same} | self.head
+        ids = {tag: index for tag, (index, _) in self.robots.items()}
+        for file, value in (("config", config), ("processor_config", settings), ("statistics", self.statistics(seed)), ("embodiment_id", ids)):
+            write_json(folder / f"{file}.json", value, indent=1)
+        index = {}
+        for i, shapes in enumerate((self.backbone_shapes(), self.head_shapes())):
+            file = f"model-{i + 1:05d}-of-00002.safetensors"
+            write_stream(folder / file, {n: ("BF16", s) for n, s in sorted(shapes.items())},
+                         lambda name, shapes=shapes: bfloat16_bits(self.value(name, shapes[name], seed)), {"format": "pt"})
+            index |= {name: (file, layout.count(shape)) for name, shape in shapes.items()}
+        n = sum(count for _, count in index.values())
+        write_json(folder / "model.safetensors.index.json", {
+            "metadata": {"total_size": 2 * n}, "weight_map": {name: file for name, (file, _) in sorted(index.items())}}, indent=1)
+        return n
+
+    def processor_config(self):
+        settings = {
+            "modality_configs": {tag: modalities(robot) for tag, (_, robot) in self.robots.items()},
+            "image_crop_size": None, "image_target_size": None, "use_albumentations": True, "random_rotation_angle": None,
+            "color_jitter_params": None, "shortest_image_edge": None, "crop_fraction": None, "letter_box_transform": False,
+            "model_name": self.CONFIG["model_name"], "model_type": self.CONFIG["backbone_model_type"], "formalize_language": True,
+            "max_state_dim": self.head["max_state_dim"], "max_action_dim": self.head["max_action_dim"], "max_action_horizon": self.head["action_horizon"],
+            "use_percentiles": self.percentiles, "use_mean_std": False, "clip_outliers": True, "apply_sincos_state_encoding": False,
+            "use_relative_action": any(robot.relative for _, robot in self.robots.values()), "exclude_state": False,
+            "state_dropout_prob": 0.2}
+        return {"processor_class": self.PROCESSOR_CLASS, "processor_kwargs": settings | self.SETTINGS | self.image}
+
+    def statistics(self, seed):
+        out = {}
+        for i, (tag, (_, robot)) in enumerate(self.robots.items()):
+            flat, changes = robot.statistics(seed + i), robot.statistics(seed + i + 1000)["action"]
+            relative = per_key(changes, robot.actions)
+            out[tag] = {"state": per_key(flat["observation.state"], robot.states), "action": per_key(flat["action"], robot.actions),
+                        "relative_action": {key: relative[key] for key in robot.relative}}
+        return out
+
+
+def modalities(robot):
+    def part(keys, deltas, actions=None):
+        return {"delta_indices": deltas, "modality_keys": list(keys), "sin_cos_embedding_keys": None, "mean_std_embedding_keys": None,
+                "action_configs": actions}
+
+    configs = [RELATIVE | {"state_key": robot.relative[k]} if k in robot.relative else ABSOLUTE for k in robot.actions]
+    return {"video": part(robot.views, [0]), "state": part(robot.states, [0]),
+            "action": part(robot.actions, list(range(robot.rows)), configs),
+            "language": part(["annotation.human.action.task_description"], [0])}
+
+
+def per_key(numbers, groups):
+    """Statistics of a whole vector -> those of its parts."""
+    out, start = {}, 0
+    for key, n in groups.items():
+        out[key] = {k: numbers[k][start : start + n].tolist() for k in ("min", "max", "mean", "std", "q01", "q99")}
+        start += n
+    return out
+
+
+def head(layers, dit, vl, d_hidden, d_state, d_action, horizon, **more):
+    """layers: of the language model, which the policy keeps; dit, vl: (layers, heads, width of a head)."""
+    same = {"positional_embeddings": None, "dropout": 0.2, "final_dropout": True}
+    sizes = ("num_layers", "num_attention_heads", "attention_head_dim")
+    return {"select_layer": layers, "input_embedding_dim": dit[1] * dit[2], "hidden_size": d_hidden, "max_state_dim": d_state,
+            "max_action_dim": d_action, "action_horizon": horizon, "max_seq_len": horizon + 4, "max_num_embodiments": 3,
+            "diffusion_model_cfg": same | dict(zip(sizes, dit)) | {
+                "norm_type": "ada_norm", "output_dim": d_hidden, "interleave_self_attention": True},
+            "vl_self_attention_cfg": same | dict(zip(sizes, vl)) if vl else None, **more}
+
+
+def case(seed, frames, instruction, description, **more):
+    options = {"embodiment": description.tag} | more.pop("options", {})
+    return Case(seed, frames, instruction, description, options=options, **more)
+
+
+POSE = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1)
+
+
+# --- the reference ---------------------------------------------------------------------------------------------------
+
+
+def embodiment(checkpoint):
+    return json.loads((Path(checkpoint).parent / "convert.json").read_text())["embodiment"]
+
+
+class HeadTaps(Taps):
+    """Hooks on LeRobot's action head.  A recorder sets `image`, which says of every token whether it is an image's."""
+
+    def action_head(self, head):
+        self.before(head.state_encoder, lambda x: self.put("state", x[0, 0]))
+        self.after(head.state_encoder, lambda x: self.put("state_out", x[0]))
+        self.before(head.action_encoder, self.on_step)
+        dit = head.model
+        dit.register_forward_pre_hook(lambda m, args, kw: self.at_step("action_token", kw["hidden_states"][:, 1:]), with_kwargs=True)
+        for i, block in enumerate(dit.transformer_blocks):
+            self.stepwise(block, f"dit.blk.{i}")
+            if i % 2 == 0:
+                of_text = i % (2 * dit.attend_text_every_n_blocks) == 0
+                for leaf, module in (("k", block.attn1.to_k), ("v", block.attn1.to_v)):
+                    self.after(module, lambda x, name=f"dit.blk.{i}.{leaf}", a=block.attn1, t=of_text: self.seen(name, x, a.heads, t))
+        self.stepwise(dit, "dit.out")
+
+    def seen(self, name, x, n_head, of_text):
+        """Keys or values of the rows that a cross block looks at: those of the text or those of the images."""
+        if self.step == 0:
+            self.put(name, x[0][self.image != of_text].unflatten(-1, (n_head, -1)))
+
+    def on_step(self, x):
+        if self.step >= 0:
+            self.put(f"step.{self.step}.x", x[0])
+        self.step += 1
