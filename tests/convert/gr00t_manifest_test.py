@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from manifest_test import vla
-from vla_cpp.convert.archs import gr00t_n1_6, gr00t_n1_7
+from vla_cpp.convert.archs import gr00t_n1_5, gr00t_n1_6, gr00t_n1_7
 from vla_cpp.convert.archs.gr00t.plan import network_keys, read_sizes, weights
 from vla_cpp.convert.errors import Problems
 
@@ -155,3 +155,43 @@ def test_n1_6_declares_what_its_checkpoint_has(tmp_path):
         assert keys[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
     tower = sum(int(np.prod(row.shape)) for row in weights(release, sizes) if row.target.startswith("vision."))
     assert tower / 1e6 == pytest.approx(412.4, abs=0.1)
+
+
+N1_5 = {
+    "model_type": "gr00t_n1_5",
+    "backbone_cfg": {"select_layer": 12, "project_to_dim": None},
+    "action_head_cfg": {
+        "backbone_embedding_dim": 2048,
+        "input_embedding_dim": 1536,
+        "hidden_size": 1024,
+        "max_state_dim": 64,
+        "action_dim": 32,
+        "action_horizon": 16,
+        "num_target_vision_tokens": 32,
+        "num_inference_timesteps": 4,
+        "diffusion_model_cfg": {**CONFIG["diffusion_model_cfg"], "num_layers": 16, "cross_attention_dim": 2048},
+        "vl_self_attention_cfg": CONFIG["vl_self_attention_cfg"],
+    },
+}
+
+
+def test_n1_5_declares_what_its_checkpoint_has(tmp_path):
+    eagle = {**EAGLE_3, "model_type": "eagle_2_5_vl", "use_pixel_shuffle": False, "mlp_connector_layers": 1}
+    (tmp_path / "config.json").write_text(json.dumps(eagle))
+    problems = Problems("published")
+    sizes, n_future = gr00t_n1_5.read_sizes(N1_5, str(tmp_path), problems)
+    problems.raise_any()
+    sizes.n_slot = 2
+    declared = json.loads(
+        subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_5"], capture_output=True, check=True).stdout
+    )
+    rows = gr00t_n1_5.weights(sizes, n_future)
+    ours = {row.target: (list(row.shape), row.kind) for row in rows}
+    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in declared["parameters"]}
+    keys = {key.name: key.value for key in gr00t_n1_5.network_keys(sizes, n_future)}
+    keys["policy.view_starts"] = [20, 283]  # behind the system's turn, the user's mark and the first view's number
+    for name, value in declared["config"].items():
+        assert keys[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+    # What is published, but for the rows of 31 other robots and the pooling head.
+    count = sum(int(np.prod(row.shape)) for row in rows)
+    assert count / 1e6 == pytest.approx(412.4 + 2.36 + 604.0 + 310.6 + 201.4 + 550.4 + 9.9 + 1.57, abs=0.3)

@@ -212,16 +212,18 @@ def embodiment(checkpoint):
 class HeadTaps(Taps):
     """Hooks on LeRobot's action head.  A recorder sets `image`, which says of every token whether it is an image's."""
 
+    n_front = 1  # tokens in front of those of the actions
+
     def action_head(self, head):
         self.before(head.state_encoder, lambda x: self.put("state", x[0, 0]))
         self.after(head.state_encoder, lambda x: self.put("state_out", x[0]))
         self.before(head.action_encoder, self.on_step)
         dit = head.model
-        dit.register_forward_pre_hook(lambda m, args, kw: self.at_step("action_token", kw["hidden_states"][:, 1:]), with_kwargs=True)
+        dit.register_forward_pre_hook(lambda m, args, kw: self.at_step("action_token", kw["hidden_states"][:, self.n_front :]), with_kwargs=True)
         for i, block in enumerate(dit.transformer_blocks):
             self.stepwise(block, f"dit.blk.{i}")
             if i % 2 == 0:
-                of_text = i % (2 * dit.attend_text_every_n_blocks) == 0
+                of_text = i % (2 * getattr(dit, "attend_text_every_n_blocks", 1)) == 0
                 for leaf, module in (("k", block.attn1.to_k), ("v", block.attn1.to_v)):
                     self.after(module, lambda x, name=f"dit.blk.{i}.{leaf}", a=block.attn1, t=of_text: self.seen(name, x, a.heads, t))
         self.stepwise(dit, "dit.out")

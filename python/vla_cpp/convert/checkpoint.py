@@ -18,7 +18,7 @@ from .safetensors_file import Entry, read_safetensors
 from .torch_file import read_torch
 
 LEROBOT, OPENPI, EVO1 = "lerobot", "openpi", "evo1"  # layouts; those of GR00T are called as its releases
-GR00T_MODELS = {"Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}  # what config.json states as model_type
+GR00T_MODELS = {"gr00t_n1_5": "gr00t_n1_5", "Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}  # what config.json states as model_type
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
 # What Evo-1's trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.

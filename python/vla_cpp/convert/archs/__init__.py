@@ -101,7 +101,7 @@ GR00T = tuple(GR00T_MODELS.values())
 LAYOUT_OPTIONS = {
     "identity_stats": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
     "position_precision": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
-    "variant": ((OPENPI, EVO1), "a checkpoint of openpi or of Evo-1's authors"),
+    "variant": ((OPENPI, EVO1, GR00T_MODELS["gr00t_n1_5"]), "a checkpoint of openpi, of Evo-1's authors or of GR00T N1.5"),
     "stats": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "views": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),

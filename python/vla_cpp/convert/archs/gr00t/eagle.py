@@ -12,13 +12,13 @@ import math
 import os
 from typing import Dict, List
 
+from ...ascii_bpe import special_ids
 from ...errors import Problems
 from ...files import member, read_json
+from ...layers import linear, norm, siglip, vector
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
 from .. import MATRIX, Dropped, Weight
-from ...ascii_bpe import special_ids
-from ...layers import linear, norm, siglip, vector
 from . import language
 from . import prompt as prompts
 from .pictures import Area
@@ -96,7 +96,9 @@ class Eagle:
             rope.bad("rope_type", "'default'", unsupported=True)
         s.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
         s.merge = self.merge
-        self._read_vision(Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s)
+        self._read_vision(
+            Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s
+        )
 
     def _read_vision(self, vision: Section, s: Sizes) -> None:
         vision.check_fixed(VISION_FIXED)
@@ -139,7 +141,12 @@ class Eagle:
             # Patches are flattened pixel by pixel there, channel by channel here.
             source, shape = vision + "embeddings.patch_embedding.weight", (s.d_vision, 3 * s.patch_size**2)
             rows[0] = Weight("vision.patch_embed.weight", source, MATRIX, shape, shape, regroup=3)
-        return [*rows, *self._connector(s), *language.weights(s, self.LM), *vector("lm.norm.weight", self.LM + "norm.weight", s.d_model)]
+        return [
+            *rows,
+            *self._connector(s),
+            *language.weights(s, self.LM),
+            *vector("lm.norm.weight", self.LM + "norm.weight", s.d_model),
+        ]
 
     def _connector(self, s: Sizes) -> List[Weight]:
         source = self.root + "mlp1."
@@ -158,7 +165,11 @@ class Eagle:
     def dropped(self, s: Sizes) -> List[Dropped]:
         head, d = self.root + "vision_model.vision_model.head.", s.d_vision
         pool = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
-        for name, d_out, d_in in (("attention.out_proj", d, d), ("mlp.fc1", s.d_vision_ff, d), ("mlp.fc2", d, s.d_vision_ff)):
+        for name, d_out, d_in in (
+            ("attention.out_proj", d, d),
+            ("mlp.fc1", s.d_vision_ff, d),
+            ("mlp.fc2", d, s.d_vision_ff),
+        ):
             pool.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
         pool.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
         rows = [Dropped(head + name, shape, "pooling head of the tower") for name, shape in pool.items()]
@@ -176,7 +187,11 @@ class Eagle:
         }
         if self.merge == 1:
             u32["vision.image_size"] = s.image_width
-            return {"u32": u32, "f32": {"vision.norm_eps": s.vision_eps}, "string": {"vision.position_rule": "row_major"}}
+            return {
+                "u32": u32,
+                "f32": {"vision.norm_eps": s.vision_eps},
+                "string": {"vision.position_rule": "row_major"},
+            }
         u32.update(
             {
                 "vision.image_width": s.image_width,

@@ -33,6 +33,7 @@ DIT_FIXED: Fixed = {
     "interleave_self_attention": (False, True),
 }
 TRANSFORMER_IGNORED = {
+    "cross_attention_dim",  # checked by the shapes of keys and values
     "dropout",
     "final_dropout",
     "num_embeds_ada_norm",

@@ -133,5 +133,7 @@ def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int,
         grow = math.sqrt(area.least / (width * height))
         sides = [math.ceil(side * grow / unit) * unit for side in (width, height)]
     if max(width, height) > 200 * min(width, height) or max(sides) > MAX_SIDE:
-        problems.unsupported("--camera-size", "pictures of at most 200 times the other side", "{}x{}".format(width, height))
+        problems.unsupported(
+            "--camera-size", "pictures of at most 200 times the other side", "{}x{}".format(width, height)
+        )
     return sides[0], sides[1]

@@ -19,16 +19,9 @@ from ...section import Fixed, Section
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan, Weight
 from . import head, language
-from .pictures import read_pictures
+from .pictures import Pictures, read_pictures
 from .prompt import text_ops
-from .robot import (
-    PROCESSOR,
-    STATISTICS,
-    choose,
-    embodiment_index,
-    processor_file,
-    read_robot,
-)
+from .robot import PROCESSOR, STATISTICS, Robot, choose, embodiment_index, processor_file, read_robot
 from .sizes import MAX_LAYERS, Sizes
 from .vectors import action_ops, feature_description, state_ops, statistics_of
 
@@ -100,20 +93,48 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     s.n_slot = len(robot.cameras)
     area = backbone.read_area(folder, s, problems)
     pictures = read_pictures(processor, area, options, checkpoint.notes, problems)
-    s.image_width, s.image_height = pictures.width, pictures.height
-    tokenizer = read_tokenizer(folder, s.n_vocab, problems, checkpoint.notes)
-    problems.raise_any()  # a prompt takes a sound tokenizer
-    prompt = backbone.read_prompt(tokenizer, folder, s, problems)
     if processor.count("max_state_dim") != s.d_state:
         processor.bad("max_state_dim", "{} as in config.json".format(s.d_state))
+    s.image_width, s.image_height = pictures.width, pictures.height
+    clip, formalize = processor.get("clip_outliers"), processor.get("formalize_language")
+    parts = Parts(backbone, folder, robot, pictures, clip, True, formalize)
+    return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
+
+
+class Parts(NamedTuple):
+    """What a bundle is made of beside the network."""
+
+    backbone: Any
+    folder: str  # the backbone's
+    robot: Robot
+    pictures: Pictures
+    clip_states: bool
+    clip_actions: bool
+    formalize: bool  # instructions are cleaned
+
+
+def assemble(
+    parts: Parts,
+    keys: List[Key],
+    rows: List[Weight],
+    checkpoint: Checkpoint,
+    options: Options,
+    s: Sizes,
+    problems: Problems,
+) -> Plan:
+    """`keys`, `rows`: the network's."""
+    robot, backbone = parts.robot, parts.backbone
+    tokenizer = read_tokenizer(parts.folder, s.n_vocab, problems, checkpoint.notes)
+    problems.raise_any()  # a prompt takes a sound tokenizer
+    prompt = backbone.read_prompt(tokenizer, parts.folder, s, problems)
     document = {
-        "image": pictures.ops,
-        "text": text_ops(backbone.TEMPLATE, processor.get("formalize_language"), prompt, s),
-        "state": state_ops(robot, processor.get("clip_outliers"), s, problems),
-        "action": action_ops(robot, s, problems),
+        "image": parts.pictures.ops,
+        "text": text_ops(backbone.TEMPLATE, parts.formalize, prompt, s),
+        "state": state_ops(robot, parts.clip_states, s, problems),
+        "action": action_ops(robot, parts.clip_actions, s, problems),
     }
-    keys = [
-        *network_keys(release, s),
+    all_keys = [
+        *keys,
         *prompt.keys(),
         *feature_description(robot, options, checkpoint.notes, problems),
         *tokenizer.keys,
@@ -121,7 +142,7 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     ]
     problems.raise_any()
     tensors = {**statistics_of(recipe.STATE, robot.states), **statistics_of(recipe.ACTION, robot.actions)}
-    return Plan(keys, weights(release, s), backbone.dropped(s), tensors, _hints(backbone, s))
+    return Plan(all_keys, rows, backbone.dropped(s), tensors, _hints(backbone, s))
 
 
 def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> Section:
@@ -157,12 +178,18 @@ def read_sizes(release: Release, config: dict, folder: str, problems: Problems) 
 
 
 def network_keys(release: Release, s: Sizes) -> List[Key]:
-    groups: Dict[str, Dict[str, object]] = {"u32": {"dit.text_every": s.text_every}}
-    for part in (head.keys(s), release.backbone.keys(s), language.keys(s)):
+    keys = network_keys_of(release.backbone, s, {"dit.text_every": s.text_every})
+    if "vl_self_attention_cfg" in release.config:
+        return keys
+    return [key for key in keys if key.name not in ("vl.n_layer", "vl.n_head", "vl.d_ff")]
+
+
+def network_keys_of(backbone: Any, s: Sizes, own: Dict[str, object]) -> List[Key]:
+    """`own`: counts that a release has of its own."""
+    groups: Dict[str, Dict[str, object]] = {"u32": own}
+    for part in (head.keys(s), backbone.keys(s), language.keys(s)):
         for kind, values in part.items():
             groups[kind] = {**groups.get(kind, {}), **values}
-    if "vl_self_attention_cfg" not in release.config:
-        groups["u32"] = {k: v for k, v in groups["u32"].items() if not k.startswith("vl.")}
     return keys_by_type(groups)
 
 

@@ -39,6 +39,7 @@ class Robot(NamedTuple):
     states: List[Group]
     actions: List[Group]
     n_row: int  # actions of a chunk that are meant for this robot
+    clips: bool = False  # states are held between -1 and 1
 
 
 def processor_file(checkpoint: Checkpoint, name: str) -> str:

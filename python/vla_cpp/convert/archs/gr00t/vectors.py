@@ -36,11 +36,12 @@ def state_ops(robot: Robot, clip_outliers: bool, s: Sizes, problems: Problems) -
     return [_op("normalize", recipe.STATE, robot.states), *limits, {"op": "pad", "size": s.d_state}]
 
 
-def action_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
+def action_ops(robot: Robot, clip: bool, s: Sizes, problems: Problems) -> List[dict]:
     width = _total(robot.actions)
     if width > s.d_action:
         problems.add(STATISTICS + ": action", "at most max_action_dim {} numbers".format(s.d_action), str(width))
-    limits = [] if robot.actions[0].mean_std else [{"op": "clip", "low": -1.0, "high": 1.0}]
+    held = clip and not robot.actions[0].mean_std
+    limits = [{"op": "clip", "low": -1.0, "high": 1.0}] if held else []
     ops = [{"op": "rows", "count": robot.n_row}, {"op": "take", "size": width}, *limits]
     columns = _relative_columns(robot, problems)
     added = [{"op": "add_state", "columns": columns}] if columns else []

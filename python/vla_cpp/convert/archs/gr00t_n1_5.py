@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""GR00T N1.5: Eagle 2.5 as the prefix, self-attention over its features, a diffusion transformer with future tokens.
+
+The layout is the authors' (Isaac-GR00T, last in November 2025): config.json, weights, experiment_cfg/metadata.json with the statistics of
+every robot. Which keys a robot has, in which order, and how they are normalized stands in a class of their code, which is chosen when a
+server starts: here --variant names it, or a JSON file with the same content.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Dict, List, NamedTuple, Tuple
+
+import numpy as np
+
+from ..bundle import Key
+from ..checkpoint import Checkpoint, find_backbone
+from ..errors import Code, Problems, refuse
+from ..files import member, read_json
+from ..section import Fixed, Section
+from . import TABLE, Options, Plan, Weight
+from .gr00t import head
+from .gr00t.eagle import EAGLE_2_5
+from .gr00t.pictures import STANDARDIZE, Pictures
+from .gr00t.plan import Parts, assemble, network_keys_of
+from .gr00t.robot import Group, Robot, choose
+from .gr00t.sizes import MAX_LAYERS, Sizes
+
+POLICY, METADATA = "config.json", os.path.join("experiment_cfg", "metadata.json")
+TOP_FIXED: Fixed = {"model_type": (None, "gr00t_n1_5")}
+TOP_IGNORED = set(
+    """action_dim action_horizon hidden_size compute_dtype architectures dtype torch_dtype transformers_version _name_or_path model_dtype
+    attn_implementation""".split()
+)
+BACKBONE_FIXED: Fixed = {"project_to_dim": (1536, None), "reproject_vision": (False, False)}
+BACKBONE_IGNORED = {"tune_llm", "tune_visual", "eagle_path", "use_flash_attention", "load_bf16"}
+# FlowmatchingActionHeadConfig, of whose sizes none has the published checkpoint's value by default: they must be stated.
+HEAD = dict.fromkeys("""max_state_dim action_dim action_horizon hidden_size input_embedding_dim backbone_embedding_dim num_inference_timesteps\n    num_target_vision_tokens diffusion_model_cfg vl_self_attention_cfg""".split())
+HEAD = {**HEAD, "max_seq_len": 1024, "num_timestep_buckets": 1000, "max_num_embodiments": 32}
+HEAD_FIXED: Fixed = {"add_pos_embed": (True, True), "use_vlln": (True, True)}
+HEAD_IGNORED = set(
+    """noise_beta_alpha noise_beta_beta noise_s tune_projector tune_diffusion_model model_dtype load_pretrained_det_decode_layer_path
+    detection_coeff freeze_decode_layer expand_batch vl_self_attention_dtype model_type""".split()
+)
+EMBODIMENTS = {"new_embodiment": 31, "oxe_droid": 17, "agibot_genie1": 26, "gr1": 24}
+NAMES = {"min_max": ("min", "max"), "q99": ("q01", "q99"), "mean_std": ("mean", "std")}
+EDGE, CROP, HORIZON = 224, 0.95, 16
+
+
+class DataConfig(NamedTuple):
+    """What a robot sends and gets, and how its numbers are normalized."""
+
+    video: Tuple[str, ...]
+    state: Dict[str, str]  # key -> mode
+    action: Dict[str, str]
+    horizon: int = HORIZON
+    crop: float = CROP
+    index: int = -1  # of the robot among those of the weights, where its tag does not say it
+
+
+def _all(keys: str, mode: str = "min_max") -> Dict[str, str]:
+    return dict.fromkeys(keys.split(), mode)
+
+
+ARMS = "left_arm right_arm left_hand right_hand"
+XYZ = "x y z roll pitch yaw"
+# gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py of Isaac-GR00T: those that normalize all keys in one way.
+CONFIGS = {
+    "fourier_gr1_full_upper_body": DataConfig(("front_view",), _all(ARMS + " waist neck"), _all(ARMS + " waist neck")),
+    "so100": DataConfig(("webcam",), _all("single_arm gripper"), _all("single_arm gripper")),
+    "so100_dualcam": DataConfig(("front", "wrist"), _all("single_arm gripper"), _all("single_arm gripper")),
+    "unitree_g1": DataConfig(("rs_view",), _all(ARMS), _all(ARMS)),
+    "unitree_g1_full_body": DataConfig(("rs_view",), _all("left_leg right_leg waist " + ARMS), _all(ARMS)),
+    "libero": DataConfig(("image", "wrist_image"), _all(XYZ + " gripper"), _all(XYZ + " gripper")),
+}
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    config = _data_config(checkpoint, options.variant)
+    robots = read_json(checkpoint.path(METADATA))
+    metadata = choose(robots, options.embodiment)
+    folder = find_backbone(checkpoint, options.backbone, None, "backbone")
+    s, n_future = read_sizes(checkpoint.config, folder, problems)
+    s.n_slot = len(config.video)
+    s.embodiment = config.index if config.index >= 0 else EMBODIMENTS.get(options.embodiment, -1)
+    if not 0 <= s.embodiment < s.n_embodiment:
+        expected = "one of {}, or a projector_index below {} in --variant".format(
+            ", ".join(EMBODIMENTS), s.n_embodiment
+        )
+        problems.add("--embodiment " + options.embodiment, expected, str(s.embodiment), code=Code.USAGE)
+    robot = _robot(config, metadata, min(config.horizon, s.horizon), problems)
+    pictures = _pictures(config, metadata, s, problems)
+    problems.raise_any()
+    parts = Parts(EAGLE_2_5, folder, robot, pictures, clip_states=robot.clips, clip_actions=False, formalize=False)
+    return assemble(parts, network_keys(s, n_future), weights(s, n_future), checkpoint, options, s, problems)
+
+
+def network_keys(s: Sizes, n_future: int) -> List[Key]:
+    return network_keys_of(EAGLE_2_5, s, {"policy.n_future": n_future})
+
+
+def weights(s: Sizes, n_future: int) -> List[Weight]:
+    table = (n_future, s.d_dit)
+    future = Weight("future.weight", head.HEAD + "future_tokens.weight", TABLE, table, table)
+    return [*EAGLE_2_5.weights(s), *head.weights(s), future]
+
+
+def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
+    """A JSON file lies where the name says, or in the checkpoint."""
+    if name in CONFIGS:
+        return CONFIGS[name]
+    if not name.endswith(".json"):
+        expected = "one of {}, or a JSON file with video, state and action".format(", ".join(CONFIGS))
+        hint = "the data config that the server is started with: a checkpoint does not state it"
+        raise refuse("--variant", expected, name or "none", hint, Code.USAGE)
+    problems = Problems(name)
+    section = Section(
+        name,
+        read_json(name if os.path.exists(name) else checkpoint.path(name)),
+        {"horizon": HORIZON, "crop": CROP, "projector_index": 0},
+        problems,
+    )
+    section.refuse_unknown({"video", "state", "action", "horizon", "crop", "projector_index"})
+    video = [view for view in member(section.values, "video", list, name) if isinstance(view, str)]
+    modes = [member(section.values, part, dict, name) for part in ("state", "action")]
+    for part, keys in zip(("state", "action"), modes):
+        if not keys or not all(mode in NAMES for mode in keys.values()):
+            section.bad(part, "keys with one of " + ", ".join(NAMES), str(keys)[:80], unsupported=True)
+        elif len(set(keys.values())) > 1:
+            section.bad(part, "one mode for all keys", ", ".join(sorted(set(keys.values()))), unsupported=True)
+    crop = section.number("crop")
+    if not video or crop > 1:
+        section.bad("video", "names of cameras, and a crop of at most 1", str(video))
+    horizon, index = section.count("horizon", most=4096), section.count("projector_index", least=0)
+    problems.raise_any()
+    return DataConfig(
+        tuple(video), modes[0], modes[1], horizon, crop, index if "projector_index" in section.values else -1
+    )
+
+
+def read_sizes(config: dict, folder: str, problems: Problems) -> Tuple[Sizes, int]:
+    s, top = Sizes(), Section(POLICY, config, {}, problems)
+    top.refuse_unknown({*TOP_FIXED, *TOP_IGNORED, "backbone_cfg", "action_head_cfg"})
+    top.check_fixed(TOP_FIXED)
+    backbone = Section(POLICY + ": backbone_cfg", member(config, "backbone_cfg", dict, POLICY), {}, problems)
+    backbone.refuse_unknown({*BACKBONE_FIXED, *BACKBONE_IGNORED, "select_layer"})
+    backbone.check_fixed(BACKBONE_FIXED)
+    policy = Section(POLICY + ": action_head_cfg", member(config, "action_head_cfg", dict, POLICY), HEAD, problems)
+    policy.refuse_unknown({*HEAD, *HEAD_FIXED, *HEAD_IGNORED})
+    policy.check_fixed(HEAD_FIXED)
+    EAGLE_2_5.read(folder, backbone.count("select_layer", most=MAX_LAYERS), s, problems)
+    s.d_action = policy.count("action_dim")
+    head.read(policy, s)
+    return s, policy.count("num_target_vision_tokens", most=4096)
+
+
+def _robot(config: DataConfig, metadata: dict, n_row: int, problems: Problems) -> Robot:
+    statistics = member(metadata, "statistics", dict, METADATA)
+    groups = []
+    for part, modes in (("state", config.state), ("action", config.action)):
+        table = member(statistics, part, dict, METADATA)
+        groups.append([_group(part, key, mode, table, problems) for key, mode in modes.items()])
+    return Robot(list(config.video), groups[0], groups[1], n_row, set(config.state.values()) == {"q99"})
+
+
+def _group(part: str, key: str, mode: str, table: dict, problems: Problems) -> Group:
+    where = "{}: statistics.{}.{}".format(METADATA, part, key)
+    columns = []
+    for name in NAMES[mode]:
+        values = member(table, key, dict, where).get(name)
+        numbers = isinstance(values, list) and values and all(type(v) in (int, float) for v in values)
+        columns.append(np.asarray(values if numbers else [0.0], np.float32))
+        if not numbers or not np.isfinite(columns[-1]).all():
+            problems.add("{}.{}".format(where, name), "finite numbers", str(values)[:80])
+    low, high = columns
+    if low.size != high.size:
+        problems.add(where, "statistics of one width", "{} and {}".format(low.size, high.size))
+        high = low
+    # In a range without width the reference leaves q99 states as they are, and gives the mean of actions.
+    if (mode == "q99" or (mode == "mean_std" and part == "action")) and (high == (low if mode == "q99" else 0)).any():
+        problems.unsupported(where, "numbers that move", "one that never did")
+    return Group(key, low.size, low, high, mode == "mean_std")
+
+
+def _pictures(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) -> Pictures:
+    video = member(member(metadata, "modalities", dict, METADATA), "video", dict, METADATA)
+    sizes: List[object] = [member(video, view, dict, METADATA).get("resolution") for view in config.video]
+    size = sizes[0]
+    sound = isinstance(size, list) and len(size) == 2 and all(type(n) is int and 2 <= n <= 8192 for n in size)
+    if not sound or any(other != size for other in sizes):
+        problems.add(
+            METADATA + ": modalities.video", "one resolution for the cameras " + ", ".join(config.video), str(sizes)
+        )
+        size = [EDGE, EDGE]
+    width, height = size
+    crop = {"op": "center_crop", "width": max(1, int(width * config.crop)), "height": max(1, int(height * config.crop))}
+    side = s.image_width
+    resize = {"op": "resize", "width": side, "height": side, "filter": "torch_bilinear_cut"}
+    ops = [
+        {"op": "camera_size", "width": width, "height": height},
+        crop,
+        resize,
+        {"op": "size", "width": side, "height": side},
+    ]
+    return Pictures(side, side, [*ops, STANDARDIZE])

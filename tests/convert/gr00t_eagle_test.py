@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Conversion of GR00T N1.5 and N1.6, by the checkpoints of their golden cases."""
+
+import json
+
+import numpy as np
+import pytest
+
+from goldens import gr00t_n1_5, gr00t_n1_6
+from goldens.parameters import parameter
+from vla_cpp.convert.errors import Code
+
+N1_5, N1_6 = gr00t_n1_5.CASES["gr00t_n1_5/libero"], gr00t_n1_6.CASES["gr00t_n1_6/libero"]
+
+
+class Changed:
+    """A case's checkpoint, one of whose JSON files is changed before it is converted."""
+
+    def __init__(self, case, file="config.json", change=lambda content: None):
+        self.case, self.file, self.change = case, file, change
+
+    def save(self, folder):
+        self.case.checkpoint.write(self.case.seed, folder)
+        content = json.loads((folder / self.file).read_text())
+        self.change(content)
+        (folder / self.file).write_text(json.dumps(content))
+
+
+def recipe(bundle):
+    return json.loads(bundle.keys["processor.recipe"])
+
+
+def test_patches_and_squares_of_n1_6_are_reordered_as_the_runtime_reads_them(converter):
+    bundle = converter.bundle(Changed(N1_6), dtype="f32", **N1_6.options)
+    d, side, at = 24, 4, "backbone.model."
+
+    def stored(name, *shape):
+        return N1_6.checkpoint.value(at + name, shape, N1_6.seed)
+
+    patch = stored("vision_model.vision_model.embeddings.patch_embedding.weight", d, 3 * side**2)
+    ours = bundle.tensors["vision.patch_embed.weight"].reshape(d, 3, side, side)
+    np.testing.assert_array_equal(ours, patch.reshape(d, side, side, 3).transpose(0, 3, 1, 2))
+    up = stored("mlp1.1.weight", 40, 4 * d)  # a feature of the four patches of a square, then the next feature
+    np.testing.assert_array_equal(bundle.tensors["connector.up.weight"].reshape(40, 4, d), up.reshape(40, d, 4).swapaxes(1, 2))
+    bias = stored("mlp1.0.bias", 4 * d)
+    np.testing.assert_array_equal(bundle.tensors["connector.norm.bias"].reshape(4, d), bias.reshape(d, 4).T)
+    np.testing.assert_array_equal(bundle.tensors["connector.up.bias"], stored("mlp1.1.bias", 40))
+
+
+def test_pictures_and_prompt_of_n1_6_are_those_of_its_collator(converter):
+    bundle = converter.bundle(Changed(N1_6), dtype="f32", **N1_6.options)
+    found = recipe(bundle)
+    assert found["image"][0] == {"op": "square_pad"}
+    assert found["image"][-3] == {"op": "resize", "width": 32, "height": 32, "filter": "pillow_bicubic"}
+    assert found["text"][2] == {
+        "op": "views", "count": 2, "open": "<image {i}><img>", "token": "<IMG_CONTEXT>", "repeat": 16, "close": "</img>",
+        "place": "back",
+    }  # fmt: skip
+    assert len(bundle.keys["policy.view_starts_from_end"]) == 2 and bundle.keys["policy.view_starts_from_end"][1] == 16 + 3
+
+
+def test_n1_5_takes_the_row_and_the_statistics_that_its_data_config_names(converter):
+    bundle = converter.bundle(Changed(N1_5), dtype="f32", **N1_5.options)
+    shape = (3, 14, 20)
+    rows = N1_5.checkpoint.value("action_head.state_encoder.layer1.W", shape, N1_5.seed)
+    np.testing.assert_array_equal(bundle.tensors["state_in.weight"], rows[gr00t_n1_5.INDEX].T)
+    np.testing.assert_array_equal(
+        bundle.tensors["future.weight"], parameter("action_head.future_tokens.weight", (3, 36), N1_5.seed)
+    )
+    found = recipe(bundle)
+    assert found["image"][:3] == [
+        {"op": "camera_size", "width": 40, "height": 30},
+        {"op": "center_crop", "width": 38, "height": 28},
+        {"op": "resize", "width": 28, "height": 28, "filter": "torch_bilinear_cut"},
+    ]
+    assert [op["op"] for op in found["state"]] == ["normalize", "pad"]  # beyond the range nothing is clipped
+    assert [op["op"] for op in found["action"]] == ["rows", "take", "unnormalize"]
+    assert found["text"][1]["text"].endswith("{instruction}<|im_end|>\n<|im_start|>assistant\n")
+
+
+DATA, META = "data_config.json", "experiment_cfg/metadata.json"
+REFUSED = {
+    "config.json: backbone_cfg: project_to_dim: expected None, found 1536": (
+        "config.json", lambda c: c["backbone_cfg"].update(project_to_dim=1536)),
+    "action_head_cfg: num_target_vision_tokens: expected a whole number": (
+        "config.json", lambda c: c["action_head_cfg"].pop("num_target_vision_tokens")),
+    "action_head_cfg: new_thing: expected a key": ("config.json", lambda c: c["action_head_cfg"].update(new_thing=1)),
+    "state: expected one mode for all keys, found mean_std, min_max": (DATA, lambda c: c["state"].update(x="mean_std")),
+    "action: expected keys with one of min_max, q99, mean_std": (DATA, lambda c: c["action"].update(gripper="binary")),
+    "statistics.state.y.max: expected finite numbers, found None": (
+        META, lambda c: c["my_arm"]["statistics"]["state"]["y"].pop("max")),
+    "modalities.video: expected one resolution for the cameras image, wrist_image": (
+        META, lambda c: c["my_arm"]["modalities"]["video"].update(wrist_image={"resolution": [40, 31]})),
+    "--embodiment my_arm: expected one of new_embodiment, oxe_droid": (DATA, lambda c: c.pop("projector_index")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_what_of_n1_5_changes_numbers_is_refused_by_name(converter, message):
+    file, change = REFUSED[message]
+    assert message in converter.refusal(Changed(N1_5, file, change), **N1_5.options).message()
+
+
+def test_n1_5_asks_for_its_data_config_and_its_robot(converter):
+    error = converter.refusal(Changed(N1_5), embodiment="my_arm")
+    assert "--variant: expected one of fourier_gr1_full_upper_body, so100" in error.message() and error.code == Code.USAGE
+    error = converter.refusal(Changed(N1_5), embodiment="nobody", variant=DATA)
+    assert "--embodiment: expected the tag of the robot" in error.message() and "my_arm" in error.message()
