@@ -74,7 +74,8 @@ find_library(VLA_UTF8PROC_LIBRARY utf8proc REQUIRED)
 
 # The wire: the schema is compiled at build time, and the server needs the small runtime of Protobuf only.
 find_package(Protobuf REQUIRED)
-find_package(cppzmq REQUIRED)
+find_package(cppzmq REQUIRED)  # replay's client
+find_library(VLA_SODIUM_LIBRARY sodium REQUIRED)
 # What watches the server: metrics and the HTTP that shows them.
 find_path(VLA_PROMETHEUS_DIR prometheus/registry.h REQUIRED)
 find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)

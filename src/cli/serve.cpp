@@ -97,7 +97,7 @@ Command add_serve(CLI::App& app) {
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();
-  command->add_option("--max-pixels", server.max_pixels, "Largest picture, in pixels")
+  command->add_option("--max-pixels", server.max_pixels, "Most pixels that the pictures of an act have together")
       ->check(CLI::Range(1, 1 << 28))
       ->capture_default_str();
   command->add_option("--max-text", server.max_text, "Longest instruction, in bytes")
@@ -105,6 +105,9 @@ Command add_serve(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--queue", server.max_queue, "Acts that may wait, one for each client; further ones are refused")
       ->check(CLI::Range(1, 4096))
+      ->capture_default_str();
+  command->add_option("--connections", server.max_connections, "Connections at once; the longest idle one makes room")
+      ->check(CLI::Range(1, 65536))
       ->capture_default_str();
   command->add_flag("--insecure", server.insecure, "Let everybody in who can reach an address that is not local");
   command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")

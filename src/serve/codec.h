@@ -13,7 +13,7 @@ namespace vla::serve {
 
 /// What an act may hold. All are compared before memory is taken that the sizes ask for.
 struct ActLimits {
-  std::int64_t max_pixels = 0;  // of one picture
+  std::int64_t max_pixels = 0;  // of all pictures
   std::size_t max_text = 0;     // bytes
   std::size_t max_views = 0;
   int horizon = 0, d_noise = 0;  // of the noise that the policy takes
@@ -31,8 +31,8 @@ struct ActRequest {
 /// bad_observation.
 Result<ActRequest> decode_act(std::span<const std::byte> act, const ActLimits& limits);
 
-/// A serialized Hello -> the reply. Errors: bad_request, incompatible.
-Result<v1::HelloReply> answer_hello(std::span<const std::byte> hello);
+/// A serialized Hello -> the reply; `client` is how the client calls itself. Errors: bad_request, incompatible.
+Result<v1::HelloReply> answer_hello(std::span<const std::byte> hello, std::string* client = nullptr);
 
 /// Whether the body of a Describe or Health is the empty message that it has to be. Errors: bad_request.
 Status check_empty(std::span<const std::byte> body);

@@ -4,8 +4,10 @@
 
 #include <fcntl.h>
 #include <fmt/format.h>
+#include <sodium.h>
 #include <sys/stat.h>
 #include <unistd.h>
+#include <zmq.h>
 
 #include <array>
 #include <cerrno>
@@ -95,33 +97,19 @@ Result<std::string> public_key_of(const std::string& secret) {
   return std::string(key.data());
 }
 
-Gate::Gate(zmq::context_t& context, std::set<std::string> clients)
-    : socket_(context, zmq::socket_type::rep), clients_(std::move(clients)) {
-  socket_.bind("inproc://zeromq.zap.01");
-}
-
-std::optional<std::string> Gate::answer() {
-  // version, request id, domain, address, routing id, mechanism, credentials
-  std::vector<zmq::message_t> frames;
-  for (bool more = true; more;) {
-    zmq::message_t frame;
-    if (!socket_.recv(frame, zmq::recv_flags::dontwait)) return std::nullopt;
-    more = frame.more();
-    frames.push_back(std::move(frame));
+Result<CurveKeys> read_keys(const std::string& secret_file, const std::string& clients_file) {
+  if (sodium_init() < 0) return Error{Code::unsupported, "--curve-secret", "random numbers of the system", "none"};
+  VLA_TRY(const std::string secret, read_secret_key(secret_file));
+  VLA_TRY(const std::set<std::string> clients, read_public_keys(clients_file));
+  CurveKeys keys;
+  zmq_z85_decode(keys.secret.data(), secret.c_str());
+  crypto_scalarmult_base(keys.own_public.data(), keys.secret.data());
+  for (const std::string& client : clients) {
+    std::string bytes(32, '\0');
+    zmq_z85_decode(reinterpret_cast<std::uint8_t*>(bytes.data()), client.c_str());
+    keys.clients.insert(std::move(bytes));
   }
-  bool admitted = false;
-  if (frames.size() == 7 && frames[5].to_string_view() == "CURVE" && frames[6].size() == 32) {
-    std::array<char, kKeySize + 1> key;
-    zmq_z85_encode(key.data(), frames[6].data<std::uint8_t>(), 32);
-    admitted = clients_.contains(key.data());
-  }
-  const std::string id = frames.size() > 1 ? frames[1].to_string() : std::string();
-  for (const std::string& part : {std::string("1.0"), id, std::string(admitted ? "200" : "400"),
-                                  std::string(admitted ? "" : "no client of this server"), std::string()})
-    socket_.send(zmq::buffer(part), zmq::send_flags::sndmore);
-  socket_.send(zmq::message_t(), zmq::send_flags::none);
-  if (admitted) return std::nullopt;
-  return frames.size() > 3 ? frames[3].to_string() : std::string();
+  return keys;
 }
 
 }  // namespace vla::serve

@@ -2,12 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <optional>
 #include <set>
 #include <string>
-#include <zmq.hpp>
 
 #include "base/result.h"
+#include "serve/curve_session.h"
 
 namespace vla::serve {
 
@@ -23,19 +22,7 @@ Result<std::set<std::string>> read_public_keys(const std::string& file);
 /// The public key of a secret one. Errors: usage.
 Result<std::string> public_key_of(const std::string& secret);
 
-/// Admits the clients whose keys are listed. ZeroMQ asks it during every handshake (RFC 27, ZAP), over `socket`.
-class Gate {
- public:
-  /// One per context, bound before the socket that it guards.
-  Gate(zmq::context_t& context, std::set<std::string> clients);
-
-  zmq::socket_t& socket() { return socket_; }
-  /// Answers one question that `socket` has. The address of the client, where it is refused.
-  std::optional<std::string> answer();
-
- private:
-  zmq::socket_t socket_;
-  std::set<std::string> clients_;  // public keys, Z85
-};
+/// What a server with keys knows. Errors: those of the two files.
+Result<CurveKeys> read_keys(const std::string& secret_file, const std::string& clients_file);
 
 }  // namespace vla::serve

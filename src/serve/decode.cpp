@@ -124,13 +124,15 @@ Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string
 }
 
 Status decode_views(const v1::Act& act, const ActLimits& limits, Observation& observation) {
+  ActLimits left = limits;  // an act costs what its pictures cost together
   if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
     return too_large("act.views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
   for (const v1::View& view : act.views()) {
     VLA_CHECK(check_name(view.name(), "act.views"));
     const std::string where = fmt::format("act.views[\"{}\"]", view.name());
     if (observation.views.contains(view.name())) return bad_observation(where, "each view once", "a second one");
-    VLA_TRY(std::optional<Frame> frame, decode_view(view, where, limits));
+    VLA_TRY(std::optional<Frame> frame, decode_view(view, where, left));
+    if (frame) left.max_pixels -= std::int64_t{frame->width} * frame->height;
     observation.views.emplace(view.name(), std::move(frame));
   }
   return {};
@@ -183,8 +185,8 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
   return request;
 }
 
-Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes) {
-  constexpr std::size_t kMaxHello = 4096;
+Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::string* client) {
+  constexpr std::size_t kMaxHello = 4096, kMaxName = 64;
   if (bytes.size() > kMaxHello)
     return too_large("hello", fmt::format("at most {} bytes", kMaxHello), fmt::format("{} bytes", bytes.size()));
   VLA_TRY(const v1::Hello hello, parse<v1::Hello>(bytes, 6, "hello"));
@@ -193,6 +195,8 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes) {
                  fmt::format("{} to {}", hello.min_version(), hello.max_version())};
   if (hello.max_version() < kMinVersion || hello.min_version() > kMaxVersion)
     return incompatible(hello.min_version(), hello.max_version());
+  if (client != nullptr)
+    *client = fmt::format("{} {}", hello.client_name(), hello.client_version()).substr(0, kMaxName);
   v1::HelloReply reply;
   reply.set_min_version(kMinVersion);
   reply.set_max_version(kMaxVersion);

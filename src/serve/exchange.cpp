@@ -7,7 +7,7 @@
 
 #include <cerrno>
 #include <cstdint>
-#include <iterator>
+#include <utility>
 
 namespace vla::serve {
 
@@ -24,29 +24,28 @@ void Exchange::wake() const noexcept {
   errno = saved;
 }
 
-void Exchange::move_late(Clock::time_point now) {
-  std::vector<Job> late = jobs_.take_late(now);
-  if (late.empty()) return;
-  std::move(late.begin(), late.end(), std::back_inserter(late_));
-  wake();
-}
-
 std::optional<Job> Exchange::next() {
   std::unique_lock lock(mutex_);
   for (;;) {
-    move_late(Clock::now());
-    if (!jobs_.empty()) break;
-    if (closed_) return std::nullopt;
+    const auto deadline = jobs_.first_deadline();
+    const bool has_late = deadline && *deadline <= Clock::now();
+    if (has_late) {
+      wake();  // the I/O thread takes it out and comes back
+    } else if (!jobs_.empty()) {
+      computing_ = true;
+      return jobs_.pop();
+    } else if (closed_) {
+      return std::nullopt;
+    }
     work_.wait(lock);
   }
-  computing_ = true;
-  return jobs_.pop();
 }
 
-void Exchange::put(Answer answer) {
+void Exchange::put(Answer answer) noexcept {
   {
-    const std::lock_guard lock(mutex_);
-    answers_.push_back(std::move(answer));
+    std::unique_lock lock(mutex_);
+    work_.wait(lock, [this] { return !answer_; });
+    answer_ = std::move(answer);
     computing_ = false;
   }
   wake();
@@ -54,20 +53,26 @@ void Exchange::put(Answer answer) {
 
 Exchange::Jobs::Pushed Exchange::push(Job job) {
   const std::lock_guard lock(mutex_);
-  move_late(job.at);  // they must not keep a place from one that can still be answered
   Jobs::Pushed pushed = jobs_.push(std::move(job));
   work_.notify_one();
   return pushed;
 }
 
-std::vector<Answer> Exchange::take_answers() {
+std::optional<Answer> Exchange::take_answer() {
   const std::lock_guard lock(mutex_);
-  return std::exchange(answers_, {});
+  work_.notify_one();
+  return std::exchange(answer_, std::nullopt);
 }
 
-std::vector<Job> Exchange::take_late() {
+std::optional<Job> Exchange::take_late(Clock::time_point now) {
   const std::lock_guard lock(mutex_);
-  return std::exchange(late_, {});
+  work_.notify_one();
+  return jobs_.take_late(now);
+}
+
+std::optional<Clock::time_point> Exchange::first_deadline() const {
+  const std::lock_guard lock(mutex_);
+  return jobs_.first_deadline();
 }
 
 void Exchange::close() {
@@ -78,7 +83,7 @@ void Exchange::close() {
 
 bool Exchange::drained() const {
   const std::lock_guard lock(mutex_);
-  return jobs_.empty() && !computing_ && answers_.empty() && late_.empty();
+  return jobs_.empty() && !computing_ && !answer_;
 }
 
 std::size_t Exchange::n_waiting() const {

@@ -5,9 +5,8 @@
 #include <condition_variable>
 #include <mutex>
 #include <optional>
-#include <vector>
-#include <zmq.hpp>
 
+#include "serve/bytes.h"
 #include "serve/envelope.h"
 #include "serve/observer.h"
 #include "serve/queue.h"
@@ -16,20 +15,20 @@ namespace vla::serve {
 
 /// A request on its way through the server, with what is needed to answer it.
 struct Job : Received {
-  zmq::message_t route;    // routing id of the connection
+  std::uint64_t connection = 0;
   bool delimiter = false;  // the client put an empty frame before the request, as REQ sockets do
-  zmq::message_t bytes;    // the serialized Request
+  Bytes bytes;             // the serialized Request
   Envelope envelope;
   std::optional<Clock::time_point> deadline;
 
-  std::span<const std::byte> request() const { return {bytes.data<std::byte>(), bytes.size()}; }
+  std::span<const std::byte> request() const { return bytes.span(); }
   std::span<const std::byte> body() const { return envelope.body(request()); }
 };
 
 /// A job with its answer.
 struct Answer {
   Job job;
-  zmq::message_t response;  // the serialized Response
+  std::string response;  // the serialized Response
   std::optional<Error> error;
   Clock::time_point started, finished;
   Timing stages;
@@ -46,16 +45,18 @@ class Exchange {
   Exchange(const Exchange&) = delete;
   Exchange& operator=(const Exchange&) = delete;
 
-  /// For the engine thread. `next` sleeps until there is a job, and returns none when the exchange is closed and empty.
+  /// For the engine thread; nothing here takes memory. `next` sleeps until there is a job that is not late, and returns
+  /// none when the exchange is closed and empty.
   std::optional<Job> next();
-  void put(Answer answer);
+  void put(Answer answer) noexcept;
 
   /// For the I/O thread.
   Jobs::Pushed push(Job job);
-  std::vector<Answer> take_answers();
-  std::vector<Job> take_late();  // jobs whose deadline passed while they waited
-  void close();                  // no further jobs come
-  bool drained() const;          // nothing waits, is computed, or is still to be answered
+  std::optional<Answer> take_answer();
+  std::optional<Job> take_late(Clock::time_point now);  // whose deadline passed while it waited
+  std::optional<Clock::time_point> first_deadline() const;
+  void close();          // no further jobs come
+  bool drained() const;  // nothing waits, is computed, or is still to be answered
 
   /// For any thread; `wake` also for a signal handler.
   int fd() const { return fd_; }
@@ -64,14 +65,11 @@ class Exchange {
   bool computing() const;
 
  private:
-  void move_late(Clock::time_point now);
-
   int fd_;  // an eventfd
   mutable std::mutex mutex_;
   std::condition_variable work_;
   Jobs jobs_;
-  std::vector<Answer> answers_;
-  std::vector<Job> late_;
+  std::optional<Answer> answer_;  // the next one waits until it was taken
   bool computing_ = false, closed_ = false;
 };
 

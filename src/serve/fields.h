@@ -16,6 +16,11 @@ namespace vla::serve {
 /// What a client that follows the schema never gets.
 Error not_a_request(std::string where, std::string expected, std::string found);
 
+/// Takes no memory itself: the texts fit into the strings.
+inline Error out_of_memory(const char* where) {
+  return {Code::out_of_memory, where, "", "no memory left", "ask again later"};
+}
+
 /// Walks over the fields of one serialized message, without copying or allocating. A field takes two bytes on the wire
 /// and a hundred when it is parsed into an object, so their number is bounded here, before anything is parsed.
 class Fields {

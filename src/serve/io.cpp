@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 #include <unistd.h>
 
-#include <array>
 #include <new>
 
 #include "serve/codec.h"
@@ -14,26 +13,24 @@
 namespace vla::serve {
 namespace {
 
-constexpr int kTurn = 64;  // requests that are read before answers get their turn again
+constexpr auto kLinger = std::chrono::seconds(2);  // for the last answers on the way out
 constexpr std::uint64_t kMaxDeadlineMs = 86'400'000;
 
-std::span<const std::byte> bytes_of(const zmq::message_t& message) {
-  return {message.data<std::byte>(), message.size()};
-}
-
-std::string hexadecimal(const zmq::message_t& message) {
-  std::string text;
-  for (const std::byte byte : bytes_of(message)) text += fmt::format("{:02x}", static_cast<unsigned>(byte));
-  return text;
+Job job_of(const Client& client, Message message) {
+  Job job;
+  job.client = std::to_string(client.connection);
+  job.peer = client.peer;
+  job.name = client.name;
+  job.is_first = client.n_request == 0;
+  job.size = message.size;
+  job.at = Clock::now();
+  job.connection = client.connection;
+  job.delimiter = message.delimiter;
+  job.bytes = std::move(message.bytes);
+  return job;
 }
 
 }  // namespace
-
-zmq::message_t to_message(const v1::Response& response) {
-  zmq::message_t message(response.ByteSizeLong());
-  response.SerializeToArray(message.data(), static_cast<int>(message.size()));
-  return message;
-}
 
 Health Vitals::health(const Exchange& exchange) const {
   const Clock::duration up = Clock::now().time_since_epoch() - Clock::duration(ready_since);
@@ -45,80 +42,63 @@ Health Vitals::health(const Exchange& exchange) const {
           n_error};
 }
 
-Io::Io(zmq::socket_t& router, Gate* gate, Exchange& exchange, Vitals& vitals, const v1::Description& description,
+Io::Io(Hub& hub, Exchange& exchange, Vitals& vitals, const v1::Description& description,
        std::span<Observer* const> observers)
-    : router_(router),
-      gate_(gate),
-      exchange_(exchange),
-      vitals_(vitals),
-      description_(description),
-      observers_(observers) {}
+    : hub_(hub), exchange_(exchange), vitals_(vitals), description_(description), observers_(observers) {}
 
 void Io::run() {
-  std::array<zmq_pollitem_t, 3> items = {{{nullptr, exchange_.fd(), ZMQ_POLLIN, 0},
-                                          {router_.handle(), 0, ZMQ_POLLIN, 0},
-                                          {gate_ ? gate_->socket().handle() : nullptr, 0, ZMQ_POLLIN, 0}}};
   for (;;) {
-    zmq_poll(items.data(), gate_ ? 3 : 2, -1);
+    hub_.wait(*this, exchange_.fd(), exchange_.first_deadline());
     std::uint64_t signals;
     [[maybe_unused]] const auto drained = ::read(exchange_.fd(), &signals, sizeof(signals));
     deliver_waiting();
-    if (gate_ && (items[2].revents & ZMQ_POLLIN) != 0) admit();
-    for (int n = 0; n < kTurn && receive(); ++n) {
-    }
     if (vitals_.stopping) {
       vitals_.ready = false;
       exchange_.close();
-      if (exchange_.drained()) return;
+      if (exchange_.drained()) return hub_.flush(*this, Clock::now() + kLinger);
     }
   }
 }
 
-void Io::admit() {
-  const std::optional<std::string> refused = gate_->answer();
-  if (!refused) return;
-  for (Observer* observer : observers_) observer->refused(*refused);
+void Io::dropped(const Client& client, const std::string& why, const std::string& detail) {
+  const Dropped dropped{std::to_string(client.connection), client.peer, client.name, why, detail};
+  for (Observer* observer : observers_) observer->dropped(dropped);
 }
 
-/// Takes one message in: [routing id][empty delimiter, if any][request]. False where there is none.
-bool Io::receive() {
-  Job job;
-  if (!router_.recv(job.route, zmq::recv_flags::dontwait)) return false;
-  bool more = router_.recv(job.bytes) && job.bytes.more();
-  if (more && job.bytes.size() == 0) {
-    job.delimiter = true;
-    more = router_.recv(job.bytes) && job.bytes.more();
-  }
-  const bool is_one_frame = !more;
-  for (zmq::message_t rest; more;) more = router_.recv(rest) && rest.more();
-  job.at = Clock::now();
-  job.client = hexadecimal(job.route);
-  job.size = job.bytes.size();
-  const Status sound = is_one_frame ? read_envelope(job.request(), job.envelope)
-                                    : Status(not_a_request("request", "one frame", "several"));
-  job.request_id = job.envelope.request_id;
-  job.kind = job.envelope.kind;
-  for (Observer* observer : observers_) observer->received(job);
+void Io::received(Client& client, Message message) {
+  const std::uint64_t connection = client.connection;
+  const bool delimiter = message.delimiter;
+  std::uint64_t request_id = 0;
   try {
-    handle(std::move(job), sound);
-  } catch (const std::bad_alloc&) {  // this request is lost: an answer would take memory too
+    Status sound = message.refused ? Status(*message.refused) : Status();
+    Job job = job_of(client, std::move(message));
+    ++client.n_request;
+    const Status envelope = read_envelope(job.request(), job.envelope);
+    if (sound) sound = envelope;
+    request_id = job.request_id = job.envelope.request_id;
+    job.kind = job.envelope.kind;
+    for (Observer* observer : observers_) observer->received(job);
+    handle(client, std::move(job), sound);
+  } catch (const std::bad_alloc&) {
+    v1::Response response = response_to(request_id);
+    *response.mutable_error() = encode_error(out_of_memory("request"));
+    hub_.send(connection, response.SerializeAsString(), delimiter);
+    ++vitals_.n_error;
   }
-  return true;
 }
 
-void Io::handle(Job job, const Status& sound) {
+void Io::handle(Client& client, Job job, const Status& sound) {
   if (!sound) return refuse(std::move(job), sound.error());
   if (job.kind == Kind::act) return queue(std::move(job));
-  auto response = answer_now(job);
+  auto response = answer_now(client, job);
   if (!response) return refuse(std::move(job), response.error());
-  const Clock::time_point at = job.at;
-  deliver({std::move(job), to_message(*response), std::nullopt, at, at, {}});
+  deliver(std::move(job), *response, nullptr);
 }
 
-Result<v1::Response> Io::answer_now(const Job& job) const {
+Result<v1::Response> Io::answer_now(Client& client, const Job& job) const {
   v1::Response response = response_to(job.request_id);
   if (job.kind == Kind::hello) {
-    VLA_TRY(*response.mutable_hello(), answer_hello(job.body()));
+    VLA_TRY(*response.mutable_hello(), answer_hello(job.body(), &client.name));
     return response;
   }
   VLA_CHECK(check_empty(job.body()));
@@ -146,6 +126,7 @@ void Io::queue(Job job) {
                                      std::to_string(*deadline)});
     job.deadline = job.at + std::chrono::milliseconds(*deadline);
   }
+  deliver_waiting();  // acts that are late must not keep a place from one that can still be answered
   const std::uint64_t request_id = job.request_id;
   Exchange::Jobs::Pushed pushed = exchange_.push(std::move(job));
   if (pushed.superseded)
@@ -153,34 +134,34 @@ void Io::queue(Job job) {
         std::move(*pushed.superseded),
         {Code::superseded, "act", "", fmt::format("request {} of this client came while this one waited", request_id),
          "act on the newer one's answer"});
-  if (pushed.refused)
-    refuse(std::move(*pushed.refused), {Code::busy, "act", "room in the queue",
-                                        fmt::format("{} acts of other clients that wait", exchange_.n_waiting()),
-                                        "ask again later, or less often"});
+  for (Job& refused : pushed.refused)
+    refuse(std::move(refused), {Code::busy, "act", "room in the queue",
+                                fmt::format("{} acts of other clients that wait", exchange_.n_waiting()),
+                                "ask again later, or less often"});
 }
 
 void Io::refuse(Job job, const Error& error) {
   v1::Response response = response_to(job.request_id);
   *response.mutable_error() = encode_error(error);
+  deliver(std::move(job), response, &error);
+}
+
+void Io::deliver(Job job, const v1::Response& response, const Error* error) {
   const Clock::time_point at = job.at;
-  deliver({std::move(job), to_message(response), error, at, at, {}});
+  deliver(
+      {std::move(job), response.SerializeAsString(), error ? std::optional<Error>(*error) : std::nullopt, at, at, {}});
 }
 
 /// A peer that is gone, or that does not read and has its share of answers waiting, loses this one; nobody waits for
 /// it.
 void Io::deliver(Answer answer) {
-  Job& job = answer.job;
+  const Job& job = answer.job;
   if (answer.error) {
     ++vitals_.n_error;
   } else if (job.kind == Kind::act) {
     ++vitals_.n_chunk;
   }
-  zmq::message_t response;
-  response.copy(answer.response);  // shares the bytes, which observers read afterwards
-  const auto part = zmq::send_flags::sndmore | zmq::send_flags::dontwait;
-  router_.send(job.route, part);
-  if (job.delimiter) router_.send(zmq::message_t(), part);
-  router_.send(response, zmq::send_flags::dontwait);
+  hub_.send(job.connection, answer.response, job.delimiter);
   if (observers_.empty()) return;
   const Answered answered{job,
                           answer.error ? &*answer.error : nullptr,
@@ -189,17 +170,25 @@ void Io::deliver(Answer answer) {
                           Clock::now(),
                           std::move(answer.stages),
                           job.request(),
-                          bytes_of(answer.response)};
+                          std::as_bytes(std::span(answer.response))};
   for (Observer* observer : observers_) observer->answered(answered);
 }
 
-void Io::deliver_waiting() {
-  for (Answer& answer : exchange_.take_answers()) deliver(std::move(answer));
-  for (Job& job : exchange_.take_late()) {
-    const Error error{Code::late, "act.deadline_ms", fmt::format("its turn within {} ms", *job.envelope.deadline_ms),
-                      "later", "ask less often, or allow more time"};
-    refuse(std::move(job), error);
+void Io::deliver_waiting() try {
+  while (std::optional<Answer> answer = exchange_.take_answer()) {
+    if (answer->response.empty()) {  // there was no memory for it on the other thread
+      v1::Response response = response_to(answer->job.request_id);
+      *response.mutable_error() = encode_error(*answer->error);
+      answer->response = response.SerializeAsString();
+    }
+    deliver(std::move(*answer));
   }
+  while (std::optional<Job> job = exchange_.take_late(Clock::now())) {
+    const Error error{Code::late, "act.deadline_ms", fmt::format("its turn within {} ms", *job->envelope.deadline_ms),
+                      "later", "ask less often, or allow more time"};
+    refuse(std::move(*job), error);
+  }
+} catch (const std::bad_alloc&) {  // the answer at hand is lost, and the server goes on
 }
 
 }  // namespace vla::serve

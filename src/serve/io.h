@@ -4,10 +4,9 @@
 
 #include <atomic>
 #include <span>
-#include <zmq.hpp>
 
-#include "serve/curve.h"
 #include "serve/exchange.h"
+#include "serve/hub.h"
 #include "serve/vla.pb.h"
 
 namespace vla::serve {
@@ -21,31 +20,30 @@ struct Vitals {
   Health health(const Exchange& exchange) const;
 };
 
-zmq::message_t to_message(const v1::Response& response);
-
 /// The I/O thread: receives requests, answers at once what needs no engine, puts acts in line, and sends what comes
 /// back. It never computes, so that no client waits for it while another one's act runs.
-class Io {
+class Io final : public Hub::Handler {
  public:
-  /// `gate` may be null. Everything outlives the thread.
-  Io(zmq::socket_t& router, Gate* gate, Exchange& exchange, Vitals& vitals, const v1::Description& description,
+  /// Everything outlives the thread.
+  Io(Hub& hub, Exchange& exchange, Vitals& vitals, const v1::Description& description,
      std::span<Observer* const> observers);
 
   /// Until the server is told to stop and everything that waits is answered.
   void run();
 
+  void received(Client& client, Message message) override;
+  void dropped(const Client& client, const std::string& why, const std::string& detail) override;
+
  private:
-  void admit();
-  bool receive();
-  void handle(Job job, const Status& sound);
-  Result<v1::Response> answer_now(const Job& job) const;
+  void handle(Client& client, Job job, const Status& sound);
+  Result<v1::Response> answer_now(Client& client, const Job& job) const;
   void queue(Job job);
   void refuse(Job job, const Error& error);
+  void deliver(Job job, const v1::Response& response, const Error* error);
   void deliver(Answer answer);
   void deliver_waiting();
 
-  zmq::socket_t& router_;
-  Gate* gate_;
+  Hub& hub_;
   Exchange& exchange_;
   Vitals& vitals_;
   const v1::Description& description_;

@@ -98,6 +98,8 @@ void Log::answered(const Answered& answered) {
   const Received& request = answered.request;
   try {
     Fields fields = {{"client", request.client},
+                     {"peer", request.peer},
+                     {"name", request.name},
                      {"request_id", request.request_id},
                      {"kind", kind_name(request.kind)},
                      {"code", answered.code()},
@@ -113,6 +115,21 @@ void Log::answered(const Answered& answered) {
       fields["hint"] = error->hint;
     }
     event(level, "request", fields);
+  } catch (const std::exception&) {  // as above
+  }
+}
+
+/// Whoever comes without a key or does not speak ZMTP is told of; that a peer fell silent is the course of events.
+void Log::dropped(const Dropped& connection) {
+  const Level level = connection.why == "silent" ? Level::info : Level::warn;
+  if (level < least_) return;
+  try {
+    event(level, "dropped",
+          {{"client", connection.client},
+           {"peer", connection.peer},
+           {"name", connection.name},
+           {"why", connection.why},
+           {"detail", connection.detail}});
   } catch (const std::exception&) {  // as above
   }
 }

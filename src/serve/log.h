@@ -28,7 +28,7 @@ class Log final : public Observer {
   /// A request: at level debug where it was answered with what it asked for, info where the queue refused it, warn
   /// where the request was wrong, error where the server failed.
   void answered(const Answered& answered) override;
-  void refused(const std::string& address) override { event(Level::warn, "refused", {{"address", address}}); }
+  void dropped(const Dropped& connection) override;
 
  private:
   std::string line(Level level, const char* name, const Fields& fields) const;

@@ -7,13 +7,11 @@
 #include <unistd.h>
 
 #include <fstream>
-#include <functional>
 #include <new>
 
 namespace vla::serve {
 namespace {
 
-constexpr std::size_t kMaxSeen = 1 << 16;
 const prometheus::Histogram::BucketBoundaries kSeconds = {1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 0.01, 0.025,
                                                           0.05, 0.1,    0.25, 0.5,  1,      2.5,  5,    10};
 
@@ -48,6 +46,10 @@ Metrics::Metrics()
                   .Name("vla_stage_seconds")
                   .Help("Wall time of acts that reached the engine, by stage")
                   .Register(*registry_)),
+      dropped_(prometheus::BuildCounter()
+                   .Name("vla_dropped_connections_total")
+                   .Help("Connections that the server ended, by reason")
+                   .Register(*registry_)),
       received_bytes_(counter(*registry_, "vla_received_bytes_total", "Bytes of requests")),
       sent_bytes_(counter(*registry_, "vla_sent_bytes_total", "Bytes of answers")),
       clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")),
@@ -85,12 +87,15 @@ std::string Metrics::text(const Health& health) const {
   return prometheus::TextSerializer().Serialize(families);
 }
 
-/// How many clients there were is counted by hashes of a bounded number; a client that comes back after so many others
-/// counts again.
-void Metrics::received(const Received& request) try {
+void Metrics::received(const Received& request) {
   received_bytes_.Increment(static_cast<double>(request.size));
-  if (seen_.size() >= kMaxSeen) seen_.clear();
-  if (seen_.insert(std::hash<std::string>()(request.client)).second) clients_.Increment();
+  if (request.is_first) clients_.Increment();
+}
+
+/// `why` is one of a few words of the server's own.
+void Metrics::dropped(const Dropped& connection) try {
+  if (connection.why == "key") refused_.Increment();
+  dropped_.Add({{"why", connection.why}}).Increment();
 } catch (const std::bad_alloc&) {  // uncounted: the server goes on
 }
 

@@ -8,7 +8,6 @@
 
 #include <map>
 #include <string>
-#include <unordered_set>
 
 #include "engine/engine.h"
 #include "serve/observer.h"
@@ -28,7 +27,7 @@ class Metrics final : public Observer {
   std::string text(const Health& health) const;
 
   void received(const Received& request) override;
-  void refused(const std::string&) override { refused_.Increment(); }
+  void dropped(const Dropped& connection) override;
   void answered(const Answered& answered) override;
 
  private:
@@ -38,11 +37,11 @@ class Metrics final : public Observer {
   std::shared_ptr<prometheus::Registry> registry_ = std::make_shared<prometheus::Registry>();
   prometheus::Family<prometheus::Counter>& requests_;
   prometheus::Family<prometheus::Histogram>& stages_;
+  prometheus::Family<prometheus::Counter>& dropped_;
   prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_;
   // Of the I/O thread:
   std::map<std::string, prometheus::Histogram*> stage_;
   std::map<std::pair<Kind, int>, prometheus::Counter*> request_;
-  std::unordered_set<std::size_t> seen_;  // hashes of routing ids
 };
 
 }  // namespace vla::serve

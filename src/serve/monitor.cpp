@@ -6,7 +6,6 @@
 
 #include <boost/asio/io_context.hpp>
 #include <boost/asio/ip/tcp.hpp>
-#include <boost/asio/steady_timer.hpp>
 #include <boost/beast/core/flat_buffer.hpp>
 #include <boost/beast/core/tcp_stream.hpp>
 #include <boost/beast/http/empty_body.hpp>
@@ -20,6 +19,7 @@
 
 #include "base/thread.h"
 #include "serve/endpoint.h"
+#include "serve/listener.h"
 
 namespace vla::serve {
 namespace {
@@ -33,8 +33,7 @@ using Response = http::response<http::string_body>;
 
 constexpr std::size_t kMaxConnections = 64;
 constexpr std::size_t kMaxHeader = 4096;
-constexpr auto kPatience = std::chrono::seconds(2);      // from the connection to the last byte of its answer
-constexpr auto kRetry = std::chrono::milliseconds(100);  // after the system had no descriptor or memory left
+constexpr auto kPatience = std::chrono::seconds(2);  // from the connection to the last byte of its answer
 
 Response text(const Request& request, http::status status, std::string body) {
   Response response(status, request.version());
@@ -126,11 +125,8 @@ class Monitor::Http {
   Status start(const std::string& address, bool insecure) {
     VLA_TRY(const tcp::endpoint endpoint, endpoint_of(address, insecure));
     try {
-      acceptor_.open(endpoint.protocol());
-      acceptor_.set_option(tcp::acceptor::reuse_address(true));
-      acceptor_.bind(endpoint);
-      acceptor_.listen();
-      address_ = fmt::format("{}:{}", address.substr(0, address.rfind(':')), acceptor_.local_endpoint().port());
+      listener_.emplace(context_, endpoint);
+      address_ = fmt::format("{}:{}", address.substr(0, address.rfind(':')), listener_->endpoint().port());
     } catch (const boost::system::system_error& error) {
       return Error{Code::io, address, "a free address of this machine", error.code().message(),
                    "choose another with --metrics; port 0 takes a free one"};
@@ -146,28 +142,12 @@ class Monitor::Http {
   void run() noexcept {
     while (!context_.stopped()) {
       try {
-        if (!accepting_) accept();
+        listener_->listen([this](tcp::socket socket) { add(std::move(socket)); });
         context_.run();
       } catch (const std::exception&) {
-        std::this_thread::sleep_for(kRetry);
+        std::this_thread::sleep_for(std::chrono::milliseconds(100));
       }
     }
-  }
-
-  void accept() {
-    acceptor_.async_accept([this](error_code error, tcp::socket socket) {
-      accepting_ = false;
-      if (error) return accept_later();
-      add(std::move(socket));
-      accept();
-    });
-    accepting_ = true;
-  }
-
-  void accept_later() {
-    retry_.expires_after(kRetry);
-    retry_.async_wait([this](error_code) { accept(); });
-    accepting_ = true;
   }
 
   void add(tcp::socket socket) {
@@ -184,10 +164,8 @@ class Monitor::Http {
   const Sources sources_;
   std::string address_;
   boost::asio::io_context context_{1};
-  tcp::acceptor acceptor_{context_};
-  boost::asio::steady_timer retry_{context_};
+  std::optional<Listener<tcp>> listener_;
   std::list<std::weak_ptr<Connection>> open_;  // oldest first
-  bool accepting_ = false;
   std::thread thread_;
 };
 

@@ -24,11 +24,21 @@ constexpr const char* kind_name(Kind kind) {
 
 /// A request as the server knows it before it has looked into it.
 struct Received {
-  std::string client;            // routing id of the connection, hexadecimal
+  std::string client;            // the connection: a number that is never given again
+  std::string peer;              // who is there: the client's public key where there are keys, else its address
+  std::string name;              // as the client called itself in a hello on this connection
   std::uint64_t request_id = 0;  // the client's number; 0 where it could not be read
   Kind kind = Kind::unknown;
   std::size_t size = 0;  // bytes of the request
   Clock::time_point at;
+  bool is_first = false;  // of its connection
+};
+
+/// A connection that the server ended.
+struct Dropped {
+  std::string client, peer, name;
+  std::string why;  // handshake, key, protocol, size, memory, silent, connections or receipt
+  std::string detail;
 };
 
 /// An answered request.
@@ -48,9 +58,7 @@ class Observer {
  public:
   virtual ~Observer() = default;
   virtual void received(const Received&) {}  // on the I/O thread
-  virtual void refused(const std::string& address) {
-    (void)address;
-  }                                          // on the I/O thread: a client whose key is not listed
+  virtual void dropped(const Dropped&) {}    // on the I/O thread
   virtual void started(const Received&) {}   // on the engine thread, when an act leaves the queue to be computed
   virtual void answered(const Answered&) {}  // on the I/O thread
 };

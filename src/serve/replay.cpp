@@ -85,8 +85,12 @@ bool is_of_the_moment(const v1::Response& answer) {
     case v1::Error::LATE:
     case v1::Error::SHUTTING_DOWN:
       return true;
+    case v1::Error::OUT_OF_MEMORY:
+      return true;
+    case v1::Error::TOO_LARGE:  // of these two the request was not kept whole
+      return error.where() == "request";
     case v1::Error::BAD_REQUEST:
-      return error.found() == "several";  // frames, of which one was kept
+      return error.found() == "several";
     default:
       return answer.has_health();
   }

@@ -2,30 +2,21 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/server.h"
 
-#include <fmt/format.h>
-#include <pthread.h>
-
-#include <algorithm>
-#include <cerrno>
-#include <csignal>
 #include <exception>
 #include <new>
-#include <thread>
 
+#include "base/thread.h"
 #include "serve/codec.h"
 #include "serve/endpoint.h"
+#include "serve/fields.h"
 
 namespace vla::serve {
 namespace {
 
-constexpr int kReceiveMark = 8;  // requests of one connection that may wait unread, each of up to the largest size
-constexpr int kSendMark = 64;    // answers that one connection may leave unread before it loses further ones
-constexpr int kLingerMs = 2000;  // for the last answers on the way out
-constexpr int kHandshakeMs = 10'000;
-constexpr int kHeartbeatMs = 5000, kHeartbeatTimeoutMs = 15'000;
-constexpr std::size_t kQueueMessages = 8;  // acts that wait may hold so many times the largest message
+constexpr std::size_t kQueueMessages = 8;    // acts that wait may hold so many times the largest message
+constexpr std::size_t kReceiptMessages = 4;  // and requests that are being received so many times
 
-v1::Limits limits_of(const ServerOptions& options, const Engine& engine) {
+v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   v1::Limits limits;
   limits.set_max_message_bytes(options.max_message);
   limits.set_max_pixels(static_cast<std::uint64_t>(options.max_pixels));
@@ -33,18 +24,6 @@ v1::Limits limits_of(const ServerOptions& options, const Engine& engine) {
   limits.set_max_views(static_cast<std::uint32_t>(engine.processor().views().names().size()));
   limits.set_max_queue(static_cast<std::uint32_t>(options.max_queue));
   return limits;
-}
-
-Error cannot_bind(const std::string& endpoint, const zmq::error_t& error) {
-  switch (error.num()) {
-    case EADDRINUSE:
-      return {Code::io, endpoint, "a free address", "one that another program uses", "choose another with --bind"};
-    case EADDRNOTAVAIL:
-    case ENODEV:
-      return {Code::io, endpoint, "an address of this machine", error.what(), "tcp://127.0.0.1:5555 is one"};
-    default:
-      return {Code::io, endpoint, "an address that can be bound", error.what()};
-  }
 }
 
 }  // namespace
@@ -67,31 +46,18 @@ Result<double> warm_up(Engine& engine) {
   return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
 }
 
-Server::Server(const ServerOptions& options)
-    : options_(options),
-      exchange_({options.max_queue, kQueueMessages * options.max_message}),
-      router_(context_, zmq::socket_type::router) {
-  router_.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(options.max_message));
-  router_.set(zmq::sockopt::rcvhwm, kReceiveMark);
-  router_.set(zmq::sockopt::sndhwm, kSendMark);
-  router_.set(zmq::sockopt::linger, kLingerMs);
-  router_.set(zmq::sockopt::handshake_ivl, kHandshakeMs);
-  router_.set(zmq::sockopt::heartbeat_ivl, kHeartbeatMs);
-  router_.set(zmq::sockopt::heartbeat_timeout, kHeartbeatTimeoutMs);
-  const auto has_bracket = [](const std::string& endpoint) { return endpoint.find('[') != std::string::npos; };
-  router_.set(zmq::sockopt::ipv6, std::any_of(options.bind.begin(), options.bind.end(), has_bracket));
+Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
+  return {options.max_queue, kQueueMessages * options.max_message};
 }
 
 Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) {
-  try {
-    std::unique_ptr<Server> server(new Server(options));
-    if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
-    VLA_CHECK(server->guard());
-    VLA_CHECK(server->bind());
-    return server;
-  } catch (const zmq::error_t& error) {
-    return Error{Code::io, "ZeroMQ", "a socket", error.what()};
-  }
+  std::unique_ptr<Server> server(new Server(options));
+  if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
+  VLA_CHECK(server->guard());
+  const Hub::Limits limits{options.max_message, options.max_connections, kReceiptMessages * options.max_message};
+  server->hub_ = std::make_unique<Hub>(limits, server->keys_ ? &*server->keys_ : nullptr);
+  VLA_CHECK(server->bind());
+  return server;
 }
 
 /// Whoever can reach the server can move the robot: others than this machine's own programs need a key, or the user's
@@ -107,26 +73,15 @@ Status Server::guard() {
                    "vla keygen makes keys for --curve-secret and --curve-clients; --insecure lets everybody in"};
   }
   if (!has_keys) return {};
-  VLA_TRY(const std::string secret, read_secret_key(options_.curve_secret));
-  VLA_TRY(std::set<std::string> clients, read_public_keys(options_.curve_clients));
-  if (zmq_has("curve") == 0)
-    return Error{Code::unsupported, "--curve-secret", "a ZeroMQ library with CURVE", "one without"};
-  gate_ = std::make_unique<Gate>(context_, std::move(clients));
-  router_.set(zmq::sockopt::curve_server, true);
-  router_.set(zmq::sockopt::curve_secretkey, secret);
-  router_.set(zmq::sockopt::zap_domain, "vla");
+  VLA_TRY(keys_, read_keys(options_.curve_secret, options_.curve_clients));
   return {};
 }
 
 Status Server::bind() {
   for (const std::string& endpoint : options_.bind) {
     VLA_CHECK(check_free(endpoint));
-    try {
-      router_.bind(endpoint);
-    } catch (const zmq::error_t& error) {
-      return cannot_bind(endpoint, error);
-    }
-    addresses_.push_back(router_.get(zmq::sockopt::last_endpoint));
+    VLA_TRY(std::string bound, hub_->bind(endpoint));
+    addresses_.push_back(std::move(bound));
   }
   return {};
 }
@@ -137,7 +92,7 @@ void Server::stop() noexcept {
 }
 
 v1::Description Server::describe(const Engine& engine) const {
-  return serve::describe(engine, limits_of(options_, engine));
+  return serve::describe(engine, limits_told(options_, engine));
 }
 
 /// Graphs run on the thread that calls this, since it has loaded the engine: OpenMP keeps a team of threads for each
@@ -146,54 +101,36 @@ Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   description_ = describe(engine);
   vitals_.ready_since = Clock::now().time_since_epoch().count();
   vitals_.ready = true;
-  sigset_t all, before;  // signals belong to the caller's threads
-  sigfillset(&all);
-  pthread_sigmask(SIG_SETMASK, &all, &before);
-  Status talked;
-  std::thread io([&] { talked = talk(observers); });
-  pthread_sigmask(SIG_SETMASK, &before, nullptr);
+  Io io(*hub_, exchange_, vitals_, description_, observers);
+  VLA_TRY(std::thread thread, start_thread("I/O thread", [&] { io.run(); }));
   while (std::optional<Job> job = exchange_.next()) {
     for (Observer* observer : observers) observer->started(*job);
     exchange_.put(compute(engine, std::move(*job)));
   }
-  io.join();
-  gate_.reset();
-  router_.close();
-  context_.close();  // waits for the last answers to leave, for as long as the socket lingers
-  return talked;
+  thread.join();
+  hub_.reset();
+  return {};
 }
 
-Status Server::talk(std::span<Observer* const> observers) noexcept {
-  Status status;
-  try {
-    Io(router_, gate_.get(), exchange_, vitals_, description_, observers).run();
-  } catch (const std::exception& exception) {
-    status = Error{Code::internal, "I/O thread", "", exception.what()};
-  }
-  vitals_.ready = false;
-  exchange_.close();
-  return status;
-}
-
-Answer Server::compute(Engine& engine, Job job) const {
+/// What a library throws is this request's misfortune, not the server's.
+Answer Server::compute(Engine& engine, Job job) const noexcept {
   Answer answer;
   answer.started = Clock::now();
-  v1::Response response = response_to(job.request_id);
-  try {  // what a library throws is this request's misfortune, not the server's
+  try {
+    v1::Response response = response_to(job.request_id);
     auto chunk = act(engine, job, answer.stages);
     if (chunk) {
       chunk->set_queue_ms(std::chrono::duration<double, std::milli>(answer.started - job.at).count());
       *response.mutable_chunk() = std::move(*chunk);
+      answer.response = response.SerializeAsString();
     } else {
       answer.error = chunk.error();
     }
   } catch (const std::bad_alloc&) {
-    answer.error = Error{Code::out_of_memory, "act", "", "the system has no memory left"};
-  } catch (const std::exception& exception) {
-    answer.error = Error{Code::internal, "act", "", exception.what(), "please report this"};
+    answer.error = out_of_memory("act");
+  } catch (const std::exception&) {
+    answer.error = Error{Code::internal, "act", "", "an exception", "report this"};
   }
-  if (answer.error) *response.mutable_error() = encode_error(*answer.error);
-  answer.response = to_message(response);
   answer.finished = Clock::now();
   answer.job = std::move(job);
   return answer;

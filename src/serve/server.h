@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "engine/engine.h"
+#include "serve/curve.h"
 #include "serve/io.h"
 #include "serve/observer.h"
 
@@ -18,9 +19,10 @@ struct ServerOptions {
   bool insecure = false;                    // an address that others can reach may be bound without keys
   std::string curve_secret, curve_clients;  // files; both or neither
   std::size_t max_message = 32 << 20;       // bytes
-  std::int64_t max_pixels = 1 << 24;        // of one picture
+  std::int64_t max_pixels = 1 << 24;        // of the pictures of an act
   std::size_t max_text = 4096;              // bytes
   std::size_t max_queue = 64;               // acts
+  std::size_t max_connections = 256;
 };
 
 /// Computes one act of a synthetic observation with every view and the longest text, so that the first client does not
@@ -28,7 +30,7 @@ struct ServerOptions {
 /// Milliseconds. Errors: device, out_of_memory, internal.
 Result<double> warm_up(Engine& engine);
 
-/// One resident policy behind a ZeroMQ ROUTER. It keeps nothing between requests.
+/// One resident policy behind a socket that speaks like a ZeroMQ ROUTER. It keeps nothing between requests.
 class Server {
  public:
   /// Binds the addresses. Requests that come before `run` wait. Errors: usage (an address or a key that is none; an
@@ -39,7 +41,7 @@ class Server {
   const std::vector<std::string>& addresses() const { return addresses_; }
 
   /// Serves on this thread, which computes, and a second one, which talks, until `stop`; then answers what waits and
-  /// returns. Observers outlive the call. Once for each server. Errors: internal.
+  /// returns. Observers outlive the call. Once for each server. Errors: out_of_memory.
   Status run(Engine& engine, std::span<Observer* const> observers = {});
   /// What `describe` is answered with once this engine is served.
   v1::Description describe(const Engine& engine) const;
@@ -49,20 +51,19 @@ class Server {
   Health health() const { return vitals_.health(exchange_); }
 
  private:
-  explicit Server(const ServerOptions& options);
+  explicit Server(const ServerOptions& options) : options_(options), exchange_(limits_of(options)) {}
+  static Exchange::Jobs::Limits limits_of(const ServerOptions& options);
   Status guard();
   Status bind();
-  Status talk(std::span<Observer* const> observers) noexcept;
-  Answer compute(Engine& engine, Job job) const;
+  Answer compute(Engine& engine, Job job) const noexcept;
   Result<v1::ActionChunk> act(Engine& engine, const Job& job, Timing& stages) const;
 
   ServerOptions options_;
   Vitals vitals_;
   Exchange exchange_;
   v1::Description description_;
-  zmq::context_t context_;
-  std::unique_ptr<Gate> gate_;
-  zmq::socket_t router_;
+  std::optional<CurveKeys> keys_;
+  std::unique_ptr<Hub> hub_;
   std::vector<std::string> addresses_;
 };
 

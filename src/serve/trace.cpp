@@ -60,7 +60,7 @@ std::int64_t Trace::ns(Clock::time_point time) const {
   return std::max<std::int64_t>(0, std::chrono::nanoseconds(time - start_).count());
 }
 
-/// Every name that goes into the file is the server's own; of a client there is its routing id, in hexadecimal.
+/// Every name that goes into the file is the server's own; of a client there is the number of its connection.
 void Trace::answered(const Answered& answered) {
   const Received& request = answered.request;
   const std::uint64_t id = ++n_request_;

@@ -40,7 +40,7 @@ LIBRARIES = [
     (re.compile(r"jpeglib\.h"), {"processor"}),
     (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
-    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|prometheus/.*|boost/.*"), {"serve"}),
+    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|prometheus/.*|boost/.*|sodium\.h"), {"serve"}),
 ]
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 

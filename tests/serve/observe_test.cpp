@@ -62,7 +62,7 @@ std::string content(const std::string& path) {
 
 /// A request that was answered after 10 ms, of which it waited 4 and was computed for 5.
 struct Sample {
-  Received request{"0a0b", 7, Kind::act, 3, Clock::now()};
+  Received request{"12", "10.0.0.7", "arm 1.0", 7, Kind::act, 3, Clock::now(), true};
   Error error{Code::bad_observation, "where", "this", "that", "do"};
   std::string in = "abc", out = "defgh";
   Answered answered(bool with_error, std::size_t n_in = 3) {
@@ -197,6 +197,7 @@ TEST_CASE("metrics count a request once, and time only what the engine saw") {
   Metrics metrics;
   Sample sample;
   metrics.received(sample.request);
+  sample.request.is_first = false;
   metrics.received(sample.request);
   metrics.answered(sample.answered(false));
   metrics.answered(sample.answered(true));

@@ -16,7 +16,8 @@ struct Item {
   std::string client;
   int number = 0;
   std::size_t size = 1;
-  std::optional<Clock::time_point> deadline;
+  std::optional<Clock::time_point> deadline = {};
+  std::string peer = {};
 };
 
 Clock::time_point at(int ms) { return Clock::time_point(std::chrono::milliseconds(ms)); }
@@ -42,7 +43,7 @@ TEST_CASE("a full queue refuses a new client and still takes the newest act of o
   Queue<Item> queue({2, 100});
   queue.push({"a", 1});
   queue.push({"b", 2});
-  CHECK(queue.push({"c", 3}).refused->number == 3);
+  CHECK(queue.push({"c", 3}).refused.at(0).number == 3);
   CHECK(queue.push({"a", 4}).superseded->number == 1);
   CHECK(queue.size() == 2);
 }
@@ -50,22 +51,55 @@ TEST_CASE("a full queue refuses a new client and still takes the newest act of o
 TEST_CASE("bytes are bounded, counting what a newer act frees") {
   Queue<Item> queue({10, 10});
   queue.push({"a", 1, 6});
-  CHECK(queue.push({"b", 2, 5}).refused);
+  CHECK(queue.push({"b", 2, 5}).refused.size() == 1);
   CHECK(queue.push({"a", 3, 10}).superseded);
-  CHECK(queue.push({"a", 4, 11}).refused->number == 4);
+  CHECK(queue.push({"a", 4, 11}).refused.at(0).number == 4);
   CHECK(queue.pop()->number == 3);
-  CHECK_FALSE(queue.push({"b", 5, 10}).refused);
+  CHECK(queue.push({"b", 5, 10}).refused.empty());
 }
 
 TEST_CASE("an act is late from its deadline on, not before") {
   Queue<Item> queue(kRoom);
   queue.push({"a", 1, 1, at(10)});
   queue.push({"b", 2, 1});
-  CHECK(queue.take_late(at(9)).empty());
-  const auto late = queue.take_late(at(10));
-  REQUIRE(late.size() == 1);
-  CHECK(late[0].number == 1);
+  CHECK(queue.first_deadline() == at(10));
+  CHECK_FALSE(queue.take_late(at(9)));
+  CHECK(queue.take_late(at(10))->number == 1);
+  CHECK_FALSE(queue.take_late(at(10)));
+  CHECK_FALSE(queue.first_deadline());
   CHECK(queue.pop()->number == 2);
+}
+
+TEST_CASE("a peer of seventy connections gets as many turns as a peer of one") {
+  Queue<Item> queue(kRoom);
+  for (int i = 0; i < 70; ++i) queue.push({"many" + std::to_string(i), i, 1, {}, "many"});
+  for (int turn = 0; turn < 5; ++turn) {
+    queue.push({"one", 100 + turn, 1, {}, "one"});
+    std::set<std::string> served = {queue.pop()->peer, queue.pop()->peer};
+    CHECK(served == std::set<std::string>{"many", "one"});
+  }
+}
+
+TEST_CASE("where the queue is full, the last act of the peer that has most gives way to a peer that has less") {
+  Queue<Item> queue({3, 100});
+  for (int i = 0; i < 3; ++i) queue.push({"a" + std::to_string(i), i, 1, {}, "a"});
+  CHECK(queue.push({"a3", 3, 1, {}, "a"}).refused.at(0).number == 3);
+  CHECK(queue.push({"b0", 4, 1, {}, "b"}).refused.at(0).number == 2);
+  CHECK(queue.push({"b1", 5, 1, {}, "b"}).refused.at(0).number == 5);  // it would have as many
+  CHECK(queue.push({"c0", 6, 1, {}, "c"}).refused.at(0).number == 1);
+  CHECK(queue.push({"d0", 7, 1, {}, "d"}).refused.at(0).number == 7);  // all have the same
+  CHECK(queue.size() == 3);
+}
+
+TEST_CASE("bytes too are taken from the peer that has most of them") {
+  Queue<Item> queue({10, 10});
+  queue.push({"a0", 0, 5, {}, "a"});
+  queue.push({"a1", 1, 4, {}, "a"});
+  const auto pushed = queue.push({"b0", 2, 4, {}, "b"});
+  REQUIRE(pushed.refused.size() == 1);
+  CHECK(pushed.refused[0].number == 1);
+  CHECK(queue.push({"b1", 3, 6, {}, "b"}).refused.at(0).number == 3);
+  CHECK(queue.size() == 2);
 }
 
 TEST_CASE("over random traffic every act comes out once, bounds hold, and nobody is passed over twice") {
@@ -97,19 +131,20 @@ TEST_CASE("over random traffic every act comes out once, bounds hold, and nobody
           CHECK(pushed.superseded->number == newest.at(client));
           leaves(*pushed.superseded);
         }
-        if (pushed.refused) {
-          CHECK(pushed.refused->number == number);
-          leaves(*pushed.refused);
+        if (!pushed.refused.empty()) {
+          CHECK(pushed.refused.size() == 1);
+          CHECK(pushed.refused[0].number == number);
+          leaves(pushed.refused[0]);
         } else {
           if (!newest.contains(client)) passed_by[client] = 0;
           newest[client] = number;
         }
       }
-      for (const Item& late : queue.take_late(at(now))) {
-        CHECK(*late.deadline <= at(now));
-        CHECK(newest.at(late.client) == late.number);
-        leaves(late);
-        newest.erase(late.client);
+      while (const auto late = queue.take_late(at(now))) {
+        CHECK(*late->deadline <= at(now));
+        CHECK(newest.at(late->client) == late->number);
+        leaves(*late);
+        newest.erase(late->client);
       }
       if (draw(3) == 0) {
         if (const auto item = queue.pop()) {

@@ -163,16 +163,20 @@ TEST_CASE("garbage, empty messages and several frames are answered bad_request, 
   check_serves(peer);
 }
 
-TEST_CASE("a message over the limit costs its sender the connection and nobody else anything") {
+TEST_CASE("a request over the limit is answered too_large with its number, and the next one is served") {
   serve::ServerOptions options;
   options.max_message = 1 << 20;
   Running running(options);
   Peer large(running.address()), other(running.address());
   check_serves(large);
-  large.send(std::string((1 << 20) + 1, 'x'));
-  CHECK_FALSE(large.receive(300).has_value());
+  v1::Request request = act_request(golden(), 77);
+  request.mutable_act()->set_text(std::string(1 << 20, 'x'));
+  const v1::Response refused = large.ask(request);
+  CHECK(refused.request_id() == 77);
+  CHECK(code_of(refused) == "TOO_LARGE");
+  CHECK(refused.error().where() == "request");
   check_serves(other);
-  check_serves(large);  // ZeroMQ has connected again
+  check_serves(large);
 }
 
 TEST_CASE("bytes that are no ZeroMQ at all do not disturb others") {

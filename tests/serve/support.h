@@ -10,6 +10,7 @@
 #include <string>
 #include <thread>
 #include <vector>
+#include <zmq.hpp>
 
 #include "serve/server.h"
 #include "support/editable_bundle.h"

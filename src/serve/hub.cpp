@@ -1,0 +1,402 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/hub.h"
+
+#include <fmt/format.h>
+#include <ifaddrs.h>
+#include <net/if.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <boost/asio/generic/stream_protocol.hpp>
+#include <boost/asio/io_context.hpp>
+#include <boost/asio/ip/tcp.hpp>
+#include <boost/asio/local/stream_protocol.hpp>
+#include <boost/asio/posix/stream_descriptor.hpp>
+#include <boost/asio/post.hpp>
+#include <boost/asio/steady_timer.hpp>
+#include <boost/asio/write.hpp>
+#include <cerrno>
+#include <charconv>
+#include <deque>
+#include <exception>
+#include <list>
+#include <map>
+
+#include "serve/listener.h"
+
+namespace vla::serve {
+namespace {
+
+namespace asio = boost::asio;
+using asio::ip::tcp;
+using Local = asio::local::stream_protocol;
+using boost::system::error_code;
+
+constexpr std::size_t kMaxAnswers = 64;  // that one connection may leave unread
+constexpr int kTurn = 4;                 // messages of a connection before the others get their turn
+constexpr auto kSweep = std::chrono::seconds(1);
+constexpr int kHandshakePatience = 10, kSilencePatience = 15, kPingAfter = 5;  // in sweeps
+
+/// The first address of an interface, IPv4 before IPv6.
+std::optional<asio::ip::address> address_of_interface(const std::string& name) {
+  ifaddrs* all = nullptr;
+  if (getifaddrs(&all) != 0) return std::nullopt;
+  std::optional<asio::ip::address> found;
+  for (const ifaddrs* at = all; at != nullptr; at = at->ifa_next) {
+    if (at->ifa_addr == nullptr || name != at->ifa_name) continue;
+    if (at->ifa_addr->sa_family == AF_INET) {
+      found = asio::ip::address_v4(ntohl(reinterpret_cast<const sockaddr_in*>(at->ifa_addr)->sin_addr.s_addr));
+      break;
+    }
+    if (at->ifa_addr->sa_family != AF_INET6 || found) continue;
+    const auto& v6 = *reinterpret_cast<const sockaddr_in6*>(at->ifa_addr);
+    asio::ip::address_v6::bytes_type bytes;
+    std::copy_n(v6.sin6_addr.s6_addr, bytes.size(), bytes.begin());
+    found = asio::ip::address_v6(bytes, v6.sin6_scope_id);
+  }
+  freeifaddrs(all);
+  return found;
+}
+
+/// HOST:PORT of a `tcp://` endpoint, HOST an address, an IPv6 address in brackets, an interface, or `*`.
+std::optional<tcp::endpoint> tcp_endpoint(const std::string& where) {
+  const std::size_t colon = where.rfind(':');
+  std::string host = where.substr(0, colon);
+  unsigned short port = 0;
+  std::from_chars(where.data() + colon + 1, where.data() + where.size(), port);
+  if (host == "*") host = "0.0.0.0";
+  if (host.starts_with('[') && host.ends_with(']')) host = host.substr(1, host.size() - 2);
+  error_code not_an_address;
+  const auto address = asio::ip::make_address(host, not_an_address);
+  if (!not_an_address) return tcp::endpoint(address, port);
+  const auto of_interface = address_of_interface(host);
+  return of_interface ? std::optional(tcp::endpoint(*of_interface, port)) : std::nullopt;
+}
+
+std::string text_of(const tcp::endpoint& endpoint) {
+  const std::string address = endpoint.address().to_string();
+  return fmt::format("tcp://{}:{}", endpoint.address().is_v6() ? "[" + address + "]" : address, endpoint.port());
+}
+
+Error cannot_bind(const std::string& endpoint, const error_code& error) {
+  switch (error.value()) {
+    case EADDRINUSE:
+      return {Code::io, endpoint, "a free address", "one that another program uses", "choose another with --bind"};
+    case EADDRNOTAVAIL:
+    case ENODEV:
+      return {Code::io, endpoint, "an address of this machine", error.message(), "tcp://127.0.0.1:5555 is one"};
+    default:
+      return {Code::io, endpoint, "an address that can be bound", error.message()};
+  }
+}
+
+std::string peer_of(tcp::socket& socket) {
+  error_code gone;
+  const auto endpoint = socket.remote_endpoint(gone);
+  return gone ? "" : endpoint.address().to_string();
+}
+
+std::string peer_of(Local::socket& socket) {
+  ucred user = {};
+  socklen_t size = sizeof(user);
+  if (getsockopt(socket.native_handle(), SOL_SOCKET, SO_PEERCRED, &user, &size) != 0) return "ipc";
+  return fmt::format("ipc user {}", user.uid);
+}
+
+void set_options(tcp::socket& socket) {
+  error_code ignored;
+  socket.set_option(tcp::no_delay(true), ignored);
+}
+void set_options(Local::socket&) {}
+
+class Connection;
+
+/// What the connections of a hub share.
+struct Shared {
+  Hub::Limits limits;
+  const CurveKeys* keys;
+  asio::io_context context{1};
+  Hub::Handler* handler = nullptr;
+  std::map<std::uint64_t, std::shared_ptr<Connection>> connections;  // oldest first
+  std::size_t n_held = 0;                                            // bytes of requests that are not whole
+  void make_room();
+  void bound_receipt();
+};
+
+class Connection : public std::enable_shared_from_this<Connection> {
+ public:
+  using Socket = asio::generic::stream_protocol::socket;
+  Connection(Shared& shared, Socket socket, Client client)
+      : shared_(shared),
+        socket_(std::move(socket)),
+        client_(std::move(client)),
+        session_(shared.limits.message, shared.keys) {}
+
+  void start() {
+    send(session_.take_output());
+    read();
+  }
+  void answer(std::string_view response, bool delimiter) {
+    if (out_.size() < kMaxAnswers) send(session_.pack(response, delimiter));
+  }
+  void drop(const char* why, const std::string& detail) {
+    if (is_closed_) return;
+    const auto self = shared_from_this();
+    close();
+    shared_.handler->dropped(client_, why, detail);
+  }
+  void close() {
+    if (std::exchange(is_closed_, true)) return;
+    error_code ignored;
+    socket_.shutdown(Socket::shutdown_both, ignored);
+    socket_.close(ignored);
+    hold(0);
+    shared_.connections.erase(client_.connection);
+  }
+
+  /// Once a second, as far as this process runs: a machine that stood still must not cost its clients the connection.
+  void sweep() {
+    ++age_;
+    ++silent_;
+    slow_ = session_.is_receiving() ? slow_ + 1 : 0;
+    if (!session_.is_open() && age_ > kHandshakePatience) return drop("handshake", "none within 10 s");
+    if (silent_ > kSilencePatience) return drop("silent", "no byte for 15 s");
+    // The heartbeats of a peer wait behind its request: while that is on its way, ours show that somebody is here.
+    if (session_.is_open() && out_.empty() && (slow_ > 1 || silent_ > kPingAfter)) send(session_.ping());
+  }
+
+  const std::string& peer() const { return client_.peer; }
+  std::size_t n_held() const { return n_held_; }
+  Clock::time_point began() const { return began_; }  // the request that is being received
+  Clock::time_point served() const { return served_; }
+  bool has_answers() const { return !out_.empty(); }
+
+ private:
+  /// No memory on the way costs this connection only.
+  template <class Step>
+  void guard(Step step) {
+    try {
+      if (!is_closed_) step();
+    } catch (const std::exception& exception) {
+      drop("memory", exception.what());
+    }
+  }
+
+  void read() {
+    const std::span<std::byte> room = session_.room();
+    socket_.async_read_some(asio::buffer(room.data(), room.size()),
+                            [self = shared_from_this()](error_code error, std::size_t n) {
+                              if (error) return self->close();
+                              self->silent_ = 0;
+                              if (!self->session_.is_receiving()) self->began_ = Clock::now();
+                              self->session_.filled(n);
+                              self->handle();
+                            });
+  }
+
+  /// A few of the messages that came; the rest when the other connections had their turn, or when the peer has read.
+  void handle() {
+    guard([this] {
+      for (int i = 0; i < kTurn; ++i) {
+        is_paused_ = out_.size() >= kMaxAnswers;
+        if (is_paused_) return;
+        Result<std::optional<Message>> message = session_.next();
+        if (std::string control = session_.take_output(); !control.empty()) send(std::move(control));
+        if (!message)
+          return drop(message.error().where.c_str(),
+                      fmt::format("expected {}, found {}", message.error().expected, message.error().found));
+        hold(session_.n_held());
+        if (!*message) {
+          shared_.bound_receipt();
+          if (!is_closed_) read();
+          return;
+        }
+        began_ = served_ = Clock::now();
+        if (!session_.client_key().empty()) client_.peer = session_.client_key();
+        shared_.handler->received(client_, std::move(**message));
+        if (is_closed_) return;
+      }
+      asio::post(shared_.context, [self = shared_from_this()] { self->handle(); });
+    });
+  }
+
+  void hold(std::size_t n) {
+    shared_.n_held += n - n_held_;
+    n_held_ = n;
+  }
+
+  void send(std::string bytes) {
+    out_.push_back(std::move(bytes));
+    if (out_.size() == 1) write();
+  }
+  void write() {
+    asio::async_write(socket_, asio::buffer(out_.front()), [self = shared_from_this()](error_code error, std::size_t) {
+      if (error) return self->close();
+      self->out_.pop_front();
+      self->guard([&] {
+        if (!self->out_.empty()) self->write();
+        if (self->is_paused_ && self->out_.size() < kMaxAnswers / 2) self->handle();
+      });
+    });
+  }
+
+  Shared& shared_;
+  Socket socket_;
+  Client client_;
+  Session session_;
+  std::deque<std::string> out_;  // the first one is on its way
+  Clock::time_point began_ = Clock::now(), served_ = {};
+  int age_ = 0, silent_ = 0, slow_ = 0;  // sweeps: since it came, since a byte, since a request began
+  std::size_t n_held_ = 0;
+  bool is_paused_ = false, is_closed_ = false;
+};
+
+/// Which peer has the most, counted by `amount`.
+template <class Amount>
+std::string heaviest(const std::map<std::uint64_t, std::shared_ptr<Connection>>& connections, Amount amount) {
+  std::map<std::string, std::size_t> sums;
+  for (const auto& [id, connection] : connections) sums[connection->peer()] += amount(*connection);
+  const auto most = std::max_element(sums.begin(), sums.end(), [](auto& a, auto& b) { return a.second < b.second; });
+  return most == sums.end() ? "" : most->first;
+}
+
+/// Of the peer with the most connections the one goes that was served longest ago, or never.
+void Shared::make_room() {
+  while (connections.size() > limits.connections) {
+    const std::string peer = heaviest(connections, [](const Connection&) { return std::size_t{1}; });
+    std::shared_ptr<Connection> idle;
+    for (const auto& [id, connection] : connections)
+      if (connection->peer() == peer && (!idle || connection->served() < idle->served())) idle = connection;
+    idle->drop("connections", fmt::format("more than {}, and this one was served longest ago", limits.connections));
+  }
+}
+
+/// Of the peer with the most bytes in receipt the request goes that began first.
+void Shared::bound_receipt() {
+  while (n_held > limits.receipt) {
+    const std::string peer = heaviest(connections, [](const Connection& c) { return c.n_held(); });
+    std::shared_ptr<Connection> slowest;
+    for (const auto& [id, connection] : connections)
+      if (connection->peer() == peer && connection->n_held() > 0 &&
+          (!slowest || connection->began() < slowest->began()))
+        slowest = connection;
+    if (!slowest) return;
+    slowest->drop("receipt",
+                  fmt::format("requests in receipt took more than {} bytes, and this one began first", limits.receipt));
+  }
+}
+
+}  // namespace
+
+class Hub::Sockets : public Shared {
+ public:
+  Sockets(const Limits& its_limits, const CurveKeys* its_keys) : Shared{its_limits, its_keys} {}
+  ~Sockets() {
+    for (const std::string& path : paths_) ::unlink(path.c_str());
+    while (!connections.empty()) connections.begin()->second->close();
+    context.restart();
+    context.poll();  // what was cancelled lets go of its connection
+  }
+
+  Result<std::string> bind(const std::string& endpoint) {
+    try {
+      if (endpoint.starts_with("ipc://")) {
+        std::string path = endpoint.substr(6);
+        if (path.front() == '@') {
+          path.front() = '\0';  // an abstract address, which is no file
+        } else {
+          ::unlink(path.c_str());  // that nobody serves it was checked
+          paths_.push_back(path);
+        }
+        locals_.emplace_back(context, Local::endpoint(path));
+        return endpoint;
+      }
+      const auto wanted = tcp_endpoint(endpoint.substr(6));
+      if (!wanted) return cannot_bind(endpoint, error_code(ENODEV, boost::system::system_category()));
+      tcps_.emplace_back(context, *wanted);
+      return text_of(tcps_.back().endpoint());
+    } catch (const boost::system::system_error& error) {
+      return cannot_bind(endpoint, error.code());
+    }
+  }
+
+  void wait(Handler& its_handler, int fd, std::optional<Clock::time_point> until) {
+    handler = &its_handler;
+    try {
+      for (auto& listener : tcps_) listener.listen([this](tcp::socket socket) { add(std::move(socket)); });
+      for (auto& listener : locals_) listener.listen([this](Local::socket socket) { add(std::move(socket)); });
+      watch(fd);
+      sweep_later();
+      context.restart();
+      const auto latest = until.value_or(Clock::time_point::max());
+      is_woken_ = false;
+      context.run_one_until(std::min(latest, Clock::now() + kSweep));
+      for (int n = 0; n < kRound && !is_woken_ && context.poll_one() > 0; ++n) {
+      }
+    } catch (const std::exception&) {  // no memory: what was not begun is begun by the next call
+    }
+  }
+
+  void send(std::uint64_t connection, std::string_view response, bool delimiter) {
+    const auto found = connections.find(connection);
+    if (found != connections.end()) found->second->answer(response, delimiter);
+  }
+
+  bool has_answers() const {
+    return std::any_of(connections.begin(), connections.end(), [](const auto& c) { return c.second->has_answers(); });
+  }
+
+ private:
+  static constexpr int kRound = 64;  // steps of connections before the caller has its turn
+
+  template <class Socket>
+  void add(Socket socket) {
+    set_options(socket);
+    Client client{++n_connection_, peer_of(socket), {}, 0};
+    const auto connection = std::make_shared<Connection>(*this, std::move(socket), std::move(client));
+    connections.emplace(n_connection_, connection);
+    connection->start();
+    make_room();
+  }
+
+  void watch(int fd) {
+    if (!woken_by_) woken_by_.emplace(context, ::dup(fd));
+    if (std::exchange(is_watching_, true)) return;
+    woken_by_->async_wait(asio::posix::stream_descriptor::wait_read, [this](error_code) {
+      is_woken_ = true;
+      is_watching_ = false;
+    });
+  }
+
+  void sweep_later() {
+    if (std::exchange(is_sweeping_, true)) return;
+    sweeper_.expires_after(kSweep);
+    sweeper_.async_wait([this](error_code) {
+      is_sweeping_ = false;
+      const auto all = connections;
+      for (const auto& [id, connection] : all) connection->sweep();
+    });
+  }
+
+  std::list<Listener<tcp>> tcps_;
+  std::list<Listener<Local>> locals_;
+  std::vector<std::string> paths_;
+  std::optional<asio::posix::stream_descriptor> woken_by_;
+  asio::steady_timer sweeper_{context};
+  bool is_watching_ = false, is_woken_ = false, is_sweeping_ = false;
+  std::uint64_t n_connection_ = 0;
+};
+
+Hub::Hub(const Limits& limits, const CurveKeys* keys) : sockets_(std::make_unique<Sockets>(limits, keys)) {}
+Hub::~Hub() = default;
+Result<std::string> Hub::bind(const std::string& endpoint) { return sockets_->bind(endpoint); }
+void Hub::wait(Handler& handler, int fd, std::optional<Clock::time_point> until) { sockets_->wait(handler, fd, until); }
+void Hub::send(std::uint64_t connection, std::string_view response, bool delimiter) {
+  sockets_->send(connection, response, delimiter);
+}
+void Hub::flush(Handler& handler, Clock::time_point until) {
+  while (sockets_->has_answers() && Clock::now() < until) sockets_->wait(handler, -1, until);
+}
+
+}  // namespace vla::serve
