@@ -52,7 +52,9 @@ Result<Reach> reach_of(const std::string& endpoint) {
   const std::size_t colon = endpoint.rfind(':');
   if (!endpoint.starts_with("tcp://") || colon < 7 || !is_port(endpoint.substr(colon + 1))) return refused;
   const std::string host = endpoint.substr(6, colon - 6);
-  if (host == "localhost" || host.find_first_of("; /") != std::string::npos) return refused;  // ZeroMQ binds no names
+  if (host == "localhost" || host.find_first_of("; /") != std::string::npos)
+    return Error{Code::usage, "--bind", "an address or an interface, since names are not looked up", "'" + host + "'",
+                 "for example tcp://127.0.0.1:5555"};
   return reach_of_host(host);
 }
 

@@ -28,7 +28,7 @@ struct Job : Received {
 /// A job with its answer.
 struct Answer {
   Job job;
-  std::string response;  // the serialized Response
+  std::string response;  // the serialized Response; empty where there is an error
   std::optional<Error> error;
   Clock::time_point started, finished;
   Timing stages;

@@ -138,7 +138,9 @@ class Connection : public std::enable_shared_from_this<Connection> {
     read();
   }
   void answer(std::string_view response, bool delimiter) {
-    if (out_.size() < kMaxAnswers) send(session_.pack(response, delimiter));
+    guard([&] {
+      if (out_.size() < kMaxAnswers) send(session_.pack(response, delimiter));
+    });
   }
   void drop(const char* why, const std::string& detail) {
     if (is_closed_) return;
@@ -362,21 +364,23 @@ class Hub::Sockets : public Shared {
 
   void watch(int fd) {
     if (!woken_by_) woken_by_.emplace(context, ::dup(fd));
-    if (std::exchange(is_watching_, true)) return;
+    if (is_watching_) return;
     woken_by_->async_wait(asio::posix::stream_descriptor::wait_read, [this](error_code) {
       is_woken_ = true;
       is_watching_ = false;
     });
+    is_watching_ = true;
   }
 
   void sweep_later() {
-    if (std::exchange(is_sweeping_, true)) return;
+    if (is_sweeping_) return;
     sweeper_.expires_after(kSweep);
     sweeper_.async_wait([this](error_code) {
       is_sweeping_ = false;
       const auto all = connections;
       for (const auto& [id, connection] : all) connection->sweep();
     });
+    is_sweeping_ = true;
   }
 
   std::list<Listener<tcp>> tcps_;

@@ -80,11 +80,17 @@ void Io::received(Client& client, Message message) {
     for (Observer* observer : observers_) observer->received(job);
     handle(client, std::move(job), sound);
   } catch (const std::bad_alloc&) {
-    v1::Response response = response_to(request_id);
-    *response.mutable_error() = encode_error(out_of_memory("request"));
-    hub_.send(connection, response.SerializeAsString(), delimiter);
-    ++vitals_.n_error;
+    answer_without_memory(connection, request_id, delimiter);
   }
+}
+
+/// What was answered otherwise has been freed by now.
+void Io::answer_without_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept try {
+  v1::Response response = response_to(request_id);
+  *response.mutable_error() = encode_error(out_of_memory("request"));
+  hub_.send(connection, response.SerializeAsString(), delimiter);
+  ++vitals_.n_error;
+} catch (const std::exception&) {  // not even for that: the client's patience ends it
 }
 
 void Io::handle(Client& client, Job job, const Status& sound) {
@@ -92,7 +98,8 @@ void Io::handle(Client& client, Job job, const Status& sound) {
   if (job.kind == Kind::act) return queue(std::move(job));
   auto response = answer_now(client, job);
   if (!response) return refuse(std::move(job), response.error());
-  deliver(std::move(job), *response, nullptr);
+  const Clock::time_point at = job.at;
+  deliver({std::move(job), response->SerializeAsString(), std::nullopt, at, at, {}});
 }
 
 Result<v1::Response> Io::answer_now(Client& client, const Job& job) const {
@@ -141,15 +148,15 @@ void Io::queue(Job job) {
 }
 
 void Io::refuse(Job job, const Error& error) {
-  v1::Response response = response_to(job.request_id);
-  *response.mutable_error() = encode_error(error);
-  deliver(std::move(job), response, &error);
+  const Clock::time_point at = job.at;
+  refuse(Answer{std::move(job), {}, error, at, at, {}});
 }
 
-void Io::deliver(Job job, const v1::Response& response, const Error* error) {
-  const Clock::time_point at = job.at;
-  deliver(
-      {std::move(job), response.SerializeAsString(), error ? std::optional<Error>(*error) : std::nullopt, at, at, {}});
+void Io::refuse(Answer answer) {
+  v1::Response response = response_to(answer.job.request_id);
+  *response.mutable_error() = encode_error(*answer.error);
+  answer.response = response.SerializeAsString();
+  deliver(std::move(answer));
 }
 
 /// A peer that is gone, or that does not read and has its share of answers waiting, loses this one; nobody waits for
@@ -174,21 +181,31 @@ void Io::deliver(Answer answer) {
   for (Observer* observer : observers_) observer->answered(answered);
 }
 
-void Io::deliver_waiting() try {
+void Io::deliver_waiting() {
   while (std::optional<Answer> answer = exchange_.take_answer()) {
-    if (answer->response.empty()) {  // there was no memory for it on the other thread
-      v1::Response response = response_to(answer->job.request_id);
-      *response.mutable_error() = encode_error(*answer->error);
-      answer->response = response.SerializeAsString();
+    const std::uint64_t connection = answer->job.connection, request_id = answer->job.request_id;
+    const bool delimiter = answer->job.delimiter;
+    try {
+      if (answer->error) {
+        refuse(std::move(*answer));
+      } else {
+        deliver(std::move(*answer));
+      }
+    } catch (const std::bad_alloc&) {
+      answer_without_memory(connection, request_id, delimiter);
     }
-    deliver(std::move(*answer));
   }
   while (std::optional<Job> job = exchange_.take_late(Clock::now())) {
-    const Error error{Code::late, "act.deadline_ms", fmt::format("its turn within {} ms", *job->envelope.deadline_ms),
-                      "later", "ask less often, or allow more time"};
-    refuse(std::move(*job), error);
+    const std::uint64_t connection = job->connection, request_id = job->request_id;
+    const bool delimiter = job->delimiter;
+    try {
+      const Error error{Code::late, "act.deadline_ms", fmt::format("its turn within {} ms", *job->envelope.deadline_ms),
+                        "later", "ask less often, or allow more time"};
+      refuse(std::move(*job), error);
+    } catch (const std::bad_alloc&) {
+      answer_without_memory(connection, request_id, delimiter);
+    }
   }
-} catch (const std::bad_alloc&) {  // the answer at hand is lost, and the server goes on
 }
 
 }  // namespace vla::serve

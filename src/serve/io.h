@@ -39,9 +39,10 @@ class Io final : public Hub::Handler {
   Result<v1::Response> answer_now(Client& client, const Job& job) const;
   void queue(Job job);
   void refuse(Job job, const Error& error);
-  void deliver(Job job, const v1::Response& response, const Error* error);
+  void refuse(Answer answer);
   void deliver(Answer answer);
   void deliver_waiting();
+  void answer_without_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;
 
   Hub& hub_;
   Exchange& exchange_;

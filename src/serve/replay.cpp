@@ -6,11 +6,14 @@
 #include <fmt/ranges.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstring>
+#include <new>
 #include <zmq.hpp>
 
 #include "serve/envelope.h"
+#include "serve/fields.h"
 
 namespace vla::serve {
 namespace {
@@ -107,30 +110,46 @@ std::string request_again(const std::string& request, const v1::Response& record
   return again.SerializeAsString();
 }
 
-/// One connection to a server, one request at a time.
+/// One connection to a server, one request at a time. A server that is not there, or goes away, is noticed at once and
+/// not when an answer is overdue.
 class Line {
  public:
   Line(const ReplayOptions& options) : options_(options), socket_(context_, zmq::socket_type::dealer) {
     socket_.set(zmq::sockopt::linger, 0);
-    socket_.set(zmq::sockopt::rcvtimeo, options.timeout_ms);
-    socket_.set(zmq::sockopt::sndtimeo, options.timeout_ms);
+    socket_.set(zmq::sockopt::immediate, true);  // nothing is sent before there is a connection
+    socket_.set(zmq::sockopt::sndtimeo, kConnectMs);
+    if (zmq_socket_monitor(socket_.handle(), kMonitor, ZMQ_EVENT_DISCONNECTED) != 0) throw zmq::error_t();
+    monitor_ = zmq::socket_t(context_, zmq::socket_type::pair);
+    monitor_.set(zmq::sockopt::linger, 0);
+    monitor_.connect(kMonitor);
     socket_.connect(options.address);
   }
   Result<v1::Response> ask(const std::string& request) {
+    if (!socket_.send(zmq::buffer(request)))
+      return missing(fmt::format("a server within {} s", kConnectMs / 1000), "is a server running there?");
+    std::array<zmq_pollitem_t, 2> items = {
+        {{socket_.handle(), 0, ZMQ_POLLIN, 0}, {monitor_.handle(), 0, ZMQ_POLLIN, 0}}};
+    zmq_poll(items.data(), static_cast<int>(items.size()), options_.timeout_ms);
     zmq::message_t message;
+    if (!socket_.recv(message, zmq::recv_flags::dontwait))
+      return items[1].revents != 0 ? missing("an answer", "the server ended the connection")
+                                   : missing(fmt::format("an answer within {} s", options_.timeout_ms / 1000), "");
     v1::Response response;
-    if (!socket_.send(zmq::buffer(request)) || !socket_.recv(message))
-      return Error{Code::io, options_.address, fmt::format("an answer within {} s", options_.timeout_ms / 1000), "none",
-                   "is a server running there?"};
     if (!response.ParseFromArray(message.data(), static_cast<int>(message.size())))
       return Error{Code::io, options_.address, "a Response", "bytes that are none"};
     return response;
   }
 
  private:
+  static constexpr int kConnectMs = 5000;
+  static constexpr const char* kMonitor = "inproc://monitor";
+  Error missing(std::string expected, std::string hint) const {
+    return {Code::io, options_.address, std::move(expected), "none", std::move(hint)};
+  }
+
   const ReplayOptions& options_;
   zmq::context_t context_;
-  zmq::socket_t socket_;
+  zmq::socket_t socket_, monitor_;
 };
 
 Result<v1::Description> describe(Line& line) {
@@ -195,6 +214,8 @@ Result<ReplayReport> replay(Recording& recording, const ReplayOptions& options) 
     return report;
   } catch (const zmq::error_t& error) {
     return Error{Code::io, options.address, "an address to connect to", error.what(), "tcp://127.0.0.1:5555 is one"};
+  } catch (const std::bad_alloc&) {
+    return out_of_memory("replay");
   }
 }
 

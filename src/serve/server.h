@@ -47,6 +47,7 @@ class Server {
   v1::Description describe(const Engine& engine) const;
   /// From any thread or signal handler.
   void stop() noexcept;
+  bool is_stopping() const noexcept { return vitals_.stopping; }
   /// From any thread.
   Health health() const { return vitals_.health(exchange_); }
 

@@ -413,6 +413,14 @@ def test_a_recording_is_never_written_over_and_stops_at_its_limit(vla, serve, ta
     assert answer.code == 0, answer.err
 
 
+def test_a_server_that_is_not_there_is_noticed_within_seconds(vla, recording):
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    answer = vla("replay", recording, "--connect", f"tcp://127.0.0.1:{port}")
+    answer.refused("io", "is a server running there?")
+    assert answer.seconds < 30
+
+
 def test_what_is_no_recording_and_a_server_that_is_not_there_are_refused(vla, tmp_path):
     vla("replay", tmp_path).refused("io", "requests.vlarec")
     vla("replay", tmp_path, "--bundle", "x", "--connect", "y").refused("usage")

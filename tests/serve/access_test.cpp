@@ -3,6 +3,7 @@
 //
 // Which addresses the server takes, and whom it lets in.
 #include <cstdio>
+#include <set>
 
 #include "serve/curve.h"
 #include "serve/support.h"
@@ -48,7 +49,11 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   options.curve_secret = prefix + ".server.secret";
   CHECK(serve::Server::open(options).error().where == "--curve-secret");
   options.curve_clients = prefix + ".friend.public";
-  Running running(options);
+  struct Names : serve::Observer {  // who is there, as the server sees it
+    std::set<std::string> peers;
+    void received(const serve::Received& request) override { peers.insert(request.peer); }
+  } names;
+  Running running(options, {&names});
   const auto connect = [&](const std::string& who) {
     auto peer = std::make_unique<Peer>("inproc://nowhere");
     const std::string secret = *serve::read_secret_key(prefix + who + ".secret");
@@ -67,4 +72,8 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   check_serves(*connect(".friend"));
   CHECK_FALSE(stranger->receive(200).has_value());
   CHECK_FALSE(open_text.receive(1).has_value());
+  running.server->stop();
+  CHECK(running.join().ok());
+  const std::string friends_key = *serve::public_key_of(*serve::read_secret_key(prefix + ".friend.secret"));
+  CHECK(names.peers == std::set<std::string>{friends_key});
 }

@@ -82,14 +82,19 @@ struct Sample {
   }
 };
 
-/// One request of HTTP to a monitor of this machine; what comes back until the connection is closed.
-std::string ask_http(const std::string& address, const std::string& request) {
+int connect_http(const std::string& address) {
   sockaddr_in at = {};
   at.sin_family = AF_INET;
   at.sin_port = htons(static_cast<std::uint16_t>(std::stoi(address.substr(address.rfind(':') + 1))));
   at.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
   const int fd = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
   REQUIRE(::connect(fd, reinterpret_cast<const sockaddr*>(&at), sizeof(at)) == 0);
+  return fd;
+}
+
+/// One request to a monitor of this machine; what comes back until the connection is closed.
+std::string ask_http(const std::string& address, const std::string& request) {
+  const int fd = connect_http(address);
   CHECK(::send(fd, request.data(), request.size(), MSG_NOSIGNAL) == static_cast<ssize_t>(request.size()));
   std::string answer;
   std::array<char, 4096> part;
@@ -238,6 +243,21 @@ TEST_CASE("a scrape leaves at least a megabyte of its thread's stack unused") {
   for (int i = 0; i < 20; ++i)  // a server of several threads would take turns
     CHECK(ask_http((*monitor)->address(), "GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n").starts_with("HTTP/1.1 200"));
   CHECK(unused >= std::size_t{1} << 20);
+}
+
+TEST_CASE("two hundred clients that drip their request keep no probe waiting") {
+  const auto monitor =
+      Monitor::open("127.0.0.1:0", false, {[] { return std::string(); }, [] { return std::string(); }});
+  REQUIRE(monitor.ok());
+  std::vector<int> dripping;
+  const auto start = Clock::now();
+  for (int i = 0; i < 200; ++i) {
+    dripping.push_back(connect_http((*monitor)->address()));
+    for (const int fd : dripping) ::send(fd, "G", 1, MSG_NOSIGNAL);
+  }
+  CHECK(ask_http((*monitor)->address(), "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n").starts_with("HTTP/1.1 200"));
+  CHECK(std::chrono::duration<double>(Clock::now() - start).count() < 10);  // in turn they would take minutes
+  for (const int fd : dripping) ::close(fd);
 }
 
 TEST_CASE("a trace is valid JSON, and its stages end before their act does") {

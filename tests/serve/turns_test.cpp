@@ -79,6 +79,39 @@ TEST_CASE("an act whose deadline passes while it waits is answered late, not com
   CHECK(second.ask(hurried).has_chunk());
 }
 
+TEST_CASE("an act is answered late at its deadline, however long the act before it takes") {
+  Held held;
+  auto& [brake, running, first] = held;
+  Peer second(running.address());
+  v1::Request hurried = act_request(golden(), 2);
+  hurried.mutable_act()->set_deadline_ms(50);
+  CHECK(code_of(second.ask(hurried)) == "LATE");  // the engine is still held
+  brake.let_go(1);
+  CHECK(first.receive()->has_chunk());
+}
+
+TEST_CASE("seventy connections of one peer leave a place and a turn to another peer") {
+  Held held;
+  auto& [brake, running, first] = held;
+  const std::string address = running.address().substr(std::string("tcp://").size());
+  std::vector<std::unique_ptr<Peer>> many;
+  for (std::uint64_t i = 0; i < 70; ++i) {
+    many.push_back(std::make_unique<Peer>("tcp://127.0.0.2:0;" + address));
+    many.back()->send(act_request(golden(), 100 + i));
+  }
+  v1::Request health = request_of(9);
+  health.mutable_health();
+  while (first.ask(health).health().queue_depth() < 64) {
+  }
+  Peer one(running.address());
+  one.send(act_request(golden(), 2));
+  CHECK(one.ask(health).health().queue_depth() == 64);  // the act before it on this connection is in line
+  brake.let_go(3);                                      // the first act, one of the many, and this one
+  CHECK(one.receive()->has_chunk());
+  brake.let_go(100);
+  CHECK(first.receive()->has_chunk());
+}
+
 TEST_CASE("a full queue answers busy to a further client, and those that wait are still served") {
   serve::ServerOptions options;
   options.max_queue = 1;
