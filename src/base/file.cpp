@@ -2,12 +2,42 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "base/file.h"
 
+#include <fcntl.h>
 #include <fmt/format.h>
+#include <unistd.h>
 
+#include <cerrno>
+#include <cstring>
 #include <filesystem>
 #include <fstream>
+#include <random>
 
 namespace vla {
+namespace {
+
+/// False with errno where the system does not take all of them.
+bool write_all(int fd, std::span<const std::byte> bytes) {
+  while (!bytes.empty()) {
+    const ssize_t n = ::write(fd, bytes.data(), bytes.size());
+    if (n < 0 && errno != EINTR) return false;
+    if (n > 0) bytes = bytes.subspan(static_cast<std::size_t>(n));
+  }
+  return true;
+}
+
+Error cannot_write(const std::string& path, int number) {
+  return {Code::io, path, "a file that can be written", std::strerror(number)};
+}
+
+Status write_in_place(const std::string& path, std::span<const std::byte> bytes) {
+  const int fd = ::open(path.c_str(), O_WRONLY | O_CLOEXEC);
+  const bool written = fd >= 0 && write_all(fd, bytes);
+  const int number = errno;
+  if (fd >= 0 && ::close(fd) != 0 && written) return cannot_write(path, errno);
+  return written ? Status() : cannot_write(path, number);
+}
+
+}  // namespace
 
 Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t limit) {
   std::error_code error;
@@ -21,6 +51,32 @@ Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t li
   stream.read(reinterpret_cast<char*>(bytes.data()), static_cast<std::streamsize>(size));
   if (!stream) return Error{Code::io, path, "a readable file", "an error while reading"};
   return bytes;
+}
+
+Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode) {
+  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode);
+  if (fd < 0) return cannot_write(path, errno);
+  bool written = write_all(fd, bytes) && ::fsync(fd) == 0;
+  int number = errno;
+  if (::close(fd) != 0 && written) written = false, number = errno;
+  if (written) return {};
+  ::unlink(path.c_str());
+  return cannot_write(path, number);
+}
+
+Status write_file(const std::string& path, std::span<const std::byte> bytes) {
+  std::error_code ignored;
+  const auto there = std::filesystem::status(path, ignored);
+  if (std::filesystem::exists(there) && !std::filesystem::is_regular_file(there)) return write_in_place(path, bytes);
+  const bool is_link = std::filesystem::is_symlink(std::filesystem::symlink_status(path, ignored));
+  const std::string target = is_link ? std::filesystem::weakly_canonical(path, ignored).string() : path;
+  const std::string part = fmt::format("{}.{:08x}.part", target, std::random_device()());
+  if (const Status written = write_new_file(part, bytes, 0666); !written)
+    return Error{Code::io, path, written.error().expected, written.error().found};
+  if (::rename(part.c_str(), target.c_str()) == 0) return {};
+  const int number = errno;
+  ::unlink(part.c_str());
+  return cannot_write(path, number);
 }
 
 }  // namespace vla

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstddef>
+#include <span>
 #include <string>
 #include <vector>
 
@@ -12,5 +13,14 @@ namespace vla {
 
 /// The bytes of a regular file of at most `limit` bytes. Errors: io, naming the path.
 Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t limit);
+
+/// Writes a file that is not there yet, whole or not at all. Errors: io.
+Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode);
+/// Writes a file whole or not at all: the bytes go into a new file beside it, which takes its name when all of them are
+/// on the disk. What is no regular file, such as a pipe, is written to as it is. Errors: io.
+Status write_file(const std::string& path, std::span<const std::byte> bytes);
+inline Status write_file(const std::string& path, const std::string& text) {
+  return write_file(path, std::as_bytes(std::span(text)));
+}
 
 }  // namespace vla

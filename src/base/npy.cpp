@@ -6,8 +6,9 @@
 
 #include <charconv>
 #include <cstring>
-#include <fstream>
 #include <string_view>
+
+#include "base/file.h"
 
 namespace vla {
 namespace {
@@ -91,14 +92,10 @@ Status write_npy(const std::string& path, std::span<const float> values, std::si
   header.append(63 - (kMagic.size() + 4 + header.size()) % 64, ' ');  // the data starts at a multiple of 64
   header += '\n';
   const auto length = static_cast<std::uint16_t>(header.size());
-  std::ofstream file(path, std::ios::binary);
-  file << kMagic << '\x01' << '\0';
-  file.write(reinterpret_cast<const char*>(&length), 2);
-  file << header;
-  file.write(reinterpret_cast<const char*>(values.data()), static_cast<std::streamsize>(values.size_bytes()));
-  file.close();
-  if (file) return {};
-  return Error{Code::io, path, "a file that can be written", "an error while writing"};
+  std::string bytes = std::string(kMagic).append("\x01\0", 2);
+  bytes.append(reinterpret_cast<const char*>(&length), 2).append(header);
+  bytes.append(reinterpret_cast<const char*>(values.data()), values.size_bytes());
+  return write_file(path, bytes);
 }
 
 }  // namespace vla

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <fstream>
 #include <string_view>
 
 #include "base/file.h"
@@ -65,11 +64,7 @@ Status write_taps(const std::vector<Tap>& taps, const std::string& file) {
   std::vector<TensorInfo> tensors;
   for (const Tap& tap : taps)
     tensors.push_back({tap.path, DType::f32, tap.shape, std::as_bytes(std::span(tap.values))});
-  std::ofstream stream(file, std::ios::binary);
-  stream << write_gguf(keys, tensors);
-  stream.close();
-  if (stream) return {};
-  return Error{Code::io, file, "a file that can be written", "an error while writing"};
+  return write_file(file, write_gguf(keys, tensors));
 }
 
 Result<std::vector<Tap>> read_taps(const std::string& file) {

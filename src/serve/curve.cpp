@@ -33,18 +33,12 @@ Result<std::string> read_text(const std::string& file) {
   return std::string(reinterpret_cast<const char*>(bytes.data()), bytes.size());
 }
 
-/// Creates the file or fails: a key that others use is never lost.
-Status write_new(const std::string& file, const char* key, mode_t mode) {
-  const auto failed = [&] {
-    const std::string hint = errno == EEXIST ? "name another prefix, or remove the old keys" : "";
-    return Error{Code::io, file, "a new file", std::strerror(errno), hint};
-  };
-  const int fd = ::open(file.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode);
-  if (fd < 0) return failed();
+/// A key that others use is never lost.
+Status write_key(const std::string& file, const char* key, unsigned mode) {
   const std::string line = std::string(key) + "\n";
-  const bool written = ::write(fd, line.data(), line.size()) == static_cast<ssize_t>(line.size());
-  const bool closed = ::close(fd) == 0;
-  return written && closed ? Status() : Status(failed());
+  if (const Status written = write_new_file(file, std::as_bytes(std::span(line)), mode); !written)
+    return Error{Code::io, file, "a new file", written.error().found, "name another prefix, or remove the old keys"};
+  return {};
 }
 
 }  // namespace
@@ -57,8 +51,10 @@ Status write_key_pair(const std::string& prefix) {
   if (::stat((prefix + ".public").c_str(), &there) == 0)
     return Error{Code::io, prefix + ".public", "a new file", "File exists",
                  "name another prefix, or remove the old keys"};
-  VLA_CHECK(write_new(prefix + ".secret", secret_key.data(), 0600));
-  return write_new(prefix + ".public", public_key.data(), 0644);
+  VLA_CHECK(write_key(prefix + ".secret", secret_key.data(), 0600));
+  const Status written = write_key(prefix + ".public", public_key.data(), 0644);
+  if (!written) ::unlink((prefix + ".secret").c_str());  // half a pair is of no use
+  return written;
 }
 
 Result<std::string> read_secret_key(const std::string& file) {

@@ -34,21 +34,22 @@ std::string_view text_of(std::span<const std::byte> bytes) {
   return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
 }
 
-/// The fields of a message in the order of their numbers, from 1: v varint, b bytes, t text, f floats (packed or not),
-/// and a digit for a message, the index of its own row.
+/// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, f floats
+/// (packed or not), and a digit for a message, the index of its own row.
 constexpr std::array<const char*, 7> kFields = {
     "15t3vvv",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms
     "t2bb4",    // 1 View: name, rgb, jpeg, png, absent
-    "vvb",      // 2 RawRgb: width, height, rows
-    "vvf",      // 3 Noise: horizon, d_action, values
+    "uub",      // 2 RawRgb: width, height, rows
+    "uuf",      // 3 Noise: horizon, d_action, values
     "",         // 4 Absent
     "tf",       // 5 State: name, values
-    "vvtt",     // 6 Hello: min_version, max_version, client_name, client_version
+    "uutt",     // 6 Hello: min_version, max_version, client_name, client_version
 };
 
 /// Whether a field that was read is encoded as its type says.
 bool fits(const Fields& field, char type) {
   if (type == 'v') return field.type == 'v';
+  if (type == 'u') return field.type == 'v' && field.varint <= ~std::uint32_t{0};  // Protobuf would cut it off
   return field.type == 'b' || (type == 'f' && field.type == 'f');
 }
 

@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
+
 #include "serve/fields.h"
 #include "serve/vla.pb.h"
 
@@ -32,7 +34,7 @@ Status read_request(std::span<const std::byte> request, Envelope& envelope) {
     VLA_TRY(const bool more, field.next());
     if (!more) break;
     if (field.number == v1::Request::kProtocolVersionFieldNumber && field.type == 'v') {
-      envelope.version = static_cast<std::uint32_t>(field.varint);
+      envelope.version = static_cast<std::uint32_t>(std::min<std::uint64_t>(field.varint, ~std::uint32_t{0}));
     } else if (field.number == v1::Request::kRequestIdFieldNumber && field.type == 'v') {
       envelope.request_id = field.varint;
     } else if (kind_of(field.number) != Kind::unknown && field.type == 'b') {

@@ -58,11 +58,15 @@ std::string_view text(std::span<const std::byte> bytes) {
 
 Result<std::unique_ptr<Recorder>> Recorder::open(const std::string& folder, std::uint64_t max_bytes) {
   std::error_code failed;
-  std::filesystem::create_directories(folder, failed);
+  if (std::filesystem::create_directories(folder, failed))
+    std::filesystem::permissions(folder, std::filesystem::perms::owner_all, failed);
   if (failed) return Error{Code::io, folder, "a folder that can be made", failed.message()};
-  std::string path = folder + "/" + kRecordingFile;
+  const std::string path = folder + "/" + kRecordingFile;
   VLA_TRY(const int fd, open_to_write(path, true));
-  return std::unique_ptr<Recorder>(new Recorder(std::move(path), fd, max_bytes));
+  std::unique_ptr<Recorder> recorder(new Recorder(path, fd, max_bytes));
+  if (const int failure = recorder->writer_.failure(); failure != 0)
+    return Error{Code::io, path, "a thread to write it", std::strerror(failure)};
+  return recorder;
 }
 
 Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
@@ -118,9 +122,12 @@ Error Recording::damaged(const std::string& expected, const std::string& found) 
 Result<Recording> Recording::open(const std::string& folder) {
   Recording recording(folder + "/" + kRecordingFile);
   std::error_code failed;
-  recording.size_ = std::filesystem::file_size(recording.path_, failed);
-  recording.file_.open(recording.path_, std::ios::binary);
-  if (failed || !recording.file_)
+  const bool is_file = std::filesystem::is_regular_file(recording.path_, failed);  // a pipe would be waited for
+  if (is_file) {
+    recording.size_ = std::filesystem::file_size(recording.path_, failed);
+    recording.file_.open(recording.path_, std::ios::binary);
+  }
+  if (!is_file || failed || !recording.file_)
     return Error{Code::io, recording.path_, "a recording of vla serve --record", "no file that can be read"};
   std::array<char, kMagic.size()> magic = {};
   recording.file_.read(magic.data(), magic.size());

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <exception>
 
 namespace vla::serve {
@@ -41,7 +42,10 @@ std::string on_engine(const std::string& name, std::int64_t from, std::int64_t t
 
 Result<std::unique_ptr<Trace>> Trace::open(const std::string& path) {
   VLA_TRY(const int fd, open_to_write(path, false));
-  return std::unique_ptr<Trace>(new Trace(fd));
+  std::unique_ptr<Trace> trace(new Trace(fd));
+  if (const int failure = trace->writer_.failure(); failure != 0)
+    return Error{Code::io, path, "a thread to write it", std::strerror(failure)};
+  return trace;
 }
 
 Trace::Trace(int fd) : writer_(fd, Writer::Owns::yes, kMaxWaiting) {

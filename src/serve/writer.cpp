@@ -4,16 +4,16 @@
 
 #include <fcntl.h>
 #include <poll.h>
-#include <pthread.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
 #include <climits>
-#include <csignal>
 #include <cstring>
 #include <new>
+
+#include "base/thread.h"
 
 namespace vla::serve {
 namespace {
@@ -24,7 +24,8 @@ constexpr int kPollMs = 100;
 }  // namespace
 
 Result<int> open_to_write(const std::string& path, bool fresh) {
-  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_CLOEXEC | (fresh ? O_EXCL : O_TRUNC), 0644);
+  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_CLOEXEC | O_NONBLOCK | (fresh ? O_EXCL : O_TRUNC), 0600);
+  if (fd >= 0 && !fresh && ::fchmod(fd, 0600) != 0) errno = 0;  // of another user's file: as it is
   if (fd >= 0) return fd;
   if (errno == EEXIST) return Error{Code::io, path, "no such file yet", "one", "name another place, or remove it"};
   return Error{Code::io, path, "a file that can be written", std::strerror(errno)};
@@ -33,11 +34,12 @@ Result<int> open_to_write(const std::string& path, bool fresh) {
 Writer::Writer(int fd, Owns owns, std::size_t max_waiting) : fd_(fd), owns_(owns), max_waiting_(max_waiting) {
   struct stat info;
   is_file_ = ::fstat(fd, &info) == 0 && S_ISREG(info.st_mode) && owns == Owns::yes;
-  sigset_t all, before;  // a reader that is gone must be an error here, not a SIGPIPE that ends the program
-  sigfillset(&all);
-  pthread_sigmask(SIG_SETMASK, &all, &before);
-  thread_ = std::thread([this] { run(); });
-  pthread_sigmask(SIG_SETMASK, &before, nullptr);
+  auto thread = start_thread("writer", [this] { run(); });
+  if (thread) {
+    thread_ = std::move(*thread);
+  } else {
+    failure_ = EAGAIN;
+  }
 }
 
 Writer::~Writer() {
@@ -47,7 +49,7 @@ Writer::~Writer() {
     closing_since_ = std::chrono::steady_clock::now();
   }
   changed_.notify_one();
-  thread_.join();
+  if (thread_.joinable()) thread_.join();
   write_all(tail_);
   if (owns_ == Owns::yes) ::close(fd_);
 }

@@ -15,7 +15,8 @@
 
 namespace vla::serve {
 
-/// Opens a file to be written from its start, which must not exist yet where `fresh`. Errors: io.
+/// Opens a file to be written from its start, which must not exist yet where `fresh`. Only its owner may read it, since
+/// it tells what a robot sees and does. Errors: io.
 Result<int> open_to_write(const std::string& path, bool fresh);
 
 /// Writes to a file or a pipe from a thread of its own, so that whoever has something to write never waits for a disk
@@ -23,7 +24,8 @@ Result<int> open_to_write(const std::string& path, bool fresh);
 class Writer {
  public:
   enum class Owns { no, yes };
-  /// `fd` is closed at the end where it is owned. At most `max_waiting` bytes wait.
+  /// `fd` is closed at the end where it is owned. At most `max_waiting` bytes wait. Without a thread it has failed from
+  /// the start. A reader that is gone is a failure too, not a signal.
   Writer(int fd, Owns owns, std::size_t max_waiting);
   /// Writes what waits, then `tail`, for as long as somebody reads.
   ~Writer();

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the programs write: whole or not at all, and readable by those only whom it concerns."""
+
+import os
+import resource
+import signal
+import stat
+import subprocess
+
+import numpy as np
+import pytest
+import wire
+from serve_test import Server
+
+LOCAL = ("--bind", "tcp://127.0.0.1:0", "--threads", "1")
+MODE = 0o777
+
+
+def mode(path):
+    return stat.S_IMODE(path.stat().st_mode) & MODE
+
+
+def limited(vla, size, *args):
+    """Runs with a limit on the size of files: what a full disk does, where nobody may mount one."""
+    return subprocess.run(
+        [vla.path, *map(str, args)], env=vla.environment, capture_output=True, text=True, timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("option", ["--out", "--taps-out"])
+def test_an_output_that_does_not_fit_leaves_the_old_file_and_nothing_else(vla, golden, tmp_path, option):
+    path = tmp_path / "out"
+    path.write_bytes(b"before")
+    options = (option, path) + (("--tap", "*") if option == "--taps-out" else ())
+    full = limited(vla, 100, *golden.arguments(options=options))
+    assert full.returncode == 9 and full.stderr.startswith(f"error: io: {path}: ") and full.stdout == ""
+    assert path.read_bytes() == b"before" and os.listdir(tmp_path) == ["out"]
+
+
+def test_an_output_takes_the_place_of_a_file_behind_a_link_and_is_written_into_a_pipe(vla, golden, tmp_path):
+    target, link, pipe = tmp_path / "target", tmp_path / "link", tmp_path / "pipe"
+    target.write_bytes(b"before")
+    link.symlink_to(target)
+    assert vla(*golden.arguments(options=("--out", link))).code == 0
+    assert link.is_symlink() and np.load(target).dtype == np.float32
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    assert vla(*golden.arguments(options=("--out", pipe))).code == 0
+    assert os.read(reader, 1 << 20) == target.read_bytes()
+    os.close(reader)
+
+
+def test_a_key_that_does_not_fit_leaves_no_file(vla, tmp_path):
+    full = limited(vla, 10, "keygen", tmp_path / "key")
+    assert full.returncode == 9 and os.listdir(tmp_path) == []
+
+
+def test_recordings_and_traces_are_for_their_owner_only(vla, golden, tmp_path):
+    trace = tmp_path / "trace.json"
+    trace.write_text("before")
+    trace.chmod(0o644)
+    server = Server(vla, golden.bundle, *LOCAL, "--record", tmp_path / "recording", "--trace", trace)
+    try:
+        peer = wire.Peer(server.ready["address"])
+        peer.ask(wire.health(1))
+        peer.close()
+        assert mode(tmp_path / "recording") == 0o700
+        assert mode(tmp_path / "recording/requests.vlarec") == 0o600
+        assert mode(trace) == 0o600
+        assert server.stop(signal.SIGTERM)[0] == 0
+    finally:
+        server.process.kill()
+
+
+def test_a_recording_that_is_a_pipe_is_refused_at_once(vla, tmp_path):
+    os.mkfifo(tmp_path / "requests.vlarec")
+    answer = vla("replay", tmp_path)
+    answer.refused("io", "requests.vlarec")
+    assert answer.seconds < 20
+
+
+def test_a_second_signal_ends_a_server_at_once_though_it_is_another_one(vla, golden):
+    server = Server(vla, golden.bundle, *LOCAL)
+    try:
+        server.process.send_signal(signal.SIGSTOP)  # so that both have come before the server can be done
+        server.process.send_signal(signal.SIGINT)
+        server.process.send_signal(signal.SIGTERM)
+        server.process.send_signal(signal.SIGCONT)
+        assert server.process.wait(20) in (-signal.SIGINT, -signal.SIGTERM)
+    finally:
+        server.process.kill()
+        server.process.communicate()
