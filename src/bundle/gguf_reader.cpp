@@ -4,9 +4,14 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cstring>
+#include <iterator>
 #include <limits>
 #include <set>
+#include <string_view>
+
+#include "base/printable.h"
 
 namespace vla {
 namespace {
@@ -152,12 +157,32 @@ Result<Value> read_value(Cursor& cursor, const std::string& what) {
   return cursor.bad(what, "a GGUF value type from 0 to 12", std::to_string(type));
 }
 
+/// Names are shown to people and told to clients: nothing in one may act on a terminal or begin a line.
+Status check_shown(const Cursor& cursor, const std::string& what, const std::string& text) {
+  return is_printable(text) ? Status()
+                            : cursor.bad(printable(what), "text without control characters", printable(text));
+}
+
+/// What is told of a bundle: where it is from, and how features, numbers and units are called.
+Status check_shown(const Cursor& cursor, const std::string& key, const Value& value) {
+  constexpr std::string_view kShown[] = {"general.", "vla.", "observation.", "action."};
+  if (std::none_of(std::begin(kShown), std::end(kShown),
+                   [&](std::string_view prefix) { return key.starts_with(prefix); }))
+    return {};
+  if (const auto* text = std::get_if<std::string>(&value)) return check_shown(cursor, key, *text);
+  if (const auto* list = std::get_if<std::vector<std::string>>(&value))
+    for (const std::string& text : *list) VLA_CHECK(check_shown(cursor, key, text));
+  return {};
+}
+
 Result<Keys> read_keys(Cursor& cursor, std::uint64_t count) {
   Keys keys;
   for (std::uint64_t i = 0; i < count; ++i) {
     VLA_TRY(std::string key, cursor.text(kMaxNameLength, fmt::format("key {} of {}", i + 1, count)));
+    VLA_CHECK(check_shown(cursor, fmt::format("key {} of {}", i + 1, count), key));
     if (keys.has(key)) return cursor.bad(key, "one value", "the key a second time");
     VLA_TRY(Value value, read_value(cursor, key));
+    VLA_CHECK(check_shown(cursor, key, value));
     keys.set(std::move(key), std::move(value));
   }
   return keys;
@@ -188,6 +213,7 @@ struct PlacedTensor {
 Result<PlacedTensor> read_tensor(Cursor& cursor, std::uint64_t file_size, const std::string& which) {
   PlacedTensor tensor;
   VLA_TRY(tensor.info.name, cursor.text(kMaxNameLength, which));
+  VLA_CHECK(check_shown(cursor, which, tensor.info.name));
   const std::string what = "tensor " + tensor.info.name;
   VLA_TRY(const std::uint32_t n_dims, cursor.scalar<std::uint32_t>(what));
   if (n_dims < 1 || n_dims > kMaxDims) return cursor.bad(what, "1 to 4 dimensions", std::to_string(n_dims));

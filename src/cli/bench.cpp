@@ -3,13 +3,14 @@
 #include <fmt/format.h>
 
 #include <charconv>
-#include <fstream>
 #include <iostream>
 
+#include "base/file.h"
 #include "bench/bench.h"
 #include "bench/roofline.h"
 #include "bench/versus.h"
 #include "cli/commands.h"
+#include "cli/say.h"
 
 namespace vla::cli {
 namespace {
@@ -51,12 +52,6 @@ DType dtype_of(const std::string& name) {
   return DType::bf16;
 }
 
-Status write_text(const std::string& path, const std::string& text) {
-  std::ofstream file(path, std::ios::binary);
-  if (file << text << std::flush) return {};
-  return Error{Code::io, path, "a file that can be written", "the system refused it"};
-}
-
 Status wait_for_line() {
   std::string line;
   if (std::getline(std::cin, line)) return {};
@@ -75,17 +70,17 @@ Status run_bench(const BenchOptions& options) {
     VLA_TRY(earlier, bench::Earlier::read(options.vs));
   }
   const auto accept = [&](const bench::Conditions& now) { return earlier ? earlier->check(now) : Status(); };
-  const bench::Watcher watcher = {[](const std::string& line) { fmt::print(stderr, "{}\n", line); },
+  const bench::Watcher watcher = {[](const std::string& line) { say(stderr, "{}\n", line); },
                                   [&] { return options.paced ? wait_for_line() : Status(); }};
   VLA_TRY(const bench::Report report, bench::measure(request, accept, watcher));
-  if (!options.plot.empty()) VLA_CHECK(write_text(options.plot, draw_roofline(report)));
+  if (!options.plot.empty()) VLA_CHECK(write_file(options.plot, draw_roofline(report)));
   if (options.json) {
-    if (earlier) fmt::print(stderr, "{}", earlier->compare(report));
-    fmt::print("{}\n", to_json(report));
+    if (earlier) say_lines(stderr, earlier->compare(report));
+    say_lines(stdout, to_json(report) + "\n");
     return {};
   }
-  fmt::print("{}", options.markdown ? to_markdown(report) : to_text(report));
-  if (earlier) fmt::print("\n{}", earlier->compare(report));
+  say_lines(stdout, options.markdown ? to_markdown(report) : to_text(report));
+  if (earlier) say_lines(stdout, "\n" + earlier->compare(report));
   return {};
 }
 

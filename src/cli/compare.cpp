@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "cli/commands.h"
+#include "cli/say.h"
 #include "engine/taps.h"
 
 namespace vla::cli {
@@ -17,8 +18,8 @@ struct CompareOptions {
 
 void print_row(const TapDifference& d, double tolerance, bool is_first_failure, std::size_t width) {
   const char* verdict = d.within(tolerance) ? "ok" : (d.comparable ? "FAIL" : "FAIL (shape, or not finite)");
-  fmt::print("{:<{}}  {:>9.2e}  {:>9.2e}  {:.8f}  {}{}\n", d.path, width, d.max_abs, d.relative, d.cosine, verdict,
-             is_first_failure ? "  <- start here" : "");
+  say(stdout, "{:<{}}  {:>9.2e}  {:>9.2e}  {:.8f}  {}{}\n", d.path, width, d.max_abs, d.relative, d.cosine, verdict,
+      is_first_failure ? "  <- start here" : "");
 }
 
 Status compare(const CompareOptions& options) {
@@ -33,16 +34,16 @@ Status compare(const CompareOptions& options) {
 
   std::size_t width = 4;
   for (const TapDifference& row : rows) width = std::max(width, row.path.size());
-  fmt::print("{:<{}}  {:>9}  {:>9}  {:<10}  tolerance {:g} of the largest magnitude\n", "path", width, "max_abs",
-             "relative", "cosine", options.tolerance);
+  say(stdout, "{:<{}}  {:>9}  {:>9}  {:<10}  tolerance {:g} of the largest magnitude\n", "path", width, "max_abs",
+      "relative", "cosine", options.tolerance);
   std::size_t n_failed = 0;
   for (const TapDifference& row : rows) {
     const bool failed = !row.within(options.tolerance);
     print_row(row, options.tolerance, failed && n_failed == 0, width);
     n_failed += failed;
   }
-  fmt::print("{} of {} taps within {:g}; {} of {} expected taps were not recorded\n", rows.size() - n_failed,
-             rows.size(), options.tolerance, n_missing, expected.size());
+  say(stdout, "{} of {} taps within {:g}; {} of {} expected taps were not recorded\n", rows.size() - n_failed,
+      rows.size(), options.tolerance, n_missing, expected.size());
   if (n_failed == 0) return {};
   const auto first =
       std::find_if(rows.begin(), rows.end(), [&](const TapDifference& row) { return !row.within(options.tolerance); });

@@ -7,6 +7,7 @@
 
 #include "cli/commands.h"
 #include "cli/json.h"
+#include "cli/say.h"
 #include "engine/description.h"
 
 namespace vla::cli {
@@ -63,7 +64,7 @@ Status print_manifest(const std::string& arch) {
     row["storage"] = storage_name(param.storage);
     root["parameters"].push_back(std::move(row));
   }
-  fmt::print("{}\n", text_of(root, 2));
+  say_lines(stdout, text_of(root, 2) + "\n");
   return {};
 }
 
@@ -88,63 +89,63 @@ StatsColumns read_stats(const Bundle& bundle, const std::string& feature) {
 void print_numbers(const std::vector<Description::Number>& numbers, const StatsColumns& stats) {
   std::size_t width = 4;
   for (const auto& number : numbers) width = std::max(width, number.name.size());
-  fmt::print("    {:<{}}  {:<10}", "name", width, "unit");
-  for (const std::string& column : stats.names) fmt::print("  {:>12}", column);
-  fmt::print("\n");
+  say(stdout, "    {:<{}}  {:<10}", "name", width, "unit");
+  for (const std::string& column : stats.names) say(stdout, "  {:>12}", column);
+  say(stdout, "\n");
   for (std::size_t i = 0; i < numbers.size(); ++i) {
-    fmt::print("    {:<{}}  {:<10}", numbers[i].name, width, numbers[i].unit.empty() ? "unstated" : numbers[i].unit);
-    for (const auto& column : stats.values) fmt::print("  {:>12.6g}", i < column.size() ? column[i] : 0.0f);
-    fmt::print("\n");
+    say(stdout, "    {:<{}}  {:<10}", numbers[i].name, width, numbers[i].unit.empty() ? "unstated" : numbers[i].unit);
+    for (const auto& column : stats.values) say(stdout, "  {:>12.6g}", i < column.size() ? column[i] : 0.0f);
+    say(stdout, "\n");
   }
 }
 
 void print_features(const Description& d, const Engine& engine) {
   constexpr const char* kFits[] = {"letterboxed", "resized", "padded, scaled and cropped as the recipe says"};
   const Recipe& recipe = engine.processor().recipe();
-  fmt::print("views        any size, {} to {} x {}; at least {} of {} must be present\n", kFits[recipe.fit.index()],
-             recipe.width, recipe.height, d.min_views, d.views.size());
+  say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", kFits[recipe.fit.index()],
+      recipe.width, recipe.height, d.min_views, d.views.size());
   for (const auto& view : d.views)
-    fmt::print("    {}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias));
+    say(stdout, "    {}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias));
   for (const auto& state : d.states) {
-    fmt::print("state        {}, {} numbers\n", state.name, state.numbers.size());
+    say(stdout, "state        {}, {} numbers\n", state.name, state.numbers.size());
     print_numbers(state.numbers, read_stats(engine.bundle(), state.name));
   }
-  fmt::print("action       {} rows of {} numbers{}\n", d.horizon, d.actions.size(),
-             d.rate_hz > 0 ? fmt::format(", {:g} rows a second", d.rate_hz) : ", control rate unstated");
+  say(stdout, "action       {} rows of {} numbers{}\n", d.horizon, d.actions.size(),
+      d.rate_hz > 0 ? fmt::format(", {:g} rows a second", d.rate_hz) : ", control rate unstated");
   print_numbers(d.actions, read_stats(engine.bundle(), "action"));
-  fmt::print("instruction  at most {} tokens\n", d.max_text_tokens);
+  say(stdout, "instruction  at most {} tokens\n", d.max_text_tokens);
 }
 
 void print_modules(const Engine& engine) {
-  fmt::print("modules      {:<18}  {:>14}  {:>10}\n", "path", "parameters", "stored");
+  say(stdout, "modules      {:<18}  {:>14}  {:>10}\n", "path", "parameters", "stored");
   std::int64_t n_param = 0;
   for (const auto& [path, size] : module_sizes(engine.params())) {
-    fmt::print("             {:<18}  {:>14}  {:>10}\n", path, fmt::format("{}", size.n_param),
-               human_size(static_cast<double>(size.stored)));
+    say(stdout, "             {:<18}  {:>14}  {:>10}\n", path, fmt::format("{}", size.n_param),
+        human_size(static_cast<double>(size.stored)));
     n_param += size.n_param;
   }
-  fmt::print("             {:<18}  {:>14}\n", "all", n_param);
+  say(stdout, "             {:<18}  {:>14}\n", "all", n_param);
 }
 
 void print_human(const Engine& engine) {
   const Description d = describe(engine);
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
-  fmt::print("bundle       {}\n", d.path);
-  fmt::print("policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(engine.bundle().file_size()));
-  fmt::print("source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
-             d.converter);
-  fmt::print("checksum     {}\n", d.checksum);
+  say(stdout, "bundle       {}\n", d.path);
+  say(stdout, "policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(engine.bundle().file_size()));
+  say(stdout, "source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
+      d.converter);
+  say(stdout, "checksum     {}\n", d.checksum);
   print_features(d, engine);
-  fmt::print("solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
+  say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
   const Json recipe = Json::parse(*engine.bundle().keys().string("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {
-    fmt::print("recipe       {}\n", list);
-    for (const Json& op : ops) fmt::print("    {}\n", text_of(op));
+    say(stdout, "recipe       {}\n", list);
+    for (const Json& op : ops) say(stdout, "    {}\n", text_of(op));
   }
   print_modules(engine);
-  fmt::print("products     {}: {}\n", engine.linear_kernels(), engine.arithmetic());
-  fmt::print("memory       {} in all: weights {}, inputs and cache {}, working memory {}\n", size(d.memory.total()),
-             size(d.memory.weights), size(d.memory.plan), size(d.memory.working));
+  say(stdout, "products     {}: {}\n", engine.linear_kernels(), engine.arithmetic());
+  say(stdout, "memory       {} in all: weights {}, inputs and cache {}, working memory {}\n", size(d.memory.total()),
+      size(d.memory.weights), size(d.memory.plan), size(d.memory.working));
 }
 
 void print_json(const Engine& engine) {
@@ -166,7 +167,7 @@ void print_json(const Engine& engine) {
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
-  fmt::print("{}\n", text_of(root, 2));
+  say_lines(stdout, text_of(root, 2) + "\n");
 }
 
 Status inspect(const InspectOptions& options) {

@@ -15,7 +15,7 @@ using Json =
 /// One line, or indented lines. Bytes that are not UTF-8, as a path may have them, become U+FFFD: JSON cannot hold
 /// them.
 inline std::string text_of(const Json& json, int indent = -1) {
-  return json.dump(indent, ' ', false, Json::error_handler_t::replace);
+  return json.dump(indent, ' ', true, Json::error_handler_t::replace);
 }
 
 /// Which bundle answered: path, architecture, dtype, source and checksum.

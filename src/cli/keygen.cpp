@@ -3,6 +3,7 @@
 #include <fmt/format.h>
 
 #include "cli/commands.h"
+#include "cli/say.h"
 #include "serve/curve.h"
 
 namespace vla::cli {
@@ -17,7 +18,7 @@ Command add_keygen(CLI::App& app) {
   command->add_option("PREFIX", *prefix, "Writes PREFIX.secret and PREFIX.public; neither may exist")->required();
   return [prefix]() -> Status {
     VLA_CHECK(serve::write_key_pair(*prefix));
-    fmt::print("{0}.secret\n{0}.public\n", *prefix);
+    say(stdout, "{0}.secret\n{0}.public\n", *prefix);
     return {};
   };
 }

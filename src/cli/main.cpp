@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <csignal>
 #include <cstdio>
 #include <cstring>
 #include <exception>
@@ -13,6 +14,7 @@
 #include <system_error>
 
 #include "cli/commands.h"
+#include "cli/say.h"
 
 namespace {
 
@@ -24,8 +26,12 @@ Bundles are made with vla-convert (docs/converting.md).
 Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation, 5 bad_action, 6 unsupported, 7 out_of_memory,
 8 device, 9 io, 10 mismatch; 11 and up are answers of a server (docs/protocol.md).)";
 
+/// Further lines of an error are indented; a line end in a text that it quotes is none.
 int fail(const vla::Error& error) {
-  fmt::print(stderr, "error: {}: {}\n", vla::code_name(error.code), error.message());
+  std::string message = error.message();
+  for (std::size_t at = 0; (at = message.find('\n', at)) != std::string::npos; ++at)
+    if (message.compare(at + 1, 2, "  ") != 0) message.replace(at, 1, "\\x0a");
+  vla::cli::say_lines(stderr, fmt::format("error: {}: {}\n", vla::code_name(error.code), message));
   return vla::exit_code(error.code);
 }
 
@@ -76,7 +82,8 @@ int run(int argc, char** argv) {
 }  // namespace
 
 int main(int argc, char** argv) {
-  try {  // what libraries may throw ends here
+  std::signal(SIGXFSZ, SIG_IGN);  // a file over the user's limit is an error like a full disk
+  try {                           // what libraries may throw ends here
     return run(argc, argv);
   } catch (const std::bad_alloc&) {
     return fail(

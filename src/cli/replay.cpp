@@ -6,9 +6,10 @@
 
 #include <algorithm>
 #include <optional>
-#include <thread>
 
+#include "base/thread.h"
 #include "cli/commands.h"
+#include "cli/say.h"
 #include "serve/server.h"
 
 namespace vla::cli {
@@ -23,7 +24,7 @@ struct ReplayOptions {
 /// Answers by another bundle or by other arithmetic may differ rightly; whoever reads the table must know.
 void announce(const v1::Description& recorded, const v1::Description& replayed) {
   const auto row = [](const char* what, const std::string& before, const std::string& now) {
-    if (before != now) fmt::print("note: {} was {} when recorded, is {} now\n", what, before, now);
+    if (before != now) say(stdout, "note: {} was {} when recorded, is {} now\n", what, before, now);
   };
   row("bundle", recorded.bundle().name() + " " + recorded.bundle().checksum(),
       replayed.bundle().name() + " " + replayed.bundle().checksum());
@@ -33,26 +34,18 @@ void announce(const v1::Description& recorded, const v1::Description& replayed) 
   row("kernels", recorded.runtime().kernels(), replayed.runtime().kernels());
 }
 
-/// What a difference says comes from the other side of a socket: nothing in it may move the cursor.
-std::string printable(std::string text) {
-  for (char& c : text)
-    if (static_cast<unsigned char>(c) < 0x20 || c == 0x7f) c = '?';
-  return text;
-}
-
 Status report(const serve::Recording& recording, const serve::ReplayReport& report) {
   announce(recording.description(), report.replayed_by);
   if (!report.differences.empty())
-    fmt::print("{:>8}  {:>20}  {:<15}  {}\n", "request", "id", "field", "recorded -> replayed");
+    say(stdout, "{:>8}  {:>20}  {:<15}  {}\n", "request", "id", "field", "recorded -> replayed");
   for (const serve::Difference& d : report.differences)
-    fmt::print("{:>8}  {:>20}  {:<15}  {} -> {}\n", d.index, d.request_id, d.field, printable(d.recorded),
-               printable(d.replayed));
-  fmt::print("{} answers the same, {} different, {} not compared\n", report.n_same, report.n_different,
-             report.n_skipped);
+    say(stdout, "{:>8}  {:>20}  {:<15}  {} -> {}\n", d.index, d.request_id, d.field, d.recorded, d.replayed);
+  say(stdout, "{} answers the same, {} different, {} not compared\n", report.n_same, report.n_different,
+      report.n_skipped);
   if (report.differences.empty()) return {};
   const serve::Difference& first = report.differences.front();
-  return Error{Code::mismatch, fmt::format("request {}: {}", first.index, first.field), printable(first.recorded),
-               printable(first.replayed), fmt::format("{} answers differ; this is the first", report.n_different)};
+  return Error{Code::mismatch, fmt::format("request {}: {}", first.index, first.field), first.recorded, first.replayed,
+               fmt::format("{} answers differ; this is the first", report.n_different)};
 }
 
 /// The limits that the requests were recorded under.
@@ -72,10 +65,10 @@ Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOpt
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
   options.replay.address = server->addresses().front();
   std::optional<Result<serve::ReplayReport>> result;
-  std::thread client([&] {
-    result = serve::replay(recording, options.replay);
-    server->stop();
-  });
+  VLA_TRY(std::thread client, start_thread("replay", [&]() noexcept {
+            result = serve::replay(recording, options.replay);
+            server->stop();
+          }));
   const Status served = server->run(*engine);
   client.join();
   VLA_CHECK(served);
@@ -88,7 +81,7 @@ Status replay(ReplayOptions& options) {
   VLA_TRY(const serve::ReplayReport result,
           options.bundle.empty() ? serve::replay(recording, options.replay) : replay_bundle(recording, options));
   if (options.replay.first == 0 && !recording.is_whole())
-    fmt::print("note: the recording has no end: its server was killed, or the file was cut between two requests\n");
+    say(stdout, "note: the recording has no end: its server was killed, or the file was cut between two requests\n");
   return report(recording, result);
 }
 

@@ -10,6 +10,7 @@
 #include "base/npy.h"
 #include "cli/commands.h"
 #include "cli/json.h"
+#include "cli/say.h"
 #include "engine/engine.h"
 
 namespace vla::cli {
@@ -100,21 +101,22 @@ void print_table(const ActionChunk& chunk, const Engine& engine) {
   const std::vector<std::string>& names = engine.processor().action_names();
   std::size_t width = 9;
   for (const std::string& name : names) width = std::max(width, name.size());
-  fmt::print("{:>4}", "step");
-  for (const std::string& name : names) fmt::print("  {:>{}}", name, width);
-  fmt::print("\n");
+  say(stdout, "{:>4}", "step");
+  for (const std::string& name : names) say(stdout, "  {:>{}}", name, width);
+  say(stdout, "\n");
   for (int row = 0; row < chunk.horizon; ++row) {
-    fmt::print("{:>4}", row);
+    say(stdout, "{:>4}", row);
     for (int i = 0; i < chunk.d_action; ++i)
-      fmt::print("  {:>{}.4f}", chunk.actions[static_cast<std::size_t>(row * chunk.d_action + i)], width);
-    fmt::print("\n");
+      say(stdout, "  {:>{}.4f}", chunk.actions[static_cast<std::size_t>(row * chunk.d_action + i)], width);
+    say(stdout, "\n");
   }
 }
 
 void print_timing(const Timing& timing, const Engine& engine) {
   std::vector<std::string> parts;
   for (const auto& [stage, ms] : timing) parts.push_back(fmt::format("{} {:.1f}", stage, ms));
-  fmt::print("ms: {}\nkernels: {}, {}\n", fmt::join(parts, ", "), engine.kernels(), engine.arithmetic());
+  say(stdout, "ms: {}\nkernels: {}, {}\n", fmt::format("{}", fmt::join(parts, ", ")), engine.kernels(),
+      engine.arithmetic());
 }
 
 void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions& options) {
@@ -134,7 +136,7 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   root["precision"] = engine.precision();
   root["notes"] = chunk.notes;
   if (options.seed && options.noise.empty()) root["seed"] = *options.seed;
-  fmt::print("{}\n", text_of(root));
+  say(stdout, "{}\n", text_of(root));
 }
 
 Status check(RunOptions& options) {
@@ -143,7 +145,7 @@ Status check(RunOptions& options) {
     return Error{Code::usage, "--tap", "--tap PATTERN and --taps-out FILE together", "one of them"};
   if (options.noise.empty() && !options.seed) {
     options.seed = std::random_device()();
-    fmt::print(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
+    say(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
   }
   return {};
 }
@@ -170,7 +172,7 @@ Status run(RunOptions& options) {
   VLA_TRY(ActionChunk chunk, engine->act(observation, noise));
   chunk.timing.insert(chunk.timing.begin(), before.begin(), before.end());
 
-  for (const std::string& note : chunk.notes) fmt::print(stderr, "note: {}\n", note);
+  for (const std::string& note : chunk.notes) say(stderr, "note: {}\n", note);
   if (!options.taps_out.empty()) VLA_CHECK(write_recorded(chunk.taps, options));
   if (!options.out.empty())
     VLA_CHECK(write_npy(options.out, chunk.actions, static_cast<std::size_t>(chunk.horizon),

@@ -3,10 +3,14 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
+#include <cctype>
 #include <csignal>
 #include <cstdio>
+#include <cstring>
 
 #include "cli/commands.h"
+#include "cli/say.h"
 #include "cli/watch.h"
 #include "serve/codec.h"
 #include "serve/server.h"
@@ -24,18 +28,26 @@ struct ServeOptions {
 
 serve::Server* stopped_by_signals = nullptr;
 
-/// The first SIGTERM or SIGINT lets the server finish; the next one ends the process.
+/// The first SIGTERM or SIGINT lets the server finish; the next one, whichever of the two, ends the process.
 void stop_on_signals(serve::Server& server) {
   stopped_by_signals = &server;
   struct sigaction action = {};
-  action.sa_handler = [](int) { stopped_by_signals->stop(); };
-  action.sa_flags = static_cast<int>(SA_RESETHAND);
+  action.sa_handler = [](int signal) {
+    if (stopped_by_signals->is_stopping()) {
+      std::signal(signal, SIG_DFL);
+      std::raise(signal);
+    }
+    stopped_by_signals->stop();
+  };
   sigaction(SIGTERM, &action, nullptr);
   sigaction(SIGINT, &action, nullptr);
 }
 
-/// As a shell reads it back.
-std::string quoted(const std::string& text) {
+/// As a shell reads it back: words as they are, anything else in quotes.
+std::string quoted(const std::string& value) {
+  const std::string text = printable(value);
+  const auto is_plain = [](unsigned char c) { return std::isalnum(c) != 0 || std::strchr("@%+=:,./-_", c) != nullptr; };
+  if (!text.empty() && std::all_of(text.begin(), text.end(), is_plain)) return text;
   std::string out = "'";
   for (const char c : text) out += c == '\'' ? std::string("'\\''") : std::string(1, c);
   return out + "'";
@@ -47,13 +59,21 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   std::vector<std::string> features = processor.views().names();
   features.insert(features.end(), processor.states().names().begin(), processor.states().names().end());
   const v1::Description description = serve::describe(engine, {});
-  fmt::print(
-      "ready address={} bundle={} arch={} device={} precision={} kernels={} memory_mb={:.1f} features={} "
-      "warm_up_ms={:.1f}{}\n",
-      fmt::join(server.addresses(), ","), quoted(description.bundle().name()), description.bundle().arch(),
-      quoted(description.runtime().device()), description.runtime().precision(),
-      quoted(description.runtime().kernels()), static_cast<double>(engine.memory().total()) / 1e6,
-      fmt::join(features, ","), warm_up_ms, metrics.empty() ? "" : " metrics=" + metrics);
+  std::string line = "ready";
+  const auto add = [&](const char* name, const std::string& value) {
+    line += fmt::format(" {}={}", name, quoted(value));
+  };
+  add("address", fmt::format("{}", fmt::join(server.addresses(), ",")));
+  add("bundle", description.bundle().name());
+  add("arch", description.bundle().arch());
+  add("device", description.runtime().device());
+  add("precision", description.runtime().precision());
+  add("kernels", description.runtime().kernels());
+  add("memory_mb", fmt::format("{:.1f}", static_cast<double>(engine.memory().total()) / 1e6));
+  add("features", fmt::format("{}", fmt::join(features, ",")));
+  add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
+  if (!metrics.empty()) add("metrics", metrics);
+  say(stdout, "{}\n", line);
   std::fflush(stdout);
 }
 

@@ -1,0 +1,17 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cli/say.h"
+
+namespace vla::cli {
+
+void say_lines(std::FILE* to, std::string_view text) {
+  std::string out;
+  for (std::size_t end; !text.empty(); text.remove_prefix(std::min(end + 1, text.size()))) {
+    end = std::min(text.find('\n'), text.size());
+    out += printable(text.substr(0, end));
+    if (end < text.size()) out += '\n';
+  }
+  fmt::print(to, "{}", out);
+}
+
+}  // namespace vla::cli

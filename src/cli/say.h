@@ -1,0 +1,36 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <fmt/format.h>
+
+#include <cstdio>
+#include <string>
+#include <type_traits>
+#include <utility>
+
+#include "base/printable.h"
+
+namespace vla::cli {
+
+/// An argument as it may be shown: texts come from bundles, recordings and servers, and must not act on a terminal.
+template <class T>
+decltype(auto) shown(const T& value) {
+  if constexpr (std::is_convertible_v<const T&, std::string_view>) {
+    return printable(value);
+  } else {
+    return (value);
+  }
+}
+
+/// The way to standard output and standard error. Line ends of the format are kept, those in arguments are not.
+template <class... Args>
+void say(std::FILE* to, fmt::format_string<decltype(shown(std::declval<const Args&>()))...> format,
+         const Args&... args) {
+  fmt::print(to, format, shown(args)...);
+}
+
+/// The same for a text of several lines that was put together here.
+void say_lines(std::FILE* to, std::string_view text);
+
+}  // namespace vla::cli
