@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, Mapping, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, Iterable, Mapping, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -15,6 +15,13 @@ Image = Union[np.ndarray, bytes, bytearray, memoryview, None]
 State = Union[Mapping[str, object], Sequence[float], np.ndarray, float]
 
 MAX_SEED = 2**64 - 1
+
+
+def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
+    """The items of a dict by name."""
+    if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
+        raise BadObservation(where, "a dict by name", repr(mapping)[:80])
+    return mapping.items()
 
 
 def picture_of(name: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:

@@ -15,7 +15,7 @@ import numpy as np
 from . import _capi
 from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
-from .observation import Image, State, check_start, noise_of, picture_of, states_of
+from .observation import Image, State, check_start, named, noise_of, picture_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 
@@ -147,7 +147,7 @@ class _Call:
         self, spec: Spec, images: Mapping[str, Image], state: State, text: str, seed: Optional[int], noise: object
     ) -> None:
         self._kept: List[Any] = []
-        views = [self._view(name, image) for name, image in images.items()]
+        views = [self._view(name, image) for name, image in named("images", images)]
         states = [
             _capi.State(name=_name_of("state", name), values=self._address(values), n_value=values.size)
             for name, values in states_of(state, spec.states).items()

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Dict, Iterable, List, Mapping, Optional, Tuple
+from typing import Any, Dict, List, Mapping, Optional
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from .chunk import Chunk
 from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
-from .observation import Image, State, noise_of, picture_of, states_of
+from .observation import Image, State, named, noise_of, picture_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 PROTOCOL_VERSION = 1
@@ -64,7 +64,7 @@ def act_bytes(
     act = request.act
     act.SetInParent()
     raw: Dict[str, np.ndarray] = {}
-    for name, image in _items("images", images):
+    for name, image in named("images", images):
         kind, data = picture_of(name, image)
         if kind == "rgb":
             raw[name] = np.asarray(data)
@@ -121,12 +121,6 @@ def _head(message: str, field: str, size: int) -> bytes:
     return bytes(head)
 
 
-def _items(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
-    if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
-        raise BadObservation(where, "a dict by name", repr(mapping)[:80])
-    return mapping.items()
-
-
 def _milliseconds(value: float) -> int:
     if not 0 < value < 2**63:
         raise UsageError("deadline_ms", "milliseconds above 0", str(value))
@@ -140,7 +134,7 @@ def _int64(where: str, value: int) -> int:
 
 
 def _check_limits(raw: Mapping[str, np.ndarray], size: int, limits: Any) -> None:
-    """Refuses what the server would refuse; it would end the connection over a message that is too large, and tell nothing."""
+    """Refuses what the server would refuse; it would read all of a message that is too large before it says so."""
     for name, rows in raw.items():
         pixels = rows.shape[0] * rows.shape[1]
         if pixels > limits.max_pixels > 0:
