@@ -14,7 +14,7 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
-	@echo "make tsan      build the server and run its tests under the thread sanitizer"
+	@echo "make tsan      build executor and server and run their tests under the thread sanitizer"
 	@echo "make fuzz      build the fuzz targets (clang) and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
 	@echo "make clean     remove what was built"

@@ -42,12 +42,7 @@ if(NOT vla_ggml_tree)
 endif()
 set(BUILD_SHARED_LIBS OFF)
 set(GGML_NATIVE ${VLA_NATIVE} CACHE BOOL "" FORCE)
-# The barriers of OpenMP go to sleep on a busy machine; ggml's own only spin, but the thread sanitizer understands them.
-if(VLA_SANITIZE MATCHES "thread")
-  set(GGML_OPENMP OFF CACHE BOOL "" FORCE)
-else()
-  set(GGML_OPENMP ON CACHE BOOL "" FORCE)
-endif()
+set(GGML_OPENMP OFF CACHE BOOL "" FORCE)
 set(GGML_LLAMAFILE ON CACHE BOOL "" FORCE)    # blocked float32 products
 set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle uses
 set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include "lower/open.h"
 #include "policies/policy.h"
 
 namespace vla::bench {
@@ -43,7 +44,7 @@ Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const st
 
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher) {
-  VLA_TRY(const Device device, Device::cpu(request.n_thread, request.kernels));
+  VLA_TRY(const std::unique_ptr<Device> device, open_device(request.n_thread, request.kernels));
   std::optional<RandomBundle> random;
   if (request.bundle.empty()) {
     VLA_TRY(RandomBundle made, make_random(request, watcher));
@@ -52,7 +53,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   Report report;
   report.cpu = cpu_name();
   watcher.tell("measuring what the machine can do");
-  report.before = measure_roofs(device.n_thread());
+  report.before = measure_roofs(device->n_thread());
   forget_peak_memory();
   StageClock clock;
   Timing load;
@@ -72,7 +73,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   report.predicted = engine->memory();
   report.process = process_memory();
   watcher.tell("measuring what the machine can do now");
-  report.after = measure_roofs(device.n_thread());
+  report.after = measure_roofs(device->n_thread());
   summarize(all.back(), report);
   if (all.size() > 1) report.fit = fit_steps(all);
   return report;

@@ -46,7 +46,7 @@ double Round::total() const {
 }
 
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher) {
-  const kernels::PeakProbe& probe = kernels::peak_probe_of(engine.isa());
+  const kernels::PeakProbe& probe = kernels::peak_probe_of(*choose_isa(engine.kernels()));
   const auto measure_peak = [&] { return kernels::measure_peak(probe, engine.device().n_thread(), kProbeSeconds); };
   Series series{engine.solver().n_step, probe.name, {}, {}};
   for (int i = 0; i < n_warmup; ++i) {

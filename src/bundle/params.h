@@ -27,6 +27,8 @@ struct Param {
   const TensorInfo* source = nullptr;  // set where the bundle has a tensor that fits
 
   std::int64_t count() const;
+  /// As stored; float32 where no bundle gives it.
+  DType type() const { return source != nullptr ? source->type : DType::f32; }
 };
 
 /// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they

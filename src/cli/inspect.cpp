@@ -14,7 +14,7 @@ namespace vla::cli {
 namespace {
 
 struct InspectOptions {
-  std::string bundle, manifest;
+  std::string bundle, manifest, graph, kernels;
   bool json = false;
 };
 
@@ -170,12 +170,20 @@ void print_json(const Engine& engine) {
   say_lines(stdout, text_of(root, 2) + "\n");
 }
 
+Status print_graph(Engine& engine, const std::string& part) {
+  VLA_TRY(const std::string text, engine.program_text(part == "prefix" ? Engine::Part::prefix : Engine::Part::step));
+  fmt::print("phase kernel        MFLOP        MB  operation: operand -> results\n{}", text);
+  return {};
+}
+
 Status inspect(const InspectOptions& options) {
   if (options.manifest.empty() == options.bundle.empty())
     return Error{Code::usage, "inspect", "BUNDLE or --manifest ARCH", options.bundle.empty() ? "neither" : "both"};
   if (!options.manifest.empty()) return print_manifest(options.manifest);
   // A dry load checks everything that a run would check and reserves the memory that it would take, without filling it.
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.dry = true}));
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          Engine::load(options.bundle, {.kernels = options.kernels, .dry = true}));
+  if (!options.graph.empty()) return print_graph(*engine, options.graph);
   options.json ? print_json(*engine) : print_human(*engine);
   return {};
 }
@@ -187,11 +195,18 @@ Command add_inspect(CLI::App& app) {
   CLI::App* command =
       app.add_subcommand("inspect", "Show what a bundle is: features, statistics, recipe, sizes, memory");
   command->footer(
-      "  vla inspect policy.gguf\n  vla inspect policy.gguf --json\n  vla inspect --manifest smolvla    # parameters "
-      "at the published size");
+      "  vla inspect policy.gguf\n  vla inspect policy.gguf --json\n  vla inspect policy.gguf --graph step    # the "
+      "program that runs in every solver step\n  vla inspect --manifest smolvla    # parameters at the published size");
   command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert");
   command->add_option("--manifest", options->manifest,
                       "Print the keys and parameters that an architecture declares, as JSON");
+  command
+      ->add_option("--graph", options->graph,
+                   "Print the program of the prefix or of a step for the largest observation, a line an operation: the "
+                   "phase in which it runs (those of one phase run side by side), kernel, work, what was fused, and "
+                   "shapes with their layout (@slot: outlives a run, @kept: made once per observation)")
+      ->check(CLI::IsMember({"prefix", "step"}));
+  command->add_option("--kernels", options->kernels, "As for vla run: what the program is made of");
   command->add_flag("--json", options->json, "Print JSON for machines");
   return [options] { return inspect(*options); };
 }

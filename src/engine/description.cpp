@@ -47,7 +47,7 @@ Description describe(const Engine& engine) {
   out.solver = *keys.string("solver.kind");
   out.noise = engine.solver().noise;
   out.n_step = engine.solver().n_step;
-  out.t_start = engine.solver().times.front();
+  out.t_start = engine.solver().times.front().value;
 
   out.path = engine.bundle().path();
   for (const auto& [key, text] : {std::pair{"arch", &out.arch},

@@ -5,8 +5,9 @@
 #include <fmt/format.h>
 
 #include <cmath>
+#include <new>
 
-#include "kernels/linear_kernel.h"
+#include "lower/open.h"
 
 namespace vla {
 namespace {
@@ -18,18 +19,19 @@ constexpr int kMaxHorizon = 4096;
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
   VLA_TRY(Bundle bundle, Bundle::open(path));
   VLA_TRY(Processor processor, Processor::create(bundle));
-  VLA_TRY(Device device, Device::cpu(options.n_thread, options.kernels));
+  VLA_TRY(std::unique_ptr<Device> device, open_device(options.n_thread, options.kernels));
   std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
   engine->tap_pattern_ = options.tap_pattern;
-  VLA_CHECK(engine->load_policy(options.dry));
+  engine->dry_ = options.dry;
+  VLA_CHECK(engine->load_policy());
   VLA_CHECK(engine->make_conditions());
-  VLA_CHECK(engine->make_constants(options.dry));
+  VLA_CHECK(engine->make_constants());
   VLA_CHECK(engine->make_plans());
-  if (!options.dry) engine->plans_->touch();
+  if (!options.dry) engine->device_->touch();
   return engine;
 }
 
-Status Engine::load_policy(bool dry) {
+Status Engine::load_policy() {
   const Keys& keys = bundle_.keys();
   VLA_TRY(const std::string arch, keys.string("vla.arch"));
   VLA_TRY(const PolicyEntry entry, find_policy(arch));
@@ -40,24 +42,27 @@ Status Engine::load_policy(bool dry) {
   VLA_TRY(horizon_, keys.integer("policy.horizon", {1, kMaxHorizon}));
   VLA_TRY(d_action_, keys.integer("policy.d_action", {1, kMaxVector}));
   VLA_TRY(d_state_, keys.integer("policy.d_state", {0, kMaxVector}));
-  VLA_TRY(Weights weights,
-          Weights::load(*params_, device_, dry ? Weights::Fill::no : Weights::Fill::yes, kernels::choose_linear));
-  weights_ = std::make_unique<Weights>(std::move(weights));
-  return {};
+  return device_->load(*params_, !dry_);
+}
+
+/// Load rate: lowers a graph that nobody needs afterwards, and runs it.
+Status Engine::run_once(const Graph& graph) {
+  VLA_CHECK(device_->allocate(graph.slots()));
+  VLA_TRY(const std::unique_ptr<Program> program, device_->lower(graph));
+  return dry_ ? Status() : program->run();
 }
 
 /// Load rate: the table of everything that depends on the time alone.
 Status Engine::make_conditions() {
-  tables_ = std::make_unique<Store>(64);
-  Graph graph(*weights_, *tables_, {});
+  tables_ = std::make_unique<Slots>();
+  conditions_ = nullptr;
+  Graph graph(*tables_);
   const Tensor computed = policy_->condition(graph, solver_.times);
-  conditions_ = tables_->add_like(computed);
-  graph.write(computed, conditions_);
-  VLA_CHECK(tables_->allocate(device_));
-  ComputeMemory memory(device_);
-  VLA_CHECK(graph.reserve(memory));
-  VLA_CHECK(graph.allocate(memory));
-  return graph.run(device_);
+  if (!computed) return {};
+  Slot* table = tables_->add_f32(computed.shape());
+  graph.write(computed, table);
+  conditions_ = table;
+  return run_once(graph);
 }
 
 InputShape Engine::largest_shape() const {
@@ -71,28 +76,23 @@ InputShape Engine::largest_shape() const {
 std::uint32_t Engine::placed(std::uint32_t views) const { return policy_->places_views() ? views : 0; }
 
 /// Load rate: what every prefix needs and the weights alone decide, for policies that have such a thing.
-Status Engine::make_constants(bool dry) {
+Status Engine::make_constants() {
   const Recipe& recipe = processor_.recipe();
   VLA_CHECK(policy_->check(largest_shape()));
-  constant_store_ = std::make_unique<Store>(64 + 2 * weights_->count());
-  Graph graph(*weights_, *constant_store_, {});
+  constant_slots_ = std::make_unique<Slots>();
+  Graph graph(*constant_slots_);
   const auto absent_view = [&] {
-    return constant_store_->add_constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
+    return graph.constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
   };
   policy_->constants(graph, absent_view, constants_);
-  if (graph.n_node() == 0) return {};
-  VLA_CHECK(constant_store_->allocate(device_));
-  ComputeMemory memory(device_);
-  VLA_CHECK(graph.reserve(memory));
-  VLA_CHECK(graph.allocate(memory));
-  return dry ? Status() : graph.run(device_);
+  return graph.nodes().empty() ? Status() : run_once(graph);
 }
 
 /// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
 Status Engine::make_plans() {
   last_plan_ = nullptr;
   plans_ = std::make_unique<Plans>(
-      PlanContext{*policy_, *weights_, device_, solver_, conditions_, constants_, d_action_, horizon_, tap_pattern_});
+      PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_, horizon_, tap_pattern_, dry_});
   const auto plan = plans_->for_shape(largest_shape());
   return plan ? Status() : Status(plan.error());
 }
@@ -139,7 +139,21 @@ void Engine::record_chunk(const std::vector<float>& x, ActionChunk& chunk) const
   record(chunk.taps, "actions", {chunk.d_action, chunk.horizon}, chunk.actions);
 }
 
-Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) {
+Result<std::string> Engine::program_text(Part part) {
+  VLA_TRY(const Plan* plan, plans_->for_shape(largest_shape()));
+  return (part == Part::prefix ? plan->prefix() : plan->step()).text();
+}
+
+Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) noexcept {
+  // Containers throw where there is no memory: whatever was begun is given up, and the next act starts anew.
+  try {
+    return run(observation, noise);
+  } catch (const std::bad_alloc&) {
+    return Error{Code::out_of_memory, "act", "", "the system refused an allocation", "free memory"};
+  }
+}
+
+Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noise) {
   ActionChunk chunk;
   StageClock clock;
   inputs_.notes.clear();
@@ -157,12 +171,12 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   plan->set_x(x);
   record_inputs(chunk.taps);
   clock.lap(chunk.timing, "plan");
-  VLA_CHECK(plan->run_prefix(device_));
-  for (const Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
+  VLA_CHECK(plan->run_prefix());
+  for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
   clock.lap(chunk.timing, "prefix");
   plan->collect_prefix_taps(chunk.taps);
   for (int k = 0; k < solver_.n_step; ++k) {
-    VLA_CHECK(plan->run_step(device_, k));
+    VLA_CHECK(plan->run_step(k));
     plan->collect_step_taps(k, chunk.taps);
   }
   clock.lap(chunk.timing, "steps");
@@ -177,11 +191,12 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
 }
 
 std::string Engine::arithmetic() const {
-  return isa() == Isa::amx ? "bf16 products on AMX tiles, sums in float32; --kernels float32 avoids them" : "float32";
+  return precision() == "bf16" ? "bf16 products on AMX tiles, sums in float32; --kernels float32 avoids them"
+                               : "float32";
 }
 
 MemoryUse Engine::memory() const {
-  return {weights_->size() + tables_->size(), plans_->size(), plans_->working_size() + device_.scratch()->size()};
+  return {device_->weights_size() + tables_->size() + constant_slots_->size(), plans_->size(), device_->working_size()};
 }
 
 }  // namespace vla

@@ -47,17 +47,21 @@ class Engine {
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
   /// Errors: bad_observation, bad_action (a number that is not finite came out), device, out_of_memory.
-  Result<ActionChunk> act(const Observation& observation, const Noise& noise);
+  Result<ActionChunk> act(const Observation& observation, const Noise& noise) noexcept;
 
   /// Solves in another number of steps than the bundle asks for, to measure what a step costs. Errors: bad_bundle,
   /// out_of_memory, device.
   Status set_steps(int n_step);
+  /// The program of the prefix or of a step for the largest observation, one line an operation: phase, kernel, MFLOP,
+  /// MB, what is computed, and how its operand and results lie in memory. Errors: out_of_memory.
+  enum class Part { prefix, step };
+  Result<std::string> program_text(Part part);
   /// What the network computed for the last observation; empty before the first.
   StageWork work() const { return last_plan_ != nullptr ? last_plan_->work(solver_.n_step) : StageWork(); }
 
   const Bundle& bundle() const { return bundle_; }
   const Processor& processor() const { return processor_; }
-  const Device& device() const { return device_; }
+  const Device& device() const { return *device_; }
   const Solver& solver() const { return solver_; }
   const ParamList& params() const { return *params_; }
   /// Rows of a chunk.
@@ -67,22 +71,23 @@ class Engine {
   int d_action_padded() const { return d_action_; }
   MemoryUse memory() const;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
-  const std::string& linear_kernels() const { return weights_->kernels(); }
-  /// The kernels in use: those of the device, or others where the bundle's dtype asks for float32.
-  Isa isa() const { return weights_->isa(); }
-  /// The same, as `--kernels` names them.
-  std::string kernels() const { return isa_name(isa()); }
+  const std::string& linear_kernels() const { return device_->linear_kernels(); }
+  /// The kernels in use, as `--kernels` names them: those of the machine, or others where the bundle's dtype asks for
+  /// float32.
+  std::string kernels() const { return device_->kernels(); }
   /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
-  std::string precision() const { return isa() == Isa::amx ? "bf16" : "f32"; }
+  std::string precision() const { return device_->precision(); }
   /// The same in plain words, for people.
   std::string arithmetic() const;
 
  private:
-  Engine(Bundle bundle, Processor processor, Device device)
+  Engine(Bundle bundle, Processor processor, std::unique_ptr<Device> device)
       : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
-  Status load_policy(bool dry);
+  Status load_policy();
+  Result<ActionChunk> run(const Observation& observation, const Noise& noise);
   Status make_conditions();
-  Status make_constants(bool dry);
+  Status run_once(const Graph& graph);
+  Status make_constants();
   Status make_plans();
   InputShape largest_shape() const;
   std::uint32_t placed(std::uint32_t views) const;
@@ -95,17 +100,17 @@ class Engine {
 
   Bundle bundle_;
   Processor processor_;
-  Device device_;
+  std::unique_ptr<Device> device_;
   Solver solver_;
   int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   std::string tap_pattern_;
+  bool dry_ = false;
   std::unique_ptr<ParamList> params_;
   std::unique_ptr<Policy> policy_;
-  std::unique_ptr<Weights> weights_;
-  std::unique_ptr<Store> tables_;
-  Tensor conditions_;
-  std::unique_ptr<Store> constant_store_;
-  Cache constants_;  // in constant_store_
+  std::unique_ptr<Slots> tables_;
+  const Slot* conditions_ = nullptr;  // in tables_
+  std::unique_ptr<Slots> constant_slots_;
+  Cache constants_;  // in constant_slots_
   std::unique_ptr<Plans> plans_;
   const Plan* last_plan_ = nullptr;
   Inputs inputs_;  // of the last observation; its vectors keep their memory

@@ -7,6 +7,7 @@
 
 #include "engine/solver.h"
 #include "engine/taps.h"
+#include "graph/device.h"
 #include "policies/policy.h"
 
 namespace vla {
@@ -17,72 +18,69 @@ using StageWork = std::vector<std::pair<std::string, Work>>;
 /// What every plan is built from and shares.
 struct PlanContext {
   const Policy& policy;
-  const Weights& weights;
-  const Device& device;
+  Device& device;
   const Solver& solver;
-  Tensor conditions;       // [d, n_step]: what depends on the time alone, one column per solver step
+  const Slot* conditions;  // [d, n_step]: what depends on the time alone, one column per solver step; or null
   const Cache& constants;  // what depends on the weights alone
   int d_action, horizon;
   std::string tap_pattern;
+  bool dry;  // nothing is computed
 };
 
-/// The two graphs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
+/// The two programs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
 /// replayed.
 class Plan {
  public:
-  /// Errors: out_of_memory.
-  static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape,
-                                             ComputeMemory& memory);
+  /// Errors: out_of_memory, internal.
+  static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape);
 
   void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
-  void set_x(std::span<const float> x);
-  std::vector<float> x() const;
+  void set_x(std::span<const float> x) { device_.set(*x_, x.data(), x.size_bytes()); }
+  std::vector<float> x() const { return device_.get(*x_); }
 
-  /// Graph::touch for both graphs.
-  void touch() const { prefix_.touch(), step_.touch(); }
-  Status run_prefix(const Device& device) { return prefix_.run(device); }
-  /// Solver step k: x <- x + dt * velocity(x, t_k).
-  Status run_step(const Device& device, int k);
+  /// Fills the cache, and computes what the steps need of it in another layout.
+  Status run_prefix();
+  /// Solver step k: x <- the solver's next x.
+  Status run_step(int k);
 
   /// The stages that the policy's prefix names, with the times of the last run.
-  const std::deque<Stage>& prefix_stages() const { return prefix_.stages(); }
+  const std::vector<Program::Stage>& prefix_stages() const { return prefix_->stages(); }
+  const Program& prefix() const { return *prefix_; }
+  const Program& step() const { return *step_; }
 
   /// What the network computes for one observation: the prefix, stage by stage, and `n_step` solver steps.
   StageWork work(int n_step) const;
 
-  /// What the last run recorded; of a step graph the paths are `step.<k>.<path>`.
+  /// What the last run recorded; of a step the paths are `step.<k>.<path>`.
   void collect_prefix_taps(std::vector<Tap>& taps) const;
   void collect_step_taps(int k, std::vector<Tap>& taps) const;
 
-  std::size_t size() const { return store_.size(); }
+  /// Bytes: slots, constants and the programs themselves.
+  std::size_t size() const { return slots_.size() + prefix_->size() + step_->size(); }
 
  private:
   Plan(const PlanContext& context, const InputShape& shape);
-  void build_prefix(const PlanContext& context);
-  void build_step(const PlanContext& context);
+  Status lower(const PlanContext& context);
 
   std::string tap_pattern_;
-  Store store_;
-  PrefixInputs in_;
-  Tensor x_, k_;
+  Device& device_;
+  Slots slots_;
+  Slot *images_, *tokens_, *state_, *x_, *k_;  // state may be null
+  std::uint32_t views_;
   Cache cache_;
-  Graph prefix_, step_;
+  std::unique_ptr<Program> prefix_, step_;
 };
 
-/// The plans that exist. All share one working memory; when a new shape makes it grow, the others are built again.
+/// The plans that exist, as many as memory allows them.
 class Plans {
  public:
-  Plans(PlanContext context) : context_(std::move(context)), memory_(context_.device) {}
+  explicit Plans(PlanContext context) : context_(std::move(context)) {}
   Result<Plan*> for_shape(const InputShape& shape);
-  /// Has the system back the memory of every plan before the first request.
-  void touch() const;
-  /// Bytes of inputs, caches and constants of all plans.
+  /// Bytes of all plans.
   std::size_t size() const;
-  std::size_t working_size() const { return memory_.size(); }
 
  private:
   PlanContext context_;
-  ComputeMemory memory_;
   std::map<InputShape, std::unique_ptr<Plan>> plans_;
 };
 

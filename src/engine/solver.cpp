@@ -2,25 +2,46 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "engine/solver.h"
 
+#include "nn/tokens.h"
+
 namespace vla {
+namespace {
+
+Status expect(bool holds, const char* key, const char* expected, const std::string& found) {
+  if (holds) return {};
+  return Error{Code::bad_bundle, key, expected, found, "this bundle needs a newer vla, or was not made by vla-convert"};
+}
+
+}  // namespace
 
 Result<Solver> Solver::read(const Keys& keys) {
-  VLA_TRY(const std::string kind, keys.string("solver.kind"));
-  if (kind != "euler" && kind != "euler_float32")
-    return Error{Code::bad_bundle, "solver.kind", "euler or euler_float32", kind, "this bundle needs a newer vla"};
   Solver solver;
-  VLA_TRY(solver.n_step, keys.integer("solver.steps", {1, 1000}));
+  VLA_TRY(const std::string kind, keys.string("solver.kind"));
+  VLA_CHECK(expect(kind == "euler" || kind == "euler_float32" || kind == "direct", "solver.kind",
+                   "euler, euler_float32 or direct", kind));
+  solver.direct = kind == "direct";
+  VLA_TRY(solver.n_step, keys.integer("solver.steps", {1, solver.direct ? 1.0 : 1000.0}));
+  VLA_TRY(solver.noise, keys.string("solver.noise"));
+  if (solver.direct) {
+    VLA_CHECK(expect(solver.noise == "none", "solver.noise", "none", solver.noise));
+    solver.times.push_back({0.0f, 0.0});
+    return solver;
+  }
+  VLA_CHECK(
+      expect(solver.noise == "normal" || solver.noise == "uniform", "solver.noise", "normal or uniform", solver.noise));
   VLA_TRY(const double start, keys.number("solver.t_start", {0, 1}));
   VLA_TRY(const double end, keys.number("solver.t_end", {0, 1}));
-  VLA_TRY(solver.noise, keys.string("solver.noise"));
-  if (solver.noise != "normal" && solver.noise != "uniform")
-    return Error{Code::bad_bundle, "solver.noise", "normal or uniform", solver.noise};
   const double dt = (end - start) / solver.n_step;
   solver.dt = static_cast<float>(dt);
   float accumulated = static_cast<float>(start);
   for (int k = 0; k < solver.n_step; ++k, accumulated += solver.dt)
-    solver.times.push_back(kind == "euler" ? static_cast<float>(start + k * dt) : accumulated);
+    solver.times.push_back({kind == "euler" ? static_cast<float>(start + k * dt) : accumulated,
+                            start + (end - start) * k / solver.n_step});
   return solver;
+}
+
+Tensor Solver::next(Graph& g, Tensor x, Tensor answer) const {
+  return direct ? answer : add(g, x, scale(g, answer, dt));
 }
 
 }  // namespace vla

@@ -6,22 +6,30 @@
 #include <vector>
 
 #include "bundle/keys.h"
+#include "graph/graph.h"
+#include "modules/timestep_embedding.h"
 
 namespace vla {
 
-/// Euler's rule with equal steps from t_start to t_end: x <- x + dt * velocity(x, t_k).
+/// How the action head's answers become the chunk, as data: the times at which it is asked, and the rule of a step.
+///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
+///   direct                one pass: x <- what the network gives, from a start of zeros
 struct Solver {
   int n_step = 0;
+  bool direct = false;
   float dt = 0;  // (t_end - t_start) / n_step, made in double and rounded once, as the reference scales by it
   /// t_k; t_end is never evaluated. `euler`: t_start + k * dt, made in double and rounded once, as LeRobot.
   /// `euler_float32`: dt added k times in float32, as openpi; of a sine with a period of 4e-3 the 1e-7 between them is
   /// a part in 1e4.
-  std::vector<float> times;
-  std::string noise;  // kind of the starting noise
+  std::vector<SolverTime> times;
+  std::string noise;  // kind of the start: normal, uniform or none
 
   /// Reads `solver.*`. Errors: bad_bundle. Source: lerobot policies/common/flow_matching.py euler_integrate, openpi
   /// models_pytorch/pi0_pytorch.py sample_actions.
   static Result<Solver> read(const Keys& keys);
+
+  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x.
+  Tensor next(Graph& g, Tensor x, Tensor answer) const;
 };
 
 }  // namespace vla

@@ -55,7 +55,7 @@ using Attention = AttentionTile<PairProducts<Avx512, AmxTile>>;
 }  // namespace
 
 extern const AttentionKernel kAttentionAmx;
-const AttentionKernel kAttentionAmx = {Attention::packed_size, Attention::pack, Attention::run};
+const AttentionKernel kAttentionAmx = Attention::kernel();
 
 }  // namespace vla::kernels
 #endif

@@ -2,44 +2,68 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 
-#include "kernels/turns.h"
+#include "kernels/row_kernel.h"
 
 namespace vla::kernels {
 
+/// Rows of d_head floats, and how many floats lie from one head, token or batch to the next.
+struct HeadRows {
+  const float* data;
+  std::int64_t head, token, batch;
+  const float* at(std::int64_t i_head, std::int64_t i_token, std::int64_t i_batch) const {
+    return data + i_head * head + i_token * token + i_batch * batch;
+  }
+};
+
+/// Keys and values that are laid out as attention reads them. A unit is one head of keys and values, of one batch.
+struct PackJob {
+  std::int64_t d_head, n_head_kv, n_key, n_batch;
+  HeadRows k, v;
+  RowPrep prep;  // of keys
+  std::byte* packed;
+
+  std::int64_t n_unit() const { return n_head_kv * n_batch; }
+};
+
 /// One attention: sizes, and where everything lies.
 struct AttentionJob {
-  /// Rows of d_head floats, and how many floats lie from one head, token or batch to the next.
-  struct Rows {
-    const float* data;
-    std::int64_t head, token, batch;
-    const float* at(std::int64_t i_head, std::int64_t i_token, std::int64_t i_batch) const {
-      return data + i_head * head + i_token * token + i_batch * batch;
-    }
+  /// Packed keys and values that stand one after the other.
+  struct Segment {
+    const std::byte* packed;
+    std::int64_t n_key;
+    std::int64_t first = 0;  // keys of the segments before it
   };
+  static constexpr int kMaxSegment = 6;
 
   std::int64_t d_head, n_head, n_head_kv, n_query, n_key, n_batch;
   float scale;
-  Rows q, k, v;
-  const float* mask;  // [n_key, n_query], or null
-  float* packed;      // what `pack` writes and `run` reads
-  float* out;         // [d_head, n_head, n_query, n_batch]
-  Turns* turns;       // of `run`
+  HeadRows q;
+  RowPrep prep;       // of queries
+  const float* mask;  // [n_key, n_query] of any numbers but +infinity, or null
+  int n_segment;
+  Segment segment[kMaxSegment];
+  float* out;               // [d_head, n_head, n_query, n_batch]
+  std::int64_t block_rows;  // made by AttentionKernel::cut
 
   /// Query heads that share keys and values: their queries are rows of one and the same product.
   std::int64_t n_row() const { return n_head / n_head_kv * n_query; }
   std::int64_t n_unit() const { return n_head_kv * n_batch; }
 };
 
-/// Attention for one instruction set, in two operations with a barrier between them. Another arithmetic (bf16 tiles)
-/// is another such pair.
+/// Attention for one instruction set: softmax(q k * scale + mask) v in float32, heads concatenated, without a matrix of
+/// scores in memory. Chunks of keys that a block of queries sees nothing of (-infinity all over) are skipped. Another
+/// arithmetic (bf16 tiles) is another row.
 struct AttentionKernel {
-  /// Floats that one job's packed keys and values take.
-  std::int64_t (*packed_size)(const AttentionJob& job);
-  /// Lays keys and values out as `run` reads them; thread `ith` of `nth` does its part.
-  void (*pack)(const AttentionJob& job, int ith, int nth);
-  void (*run)(const AttentionJob& job, int ith, int nth);
+  /// Bytes that packed keys and values take.
+  std::size_t (*packed_size)(const PackJob& job);
+  std::int64_t (*n_pack)(const PackJob& job);
+  void (*pack)(const PackJob& job, std::int64_t item);
+  /// Cuts a job into items for so many threads, and says how many there are.
+  std::int64_t (*cut)(AttentionJob& job, int n_thread);
+  void (*run)(const AttentionJob& job, std::int64_t item);
 };
 
 /// Heads wider than this have no kernel.

@@ -3,13 +3,12 @@
 #pragma once
 
 #include "kernels/attention_products.h"
-#include "kernels/pieces.h"
+#include "kernels/sizes.h"
 
 namespace vla::kernels {
 
-/// Keys and values of one job as the products read them: for each unit (a head of keys and values, of one batch) panels
-/// of keys, whose depth is the width of a head, and behind them panels of features, whose depth is the number of keys.
-/// `P` is a type of attention_products.h.
+/// Packed keys and values as the products read them: for each unit panels of keys, whose depth is the width of a head,
+/// and behind them panels of features, whose depth is the number of keys. `P` is a type of attention_products.h.
 template <class P>
 class AttentionPanels {
   using V = typename P::Vector;
@@ -19,36 +18,45 @@ class AttentionPanels {
   static_assert(kPanel % (2 * kWidth) == 0 && kPanel % P::kDepth == 0);
 
  public:
-  explicit AttentionPanels(const AttentionJob& j)
-      : job(j),
-        n_key(round_up(j.n_key, kPanel)),
-        key_depth(round_up(j.d_head, P::kDepth)),
-        d_value(round_up(j.d_head, P::kLeastPanel)) {}
+  AttentionPanels(std::int64_t head, std::int64_t count)
+      : d_head(head),
+        n_key(round_up(count, kPanel)),
+        key_depth(round_up(head, P::kDepth)),
+        d_value(round_up(head, P::kMinPanel)) {}
 
-  const AttentionJob& job;
+  const std::int64_t d_head;
   const std::int64_t n_key;      // keys with those that fill the last panel
   const std::int64_t key_depth;  // numbers of a key, with what fills up the depth
   const std::int64_t d_value;    // columns of all panels of features
 
   /// Numbers that one unit takes.
   std::int64_t unit_size() const { return n_key * (key_depth + d_value); }
-  Number* keys(std::int64_t unit) const { return reinterpret_cast<Number*>(job.packed) + unit * unit_size(); }
-  Number* values(std::int64_t unit) const { return keys(unit) + n_key * key_depth; }
+  /// Where the keys of a unit begin, and its values.
+  std::int64_t keys(std::int64_t unit) const { return unit * unit_size(); }
+  std::int64_t values(std::int64_t unit) const { return keys(unit) + n_key * key_depth; }
   /// Columns of the panel of features that starts at feature i.
-  std::int64_t width(std::int64_t i) const { return d_value - i < kPanel ? P::kLeastPanel : kPanel; }
+  std::int64_t width(std::int64_t i) const { return d_value - i < kPanel ? P::kMinPanel : kPanel; }
 
-  void pack(int ith, int nth) const {
-    const std::int64_t n_panel = n_key / kPanel, n = job.n_unit() * n_panel;
-    for (std::int64_t i = n * ith / nth; i < n * (ith + 1) / nth; ++i) {
-      pack_keys(i / n_panel, i % n_panel * kPanel);
-      pack_values(i / n_panel, i % n_panel * kPanel);
-    }
+  static std::size_t packed_size(const PackJob& job) {
+    return static_cast<std::size_t>(job.n_unit() * AttentionPanels(job.d_head, job.n_key).unit_size()) * sizeof(Number);
+  }
+  static std::int64_t n_pack(const PackJob& job) { return job.n_unit() * ceil_div(job.n_key, kPanel); }
+  static void pack(const PackJob& job, std::int64_t item) {
+    const AttentionPanels panels(job.d_head, job.n_key);
+    const std::int64_t n_panel = panels.n_key / kPanel, unit = item / n_panel, first = item % n_panel * kPanel;
+    Number* packed = reinterpret_cast<Number*>(job.packed);
+    alignas(64) Number rows[kPanel * kHeadStride];
+    panels.copy_rows(job, job.k, job.prep, unit, first, panels.key_depth, rows);
+    P::put_keys(rows, panels.key_depth, packed + panels.keys(unit) + first * panels.key_depth);
+    panels.copy_rows(job, job.v, {}, unit, first, panels.d_value, rows);
+    for (std::int64_t i = 0; i < panels.d_value; i += kPanel)
+      P::put_values(rows + i, first, panels.width(i), packed + panels.values(unit) + i * panels.n_key);
   }
 
   /// The d_head numbers of a row, or of none, and zeros up to `n_padded`. What follows them in steps of two vectors is
   /// written too.
   VLA_INLINE void copy_row(const float* from, std::int64_t n_padded, Number* to) const {
-    const std::int64_t n = from != nullptr ? job.d_head : 0;
+    const std::int64_t n = from != nullptr ? d_head : 0;
     std::int64_t i = 0;
     for (; i + 2 * kWidth <= n; i += 2 * kWidth) P::store(to + i, V::load(from + i), V::load(from + i + kWidth));
     const auto part = [&](std::int64_t j) VLA_LAMBDA { return j < n ? load<V>(from + j, n - j) : Float{}; };
@@ -58,28 +66,18 @@ class AttentionPanels {
  private:
   /// Keys or values of kPanel tokens from `first` on, as numbers and padded to `n_padded`; missing tokens are zeros.
   /// The tokens after them are asked for: they are too far apart for the machine to foresee.
-  VLA_INLINE void copy_rows(const AttentionJob::Rows& from, std::int64_t unit, std::int64_t first,
-                            std::int64_t n_padded, Number* rows) const {
+  VLA_INLINE void copy_rows(const PackJob& job, const HeadRows& from, const RowPrep& prep, std::int64_t unit,
+                            std::int64_t first, std::int64_t n_padded, Number* rows) const {
     const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv;
+    alignas(64) float room[kMaxHead];
     for (std::int64_t j = 0; j < kPanel; ++j) {
-      copy_row(first + j < job.n_key ? from.at(head, first + j, batch) : nullptr, n_padded, rows + j * kHeadStride);
+      const float* row = nullptr;
+      if (first + j < job.n_key) row = prep(from.at(head, first + j, batch), first + j, d_head, room);
+      copy_row(row, n_padded, rows + j * kHeadStride);
       if (first + kPanel + j >= job.n_key) continue;
       const float* next = from.at(head, first + kPanel + j, batch);
-      for (std::int64_t i = 0; i < job.d_head; i += 16) __builtin_prefetch(next + i);
+      for (std::int64_t i = 0; i < d_head; i += 16) __builtin_prefetch(next + i);
     }
-  }
-
-  void pack_keys(std::int64_t unit, std::int64_t first) const {
-    alignas(64) Number rows[kPanel * kHeadStride];
-    copy_rows(job.k, unit, first, key_depth, rows);
-    P::put_keys(rows, key_depth, keys(unit) + first * key_depth);
-  }
-
-  void pack_values(std::int64_t unit, std::int64_t first) const {
-    alignas(64) Number rows[kPanel * kHeadStride];
-    copy_rows(job.v, unit, first, d_value, rows);
-    for (std::int64_t i = 0; i < d_value; i += kPanel)
-      P::put_values(rows + i, first, width(i), values(unit) + i * n_key);
   }
 };
 

@@ -23,7 +23,7 @@ struct FloatProducts {
   struct Session {};
   static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, of a block, of a pass
   static constexpr int kKeys = 128;                                     // of a chunk
-  static constexpr int kPanel = 2 * V::width, kLeastPanel = V::width, kDepth = 1;  // columns; unit of the depth
+  static constexpr int kPanel = 2 * V::width, kMinPanel = V::width, kDepth = 1;  // columns; unit of the depth
   static constexpr bool kBeside = false;
 
   /// Weights are e^x, and relative to the greatest score of their row.
@@ -105,7 +105,7 @@ struct PairProducts {
   using Float = typename V::Float;
   using Number = std::uint16_t;
   using Session = typename Tile::Session;
-  static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256, kPanel = 32, kLeastPanel = 32, kDepth = 32;
+  static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256, kPanel = 32, kMinPanel = 32, kDepth = 32;
   static constexpr bool kBeside = true;  // products wait for other work to be done beside it
 
   /// Weights are 2^x. Rounding errs by a share of a weight, so that weights may as well be up to 2^kSlack: then the

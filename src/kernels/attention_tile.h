@@ -33,32 +33,27 @@ class AttentionTile {
   static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
  public:
-  static std::int64_t packed_size(const AttentionJob& job) {
-    return job.n_unit() * Panels(job).unit_size() * static_cast<std::int64_t>(sizeof(Number)) / 4 + 1;
-  }
-
-  static void pack(const AttentionJob& job, int ith, int nth) { Panels(job).pack(ith, nth); }
-
-  static void run(const AttentionJob& job, int ith, int nth) {
-    [[maybe_unused]] typename P::Session session;
-    const Panels panels(job);
-    // Blocks are made smaller where there would be too few of them to share out.
-    const std::int64_t fair = round_up(job.n_row() * job.n_unit() / (4 * nth) + 1, kTile);
-    const std::int64_t n_row = fair < kRows ? fair : kRows;
-    const std::int64_t n_block = pieces(job.n_row(), n_row), n = n_block * job.n_unit();
-    job.turns->share(ith, nth, n, [&](std::int64_t i) {
-      const std::int64_t row = i % n_block * n_row, left = job.n_row() - row;
-      Block(panels, i / n_block, row, static_cast<int>(left < n_row ? left : n_row)).run();
-    });
-  }
+  static constexpr AttentionKernel kernel() { return {Panels::packed_size, Panels::n_pack, Panels::pack, cut, run}; }
 
  private:
+  static std::int64_t cut(AttentionJob& job, int n_thread) {
+    // Blocks are made smaller where there would be too few of them to share out.
+    const std::int64_t fair = round_up(job.n_row() * job.n_unit() / (4 * n_thread) + 1, kTile);
+    job.block_rows = min(fair, kRows);
+    return ceil_div(job.n_row(), job.block_rows) * job.n_unit();
+  }
+
+  static void run(const AttentionJob& job, std::int64_t item) {
+    [[maybe_unused]] typename P::Session session;
+    const std::int64_t n_block = ceil_div(job.n_row(), job.block_rows), row = item % n_block * job.block_rows;
+    Block(job, item / n_block, row, static_cast<int>(min(job.n_row() - row, job.block_rows))).run();
+  }
+
   /// At most kRows rows of one unit.
   struct Block {
-    const Panels& panels;
     const AttentionJob& job;
-    const std::int64_t batch;
-    const Number *keys, *values;
+    const std::int64_t unit, batch;
+    const Panels query_panels = Panels(job.d_head, 0);
     const int n_row;
     const int n_tiled = static_cast<int>(round_up(n_row, kTile));
     std::int64_t head[kRows], query[kRows];  // of each row
@@ -77,8 +72,8 @@ class AttentionTile {
     // One number for each row; weights are relative to the score `base`.
     alignas(64) float base[kRowVectors], minus_offset[kRowVectors], shrink[kRowVectors];
 
-    VLA_INLINE Block(const Panels& p, std::int64_t unit, std::int64_t first_row, int n)
-        : panels(p), job(p.job), batch(unit / job.n_head_kv), keys(p.keys(unit)), values(p.values(unit)), n_row(n) {
+    VLA_INLINE Block(const AttentionJob& j, std::int64_t i, std::int64_t first_row, int n)
+        : job(j), unit(i), batch(unit / job.n_head_kv), n_row(n) {
       std::int64_t h = unit % job.n_head_kv * (job.n_head / job.n_head_kv) + first_row / job.n_query;
       std::int64_t q = first_row % job.n_query;
       for (int r = 0; r < n_row; ++r) {
@@ -88,8 +83,9 @@ class AttentionTile {
     }
 
     enum class Seen { none, some, all };
-    /// Some rows of the block meet a chunk: n keys from `key` on.
+    /// Some rows of the block meet a chunk: n keys of a segment from `key` on.
     struct Pass {
+      int segment = 0;
       std::int64_t key = 0;
       int n = 0;
       Seen seen = Seen::none;
@@ -108,7 +104,7 @@ class AttentionTile {
 
     void run() {
       start();
-      Pass before, now = pass_from(0);
+      Pass before, now = pass_from(0, 0);
       if (now.n == 0) std::memset(mixed, 0, sizeof(mixed));  // the rows see nothing, and become NaNs
       multiply_keys(now);
       work.finish();
@@ -126,19 +122,25 @@ class AttentionTile {
     }
 
     void start() {
+      alignas(64) float room[kMaxHead];
       for (int r = 0; r < n_tiled; ++r)
-        panels.copy_row(r < n_row ? job.q.at(head[r], query[r], batch) : nullptr, panels.key_depth,
-                        query_number + r * kHeadStride);
+        query_panels.copy_row(
+            r < n_row ? job.prep(job.q.at(head[r], query[r], batch), query[r], job.d_head, room) : nullptr,
+            query_panels.key_depth, query_number + r * kHeadStride);
       for (int r = 0; r < kRowVectors; ++r) V::store(sum + r * kWidth, Float{});
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
     }
 
-    /// The first pass with the first chunk at or behind `key` of which the block's queries see something, or none.
-    Pass pass_from(std::int64_t key) const {
-      for (; key < job.n_key; key += kKeys) {
-        const int n = static_cast<int>(job.n_key - key < kKeys ? job.n_key - key : kKeys);
-        const Seen seen = job.mask == nullptr ? Seen::all : look(key, n);
-        if (seen != Seen::none) return {key, n, seen, false, 0, n_row < kPart ? n_row : kPart, 0};
+    /// The first pass with the first chunk at or behind `key` of a segment of which the block's queries see something,
+    /// or none.
+    Pass pass_from(int i_segment, std::int64_t key) const {
+      for (; i_segment < job.n_segment; ++i_segment, key = 0) {
+        const AttentionJob::Segment& segment = job.segment[i_segment];
+        for (; key < segment.n_key; key += kKeys) {
+          const int n = static_cast<int>(min(segment.n_key - key, kKeys));
+          const Seen seen = job.mask == nullptr ? Seen::all : look(segment.first + key, n);
+          if (seen != Seen::none) return {i_segment, key, n, seen, false, 0, n_row < kPart ? n_row : kPart, 0};
+        }
       }
       return {};
     }
@@ -149,7 +151,7 @@ class AttentionTile {
         next.first = pass.end;
         next.end = n_row - pass.end < kPart ? n_row : pass.end + kPart;
       } else {
-        next = pass_from(pass.key + kKeys);
+        next = pass_from(pass.segment, pass.key + kKeys);
         next.sum = true;
       }
       next.buffer = kBuffers - 1 - pass.buffer;
@@ -161,13 +163,13 @@ class AttentionTile {
       bool none = true, all = true;
       for (int r = 0; r < n_row && (none || all); ++r) {
         const float* mask = job.mask + query[r] * job.n_key + key;
-        Float most_seen = V::set(mask[0]), least_seen = V::set(-mask[0]);
+        Float max_seen = V::set(mask[0]), min_seen = V::set(-mask[0]);
         int j = 0;
         for (; j + kWidth <= n; j += kWidth) {
-          most_seen = V::max(most_seen, V::load(mask + j));
-          least_seen = V::max(least_seen, -V::load(mask + j));
+          max_seen = V::max(max_seen, V::load(mask + j));
+          min_seen = V::max(min_seen, -V::load(mask + j));
         }
-        float top = V::max(most_seen), bottom = -V::max(least_seen);
+        float top = V::max(max_seen), bottom = -V::max(min_seen);
         for (; j < n; ++j) top = mask[j] > top ? mask[j] : top, bottom = mask[j] < bottom ? mask[j] : bottom;
         none = none && top == kNever;
         all = all && top == 0.0f && bottom == 0.0f;
@@ -175,7 +177,15 @@ class AttentionTile {
       return all ? Seen::all : none ? Seen::none : Seen::some;
     }
 
+    Panels panels_of(const Pass& pass) const { return Panels(job.d_head, job.segment[pass.segment].n_key); }
+    const Number* packed(const Pass& pass) const {
+      return reinterpret_cast<const Number*>(job.segment[pass.segment].packed);
+    }
+
     void multiply_keys(const Pass& pass) {
+      if (pass.n == 0) return;
+      const Panels panels = panels_of(pass);
+      const Number* keys = packed(pass) + panels.keys(unit);
       const std::int64_t depth = panels.key_depth;
       for (int j = 0; j < pass.n; j += kPanel)
         for (int r = pass.first; r < pass.end; r += kTile)
@@ -201,7 +211,7 @@ class AttentionTile {
         for (int j = 0; last < pass.n && j < kPanel; j += kWidth)
           V::store(row + last + j, V::load(row + last + j) + V::load(missing + j));
         if (pass.seen == Seen::all) continue;
-        const float* mask = job.mask + query[r] * job.n_key + pass.key;
+        const float* mask = job.mask + query[r] * job.n_key + job.segment[pass.segment].first + pass.key;
         for (int j = 0; j < pass.n; j += kWidth)
           V::store(row + j, V::fma(V::load(row + j), V::set(job.scale), load<V>(mask + j, pass.n - j)));
       }
@@ -253,12 +263,14 @@ class AttentionTile {
       for (int r = pass.first; pass.sum && r < pass.end; ++r) {
         if (shrink[r] == 1.0f) continue;
         float* row = mixed + r * kHeadStride;
-        for (std::int64_t i = 0; i < panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * shrink[r]);
+        for (std::int64_t i = 0; i < query_panels.d_value; i += kWidth) V::store(row + i, V::load(row + i) * shrink[r]);
       }
     }
 
     void mix_values(const Pass& pass) {
       if (pass.n == 0) return;
+      const Panels panels = panels_of(pass);
+      const Number* values = packed(pass) + panels.values(unit);
       for (std::int64_t i = 0; i < panels.d_value; i += kPanel) {
         const std::int64_t width = panels.width(i);
         const Number* panel = values + i * panels.n_key + pass.key * width;

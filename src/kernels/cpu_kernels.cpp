@@ -7,6 +7,22 @@
 
 namespace vla::kernels {
 
+RowKernel CpuKernels::activation(Activation activation) const {
+  switch (activation) {
+    case Activation::gelu_tanh:
+      return gelu_tanh;
+    case Activation::gelu_erf:
+      return gelu_erf;
+    case Activation::silu:
+      return silu;
+    case Activation::relu:
+      return relu;
+    case Activation::none:
+      break;
+  }
+  return nullptr;
+}
+
 #if defined(__x86_64__)
 // Each in the file of its name.
 extern const CpuKernels kAvx2Kernels, kAvx512Kernels;
@@ -80,7 +96,7 @@ struct EmulatedTile {
 
 const AttentionKernel& emulated_amx_attention() {
   using Attention = AttentionTile<PairProducts<Portable, EmulatedTile>>;
-  static constexpr AttentionKernel kernel = {Attention::packed_size, Attention::pack, Attention::run};
+  static constexpr AttentionKernel kernel = Attention::kernel();
   return kernel;
 }
 

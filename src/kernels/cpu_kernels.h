@@ -2,22 +2,24 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "backend/isa.h"
+#include "base/activation.h"
 #include "kernels/attention_kernel.h"
+#include "kernels/isa.h"
 
 namespace vla::kernels {
 
 /// Everything that is not a matrix product, for one instruction set. Rows are contiguous, and need no alignment.
 struct CpuKernels {
-  using Map = void (*)(const float* x, float* y, std::int64_t n);
-  /// y = (x - mean) / deviation * weight + bias; weight and bias may be null.
-  using Norm = void (*)(const float* x, const float* weight, const float* bias, float eps, float* y, std::int64_t n);
-
-  Map silu, gelu_tanh, gelu_erf, relu;  // math.h, gelu_erf.h
-  Norm layer_norm, rms_norm;
-  /// Turns the pairs (x_i, x_{i + half}).
-  void (*rotate_half)(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half);
+  RowKernel silu, gelu_tanh, gelu_erf, relu;  // math.h, gelu_erf.h
+  /// y = (x - mean) / sqrt(variance + s) * w + b, and y = x / sqrt(mean(x^2) + s) * w + b; w and b may be null.
+  RowKernel layer_norm, rms_norm;
+  /// Turns the pairs (x_i, x_{i + n/2}) by n/2 cosines in w and n/2 sines behind them.
+  RowKernel rotate_half;
+  RowKernel add, multiply;  // y = x + w, x * w
+  RowKernel scale;          // y = x * s
   AttentionKernel attention;
+
+  RowKernel activation(Activation activation) const;
 };
 
 /// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used. Those of `amx`

@@ -16,28 +16,53 @@ class CpuKernelsMaker {
 
  public:
   static constexpr CpuKernels make() {
-    using Attention = AttentionTile<FloatProducts<V, kTile>>;
-    return {map<Silu>,  map<GeluTanh>, map<GeluErf>, map<Relu>,
-            layer_norm, rms_norm,      rotate_half,  {Attention::packed_size, Attention::pack, Attention::run}};
+    return {map<Silu>,
+            map<GeluTanh>,
+            map<GeluErf>,
+            map<Relu>,
+            layer_norm,
+            rms_norm,
+            rotate_half,
+            map<Plus>,
+            map<Times>,
+            scaled,
+            AttentionTile<FloatProducts<V, kTile>>::kernel()};
   }
 
  private:
   struct Silu {
-    static VLA_INLINE Float of(Float x) { return silu<V>(x); }
+    static VLA_INLINE Float of(Float x, Float) { return silu<V>(x); }
   };
   struct GeluTanh {
-    static VLA_INLINE Float of(Float x) { return gelu_tanh<V>(x); }
+    static VLA_INLINE Float of(Float x, Float) { return gelu_tanh<V>(x); }
   };
   struct GeluErf {
-    static VLA_INLINE Float of(Float x) { return gelu_erf<V>(x); }
+    static VLA_INLINE Float of(Float x, Float) { return gelu_erf<V>(x); }
   };
   struct Relu {
-    static VLA_INLINE Float of(Float x) { return relu<V>(x); }
+    static VLA_INLINE Float of(Float x, Float) { return relu<V>(x); }
+  };
+
+  struct Plus {
+    static VLA_INLINE Float of(Float x, Float w) { return x + w; }
+    static constexpr bool kBinary = true;
+  };
+  struct Times {
+    static VLA_INLINE Float of(Float x, Float w) { return x * w; }
+    static constexpr bool kBinary = true;
   };
 
   template <class F>
-  static void map(const float* x, float* y, std::int64_t n) {
-    for (std::int64_t i = 0; i < n; i += V::width) store<V>(y + i, F::of(load<V>(x + i, n - i)), n - i);
+  static void map(const float* x, const float* w, const float*, float, float* y, std::int64_t n) {
+    for (std::int64_t i = 0; i < n; i += V::width) {
+      Float second = {};
+      if constexpr (requires { F::kBinary; }) second = load<V>(w + i, n - i);
+      store<V>(y + i, F::of(load<V>(x + i, n - i), second), n - i);
+    }
+  }
+
+  static void scaled(const float* x, const float*, const float*, float s, float* y, std::int64_t n) {
+    for (std::int64_t i = 0; i < n; i += V::width) store<V>(y + i, load<V>(x + i, n - i) * s, n - i);
   }
 
   /// The sum of (x - mean)^2, or of x where `mean` is null. Two chains of sums, so that one need not wait for the
@@ -77,11 +102,12 @@ class CpuKernelsMaker {
     scale(x, zero, 1.0f / __builtin_sqrtf(mean_square + eps), weight, bias, y, n);
   }
 
-  static void rotate_half(const float* x, const float* cosine, const float* sine, float* y, std::int64_t half) {
+  static void rotate_half(const float* x, const float* w, const float*, float, float* y, std::int64_t n) {
+    const std::int64_t half = n / 2;
     for (std::int64_t i = 0; i < half; i += V::width) {
       const std::int64_t left = half - i;
       const Float a = load<V>(x + i, left), b = load<V>(x + half + i, left);
-      const Float c = load<V>(cosine + i, left), s = load<V>(sine + i, left);
+      const Float c = load<V>(w + i, left), s = load<V>(w + half + i, left);
       store<V>(y + i, a * c - b * s, left);
       store<V>(y + half + i, b * c + a * s, left);
     }

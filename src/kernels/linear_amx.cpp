@@ -26,14 +26,14 @@ struct AmxTile : PairTile {
   }
 
   static void multiply(DType, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const std::byte* ahead) {
+                       float* c, bool add, const Ahead& ahead) {
     // Rows that x does not have are multiplied too; nobody looks at their sums.
     if (rest != nullptr)
-      n_row > 16 ? product<true, true>(x, rest, panel, depth, c, add, ahead)
-                 : product<false, true>(x, rest, panel, depth, c, add, ahead);
+      n_row > 16 ? product<true, true>(x, rest, panel, depth, c, add, ahead.from)
+                 : product<false, true>(x, rest, panel, depth, c, add, ahead.from);
     else
-      n_row > 16 ? product<true, false>(x, rest, panel, depth, c, add, ahead)
-                 : product<false, false>(x, rest, panel, depth, c, add, ahead);
+      n_row > 16 ? product<true, false>(x, rest, panel, depth, c, add, ahead.from)
+                 : product<false, false>(x, rest, panel, depth, c, add, ahead.from);
   }
 
  private:
@@ -46,11 +46,11 @@ struct AmxTile : PairTile {
   static constexpr std::size_t kLineX = kXStride * sizeof(X), kLineC = kColumns * sizeof(float);
 
   /// All 32 rows, or the first 16; with what the rounding of x left, or without.
-  template <bool kAll, bool kFine>
+  template <bool kAll, bool kSplit>
   static VLA_INLINE void product(const X* x, const X* rest, const std::byte* panel, std::int64_t depth, float* c,
                                  bool add, const std::byte* ahead) {
     // Bytes of the panel's next step to ask for with each two blocks: the rows of x share them.
-    constexpr int kAhead = kFine ? 1024 : 512;
+    constexpr int kAhead = kSplit ? 1024 : 512;
     float* lower = c + 16 * kColumns;
     before_tile_loads();
     if (add) {
@@ -70,7 +70,7 @@ struct AmxTile : PairTile {
       _tile_loadd(6, panel, 64);
       _tile_loadd(7, panel + kPanelBlock, 64);
       add_products<kAll>(x + k);
-      if constexpr (kFine) add_products<kAll>(rest + k);
+      if constexpr (kSplit) add_products<kAll>(rest + k);
       for (int line = 0; line < kAhead; line += 64) __builtin_prefetch(ahead + line, 0, 2);  // to the second cache
     }
     _tile_stored(0, c, kLineC);

@@ -12,17 +12,15 @@ struct Avx2Tile {
   using V = Avx2;
   using X = float;
   static constexpr int kRows = 6, kColumns = 16;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 768, kBlockRows = 54, kFineRows = 0, kUnpacked = 0;
+  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 768, kBlockRows = 54, kSplitRows = 0;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
 
-  static VLA_INLINE const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
-
   static void multiply(DType type, int n_row, const float* x, const float*, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const std::byte* ahead) {
+                       float* c, bool add, const Ahead& ahead) {
     using Function = void (*)(const float*, const std::byte*, std::int64_t, float*, bool, const std::byte*);
     static constexpr Function kPairs[] = {tile<1, Pairs>, tile<2, Pairs>, tile<3, Pairs>,
                                           tile<4, Pairs>, tile<5, Pairs>, tile<6, Pairs>};
@@ -31,7 +29,7 @@ struct Avx2Tile {
     static constexpr Function kFloats[] = {tile<1, Floats>, tile<2, Floats>, tile<3, Floats>,
                                            tile<4, Floats>, tile<5, Floats>, tile<6, Floats>};
     const Function* tiles = type == DType::bf16 ? kPairs : type == DType::f16 ? kHalves : kFloats;
-    tiles[n_row - 1](x, panel, depth, c, add, ahead);
+    tiles[n_row - 1](x, panel, depth, c, add, ahead.from);
   }
 
  private:

@@ -10,15 +10,14 @@ struct FloatTile {
   using V = Portable;
   using X = float;
   static constexpr int kRows = 5, kColumns = 16;
-  static constexpr int kMaxDepth = 96, kManyDepth = 64, kStep = 32, kBlockRows = 10, kFineRows = 0, kUnpacked = 0;
+  static constexpr int kMaxDepth = 96, kManyDepth = 64, kStep = 32, kBlockRows = 10, kSplitRows = 0;
   static constexpr int kXStride = kMaxDepth + 1;
   static constexpr bool kEven = true, kRounds = false;
   struct Session {};
 
   static void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
-  static const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
   static void multiply(DType type, int n_row, const float* x, const float*, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const std::byte*) {
+                       float* c, bool add, const Ahead&) {
     for (int r = 0; r < n_row; ++r)
       for (int n = 0; n < kColumns; ++n) {
         float sum = 0;
@@ -47,7 +46,7 @@ struct EmulatedAmxTile : PairTile {
   }
 
   static void multiply(DType type, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const std::byte*) {
+                       float* c, bool add, const Ahead&) {
     for (int r = 0; r < n_row; ++r)
       for (int n = 0; n < kColumns; ++n) {
         float sum = 0;

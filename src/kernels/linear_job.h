@@ -5,22 +5,21 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "base/activation.h"
 #include "bundle/bundle.h"
-#include "kernels/cpu_kernels.h"
-#include "kernels/turns.h"
+#include "kernels/row_kernel.h"
 
 namespace vla::kernels {
 
-enum class Activation { none, gelu_tanh, gelu_erf, silu, relu };
-
-/// One node of matrix products: what is multiplied, and where everything lies.
+/// Matrix products of one x, with everything that follows them: what is multiplied, and where everything lies.
 struct LinearJob {
-  /// y = activation(W x + bias) + residual. y and residual are contiguous rows of d_out numbers, one for each row of x;
-  /// bias and residual may be null.
+  /// y = activation(W x + bias) * factor + residual. y and residual are contiguous rows of d_out numbers, one for each
+  /// row of x; bias, factor [d_out] and residual may be null.
   struct Part {
     DType type;               // of the stored weight
     const std::byte* weight;  // packed for its kernel
     const float* bias;
+    const float* factor;
     const float* residual;
     std::byte* y;
     std::int64_t d_out;
@@ -29,13 +28,14 @@ struct LinearJob {
 
   /// y = run(x); null where x is multiplied as it is.
   struct Norm {
-    CpuKernels::Norm run = nullptr;
+    RowKernel run = nullptr;
     const float *weight = nullptr, *bias = nullptr;
     float eps = 0;
   };
 
-  const std::byte* x;  // contiguous rows of d_in numbers
-  Norm norm;           // what is multiplied is the norm of each row
+  const std::byte* x;     // n_row rows of d_in numbers
+  std::int64_t x_stride;  // numbers from one row to the next
+  Norm norm;              // what is multiplied is the norm of each row
   std::int64_t n_row, d_in;
   int n_part;
   Part part[kMaxPart];
@@ -44,7 +44,7 @@ struct LinearJob {
   bool gated;
   /// Of x and y: f32, or bf16 where the kernel rounds what it multiplies (LinearKernel::rounds).
   DType x_type, y_type;
-  Turns* turns;  // of this node
+  std::int64_t n_group;  // of panels, made by LinearKernel::cut
 };
 
 }  // namespace vla::kernels

@@ -17,7 +17,7 @@ std::span<const LinearKernel* const> linear_kernels() {
 #endif
 }
 
-const MatrixFormat* choose_linear(const MatrixDesc& desc, Isa isa) {
+const LinearKernel* choose_linear(const MatrixDesc& desc, Isa isa) {
   for (const LinearKernel* kernel : linear_kernels())
     if (kernel->supports(desc, isa)) return kernel;
   return nullptr;

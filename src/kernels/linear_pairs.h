@@ -13,12 +13,9 @@ struct PairTile {
   using X = std::uint16_t;
   static constexpr int kRows = 32, kColumns = 32;
   // A step of a panel is 24 KiB and stays in the first cache.
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 384, kBlockRows = 256, kFineRows = 64,
-                       kUnpacked = 0;
+  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 384, kBlockRows = 256, kSplitRows = 64;
   static constexpr int kXStride = kMaxDepth + 32;
   static constexpr bool kEven = false, kRounds = true;
-
-  static VLA_INLINE const std::byte* unpack(DType, const std::byte* panel, std::int64_t, float*) { return panel; }
 };
 
 }  // namespace vla::kernels

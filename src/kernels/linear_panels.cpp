@@ -22,7 +22,7 @@ void put(DType type, const std::byte* numbers, std::int64_t n, std::byte* column
 
 template <int kColumns>
 std::size_t Panels<kColumns>::packed_size(const MatrixDesc& desc) {
-  return static_cast<std::size_t>(pieces(desc.d_out, kColumns) * size(desc.type, round_up(desc.d_in, kPanelDepth)));
+  return static_cast<std::size_t>(ceil_div(desc.d_out, kColumns) * size(desc.type, round_up(desc.d_in, kPanelDepth)));
 }
 
 template <int kColumns>
@@ -30,11 +30,11 @@ void Panels<kColumns>::pack(const MatrixDesc& desc, const std::byte* stored, std
   const std::int64_t row = desc.d_in * number_size(desc.type), depth = block_depth(desc.type);
   const std::int64_t panel = size(desc.type, round_up(desc.d_in, kPanelDepth));
   for (std::int64_t first = 0; first < desc.d_out; first += kColumns, packed += panel) {
-    const std::int64_t n_column = least(desc.d_out - first, kColumns);
+    const std::int64_t n_column = min(desc.d_out - first, kColumns);
     if (n_column < kColumns || desc.d_in % kPanelDepth != 0) std::memset(packed, 0, static_cast<std::size_t>(panel));
     for (std::int64_t k = 0; k < desc.d_in; k += depth)
       for (std::int64_t n = 0; n < n_column; ++n)
-        put(desc.type, stored + (first + n) * row + k * number_size(desc.type), least(depth, desc.d_in - k),
+        put(desc.type, stored + (first + n) * row + k * number_size(desc.type), min(depth, desc.d_in - k),
             packed + place(desc.type, k, n));
   }
 }

@@ -2,9 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "backend/matrix.h"
+#include "kernels/linear_kernel.h"
 #include "kernels/numbers.h"
-#include "kernels/pieces.h"
+#include "kernels/sizes.h"
 
 /// How a matrix lies in memory for the kernels, from load on.
 ///
@@ -33,7 +33,7 @@ struct Panels {
   /// Bytes over a depth that is a multiple of 32.
   static VLA_INLINE std::int64_t size(DType type, std::int64_t depth) { return depth * kColumns * number_size(type); }
 
-  // A MatrixFormat's functions.
+  // A LinearKernel's functions.
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 

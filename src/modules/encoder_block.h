@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include "modules/attention.h"
 #include "nn/mlp.h"
-#include "nn/norm.h"
 
 namespace vla {
 
@@ -26,9 +26,8 @@ class EncoderBlock : public Module<EncoderBlock> {
   Tensor forward(Graph& g, Tensor x, Tensor rotary = {}) const;
 
  private:
-  int n_head_;
   LayerNorm attn_norm_;
-  Linear q_, k_, v_, out_;
+  Attention attention_;
   LayerNorm ffn_norm_;
   Mlp mlp_;
   const Param* attn_scale_ = nullptr;  // of scaled families

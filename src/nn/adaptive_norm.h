@@ -3,14 +3,15 @@
 #pragma once
 
 #include "nn/linear.h"
+#include "nn/tokens.h"
 
 namespace vla {
 
 /// RMS norm whose scale and shift, and the gate of the residual that follows, are linear in a condition.
 /// Source: lerobot policies/pi_gemma.py PiGemmaRMSNorm.
-class AdaptiveRmsNorm : public Module<AdaptiveRmsNorm> {
+class AdaRmsNorm : public Module<AdaRmsNorm> {
  public:
-  AdaptiveRmsNorm(const Scope& s, int d, int d_condition, float eps);
+  AdaRmsNorm(const Scope& s, int d, int d_condition, float eps);
 
   /// Load rate, one column per condition: [d_condition, n] -> [3 d, n], the factors (1 + scale), shifts and gates.
   Tensor modulation(Graph& g, Tensor condition) const;
@@ -28,11 +29,11 @@ class AdaptiveRmsNorm : public Module<AdaptiveRmsNorm> {
 /// LayerNorm without weights, whose scale and shift are linear in a condition by a matrix of the norm's own path.
 /// Sources: lerobot policies/groot/action_head/cross_attention_dit.py AdaLayerNorm (scale_shift), DiT.forward
 /// (shift_scale).
-class AdaptiveLayerNorm {
+class AdaLayerNorm {
  public:
   /// Which of the two are the first `d` rows of the matrix.
   enum class Order { scale_shift, shift_scale };
-  AdaptiveLayerNorm(const Scope& s, int d, float eps, Order order);
+  AdaLayerNorm(const Scope& s, int d, float eps, Order order);
 
   /// Load rate, one column per condition: [d, n] -> [2 d, n], with factors (1 + scale) in place of scales.
   Tensor modulation(Graph& g, Tensor condition) const;
@@ -48,8 +49,5 @@ class AdaptiveLayerNorm {
 /// x + y * gate. x and y [d, n, ...], gate [d] for every token.
 /// Sources: lerobot policies/pi_gemma.py _gated_residual; transformers modeling_internvl.py (LayerScale).
 Tensor gated_add(Graph& g, Tensor x, Tensor y, Tensor gate);
-
-/// Features first to first + count - 1 of one vector, without a copy: [d, 1] -> [count, 1].
-Tensor slice_features(Graph& g, Tensor x, int first, int count);
 
 }  // namespace vla

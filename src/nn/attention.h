@@ -5,22 +5,22 @@
 #include <span>
 #include <vector>
 
-#include "backend/graph.h"
+#include "graph/graph.h"
 
 namespace vla {
 
-/// softmax(q k / sqrt(d_head) + mask) v, float32 throughout, heads concatenated.
-/// q [d_head, n_head, n_query, n_batch], k and v [d_head, n_head_kv, n_key, n_batch], mask [n_key, n_query] or none ->
+/// Keys and values of one stretch of tokens: [d_head, n_head_kv, n_key, n_batch] each.
+struct KeyValue {
+  Tensor key, value;
+};
+
+/// softmax(q k / sqrt(d_head) + mask) v, float32 throughout, heads concatenated, over the keys and values of segments
+/// that stand one after the other. q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] or none ->
 /// [d_head * n_head, n_query, n_batch]. Query head h reads key head h / (n_head / n_head_kv). The mask is 0 for a key
 /// that is seen, -infinity for one that is not, and ln(n) for one that stands for n equal ones with equal values. Every
 /// query must see at least one key.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
-Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask);
-/// The same for keys and values that do not change between runs: `packed` is what pack_keys made of them.
-Tensor attention(Graph& g, Tensor q, Tensor k, Tensor v, Tensor mask, Tensor packed);
-/// Keys and values laid out once for many runs, in the order that the graph's kernels read; none where they read them
-/// as they are.
-Tensor pack_keys(Graph& g, Tensor k, Tensor v);
+Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tensor mask);
 
 /// The mask of consecutive groups of tokens: a token sees its own group and every earlier one. Sizes in tokens; the
 /// mask is [n, n] with n their sum. Source: lerobot policies/common/vla_utils.py make_att_2d_masks.
@@ -37,9 +37,9 @@ Tensor causal_mask(Graph& g, const std::vector<bool>& seen);
 /// times exp(score). [copies.size(), n_query], or none where all are 1.
 Tensor copies_mask(Graph& g, const std::vector<int>& copies, int n_query);
 
-/// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...], without a copy.
+/// [d_model, n, ...] -> [d_model / n_head, n_head, n, ...].
 Tensor split_heads(Graph& g, Tensor x, int n_head);
-/// [d_head, n_head, n] -> [d_head * n_head, n], without a copy.
+/// [d_head, n_head, n, ...] -> [d_head * n_head, n, ...].
 Tensor merge_heads(Graph& g, Tensor x);
 
 }  // namespace vla

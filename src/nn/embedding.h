@@ -5,20 +5,20 @@
 #include <string>
 #include <vector>
 
-#include "nn/module.h"
+#include "nn/linear.h"
 
 namespace vla {
 
 /// Ids that do not change from run to run, for a table: [ids.size()] i32. `key` tells lists of a graph apart.
 Tensor constant_ids(Graph& g, const std::string& key, const std::vector<std::int32_t>& ids);
 /// 0, 1, ... count - 1.
-Tensor counting_ids(Graph& g, int count);
+Tensor arange(Graph& g, int count);
 
 /// Rows of a table. ids [n] i32 -> [d_model, n]. Ids must be below n_row: whoever makes them checks.
 class Embedding : public Module<Embedding> {
  public:
   Embedding(const Scope& s, int d_model, int n_row);
-  Tensor forward(Graph& g, Tensor ids) const;
+  Tensor forward(Graph& g, Tensor ids) const { return g.add(op::Embedding{weight_}, {ids}); }
 
  private:
   const Param* weight_;
@@ -37,8 +37,7 @@ class PatchEmbed : public Module<PatchEmbed> {
 
  private:
   int patch_size_;
-  const Param* weight_;
-  const Param* bias_;
+  Linear product_;
 };
 
 }  // namespace vla

@@ -5,8 +5,8 @@
 #include <string>
 #include <utility>
 
-#include "backend/graph.h"
 #include "bundle/params.h"
+#include "graph/graph.h"
 
 namespace vla {
 

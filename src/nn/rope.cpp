@@ -8,8 +8,6 @@
 #include <cmath>
 #include <numeric>
 
-#include "kernels/elementwise.h"
-
 namespace vla {
 namespace {
 
@@ -21,59 +19,57 @@ struct Pair {
 
 /// Cosines and sines are rounded once from double.
 Tensor make_table(Graph& g, float base, RotaryAngle rule, const std::vector<Pair>& pairs,
-                  const std::vector<Place>& places) {
-  std::string key = fmt::format("rope/{}/{}/{}", base, static_cast<int>(rule), fmt::join(places, "/"));
+                  const std::vector<PositionId>& positions) {
+  std::string key = fmt::format("rope/{}/{}/{}", base, static_cast<int>(rule), fmt::join(positions, "/"));
   for (const Pair& pair : pairs) key += fmt::format("/{}:{}", pair.axis, pair.exponent);
-  const auto angle = [&](const Place& place, const Pair& pair) {
-    const float position = static_cast<float>(place[static_cast<std::size_t>(pair.axis)]);
+  const auto angle = [&](const PositionId& id, const Pair& pair) {
+    const float position = static_cast<float>(id[static_cast<std::size_t>(pair.axis)]);
     const float period = static_cast<float>(std::pow(double{base}, double{pair.exponent}));
     return double{rule == RotaryAngle::quotient ? position / period : position * (1.0f / period)};
   };
-  return g.constant(key, [&](Store& store) {
+  const auto d_head = static_cast<std::int64_t>(2 * pairs.size()), n = static_cast<std::int64_t>(positions.size());
+  return g.constant(key, {d_head, n, 1, 1}, [&] {
     std::vector<float> table;
-    for (const Place& place : places) {
-      for (const Pair& pair : pairs) table.push_back(static_cast<float>(std::cos(angle(place, pair))));
-      for (const Pair& pair : pairs) table.push_back(static_cast<float>(std::sin(angle(place, pair))));
+    for (const PositionId& id : positions) {
+      for (const Pair& pair : pairs) table.push_back(static_cast<float>(std::cos(angle(id, pair))));
+      for (const Pair& pair : pairs) table.push_back(static_cast<float>(std::sin(angle(id, pair))));
     }
-    return store.add_constant(std::move(table),
-                              {static_cast<std::int64_t>(2 * pairs.size()), static_cast<std::int64_t>(places.size())});
+    return table;
   });
 }
 
 }  // namespace
 
-Tensor rope(Graph& g, Tensor x, Tensor table) { return kernels::rotate_half(g, x, table); }
-
-Tensor rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first) {
+Tensor apply_rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first) {
   std::vector<int> positions(static_cast<std::size_t>(x.dim(2)));
   std::iota(positions.begin(), positions.end(), first);
-  return rope(g, x, rotary_table(g, static_cast<int>(x.dim(0)), base, angle, positions));
+  return apply_rope(g, x, rotary_table(g, static_cast<int>(x.dim(0)), base, angle, positions));
 }
 
 Tensor rotary_table(Graph& g, int d_head, float base, RotaryAngle angle, std::span<const int> positions) {
   std::vector<Pair> pairs;
   for (int i = 0; i < d_head / 2; ++i) pairs.push_back({0, 2.0f / static_cast<float>(d_head) * static_cast<float>(i)});
-  std::vector<Place> places;
-  for (const int position : positions) places.push_back({position, 0, 0});
-  return make_table(g, base, angle, pairs, places);
+  std::vector<PositionId> ids;
+  for (const int position : positions) ids.push_back({position, 0, 0});
+  return make_table(g, base, angle, pairs, ids);
 }
 
-Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<Place>& places) {
+Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<PositionId>& positions) {
   std::vector<Pair> pairs;
   for (const int axis : {1, 2})
     for (int i = 0; i < d_head / 4; ++i)
       pairs.push_back({axis, static_cast<float>(2 * i) / static_cast<float>(d_head / 2)});
-  return make_table(g, base, RotaryAngle::product, pairs, places);
+  return make_table(g, base, RotaryAngle::product, pairs, positions);
 }
 
-Tensor interleaved_rotary_table(Graph& g, int d_head, float base, const std::array<int, 3>& sections,
-                                const std::vector<Place>& places) {
+Tensor mrope_table(Graph& g, int d_head, float base, const std::array<int, 3>& sections,
+                   const std::vector<PositionId>& positions) {
   std::vector<Pair> pairs;
   for (int i = 0; i < d_head / 2; ++i) {
     const int axis = i / 3 < sections[static_cast<std::size_t>(i % 3)] ? i % 3 : 0;
     pairs.push_back({axis, static_cast<float>(2 * i) / static_cast<float>(d_head)});
   }
-  return make_table(g, base, RotaryAngle::product, pairs, places);
+  return make_table(g, base, RotaryAngle::product, pairs, positions);
 }
 
 }  // namespace vla

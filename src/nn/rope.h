@@ -6,7 +6,7 @@
 #include <span>
 #include <vector>
 
-#include "backend/graph.h"
+#include "graph/graph.h"
 
 namespace vla {
 
@@ -17,24 +17,24 @@ enum class RotaryAngle { quotient, product };
 
 /// Rotary embedding, half-split pairing: (x_i, x_{i + d/2}) turn by position / base^(2i/d). Token j of x stands at
 /// position `first` + j. x [d_head, n_head, n_token] -> the same shape; d_head must be even.
-Tensor rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first);
+Tensor apply_rope(Graph& g, Tensor x, float base, RotaryAngle angle, int first);
 /// The same by the angles of a table [d_head, n_token], which every batch shares. x [d_head, n_head, n_token, n_batch].
-Tensor rope(Graph& g, Tensor x, Tensor table);
+inline Tensor apply_rope(Graph& g, Tensor x, Tensor table) { return g.add(op::Rope{}, {x, table}); }
 
 /// The table of tokens at these positions, one for each: [d_head, n_token], per token d/2 cosines, then d/2 sines.
 Tensor rotary_table(Graph& g, int d_head, float base, RotaryAngle angle, std::span<const int> positions);
 
-/// Where a token stands among pictures: time, row and column.
-using Place = std::array<int, 3>;
+/// mRoPE position id of a token: time, row and column.
+using PositionId = std::array<int, 3>;
 
 /// The table of patches: the first half of the pairs turns by row / base^(4i/d), the second half by the column
 /// likewise. d_head must be divisible by 4. Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.rot_pos_emb.
-Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<Place>& places);
+Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<PositionId>& positions);
 
-/// The table of pictures within text: pair i turns by one of the three / base^(2i/d). Rows have the pairs 1, 4, 7, ...,
-/// `sections[1]` of them, columns the `sections[2]` pairs 2, 5, 8, ..., time all others.
-/// Source: the same file, Qwen3VLTextRotaryEmbedding.apply_interleaved_mrope.
-Tensor interleaved_rotary_table(Graph& g, int d_head, float base, const std::array<int, 3>& sections,
-                                const std::vector<Place>& places);
+/// The mRoPE table of images within text: pair i turns by one of the three / base^(2i/d). Rows have the pairs 1, 4, 7,
+/// ..., `sections[1]` of them, columns the `sections[2]` pairs 2, 5, 8, ..., time all others. Source: the same file,
+/// Qwen3VLTextRotaryEmbedding.apply_interleaved_mrope.
+Tensor mrope_table(Graph& g, int d_head, float base, const std::array<int, 3>& sections,
+                   const std::vector<PositionId>& positions);
 
 }  // namespace vla

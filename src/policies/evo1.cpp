@@ -91,12 +91,11 @@ class Evo1 final : public Policy {
 
   bool places_views() const override { return in_place_; }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override {
-    // The reference takes a row of its table by i / N in double, whatever the times are.
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
+    // The reference takes a row of its table by the time in double.
     std::vector<std::int32_t> rows;
-    for (std::size_t k = 0; k < times.size(); ++k)
-      rows.push_back(std::min(
-          kTimes - 1, static_cast<int>(static_cast<double>(k) / static_cast<double>(times.size()) * time_scale_)));
+    for (const SolverTime& time : times)
+      rows.push_back(std::min(kTimes - 1, static_cast<int>(time.exact * time_scale_)));
     return time_(g, constant_ids(g, "time_rows", rows));  // [d_model, n_time]
   }
 
@@ -108,20 +107,21 @@ class Evo1 final : public Policy {
   }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
-    const Tensor image = g.stage("vision", connector_(g, vision_(g, in.images)));  // [d_model, n_view_token, n_view]
+    const Tensor image = connector_(g, vision_(g, in.images));  // [d_model, n_view_token, n_view]
+    g.end_stage("vision");
     const Rows rows = arrange(g, image, in, cache);
     const Tensor x = g.name("prefix", concat_tokens(g, rows.parts));
     const Tensor context = lm_(g, x, rows.positions, causal_mask(g, rows.seen));  // [d_model, n_row]
-    const Tensor state = state_out_(g, state_in_.activated(g, in.state, Activation::relu));
+    const Tensor state = state_out_(g, activate(g, state_in_(g, in.state), Activation::relu));
     head_.prepare(g, concat_tokens(g, {context, state}), rows.kept, horizon_, cache);
   }
 
   Tensor velocity(Graph& g, Tensor x_t, Tensor time, const Cache& cache) const override {
-    const Tensor action = action_in_.activated(g, first_features(g, x_t, d_robot_), Activation::relu);
-    const Tensor placed = add(g, action, action_position_(g, counting_ids(g, horizon_)));  // [d_model, horizon]
-    const Tensor token = action_token_(g, action_mix_.activated(g, placed, Activation::relu));
+    const Tensor action = activate(g, action_in_(g, first_features(g, x_t, d_robot_)), Activation::relu);
+    const Tensor placed = add(g, action, action_position_(g, arange(g, horizon_)));  // [d_model, horizon]
+    const Tensor token = action_token_(g, activate(g, action_mix_(g, placed), Activation::relu));
     const Tensor pooled = pool_(g, one_column(g, head_(g, token, time, cache)));  // [d_model, 1]
-    const Tensor hidden = velocity_in_.activated(g, pooled, Activation::relu);
+    const Tensor hidden = activate(g, velocity_in_(g, pooled), Activation::relu);
     return columns(g, velocity_out_(g, hidden), d_action_);  // [d_action, horizon]
   }
 
@@ -168,7 +168,7 @@ class Evo1 final : public Policy {
       else if (view != kAbsent)
         rows.add(one_view(g, image, view), piece.first, true);
       else if (dead_rows_ == DeadRows::causal_attention)
-        rows.add(cache.get("absent"), piece.first, false);
+        rows.add(cache.get(g, "absent"), piece.first, false);
       else
         ++n_absent;
     }

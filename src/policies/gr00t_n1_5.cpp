@@ -37,11 +37,12 @@ class Gr00tN15 final : public Policy {
     return check_prefix(0, 0, shape.n_text);  // views are part of the text
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override { return head_.condition(g, times); }
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override { return head_.condition(g, times); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
-    const Tensor image = g.stage("vision", projector_(g, vision_(g, in.images)));  // [d_model, n_view_token, n_view]
-    const Tensor x = g.name("prefix", lm_.embed(g, in.tokens, image, places_));    // [d_model, n_text]
+    const Tensor image = projector_(g, vision_(g, in.images));  // [d_model, n_view_token, n_view]
+    g.end_stage("vision");
+    const Tensor x = g.name("prefix", lm_.embed(g, in.tokens, image, places_));  // [d_model, n_text]
     const Tensor context = head_.context(g, lm_(g, x));
     head_.prepare(g, context, context, in.state, cache);
   }

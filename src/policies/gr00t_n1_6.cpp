@@ -37,12 +37,13 @@ class Gr00tN16 final : public Policy {
     return check_prefix(0, 0, shape.n_text);  // views are part of the text
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override { return head_.condition(g, times); }
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override { return head_.condition(g, times); }
 
   void constants(Graph& g, const std::function<Tensor()>&, Cache& cache) const override { vision_.keep(g, cache); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
-    const Tensor image = g.stage("vision", connector_(g, vision_(g, in.images, cache)));
+    const Tensor image = connector_(g, vision_(g, in.images, cache));
+    g.end_stage("vision");
     const Tensor x = g.name("prefix", lm_.embed(g, in.tokens, image, places_));  // [d_model, n_text]
     const auto [images, text] = places_.split(g, head_.context(g, lm_(g, x)));
     head_.prepare(g, text, images, in.state, cache);

@@ -25,7 +25,7 @@ class Gr00tN17 final : public Policy {
     return check_prefix(0, 0, shape.n_text);  // views are part of the text
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override { return head_.condition(g, times); }
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override { return head_.condition(g, times); }
 
   void constants(Graph& g, const std::function<Tensor()>&, Cache& cache) const override { backbone_.keep(g, cache); }
 

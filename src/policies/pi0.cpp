@@ -7,7 +7,7 @@
 
 #include "modules/action/gemma_expert.h"
 #include "modules/language/paligemma.h"
-#include "modules/time_embedding.h"
+#include "modules/timestep_embedding.h"
 #include "nn/tokens.h"
 #include "policies/policy.h"
 
@@ -19,7 +19,7 @@ class Pi0 final : public Policy {
   GemmaExpert expert_;
   Linear state_in_;                                                   // observation rate
   Linear action_in_, action_time_in_, action_time_out_, action_out_;  // step rate
-  TimeEmbedding time_;                                                // load rate
+  TimestepEmbedding time_;                                            // load rate
 
  public:
   explicit Pi0(const Scope& s)
@@ -37,7 +37,7 @@ class Pi0 final : public Policy {
     return check_prefix(shape.n_view, backbone_.n_token(shape.width), shape.n_text + 1);
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override { return time_(g, times); }
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override { return time_(g, times); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
     backbone_.prefill(g, in.images, in.tokens, cache);

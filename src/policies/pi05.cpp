@@ -7,7 +7,7 @@
 
 #include "modules/action/gemma_expert.h"
 #include "modules/language/paligemma.h"
-#include "modules/time_embedding.h"
+#include "modules/timestep_embedding.h"
 #include "policies/policy.h"
 
 namespace vla {
@@ -18,7 +18,7 @@ class Pi05 final : public Policy {
   GemmaExpert expert_;
   Linear action_in_, action_out_;      // step rate
   Linear time_mlp_in_, time_mlp_out_;  // load rate
-  TimeEmbedding time_;
+  TimestepEmbedding time_;
 
  public:
   explicit Pi05(const Scope& s)
@@ -35,7 +35,7 @@ class Pi05 final : public Policy {
     return check_prefix(shape.n_view, backbone_.n_token(shape.width), shape.n_text);
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override {
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
     const Tensor hidden = silu(g, time_mlp_in_(g, time_(g, times)));   // [d_expert, n_time]
     return expert_.modulations(g, silu(g, time_mlp_out_(g, hidden)));  // [3 * d_expert * n_norm, n_time]
   }

@@ -9,8 +9,9 @@
 #include <string>
 #include <vector>
 
-#include "backend/cache.h"
 #include "bundle/params.h"
+#include "graph/cache.h"
+#include "modules/timestep_embedding.h"
 
 namespace vla {
 
@@ -39,8 +40,12 @@ class Policy {
   /// Whether the network is defined on inputs of this size; asked at load. Errors: bad_bundle, unsupported.
   virtual Status check(const InputShape& shape) const = 0;
 
-  /// Load rate: everything that depends on the time alone, one column per solver step: [d, times.size()].
-  virtual Tensor condition(Graph& g, std::span<const float> times) const = 0;
+  /// Load rate: everything that depends on the time alone, one column per solver step: [d, times.size()]. None where
+  /// the network knows no time.
+  virtual Tensor condition(Graph& g, std::span<const SolverTime> times) const {
+    static_cast<void>(g), static_cast<void>(times);
+    return {};
+  }
 
   /// Whether it matters which views are present, and not their number alone.
   virtual bool places_views() const { return false; }

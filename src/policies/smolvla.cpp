@@ -9,7 +9,7 @@
 
 #include "modules/action/expert.h"
 #include "modules/language/decoder.h"
-#include "modules/time_embedding.h"
+#include "modules/timestep_embedding.h"
 #include "modules/vision/pixel_connector.h"
 #include "modules/vision/siglip.h"
 #include "nn/attention.h"
@@ -28,7 +28,7 @@ class SmolVla final : public Policy {
   Expert expert_;
   Linear action_in_, action_time_in_, action_time_out_, action_out_;  // step rate
   float image_scale_, text_scale_;
-  TimeEmbedding time_;  // load rate
+  TimestepEmbedding time_;  // load rate
 
  public:
   explicit SmolVla(const Scope& s)
@@ -52,13 +52,14 @@ class SmolVla final : public Policy {
     return check_prefix(shape.n_view, connector_.n_token(side), shape.n_text + 1);
   }
 
-  Tensor condition(Graph& g, std::span<const float> times) const override { return time_(g, times); }
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const override { return time_(g, times); }
 
   void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
-    const Tensor view = g.stage("vision", connector_(g, vision_(g, in.images)));  // [d_model, n_token, n_view]
-    const Tensor image = flatten_views(g, view);                                  // [d_model, n_token * n_view]
-    const Tensor text = lm_.embed(g, in.tokens);                                  // [d_model, n_text]
-    const Tensor state = state_in_(g, in.state);                                  // [d_model, 1]
+    const Tensor view = connector_(g, vision_(g, in.images));  // [d_model, n_token, n_view]
+    g.end_stage("vision");
+    const Tensor image = flatten_views(g, view);  // [d_model, n_token * n_view]
+    const Tensor text = lm_.embed(g, in.tokens);  // [d_model, n_text]
+    const Tensor state = state_in_(g, in.state);  // [d_model, 1]
     const Tensor x =
         g.name("prefix", concat_tokens(g, {scale(g, image, image_scale_), scale(g, text, text_scale_), state}));
     // Images and text see each other and not the state; the state sees everything.

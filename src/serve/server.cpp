@@ -95,8 +95,7 @@ v1::Description Server::describe(const Engine& engine) const {
   return serve::describe(engine, limits_told(options_, engine));
 }
 
-/// Graphs run on the thread that calls this, since it has loaded the engine: OpenMP keeps a team of threads for each
-/// thread that computes.
+/// Programs run on the thread that calls this.
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   description_ = describe(engine);
   vitals_.ready_since = Clock::now().time_since_epoch().count();

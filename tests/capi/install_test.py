@@ -43,7 +43,7 @@ def test_an_installation_has_these_files_and_no_others(prefix):
     assert files == {
         "bin/vla", "include/vla/vla.h", "lib/libvla.so", "lib/libvla.so.1", "lib/pkgconfig/vla.pc",
         *(f"lib/cmake/vla/{f}.cmake" for f in ("vlaConfig", "vlaConfigVersion", "vlaTargets", "vlaTargets-release")),
-        "share/doc/vla/LICENSE", "share/doc/vla/LICENSES-third-party.md",
+        "share/doc/vla/LICENSE", "share/doc/vla/LICENSES-third-party.md", "share/vla/vla.proto",
     }  # fmt: skip
     assert (
         run(prefix / "bin/vla", "--version").strip()

@@ -53,7 +53,8 @@ class Golden:
         """Options of vla-convert for what the checkpoint does not say."""
         for name, value in self.said.items():
             yield "--" + name.replace("_", "-")
-            yield ",".join(value) if isinstance(value, list) else str(value)
+            if value is not True:  # a flag stands alone
+                yield ",".join(value) if isinstance(value, list) else str(value)
 
     def arguments(self, bundle=None, images=None, state=None, text=None, noise=None, options=("--json",)):
         images = self.images if images is None else images

@@ -5,6 +5,8 @@
 #include <doctest/doctest.h>
 
 #include "engine/plan.h"
+#include "kernels/isa.h"
+#include "lower/open.h"
 
 using namespace vla;
 
@@ -52,18 +54,17 @@ TEST_CASE("the published SmolVLA counts the operations of its configuration, und
   REQUIRE(list.report("smolvla", {}).ok());
   Solver solver;
   solver.n_step = 10;
-  solver.times.assign(10, 1.0f);
+  solver.times.assign(10, {1.0f, 1.0});
   for (Isa isa : usable_isas()) {
     CAPTURE(isa_name(isa));
-    const auto device = Device::cpu(1, isa_name(isa));
+    const auto device = open_device(1, isa_name(isa));
     REQUIRE(device.ok());
-    const auto weights = Weights::load(list, *device, Weights::Fill::no);  // memory that is never touched
-    REQUIRE(weights.ok());
-    Store tables(4);
-    const Tensor conditions = tables.add_f32({720, 10});
-    REQUIRE(tables.allocate(*device).ok());
+    REQUIRE((*device)->load(list, false).ok());  // memory that is never touched
+    Slots tables;
+    const Slot* conditions = tables.add_f32({720, 10, 1, 1});
+    REQUIRE((*device)->allocate(tables).ok());
     const Cache constants;
-    Plans plans(PlanContext{*policy, *weights, *device, solver, conditions, constants, 32, 50, ""});
+    Plans plans(PlanContext{*policy, **device, solver, conditions, constants, 32, 50, "", true});
     for (const auto& [n_view, n_text] : {std::pair(2, 48), std::pair(1, 5)}) {
       const auto plan = plans.for_shape({512, 512, n_view, n_text, 32});
       REQUIRE(plan.ok());

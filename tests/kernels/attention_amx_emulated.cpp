@@ -3,7 +3,6 @@
 //
 // The AMX kernels for machines with AVX2.
 #if defined(__x86_64__)
-#include "kernels/attention_kernel.h"
 #include "support/amx_emulation.h"
 
 #include "kernels/attention_amx.cpp"

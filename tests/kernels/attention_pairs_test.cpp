@@ -22,7 +22,7 @@ std::vector<float> as_bf16(std::vector<float> values) {
 constexpr double kPairBound = 3.0 / 512 + 1e-5;  // 3 is the greatest value
 
 void check_pairs(const AttentionKernel& kernel) {
-  for (const Shape& shape : kShapes) {
+  for (const AttentionShape& shape : kShapes) {
     CAPTURE(shape.d_head);
     CAPTURE(shape.n_key);
     for (bool masked : {false, true}) {
@@ -35,7 +35,7 @@ void check_pairs(const AttentionKernel& kernel) {
 }
 
 void check_pair_repeated(const AttentionKernel& kernel) {
-  for (const Shape& shape : kRepeatedShapes)
+  for (const AttentionShape& shape : kRepeatedShapes)
     for (int n : {2, 218, 512}) {
       CAPTURE(shape.n_key);
       CAPTURE(n);

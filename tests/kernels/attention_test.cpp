@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/attention.h"
-
 #include "nn/attention.h"
+#include "nn/tokens.h"
 #include "support/attention_case.h"
 #include "support/kernel_rows.h"
 
@@ -14,18 +13,16 @@ namespace {
 
 /// The plain operations of ggml on the same numbers.
 std::vector<float> run_plain(const Case& c) {
-  const Shape& s = c.shape;
+  const AttentionShape& s = c.shape;
   return test::run_graph(
       [&](Graph& g) {
         const auto add = [&](const std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) {
-          const Tensor all = g.store().add_constant(x, {s.d_head + c.gap, n_head, n_token, s.n_batch});
-          const ggml_tensor* t = all.node();
-          return Tensor(ggml_view_4d(g.context(), all.node(), s.d_head, n_head, n_token, s.n_batch, t->nb[1], t->nb[2],
-                                     t->nb[3], 0));
+          const Tensor all = constant(g, x, {s.d_head + c.gap, n_head, n_token, s.n_batch});
+          return slice(g, all, 0, 0, static_cast<int>(s.d_head));
         };
-        const Tensor mask = c.mask.empty() ? Tensor() : g.store().add_constant(c.mask, {s.n_key, s.n_query});
-        return attention(g, add(c.q, s.n_head, s.n_query), add(c.k, s.n_head_kv, s.n_key),
-                         add(c.v, s.n_head_kv, s.n_key), mask);
+        const Tensor mask = c.mask.empty() ? Tensor() : constant(g, c.mask, {s.n_key, s.n_query});
+        return attention(g, add(c.q, s.n_head, s.n_query),
+                         {{add(c.k, s.n_head_kv, s.n_key), add(c.v, s.n_head_kv, s.n_key)}}, mask);
       },
       "ggml");
 }
@@ -33,7 +30,7 @@ std::vector<float> run_plain(const Case& c) {
 /// Both sides round sums of the same length in another order. The second part is one rounding of a score of 8, which
 /// changes its weight by 5e-7 of itself.
 void check_against_plain(const CpuKernels& kernels, const Case& c, int n_thread) {
-  const Shape& s = c.shape;
+  const AttentionShape& s = c.shape;
   CAPTURE(s.d_head);
   CAPTURE(s.n_query);
   CAPTURE(s.n_key);
@@ -42,12 +39,12 @@ void check_against_plain(const CpuKernels& kernels, const Case& c, int n_thread)
 }
 
 void check_shapes(const CpuKernels& kernels) {
-  for (const Shape& shape : kShapes)
+  for (const AttentionShape& shape : kShapes)
     for (float range : {1.0f, 30.0f}) check_against_plain(kernels, Case(shape, range, shape.n_key % 3), 3);
 }
 
 void check_masks(const CpuKernels& kernels) {
-  for (const Shape& shape : {kShapes[0], kShapes[1], kShapes[3]}) {
+  for (const AttentionShape& shape : {kShapes[0], kShapes[1], kShapes[3]}) {
     Case causal(shape, 2, 0), speckled(shape, 2, 0), late(shape, 2, 0), biased(shape, 2, 0),
         nowhere_hidden(shape, 2, 0);
     causal.set_mask([&](std::int64_t i, std::int64_t j) { return j <= i + 1 ? 0.0f : kHidden; });
@@ -61,7 +58,7 @@ void check_masks(const CpuKernels& kernels) {
 }
 
 void check_repeated(const CpuKernels& kernels) {
-  for (const Shape& shape : kRepeatedShapes)
+  for (const AttentionShape& shape : kRepeatedShapes)
     for (int n : {2, 218, 512}) {
       CAPTURE(shape.n_key);
       CAPTURE(n);
@@ -80,9 +77,46 @@ void check_rising(const CpuKernels& kernels) {
 }
 
 void check_threads(const CpuKernels& kernels) {
-  for (const Shape& shape : {kShapes[1], kShapes[6]}) {
+  for (const AttentionShape& shape : {kShapes[1], kShapes[6]}) {
     const Case c(shape, 1, 0);
     for (int n_thread : {1, 2, 7, 64}) CHECK(worst_error(c, run(kernels.attention, c, n_thread)) <= 2e-6);
+  }
+}
+
+/// Keys and values that are packed apart, as those of a prefix and of the tokens behind it are.
+void check_segments(const CpuKernels& kernels) {
+  for (const AttentionShape& shape : {kShapes[0], kShapes[1], kShapes[10]}) {
+    Case whole(shape, 2, 1), masked(shape, 2, 1);
+    masked.set_mask([&](std::int64_t i, std::int64_t j) {
+      return j % 97 < 60 || (i + j) % 3 == 0 ? static_cast<float>(j % 5) / 4 : kHidden;
+    });
+    const std::int64_t n = shape.n_key;
+    for (const Case* c : {&whole, &masked})
+      for (const std::vector<std::int64_t>& n_key :
+           {std::vector<std::int64_t>{1, n - 1}, {n - 1, 1}, {n / 2, n - n / 2}, {5, 1, 1, n - 9, 2}})
+        CHECK(worst_error(*c, run(kernels.attention, *c, 2, n_key)) <= 4 * worst_error(*c, run_plain(*c)) + 5e-7);
+  }
+}
+
+/// Norm and rotation of heads while rows are copied, against the same done beforehand.
+void check_prepared(const CpuKernels& kernels) {
+  for (const AttentionShape& shape : {kShapes[1], kShapes[4], kShapes[10]}) {
+    const Case c(shape, 2, 0);
+    const auto d = static_cast<std::size_t>(shape.d_head);
+    const std::vector<float> weight = ramp(d, 2), table = ramp(d * 300, 1);
+    kernels::RowPrep prep = {kernels.rms_norm, weight.data(), 1e-5f, kernels.rotate_half, table.data()};
+    Case done = c;
+    const auto prepare = [&](std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) {
+      for (std::size_t row = 0; row < x.size() / d; ++row) {
+        const std::int64_t token = static_cast<std::int64_t>(row) / n_head % n_token;
+        prep(&x[row * d], token, shape.d_head, &x[row * d]);
+      }
+    };
+    prepare(done.q, shape.n_head, shape.n_query);
+    prepare(done.k, shape.n_head_kv, shape.n_key);
+    CHECK(run(kernels.attention, c, 2, {}, {prep, prep}) == run(kernels.attention, done, 2));
+    CHECK(run(kernels.attention, c, 2, {3, shape.n_key - 3}, {prep, prep}) ==
+          run(kernels.attention, done, 2, {3, shape.n_key - 3}));
   }
 }
 
@@ -97,10 +131,12 @@ VLA_KERNEL_TEST("a key with the logarithm of n in the mask is as n equal keys", 
 VLA_KERNEL_TEST("attention is exact however many threads share it", check_threads)
 VLA_KERNEL_TEST("attention is exact whatever the width of a head and the number of keys", check_ends)
 VLA_KERNEL_TEST("attention is exact where each chunk of keys brings greater scores", check_rising)
+VLA_KERNEL_TEST("attention over keys in several segments is as over all of them in one", check_segments)
+VLA_KERNEL_TEST("norm and rotation of heads on the way are as before", check_prepared)
 VLA_KERNEL_TEST("a query that sees nothing, and what is not finite, does not become an answer", check_not_finite)
 
 TEST_CASE("ggml: a key with the logarithm of n in the mask is as n equal keys") {
-  for (const Shape& shape : kRepeatedShapes)
+  for (const AttentionShape& shape : kRepeatedShapes)
     for (int n : {2, 218, 512}) {
       const Repeated r = repeated(shape, n);
       CHECK(worst_error(r.all, run_plain(r.one)) <= 1e-5);

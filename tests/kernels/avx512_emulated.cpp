@@ -3,8 +3,6 @@
 //
 // The AVX-512 kernels for machines with AVX2.
 #if defined(__x86_64__)
-#include "kernels/cpu_kernels.h"
-#include "kernels/linear_kernel.h"
 #include "support/avx512_emulation.h"
 
 #define asm(...) static_cast<void>(0)  // a hint that names a register of 64 bytes

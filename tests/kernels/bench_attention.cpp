@@ -11,6 +11,7 @@
 #include <cmath>
 #include <cstdlib>
 #include <ctime>
+#include <memory>
 #include <vector>
 
 #include "kernels/cpu_kernels.h"
@@ -48,6 +49,12 @@ double best_time(double seconds, Work work) {
   return best;
 }
 
+struct Memory {
+  explicit Memory(std::size_t size)
+      : data(static_cast<std::byte*>(std::aligned_alloc(64, (size + 63) / 64 * 64)), std::free) {}
+  std::unique_ptr<std::byte, decltype(&std::free)> data;
+};
+
 void measure(const AttentionKernel& kernel, const std::string& name, const Shape& s, double seconds) {
   const auto numbers = [](std::int64_t n) {
     std::vector<float> x(static_cast<std::size_t>(n));
@@ -57,18 +64,25 @@ void measure(const AttentionKernel& kernel, const std::string& name, const Shape
   const std::vector<float> q = numbers(s.d_head * s.n_head * s.n_query);
   const std::vector<float> k = numbers(s.d_head * s.n_head_kv * s.n_key), v = numbers(s.d_head * s.n_head_kv * s.n_key);
   const auto rows = [&](const std::vector<float>& x, std::int64_t n_head) {
-    return AttentionJob::Rows{x.data(), s.d_head, s.d_head * n_head, 0};
+    return HeadRows{x.data(), s.d_head, s.d_head * n_head, 0};
   };
+  PackJob keys = {s.d_head, s.n_head_kv, s.n_key, 1, rows(k, s.n_head_kv), rows(v, s.n_head_kv), {}, nullptr};
+  const Memory packed(kernel.packed_size(keys));
+  std::vector<float> out(q.size());
+  keys.packed = packed.data.get();
   AttentionJob job = {};
   job.d_head = s.d_head, job.n_head = s.n_head, job.n_head_kv = s.n_head_kv;
   job.n_query = s.n_query, job.n_key = s.n_key, job.n_batch = 1;
   job.scale = 1 / std::sqrt(static_cast<float>(s.d_head));
-  job.q = rows(q, s.n_head), job.k = rows(k, s.n_head_kv), job.v = rows(v, s.n_head_kv);
-  std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job))), out(q.size());
-  Turns turns;
-  job.packed = packed.data(), job.out = out.data(), job.turns = &turns;
-  const double pack = best_time(seconds / 4, [&] { kernel.pack(job, 0, 1); });
-  const double run = best_time(seconds, [&] { kernel.run(job, 0, 1); });
+  job.q = rows(q, s.n_head), job.out = out.data();
+  job.n_segment = 1, job.segment[0] = {keys.packed, s.n_key};
+  const std::int64_t n_item = kernel.cut(job, 1);
+  const double pack = best_time(seconds / 4, [&] {
+    for (std::int64_t i = 0; i < kernel.n_pack(keys); ++i) kernel.pack(keys, i);
+  });
+  const double run = best_time(seconds, [&] {
+    for (std::int64_t i = 0; i < n_item; ++i) kernel.run(job, i);
+  });
   const double flop = 4.0 * static_cast<double>(s.d_head * s.n_head * s.n_query * s.n_key);
   fmt::print("{:8} {:12} pack {:8.1f} us  run {:9.1f} us  {:7.1f} GFLOP/s\n", name, s.what, 1e6 * pack, 1e6 * run,
              1e-9 * flop / run);

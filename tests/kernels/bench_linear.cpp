@@ -8,13 +8,12 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <barrier>
 #include <chrono>
 #include <cstdlib>
 #include <ctime>
 #include <memory>
-#include <thread>
 
+#include "kernels/executor.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 #include "kernels/probe/probe.h"
@@ -50,31 +49,29 @@ double now(int n_thread) {
   return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
 }
 
-/// Seconds of the fastest of the runs in about `seconds`, all threads side by side.
-double best_time(const LinearKernel& kernel, const LinearJob& job, int n_thread, double seconds) {
-  const std::size_t piece = (kernel.scratch_size + 4095) / 4096 * 4096;
-  Block scratch(piece * static_cast<std::size_t>(n_thread));
-  double best = 1e9, last = 0;
-  const double start = now(n_thread);
-  bool done = false;
-  std::barrier together(n_thread, [&]() noexcept {  // between runs, while all threads wait
-    const double time = now(n_thread);
-    if (last > 0) best = std::min(best, time - last);
-    done = last > 0 && time - start > seconds;
-    last = now(n_thread);
-  });
-  const auto work = [&](int ith) {
-    for (together.arrive_and_wait(); !done; together.arrive_and_wait())
-      kernel.run(job, ith, n_thread, scratch.data + piece * static_cast<std::size_t>(ith));
-  };
-  std::vector<std::thread> threads;
-  for (int i = 1; i < n_thread; ++i) threads.emplace_back(work, i);
-  work(0);
-  for (std::thread& thread : threads) thread.join();
+/// A product for the executor.
+struct Product final : Task {
+  Product(const LinearKernel& k, LinearJob j, int n_thread) : kernel(k), job(j) { n_item = kernel.cut(job, n_thread); }
+  void run(std::int64_t item, Worker& worker) const override { kernel.run(job, item, worker); }
+  const LinearKernel& kernel;
+  LinearJob job;
+};
+
+/// Seconds of the fastest of the runs in about `seconds`.
+double best_time(Executor& executor, const Product& product, double seconds) {
+  const Phase phase = {{&product}, nullptr};
+  double best = 1e9;
+  const double start = now(executor.n_thread());
+  do {
+    const double before = now(executor.n_thread());
+    executor.run(std::span(&phase, 1));
+    best = std::min(best, now(executor.n_thread()) - before);
+  } while (now(executor.n_thread()) - start < seconds);
   return best;
 }
 
-void measure(const LinearKernel& kernel, Isa isa, const Shape& s, int n_thread, int n_round) {
+void measure(Executor& executor, const LinearKernel& kernel, Isa isa, const Shape& s, int n_round) {
+  const int n_thread = executor.n_thread();
   const MatrixDesc desc = {DType::bf16, s.d_in, s.d_out};
   Block x(static_cast<std::size_t>(s.n_row * s.d_in) * 4), y(static_cast<std::size_t>(s.n_row * s.d_out) * 4);
   Block stored(static_cast<std::size_t>(s.d_in * s.d_out) * 2);
@@ -86,14 +83,15 @@ void measure(const LinearKernel& kernel, Isa isa, const Shape& s, int n_thread, 
   const auto start = std::chrono::steady_clock::now();
   kernel.pack(desc, stored.data, packed.data);
   const double pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-  Turns turns;
-  LinearJob job = {x.data, {}, s.n_row, s.d_in, 1, {}, Activation::none, false, DType::f32, DType::f32, &turns};
-  job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, y.data, s.d_out};
+  LinearJob job = {};
+  job.x = x.data, job.x_stride = s.d_in, job.n_row = s.n_row, job.d_in = s.d_in, job.n_part = 1;
+  job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, nullptr, y.data, s.d_out};
+  const Product product(kernel, job, n_thread);
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
   std::vector<double> rates, peaks, shares;
   for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
     peaks.push_back(measure_peak(peak_probe_of(isa), n_thread, 0.02));
-    rates.push_back(flop / best_time(kernel, job, n_thread, 0.05));
+    rates.push_back(flop / best_time(executor, product, 0.05));
     shares.push_back(rates.back() / peaks.back());
   }
   std::sort(shares.begin(), shares.end());
@@ -112,8 +110,12 @@ int main(int argc, char** argv) {
   const int n_thread = argc > 1 ? std::atoi(argv[1]) : 1, n_round = argc > 2 ? std::atoi(argv[2]) : 7;
   if (n_thread < 1 || n_round < 1) return fmt::print("usage: bench_linear [threads] [rounds] [kernel]\n"), 1;
   fmt::print("{} thread(s), best and median of {} rounds, bf16 weights\n", n_thread, n_round);
-  for (const LinearKernel* kernel : linear_kernels())
+  const auto executor = Executor::shared(n_thread);
+  if (!executor) return fmt::print("{}\n", executor.error().message()), 1;
+  for (const LinearKernel* kernel : linear_kernels()) {
+    if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
     for (Isa isa : usable_isas())
       if (isa_name(isa) == kernel->name && (argc < 4 || kernel->name == std::string(argv[3])))
-        for (const Shape& shape : kShapes) measure(*kernel, isa, shape, n_thread, n_round);
+        for (const Shape& shape : kShapes) measure(**executor, *kernel, isa, shape, n_round);
+  }
 }

@@ -3,7 +3,6 @@
 //
 // The AMX kernels for machines with AVX2.
 #if defined(__x86_64__)
-#include "kernels/linear_kernel.h"
 #include "support/amx_emulation.h"
 
 #include "kernels/linear_amx.cpp"

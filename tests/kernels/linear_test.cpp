@@ -4,14 +4,17 @@
 // Every implementation of the matrix product against a sum in double precision, on one list of awkward shapes.
 #include <doctest/doctest.h>
 
+#include <atomic>
 #include <cmath>
 #include <cstring>
 #include <limits>
 #include <thread>
 
+#include "kernels/cpu_kernels.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 #include "support/kernel_rows.h"
+#include "support/stored.h"
 
 using namespace vla;
 using namespace vla::kernels;
@@ -50,27 +53,6 @@ class Numbers {
   std::uint32_t state_ = 12345;
 };
 
-/// x in the storage type, and what the type made of it.
-std::vector<std::byte> store_as(DType type, std::vector<float>& values) {
-  std::vector<std::byte> out(values.size() * (type == DType::f32 ? 4 : 2));
-  for (std::size_t i = 0; i < values.size(); ++i) {
-    if (type == DType::f32) {
-      std::memcpy(&out[4 * i], &values[i], 4);
-      continue;
-    }
-    std::uint16_t bits = to_bf16(values[i]);
-    if (type == DType::f16) {  // eleven bits, exponents from the smallest normal up
-      const float clear = std::abs(values[i]) < 0x1p-14f ? 0x1p-14f : values[i];
-      const auto word = std::bit_cast<std::uint32_t>(clear);
-      bits = static_cast<std::uint16_t>((word >> 16 & 0x8000U) | (((word >> 23 & 255U) - 112U) << 10) |
-                                        (word >> 13 & 1023U));
-    }
-    std::memcpy(&out[2 * i], &bits, 2);
-    values[i] = stored_number(type, out.data(), static_cast<std::int64_t>(i));
-  }
-  return out;
-}
-
 double activate(Activation activation, double x) {
   if (activation == Activation::silu) return x / (1 + std::exp(-x));
   if (activation == Activation::gelu_tanh)
@@ -82,7 +64,7 @@ double activate(Activation activation, double x) {
 
 /// One part of a job, with memory of its own.
 struct Part {
-  std::vector<float> weight, bias, residual, y;
+  std::vector<float> weight, bias, factor, residual, y;
   std::vector<std::byte> stored;
   std::vector<std::byte> packed;
 };
@@ -95,7 +77,7 @@ struct Case {
   DType type = DType::bf16;
   Activation activation = Activation::none;
   int n_part = 1;
-  bool gated = false, with_bias = false, with_residual = false;
+  bool gated = false, with_bias = false, with_residual = false, with_factor = false;
   int n_thread = 1;
   DType x_type = DType::f32, y_type = DType::f32;
 };
@@ -114,32 +96,38 @@ class Trial {
 
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
-    Turns turns;
     std::vector<std::uint16_t> rounded;
     for (float value : x_) rounded.push_back(to_bf16(value));
-    LinearJob job = {case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(&rounded[1]) : bytes(x_),
-                     {},
-                     n_row,
-                     d_in,
-                     case_.n_part,
-                     {},
-                     case_.activation,
-                     case_.gated,
-                     case_.x_type,
-                     case_.y_type,
-                     &turns};
+    LinearJob job = {};
+    job.x = case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(&rounded[1]) : bytes(x_);
+    job.x_stride = d_in, job.n_row = n_row, job.d_in = d_in, job.n_part = case_.n_part;
+    job.activation = case_.activation, job.gated = case_.gated;
+    job.x_type = case_.x_type, job.y_type = case_.y_type;
     for (int i = 0; i < case_.n_part; ++i) {
       Part& part = parts_[static_cast<std::size_t>(i)];
       job.part[i] = {case_.type,
                      packed(part, {case_.type, d_in, d_out(i)}),
                      case_.with_bias ? &part.bias[1] : nullptr,
+                     case_.with_factor ? &part.factor[1] : nullptr,
                      case_.with_residual ? &part.residual[1] : nullptr,
                      bytes(part.y),
                      d_out(i)};
     }
+    const std::int64_t n_item = kernel_.cut(job, case_.n_thread);
+    CHECK(n_item >= 1);
+    std::atomic<std::int64_t> next = 0;
+    const auto work = [&](int index) {
+      // What a thread finds in its scratch memory must not matter: all ones are NaN.
+      const std::int64_t size = round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096);
+      std::unique_ptr<std::byte, decltype(&std::free)> scratch(
+          static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(size))), std::free);
+      std::memset(scratch.get(), 0xff, kernel_.scratch_size);
+      Worker worker = {index, scratch.get(), 1};
+      for (std::int64_t item = next++; item < n_item; item = next++) kernel_.run(job, item, worker);
+    };
     std::vector<std::thread> threads;
-    for (int ith = 1; ith < case_.n_thread; ++ith) threads.emplace_back([&, ith] { run_thread(job, ith); });
-    run_thread(job, 0);
+    for (int i = 1; i < case_.n_thread; ++i) threads.emplace_back(work, i);
+    work(0);
     for (std::thread& thread : threads) thread.join();
   }
 
@@ -177,23 +165,15 @@ class Trial {
     return place;
   }
 
-  void run_thread(const LinearJob& job, int ith) const {
-    // What a thread finds in its scratch memory must not matter: all ones are NaN.
-    const std::int64_t size = round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096);
-    std::unique_ptr<std::byte, decltype(&std::free)> scratch(
-        static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(size))), std::free);
-    std::memset(scratch.get(), 0xff, kernel_.scratch_size);
-    kernel_.run(job, ith, case_.n_thread, scratch.get());
-  }
-
-  /// Parts differ in width, so that a thread's share crosses from one to the next; a gate and its up do not.
+  /// Parts differ in width, so that items cross from one to the next; a gate and its up do not.
   std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
 
   Part make_part(std::int64_t width) {
     Part part;
     part.weight = numbers_.some(case_.shape.d_in * width);
-    part.stored = store_as(case_.type, part.weight);
+    part.stored = test::store_as(case_.type, part.weight);
     part.bias = numbers_.some(width);
+    part.factor = numbers_.some(width);
     part.residual = numbers_.some(case_.shape.n_row * width);
     part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, kUntouched);
     return part;
@@ -224,6 +204,10 @@ class Trial {
       y = {y.value * factor, y.tolerance * (std::abs(factor) + slack) + slack * std::abs(y.value)};
     } else {
       y = {activate(case_.activation, y.value), 1.13 * y.tolerance};
+    }
+    if (case_.with_factor) {
+      const double factor = parts_[static_cast<std::size_t>(i)].factor[static_cast<std::size_t>(n + 1)];
+      y = {y.value * factor, y.tolerance * std::abs(factor)};
     }
     if (case_.with_residual)
       y.value += parts_[static_cast<std::size_t>(i)].residual[static_cast<std::size_t>(row * d_out(i) + n + 1)];
@@ -257,11 +241,12 @@ void check_shapes_and_types(const LinearKernel& kernel) {
 void check_epilogues(const LinearKernel& kernel) {
   for (const Shape& shape : {Shape{1, 33, 17}, Shape{7, 64, 48}, Shape{50, 72, 205}})
     for (Activation activation : kActivations)
-      for (int options = 0; options < 4; ++options)
+      for (int options = 0; options < 8; ++options)
         check(kernel, {.shape = shape,
                        .activation = activation,
                        .with_bias = (options & 1) != 0,
-                       .with_residual = (options & 2) != 0});
+                       .with_residual = (options & 2) != 0,
+                       .with_factor = (options & 4) != 0});
 }
 
 void check_gates_and_groups(const LinearKernel& kernel) {
@@ -335,7 +320,7 @@ const LinearKernel& row(const std::string& name) {
   TEST_CASE("amx: " sentence* doctest::skip(vla::test::lacks(Isa::amx))) { check(row("amx")); }
 
 VLA_LINEAR_TEST("products of any shape and storage type are within float32's rounding", check_shapes_and_types)
-VLA_LINEAR_TEST("bias, activation and residual follow the product", check_epilogues)
+VLA_LINEAR_TEST("bias, activation, factor and residual follow the product", check_epilogues)
 VLA_LINEAR_TEST("a gate multiplies, and products of one x stand side by side", check_gates_and_groups)
 VLA_LINEAR_TEST("any number of threads computes every number once", check_threads)
 VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_rounded)
@@ -344,7 +329,7 @@ VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
 TEST_CASE("every machine takes the first row that it can run, and ggml where there is none") {
   for (Isa isa : {Isa::ggml, Isa::avx2, Isa::avx512, Isa::amx})
     for (DType type : {DType::bf16, DType::f16, DType::f32}) {
-      const MatrixFormat* chosen = choose_linear({type, 768, 3072}, isa);
+      const LinearKernel* chosen = choose_linear({type, 768, 3072}, isa);
       const bool tiles = isa == Isa::amx && type == DType::bf16;
       const std::string expected = tiles ? "amx" : isa == Isa::amx ? "avx512" : isa_name(isa);
       CHECK((chosen == nullptr ? "ggml" : chosen->name) == expected);

@@ -43,10 +43,10 @@ std::vector<float> numbers() {
   return all;
 }
 
-double worst_error(CpuKernels::Map map, Function exact) {
+double worst_error(kernels::RowKernel map, Function exact) {
   const std::vector<float> x = numbers();
   std::vector<float> y(x.size());
-  map(x.data(), y.data(), static_cast<std::int64_t>(x.size()));
+  map(x.data(), nullptr, nullptr, 0, y.data(), static_cast<std::int64_t>(x.size()));
   double worst = 0;
   for (std::size_t i = 0; i < x.size(); ++i) {
     const double expected = exact(x[i]), error = std::abs(y[i] - expected) / unit(expected);
@@ -63,10 +63,10 @@ void check_accuracy(const CpuKernels& kernels) {
 
 void check_not_finite(const CpuKernels& kernels) {
   const float infinity = std::numeric_limits<float>::infinity(), nan = std::numeric_limits<float>::quiet_NaN();
-  for (CpuKernels::Map map : {kernels.silu, kernels.gelu_tanh, kernels.gelu_erf}) {
+  for (kernels::RowKernel map : {kernels.silu, kernels.gelu_tanh, kernels.gelu_erf}) {
     const float x[] = {infinity, -infinity, nan};
     float y[3] = {};
-    map(x, y, 3);
+    map(x, nullptr, nullptr, 0, y, 3);
     CHECK(y[0] == infinity);
     CHECK_FALSE(std::isfinite(y[1]));
     CHECK(std::isnan(y[2]));
@@ -80,7 +80,7 @@ void check_relu(const CpuKernels& kernels) {
   for (float value : x) expected.push_back(value > 0 ? value : 0);
   x.push_back(std::numeric_limits<float>::quiet_NaN());
   std::vector<float> y(x.size());
-  kernels.relu(x.data(), y.data(), static_cast<std::int64_t>(x.size()));
+  kernels.relu(x.data(), nullptr, nullptr, 0, y.data(), static_cast<std::int64_t>(x.size()));
   CHECK(std::isnan(y.back()));
   y.pop_back();
   CHECK(y == expected);
@@ -89,11 +89,11 @@ void check_relu(const CpuKernels& kernels) {
 void check_ends(const CpuKernels& kernels) {
   const std::vector<float> x(70, 1.0f);
   float expected = -1.0f;
-  kernels.silu(x.data(), &expected, 1);
+  kernels.silu(x.data(), nullptr, nullptr, 0, &expected, 1);
   CHECK(expected != -1.0f);
   for (std::int64_t n = 0; n <= 66; ++n) {
     std::vector<float> y(70, -1.0f);
-    kernels.silu(x.data() + 1, y.data() + 1, n);  // one number off, so that nothing is aligned
+    kernels.silu(x.data() + 1, nullptr, nullptr, 0, y.data() + 1, n);  // one number off, so that nothing is aligned
     for (std::size_t i = 0; i < y.size(); ++i)
       CHECK(y[i] == (i >= 1 && i < 1 + static_cast<std::size_t>(n) ? expected : -1.0f));
   }

@@ -1,8 +1,10 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/norm.h"
+// Row kernels that take more than x, against their definitions.
+#include <doctest/doctest.h>
 
 #include <cmath>
+#include <vector>
 
 #include "support/graph_runner.h"
 #include "support/kernel_rows.h"
@@ -10,7 +12,6 @@
 using namespace vla;
 using kernels::CpuKernels;
 using test::ramp;
-using test::run_graph;
 
 namespace {
 
@@ -29,7 +30,7 @@ std::vector<double> by_hand(const std::vector<float>& x, const std::vector<float
 }
 
 /// Sums of d numbers in float32 by lanes, some roundings for each result, and values of order 10.
-void check_norm(CpuKernels::Norm norm, bool centred, bool biased) {
+void check_norm(kernels::RowKernel norm, bool centred, bool biased) {
   for (int d : kWidths) {
     CAPTURE(d);
     const auto n = static_cast<std::size_t>(d);
@@ -49,27 +50,49 @@ void check_norms(const CpuKernels& kernels) {
   }
 }
 
-/// Rows that are parts of wider ones, as a view of a joint product leaves them.
-Tensor views(Graph& g, const std::vector<float>& x, int d, int n) {
-  const Tensor wide = g.store().add_constant(x, {2 * d, n, 2});
-  return ggml_view_3d(g.context(), wide.node(), d, n, 2, wide.node()->nb[1], wide.node()->nb[2], sizeof(float));
+/// Rows of any length, in place too: one vector more or less must not matter.
+void check_pairs_of_rows(const CpuKernels& kernels) {
+  for (int d : kWidths) {
+    CAPTURE(d);
+    const auto n = static_cast<std::size_t>(d);
+    const std::vector<float> x = ramp(n, 3), w = ramp(n + 1, 2);
+    for (const bool in_place : {false, true}) {
+      std::vector<float> room = x, y(n, NAN), sum(n), product(n), scaled(n);
+      float* to = in_place ? room.data() : y.data();
+      const auto run = [&](kernels::RowKernel kernel, std::vector<float>& result) {
+        room = x;
+        kernel(room.data(), w.data() + 1, nullptr, 1.5f, to, d);
+        result.assign(to, to + n);
+      };
+      run(kernels.add, sum), run(kernels.multiply, product), run(kernels.scale, scaled);
+      for (std::size_t i = 0; i < n; ++i) {
+        CHECK(sum[i] == x[i] + w[i + 1]);
+        CHECK(product[i] == x[i] * w[i + 1]);
+        CHECK(scaled[i] == x[i] * 1.5f);
+      }
+    }
+  }
+}
+
+void check_rotation(const CpuKernels& kernels) {
+  for (int d : {2, 6, 16, 34, 64, 66, 256}) {
+    CAPTURE(d);
+    const auto n = static_cast<std::size_t>(d), half = n / 2;
+    const std::vector<float> x = ramp(n, 3), table = ramp(n, 1);
+    std::vector<float> apart(n), in_place = x;
+    kernels.rotate_half(x.data(), table.data(), nullptr, 0, apart.data(), d);
+    kernels.rotate_half(in_place.data(), table.data(), nullptr, 0, in_place.data(), d);
+    CHECK(apart == in_place);
+    for (std::size_t i = 0; i < half; ++i) {
+      CHECK(std::abs(apart[i] - (double{x[i]} * table[i] - double{x[half + i]} * table[half + i])) <= 1e-6);
+      CHECK(std::abs(apart[half + i] - (double{x[half + i]} * table[i] + double{x[i]} * table[half + i])) <= 1e-6);
+    }
+  }
 }
 
 }  // namespace
 
 VLA_KERNEL_TEST("layer and RMS norms of any width agree with their definitions", check_norms)
 
-TEST_CASE("norms of rows that lie apart agree with ggml's own operations") {
-  constexpr int kD = 33, kN = 5;
-  const std::vector<float> x = ramp(2 * kD * kN * 2, 3), weight = ramp(kD, 2), bias = ramp(kD, 1);
-  for (bool centred : {false, true}) {
-    const auto build = [&](Graph& g) {
-      const Tensor w = g.store().add_constant(weight, {kD}), b = g.store().add_constant(bias, {kD});
-      const auto norm = centred ? kernels::layer_norm : kernels::rms_norm;
-      return norm(g, views(g, x, kD, kN), w, b, kEps);
-    };
-    const auto got = run_graph(build), expected = run_graph(build, "ggml");
-    REQUIRE(got.size() == expected.size());
-    for (std::size_t i = 0; i < got.size(); ++i) CHECK(std::abs(got[i] - expected[i]) <= 4e-6);
-  }
-}
+VLA_KERNEL_TEST("sums, products and multiples of rows of any length, in place too", check_pairs_of_rows)
+VLA_KERNEL_TEST("pairs of a row turn by the angles of a table, in place too", check_rotation)

@@ -10,14 +10,14 @@
 using namespace vla;
 
 TEST_CASE("squares of patches follow each other row by row, and the patches of a square likewise") {
-  const std::vector<Place> expected = {{0, 0, 0}, {0, 0, 1}, {0, 1, 0}, {0, 1, 1}, {0, 0, 2}, {0, 0, 3},
-                                       {0, 1, 2}, {0, 1, 3}, {0, 2, 0}, {0, 2, 1}, {0, 3, 0}, {0, 3, 1},
-                                       {0, 2, 2}, {0, 2, 3}, {0, 3, 2}, {0, 3, 3}};
+  const std::vector<PositionId> expected = {{0, 0, 0}, {0, 0, 1}, {0, 1, 0}, {0, 1, 1}, {0, 0, 2}, {0, 0, 3},
+                                            {0, 1, 2}, {0, 1, 3}, {0, 2, 0}, {0, 2, 1}, {0, 3, 0}, {0, 3, 1},
+                                            {0, 2, 2}, {0, 2, 3}, {0, 3, 2}, {0, 3, 3}};
   CHECK(merge_block_places(4, 4, 2) == expected);
   const auto oblong = merge_block_places(6, 3, 3);
-  CHECK(std::set<Place>(oblong.begin(), oblong.end()).size() == 18);
-  CHECK(oblong[4] == Place{0, 1, 1});
-  CHECK(oblong[9] == Place{0, 3, 0});
+  CHECK(std::set<PositionId>(oblong.begin(), oblong.end()).size() == 18);
+  CHECK(oblong[4] == PositionId{0, 1, 1});
+  CHECK(oblong[9] == PositionId{0, 3, 0});
 }
 
 TEST_CASE("a table stretched over a picture is a bilinear blend whose corners are the picture's") {

@@ -8,10 +8,11 @@
 
 #include <cmath>
 
+#include "kernels/isa.h"
 #include "nn/mlp.h"
 #include "nn/norm.h"
-#include "support/editable_bundle.h"
 #include "support/graph_runner.h"
+#include "support/param_set.h"
 
 using namespace vla;
 using test::ramp;
@@ -21,33 +22,14 @@ namespace {
 constexpr int kWidth = 6, kCondition = 4, kToken = 3, kHidden = 5;
 constexpr float kEps = 1e-3f;  // large enough to show
 
-/// A weight of a module under `m`, fastest dimension first.
-struct Piece {
-  std::string name;
-  std::vector<std::int64_t> shape;
-  std::vector<float> values;
-};
+using Piece = test::ParamSet::Piece;  // of a module under `m`
 
 /// Declares a `Made` on these weights, and returns the values of what `use` makes with it.
 template <class Made, class Make, class Use>
 std::vector<float> run_module(const std::vector<Piece>& pieces, const Make& make, const Use& use) {
-  test::EditableBundle bundle;
-  for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
-    bundle.set(key, Value(std::string("test")));
-  bundle.set("vla.dtype", Value(std::string("f32")));
-  bundle.set("vla.bundle_version", Value(std::int64_t{1}));
-  for (const Piece& piece : pieces) {
-    const auto bytes = std::as_bytes(std::span(piece.values));
-    bundle.tensors.push_back(
-        {piece.name, DType::f32, piece.shape, {reinterpret_cast<const char*>(bytes.data()), bytes.size()}});
-  }
-  const auto opened = Bundle::open(bundle.write("module.gguf"));
-  REQUIRE_MESSAGE(opened.ok(), (opened ? "" : opened.error().message()));
-  ParamList list(opened->keys(), &*opened);
-  const Made module = make(Scope(list, "m"));
-  const Status fits = list.report("m", [](const std::string&) { return false; });
-  REQUIRE_MESSAGE(fits.ok(), (fits ? "" : fits.error().message()));
-  return test::run_graph(list, [&](Graph& g) { return use(module, g); });
+  test::ParamSet params(pieces);
+  const Made module = make(params.scope("m"));
+  return test::run_graph(params.list(), [&](Graph& g) { return use(module, g); });
 }
 
 float at(const std::vector<float>& values, int i) { return values[static_cast<std::size_t>(i)]; }
@@ -67,13 +49,12 @@ TEST_CASE("an adaptive norm scales, shifts and gates by what its condition says"
              y = ramp(kWidth * kToken, 1), condition = ramp(kCondition, 1.5f);
   const std::vector<Piece> pieces = {{"m.dense.weight", {kCondition, 3 * kWidth}, weight},
                                      {"m.dense.bias", {3 * kWidth}, bias}};
-  const auto got = run_module<AdaptiveRmsNorm>(
-      pieces, [](const Scope& s) { return AdaptiveRmsNorm(s, kWidth, kCondition, kEps); },
-      [&](const AdaptiveRmsNorm& norm, Graph& g) {
-        Store& store = g.store();
-        const Tensor m = norm.modulation(g, store.add_constant(condition, {kCondition, 1}));
-        const Tensor h = norm(g, store.add_constant(x, {kWidth, kToken}), m);
-        return gated_add(g, h, store.add_constant(y, {kWidth, kToken}), norm.gate(g, m));
+  const auto got = run_module<AdaRmsNorm>(
+      pieces, [](const Scope& s) { return AdaRmsNorm(s, kWidth, kCondition, kEps); },
+      [&](const AdaRmsNorm& norm, Graph& g) {
+        const Tensor m = norm.modulation(g, test::constant(g, condition, {kCondition, 1}));
+        const Tensor h = norm(g, test::constant(g, x, {kWidth, kToken}), m);
+        return gated_add(g, h, test::constant(g, y, {kWidth, kToken}), norm.gate(g, m));
       });
   REQUIRE(got.size() == x.size());
   const auto modulation = [&](int row) { return dot(weight, row, condition, 0, kCondition) + at(bias, row); };
@@ -102,7 +83,7 @@ TEST_CASE("an MLP activates what goes up by the activation it was given") {
     const auto got = run_module<Mlp>(
         pieces, [activation = activation](const Scope& s) { return Mlp(s, kWidth, kHidden, activation); },
         [&](const Mlp& mlp, Graph& g) {
-          return mlp(g, g.store().add_constant(x, {kWidth, kToken}));
+          return mlp(g, test::constant(g, x, {kWidth, kToken}));
         });
     REQUIRE(got.size() == x.size());
     for (int token = 0; token < kToken; ++token) {
@@ -116,16 +97,16 @@ TEST_CASE("an MLP activates what goes up by the activation it was given") {
 }
 
 TEST_CASE("an adaptive LayerNorm takes scale and shift in the order of its kind") {
-  using Order = AdaptiveLayerNorm::Order;
+  using Order = AdaLayerNorm::Order;
   const auto weight = ramp(2 * kWidth * kWidth, 1), bias = ramp(2 * kWidth, 2), x = ramp(kWidth * kToken, 3),
              condition = ramp(kWidth, 1.5f);
   for (const Order order : {Order::scale_shift, Order::shift_scale}) {
-    const auto got = run_module<std::vector<AdaptiveLayerNorm>>(
+    const auto got = run_module<std::vector<AdaLayerNorm>>(
         {{"m.weight", {kWidth, 2 * kWidth}, weight}, {"m.bias", {2 * kWidth}, bias}},
-        [&](const Scope& s) { return std::vector{AdaptiveLayerNorm(s, kWidth, kEps, order)}; },
-        [&](const std::vector<AdaptiveLayerNorm>& norm, Graph& g) {
-          const Tensor m = norm[0].modulation(g, g.store().add_constant(condition, {kWidth, 1}));
-          return norm[0].forward(g, g.store().add_constant(x, {kWidth, kToken}), m);
+        [&](const Scope& s) { return std::vector{AdaLayerNorm(s, kWidth, kEps, order)}; },
+        [&](const std::vector<AdaLayerNorm>& norm, Graph& g) {
+          const Tensor m = norm[0].modulation(g, test::constant(g, condition, {kWidth, 1}));
+          return norm[0].forward(g, test::constant(g, x, {kWidth, kToken}), m);
         });
     REQUIRE(got.size() == x.size());
     const auto modulation = [&](int row) { return dot(weight, row, condition, 0, kWidth) + at(bias, row); };
@@ -149,7 +130,7 @@ TEST_CASE("a norm without weights has mean 0 and a variance just below 1") {
   for (Isa isa : usable_isas()) {
     const auto got = test::run_graph(
         [&](Graph& g) {
-          return layer_norm(g, g.store().add_constant(x, {kWidth, kToken}), kEps);
+          return layer_norm(g, test::constant(g, x, {kWidth, kToken}), kEps);
         },
         isa_name(isa));
     for (int token = 0; token < kToken; ++token) {
@@ -172,7 +153,7 @@ TEST_CASE("a GELU-gated MLP multiplies the activated gate with what goes up") {
   const auto got = run_module<GatedMlp>(
       pieces, [](const Scope& s) { return GatedMlp(s, kWidth, kHidden, Activation::gelu_tanh); },
       [&](const GatedMlp& mlp, Graph& g) {
-        return mlp(g, g.store().add_constant(x, {kWidth, kToken}));
+        return mlp(g, test::constant(g, x, {kWidth, kToken}));
       });
   REQUIRE(got.size() == x.size());
   for (int token = 0; token < kToken; ++token) {

@@ -7,7 +7,7 @@
 #include <cmath>
 #include <functional>
 
-#include "kernels/elementwise.h"
+#include "kernels/isa.h"
 #include "nn/attention.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
@@ -20,12 +20,12 @@ namespace {
 
 double gelu(double x) { return 0.5 * x * (1 + std::tanh(std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x))); }
 
-struct Shape {
+struct Sizes {
   int d_head, n_head, n_head_kv, n_query, n_key;
 };
 
 /// The definition of attention, with a mask that lets query i see the first `n_seen(i)` keys.
-std::vector<float> attention_by_hand(const Shape& s, const std::vector<float>& q, const std::vector<float>& k,
+std::vector<float> attention_by_hand(const Sizes& s, const std::vector<float>& q, const std::vector<float>& k,
                                      const std::vector<float>& v, bool causal) {
   std::vector<float> out;
   for (int i = 0; i < s.n_query; ++i)
@@ -63,7 +63,7 @@ TEST_CASE("gelu agrees with its definition over the whole range of float32") {
   std::vector<float> x = ramp(4099, 12);
   for (float edge : {0.0f, -0.0f, 1e-30f, -1e-30f, 100.0f, -100.0f, 1e30f, -1e30f}) x.push_back(edge);
   const auto y = run_graph([&](Graph& g) {
-    return kernels::gelu_tanh(g, g.store().add_constant(x, {static_cast<std::int64_t>(x.size())}));
+    return activate(g, test::constant(g, x, {static_cast<std::int64_t>(x.size())}), Activation::gelu_tanh);
   });
   for (std::size_t i = 0; i < x.size(); ++i) {
     const double expected = gelu(x[i]);
@@ -76,12 +76,14 @@ TEST_CASE("gelu of erf and relu agree with their definitions on every choice of 
   std::vector<float> x = ramp(4099, 12);
   for (float edge : {0.0f, -0.0f, 1e-30f, -1e-30f, 100.0f, -100.0f, 1e30f, -1e30f, NAN}) x.push_back(edge);
   for (Isa isa : usable_isas()) {
-    const auto run = [&](const std::function<Tensor(Graph&, Tensor)>& map) {
+    const auto run = [&](Activation activation) {
       return run_graph(
-          [&](Graph& g) { return map(g, g.store().add_constant(x, {static_cast<std::int64_t>(x.size())})); },
+          [&](Graph& g) {
+            return activate(g, test::constant(g, x, {static_cast<std::int64_t>(x.size())}), activation);
+          },
           isa_name(isa));
     };
-    const auto gelu = run(kernels::gelu_erf), relu = run(kernels::relu);
+    const auto gelu = run(Activation::gelu_erf), relu = run(Activation::relu);
     CHECK(std::isnan(gelu.back()));
     CHECK(std::isnan(relu.back()));
     for (std::size_t i = 0; i + 1 < x.size(); ++i) {
@@ -95,17 +97,17 @@ TEST_CASE("gelu of erf and relu agree with their definitions on every choice of 
 }
 
 TEST_CASE("attention with grouped heads agrees with its definition, with and without a causal mask") {
-  for (const Shape s : {Shape{16, 6, 2, 5, 17}, Shape{8, 3, 3, 1, 1}, Shape{64, 15, 5, 50, 177}})
+  for (const Sizes s : {Sizes{16, 6, 2, 5, 17}, Sizes{8, 3, 3, 1, 1}, Sizes{64, 15, 5, 50, 177}})
     for (bool causal : {false, true}) {
       const auto q = ramp(static_cast<std::size_t>(s.d_head * s.n_head * s.n_query), 2),
                  k = ramp(static_cast<std::size_t>(s.d_head * s.n_head_kv * s.n_key), 1),
                  v = ramp(static_cast<std::size_t>(s.d_head * s.n_head_kv * s.n_key), 3);
       const auto got = run_graph([&](Graph& g) {
-        Store& store = g.store();
         const Tensor mask = causal ? causal_mask(g, s.n_key - s.n_query, s.n_query) : Tensor();
-        return attention(g, store.add_constant(q, {s.d_head, s.n_head, s.n_query}),
-                         store.add_constant(k, {s.d_head, s.n_head_kv, s.n_key}),
-                         store.add_constant(v, {s.d_head, s.n_head_kv, s.n_key}), mask);
+        return attention(g, test::constant(g, q, {s.d_head, s.n_head, s.n_query}),
+                         {{test::constant(g, k, {s.d_head, s.n_head_kv, s.n_key}),
+                           test::constant(g, v, {s.d_head, s.n_head_kv, s.n_key})}},
+                         mask);
       });
       check_close(got, attention_by_hand(s, q, k, v, causal), 2e-6f);
     }
@@ -124,7 +126,7 @@ TEST_CASE("pixel shuffle puts the patches of a square into one token, row by row
   for (int view = 0; view < 2; ++view)
     for (int r = 0; r < 4; ++r)
       for (int c = 0; c < 4; ++c) x.push_back(static_cast<float>(100 * view + 10 * r + c));
-  const auto y = run_graph([&](Graph& g) { return pixel_shuffle(g, g.store().add_constant(x, {1, 16, 2}), 2); });
+  const auto y = run_graph([&](Graph& g) { return pixel_shuffle(g, test::constant(g, x, {1, 16, 2}), 2); });
   CHECK(std::vector<float>(y.begin(), y.begin() + 8) == std::vector<float>{0, 1, 10, 11, 2, 3, 12, 13});
   CHECK(std::vector<float>(y.end() - 4, y.end()) == std::vector<float>{122, 123, 132, 133});
 }
@@ -140,13 +142,12 @@ TEST_CASE("a slice holds the tokens of its range, and whatever takes tokens take
     return run_graph(
         [&](Graph& g) {
           const std::vector<float> some(x.begin(), x.begin() + kWidth * kToken * n_view);
-          return use(g, slice_tokens(g, g.store().add_constant(some, {kWidth, kToken, n_view}), 1, 3));
+          return use(g, slice_tokens(g, test::constant(g, some, {kWidth, kToken, n_view}), 1, 3));
         },
         isa);
   };
   const auto tokens = [&](Graph& g, float value, int n_view) {
-    return g.store().add_constant(std::vector<float>(static_cast<std::size_t>(kWidth * n_view), value),
-                                  {kWidth, 1, n_view});
+    return test::constant(g, std::vector<float>(static_cast<std::size_t>(kWidth * n_view), value), {kWidth, 1, n_view});
   };
   for (Isa isa : usable_isas())
     for (int n_view : {1, kView}) {
@@ -166,16 +167,16 @@ TEST_CASE("a slice holds the tokens of its range, and whatever takes tokens take
       CHECK(run([](Graph& g, Tensor s) { return flatten_views(g, s); }) == same);
       CHECK(run([&](Graph& g, Tensor s) { return concat_tokens(g, {tokens(g, 2, n_view), s}); }) == between);
       CHECK(run([&](Graph& g, Tensor s) {
-              return concat_tokens(g, {tokens(g, 2, n_view), kernels::contiguous(g, s)});
+              return concat_tokens(g, {tokens(g, 2, n_view), scale(g, s, 1)});
             }) == between);
       CHECK(run([&](Graph& g, Tensor s) {
               return slice_tokens(g, concat_tokens(g, {tokens(g, 2, n_view), s}), 1, 3);
             }) == same);
       CHECK(run([&](Graph& g, Tensor s) { return add(g, s, scale(g, s, -1)); }) ==
             std::vector<float>(same.size(), 0.0f));
-      CHECK(run([](Graph& g, Tensor s) { return kernels::relu(g, s); }) == positive);
+      CHECK(run([](Graph& g, Tensor s) { return activate(g, s, Activation::relu); }) == positive);
       CHECK(run([](Graph& g, Tensor s) {
-              return multiply(g, s, g.store().add_constant(std::vector<float>{1, 2, 3}, {kWidth}));
+              return multiply(g, s, test::constant(g, std::vector<float>{1, 2, 3}, {kWidth}));
             }) == factored);
     }
 }
@@ -185,7 +186,7 @@ TEST_CASE("pixel shuffle takes the patches of every view behind a class token") 
   for (int view = 0; view < 2; ++view)
     for (int i = -1; i < 4; ++i) x.push_back(static_cast<float>(10 * view + i));
   const auto y = run_graph([&](Graph& g) {
-    return pixel_shuffle(g, slice_tokens(g, g.store().add_constant(x, {1, 5, 2}), 1, 4), 2);
+    return pixel_shuffle(g, slice_tokens(g, test::constant(g, x, {1, 5, 2}), 1, 4), 2);
   });
   CHECK(y == std::vector<float>{0, 1, 2, 3, 10, 11, 12, 13});
 }
@@ -193,7 +194,7 @@ TEST_CASE("pixel shuffle takes the patches of every view behind a class token") 
 TEST_CASE("a tap of a view keeps its values when later nodes reuse the memory") {
   const std::vector<float> x = {1, 2, 3, 4};
   const auto y = run_graph([&](Graph& g) {
-    return merge_heads(g, split_heads(g, scale(g, g.store().add_constant(x, {4, 1}), 2), 2));
+    return merge_heads(g, split_heads(g, scale(g, test::constant(g, x, {4, 1}), 2), 2));
   });
   CHECK(y == std::vector<float>{2, 4, 6, 8});
 }

@@ -6,6 +6,7 @@
 
 #include <cmath>
 
+#include "kernels/isa.h"
 #include "support/graph_runner.h"
 
 using namespace vla;
@@ -22,7 +23,7 @@ void check_turned(int d_head, int n_token, const MakeTable& make_table, const An
   for (Isa isa : usable_isas()) {
     const auto y = run_graph(
         [&](Graph& g) {
-          return rope(g, g.store().add_constant(x, {d_head, kHeads, n_token, kBatches}), make_table(g));
+          return apply_rope(g, test::constant(g, x, {d_head, kHeads, n_token, kBatches}), make_table(g));
         },
         isa_name(isa));
     REQUIRE(y.size() == x.size());
@@ -42,7 +43,7 @@ TEST_CASE("rope turns half-split pairs, which differs from interleaved ones, for
   constexpr int kHead = 64, kTokens = 3, kFirst = 200;
   const std::vector<float> x = ramp(kHead * 2 * kTokens, 1);
   const auto y = run_graph([&](Graph& g) {
-    return rope(g, g.store().add_constant(x, {kHead, 2, kTokens}), 10000.0f, RotaryAngle::quotient, kFirst);
+    return apply_rope(g, test::constant(g, x, {kHead, 2, kTokens}), 10000.0f, RotaryAngle::quotient, kFirst);
   });
   double interleaved_difference = 0;
   for (int token = 0; token < kTokens; ++token)
@@ -68,7 +69,7 @@ TEST_CASE("rotary angles are rounded as either reference rounds them, which diff
   x[kPair] = 1;
   const auto turned = [&](RotaryAngle angle) {
     return run_graph([&](Graph& g) {
-      return rope(g, g.store().add_constant(x, {kHead, 1, 1}), 10000.0f, angle, kPosition);
+      return apply_rope(g, test::constant(g, x, {kHead, 1, 1}), 10000.0f, angle, kPosition);
     });
   };
   const auto product = turned(RotaryAngle::product), quotient = turned(RotaryAngle::quotient);
@@ -86,8 +87,8 @@ TEST_CASE("rope at given positions turns every token as rope of that position al
                               x.begin() + static_cast<std::ptrdiff_t>((j + 1) * 2 * kHead));
   };
   const auto turn = [](Graph& g, const std::vector<float>& values, auto place) {
-    const Tensor q = g.store().add_constant(values, {kHead, 2, static_cast<std::int64_t>(values.size()) / (2 * kHead)});
-    return rope(g, q, rotary_table(g, kHead, 1e6f, RotaryAngle::product, place));
+    const Tensor q = test::constant(g, values, {kHead, 2, static_cast<std::int64_t>(values.size()) / (2 * kHead)});
+    return apply_rope(g, q, rotary_table(g, kHead, 1e6f, RotaryAngle::product, place));
   };
   for (const std::vector<int>& positions : {apart, in_order, beginning}) {
     const std::vector<float> some(x.begin(), x.begin() + static_cast<std::ptrdiff_t>(positions.size() * 2 * kHead));
@@ -106,20 +107,20 @@ TEST_CASE("rope at given positions turns every token as rope of that position al
 }
 
 TEST_CASE("patches turn by their row in the first half of the pairs and by their column in the second, in every view") {
-  const std::vector<Place> places = {{0, 0, 0}, {0, 0, 1}, {0, 5, 2}, {9, 3, 15}};
+  const std::vector<PositionId> places = {{0, 0, 0}, {0, 0, 1}, {0, 5, 2}, {9, 3, 15}};
   for (const int d_head : {64, 12}) {
     const int quarter = d_head / 4;
     check_turned(
         d_head, 4, [&](Graph& g) { return grid_rotary_table(g, d_head, 1e4f, places); },
         [&](int j, int i) {
-          const Place& place = places[static_cast<std::size_t>(j)];
+          const PositionId& place = places[static_cast<std::size_t>(j)];
           return place[i < quarter ? 1 : 2] / std::pow(1e4, 4.0 * (i % quarter) / d_head);
         });
   }
 }
 
 TEST_CASE("time, rows and columns take turns among the pairs until their shares end, and the rest is time's") {
-  const std::vector<Place> places = {{0, 0, 0}, {4, 11, 7}, {14, 14, 21}};
+  const std::vector<PositionId> places = {{0, 0, 0}, {4, 11, 7}, {14, 14, 21}};
   struct Layout {
     int d_head;
     std::array<int, 3> sections;
@@ -129,8 +130,7 @@ TEST_CASE("time, rows and columns take turns among the pairs until their shares 
     for (const std::size_t other : {1, 2})
       for (std::size_t n = 0; n < static_cast<std::size_t>(layout.sections[other]); ++n) axis[3 * n + other] = other;
     check_turned(
-        layout.d_head, 3,
-        [&](Graph& g) { return interleaved_rotary_table(g, layout.d_head, 5e6f, layout.sections, places); },
+        layout.d_head, 3, [&](Graph& g) { return mrope_table(g, layout.d_head, 5e6f, layout.sections, places); },
         [&](int j, int i) {
           return places[static_cast<std::size_t>(j)][axis[static_cast<std::size_t>(i)]] /
                  std::pow(5e6, 2.0 * i / layout.d_head);
@@ -140,7 +140,7 @@ TEST_CASE("time, rows and columns take turns among the pairs until their shares 
 
 TEST_CASE("text among pictures turns as text alone") {
   const std::vector<int> positions = {0, 3, 117};
-  const std::vector<Place> places = {{0, 0, 0}, {3, 3, 3}, {117, 117, 117}};
+  const std::vector<PositionId> places = {{0, 0, 0}, {3, 3, 3}, {117, 117, 117}};
   const auto one = run_graph([&](Graph& g) { return rotary_table(g, 128, 5e6f, RotaryAngle::product, positions); });
-  CHECK(one == run_graph([&](Graph& g) { return interleaved_rotary_table(g, 128, 5e6f, {24, 20, 20}, places); }));
+  CHECK(one == run_graph([&](Graph& g) { return mrope_table(g, 128, 5e6f, {24, 20, 20}, places); }));
 }

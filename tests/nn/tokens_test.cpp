@@ -24,10 +24,8 @@ std::vector<float> counted(int count) {
   return values;
 }
 
-Tensor numbers(Graph& g, std::initializer_list<std::int64_t> shape) {
-  std::int64_t count = 1;
-  for (const std::int64_t n : shape) count *= n;
-  return g.store().add_constant(counted(static_cast<int>(count)), shape);
+Tensor numbers(Graph& g, std::initializer_list<std::int64_t> sizes) {
+  return test::constant(g, counted(static_cast<int>(count(test::shape_of(sizes)))), sizes);
 }
 
 using Values = std::vector<float>;
@@ -37,7 +35,7 @@ constexpr float kHidden = -std::numeric_limits<float>::infinity();
 
 TEST_CASE("a token in front of every view's is dropped again without a trace") {
   const auto with = [](Graph& g) {
-    return prepend_token(g, g.store().add_constant(Values{-1, -2}, {2}), numbers(g, {2, 3, 2}));
+    return prepend_token(g, test::constant(g, Values{-1, -2}, {2}), numbers(g, {2, 3, 2}));
   };
   CHECK(run_graph(with) == Values{-1, -2, 0, 1, 2, 3, 4, 5, -1, -2, 6, 7, 8, 9, 10, 11});
   CHECK(run_graph([&](Graph& g) { return slice_tokens(g, with(g), 1, 3); }) == counted(12));
@@ -54,7 +52,7 @@ TEST_CASE("one view of several, and parts of any number in their order") {
 TEST_CASE("keys are cut where their tokens stand, and joined behind others") {
   const auto got = run_graph([](Graph& g) {
     const Tensor x = numbers(g, {2, 2, 3});
-    return append_keys(g, slice_keys(g, x, 2, 1), slice_keys(g, x, 0, 1));
+    return concat(g, {slice_keys(g, x, 2, 1), slice_keys(g, x, 0, 1)}, 2);
   });
   CHECK(got == Values{8, 9, 10, 11, 0, 1, 2, 3});
 }
@@ -86,9 +84,9 @@ TEST_CASE("a key that stands for several weighs like that many") {
   const auto attend = [&](int n_key, const std::vector<int>& copies) {
     return run_graph([&](Graph& g) {
       const auto part = [&](const Values& x, int n) {
-        return g.store().add_constant(Values(x.begin(), x.begin() + 2 * n), {2, 1, n});
+        return test::constant(g, Values(x.begin(), x.begin() + 2 * n), {2, 1, n});
       };
-      return attention(g, part(q, 1), part(k, n_key), part(v, n_key), copies_mask(g, copies, 1));
+      return attention(g, part(q, 1), {{part(k, n_key), part(v, n_key)}}, copies_mask(g, copies, 1));
     });
   };
   const Values all = attend(4, {1, 1, 1, 1}), short_cut = attend(2, {1, 3});
@@ -110,12 +108,12 @@ TEST_CASE(
 
 TEST_CASE("a token's own factor scales all its numbers") {
   const auto got = run_graph([](Graph& g) {
-    return multiply(g, numbers(g, {3, 2}), g.store().add_constant(Values{2, -1}, {1, 2}));
+    return multiply(g, numbers(g, {3, 2}), test::constant(g, Values{2, -1}, {1, 2}));
   });
   CHECK(got == Values{0, 2, 4, -3, -4, -5});
 }
 
 TEST_CASE("filled tokens hold their number, and others of the same shape another") {
-  const auto got = run_graph([](Graph& g) { return concat_tokens(g, {filled(g, 0, 2, 1), filled(g, 1.5f, 2, 1)}); });
+  const auto got = run_graph([](Graph& g) { return concat_tokens(g, {full(g, 0, 2, 1), full(g, 1.5f, 2, 1)}); });
   CHECK(got == Values{0, 0, 1.5f, 1.5f});
 }

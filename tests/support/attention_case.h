@@ -7,11 +7,12 @@
 
 #include <cmath>
 #include <limits>
-#include <thread>
+#include <memory>
 #include <utility>
 #include <vector>
 
 #include "kernels/attention_kernel.h"
+#include "support/executor.h"
 #include "support/graph_runner.h"
 
 namespace vla::test {
@@ -22,23 +23,23 @@ using kernels::AttentionKernel;
 /// What a mask holds for a key that is not seen.
 inline constexpr float kHidden = -std::numeric_limits<float>::infinity();
 
-struct Shape {
+struct AttentionShape {
   std::int64_t d_head, n_head, n_head_kv, n_query, n_key, n_batch;
 };
 
 /// One of everything that blocks, panels, chunks and groups have edges at.
-inline constexpr Shape kShapes[] = {{64, 2, 2, 70, 130, 2}, {64, 15, 5, 50, 227, 1}, {16, 6, 2, 5, 17, 1},
-                                    {72, 2, 1, 25, 129, 1}, {80, 3, 3, 24, 128, 1},  {256, 4, 1, 7, 33, 1},
-                                    {17, 1, 1, 1, 1, 3},    {1, 2, 2, 3, 300, 1},    {33, 4, 2, 1, 257, 1},
-                                    {96, 1, 1, 49, 16, 1},  {8, 3, 3, 13, 31, 2}};
+inline constexpr AttentionShape kShapes[] = {{64, 2, 2, 70, 130, 2}, {64, 15, 5, 50, 227, 1}, {16, 6, 2, 5, 17, 1},
+                                             {72, 2, 1, 25, 129, 1}, {80, 3, 3, 24, 128, 1},  {256, 4, 1, 7, 33, 1},
+                                             {17, 1, 1, 1, 1, 3},    {1, 2, 2, 3, 300, 1},    {33, 4, 2, 1, 257, 1},
+                                             {96, 1, 1, 49, 16, 1},  {8, 3, 3, 13, 31, 2}};
 
 /// Values, and a mask that may be empty. Rows lie `gap` floats apart.
 struct Case {
-  Shape shape;
+  AttentionShape shape;
   std::vector<float> q, k, v, mask;
   std::int64_t gap = 0;
 
-  Case(const Shape& s, float range, std::int64_t row_gap) : shape(s), gap(row_gap) {
+  Case(const AttentionShape& s, float range, std::int64_t row_gap) : shape(s), gap(row_gap) {
     const auto count = [&](std::int64_t n_head, std::int64_t n_token) {
       return static_cast<std::size_t>((s.d_head + gap) * n_head * n_token * s.n_batch);
     };
@@ -53,64 +54,72 @@ struct Case {
       for (std::int64_t j = 0; j < shape.n_key; ++j) mask.push_back(value(i, j));
   }
 
-  AttentionJob::Rows rows(const std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) const {
+  kernels::HeadRows rows(const std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) const {
     const std::int64_t row = shape.d_head + gap;
     return {x.data(), row, row * n_head, row * n_head * n_token};
   }
-  AttentionJob job() const {
-    const Shape& s = shape;
-    return {.d_head = s.d_head,
-            .n_head = s.n_head,
-            .n_head_kv = s.n_head_kv,
-            .n_query = s.n_query,
-            .n_key = s.n_key,
-            .n_batch = s.n_batch,
-            .scale = 1 / std::sqrt(static_cast<float>(s.d_head)),
-            .q = rows(q, s.n_head, s.n_query),
-            .k = rows(k, s.n_head_kv, s.n_key),
-            .v = rows(v, s.n_head_kv, s.n_key),
-            .mask = mask.empty() ? nullptr : mask.data(),
-            .packed = nullptr,
-            .out = nullptr,
-            .turns = nullptr};
-  }
+  kernels::HeadRows queries() const { return rows(q, shape.n_head, shape.n_query); }
+  kernels::HeadRows keys() const { return rows(k, shape.n_head_kv, shape.n_key); }
+  kernels::HeadRows values() const { return rows(v, shape.n_head_kv, shape.n_key); }
+  float scale() const { return 1 / std::sqrt(static_cast<float>(shape.d_head)); }
 };
 
-/// What the kernel answers when `n_thread` threads share the work. Memory holds NaNs before it is written.
-inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int n_thread) {
-  AttentionJob job = c.job();
+/// What is done to queries and keys on the way.
+struct Preparation {
+  kernels::RowPrep q, k;
+};
+
+/// What the kernel answers with `n_thread` workers, keys and values in segments of `n_key`, which add up to all. Memory
+/// holds NaNs before it is written.
+inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int n_thread,
+                              std::vector<std::int64_t> n_key = {}, const Preparation& prep = {}) {
+  const AttentionShape& s = c.shape;
+  if (n_key.empty()) n_key = {s.n_key};
   const float nan = std::numeric_limits<float>::quiet_NaN();
-  std::vector<float> packed(static_cast<std::size_t>(kernel.packed_size(job)), nan);
-  std::vector<float> out(static_cast<std::size_t>(job.d_head * job.n_head * job.n_query * job.n_batch), nan);
-  job.packed = packed.data();
+  std::vector<float> out(static_cast<std::size_t>(s.d_head * s.n_head * s.n_query * s.n_batch), nan);
+  AttentionJob job = {};
+  job.d_head = s.d_head, job.n_head = s.n_head, job.n_head_kv = s.n_head_kv;
+  job.n_query = s.n_query, job.n_key = s.n_key, job.n_batch = s.n_batch;
+  job.scale = c.scale(), job.q = c.queries(), job.prep = prep.q;
+  job.mask = c.mask.empty() ? nullptr : c.mask.data();
   job.out = out.data();
-  for (int i = 0; i < n_thread; ++i) kernel.pack(job, i, n_thread);
-  kernels::Turns turns;
-  job.turns = &turns;
-  std::vector<std::thread> threads;
-  for (int i = 0; i < n_thread; ++i) threads.emplace_back([&, i] { kernel.run(job, i, n_thread); });
-  for (std::thread& thread : threads) thread.join();
+  std::vector<std::vector<float>> packed;  // a vector keeps its numbers where they are when it moves
+  std::int64_t first = 0;
+  for (const std::int64_t n : n_key) {
+    kernels::PackJob pack = {s.d_head, s.n_head_kv, n, s.n_batch, c.keys(), c.values(), prep.k, nullptr};
+    pack.k.data += first * pack.k.token, pack.v.data += first * pack.v.token;
+    if (pack.prep.table != nullptr) pack.prep.table += first * s.d_head;
+    packed.emplace_back(kernel.packed_size(pack) / sizeof(float) + 16, nan);
+    void* place = packed.back().data();
+    std::size_t room = packed.back().size() * sizeof(float);
+    pack.packed = static_cast<std::byte*>(std::align(64, kernel.packed_size(pack), place, room));
+    run_items(kernel.n_pack(pack), n_thread, [&](std::int64_t item, kernels::Worker&) { kernel.pack(pack, item); });
+    job.segment[job.n_segment++] = {pack.packed, n, first};
+    first += n;
+  }
+  REQUIRE(first == s.n_key);
+  run_items(kernel.cut(job, n_thread), n_thread, [&](std::int64_t item, kernels::Worker&) { kernel.run(job, item); });
   return out;
 }
 
 /// The definition for one query and head, in double.
 inline std::vector<double> exact_row(const Case& c, std::int64_t head, std::int64_t query, std::int64_t batch) {
-  const AttentionJob job = c.job();
-  const std::int64_t head_kv = head / (job.n_head / job.n_head_kv);
-  std::vector<double> score, mixed(static_cast<std::size_t>(job.d_head));
+  const AttentionShape& s = c.shape;
+  const std::int64_t head_kv = head / (s.n_head / s.n_head_kv);
+  std::vector<double> score, mixed(static_cast<std::size_t>(s.d_head));
   double most = kHidden, sum = 0;
-  for (std::int64_t j = 0; j < job.n_key; ++j) {
+  for (std::int64_t j = 0; j < s.n_key; ++j) {
     double dot = 0;
-    for (std::int64_t i = 0; i < job.d_head; ++i)
-      dot += double{job.q.at(head, query, batch)[i]} * job.k.at(head_kv, j, batch)[i];
-    score.push_back(dot / std::sqrt(static_cast<double>(job.d_head)) +
-                    (job.mask != nullptr ? job.mask[query * job.n_key + j] : 0));
+    for (std::int64_t i = 0; i < s.d_head; ++i)
+      dot += double{c.queries().at(head, query, batch)[i]} * c.keys().at(head_kv, j, batch)[i];
+    score.push_back(dot / std::sqrt(static_cast<double>(s.d_head)) +
+                    (c.mask.empty() ? 0 : c.mask[static_cast<std::size_t>(query * s.n_key + j)]));
     most = std::max(most, score.back());
   }
   for (double& value : score) sum += value = std::exp(value - most);
-  for (std::int64_t j = 0; j < job.n_key; ++j)
+  for (std::int64_t j = 0; j < s.n_key; ++j)
     for (std::size_t i = 0; i < mixed.size(); ++i)
-      mixed[i] += score[static_cast<std::size_t>(j)] / sum * job.v.at(head_kv, j, batch)[i];
+      mixed[i] += score[static_cast<std::size_t>(j)] / sum * c.values().at(head_kv, j, batch)[i];
   return mixed;
 }
 
@@ -157,8 +166,8 @@ inline Case rising(double step) {
 struct Repeated {
   Case one, all;
 };
-inline Repeated repeated(const Shape& shape, int n) {
-  Shape longer = shape;
+inline Repeated repeated(const AttentionShape& shape, int n) {
+  AttentionShape longer = shape;
   longer.n_key += n - 1;
   Repeated r = {Case(shape, 2, 0), Case(longer, 2, 0)};
   r.one.set_mask(
@@ -172,7 +181,8 @@ inline Repeated repeated(const Shape& shape, int n) {
   return r;
 }
 /// Vision towers, and the head of an action: a width and a number of keys that nothing divides.
-inline constexpr Shape kRepeatedShapes[] = {{112, 8, 8, 50, 1025, 1}, {112, 2, 1, 3, 2, 1}, {64, 2, 1, 7, 129, 1}};
+inline constexpr AttentionShape kRepeatedShapes[] = {
+    {112, 8, 8, 50, 1025, 1}, {112, 2, 1, 3, 2, 1}, {64, 2, 1, 7, 129, 1}};
 
 inline void check_attention_of_not_finite(const AttentionKernel& attention) {
   Case unseen(kShapes[2], 1, 0);

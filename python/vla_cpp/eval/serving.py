@@ -45,11 +45,9 @@ class Server:
     def __init__(self, vla: str, bundle: Path, threads: int, kernels: str = "") -> None:
         command: List[str] = [find_vla(vla), "serve", str(bundle), "--bind", "tcp://127.0.0.1:*", "--threads", str(threads)]
         command += ["--kernels", kernels] if kernels else []
-        # Threads that wait must sleep, or they take the cores that the simulators need.
-        environment = {**os.environ, "OMP_WAIT_POLICY": "passive"}
         self._log: IO[bytes] = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=self._log, env=environment, preexec_fn=die_with_parent
+            command, stdout=subprocess.PIPE, stderr=self._log, preexec_fn=die_with_parent
         )
         self.ready_line = self._process.stdout.readline().decode("utf-8", "replace").strip()  # type: ignore[union-attr]
         address = ADDRESS.search(self.ready_line)

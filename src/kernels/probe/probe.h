@@ -5,7 +5,7 @@
 #include <string>
 #include <vector>
 
-#include "backend/isa.h"
+#include "kernels/isa.h"
 
 namespace vla::kernels {
 

@@ -4,31 +4,20 @@
 
 #include <fmt/format.h>
 
-#include "nn/attention.h"
 #include "nn/tokens.h"
 
 namespace vla {
 
 CrossBlock::CrossBlock(const Scope& s, int d_model, int d_ff, int n_head, float eps)
     : Module(s),
-      n_head_(n_head),
       attn_norm_(s / "attn_norm", d_model, eps),
-      q_(s / "attn_q", d_model, d_model, Bias::yes),
-      k_(s / "attn_k", d_model, d_model, Bias::yes),
-      v_(s / "attn_v", d_model, d_model, Bias::yes),
-      out_(s / "attn_out", d_model, d_model, Bias::yes),
+      attention_(s, d_model, d_model, Heads::even(d_model, n_head)),
       ffn_norm_(s / "ffn_norm", d_model, eps),
       mlp_(s, d_model, d_ff, Activation::gelu_erf) {}
 
-KeyValue CrossBlock::project(Graph& g, Tensor context) const {
-  const std::vector<Tensor> kv = Linear::group(g, {&k_, &v_}, context);
-  return {split_heads(g, kv[0], n_head_), split_heads(g, kv[1], n_head_)};
-}
-
 Tensor CrossBlock::forward(Graph& g, Tensor x, Tensor time, const KeyValue& seen, Tensor mask) const {
-  const Tensor query = split_heads(g, q_(g, attn_norm_(g, x)), n_head_);
-  x = out_.added_to(g, x, attention(g, query, seen.key, seen.value, mask, seen.packed));
-  return mlp_.added_to(g, x, add(g, ffn_norm_(g, x), time));
+  x = add(g, x, attention_(g, attn_norm_(g, x), {}, {seen}, mask));
+  return add(g, x, mlp_(g, add(g, ffn_norm_(g, x), time)));
 }
 
 CrossHead::CrossHead(const Scope& s, int d_model)
@@ -41,20 +30,20 @@ CrossHead::CrossHead(const Scope& s, int d_model)
 }
 
 void CrossHead::keep(Graph& g, Tensor rows, Cache& cache) const {
-  for (const CrossBlock& block : blocks_) block.project(g, rows).put(g, cache, block.path() + ".kept");
+  for (const CrossBlock& block : blocks_) put(g, cache, block.path() + ".kept", block.project()(g, rows));
 }
 
 void CrossHead::prepare(Graph& g, Tensor context, std::span<const Kept> kept, int n_query, Cache& cache) const {
   std::vector<int> copies(static_cast<std::size_t>(context.dim(1)), 1);
   for (const Kept& rows : kept) copies.insert(copies.end(), static_cast<std::size_t>(rows.count), rows.copies);
   for (const CrossBlock& block : blocks_) {
-    KeyValue seen = block.project(g, context);
+    KeyValue seen = block.project()(g, context);
     for (const Kept& rows : kept) {
-      const KeyValue all = KeyValue::get(cache, block.path() + ".kept");
-      seen = {append_keys(g, seen.key, slice_keys(g, all.key, rows.first, rows.count)),
-              append_keys(g, seen.value, slice_keys(g, all.value, rows.first, rows.count))};
+      const KeyValue all = get(g, cache, block.path() + ".kept");
+      seen = {concat(g, {seen.key, slice_keys(g, all.key, rows.first, rows.count)}, 2),
+              concat(g, {seen.value, slice_keys(g, all.value, rows.first, rows.count)}, 2)};
     }
-    seen.put_packed(g, cache, block.path());
+    put(g, cache, block.path(), seen);
   }
   if (const Tensor mask = copies_mask(g, copies, n_query)) cache.put(g, path_ + ".mask", mask);
 }
@@ -62,7 +51,7 @@ void CrossHead::prepare(Graph& g, Tensor context, std::span<const Kept> kept, in
 Tensor CrossHead::operator()(Graph& g, Tensor x, Tensor time, const Cache& cache) const {
   const std::string mask = path_ + ".mask";
   for (const CrossBlock& block : blocks_)
-    x = block(g, x, time, KeyValue::get(cache, block.path()), cache.has(mask) ? cache.get(mask) : Tensor());
+    x = block(g, x, time, get(g, cache, block.path()), cache.has(mask) ? cache.get(g, mask) : Tensor());
   return norm_(g, x);
 }
 

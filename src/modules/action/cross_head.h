@@ -6,7 +6,7 @@
 #include <string>
 #include <vector>
 
-#include "modules/language/decoder.h"
+#include "modules/attention.h"
 #include "nn/mlp.h"
 #include "nn/norm.h"
 
@@ -18,15 +18,14 @@ namespace vla {
 class CrossBlock : public Module<CrossBlock> {
  public:
   CrossBlock(const Scope& s, int d_model, int d_ff, int n_head, float eps);
-  /// Keys and values of a context [d_model, n], which is not normalized: [d_head, n_head, n] each.
-  KeyValue project(Graph& g, Tensor context) const;
+  /// Makes keys and values of a context [d_model, n], which is not normalized.
+  const KeyValueProjection& project() const { return attention_.project(); }
   /// x [d_model, n], time [d_model, 1], mask [n_key, n] or none -> the shape of x.
   Tensor forward(Graph& g, Tensor x, Tensor time, const KeyValue& seen, Tensor mask) const;
 
  private:
-  int n_head_;
   LayerNorm attn_norm_;
-  Linear q_, k_, v_, out_;
+  Attention attention_;
   LayerNorm ffn_norm_;
   Mlp mlp_;
 };

@@ -4,40 +4,28 @@
 
 #include <fmt/format.h>
 
-#include "nn/attention.h"
 #include "nn/tokens.h"
 
 namespace vla {
 
 DitBlock::DitBlock(const Scope& s, int d_model, int d_context, int n_head, int d_ff, float eps)
     : Module(s),
-      n_head_(n_head),
       eps_(eps),
-      norm_(s / "ada", d_model, eps, AdaptiveLayerNorm::Order::scale_shift),
-      q_(s / "attn_q", d_model, d_model, Bias::yes),
-      k_(s / "attn_k", d_context, d_model, Bias::yes),
-      v_(s / "attn_v", d_context, d_model, Bias::yes),
-      out_(s / "attn_out", d_model, d_model, Bias::yes),
+      norm_(s / "ada", d_model, eps, AdaLayerNorm::Order::scale_shift),
+      attention_(s, d_model, d_context, Heads::even(d_model, n_head)),
       mlp_(s, d_model, d_ff, Activation::gelu_tanh) {}
 
-KeyValue DitBlock::project(Graph& g, Tensor context) const {
-  const std::vector<Tensor> kv = Linear::group(g, {&k_, &v_}, context);
-  return {split_heads(g, kv[0], n_head_), split_heads(g, kv[1], n_head_)};
-}
-
-Tensor DitBlock::forward(Graph& g, Tensor x, Tensor modulation, const KeyValue& seen) const {
+Tensor DitBlock::forward(Graph& g, Tensor x, Tensor modulation, const std::optional<KeyValue>& seen) const {
   const Tensor h = norm_.forward(g, x, modulation);
-  const KeyValue kv = seen.key ? seen : project(g, h);
-  const Tensor mixed = attention(g, split_heads(g, q_(g, h), n_head_), kv.key, kv.value, {}, kv.packed);
-  x = out_.added_to(g, x, mixed);
-  return mlp_.added_to(g, x, layer_norm(g, x, eps_));
+  x = add(g, x, seen ? attention_(g, h, {}, {*seen}) : attention_.among(g, h, {}));
+  return add(g, x, mlp_(g, layer_norm(g, x, eps_)));
 }
 
 Dit::Dit(const Scope& s, int d_context, bool alternating)
     : d_model_(s.dim("d_model")),
       d_out_(s.dim("d_out")),
       text_every_(alternating ? s.dim("text_every", 512) : 1),
-      out_norm_(s / "out_ada", d_model_, s.number("out_eps", kNormEps), AdaptiveLayerNorm::Order::shift_scale),
+      out_norm_(s / "out_ada", d_model_, s.number("out_eps", kNormEps), AdaLayerNorm::Order::shift_scale),
       out_(s / "out", d_model_, d_out_, Bias::yes) {
   const int n_layer = s.n_layer("n_layer"), n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff");
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
@@ -58,7 +46,7 @@ Tensor Dit::modulations(Graph& g, Tensor time) const {
 void Dit::prepare(Graph& g, Tensor text, Tensor image, Cache& cache) const {
   for (std::size_t i = 0; i < blocks_.size(); i += 2) {
     const bool of_text = static_cast<int>(i) % (2 * text_every_) == 0;
-    blocks_[i].project(g, of_text ? text : image).put_packed(g, cache, blocks_[i].path());
+    put(g, cache, blocks_[i].path(), blocks_[i].project()(g, of_text ? text : image));
   }
 }
 
@@ -67,7 +55,7 @@ Tensor Dit::operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cach
     return slice_features(g, modulations, static_cast<int>(i) * 2 * d_model_, 2 * d_model_);
   };
   for (std::size_t i = 0; i < blocks_.size(); ++i)
-    x = blocks_[i](g, x, part(i), i % 2 == 0 ? KeyValue::get(cache, blocks_[i].path()) : KeyValue());
+    x = blocks_[i](g, x, part(i), i % 2 == 0 ? std::optional(get(g, cache, blocks_[i].path())) : std::nullopt);
   return out_(g, out_norm_.forward(g, x, part(blocks_.size())));
 }
 

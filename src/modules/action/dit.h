@@ -4,8 +4,9 @@
 
 #include <vector>
 
-#include "modules/language/decoder.h"
+#include "modules/attention.h"
 #include "nn/adaptive_norm.h"
+#include "nn/mlp.h"
 
 namespace vla {
 
@@ -16,18 +17,17 @@ class DitBlock : public Module<DitBlock> {
  public:
   /// `d_context`: width of what keys and values are made from.
   DitBlock(const Scope& s, int d_model, int d_context, int n_head, int d_ff, float eps);
-  /// Keys and values of a context [d_context, n], which is not normalized: [d_head, n_head, n] each.
-  KeyValue project(Graph& g, Tensor context) const;
+  /// Makes keys and values of a context [d_context, n], which is not normalized.
+  const KeyValueProjection& project() const { return attention_.project(); }
   /// x [d_model, n], modulation [2 d_model, 1] -> the shape of x. Where `seen` is empty the tokens see each other.
-  Tensor forward(Graph& g, Tensor x, Tensor modulation, const KeyValue& seen) const;
+  Tensor forward(Graph& g, Tensor x, Tensor modulation, const std::optional<KeyValue>& seen) const;
 
-  const AdaptiveLayerNorm& norm() const { return norm_; }
+  const AdaLayerNorm& norm() const { return norm_; }
 
  private:
-  int n_head_;
   float eps_;
-  AdaptiveLayerNorm norm_;
-  Linear q_, k_, v_, out_;
+  AdaLayerNorm norm_;
+  Attention attention_;
   Mlp mlp_;
 };
 
@@ -55,7 +55,7 @@ class Dit {
  private:
   int d_model_, d_out_, text_every_;
   std::vector<DitBlock> blocks_;
-  AdaptiveLayerNorm out_norm_;
+  AdaLayerNorm out_norm_;
   Linear out_;
 };
 

@@ -12,36 +12,36 @@ namespace vla {
 ExpertSelfBlock::ExpertSelfBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
     : Module(s),
       attn_norm_(s / "attn_norm", d_model, eps),
-      kv_(s, d_model, heads),
-      rest_(s, d_model, d_ff, heads, Activation::silu, eps) {}
+      attention_(s, d_model, d_model, heads),
+      ffn_norm_(s / "ffn_norm", d_model, eps),
+      mlp_(s, d_model, d_ff, Activation::silu) {}
 
 Tensor ExpertSelfBlock::forward(Graph& g, Tensor x, const KeyValue& prefix) const {
   const int n_prefix = static_cast<int>(prefix.key.dim(2)), horizon = static_cast<int>(x.dim(1));
-  const Tensor h = attn_norm_(g, x);
-  const KeyValue own = kv_(g, h, n_prefix);
-  const KeyValue seen = {append_keys(g, prefix.key, own.key), append_keys(g, prefix.value, own.value)};
-  return rest_(g, x, h, n_prefix, seen, causal_mask(g, n_prefix, horizon));
+  const Tensor h = attn_norm_(g, x), rotary = attention_.heads().rotary(g, n_prefix, horizon);
+  const KeyValue own = attention_.project()(g, h, rotary);
+  x = add(g, x, attention_(g, h, rotary, {prefix, own}, causal_mask(g, n_prefix, horizon)));
+  return add(g, x, mlp_(g, ffn_norm_(g, x)));
 }
 
 ExpertCrossBlock::ExpertCrossBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
     : Module(s),
-      heads_(heads),
       attn_norm_(s / "attn_norm", d_model, eps),
-      k_(s / "attn_k", heads.d_key(), heads.d_key(), Bias::no),
-      v_(s / "attn_v", heads.d_key(), heads.d_key(), Bias::no),
-      rest_(s, d_model, d_ff, heads, Activation::silu, eps) {}
+      attention_(s, d_model, heads.d_key(), heads),
+      ffn_norm_(s / "ffn_norm", d_model, eps),
+      mlp_(s, d_model, d_ff, Activation::silu) {}
 
 void ExpertCrossBlock::prepare(Graph& g, const KeyValue& prefix, Cache& cache) const {
   // The cached keys already carry their rotation, and the reference projects them as they are.
-  const KeyValue own = {split_heads(g, k_(g, merge_heads(g, prefix.key)), heads_.n_head_kv),
-                        split_heads(g, v_(g, merge_heads(g, prefix.value)), heads_.n_head_kv)};
-  own.put_packed(g, cache, path());
+  put(g, cache, path(), attention_.project()(g, merge_heads(g, prefix.key), merge_heads(g, prefix.value), {}));
 }
 
 Tensor ExpertCrossBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
   // Positions of a cross layer's queries start at 0, not behind the prefix: forward_cross_attn_layer subtracts their
-  // least.
-  return rest_(g, x, attn_norm_(g, x), 0, KeyValue::get(cache, path()), {});
+  // minimum.
+  const Tensor rotary = attention_.heads().rotary(g, 0, static_cast<int>(x.dim(1)));
+  x = add(g, x, attention_(g, attn_norm_(g, x), rotary, {get(g, cache, path())}));
+  return add(g, x, mlp_(g, ffn_norm_(g, x)));
 }
 
 Expert::Expert(const Scope& s, const Decoder& lm)
@@ -70,7 +70,7 @@ Expert::Expert(const Scope& s, const Decoder& lm)
 void Expert::prepare(Graph& g, Cache& cache) const {
   for (const Layer& layer : layers_)
     if (const auto* cross = std::get_if<ExpertCrossBlock>(&layer.block))
-      cross->prepare(g, lm_.cached(cache, layer.i_lm), cache);
+      cross->prepare(g, lm_.cached(g, cache, layer.i_lm), cache);
 }
 
 Tensor Expert::operator()(Graph& g, Tensor x, const Cache& cache) const {
@@ -78,7 +78,7 @@ Tensor Expert::operator()(Graph& g, Tensor x, const Cache& cache) const {
     if (const auto* cross = std::get_if<ExpertCrossBlock>(&layer.block))
       x = (*cross)(g, x, cache);
     else
-      x = std::get<ExpertSelfBlock>(layer.block)(g, x, lm_.cached(cache, layer.i_lm));
+      x = std::get<ExpertSelfBlock>(layer.block)(g, x, lm_.cached(g, cache, layer.i_lm));
   }
   return norm_(g, x);
 }

@@ -18,8 +18,9 @@ class ExpertSelfBlock : public Module<ExpertSelfBlock> {
 
  private:
   RmsNorm attn_norm_;
-  KeyValueProjection kv_;
-  DecoderRest rest_;
+  Attention attention_;
+  RmsNorm ffn_norm_;
+  GatedMlp mlp_;
 };
 
 /// An expert layer whose actions see only the prefix, through keys and values projected once more.
@@ -32,10 +33,10 @@ class ExpertCrossBlock : public Module<ExpertCrossBlock> {
   Tensor forward(Graph& g, Tensor x, const Cache& cache) const;
 
  private:
-  Heads heads_;
   RmsNorm attn_norm_;
-  Linear k_, v_;
-  DecoderRest rest_;
+  Attention attention_;
+  RmsNorm ffn_norm_;
+  GatedMlp mlp_;
 };
 
 /// The action expert beside a language model: a narrower decoder whose layer i attends to what layer i of the language

@@ -9,9 +9,9 @@
 namespace vla {
 namespace {
 
-std::variant<RmsNorm, AdaptiveRmsNorm> make_norm(const Scope& s, ExpertNorm kind, int d, float eps) {
+std::variant<RmsNorm, AdaRmsNorm> make_norm(const Scope& s, ExpertNorm kind, int d, float eps) {
   if (kind == ExpertNorm::weighted) return RmsNorm(s, d, eps);
-  return AdaptiveRmsNorm(s, d, d, eps);
+  return AdaRmsNorm(s, d, d, eps);
 }
 
 Tensor residual(Graph& g, Tensor x, Tensor y, Tensor gate) { return gate ? gated_add(g, x, y, gate) : add(g, x, y); }
@@ -22,7 +22,7 @@ TimedNorm::TimedNorm(const Scope& s, ExpertNorm kind, int d, float eps) : norm_(
 
 TimedNorm::Result TimedNorm::operator()(Graph& g, Tensor x, Tensor modulation) const {
   if (const auto* weighted = std::get_if<RmsNorm>(&norm_)) return {(*weighted)(g, x), {}};
-  const AdaptiveRmsNorm& adaptive = std::get<AdaptiveRmsNorm>(norm_);
+  const AdaRmsNorm& adaptive = std::get<AdaRmsNorm>(norm_);
   return {adaptive(g, x, modulation), adaptive.gate(g, modulation)};
 }
 
@@ -30,33 +30,30 @@ GemmaExpertBlock::GemmaExpertBlock(const Scope& s, ExpertNorm kind, int d_model,
                                    float eps)
     : Module(s),
       attn_norm_(s / "attn_norm", kind, d_model, eps),
-      kv_(s, d_model, heads),
-      attention_(s, d_model, heads),
+      attention_(s, d_model, d_model, heads),
       ffn_norm_(s / "ffn_norm", kind, d_model, eps),
       mlp_(s, d_model, d_ff, Activation::gelu_tanh) {}
 
-KeyValue GemmaExpertBlock::append(Graph& g, Tensor h, const KeyValue& past) const {
-  const KeyValue own = kv_(g, h, static_cast<int>(past.key.dim(2)));
-  return {append_keys(g, past.key, own.key), append_keys(g, past.value, own.value)};
-}
-
-Tensor GemmaExpertBlock::rest(Graph& g, Tensor x, const TimedNorm::Result& normed, int first, const KeyValue& seen,
-                              Tensor ffn) const {
-  x = residual(g, x, attention_(g, normed.h, first, seen, {}), normed.gate);
+Tensor GemmaExpertBlock::rest(Graph& g, Tensor x, const TimedNorm::Result& normed, Tensor rotary,
+                              const std::vector<KeyValue>& segments, Tensor ffn) const {
+  x = residual(g, x, attention_(g, normed.h, rotary, segments), normed.gate);
   const auto [h, gate] = ffn_norm_(g, x, ffn);
   return residual(g, x, mlp_(g, h), gate);
 }
 
 Tensor GemmaExpertBlock::forward(Graph& g, Tensor x, const KeyValue& past, const Modulations& modulations) const {
   const TimedNorm::Result normed = attn_norm_(g, x, modulations.attn);
-  return rest(g, x, normed, static_cast<int>(past.key.dim(2)), append(g, normed.h, past), modulations.ffn);
+  const Tensor turned = rotary(g, x, past);
+  return rest(g, x, normed, turned, {past, attention_.project()(g, normed.h, turned)}, modulations.ffn);
 }
 
 Tensor GemmaExpertBlock::prefill(Graph& g, Tensor x, const KeyValue& past, Cache& cache) const {
   const TimedNorm::Result normed = attn_norm_(g, x, {});
-  const KeyValue seen = append(g, normed.h, past);
-  seen.put(g, cache, path());
-  return rest(g, x, normed, static_cast<int>(past.key.dim(2)), seen, {});
+  const Tensor turned = rotary(g, x, past);
+  const KeyValue own = attention_.project()(g, normed.h, turned);
+  const KeyValue seen = {concat(g, {past.key, own.key}, 2), concat(g, {past.value, own.value}, 2)};
+  put(g, cache, path(), seen);
+  return rest(g, x, normed, turned, {seen}, {});
 }
 
 GemmaExpert::GemmaExpert(const Scope& s, const Decoder& lm, ExpertNorm kind)
@@ -70,9 +67,9 @@ GemmaExpert::GemmaExpert(const Scope& s, const Decoder& lm, ExpertNorm kind)
     blocks_.emplace_back(s / "blk" / i, kind, d_model_, d_ff, heads, s.number("norm_eps", kNormEps));
 }
 
-KeyValue GemmaExpert::past(const Cache& cache, std::size_t i) const {
-  if (cache.has(blocks_[i].path() + ".k")) return KeyValue::get(cache, blocks_[i].path());
-  return lm_.cached(cache, static_cast<int>(i));
+KeyValue GemmaExpert::past(Graph& g, const Cache& cache, std::size_t i) const {
+  if (cache.has(blocks_[i].path() + ".k")) return get(g, cache, blocks_[i].path());
+  return lm_.cached(g, cache, static_cast<int>(i));
 }
 
 std::vector<const TimedNorm*> GemmaExpert::norms() const {
@@ -98,12 +95,12 @@ Tensor GemmaExpert::part(Graph& g, Tensor modulations, std::size_t i_norm) const
 
 void GemmaExpert::prefill(Graph& g, Tensor x, Cache& cache) const {
   // Nothing reads what the last layer makes of x beyond its keys and values, and the graph does not run it.
-  for (std::size_t i = 0; i < blocks_.size(); ++i) x = blocks_[i].prefill(g, x, past(cache, i), cache);
+  for (std::size_t i = 0; i < blocks_.size(); ++i) x = blocks_[i].prefill(g, x, past(g, cache, i), cache);
 }
 
 Tensor GemmaExpert::operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cache) const {
   for (std::size_t i = 0; i < blocks_.size(); ++i)
-    x = blocks_[i](g, x, past(cache, i),
+    x = blocks_[i](g, x, past(g, cache, i),
                    GemmaExpertBlock::Modulations{part(g, modulations, 2 * i), part(g, modulations, 2 * i + 1)});
   return norm_(g, x, part(g, modulations, 2 * blocks_.size())).h;
 }

@@ -25,10 +25,10 @@ class TimedNorm {
   /// x [d, n], modulation [3 d, 1] or none.
   Result operator()(Graph& g, Tensor x, Tensor modulation) const;
   /// Load rate, of adaptive norms: [d, n_time] -> [3 d, n_time].
-  Tensor modulation(Graph& g, Tensor time) const { return std::get<AdaptiveRmsNorm>(norm_).modulation(g, time); }
+  Tensor modulation(Graph& g, Tensor time) const { return std::get<AdaRmsNorm>(norm_).modulation(g, time); }
 
  private:
-  std::variant<RmsNorm, AdaptiveRmsNorm> norm_;
+  std::variant<RmsNorm, AdaRmsNorm> norm_;
 };
 
 /// One layer of the expert: its tokens see those before them and each other, both ways.
@@ -48,12 +48,16 @@ class GemmaExpertBlock : public Module<GemmaExpertBlock> {
   const TimedNorm& ffn_norm() const { return ffn_norm_; }
 
  private:
-  KeyValue append(Graph& g, Tensor h, const KeyValue& past) const;
-  Tensor rest(Graph& g, Tensor x, const TimedNorm::Result& normed, int first, const KeyValue& seen, Tensor ffn) const;
+  /// Attention of the normalized x, whose rotary table is given, to `segments`, and all behind it.
+  Tensor rest(Graph& g, Tensor x, const TimedNorm::Result& normed, Tensor rotary, const std::vector<KeyValue>& segments,
+              Tensor ffn) const;
+  /// The rotary table of tokens x behind the past.
+  Tensor rotary(Graph& g, Tensor x, const KeyValue& past) const {
+    return attention_.heads().rotary(g, static_cast<int>(past.key.dim(2)), static_cast<int>(x.dim(1)));
+  }
 
   TimedNorm attn_norm_;
-  KeyValueProjection kv_;
-  QueryAttention attention_;
+  Attention attention_;
   TimedNorm ffn_norm_;
   GatedMlp mlp_;
 };
@@ -80,7 +84,7 @@ class GemmaExpert {
   /// In the order of their modulations: attention and MLP of every layer, then the final one.
   std::vector<const TimedNorm*> norms() const;
   /// What layer i attends to: the prefix, with the tokens of `prefill` where there are any.
-  KeyValue past(const Cache& cache, std::size_t i) const;
+  KeyValue past(Graph& g, const Cache& cache, std::size_t i) const;
   /// The part of norm number `i_norm` in a column of modulations: none for norms with weights.
   Tensor part(Graph& g, Tensor modulations, std::size_t i_norm) const;
 

@@ -4,7 +4,6 @@
 
 #include <fmt/format.h>
 
-#include "modules/time_embedding.h"
 #include "nn/tokens.h"
 
 namespace vla {
@@ -41,13 +40,12 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
   (s / "dit").require(dit_.d_model() % 2 == 0, "d_model", "an even number", std::to_string(dit_.d_model()));
 }
 
-Tensor GrootHead::condition(Graph& g, std::span<const float> times) const {
-  // The reference makes a whole number of i / N in double, whatever the times are.
+Tensor GrootHead::condition(Graph& g, std::span<const SolverTime> times) const {
+  // The reference makes a whole number of the time in double.
   std::vector<int> buckets;
-  for (std::size_t k = 0; k < times.size(); ++k)
-    buckets.push_back(static_cast<int>(static_cast<double>(k) / static_cast<double>(times.size()) * n_bucket_));
+  for (const SolverTime& time : times) buckets.push_back(static_cast<int>(time.exact * n_bucket_));
   const auto embedded = [&](int d, BucketWaves waves) {
-    return g.store().add_constant(bucket_embedding(buckets, d, waves), {d, static_cast<std::int64_t>(buckets.size())});
+    return g.constant(bucket_embedding(buckets, d, waves), {d, static_cast<std::int64_t>(buckets.size()), 1, 1});
   };
   const Tensor hidden = silu(g, time_in_(g, embedded(d_time_, BucketWaves::cosines_first)));
   const Tensor modulations = dit_.modulations(g, silu(g, time_out_(g, hidden)));
@@ -62,23 +60,23 @@ Tensor GrootHead::context(Graph& g, Tensor features) const {
 
 void GrootHead::prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const {
   dit_.prepare(g, text, image, cache);
-  const Tensor hidden = state_in_.activated(g, state, Activation::relu);
+  const Tensor hidden = activate(g, state_in_(g, state), Activation::relu);
   cache.put(g, state_out_.path(), state_out_.forward(g, hidden));  // [d_dit, 1]
-  if (future_) cache.put(g, future_->path(), future_->forward(g, counting_ids(g, n_future_)));
+  if (future_) cache.put(g, future_->path(), future_->forward(g, arange(g, n_future_)));
 }
 
 Tensor GrootHead::velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const {
   const Tensor action = action_in_(g, x_t);  // [d_dit, horizon]
   const Tensor time = slice_features(g, condition, dit_.d_modulations(), dit_.d_model());
   const Tensor timed = concat_features(g, action, repeat_like(g, time, action));
-  const Tensor token = action_token_.forward(g, action_mix_.activated(g, timed, Activation::silu));
-  const Tensor placed = add(g, token, action_position_(g, counting_ids(g, horizon_)));
-  std::vector<Tensor> tokens = {cache.get(state_out_.path())};
-  if (future_) tokens.push_back(cache.get(future_->path()));
+  const Tensor token = action_token_.forward(g, silu(g, action_mix_(g, timed)));
+  const Tensor placed = add(g, token, action_position_(g, arange(g, horizon_)));
+  std::vector<Tensor> tokens = {cache.get(g, state_out_.path())};
+  if (future_) tokens.push_back(cache.get(g, future_->path()));
   tokens.push_back(g.name(action_token_.path(), placed));
   const Tensor x = dit_(g, concat_tokens(g, tokens), condition, cache);
-  const Tensor out = slice_tokens(g, x, 1 + n_future_, horizon_);         // [d_out, horizon]
-  return decode_out_(g, decode_in_.activated(g, out, Activation::relu));  // [d_action, horizon]
+  const Tensor out = slice_tokens(g, x, 1 + n_future_, horizon_);            // [d_out, horizon]
+  return decode_out_(g, activate(g, decode_in_(g, out), Activation::relu));  // [d_action, horizon]
 }
 
 }  // namespace vla

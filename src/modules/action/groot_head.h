@@ -8,6 +8,7 @@
 
 #include "modules/action/dit.h"
 #include "modules/encoder_block.h"
+#include "modules/timestep_embedding.h"
 #include "nn/embedding.h"
 
 namespace vla {
@@ -29,7 +30,7 @@ class GrootHead {
   GrootHead(const Scope& s, int d_context, GrootFamily family);
 
   /// Load rate: modulations of all norms and the actions' time, one column per time.
-  Tensor condition(Graph& g, std::span<const float> times) const;
+  Tensor condition(Graph& g, std::span<const SolverTime> times) const;
   /// Observation rate: features [d_context, n] -> the same shape, normalized and mixed.
   Tensor context(Graph& g, Tensor features) const;
   /// Observation rate: keys and values of the context's rows, and the tokens that stand before those of the actions.

@@ -14,9 +14,10 @@ PaliGemma::PaliGemma(const Scope& s)
 
 void PaliGemma::prefill(Graph& g, Tensor images, Tensor tokens, Cache& cache) const {
   // Only embedding rows are scaled: Gemma was trained with sqrt(d_model) on them, and the projector without.
-  const Tensor view = g.stage("vision", projector_(g, vision_(g, images)));  // [d_model, n_token, n_view]
-  const Tensor image = flatten_views(g, view);                               // [d_model, n_token * n_view]
-  const Tensor text = scale(g, lm_.embed(g, tokens), text_scale_);           // [d_model, n_text]
+  const Tensor view = projector_(g, vision_(g, images));  // [d_model, n_token, n_view]
+  g.end_stage("vision");
+  const Tensor image = flatten_views(g, view);                      // [d_model, n_token * n_view]
+  const Tensor text = scale(g, lm_.embed(g, tokens), text_scale_);  // [d_model, n_text]
   lm_.prefill(g, g.name("prefix", concat_tokens(g, {image, text})), {}, cache);
 }
 

@@ -25,7 +25,7 @@ constexpr QwenFamily kQwen3Inner = {Bias::no, true, false};
 /// Sources: transformers modeling_qwen2.py Qwen2DecoderLayer, modeling_qwen3.py Qwen3DecoderLayer.
 class QwenBlock : public Module<QwenBlock> {
  public:
-  QwenBlock(const Scope& s, QwenFamily family, int d_model, int d_ff, const Heads& heads, float eps);
+  QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
   /// x [d_model, n], rotary [d_head, n], mask [n, n] -> the shape of x. `added` [d_model, n], or none, is added to the
   /// layer's result.
   Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added = {}) const;
@@ -33,10 +33,8 @@ class QwenBlock : public Module<QwenBlock> {
   Tensor alone(Graph& g, Tensor x) const;
 
  private:
-  Heads heads_;
   RmsNorm attn_norm_;
-  Linear q_, k_, v_, out_;
-  std::optional<RmsNorm> q_norm_, k_norm_;
+  Attention attention_;
   RmsNorm ffn_norm_;
   GatedMlp mlp_;
 };

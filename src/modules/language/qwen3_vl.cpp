@@ -12,8 +12,8 @@
 
 namespace vla {
 
-std::vector<Place> prompt_places(std::span<const int> view_starts, int n_row, int n_column, int n_token) {
-  std::vector<Place> places;
+std::vector<PositionId> mrope_position_ids(std::span<const int> view_starts, int n_row, int n_column, int n_token) {
+  std::vector<PositionId> places;
   int next = 0;
   const auto text_until = [&](int end) {
     for (; static_cast<int>(places.size()) < end; ++next) places.push_back({next, next, next});
@@ -61,16 +61,15 @@ Tensor Qwen3Vl::operator()(Graph& g, Tensor images, Tensor tokens, const Cache& 
   const std::vector<Tensor> seen = vision_(g, images, cache);
   std::vector<Tensor> added;
   for (std::size_t k = 0; k < deepstack_.size(); ++k) {
-    added.push_back(places_.arrange(g, deepstack_[k](g, seen[k]), n_token, [&](const PromptPiece& piece) {
-      return filled(g, 0, lm_.d_model(), piece.count);
-    }));
-    g.require(added.back());  // before the stage ends
+    added.push_back(places_.arrange(g, deepstack_[k](g, seen[k]), n_token,
+                                    [&](const PromptPiece& piece) { return full(g, 0, lm_.d_model(), piece.count); }));
   }
-  const Tensor image = g.stage("vision", connector_(g, seen.back()));
+  const Tensor image = connector_(g, seen.back());
+  g.end_stage("vision");
   const Tensor x = lm_.embed(g, tokens, image, places_);
-  const Tensor rotary = interleaved_rotary_table(
+  const Tensor rotary = mrope_table(
       g, lm_.heads().d_head, lm_.heads().rope_base, rope_sections_,
-      prompt_places(places_.starts(n_token), vision_.n_token_row(), vision_.n_token_column(), n_token));
+      mrope_position_ids(places_.starts(n_token), vision_.n_token_row(), vision_.n_token_column(), n_token));
   return lm_(g, g.name("prefix", x), rotary, causal_mask(g, 0, n_token), added);
 }
 

@@ -13,10 +13,10 @@
 
 namespace vla {
 
-/// Places of a prompt's tokens: those of a picture of n_row x n_column tokens, which starts at each of `view_starts`,
-/// share a time and count rows and columns from it; text counts on behind the farthest of them.
-/// Source: transformers modeling_qwen3_vl.py Qwen3VLModel.get_rope_index.
-std::vector<Place> prompt_places(std::span<const int> view_starts, int n_row, int n_column, int n_token);
+/// mRoPE position ids of a prompt's tokens: those of a picture of n_row x n_column tokens, which starts at each of
+/// `view_starts`, share a time and count rows and columns from it; text counts on behind the farthest of them. Source:
+/// transformers modeling_qwen3_vl.py Qwen3VLModel.get_rope_index.
+std::vector<PositionId> mrope_position_ids(std::span<const int> view_starts, int n_row, int n_column, int n_token);
 
 /// Qwen3-VL as a policy uses it: pictures and text become the features of one sequence. The first layers of the
 /// language model get what inner layers of the tower saw, added to the tokens of the pictures (DeepStack).

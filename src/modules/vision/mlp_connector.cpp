@@ -22,7 +22,7 @@ MlpConnector::MlpConnector(const Scope& s, int d_vision, int d_model, int n_row,
 
 Tensor MlpConnector::forward(Graph& g, Tensor x) const {
   const Tensor h = norm_(g, pixel_shuffle(g, x, n_column_, factor_));
-  return down_(g, up_.activated(g, h, Activation::gelu_erf));
+  return down_(g, activate(g, up_(g, h), Activation::gelu_erf));
 }
 
 }  // namespace vla

@@ -62,15 +62,15 @@ std::size_t longest(const std::vector<Window>& windows) {
 
 }  // namespace
 
-std::vector<Place> merge_block_places(int n_row, int n_column, int merge) {
-  std::vector<Place> places;
+std::vector<PositionId> merge_block_places(int n_row, int n_column, int merge) {
+  std::vector<PositionId> places;
   for (int row = 0; row < n_row; row += merge)
     for (int column = 0; column < n_column; column += merge)
       for (int i = 0; i < merge * merge; ++i) places.push_back({0, row + i / merge, column + i % merge});
   return places;
 }
 
-PositionBlend blend_positions(const std::vector<Place>& places, int n_row, int n_column, int n_side) {
+PositionBlend blend_positions(const std::vector<PositionId>& places, int n_row, int n_column, int n_side) {
   PositionBlend blend{std::vector<std::vector<std::int32_t>>(4), std::vector<std::vector<float>>(4)};
   for (const auto& [time, row, column] : places) {
     const Stretch y = stretch(row, n_row, n_side), x = stretch(column, n_column, n_side);
@@ -103,7 +103,7 @@ Tensor blended(Graph& g, const Embedding& table, const PositionBlend& blend) {
   Tensor sum;
   for (std::size_t k = 0; k < blend.ids.size(); ++k) {
     const Tensor rows = table.forward(g, constant_ids(g, fmt::format("position/{}", k), blend.ids[k]));
-    const Tensor weights = g.store().add_constant(blend.weights[k], {1, rows.dim(1)});
+    const Tensor weights = g.constant(blend.weights[k], {1, rows.dim(1), 1, 1});
     const Tensor part = multiply(g, rows, weights);
     sum = sum ? add(g, sum, part) : part;
   }

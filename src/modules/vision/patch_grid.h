@@ -13,7 +13,7 @@ namespace vla {
 /// Rows and columns of the patches of a picture whose squares of `merge` x `merge` patches follow each other row by
 /// row, and the patches of a square likewise: [n_row * n_column], time 0. Source: transformers modeling_qwen3_vl.py
 /// Qwen3VLVisionModel.rot_pos_emb.
-std::vector<Place> merge_block_places(int n_row, int n_column, int merge);
+std::vector<PositionId> merge_block_places(int n_row, int n_column, int merge);
 
 /// Rows of a square position table that patches read, and with which weights: `ids[k]` and `weights[k]` have a number
 /// for each patch, and a patch's position is the sum over k.
@@ -25,7 +25,7 @@ struct PositionBlend {
 /// The position table of `n_side`^2 rows stretched over n_row x n_column patches, so that its corners are those of the
 /// picture, for patches at `places`. Weights are float32, as the reference makes them. Source: the same class,
 /// fast_pos_embed_interpolate.
-PositionBlend blend_positions(const std::vector<Place>& places, int n_row, int n_column, int n_side);
+PositionBlend blend_positions(const std::vector<PositionId>& places, int n_row, int n_column, int n_side);
 
 /// The same table resized as a picture is: bilinear, with antialiasing where it shrinks, for patches row by row.
 /// Source: transformers modeling_siglip2.py Siglip2VisionEmbeddings.resize_positional_embeddings.

@@ -16,7 +16,7 @@ PatchMerger::PatchMerger(const Scope& s, Norm norm, int d_vision, int count, int
 
 Tensor PatchMerger::forward(Graph& g, Tensor x) const {
   const Tensor token = kind_ == Norm::patch ? columns(g, norm_(g, x), d_token_) : norm_(g, columns(g, x, d_token_));
-  return down_.forward(g, up_.activated(g, token, Activation::gelu_erf));
+  return down_.forward(g, activate(g, up_(g, token), Activation::gelu_erf));
 }
 
 }  // namespace vla

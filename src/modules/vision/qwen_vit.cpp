@@ -44,7 +44,7 @@ QwenVit::QwenVit(const Scope& s)
   for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, n_head_, d_ff, norm_eps_);
 }
 
-std::vector<Place> QwenVit::places() const { return merge_block_places(n_row_, n_column_, merge_); }
+std::vector<PositionId> QwenVit::places() const { return merge_block_places(n_row_, n_column_, merge_); }
 
 Status QwenVit::check(int width, int height) const {
   if (width == width_ && height == height_) return {};
@@ -59,8 +59,8 @@ void QwenVit::keep(Graph& g, Cache& cache) const {
 std::vector<Tensor> QwenVit::operator()(Graph& g, Tensor images, const Cache& cache) const {
   const Tensor pixels = patches(g, images, patch_size_);
   const Tensor ordered = columns(g, pixel_shuffle(g, pixels, n_column_, merge_), pixels.dim(0));
-  Tensor x = patch_embed_next_.added_to(g, patch_embed_.forward(g, ordered), ordered);
-  x = add(g, g.name(patch_embed_.path(), x), cache.get(position_.path()));
+  Tensor x = add(g, patch_embed_.forward(g, ordered), patch_embed_next_(g, ordered));
+  x = add(g, g.name(patch_embed_.path(), x), cache.get(g, position_.path()));
   const Tensor rotary = grid_rotary_table(g, d_model_ / n_head_, rope_base_, places());
   std::vector<Tensor> seen;
   for (std::size_t i = 0; i < blocks_.size(); ++i) {

@@ -4,7 +4,7 @@
 
 #include <vector>
 
-#include "backend/cache.h"
+#include "graph/cache.h"
 #include "modules/encoder_block.h"
 #include "nn/embedding.h"
 #include "nn/linear.h"
@@ -38,7 +38,7 @@ class QwenVit {
   int n_deepstack() const { return static_cast<int>(deepstack_layers_.size()); }
 
  private:
-  std::vector<Place> places() const;
+  std::vector<PositionId> places() const;
 
   int d_model_, n_head_, width_, height_, patch_size_, merge_, n_row_, n_column_, n_side_;
   float norm_eps_, rope_base_;

@@ -33,9 +33,8 @@ Status Siglip::check(int width, int height) const {
 
 Tensor Siglip::operator()(Graph& g, Tensor images) const {
   Tensor x = patch_embed_(g, images);
-  const Tensor ids = g.constant("vision_position_ids", [&](Store& store) {
-    return store.add_constant(
-        *vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_), {x.dim(1)});
+  const Tensor ids = g.constant_ids("vision_position_ids", [&] {
+    return *vision_position_ids(position_rule_, static_cast<int>(images.dim(0)) / patch_size_, n_table_);
   });
   x = add(g, x, position_(g, ids));
   for (const EncoderBlock& block : blocks_) x = block(g, x);

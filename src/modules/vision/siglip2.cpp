@@ -39,7 +39,7 @@ void Siglip2::keep(Graph& g, Cache& cache) const {
 }
 
 Tensor Siglip2::operator()(Graph& g, Tensor images, const Cache& cache) const {
-  Tensor x = add(g, patch_embed_(g, images), cache.get(position_.path()));
+  Tensor x = add(g, patch_embed_(g, images), cache.get(g, position_.path()));
   for (const EncoderBlock& block : blocks_) x = block(g, x);
   return post_norm_(g, x);
 }

@@ -4,7 +4,7 @@
 
 #include <vector>
 
-#include "backend/cache.h"
+#include "graph/cache.h"
 #include "modules/encoder_block.h"
 #include "nn/embedding.h"
 

@@ -1,0 +1,15 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+namespace vla {
+
+/// Elementwise nonlinearities. Sources: torch gelu(approximate="tanh"), gelu(approximate="none"), silu, relu.
+enum class Activation { none, gelu_tanh, gelu_erf, silu, relu };
+
+constexpr const char* activation_name(Activation activation) {
+  constexpr const char* kNames[] = {"none", "gelu_tanh", "gelu_erf", "silu", "relu"};
+  return kNames[static_cast<int>(activation)];
+}
+
+}  // namespace vla

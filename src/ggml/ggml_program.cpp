@@ -1,0 +1,250 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "ggml/ggml_program.h"
+
+#include <fmt/format.h>
+
+#include <cmath>
+
+namespace vla {
+namespace {
+
+/// What ggml makes of one node: an operation, or a few. Where its own operation would differ from float32 in the last
+/// digits it is composed of exact ones.
+class Translator {
+ public:
+  Translator(ggml_context* context, ggml_context* constants, const GgmlDevice& device)
+      : c(context), constants_(constants), device_(device) {}
+
+  ggml_tensor* operator()(const Node& n) {
+    node_ = &n;
+    return std::visit([this](const auto& op) { return translate(op); }, n.op);
+  }
+  void keep(ggml_tensor* tensor) { made_.push_back(tensor); }
+
+ private:
+  ggml_tensor* in(std::size_t i) const { return made_[static_cast<std::size_t>(node_->in[i].node()->id)]; }
+  /// Not every operation takes the strides that a view may have in dimensions of size one.
+  ggml_tensor* contiguous(ggml_tensor* x) const {
+    if (!ggml_is_contiguous(x)) return ggml_cont(c, x);
+    return x->view_src != nullptr ? ggml_reshape(c, x, x) : x;
+  }
+  ggml_tensor* reshaped(ggml_tensor* x, const Shape& s) const {
+    return ggml_reshape_4d(c, contiguous(x), s[0], s[1], s[2], s[3]);
+  }
+
+  ggml_tensor* translate(const op::Input& op) { return static_cast<ggml_tensor*>(op.slot->place); }
+  ggml_tensor* translate(const op::Parameter& op) { return device_.weight(op.param); }
+  ggml_tensor* translate(const op::Constant& op) {
+    return ggml_new_tensor(constants_, op.values.index() == 1 ? GGML_TYPE_I32 : GGML_TYPE_F32, 4, node_->shape.data());
+  }
+  ggml_tensor* translate(const op::Linear& op) {
+    ggml_tensor* y = ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
+    return op.bias != nullptr ? ggml_add(c, y, device_.weight(op.bias)) : y;
+  }
+  ggml_tensor* translate(const op::Embedding& op) { return ggml_get_rows(c, device_.weight(op.table), in(0)); }
+  ggml_tensor* translate(const op::Gather&) { return ggml_get_rows(c, in(0), in(1)); }
+  ggml_tensor* translate(const op::Norm& op) {
+    ggml_tensor* x = contiguous(in(0));
+    ggml_tensor* y = op.kind == op::NormKind::rms ? ggml_rms_norm(c, x, op.eps) : ggml_norm(c, x, op.eps);
+    if (node_->in.size() > 1) y = ggml_mul(c, y, in(1));
+    return node_->in.size() > 2 ? ggml_add(c, y, in(2)) : y;
+  }
+
+  /// ggml's own rotation multiplies its way from angle to angle: the angles here come from a table.
+  ggml_tensor* translate(const op::Rope&) {
+    ggml_tensor* x = contiguous(in(0));
+    ggml_tensor* table = contiguous(in(1));
+    const std::int64_t half = x->ne[0] / 2;
+    const std::size_t middle = static_cast<std::size_t>(half) * sizeof(float);
+    const auto of_x = [&](std::size_t offset) {
+      return ggml_view_4d(c, x, half, x->ne[1], x->ne[2], x->ne[3], x->nb[1], x->nb[2], x->nb[3], offset);
+    };
+    const auto of_table = [&](std::size_t offset) {
+      return ggml_view_3d(c, table, half, 1, x->ne[2], 2 * middle, 2 * middle, offset);
+    };
+    ggml_tensor *a = ggml_cont(c, of_x(0)), *b = ggml_cont(c, of_x(middle));
+    ggml_tensor *cosine = ggml_cont(c, of_table(0)), *sine = ggml_cont(c, of_table(middle));
+    ggml_tensor* first = ggml_sub(c, ggml_mul(c, a, cosine), ggml_mul(c, b, sine));
+    return ggml_concat(c, first, ggml_add(c, ggml_mul(c, b, cosine), ggml_mul(c, a, sine)), 0);
+  }
+
+  /// A product, a softmax and a product: ggml's fused attention takes keys and values in float16.
+  ggml_tensor* translate(const op::Attention& op) {
+    const std::size_t first = op.has_mask ? 2 : 1;
+    ggml_tensor *k = in(first), *v = in(first + 1), *q = in(0);
+    for (std::size_t i = first + 2; i < node_->in.size(); i += 2)
+      k = ggml_concat(c, k, in(i), 2), v = ggml_concat(c, v, in(i + 1), 2);
+    const float scale = 1.0f / std::sqrt(static_cast<float>(q->ne[0]));
+    ggml_tensor* query = ggml_cont(c, ggml_permute(c, q, 0, 2, 1, 3));  // [d_head, n_query, n_head, n_batch]
+    ggml_tensor* key = ggml_cont(c, ggml_permute(c, k, 0, 2, 1, 3));    // [d_head, n_key, n_head_kv, n_batch]
+    ggml_tensor* value = ggml_cont(c, ggml_permute(c, v, 1, 2, 0, 3));  // [n_key, d_head, n_head_kv, n_batch]
+    ggml_tensor* score = ggml_mul_mat(c, key, query);                   // [n_key, n_query, n_head, n_batch]
+    ggml_tensor* weight = ggml_soft_max_ext(c, score, op.has_mask ? contiguous(in(1)) : nullptr, scale, 0.0f);
+    ggml_tensor* mixed = ggml_permute(c, ggml_mul_mat(c, value, weight), 0, 2, 1, 3);
+    return ggml_cont_3d(c, mixed, q->ne[0] * q->ne[1], q->ne[2], q->ne[3]);
+  }
+
+  ggml_tensor* translate(const op::Activate& op) {
+    ggml_tensor* x = contiguous(in(0));
+    switch (op.activation) {
+      case Activation::gelu_tanh: {  // x sigmoid(2 u): ggml's own operation reads a float16 table
+        constexpr float kLinear = 1.5957691216f, kCubic = kLinear * 0.044715f;  // 2 sqrt(2/pi)
+        ggml_tensor* factor = ggml_scale_bias(c, ggml_sqr(c, x), kCubic, kLinear);
+        return ggml_mul(c, x, ggml_sigmoid(c, ggml_mul(c, x, factor)));
+      }
+      case Activation::gelu_erf:
+        return ggml_gelu_erf(c, x);
+      case Activation::silu:
+        return ggml_silu(c, x);
+      case Activation::relu:  // ggml's own makes zero of NaN; what is not finite stays so
+        return ggml_add(c, ggml_relu(c, x), ggml_scale(c, x, 0.0f));
+      case Activation::none:
+        break;
+    }
+    return x;
+  }
+  ggml_tensor* translate(const op::Add&) { return ggml_add(c, contiguous(in(0)), contiguous(in(1))); }
+  ggml_tensor* translate(const op::Multiply&) { return ggml_mul(c, contiguous(in(0)), contiguous(in(1))); }
+  ggml_tensor* translate(const op::Scale& op) { return ggml_scale(c, contiguous(in(0)), op.factor); }
+  ggml_tensor* translate(const op::Concat& op) {
+    ggml_tensor* all = in(0);
+    for (std::size_t i = 1; i < node_->in.size(); ++i) all = ggml_concat(c, all, in(i), op.dim);
+    return all;
+  }
+  ggml_tensor* translate(const op::Slice& op) {
+    ggml_tensor* x = in(0);
+    const Shape& s = node_->shape;
+    return ggml_view_4d(c, x, s[0], s[1], s[2], s[3], x->nb[1], x->nb[2], x->nb[3],
+                        static_cast<std::size_t>(op.first) * x->nb[op.dim]);
+  }
+  ggml_tensor* translate(const op::Repeat&) {
+    const Shape& s = node_->shape;
+    return ggml_repeat_4d(c, contiguous(in(0)), s[0], s[1], s[2], s[3]);
+  }
+  ggml_tensor* translate(const op::Reshape&) { return reshaped(in(0), node_->shape); }
+  ggml_tensor* translate(const op::Patches& op) {
+    ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, op.size, op.size, 3, 1);  // read for its shape only
+    ggml_tensor* rows = ggml_im2col(c, kernel, contiguous(in(0)), op.size, op.size, 0, 0, 1, 1, true, GGML_TYPE_F32);
+    return reshaped(rows, node_->shape);
+  }
+  ggml_tensor* translate(const op::PixelShuffle& op) {
+    ggml_tensor* x = in(0);
+    const std::int64_t f = op.factor, n_row = x->ne[1] / op.n_column;
+    // Patch (f R + r, f C + c): c is the fastest after the features, then C, r, R; C and r change places.
+    ggml_tensor* split = reshaped(x, {x->ne[0] * f, op.n_column / f, f, n_row / f * x->ne[2]});
+    return reshaped(ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3)), node_->shape);
+  }
+  ggml_tensor* translate(const op::Write& op) { return ggml_cpy(c, in(0), static_cast<ggml_tensor*>(op.slot->place)); }
+
+  ggml_context *c, *constants_;
+  const GgmlDevice& device_;
+  const Node* node_ = nullptr;
+  std::vector<ggml_tensor*> made_;  // by Node::id
+};
+
+bool is_leaf(const Node& node) { return node.in.empty(); }
+
+std::vector<bool> needed_nodes(const Graph& graph) {
+  std::vector<bool> needed(graph.nodes().size(), false);
+  for (auto node = graph.nodes().rbegin(); node != graph.nodes().rend(); ++node) {
+    const auto id = static_cast<std::size_t>(node->id);
+    needed[id] = needed[id] || node->tapped || node->as<op::Write>() != nullptr;
+    if (needed[id])
+      for (Tensor in : node->in) needed[static_cast<std::size_t>(in.node()->id)] = true;
+  }
+  return needed;
+}
+
+Work work_of(const Node& node) {
+  Work work = {flop_of(node), 4.0 * static_cast<double>(count(node.shape))};
+  for (Tensor in : node.in) work.bytes += 4.0 * static_cast<double>(count(in.shape()));
+  if (const auto* linear = node.as<op::Linear>()) work.bytes += 4.0 * static_cast<double>(linear->weight->count());
+  return work;
+}
+
+}  // namespace
+
+Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevice& device) {
+  constexpr std::size_t kMaxPerNode = 16;  // tensors that one node becomes, but for concatenations
+  std::unique_ptr<GgmlProgram> program(new GgmlProgram(device));
+  std::size_t n = 64;
+  for (const Node& node : graph.nodes()) n += kMaxPerNode + 2 * node.in.size();
+  const std::size_t n_stage = graph.stages().size() + 1;
+  VLA_TRY(program->context_, make_context(n, (n_stage + 1) * ggml_graph_overhead_custom(n, false)));
+  VLA_TRY(program->constant_context_, make_context(graph.nodes().size() + 1));
+  ggml_context* c = program->context_.get();
+  program->graph_ = ggml_new_graph_custom(c, n, false);
+
+  Translator translate(c, program->constant_context_.get(), device);
+  const std::vector<bool> needed = needed_nodes(graph);
+  std::vector<std::pair<ggml_tensor*, const Node*>> constants;
+  std::vector<int> stage_end;
+  program->work_.resize(n_stage);
+  for (const Node& node : graph.nodes()) {
+    while (stage_end.size() < graph.stages().size() &&
+           static_cast<std::size_t>(node.id) >= graph.stages()[stage_end.size()].n_node)
+      stage_end.push_back(ggml_graph_n_nodes(program->graph_));
+    ggml_tensor* made = needed[static_cast<std::size_t>(node.id)] ? translate(node) : nullptr;
+    translate.keep(made);
+    if (made == nullptr) continue;
+    if (node.as<op::Constant>() != nullptr) constants.emplace_back(made, &node);
+    if (node.tapped) {  // a view's memory may be overwritten later in the run: keep a copy
+      if (made->view_src != nullptr || !ggml_is_contiguous(made) || is_leaf(node)) made = ggml_cont(c, made);
+      ggml_set_output(made);
+      program->taps_.push_back({node.path, node.shape});
+      program->tap_tensors_.push_back(made);
+    }
+    if (is_leaf(node) && !node.tapped) continue;
+    ggml_build_forward_expand(program->graph_, made);
+    program->work_[stage_end.size()] += work_of(node);
+  }
+  while (stage_end.size() < n_stage) stage_end.push_back(ggml_graph_n_nodes(program->graph_));
+  for (const Graph::Stage& stage : graph.stages()) program->stages_.push_back({stage.name, {}});
+
+  if (!constants.empty()) {
+    program->constant_buffer_.reset(ggml_backend_alloc_ctx_tensors(program->constant_context_.get(), device.backend()));
+    if (!program->constant_buffer_) return Error{Code::out_of_memory, "constants", "", "the device refused them"};
+    for (const auto& [tensor, node] : constants)
+      std::visit([&](const auto& values) { ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * 4); },
+                 node->as<op::Constant>()->values);
+    program->size_ += ggml_backend_buffer_get_size(program->constant_buffer_.get());
+  }
+  program->allocator_.reset(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend())));
+  if (!ggml_gallocr_alloc_graph(program->allocator_.get(), program->graph_))
+    return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation"};
+  int begin = 0;
+  for (const int end : stage_end) {
+    ggml_cgraph* part = ggml_new_graph_custom(c, static_cast<std::size_t>(end - begin) + 1, false);
+    for (int i = begin; i < end; ++i) {
+      ggml_tensor* node = ggml_graph_node(program->graph_, i);
+      ggml_graph_add_node(part, node);
+      program->text_ += fmt::format("{:>4} {:<12} [{}, {}, {}, {}]\n", i, ggml_op_desc(node), node->ne[0], node->ne[1],
+                                    node->ne[2], node->ne[3]);
+    }
+    program->parts_.push_back(part);
+    begin = end;
+  }
+  program->size_ += ggml_used_mem(c) + ggml_gallocr_get_buffer_size(program->allocator_.get(), 0);
+  return std::unique_ptr<Program>(std::move(program));
+}
+
+Status GgmlProgram::run() {
+  for (std::size_t i = 0; i < parts_.size(); ++i) {
+    const ggml_status status = ggml_backend_graph_compute(device_.backend(), parts_[i]);
+    if (status == GGML_STATUS_ALLOC_FAILED)
+      return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
+    if (status != GGML_STATUS_SUCCESS)
+      return Error{Code::device, "graph", "a finished run", ggml_status_to_string(status)};
+    if (i < stages_.size()) stages_[i].done = std::chrono::steady_clock::now();
+  }
+  return {};
+}
+
+std::vector<float> GgmlProgram::tap(std::size_t i) const {
+  std::vector<float> values(static_cast<std::size_t>(ggml_nelements(tap_tensors_[i])));
+  ggml_backend_tensor_get(tap_tensors_[i], values.data(), 0, values.size() * sizeof(float));
+  return values;
+}
+
+}  // namespace vla

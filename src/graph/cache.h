@@ -1,0 +1,38 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <map>
+#include <string>
+
+#include "graph/graph.h"
+
+namespace vla {
+
+/// What one graph leaves for the graphs that run after it, by path: the prefix for the solver steps, load time for
+/// both.
+class Cache {
+ public:
+  /// Keeps `value` under its path, which is a tap too. Called while the graph that computes it is recorded.
+  void put(Graph& g, const std::string& path, Tensor value) {
+    Slot* slot = g.slots().add_f32(value.shape());
+    g.write(g.name(path, value), slot);
+    entries_[path] = {slot, g.serial(), value};
+  }
+  bool has(const std::string& path) const { return entries_.count(path) != 0; }
+  /// What `put` kept: the value itself in the graph that computes it.
+  Tensor get(Graph& g, const std::string& path) const {
+    const Entry& entry = entries_.at(path);
+    return entry.graph == g.serial() ? entry.value : g.input(entry.slot);
+  }
+
+ private:
+  struct Entry {
+    Slot* slot;
+    std::uint64_t graph;
+    Tensor value;
+  };
+  std::map<std::string, Entry> entries_;
+};
+
+}  // namespace vla

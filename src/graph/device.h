@@ -1,0 +1,95 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <chrono>
+#include <memory>
+#include <span>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "graph/graph.h"
+#include "graph/work.h"
+
+namespace vla {
+
+/// A graph made ready for a device: memory is there, and it can be run as often as wanted.
+class Program {
+ public:
+  using Time = std::chrono::steady_clock::time_point;
+  virtual ~Program() = default;
+
+  /// Computes what depends on inputs that stay the same from run to run (LowerOptions::varying). Errors: device.
+  virtual Status prepare() { return {}; }
+  /// Errors: device.
+  virtual Status run() = 0;
+
+  struct Stage {
+    std::string name;
+    Time done;  // of the last run
+  };
+  virtual const std::vector<Stage>& stages() const = 0;
+  /// The work of a run: one entry for each stage, then one for all that follows the last.
+  virtual std::vector<Work> work() const = 0;
+
+  struct Tap {
+    std::string path;
+    Shape shape;
+  };
+  virtual const std::vector<Tap>& taps() const = 0;
+  /// Values of tap i in the last run.
+  virtual std::vector<float> tap(std::size_t i) const = 0;
+
+  /// One line an operation: what is computed, by what kernel, in which layout, at what cost.
+  virtual std::string text() const = 0;
+  /// Bytes that belong to this program alone.
+  virtual std::size_t size() const = 0;
+};
+
+/// How a graph is to be lowered.
+struct LowerOptions {
+  /// Slots that change from run to run. What depends on none of them is computed by Program::prepare, if this is given.
+  std::vector<const Slot*> varying;
+};
+
+/// Something that graphs run on: it keeps parameters, slots and working memory, and lowers graphs for itself.
+class Device {
+ public:
+  virtual ~Device() = default;
+
+  /// Makes the parameters resident, laid out for this device. Every one must have its source: call ParamList::report
+  /// first. `fill` false reserves memory without touching it, which is enough to learn sizes; no source is needed.
+  /// Errors: out_of_memory.
+  virtual Status load(const ParamList& params, bool fill) = 0;
+  /// Gives slots memory, filled with zeros. Errors: out_of_memory.
+  virtual Status allocate(Slots& slots) = 0;
+  virtual void set(const Slot& slot, const void* data, std::size_t size) = 0;
+  virtual void get(const Slot& slot, void* data, std::size_t size) const = 0;
+  /// The graph's slots must have memory; the graph is not needed afterwards. Errors: out_of_memory, internal,
+  /// unsupported for sizes that the device has no kernel for.
+  virtual Result<std::unique_ptr<Program>> lower(const Graph& graph, const LowerOptions& options = {}) = 0;
+
+  /// For people: "cpu, 2 threads".
+  virtual std::string name() const = 0;
+  virtual int n_thread() const = 0;
+  /// As `--kernels` names them.
+  virtual std::string kernels() const = 0;
+  /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
+  virtual std::string precision() const = 0;
+  /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
+  virtual const std::string& linear_kernels() const = 0;
+  /// Bytes of parameters, those of the mapped file included, and of what programs share while they run.
+  virtual std::size_t weights_size() const = 0;
+  virtual std::size_t working_size() const = 0;
+  /// Has the system back the shared memory now, so that no request waits for it.
+  virtual void touch() {}
+
+  std::vector<float> get(const Slot& slot) const {
+    std::vector<float> values(static_cast<std::size_t>(count(slot.shape)));
+    get(slot, values.data(), slot.size());
+    return values;
+  }
+};
+
+}  // namespace vla

@@ -1,0 +1,87 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "graph/graph.h"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <atomic>
+
+#include "graph/shapes.h"
+
+namespace vla {
+
+std::vector<std::int64_t> dims(const Shape& shape) {
+  std::size_t n = shape.size();
+  while (n > 1 && shape[n - 1] == 1) --n;
+  return {shape.begin(), shape.begin() + static_cast<std::ptrdiff_t>(n)};
+}
+
+std::string shape_text(const Shape& shape) { return fmt::format("[{}]", fmt::join(dims(shape), ", ")); }
+
+const char* op_name(const Op& op) {
+  constexpr const char* kNames[] = {"input", "constant",  "parameter", "linear",  "embedding",     "gather", "norm",
+                                    "rope",  "attention", "activate",  "add",     "multiply",      "scale",  "concat",
+                                    "slice", "repeat",    "reshape",   "patches", "pixel_shuffle", "write"};
+  return kNames[op.index()];
+}
+
+Graph::Graph(Slots& slots, TapFilter filter) : slots_(slots), filter_(std::move(filter)) {
+  static std::atomic<std::uint64_t> n_graph = 0;
+  serial_ = ++n_graph;
+}
+
+Tensor Graph::add(Op op, std::vector<Tensor> in, const Shape& shape) {
+  const ShapeCheck check = check_shapes(op, in, shape);
+  if (!check.fits && problem_.empty()) {
+    std::vector<std::string> operands;
+    for (Tensor tensor : in) operands.push_back(tensor ? shape_text(tensor.shape()) : "none");
+    problem_ = fmt::format("{} {} of {}: operands do not fit", op_name(op), nodes_.size(), fmt::join(operands, ", "));
+  }
+  const DType type = check.type;
+  return Tensor(&nodes_.emplace_back(
+      Node{static_cast<int>(nodes_.size()), std::move(op), std::move(in), type, check.shape, {}, false}));
+}
+
+Tensor Graph::input(const Slot* slot) {
+  Tensor& leaf = leaves_[slot];
+  return leaf ? leaf : leaf = add(op::Input{slot}, {}, slot->shape);
+}
+
+Tensor Graph::parameter(const Param* param) {
+  Tensor& leaf = leaves_[param];
+  return leaf ? leaf : leaf = add(op::Parameter{param}, {}, {param->shape[0], 1, 1, 1});
+}
+
+Tensor Graph::constant(const std::string& key, const Shape& shape, const std::function<std::vector<float>()>& make) {
+  Tensor& leaf = constants_[key];
+  return leaf ? leaf : leaf = constant(make(), shape);
+}
+
+Tensor Graph::constant_ids(const std::string& key, const std::function<std::vector<std::int32_t>()>& make) {
+  Tensor& leaf = constants_["ids/" + key];
+  if (leaf) return leaf;
+  std::vector<std::int32_t> ids = make();
+  const auto n = static_cast<std::int64_t>(ids.size());
+  return leaf = add(op::Constant{std::move(ids)}, {}, {n, 1, 1, 1});
+}
+
+Tensor Graph::constant(std::vector<float> values, const Shape& shape) {
+  return add(op::Constant{std::move(values)}, {}, shape);
+}
+
+Tensor Graph::name(const std::string& path, Tensor value) {
+  Node& node = *value.node();
+  if (node.path.empty()) node.path = path;
+  if (!filter_ || !filter_(path)) return value;
+  // A value has one path; where it has two, the second is that of a value of its own.
+  if (node.path != path || node.tapped || node.as<op::Input>() != nullptr) {
+    const Tensor copy = add(op::Reshape{}, {value}, value.shape());
+    copy.node()->path = path, copy.node()->tapped = true;
+    return value;
+  }
+  node.tapped = true;
+  return value;
+}
+
+}  // namespace vla

@@ -1,0 +1,19 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "graph/graph.h"
+
+namespace vla {
+
+/// What an operation makes of its operands.
+struct ShapeCheck {
+  bool fits;
+  Shape shape = {1, 1, 1, 1};  // of the result
+  DType type = DType::f32;
+};
+
+/// The rules of graph/op.h. `asked` is the result's shape where operands do not determine it.
+ShapeCheck check_shapes(const Op& op, const std::vector<Tensor>& in, const Shape& asked);
+
+}  // namespace vla

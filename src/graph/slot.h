@@ -1,0 +1,54 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <deque>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "bundle/bundle.h"
+
+namespace vla {
+
+/// Sizes, fastest dimension first; what a tensor does not have is 1.
+using Shape = std::array<std::int64_t, 4>;
+
+constexpr std::int64_t count(const Shape& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
+/// "[720, 50]": all dimensions up to the last that is not 1.
+std::string shape_text(const Shape& shape);
+/// The same as numbers.
+std::vector<std::int64_t> dims(const Shape& shape);
+
+/// A tensor that outlives the graphs which read and write it: inputs, the cache, x, tables made at load. Float32 or
+/// i32.
+struct Slot {
+  DType type = DType::f32;
+  Shape shape = {1, 1, 1, 1};
+  void* place = nullptr;  // where its device keeps it, once memory is there
+
+  std::size_t size() const { return static_cast<std::size_t>(count(shape)) * 4; }
+};
+
+/// Slots that share one piece of memory: first all are declared, then Device::allocate gives it.
+class Slots {
+ public:
+  Slot* add(DType type, const Shape& shape) { return &slots_.emplace_back(Slot{type, shape, nullptr}); }
+  Slot* add_f32(const Shape& shape) { return add(DType::f32, shape); }
+  Slot* add_i32(const Shape& shape) { return add(DType::i32, shape); }
+
+  std::deque<Slot>& all() { return slots_; }
+  /// Bytes of the memory.
+  std::size_t size() const { return size_; }
+  /// What holds the slots, kept as long as this lives.
+  void hold(std::shared_ptr<void> memory, std::size_t size) { memory_ = std::move(memory), size_ = size; }
+
+ private:
+  std::deque<Slot> slots_;  // a deque: graphs keep pointers to them
+  std::shared_ptr<void> memory_;
+  std::size_t size_ = 0;
+};
+
+}  // namespace vla

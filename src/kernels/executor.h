@@ -1,0 +1,108 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <atomic>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <span>
+#include <thread>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla::kernels {
+
+/// A thread that takes items of a phase.
+struct Worker {
+  int index;
+  std::byte* scratch;   // memory of its own, at a multiple of a page
+  std::uint64_t phase;  // the same number as long as one run of one phase lasts, and never again
+};
+
+/// Work that is cut into items, which any worker may take in any order.
+class Task {
+ public:
+  virtual ~Task() = default;
+  virtual void run(std::int64_t item, Worker& worker) const = 0;
+  std::int64_t n_item = 1;
+};
+
+/// Tasks that do not depend on each other: their items are taken side by side.
+struct Phase {
+  std::vector<const Task*> tasks;
+  std::chrono::steady_clock::time_point* done = nullptr;  // when the last item was done in the last run, if wanted
+};
+
+/// Threads that run phases one after the other. A phase is done when its *items* are done: a worker that the system has
+/// put aside between two items holds nobody up. Whoever finishes the last item opens the next phase. A worker without
+/// work spins for a moment, then sleeps until a phase of several items is opened; an idle executor takes no time.
+///
+/// A worker starts with a stretch of the items that is its own from run to run, whose operands may still lie in its
+/// caches, and then helps with those of others.
+class Executor {
+ public:
+  /// The executor of `n_thread` threads, the caller of `run` among them. Engines of one process that ask for the same
+  /// number share it, and their runs take turns. Errors: device where the system refuses a thread.
+  static Result<std::shared_ptr<Executor>> shared(int n_thread);
+  explicit Executor(int n_thread);
+  ~Executor();
+
+  int n_thread() const { return n_thread_; }
+  /// At least `size` bytes of scratch memory for each worker from the next run on. Errors: out_of_memory.
+  Status reserve(std::size_t size);
+  std::size_t scratch_size() const { return scratch_size_ * static_cast<std::size_t>(n_thread_); }
+  /// Has the system back the scratch memory now.
+  void touch();
+
+  /// Runs the phases in order and returns when the last is done. One thread at a time runs; others wait.
+  void run(std::span<const Phase> phases);
+
+ private:
+  static constexpr int kMaxStretches = 64;
+  /// How many items of a worker's stretch are left, below the number of the phase that they belong to: a worker that
+  /// was put aside cannot take an item of a later phase for one of an earlier.
+  struct alignas(64) Stretch {
+    std::atomic<std::uint64_t> left = 0;
+    std::int64_t end = 0;  // one behind the last item
+  };
+
+  Status start();
+  void serve(int index);
+  bool work(Worker& worker);
+  void run_item(std::int64_t item, Worker& worker);
+  void finish_item(Worker& worker);
+  void open(std::size_t i_phase);
+  bool has_work() const;
+  template <class Ready>
+  void wait(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, const Ready& ready);
+  void wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, int n);
+
+  const int n_thread_, n_stretch_;
+  std::mutex turn_;  // of those who run
+  std::vector<std::thread> threads_;
+  std::size_t scratch_size_ = 0;
+  struct Free {
+    void operator()(std::byte* memory) const;
+  };
+  std::unique_ptr<std::byte, Free> scratch_;
+
+  // What runs. Written by whoever opens a phase, read by workers that hold an item of it.
+  std::span<const Phase> phases_;
+  std::size_t i_phase_ = 0;
+  std::uint64_t ticket_ = 0;
+  Stretch stretches_[kMaxStretches];
+  alignas(64) std::atomic<std::int64_t> n_left_ = 0;  // items of the phase that are not done
+
+  // Two words to sleep on: workers for a phase, the caller for a phase or the end.
+  alignas(64) std::atomic<std::uint32_t> opened_ = 0;
+  std::atomic<int> n_sleeping_ = 0;
+  alignas(64) std::atomic<std::uint32_t> caller_word_ = 0;
+  std::atomic<int> caller_sleeps_ = 0;
+  std::atomic<bool> finished_ = true, stop_ = false;
+};
+
+}  // namespace vla::kernels

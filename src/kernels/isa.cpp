@@ -1,0 +1,100 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "kernels/isa.h"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <algorithm>
+
+#if defined(__x86_64__)
+#include <cpuid.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+#endif
+
+namespace vla {
+namespace {
+
+#if defined(__x86_64__)
+
+/// Tiles are 8 kB of registers that the kernel saves only for a process that asked for them.
+bool may_use_tiles() {
+  constexpr int kRequestPermission = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
+  return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
+}
+
+/// Tiles of bf16, and the instruction that rounds vectors to it, which every processor with such tiles has.
+bool has_amx_bf16() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  if (__get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
+  constexpr unsigned kTileBf16 = 1U << 22, kTile = 1U << 24, kVectorBf16 = 1U << 5;
+  if ((d & kTileBf16) == 0 || (d & kTile) == 0) return false;
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) != 0 && (a & kVectorBf16) != 0 && may_use_tiles();
+}
+
+/// Clang's __builtin_cpu_supports knows no "f16c". The registers are AVX's.
+bool has_f16c() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  constexpr unsigned kF16c = 1U << 29;
+  return __get_cpuid(1, &a, &b, &c, &d) != 0 && (c & kF16c) != 0;
+}
+
+std::vector<Isa> detect() {
+  std::vector<Isa> found = {Isa::ggml};
+  __builtin_cpu_init();
+  if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !has_f16c()) return found;
+  found.push_back(Isa::avx2);
+  if (!__builtin_cpu_supports("avx512f") || !__builtin_cpu_supports("avx512bw") ||
+      !__builtin_cpu_supports("avx512dq") || !__builtin_cpu_supports("avx512vl"))
+    return found;
+  found.push_back(Isa::avx512);
+  if (has_amx_bf16()) found.push_back(Isa::amx);
+  return found;
+}
+
+#else
+
+std::vector<Isa> detect() { return {Isa::ggml}; }
+
+#endif
+
+constexpr Isa kAll[] = {Isa::ggml, Isa::avx2, Isa::avx512, Isa::amx};
+
+}  // namespace
+
+std::string isa_name(Isa isa) {
+  switch (isa) {
+    case Isa::avx2:
+      return "avx2";
+    case Isa::avx512:
+      return "avx512";
+    case Isa::amx:
+      return "amx";
+    case Isa::ggml:
+      break;
+  }
+  return "ggml";
+}
+
+const std::vector<Isa>& usable_isas() {
+  static const std::vector<Isa> usable = detect();
+  return usable;
+}
+
+Isa without_rounding(Isa isa) { return isa == Isa::amx ? Isa::avx512 : isa; }
+
+Result<Isa> choose_isa(const std::string& name) {
+  const std::vector<Isa>& usable = usable_isas();
+  if (name.empty()) return usable.back();
+  if (name == "float32") return without_rounding(usable.back());
+  const auto known = std::find_if(std::begin(kAll), std::end(kAll), [&](Isa isa) { return isa_name(isa) == name; });
+  if (known == std::end(kAll)) return Error{Code::usage, "kernels", "ggml, avx2, avx512, amx or float32", name};
+  if (std::find(usable.begin(), usable.end(), *known) != usable.end()) return *known;
+  std::vector<std::string> names;
+  for (Isa isa : usable) names.push_back(isa_name(isa));
+  return Error{Code::device, "kernels", fmt::format("what this machine can run: {}", fmt::join(names, ", ")), name,
+               "leave the choice to the program"};
+}
+
+}  // namespace vla

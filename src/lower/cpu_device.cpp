@@ -1,0 +1,86 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cpu_device.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cstring>
+
+#include "kernels/attention_kernel.h"
+#include "kernels/pages.h"
+#include "lower/cpu_program.h"
+#include "lower/precision.h"
+
+namespace vla::lower {
+namespace {
+
+/// Kernels of attention have room for so much.
+Status check_attention(const Graph& graph) {
+  for (const Node& node : graph.nodes()) {
+    const auto* attention = node.as<op::Attention>();
+    if (attention == nullptr) continue;
+    if (node.in[0].dim(0) > kernels::kMaxHead)
+      return Error{Code::unsupported, "attention", fmt::format("heads of at most {} numbers", kernels::kMaxHead),
+                   std::to_string(node.in[0].dim(0)), "use --kernels ggml"};
+    const std::size_t n_segment = (node.in.size() - (attention->has_mask ? 2 : 1)) / 2;
+    if (n_segment > kernels::AttentionJob::kMaxSegment)
+      return Error{Code::internal, "attention", "fewer segments of keys", std::to_string(n_segment),
+                   "please report this"};
+  }
+  return {};
+}
+
+}  // namespace
+
+Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa) {
+  std::unique_ptr<CpuDevice> device(new CpuDevice(isa));
+  VLA_TRY(device->executor_, kernels::Executor::shared(n_thread));
+  return std::unique_ptr<Device>(std::move(device));
+}
+
+std::string CpuDevice::name() const { return fmt::format("cpu, {} thread{}", n_thread(), n_thread() == 1 ? "" : "s"); }
+
+Status CpuDevice::load(const ParamList& params, bool fill) {
+  isa_ = isa_for(params, isa_);
+  VLA_TRY(weights_, CpuWeights::load(params, isa_, n_thread(), fill));
+  return {};
+}
+
+Status CpuDevice::allocate(Slots& slots) {
+  std::size_t size = 0;
+  for (const Slot& slot : slots.all()) size += aligned(slot.size());
+  VLA_TRY(const Memory memory, Memory::allocate(size, "inputs and cache"));
+  std::byte* place = memory.data();
+  for (Slot& slot : slots.all()) slot.place = place, place += aligned(slot.size());
+  want_memory_now(memory.data(), size);
+  slots.hold(memory.shared(), size);
+  return {};
+}
+
+void CpuDevice::set(const Slot& slot, const void* data, std::size_t size) { std::memcpy(slot.place, data, size); }
+void CpuDevice::get(const Slot& slot, void* data, std::size_t size) const { std::memcpy(data, slot.place, size); }
+
+Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const LowerOptions& options) {
+  if (!graph.problem().empty())
+    return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
+  VLA_CHECK(check_attention(graph));
+  Lowering l = {graph, options, weights_, isa_, n_thread(), {}, {}, {}, {}, {}, 0, 0, 0, 0};
+  start(l);
+  fuse(l);
+  choose_layouts(l);
+  schedule(l);
+  place(l);
+  if (l.arena_size > arena_.size()) {
+    // Programs made before keep the memory that they were given.
+    VLA_TRY(arena_, Memory::allocate(l.arena_size, "working memory"));
+  }
+  return CpuProgram::make(l, arena_, executor_);
+}
+
+void CpuDevice::touch() {
+  if (arena_.size() > 0) want_memory_now(arena_.data(), arena_.size());
+  executor_->touch();
+}
+
+}  // namespace vla::lower

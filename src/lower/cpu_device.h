@@ -1,0 +1,42 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "graph/device.h"
+#include "kernels/executor.h"
+#include "kernels/isa.h"
+#include "lower/cpu_weights.h"
+
+namespace vla::lower {
+
+/// This machine's cores, with kernels of our own.
+class CpuDevice final : public Device {
+ public:
+  /// Errors: device.
+  static Result<std::unique_ptr<Device>> open(int n_thread, Isa isa);
+
+  Status load(const ParamList& params, bool fill) override;
+  Status allocate(Slots& slots) override;
+  void set(const Slot& slot, const void* data, std::size_t size) override;
+  void get(const Slot& slot, void* data, std::size_t size) const override;
+  Result<std::unique_ptr<Program>> lower(const Graph& graph, const LowerOptions& options) override;
+
+  std::string name() const override;
+  int n_thread() const override { return executor_->n_thread(); }
+  std::string kernels() const override { return isa_name(isa_); }
+  std::string precision() const override { return isa_ == Isa::amx ? "bf16" : "f32"; }
+  const std::string& linear_kernels() const override { return weights_.text(); }
+  std::size_t weights_size() const override { return weights_.size(); }
+  std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }
+  void touch() override;
+
+ private:
+  explicit CpuDevice(Isa isa) : isa_(isa) {}
+
+  Isa isa_;
+  std::shared_ptr<kernels::Executor> executor_;
+  CpuWeights weights_;
+  Memory arena_;  // of values that live within a run: programs share it, since one runs at a time
+};
+
+}  // namespace vla::lower

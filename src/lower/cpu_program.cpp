@@ -1,0 +1,108 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cpu_program.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cstring>
+
+#include "kernels/linear_kernel.h"
+#include "lower/emit.h"
+
+namespace vla::lower {
+
+Result<std::unique_ptr<Program>> CpuProgram::make(Lowering& l, const Memory& arena,
+                                                  std::shared_ptr<kernels::Executor> executor) {
+  std::unique_ptr<CpuProgram> program(new CpuProgram);
+  program->executor_ = std::move(executor);
+  program->arena_ = arena;
+  VLA_CHECK(program->give_addresses(l));
+  VLA_CHECK(program->make_tasks(l));
+  program->make_taps(l);
+  return std::unique_ptr<Program>(std::move(program));
+}
+
+Status CpuProgram::give_addresses(Lowering& l) {
+  std::size_t size = aligned(l.kept_size);
+  for (const Value& value : l.values)
+    if (value.home == Value::Home::constant) size += aligned(value.size);
+  VLA_TRY(own_, Memory::allocate(size, "constants"));
+  std::byte* next = own_.data() + aligned(l.kept_size);
+  for (std::size_t i = 0; i < l.values.size(); ++i) {
+    Value& value = l.values[i];
+    if (value.base != static_cast<ValueId>(i)) continue;
+    if (value.home == Value::Home::constant) {
+      const auto& values = value.node->as<op::Constant>()->values;
+      value.data = next, next += aligned(value.size);
+      std::visit([&](const auto& numbers) { std::memcpy(value.data, numbers.data(), value.size); }, values);
+    } else if (value.home == Value::Home::kept) {
+      value.data = own_.data() + value.offset, value.offset = 0;
+    } else if (value.home == Value::Home::arena) {
+      value.data = arena_.data() + value.offset, value.offset = 0;
+    }
+  }
+  return {};
+}
+
+Status CpuProgram::make_tasks(const Lowering& l) {
+  std::size_t scratch = 0;
+  for (const kernels::LinearKernel* kernel : kernels::linear_kernels())
+    if (kernel->name == isa_name(l.isa) || l.isa == Isa::amx) scratch = std::max(scratch, kernel->scratch_size);
+  VLA_CHECK(executor_->reserve(scratch));
+  n_prepare_ = static_cast<std::size_t>(l.n_prepare);
+  phases_.resize(static_cast<std::size_t>(l.n_phase));
+  const auto& stages = l.graph.stages();
+  work_.resize(stages.size() + 1);
+  std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
+  for (const FusedOp& op : l.ops) {
+    tasks_.push_back(emit(l, op));
+    const auto phase = static_cast<std::size_t>(op.phase);
+    phases_[phase].tasks.push_back(tasks_.back().get());
+    text_ += text_of(l, op) + "\n";
+    std::size_t stage = 0;
+    while (stage < stages.size() && op.order >= static_cast<int>(stages[stage].n_node)) ++stage;
+    if (!op.invariant) work_[stage] += work_of(l, op);
+    if (stage < stages.size() && !op.invariant) stage_end[stage] = std::max(stage_end[stage], phase + 1);
+    host_size_ += sizeof(kernels::LinearJob) + 2 * sizeof(void*) + 256;
+  }
+  for (const Graph::Stage& stage : stages) stages_.push_back({stage.name, {}});
+  for (std::size_t i = 0; i < stages.size(); ++i)
+    if (stage_end[i] > 0) phases_[stage_end[i] - 1].done = &stages_[i].done;
+  host_size_ += text_.size();
+  return {};
+}
+
+void CpuProgram::make_taps(const Lowering& l) {
+  for (const Node& node : l.graph.nodes()) {
+    if (!node.tapped) continue;
+    const Value& value = l.value(node.id);
+    const auto* data = reinterpret_cast<const float*>(l.base(node.id).data) + value.offset;
+    taps_.push_back({node.path, node.shape});
+    tap_places_.push_back({data, value.shape, value.stride});
+  }
+}
+
+Status CpuProgram::prepare() {
+  executor_->run(std::span(phases_).first(n_prepare_));
+  return {};
+}
+
+Status CpuProgram::run() {
+  executor_->run(std::span(phases_).subspan(n_prepare_));
+  return {};
+}
+
+std::vector<float> CpuProgram::tap(std::size_t i) const {
+  const auto& [data, shape, stride] = tap_places_[i];
+  std::vector<float> values;
+  values.reserve(static_cast<std::size_t>(count(shape)));
+  for (std::int64_t a = 0; a < shape[3]; ++a)
+    for (std::int64_t b = 0; b < shape[2]; ++b)
+      for (std::int64_t c = 0; c < shape[1]; ++c)
+        for (std::int64_t d = 0; d < shape[0]; ++d)
+          values.push_back(data[a * stride[3] + b * stride[2] + c * stride[1] + d * stride[0]]);
+  return values;
+}
+
+}  // namespace vla::lower

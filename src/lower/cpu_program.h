@@ -1,0 +1,49 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <deque>
+
+#include "kernels/executor.h"
+#include "lower/lowering.h"
+
+namespace vla::lower {
+
+/// Phases for the executor, and the memory that they work in.
+class CpuProgram final : public Program {
+ public:
+  /// The last pass: addresses and tasks. Errors: out_of_memory.
+  static Result<std::unique_ptr<Program>> make(Lowering& l, const Memory& arena,
+                                               std::shared_ptr<kernels::Executor> executor);
+
+  Status prepare() override;
+  Status run() override;
+  const std::vector<Stage>& stages() const override { return stages_; }
+  std::vector<Work> work() const override { return work_; }
+  const std::vector<Tap>& taps() const override { return taps_; }
+  std::vector<float> tap(std::size_t i) const override;
+  std::string text() const override { return text_; }
+  std::size_t size() const override { return own_.size() + host_size_; }
+
+ private:
+  struct TapPlace {
+    const float* data;
+    Shape shape, stride;
+  };
+  Status give_addresses(Lowering& l);
+  Status make_tasks(const Lowering& l);
+  void make_taps(const Lowering& l);
+
+  std::shared_ptr<kernels::Executor> executor_;
+  Memory arena_, own_;  // own: constants, and what prepare leaves
+  std::vector<std::unique_ptr<kernels::Task>> tasks_;
+  std::vector<kernels::Phase> phases_;
+  std::size_t n_prepare_ = 0, host_size_ = 0;
+  std::vector<Stage> stages_;
+  std::vector<Work> work_;
+  std::vector<Tap> taps_;
+  std::vector<TapPlace> tap_places_;
+  std::string text_;
+};
+
+}  // namespace vla::lower

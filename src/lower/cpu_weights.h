@@ -1,0 +1,45 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "bundle/params.h"
+#include "kernels/linear_kernel.h"
+#include "lower/memory.h"
+
+namespace vla::lower {
+
+/// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in the bundle's dtype, in panels;
+/// vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
+class CpuWeights {
+ public:
+  /// Every parameter must have its source. Without `fill` memory is reserved and never touched. Errors: out_of_memory.
+  static Result<CpuWeights> load(const ParamList& list, Isa isa, int n_thread, bool fill);
+
+  const std::byte* data(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].data; }
+  /// What multiplies by a matrix.
+  const kernels::LinearKernel* kernel(const Param* param) const {
+    return places_[static_cast<std::size_t>(param->id)].kernel;
+  }
+  /// Bytes in memory, those of the bundle's tables included.
+  std::size_t size() const { return memory_.size() + table_size_; }
+  /// Which kernel multiplies how many matrices, for people: `avx2 (98 bf16)`.
+  const std::string& text() const { return text_; }
+
+ private:
+  struct Place {
+    const std::byte* data = nullptr;
+    const kernels::LinearKernel* kernel = nullptr;
+  };
+
+  Memory memory_;
+  std::shared_ptr<const void> file_;  // of the tables
+  std::size_t table_size_ = 0;
+  std::vector<Place> places_;
+  std::string text_;
+};
+
+}  // namespace vla::lower

@@ -1,0 +1,337 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/emit.h"
+
+#include <cmath>
+#include <cstring>
+
+#include "kernels/cpu_kernels.h"
+#include "kernels/numbers.h"
+#include "kernels/sizes.h"
+
+namespace vla::lower {
+namespace {
+
+using kernels::Task;
+using kernels::Worker;
+
+/// A product of fewer operations takes about as long as waking a thread.
+constexpr double kMinSharedFlop = 2e6;
+/// Numbers of an item of what is not a product.
+constexpr std::int64_t kItemNumbers = 16384;
+
+std::byte* address(const Lowering& l, ValueId id) {
+  const Value& value = l.value(id);
+  return l.base(id).data + value.offset * static_cast<std::int64_t>(dtype_size(value.type));
+}
+float* floats(const Lowering& l, ValueId id) { return reinterpret_cast<float*>(address(l, id)); }
+/// Null for an operand that there is not.
+const float* operand(const Lowering& l, ValueId id) { return id != kNone ? floats(l, id) : nullptr; }
+
+const kernels::CpuKernels& cpu(const Lowering& l) { return *kernels::cpu_kernels(l.isa); }
+
+struct LinearTask : Task {
+  const kernels::LinearKernel* kernel;
+  kernels::LinearJob job = {};
+  void run(std::int64_t item, Worker& worker) const override { kernel->run(job, item, worker); }
+};
+
+struct PackTask : Task {
+  const kernels::AttentionKernel* kernel;
+  kernels::PackJob job;
+  void run(std::int64_t item, Worker&) const override { kernel->pack(job, item); }
+};
+
+struct AttentionTask : Task {
+  const kernels::AttentionKernel* kernel;
+  kernels::AttentionJob job = {};
+  void run(std::int64_t item, Worker&) const override { kernel->run(job, item); }
+};
+
+/// Rows of up to two operands through a row kernel; the result is contiguous.
+struct RowTask : Task {
+  kernels::RowKernel kernel;
+  const float *x, *w = nullptr, *b = nullptr;
+  float s = 0;
+  float* y;
+  Shape shape, x_stride, w_stride = {};
+  bool w_is_scalar = false;  // of each row
+  std::int64_t item_rows;
+
+  void run(std::int64_t item, Worker&) const override {
+    const std::int64_t n_row = shape[1] * shape[2] * shape[3], end = std::min(n_row, (item + 1) * item_rows);
+    for (std::int64_t row = item * item_rows; row < end; ++row) {
+      const std::int64_t i = row % shape[1], j = row / shape[1] % shape[2], k = row / shape[1] / shape[2];
+      const float* w_row = w != nullptr ? w + i * w_stride[1] + j * w_stride[2] + k * w_stride[3] : nullptr;
+      kernel(x + i * x_stride[1] + j * x_stride[2] + k * x_stride[3], w_row, b, w_is_scalar ? *w_row : s,
+             y + row * shape[0], shape[0]);
+    }
+  }
+};
+
+/// Words of four bytes from one place to another; an item is some rows of a part.
+struct CopyTask : Task {
+  struct Part {
+    const std::uint32_t* from;
+    std::uint32_t* to;
+    Shape shape, from_stride, to_stride;
+    std::int64_t item_rows, first_item;
+  };
+  std::vector<Part> parts;
+
+  void run(std::int64_t item, Worker&) const override {
+    std::size_t i = parts.size() - 1;
+    while (parts[i].first_item > item) --i;
+    const Part& part = parts[i];
+    const Shape& n = part.shape;
+    const std::int64_t begin = (item - part.first_item) * part.item_rows;
+    const std::int64_t end = std::min(n[1] * n[2] * n[3], begin + part.item_rows);
+    const auto place = [&](const Shape& stride, std::int64_t row) {
+      return row % n[1] * stride[1] + row / n[1] % n[2] * stride[2] + row / n[1] / n[2] * stride[3];
+    };
+    for (std::int64_t row = begin; row < end; ++row) {
+      const std::uint32_t* from = part.from + place(part.from_stride, row);
+      std::uint32_t* to = part.to + place(part.to_stride, row);
+      if (part.from_stride[0] == 1)
+        std::memcpy(to, from, static_cast<std::size_t>(n[0]) * 4);
+      else
+        for (std::int64_t j = 0; j < n[0]; ++j) to[j] = from[j * part.from_stride[0]];
+    }
+  }
+};
+
+/// Rows of a table, widened to float32.
+struct LookupTask : Task {
+  const std::byte* table;
+  DType type;
+  const std::int32_t* ids;
+  float* y;
+  std::int64_t d, n, item_rows, row_stride;
+
+  void run(std::int64_t item, Worker&) const override {
+    for (std::int64_t i = item * item_rows; i < std::min(n, (item + 1) * item_rows); ++i) {
+      const std::byte* row = table + ids[i] * row_stride * kernels::number_size(type);
+      if (type == DType::f32)
+        std::memcpy(y + i * d, row, static_cast<std::size_t>(d) * sizeof(float));
+      else
+        for (std::int64_t j = 0; j < d; ++j) y[i * d + j] = kernels::stored_number(type, row, j);
+    }
+  }
+};
+
+/// An item is a row of patches of a view.
+struct PatchesTask : Task {
+  const float* images;
+  float* y;
+  std::int64_t width, height, size;
+
+  void run(std::int64_t item, Worker&) const override {
+    const std::int64_t n_column = width / size, n_row = height / size, view = item / n_row, row = item % n_row;
+    float* to = y + item * n_column * 3 * size * size;
+    for (std::int64_t column = 0; column < n_column; ++column)
+      for (std::int64_t channel = 0; channel < 3; ++channel)
+        for (std::int64_t line = 0; line < size; ++line, to += size)
+          std::memcpy(to, images + ((view * 3 + channel) * height + row * size + line) * width + column * size,
+                      static_cast<std::size_t>(size) * sizeof(float));
+  }
+};
+
+/// Cuts rows of d numbers into items for the threads, and says how many rows an item has.
+std::int64_t item_rows(const Lowering& l, std::int64_t n_row, std::int64_t d, std::int64_t& n_item) {
+  const std::int64_t wanted = l.n_thread == 1 ? 1 : std::min<std::int64_t>(n_row * d / kItemNumbers, 8 * l.n_thread);
+  const std::int64_t rows = kernels::ceil_div(n_row, std::max<std::int64_t>(1, wanted));
+  n_item = kernels::ceil_div(n_row, rows);
+  return rows;
+}
+
+kernels::RowPrep prep_of(const Lowering& l, const Prepared& rows) {
+  kernels::RowPrep prep;
+  if (rows.norm != nullptr) {
+    const auto& norm = *rows.norm->as<op::Norm>();
+    prep.norm = norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm;
+    prep.weight = floats(l, rows.weight), prep.eps = norm.eps;
+  }
+  if (rows.rope != nullptr) prep.rotate = cpu(l).rotate_half, prep.table = floats(l, rows.table);
+  return prep;
+}
+
+/// x [d_head, n_head, n_token, n_batch].
+kernels::HeadRows head_rows(const Lowering& l, ValueId id) {
+  const Value& x = l.value(id);
+  return {floats(l, id), x.stride[1], x.stride[2], x.stride[3]};
+}
+
+double flop_of_op(const FusedOp& op) {
+  double flop = 0;
+  if (const auto* linear = std::get_if<LinearOp>(&op.op))
+    for (const Node* node : linear->linears) flop += flop_of(*node);
+  if (const auto* attention = std::get_if<AttentionOp>(&op.op)) flop = flop_of(*attention->node);
+  return flop;
+}
+
+/// Threads that share an operation.
+int threads_for(const Lowering& l, const FusedOp& op) { return flop_of_op(op) < kMinSharedFlop ? 1 : l.n_thread; }
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp& linear) {
+  auto task = std::make_unique<LinearTask>();
+  kernels::LinearJob& job = task->job;
+  const Value& x = l.value(linear.x);
+  task->kernel = l.weights.kernel(linear.linears[0]->as<op::Linear>()->weight);
+  job.x = address(l, linear.x), job.x_type = x.type, job.x_stride = row_stride(x);
+  job.d_in = x.shape[0], job.n_row = count(x.shape) / x.shape[0];
+  job.activation = linear.activation, job.gated = linear.gated;
+  if (linear.norm != nullptr) {
+    const auto& norm = *linear.norm->as<op::Norm>();
+    job.norm = {norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm, operand(l, linear.norm_weight),
+                operand(l, linear.norm_bias), norm.eps};
+  }
+  job.y_type = l.value(op.writes.back()).type;
+  for (const Node* node : linear.linears) {
+    const auto& product = *node->as<op::Linear>();
+    kernels::LinearJob::Part& part = job.part[job.n_part++];
+    part.type = product.weight->type();
+    part.weight = l.weights.data(product.weight);
+    part.bias = product.bias != nullptr ? reinterpret_cast<const float*>(l.weights.data(product.bias)) : nullptr;
+    part.d_out = product.weight->shape[1];
+    // Of gate and up the one result is up's.
+    const std::size_t i = linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1);
+    part.y = address(l, op.writes[i]);
+  }
+  kernels::LinearJob::Part& last = job.part[job.n_part - 1];
+  last.factor = operand(l, linear.factor), last.residual = operand(l, linear.residual);
+  task->n_item = task->kernel->cut(job, threads_for(l, op));
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PackOp& pack) {
+  auto task = std::make_unique<PackTask>();
+  task->kernel = &cpu(l).attention;
+  task->job = pack_sizes(l, pack);
+  task->job.k = head_rows(l, pack.k.x), task->job.v = head_rows(l, pack.v), task->job.prep = prep_of(l, pack.k);
+  task->job.packed = address(l, op.writes[0]);
+  task->n_item = task->kernel->n_pack(task->job);
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const AttentionOp& attention) {
+  auto task = std::make_unique<AttentionTask>();
+  kernels::AttentionJob& job = task->job;
+  const Value& q = l.value(attention.q.x);
+  task->kernel = &cpu(l).attention;
+  job.d_head = q.shape[0], job.n_head = q.shape[1], job.n_query = q.shape[2], job.n_batch = q.shape[3];
+  job.n_head_kv = attention.node->in.back().dim(1);
+  job.scale = 1.0f / std::sqrt(static_cast<float>(job.d_head));
+  job.q = head_rows(l, attention.q.x), job.prep = prep_of(l, attention.q);
+  job.mask = operand(l, attention.mask);
+  for (std::size_t i = 0; i < attention.packed.size(); ++i) {
+    job.segment[job.n_segment++] = {address(l, attention.packed[i]), attention.n_key[i], job.n_key};
+    job.n_key += attention.n_key[i];
+  }
+  job.out = floats(l, op.writes[0]);
+  task->n_item = task->kernel->cut(job, threads_for(l, op));
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const RowOp& row) {
+  auto task = std::make_unique<RowTask>();
+  const Node& node = *row.node;
+  task->x = floats(l, row.x), task->x_stride = l.value(row.x).stride;
+  task->w = operand(l, row.w), task->b = operand(l, row.b);
+  task->y = floats(l, op.writes[0]), task->shape = node.shape;
+  if (const auto* norm = node.as<op::Norm>()) {
+    task->kernel = norm->kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm;
+    task->s = norm->eps;
+  } else if (node.as<op::Rope>() != nullptr) {
+    task->kernel = cpu(l).rotate_half;
+    task->w_stride = {1, 0, node.shape[0], 0};
+  } else if (const auto* activate = node.as<op::Activate>()) {
+    task->kernel = cpu(l).activation(activate->activation);
+  } else if (const auto* scale = node.as<op::Scale>()) {
+    task->kernel = cpu(l).scale, task->s = scale->factor;
+  } else {
+    const Value& w = l.value(row.w);
+    for (std::size_t i = 1; i < 4; ++i) task->w_stride[i] = w.shape[i] == 1 ? 0 : w.stride[i];
+    task->w_is_scalar = w.shape[0] == 1 && node.shape[0] != 1;
+    task->kernel = node.as<op::Add>() != nullptr ? cpu(l).add : task->w_is_scalar ? cpu(l).scale : cpu(l).multiply;
+  }
+  task->item_rows = item_rows(l, count(node.shape) / node.shape[0], node.shape[0], task->n_item);
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const CopyOp& copy) {
+  auto task = std::make_unique<CopyTask>();
+  task->n_item = 0;
+  for (const CopyOp::Part& part : copy.parts) {
+    std::int64_t n_item = 0;
+    const std::int64_t rows = item_rows(l, count(part.shape) / part.shape[0], part.shape[0], n_item);
+    task->parts.push_back({reinterpret_cast<const std::uint32_t*>(address(l, part.from)) + part.from_offset,
+                           reinterpret_cast<std::uint32_t*>(address(l, op.writes[0])) + part.to_offset, part.shape,
+                           part.from_stride, part.to_stride, rows, task->n_item});
+    task->n_item += n_item;
+  }
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LookupOp& lookup) {
+  auto task = std::make_unique<LookupTask>();
+  const Node& node = *lookup.node;
+  if (const auto* embedding = node.as<op::Embedding>()) {
+    task->table = l.weights.data(embedding->table), task->type = embedding->table->type();
+    task->row_stride = node.shape[0];
+  } else {
+    task->table = address(l, lookup.table), task->type = DType::f32;
+    task->row_stride = l.value(lookup.table).stride[1];
+  }
+  task->ids = reinterpret_cast<const std::int32_t*>(address(l, lookup.ids));
+  task->y = floats(l, op.writes[0]), task->d = node.shape[0], task->n = node.shape[1];
+  task->item_rows = item_rows(l, task->n, task->d, task->n_item);
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PatchesOp& patches) {
+  auto task = std::make_unique<PatchesTask>();
+  const Node& node = *patches.node;
+  task->images = floats(l, patches.images), task->y = floats(l, op.writes[0]);
+  task->width = node.in[0].dim(0), task->height = node.in[0].dim(1), task->size = node.as<op::Patches>()->size;
+  task->n_item = task->height / task->size * node.in[0].dim(3);
+  return task;
+}
+
+std::size_t bytes_of(const Value& value) {
+  return static_cast<std::size_t>(count(value.shape)) * dtype_size(value.type);
+}
+
+}  // namespace
+
+kernels::PackJob pack_sizes(const Lowering& l, const PackOp& op) {
+  const Value& k = l.value(op.k.x);
+  return {k.shape[0], k.shape[1], k.shape[2], k.shape[3], {}, {}, {}, nullptr};
+}
+
+std::unique_ptr<Task> emit(const Lowering& l, const FusedOp& op) {
+  return std::visit([&](const auto& what) { return make(l, op, what); }, op.op);
+}
+
+Work work_of(const Lowering& l, const FusedOp& op) {
+  Work work = {flop_of_op(op), 0};
+  const auto* lookup = std::get_if<LookupOp>(&op.op);
+  for (const ValueId id : op.reads) {
+    // Of a table only the rows that are looked up are read.
+    const Value& value = lookup != nullptr && id == lookup->table ? l.value(op.writes[0]) : l.value(id);
+    work.bytes += static_cast<double>(value.node != nullptr ? bytes_of(value) : value.size);
+  }
+  for (const ValueId id : op.writes) {
+    const Value& value = l.value(id);
+    work.bytes += static_cast<double>(value.node != nullptr ? bytes_of(value) : value.size);
+  }
+  if (const auto* linear = std::get_if<LinearOp>(&op.op))
+    for (const Node* node : linear->linears) {
+      const auto& product = *node->as<op::Linear>();
+      work.bytes +=
+          static_cast<double>(product.weight->count()) * static_cast<double>(dtype_size(product.weight->type()));
+      if (product.bias != nullptr) work.bytes += 4.0 * static_cast<double>(product.bias->shape[0]);
+    }
+  return work;
+}
+
+}  // namespace vla::lower

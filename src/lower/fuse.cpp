@@ -1,0 +1,296 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <map>
+
+#include "lower/lowering.h"
+
+namespace vla::lower {
+namespace {
+
+std::size_t at(const Node* node) { return static_cast<std::size_t>(node->id); }
+
+class Fuser {
+ public:
+  explicit Fuser(Lowering& lowering) : l(lowering) {}
+
+  void run() {
+    for (const Node& node : l.graph.nodes())
+      if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
+    join_products();
+    fuse_norms();
+    // A norm that its readers compute is no operation.
+    std::erase_if(l.ops, [&](const FusedOp& op) {
+      const auto* row = std::get_if<RowOp>(&op.op);
+      return row != nullptr && l.fused[at(row->node)];
+    });
+    for (FusedOp& op : l.ops) note_operands(op);
+    std::stable_sort(l.ops.begin(), l.ops.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
+  }
+
+ private:
+  void add(decltype(FusedOp::op) op, const Node& result) {
+    FusedOp& added = l.ops.emplace_back();
+    added.op = std::move(op), added.writes = {result.id}, added.order = result.id;
+  }
+
+  void visit(const Node& node) {
+    if (node.as<op::Linear>() != nullptr)
+      visit_linear(node);
+    else if (node.as<op::Attention>() != nullptr)
+      visit_attention(node);
+    else if (node.as<op::Concat>() != nullptr)
+      add(concat(node), node);
+    else if (node.as<op::PixelShuffle>() != nullptr)
+      add(pixel_shuffle(node), node);
+    else if (node.as<op::Embedding>() != nullptr || node.as<op::Gather>() != nullptr)
+      add(LookupOp{&node, operand(node, node.in.size() - 1), node.in.size() > 1 ? operand(node, 0) : kNone}, node);
+    else if (node.as<op::Patches>() != nullptr)
+      add(PatchesOp{&node, operand(node, 0)}, node);
+    else if (is_view_op(node)) {
+      if (l.value(node.id).base == node.id) add(copy(node), node);
+    } else if (!node.in.empty() && node.as<op::Write>() == nullptr)
+      add(RowOp{&node, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
+  }
+
+  static ValueId operand(const Node& node, std::size_t i) { return i < node.in.size() ? node.in[i].node()->id : kNone; }
+
+  static bool is_view_op(const Node& node) {
+    return node.as<op::Slice>() != nullptr || node.as<op::Repeat>() != nullptr || node.as<op::Reshape>() != nullptr;
+  }
+
+  /// What would be a view, but must not be one.
+  CopyOp copy(const Node& node) const {
+    const ValueId x = node.in[0].node()->id;
+    const Value& from = l.value(x);
+    CopyOp::Part part = {x, node.shape, from.stride, contiguous_strides(node.shape), 0};
+    if (node.as<op::Reshape>() != nullptr) part.shape = from.shape, part.to_stride = contiguous_strides(from.shape);
+    if (const auto* slice = node.as<op::Slice>())
+      part.from_offset = slice->first * from.stride[static_cast<std::size_t>(slice->dim)];
+    for (std::size_t i = 0; node.as<op::Repeat>() != nullptr && i < 4; ++i)
+      if (from.shape[i] == 1) part.from_stride[i] = 0;
+    return {{part}};
+  }
+
+  CopyOp concat(const Node& node) const {
+    CopyOp op;
+    const auto dim = static_cast<std::size_t>(node.as<op::Concat>()->dim);
+    const Shape to = contiguous_strides(node.shape);
+    std::int64_t offset = 0;
+    for (Tensor part : node.in) {
+      const Value& from = l.value(part.node()->id);
+      op.parts.push_back({part.node()->id, from.shape, from.stride, to, offset});
+      offset += from.shape[dim] * to[dim];
+    }
+    return op;
+  }
+
+  /// Patch (factor R + r, factor C + c) becomes part (r, c) of token (R, C): one copy for each r, of factor * d numbers
+  /// at once where x is contiguous.
+  CopyOp pixel_shuffle(const Node& node) const {
+    const auto [n_column, factor] = *node.as<op::PixelShuffle>();
+    const Value& x = l.value(node.in[0].node()->id);
+    const std::int64_t d = x.shape[0], row = x.stride[1], n_row = x.shape[1] / n_column;
+    CopyOp op;
+    for (int r = 0; r < factor; ++r)
+      for (int c = 0; c < factor; ++c) {
+        CopyOp::Part part;
+        part.from = node.in[0].node()->id;
+        part.shape = {d, n_column / factor, n_row / factor, x.shape[2]};
+        part.from_stride = {x.stride[0], factor * row, factor * n_column * row, x.stride[2]};
+        part.to_stride = {1, node.shape[0], node.shape[0] * (n_column / factor), node.shape[0] * node.shape[1]};
+        part.to_offset = (r * factor + c) * d;
+        // The part begins at patch (r, c).
+        part.from_offset = (r * n_column + c) * row;
+        op.parts.push_back(part);
+      }
+    return op;
+  }
+
+  /// The only node that reads this one, where nobody else and no tap does, unless it is part of something already.
+  const Node* only_reader(const Node& node) const {
+    if (node.tapped || l.readers[at(&node)].size() != 1) return nullptr;
+    const Node* reader = l.readers[at(&node)][0];
+    return l.fused[at(reader)] ? nullptr : reader;
+  }
+
+  const kernels::LinearKernel* kernel(const Node& linear) const {
+    return l.weights.kernel(linear.as<op::Linear>()->weight);
+  }
+
+  void visit_linear(const Node& linear) {
+    LinearOp op;
+    op.linears = {&linear}, op.x = linear.in[0].node()->id;
+    const Node* result = &linear;
+    if (const Node* gated = fuse_gate(linear, op)) {
+      result = gated;
+    } else {
+      if (const Node* next = only_reader(*result); next != nullptr && next->as<op::Activate>() != nullptr)
+        op.activation = next->as<op::Activate>()->activation, result = take(next);
+      if (const Node* next = only_reader(*result); next != nullptr && next->as<op::Multiply>() != nullptr &&
+                                                   next->in[0].node() == result && is_vector(next->in[1], *result))
+        op.factor = next->in[1].node()->id, result = take(next);
+      if (const Node* next = only_reader(*result); next != nullptr && next->as<op::Add>() != nullptr) {
+        const Tensor other = next->in[next->in[0].node() == result ? 1 : 0];
+        if (other.shape() == result->shape) op.residual = other.node()->id, result = take(next);
+      }
+    }
+    add(std::move(op), *result);
+  }
+
+  const Node* take(const Node* node) {
+    l.fused[at(node)] = true;
+    return node;
+  }
+
+  /// [d] of numbers that follow each other, for every row of a result.
+  bool is_vector(Tensor factor, const Node& result) const {
+    return factor.dim(0) == result.shape[0] && count(factor.shape()) == factor.dim(0) &&
+           l.value(factor.node()->id).stride[0] == 1;
+  }
+
+  /// activation(gate) * up, where `linear` is one of the two and the other has the same x.
+  const Node* fuse_gate(const Node& linear, LinearOp& op) {
+    const Node* next = only_reader(linear);
+    const Node* activate = next != nullptr && next->as<op::Activate>() != nullptr ? next : nullptr;
+    const Node* product = activate != nullptr ? only_reader(*activate) : next;
+    if (product == nullptr || product->as<op::Multiply>() == nullptr) return nullptr;
+    const Node* self = activate != nullptr ? activate : &linear;
+    const Node* other = product->in[product->in[0].node() == self ? 1 : 0].node();
+    const Node *gate = &linear, *up = other;
+    if (activate == nullptr) {  // then the other side must be the activated one
+      if (other->as<op::Activate>() == nullptr || only_reader(*other) != product) return nullptr;
+      activate = other, gate = other->in[0].node(), up = &linear;
+      if (gate->as<op::Linear>() == nullptr || only_reader(*gate) != activate) return nullptr;
+    }
+    if (up->as<op::Linear>() == nullptr || only_reader(*up) != product || up->in[0] != gate->in[0] ||
+        kernel(*up) != kernel(*gate) || up->shape != gate->shape)
+      return nullptr;
+    op.linears = {gate, up}, op.gated = true, op.activation = activate->as<op::Activate>()->activation;
+    take(gate), take(up), take(activate);
+    return take(product);
+  }
+
+  /// A norm or a rotation of heads that only this attention reads is done while it copies the rows.
+  Prepared prepared(Tensor x) {
+    Prepared result = {x.node()->id};
+    const auto is_only = [&](const Node* node) { return !node->tapped && l.readers[at(node)].size() == 1; };
+    const Node* node = x.node();
+    if (node->as<op::Rope>() != nullptr && is_only(node)) {
+      result.rope = node, result.table = operand(*node, 1);
+      node = node->in[0].node();
+      result.x = node->id;
+    }
+    const auto* norm = node->as<op::Norm>();
+    if (norm != nullptr && node->in.size() == 2 && is_only(node)) {
+      result.norm = node, result.weight = operand(*node, 1);
+      result.x = operand(*node, 0);
+    }
+    return result;
+  }
+
+  /// Rows of norms and rotations were visited before the attention that takes them.
+  void drop(const Prepared& rows) {
+    for (const Node* node : {rows.norm, rows.rope})
+      if (node != nullptr) l.fused[at(node)] = true;
+  }
+
+  ValueId pack(Tensor k, Tensor v, const Node& attention) {
+    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id}, kNone);
+    if (!is_new) return known->second;
+    const ValueId id = static_cast<ValueId>(l.values.size());
+    Value& value = l.values.emplace_back();
+    value.base = id, value.shape = k.shape();
+    PackOp op = {prepared(k), v.node()->id};
+    drop(op.k);
+    add(std::move(op), attention);
+    l.ops.back().writes = {id};
+    return known->second = id;
+  }
+
+  void visit_attention(const Node& node) {
+    const bool has_mask = node.as<op::Attention>()->has_mask;
+    AttentionOp op;
+    op.node = &node, op.q = prepared(node.in[0]);
+    drop(op.q);
+    if (has_mask) op.mask = node.in[1].node()->id;
+    for (std::size_t i = has_mask ? 2 : 1; i < node.in.size(); i += 2) {
+      op.packed.push_back(pack(node.in[i], node.in[i + 1], node));
+      op.n_key.push_back(node.in[i].dim(2));
+    }
+    add(std::move(op), node);
+  }
+
+  /// Products of one x that nothing follows share the reading of it.
+  void join_products() {
+    std::map<std::pair<ValueId, const kernels::LinearKernel*>, FusedOp*> open;
+    for (FusedOp& op : l.ops) {
+      auto* linear = std::get_if<LinearOp>(&op.op);
+      if (linear == nullptr || linear->gated || linear->activation != Activation::none || linear->factor != kNone ||
+          linear->residual != kNone)
+        continue;
+      FusedOp*& first = open[{linear->x, kernel(*linear->linears[0])}];
+      if (first == nullptr || first->writes.size() == kernels::LinearJob::kMaxPart) {
+        first = &op;
+        continue;
+      }
+      std::get<LinearOp>(first->op).linears.push_back(linear->linears[0]);
+      first->writes.push_back(op.writes[0]);
+      op.writes.clear();
+    }
+    std::erase_if(l.ops, [](const FusedOp& op) { return op.writes.empty(); });
+  }
+
+  /// A norm that products alone read is computed by them, row by row as they copy x.
+  void fuse_norms() {
+    for (FusedOp& op : l.ops) {
+      auto* linear = std::get_if<LinearOp>(&op.op);
+      if (linear == nullptr) continue;
+      const Node* norm = l.node(linear->x);
+      if (norm == nullptr || norm->as<op::Norm>() == nullptr || norm->tapped) continue;
+      const bool takes = std::all_of(l.readers[at(norm)].begin(), l.readers[at(norm)].end(), [&](const Node* reader) {
+        return reader->as<op::Linear>() != nullptr && norm->shape[0] <= kernel(*reader)->max_norm;
+      });
+      const Value& x = l.value(norm->in[0].node()->id);
+      if (!takes || row_stride(x) < 0) continue;
+      linear->norm = norm, linear->x = operand(*norm, 0);
+      linear->norm_weight = operand(*norm, 1), linear->norm_bias = operand(*norm, 2);
+      l.fused[at(norm)] = true;
+    }
+  }
+
+  static void note_operands(FusedOp& op) {
+    const auto read = [&](std::initializer_list<ValueId> ids) {
+      for (const ValueId id : ids)
+        if (id != kNone) op.reads.push_back(id);
+    };
+    const auto read_prepared = [&](const Prepared& rows) { read({rows.x, rows.weight, rows.table}); };
+    if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
+      read({linear->x, linear->factor, linear->residual, linear->norm_weight, linear->norm_bias});
+    } else if (const auto* pack = std::get_if<PackOp>(&op.op)) {
+      read_prepared(pack->k);
+      read({pack->v});
+    } else if (const auto* attention = std::get_if<AttentionOp>(&op.op)) {
+      op.reads = attention->packed;
+      read_prepared(attention->q);
+      read({attention->mask});
+    } else if (const auto* copy = std::get_if<CopyOp>(&op.op)) {
+      for (const CopyOp::Part& part : copy->parts) read({part.from});
+    } else if (const auto* row = std::get_if<RowOp>(&op.op)) {
+      read({row->x, row->w, row->b});
+    } else if (const auto* lookup = std::get_if<LookupOp>(&op.op)) {
+      read({lookup->table, lookup->ids});
+    } else {
+      read({std::get<PatchesOp>(op.op).images});
+    }
+  }
+
+  Lowering& l;
+  std::map<std::pair<ValueId, ValueId>, ValueId> packs_;
+};
+
+}  // namespace
+
+void fuse(Lowering& l) { Fuser(l).run(); }
+
+}  // namespace vla::lower

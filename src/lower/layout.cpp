@@ -1,0 +1,155 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
+#include "kernels/cpu_kernels.h"
+#include "lower/emit.h"
+#include "lower/lowering.h"
+
+namespace vla::lower {
+namespace {
+
+class Layouts {
+ public:
+  explicit Layouts(Lowering& lowering) : l(lowering) {}
+
+  void run() {
+    for (FusedOp& op : l.ops) {
+      op_ = &op;
+      std::visit([&](auto& what) { require_layouts(what); }, op.op);
+      out_.push_back(std::move(op));
+    }
+    l.ops = std::move(out_);
+    for (const Node& node : l.graph.nodes())
+      if (node.as<op::Write>() != nullptr) store(node);
+    for (FusedOp& op : l.ops)
+      if (const auto* linear = std::get_if<LinearOp>(&op.op)) round_result(op, *linear);
+  }
+
+ private:
+  /// A contiguous copy of a value, made just before the operation at hand, which reads that instead. A value with 1 in
+  /// the first dimension may be copied `d` times.
+  ValueId copied(ValueId id, std::int64_t d) {
+    const ValueId copy = static_cast<ValueId>(l.values.size());
+    Value& to = l.values.emplace_back(Value(l.value(id)));
+    to.shape[0] = d;
+    to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.home = Value::Home::arena;
+    to.data = nullptr, to.size = static_cast<std::size_t>(count(to.shape)) * 4;
+    Shape from_stride = l.value(id).stride;
+    if (l.value(id).shape[0] != d) from_stride[0] = 0;
+    FusedOp& op = out_.emplace_back();
+    op.op = CopyOp{{{id, to.shape, from_stride, to.stride, 0}}};
+    op.reads = {id}, op.writes = {copy}, op.order = op_->order;
+    std::replace(op_->reads.begin(), op_->reads.end(), id, copy);
+    return copy;
+  }
+
+  void require(ValueId& id, bool fits) {
+    if (!fits) id = copied(id, l.value(id).shape[0]);
+  }
+  /// Numbers of a row follow each other.
+  void require_rows(ValueId& id) {
+    if (id != kNone) require(id, l.value(id).shape[0] == 1 || l.value(id).stride[0] == 1);
+  }
+  void require_contiguous(ValueId& id) {
+    if (id != kNone) require(id, is_contiguous(l.value(id)));
+  }
+  void require_rows(Prepared& rows) {
+    require_rows(rows.x);
+    require_rows(rows.weight);
+    require_contiguous(rows.table);
+  }
+
+  void require_layouts(LinearOp& op) {
+    require(op.x, row_stride(l.value(op.x)) >= 0);
+    require_contiguous(op.residual);
+    require_rows(op.norm_weight);
+    require_rows(op.norm_bias);
+  }
+  void require_layouts(PackOp& op) {
+    require_rows(op.k);
+    require_rows(op.v);
+    l.value(op_->writes[0]).size = kernels::cpu_kernels(l.isa)->attention.packed_size(pack_sizes(l, op));
+  }
+  void require_layouts(AttentionOp& op) {
+    require_rows(op.q);
+    require_contiguous(op.mask);
+  }
+  void require_layouts(RowOp& op) {
+    require_rows(op.x);
+    const std::int64_t d = op.node->shape[0];
+    if (op.node->as<op::Add>() != nullptr && l.value(op.w).shape[0] != d) op.w = copied(op.w, d);
+    if (op.node->as<op::Rope>() != nullptr) require_contiguous(op.w);
+    require_rows(op.w);
+    require_rows(op.b);
+  }
+  void require_layouts(CopyOp&) {}  // takes anything
+  void require_layouts(LookupOp& op) {
+    require_rows(op.table);
+    require_contiguous(op.ids);
+  }
+  void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
+
+  /// A value goes to its slot at once where its operation may write there, else by a copy.
+  void store(const Node& write) {
+    const ValueId from = write.in[0].node()->id;
+    Value& value = l.value(from);
+    Value& base = l.base(from);
+    const bool is_whole = is_contiguous(value) && value.offset == 0 && count(value.shape) == count(base.shape);
+    if (is_whole && base.home == Value::Home::arena && may_write(write, value.base)) {
+      base.home = Value::Home::slot, base.data = l.value(write.id).data;
+      return;
+    }
+    FusedOp& op = l.ops.emplace_back();
+    op.op = CopyOp{{{from, value.shape, value.stride, contiguous_strides(value.shape), 0}}};
+    op.reads = {from}, op.writes = {write.id}, op.order = write.id;
+  }
+
+  /// Nobody may need what the slot held once it is overwritten. An operation row by row may read it itself, every
+  /// number before it writes that.
+  bool may_write(const Node& write, ValueId result) const {
+    const std::byte* slot = l.value(write.id).data;
+    const auto writer = std::find_if(l.ops.begin(), l.ops.end(), [&](const FusedOp& op) {
+      return std::find(op.writes.begin(), op.writes.end(), result) != op.writes.end();
+    });
+    if (writer == l.ops.end()) return false;
+    for (const FusedOp& op : l.ops)
+      for (const ValueId id : op.reads) {
+        if (l.base(id).home != Value::Home::slot || l.base(id).data != slot) continue;
+        if (op.order > writer->order) return false;
+        if (op.order < writer->order) continue;
+        const Value& value = l.value(id);
+        const bool in_place = std::holds_alternative<RowOp>(op.op) && value.shape == l.value(result).shape &&
+                              value.offset == 0 && is_contiguous(value);
+        if (!in_place) return false;
+      }
+    return true;
+  }
+
+  /// What products alone read is stored as they would round it.
+  void round_result(const FusedOp& op, const LinearOp& linear) {
+    if (op.writes.size() != 1 || (linear.activation == Activation::none && !linear.gated)) return;
+    Value& y = l.value(op.writes[0]);
+    if (y.home != Value::Home::arena || y.node->tapped || linear.residual != kNone || linear.factor != kNone) return;
+    const std::int64_t n_row = count(y.shape) / y.shape[0], d = linear.linears[0]->in[0].dim(0);
+    const auto* kernel = l.weights.kernel(linear.linears[0]->as<op::Linear>()->weight);
+    if (!kernel->rounds(n_row, d)) return;
+    for (const Node* reader : l.readers[static_cast<std::size_t>(y.node->id)]) {
+      const auto* product = reader->as<op::Linear>();
+      if (product == nullptr || l.weights.kernel(product->weight) != kernel || !kernel->rounds(n_row, y.shape[0]))
+        return;
+    }
+    y.type = DType::bf16;
+    y.size /= 2;
+  }
+
+  Lowering& l;
+  FusedOp* op_ = nullptr;
+  std::vector<FusedOp> out_;
+};
+
+}  // namespace
+
+void choose_layouts(Lowering& l) { Layouts(l).run(); }
+
+}  // namespace vla::lower

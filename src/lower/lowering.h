@@ -1,0 +1,139 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <array>
+#include <string>
+#include <variant>
+#include <vector>
+
+#include "graph/device.h"
+#include "lower/cpu_weights.h"
+
+/// How a graph becomes a program for the CPU: a short list of passes over the structures below, each in a file of its
+/// name (fuse, layout, schedule, place, emit).
+namespace vla::lower {
+
+/// An index into Lowering::values. Values of nodes come first, by Node::id.
+using ValueId = int;
+constexpr ValueId kNone = -1;
+
+/// Where numbers lie: of a node's result, or of packed keys and values.
+struct Value {
+  enum class Home { arena, kept, slot, constant, parameter };
+
+  const Node* node = nullptr;  // none for packed keys and values
+  DType type = DType::f32;
+  Shape shape = {1, 1, 1, 1};
+  Shape stride = {1, 1, 1, 1};  // numbers from one index to the next
+  ValueId base = kNone;         // whose memory this is: its own, or that of the value it is a view of
+  std::int64_t offset = 0;      // numbers from the beginning of the base
+
+  // Of a base alone.
+  Home home = Home::arena;
+  std::size_t size = 0;       // bytes
+  std::byte* data = nullptr;  // known when memory is placed
+};
+
+/// What is done to rows of queries or keys on the way: nodes that were fused, or null.
+struct Prepared {
+  ValueId x;
+  const Node *norm = nullptr, *rope = nullptr;
+  ValueId weight = kNone, table = kNone;
+};
+
+/// activation(W x + b) * factor + residual, or up to three products of the same x, or gate and up of a gated MLP.
+struct LinearOp {
+  std::vector<const Node*> linears;
+  ValueId x;
+  const Node* norm = nullptr;  // x is what this node normalizes
+  ValueId norm_weight = kNone, norm_bias = kNone;
+  Activation activation = Activation::none;
+  bool gated = false;
+  ValueId factor = kNone, residual = kNone;
+};
+struct PackOp {
+  Prepared k;
+  ValueId v;
+};
+struct AttentionOp {
+  const Node* node;
+  Prepared q;
+  ValueId mask = kNone;
+  std::vector<ValueId> packed;
+  std::vector<std::int64_t> n_key;
+};
+/// One row at a time: norm, rope, activation, add, multiply, scale.
+struct RowOp {
+  const Node* node;
+  ValueId x, w = kNone, b = kNone;
+};
+/// Parts of the result from numbers that lie elsewhere: concat, pixel_shuffle, and views that must be contiguous.
+struct CopyOp {
+  struct Part {
+    ValueId from;
+    Shape shape, from_stride, to_stride;
+    std::int64_t to_offset, from_offset = 0;
+  };
+  std::vector<Part> parts;
+};
+/// embedding, gather
+struct LookupOp {
+  const Node* node;
+  ValueId ids, table = kNone;
+};
+struct PatchesOp {
+  const Node* node;
+  ValueId images;
+};
+
+/// One operation of the program: nodes that were fused.
+struct FusedOp {
+  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
+  std::vector<ValueId> reads, writes;
+  int order = 0;           // the id of the node whose result it gives
+  bool invariant = false;  // the same from run to run
+  int phase = 0;
+};
+
+struct Lowering {
+  const Graph& graph;
+  const LowerOptions& options;
+  const CpuWeights& weights;
+  Isa isa;
+  int n_thread;
+
+  std::vector<Value> values;
+  std::vector<FusedOp> ops;
+  std::vector<std::vector<const Node*>> readers;  // of each node that is needed
+  std::vector<bool> needed;                       // nodes that a write or a tap depends on
+  std::vector<bool> fused;                        // nodes that are part of an operation of another
+  int n_prepare = 0, n_phase = 0;                 // phases of Program::prepare, and of both
+  std::size_t arena_size = 0, kept_size = 0;
+
+  const Node* node(ValueId id) const { return values[static_cast<std::size_t>(id)].node; }
+  Value& value(ValueId id) { return values[static_cast<std::size_t>(id)]; }
+  const Value& value(ValueId id) const { return values[static_cast<std::size_t>(id)]; }
+  Value& base(ValueId id) { return value(value(id).base); }
+  const Value& base(ValueId id) const { return value(value(id).base); }
+};
+
+/// Strides of numbers that lie one after the other.
+Shape contiguous_strides(const Shape& shape);
+bool is_contiguous(const Value& value);
+/// Whether all rows lie at the same distance: then that, else -1.
+std::int64_t row_stride(const Value& value);
+
+/// Finds what is needed, and makes a value of every node: memory of its own, or a view.
+void start(Lowering& l);
+/// Makes operations of nodes: norm into product; bias, activation, gate, factor and residual behind it; products of one
+/// x; gate and up; norm and rope into attention. A tapped node is computed for itself.
+void fuse(Lowering& l);
+/// Chooses the dtype of what lies between products, and copies what its reader needs contiguous.
+void choose_layouts(Lowering& l);
+/// Puts operations that do not depend on each other into one phase, and what stays the same into Program::prepare.
+void schedule(Lowering& l);
+/// Gives every value its place: in its slot, in the memory that programs share, or in memory of the program.
+void place(Lowering& l);
+
+}  // namespace vla::lower

@@ -1,0 +1,26 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/memory.h"
+
+#include <fmt/format.h>
+#include <sys/mman.h>
+
+#include "kernels/pages.h"
+
+namespace vla::lower {
+
+Result<Memory> Memory::allocate(std::size_t size, const char* what) {
+  Memory memory;
+  if (size == 0) return memory;
+  void* data = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+  if (data == MAP_FAILED)
+    return Error{Code::out_of_memory, what, "",
+                 fmt::format("the system refused {:.1f} MB", 1e-6 * static_cast<double>(size)),
+                 "free memory or use a smaller model"};
+  memory.data_.reset(static_cast<std::byte*>(data), [size](std::byte* bytes) { munmap(bytes, size); });
+  memory.size_ = size;
+  want_large_pages(data, size);
+  return memory;
+}
+
+}  // namespace vla::lower

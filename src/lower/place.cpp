@@ -1,0 +1,66 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <numeric>
+
+#include "lower/lowering.h"
+
+namespace vla::lower {
+namespace {
+
+/// The phases in which a value must stand in memory.
+struct Life {
+  int first = 0, last = -1;
+  bool overlaps(const Life& other) const { return first <= other.last && other.first <= last; }
+};
+
+std::vector<Life> find_lives(const Lowering& l) {
+  std::vector<Life> lives(l.values.size());
+  const auto at = [&](ValueId id) -> Life& { return lives[static_cast<std::size_t>(l.value(id).base)]; };
+  for (const FusedOp& op : l.ops)
+    for (const ValueId id : op.writes) at(id) = {op.phase, op.phase};
+  for (const FusedOp& op : l.ops)
+    for (const ValueId id : op.reads) at(id).last = std::max(at(id).last, op.phase);
+  for (const Node& node : l.graph.nodes())
+    if (node.tapped) at(node.id).last = l.n_phase;
+  return lives;
+}
+
+}  // namespace
+
+/// Values one after the other, largest first, each at the lowest place that no other value takes while it lives.
+void place(Lowering& l) {
+  const std::vector<Life> lives = find_lives(l);
+  std::vector<std::size_t> order(l.values.size());
+  std::iota(order.begin(), order.end(), std::size_t{0});
+  std::stable_sort(order.begin(), order.end(),
+                   [&](std::size_t a, std::size_t b) { return l.values[a].size > l.values[b].size; });
+  struct Taken {
+    Life life;
+    std::size_t begin, end;
+  };
+  std::vector<Taken> taken;  // by where they begin
+  for (const std::size_t i : order) {
+    Value& value = l.values[i];
+    const Life& life = lives[i];
+    if (value.home != Value::Home::arena || value.base != static_cast<ValueId>(i) || life.last < 0) continue;
+    const std::size_t size = aligned(value.size);
+    if (life.first < l.n_prepare && life.last >= l.n_prepare) {  // made by prepare, for every run
+      value.home = Value::Home::kept;
+      value.offset = static_cast<std::int64_t>(l.kept_size);
+      l.kept_size += size;
+      continue;
+    }
+    std::size_t begin = 0;
+    for (const Taken& other : taken)
+      if (other.life.overlaps(life) && other.begin < begin + size && other.end > begin) begin = other.end;
+    value.offset = static_cast<std::int64_t>(begin);
+    const Taken now = {life, begin, begin + size};
+    taken.insert(std::upper_bound(taken.begin(), taken.end(), begin,
+                                  [](std::size_t b, const Taken& other) { return b < other.begin; }),
+                 now);
+    l.arena_size = std::max(l.arena_size, now.end);
+  }
+}
+
+}  // namespace vla::lower

@@ -1,0 +1,15 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "bundle/params.h"
+#include "kernels/isa.h"
+
+namespace vla {
+
+/// The kernels that compute with these parameters on a machine for `isa`. Tiles of bf16 round whatever they multiply,
+/// attention's operands too. A bundle asks for that by storing its matrices as bf16; one matrix of another dtype, or
+/// none at all, makes everything float32.
+Isa isa_for(const ParamList& list, Isa isa);
+
+}  // namespace vla

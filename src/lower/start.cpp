@@ -1,0 +1,126 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <optional>
+
+#include "lower/lowering.h"
+
+namespace vla::lower {
+
+Shape contiguous_strides(const Shape& shape) {
+  return {1, shape[0], shape[0] * shape[1], shape[0] * shape[1] * shape[2]};
+}
+
+bool is_contiguous(const Value& value) {
+  const Shape packed = contiguous_strides(value.shape);
+  for (std::size_t i = 0; i < 4; ++i)
+    if (value.shape[i] != 1 && value.stride[i] != packed[i]) return false;
+  return true;
+}
+
+std::int64_t row_stride(const Value& value) {
+  if (value.shape[0] != 1 && value.stride[0] != 1) return -1;
+  std::int64_t row = value.shape[0], n = 0;  // rows seen so far
+  for (std::size_t i = 1; i < 4; ++i) {
+    if (value.shape[i] == 1) continue;
+    if (n == 0)
+      row = value.stride[i], n = value.shape[i];
+    else if (value.stride[i] == row * n)
+      n *= value.shape[i];
+    else
+      return -1;
+  }
+  return row;
+}
+
+namespace {
+
+/// Strides of the same numbers in another shape, where that takes no copy: every dimension of the one must be cut from
+/// dimensions of the other that follow each other in memory.
+std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
+  std::vector<std::int64_t> sizes, strides;  // of the old shape, dimensions joined where they follow each other
+  for (std::size_t i = 0; i < 4; ++i) {
+    if (value.shape[i] == 1) continue;
+    if (!sizes.empty() && value.stride[i] == strides.back() * sizes.back())
+      sizes.back() *= value.shape[i];
+    else
+      sizes.push_back(value.shape[i]), strides.push_back(value.stride[i]);
+  }
+  Shape result = contiguous_strides(to);
+  std::size_t at = 0;
+  std::int64_t taken = 1;  // of the old dimension
+  for (std::size_t i = 0; i < 4; ++i) {
+    if (to[i] == 1) continue;
+    if (at == sizes.size() || sizes[at] % (taken * to[i]) != 0) return {};
+    result[i] = strides[at] * taken;
+    taken *= to[i];
+    if (taken == sizes[at]) ++at, taken = 1;
+  }
+  return result;
+}
+
+Value own(const Node& node) {
+  Value value;
+  value.node = &node, value.base = node.id, value.type = node.type, value.shape = node.shape;
+  value.stride = contiguous_strides(node.shape);
+  value.size = static_cast<std::size_t>(count(node.shape)) * dtype_size(node.type);
+  return value;
+}
+
+Value view(const Node& node, const Value& of, const Shape& stride, std::int64_t offset) {
+  Value value = own(node);
+  value.base = of.base, value.stride = stride, value.offset = of.offset + offset, value.size = 0;
+  return value;
+}
+
+/// A view where the operation computes nothing, else a value of its own.
+Value value_of(const Lowering& l, const Node& node) {
+  Value value = own(node);
+  if (const auto* input = node.as<op::Input>()) {
+    value.home = Value::Home::slot, value.data = static_cast<std::byte*>(input->slot->place);
+  } else if (const auto* write = node.as<op::Write>()) {
+    value.home = Value::Home::slot, value.data = static_cast<std::byte*>(write->slot->place);
+  } else if (node.as<op::Constant>() != nullptr) {
+    value.home = Value::Home::constant;
+  } else if (const auto* parameter = node.as<op::Parameter>()) {
+    value.home = Value::Home::parameter;
+    value.data = const_cast<std::byte*>(l.weights.data(parameter->param));
+  }
+  if (node.in.empty()) return value;
+  const Value& x = l.value(node.in[0].node()->id);
+  // What a slot holds may be overwritten later in the run: record a copy.
+  if (node.tapped && l.base(x.base).home == Value::Home::slot) return value;
+  if (const auto* slice = node.as<op::Slice>()) {
+    return view(node, x, x.stride, slice->first * x.stride[static_cast<std::size_t>(slice->dim)]);
+  }
+  if (node.as<op::Repeat>() != nullptr) {
+    Shape stride = x.stride;
+    for (std::size_t i = 0; i < 4; ++i)
+      if (x.shape[i] == 1) stride[i] = 0;
+    return view(node, x, stride, 0);
+  }
+  if (node.as<op::Reshape>() != nullptr)
+    if (const auto stride = reshape_strides(x, node.shape)) return view(node, x, *stride, 0);
+  return value;
+}
+
+}  // namespace
+
+void start(Lowering& l) {
+  const auto& nodes = l.graph.nodes();
+  l.needed.assign(nodes.size(), false);
+  l.fused.assign(nodes.size(), false);
+  l.readers.resize(nodes.size());
+  for (auto node = nodes.rbegin(); node != nodes.rend(); ++node) {
+    const auto id = static_cast<std::size_t>(node->id);
+    l.needed[id] = l.needed[id] || node->tapped || node->as<op::Write>() != nullptr;
+    if (!l.needed[id]) continue;
+    for (Tensor in : node->in) {
+      l.needed[static_cast<std::size_t>(in.node()->id)] = true;
+      l.readers[static_cast<std::size_t>(in.node()->id)].push_back(&*node);
+    }
+  }
+  for (const Node& node : nodes) l.values.push_back(value_of(l, node));
+}
+
+}  // namespace vla::lower

@@ -1,0 +1,79 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include "lower/emit.h"
+
+namespace vla::lower {
+namespace {
+
+std::string path_of(const Node& node) { return node.path.empty() ? fmt::format("%{}", node.id) : node.path; }
+
+/// The parts of a fused operation in the order in which they are computed.
+struct Describe {
+  const Lowering& l;
+  const FusedOp& fused;
+
+  /// `what [shape] -> [shape] kernel`.
+  struct Words {
+    std::string what, kernel;
+    ValueId x;
+  };
+
+  static std::string prepared(const Prepared& rows) {
+    return fmt::format("{}{}", rows.norm != nullptr ? "norm " : "", rows.rope != nullptr ? "rope " : "");
+  }
+
+  Words operator()(const LinearOp& op) const {
+    std::vector<std::string> names;
+    for (const Node* node : op.linears) names.push_back(path_of(*node));
+    std::string what = fmt::format("{}linear {}", op.norm != nullptr ? "norm, " : "", fmt::join(names, " | "));
+    if (op.activation != Activation::none) what += fmt::format(", {}", activation_name(op.activation));
+    if (op.gated) what += ", gate";
+    if (op.factor != kNone) what += ", factor";
+    if (op.residual != kNone) what += ", residual";
+    return {what, l.weights.kernel(op.linears[0]->as<op::Linear>()->weight)->name, op.x};
+  }
+  Words operator()(const PackOp& op) const {
+    return {prepared(op.k) + "pack keys and values", isa_name(l.isa), op.k.x};
+  }
+  Words operator()(const AttentionOp& op) const {
+    return {fmt::format("{}attention {} over {} keys{}", prepared(op.q), path_of(*op.node), fmt::join(op.n_key, " + "),
+                        op.mask != kNone ? ", mask" : ""),
+            isa_name(l.isa), op.q.x};
+  }
+  Words operator()(const RowOp& op) const {
+    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), isa_name(l.isa), op.x};
+  }
+  Words operator()(const CopyOp& op) const {
+    return {fmt::format("copy {} part{}", op.parts.size(), op.parts.size() == 1 ? "" : "s"), "copy", op.parts[0].from};
+  }
+  Words operator()(const LookupOp& op) const {
+    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), "copy", op.ids};
+  }
+  Words operator()(const PatchesOp& op) const { return {"patches", "copy", op.images}; }
+};
+
+std::string layout(const Lowering& l, ValueId id) {
+  const Value& value = l.value(id);
+  const char* home = l.base(id).home == Value::Home::slot   ? "@slot"
+                     : l.base(id).home == Value::Home::kept ? "@kept"
+                                                            : "";
+  if (value.node == nullptr && value.size > 0 && value.stride == Shape{1, 1, 1, 1})
+    return fmt::format("panels{}", home);
+  return fmt::format("{}{}{}", dtype_name(value.type), shape_text(value.shape), home);
+}
+
+}  // namespace
+
+std::string text_of(const Lowering& l, const FusedOp& op) {
+  const auto words = std::visit(Describe{l, op}, op.op);
+  std::vector<std::string> results;
+  for (const ValueId id : op.writes) results.push_back(layout(l, id));
+  const Work work = work_of(l, op);
+  return fmt::format("{:>4} {:<8} {:>10.2f} {:>9.3f}  {}  {} -> {}", op.phase, words.kernel, 1e-6 * work.flop,
+                     1e-6 * work.bytes, words.what, layout(l, words.x), fmt::join(results, ", "));
+}
+
+}  // namespace vla::lower

@@ -1,0 +1,81 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <optional>
+#include <span>
+#include <string>
+
+#include "graph/cache.h"
+#include "nn/attention.h"
+#include "nn/linear.h"
+#include "nn/norm.h"
+#include "nn/rope.h"
+
+namespace vla {
+
+/// The heads of an attention, whose width need not be the model's.
+struct Heads {
+  int n_head, n_head_kv, d_head;
+  Bias bias = Bias::no;                // of queries, keys and values
+  Bias out_bias = Bias::no;            // of the output product
+  std::optional<float> norm_eps = {};  // queries and keys pass an RMS norm over the head
+  float rope_base = 0;                 // 0: nothing turns by position alone
+  RotaryAngle rope_angle = RotaryAngle::product;
+
+  int d_query() const { return n_head * d_head; }
+  int d_key() const { return n_head_kv * d_head; }
+  /// Reads n_head, n_head_kv, d_head and rope_base of `s`, and checks that they go together.
+  static Heads read(const Scope& s, RotaryAngle angle);
+  /// Heads that share the model's width evenly, with biases everywhere.
+  static Heads even(int d_model, int n_head) { return {n_head, n_head, d_model / n_head, Bias::yes, Bias::yes}; }
+  /// The rotary table of `count` tokens from position `first` on.
+  Tensor rotary(Graph& g, int first, int count) const;
+};
+
+/// Keys and values in the cache, as `<path>.k` and `<path>.v`.
+void put(Graph& g, Cache& cache, const std::string& path, const KeyValue& kv);
+KeyValue get(Graph& g, const Cache& cache, const std::string& path);
+
+/// The products that make keys and values: `attn_k` and `attn_v`, with `attn_k_norm` where heads are normalized.
+class KeyValueProjection {
+ public:
+  KeyValueProjection(const Scope& s, int d_context, const Heads& heads);
+  /// Of a context [d_context, n, ...], keys turned by `rotary` [d_head, n] if given.
+  KeyValue operator()(Graph& g, Tensor context, Tensor rotary = {}) const {
+    return (*this)(g, context, context, rotary);
+  }
+  /// The same of two contexts.
+  KeyValue operator()(Graph& g, Tensor key_context, Tensor value_context, Tensor rotary) const;
+
+ private:
+  int n_head_;
+  Linear k_, v_;
+  std::optional<RmsNorm> norm_;
+};
+
+/// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves: the products
+/// `attn_q`, `attn_k`, `attn_v` and `attn_out`, with `attn_q_norm` and `attn_k_norm` where heads are normalized.
+class Attention {
+ public:
+  Attention(const Scope& s, int d_model, int d_context, const Heads& heads);
+
+  const KeyValueProjection& project() const { return kv_; }
+  /// What tokens x see of these segments: the shape of x. `rotary` [d_head, n] turns queries; mask [n_key, n] or none.
+  Tensor operator()(Graph& g, Tensor x, Tensor rotary, const std::vector<KeyValue>& segments, Tensor mask = {}) const;
+  /// Tokens that see each other.
+  Tensor among(Graph& g, Tensor x, Tensor rotary, Tensor mask = {}) const {
+    return (*this)(g, x, rotary, {kv_(g, x, rotary)}, mask);
+  }
+
+  const Heads& heads() const { return heads_; }
+
+ private:
+  Heads heads_;
+  Linear q_;
+  std::optional<RmsNorm> norm_;
+  KeyValueProjection kv_;
+  Linear out_;
+};
+
+}  // namespace vla

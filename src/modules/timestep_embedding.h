@@ -1,0 +1,46 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "bundle/params.h"
+#include "graph/graph.h"
+
+namespace vla {
+
+/// The time of a solver step: as the reference's network gets it, and before it was rounded to float32.
+struct SolverTime {
+  float value;
+  double exact;
+};
+
+/// Sines, then cosines, of times at geometrically spaced periods: values of [d, n_time], one column per time. `d` is
+/// even. The times are float32; everything after is double, as in the reference, since in float32 the shortest period
+/// alone would cost 1e-4. Source: lerobot policies/common/vla_utils.py create_sinusoidal_pos_embedding.
+std::vector<float> sinusoidal_time_embedding(std::span<const float> times, int d, double min_period, double max_period);
+
+/// The solver's times as a policy embeds them, with the periods of `<path>.min_period` and `<path>.max_period`.
+class TimestepEmbedding {
+ public:
+  /// `d`: width of an embedding, even.
+  TimestepEmbedding(const Scope& s, int d);
+  /// Load rate: one column per time, [d, times.size()].
+  Tensor operator()(Graph& g, std::span<const SolverTime> times) const;
+
+ private:
+  int d_;
+  double min_period_, max_period_;
+};
+
+/// How a reference embeds a whole-numbered time t, with n = d/2 and float32 angles t * exp(-ln(10000) i / m):
+/// `cosines_first` with m = n - 1 (diffusers models/embeddings.py get_timestep_embedding, flip_sin_to_cos),
+/// `sines_first` with m = n (lerobot policies/groot/groot_n1_7.py SinusoidalPositionalEncoding). The exponents are
+/// rounded as each rounds them: at t = 750 an exponent's last bit turns an angle by 5e-5.
+enum class BucketWaves { cosines_first, sines_first };
+
+/// Values of [d, buckets.size()], one column per time; `d` is even and above 2.
+std::vector<float> bucket_embedding(std::span<const int> buckets, int d, BucketWaves waves);
+
+}  // namespace vla

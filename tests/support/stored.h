@@ -1,0 +1,35 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <bit>
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "kernels/numbers.h"
+
+namespace vla::test {
+
+/// Values in a storage type, and what the type made of them.
+inline std::vector<std::byte> store_as(DType type, std::vector<float>& values) {
+  std::vector<std::byte> out(values.size() * (type == DType::f32 ? 4 : 2));
+  for (std::size_t i = 0; i < values.size(); ++i) {
+    if (type == DType::f32) {
+      std::memcpy(&out[4 * i], &values[i], 4);
+      continue;
+    }
+    std::uint16_t bits = to_bf16(values[i]);
+    if (type == DType::f16) {  // eleven bits, exponents from the smallest normal up
+      const float clear = std::abs(values[i]) < 0x1p-14f ? 0x1p-14f : values[i];
+      const auto word = std::bit_cast<std::uint32_t>(clear);
+      bits = static_cast<std::uint16_t>((word >> 16 & 0x8000U) | (((word >> 23 & 255U) - 112U) << 10) |
+                                        (word >> 13 & 1023U));
+    }
+    std::memcpy(&out[2 * i], &bits, 2);
+    values[i] = kernels::stored_number(type, out.data(), static_cast<std::int64_t>(i));
+  }
+  return out;
+}
+
+}  // namespace vla::test
