@@ -145,3 +145,22 @@ def test_rows_are_no_more_than_the_networks(converter):
     tiny = TinyGr00t()
     tiny.robots[TAG]["action"]["delta_indices"] = list(range(HORIZON + 3))
     assert recipe(convert(converter, tiny))["action"][0] == {"op": "rows", "count": HORIZON}
+
+
+def test_a_gripper_becomes_the_sign_that_a_simulator_wants_on_request(converter):
+    action = recipe(convert(converter, gripper_sign="gripper"))["action"]
+    assert action[-1] == {"op": "threshold", "columns": [1], "above": 0.5, "then": -1.0, "else": 1.0}
+
+
+def test_a_gripper_that_is_not_there_is_told_with_those_that_are(converter):
+    error = converter.refusal(TinyGr00t(), embodiment=TAG, gripper_sign="hand")
+    assert "--gripper-sign: expected a key of the actions: x, gripper, found hand" in error.message()
+
+
+def test_frames_of_several_moments_are_views_of_their_own_the_oldest_first(converter):
+    tiny = TinyGr00t()
+    tiny.robots[TAG]["video"]["delta_indices"] = [-15, 0]
+    bundle = convert(converter, tiny)
+    names = ["front@-15", "wrist@-15", "front", "wrist"]
+    assert bundle.keys["observation.views"] == ["observation.images." + name for name in names]
+    assert bundle.keys["policy.n_slot"] == 4 and recipe(bundle)["text"][2]["count"] == 4

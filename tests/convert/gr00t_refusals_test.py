@@ -80,9 +80,6 @@ UNSUPPORTED = {
     "processor_config.json: exclude_state: expected False": {"kwargs/exclude_state": True},
     "processor_config.json: new_thing: expected a key that this converter knows": {"kwargs/new_thing": 1},
     "processor_config.json: image_target_size: expected [side, side] or null": {"kwargs/image_target_size": [12, 16]},
-    "arm.video: delta_indices: expected [0], found [-15, 0]; pictures of several moments are not supported yet": {
-        ARM + "video/delta_indices": [-15, 0]
-    },
     "arm.state: delta_indices: expected [0]": {ARM + "state/delta_indices": [-1, 0]},
     "arm.state: sin_cos_embedding_keys: expected none": {
         ARM + "state/sin_cos_embedding_keys": ["x"],
@@ -100,6 +97,9 @@ UNSUPPORTED = {
     "preprocessor_config.json: new_thing: expected a key": {"images/new_thing": 1},
 }
 BAD = {
+    "arm.video: delta_indices: expected rising numbers of steps from -1000 to 0, found [0, -15]": {
+        ARM + "video/delta_indices": [0, -15]
+    },
     "config.json: select_layer: expected a whole number from 1": {"config/select_layer": -1},
     "config.json: backbone_embedding_dim: expected the language model's width 12": {
         "config/backbone_embedding_dim": 13

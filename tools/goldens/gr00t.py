@@ -35,6 +35,7 @@ class Robot:
     rows: int  # of the head's horizon, which the robot gets
     relative: dict = field(default_factory=dict)  # action key -> the state key that it is added to, None: of the same name
     zero_spread: tuple = ()
+    moments: tuple = (0,)  # steps at which frames are taken
 
     def statistics(self, seed):
         return statistics(sum(self.states.values()), sum(self.actions.values()), seed, self.zero_spread)
@@ -169,7 +170,7 @@ def modalities(robot):
                 "action_configs": actions}
 
     configs = [RELATIVE | {"state_key": robot.relative[k]} if k in robot.relative else ABSOLUTE for k in robot.actions]
-    return {"video": part(robot.views, [0]), "state": part(robot.states, [0]),
+    return {"video": part(robot.views, list(robot.moments)), "state": part(robot.states, [0]),
             "action": part(robot.actions, list(range(robot.rows)), configs),
             "language": part(["annotation.human.action.task_description"], [0])}
 

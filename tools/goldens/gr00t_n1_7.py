@@ -147,6 +147,12 @@ CASES = {
         vision(16, 3, 2, 24, 5, (0, 1, 2)), text(24, 5, 3, 1, 8, 32, (2, 1, 1)),
         head(4, (4, 2, 10), (1, 3, 8), 14, 6, 5, 5), {"image_target_size": [26, 26], "image_crop_size": [24, 24]}, 16),
         options={"camera_size": "40x30"}),
+    # Two cameras, each with the frame of now and that of fifteen steps ago.
+    "gr00t_n1_7/two_moments": case(47, {name: (20, 20, "png") for name in ("front@-15", "wrist@-15", "front", "wrist")},
+        "push the plate slowly", Checkpoint(
+        "xdof", 1, Robot(("front", "wrist"), {"joints": 4}, {"joints": 4}, 4, moments=(-15, 0)),
+        vision(16, 3, 2, 24, 5, (0, 1, 2)), text(24, 5, 3, 1, 8, 32, (2, 1, 1)),
+        head(4, (4, 2, 10), (1, 3, 8), 14, 6, 5, 5), {"image_target_size": [16, 16], "image_crop_size": [15, 15]}, 16)),
 }
 
 # --- the reference ---------------------------------------------------------------------------------------------------
@@ -233,7 +239,12 @@ def load(checkpoint, dtype="float32", tag=None):
         policy._groot_model.to(torch.bfloat16)
 
     def from_bytes(batch):
-        return before({k: (v * 255).round().byte() if k.startswith("observation.images.") else v for k, v in batch.items()})
+        images = {k: (v * 255).round().byte() for k, v in batch.items() if k.startswith("observation.images.")}
+        for name in [k for k in images if "@" in k]:  # an older frame of a camera: (time, 3, height, width)
+            camera = name.split("@")[0]
+            images[camera] = torch.stack([images.pop(name), images[camera]])[None]
+        rest = {k: v for k, v in batch.items() if k not in images and "@" not in k}
+        return before({**images, **rest})
 
     return Reference(policy), from_bytes, after
 

@@ -120,6 +120,12 @@ def _add_gr00t(parser: argparse.ArgumentParser) -> None:
         help="pixels of a camera, for a pipeline that keeps the aspect of pictures; they are square without it",
     )
     add(
+        "--gripper-sign",
+        metavar="KEY",
+        default="",
+        help="answer -1 where the action KEY is above 0.5 and 1 elsewhere, as LIBERO's simulator wants its gripper",
+    )
+    add(
         "--letterbox",
         action="store_true",
         help="pad pictures to squares whatever the checkpoint says, as the authors' servers have done since March 2026",
@@ -185,6 +191,7 @@ def main(argv=None) -> int:
         embodiment=args.embodiment,
         camera_size=args.camera_size,
         letterbox=args.letterbox,
+        gripper_sign=args.gripper_sign,
     )
     try:
         with _progress(args.quiet) as progress:

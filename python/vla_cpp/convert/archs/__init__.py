@@ -57,6 +57,7 @@ class Options:
     view_slots: int = 0  # Evo-1: places for views in the prompt
     embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
     camera_size: str = ""  # GR00T: WIDTHxHEIGHT of pictures whose aspect the pipeline keeps; they are square without it
+    gripper_sign: str = ""  # GR00T: the key of a gripper's actions, which become -1 where it opens and 1 where it closes
     letterbox: bool = False  # GR00T: pictures are padded to squares, as the authors' later servers do
     dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
@@ -109,6 +110,7 @@ LAYOUT_OPTIONS = {
     "embodiment": (GR00T, "a checkpoint of GR00T"),
     "camera_size": (GR00T, "a checkpoint of GR00T"),
     "letterbox": (GR00T, "a checkpoint of GR00T"),
+    "gripper_sign": (GR00T, "a checkpoint of GR00T"),
 }
 LAYOUT_NAMES = {
     LEROBOT: "config.json of type {}, which states everything itself",

@@ -23,7 +23,7 @@ from .pictures import Pictures, read_pictures
 from .prompt import text_ops
 from .robot import PROCESSOR, STATISTICS, Robot, choose, embodiment_index, processor_file, read_robot
 from .sizes import MAX_LAYERS, Sizes
-from .vectors import action_ops, feature_description, state_ops, statistics_of
+from .vectors import action_ops, feature_description, gripper_ops, state_ops, statistics_of
 
 POLICY = "config.json"
 # Gr00tN1d7Processor of Isaac-GR00T. LeRobot reads an absent size of pictures otherwise, so that these must be stated, if only as null.
@@ -133,6 +133,8 @@ def assemble(
         "state": state_ops(robot, parts.clip_states, s, problems),
         "action": action_ops(robot, parts.clip_actions, s, problems),
     }
+    if options.gripper_sign:
+        document["action"] += gripper_ops(robot, options.gripper_sign, problems)
     all_keys = [
         *keys,
         *prompt.keys(),

@@ -233,15 +233,26 @@ class _Reader:
         return True
 
 
+def views(video: Section) -> List[str]:
+    """Every camera at every moment, the moments in the order of `delta_indices` and in each the cameras: a frame that was taken 15 steps
+    ago is a view of its own, camera@-15."""
+    moments = video.get("delta_indices")
+    sound = isinstance(moments, list) and moments and all(type(t) is int and -1000 <= t <= 0 for t in moments)
+    if not sound or sorted(set(moments)) != moments:
+        video.bad("delta_indices", "rising numbers of steps from -1000 to 0")
+        moments = [0]
+    return ["{}@{}".format(key, t) if t else key for t in moments for key in video.get("modality_keys")]
+
+
 def read_robot(tag: str, config: dict, statistics: dict, processor: Section, horizon: int, problems: Problems) -> Robot:
     """`processor`: the members of processor_kwargs. `horizon`: rows of the network's chunk, of which the first are the robot's."""
     reader = _Reader(tag, config, statistics, processor, problems)
     video = reader.modality("video")
-    reader.one_step(video, "pictures")
+    cameras = views(video)
     states = reader.states()
     actions = reader.actions(states)
     steps = reader.modality("action").get("delta_indices")
     if not isinstance(steps, list) or not steps:
         problems.add("{}: {}.action: delta_indices".format(PROCESSOR, tag), "a list of steps", repr(steps)[:80])
         steps = [0]
-    return Robot(video.get("modality_keys"), states, actions, min(len(steps), horizon))
+    return Robot(cameras, states, actions, min(len(steps), horizon))

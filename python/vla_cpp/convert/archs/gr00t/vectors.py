@@ -10,7 +10,7 @@ import numpy as np
 
 from ... import recipe
 from ...bundle import Key
-from ...errors import Problems
+from ...errors import Code, Problems
 from ...features import feature_keys
 from .. import Options
 from .robot import PROCESSOR, STATISTICS, Group, Robot
@@ -46,6 +46,17 @@ def action_ops(robot: Robot, clip: bool, s: Sizes, problems: Problems) -> List[d
     columns = _relative_columns(robot, problems)
     added = [{"op": "add_state", "columns": columns}] if columns else []
     return [*ops, _op("unnormalize", recipe.ACTION, robot.actions), *added]
+
+
+def gripper_ops(robot: Robot, key: str, problems: Problems) -> List[dict]:
+    """The sign that a simulator wants of a gripper whose actions count from 0, closed, to 1, open: -sign(2 g - 1)."""
+    starts = _starts(robot.actions)
+    if key not in starts:
+        problems.add("--gripper-sign", "a key of the actions: " + ", ".join(starts), key, code=Code.USAGE)
+        return []
+    width = next(group.width for group in robot.actions if group.key == key)
+    columns = list(range(starts[key], starts[key] + width))
+    return [{"op": "threshold", "columns": columns, "above": 0.5, "then": -1.0, "else": 1.0}]
 
 
 def _starts(groups: Sequence[Group]) -> Dict[str, int]:
