@@ -197,7 +197,8 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::strin
   if (hello.max_version() < kMinVersion || hello.min_version() > kMaxVersion)
     return incompatible(hello.min_version(), hello.max_version());
   if (client != nullptr)
-    *client = fmt::format("{} {}", hello.client_name(), hello.client_version()).substr(0, kMaxName);
+    *client = (hello.client_name() + (hello.client_version().empty() ? "" : " ") + hello.client_version())
+                  .substr(0, kMaxName);
   v1::HelloReply reply;
   reply.set_min_version(kMinVersion);
   reply.set_max_version(kMaxVersion);

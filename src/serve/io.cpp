@@ -97,6 +97,7 @@ void Io::handle(Client& client, Job job, const Status& sound) {
   if (!sound) return refuse(std::move(job), sound.error());
   if (job.kind == Kind::act) return queue(std::move(job));
   auto response = answer_now(client, job);
+  job.name = client.name;  // a hello tells it
   if (!response) return refuse(std::move(job), response.error());
   const Clock::time_point at = job.at;
   deliver({std::move(job), response->SerializeAsString(), std::nullopt, at, at, {}});

@@ -235,6 +235,19 @@ def test_the_json_log_has_the_course_of_events_one_object_a_line(serve, talk, go
     assert events[-1]["chunks"] == 2 and events[-1]["errors"] == 1
 
 
+def test_the_log_tells_robots_apart_and_knows_of_a_request_that_was_too_large(serve, talk, golden):
+    server = serve("--log", "json", "--log-level", "debug", "--max-message", 1)
+    too_large = wire.act(9, golden, text="x" * 2_000_000)
+    assert talk(server, wire.hello(1, "left-arm", "2.1"), wire.act(2, golden, seed=1), too_large) == ["hello", "chunk", "error"]
+    assert talk(server, wire.hello(1, "right-arm", ""), wire.health(2)) == ["hello", "health"]
+    requests = [e for e in map(json.loads, log_of(server)) if e["event"] == "request"]
+    assert [e["name"] for e in requests] == ["left-arm 2.1"] * 3 + ["right-arm"] * 2
+    assert len({e["client"] for e in requests}) == 2 and {e["peer"] for e in requests} == {"127.0.0.1"}
+    refused = requests[2]
+    assert (refused["request_id"], refused["code"], refused["level"]) == (9, "too_large", "warn")
+    assert refused["found"] == str(len(too_large))
+
+
 def test_what_a_client_sends_cannot_break_a_line(serve, talk, golden):
     server = serve("--log", "text")
     act = wire.act(1, golden, seed=1)

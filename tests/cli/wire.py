@@ -36,6 +36,11 @@ def act(request_id, golden, seed=None, deadline_ms=None, text=None):
     return _number(1, 1) + _number(2, request_id) + _bytes(5, body)
 
 
+def hello(request_id, name, version):
+    body = _number(1, 1) + _number(2, 1) + _bytes(3, name.encode()) + _bytes(4, version.encode())
+    return _number(1, 1) + _number(2, request_id) + _bytes(3, body)
+
+
 def health(request_id):
     return _number(1, 1) + _number(2, request_id) + _bytes(6, b"")
 
