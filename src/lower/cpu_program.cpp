@@ -60,8 +60,7 @@ Status CpuProgram::make_tasks(const Lowering& l) {
     const auto phase = static_cast<std::size_t>(op.phase);
     phases_[phase].tasks.push_back(tasks_.back().get());
     text_ += text_of(l, op) + "\n";
-    std::size_t stage = 0;
-    while (stage < stages.size() && op.order >= static_cast<int>(stages[stage].n_node)) ++stage;
+    const std::size_t stage = stage_of(l, op);
     if (!op.invariant) work_[stage] += work_of(l, op);
     if (stage < stages.size() && !op.invariant) stage_end[stage] = std::max(stage_end[stage], phase + 1);
     host_size_ += sizeof(kernels::LinearJob) + 2 * sizeof(void*) + 256;

@@ -85,8 +85,8 @@ class Fuser {
     return op;
   }
 
-  /// Patch (factor R + r, factor C + c) becomes part (r, c) of token (R, C): one copy for each r, of factor * d numbers
-  /// at once where x is contiguous.
+  /// Patch (factor R + r, factor C + c) becomes part (r, c) of token (R, C): one copy for each
+  /// part.
   CopyOp pixel_shuffle(const Node& node) const {
     const auto [n_column, factor] = *node.as<op::PixelShuffle>();
     const Value& x = l.value(node.in[0].node()->id);

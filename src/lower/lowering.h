@@ -118,6 +118,8 @@ struct Lowering {
   const Value& base(ValueId id) const { return value(value(id).base); }
 };
 
+/// Which stage an operation belongs to, by when its node was recorded.
+std::size_t stage_of(const Lowering& l, const FusedOp& op);
 /// Strides of numbers that lie one after the other.
 Shape contiguous_strides(const Shape& shape);
 bool is_contiguous(const Value& value);

@@ -26,14 +26,6 @@ void find_invariants(Lowering& l) {
   }
 }
 
-/// Which stage an operation belongs to, by when its node was recorded.
-std::size_t stage_of(const Lowering& l, const FusedOp& op) {
-  const auto& stages = l.graph.stages();
-  std::size_t i = 0;
-  while (i < stages.size() && op.order >= static_cast<int>(stages[i].n_node)) ++i;
-  return i;
-}
-
 /// The last phases that read a slot, and that write it.
 struct SlotUse {
   int read = -1, written = -1;
@@ -72,6 +64,13 @@ int schedule_part(Lowering& l, bool invariant, int first) {
 }
 
 }  // namespace
+
+std::size_t stage_of(const Lowering& l, const FusedOp& op) {
+  const auto& stages = l.graph.stages();
+  std::size_t i = 0;
+  while (i < stages.size() && op.order >= static_cast<int>(stages[i].n_node)) ++i;
+  return i;
+}
 
 void schedule(Lowering& l) {
   std::stable_sort(l.ops.begin(), l.ops.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
