@@ -12,6 +12,7 @@
 #include <cerrno>
 #include <cmath>
 #include <cstring>
+#include <utility>
 
 #include "bundle/gguf_reader.h"
 
@@ -25,27 +26,62 @@ constexpr std::size_t kDigits = 16;
 
 Error io_error(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
 
-struct Mapping {
+/// Bytes of an opened file, and what keeps them in memory.
+struct Content {
   std::shared_ptr<const void> owner;
   std::span<const std::byte> bytes;
 };
 
-Result<Mapping> map_file(const std::string& path) {
+struct File {
+  int descriptor;
+  std::size_t size = 0;
+
+  explicit File(int fd) : descriptor(fd) {}
+  File(File&& other) noexcept : descriptor(std::exchange(other.descriptor, -1)), size(other.size) {}
+  ~File() {
+    if (descriptor >= 0) ::close(descriptor);
+  }
+};
+
+Result<File> open_file(const std::string& path) {
   // Opening a pipe waits for its writer unless told not to; a file is not affected.
-  const int file = ::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK);
-  if (file < 0) return io_error(path, "a readable bundle");
+  File file(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK));
+  if (file.descriptor < 0) return io_error(path, "a readable bundle");
   struct stat info = {};
-  const bool regular = ::fstat(file, &info) == 0 && S_ISREG(info.st_mode);
-  const std::size_t size = regular ? static_cast<std::size_t>(info.st_size) : 0;
-  void* memory = size > 0 ? ::mmap(nullptr, size, PROT_READ, MAP_PRIVATE, file, 0) : MAP_FAILED;
-  const int why = errno;
-  ::close(file);
-  if (!regular) return Error{Code::io, path, "a file", "something that is not a regular file"};
-  if (size == 0) return Error{Code::bad_bundle, path, "a GGUF file", "an empty file", "copy or convert it again"};
-  errno = why;
-  if (memory == MAP_FAILED) return io_error(path, "a file that can be mapped");
-  const auto* data = static_cast<const std::byte*>(memory);
-  return Mapping{{memory, [size](void* pointer) { ::munmap(pointer, size); }}, {data, size}};
+  if (::fstat(file.descriptor, &info) != 0 || !S_ISREG(info.st_mode))
+    return Error{Code::io, path, "a file", "something that is not a regular file"};
+  file.size = static_cast<std::size_t>(info.st_size);
+  if (file.size > 0) return file;
+  return Error{Code::bad_bundle, path, "a GGUF file", "an empty file", "copy or convert it again"};
+}
+
+/// `file` -1: memory without a file, to be written.
+Result<Content> map(int file, std::size_t size, const std::string& path) {
+  const int protection = file < 0 ? PROT_READ | PROT_WRITE : PROT_READ;
+  void* memory = ::mmap(nullptr, size, protection, file < 0 ? MAP_PRIVATE | MAP_ANONYMOUS : MAP_PRIVATE, file, 0);
+  if (memory == MAP_FAILED) {
+    if (errno != ENOMEM) return io_error(path, "a file that can be mapped");
+    return Error{Code::out_of_memory, path, fmt::format("{} bytes of memory", size), "less",
+                 "free memory or use a smaller model"};
+  }
+  return Content{{memory, [size](void* pointer) { ::munmap(pointer, size); }},
+                 {static_cast<const std::byte*>(memory), size}};
+}
+
+Result<Content> copy(const File& file, const std::string& path) {
+  VLA_TRY(Content content, map(-1, file.size, path));
+  auto* bytes = const_cast<std::byte*>(content.bytes.data());
+  for (std::size_t done = 0; done < file.size;) {
+    const ssize_t got = ::read(file.descriptor, bytes + done, file.size - done);
+    if (got < 0 && errno == EINTR) continue;
+    if (got < 0) return io_error(path, "a readable bundle");
+    if (got == 0)
+      return Error{Code::bad_bundle, path, fmt::format("a file of {} bytes", file.size),
+                   fmt::format("one that ended at {} while it was read", done),
+                   "replace a bundle by renaming a new file over it"};
+    done += static_cast<std::size_t>(got);
+  }
+  return content;
 }
 
 /// XXH3-64 of the file with the digits at `digits` read as zeros.
@@ -104,11 +140,13 @@ std::int64_t TensorInfo::count() const {
   return product;
 }
 
-Result<Bundle> Bundle::open(const std::string& path) {
-  VLA_TRY(Mapping mapping, map_file(path));
-  VLA_TRY(Bundle bundle, parse(mapping.bytes, path));
-  bundle.mapping_ = std::move(mapping.owner);
-  bundle.release_pages(bundle.bytes_);  // the checksum has read them all; the weights come tensor by tensor
+Result<Bundle> Bundle::open(const std::string& path, Access access) {
+  VLA_TRY(const File file, open_file(path));
+  VLA_TRY(Content content, access == Access::map ? map(file.descriptor, file.size, path) : copy(file, path));
+  VLA_TRY(Bundle bundle, parse(content.bytes, path));
+  bundle.access_ = access;
+  bundle.mapping_ = std::move(content.owner);
+  if (access == Access::map) bundle.release_pages(bundle.bytes_);  // the checksum has read them all
   return bundle;
 }
 
@@ -134,11 +172,14 @@ void Bundle::release_pages(std::span<const std::byte> part) const {
   const auto page = static_cast<std::size_t>(::sysconf(_SC_PAGESIZE));
   const auto offset = static_cast<std::size_t>(part.data() - bytes_.data()), first = (offset + page - 1) / page * page;
   const std::size_t last = (offset + part.size()) / page * page;
-  if (first < last) ::madvise(const_cast<std::byte*>(bytes_.data()) + first, last - first, MADV_DONTNEED);
+  if (first >= last) return;
+  std::byte* start = const_cast<std::byte*>(bytes_.data()) + first;
+  ::madvise(start, last - first, MADV_DONTNEED);
+  if (access_ == Access::copy) ::mprotect(start, last - first, PROT_NONE);  // zeros would pass for weights
 }
 
 void Bundle::keep_pages(std::span<const std::byte> part) const {
-  if (!mapping_ || part.empty()) return;
+  if (!mapping_ || part.empty() || access_ == Access::copy) return;
   const auto page = static_cast<std::size_t>(::sysconf(_SC_PAGESIZE));
   const std::size_t first = static_cast<std::size_t>(part.data() - bytes_.data()) / page * page;
   const std::size_t last = static_cast<std::size_t>(part.data() - bytes_.data()) + part.size();

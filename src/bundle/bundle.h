@@ -30,12 +30,17 @@ struct TensorInfo {
   std::int64_t count() const;
 };
 
-/// An opened, fully checked GGUF file: see docs/bundle.md. The file is mapped, and every length in it was compared with
-/// the file's size before it was used, so that a truncated or hostile file is refused instead of read.
+/// An opened, fully checked GGUF file: see docs/bundle.md. Every length in it was compared with the file's size before
+/// it was used, so that a truncated or hostile file is refused instead of read.
 class Bundle {
  public:
-  /// Maps the file, parses it, and compares checksum and version. Errors: io, bad_bundle.
-  static Result<Bundle> open(const std::string& path);
+  /// How a file comes into memory. A copy is what its checksum says, whatever happens to the file afterwards. A mapping
+  /// takes no memory of the process, but who changes the file changes what it holds, and who makes it shorter ends the
+  /// process (SIGBUS).
+  enum class Access { copy, map };
+
+  /// Reads or maps the file, parses it, and compares checksum and version. Errors: io, bad_bundle, out_of_memory.
+  static Result<Bundle> open(const std::string& path, Access access = Access::copy);
   /// The same on bytes in memory, which must outlive the bundle.
   static Result<Bundle> parse(std::span<const std::byte> bytes, std::string name);
 
@@ -46,15 +51,17 @@ class Bundle {
   /// A one-dimensional f32 tensor of finite values, for statistics. Errors: bad_bundle.
   Result<std::vector<float>> stats(std::string_view name) const;
   std::size_t file_size() const { return bytes_.size(); }
-  /// Gives whole pages of a part of a mapped file back to the system; they are read again where they are needed again.
+  /// Gives whole pages of a part of an opened file back to the system, because nobody reads them any more: of a copy
+  /// they are gone, and touching them ends the process.
   void release_pages(std::span<const std::byte> part) const;
   /// Reads a part of a mapped file into memory now, instead of page by page when it is used.
   void keep_pages(std::span<const std::byte> part) const;
-  /// Keeps the mapped file where it is for as long as somebody holds this; null for bytes in memory.
+  /// Keeps an opened file's bytes where they are for as long as somebody holds this; null for bytes of `parse`.
   const std::shared_ptr<const void>& mapping() const { return mapping_; }
 
  private:
   std::string path_;
+  Access access_ = Access::map;
   std::shared_ptr<const void> mapping_;
   std::span<const std::byte> bytes_;
   Keys keys_;

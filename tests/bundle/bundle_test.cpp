@@ -204,3 +204,33 @@ TEST_CASE("a report of very many problems names the first fifty and counts the o
   CHECK(contains(message, "and 49952 more"));
   CHECK(message.size() < 10000);
 }
+
+TEST_CASE("a file that is written over, cut or removed after it was opened leaves the bundle as it was") {
+  const std::string bytes = small_bundle().bytes();
+  for (const bool cut : {false, true}) {
+    const std::string path = test::write_file("changed.gguf", bytes);
+    const auto bundle = Bundle::open(path);
+    REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
+    test::write_file("changed.gguf", cut ? "" : std::string(bytes.size(), 'x'));  // in place, as cp does
+    const auto data = bundle->find("lm.weight")->data;
+    CHECK(std::string(reinterpret_cast<const char*>(data.data()), data.size()) == std::string(32, '\1'));
+    CHECK(bundle->stats("stats.x")->size() == 3);
+    std::remove(path.c_str());
+    CHECK(bundle->stats("stats.x")->size() == 3);
+  }
+}
+
+TEST_CASE("a bundle is a bundle whether it is copied or mapped, and a copy gives memory back part by part") {
+  EditableBundle editable = small_bundle();
+  editable.tensors.push_back({"lm.large", DType::f32, {1 << 20}, std::string(4 << 20, '\2')});
+  const std::string path = editable.write("access.gguf");
+  for (const auto access : {Bundle::Access::copy, Bundle::Access::map}) {
+    const auto bundle = Bundle::open(path, access);
+    REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
+    CHECK(bundle->find("lm.large")->data.back() == std::byte{2});
+    bundle->release_pages(bundle->find("lm.large")->data);
+    bundle->keep_pages(bundle->find("lm.weight")->data);
+    CHECK(bundle->find("lm.weight")->data.back() == std::byte{1});
+    CHECK(bundle->stats("stats.x")->size() == 3);
+  }
+}

@@ -84,3 +84,25 @@ def _read(data, at):
         at, shift = at + 1, shift + 7
         if byte < 0x80:
             return value, at
+
+
+def _fields(data):
+    """(number, value) of every field; bytes for what has a length."""
+    at = 0
+    while at < len(data):
+        tag, at = _read(data, at)
+        size = {1: 8, 5: 4}.get(tag & 7)
+        if tag & 7 == 0:
+            value, at = _read(data, at)
+            yield tag >> 3, value
+            continue
+        if size is None:
+            size, at = _read(data, at)
+        yield tag >> 3, data[at : at + size]
+        at += size
+
+
+def actions(response):
+    """The bytes of a chunk's actions."""
+    (chunk,) = (value for number, value in _fields(response) if number == 5)
+    return b"".join(value for number, value in _fields(chunk) if number == 3)

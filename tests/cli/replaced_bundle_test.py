@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A bundle that somebody replaces, cuts or removes while a server answers with it."""
+
+import os
+import shutil
+
+import pytest
+import wire
+from serve_test import Server
+
+
+def written_over(path, other):
+    """As `cp other path` does: the same file with other bytes."""
+    path.write_bytes(other.read_bytes())
+
+
+def turned(path, other):
+    """The same size and other weights, as a damaged disk gives them."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 4 :] = bytes(byte ^ 0x55 for byte in data[len(data) // 4 :])
+    with open(path, "r+b") as file:
+        file.write(data)
+
+
+@pytest.mark.parametrize(
+    "change", [written_over, turned, lambda path, other: os.truncate(path, 0), lambda path, other: path.unlink()]
+)
+def test_a_server_answers_with_the_bytes_that_it_has_loaded(vla, golden, tmp_path, change):
+    path, other = tmp_path / "policy.gguf", tmp_path / "other.gguf"
+    shutil.copy(golden.bundle, path)
+    other.write_bytes(golden.bundle.read_bytes()[:50_000])
+    server = Server(vla, path, "--bind", "tcp://127.0.0.1:0", "--threads", "1")
+    peer = wire.Peer(server.ready["address"])
+
+    def chunk(i):
+        """The actions of the answer: what follows its request id up to the timings."""
+        answer = peer.ask(wire.act(1, golden, seed=i))
+        assert wire.kind(answer) == "chunk"
+        return wire.actions(answer)
+
+    try:
+        before = [chunk(i) for i in range(3)]
+        change(path, other)
+        assert [chunk(i) for i in range(3)] == before
+        assert server.process.poll() is None
+    finally:
+        peer.close()
+        server.process.kill()
+        server.process.communicate()
+
+
+def test_a_file_that_is_cut_while_it_is_read_is_refused(vla, golden, tmp_path):
+    """Half of it is there when the program looks at its size, and nothing but that half when it reads."""
+    path = tmp_path / "policy.gguf"
+    path.write_bytes(golden.bundle.read_bytes()[:-4096])
+    vla(*golden.arguments(bundle=path)).refused("bad_bundle", "copy or convert it again")
