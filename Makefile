@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo test build packages asan tsan fuzz format clean
+.PHONY: help demo test build wheel packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -14,6 +14,7 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
+	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make tsan      build executor and server and run their tests under the thread sanitizer"
 	@echo "make fuzz      build the fuzz targets (clang) and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
@@ -31,6 +32,13 @@ $(STAMP): python/pyproject.toml python/requirements-test.txt
 build: packages $(STAMP)
 	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
 	cmake --build --preset cpu
+
+# A wheel for any x86-64 machine with a system as old as this one's: pip installs it in seconds.
+wheel: packages $(STAMP)
+	@test -f build/wheel/CMakeCache.txt || cmake -S . -B build/wheel -G Ninja -DCMAKE_BUILD_TYPE=Release -DVLA_BUILD_TESTS=OFF \
+	  -DVLA_BUILD_SERVER=OFF -DVLA_NATIVE=OFF $(CMAKE_ARGS)
+	cmake --build build/wheel --target vla_shared
+	VLA_BUILD_DIR=build/wheel $(VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps -w out ./python
 
 # The simulator has an environment of its own. RECORDED=1: recorded camera frames instead, where MuJoCo cannot draw.
 SIM       := .venv-sim

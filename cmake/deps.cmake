@@ -67,11 +67,13 @@ find_library(VLA_XXHASH_LIBRARY xxhash REQUIRED)
 find_path(VLA_UTF8PROC_DIR utf8proc.h REQUIRED)
 find_library(VLA_UTF8PROC_LIBRARY utf8proc REQUIRED)
 
-# The wire: the schema is compiled at build time, and the server needs the small runtime of Protobuf only.
-find_package(Protobuf REQUIRED)
-find_package(cppzmq REQUIRED)  # replay's client
-find_library(VLA_SODIUM_LIBRARY sodium REQUIRED)
-# What watches the server: metrics and the HTTP that shows them.
-find_path(VLA_PROMETHEUS_DIR prometheus/registry.h REQUIRED)
-find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
-find_path(VLA_BOOST_DIR boost/beast/http.hpp REQUIRED)  # Asio and Beast, headers only
+if(VLA_BUILD_SERVER)
+  # The wire: the schema is compiled at build time, and the server needs the small runtime of Protobuf only.
+  find_package(Protobuf REQUIRED)
+  find_package(cppzmq REQUIRED)  # replay's client
+  find_library(VLA_SODIUM_LIBRARY sodium REQUIRED)
+  # What watches the server: metrics and the HTTP that shows them.
+  find_path(VLA_PROMETHEUS_DIR prometheus/registry.h REQUIRED)
+  find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
+  find_path(VLA_BOOST_DIR boost/beast/http.hpp REQUIRED)  # Asio and Beast, headers only
+endif()

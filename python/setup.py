@@ -4,11 +4,12 @@
 
 An editable install compiles nothing: it finds the library in the build of the source tree. Environment of a real one:
 
-    VLA_BUILD_DIR   build folder to use or to make (default: build/wheel beside this folder)
+    VLA_BUILD_DIR   build folder to use or to make (default: build/cpu beside this folder where it was configured, else build/wheel)
     CMAKE_ARGS      for the first configuration of it, e.g. -DVLA_NATIVE=OFF for a wheel that goes to other machines
 """
 
 import os
+import platform
 import re
 import shlex
 import shutil
@@ -30,6 +31,25 @@ def run(*command):
     subprocess.run([str(word) for word in command], check=True)
 
 
+def compile_library(build):
+    """pip shows nothing of a build, which takes minutes: what is done is told to the terminal, where there is one."""
+    command = ["cmake", "--build", str(build), "--target", "vla_shared", "--parallel", str(os.cpu_count() or 1)]
+    print("+", shlex.join(command), flush=True)
+    try:
+        terminal = open("/dev/tty", "w")
+    except OSError:
+        terminal = open(os.devnull, "w")
+    with terminal, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            print(line, end="")
+            done = re.match(r"\[\s*(\d+(?:/\d+|%))\]", line)
+            if done:
+                print(f"\r  compiling the C++ runtime: {done[1]} ", end="", file=terminal, flush=True)
+        print("\r" + " " * 50, end="\r", file=terminal)
+    if process.returncode:
+        raise SystemExit("the C++ runtime could not be compiled: pip install -v shows why")
+
+
 def copy_licence(path, folder):
     """The licence of a Debian package that a carried library is from, as its terms ask; other systems keep them elsewhere."""
     real = os.path.realpath(path)
@@ -47,11 +67,14 @@ def build_library(folder):
     """Builds libvla.so and installs it into `folder`, with what it needs beside it."""
     if not (ROOT / "CMakeLists.txt").is_file():
         raise SystemExit(f"{ROOT}: expected the source tree of vla.cpp around the folder python/, found none")
-    build = Path(os.environ.get("VLA_BUILD_DIR") or ROOT / "build" / "wheel")
+    configured = ROOT / "build/cpu"
+    default = configured if (configured / "CMakeCache.txt").is_file() else ROOT / "build/wheel"
+    build = Path(os.environ.get("VLA_BUILD_DIR") or default).resolve()
     if not (build / "CMakeCache.txt").is_file():
         arguments = shlex.split(os.environ.get("CMAKE_ARGS", ""))
-        run("cmake", "-S", ROOT, "-B", build, "-DCMAKE_BUILD_TYPE=Release", "-DVLA_BUILD_TESTS=OFF", *arguments)
-    run("cmake", "--build", build, "--target", "vla_shared", "--parallel", os.cpu_count() or 1)
+        run("cmake", "-S", ROOT, "-B", build, "-DCMAKE_BUILD_TYPE=Release", "-DVLA_BUILD_TESTS=OFF",
+            "-DVLA_BUILD_SERVER=OFF", *arguments)
+    compile_library(build)
     run("cmake", "--install", build, "--component", "library", "--prefix", build / "wheel_prefix")
     folder.mkdir(parents=True, exist_ok=True)
     library = next((build / "wheel_prefix").rglob(LIBRARY))
@@ -74,8 +97,10 @@ class BuildWithLibrary(build_py):
 
 class PlatformWheel(bdist_wheel):
     def get_tag(self):
-        """Any Python, since ctypes loads the library; this platform only."""
-        return "py3", "none", super().get_tag()[2]
+        """Any Python, since ctypes loads the library; systems whose C library is as new as this one's."""
+        libc, version = platform.libc_ver()
+        system = f"manylinux_{version.replace('.', '_')}_{platform.machine()}"
+        return "py3", "none", system if libc == "glibc" else super().get_tag()[2]
 
 
 class PlatformDistribution(Distribution):

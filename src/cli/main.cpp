@@ -63,10 +63,12 @@ int run(int argc, char** argv) {
   choose("run", vla::cli::add_run(app));
   choose("inspect", vla::cli::add_inspect(app));
   choose("compare", vla::cli::add_compare(app));
+  choose("bench", vla::cli::add_bench(app));
+#ifdef VLA_SERVER
   choose("serve", vla::cli::add_serve(app));
   choose("keygen", vla::cli::add_keygen(app));
-  choose("bench", vla::cli::add_bench(app));
   choose("replay", vla::cli::add_replay(app));
+#endif
 
   try {
     app.parse(argc, argv);
