@@ -100,9 +100,8 @@ void print_numbers(const std::vector<Description::Number>& numbers, const StatsC
 }
 
 void print_features(const Description& d, const Engine& engine) {
-  constexpr const char* kFits[] = {"letterboxed", "resized", "padded, scaled and cropped as the recipe says"};
   const Recipe& recipe = engine.processor().recipe();
-  say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", kFits[recipe.fit.index()],
+  say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", recipe.fit->described(),
       recipe.width, recipe.height, d.min_views, d.views.size());
   for (const auto& view : d.views)
     say(stdout, "    {}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias));

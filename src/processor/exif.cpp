@@ -96,28 +96,28 @@ Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& x
   return found && *found >= 1 && *found <= 8 ? *found : 1;
 }
 
-void turn_upright(Picture& picture, int orientation) {
+void turn_upright(Image& image, int orientation) {
   if (orientation == 1) return;
   // Source coordinates of the upright pixel (x, y): optionally exchanged, then mirrored.
   const bool exchanged = orientation >= 5;
   const bool mirror_x = orientation == 2 || orientation == 3 || orientation == 7 || orientation == 8;
   const bool mirror_y = orientation == 3 || orientation == 4 || orientation == 6 || orientation == 7;
-  const int width = exchanged ? picture.height : picture.width;
-  const int height = exchanged ? picture.width : picture.height;
-  std::vector<std::uint8_t> turned(picture.rgb.size());
+  const int width = exchanged ? image.height : image.width;
+  const int height = exchanged ? image.width : image.height;
+  std::vector<std::uint8_t> turned(image.rgb.size());
   std::uint8_t* out = turned.data();
   for (int y = 0; y < height; ++y) {
     for (int x = 0; x < width; ++x, out += 3) {
       const int along_x = exchanged ? y : x;
       const int along_y = exchanged ? x : y;
-      const int source_x = mirror_x ? picture.width - 1 - along_x : along_x;
-      const int source_y = mirror_y ? picture.height - 1 - along_y : along_y;
-      const auto pixel = static_cast<std::size_t>(source_y) * static_cast<std::size_t>(picture.width) +
+      const int source_x = mirror_x ? image.width - 1 - along_x : along_x;
+      const int source_y = mirror_y ? image.height - 1 - along_y : along_y;
+      const auto pixel = static_cast<std::size_t>(source_y) * static_cast<std::size_t>(image.width) +
                          static_cast<std::size_t>(source_x);
-      std::copy_n(picture.rgb.data() + pixel * 3, 3, out);
+      std::copy_n(image.rgb.data() + pixel * 3, 3, out);
     }
   }
-  picture = {width, height, std::move(turned), std::move(picture.exif), std::move(picture.xmp)};
+  image = {width, height, std::move(turned), std::move(image.exif), std::move(image.xmp)};
 }
 
 }  // namespace vla::codecs

@@ -36,12 +36,12 @@ Status check_floats(std::span<const float> values, const std::string& where) {
   return {};
 }
 
-Result<Frame> decode_picture(codecs::Bytes file, const std::string& where, const ImageLimits& limits) {
-  VLA_TRY(codecs::Picture picture,
+Result<Frame> decode_pixels(codecs::Bytes file, const std::string& where, const ImageLimits& limits) {
+  VLA_TRY(codecs::Image image,
           codecs::is_png(file) ? codecs::decode_png(file, where, limits) : codecs::decode_jpeg(file, where, limits));
-  VLA_TRY(const int orientation, codecs::orientation(picture.exif, picture.xmp, where));
-  codecs::turn_upright(picture, orientation);
-  return Frame{picture.width, picture.height, std::move(picture.rgb)};
+  VLA_TRY(const int orientation, codecs::orientation(image.exif, image.xmp, where));
+  codecs::turn_upright(image, orientation);
+  return Frame{image.width, image.height, std::move(image.rgb)};
 }
 
 Result<Frame> decode_npy(codecs::Bytes file, const std::string& where, const ImageLimits& limits) {
@@ -72,7 +72,7 @@ Status check_frame(const Frame& frame, const std::string& where, const ImageLimi
 Result<Frame> decode_image(std::span<const std::byte> file, const std::string& where, const ImageLimits& limits) {
   constexpr const char* kFormats = "a PNG, JPEG or .npy image";
   if (file.empty()) return codecs::refused(where, kFormats, "an empty file");
-  if (codecs::is_png(file) || codecs::is_jpeg(file)) return decode_picture(file, where, limits);
+  if (codecs::is_png(file) || codecs::is_jpeg(file)) return decode_pixels(file, where, limits);
   if (is_npy(file)) return decode_npy(file, where, limits);
   return codecs::refused(where, kFormats, "a file of another kind");
 }

@@ -17,7 +17,7 @@ namespace vla::codecs {
 using Bytes = std::span<const std::byte>;
 
 /// What a PNG or JPEG file holds, before orientation.
-struct Picture {
+struct Image {
   int width = 0;
   int height = 0;
   std::vector<std::uint8_t> rgb;   // (height, width, 3)
@@ -30,15 +30,15 @@ Status check_size(std::int64_t width, std::int64_t height, const std::string& wh
 
 bool is_png(Bytes file);
 bool is_jpeg(Bytes file);
-Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits);
-Result<Picture> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits);
+Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits& limits);
+Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits);
 
 /// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says. Errors: bad_observation for EXIF
 /// data that does not start as a TIFF structure. Source: Pillow Image.getexif, TiffImagePlugin
 /// ImageFileDirectory_v2.load.
 Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& xmp, const std::string& where);
 
-/// Turns the picture upright. Source: Pillow ImageOps.exif_transpose.
-void turn_upright(Picture& picture, int orientation);
+/// Turns the image upright. Source: Pillow ImageOps.exif_transpose.
+void turn_upright(Image& image, int orientation);
 
 }  // namespace vla::codecs

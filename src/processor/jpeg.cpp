@@ -81,15 +81,15 @@ std::string_view payload(jpeg_saved_marker_ptr marker, std::string_view name) {
   return data.starts_with(name) ? data.substr(name.size()) : std::string_view{};
 }
 
-void read_metadata(const JpegReader& reader, Picture& picture) {
+void read_metadata(const JpegReader& reader, Image& image) {
   using namespace std::string_view_literals;
   std::string exif;
   for (jpeg_saved_marker_ptr marker = reader.jpeg.marker_list; marker != nullptr; marker = marker->next) {
     exif += payload(marker, "Exif\0\0"sv);
-    if (const auto xmp = payload(marker, "http://ns.adobe.com/xap/1.0/\0"sv); !xmp.empty()) picture.xmp = xmp;
+    if (const auto xmp = payload(marker, "http://ns.adobe.com/xap/1.0/\0"sv); !xmp.empty()) image.xmp = xmp;
   }
   if (exif.starts_with("Exif\0\0"sv)) exif.erase(0, 6);  // some cameras write the name twice
-  picture.exif.assign(exif.begin(), exif.end());
+  image.exif.assign(exif.begin(), exif.end());
 }
 
 Error corrupt(const JpegReader& reader, const std::string& where) {
@@ -103,7 +103,7 @@ bool is_jpeg(Bytes file) {
   return file.size() >= sizeof kStart && std::memcmp(file.data(), kStart, sizeof kStart) == 0;
 }
 
-Result<Picture> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits) {
+Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits) {
   JpegReader reader;
   if (!guarded_header(reader, file)) return corrupt(reader, where);
   const auto width = static_cast<std::int64_t>(reader.jpeg.image_width);
@@ -112,12 +112,12 @@ Result<Picture> decode_jpeg(Bytes file, const std::string& where, const ImageLim
   if (reader.jpeg.num_components != 1 && reader.jpeg.num_components != 3)
     return refused(where, "a grey or RGB JPEG",
                    reader.jpeg.num_components == 4 ? "a CMYK one" : "another number of channels", "convert it to RGB");
-  Picture picture{static_cast<int>(width), static_cast<int>(height), {}, {}, {}};
-  read_metadata(reader, picture);  // now, because finishing frees the markers
+  Image image{static_cast<int>(width), static_cast<int>(height), {}, {}, {}};
+  read_metadata(reader, image);  // now, because finishing frees the markers
   reader.pixels.resize(static_cast<std::size_t>(width * height) * 3);
   if (!guarded_pixels(reader)) return corrupt(reader, where);
-  picture.rgb = std::move(reader.pixels);
-  return picture;
+  image.rgb = std::move(reader.pixels);
+  return image;
 }
 
 }  // namespace vla::codecs

@@ -118,7 +118,7 @@ Result<std::string> JsonFields::string(const std::string& name) {
   return value->get<std::string>();
 }
 
-Result<int> JsonFields::choice(const std::string& name, std::initializer_list<const char*> spellings) {
+Result<int> JsonFields::choice(const std::string& name, const std::vector<const char*>& spellings) {
   VLA_TRY(const std::string text, string(name));
   std::string expected;
   int index = 0;

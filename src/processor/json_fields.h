@@ -41,7 +41,7 @@ class JsonFields {
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);
   /// One of the spellings; the result is its index.
-  Result<int> choice(const std::string& name, std::initializer_list<const char*> spellings);
+  Result<int> choice(const std::string& name, const std::vector<const char*>& spellings);
 
   Status done() const;
   Error wrong(const std::string& name, std::string expected) const;

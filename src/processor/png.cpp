@@ -127,7 +127,7 @@ std::vector<std::uint8_t> from_raw_profile(std::string_view text) {
   return bytes;
 }
 
-/// The two texts among a file's chunks that may say how a picture is to be turned.
+/// The two texts among a file's chunks that may say how an image is to be turned.
 struct Texts {
   static constexpr std::size_t kMost = 1 << 20;  // bytes of both and of all their repetitions, unpacked
   static constexpr std::size_t kEach = 1 << 12;  // what each of them counts at least
@@ -216,7 +216,7 @@ bool is_png(Bytes file) {
   return file.size() >= kSignature.size() && std::memcmp(file.data(), kSignature.data(), kSignature.size()) == 0;
 }
 
-Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {
+Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {
   Bytes exif;
   Texts texts;
   if (const char* found = damage(file, exif, texts)) return refused(where, "a whole PNG image", found);
@@ -239,12 +239,11 @@ Result<Picture> decode_png(Bytes file, const std::string& where, const ImageLimi
   if (!guarded_pixels(reader)) return corrupt(reader, where);
   if (palette && !expand_palette(reader)) return refused(where, "a whole PNG image", "a pixel beyond its palette");
 
-  Picture picture{
-      static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, std::move(texts.xmp)};
-  for (const std::byte byte : exif) picture.exif.push_back(std::to_integer<std::uint8_t>(byte));
-  if (exif.empty()) picture.exif = std::move(texts.exif);
-  drop_exif_name(picture.exif);
-  return picture;
+  Image image{static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, std::move(texts.xmp)};
+  for (const std::byte byte : exif) image.exif.push_back(std::to_integer<std::uint8_t>(byte));
+  if (exif.empty()) image.exif = std::move(texts.exif);
+  drop_exif_name(image.exif);
+  return image;
 }
 
 }  // namespace vla::codecs

@@ -7,9 +7,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "processor/columns.h"
-#include "processor/python_text.h"
-#include "processor/text.h"
+#include "processor/ops/text.h"
 #include "processor/unicode.h"
 
 namespace vla {
@@ -25,26 +23,8 @@ std::size_t first_bad(std::span<const float> values) {
   return static_cast<std::size_t>(found - values.begin());
 }
 
-void apply(const ImageOp& op, std::span<float> pixels) {
-  if (const auto* scaled = std::get_if<AffineOp>(&op)) affine(pixels, scaled->scale, scaled->shift);
-  if (const auto* held = std::get_if<ClipOp>(&op)) clip(pixels, held->low, held->high);
-  if (const auto* by_channel = std::get_if<Standardize>(&op)) standardize(pixels, *by_channel);
-}
-
 std::size_t view_size(const Recipe& recipe) {
   return std::size_t{3} * static_cast<std::size_t>(recipe.width) * static_cast<std::size_t>(recipe.height);
-}
-
-bool drops_text(const Recipe& recipe) {
-  return std::any_of(recipe.text.begin(), recipe.text.end(),
-                     [](const TextOp& op) { return std::holds_alternative<DropPunctuationOp>(op); });
-}
-
-/// Bounds what ops may make of a sentence: four that replace a letter by a thousand make a terabyte of one.
-Status check_prompt(std::size_t size) {
-  if (size <= kMaxPrompt) return {};
-  return bad_observation("instruction", fmt::format("text that makes a prompt of at most {} bytes", kMaxPrompt),
-                         std::to_string(size));
 }
 
 /// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
@@ -106,10 +86,8 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
 }
 
 Status Processor::encode_view(const Frame& frame, const std::string& name, std::span<float> out) const {
-  if (const auto* box = std::get_if<Letterbox>(&recipe_.fit)) VLA_CHECK(letterbox(frame, *box, out, name));
-  if (const auto* stretched = std::get_if<Resize>(&recipe_.fit)) VLA_CHECK(resize(frame, *stretched, out, name));
-  if (const auto* ops = std::get_if<Pipeline>(&recipe_.fit)) VLA_CHECK(run_pipeline(frame, *ops, out, name));
-  for (const ImageOp& op : recipe_.image) apply(op, out);
+  VLA_CHECK(recipe_.fit->apply(frame, out, name));
+  for (const auto& op : recipe_.image) op->apply(out);
   return {};
 }
 
@@ -120,22 +98,10 @@ std::vector<float> Processor::absent_view() const {
   return pixels;
 }
 
-Result<std::string> Processor::fill_prompt(const std::string& instruction, std::span<const int> state_words) const {
+Result<std::string> Processor::fill_prompt(const std::string& instruction, std::span<const int> state) const {
   std::string text = instruction;
-  for (const TextOp& op : recipe_.text) {
-    if (std::holds_alternative<StripOp>(op)) text = std::string(strip(text));
-    if (std::holds_alternative<LowerOp>(op)) text = python::lower(text);
-    if (std::holds_alternative<DropPunctuationOp>(op)) text = python::drop_punctuation(text);
-    if (const auto* replace = std::get_if<ReplaceOp>(&op)) {
-      const std::size_t n = occurrences(text, replace->from);
-      VLA_CHECK(check_prompt(text.size() + n * replace->to.size() - n * replace->from.size()));
-      text = replace_all(text, replace->from, replace->to);
-    }
-    if (const auto* end = std::get_if<EnsureSuffixOp>(&op); end != nullptr && !text.ends_with(end->suffix))
-      text += end->suffix;
-    if (const auto* whole = std::get_if<TemplateOp>(&op)) text = fill_template(whole->text, text, state_words);
-    if (const auto* views = std::get_if<ViewsOp>(&op))
-      text = views->behind ? text + view_places(*views) : view_places(*views) + text;
+  for (const auto& op : recipe_.text) {
+    VLA_TRY(text, op->apply(std::move(text), state));
     VLA_CHECK(check_prompt(text.size()));
   }
   return text;
@@ -147,10 +113,10 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   if (observation.text.size() > Tokenizer::kMaxText ||
       unicode::valid_prefix(observation.text) < observation.text.size())
     return tokenizer_.encode(observation.text).error();  // before anything reads it as characters
-  if (bins_ && inputs.state_words.size() != n_state_)
+  if (recipe_.discretizes_state && inputs.discretized_state.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
-  VLA_TRY(const std::string prompt, fill_prompt(observation.text, inputs.state_words));
-  if (drops_text(recipe_) && prompt == *fill_prompt({}, inputs.state_words))
+  VLA_TRY(const std::string prompt, fill_prompt(observation.text, inputs.discretized_state));
+  if (recipe_.drops_punctuation && prompt == *fill_prompt({}, inputs.discretized_state))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");
   VLA_TRY(inputs.tokens, tokenizer_.encode(prompt, kMaxPrompt));
@@ -163,7 +129,7 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   return view_tokens_.empty() ? Status() : check_view_places(inputs.tokens);
 }
 
-/// The network puts pictures where the bundle says that their places are, whatever the prompt says.
+/// The network puts images where the bundle says that their places are, whatever the prompt says.
 Status Processor::check_view_places(std::span<const std::int32_t> tokens) const {
   const std::size_t n = view_tokens_.size(), n_rest = tokens.size() - std::min(n, tokens.size());
   const auto placed = views_behind_ ? tokens.subspan(n_rest) : tokens.first(tokens.size() - n_rest);
@@ -205,41 +171,25 @@ Status Processor::gather_states(const Observation& observation, std::vector<floa
 }
 
 Status Processor::encode_state(const Observation& observation, Inputs& inputs) const {
+  using Stage = StateOp::Stage;
   VLA_CHECK(gather_states(observation, inputs.state));
-  const std::span<float> state(inputs.state);
+  const StateOp* end = nullptr;
   bool raw = true;
-  for (const StateStep& step : state_steps_) {
-    const std::span<float> columns = state.subspan(step.offset, step.width);
-    if (const auto* normalizer = std::get_if<Normalizer>(&step.op)) {
-      if (raw) inputs.raw_state = inputs.state;
+  for (const auto& op : recipe_.state) {
+    if (raw && op->stage() != Stage::convention) {
+      inputs.raw_state = inputs.state;
       raw = false;
-      normalizer->apply(columns);
     }
-    if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, columns);
-    if (const auto* angle = std::get_if<HornAngleOp>(&step.op)) map_columns(*angle, columns);
-    if (const auto* held = std::get_if<ClipOp>(&step.op)) clip(columns, held->low, held->high);
+    if (op->stage() == Stage::end) end = op.get();
+    op->apply(inputs.state);
   }
   if (raw) inputs.raw_state = inputs.state;
-  if (const std::size_t bad = first_bad(state); bad < state.size())
+  if (const std::size_t bad = first_bad(inputs.state); bad < inputs.state.size())
     return bad_observation(fmt::format("state[{}]", bad), "a number that stays finite when normalized",
-                           fmt::format("{}", state[bad]));
-  inputs.state_words = bins_ ? bins(*bins_, state) : std::vector<int>{};
-  inputs.state.resize(d_state_, padding_);
+                           fmt::format("{}", inputs.state[bad]));
+  inputs.discretized_state.clear();
+  if (end != nullptr) end->finish(inputs.state, inputs.discretized_state);
   return {};
-}
-
-void Processor::decode_row(std::vector<float>& row, std::span<const float> raw_state) const {
-  for (const ActionStep& step : action_steps_) {
-    row.resize(step.width);
-    if (const auto* normalizer = std::get_if<Normalizer>(&step.op)) normalizer->apply(row);
-    if (const auto* affine = std::get_if<ColumnAffineOp>(&step.op)) map_columns(*affine, row);
-    if (const auto* threshold = std::get_if<ThresholdOp>(&step.op)) map_columns(*threshold, row);
-    if (const auto* held = std::get_if<ClipOp>(&step.op)) hold(*held, row);
-    if (const auto* add = std::get_if<AddStateOp>(&step.op))
-      for (const int column : add->columns)
-        row[static_cast<std::size_t>(column)] += raw_state[static_cast<std::size_t>(column)];
-  }
-  row.resize(action_names_.size());
 }
 
 Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int horizon, int d_action,
@@ -255,7 +205,7 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
     const auto numbers = chunk.subspan(static_cast<std::size_t>(i) * static_cast<std::size_t>(d_action),
                                        static_cast<std::size_t>(d_action));
     row.assign(numbers.begin(), numbers.end());
-    decode_row(row, raw_state);
+    for (const auto& op : recipe_.action) op->apply(row, raw_state);
     if (const std::size_t bad = first_bad(row); bad < width)
       return Error{Code::bad_action, fmt::format("actions[{}][\"{}\"]", i, action_names_[bad]), "a finite number",
                    fmt::format("{}", row[bad])};
@@ -265,12 +215,7 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
 }
 
 bool Processor::reads(const std::string& tensor) const {
-  const auto read_by = [&](const auto& op) {
-    const auto* normalize = std::get_if<NormalizeOp>(&op);
-    if (normalize == nullptr) return false;
-    const std::vector<std::string> names = statistics_of(*normalize);
-    return std::find(names.begin(), names.end(), tensor) != names.end();
-  };
+  const auto read_by = [&](const auto& op) { return op->reads(tensor); };
   return std::any_of(recipe_.state.begin(), recipe_.state.end(), read_by) ||
          std::any_of(recipe_.action.begin(), recipe_.action.end(), read_by);
 }

@@ -7,7 +7,6 @@
 #include <optional>
 #include <span>
 #include <string>
-#include <variant>
 #include <vector>
 
 #include "base/result.h"
@@ -16,7 +15,6 @@
 #include "processor/names.h"
 #include "processor/recipe.h"
 #include "processor/tokenizer.h"
-#include "processor/vector.h"
 
 namespace vla {
 
@@ -32,16 +30,13 @@ struct Inputs {
   int n_view = 0;
   std::uint32_t views = 0;  // bit i: view i of the bundle's order is present
   int height = 0, width = 0;
-  std::vector<float> pixels;         // (n_view, 3, height, width), present views only, in the bundle's order
-  std::vector<std::int32_t> tokens;  // at most `recipe().max_tokens`
-  std::vector<float> state;          // normalized, padded; empty where the network sees none
-  std::vector<int> state_words;      // the state in the words of the prompt, where the recipe puts it there
-  std::vector<float> raw_state;      // before its normalization, which actions may be relative to
-  std::vector<std::string> notes;    // what the user must be told, e.g. that the instruction was cut
+  std::vector<float> pixels;           // (n_view, 3, height, width), present views only, in the bundle's order
+  std::vector<std::int32_t> tokens;    // at most `recipe().max_tokens`
+  std::vector<float> state;            // normalized, padded; empty where the network sees none
+  std::vector<int> discretized_state;  // where the prompt has a place for it
+  std::vector<float> raw_state;        // before its normalization, which actions may be relative to
+  std::vector<std::string> notes;      // what the user must be told, e.g. that the instruction was cut
 };
-
-/// Bytes of the longest prompt: the places for views and an instruction.
-inline constexpr std::size_t kMaxPrompt = kMaxViewsText + Tokenizer::kMaxText;
 
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
@@ -85,22 +80,10 @@ class Processor {
   const Recipe& recipe() const { return recipe_; }
 
  private:
-  /// A step and the columns that it works on.
-  struct StateStep {
-    std::variant<ColumnAffineOp, HornAngleOp, Normalizer, ClipOp> op;
-    std::size_t offset, width;
-  };
-  struct ActionStep {
-    std::variant<Normalizer, ClipOp, AddStateOp, ColumnAffineOp, ThresholdOp> op;
-    std::size_t width;
-  };
-
   Status read_features(const Bundle& bundle);
   Status check_descriptions(const Keys& keys) const;
-  Status check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where) const;
-  Result<StateStep> read_normalize(const Bundle& bundle, const NormalizeOp& op, const std::string& where) const;
-  Status read_state_steps(const Bundle& bundle);
-  Status read_action_steps(const Bundle& bundle);
+  Status bind_state(const Bundle& bundle);
+  Status bind_action(const Bundle& bundle);
   Status read_view_places(const Keys& keys);
   struct PresentView {
     std::size_t index;
@@ -108,11 +91,10 @@ class Processor {
     const Frame* frame;
   };
   Result<std::vector<PresentView>> present_views(const Observation& observation) const;
-  Result<std::string> fill_prompt(const std::string& instruction, std::span<const int> state_words) const;
+  Result<std::string> fill_prompt(const std::string& instruction, std::span<const int> state) const;
   Status encode_view(const Frame& frame, const std::string& name, std::span<float> out) const;
   Status check_view_places(std::span<const std::int32_t> tokens) const;
   void cut_tokens(std::vector<std::int32_t>& tokens) const;
-  void decode_row(std::vector<float>& row, std::span<const float> raw_state) const;
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;
@@ -122,9 +104,6 @@ class Processor {
   std::vector<std::string> action_names_;
   Recipe recipe_;
   Tokenizer tokenizer_;
-  std::vector<StateStep> state_steps_;
-  std::vector<ActionStep> action_steps_;
-  std::optional<BinsOp> bins_;  // the state goes into the prompt
   /// Where the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
   /// and the token of a place.
   std::vector<std::int32_t> view_tokens_;
@@ -132,10 +111,8 @@ class Processor {
   std::int32_t view_token_ = -1;
   std::string view_token_text_;
   std::size_t n_state_ = 0;  // numbers of all states together
-  std::size_t d_state_ = 0;  // of the network, after padding
-  float padding_ = 0.0f;
-  int d_action_ = 0;  // of the network
-  int n_row_ = 0;     // that the recipe keeps; 0: all
+  int d_action_ = 0;         // of the network
+  int n_row_ = 0;            // that the recipe keeps; 0: all
 };
 
 }  // namespace vla

@@ -9,14 +9,11 @@
 #include <numeric>
 #include <set>
 
+#include "processor/ops/text.h"
 #include "processor/processor.h"
 
 namespace vla {
 namespace {
-
-Error misfit(std::string where, std::string expected, std::string found) {
-  return {Code::bad_bundle, std::move(where), std::move(expected), std::move(found), "convert the checkpoint again"};
-}
 
 Status check_names(const std::string& key, const std::vector<std::string>& names) {
   const std::set<std::string> unique(names.begin(), names.end());
@@ -57,8 +54,8 @@ Result<Processor> Processor::create(const Bundle& bundle) {
   VLA_TRY(const std::string recipe, keys.string("processor.recipe"));
   VLA_TRY(processor.recipe_, parse_recipe(recipe));
   VLA_CHECK(processor.read_features(bundle));
-  VLA_CHECK(processor.read_state_steps(bundle));
-  VLA_CHECK(processor.read_action_steps(bundle));
+  VLA_CHECK(processor.bind_state(bundle));
+  VLA_CHECK(processor.bind_action(bundle));
   VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
   VLA_TRY(processor.tokenizer_, Tokenizer::create(keys, n_vocab));
   VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens", {1, kMaxVector}));
@@ -110,36 +107,12 @@ Status Processor::check_descriptions(const Keys& keys) const {
   return rate ? Status() : Status(rate.error());
 }
 
-/// The columns that an op on the state names must exist in it.
-Status Processor::check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where) const {
-  for (const int column : columns)
-    if (static_cast<std::size_t>(column) >= width)
-      return misfit(where + ".columns", fmt::format("columns below {}", width), std::to_string(column));
-  return {};
-}
-
-Result<Processor::StateStep> Processor::read_normalize(const Bundle& bundle, const NormalizeOp& op,
-                                                       const std::string& where) const {
-  std::size_t offset = 0, n_column = n_state_;
-  if (!op.feature.empty() || (states_.names().size() > 1 && !is_groot(op.kind))) {
-    const auto& names = states_.names();
-    const auto index = static_cast<std::size_t>(std::find(names.begin(), names.end(), op.feature) - names.begin());
-    if (index == names.size())
-      return misfit(where + ".feature", "one of " + states_.listed(), "\"" + op.feature + "\"");
-    offset = static_cast<std::size_t>(total_dims(std::span(state_dims_).first(index)));
-    n_column = static_cast<std::size_t>(state_dims_[index]);
-  }
-  VLA_TRY(Normalizer normalizer,
-          Normalizer::create(bundle, op, Normalizer::Direction::normalize, static_cast<int>(n_column), where));
-  return StateStep{std::move(normalizer), offset, n_column};
-}
-
 /// The prompt of an empty instruction shows where the places are; nothing that follows them may move them.
 Status Processor::read_view_places(const Keys& keys) {
-  const auto op = std::find_if(recipe_.text.begin(), recipe_.text.end(),
-                               [](const TextOp& text) { return std::holds_alternative<ViewsOp>(text); });
-  if (op == recipe_.text.end()) return {};
-  const auto* views = std::get_if<ViewsOp>(&*op);
+  const ViewsOp* const views = recipe_.views;
+  if (views == nullptr) return {};
+  const auto is_views = [&](const auto& op) { return op.get() == views; };
+  const auto op = std::find_if(recipe_.text.begin(), recipe_.text.end(), is_views);
   const std::string where = fmt::format("processor.recipe.text[{}]", op - recipe_.text.begin());
   views_behind_ = views->behind;
   const std::string key = views_behind_ ? "policy.view_starts_from_end" : "policy.view_starts";
@@ -172,76 +145,26 @@ Status Processor::read_view_places(const Keys& keys) {
                 std::to_string(recipe_.max_tokens));
 }
 
-Status Processor::read_state_steps(const Bundle& bundle) {
+Status Processor::bind_state(const Bundle& bundle) {
   n_state_ = static_cast<std::size_t>(total_dims(state_dims_));
-  d_state_ = n_state_;
-  for (std::size_t i = 0; i < recipe_.state.size(); ++i) {
-    const std::string where = fmt::format("processor.recipe.state[{}]", i);
-    const StateOp& op = recipe_.state[i];
-    if (const auto* normalize = std::get_if<NormalizeOp>(&op)) {
-      VLA_TRY(StateStep step, read_normalize(bundle, *normalize, where));
-      state_steps_.push_back(std::move(step));
-    } else if (const auto* affine = std::get_if<ColumnAffineOp>(&op)) {
-      VLA_CHECK(check_columns(affine->columns, n_state_, where));
-      state_steps_.push_back({*affine, 0, n_state_});
-    } else if (const auto* angle = std::get_if<HornAngleOp>(&op)) {
-      VLA_CHECK(check_columns(angle->columns, n_state_, where));
-      state_steps_.push_back({*angle, 0, n_state_});
-    } else if (const auto* pad = std::get_if<PadOp>(&op)) {
-      if (static_cast<std::size_t>(pad->size) < n_state_)
-        return misfit(where + ".size", fmt::format("at least the {} numbers of the state", n_state_),
-                      std::to_string(pad->size));
-      d_state_ = static_cast<std::size_t>(pad->size);
-      padding_ = pad->value;
-    } else if (const auto* held = std::get_if<ClipOp>(&op)) {
-      state_steps_.push_back({*held, 0, n_state_});
-    } else {  // bins or drop: nothing is left for the network
-      if (const auto* words = std::get_if<BinsOp>(&op)) bins_ = *words;
-      d_state_ = 0;
-    }
-  }
+  const StateLayout layout{bundle, states_, state_dims_, n_state_};
+  for (std::size_t i = 0; i < recipe_.state.size(); ++i)
+    VLA_CHECK(recipe_.state[i]->bind(layout, fmt::format("processor.recipe.state[{}]", i)));
+  const std::size_t left = recipe_.state.empty() ? n_state_ : recipe_.state.back()->d_state(n_state_);
   VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state", {0, kMaxVector}));
-  if (d_state_ == static_cast<std::size_t>(d_state)) return {};
+  if (left == static_cast<std::size_t>(d_state)) return {};
   return misfit("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
-                std::to_string(d_state_));
+                std::to_string(left));
 }
 
-Status Processor::read_action_steps(const Bundle& bundle) {
+Status Processor::bind_action(const Bundle& bundle) {
   VLA_TRY(d_action_, bundle.keys().integer("policy.d_action", {1, kMaxVector}));
-  int width = d_action_;
-  for (std::size_t i = 0; i < recipe_.action.size(); ++i) {
-    const std::string where = fmt::format("processor.recipe.action[{}]", i);
-    const ActionOp& op = recipe_.action[i];
-    const auto n_column = static_cast<std::size_t>(width);
-    if (const auto* take = std::get_if<TakeOp>(&op)) {
-      if (take->size > width)
-        return misfit(where + ".size", fmt::format("at most {} columns", width), std::to_string(take->size));
-      width = take->size;
-    } else if (const auto* rows = std::get_if<RowsOp>(&op)) {
-      VLA_TRY(const int horizon, bundle.keys().integer("policy.horizon", kAnySize));
-      if (rows->count > horizon)
-        return misfit(where + ".count", fmt::format("at most the {} rows of a chunk (policy.horizon)", horizon),
-                      std::to_string(rows->count));
-      n_row_ = rows->count;
-    } else if (const auto* held = std::get_if<ClipOp>(&op)) {
-      action_steps_.push_back({*held, n_column});
-    } else if (const auto* add = std::get_if<AddStateOp>(&op)) {
-      VLA_CHECK(check_columns(add->columns, std::min(n_column, n_state_), where));
-      action_steps_.push_back({*add, n_column});
-    } else if (const auto* affine = std::get_if<ColumnAffineOp>(&op)) {
-      VLA_CHECK(check_columns(affine->columns, n_column, where));
-      action_steps_.push_back({*affine, n_column});
-    } else if (const auto* threshold = std::get_if<ThresholdOp>(&op)) {
-      VLA_CHECK(check_columns(threshold->columns, n_column, where));
-      action_steps_.push_back({*threshold, n_column});
-    } else {
-      VLA_TRY(Normalizer unnormalize,
-              Normalizer::create(bundle, std::get<NormalizeOp>(op), Normalizer::Direction::unnormalize, width, where));
-      action_steps_.push_back({std::move(unnormalize), n_column});
-    }
-  }
-  if (static_cast<std::size_t>(width) == action_names_.size()) return {};
-  return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", width),
+  ActionLayout layout{bundle, n_state_, d_action_};
+  for (std::size_t i = 0; i < recipe_.action.size(); ++i)
+    VLA_CHECK(recipe_.action[i]->bind(layout, fmt::format("processor.recipe.action[{}]", i)));
+  n_row_ = layout.n_row;
+  if (static_cast<std::size_t>(layout.width) == action_names_.size()) return {};
+  return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", layout.width),
                 std::to_string(action_names_.size()));
 }
 

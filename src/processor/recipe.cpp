@@ -4,35 +4,52 @@
 
 #include <fmt/format.h>
 
-#include <map>
+#include <algorithm>
+#include <array>
 
-#include "processor/recipe_ops.h"
+// The table of ops: one function of each file in ops/.
+#define OPS(file)   \
+  namespace vla {   \
+  Ops file##_ops(); \
+  }
+#include "processor/recipe_ops.inc"
+#undef OPS
 
 namespace vla {
 namespace {
 
-using namespace recipe_ops;
-
 constexpr const char* kWhere = "processor.recipe";
+constexpr std::array<const char*, 4> kLists = {"image", "text", "state", "action"};
+constexpr std::size_t kMaxOps = 64;  // of one list
 
-/// What one list makes, another must use: a state in words without a place for it would be lost without a word.
-Status check_words(const Recipe& recipe) {
-  const bool made = !recipe.state.empty() && std::holds_alternative<BinsOp>(recipe.state.back());
-  bool used = false;
-  for (const TextOp& op : recipe.text) {
-    const auto* text = std::get_if<TemplateOp>(&op);
-    used |= text != nullptr && text->text.find("{state}") != std::string::npos;
-  }
-  if (made == used) return {};
-  return Error{Code::bad_bundle, std::string(kWhere) + ".text",
-               made ? "a template with {state} for the state that ends in bins"
-                    : "no {state}, or a state list that ends in bins",
-               made ? "none" : "{state}"};
+const Ops& all_ops() {
+  static const Ops ops = [] {
+    Ops all;
+    for (const auto& part : {
+#define OPS(file) file##_ops(),
+#include "processor/recipe_ops.inc"
+#undef OPS
+         })
+      all.insert(all.end(), part.begin(), part.end());
+    return all;
+  }();
+  return ops;
 }
 
-using ParseOp = Status (*)(JsonFields& fields, int index, Recipe& recipe);
+Status parse_op(const char* list, JsonFields& fields, Recipe& recipe) {
+  std::vector<const OpEntry*> known;
+  std::vector<const char*> names;
+  for (const OpEntry& entry : all_ops())
+    if (std::string_view(entry.list) == list) {
+      known.push_back(&entry);
+      names.push_back(entry.name);
+    }
+  VLA_TRY(const int index, fields.choice("op", names));
+  VLA_CHECK(known[static_cast<std::size_t>(index)]->parse(fields, recipe));
+  return fields.done();
+}
 
-Status parse_list(const Json& document, const char* name, ParseOp parse_op, Recipe& recipe) {
+Status parse_list(const Json& document, const char* name, Recipe& recipe) {
   const std::string where = std::string(kWhere) + "." + name;
   const auto list = document.find(name);
   if (list == document.end())
@@ -41,11 +58,19 @@ Status parse_list(const Json& document, const char* name, ParseOp parse_op, Reci
   if (list->size() > kMaxOps)
     return Error{Code::bad_bundle, where, fmt::format("at most {} ops", kMaxOps), std::to_string(list->size())};
   for (std::size_t i = 0; i < list->size(); ++i) {
-    VLA_TRY(JsonFields fields, JsonFields::open((*list)[i], where + "[" + std::to_string(i) + "]"));
-    VLA_CHECK(parse_op(fields, static_cast<int>(i), recipe));
-    VLA_CHECK(fields.done());
+    VLA_TRY(JsonFields fields, JsonFields::open((*list)[i], fmt::format("{}[{}]", where, i)));
+    VLA_CHECK(parse_op(name, fields, recipe));
   }
   return {};
+}
+
+/// What one list makes, another must use: a discretized state without a place for it would be lost without a word.
+Status check_state(const Recipe& recipe) {
+  if (recipe.discretizes_state == recipe.prompt_takes_state) return {};
+  return Error{Code::bad_bundle, std::string(kWhere) + ".text",
+               recipe.discretizes_state ? "a template with {state} for the state that ends in bins"
+                                        : "no {state}, or a state list that ends in bins",
+               recipe.discretizes_state ? "none" : "{state}"};
 }
 
 }  // namespace
@@ -53,19 +78,17 @@ Status parse_list(const Json& document, const char* name, ParseOp parse_op, Reci
 Result<Recipe> parse_recipe(const std::string& json) {
   VLA_TRY(const Json document, parse_json(json, kWhere));
   if (!document.is_object()) return Error{Code::bad_bundle, kWhere, "a JSON object", "other text"};
-  const std::map<std::string, ParseOp> lists = {
-      {"image", parse_image_op}, {"text", parse_text_op}, {"state", parse_state_op}, {"action", parse_action_op}};
   Recipe recipe;
-  for (const auto& [name, parse_op] : lists) VLA_CHECK(parse_list(document, name.c_str(), parse_op, recipe));
+  for (const char* list : kLists) VLA_CHECK(parse_list(document, list, recipe));
   for (const auto& item : document.items())
-    if (!lists.contains(item.key()))
+    if (std::find(kLists.begin(), kLists.end(), item.key()) == kLists.end())
       return Error{Code::bad_bundle, std::string(kWhere) + "." + item.key(), "", "unknown field",
                    "this bundle needs a newer vla"};
   if (recipe.width == 0)
     return Error{Code::bad_bundle, std::string(kWhere) + ".image", "a letterbox, a resize or a size", "none"};
   if (recipe.max_tokens == 0)
     return Error{Code::bad_bundle, std::string(kWhere) + ".text", "tokenize as the last op", "none"};
-  VLA_CHECK(check_words(recipe));
+  VLA_CHECK(check_state(recipe));
   return recipe;
 }
 

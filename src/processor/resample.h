@@ -8,11 +8,11 @@
 
 namespace vla {
 
-/// How bytes are resized in integers, by a filter that widens when a picture shrinks (antialiasing): a triangle or
+/// How bytes are resized in integers, by a filter that widens when an image shrinks (antialiasing): a triangle or
 /// Keys' cubic with a = -0.5, with weights of 22 binary digits, or of as many as 16 bits hold.
 enum class ByteFilter { pillow_bilinear, pillow_bicubic, torch_bicubic };
 
-/// An RGB picture of interleaved bytes at another size, equal to the bit to Pillow's or to torchvision's resize of an
+/// An RGB image of interleaved bytes at another size, equal to the bit to Pillow's or to torchvision's resize of an
 /// 8-bit tensor (transforms.v2, torch 2.13). Rows are rounded to bytes before columns are summed. All sizes must be at
 /// least 1. Sources: Pillow src/libImaging/Resample.c; torch aten/src/ATen/native/cpu/UpSampleKernelAVXAntialias.h.
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
@@ -23,7 +23,7 @@ std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int w
 std::vector<std::uint8_t> resample_opencv(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                           int to_height);
 
-/// The same with INTER_AREA, for pictures of three channels: the mean of the part of the picture that an output pixel
+/// The same with INTER_AREA, for images of three channels: the mean of the part of the image that an output pixel
 /// covers, in integers where both sides shrink by whole numbers and else in float32; where a side grows, two pixels are
 /// blended with weights of 11 binary digits. Source: as above.
 std::vector<std::uint8_t> resample_opencv_area(std::span<const std::uint8_t> rgb, int width, int height, int to_width,

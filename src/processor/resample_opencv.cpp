@@ -34,7 +34,7 @@ std::vector<Tap> make_taps(int n_in, int n_out, bool columns) {
   return taps;
 }
 
-/// The same for INTER_AREA where a picture grows: an output position that lies inside one source position takes it
+/// The same for INTER_AREA where an image grows: an output position that lies inside one source position takes it
 /// alone.
 std::vector<Tap> make_area_taps(int n_in, int n_out) {
   const double inverse = static_cast<double>(n_out) / n_in, scale = 1.0 / inverse;
@@ -51,7 +51,7 @@ std::vector<Tap> make_area_taps(int n_in, int n_out) {
   return taps;
 }
 
-/// One row of the picture at its new width; numbers are 2048 times as large as bytes.
+/// One row of the image at its new width; numbers are 2048 times as large as bytes.
 void widen(const std::uint8_t* row, const std::vector<Tap>& columns, int* out) {
   for (const Tap& tap : columns)
     for (int c = 0; c < 3; ++c)

@@ -109,7 +109,7 @@ void turn(std::span<const float> rgb, std::size_t width, float* out) {
       for (std::size_t c = 0; c < 3; ++c) out[(x * height + y) * 3 + c] = rgb[(y * width + x) * 3 + c];
 }
 
-/// The picture at its new width. A band of rows is turned, so that one loop over whole rows serves columns as well; it
+/// The image at its new width. A band of rows is turned, so that one loop over whole rows serves columns as well; it
 /// is a narrow one that stays in the cache.
 std::vector<float> widened(std::span<const float> rgb, std::size_t width, std::size_t to_width, const Filter& filter) {
   constexpr std::size_t kBand = 16;

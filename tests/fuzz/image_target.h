@@ -6,7 +6,7 @@
 #include <span>
 
 #include "processor/image.h"
-#include "processor/letterbox.h"
+#include "processor/ops/letterbox.h"
 
 namespace vla::fuzz {
 

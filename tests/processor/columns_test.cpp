@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "processor/columns.h"
+#include "processor/ops/columns.h"
 
 #include <cmath>
 
@@ -26,9 +26,9 @@ void check_close(const std::vector<float>& found, const nlohmann::json& expected
 TEST_CASE("an ALOHA state turns into joint angles and servo angles as the reference has them") {
   for (const auto& test : data_json("aloha.json")) {
     std::vector<float> state = test["x"].get<std::vector<float>>();
-    map_columns(ColumnAffineOp{kFlipped, -1.0, 0.0}, state);
-    map_columns(HornAngleOp{kGrippers, 0.058 - 0.01844, 0.01844, 0.036, 0.022}, state);
-    map_columns(ColumnAffineOp{kGrippers, 1 / (1.6296 - 0.5476), -0.5476 / (1.6296 - 0.5476)}, state);
+    map_columns(ColumnAffine{kFlipped, -1.0, 0.0}, state);
+    map_columns(HornAngle{kGrippers, 0.058 - 0.01844, 0.01844, 0.036, 0.022}, state);
+    map_columns(ColumnAffine{kGrippers, 1 / (1.6296 - 0.5476), -0.5476 / (1.6296 - 0.5476)}, state);
     check_close(state, test["state"]);
   }
 }
@@ -36,15 +36,15 @@ TEST_CASE("an ALOHA state turns into joint angles and servo angles as the refere
 TEST_CASE("ALOHA actions come back to the robot's conventions as the reference has them") {
   for (const auto& test : data_json("aloha.json")) {
     std::vector<float> action = test["x"].get<std::vector<float>>();
-    map_columns(ColumnAffineOp{kFlipped, -1.0, 0.0}, action);
-    map_columns(ColumnAffineOp{kGrippers, 1 / (1.491 + 0.6213), (0.5476 + 0.6213) / (1.491 + 0.6213)}, action);
+    map_columns(ColumnAffine{kFlipped, -1.0, 0.0}, action);
+    map_columns(ColumnAffine{kGrippers, 1 / (1.491 + 0.6213), (0.5476 + 0.6213) / (1.491 + 0.6213)}, action);
     check_close(action, test["action"]);
   }
 }
 
 TEST_CASE("a horn that cannot reach the opening stays at its end") {
   std::vector<float> values = {1.0f, 0.0f, -1.0f};
-  map_columns(HornAngleOp{{0, 1, 2}, 1.0, 0.0, 0.036, 0.022}, values);
+  map_columns(HornAngle{{0, 1, 2}, 1.0, 0.0, 0.036, 0.022}, values);
   CHECK(values[0] == static_cast<float>(std::asin(1.0)));
   CHECK(values[1] == static_cast<float>(std::asin(-1.0)));
   CHECK(values[2] == static_cast<float>(std::asin(-1.0)));
@@ -52,7 +52,7 @@ TEST_CASE("a horn that cannot reach the opening stays at its end") {
 
 TEST_CASE("a threshold gives one of two values, and leaves what is no number to be found") {
   std::vector<float> values = {0.5f, std::nextafter(0.5f, 1.0f), -3.0f, NAN, INFINITY, 9.0f};
-  map_columns(ThresholdOp{{0, 1, 2, 3, 4}, 0.5f, -1.0f, 1.0f}, values);
+  map_columns(Threshold{{0, 1, 2, 3, 4}, 0.5f, -1.0f, 1.0f}, values);
   CHECK(values[0] == 1.0f);
   CHECK(values[1] == -1.0f);
   CHECK(values[2] == 1.0f);

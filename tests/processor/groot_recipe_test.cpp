@@ -1,7 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Ops of a policy whose pictures keep their aspect and whose instruction is cleaned: GR00T N1.7.
+// Ops of a policy whose images keep their aspect and whose instruction is cleaned: GR00T N1.7.
+#include "processor/ops/normalize.h"
+#include "processor/ops/pipeline.h"
 #include "processor/python_text.h"
 #include "processor/resample.h"
 #include "processor/sample.h"
@@ -66,15 +68,15 @@ TEST_CASE("text is lower-cased and cleaned as Python does it") {
 TEST_CASE("the kinds of GR00T have no epsilon and leave what has no spread") {
   using Direction = Normalizer::Direction;
   std::vector<float> x = {2.0f, 5.0f};
-  Normalizer(NormKind::groot_min_max, Direction::normalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
+  Normalizer(norm_rule("groot_min_max"), Direction::normalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
   CHECK(x == std::vector<float>{-0.5f, 0.0f});
-  Normalizer(NormKind::groot_min_max, Direction::unnormalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
+  Normalizer(norm_rule("groot_min_max"), Direction::unnormalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
   CHECK(x == std::vector<float>{2.0f, 1.0f});
-  Normalizer(NormKind::groot_mean_std, Direction::normalize, 0.0, {1.0f, 7.0f}, {2.0f, 0.0f}).apply(x);
+  Normalizer(norm_rule("groot_mean_std"), Direction::normalize, 0.0, {1.0f, 7.0f}, {2.0f, 0.0f}).apply(x);
   CHECK(x == std::vector<float>{0.5f, 1.0f});
 }
 
-TEST_CASE("ops on pictures end in size, and rows come first") {
+TEST_CASE("ops on images end in size, and rows come first") {
   CHECK(parse_recipe(kRecipe).ok());
   Json recipe = Json::parse(kRecipe);
   recipe["image"].erase(3);
@@ -94,7 +96,7 @@ TEST_CASE("a pipeline keeps the aspect, refuses another and takes bytes only") {
   CHECK(run_pipeline(wide, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top").ok());
   CHECK(out == std::vector<float>(12, 128.0f / 255.0f));
   const std::string message = refusal(run_pipeline(wide, {2, 2, {SmallestSide{2}}}, out, "top"), Code::bad_observation);
-  CHECK(contains(message, "top: expected a picture with the aspect of 2 x 2, found 4 x 2, which becomes 4 x 2"));
+  CHECK(contains(message, "top: expected an image with the aspect of 2 x 2, found 4 x 2, which becomes 4 x 2"));
   const Frame sliver{1, 60000, std::vector<std::uint8_t>(180000)};
   CHECK(contains(
       refusal(run_pipeline(sliver, {2, 2, {SquarePad{}, SmallestSide{2}}}, out, "top"), Code::bad_observation), "top"));
@@ -162,17 +164,16 @@ TEST_CASE("a frame of another camera than the policy was trained with is refused
   const auto parsed = parse_recipe(recipe.dump());
   REQUIRE(parsed.ok());
   std::vector<float> out(9);
-  const auto& pipeline = std::get<Pipeline>(parsed->fit);
-  CHECK(run_pipeline({6, 4, colours()}, pipeline, out, "view").ok());
+  CHECK(parsed->fit->apply({6, 4, colours()}, out, "view").ok());
   // 3 of 6 columns leave 1.5 on each side, 1 of 4 rows the same: both are rounded to 2, the even number.
   CHECK(out[0] == doctest::Approx((2 * 38 + 2 * 91) % 256 / 255.0));
-  CHECK_FALSE(run_pipeline({4, 6, colours()}, pipeline, out, "view").ok());
+  CHECK_FALSE(parsed->fit->apply({4, 6, colours()}, out, "view").ok());
   recipe["image"][1]["width"] = 7;
   recipe["image"][2]["width"] = 7;
   const auto wide = parse_recipe(recipe.dump());
   REQUIRE(wide.ok());
   std::vector<float> row(21);
-  CHECK_FALSE(run_pipeline({6, 4, colours()}, std::get<Pipeline>(wide->fit), row, "view").ok());
+  CHECK_FALSE(wide->fit->apply({6, 4, colours()}, row, "view").ok());
 }
 
 TEST_CASE("views behind the instruction are found from the end of the prompt, whatever its length") {

@@ -49,7 +49,7 @@ std::string packed(const std::string& text) {
   return out.substr(0, size);
 }
 
-/// A small picture with these chunks behind its header.
+/// A small image with these chunks behind its header.
 std::string png_with(const std::string& chunks) {
   constexpr std::size_t kHeader = 8 + 25;
   return read_text(data_path("images/rgb.png")).insert(kHeader, chunks);

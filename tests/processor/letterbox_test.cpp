@@ -1,11 +1,12 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "processor/letterbox.h"
+#include "processor/ops/letterbox.h"
+#include "processor/ops/planes.h"
 
 #include <cmath>
 
 #include "base/npy.h"
-#include "processor/pictures.h"
+#include "processor/images.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -47,7 +48,7 @@ TEST_CASE("letterbox and affine equal torch and Pillow bit for bit at every size
   CHECK(rest.empty());
 }
 
-TEST_CASE("letterbox puts the picture at the bottom right and fills the rest") {
+TEST_CASE("letterbox puts the image at the bottom right and fills the rest") {
   const Frame white{1, 2, std::vector<std::uint8_t>(6, 255)};
   const std::vector<float> wide = boxed(white, 4, 4, 0.25f);  // 2 x 4 of the 4 x 4
   CHECK(wide[1] == 0.25f);
@@ -58,7 +59,7 @@ TEST_CASE("letterbox puts the picture at the bottom right and fills the rest") {
   CHECK(tall[8] == 1.0f);
 }
 
-TEST_CASE("a centred picture leaves the smaller half of an odd rest at the left and at the top") {
+TEST_CASE("a centred image leaves the smaller half of an odd rest at the left and at the top") {
   Letterbox box{5, 2, 0.25f, Letterbox::Align::center};
   const std::vector<float> wide = boxed({1, 1, std::vector<std::uint8_t>(3, 255)}, box);  // 2 x 2 of the 5 x 2
   CHECK(std::vector<float>(wide.begin(), wide.begin() + 5) == std::vector<float>{0.25f, 1.0f, 1.0f, 0.25f, 0.25f});
@@ -92,7 +93,7 @@ TEST_CASE("a frame of the right size is copied untouched") {
   CHECK(out[15 + 7] == static_cast<float>(rgb[7 * 3 + 1]) / 255.0f);
 }
 
-TEST_CASE("a picture too narrow to leave a pixel is refused") {
+TEST_CASE("an image too narrow to leave a pixel is refused") {
   std::vector<float> out(3 * 16 * 16);
   CHECK(contains(refusal(letterbox(frame_of(1000, 2), Letterbox{16, 16, 0.0f}, out, "top"), Code::bad_observation),
                  "top: "));

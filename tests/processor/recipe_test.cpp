@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/recipe.h"
 
+#include "processor/ops/columns.h"
 #include "processor/support.h"
 
 using namespace vla;
@@ -38,21 +39,25 @@ TEST_CASE("the recipe of the document is read op by op") {
   REQUIRE(recipe.ok());
   CHECK(recipe->width == 512);
   CHECK(recipe->height == 384);
-  CHECK(std::get<Letterbox>(recipe->fit).fill == 0.5f);
+  std::vector<float> planes(3 * 512 * 384);
+  REQUIRE(recipe->fit->apply(Frame{1, 2, std::vector<float>(6)}, planes, "top").ok());
+  CHECK(planes[0] == 0.5f);  // what a tall frame leaves at the left
   REQUIRE(recipe->image.size() == 1);
-  CHECK(std::get<AffineOp>(recipe->image[0]).scale == 2.0f);
-  CHECK(std::get<AffineOp>(recipe->image[0]).shift == -1.0f);
+  recipe->image[0]->apply(planes);
+  CHECK(planes[0] == 0.0f);  // 2 x - 1
   REQUIRE(recipe->text.size() == 1);
-  CHECK(std::get<EnsureSuffixOp>(recipe->text[0]).suffix == "\n");
+  CHECK(*recipe->text[0]->apply("open", {}) == "open\n");
   CHECK(recipe->max_tokens == 48);
-  const auto& normalize = std::get<NormalizeOp>(recipe->state.at(0));
-  CHECK(normalize.kind == NormKind::mean_std);
-  CHECK(normalize.stats == "stats.observation.state");
-  CHECK(normalize.eps == 1e-8);
-  CHECK(normalize.feature.empty());
-  CHECK(std::get<PadOp>(recipe->state.at(1)).size == 32);
-  CHECK(std::get<TakeOp>(recipe->action.at(0)).size == 7);
-  CHECK(std::get<NormalizeOp>(recipe->action.at(1)).kind == NormKind::min_max);
+  REQUIRE(recipe->state.size() == 2);
+  CHECK(recipe->state[0]->reads("stats.observation.state.mean"));
+  CHECK(recipe->state[0]->reads("stats.observation.state.std"));
+  CHECK_FALSE(recipe->state[0]->reads("stats.observation.state.min"));
+  CHECK(recipe->state[1]->d_state(6) == 32);
+  REQUIRE(recipe->action.size() == 2);
+  std::vector<float> row(32);
+  recipe->action[0]->apply(row, {});
+  CHECK(row.size() == 7);
+  CHECK(recipe->action[1]->reads("stats.action.min"));
 }
 
 TEST_CASE("the ops of a list, and the text in them, are bounded") {
@@ -163,7 +168,9 @@ TEST_CASE("an identity needs no statistics") {
   recipe["state"][0] = {{"op", "normalize"}, {"kind", "identity"}};
   const auto parsed = parse_recipe(recipe.dump());
   REQUIRE(parsed.ok());
-  CHECK(std::get<NormalizeOp>(parsed->state.at(0)).kind == NormKind::identity);
+  std::vector<float> state = {1.0f, -2.0f};
+  parsed->state.at(0)->apply(state);
+  CHECK(state == std::vector<float>{1.0f, -2.0f});
 }
 
 namespace {
@@ -197,21 +204,29 @@ std::string refused_robot(const char* pointer, const Json& value) {
 TEST_CASE("ops of robots and of prompts with a state are read") {
   const auto recipe = parse_recipe(robot().dump());
   REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
-  CHECK(std::get<Letterbox>(recipe->fit).align == Letterbox::Align::center);
-  CHECK(std::get<Letterbox>(recipe->fit).antialias);
-  CHECK(std::get<ClipOp>(recipe->image.at(0)).high == 1.0f);
-  CHECK(std::holds_alternative<StripOp>(recipe->text.at(0)));
-  CHECK(std::get<ReplaceOp>(recipe->text.at(1)).from == "_");
-  CHECK(std::get<TemplateOp>(recipe->text.at(2)).text == "Task: {instruction}, State: {state};");
-  const auto& affine = std::get<ColumnAffineOp>(recipe->state.at(0));
-  CHECK(affine.columns == std::vector<int>{1, 2});
-  CHECK(affine.scale == -1.0);
-  CHECK(affine.shift == 0.25);
-  CHECK(std::get<HornAngleOp>(recipe->state.at(1)).arm_length == 0.036);
-  CHECK(std::get<NormalizeOp>(recipe->state.at(2)).kind == NormKind::openpi_quantiles);
-  CHECK(std::get<BinsOp>(recipe->state.at(3)).count == 256);
-  CHECK(std::get<AddStateOp>(recipe->action.at(2)).columns == std::vector<int>{0, 1});
-  CHECK(std::get<ColumnAffineOp>(recipe->action.at(3)).shift == 1.5);
+  std::vector<float> planes = {2.0f, -1.0f};
+  recipe->image.at(0)->apply(planes);
+  CHECK(planes == std::vector<float>{1.0f, 0.0f});
+  CHECK(*recipe->text.at(0)->apply(" a b ", {}) == "a b");
+  CHECK(*recipe->text.at(1)->apply("a_b", {}) == "a b");
+  CHECK(*recipe->text.at(2)->apply("go", std::vector<int>{3, -1}) == "Task: go, State: 3 -1;");
+  std::vector<float> state(7, 1.0f), angle = {0, 0, 0, 0, 0, 0, 1.0f};
+  recipe->state.at(0)->apply(state);
+  CHECK(state == std::vector<float>{1, -0.75f, -0.75f, 1, 1, 1, 1});
+  recipe->state.at(1)->apply(state);
+  map_columns(HornAngle{{6}, 2.0, 0.5, 0.036, 0.022}, angle);
+  CHECK(state[6] == angle[6]);
+  CHECK(recipe->state.at(2)->reads("stats.observation.state.q99"));
+  std::vector<float> normalized = {-2.0f, 0.0f, 2.0f};
+  std::vector<int> discretized;
+  recipe->state.at(3)->finish(normalized, discretized);
+  CHECK(discretized == std::vector<int>{-1, 128, 255});
+  CHECK(normalized.empty());
+  std::vector<float> row(7, 1.0f);
+  recipe->action.at(2)->apply(row, state);
+  CHECK(row[1] == 0.25f);
+  recipe->action.at(3)->apply(row, state);
+  CHECK(row[6] == 2.0f);
 }
 
 TEST_CASE("every field of the ops of robots is required") {

@@ -1,11 +1,11 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "processor/resize.h"
+#include "processor/ops/resize.h"
 
 #include "base/npy.h"
-#include "processor/pictures.h"
+#include "processor/images.h"
+#include "processor/ops/planes.h"
 #include "processor/resample.h"
-#include "processor/standardize.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -60,7 +60,7 @@ TEST_CASE("pixels as floats are cut to bytes for torch's filter and refused for 
                  "top: expected pixels of 8 bits, found float pixels"));
 }
 
-TEST_CASE("a picture of the size keeps its bytes under both filters") {
+TEST_CASE("an image of the size keeps its bytes under both filters") {
   const Frame frame = frame_of(5, 4);
   const auto& rgb = std::get<std::vector<std::uint8_t>>(frame.rgb);
   CHECK(resample_opencv(rgb, 5, 4, 5, 4) == rgb);

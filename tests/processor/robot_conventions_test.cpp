@@ -44,7 +44,7 @@ TEST_CASE("a state in words goes into the prompt and the network sees no other")
   const auto inputs = make(robot()).encode(seen);
   REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
   CHECK(inputs->state.empty());
-  CHECK(inputs->state_words == std::vector<int>{128, 64});
+  CHECK(inputs->discretized_state == std::vector<int>{128, 64});
   CHECK(inputs->raw_state == std::vector<float>{1.0f, 1.0f});
   CHECK(inputs->tokens == *Tokenizer::create(tokenizer_keys("smol"), 4096)->encode("go 128 64"));
   Inputs empty;

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "processor/text.h"
+#include "processor/ops/text.h"
 
-#include "processor/columns.h"
+#include "processor/ops/columns.h"
 #include "processor/support.h"
 
 using namespace vla;
@@ -10,7 +10,7 @@ using namespace vla::test;
 
 namespace {
 
-constexpr BinsOp kBins = {-1.0, 1.0, 256};
+constexpr Bins kBins = {-1.0, 1.0, 256};
 
 /// The prompt as the recipe of pi0.5 makes it.
 std::string prompt_of(const std::string& text, const std::vector<float>& state) {

@@ -15,8 +15,8 @@
 #include <nlohmann/json.hpp>
 
 #include "processor/image.h"
-#include "processor/letterbox.h"
-#include "processor/resize.h"
+#include "processor/ops/letterbox.h"
+#include "processor/ops/resize.h"
 #include "processor/tokenizer.h"
 
 namespace {

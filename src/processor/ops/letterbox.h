@@ -17,8 +17,8 @@ struct Letterbox {
   int width = 0;
   int height = 0;
   float fill = 0.0f;
-  Align align = Align::bottom_right;  // where the picture is; of an odd rest `center` leaves less at the left and top
-  bool antialias = false;             // as Pillow resamples 8-bit pictures, see below
+  Align align = Align::bottom_right;  // where the image is; of an odd rest `center` leaves less at the left and top
+  bool antialias = false;             // as Pillow resamples 8-bit images, see below
 };
 
 /// Writes (3, height, width) float32 to `out`; 8-bit values are divided by 255. A frame that has the size already is
@@ -32,13 +32,7 @@ struct Letterbox {
 /// With `antialias` everything happens in 8 bits, and a float frame is first cut to them (255 x, without rounding); the
 /// result equals Pillow's. Source: openpi image_tools.py resize_with_pad; `resample_8bit`.
 ///
-/// Errors: bad_observation when a side of the resized picture is shorter than a pixel.
+/// Errors: bad_observation when a side of the resized image is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
-
-/// `x * scale + shift`, each rounded to float32, in place.
-void affine(std::span<float> values, float scale, float shift);
-
-/// Holds every value in [low, high], in place. Interpolation can leave the range of its inputs by a rounding error.
-void clip(std::span<float> values, float low, float high);
 
 }  // namespace vla

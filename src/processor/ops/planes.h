@@ -7,7 +7,7 @@
 
 namespace vla {
 
-/// `(x - mean) / std` of each channel of a picture.
+/// `(x - mean) / std` of each channel of an image.
 struct Standardize {
   /// float32; every number and result rounded to bfloat16; only the last result of float32; or float32 in bytes, where
   /// x, mean and std are 255 times as large, so that the division by 255 rounds nothing.
@@ -21,5 +21,11 @@ struct Standardize {
 /// (_batched_pixel_values), torch's element-wise arithmetic; in bytes transformers image_processing_utils_fast.py
 /// (_fuse_mean_std_and_rescale_factor).
 void standardize(std::span<float> pixels, const Standardize& op);
+
+/// `x * scale + shift`, each rounded to float32, in place.
+void affine(std::span<float> values, float scale, float shift);
+
+/// Holds every value in [low, high], in place. Interpolation can leave the range of its inputs by a rounding error.
+void clip(std::span<float> values, float low, float high);
 
 }  // namespace vla

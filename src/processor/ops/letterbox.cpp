@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "processor/letterbox.h"
+#include "processor/ops/letterbox.h"
 
 #include <fmt/format.h>
 
@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "processor/byte_pixels.h"
+#include "processor/recipe.h"
 #include "processor/resample.h"
 
 namespace vla {
@@ -45,7 +46,7 @@ struct FloatSource {
   float operator()(std::size_t i) const { return values[i]; }
 };
 
-/// Where a picture of `width` x `height` lands in planes of `plane` floats whose rows are `stride` apart.
+/// Where an image of `width` x `height` lands in planes of `plane` floats whose rows are `stride` apart.
 struct Target {
   float* out;
   std::size_t plane, stride;
@@ -132,7 +133,7 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
     target.height = static_cast<int>(frame.height / ratio);
     if (target.width < 1 || target.height < 1)
       return Error{Code::bad_observation, where,
-                   fmt::format("a picture that fits {} x {} with both sides", to.width, to.height),
+                   fmt::format("an image that fits {} x {} with both sides", to.width, to.height),
                    fmt::format("{} x {}, which leaves a side shorter than a pixel", frame.width, frame.height)};
     std::fill(out.begin(), out.end(), to.fill);
   }
@@ -150,15 +151,43 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
   return {};
 }
 
-void affine(std::span<float> values, float scale, float shift) {
-  for (float& value : values) {
-    const float scaled = value * scale;
-    value = scaled + shift;
+namespace {
+
+class LetterboxFit final : public Fit {
+ public:
+  explicit LetterboxFit(const Letterbox& box) : box_(box) {}
+  const char* described() const override { return "letterboxed"; }
+  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
+    return letterbox(frame, box_, planes, where);
   }
+
+ private:
+  Letterbox box_;
+};
+
+Result<Letterbox> read_letterbox(JsonFields& fields) {
+  Letterbox op;
+  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
+  VLA_CHECK(fields.choice("filter", {"bilinear"}));
+  VLA_TRY(op.antialias, fields.boolean("antialias"));
+  VLA_TRY(const int align, fields.choice("align", {"bottom_right", "center"}));
+  op.align = static_cast<Letterbox::Align>(align);
+  VLA_TRY(op.fill, fields.number("fill", {0, 1}));
+  return op;
 }
 
-void clip(std::span<float> values, float low, float high) {
-  for (float& value : values) value = std::clamp(value, low, high);
+Status parse(JsonFields& fields, Recipe& recipe) {
+  if (recipe.fit != nullptr) return misplaced(fields, "a letterbox as the first and only op on images of any size");
+  VLA_TRY(const Letterbox op, read_letterbox(fields));
+  recipe.fit = std::make_unique<LetterboxFit>(op);
+  recipe.width = op.width;
+  recipe.height = op.height;
+  return {};
 }
+
+}  // namespace
+
+Ops letterbox_ops() { return {{"image", "letterbox", parse}}; }
 
 }  // namespace vla

@@ -6,7 +6,7 @@
 
 namespace vla::test {
 
-/// The same picture as `frame_of` in the script that wrote the expected planes.
+/// The same image as `frame_of` in the script that wrote the expected planes.
 inline Frame frame_of(int width, int height) {
   std::vector<std::uint8_t> rgb;
   for (int y = 0; y < height; ++y)

@@ -9,10 +9,11 @@
 
 #include "base/result.h"
 #include "processor/image.h"
+#include "processor/ops/op.h"
 
 namespace vla {
 
-/// Black on both sides of a picture that is not square, until it is; of an odd rest less at the left and at the top.
+/// Black on both sides of an image that is not square, until it is; of an odd rest less at the left and at the top.
 struct SquarePad {};
 
 /// Both sides scaled so that the shorter one is `size`, as cv2.resize does with INTER_AREA.
@@ -20,7 +21,7 @@ struct SmallestSide {
   int size = 0;
 };
 
-/// The middle of a picture: this fraction of each side, cut to whole pixels, but one pixel at least.
+/// The middle of an image: this fraction of each side, cut to whole pixels, but one pixel at least.
 struct CropFraction {
   double fraction = 0.0;
 };
@@ -40,19 +41,19 @@ struct CameraSize {
   int height = 0;
 };
 
-/// The middle of a picture, no larger than it; of an odd rest that is cut off the half is rounded to even.
+/// The middle of an image, no larger than it; of an odd rest that is cut off the half is rounded to even.
 struct CenterCrop {
   int width = 0;
   int height = 0;
 };
 
-using PictureOp = std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop>;
+using ByteOp = std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop>;
 
-/// Ops on 8-bit pictures one after the other, and the size at which they must come out.
+/// Ops on 8-bit images one after the other, and the size at which they must come out.
 struct Pipeline {
   int width = 0;
   int height = 0;
-  std::vector<PictureOp> ops;
+  std::vector<ByteOp> ops;
 };
 
 /// Writes (3, height, width) float32 to `out`: the bytes that come out, divided by 255. A frame of floats is refused,
@@ -60,5 +61,8 @@ struct Pipeline {
 /// Source: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations).
 /// Errors: bad_observation.
 Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
+
+/// The op "resize" among others.
+Status parse_byte_resize(JsonFields& fields, Recipe& recipe);
 
 }  // namespace vla

@@ -1,0 +1,190 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/ops/columns.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "processor/ops/planes.h"
+#include "processor/recipe.h"
+
+namespace vla {
+
+void map_columns(const ColumnAffine& op, std::span<float> values) {
+  for (const int column : op.columns) {
+    float& value = values[static_cast<std::size_t>(column)];
+    value = static_cast<float>(static_cast<double>(value) * op.scale + op.shift);
+  }
+}
+
+void map_columns(const HornAngle& op, std::span<float> values) {
+  for (const int column : op.columns) {
+    float& value = values[static_cast<std::size_t>(column)];
+    const double x = static_cast<double>(value) * op.scale + op.shift, r = op.horn_radius, a = op.arm_length;
+    const double sine = (r * r + x * x - a * a) / (2.0 * r * x);
+    value = static_cast<float>(std::asin(std::clamp(sine, -1.0, 1.0)));
+  }
+}
+
+void map_columns(const Threshold& op, std::span<float> values) {
+  for (const int column : op.columns) {
+    float& value = values[static_cast<std::size_t>(column)];
+    if (std::isfinite(value)) value = value > op.above ? op.then : op.otherwise;
+  }
+}
+
+void hold(const Clip& op, std::span<float> values) {
+  for (float& value : values)
+    if (std::isfinite(value)) value = std::clamp(value, op.low, op.high);
+}
+
+std::vector<int> bins(const Bins& op, std::span<const float> values) {
+  std::vector<double> edges;
+  const double step = (op.high - op.low) / op.count;
+  for (int i = 0; i < op.count; ++i) edges.push_back(i * step + op.low);
+  std::vector<int> numbers;
+  for (const float value : values) {
+    const auto above = std::upper_bound(edges.begin(), edges.end(), static_cast<double>(value));
+    numbers.push_back(static_cast<int>(above - edges.begin()) - 1);
+  }
+  return numbers;
+}
+
+namespace {
+
+/// The columns that an op names must exist.
+Status check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where) {
+  for (const int column : columns)
+    if (static_cast<std::size_t>(column) >= width)
+      return misfit(where + ".columns", fmt::format("columns below {}", width), std::to_string(column));
+  return {};
+}
+
+Status read(JsonFields& fields, ColumnAffine& op) {
+  VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
+  VLA_TRY(op.scale, fields.wide_number("scale", kPlain));
+  VLA_TRY(op.shift, fields.wide_number("shift", kPlain));
+  return {};
+}
+
+Status read(JsonFields& fields, HornAngle& op) {
+  VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
+  VLA_TRY(op.scale, fields.wide_number("scale", kPlain));
+  VLA_TRY(op.shift, fields.wide_number("shift", kPlain));
+  VLA_TRY(op.arm_length, fields.wide_number("arm_length", kPlain));
+  VLA_TRY(op.horn_radius, fields.wide_number("horn_radius", {1e-9, kPlain.high}));
+  return {};
+}
+
+Status read(JsonFields& fields, Threshold& op) {
+  VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
+  VLA_TRY(op.above, fields.number("above", kPlain));
+  VLA_TRY(op.then, fields.number("then", kPlain));
+  VLA_TRY(op.otherwise, fields.number("else", kPlain));
+  return {};
+}
+
+Status read(JsonFields& fields, Clip& op) {
+  VLA_TRY(op.low, fields.number("low", kPlain));
+  VLA_TRY(op.high, fields.number("high", kPlain));
+  return op.low > op.high ? fields.wrong("high", "a number that is not below low") : Status();
+}
+
+StateOp::Stage last_stage(const Recipe& recipe) {
+  return recipe.state.empty() ? StateOp::Stage::convention : recipe.state.back()->stage();
+}
+
+/// A convention of a robot: some columns of its state.
+template <class Params>
+struct ColumnStateOp final : StateOp {
+  Params params;
+  Stage stage() const override { return Stage::convention; }
+  Status bind(const StateLayout& layout, const std::string& where) override {
+    return check_columns(params.columns, layout.n_state, where);
+  }
+  void apply(std::span<float> state) const override { map_columns(params, state); }
+};
+
+template <class Params>
+Status parse_state(JsonFields& fields, Recipe& recipe) {
+  if (last_stage(recipe) == StateOp::Stage::end) return misplaced(fields, "nothing after pad, bins or drop");
+  if (last_stage(recipe) != StateOp::Stage::convention)
+    return misplaced(fields, "the robot's conventions before normalize");
+  auto op = std::make_unique<ColumnStateOp<Params>>();
+  VLA_CHECK(read(fields, op->params));
+  recipe.state.push_back(std::move(op));
+  return {};
+}
+
+struct ClipStateOp final : StateOp {
+  Clip params;
+  Stage stage() const override { return Stage::clipped; }
+  void apply(std::span<float> state) const override { clip(state, params.low, params.high); }
+};
+
+Status parse_state_clip(JsonFields& fields, Recipe& recipe) {
+  if (last_stage(recipe) == StateOp::Stage::end) return misplaced(fields, "nothing after pad, bins or drop");
+  if (last_stage(recipe) != StateOp::Stage::normalized) return misplaced(fields, "one clip, after normalize");
+  auto op = std::make_unique<ClipStateOp>();
+  VLA_CHECK(read(fields, op->params));
+  recipe.state.push_back(std::move(op));
+  return {};
+}
+
+template <class Params>
+struct ColumnActionOp final : ActionOp {
+  Params params;
+  Status bind(ActionLayout& layout, const std::string& where) override {
+    return check_columns(params.columns, static_cast<std::size_t>(layout.width), where);
+  }
+  void apply(std::vector<float>& row, std::span<const float>) const override { map_columns(params, row); }
+};
+
+struct ClipActionOp final : ActionOp {
+  Clip params;
+  Status bind(ActionLayout&, const std::string&) override { return {}; }
+  void apply(std::vector<float>& row, std::span<const float>) const override { hold(params, row); }
+};
+
+template <class Op>
+Status parse_action(JsonFields& fields, Recipe& recipe) {
+  auto op = std::make_unique<Op>();
+  VLA_CHECK(read(fields, op->params));
+  recipe.action.push_back(std::move(op));
+  return {};
+}
+
+/// Adds the state, as it is before its normalization, to the columns named.
+struct AddStateOp final : ActionOp {
+  std::vector<int> columns;
+  Status bind(ActionLayout& layout, const std::string& where) override {
+    return check_columns(columns, std::min(static_cast<std::size_t>(layout.width), layout.n_state), where);
+  }
+  void apply(std::vector<float>& row, std::span<const float> raw_state) const override {
+    for (const int column : columns)
+      row[static_cast<std::size_t>(column)] += raw_state[static_cast<std::size_t>(column)];
+  }
+};
+
+Status parse_add_state(JsonFields& fields, Recipe& recipe) {
+  auto op = std::make_unique<AddStateOp>();
+  VLA_TRY(op->columns, fields.integers("columns", 0, kMaxVector - 1));
+  recipe.action.push_back(std::move(op));
+  return {};
+}
+
+}  // namespace
+
+Ops columns_ops() {
+  return {{"state", "affine", parse_state<ColumnAffine>},
+          {"state", "horn_angle", parse_state<HornAngle>},
+          {"state", "clip", parse_state_clip},
+          {"action", "affine", parse_action<ColumnActionOp<ColumnAffine>>},
+          {"action", "threshold", parse_action<ColumnActionOp<Threshold>>},
+          {"action", "clip", parse_action<ClipActionOp>},
+          {"action", "add_state", parse_add_state}};
+}
+
+}  // namespace vla

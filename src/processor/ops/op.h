@@ -1,0 +1,112 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+#include "bundle/bundle.h"
+#include "processor/image.h"
+#include "processor/json_fields.h"
+#include "processor/names.h"
+
+/// The kinds of ops of a recipe. An op is read from its fields, checked against the bundle once, and applied to every
+/// observation or chunk. Each file of this folder holds an op, or a few that are close kin, and names them in a
+/// function
+/// `<file>_ops()`; the build puts these functions into one table (src/CMakeLists.txt).
+namespace vla {
+
+struct Recipe;
+
+/// A line of the table.
+struct OpEntry {
+  const char* list;  // image, text, state or action
+  const char* name;
+  /// Reads the op and appends it to its list. Errors: bad_bundle, also for a place where the op has no meaning.
+  Status (*parse)(JsonFields& fields, Recipe& recipe);
+};
+using Ops = std::vector<OpEntry>;
+
+/// Makes planes of the network's size from a frame of any size.
+class Fit {
+ public:
+  virtual ~Fit() = default;
+  virtual const char* described() const = 0;
+  /// Writes (3, height, width) float32 in [0, 1]. Errors: bad_observation, at `where`.
+  virtual Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const = 0;
+};
+
+/// Works on planes (3, height, width).
+class PlaneOp {
+ public:
+  virtual ~PlaneOp() = default;
+  virtual void apply(std::span<float> planes) const = 0;
+};
+
+class TextOp {
+ public:
+  virtual ~TextOp() = default;
+  /// `state`: the discretized state, where the prompt has a place for it. Errors: bad_observation.
+  virtual Result<std::string> apply(std::string text, std::span<const int> state) const = 0;
+};
+
+/// What a state consists of.
+struct StateLayout {
+  const Bundle& bundle;
+  const FeatureNames& features;
+  std::span<const int> dims;  // of each feature
+  std::size_t n_state;        // numbers of all features together
+};
+
+class StateOp {
+ public:
+  /// The order in which the kinds of ops may follow each other; only the last op is of kind `end`.
+  enum class Stage { convention, normalized, clipped, end };
+
+  virtual ~StateOp() = default;
+  virtual Stage stage() const = 0;
+  /// Reads statistics and checks sizes. `where` is the op's place in the recipe. Errors: bad_bundle.
+  virtual Status bind(const StateLayout&, const std::string& /*where*/) { return {}; }
+  virtual void apply(std::span<float> /*state*/) const {}
+  /// Of kind `end`: what the network sees of the state, and what goes into the prompt.
+  virtual void finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const {}
+  virtual std::size_t d_state(std::size_t n_state) const { return n_state; }
+  virtual bool reads(const std::string& /*tensor*/) const { return false; }
+};
+
+/// What the ops so far leave of a chunk.
+struct ActionLayout {
+  const Bundle& bundle;
+  std::size_t n_state;
+  int width;      // columns
+  int n_row = 0;  // rows, 0: all
+};
+
+class ActionOp {
+ public:
+  virtual ~ActionOp() = default;
+  /// Reads statistics, checks sizes, and changes the layout where the op does. Errors: bad_bundle.
+  virtual Status bind(ActionLayout& layout, const std::string& where) = 0;
+  /// One row, in place. `raw_state` is the state before its normalization.
+  virtual void apply(std::vector<float>& row, std::span<const float> raw_state) const = 0;
+  virtual bool reads(const std::string& /*tensor*/) const { return false; }
+};
+
+/// Largest image side and vector that a recipe may ask for: a damaged number must not ask for all memory.
+inline constexpr int kMaxImageSide = 8192;
+inline constexpr int kMaxVector = 65536;
+inline constexpr int kMaxViews = 32;
+inline constexpr std::size_t kMaxOpText = 1 << 12;     // bytes of a text that an op looks for or writes
+inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op adds
+
+/// Numbers of pixels, states and actions: far beyond any of them, and far from the end of float32.
+inline constexpr Range kPlain = {-1e9, 1e9};
+
+inline Error misplaced(const JsonFields& fields, const char* expected) { return fields.wrong("op", expected); }
+inline Error misfit(std::string where, std::string expected, std::string found) {
+  return {Code::bad_bundle, std::move(where), std::move(expected), std::move(found), "convert the checkpoint again"};
+}
+
+}  // namespace vla

@@ -1,0 +1,215 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "processor/ops/pipeline.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "processor/byte_pixels.h"
+#include "processor/recipe.h"
+#include "processor/resample.h"
+
+namespace vla {
+namespace {
+
+/// Sides in double precision, in which the reference scales them: those of a sliver of an image may be out of reach.
+struct Size {
+  double width, height;
+  bool operator==(const Size&) const = default;
+};
+
+struct Image {
+  int width, height;
+  std::vector<std::uint8_t> rgb;
+};
+
+Size size_after(const SquarePad&, const Size& from) {
+  const double side = std::max(from.width, from.height);
+  return {side, side};
+}
+
+Size size_after(const SmallestSide& op, const Size& from) {
+  const double scale = op.size / std::min(from.width, from.height);
+  return {std::max(1.0, std::nearbyint(from.width * scale)), std::max(1.0, std::nearbyint(from.height * scale))};
+}
+
+Size size_after(const CropFraction& op, const Size& from) {
+  return {std::max(1.0, std::floor(from.width * op.fraction)), std::max(1.0, std::floor(from.height * op.fraction))};
+}
+
+/// Of the ops that state a size.
+template <class Op>
+Size size_after(const Op& op, const Size&) {
+  return {static_cast<double>(op.width), static_cast<double>(op.height)};
+}
+
+/// As Python rounds a half.
+int half_to_even(int whole) { return whole / 2 + (whole % 4 == 3 ? 1 : 0); }
+
+Image cropped(const Image& from, const CenterCrop& op) {
+  Image to{op.width, op.height, {}};
+  const int left = half_to_even(from.width - op.width), top = half_to_even(from.height - op.height);
+  for (int y = 0; y < op.height; ++y) {
+    const auto start = from.rgb.begin() + 3 * (static_cast<std::ptrdiff_t>(top + y) * from.width + left);
+    to.rgb.insert(to.rgb.end(), start, start + 3 * static_cast<std::ptrdiff_t>(op.width));
+  }
+  return to;
+}
+
+std::vector<std::uint8_t> resized(const Image& from, const ByteResize& op) {
+  switch (op.filter) {
+    case ByteResize::Filter::pillow_bicubic:
+      return resample_8bit(from.rgb, from.width, from.height, op.width, op.height, ByteFilter::pillow_bicubic);
+    case ByteResize::Filter::torch_bicubic_16bit:
+      return resample_8bit(from.rgb, from.width, from.height, op.width, op.height, ByteFilter::torch_bicubic);
+    case ByteResize::Filter::torch_bilinear_cut:
+      break;
+  }
+  return resample_torch_linear(from.rgb, from.width, from.height, op.width, op.height);
+}
+
+/// The image in the middle of another size: what is beyond it is cut off, what it does not reach is black.
+Image centred(const Image& from, int width, int height) {
+  Image to{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
+  const int left = (width - from.width) / 2, top = (height - from.height) / 2;
+  const int n_column = std::min(width, from.width), n_row = std::min(height, from.height);
+  for (int y = 0; y < n_row; ++y) {
+    const std::size_t in_row = static_cast<std::size_t>(y + std::max(0, (from.height - height) / 2)) * from.width;
+    const std::size_t out_row = static_cast<std::size_t>(y + std::max(0, top)) * width;
+    const auto start = static_cast<std::ptrdiff_t>(3 * (in_row + std::max(0, (from.width - width) / 2)));
+    std::copy_n(from.rgb.begin() + start, 3 * n_column,
+                to.rgb.begin() + static_cast<std::ptrdiff_t>(3 * (out_row + std::max(0, left))));
+  }
+  return to;
+}
+
+Image applied(const ByteOp& op, const Image& from, int width, int height) {
+  if (std::holds_alternative<SmallestSide>(op))
+    return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
+  if (const auto* resize = std::get_if<ByteResize>(&op)) return {width, height, resized(from, *resize)};
+  if (const auto* crop = std::get_if<CenterCrop>(&op)) return cropped(from, *crop);
+  return centred(from, width, height);
+}
+
+}  // namespace
+
+Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where) {
+  const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
+  if (bytes == nullptr)
+    return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
+                 "send the camera's bytes: this policy's images are resized as bytes"};
+  for (const ByteOp& op : pipeline.ops) {
+    const auto* camera = std::get_if<CameraSize>(&op);
+    if (camera != nullptr && (camera->width != frame.width || camera->height != frame.height))
+      return Error{Code::bad_observation, where, fmt::format("an image of {} x {}", camera->width, camera->height),
+                   fmt::format("{} x {}", frame.width, frame.height),
+                   "this policy takes the images of the cameras that it was trained with"};
+  }
+  // All sizes come before any image, so that none is made which nothing needs or no memory holds.
+  std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
+  bool fits = true;
+  for (const ByteOp& op : pipeline.ops) {
+    if (const auto* crop = std::get_if<CenterCrop>(&op))
+      fits &= crop->width <= sizes.back().width && crop->height <= sizes.back().height;
+    sizes.push_back(std::visit([&](const auto& o) { return size_after(o, sizes.back()); }, op));
+    fits &= sizes.back().width * sizes.back().height <= static_cast<double>(ImageLimits().max_pixels);
+  }
+  if (!fits || sizes.back() != Size{static_cast<double>(pipeline.width), static_cast<double>(pipeline.height)})
+    return Error{Code::bad_observation, where,
+                 fmt::format("an image with the aspect of {} x {}", pipeline.width, pipeline.height),
+                 fmt::format("{} x {}, which becomes {} x {}", frame.width, frame.height, sizes.back().width,
+                             sizes.back().height),
+                 "this policy's images keep their aspect; send those of the camera that the bundle was made for"};
+  Image image{frame.width, frame.height, *bytes};
+  for (std::size_t i = 0; i < pipeline.ops.size(); ++i)
+    image =
+        applied(pipeline.ops[i], image, static_cast<int>(sizes[i + 1].width), static_cast<int>(sizes[i + 1].height));
+  spread_bytes(image.rgb, out);
+  return {};
+}
+
+namespace {
+
+constexpr std::size_t kMaxByteOps = 16;
+
+class PipelineFit final : public Fit {
+ public:
+  const char* described() const override { return "padded, scaled and cropped as the recipe says"; }
+  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
+    return run_pipeline(frame, pipeline, planes, where);
+  }
+
+  Pipeline pipeline;
+};
+
+/// The pipeline that the next op belongs to.
+Result<Pipeline*> open_pipeline(const JsonFields& fields, Recipe& recipe) {
+  if (recipe.width > 0) return misplaced(fields, "images of any size before size, letterbox or resize");
+  if (recipe.fit == nullptr) recipe.fit = std::make_unique<PipelineFit>();
+  return &static_cast<PipelineFit&>(*recipe.fit).pipeline;  // every other fit has stated the size
+}
+
+Status add(const JsonFields& fields, Recipe& recipe, ByteOp op) {
+  VLA_TRY(Pipeline* const pipeline, open_pipeline(fields, recipe));
+  if (pipeline->ops.size() == kMaxByteOps) return misplaced(fields, "fewer ops on images of any size");
+  pipeline->ops.push_back(op);
+  return {};
+}
+
+Status parse_square_pad(JsonFields& fields, Recipe& recipe) { return add(fields, recipe, SquarePad{}); }
+
+Status parse_smallest_side(JsonFields& fields, Recipe& recipe) {
+  SmallestSide op;
+  VLA_TRY(op.size, fields.integer("size", 1, kMaxImageSide));
+  VLA_CHECK(fields.choice("filter", {"opencv_area"}));
+  return add(fields, recipe, op);
+}
+
+Status parse_crop_fraction(JsonFields& fields, Recipe& recipe) {
+  CropFraction op;
+  VLA_TRY(op.fraction, fields.wide_number("fraction", {1e-6, 1}));
+  return add(fields, recipe, op);
+}
+
+template <class Op>
+Status parse_stated_size(JsonFields& fields, Recipe& recipe) {
+  Op op;
+  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
+  return add(fields, recipe, op);
+}
+
+/// The end of a pipeline: the size that the images must have.
+Status parse_size(JsonFields& fields, Recipe& recipe) {
+  VLA_TRY(Pipeline* const pipeline, open_pipeline(fields, recipe));
+  VLA_TRY(recipe.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(recipe.height, fields.integer("height", 1, kMaxImageSide));
+  pipeline->width = recipe.width;
+  pipeline->height = recipe.height;
+  return {};
+}
+
+}  // namespace
+
+Status parse_byte_resize(JsonFields& fields, Recipe& recipe) {
+  if (recipe.width > 0) return misplaced(fields, "images of any size before size, letterbox or resize");
+  ByteResize op;
+  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
+  VLA_TRY(const int filter, fields.choice("filter", {"pillow_bicubic", "torch_bicubic_16bit", "torch_bilinear_cut"}));
+  op.filter = static_cast<ByteResize::Filter>(filter);
+  return add(fields, recipe, op);
+}
+
+Ops pipeline_ops() {
+  return {{"image", "square_pad", parse_square_pad},
+          {"image", "smallest_side", parse_smallest_side},
+          {"image", "crop_fraction", parse_crop_fraction},
+          {"image", "camera_size", parse_stated_size<CameraSize>},
+          {"image", "center_crop", parse_stated_size<CenterCrop>},
+          {"image", "size", parse_size}};
+}
+
+}  // namespace vla

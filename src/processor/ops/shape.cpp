@@ -1,0 +1,125 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// What ends the list of a state, and what of a chunk is for the robot.
+#include <fmt/format.h>
+
+#include "processor/ops/columns.h"
+#include "processor/recipe.h"
+
+namespace vla {
+namespace {
+
+struct PadOp final : StateOp {
+  int size = 0;
+  float value = 0.0f;
+  Stage stage() const override { return Stage::end; }
+  Status bind(const StateLayout& layout, const std::string& where) override {
+    if (static_cast<std::size_t>(size) >= layout.n_state) return {};
+    return misfit(where + ".size", fmt::format("at least the {} numbers of the state", layout.n_state),
+                  std::to_string(size));
+  }
+  void finish(std::vector<float>& state, std::vector<int>&) const override { state.resize(d_state(0), value); }
+  std::size_t d_state(std::size_t) const override { return static_cast<std::size_t>(size); }
+};
+
+/// The state goes into the prompt as whole numbers.
+struct BinsOp final : StateOp {
+  Bins params;
+  Stage stage() const override { return Stage::end; }
+  void finish(std::vector<float>& state, std::vector<int>& discretized) const override {
+    discretized = bins(params, state);
+    state.clear();
+  }
+  std::size_t d_state(std::size_t) const override { return 0; }
+};
+
+/// The network sees no state.
+struct DropOp final : StateOp {
+  Stage stage() const override { return Stage::end; }
+  void finish(std::vector<float>& state, std::vector<int>&) const override { state.clear(); }
+  std::size_t d_state(std::size_t) const override { return 0; }
+};
+
+Status read(JsonFields& fields, PadOp& op) {
+  VLA_TRY(op.size, fields.integer("size", 1, kMaxVector));
+  if (fields.has("value")) {
+    VLA_TRY(op.value, fields.number("value", kPlain));
+  }
+  return {};
+}
+
+Status read(JsonFields& fields, BinsOp& op) {
+  VLA_TRY(op.params.low, fields.wide_number("low", kPlain));
+  VLA_TRY(op.params.high, fields.wide_number("high", kPlain));
+  VLA_TRY(op.params.count, fields.integer("count", 1, kMaxVector));
+  return op.params.low >= op.params.high ? fields.wrong("high", "a number above low") : Status();
+}
+
+Status read(JsonFields&, DropOp&) { return {}; }
+
+template <class Op>
+Status parse_end(JsonFields& fields, Recipe& recipe) {
+  if (!recipe.state.empty() && recipe.state.back()->stage() == StateOp::Stage::end)
+    return misplaced(fields, "nothing after pad, bins or drop");
+  auto op = std::make_unique<Op>();
+  VLA_CHECK(read(fields, *op));
+  recipe.discretizes_state = std::is_same_v<Op, BinsOp>;
+  recipe.state.push_back(std::move(op));
+  return {};
+}
+
+/// The first columns, which are the robot's.
+struct TakeOp final : ActionOp {
+  int size = 0;
+  Status bind(ActionLayout& layout, const std::string& where) override {
+    if (size > layout.width)
+      return misfit(where + ".size", fmt::format("at most {} columns", layout.width), std::to_string(size));
+    layout.width = size;
+    return {};
+  }
+  void apply(std::vector<float>& row, std::span<const float>) const override {
+    row.resize(static_cast<std::size_t>(size));
+  }
+};
+
+Status parse_take(JsonFields& fields, Recipe& recipe) {
+  auto op = std::make_unique<TakeOp>();
+  VLA_TRY(op->size, fields.integer("size", 1, kMaxVector));
+  recipe.action.push_back(std::move(op));
+  return {};
+}
+
+/// The first rows of a chunk, which are what the robot is meant to do.
+struct RowsOp final : ActionOp {
+  int count = 0;
+  Status bind(ActionLayout& layout, const std::string& where) override {
+    VLA_TRY(const int horizon, layout.bundle.keys().integer("policy.horizon", kAnySize));
+    if (count > horizon)
+      return misfit(where + ".count", fmt::format("at most the {} rows of a chunk (policy.horizon)", horizon),
+                    std::to_string(count));
+    layout.n_row = count;
+    return {};
+  }
+  void apply(std::vector<float>&, std::span<const float>) const override {}
+};
+
+Status parse_rows(JsonFields& fields, Recipe& recipe) {
+  if (!recipe.action.empty()) return misplaced(fields, "rows as the first op");
+  auto op = std::make_unique<RowsOp>();
+  VLA_TRY(op->count, fields.integer("count", 1, kMaxVector));
+  recipe.action.push_back(std::move(op));
+  return {};
+}
+
+}  // namespace
+
+Ops shape_ops() {
+  return {{"state", "pad", parse_end<PadOp>},
+          {"state", "bins", parse_end<BinsOp>},
+          {"state", "drop", parse_end<DropOp>},
+          {"action", "take", parse_take},
+          {"action", "rows", parse_rows}};
+}
+
+}  // namespace vla
