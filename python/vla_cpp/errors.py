@@ -106,7 +106,7 @@ class Busy(VlaError):
 
 
 class TooLarge(VlaError):
-    """Server: the message, a picture or the text is larger than the server admits."""
+    """Server: the message, an image or the text is larger than the server admits."""
 
     code = "too_large"
 

@@ -95,7 +95,7 @@ def act_bytes(
 
 
 def _with_raw_pictures(request: Any, raw: Mapping[str, np.ndarray]) -> List[Any]:
-    """The request's bytes in pieces, with the raw pictures appended to its act.
+    """The request's bytes in pieces, with the raw images appended to its act.
 
     They are framed here because protobuf would copy them twice into memory that is new each time, which takes longer than
     everything else that a client does. A repeated field may come in pieces, and a message's fields in any order.

@@ -222,7 +222,9 @@ Command add_run(CLI::App& app) {
           "--noise", options->noise,
           "The solver's starting noise: a float32 .npy file, horizon x padded action width, or a batch of one of it")
       ->check(CLI::Validator(check_given, ""));
-  command->add_option("--seed", options->seed, "Draw the noise; the same seed gives the same bytes on every machine")
+  command
+      ->add_option("--seed", options->seed,
+                   "Draw the noise, the same on every machine; actions may differ in their last digits")
       ->check(CLI::Validator(check_seed, ""));
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions")

@@ -117,7 +117,7 @@ def _add_gr00t(parser: argparse.ArgumentParser) -> None:
         "--camera-size",
         metavar="WxH",
         default="",
-        help="pixels of a camera, for a pipeline that keeps the aspect of pictures; they are square without it",
+        help="pixels of a camera, for a pipeline that keeps the aspect of images; they are square without it",
     )
     add(
         "--gripper-sign",

@@ -25,7 +25,7 @@ class Declaration:
     rate_hz      control steps per second of the simulated robot
     limit        steps after which an episode has failed
     replan_every steps executed of a chunk before the next look, unless the caller says otherwise
-    conventions  text for people: turned pictures, frames of reference, units
+    conventions  text for people: turned images, frames of reference, units
     """
 
     views: Mapping[str, Tuple[int, int]]

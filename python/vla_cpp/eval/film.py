@@ -95,7 +95,7 @@ def _latencies(draw: ImageDraw.ImageDraw, box: Tuple[int, int, int, int], looks:
 
 
 def draw_frame(shot: Shot, looks: Sequence[Look], outcome: Outcome, names: Sequence[str], title: str, end: bool) -> Image.Image:
-    """One picture of the film, 960 x 480."""
+    """One image of the film, 960 x 480."""
     page = Image.new("RGB", (WIDTH, HEIGHT), PAPER)
     draw = ImageDraw.Draw(page)
     page.paste(Image.fromarray(shot.frame).resize((PICTURE, PICTURE), Image.BICUBIC), (24, 56))
@@ -154,6 +154,6 @@ def contact_sheet(recorder: Recorder, outcome: Outcome, names: Sequence[str], ti
     wide, high = 2 * WIDTH // 3, 2 * HEIGHT // 3
     page = Image.new("RGB", (columns * wide, rows * high), PAPER)
     for i, shot in enumerate(shots):
-        picture = draw_frame(shot, recorder.looks, outcome, names, title, shot is recorder.shots[-1])
-        page.paste(picture.resize((wide, high), Image.LANCZOS), ((i % columns) * wide, (i // columns) * high))
+        image = draw_frame(shot, recorder.looks, outcome, names, title, shot is recorder.shots[-1])
+        page.paste(image.resize((wide, high), Image.LANCZOS), ((i % columns) * wide, (i // columns) * high))
     page.save(str(path), optimize=True)

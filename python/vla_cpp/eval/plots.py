@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of results. Needs matplotlib, which the extra `eval` brings."""
+"""Images of results. Needs matplotlib, which the extra `eval` brings."""
 
 from __future__ import annotations
 

@@ -56,9 +56,9 @@ class Options:
     views: Sequence[str] = ()  # Evo-1: names of the cameras in the order of the prompt's slots
     view_slots: int = 0  # Evo-1: places for views in the prompt
     embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
-    camera_size: str = ""  # GR00T: WIDTHxHEIGHT of pictures whose aspect the pipeline keeps; they are square without it
+    camera_size: str = ""  # GR00T: WIDTHxHEIGHT of images whose aspect the pipeline keeps; they are square without it
     gripper_sign: str = ""  # GR00T: the key of a gripper's actions, which become -1 where it opens and 1 where it closes
-    letterbox: bool = False  # GR00T: pictures are padded to squares, as the authors' later servers do
+    letterbox: bool = False  # GR00T: images are padded to squares, as the authors' later servers do
     dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
 

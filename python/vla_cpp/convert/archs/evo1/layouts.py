@@ -82,8 +82,8 @@ MEANINGS = {
     "--variant": "the authors' code before 9 April 2026 takes other steps, times, pixels and paddings than the code since, and a policy"
     " is served by the one that it was made for: go by the date of the upload, or by what config.json holds",
     "--stats": "the robot and the data set whose numbers the policy sees; the authors' server gets both names from its client",
-    "--view-slots": "the prompt has a slot for every picture of a request, black ones too, and the authors' server takes exactly 3",
-    "--views": "names of the cameras in the order in which the client sends their pictures; slots behind them stay masked",
+    "--view-slots": "the prompt has a slot for every image of a request, black ones too, and the authors' server takes exactly 3",
+    "--views": "names of the cameras in the order in which the client sends their images; slots behind them stay masked",
     "--dead-rows": "the action head reads masked rows too, and flash-attention leaves zeros in them where other attention does not:"
     " zero_attention where flash-attn was installed, as the authors ask for, causal_attention where it was not",
 }
@@ -294,7 +294,7 @@ def _view_name(name: str) -> str:
 
 
 def _authors_features(checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems) -> List[Key]:
-    """Every view may stay away: its slot is masked, as a client of the reference masks the pictures that it does not have."""
+    """Every view may stay away: its slot is masked, as a client of the reference masks the images that it does not have."""
     views: Sequence[str] = [_view_name(name) for name in options.views]
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
     return [

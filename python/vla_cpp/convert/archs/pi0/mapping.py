@@ -128,7 +128,7 @@ def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> 
 
 
 def check_image(policy: Section, key: str, sizes: Sizes, resolution) -> None:
-    """Sets the size of the pictures, which the reference wants square."""
+    """Sets the size of the images, which the reference wants square."""
     square = isinstance(resolution, list) and len(resolution) == 2 and resolution[0] == resolution[1]
     side = resolution[0] if square else 0
     if type(side) is not int or not sizes.patch_size <= side <= 8192:
