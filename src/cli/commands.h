@@ -14,6 +14,10 @@ constexpr const char* kKernelsHelp =
     "ggml, avx2, avx512, amx, or float32: the best that does not round to bf16; not given: the best for the bundle's "
     "dtype, which multiplies bf16 on AMX tiles if the bundle is stored as bf16";
 
+/// Of --strict-state, wherever observations come in.
+constexpr const char* kStrictStateHelp =
+    "Refuse a state that is far beyond what the policy has seen, instead of answering with a note";
+
 /// Adds one subcommand. What it returns is run after parsing; its Status becomes the exit code (base/result.h).
 using Command = std::function<Status()>;
 

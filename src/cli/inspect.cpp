@@ -131,8 +131,12 @@ void print_human(const Engine& engine) {
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
   say(stdout, "bundle       {}\n", d.path);
   say(stdout, "policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(engine.bundle().file_size()));
+  for (const std::string& feature : engine.processor().degraded())
+    say(stdout, "DEGRADED     {} passes unnormalized, as --identity-stats allowed when converting\n", feature);
   say(stdout, "source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
       d.converter);
+  if (const auto backbone = engine.bundle().keys().string("vla.source.backbone"))
+    say(stdout, "backbone     {}\n", *backbone);
   say(stdout, "checksum     {}\n", d.checksum);
   print_features(d, engine);
   say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);

@@ -23,7 +23,7 @@ struct RunOptions {
   std::vector<std::string> images, states;
   std::optional<std::uint64_t> seed;
   int n_thread = 0;
-  bool json = false;
+  bool json = false, strict_state = false;
 };
 
 struct NameValue {
@@ -162,6 +162,7 @@ Status run(RunOptions& options) {
   Timing before;
   VLA_TRY(const std::unique_ptr<Engine> engine,
           Engine::load(options.bundle, {options.n_thread, options.kernels, options.tap}));
+  if (options.strict_state) engine->refuse_beyond();
   clock.lap(before, "load");
   Observation observation;
   observation.text = options.text;
@@ -239,6 +240,7 @@ Command add_run(CLI::App& app) {
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
   command->add_option("--kernels", options->kernels, kKernelsHelp)->check(CLI::Validator(check_given, ""));
+  command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   return [options] { return run(*options); };
 }
 

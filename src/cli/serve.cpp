@@ -21,6 +21,7 @@ namespace {
 struct ServeOptions {
   std::string bundle, kernels;
   int n_thread = 0;
+  bool strict_state = false;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
   WatchOptions watch;
@@ -73,6 +74,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("features", fmt::format("{}", fmt::join(features, ",")));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
   if (!metrics.empty()) add("metrics", metrics);
+  if (!processor.degraded().empty()) add("DEGRADED", fmt::format("{}", fmt::join(processor.degraded(), ",")));
   say(stdout, "{}\n", line);
   std::fflush(stdout);
 }
@@ -84,6 +86,7 @@ Status serve(ServeOptions& options) {
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
   watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
+  if (options.strict_state) engine->refuse_beyond();  // not before, as warming up takes any numbers
   stop_on_signals(*server);
   watch->ready(warm_up_ms);
   print_ready(*server, *engine, warm_up_ms, watch->metrics_address());
@@ -129,6 +132,7 @@ Command add_serve(CLI::App& app) {
   command->add_option("--connections", server.max_connections, "Connections at once; the longest idle one makes room")
       ->check(CLI::Range(1, 65536))
       ->capture_default_str();
+  command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   command->add_flag("--insecure", server.insecure, "Let everybody in who can reach an address that is not local");
   command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")
       ->check(CLI::ExistingFile);

@@ -156,7 +156,6 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
 Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noise) {
   ActionChunk chunk;
   StageClock clock;
-  inputs_.notes.clear();
   VLA_CHECK(processor_.encode_images(observation, inputs_));
   VLA_CHECK(processor_.encode_state(observation, inputs_));
   clock.lap(chunk.timing, "preprocess");
@@ -186,6 +185,7 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   chunk.horizon = horizon();
   chunk.d_action = static_cast<int>(processor_.action_names().size());
   chunk.notes = inputs_.notes;
+  chunk.is_beyond = inputs_.is_beyond;
   record_chunk(result, chunk);
   return chunk;
 }

@@ -28,6 +28,7 @@ struct ActionChunk {
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
   std::vector<std::string> notes;  // what the user must be told about this answer
+  bool is_beyond = false;          // one of them: the state is beyond the bundle's bound
   Timing timing;
   std::vector<Tap> taps;
 };
@@ -47,6 +48,8 @@ class Engine {
   /// device.
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
+  /// From now on a state beyond the bundle's bound is refused, as Processor::refuse_beyond.
+  void refuse_beyond() { processor_.refuse_beyond(); }
   /// Errors: bad_observation, bad_action (a number that is not finite came out), device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise) noexcept;
 

@@ -108,7 +108,6 @@ Result<std::string> Processor::fill_prompt(const std::string& instruction, std::
 }
 
 Status Processor::encode_text(const Observation& observation, Inputs& inputs) const {
-  inputs.notes.clear();
   if (observation.text.empty()) return bad_observation("instruction", "a sentence", "empty text");
   if (observation.text.size() > Tokenizer::kMaxText ||
       unicode::valid_prefix(observation.text) < observation.text.size())
@@ -170,8 +169,39 @@ Status Processor::gather_states(const Observation& observation, std::vector<floa
   return {};
 }
 
+/// A number of the concatenated states, by feature and name.
+std::string Processor::state_place(std::size_t i) const {
+  std::size_t first = 0, feature = 0;
+  for (; i - first >= static_cast<std::size_t>(state_dims_[feature]); ++feature)
+    first += static_cast<std::size_t>(state_dims_[feature]);
+  return fmt::format("{}[{}] (\"{}\")", states_.names()[feature], i - first, state_names_[i]);
+}
+
+/// Tells the user, or refuses, where normalized numbers of the state are far from everything that the policy has seen.
+Status Processor::check_bound(std::span<const float> normalized, Inputs& inputs) const {
+  const auto is_beyond = [this](float value) { return std::abs(static_cast<double>(value)) > state_bound_; };
+  const auto first = std::find_if(normalized.begin(), normalized.end(), is_beyond);
+  if (first == normalized.end()) return {};
+  const auto i = static_cast<std::size_t>(&*first - inputs.state.data());
+  const auto n_other = std::count_if(first, normalized.end(), is_beyond) - 1;
+  const std::string found = fmt::format("{}, which is {:.3g} when normalized{}", inputs.raw_state[i], *first,
+                                        n_other > 0 ? fmt::format(", and {} more such numbers", n_other) : "");
+  if (refuses_beyond_)
+    return bad_observation(state_place(i), fmt::format("at most {} when normalized", state_bound_), found,
+                           "are its units those of the training data?");
+  inputs.is_beyond = true;
+  inputs.notes.push_back(
+      fmt::format("{}: {}; more than {} is far from what the policy has seen", state_place(i), found, state_bound_));
+  return {};
+}
+
 Status Processor::encode_state(const Observation& observation, Inputs& inputs) const {
   using Stage = StateOp::Stage;
+  inputs.notes.clear();
+  inputs.is_beyond = false;
+  for (const std::string& feature : degraded_)
+    inputs.notes.push_back("DEGRADED: " + feature +
+                           " passes unnormalized, as --identity-stats allowed when converting");
   VLA_CHECK(gather_states(observation, inputs.state));
   const StateOp* end = nullptr;
   bool raw = true;
@@ -182,10 +212,11 @@ Status Processor::encode_state(const Observation& observation, Inputs& inputs) c
     }
     if (op->stage() == Stage::end) end = op.get();
     op->apply(inputs.state);
+    VLA_CHECK(check_bound(op->normalized(inputs.state), inputs));
   }
   if (raw) inputs.raw_state = inputs.state;
   if (const std::size_t bad = first_bad(inputs.state); bad < inputs.state.size())
-    return bad_observation(fmt::format("state[{}]", bad), "a number that stays finite when normalized",
+    return bad_observation(state_place(bad), "a number that stays finite when normalized",
                            fmt::format("{}", inputs.state[bad]));
   inputs.discretized_state.clear();
   if (end != nullptr) end->finish(inputs.state, inputs.discretized_state);

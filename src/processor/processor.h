@@ -35,8 +35,13 @@ struct Inputs {
   std::vector<float> state;            // normalized, padded; empty where the network sees none
   std::vector<int> discretized_state;  // where the prompt has a place for it
   std::vector<float> raw_state;        // before its normalization, which actions may be relative to
+  bool is_beyond = false;              // the state has a number beyond the bundle's bound, as a note says
   std::vector<std::string> notes;      // what the user must be told, e.g. that the instruction was cut
 };
+
+/// How large a normalized number of the state may be before the user is told, where the bundle says nothing else: ten
+/// standard deviations, or five times the range of what the policy has seen. Degrees instead of radians are beyond.
+inline constexpr double kStateBound = 10.0;
 
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
@@ -45,6 +50,9 @@ class Processor {
   /// `policy.d_action`, where the text has places for views where they are, and where rows are cut off
   /// `policy.horizon`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
   static Result<Processor> create(const Bundle& bundle);
+
+  /// From now on a state beyond its bound is refused. Without it the state is taken and a note says so.
+  void refuse_beyond() { refuses_beyond_ = true; }
 
   /// All three parts below. Errors: bad_observation.
   Result<Inputs> encode(const Observation& observation) const;
@@ -78,6 +86,8 @@ class Processor {
   /// Tokens that every prompt has around its places for views; 0 where the text has no such places.
   int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
+  /// Features that pass unnormalized because whoever converted the checkpoint allowed it. Every answer has to say so.
+  const std::vector<std::string>& degraded() const { return degraded_; }
 
  private:
   Status read_features(const Bundle& bundle);
@@ -95,13 +105,18 @@ class Processor {
   Status encode_view(const Frame& frame, const std::string& name, std::span<float> out) const;
   Status check_view_places(std::span<const std::int32_t> tokens) const;
   void cut_tokens(std::vector<std::int32_t>& tokens) const;
+  Status read_degraded(const Keys& keys);
+  std::string state_place(std::size_t i) const;
+  Status check_bound(std::span<const float> normalized, Inputs& inputs) const;
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;
   std::vector<int> view_optional_;  // per view 1 where it may be left unmentioned
   int min_views_ = 0;
   std::vector<int> state_dims_;
-  std::vector<std::string> action_names_;
+  std::vector<std::string> state_names_, action_names_, degraded_;
+  double state_bound_ = kStateBound;
+  bool refuses_beyond_ = false;
   Recipe recipe_;
   Tokenizer tokenizer_;
   /// Where the text has places for views: the tokens of every prompt up to the last place, or from the first place on,

@@ -65,6 +65,7 @@ Result<Processor> Processor::create(const Bundle& bundle) {
                   std::to_string(processor.recipe_.max_tokens));
   VLA_CHECK(processor.read_view_places(keys));
   VLA_CHECK(processor.check_descriptions(keys));
+  VLA_CHECK(processor.read_degraded(keys));
   return processor;
 }
 
@@ -105,6 +106,20 @@ Status Processor::check_descriptions(const Keys& keys) const {
   VLA_CHECK(check_size("observation.state_units", state_units, n_state));
   const auto rate = keys.number("action.rate_hz", kRateHz);
   return rate ? Status() : Status(rate.error());
+}
+
+Status Processor::read_degraded(const Keys& keys) {
+  constexpr const char *kBound = "observation.state_bound", *kDegraded = "vla.degraded";
+  VLA_TRY(state_names_, keys.strings("observation.state_names"));
+  if (keys.has(kBound)) {
+    VLA_TRY(state_bound_, keys.number(kBound, {1, 1e9}));
+  }
+  if (!keys.has(kDegraded)) return {};
+  VLA_TRY(degraded_, keys.strings(kDegraded));
+  for (const std::string& feature : degraded_)
+    if (feature != "action" && std::count(states_.names().begin(), states_.names().end(), feature) == 0)
+      return misfit(kDegraded, "action, " + states_.listed(), feature);
+  return {};
 }
 
 /// The prompt of an empty instruction shows where the places are; nothing that follows them may move them.

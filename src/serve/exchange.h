@@ -32,6 +32,7 @@ struct Answer {
   std::optional<Error> error;
   Clock::time_point started, finished;
   Timing stages;
+  bool is_beyond = false;  // the state is beyond the bundle's bound
 };
 
 /// Where the I/O thread and the engine thread meet: jobs one way, answers the other. Neither holds the lock for longer

@@ -178,7 +178,8 @@ void Io::deliver(Answer answer) {
                           Clock::now(),
                           std::move(answer.stages),
                           job.request(),
-                          std::as_bytes(std::span(answer.response))};
+                          std::as_bytes(std::span(answer.response)),
+                          answer.is_beyond};
   for (Observer* observer : observers_) observer->answered(answered);
 }
 

@@ -53,7 +53,8 @@ Metrics::Metrics()
       received_bytes_(counter(*registry_, "vla_received_bytes_total", "Bytes of requests")),
       sent_bytes_(counter(*registry_, "vla_sent_bytes_total", "Bytes of answers")),
       clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")),
-      refused_(counter(*registry_, "vla_refused_clients_total", "Handshakes of clients whose key is not listed")) {
+      refused_(counter(*registry_, "vla_refused_clients_total", "Handshakes of clients whose key is not listed")),
+      beyond_(counter(*registry_, "vla_state_beyond_total", "Acts answered though their state is beyond its bound")) {
   info("vla_build_info", "Version of the server", {{"version", VLA_VERSION}});
 }
 
@@ -106,6 +107,7 @@ void Metrics::answered(const Answered& answered) try {
   prometheus::Counter*& count = request_[{request.kind, code}];
   if (count == nullptr) count = &requests_.Add({{"kind", kind_name(request.kind)}, {"code", answered.code()}});
   count->Increment();
+  if (answered.is_beyond) beyond_.Increment();
   if (answered.stages.empty()) return;
   observe("queue", seconds(answered.started - request.at));
   for (const auto& [stage, ms] : answered.stages) observe(stage, ms / 1e3);

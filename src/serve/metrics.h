@@ -38,7 +38,7 @@ class Metrics final : public Observer {
   prometheus::Family<prometheus::Counter>& requests_;
   prometheus::Family<prometheus::Histogram>& stages_;
   prometheus::Family<prometheus::Counter>& dropped_;
-  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_;
+  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_, &beyond_;
   // Of the I/O thread:
   std::map<std::string, prometheus::Histogram*> stage_;
   std::map<std::pair<Kind, int>, prometheus::Counter*> request_;

@@ -117,7 +117,7 @@ Answer Server::compute(Engine& engine, Job job) const noexcept {
   answer.started = Clock::now();
   try {
     v1::Response response = response_to(job.request_id);
-    auto chunk = act(engine, job, answer.stages);
+    auto chunk = act(engine, job, answer);
     if (chunk) {
       chunk->set_queue_ms(std::chrono::duration<double, std::milli>(answer.started - job.at).count());
       *response.mutable_chunk() = std::move(*chunk);
@@ -135,15 +135,17 @@ Answer Server::compute(Engine& engine, Job job) const noexcept {
   return answer;
 }
 
-Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Timing& stages) const {
+Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Answer& answer) const {
   const ActLimits limits{options_.max_pixels, options_.max_text, description_.limits().max_views(),
                          engine.solver_horizon(), engine.d_action_padded()};
   StageClock clock;
   VLA_TRY(const ActRequest request, decode_act(job.body(), limits));
+  Timing& stages = answer.stages;
   clock.lap(stages, "decode");
   VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise));
   stages.insert(stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = stages;
+  answer.is_beyond = chunk.is_beyond;
   return encode_chunk(request, std::move(chunk), description_);
 }
 

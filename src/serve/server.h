@@ -57,7 +57,7 @@ class Server {
   Status guard();
   Status bind();
   Answer compute(Engine& engine, Job job) const noexcept;
-  Result<v1::ActionChunk> act(Engine& engine, const Job& job, Timing& stages) const;
+  Result<v1::ActionChunk> act(Engine& engine, const Job& job, Answer& answer) const;
 
   ServerOptions options_;
   Vitals vitals_;

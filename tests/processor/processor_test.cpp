@@ -371,3 +371,41 @@ TEST_CASE("of very many names a message lists the first fifty") {
   CHECK(contains(message, "state.number_49 and 19950 more"));
   CHECK(message.size() < 4096);
 }
+
+TEST_CASE("a state far beyond what the policy has seen is told by name, or refused where that is asked for") {
+  Observation seen = observation();
+  seen.states["state"] = {1.5f, 1e30f};
+  Processor processor = make();
+  const auto inputs = processor.encode(seen);
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->is_beyond);
+  REQUIRE(inputs->notes.size() == 1);
+  CHECK(contains(inputs->notes[0],
+                 "observation.state[1] (\"y\"): 1e+30, which is 5e+29 when normalized; more than 10 is far"));
+  seen.states["state"] = {-20.0f, 1e30f};
+  CHECK(contains(processor.encode(seen)->notes.at(0),
+                 "observation.state[0] (\"x\"): -20, which is -21 when normalized, and 1 more"));
+  processor.refuse_beyond();
+  CHECK(contains(refusal(processor.encode(seen), Code::bad_observation),
+                 "observation.state[0] (\"x\"): expected at most 10 when normalized"));
+  seen.states["state"] = {10.9f, -17.9f};  // 9.9 and -9.95 of 0.5 + 0.5 and 1.5 + 0.5
+  CHECK(processor.encode(seen)->notes.empty());
+  CHECK_FALSE(processor.encode(seen)->is_beyond);
+  EditableBundle bundle = sample();
+  bundle.set("observation.state_bound", 5.0);
+  CHECK(make(bundle).encode(seen)->is_beyond);
+}
+
+TEST_CASE("a feature that passes unnormalized by permission is told with every answer") {
+  EditableBundle bundle = sample();
+  bundle.set("vla.degraded", std::vector<std::string>{"observation.state", "action"});
+  const Processor processor = make(bundle);
+  CHECK(processor.degraded().size() == 2);
+  for (int i = 0; i < 2; ++i) {
+    const auto notes = processor.encode(observation())->notes;
+    REQUIRE(notes.size() == 2);
+    CHECK(contains(notes[0], "DEGRADED: observation.state passes unnormalized"));
+  }
+  bundle.set("vla.degraded", std::vector<std::string>{"gripper"});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "vla.degraded: expected action, observation.state"));
+}

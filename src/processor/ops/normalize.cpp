@@ -136,6 +136,9 @@ class NormalizeOp final : public StateOp {
   void apply(std::span<float> state) const override {
     for (const Normalizer& normalizer : normalizer_) normalizer.apply(state.subspan(offset_, width_));
   }
+  std::span<const float> normalized(std::span<const float> state) const override {
+    return normalizer_.empty() ? std::span<const float>() : state.subspan(offset_, width_);
+  }
   bool reads(const std::string& tensor) const override { return fields.reads(tensor); }
 
  private:

@@ -70,6 +70,8 @@ class StateOp {
   /// Reads statistics and checks sizes. `where` is the op's place in the recipe. Errors: bad_bundle.
   virtual Status bind(const StateLayout&, const std::string& /*where*/) { return {}; }
   virtual void apply(std::span<float> /*state*/) const {}
+  /// The part of a state that `apply` has normalized by statistics.
+  virtual std::span<const float> normalized(std::span<const float> /*state*/) const { return {}; }
   /// Of kind `end`: what the network sees of the state, and what goes into the prompt.
   virtual void finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const {}
   virtual std::size_t d_state(std::size_t n_state) const { return n_state; }

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A state far beyond what the policy has seen, and a policy without statistics: both are told wherever somebody looks."""
+
+import copy
+import json
+import shutil
+import urllib.request
+
+import pytest
+import wire
+from convert_and_run_test import convert
+from serve_test import Server
+
+LOCAL = ("--bind", "tcp://127.0.0.1:0", "--threads", "2")
+
+
+@pytest.fixture
+def degrees(golden):
+    """The golden case with a state that no normalization makes small."""
+    case = copy.copy(golden)
+    case.state = [*golden.state[:-1], 1e30]
+    return case
+
+
+def test_a_state_beyond_its_bound_is_told_in_the_notes_and_refused_where_that_is_asked_for(vla, golden, degrees):
+    assert vla(*golden.arguments()).json()["notes"] == []
+    (note,) = vla(*degrees.arguments()).json()["notes"]
+    assert "1e+30, which is" in note and "when normalized; more than 10 is far from what the policy has seen" in note
+    vla(*degrees.arguments(options=["--strict-state"])).refused("bad_observation", "expected at most 10 when normalized")
+    assert vla(*golden.arguments(options=["--strict-state", "--json"])).json()["notes"] == []
+
+
+def beyond(server):
+    """What the server counts."""
+    with urllib.request.urlopen(f"http://{server.ready['metrics']}/metrics", timeout=20) as answer:
+        lines = answer.read().decode().splitlines()
+    return [line.split()[1] for line in lines if line.startswith("vla_state_beyond_total ")]
+
+
+@pytest.mark.parametrize("options, kinds, count", [((), ["chunk", "chunk"], ["1"]), (("--strict-state",), ["chunk", "error"], ["0"])])
+def test_a_server_counts_states_beyond_their_bound_or_refuses_them(vla, golden, degrees, options, kinds, count):
+    server = Server(vla, golden.bundle, *LOCAL, "--metrics", "127.0.0.1:0", *options)
+    peer = wire.Peer(server.ready["address"])
+    try:
+        assert [wire.kind(peer.ask(wire.act(i, case, seed=1))) for i, case in enumerate([golden, degrees])] == kinds
+        assert beyond(server) == count
+    finally:
+        peer.close()
+        server.process.kill()
+        server.process.communicate()
+
+
+@pytest.fixture
+def degraded(golden, tmp_path):
+    """The bundle of the golden checkpoint without statistics of its state."""
+    case = copy.copy(golden)
+    case.folder = tmp_path / "case"
+    shutil.copytree(golden.folder / "checkpoint", case.folder / "checkpoint")
+    for file in (case.folder / "checkpoint").glob("policy_preprocessor.json"):
+        pipeline = json.loads(file.read_text())
+        for step in pipeline["steps"]:
+            if step["registry_name"] == "normalizer_processor":
+                step.pop("state_file")
+        file.write_text(json.dumps(pipeline))
+    case.said = {**golden.said, "identity_stats": "observation.state"}
+    case.bundle = convert(case, tmp_path / "policy.gguf", "bf16")
+    return case
+
+
+def test_a_policy_whose_state_passes_unnormalized_says_degraded_everywhere(vla, degraded):
+    assert "DEGRADED     observation.state passes unnormalized" in vla("inspect", degraded.bundle).out
+    (note,) = vla(*degraded.arguments()).json()["notes"]
+    assert note.startswith("DEGRADED: observation.state passes unnormalized")
+    server = Server(vla, degraded.bundle, *LOCAL)
+    try:
+        assert server.ready["DEGRADED"] == "observation.state"
+    finally:
+        server.process.kill()
+        server.process.communicate()
