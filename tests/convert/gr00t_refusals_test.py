@@ -63,10 +63,10 @@ UNSUPPORTED = {
     "config.json: use_vlln: expected True": {"config/use_vlln": False},
     "config.json: add_pos_embed: expected True": {"config/add_pos_embed": False},
     "config.json: new_thing: expected a key that this converter knows": {"config/new_thing": 1},
-    "diffusion_model_cfg: positional_embeddings: expected None, found 'sinusoidal'": {
+    "diffusion_model_cfg: positional_embeddings: expected None, found no such key, which means 'sinusoidal'": {
         "config/diffusion_model_cfg/positional_embeddings": REMOVED
     },
-    "diffusion_model_cfg: interleave_self_attention: expected True, found False": {
+    "diffusion_model_cfg: interleave_self_attention: expected True, found no such key, which means False": {
         "config/diffusion_model_cfg/interleave_self_attention": REMOVED
     },
     "diffusion_model_cfg: norm_eps: expected 1e-05": {"config/diffusion_model_cfg/norm_eps": 1e-6},
@@ -92,7 +92,7 @@ UNSUPPORTED = {
     "text_config: attention_bias: expected False": {"backbone/text_config/attention_bias": True},
     "vision_config: spatial_merge_size: expected 2": {"backbone/vision_config/spatial_merge_size": 3},
     "backbone config.json: model_type: expected 'qwen3_vl'": {"backbone/model_type": "qwen2_vl"},
-    "preprocessor_config.json: image_mean: expected [0.5, 0.5, 0.5], found None": {"images/image_mean": REMOVED},
+    "preprocessor_config.json: image_mean: expected [0.5, 0.5, 0.5], found no such key, which means None": {"images/image_mean": REMOVED},
     "preprocessor_config.json: resample: expected 3": {"images/resample": 2},
     "preprocessor_config.json: new_thing: expected a key": {"images/new_thing": 1},
 }

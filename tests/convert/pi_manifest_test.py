@@ -29,7 +29,7 @@ def sizes(family, tmp_path):
     checkpoint = Checkpoint("published", str(tmp_path), "", {}, {}, {}, {}, None)
     sizes = read_towers(Section("config.json", CONFIG, {}, problems), checkpoint, problems)
     problems.raise_any()
-    sizes.image_size, sizes.horizon, sizes.n_step = 224, 50, 10
+    sizes.vision.image_size, sizes.horizon, sizes.n_step = 224, 50, 10
     sizes.d_state, sizes.d_action = (32 if family.state_token else 0), 32
     sizes.min_period, sizes.max_period = 4e-3, 4.0
     return sizes
@@ -48,6 +48,6 @@ def test_names_shapes_and_storage_are_those_that_the_runtime_declares(family, si
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
-    ours = {name: value for group in network_keys(sizes).values() for name, value in group.items()}
+    ours = {key.name: key.value for key in network_keys(sizes)}
     for name, value in manifest["config"].items():
         assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name

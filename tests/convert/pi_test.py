@@ -278,7 +278,7 @@ def test_the_published_size_asks_for_the_published_tensors(tmp_path, family, tot
     policy = Section("config.json", {}, {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}, problems)
     sizes = mapping.read_towers(policy, checkpoint, problems)
     problems.raise_any()
-    sizes.image_size, sizes.d_state, sizes.d_action = 224, 32, 32
+    sizes.vision.image_size, sizes.d_state, sizes.d_action = 224, 32, 32
     unused = ("gemma_expert.lm_head", "state_proj") if family is pi05.FAMILY else ("gemma_expert.lm_head",)
     dropped = [
         row

@@ -4,12 +4,25 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Optional
+from typing import Dict, List, Optional, Sequence
 
 from .bundle import Key
 from .errors import Problems
 from .files import member, read_json
 from .recipe import ACTION, STATE
+
+
+def views_of(views: Sequence[str], aliases: Sequence[str], optional: Sequence[int], min_views: int = 1) -> List[Key]:
+    return [
+        Key("observation.views", "string[]", views),
+        Key("observation.view_aliases", "string[]", aliases),
+        Key("observation.view_optional", "u32[]", optional),
+        Key("observation.min_views", "u32", min_views),
+    ]
+
+
+def states_of(dims: Dict[str, int]) -> List[Key]:
+    return [Key("observation.states", "string[]", list(dims)), Key("observation.state_dims", "u32[]", list(dims.values()))]
 
 
 def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problems: Problems) -> List[Key]:

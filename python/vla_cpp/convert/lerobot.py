@@ -12,6 +12,7 @@ from .archs import Options
 from .bundle import Key
 from .checkpoint import Checkpoint
 from .errors import Problems
+from .features import views_of
 from .section import Section
 
 EMPTY_CAMERA = "observation.images.empty_camera_"
@@ -87,6 +88,16 @@ def vector_dim(policy: Section, key: str, name: str, kind: str) -> int:
     return 1
 
 
+def check_widths(policy: Section, widths: Dict[str, Tuple[int, int]]) -> None:
+    """`widths`: key of the padded width -> (padded, the feature's)."""
+    for key, (padded, real) in widths.items():
+        if real > padded:
+            policy.bad(key, "at least the feature's width {}".format(real))
+    if policy.count("n_action_steps") > policy.count("chunk_size"):
+        hint = "the reference refuses it too"
+        policy.bad("n_action_steps", "at most chunk_size {}".format(policy.count("chunk_size")), hint=hint)
+
+
 def view_keys(
     checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems
 ) -> List[Key]:
@@ -96,12 +107,7 @@ def view_keys(
     if empty:
         checkpoint.notes.append("views that stay empty unless a frame is given: " + ", ".join(empty))
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
-    return [
-        Key("observation.views", "string[]", views),
-        Key("observation.view_aliases", "string[]", aliases),
-        Key("observation.view_optional", "u32[]", [int(view in empty) for view in views]),
-        Key("observation.min_views", "u32", 1),
-    ]
+    return views_of(views, aliases, [int(view in empty) for view in views])
 
 
 def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:

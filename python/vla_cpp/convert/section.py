@@ -53,7 +53,8 @@ class Section:
         for key, (default, value) in fixed.items():
             self.defaults[key] = default
             if self.get(key) != value:
-                self.bad(key, repr(value), hint=hint, unsupported=True)
+                found = repr(self.values[key]) if key in self.values else "no such key, which means {!r}".format(default)
+                self.bad(key, repr(value), found, hint, unsupported=True)
 
     def refuse_unknown(self, known: Collection[str]) -> None:
         for key in sorted(set(self.values) - set(known)):

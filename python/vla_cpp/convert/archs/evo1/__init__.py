@@ -28,7 +28,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     source = read(checkpoint, options, problems)
     problems.raise_any()
     sizes = source.sizes
-    tokenizer = read_tokenizer(source.tokenizer, sizes.n_vocab, problems, checkpoint.notes)
+    tokenizer = read_tokenizer(source.tokenizer, sizes.lm.n_vocab, problems, checkpoint.notes)
     problems.raise_any()  # a prompt takes a sound tokenizer
     prompt = _prompt(source, tokenizer, problems)
     document = {
@@ -52,7 +52,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     ]
     problems.raise_any()
     lm = source.names.lm + "layers."
-    hints = {lm: "the policy keeps {} language layers, 0 to {}".format(sizes.n_layer, sizes.n_layer - 1)}
+    hints = {lm: "the policy keeps {} language layers, 0 to {}".format(sizes.lm.n_layer, sizes.lm.n_layer - 1)}
     return Plan(keys, weights(sizes, source.names), [], source.statistics, hints)
 
 

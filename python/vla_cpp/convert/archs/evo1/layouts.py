@@ -26,9 +26,10 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import NORM_STATS, Checkpoint, find_backbone
 from ...errors import Code, Problems
-from ...features import feature_keys
+from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
-from ...lerobot import check_keys, read_views, vector_dim
+from ...lerobot import check_keys, check_widths, read_views, vector_dim
+from ...networks import MAX_LAYERS
 from ...normalization import Normalization
 from ...section import Section
 from .. import Options
@@ -37,7 +38,6 @@ from .mapping import (
     LEROBOT,
     Names,
     Sizes,
-    check_fixed,
     check_head,
     read_chat_backbone,
     read_hf_backbone,
@@ -146,7 +146,6 @@ def read_authors(checkpoint: Checkpoint, options: Options, problems: Problems) -
     sizes = _authors_sizes(policy, checkpoint, options)
     folder = find_backbone(checkpoint, options.backbone, policy.get("vlm_name"), "vlm_name")
     read_chat_backbone(read_json(os.path.join(folder, "config.json")), sizes, problems)
-    sizes.n_layer = min(sizes.n_layer, sizes.n_backbone_layer)
     check_head(policy, sizes, policy.count("embed_dim"))
     revision = REVISIONS[options.variant]
     kind = _kind(policy, options.variant)
@@ -162,7 +161,7 @@ def read_authors(checkpoint: Checkpoint, options: Options, problems: Problems) -
         names=AUTHORS,
         tokenizer=folder,
         image_token=None,
-        image=image_ops(sizes.image_size, "opencv_bilinear", revision.arithmetic),
+        image=image_ops(sizes.vision.image_size, "opencv_bilinear", revision.arithmetic),
         state=[state.op, *([{"op": "clip", "low": -1.0, "high": 1.0}] if clip else []), pad_op(WIDTH, revision.pad)],
         action=[{"op": "take", "size": sizes.action_dim}, action.op],
         features=_authors_features(checkpoint, options, sizes, problems),
@@ -207,14 +206,14 @@ def _authors_sizes(policy: Section, checkpoint: Checkpoint, options: Options) ->
     for key in sorted(set(policy.values) - set(AUTHORS_CONFIG) - set(AUTHORS_FIXED) - AUTHORS_IGNORED):
         hint = "it may change numbers; a newer vla-convert may know it"
         policy.bad(key, "a key of EvoConfig that this converter knows", hint=hint, unsupported=True)
-    check_fixed(policy, AUTHORS_FIXED)
+    policy.check_fixed(AUTHORS_FIXED)
     if policy.get("action_horizon") not in (None, policy.get("horizon")):
         policy.bad("action_horizon", "horizon {}, or none".format(policy.get("horizon")))
     revision, dims = REVISIONS[options.variant], _dims(checkpoint, policy.problems)
     return Sizes(
-        n_layer=dims.count("language_layers", most=1024),
+        n_layer=dims.count("language_layers", most=MAX_LAYERS),
         n_token=dims.count("prompt_tokens"),
-        n_head_layer=policy.count("num_layers", most=1024),
+        n_head_layer=policy.count("num_layers", most=MAX_LAYERS),
         n_head_head=policy.count("num_heads"),
         d_hidden=policy.count("hidden_dim"),
         d_state_hidden=policy.count("state_hidden_dim"),
@@ -298,13 +297,9 @@ def _authors_features(checkpoint: Checkpoint, options: Options, s: Sizes, proble
     views: Sequence[str] = [_view_name(name) for name in options.views]
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
     return [
-        Key("observation.views", "string[]", views),
-        Key("observation.view_aliases", "string[]", [""] * len(views)),
         # The server gets an image for every slot, and the client says which of them are none: nothing is absent by silence.
-        Key("observation.view_optional", "u32[]", [0] * len(views)),
-        Key("observation.min_views", "u32", 1),
-        Key("observation.states", "string[]", [recipe.STATE]),
-        Key("observation.state_dims", "u32[]", [s.state_dim]),
+        *views_of(views, [""] * len(views), [0] * len(views)),
+        *states_of({recipe.STATE: s.state_dim}),
         *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
     ]
 
@@ -368,7 +363,7 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
         problems.add("--position-precision", "a SmolVLA checkpoint", "type evo1", "leave the option out", Code.USAGE)
     policy = Section("config.json", checkpoint.config, {**LEROBOT_CONFIG, **GRIPPER}, problems)
     check_keys(policy, "Evo1Config", set(LEROBOT_CONFIG) | set(GRIPPER) | set(LEROBOT_FIXED) | LEROBOT_IGNORED, {})
-    check_fixed(policy, LEROBOT_FIXED)
+    policy.check_fixed(LEROBOT_FIXED)
     sizes = _lerobot_sizes(policy)
     views, n_empty = read_views(policy, checkpoint)
     if len(views) > sizes.n_slot:
@@ -376,9 +371,8 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
     folder = find_backbone(checkpoint, options.backbone, policy.get("vlm_model_name"))
     backbone = read_json(os.path.join(folder, "config.json"))
     read_hf_backbone(backbone, sizes, problems)
-    sizes.n_layer = min(sizes.n_layer, sizes.n_backbone_layer)
-    if policy.get("image_resolution") != [sizes.image_size] * 2:
-        policy.bad("image_resolution", "the tower's {0} x {0}".format(sizes.image_size), hint="the reference refuses it too")
+    if policy.get("image_resolution") != [sizes.vision.image_size] * 2:
+        policy.bad("image_resolution", "the tower's {0} x {0}".format(sizes.vision.image_size), hint="the reference refuses it too")
     check_head(policy, sizes, policy.count("embed_dim"))
     problems.raise_any()
     processors = _read_pipelines(policy, checkpoint, options, sizes)
@@ -394,7 +388,7 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
         names=LEROBOT,
         tokenizer=folder,
         image_token=backbone.get("image_token_id", 151667),
-        image=image_ops(sizes.image_size, "torch_bicubic_8bit", str(arithmetic)),
+        image=image_ops(sizes.vision.image_size, "torch_bicubic_8bit", str(arithmetic)),
         state=[*processors.state.op("normalize", recipe.STATE), pad_op(sizes.d_state, pad)],
         action=[
             {"op": "take", "size": sizes.action_dim},
@@ -403,8 +397,7 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
         ],
         features=[
             *_view_keys(views, n_empty, processors, checkpoint, problems),
-            Key("observation.states", "string[]", [recipe.STATE]),
-            Key("observation.state_dims", "u32[]", [sizes.state_dim]),
+            *states_of({recipe.STATE: sizes.state_dim}),
             *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
         ],
         statistics=processors.statistics(),
@@ -414,9 +407,9 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
 def _lerobot_sizes(policy: Section) -> Sizes:
     """A state or an action that the config does not list has the padded width (Evo1Config.validate_features)."""
     s = Sizes(
-        n_layer=policy.count("vlm_num_layers", most=1024) if policy.get("vlm_num_layers") is not None else 1024,
+        n_layer=policy.count("vlm_num_layers", most=MAX_LAYERS) if policy.get("vlm_num_layers") is not None else MAX_LAYERS,
         n_token=policy.count("max_text_length"),
-        n_head_layer=policy.count("num_layers", most=1024),
+        n_head_layer=policy.count("num_layers", most=MAX_LAYERS),
         n_head_head=policy.count("num_heads"),
         d_hidden=policy.count("hidden_dim"),
         d_state_hidden=policy.count("state_hidden_dim"),
@@ -434,11 +427,7 @@ def _lerobot_sizes(policy: Section) -> Sizes:
         s.state_dim = vector_dim(policy, "input_features", recipe.STATE, "STATE")
     if recipe.ACTION in member(policy.values, "output_features", dict, "config.json"):
         s.d_robot = vector_dim(policy, "output_features", recipe.ACTION, "ACTION")
-    for key, padded, real in (("max_state_dim", s.d_state, s.state_dim), ("max_action_dim", s.d_action, s.d_robot)):
-        if real > padded:
-            policy.bad(key, "at least the feature's width {}".format(real))
-    if policy.count("n_action_steps") > s.horizon:
-        policy.bad("n_action_steps", "at most chunk_size {}".format(s.horizon), hint="the reference refuses it too")
+    check_widths(policy, {"max_state_dim": (s.d_state, s.state_dim), "max_action_dim": (s.d_action, s.d_robot)})
     s.action_dim = s.d_robot
     if policy.get("postprocess_action_dim") is not None:
         hint = "the network does not compute the other columns"
@@ -531,9 +520,5 @@ def _view_keys(
     views: List[str], n_empty: int, processors: recipe.Processors, checkpoint: Checkpoint, problems: Problems
 ) -> List[Key]:
     """The reference takes an unmentioned camera as absent, of any name, but no more of them than `empty_cameras`."""
-    return [
-        Key("observation.views", "string[]", views),
-        Key("observation.view_aliases", "string[]", recipe.view_aliases(views, processors, checkpoint.notes, problems)),
-        Key("observation.view_optional", "u32[]", [1] * len(views)),
-        Key("observation.min_views", "u32", max(1, len(views) - n_empty)),
-    ]
+    aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
+    return views_of(views, aliases, [1] * len(views), max(1, len(views) - n_empty))

@@ -9,20 +9,19 @@ stay without effect there too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from dataclasses import dataclass, field
+from typing import List, NamedTuple, Sequence
 
-from ...bundle import Key, keys_by_type
+from ...bundle import Key
 from ...errors import Problems
 from ...files import member
-from ...layers import gated_block, linear, norm, vector
-from ...section import Section
+from ...layers import linear, norm, vector
+from ...networks import EncoderNames, Language, Vision, embedding, encoder_block, keys_of, language_block, read_language, read_vision
+from ...section import Fixed, Section
 from .. import MATRIX, TABLE, VECTOR, Weight
 
 WHERE = "backbone config.json"
-MAX_LAYERS = 1024
 N_TIME = 1000  # rows of the time table, a literal of the reference
-Fixed = Dict[str, Tuple[object, object]]  # key -> the class's default, the value that the runtime implements
 
 # InternVisionConfig and InternVLChatConfig of the InternVL repository; Qwen2Config of transformers.
 CHAT_VISION = {
@@ -95,25 +94,9 @@ TEXT_FIXED: Fixed = {
 
 @dataclass
 class Sizes:
-    """Widths, counts and rules; the names are those of the bundle's keys."""
-
-    d_vision: int = 0
-    n_vision_layer: int = 0
-    n_vision_head: int = 0
-    d_vision_ff: int = 0
-    image_size: int = 0
-    patch_size: int = 0
-    vision_eps: float = 0.0
-    d_model: int = 0
-    n_layer: int = 0
-    n_backbone_layer: int = 0
-    n_head: int = 0
-    n_head_kv: int = 0
-    d_head: int = 0
-    d_ff: int = 0
-    n_vocab: int = 0
-    lm_eps: float = 0.0
-    rope_base: float = 0.0
+    vision: Vision = field(default_factory=Vision)
+    lm: Language = field(default_factory=Language)
+    n_layer: int = 0  # of the backbone's, which the policy keeps
     n_head_layer: int = 0
     n_head_head: int = 0
     d_hidden: int = 0
@@ -133,48 +116,40 @@ class Sizes:
 
     @property
     def n_view_token(self) -> int:
-        return (self.image_size // self.patch_size // 2) ** 2
-
-
-def check_fixed(section: Section, fixed: Fixed, hint: str = "") -> None:
-    for key, (default, value) in fixed.items():
-        if section.values.get(key, default) != value:
-            found = repr(section.values[key]) if key in section.values else "no such key, which means {!r}".format(default)
-            section.bad(key, repr(value), found, hint, unsupported=True)
+        return (self.vision.image_size // self.vision.patch_size // 2) ** 2
 
 
 def read_chat_backbone(config: dict, s: Sizes, problems: Problems) -> None:
     """`internvl_chat`."""
     chat = Section(WHERE, config, {}, problems)
-    check_fixed(chat, CHAT_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B")
+    chat.check_fixed(CHAT_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B")
     vision = Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), CHAT_VISION, problems)
-    check_fixed(vision, CHAT_VISION_FIXED)
+    vision.check_fixed(CHAT_VISION_FIXED)
     text = _text_section(config, "llm_config", problems)
     if text.get("architectures") != ["Qwen2ForCausalLM"]:
         text.bad("architectures", "['Qwen2ForCausalLM']", unsupported=True)
-    s.image_size, s.patch_size = vision.count("image_size"), vision.count("patch_size")
-    if (config.get("force_image_size") or s.image_size) != s.image_size:
-        chat.bad("force_image_size", "{} as in vision_config.image_size".format(s.image_size), unsupported=True)
-    _read_vision(vision, s)
+    side = vision.count("image_size")
+    if (config.get("force_image_size") or side) != side:
+        chat.bad("force_image_size", "{} as in vision_config.image_size".format(side), unsupported=True)
+    _read_vision(vision, side, vision.count("patch_size"), s)
     _read_text(text, s)
 
 
 def read_hf_backbone(config: dict, s: Sizes, problems: Problems) -> None:
     """`internvl`."""
     whole = Section(WHERE, config, {"image_seq_length": 256}, problems)
-    check_fixed(whole, HF_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B-hf")
+    whole.check_fixed(HF_FIXED, "--backbone needs the folder of OpenGVLab/InternVL3-1B-hf")
     vision = Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), HF_VISION, problems)
-    check_fixed(vision, HF_VISION_FIXED)
-    s.image_size, s.patch_size = _side(vision, "image_size"), _side(vision, "patch_size")
-    _read_vision(vision, s)
+    vision.check_fixed(HF_VISION_FIXED)
+    _read_vision(vision, _side(vision, "image_size"), _side(vision, "patch_size"), s)
     _read_text(_text_section(config, "text_config", problems), s)
-    if s.patch_size and whole.count("image_seq_length") != s.n_view_token:
+    if whole.count("image_seq_length") != s.n_view_token:
         whole.bad("image_seq_length", "{}, the tokens of a view".format(s.n_view_token))
 
 
 def _text_section(config: dict, key: str, problems: Problems) -> Section:
     where = "{}: {}".format(WHERE, key)
-    return Section(where, member(config, key, dict, WHERE), TEXT, problems, ("num_key_value_heads",))
+    return Section(where, member(config, key, dict, WHERE), TEXT, problems, ("num_key_value_heads", "head_dim"))
 
 
 def _side(section: Section, key: str) -> int:
@@ -185,32 +160,25 @@ def _side(section: Section, key: str) -> int:
     return Section(section.where, {key: value}, {}, section.problems).count(key)
 
 
-def _read_vision(vision: Section, s: Sizes) -> None:
-    s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-    s.n_vision_layer = vision.count("num_hidden_layers", most=MAX_LAYERS)
-    s.n_vision_head, s.vision_eps = vision.count("num_attention_heads"), vision.number("layer_norm_eps")
-    if s.d_vision % s.n_vision_head:
-        vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(s.d_vision))
-    if s.image_size % (2 * s.patch_size):
-        vision.bad("image_size", "a multiple of twice the patch size, {}".format(2 * s.patch_size), unsupported=True)
+def _read_vision(vision: Section, image_size: int, patch_size: int, s: Sizes) -> None:
+    s.vision = read_vision(vision, image_size, patch_size)
+    if image_size % (2 * patch_size):
+        vision.bad("image_size", "a multiple of twice the patch size, {}".format(2 * patch_size), unsupported=True)
 
 
 def _read_text(text: Section, s: Sizes) -> None:
-    check_fixed(text, TEXT_FIXED)
-    s.d_model, s.d_ff, s.n_vocab = text.count("hidden_size"), text.count("intermediate_size"), text.count("vocab_size")
-    s.n_head = text.count("num_attention_heads")
-    if "num_key_value_heads" in text.values:
-        text.defaults["num_key_value_heads"] = s.n_head  # what null means
-    s.n_head_kv, s.lm_eps = text.count("num_key_value_heads"), text.number("rms_norm_eps")
-    s.n_backbone_layer, s.d_head = text.count("num_hidden_layers", most=MAX_LAYERS), s.d_model // s.n_head
-    if s.d_model % s.n_head or s.n_head % s.n_head_kv or s.d_head % 2:
-        text.bad("num_attention_heads", "heads of an even width that divide hidden_size {}, in whole groups".format(s.d_model))
-    if text.get("head_dim") not in (None, s.d_head):
-        text.bad("head_dim", "{}, hidden_size by heads".format(s.d_head), unsupported=True)
+    """`s.n_layer`: how many of the layers the policy keeps."""
+    text.check_fixed(TEXT_FIXED)
+    s.lm = lm = read_language(text)
+    lm.n_layer, d_head = min(s.n_layer, lm.n_layer), lm.d_model // lm.n_head
+    if lm.d_model % lm.n_head or lm.n_head % lm.n_head_kv or d_head % 2:
+        text.bad("num_attention_heads", "heads of an even width that divide hidden_size {}, in whole groups".format(lm.d_model))
+    if lm.d_head != d_head:
+        text.bad("head_dim", "{}, hidden_size by heads".format(d_head), unsupported=True)
     kinds = text.get("layer_types")
     if kinds is not None and (not isinstance(kinds, list) or any(kind != "full_attention" for kind in kinds)):
         text.bad("layer_types", "full_attention only", str(kinds)[:80], unsupported=True)
-    s.rope_base = _rope(text, s)
+    lm.rope_base = _rope(text, s)
 
 
 def _rope(text: Section, s: Sizes) -> float:
@@ -228,75 +196,39 @@ def _rope(text: Section, s: Sizes) -> float:
 
 def check_head(policy: Section, s: Sizes, embed_dim: int) -> None:
     """What the head must share with the towers, and the shapes of it that the runtime does not have."""
-    if embed_dim != s.d_model:
-        policy.bad("embed_dim", "the language model's width {}".format(s.d_model))
-    if s.d_model % s.n_head_head:
-        policy.bad("num_heads", "a divisor of embed_dim {}".format(s.d_model))
+    if embed_dim != s.lm.d_model:
+        policy.bad("embed_dim", "the language model's width {}".format(s.lm.d_model))
+    if s.lm.d_model % s.n_head_head:
+        policy.bad("num_heads", "a divisor of embed_dim {}".format(s.lm.d_model))
     if s.horizon == 1:
         policy.bad("horizon", "at least 2", "1", "the reference has another action encoder for single actions", unsupported=True)
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    u32 = {
-        "policy.d_state": s.d_state,
-        "policy.d_action": s.d_action,
-        "policy.horizon": s.horizon,
-        "policy.d_robot": s.d_robot,
-        "policy.n_slot": s.n_slot,
-        "policy.n_token": s.n_token,
-        "vision.d_model": s.d_vision,
-        "vision.n_layer": s.n_vision_layer,
-        "vision.n_head": s.n_vision_head,
-        "vision.d_ff": s.d_vision_ff,
-        "vision.image_size": s.image_size,
-        "vision.patch_size": s.patch_size,
-        "connector.factor": 2,
-        "lm.d_model": s.d_model,
-        "lm.n_layer": s.n_layer,
-        "lm.n_head": s.n_head,
-        "lm.n_head_kv": s.n_head_kv,
-        "lm.d_head": s.d_head,
-        "lm.d_ff": s.d_ff,
-        "lm.n_vocab": s.n_vocab,
-        "head.n_layer": s.n_head_layer,
-        "head.n_head": s.n_head_head,
-        "head.d_ff": 4 * s.d_model,
-        "head.d_hidden": s.d_hidden,
-        "head.d_state_hidden": s.d_state_hidden,
-        "solver.steps": s.n_step,
-    }
-    f32 = {
-        "vision.norm_eps": s.vision_eps,
-        "connector.norm_eps": 1e-5,  # torch's default, which the reference leaves as it is
-        "lm.norm_eps": s.lm_eps,
-        "lm.rope_base": s.rope_base,
-        "head.norm_eps": 1e-5,
-    }
-    f64 = {"policy.time_scale": s.time_scale, "solver.t_start": 0.0, "solver.t_end": 1.0}
-    text = {
-        "policy.dead_rows": s.dead_rows,
-        "policy.absent_views": s.absent_views,
-        "solver.kind": "euler",
-        "solver.noise": "uniform",
-    }
-    return keys_by_type({"u32": u32, "f32": f32, "f64": f64, "string": text})
+    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, d_robot=s.d_robot, n_slot=s.n_slot, n_token=s.n_token)
+    head = dict(n_layer=s.n_head_layer, n_head=s.n_head_head, d_ff=4 * s.lm.d_model, d_hidden=s.d_hidden)
+    eps = 1e-5  # torch's default, which the reference leaves as it is
+    return keys_of(
+        {
+            "policy": dict(policy, time_scale=s.time_scale, dead_rows=s.dead_rows, absent_views=s.absent_views),
+            "vision": s.vision,
+            "connector": dict(factor=2, norm_eps=eps),
+            "lm": s.lm,
+            "head": dict(head, d_state_hidden=s.d_state_hidden, norm_eps=eps),
+            "solver": dict(steps=s.n_step, t_start=0.0, t_end=1.0, kind="euler", noise="uniform"),
+        }
+    )
 
 
 # --- tensors: the authors' names and LeRobot's, which differ in the towers and not in the head ------------------------------------------
 
 class Names(NamedTuple):
-    """Modules of a tower by what they are. `qkv`: one name where q, k and v are stacked, which ends before "weight" and "bias",
-    else three."""
-
     vision: str
     class_token: str
     position: str
     patch: str
-    block: str
-    norms: Sequence[str]
-    qkv: Sequence[str]
-    out: str
-    scales: Sequence[str]
+    blocks: str
+    block: EncoderNames
     connector: Sequence[str]
     lm: str
     head: str
@@ -307,11 +239,8 @@ AUTHORS = Names(
     class_token="embeddings.class_embedding",
     position="embeddings.position_embedding",
     patch="embeddings.patch_embedding",
-    block="encoder.layers.{}.",
-    norms=("norm1", "norm2"),
-    qkv=("attn.qkv.",),
-    out="attn.proj",
-    scales=("ls1", "ls2"),
+    blocks="encoder.layers.{}.",
+    block=EncoderNames(("norm1", "norm2"), ("attn.qkv.",), "attn.proj", "mlp.fc1", "mlp.fc2", ("ls1", "ls2")),
     connector=tuple("embedder.model.mlp1." + part for part in "013"),
     lm="embedder.model.language_model.model.",
     head="action_head.",
@@ -321,41 +250,29 @@ LEROBOT = Names(
     class_token="embeddings.cls_token",
     position="embeddings.position_embeddings",
     patch="embeddings.patch_embeddings.projection",
-    block="encoder.layer.{}.",
-    norms=("layernorm_before", "layernorm_after"),
-    qkv=tuple("attention.{}_proj".format(part) for part in "qkv"),
-    out="attention.projection_layer",
-    scales=("lambda_1", "lambda_2"),
+    blocks="encoder.layer.{}.",
+    block=EncoderNames(
+        ("layernorm_before", "layernorm_after"),
+        tuple("attention.{}_proj".format(part) for part in "qkv"),
+        "attention.projection_layer",
+        "mlp.fc1",
+        "mlp.fc2",
+        ("lambda_1", "lambda_2"),
+    ),
     connector=tuple("model.embedder.model.multi_modal_projector." + part for part in ("layer_norm", "linear_1", "linear_2")),
     lm="model.embedder.model.language_model.",
     head="model.action_head.",
 )
+HEAD = EncoderNames(("norm1", "norm2"), ("attn.in_proj_",), "attn.out_proj", "ff.0", "ff.2")
 
 
 def weights(s: Sizes, names: Names) -> List[Weight]:
     return [*_vision(s, names), *_connector(s, names), *_language(s, names), *_head(s, names.head)]
 
 
-def _stacked(target: str, source: str, d: int) -> List[Weight]:
-    """q, k and v of width d as thirds of the rows of one matrix and one bias. `source`: their name up to "weight" and "bias"."""
-    rows: List[Weight] = []
-    for i, part in enumerate(("attn_q", "attn_k", "attn_v")):
-        rows += [
-            Weight(target + part + ".weight", source + "weight", MATRIX, (3 * d, d), (d, d), first=i * d),
-            Weight(target + part + ".bias", source + "bias", VECTOR, (3 * d,), (d,), first=i * d),
-        ]
-    return rows
-
-
-def _qkv(target: str, block: str, names: Sequence[str], d: int) -> List[Weight]:
-    if len(names) == 1:
-        return _stacked(target, block + names[0], d)
-    return [row for part, name in zip("qkv", names) for row in linear(target + "attn_" + part, block + name, d, d, bias=True)]
-
-
 def _vision(s: Sizes, names: Names) -> List[Weight]:
-    d, patch, n_position = s.d_vision, s.patch_size, (s.image_size // s.patch_size) ** 2 + 1
-    source = names.vision + names.patch
+    v, source = s.vision, names.vision + names.patch
+    d, patch, n_position = v.d_model, v.patch_size, v.n_patch + 1
     rows = [
         Weight("vision.class_token.weight", names.vision + names.class_token, VECTOR, (1, 1, d), (d,)),
         # A convolution whose stride is its kernel is a matrix over the flattened patch: channel, row, column.
@@ -363,39 +280,26 @@ def _vision(s: Sizes, names: Names) -> List[Weight]:
         *vector("vision.patch_embed.bias", source + ".bias", d),
         Weight("vision.position.weight", names.vision + names.position, TABLE, (1, n_position, d), (n_position, d)),
     ]
-    for i in range(s.n_vision_layer):
-        target, block = "vision.blk.{}.".format(i), names.vision + names.block.format(i)
-        rows += norm(target + "attn_norm", block + names.norms[0], d)
-        rows += _qkv(target, block, names.qkv, d)
-        rows += linear(target + "attn_out", block + names.out, d, d, bias=True)
-        rows += vector(target + "attn_scale.weight", block + names.scales[0], d)
-        rows += norm(target + "ffn_norm", block + names.norms[1], d)
-        rows += linear(target + "ffn_up", block + "mlp.fc1", s.d_vision_ff, d, bias=True)
-        rows += linear(target + "ffn_down", block + "mlp.fc2", d, s.d_vision_ff, bias=True)
-        rows += vector(target + "ffn_scale.weight", block + names.scales[1], d)
+    for i in range(v.n_layer):
+        rows += encoder_block("vision.blk.{}.".format(i), names.vision + names.blocks.format(i), names.block, d, v.d_ff)
     return rows
 
 
 def _connector(s: Sizes, names: Names) -> List[Weight]:
-    first, up, down = names.connector
+    (first, up, down), d = names.connector, s.lm.d_model
     return [
-        *norm("connector.norm", first, 4 * s.d_vision),
-        *linear("connector.up", up, s.d_model, 4 * s.d_vision, bias=True),
-        *linear("connector.down", down, s.d_model, s.d_model, bias=True),
+        *norm("connector.norm", first, 4 * s.vision.d_model),
+        *linear("connector.up", up, d, 4 * s.vision.d_model, bias=True),
+        *linear("connector.down", down, d, d, bias=True),
     ]
 
 
 def _language(s: Sizes, names: Names) -> List[Weight]:
-    rows = [Weight("lm.token_embd.weight", names.lm + "embed_tokens.weight", TABLE, (s.n_vocab, s.d_model), (s.n_vocab, s.d_model))]
-    d_q, d_kv = s.n_head * s.d_head, s.n_head_kv * s.d_head
-    widths = {"attn_q": d_q, "attn_k": d_kv, "attn_v": d_kv}
-    for i in range(s.n_layer):
-        target, block = "lm.blk.{}.".format(i), "{}layers.{}.".format(names.lm, i)
-        for part, parts in gated_block(target, block, s.d_model, d_q, d_kv, s.d_model, s.d_ff).items():
-            rows += parts
-            if part in widths:
-                rows += vector(target + part + ".bias", parts[0].source[: -len("weight")] + "bias", widths[part])
-    return rows + vector("lm.norm.weight", names.lm + "norm.weight", s.d_model)
+    rows = [embedding(s.lm, names.lm + "embed_tokens.weight")]
+    for i in range(s.lm.n_layer):
+        for part in language_block(s.lm, names.lm, i, qkv_bias=True).values():
+            rows += part
+    return rows + vector("lm.norm.weight", names.lm + "norm.weight", s.lm.d_model)
 
 
 def _table(target: str, source: str, n_row: int, d: int) -> Weight:
@@ -404,7 +308,7 @@ def _table(target: str, source: str, n_row: int, d: int) -> Weight:
 
 
 def _head(s: Sizes, head: str) -> List[Weight]:
-    d, encoder, out = s.d_model, head + "action_encoder.", s.horizon * s.d_action
+    d, encoder, out = s.lm.d_model, head + "action_encoder.", s.horizon * s.d_action
     rows = [
         *linear("state_in", head + "state_encoder.fc1.linear", s.d_state_hidden, s.d_state, bias=True),
         *linear("state_out", head + "state_encoder.fc2.linear", d, s.d_state_hidden, bias=True),
@@ -416,12 +320,7 @@ def _head(s: Sizes, head: str) -> List[Weight]:
     ]
     for i in range(s.n_head_layer):
         target, block = "head.blk.{}.".format(i), "{}transformer_blocks.{}.".format(head, i)
-        rows += norm(target + "attn_norm", block + "norm1", d)
-        rows += _stacked(target, block + "attn.in_proj_", d)
-        rows += linear(target + "attn_out", block + "attn.out_proj", d, d, bias=True)
-        rows += norm(target + "ffn_norm", block + "norm2", d)
-        rows += linear(target + "ffn_up", block + "ff.0", 4 * d, d, bias=True)
-        rows += linear(target + "ffn_down", block + "ff.2", d, 4 * d, bias=True)
+        rows += encoder_block(target, block, HEAD, d, 4 * d)
     return [
         *rows,
         *norm("head.norm", head + "norm_out", d),

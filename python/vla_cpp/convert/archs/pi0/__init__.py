@@ -11,7 +11,7 @@ import json
 from typing import List
 
 from ... import recipe
-from ...bundle import Key, keys_by_type
+from ...bundle import Key
 from ...checkpoint import OPENPI, Checkpoint
 from ...errors import Code, Problems, refuse
 from ...files import HUB_FORM
@@ -31,7 +31,7 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
         checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems
     )
     tokenizer = read_tokenizer(
-        _tokenizer(checkpoint, options, source.processors), source.sizes.n_vocab, problems, checkpoint.notes
+        _tokenizer(checkpoint, options, source.processors), source.sizes.lm.n_vocab, problems, checkpoint.notes
     )
     _check_newline(source.text, tokenizer, problems)
     tokenize = {"op": "tokenize", "max_tokens": source.max_tokens, "truncate": tokenizer.truncate}
@@ -42,7 +42,7 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
         "action": source.action,
     }
     keys = [
-        *keys_by_type(network_keys(source.sizes)),
+        *network_keys(source.sizes),
         *source.features,
         Key("observation.max_text_tokens", "u32", source.max_tokens),
         *tokenizer.keys,

@@ -25,9 +25,9 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys
+from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
-from ...lerobot import check_keys, read_views, vector_dim, view_keys
+from ...lerobot import check_keys, check_widths, read_views, vector_dim, view_keys
 from ...section import Section
 from .. import Options
 from .mapping import Family, Sizes, check_image, read_towers
@@ -112,15 +112,14 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
     _check_pipelines(family, policy, processors)
     features = [
         *view_keys(checkpoint, views, processors, problems),
-        Key("observation.states", "string[]", [recipe.STATE]),
-        Key("observation.state_dims", "u32[]", [sizes.state_dim]),
+        *states_of({recipe.STATE: sizes.state_dim}),
         *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
     ]
     return Source(
         sizes=sizes,
         processors=processors,
         image=[
-            recipe.letterbox(sizes.image_size, sizes.image_size, "center"),
+            recipe.letterbox(*[sizes.vision.image_size] * 2, "center"),
             {"op": "clip", "low": 0.0, "high": 1.0},
             {"op": "affine", "scale": 2.0, "shift": -1.0},
         ],
@@ -142,12 +141,9 @@ def _read_policy(family: Family, policy: Section, s: Sizes) -> None:
     if recipe.ACTION in (policy.get("output_features") or {}):
         s.action_dim = vector_dim(policy, "output_features", recipe.ACTION, "ACTION")
     s.d_state = d_state if family.state_token else 0
-    for key, padded, real in (("max_state_dim", d_state, s.state_dim), ("max_action_dim", s.d_action, s.action_dim)):
-        if real > padded and (family.state_token or key != "max_state_dim"):
-            policy.bad(key, "at least the feature's width {}".format(real))
+    widths = {"max_state_dim": (d_state, s.state_dim)} if family.state_token else {}
+    check_widths(policy, {**widths, "max_action_dim": (s.d_action, s.action_dim)})
     s.horizon, s.n_step = policy.count("chunk_size"), policy.count("num_inference_steps")
-    if policy.count("n_action_steps") > s.horizon:
-        policy.bad("n_action_steps", "at most chunk_size {}".format(s.horizon), hint="the reference refuses it too")
     s.min_period, s.max_period = policy.number("min_period"), policy.number("max_period")
     if policy.get("dtype") not in ("float32", "bfloat16"):
         policy.bad("dtype", "float32 or bfloat16", hint="the reference refuses it too", unsupported=True)
@@ -299,7 +295,7 @@ def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, proble
     return Source(
         sizes=sizes,
         processors=recipe.Processors(),
-        image=[recipe.letterbox(sizes.image_size, sizes.image_size, "center", antialias=True), {"op": "affine", "scale": 2.0, "shift": -1.0}],
+        image=[recipe.letterbox(*[sizes.vision.image_size] * 2, "center", antialias=True), {"op": "affine", "scale": 2.0, "shift": -1.0}],
         text=[*CLEAN, PROMPT] if _has_words(family, variant) else [*CLEAN, NEWLINE],
         state=[*robot.decode, *(_normalize("normalize", kind, name, state_names) for name in state_names)]
         + [_state_end(family, variant, sizes)],
@@ -332,7 +328,7 @@ def _normalize(op: str, kind: str, feature: str, features: Sequence[str]) -> dic
 
 def _openpi_sizes(family: Family, policy: Section, checkpoint: Checkpoint, variant: Variant, problems: Problems) -> Sizes:
     s = read_towers(policy, checkpoint, problems)
-    check_image(policy, "image size", s, [s.image_size or SIDE] * 2)
+    check_image(policy, "image size", s, [s.vision.image_size or SIDE] * 2)
     s.state_dim, s.action_dim = sum(width for _, width in variant.robot.states), variant.robot.n_action
     s.d_action = policy.count("action_dim")
     s.d_state = s.d_action if family.state_token else 0
@@ -405,11 +401,11 @@ def _openpi_features(
 ) -> List[Key]:
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
     return [
-        Key("observation.views", "string[]", ["observation.images." + name for name, _, _ in robot.views]),
-        Key("observation.view_aliases", "string[]", [alias for _, alias, _ in robot.views]),
-        Key("observation.view_optional", "u32[]", [int(optional) for _, _, optional in robot.views]),
-        Key("observation.min_views", "u32", 1),
-        Key("observation.states", "string[]", states),
-        Key("observation.state_dims", "u32[]", [width for _, width in robot.states]),
+        *views_of(
+            ["observation.images." + name for name, _, _ in robot.views],
+            [alias for _, alias, _ in robot.views],
+            [int(optional) for _, _, optional in robot.views],
+        ),
+        *states_of(dict(zip(states, (width for _, width in robot.states)))),
         *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
     ]

@@ -8,16 +8,18 @@ Its configuration knows two sizes by name; a `dims.json` beside it states others
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Dict, List, NamedTuple
 
+from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...files import member, read_json
-from ...layers import KEPT_OF_LAST, gated_block, linear, siglip, vector
+from ...layers import gated_block, linear, siglip, vector
+from ...networks import MAX_LAYERS, Language, Vision, dropped_of_last, embedding, keys_and_values, keys_of, plus_one, read_vision
 from ...safetensors_file import Entry
 from ...section import Section
-from .. import TABLE, Dropped, Weight
+from .. import Dropped, Weight
 
 
 class Family(NamedTuple):
@@ -56,21 +58,8 @@ EPS, ROPE_BASE = 1e-6, 10000.0  # of both Gemma configs and of the tower, which 
 
 @dataclass
 class Sizes:
-    """Widths and counts; the names are those of the bundle's keys."""
-
-    image_size: int = 0
-    patch_size: int = 0
-    d_vision: int = 0
-    n_vision_layer: int = 0
-    n_vision_head: int = 0
-    d_vision_ff: int = 0
-    d_model: int = 0
-    n_layer: int = 0
-    n_head: int = 0
-    n_head_kv: int = 0
-    d_head: int = 0
-    d_ff: int = 0
-    n_vocab: int = 0
+    vision: Vision = field(default_factory=Vision)
+    lm: Language = field(default_factory=Language)
     d_expert: int = 0
     d_expert_ff: int = 0
     state_dim: int = 0  # of the robot
@@ -82,10 +71,6 @@ class Sizes:
     min_period: float = 0.0
     max_period: float = 0.0
     solver: str = "euler"
-
-    @property
-    def n_position(self) -> int:
-        return (self.image_size // self.patch_size) ** 2
 
 
 def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> Sizes:
@@ -105,38 +90,34 @@ def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> 
         lm.bad("head_dim", "an even number, for the rotary embedding")
     if expert.count("width") % 2:
         expert.bad("width", "an even number, for the time embedding")
-    if vision.count("hidden_size") % vision.count("num_attention_heads"):
-        vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(vision.count("hidden_size")))
     top = Section(DIMS_FILE, dims, {"vocab_size": N_VOCAB}, problems)
-    return Sizes(
-        image_size=vision.count("image_size", 0) if "image_size" in vision.values else 0,
-        patch_size=vision.count("patch_size"),
-        d_vision=vision.count("hidden_size"),
-        n_vision_layer=vision.count("num_hidden_layers", most=1024),
-        n_vision_head=vision.count("num_attention_heads"),
-        d_vision_ff=vision.count("intermediate_size"),
+    image_size = vision.count("image_size", 0) if "image_size" in vision.values else 0
+    tower = read_vision(vision, image_size, vision.count("patch_size"))
+    tower.norm_eps = EPS
+    language = Language(
         d_model=lm.count("width"),
-        n_layer=lm.count("depth", most=1024),
+        n_layer=lm.count("depth", most=MAX_LAYERS),
         n_head=lm.count("num_heads"),
         n_head_kv=lm.count("num_kv_heads"),
         d_head=lm.count("head_dim"),
         d_ff=lm.count("mlp_dim"),
         n_vocab=top.count("vocab_size"),
-        d_expert=expert.count("width"),
-        d_expert_ff=expert.count("mlp_dim"),
+        norm_eps=EPS,
+        rope_base=ROPE_BASE,
     )
+    return Sizes(tower, language, expert.count("width"), expert.count("mlp_dim"))
 
 
 def check_image(policy: Section, key: str, sizes: Sizes, resolution) -> None:
     """Sets the size of the images, which the reference wants square."""
     square = isinstance(resolution, list) and len(resolution) == 2 and resolution[0] == resolution[1]
     side = resolution[0] if square else 0
-    if type(side) is not int or not sizes.patch_size <= side <= 8192:
-        policy.bad(key, "two equal sides from patch_size {} to 8192".format(sizes.patch_size), repr(resolution))
-        side = sizes.patch_size
-    if sizes.image_size not in (0, side):
-        policy.bad(key, "the image_size of {}, {}".format(DIMS_FILE, sizes.image_size), repr(resolution))
-    sizes.image_size = side
+    if type(side) is not int or not sizes.vision.patch_size <= side <= 8192:
+        policy.bad(key, "two equal sides from patch_size {} to 8192".format(sizes.vision.patch_size), repr(resolution))
+        side = sizes.vision.patch_size
+    if sizes.vision.image_size not in (0, side):
+        policy.bad(key, "the image_size of {}, {}".format(DIMS_FILE, sizes.vision.image_size), repr(resolution))
+    sizes.vision.image_size = side
 
 
 def _dims(checkpoint: Checkpoint, problems: Problems) -> dict:
@@ -166,41 +147,19 @@ def _known(section: Section) -> None:
         section.bad(key, "one of " + ", ".join(section.defaults), unsupported=True)
 
 
-def network_keys(s: Sizes) -> Dict[str, Dict[str, object]]:
-    """Values by kind and name of the bundle's keys."""
-    u32 = {
-        "policy.d_state": s.d_state,
-        "policy.d_action": s.d_action,
-        "policy.horizon": s.horizon,
-        "vision.d_model": s.d_vision,
-        "vision.n_layer": s.n_vision_layer,
-        "vision.n_head": s.n_vision_head,
-        "vision.d_ff": s.d_vision_ff,
-        "vision.image_size": s.image_size,
-        "vision.patch_size": s.patch_size,
-        "lm.d_model": s.d_model,
-        "lm.n_layer": s.n_layer,
-        "lm.n_head": s.n_head,
-        "lm.n_head_kv": s.n_head_kv,
-        "lm.d_head": s.d_head,
-        "lm.d_ff": s.d_ff,
-        "lm.n_vocab": s.n_vocab,
-        "expert.d_model": s.d_expert,
-        "expert.n_layer": s.n_layer,
-        "expert.d_ff": s.d_expert_ff,
-        "solver.steps": s.n_step,
-    }
-    f32 = {
-        "policy.text_scale": s.d_model**0.5,
-        "vision.norm_eps": EPS,
-        "lm.norm_eps": EPS,
-        "lm.rope_base": ROPE_BASE,
-        "expert.norm_eps": EPS,
-        "expert.rope_base": ROPE_BASE,
-    }
-    f64 = {"time.min_period": s.min_period, "time.max_period": s.max_period, "solver.t_start": 1.0, "solver.t_end": 0.0}
-    text = {"vision.position_rule": "row_major", "solver.kind": s.solver, "solver.noise": "normal"}
-    return {"u32": u32, "f32": f32, "f64": f64, "string": text}
+def network_keys(s: Sizes) -> List[Key]:
+    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, text_scale=s.lm.d_model**0.5)
+    expert = dict(d_model=s.d_expert, n_layer=s.lm.n_layer, d_ff=s.d_expert_ff, norm_eps=EPS, rope_base=ROPE_BASE)
+    return keys_of(
+        {
+            "policy": policy,
+            "vision": {**vars(s.vision), "position_rule": "row_major"},
+            "lm": s.lm,
+            "expert": expert,
+            "time": dict(min_period=s.min_period, max_period=s.max_period),
+            "solver": dict(steps=s.n_step, t_start=1.0, t_end=0.0, kind=s.solver, noise="normal"),
+        }
+    )
 
 
 # --- names. Releases of LeRobot, openpi and transformers moved the towers about and left prefixes out; a mapping needs one name for each
@@ -271,36 +230,15 @@ def rounded(weight: Weight) -> bool:
 
 
 def weights(family: Family, s: Sizes, checkpoint: Checkpoint) -> List[Weight]:
-    embedding = EMBEDDING if EMBEDDING in checkpoint.tensors else LM_HEAD
+    table, v = EMBEDDING if EMBEDDING in checkpoint.tensors else LM_HEAD, s.vision
     return [
-        *siglip(VISION, s.d_vision, s.d_vision_ff, s.n_vision_layer, s.patch_size, s.n_position),
-        *linear("projector", PROJECTOR, s.d_model, s.d_vision, bias=True),
-        Weight("lm.token_embd.weight", embedding, TABLE, (s.n_vocab, s.d_model), (s.n_vocab, s.d_model)),
-        *_language(s),
+        *siglip(VISION, v.d_model, v.d_ff, v.n_layer, v.patch_size, v.n_patch),
+        *linear("projector", PROJECTOR, s.lm.d_model, v.d_model, bias=True),
+        embedding(s.lm, table),
+        *keys_and_values(s.lm, LM, gemma=True),
         *_projections(family, s),
         *_expert(family, s),
         *linear("action_out", ROOT + "action_out_proj", s.d_action, s.d_expert, bias=True),
-    ]
-
-
-def _language_block(s: Sizes, i: int) -> Dict[str, List[Weight]]:
-    target, source = "lm.blk.{}.".format(i), "{}layers.{}.".format(LM, i)
-    d_kv = s.n_head_kv * s.d_head
-    block = gated_block(target, source, s.d_model, s.n_head * s.d_head, d_kv, s.d_model, s.d_ff)
-    return {part: [_plus_one(weight) for weight in rows] if "norm" in part else rows for part, rows in block.items()}
-
-
-def _plus_one(weight: Weight) -> Weight:
-    return weight._replace(plus_one=True)
-
-
-def _language(s: Sizes) -> List[Weight]:
-    return [
-        weight
-        for i in range(s.n_layer)
-        for part, rows in _language_block(s, i).items()
-        if i < s.n_layer - 1 or part in KEPT_OF_LAST
-        for weight in rows
     ]
 
 
@@ -317,10 +255,9 @@ def _projections(family: Family, s: Sizes) -> List[Weight]:
 
 def _expert(family: Family, s: Sizes) -> List[Weight]:
     rows: List[Weight] = []
-    for i in range(s.n_layer):
+    for i in range(s.lm.n_layer):
         target, source = "expert.blk.{}.".format(i), "{}layers.{}.".format(EXPERT, i)
-        d_kv = s.n_head_kv * s.d_head
-        block = gated_block(target, source, s.d_expert, s.n_head * s.d_head, d_kv, s.d_expert, s.d_expert_ff)
+        block = gated_block(target, source, s.d_expert, s.lm.d_q, s.lm.d_kv, s.d_expert, s.d_expert_ff)
         block["attn_norm"] = _expert_norm(family, s, target + "attn_norm", source + "input_layernorm")
         block["ffn_norm"] = _expert_norm(family, s, target + "ffn_norm", source + "post_attention_layernorm")
         rows += [weight for part in block.values() for weight in part]
@@ -329,26 +266,22 @@ def _expert(family: Family, s: Sizes) -> List[Weight]:
 
 def _expert_norm(family: Family, s: Sizes, target: str, source: str) -> List[Weight]:
     if family.state_token:
-        return [_plus_one(weight) for weight in vector(target + ".weight", source + ".weight", s.d_expert)]
+        return plus_one(vector(target + ".weight", source + ".weight", s.d_expert))
     return linear(target + ".dense", source + ".dense", 3 * s.d_expert, s.d_expert, bias=True)
 
 
 def dropped(family: Family, s: Sizes, checkpoint: Checkpoint) -> List[Dropped]:
-    last = [
-        weight for part, rows in _language_block(s, s.n_layer - 1).items() if part not in KEPT_OF_LAST for weight in rows
-    ]
-    head = [Dropped(LM_HEAD, (s.n_vocab, s.d_model), "the embedding table is stored under its own name too")]
+    head = [Dropped(LM_HEAD, (s.lm.n_vocab, s.lm.d_model), "the embedding table is stored under its own name too")]
     rows = [
         *(head if EMBEDDING in checkpoint.tensors else []),
-        Dropped(EXPERT_HEAD, (s.n_vocab, s.d_expert), "no action depends on the expert's language head"),
-        Dropped(LM + "norm.weight", (s.d_model,), "the prefix leaves only keys and values"),
-        *(Dropped(row.source, row.stored, "the last language layer leaves only keys and values") for row in last),
+        Dropped(EXPERT_HEAD, (s.lm.n_vocab, s.d_expert), "no action depends on the expert's language head"),
+        *dropped_of_last(s.lm, LM),
     ]
     if family.state_token:
         return rows
     # The reference's loader passes these over in a checkpoint of π0.5.
     reason = "π0.5 has its state in the prompt and its norms without weights of their own"
-    norms = ["{}layers.{}.{}.weight".format(EXPERT, i, n) for i in range(s.n_layer) for n in NORMS]
+    norms = ["{}layers.{}.{}.weight".format(EXPERT, i, n) for i in range(s.lm.n_layer) for n in NORMS]
     rows += [Dropped(name, (s.d_expert,), reason) for name in [*norms, EXPERT + "norm.weight"]]
     rows.append(Dropped(ROOT + "state_proj.weight", (s.d_expert, s.d_action), reason))
     return [*rows, Dropped(ROOT + "state_proj.bias", (s.d_expert,), reason)]
@@ -358,9 +291,9 @@ NORMS = ("input_layernorm", "post_attention_layernorm")
 
 
 def hints(s: Sizes) -> Dict[str, str]:
-    text = "the {} layers are 0 to {}".format("{}", s.n_layer - 1)
+    text = "the {} layers are 0 to {}".format("{}", s.lm.n_layer - 1)
     return {
         LM + "layers.": text.format("language model's"),
         EXPERT + "layers.": text.format("expert's"),
-        VISION + "encoder.layers.": "the tower's layers are 0 to {}".format(s.n_vision_layer - 1),
+        VISION + "encoder.layers.": "the tower's layers are 0 to {}".format(s.vision.n_layer - 1),
     }

@@ -15,7 +15,7 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys
+from ...features import feature_keys, states_of
 from ...lerobot import tokenizer_folder, view_keys
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan
@@ -31,7 +31,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     dims = {recipe.STATE: sizes.state_dim, recipe.ACTION: sizes.action_dim}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     folder = tokenizer_folder(checkpoint, options, processors) or sizes.backbone
-    tokenizer = read_tokenizer(folder, sizes.n_vocab, problems, checkpoint.notes)
+    tokenizer = read_tokenizer(folder, sizes.lm.n_vocab, problems, checkpoint.notes)
     document = json.dumps(recipe_document(sizes, processors, tokenizer.truncate), ensure_ascii=False)
     keys = [
         *network_keys(sizes),
@@ -56,12 +56,10 @@ def _feature_keys(
     checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems
 ) -> List[Key]:
     """One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same."""
+    dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
     return [
         *view_keys(checkpoint, s.views, processors, problems),
-        Key("observation.states", "string[]", [recipe.STATE]),
-        Key("observation.state_dims", "u32[]", [s.state_dim]),
+        *states_of({recipe.STATE: s.state_dim}),
         Key("observation.max_text_tokens", "u32", processors.max_tokens),
-        *feature_keys(
-            options.dataset_info, {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}, checkpoint.notes, problems
-        ),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
     ]

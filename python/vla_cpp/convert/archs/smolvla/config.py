@@ -8,13 +8,14 @@ An absent key means the default of the reference's own class, which is stated he
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import List, Sequence, Tuple
 
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import member, read_json
-from ...lerobot import check_keys, read_views, vector_dim
+from ...lerobot import check_keys, check_widths, read_views, vector_dim
+from ...networks import MAX_LAYERS, Language, Vision, read_language, read_vision
 from ...recipe import ACTION, STATE
 from ...section import ANY_INT, Section
 from .. import Options
@@ -71,13 +72,11 @@ TEXT = {
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
 TEXT_NULLABLE = ("num_key_value_heads", "head_dim")
-MAX_LAYERS = 1024
+ROPE_BASE = 10000.0  # whatever the backbone's config says: the reference rotates with its own function (apply_rope)
 
 
 @dataclass
 class Sizes:
-    """Widths, counts and rules; the names are those of the bundle's keys."""
-
     backbone: str = ""
     views: Sequence[str] = ()
     empty_cameras: int = 0
@@ -90,23 +89,10 @@ class Sizes:
     n_step: int = 0
     min_period: float = 0.0
     max_period: float = 0.0
-    d_vision: int = 0
-    n_vision_layer: int = 0
-    n_vision_head: int = 0
-    d_vision_ff: int = 0
-    image_size: int = 0
-    patch_size: int = 0
-    vision_eps: float = 0.0
+    vision: Vision = field(default_factory=Vision)
     position_precision: str = ""
     factor: int = 0
-    d_model: int = 0
-    n_layer: int = 0
-    n_head: int = 0
-    n_head_kv: int = 0
-    d_head: int = 0
-    d_ff: int = 0
-    n_vocab: int = 0
-    lm_eps: float = 0.0
+    lm: Language = field(default_factory=Language)
     d_expert: int = 0
     d_expert_ff: int = 0
     n_expert_layer: int = 0
@@ -144,12 +130,8 @@ def _check_policy(policy: Section) -> None:
 
 def _read_policy(policy: Section, s: Sizes) -> None:
     s.d_state, s.d_action = policy.count("max_state_dim"), policy.count("max_action_dim")
-    for key, padded, real in (("max_state_dim", s.d_state, s.state_dim), ("max_action_dim", s.d_action, s.action_dim)):
-        if real > padded:
-            policy.bad(key, "at least the feature's width {}".format(real))
+    check_widths(policy, {"max_state_dim": (s.d_state, s.state_dim), "max_action_dim": (s.d_action, s.action_dim)})
     s.horizon, s.n_step = policy.count("chunk_size"), policy.count("num_steps")
-    if policy.count("n_action_steps") > s.horizon:
-        policy.bad("n_action_steps", "at most chunk_size {}".format(s.horizon), hint="the reference refuses it too")
     s.min_period, s.max_period = policy.number("min_period"), policy.number("max_period")
     policy.count("prefix_length", ANY_INT)  # pads the prefix with masked tokens, which changes no number
     frame = policy.get("resize_imgs_with_padding")
@@ -170,40 +152,22 @@ def _read_policy(policy: Section, s: Sizes) -> None:
 def _read_text(policy: Section, text: Section, s: Sizes) -> None:
     for key, value in TEXT_FIXED.items():
         text.fixed(key, value)
-    s.d_model, s.d_ff, s.n_vocab = text.count("hidden_size"), text.count("intermediate_size"), text.count("vocab_size")
-    s.n_head = text.count("num_attention_heads")
-    text.defaults.update(num_key_value_heads=s.n_head, head_dim=s.d_model // s.n_head)
-    s.n_head_kv, s.d_head, s.lm_eps = (
-        text.count("num_key_value_heads"),
-        text.count("head_dim"),
-        text.number("rms_norm_eps"),
-    )
-    total, wanted = text.count("num_hidden_layers", most=MAX_LAYERS), policy.count("num_vlm_layers", ANY_INT)
-    s.n_layer = min(wanted, total) if wanted > 0 else total
-    if s.n_head % s.n_head_kv:
-        text.bad("num_key_value_heads", "a divisor of num_attention_heads {}".format(s.n_head))
-    if s.d_head % 2:
+    s.lm = read_language(text)
+    s.lm.rope_base, wanted = ROPE_BASE, policy.count("num_vlm_layers", ANY_INT)
+    s.lm.n_layer = min(wanted, s.lm.n_layer) if wanted > 0 else s.lm.n_layer
+    if s.lm.n_head % s.lm.n_head_kv:
+        text.bad("num_key_value_heads", "a divisor of num_attention_heads {}".format(s.lm.n_head))
+    if s.lm.d_head % 2:
         text.bad("head_dim", "an even number, for the rotary embedding")
 
 
 def _read_vision(vision: Section, backbone: Section, s: Sizes) -> None:
     for key, value in VISION_FIXED.items():
         vision.fixed(key, value)
-    s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-    s.n_vision_layer, s.n_vision_head = (
-        vision.count("num_hidden_layers", most=MAX_LAYERS),
-        vision.count("num_attention_heads"),
-    )
-    s.image_size, s.patch_size, s.vision_eps = (
-        vision.count("image_size"),
-        vision.count("patch_size"),
-        vision.number("layer_norm_eps"),
-    )
+    s.vision = read_vision(vision, vision.count("image_size"), vision.count("patch_size"))
     s.factor = backbone.count("scale_factor")
-    if s.d_vision % s.n_vision_head:
-        vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(s.d_vision))
-    if s.image_size < s.patch_size:
-        vision.bad("image_size", "at least patch_size {}".format(s.patch_size))
+    if s.vision.image_size < s.vision.patch_size:
+        vision.bad("image_size", "at least patch_size {}".format(s.vision.patch_size))
     width, height = s.frame
     key = "config.json: resize_imgs_with_padding"
     if width != height:
@@ -213,9 +177,9 @@ def _read_vision(vision: Section, backbone: Section, s: Sizes) -> None:
             "{} x {}".format(width, height),
             "the reference's pixel shuffle takes a square grid of patches",
         )
-    elif width and width % (s.patch_size * s.factor):
+    elif width and width % (s.vision.patch_size * s.factor):
         backbone.problems.unsupported(
-            key, "a multiple of patch_size * scale_factor = {}".format(s.patch_size * s.factor), str(width)
+            key, "a multiple of patch_size * scale_factor = {}".format(s.vision.patch_size * s.factor), str(width)
         )
 
 
@@ -275,30 +239,30 @@ def read_expert(policy: Section, s: Sizes) -> None:
     if not isinstance(mode, str):
         policy.bad("attention_mode", "a string")
         return
-    s.d_expert = int(s.d_model * multiplier)
+    s.d_expert = int(s.lm.d_model * multiplier)
     s.d_expert_ff = expert_ff(s.d_expert)
     if s.d_expert < 2 or s.d_expert % 2:
         policy.bad(
             "expert_width_multiplier",
             "an even expert width, for the time embedding",
-            "{} * {} = {}".format(s.d_model, multiplier, s.d_expert),
+            "{} * {} = {}".format(s.lm.d_model, multiplier, s.d_expert),
         )
-    s.n_expert_layer = wanted if wanted > 0 else s.n_layer
-    if s.n_layer % s.n_expert_layer:
+    s.n_expert_layer = wanted if wanted > 0 else s.lm.n_layer
+    if s.lm.n_layer % s.n_expert_layer:
         policy.bad(
             "num_expert_layers",
-            "a divisor of the {} language-model layers".format(s.n_layer),
+            "a divisor of the {} language-model layers".format(s.lm.n_layer),
             hint="the reference asserts it",
         )
         return
-    s.layer_kinds = layer_kinds(s.n_layer, s.n_expert_layer, mode, every)
+    s.layer_kinds = layer_kinds(s.lm.n_layer, s.n_expert_layer, mode, every)
     _check_expert_layers(policy, s, mode, every)
 
 
 def _check_expert_layers(policy: Section, s: Sizes, mode: str, every: int) -> None:
     """The reference counts in expert layers when it builds k and v, and in language-model layers when it runs them, so with
     fewer expert layers the two can disagree; it also cannot run self-attention where the expert has no layer."""
-    d_kv, ratio = s.n_head_kv * s.d_head, s.n_layer // s.n_expert_layer
+    d_kv, ratio = s.lm.d_kv, s.lm.n_layer // s.n_expert_layer
     s.d_kv_in = [d_kv if is_cross(j, mode, every) else s.d_expert for j in range(s.n_expert_layer)]
     for i, kind in enumerate(s.layer_kinds):
         cross = is_cross(i, mode, every)
