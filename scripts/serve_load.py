@@ -56,7 +56,7 @@ def run_tool(options, address, *arguments):
     return {**json.loads(result.stdout), "flawless": result.returncode == 0}
 
 
-def picture(seed):
+def image(seed):
     """Something like a photograph: smooth shapes, edges and a little noise."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:SIDE, 0:SIDE] / SIDE
@@ -69,7 +69,7 @@ def jpeg(seed):
     from PIL import Image
 
     data = io.BytesIO()
-    Image.fromarray(picture(seed)).save(data, "JPEG", quality=90)
+    Image.fromarray(image(seed)).save(data, "JPEG", quality=90)
     return data.getvalue()
 
 
@@ -79,7 +79,7 @@ def python_client(options, address):
 
     milliseconds = []
     with vla_cpp.Client(address, timeout=60) as client:
-        images = {view.name: picture(i) for i, view in enumerate(client.spec.views)}
+        images = {view.name: image(i) for i, view in enumerate(client.spec.views)}
         state = {s.name: np.full(s.width, 0.1, np.float32) for s in client.spec.states}
         for i in range(options.requests):
             start = time.perf_counter()

@@ -6,7 +6,7 @@
     python act.py tcp://127.0.0.1:5555 --image top=top.png --image wrist= --state 0.1,0.2,0.3 --text "open the drawer"
     python act.py smolvla.gguf --image top=top.png --state 0.1,0.2,0.3 --text "open the drawer" --seed 7
 
-A view without a file is declared absent. Needs vla_cpp; pictures are sent as the files that they are.
+A view without a file is declared absent. Needs vla_cpp; images are sent as the files that they are.
 """
 import argparse
 import sys

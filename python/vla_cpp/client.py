@@ -115,28 +115,23 @@ class Client:
     def submit(
         self,
         *,
-        images: Mapping[str, Image],
-        state: State,
-        text: str,
         seed: Optional[int] = None,
         noise: object = None,
         deadline_ms: Optional[float] = None,
-        capture_time_ns: Optional[int] = None,
         timeout: Optional[float] = None,
+        **observation: Any,
     ) -> Pending:
-        """Sends what `act` sends and returns at once: `done()` of the result never waits, `result()` is the chunk.
+        """Takes the arguments of `act`, sends them and returns at once: `done()` of the result never waits, `result()` is the chunk.
 
         Only the first call of a client may wait, for the description of the policy.
         """
         check_start(seed, noise)
         timeout = self.timeout if timeout is None else timeout
-        spec = self.spec
+        spec, limits = self.spec, self._limits
+        deadline_ms = timeout * 1000 if deadline_ms is None else deadline_ms
 
         def write(request: Any) -> bytes:
-            return wire.act_bytes(
-                request, spec, self._limits, images=images, state=state, text=text, seed=seed, noise=noise,
-                deadline_ms=timeout * 1000 if deadline_ms is None else deadline_ms, capture_time_ns=capture_time_ns,
-            )  # fmt: skip
+            return wire.act_bytes(request, spec, limits, seed=seed, noise=noise, deadline_ms=deadline_ms, **observation)
 
         return self._ask("chunk", timeout, write)
 
@@ -153,19 +148,6 @@ class Client:
             if self._context is not None:
                 self._context.term()
                 self._context = None
-
-    def __enter__(self) -> Client:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __del__(self) -> None:
-        if getattr(self, "_context", None) is not None:
-            self.close()
-
-    def __reduce__(self):
-        raise UsageError("Client", "use in the process that made it", "pickling", "make one per process")
 
     # --- requests and answers ------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
     return mapping.items()
 
 
-def picture_of(name: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
+def image_arg(name: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
     """("rgb", contiguous uint8 array (height, width, 3)), ("jpeg" or "png", the file's bytes), or ("absent", None)."""
     where = f'images["{name}"]'
     if image is None:

@@ -15,11 +15,12 @@ import numpy as np
 from . import _capi
 from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
-from .observation import Image, State, check_start, named, noise_of, picture_of, states_of
+from .handle import Handle, wrong_process
+from .observation import Image, State, check_start, named, noise_of, image_arg, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 
-class Policy:
+class Policy(Handle):
     """A loaded bundle: `act` takes an observation and returns a chunk.
 
         with vla_cpp.Policy("policy.gguf") as policy:
@@ -99,24 +100,13 @@ class Policy:
             self._library.vla_policy_close(self._handle)
             self._handle = ctypes.c_void_p()
 
-    def __enter__(self) -> Policy:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def __del__(self) -> None:
         if getattr(self, "_library", None) is not None:
             self.close()
 
-    def __reduce__(self):
-        raise UsageError("Policy", "use in the process that made it", "an attempt to pickle it", "make one per process")
-
     def _check_usable(self) -> None:
         if os.getpid() != self._pid:
-            raise UsageError(
-                "Policy", "use in the process that made it", "use in a child process", "make one per process"
-            )
+            raise wrong_process(self, "use in a child process")
         if not self._handle:
             raise UsageError("Policy", "an open policy", "one that was closed")
 
@@ -169,7 +159,7 @@ class _Call:
             self.observation.noise, self.observation.n_noise = self._address(values), values.size
 
     def _view(self, name: str, image: Image) -> _capi.View:
-        data = picture_of(name, image)[1]
+        data = image_arg(name, image)[1]
         view = _capi.View(name=_name_of("images", name), kind=_capi.IMAGE_ABSENT)
         if isinstance(data, bytes):
             view.kind, data = _capi.IMAGE_FILE, np.frombuffer(data, np.uint8)

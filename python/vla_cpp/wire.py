@@ -17,7 +17,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from .chunk import Chunk
 from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
-from .observation import Image, State, named, noise_of, picture_of, states_of
+from .observation import Image, State, named, noise_of, image_arg, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 PROTOCOL_VERSION = 1
@@ -65,7 +65,7 @@ def act_bytes(
     act.SetInParent()
     raw: Dict[str, np.ndarray] = {}
     for name, image in named("images", images):
-        kind, data = picture_of(name, image)
+        kind, data = image_arg(name, image)
         if kind == "rgb":
             raw[name] = np.asarray(data)
         elif kind == "absent":
@@ -89,12 +89,12 @@ def act_bytes(
     act.deadline_ms = _milliseconds(deadline_ms)
     if capture_time_ns is not None:
         act.capture_time_ns = _int64("capture_time_ns", capture_time_ns)
-    data = b"".join(_with_raw_pictures(request, raw))
+    data = b"".join(_with_raw_images(request, raw))
     _check_limits(raw, len(data), limits)
     return data
 
 
-def _with_raw_pictures(request: Any, raw: Mapping[str, np.ndarray]) -> List[Any]:
+def _with_raw_images(request: Any, raw: Mapping[str, np.ndarray]) -> List[Any]:
     """The request's bytes in pieces, with the raw images appended to its act.
 
     They are framed here because protobuf would copy them twice into memory that is new each time, which takes longer than

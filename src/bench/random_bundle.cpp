@@ -49,21 +49,21 @@ struct ViewPlaces {
 };
 
 /// Pixels of a view.
-struct PictureSize {
+struct ImageSize {
   int width = 0, height = 0;
 };
 
 /// Errors: bad_bundle.
-Result<PictureSize> picture_size(const Keys& keys) {
-  const bool oblong = keys.has("vision.image_width");
-  PictureSize size;
-  VLA_TRY(size.width, keys.integer(oblong ? "vision.image_width" : "vision.image_size", kAnySize));
-  VLA_TRY(size.height, keys.integer(oblong ? "vision.image_height" : "vision.image_size", kAnySize));
+Result<ImageSize> image_size(const Keys& keys) {
+  const bool two_sides = keys.has("vision.image_width");
+  ImageSize size;
+  VLA_TRY(size.width, keys.integer(two_sides ? "vision.image_width" : "vision.image_size", kAnySize));
+  VLA_TRY(size.height, keys.integer(two_sides ? "vision.image_height" : "vision.image_size", kAnySize));
   return size;
 }
 
 /// Errors: bad_bundle.
-Result<ViewPlaces> view_places(const Keys& keys, const PictureSize& picture) {
+Result<ViewPlaces> view_places(const Keys& keys, const ImageSize& image) {
   ViewPlaces places;
   if (!keys.has("policy.n_slot")) return places;
   VLA_TRY(const int patch_size, keys.integer("vision.patch_size", kAnySize));
@@ -74,13 +74,13 @@ Result<ViewPlaces> view_places(const Keys& keys, const PictureSize& picture) {
     }
   VLA_TRY(places.count, keys.integer("policy.n_slot", kAnySize));
   places.behind = keys.has(ViewPlaces::kStartsFromEnd);
-  places.repeat = (picture.width / patch_size / factor) * (picture.height / patch_size / factor);
+  places.repeat = (image.width / patch_size / factor) * (image.height / patch_size / factor);
   return places;
 }
 
-std::string recipe(const PictureSize& picture, const ViewPlaces& places, int max_tokens, int d_state, int d_robot) {
+std::string recipe(const ImageSize& image, const ViewPlaces& places, int max_tokens, int d_state, int d_robot) {
   using Json = nlohmann::ordered_json;
-  const Json letterbox = {{"op", "letterbox"},    {"width", picture.width}, {"height", picture.height},
+  const Json letterbox = {{"op", "letterbox"},    {"width", image.width}, {"height", image.height},
                           {"filter", "bilinear"}, {"antialias", false},     {"align", "bottom_right"},
                           {"fill", 0.0}};
   const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
@@ -126,10 +126,10 @@ std::string added_token(std::string_view content, std::size_t id) {
 }
 
 Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
-  VLA_TRY(const PictureSize picture, picture_size(keys));
+  VLA_TRY(const ImageSize image, image_size(keys));
   VLA_TRY(const int d_state, keys.integer("policy.d_state", kAnySize));
   VLA_TRY(const int d_action, keys.integer("policy.d_action", kAnySize));
-  VLA_TRY(const ViewPlaces places, view_places(keys, picture));
+  VLA_TRY(const ViewPlaces places, view_places(keys, image));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
   const int max_tokens = places.count * places.size() + sizes.max_tokens;
   std::vector<std::string> tokens = byte_tokens();
@@ -168,7 +168,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"tokenizer.pre", R"([{"type":"byte_level","add_prefix_space":false,"use_regex":true}])"},
       {"tokenizer.added", places.count > 0 ? added_token(ViewPlaces::kToken, tokens.size() - 1) : "[]"},
       {"tokenizer.ignore_merges", false},
-      {"processor.recipe", recipe(picture, places, max_tokens, d_state, d_robot)},
+      {"processor.recipe", recipe(image, places, max_tokens, d_state, d_robot)},
   });
   for (const auto& [key, value] : added.all()) keys.set(key, value);
   if (places.count > 0) keys.set(places.behind ? ViewPlaces::kStartsFromEnd : ViewPlaces::kStarts, places.starts());

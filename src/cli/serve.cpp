@@ -120,7 +120,7 @@ Command add_serve(CLI::App& app) {
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();
-  command->add_option("--max-pixels", server.max_pixels, "Most pixels that the pictures of an act have together")
+  command->add_option("--max-pixels", server.max_pixels, "Most pixels that the images of an act have together")
       ->check(CLI::Range(1, 1 << 28))
       ->capture_default_str();
   command->add_option("--max-text", server.max_text, "Longest instruction, in bytes")

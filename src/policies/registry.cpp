@@ -24,7 +24,7 @@ Status check_prefix(int n_view, int n_token, int n_other) {
   const std::int64_t n_prefix = std::int64_t{n_view} * n_token + n_other;
   if (n_prefix <= kMaxPrefix) return {};
   return Error{Code::unsupported, "prefix", fmt::format("at most {} tokens of views, text and state", kMaxPrefix),
-               std::to_string(n_prefix), "use smaller pictures or fewer views"};
+               std::to_string(n_prefix), "use smaller images or fewer views"};
 }
 
 const std::vector<PolicyEntry>& policy_registry() {

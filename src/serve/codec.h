@@ -13,7 +13,7 @@ namespace vla::serve {
 
 /// What an act may hold. All are compared before memory is taken that the sizes ask for.
 struct ActLimits {
-  std::int64_t max_pixels = 0;  // of all pictures
+  std::int64_t max_pixels = 0;  // of all images
   std::size_t max_text = 0;     // bytes
   std::size_t max_views = 0;
   int horizon = 0, d_noise = 0;  // of the noise that the policy takes
@@ -27,7 +27,7 @@ struct ActRequest {
   std::int64_t capture_time_ns = 0;
 };
 
-/// A serialized Act -> what the engine takes; pictures are decoded. Errors: bad_request (not an Act), too_large,
+/// A serialized Act -> what the engine takes; images are decoded. Errors: bad_request (not an Act), too_large,
 /// bad_observation.
 Result<ActRequest> decode_act(std::span<const std::byte> act, const ActLimits& limits);
 

@@ -103,7 +103,7 @@ Result<Frame> decode_file(const std::string& file, bool is_format, const char* f
 
 Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string& where, const ActLimits& limits) {
   std::optional<Frame> frame;
-  switch (view.picture_case()) {
+  switch (view.image_case()) {
     case v1::View::kRgb: {
       VLA_TRY(frame, decode_raw(view.rgb(), where, limits));
       break;
@@ -118,14 +118,14 @@ Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string
     }
     case v1::View::kAbsent:
       break;
-    case v1::View::PICTURE_NOT_SET:
+    case v1::View::IMAGE_NOT_SET:
       return bad_observation(where, "one of rgb, jpeg, png, absent", "none of them");
   }
   return frame;
 }
 
 Status decode_views(const v1::Act& act, const ActLimits& limits, Observation& observation) {
-  ActLimits left = limits;  // an act costs what its pictures cost together
+  ActLimits left = limits;  // an act costs what its images cost together
   if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
     return too_large("act.views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
   for (const v1::View& view : act.views()) {

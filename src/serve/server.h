@@ -19,7 +19,7 @@ struct ServerOptions {
   bool insecure = false;                    // an address that others can reach may be bound without keys
   std::string curve_secret, curve_clients;  // files; both or neither
   std::size_t max_message = 32 << 20;       // bytes
-  std::int64_t max_pixels = 1 << 24;        // of the pictures of an act
+  std::int64_t max_pixels = 1 << 24;        // of the images of an act
   std::size_t max_text = 4096;              // bytes
   std::size_t max_queue = 64;               // acts
   std::size_t max_connections = 256;

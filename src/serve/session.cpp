@@ -145,7 +145,7 @@ Status Session::choose_memory() {
     refused = not_a_request("request", "one frame", "several");
   } else if (is_plain && size_ > limit) {
     refused = Error{Code::too_large, "request", fmt::format("at most {} bytes", max_message_), fmt::format("{}", size_),
-                    "send smaller or compressed pictures"};
+                    "send smaller or compressed images"};
   }
   const auto keep = [&](std::uint64_t n) {
     std::optional<Bytes> bytes = Bytes::make(n);

@@ -43,7 +43,7 @@ TEST_CASE("rows with gaps between them, rows without, and the PNG file that hold
   view.stride = row + 5;
   view.data = wide.data(), view.size = wide.size();
   CHECK(actions_of(policy.get(), call.observation) == expected);
-  view.size -= 5;  // the end of a crop of a larger picture
+  view.size -= 5;  // the end of a crop of a larger image
   CHECK(actions_of(policy.get(), call.observation) == expected);
 
   const std::string file = read_text(call.golden.path + "/" + view.name + ".png");

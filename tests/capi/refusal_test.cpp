@@ -87,7 +87,7 @@ TEST_CASE("exactly one of noise and seed must be given") {
   check_refused(call, VLA_USAGE, "noise");
 }
 
-TEST_CASE("pictures whose size, kind or bytes do not go together are refused by name") {
+TEST_CASE("images whose size, kind or bytes do not go together are refused by name") {
   const auto refused = [](auto change, vla_status status, const char* part) {
     Call call;
     change(call.views[0]);

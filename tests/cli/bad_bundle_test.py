@@ -65,7 +65,7 @@ def test_another_version_of_gguf_is_refused(refused, sound):
     refused(sound[:4] + struct.pack("<I", 2) + sound[8:], "bad_bundle", "expected GGUF version 3, found version 2")
 
 
-def test_a_picture_is_not_a_bundle(refused, golden):
+def test_an_image_is_not_a_bundle(refused, golden):
     refused(golden.images["camera1"].read_bytes(), "bad_bundle", "expected a GGUF file, found other first bytes")
 
 
@@ -114,21 +114,21 @@ def test_a_weight_that_is_not_finite_is_a_bad_action_and_never_a_number(vla, gol
     vla(*golden.arguments(bundle=path)).refused("bad_action", 'actions[0]["action.0"]: expected a finite number')
 
 
-def with_picture_size(data, size):
+def with_image_size(data, size):
     old, new = b'"width": 32, "height": 32, "filter": "bilinear"', b'"width":%d,"height":%d,"filter":"bilinear"'
     return sealed(replaced(data, old, (new % (size, size)).ljust(len(old))))
 
 
-def test_a_picture_size_beyond_any_attention_is_refused_at_once(refused, sound):
-    answer = refused(with_picture_size(sound, 8192), "unsupported", "expected at most 8192 tokens")
+def test_an_image_size_beyond_any_attention_is_refused_at_once(refused, sound):
+    answer = refused(with_image_size(sound, 8192), "unsupported", "expected at most 8192 tokens")
     assert answer.seconds < 10 and answer.peak < 1 << 29
 
 
-def test_a_picture_size_that_memory_cannot_hold_is_out_of_memory(vla, golden, sound, tmp_path):
+def test_an_image_size_that_memory_cannot_hold_is_out_of_memory(vla, golden, sound, tmp_path):
     if vla.is_sanitized():
         pytest.skip("a sanitizer needs more address space than any limit leaves")
     path = tmp_path / "policy.gguf"
-    path.write_bytes(with_picture_size(sound, 960))
+    path.write_bytes(with_image_size(sound, 960))
     for arguments in (golden.arguments(bundle=path), ["inspect", path]):
         answer = vla(*arguments, memory=1 << 28)
         assert answer.code == EXIT["out_of_memory"] and answer.out == ""

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from golden_cases import Golden
-from pictures import jpeg_with_size, png, png_header, png_of_rows
+from image_files import jpeg_with_size, png, png_header, png_of_rows
 
 
 @pytest.fixture
@@ -208,7 +208,7 @@ def test_a_folder_is_not_an_image(refused, golden, tmp_path):
     refused("io", "something that is not a regular file", images=golden.with_image("camera1", tmp_path))
 
 
-def test_a_picture_of_one_pixel_is_a_picture(vla, golden, tmp_path):
+def test_an_image_of_one_pixel_is_an_image(vla, golden, tmp_path):
     (tmp_path / "dot.png").write_bytes(png(np.full((1, 1, 3), 200, np.uint8)))
     images = golden.with_image("camera1", tmp_path / "dot.png")
     assert np.isfinite(vla(*golden.arguments(images=images)).json()["actions"]).all()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vla bench: what a script finds in its JSON, what a person finds in its table and picture, and what it refuses."""
+"""vla bench: what a script finds in its JSON, what a person finds in its table and image, and what it refuses."""
 
 import json
 import subprocess

@@ -6,7 +6,7 @@ import re
 import shutil
 
 import numpy as np
-import pictures
+import image_files
 import pytest
 from golden_cases import FLOAT32, NAMES, Golden, tensors
 
@@ -136,7 +136,7 @@ def test_an_instruction_beyond_the_bucket_is_cut_and_the_user_is_told(vla, name,
 def test_a_frame_as_npy_gives_the_chunk_of_the_same_png(vla, golden, tmp_path):
     frame = np.random.default_rng(1).integers(0, 256, (20, 30, 3), np.uint8)
     np.save(tmp_path / "frame.npy", frame)
-    (tmp_path / "frame.png").write_bytes(pictures.png(frame))
+    (tmp_path / "frame.png").write_bytes(image_files.png(frame))
     chunks = [
         actions(vla(*golden.arguments(images=golden.with_image("camera1", tmp_path / f"frame.{kind}"))))
         for kind in ("npy", "png")

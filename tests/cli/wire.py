@@ -24,7 +24,7 @@ def _number(number, value):
 
 
 def act(request_id, golden, seed=None, deadline_ms=None, text=None):
-    """The act that a golden case is, its pictures as PNG."""
+    """The act that a golden case is, its images as PNG."""
     views = b"".join(
         _bytes(1, _bytes(1, name.encode()) + (_bytes(4, file.read_bytes()) if file else _bytes(5, b"")))
         for name, file in golden.images.items()

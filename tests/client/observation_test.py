@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vla_cpp import BadObservation, StateSpec, UsageError
-from vla_cpp.observation import check_start, noise_of, picture_of, states_of
+from vla_cpp.observation import check_start, noise_of, image_arg, states_of
 
 JOINTS = (StateSpec("observation.state", 2),)
 JPEG, PNG = b"\xff\xd8\xff\xe0rest", b"\x89PNG\r\n\x1a\nrest"
@@ -14,7 +14,7 @@ JPEG, PNG = b"\xff\xd8\xff\xe0rest", b"\x89PNG\r\n\x1a\nrest"
 
 def test_a_frame_that_is_not_contiguous_is_copied_with_its_pixels_in_place():
     frame = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    kind, rows = picture_of("top", frame[:, ::-1])
+    kind, rows = image_arg("top", frame[:, ::-1])
     assert kind == "rgb" and rows.flags.c_contiguous and (rows == frame[:, ::-1]).all()
 
 
@@ -22,11 +22,11 @@ def test_a_frame_that_is_not_contiguous_is_copied_with_its_pixels_in_place():
     "data, kind", [(JPEG, "jpeg"), (PNG, "png"), (bytearray(PNG), "png"), (memoryview(JPEG), "jpeg")]
 )
 def test_the_kind_of_a_file_is_read_from_its_first_bytes(data, kind):
-    assert picture_of("top", data) == (kind, bytes(data))
+    assert image_arg("top", data) == (kind, bytes(data))
 
 
 def test_none_declares_a_view_absent():
-    assert picture_of("top", None) == ("absent", None)
+    assert image_arg("top", None) == ("absent", None)
 
 
 @pytest.mark.parametrize(
@@ -43,9 +43,9 @@ def test_none_declares_a_view_absent():
         ("top.png", "str"),
     ],
 )
-def test_another_picture_is_refused_by_the_view_name(image, found):
+def test_another_image_is_refused_by_the_view_name(image, found):
     with pytest.raises(BadObservation) as caught:
-        picture_of("wrist", image)
+        image_arg("wrist", image)
     assert caught.value.where == 'images["wrist"]' and found in caught.value.found
 
 

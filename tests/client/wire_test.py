@@ -36,12 +36,12 @@ def test_the_descriptor_of_the_package_is_that_of_the_schema(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 42), (6, 7), (43, 1), (73, 74), (256, 256), (480, 641)])
-def test_a_raw_picture_of_any_size_arrives_as_it_was(shape):
+def test_a_raw_image_arg_any_size_arrives_as_it_was(shape):
     frame = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     request = parsed(images={"top": frame, "wrist": None, "side": frame[::-1]}, seed=3)
     assert (request.protocol_version, request.request_id, request.act.seed) == (1, 9, 3)
     views = {view.name: view for view in request.act.views}
-    assert len(request.act.views) == 3 and views["wrist"].WhichOneof("picture") == "absent"
+    assert len(request.act.views) == 3 and views["wrist"].WhichOneof("image") == "absent"
     for name, rows in (("top", frame), ("side", frame[::-1])):
         rgb = views[name].rgb
         assert (rgb.height, rgb.width) == shape and rgb.rows == rows.tobytes()

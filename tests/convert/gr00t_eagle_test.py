@@ -48,7 +48,7 @@ def test_patches_and_squares_of_n1_6_are_reordered_as_the_runtime_reads_them(con
     np.testing.assert_array_equal(bundle.tensors["connector.up.bias"], stored("mlp1.1.bias", 40))
 
 
-def test_pictures_and_prompt_of_n1_6_are_those_of_its_collator(converter):
+def test_images_and_prompt_of_n1_6_are_those_of_its_collator(converter):
     bundle = converter.bundle(Changed(N1_6), dtype="f32", **N1_6.options)
     found = recipe(bundle)
     assert found["image"][0] == {"op": "square_pad"}

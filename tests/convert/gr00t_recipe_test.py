@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the bundle of a GR00T N1.7 checkpoint does to pictures, text, states and actions."""
+"""What the bundle of a GR00T N1.7 checkpoint does to images, text, states and actions."""
 
 import json
 
@@ -102,7 +102,7 @@ def test_an_edge_and_a_fraction_count_before_sizes(converter):
     assert bundle.keys["vision.image_width"] == 16 and recipe(bundle)["text"][2]["repeat"] == 16
 
 
-def test_letterboxed_pictures_are_square_whatever_the_camera(converter):
+def test_letterboxed_images_are_square_whatever_the_camera(converter):
     tiny = TinyGr00t()
     tiny.kwargs["letter_box_transform"] = True
     bundle = convert(converter, tiny, camera_size="40x30")
@@ -131,7 +131,7 @@ def test_the_backbones_image_processor_resizes_what_its_limits_do_not_hold(conve
     assert (bundle.keys["vision.image_width"], bundle.keys["vision.image_height"]) == (width, height)
 
 
-def test_pictures_within_the_limits_are_not_resized_again(converter):
+def test_images_within_the_limits_are_not_resized_again(converter):
     tiny = TinyGr00t()
     tiny.images.update(min_pixels=EDGE * EDGE, max_pixels=EDGE * EDGE)
     assert [op["op"] for op in recipe(convert(converter, tiny))["image"]].count("resize") == 0

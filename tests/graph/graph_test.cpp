@@ -114,7 +114,7 @@ TEST_CASE_FIXTURE(Fixture, "parts are joined and cut along one dimension") {
   refuses(op::Reshape{}, {a}, {12, 3, 1, 1});
 }
 
-TEST_CASE_FIXTURE(Fixture, "pictures are cut into whole patches, and patches joined in whole squares") {
+TEST_CASE_FIXTURE(Fixture, "images are cut into whole patches, and patches joined in whole squares") {
   accepts(op::Patches{4}, {f32({9, 13, 3, 2})}, {48, 6, 2, 1});  // what is left of a patch is dropped
   refuses(op::Patches{4}, {f32({3, 8, 3, 1})});
   refuses(op::Patches{4}, {f32({8, 8, 1, 1})});

@@ -14,13 +14,13 @@ TEST_CASE("squares of patches follow each other row by row, and the patches of a
                                             {0, 1, 2}, {0, 1, 3}, {0, 2, 0}, {0, 2, 1}, {0, 3, 0}, {0, 3, 1},
                                             {0, 2, 2}, {0, 2, 3}, {0, 3, 2}, {0, 3, 3}};
   CHECK(merge_block_places(4, 4, 2) == expected);
-  const auto oblong = merge_block_places(6, 3, 3);
-  CHECK(std::set<PositionId>(oblong.begin(), oblong.end()).size() == 18);
-  CHECK(oblong[4] == PositionId{0, 1, 1});
-  CHECK(oblong[9] == PositionId{0, 3, 0});
+  const auto wide = merge_block_places(6, 3, 3);
+  CHECK(std::set<PositionId>(wide.begin(), wide.end()).size() == 18);
+  CHECK(wide[4] == PositionId{0, 1, 1});
+  CHECK(wide[9] == PositionId{0, 3, 0});
 }
 
-TEST_CASE("a table stretched over a picture is a bilinear blend whose corners are the picture's") {
+TEST_CASE("a table stretched over a image is a bilinear blend whose corners are the image's") {
   constexpr int kRow = 6, kColumn = 8;
   for (const int n_side : {5, 48, 1}) {
     const auto places = merge_block_places(kRow, kColumn, 2);
@@ -43,7 +43,7 @@ TEST_CASE("a table stretched over a picture is a bilinear blend whose corners ar
   }
 }
 
-TEST_CASE("a picture with as many patches as the table has rows reads one row for each") {
+TEST_CASE("a image with as many patches as the table has rows reads one row for each") {
   const auto places = merge_block_places(4, 4, 2);
   const PositionBlend blend = blend_positions(places, 4, 4, 4);
   for (std::size_t i = 0; i < places.size(); ++i) {

@@ -26,7 +26,7 @@ TEST_CASE("the shifted rule reads row 0 twice and never the last, in both axes")
   CHECK(std::set<int>(ids->begin(), ids->end()).size() == 31 * 31);
 }
 
-TEST_CASE("a smaller picture on the same table skips rows evenly") {
+TEST_CASE("a smaller image on the same table skips rows evenly") {
   const auto ids = vision_position_ids("bucketize_float32", 16, 32);
   REQUIRE(ids.ok());
   CHECK((*ids)[1] == 2);
@@ -56,7 +56,7 @@ TEST_CASE(
   }
 }
 
-TEST_CASE("row_major gives patch i row i, and refuses a picture of another size than the table's") {
+TEST_CASE("row_major gives patch i row i, and refuses a image of another size than the table's") {
   const auto ids = vision_position_ids("row_major", 3, 3);
   REQUIRE(ids.ok());
   CHECK(*ids == std::vector<std::int32_t>{0, 1, 2, 3, 4, 5, 6, 7, 8});

@@ -6,7 +6,7 @@
 
 using namespace vla;
 
-TEST_CASE("text behind a picture counts on from its longer side, and the tokens of a picture share a time") {
+TEST_CASE("text behind a image counts on from its longer side, and the tokens of a image share a time") {
   // Four words, 8 x 8 tokens, two marks, 8 x 8 tokens, a mark and two words.
   const std::vector<int> starts = {4, 70};
   const auto places = mrope_position_ids(starts, 8, 8, 137);
@@ -23,7 +23,7 @@ TEST_CASE("text behind a picture counts on from its longer side, and the tokens 
   CHECK(places[136] == PositionId{24, 24, 24});
 }
 
-TEST_CASE("rows and columns of an oblong picture are not confused") {
+TEST_CASE("rows and columns of a non-square image are not confused") {
   const std::vector<int> starts = {1};
   const std::vector<PositionId> expected = {{0, 0, 0}, {1, 1, 1}, {1, 1, 2}, {1, 1, 3},
                                             {1, 2, 1}, {1, 2, 2}, {1, 2, 3}, {4, 4, 4}};
@@ -31,7 +31,7 @@ TEST_CASE("rows and columns of an oblong picture are not confused") {
   CHECK(mrope_position_ids(starts, 3, 2, 8)[3] == PositionId{1, 2, 1});
 }
 
-TEST_CASE("a prompt that ends with a picture has no text behind it") {
+TEST_CASE("a prompt that ends with a image has no text behind it") {
   const std::vector<int> starts = {1, 2};
   CHECK(mrope_position_ids(starts, 1, 1, 3) == std::vector<PositionId>{{0, 0, 0}, {1, 1, 1}, {2, 2, 2}});
 }

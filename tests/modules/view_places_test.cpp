@@ -51,7 +51,7 @@ TEST_CASE("views behind the instruction are counted from the end of the prompt")
   CHECK(places.starts(12) == std::vector<int>{3, 7});
   CHECK(pieces(places, 12) == Pieces{{0, 3, kText}, {3, 3, 0}, {6, 1, kText}, {7, 3, 1}, {10, 2, kText}});
   CHECK(places.check(2, 10).ok());
-  CHECK_FALSE(places.check(2, 9).ok());  // the first token would be a picture's
+  CHECK_FALSE(places.check(2, 9).ok());  // the first token would be a image's
 }
 
 TEST_CASE("views that overlap, or stand where no text is in front of them, are refused") {

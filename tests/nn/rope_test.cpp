@@ -138,7 +138,7 @@ TEST_CASE("time, rows and columns take turns among the pairs until their shares 
   }
 }
 
-TEST_CASE("text among pictures turns as text alone") {
+TEST_CASE("text among images turns as text alone") {
   const std::vector<int> positions = {0, 3, 117};
   const std::vector<PositionId> places = {{0, 0, 0}, {3, 3, 3}, {117, 117, 117}};
   const auto one = run_graph([&](Graph& g) { return rotary_table(g, 128, 5e6f, RotaryAngle::product, positions); });

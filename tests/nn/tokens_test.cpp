@@ -94,7 +94,7 @@ TEST_CASE("a key that stands for several weighs like that many") {
 }
 
 TEST_CASE(
-    "pixel shuffle of an oblong picture puts squares row by row, and their patches apart again are in that order") {
+    "pixel shuffle of a non-square image puts squares row by row, and their patches apart again are in that order") {
   // Two views of 2 rows of 4 patches with two features each.
   const auto shuffled = [](Graph& g) { return pixel_shuffle(g, numbers(g, {2, 8, 2}), 4, 2); };
   const Values first = {0, 1, 2, 3, 8, 9, 10, 11, 4, 5, 6, 7, 12, 13, 14, 15};

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Compares the resize op with OpenCV and torch on random pictures of many sizes, up and down.
+"""Compares the resize op with OpenCV and torch on random images of many sizes, up and down.
 
     cmake --build --preset cpu --target reference_tool
     python tests/reference/compare_resize.py build/cpu/bin/reference_tool [--count 500] [--seed 0] [--only opencv]
 
 Run in an environment with OpenCV and torch.  Noise and black and white alternate, because ties and overshoots are rare in
-photographs.  Exit code 1 at the first OpenCV picture, or the first torch byte off by more than one, that differs; torch
+photographs.  Exit code 1 at the first OpenCV image, or the first torch byte off by more than one, that differs; torch
 kernels for other machines sum in another order, so that differing bytes are counted there.
 """
 
@@ -65,7 +65,7 @@ def main() -> None:
             if off.max() > (0 if how == "opencv" else 1):
                 raise SystemExit(f"{how}: {width} x {height} to {to_width} x {to_height} differs by {off.max()}")
             equal, n_byte, n_off = equal + (off.max() == 0), n_byte + off.size, n_off + np.count_nonzero(off)
-        print(f"{how}: {equal} of {args.count} pictures equal, {n_off} of {n_byte} bytes differ")
+        print(f"{how}: {equal} of {args.count} images equal, {n_off} of {n_byte} bytes differ")
 
 
 main()

@@ -54,7 +54,7 @@ def write_tokenizers() -> None:
     (DATA / "tokenizer_cases.json").write_text("{" + ",\n".join(lines) + "}\n")
 
 
-def picture(width: int, height: int, channels: int = 3) -> np.ndarray:
+def image(width: int, height: int, channels: int = 3) -> np.ndarray:
     y, x, c = np.mgrid[0:height, 0:width, 0:channels]
     return ((x * 23 + y * 37 + c * 71 + (x * y) % 11 * 5) % 256).astype(np.uint8)
 
@@ -109,8 +109,8 @@ def bits(width: int, height: int, depth: int, top: int) -> bytes:
 
 
 def readable_images() -> dict:
-    rgb, soft = Image.fromarray(picture(13, 9)), Image.fromarray(smooth(21, 17))
-    grey = Image.fromarray(picture(13, 9, 1)[..., 0])
+    rgb, soft = Image.fromarray(image(13, 9)), Image.fromarray(smooth(21, 17))
+    grey = Image.fromarray(image(13, 9, 1)[..., 0])
     palette = rgb.quantize(16)
     xmp = b'<x:xmpmeta><rdf:Description tiff:Orientation="6"/></x:xmpmeta>'
     text = PngImagePlugin.PngInfo()
@@ -120,9 +120,9 @@ def readable_images() -> dict:
     colours = b"".join(bytes([i * 60, 255 - i * 60, i * 17]) for i in range(4))
     images = {
         "rgb.png": saved(rgb, "PNG"),
-        "rgba.png": saved(Image.fromarray(picture(13, 9, 4), "RGBA"), "PNG"),
+        "rgba.png": saved(Image.fromarray(image(13, 9, 4), "RGBA"), "PNG"),
         "grey.png": saved(grey, "PNG"),
-        "grey_alpha.png": saved(Image.fromarray(picture(13, 9, 2), "LA"), "PNG"),
+        "grey_alpha.png": saved(Image.fromarray(image(13, 9, 2), "LA"), "PNG"),
         "grey_1_bit.png": png(13, 5, 1, 0, bits(13, 5, 1, 1)),
         "grey_2_bit.png": png(13, 5, 2, 0, bits(13, 5, 2, 3)),
         "grey_4_bit_transparent.png": png(13, 5, 4, 0, bits(13, 5, 4, 15), [(b"tRNS", b"\0\3")]),
@@ -131,7 +131,7 @@ def readable_images() -> dict:
         "palette_2_bit.png": png(13, 5, 2, 3, bits(13, 5, 2, 3), [(b"PLTE", colours), (b"tRNS", b"\0\x80")]),
         "rgb_transparent.png": png(2, 1, 8, 2, b"\0" + bytes([1, 2, 3, 4, 5, 6]), [(b"tRNS", b"\0\1\0\2\0\3")]),
         "gamma.png": png(2, 1, 8, 2, b"\0" + bytes([10, 20, 30, 40, 50, 60]), [(b"gAMA", struct.pack(">I", 100000))]),
-        "interlaced.png": interlaced(picture(13, 9)),
+        "interlaced.png": interlaced(image(13, 9)),
         "exif.png": saved(rgb, "PNG", exif=exif_block(6)),
         "xmp.png": saved(rgb, "PNG", pnginfo=text),
         "raw_profile.png": saved(rgb, "PNG", pnginfo=raw),
@@ -153,7 +153,7 @@ def readable_images() -> dict:
 
 
 def refused_images() -> dict:
-    rgb, soft = Image.fromarray(picture(13, 9)), Image.fromarray(smooth(21, 17))
+    rgb, soft = Image.fromarray(image(13, 9)), Image.fromarray(smooth(21, 17))
     whole, jpeg = saved(rgb, "PNG"), saved(soft, "JPEG")
     return {
         "bad_16_bit.png": png(2, 1, 16, 0, b"\0" + bytes(4)),

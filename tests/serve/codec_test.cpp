@@ -131,9 +131,9 @@ TEST_CASE("an error is text even where it tells of bytes that are none") {
   CHECK(error.found() == "?");
 }
 
-TEST_CASE("a view is refused by name: no picture, another format, other bytes than its size says, twice") {
+TEST_CASE("a view is refused by name: no image, another format, other bytes than its size says, twice") {
   v1::Act act = full_act();
-  act.mutable_views(0)->clear_picture();
+  act.mutable_views(0)->clear_image();
   check_refused(act, Code::bad_observation, "act.views[\"raw\"]");
   act = full_act();
   act.mutable_views(0)->mutable_rgb()->set_height(2);
@@ -208,7 +208,7 @@ TEST_CASE("an act cut anywhere is refused or is a smaller sound act, and never c
   CHECK(decode(whole).ok());
 }
 
-TEST_CASE("an envelope tells number, kind, body and deadline of a request without parsing its pictures") {
+TEST_CASE("an envelope tells number, kind, body and deadline of a request without parsing its images") {
   v1::Request request;
   request.set_protocol_version(1);
   request.set_request_id(77);

@@ -163,10 +163,10 @@ class Server:
         import torch
 
         side = self.towers.config.vision_config.image_size[0]
-        picture = np.zeros((side, side, 3), np.uint8)
+        image = np.zeros((side, side, 3), np.uint8)
         if frame is not None:
-            picture = cv2.resize((frame * 255).round().byte().permute(1, 2, 0).numpy(), (side, side))
-        x = torch.from_numpy(picture).permute(2, 0, 1).float().div(255)
+            image = cv2.resize((frame * 255).round().byte().permute(1, 2, 0).numpy(), (side, side))
+        x = torch.from_numpy(image).permute(2, 0, 1).float().div(255)
         mean, std = torch.tensor(MEAN).view(3, 1, 1), torch.tensor(STD).view(3, 1, 1)
         return ((x - mean) / std).bfloat16() if self.r1 else (x.bfloat16() - mean.bfloat16()) / std.bfloat16()
 

@@ -128,7 +128,7 @@ def _add_gr00t(parser: argparse.ArgumentParser) -> None:
     add(
         "--letterbox",
         action="store_true",
-        help="pad pictures to squares whatever the checkpoint says, as the authors' servers have done since March 2026",
+        help="pad images to squares whatever the checkpoint says, as the authors' servers have done since March 2026",
     )
 
 

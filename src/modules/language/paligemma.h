@@ -15,7 +15,7 @@ class PaliGemma {
   /// `s` is the root of the tree.
   explicit PaliGemma(const Scope& s);
 
-  /// Whether pictures of this size are those of the tower. Errors: bad_bundle, unsupported.
+  /// Whether images of this size are those of the tower. Errors: bad_bundle, unsupported.
   Status check(int width, int height) const { return vision_.check(width, height); }
   /// Tokens of one view.
   int n_token(int width) const { return (width / vision_.patch_size()) * (width / vision_.patch_size()); }

@@ -17,7 +17,7 @@ ViewPlaces::ViewPlaces(const Scope& s, int n_view_token, Count count)
   bool apart = n_slot() == s.dim("n_slot", 32);
   for (const int n : counts_) apart = apart && n > 0;
   if (apart) {
-    // Text sees text: the first token is no picture's.
+    // Text sees text: the first token is no image's.
     n_least_ = back ? 1 + counts_.front() : counts_.back() + n_view_token_;
     int end = 1;
     for (const int start : starts(n_least_)) {

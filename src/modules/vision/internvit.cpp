@@ -25,7 +25,7 @@ InternVit::InternVit(const Scope& s)
 
 Status InternVit::check(int width, int height) const {
   if (width == image_size_ && height == image_size_) return {};
-  return Error{Code::unsupported, "vision.image_size", fmt::format("pictures of {0} x {0}", image_size_),
+  return Error{Code::unsupported, "vision.image_size", fmt::format("images of {0} x {0}", image_size_),
                fmt::format("{} x {}", width, height)};
 }
 

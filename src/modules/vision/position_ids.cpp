@@ -34,7 +34,7 @@ float round_to_bfloat16(float x) {
   return std::bit_cast<float>((bits + 0x7fff + ((bits >> 16) & 1)) & 0xffff0000u);
 }
 
-/// The fraction of the picture at which patch i of n lies, in the arithmetic of the rule.
+/// The fraction of the image at which patch i of n lies, in the arithmetic of the rule.
 float fraction(const std::string& rule, int i, int n) {
   if (rule == "bucketize_shifted")
     return static_cast<float>(i) / static_cast<float>(n) * static_cast<float>(1.0 - 1e-6);
@@ -54,7 +54,7 @@ std::vector<std::int32_t> axis_ids(const std::string& rule, int n_grid, const st
 Result<std::vector<std::int32_t>> row_major_ids(int n_grid, int n_table) {
   if (n_grid != n_table)
     return Error{Code::unsupported, "vision.position_rule", fmt::format("{0} x {0} patches, as the table has", n_table),
-                 fmt::format("{0} x {0}", n_grid), "row_major is defined for pictures of vision.image_size only"};
+                 fmt::format("{0} x {0}", n_grid), "row_major is defined for images of vision.image_size only"};
   std::vector<std::int32_t> ids(static_cast<std::size_t>(n_grid) * static_cast<std::size_t>(n_grid));
   std::iota(ids.begin(), ids.end(), 0);
   return ids;

@@ -10,16 +10,16 @@
 
 namespace vla {
 
-/// Which row of the position table each patch of a square picture reads, row by row: [n_grid * n_grid].
+/// Which row of the position table each patch of a square image reads, row by row: [n_grid * n_grid].
 ///
-/// The reference places patch i of n at the fraction i/n of the picture and looks up the table's interval that holds
+/// The reference places patch i of n at the fraction i/n of the image and looks up the table's interval that holds
 /// it, all in floating point. Fractions that equal a boundary in exact arithmetic may fall on either side of it, so the
 /// result depends on the precision of the pixels and on the release (docs/bundle.md, `vision.position_rule`); the
 /// weights were trained with whatever came out. A grid for which the reference's own result depends on the vector width
 /// of the machine (its boundaries are made by torch.arange in blocks) has no right answer, and is refused. Source:
 /// transformers modeling_smolvlm.py SmolVLMVisionEmbeddings.forward.
 ///
-/// Towers whose pictures have one size only have no fractions: `row_major` gives patch i row i. Source: transformers
+/// Towers whose images have one size only have no fractions: `row_major` gives patch i row i. Source: transformers
 /// modeling_siglip.py SiglipVisionEmbeddings.forward.
 ///
 /// `rule`: bucketize_float32, bucketize_bfloat16, bucketize_shifted or row_major; `n_table`: rows of the table per

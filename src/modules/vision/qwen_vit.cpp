@@ -48,7 +48,7 @@ std::vector<PositionId> QwenVit::places() const { return merge_block_places(n_ro
 
 Status QwenVit::check(int width, int height) const {
   if (width == width_ && height == height_) return {};
-  return Error{Code::unsupported, "vision.image_width", fmt::format("pictures of {} x {}", width_, height_),
+  return Error{Code::unsupported, "vision.image_width", fmt::format("images of {} x {}", width_, height_),
                fmt::format("{} x {}", width, height)};
 }
 

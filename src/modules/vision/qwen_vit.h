@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// The vision tower of Qwen3-VL on single pictures, every view in one batch. A picture stands for two moments that are
+/// The vision tower of Qwen3-VL on single images, every view in one batch. A image stands for two moments that are
 /// the same, and each has a patch product of its own. Patches come in squares of merge x merge, one square after the
 /// other; they know their place by a learned table and by turning. There is no final norm.
 /// Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.
@@ -20,12 +20,12 @@ class QwenVit {
  public:
   explicit QwenVit(const Scope& s);
 
-  /// Load rate: the position table stretched over the picture, into the cache.
+  /// Load rate: the position table stretched over the image, into the cache.
   void keep(Graph& g, Cache& cache) const;
   /// images [width, height, 3, n_view] in [-1, 1] -> what each of `deepstack_layers` and then the last layer gives,
   /// [d_model, n_patch, n_view] each.
   std::vector<Tensor> operator()(Graph& g, Tensor images, const Cache& cache) const;
-  /// Pictures have one size. Errors: unsupported.
+  /// Images have one size. Errors: unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }

@@ -25,7 +25,7 @@ Siglip::Siglip(const Scope& s)
 
 Status Siglip::check(int width, int height) const {
   if (width != height || width < patch_size_)
-    return Error{Code::unsupported, "vision", fmt::format("a square picture of {} pixels or more", patch_size_),
+    return Error{Code::unsupported, "vision", fmt::format("a square image of {} pixels or more", patch_size_),
                  fmt::format("{} x {}", width, height)};
   const auto ids = vision_position_ids(position_rule_, width / patch_size_, n_table_);
   return ids ? Status() : Status(ids.error());

@@ -18,12 +18,12 @@ class Siglip {
 
   /// images [width, height, 3, n_view] in [-1, 1] -> [d_model, n_patch, n_view]. `check` must have accepted the size.
   Tensor operator()(Graph& g, Tensor images) const;
-  /// Whether pictures of this size have defined patches and positions. Errors: bad_bundle, unsupported.
+  /// Whether images of this size have defined patches and positions. Errors: bad_bundle, unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }
   int patch_size() const { return patch_size_; }
-  /// Rows of the position table: patches of a picture of `image_size`.
+  /// Rows of the position table: patches of a image of `image_size`.
   int n_position() const { return n_table_ * n_table_; }
 
  private:

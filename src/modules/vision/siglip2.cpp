@@ -30,7 +30,7 @@ Siglip2::Siglip2(const Scope& s)
 
 Status Siglip2::check(int width, int height) const {
   if (width == width_ && height == height_) return {};
-  return Error{Code::unsupported, "vision.image_width", fmt::format("pictures of {} x {}", width_, height_),
+  return Error{Code::unsupported, "vision.image_width", fmt::format("images of {} x {}", width_, height_),
                fmt::format("{} x {}", width, height)};
 }
 

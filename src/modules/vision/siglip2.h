@@ -10,8 +10,8 @@
 
 namespace vla {
 
-/// The vision tower of SigLIP 2 on pictures of any aspect, every view in one batch: its position table is resized to
-/// the patches of a picture. Source: transformers modeling_siglip2.py Siglip2VisionTransformer.
+/// The vision tower of SigLIP 2 on images of any aspect, every view in one batch: its position table is resized to
+/// the patches of a image. Source: transformers modeling_siglip2.py Siglip2VisionTransformer.
 class Siglip2 {
  public:
   explicit Siglip2(const Scope& s);
@@ -20,7 +20,7 @@ class Siglip2 {
   void keep(Graph& g, Cache& cache) const;
   /// images [width, height, 3, n_view] in [-1, 1] -> [d_model, n_patch, n_view], patches row by row.
   Tensor operator()(Graph& g, Tensor images, const Cache& cache) const;
-  /// Pictures have one size. Errors: unsupported.
+  /// Images have one size. Errors: unsupported.
   Status check(int width, int height) const;
 
   int d_model() const { return d_model_; }

@@ -11,7 +11,7 @@ def _chunk(kind, data):
 
 
 def png_header(width, height):
-    """Signature and IHDR of an 8-bit RGB picture of that size."""
+    """Signature and IHDR of an 8-bit RGB image of that size."""
     return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
 
 
@@ -23,7 +23,7 @@ def png(frame):
 
 
 def png_of_rows(width, height, n_row):
-    """A black picture that has the first `n_row` of its rows; the file is about a thousandth of them."""
+    """A black image that has the first `n_row` of its rows; the file is about a thousandth of them."""
     compressor, row = zlib.compressobj(1), bytes(1 + 3 * width)
     body = b"".join(compressor.compress(row) for _ in range(n_row)) + compressor.flush()
     return png_header(width, height) + _chunk(b"IDAT", body) + _chunk(b"IEND", b"")
