@@ -18,7 +18,7 @@
  * Threads. Every function may be called from any thread. Calls of vla_act with one policy are done one after the other;
  * different policies run at the same time. Nobody may use a policy or chunk while or after it is closed.
  *
- * Errors. Nothing is thrown and nothing is guessed: a bad argument is a status and an error that tells where it was,
+ * Errors. Nothing is thrown and nothing is guessed: a bad argument is a status and an error that says where it was,
  * what was expected and what was found.
  *
  * Versions. Structs grow at their end. The caller states the size that it was compiled with, so that it works with
@@ -106,7 +106,7 @@ typedef struct vla_view_info {
   int32_t width, height; /* pixels of the network; frames of any size are fitted into it */
 } vla_view_info;
 
-/* A vector that the policy feels with. */
+/* A state vector of the policy. */
 typedef struct vla_state_info {
   size_t struct_size;
   const char* name;                /* in full: "observation.state" */
@@ -123,7 +123,7 @@ typedef struct vla_description {
   const vla_view_info* const* views; /* in the order in which the network sees them */
   size_t n_state;
   const vla_state_info* const* states;
-  size_t max_text_tokens; /* of a longer instruction a part is cut, which a note of the chunk tells */
+  size_t max_text_tokens; /* longer instructions are truncated, which a note of the chunk says */
 
   size_t horizon, d_action;        /* a chunk has `horizon` rows of d_action numbers */
   const char* const* action_names; /* d_action of each */
@@ -153,7 +153,7 @@ VLA_API const vla_description* vla_describe(const vla_policy* policy);
 enum {
   VLA_IMAGE_ABSENT = 1, /* there is no such frame now; `data` is NULL */
   VLA_IMAGE_RGB8 = 2,   /* rows from top to bottom, red green blue, 8 bits each */
-  VLA_IMAGE_FILE = 3    /* the bytes of a JPEG, PNG or NumPy file, told apart by their content */
+  VLA_IMAGE_FILE = 3    /* the bytes of a JPEG, PNG or NumPy file, recognized by their content */
 };
 
 typedef struct vla_view {
@@ -177,7 +177,7 @@ typedef struct vla_state {
 #define VLA_STATE_INIT \
   { sizeof(vla_state), NULL, NULL, 0 }
 
-/* What a robot sees and is told. Exactly one of noise and seed must be given. */
+/* An observation. Exactly one of noise and seed must be given. */
 typedef struct vla_observation {
   size_t struct_size;
   const vla_view* views; /* an array */
@@ -204,7 +204,7 @@ VLA_API void vla_chunk_close(vla_chunk* chunk);
 VLA_API const float* vla_chunk_actions(const vla_chunk* chunk);
 VLA_API size_t vla_chunk_horizon(const vla_chunk* chunk);
 VLA_API size_t vla_chunk_d_action(const vla_chunk* chunk);
-/* What the user must be told about this answer, as that the instruction was cut. NULL beyond the last. */
+/* What the user must know about this answer, e.g. that the instruction was cut. NULL beyond the last. */
 VLA_API size_t vla_chunk_n_note(const vla_chunk* chunk);
 VLA_API const char* vla_chunk_note(const vla_chunk* chunk, size_t i);
 /* Milliseconds per stage, in the order in which the stages ran; NULL and 0 beyond the last. */

@@ -42,7 +42,7 @@ constexpr const char* code_name(Code code) {
   return kNames[static_cast<int>(code)];
 }
 
-/// What went wrong, for a person and for a program: where it was, what was expected, what was found, what to do next.
+/// What went wrong: where, what was expected, what was found, and what to do next.
 struct Error {
   Code code = Code::internal;
   std::string where;     // file, key, tensor path or feature name

@@ -35,7 +35,7 @@ struct ProcessMemory {
   std::size_t peak = 0, now = 0;
 };
 ProcessMemory process_memory();
-/// Lets the peak begin anew. False where the system does not allow it.
+/// Resets the peak. False where the system does not allow it.
 bool forget_peak_memory();
 
 }  // namespace vla::bench

@@ -37,7 +37,7 @@ struct ViewPlaces {
 
   static constexpr std::string_view kOpen = "View {i}: ", kToken = "<view>", kClose = "\n";
 
-  /// Every byte is a token, and there are fewer than ten places: `{i}` stands for one.
+  /// Every byte is a token, and there are fewer than ten places: `{i}` is one token.
   int open_size() const { return static_cast<int>(kOpen.size()) - 2; }
   int size() const { return open_size() + repeat + static_cast<int>(kClose.size()); }
   std::vector<std::int64_t> starts() const {
@@ -65,14 +65,14 @@ Result<ImageSize> image_size(const Keys& keys) {
 /// Errors: bad_bundle.
 Result<ViewPlaces> view_places(const Keys& keys, const ImageSize& image) {
   ViewPlaces places;
-  if (!keys.has("policy.n_slot")) return places;
+  if (!keys.has("policy.max_views")) return places;
   VLA_TRY(const int patch_size, keys.integer("vision.patch_size", kAnySize));
   int factor = 1;
   for (const char* key : {"vision.merge", "connector.factor"})
     if (keys.has(key)) {
       VLA_TRY(factor, keys.integer(key, kAnySize));
     }
-  VLA_TRY(places.count, keys.integer("policy.n_slot", kAnySize));
+  VLA_TRY(places.count, keys.integer("policy.max_views", kAnySize));
   places.behind = keys.has(ViewPlaces::kStartsFromEnd);
   places.repeat = (image.width / patch_size / factor) * (image.height / patch_size / factor);
   return places;
@@ -81,7 +81,7 @@ Result<ViewPlaces> view_places(const Keys& keys, const ImageSize& image) {
 std::string recipe(const ImageSize& image, const ViewPlaces& places, int max_tokens, int d_state, int d_robot) {
   using Json = nlohmann::ordered_json;
   const Json letterbox = {{"op", "letterbox"},    {"width", image.width}, {"height", image.height},
-                          {"filter", "bilinear"}, {"antialias", false},     {"align", "bottom_right"},
+                          {"filter", "bilinear"}, {"antialias", false},   {"align", "bottom_right"},
                           {"fill", 0.0}};
   const Json affine = {{"op", "affine"}, {"scale", 2.0}, {"shift", -1.0}};
   const Json views = {{"op", "views"},
@@ -117,7 +117,7 @@ std::vector<std::string> byte_tokens() {
   return tokens;
 }
 
-/// A token beside those of bytes, found wherever it stands.
+/// A token beside those of bytes, found anywhere in a text.
 std::string added_token(std::string_view content, std::size_t id) {
   const nlohmann::ordered_json token = {{"id", id},        {"content", content}, {"single_word", false},
                                         {"lstrip", false}, {"rstrip", false},    {"normalized", false},

@@ -62,7 +62,7 @@ void summarize(const Series& series, Report& report);
 
 /// One JSON object on one line.
 std::string to_json(const Report& report);
-/// For a person: a table with what stands around it, or the same as Markdown.
+/// For display: a table with its conditions, or the same as Markdown.
 std::string to_text(const Report& report);
 std::string to_markdown(const Report& report);
 

@@ -28,7 +28,7 @@ struct Series {
   StageWork work;  // of the network's stages
 };
 
-/// Who watches: told what happens, a line at a time, and asked before each round, which may wait or refuse.
+/// Observes a run: gets its messages, and is called before each round, which it may delay or refuse.
 struct Watcher {
   std::function<void(const std::string& line)> tell;
   std::function<Status()> before_round;

@@ -44,7 +44,7 @@ struct File {
 };
 
 Result<File> open_file(const std::string& path) {
-  // Opening a pipe waits for its writer unless told not to; a file is not affected.
+  // O_NONBLOCK: opening a pipe would wait for its writer; a file is not affected.
   File file(::open(path.c_str(), O_RDONLY | O_CLOEXEC | O_NONBLOCK));
   if (file.descriptor < 0) return io_error(path, "a readable bundle");
   struct stat info = {};
@@ -99,7 +99,7 @@ Status check_sum(std::span<const std::byte> bytes, const Keys& keys, const std::
   VLA_TRY(const std::string stated, keys.string(kChecksumKey));
   if (stated.size() != kChecksumPrefix.size() + kDigits || !stated.starts_with(kChecksumPrefix))
     return Error{Code::bad_bundle, name + ": " + std::string(kChecksumKey), "xxh3: and 16 hex digits", stated};
-  // The digits are found by their key, whose text stands once before them: any other place would not hash to them.
+  // The digits are found by their key, whose text occurs once before them: any other place would not hash to them.
   const std::string_view text(reinterpret_cast<const char*>(bytes.data()), bytes.size());
   const std::size_t key = text.find(kChecksumKey);
   const std::size_t digits = text.find(stated, key) + kChecksumPrefix.size();

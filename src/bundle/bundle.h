@@ -20,7 +20,7 @@ enum class DType { f32, f16, bf16, i32 };
 const char* dtype_name(DType type);
 std::size_t dtype_size(DType type);
 
-/// A tensor as it lies in the file. `shape` follows ggml: fastest dimension first.
+/// A tensor as stored in the file. `shape` follows ggml: fastest dimension first.
 struct TensorInfo {
   std::string name;
   DType type;
@@ -51,7 +51,7 @@ class Bundle {
   /// A one-dimensional f32 tensor of finite values, for statistics. Errors: bad_bundle.
   Result<std::vector<float>> stats(std::string_view name) const;
   std::size_t file_size() const { return bytes_.size(); }
-  /// Gives whole pages of a part of an opened file back to the system, because nobody reads them any more: of a copy
+  /// Gives whole pages of a part of an opened file back to the system, because they are not read any more: of a copy
   /// they are gone, and touching them ends the process.
   void release_pages(std::span<const std::byte> part) const;
   /// Reads a part of a mapped file into memory now, instead of page by page when it is used.

@@ -157,13 +157,13 @@ Result<Value> read_value(Cursor& cursor, const std::string& what) {
   return cursor.bad(what, "a GGUF value type from 0 to 12", std::to_string(type));
 }
 
-/// Names are shown to people and told to clients: nothing in one may act on a terminal or begin a line.
+/// Names are displayed and sent to clients: they must not control a terminal or start a new line.
 Status check_shown(const Cursor& cursor, const std::string& what, const std::string& text) {
   return is_printable(text) ? Status()
                             : cursor.bad(printable(what), "text without control characters", printable(text));
 }
 
-/// What is told of a bundle: where it is from, and how features, numbers and units are called.
+/// Metadata that is displayed: the source, and names of features, numbers and units.
 Status check_shown(const Cursor& cursor, const std::string& key, const Value& value) {
   constexpr std::string_view kShown[] = {"general.", "vla.", "observation.", "action."};
   if (std::none_of(std::begin(kShown), std::end(kShown),

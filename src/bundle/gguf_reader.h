@@ -11,7 +11,7 @@
 
 namespace vla {
 
-/// What stands in a GGUF file. Tensor data points into the parsed bytes.
+/// The contents of a GGUF file. Tensor data points into the parsed bytes.
 struct GgufContent {
   Keys keys;
   std::vector<TensorInfo> tensors;

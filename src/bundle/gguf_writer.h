@@ -12,7 +12,7 @@ namespace vla {
 /// Tensors start at multiples of this many bytes, the format's own default.
 inline constexpr std::size_t kGgufAlignment = 32;
 
-/// All of a GGUF file that stands before the first tensor's bytes. Of the tensors' data only the sizes are looked at.
+/// Everything of a GGUF file before the first tensor's bytes. Only the sizes of the tensors' data are used.
 std::string write_gguf_head(const Keys& keys, std::span<const TensorInfo> tensors);
 
 /// The bytes of a GGUF file, version 3, that `read_gguf` reads back: keys in their order, then tensors in theirs.

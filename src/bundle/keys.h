@@ -17,7 +17,7 @@ namespace vla {
 using Value = std::variant<bool, std::int64_t, double, std::string, std::vector<std::int64_t>, std::vector<double>,
                            std::vector<std::string>>;
 
-/// The values that a number may have, both ends included. Whoever reads a number says them: what nobody has tried is
+/// The values that a number may have, both ends included. The reader of a number states them: what was never tried is
 /// refused at load, not found out by a robot.
 struct Range {
   double low, high;

@@ -46,7 +46,7 @@ class ParamList {
   void problem(std::string line) { problems_.push_back(std::move(line)); }
   void problem(const Error& error);
 
-  /// All problems, and every tensor of the bundle that nobody declared or `is_used` does not know: the first 50 in
+  /// All problems, and every tensor of the bundle that is neither declared nor known to `is_used`: the first 50 in
   /// words and the number of the others. Errors: bad_bundle.
   Status report(const std::string& policy, const std::function<bool(const std::string&)>& is_used) const;
 

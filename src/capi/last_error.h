@@ -13,7 +13,7 @@ namespace vla::capi {
 
 /// Keeps an error for `last_error` of this thread. Returns its status.
 vla_status fail(const vla_policy* policy, Error error) noexcept;
-/// The same for an exception that nobody expected, and for a system without memory, where no string can be made.
+/// The same for an unexpected exception, and for out of memory, where no string can be made.
 vla_status fail_unexpected(const vla_policy* policy, const char* what) noexcept;
 vla_status fail_without_memory(const vla_policy* policy) noexcept;
 const vla_error* last_error(const vla_policy* policy) noexcept;

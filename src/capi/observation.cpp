@@ -88,7 +88,7 @@ Status read_states(const vla_observation& given, const FeatureNames& features, O
   return {};
 }
 
-/// Without a default: a chunk that follows from noise that nobody chose could not be had again.
+/// Without a default: a chunk from noise that was not chosen could not be reproduced.
 Result<Noise> read_noise(const vla_observation& given, const Engine& engine) {
   if (given.has_seed > 1) return usage("observation.has_seed", "0 or 1", std::to_string(given.has_seed));
   const bool has_noise = given.noise != nullptr;

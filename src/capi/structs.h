@@ -25,7 +25,7 @@ inline Error usage(std::string where, std::string expected, std::string found, s
 }
 
 /// A struct of the caller as this library knows it: fields that the caller was compiled without are zero. Bytes that
-/// this library was compiled without must be zero, or something that was asked for would be left out in silence.
+/// this library was compiled without must be zero, or a request would be ignored silently.
 template <class T>
 Result<T> read_struct(const void* given, const std::string& where) {
   if (given == nullptr) return usage(where, "a pointer", "NULL");

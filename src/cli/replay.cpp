@@ -21,7 +21,7 @@ struct ReplayOptions {
   serve::ReplayOptions replay;
 };
 
-/// Answers by another bundle or by other arithmetic may differ rightly; whoever reads the table must know.
+/// Another bundle or other arithmetic may rightly give other answers, so the table says so.
 void announce(const v1::Description& recorded, const v1::Description& replayed) {
   const auto row = [](const char* what, const std::string& before, const std::string& now) {
     if (before != now) say(stdout, "note: {} was {} when recorded, is {} now\n", what, before, now);

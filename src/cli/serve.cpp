@@ -54,7 +54,7 @@ std::string quoted(const std::string& value) {
   return out + "'";
 }
 
-/// One line for people, and for programs that split it as a shell would.
+/// One line that programs can split as a shell would.
 void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const std::string& metrics) {
   const Processor& processor = engine.processor();
   std::vector<std::string> features = processor.views().names();

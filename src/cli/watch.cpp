@@ -14,7 +14,7 @@ namespace {
 
 using serve::Level;
 
-/// Whoever asks for a log gets the course of events; everybody else hears of trouble only.
+/// With --log the level is info, otherwise warn.
 Level level_of(const WatchOptions& options) {
   const auto found = std::find(std::begin(serve::kLevelNames), std::end(serve::kLevelNames), options.level);
   if (found == std::end(serve::kLevelNames)) return options.log.empty() ? Level::warn : Level::info;

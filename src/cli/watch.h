@@ -28,7 +28,7 @@ void add_watch_options(CLI::App& command, WatchOptions& options);
 /// Everything that watches a server: what the options ask for, and nothing else. It lives as long as the server runs.
 class Watch {
  public:
-  /// Before the bundle is loaded, so that whoever waits for readiness can ask. Errors: usage, io.
+  /// Before the bundle is loaded, so that readiness can be polled. Errors: usage, io.
   static Result<std::unique_ptr<Watch>> start(const WatchOptions& options, const serve::Server& server, bool insecure);
   ~Watch();
 

@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// What a loaded policy takes and gives, for whoever prints or sends it.
+/// Inputs and outputs of a loaded policy, for printing and sending.
 struct Description {
   struct View {
     std::string name, alias;  // the alias is empty where there is none

@@ -45,7 +45,7 @@ Status Engine::load_policy() {
   return device_->load(*params_, !dry_);
 }
 
-/// Load rate: lowers a graph that nobody needs afterwards, and runs it.
+/// Load rate: lowers a graph that is used once, and runs it.
 Status Engine::run_once(const Graph& graph) {
   VLA_CHECK(device_->allocate(graph.slots()));
   VLA_TRY(const std::unique_ptr<Program> program, device_->lower(graph));
@@ -145,7 +145,7 @@ Result<std::string> Engine::program_text(Part part) {
 }
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) noexcept {
-  // Containers throw where there is no memory: whatever was begun is given up, and the next act starts anew.
+  // Containers throw where there is no memory: the act is given up, and the next one starts afresh.
   try {
     return run(observation, noise);
   } catch (const std::bad_alloc&) {

@@ -27,7 +27,7 @@ struct ActionChunk {
   int horizon = 0;  // rows
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
-  std::vector<std::string> notes;  // what the user must be told about this answer
+  std::vector<std::string> notes;  // what the user must know about this answer
   bool is_beyond = false;          // one of them: the state is beyond the bundle's bound
   Timing timing;
   std::vector<Tap> taps;
@@ -81,7 +81,7 @@ class Engine {
   std::string kernels() const { return device_->kernels(); }
   /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
   std::string precision() const { return device_->precision(); }
-  /// The same in plain words, for people.
+  /// The same as text for display.
   std::string arithmetic() const;
 
  private:

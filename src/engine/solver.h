@@ -11,7 +11,7 @@
 
 namespace vla {
 
-/// How the action head's answers become the chunk, as data: the times at which it is asked, and the rule of a step.
+/// The solver as data: the times at which the action head is evaluated, and the update rule.
 ///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
 ///   direct                one pass: x <- what the network gives, from a start of zeros
 struct Solver {

@@ -17,7 +17,7 @@ struct Tap {
   std::vector<float> values;
 };
 
-/// `*` stands for any characters; several patterns are separated by commas: `lm.blk.*,chunk`.
+/// `*` matches any characters; several patterns are separated by commas: `lm.blk.*,chunk`.
 bool match_path(const std::string& pattern, const std::string& path);
 
 /// Writes taps as f32 tensors of a GGUF file. Errors: io.

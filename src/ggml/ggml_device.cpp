@@ -60,7 +60,7 @@ Result<ggml_context_ptr> make_context(std::size_t n, std::size_t extra) {
 void GgmlDevice::FreePool::operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
 
 Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
-  ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);  // what fails becomes an Error, told once
+  ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);  // failures become an Error instead
   auto device = std::make_unique<GgmlDevice>();
   device->n_thread_ = n_thread;
   device->backend_.reset(ggml_backend_cpu_init());

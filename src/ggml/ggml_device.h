@@ -12,7 +12,7 @@
 namespace vla {
 
 /// A backend of ggml: graphs run as its plain operations, without a node of our own. On the CPU this is the reference
-/// that every kernel and every fusion is tested against; what a graph needs of a backend stands in ggml_program.cpp.
+/// that every kernel and every fusion is tested against; what a graph needs of a backend is in ggml_program.cpp.
 class GgmlDevice final : public Device {
  public:
   /// Errors: device.

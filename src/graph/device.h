@@ -70,7 +70,7 @@ class Device {
   /// unsupported for sizes that the device has no kernel for.
   virtual Result<std::unique_ptr<Program>> lower(const Graph& graph, const LowerOptions& options = {}) = 0;
 
-  /// For people: "cpu, 2 threads".
+  /// For display: "cpu, 2 threads".
   virtual std::string name() const = 0;
   virtual int n_thread() const = 0;
   /// As `--kernels` names them.

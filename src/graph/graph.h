@@ -68,7 +68,7 @@ class Graph {
   /// Values that depend on the shape alone: made once per graph for each `key`.
   Tensor constant(const std::string& key, const Shape& shape, const std::function<std::vector<float>()>& make);
   Tensor constant_ids(const std::string& key, const std::function<std::vector<std::int32_t>()>& make);
-  /// Values that nobody else uses.
+  /// Values without other readers.
   Tensor constant(std::vector<float> values, const Shape& shape);
 
   /// Gives `value` its path, under which it is recorded where the filter wants it.
@@ -87,7 +87,7 @@ class Graph {
 
   const std::deque<Node>& nodes() const { return nodes_; }
   const std::vector<Stage>& stages() const { return stages_; }
-  /// The first operation whose operands did not fit; empty where all did. A fault of ours, told when it is lowered.
+  /// The first operation whose operands did not fit; empty where all did. A bug of ours, reported when it is lowered.
   const std::string& problem() const { return problem_; }
 
  private:

@@ -70,7 +70,7 @@ struct Scale {
 struct Concat {
   int dim;
 };
-/// Indices first to first + count - 1 of dimension `dim`; `count` stands in the result's shape.
+/// Indices first to first + count - 1 of dimension `dim`; `count` is in the result's shape.
 struct Slice {
   int dim;
   std::int64_t first;

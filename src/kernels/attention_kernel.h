@@ -28,7 +28,7 @@ struct PackJob {
   std::int64_t n_unit() const { return n_head_kv * n_batch; }
 };
 
-/// One attention: sizes, and where everything lies.
+/// One attention: sizes and addresses.
 struct AttentionJob {
   /// Packed keys and values that stand one after the other.
   struct Segment {

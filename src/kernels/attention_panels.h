@@ -65,7 +65,7 @@ class AttentionPanels {
 
  private:
   /// Keys or values of kPanel tokens from `first` on, as numbers and padded to `n_padded`; missing tokens are zeros.
-  /// The tokens after them are asked for: they are too far apart for the machine to foresee.
+  /// The next tokens are prefetched: they are too far apart for the hardware prefetcher.
   VLA_INLINE void copy_rows(const PackJob& job, const HeadRows& from, const RowPrep& prep, std::int64_t unit,
                             std::int64_t first, std::int64_t n_padded, Number* rows) const {
     const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv;

@@ -64,7 +64,7 @@ class AttentionTile {
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
     // Weights take the place of the scores, unless they are numbers of another kind. Those of rows that no query has
-    // are anything: they are multiplied too, into rows that nobody reads.
+    // are anything: they are multiplied too, into rows that are not read.
     static constexpr bool kInPlace = std::is_same_v<Number, float>;
     alignas(64) Number rounded_weight[kInPlace ? 1 : kBuffers * kBufferSize];
     static constexpr int kRowVectors = round_up(kRows, kWidth);  // room for whole vectors

@@ -170,7 +170,7 @@ void Executor::open(std::size_t i_phase) {
     stretches_[i].left.store(ticket_ << kCountBits | static_cast<std::uint64_t>(end - begin),
                              std::memory_order_seq_cst);
   }
-  // A single item is whoever's comes first, and that is as a rule the one who opens the phase.
+  // A single item goes to the first thread, usually the one that opens the phase.
   if (n > 1) {
     wake(opened_, n_sleeping_, static_cast<int>(std::min<std::int64_t>(n - 1, n_thread_)));
     wake(caller_word_, caller_sleeps_, 1);

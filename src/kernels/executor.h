@@ -38,8 +38,8 @@ struct Phase {
 };
 
 /// Threads that run phases one after the other. A phase is done when its *items* are done: a worker that the system has
-/// put aside between two items holds nobody up. Whoever finishes the last item opens the next phase. A worker without
-/// work spins for a moment, then sleeps until a phase of several items is opened; an idle executor takes no time.
+/// put aside between two items delays no other. Who finishes the last item opens the next phase. A worker without work
+/// spins for a moment, then sleeps until a phase of several items is opened: an idle executor takes no time.
 ///
 /// A worker starts with a stretch of the items that is its own from run to run, whose operands may still lie in its
 /// caches, and then helps with those of others.
@@ -90,7 +90,7 @@ class Executor {
   };
   std::unique_ptr<std::byte, Free> scratch_;
 
-  // What runs. Written by whoever opens a phase, read by workers that hold an item of it.
+  // What runs. Written by the thread that opens a phase, read by workers that hold an item of it.
   std::span<const Phase> phases_;
   std::size_t i_phase_ = 0;
   std::uint64_t ticket_ = 0;

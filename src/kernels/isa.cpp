@@ -18,7 +18,7 @@ namespace {
 
 #if defined(__x86_64__)
 
-/// Tiles are 8 kB of registers that the kernel saves only for a process that asked for them.
+/// Tiles are 8 kB of registers that the kernel saves only for processes that request them.
 bool may_use_tiles() {
   constexpr int kRequestPermission = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;

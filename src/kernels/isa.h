@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// Which kernels a device uses, each with what stands before it: a machine for `amx` runs `avx512` ones too.
+/// Which kernels a device uses; each includes the ones before it: a machine with `amx` runs `avx512` too.
 enum class Isa {
   ggml,    // no kernels of our own: plain ggml operations, the reference of every other row
   avx2,    // AVX2, FMA, F16C

@@ -27,7 +27,7 @@ struct AmxTile : PairTile {
 
   static void multiply(DType, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
                        float* c, bool add, const Ahead& ahead) {
-    // Rows that x does not have are multiplied too; nobody looks at their sums.
+    // Rows beyond x are multiplied too; their sums are not read.
     if (rest != nullptr)
       n_row > 16 ? product<true, true>(x, rest, panel, depth, c, add, ahead.from)
                  : product<false, true>(x, rest, panel, depth, c, add, ahead.from);

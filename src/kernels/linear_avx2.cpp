@@ -33,7 +33,7 @@ struct Avx2Tile {
   }
 
  private:
-  // What stands in a line of a panel: how many steps of the depth, and 8 columns of one of them as floats.
+  // A cache line of a panel holds how many steps of the depth, and 8 columns of one of them as floats.
   struct Pairs {
     static constexpr int kDepth = 2, kSize = 64;
     static VLA_INLINE __m256 load(const std::byte* line, int k, int half) {

@@ -11,7 +11,7 @@
 
 namespace vla::kernels {
 
-/// Matrix products of one x, with everything that follows them: what is multiplied, and where everything lies.
+/// Matrix products of one x, with their epilogues: operands and addresses.
 struct LinearJob {
   /// y = activation(W x + bias) * factor + residual. y and residual are contiguous rows of d_out numbers, one for each
   /// row of x; bias, factor [d_out] and residual may be null.

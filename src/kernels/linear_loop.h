@@ -6,7 +6,7 @@
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 
-/// The loops around a tile: what an item is, what lies in which cache, edges, and the epilogue.
+/// The loops around a tile: items, cache blocking, edges, epilogue.
 ///
 /// A tile multiplies a few rows of x by the columns of a panel (linear_panels.h) over some depth of d_in. A block of
 /// rows of x is copied to rows of a fixed stride in the second cache, so that neither their addresses nor their width
@@ -29,7 +29,7 @@ struct Ahead {
 ///   copy(from, n, to, rest)           n numbers of x, zeros up to a multiple of 32; what rounding leaves, or null
 ///   store_rounded(to, vector, left)   y as bf16, where kRounds
 ///   multiply(type, n_row, x, rest, panel, depth, c, add, ahead)
-///     c [kColumns] x n_row <= kRows, += where `add`; what lies ahead is asked for meanwhile
+///     c [kColumns] x n_row <= kRows, += where `add`; prefetches ahead
 template <class Tile>
 class LinearLoop {
   using V = typename Tile::V;
@@ -63,7 +63,7 @@ class LinearLoop {
  private:
   static std::int64_t cut(LinearJob& job, int n_thread) {
     const LinearLoop loop(job);
-    // A group whose depth takes more than one block copies x anew, which several panels must pay for.
+    // A group whose depth takes more than one block copies x again, which several panels must amortize.
     const std::int64_t min_panels = loop.whole_depth() ? 1 : 16;
     job.n_group =
         n_thread == 1 ? 1 : min(ceil_div(kMinItems * n_thread, loop.n_block_), ceil_div(loop.n_panel_, min_panels));
@@ -192,7 +192,7 @@ class LinearLoop {
                              Layout::size(part.type, s.k);
     for (std::int64_t k = 0; k < depth; k += step) {
       const std::int64_t d = min(step, depth - k), size = Layout::size(part.type, d);
-      const std::byte* next = panel + size;  // what is asked for while this is multiplied
+      const std::byte* next = panel + size;  // prefetched meanwhile
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = first_row(s.n_row, t, n_tile), n_row = first_row(s.n_row, t + 1, n_tile) - r;
         if (k + d == depth) before(r, n_row);

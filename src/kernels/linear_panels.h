@@ -6,7 +6,7 @@
 #include "kernels/numbers.h"
 #include "kernels/sizes.h"
 
-/// How a matrix lies in memory for the kernels, from load on.
+/// Memory layout of a packed matrix.
 ///
 /// A *panel* holds some columns of the product (rows of W) over the whole depth (d_in), one block of 1 KiB after the
 /// other. A block has 16 columns, and lines across them: a line of 64 bytes is two consecutive bf16 of every column, or
@@ -45,7 +45,7 @@ struct Panels {
  private:
   static constexpr std::int64_t block_depth(DType type) { return type == DType::f32 ? 16 : 32; }
 
-  /// Where number k of column n lies.
+  /// Offset of number k of column n.
   static VLA_INLINE std::int64_t place(DType type, std::int64_t k, std::int64_t n) {
     const std::int64_t depth = block_depth(type), inner = k % depth, column = n % 16;
     const std::int64_t block = (k / depth * (kColumns / 16) + n / 16) * kPanelBlock;

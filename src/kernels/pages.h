@@ -4,7 +4,7 @@
 
 #include <cstddef>
 
-/// Wishes about memory, which a system may leave unheard. Pages that lie only partly in it are left alone.
+/// Hints about memory that the system may ignore. Pages that are only partly inside are left alone.
 namespace vla {
 
 /// Large pages: fewer of them are looked up while weights and activations stream by, and fewer are made.

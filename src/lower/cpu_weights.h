@@ -26,7 +26,7 @@ class CpuWeights {
   }
   /// Bytes in memory, those of the bundle's tables included.
   std::size_t size() const { return memory_.size() + table_size_; }
-  /// Which kernel multiplies how many matrices, for people: `avx2 (98 bf16)`.
+  /// Which kernel multiplies how many matrices, for display: `avx2 (98 bf16)`.
   const std::string& text() const { return text_; }
 
  private:

@@ -107,7 +107,7 @@ class Fuser {
     return op;
   }
 
-  /// The only node that reads this one, where nobody else and no tap does, unless it is part of something already.
+  /// The only node that reads this one, if there is exactly one and no tap, unless it is part of something already.
   const Node* only_reader(const Node& node) const {
     if (node.tapped || l.readers[at(&node)].size() != 1) return nullptr;
     const Node* reader = l.readers[at(&node)][0];

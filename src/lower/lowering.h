@@ -131,7 +131,7 @@ void start(Lowering& l);
 /// Makes operations of nodes: norm into product; bias, activation, gate, factor and residual behind it; products of one
 /// x; gate and up; norm and rope into attention. A tapped node is computed for itself.
 void fuse(Lowering& l);
-/// Chooses the dtype of what lies between products, and copies what its reader needs contiguous.
+/// Chooses the dtype of values between products, and copies what its reader needs contiguous.
 void choose_layouts(Lowering& l);
 /// Puts operations that do not depend on each other into one phase, and what stays the same into Program::prepare.
 void schedule(Lowering& l);

@@ -7,7 +7,7 @@
 
 namespace vla {
 
-/// What tells the families of encoders apart.
+/// How the families of encoders differ.
 struct EncoderFamily {
   Activation activation;  // of the MLP
   bool scaled;            // attention and MLP are multiplied feature by feature before they are added (LayerScale)

@@ -17,7 +17,7 @@ struct KeyValue {
 /// softmax(q k / sqrt(d_head) + mask) v, float32 throughout, heads concatenated, over the keys and values of segments
 /// that stand one after the other. q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] or none ->
 /// [d_head * n_head, n_query, n_batch]. Query head h reads key head h / (n_head / n_head_kv). The mask is 0 for a key
-/// that is seen, -infinity for one that is not, and ln(n) for one that stands for n equal ones with equal values. Every
+/// that is seen, -infinity for one that is not, and ln(n) for one that represents n equal keys with equal values. Every
 /// query must see at least one key.
 /// Source: lerobot policies/smolvla/smolvlm_with_expert.py eager_attention_forward.
 Tensor attention(Graph& g, Tensor q, const std::vector<KeyValue>& segments, Tensor mask);

@@ -9,12 +9,12 @@
 
 namespace vla {
 
-/// Ids that do not change from run to run, for a table: [ids.size()] i32. `key` tells lists of a graph apart.
+/// Ids that do not change from run to run, for a table: [ids.size()] i32. `key` identifies the list within a graph.
 Tensor constant_ids(Graph& g, const std::string& key, const std::vector<std::int32_t>& ids);
 /// 0, 1, ... count - 1.
 Tensor arange(Graph& g, int count);
 
-/// Rows of a table. ids [n] i32 -> [d_model, n]. Ids must be below n_row: whoever makes them checks.
+/// Rows of a table. ids [n] i32 -> [d_model, n]. Ids must be below n_row; the caller checks.
 class Embedding : public Module<Embedding> {
  public:
   Embedding(const Scope& s, int d_model, int n_row);

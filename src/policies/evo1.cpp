@@ -80,9 +80,9 @@ class Evo1 final : public Policy {
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
-    if (shape.n_view > places_.n_slot())
-      return Error{Code::bad_bundle, "policy.n_slot", fmt::format("{} or more, one for each view", shape.n_view),
-                   std::to_string(places_.n_slot())};
+    if (shape.n_view > places_.max_views())
+      return Error{Code::bad_bundle, "policy.max_views", fmt::format("{} or more, one for each view", shape.n_view),
+                   std::to_string(places_.max_views())};
     if (shape.n_text < places_.n_least() || shape.n_text > n_token_)
       return Error{Code::bad_bundle, "processor.recipe.text",
                    fmt::format("{} to {} tokens", places_.n_least(), n_token_), std::to_string(shape.n_text)};
@@ -126,7 +126,7 @@ class Evo1 final : public Policy {
   }
 
  private:
-  /// What the language model reads, and what the head sees besides.
+  /// What the language model reads, and what only the head sees.
   struct Rows {
     std::vector<Tensor> parts;  // [d_model, n] each
     std::vector<int> positions;
@@ -146,10 +146,10 @@ class Evo1 final : public Policy {
 
   /// For every slot the view that fills it, as an index of the views that are present, or kAbsent.
   std::vector<int> fill_slots(const PrefixInputs& in) const {
-    std::vector<int> slots(static_cast<std::size_t>(places_.n_slot()), kAbsent);
+    std::vector<int> slots(static_cast<std::size_t>(places_.max_views()), kAbsent);
     int next = 0;
     const int n_view = static_cast<int>(in.images.dim(3));
-    for (int slot = 0; slot < places_.n_slot() && next < n_view; ++slot)
+    for (int slot = 0; slot < places_.max_views() && next < n_view; ++slot)
       if (!in_place_ || (in.views >> slot & 1) != 0) slots[static_cast<std::size_t>(slot)] = next++;
     return slots;
   }
@@ -187,7 +187,7 @@ Keys published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 24}, {"policy.d_action", 24}, {"policy.horizon", 50}, {"policy.d_robot", 7},
-      {"policy.n_slot", 3}, {"policy.n_token", 1024}, {"policy.pad_token", 151643},
+      {"policy.max_views", 3}, {"policy.n_token", 1024}, {"policy.pad_token", 151643},
       {"policy.view_starts", std::vector<std::int64_t>{6, 270, 534}},
       {"policy.dead_rows", "zero_attention"}, {"policy.absent_views", "in_place"}, {"policy.time_scale", 999.0},
       {"vision.d_model", 1024}, {"vision.n_layer", 24}, {"vision.n_head", 16}, {"vision.d_ff", 4096},

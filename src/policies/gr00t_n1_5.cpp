@@ -58,7 +58,7 @@ Keys published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 64}, {"policy.d_action", 32}, {"policy.horizon", 16}, {"policy.n_position", 1024},
-      {"policy.n_future", 32}, {"policy.n_slot", 2}, {"policy.view_starts", std::vector<std::int64_t>{20, 283}},
+      {"policy.n_future", 32}, {"policy.max_views", 2}, {"policy.view_starts", std::vector<std::int64_t>{20, 283}},
       {"vision.d_model", 1152}, {"vision.n_layer", 27}, {"vision.n_head", 16}, {"vision.d_ff", 4304},
       {"vision.image_size", 224}, {"vision.patch_size", 14}, {"vision.norm_eps", 1e-6},
       {"vision.position_rule", "row_major"},

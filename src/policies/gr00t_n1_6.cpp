@@ -60,7 +60,7 @@ Keys published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 128}, {"policy.d_action", 128}, {"policy.horizon", 50}, {"policy.n_position", 1024},
-      {"policy.n_slot", 2}, {"policy.view_starts_from_end", std::vector<std::int64_t>{172, 84}},
+      {"policy.max_views", 2}, {"policy.view_starts_from_end", std::vector<std::int64_t>{172, 84}},
       {"vision.d_model", 1152}, {"vision.n_layer", 27}, {"vision.n_head", 16}, {"vision.d_ff", 4304},
       {"vision.image_width", 252}, {"vision.image_height", 252}, {"vision.patch_size", 14},
       {"vision.n_position_side", 16}, {"vision.norm_eps", 1e-6}, {"connector.factor", 2}, {"connector.norm_eps", 1e-5},
@@ -68,7 +68,7 @@ Keys published() {
       {"lm.d_ff", 6144}, {"lm.n_vocab", 151680}, {"lm.norm_eps", 1e-6}, {"lm.rope_base", 1e6},
       {"vl.norm_eps", 1e-5},
       {"dit.d_model", 1536}, {"dit.n_layer", 32}, {"dit.n_head", 32}, {"dit.d_ff", 6144}, {"dit.d_out", 1024},
-      {"dit.text_every", 2}, {"dit.d_time", 256}, {"dit.n_bucket", 1000}, {"dit.d_hidden", 1024},
+      {"dit.attend_text_every_n_blocks", 2}, {"dit.d_time", 256}, {"dit.n_bucket", 1000}, {"dit.d_hidden", 1024},
       {"dit.norm_eps", 1e-5}, {"dit.out_eps", 1e-6}});
   // clang-format on
 }

@@ -46,7 +46,7 @@ Keys published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 132}, {"policy.d_action", 132}, {"policy.horizon", 40}, {"policy.n_position", 1024},
-      {"policy.n_slot", 2}, {"policy.view_starts", std::vector<std::int64_t>{4, 70}},
+      {"policy.max_views", 2}, {"policy.view_starts", std::vector<std::int64_t>{4, 70}},
       {"vision.d_model", 1024}, {"vision.n_layer", 24}, {"vision.n_head", 16}, {"vision.d_ff", 4096},
       {"vision.patch_size", 16}, {"vision.image_width", 256}, {"vision.image_height", 256},
       {"vision.n_position_side", 48}, {"vision.merge", 2}, {"vision.norm_eps", 1e-6}, {"vision.rope_base", 1e4},
@@ -56,7 +56,7 @@ Keys published() {
       {"lm.rope_sections", std::vector<std::int64_t>{24, 20, 20}},
       {"vl.n_layer", 4}, {"vl.n_head", 32}, {"vl.d_ff", 8192}, {"vl.norm_eps", 1e-5},
       {"dit.d_model", 1536}, {"dit.n_layer", 32}, {"dit.n_head", 32}, {"dit.d_ff", 6144}, {"dit.d_out", 1024},
-      {"dit.text_every", 2}, {"dit.d_time", 256}, {"dit.n_bucket", 1000}, {"dit.d_hidden", 1024},
+      {"dit.attend_text_every_n_blocks", 2}, {"dit.d_time", 256}, {"dit.n_bucket", 1000}, {"dit.d_hidden", 1024},
       {"dit.norm_eps", 1e-5}, {"dit.out_eps", 1e-6}});
   // clang-format on
 }

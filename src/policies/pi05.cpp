@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// π0.5: π0 without a state token, since the state stands in the prompt as integers, and with a time that modulates
+// π0.5: π0 without a state token, since the discretized state is part of the prompt, and with a time that modulates
 // every norm of the expert instead of mixing with the actions. Reference: lerobot
 // src/lerobot/policies/pi05/modeling_pi05.py (embed_prefix, embed_suffix, denoise_step).
 

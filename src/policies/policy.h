@@ -37,7 +37,7 @@ class Policy {
  public:
   virtual ~Policy() = default;
 
-  /// Whether the network is defined on inputs of this size; asked at load. Errors: bad_bundle, unsupported.
+  /// Whether the network is defined on inputs of this size; checked at load. Errors: bad_bundle, unsupported.
   virtual Status check(const InputShape& shape) const = 0;
 
   /// Load rate: everything that depends on the time alone, one column per solver step: [d, times.size()]. None where

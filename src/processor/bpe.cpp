@@ -23,7 +23,7 @@ std::array<std::uint32_t, 256> make_symbols() {
   return symbols;
 }
 
-/// The bytes that a token's text stands for, or nothing when the text is not of the alphabet.
+/// The bytes that a token's text encodes, or nothing when the text is not of the alphabet.
 std::optional<std::string> bytes_of(std::string_view text) {
   std::string bytes;
   while (!text.empty()) {

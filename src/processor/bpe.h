@@ -14,7 +14,7 @@
 
 namespace vla {
 
-/// The byte that a character of the byte-level alphabet stands for (U+0100 is byte 0, `Ġ` is the blank, printable ASCII
+/// The byte that a character of the byte-level alphabet encodes (U+0100 is byte 0, `Ġ` is the blank, printable ASCII
 /// is itself); -1 for every other character.
 int byte_of_symbol(std::uint32_t code_point);
 

@@ -21,7 +21,7 @@ Result<Json> parse_json(const std::string& text, const std::string& where);
 Result<Json> parse_json_list(const std::string& text, const std::string& where);
 
 /// One JSON object of a bundle whose fields are all required and all known: each is read by name and type, and `done`
-/// refuses what nobody read. Errors: bad_bundle at `where.field`.
+/// refuses fields that were not read. Errors: bad_bundle at `where.field`.
 class JsonFields {
  public:
   static Result<JsonFields> open(const Json& object, std::string where);

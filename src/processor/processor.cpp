@@ -94,7 +94,7 @@ Status Processor::encode_view(const Frame& frame, const std::string& name, std::
 std::vector<float> Processor::absent_view() const {
   std::vector<float> pixels(view_size(recipe_));
   const Frame black{recipe_.width, recipe_.height, std::vector<std::uint8_t>(pixels.size())};
-  (void)encode_view(black, "absent view", pixels);  // bytes of the size that is asked for are never refused
+  (void)encode_view(black, "absent view", pixels);  // bytes of the expected size are never refused
   return pixels;
 }
 
@@ -141,7 +141,7 @@ Status Processor::check_view_places(std::span<const std::int32_t> tokens) const 
                          "the places of the views are made by the runtime; remove it from the text");
 }
 
-/// Keeps as many tokens as the recipe says. What stands in front of every text is not part of it and stays.
+/// Keeps as many tokens as the recipe says. The prefix of every text is not part of it and stays.
 void Processor::cut_tokens(std::vector<std::int32_t>& tokens) const {
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (recipe_.keep_last) {

@@ -18,7 +18,7 @@
 
 namespace vla {
 
-/// What a robot sees and is told, by name: see `FeatureNames` for the names that are understood.
+/// An observation, by name: see `FeatureNames` for the names that are understood.
 struct Observation {
   std::map<std::string, std::optional<Frame>> views;  // nullopt: declared absent
   std::map<std::string, std::vector<float>> states;   // world units
@@ -36,7 +36,7 @@ struct Inputs {
   std::vector<int> discretized_state;  // where the prompt has a place for it
   std::vector<float> raw_state;        // before its normalization, which actions may be relative to
   bool is_beyond = false;              // the state has a number beyond the bundle's bound, as a note says
-  std::vector<std::string> notes;      // what the user must be told, e.g. that the instruction was cut
+  std::vector<std::string> notes;      // what the user must know, e.g. that the instruction was cut
 };
 
 /// How large a normalized number of the state may be before the user is told, where the bundle says nothing else: ten
@@ -86,7 +86,7 @@ class Processor {
   /// Tokens that every prompt has around its places for views; 0 where the text has no such places.
   int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
-  /// Features that pass unnormalized because whoever converted the checkpoint allowed it. Every answer has to say so.
+  /// Features that pass unnormalized because --identity-stats allowed it. Every answer has to say so.
   const std::vector<std::string>& degraded() const { return degraded_; }
 
  private:

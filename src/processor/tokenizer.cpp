@@ -17,7 +17,7 @@ Result<bool> is_byte_level(const Keys& keys) {
                "this bundle needs a newer vla"};
 }
 
-/// The text of an added token stands at its id as well, so that a bundle's list of tokens is whole.
+/// The text of an added token is in the list of tokens too, so that the list is complete.
 /// `whole_words`: a single word token that is passed over could come back as a word of the model, and the bundle does
 /// not say whether the model's own vocabulary has it.
 Status check_added(const std::vector<AddedToken>& added, const std::vector<std::string>& tokens, bool whole_words) {

@@ -17,7 +17,7 @@
 namespace vla::serve {
 namespace {
 
-constexpr std::size_t kMaxName = 256;  // bytes; a name is told back in errors
+constexpr std::size_t kMaxName = 256;  // bytes; errors quote the name
 
 Error bad_observation(std::string where, std::string expected, std::string found) {
   return {Code::bad_observation, std::move(where), std::move(expected), std::move(found)};

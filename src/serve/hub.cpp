@@ -308,7 +308,7 @@ class Hub::Sockets : public Shared {
         if (path.front() == '@') {
           path.front() = '\0';  // an abstract address, which is no file
         } else {
-          ::unlink(path.c_str());  // that nobody serves it was checked
+          ::unlink(path.c_str());  // it was checked that no process serves it
           paths_.push_back(path);
         }
         locals_.emplace_back(context, Local::endpoint(path));

@@ -160,7 +160,7 @@ void Io::refuse(Answer answer) {
   deliver(std::move(answer));
 }
 
-/// A peer that is gone, or that does not read and has its share of answers waiting, loses this one; nobody waits for
+/// A peer that is gone, or that does not read and has its share of answers waiting, loses this one; nothing waits for
 /// it.
 void Io::deliver(Answer answer) {
   const Job& job = answer.job;

@@ -28,7 +28,7 @@ class Io final : public Hub::Handler {
   Io(Hub& hub, Exchange& exchange, Vitals& vitals, const v1::Description& description,
      std::span<Observer* const> observers);
 
-  /// Until the server is told to stop and everything that waits is answered.
+  /// Until the server is stopped and all waiting requests are answered.
   void run();
 
   void received(Client& client, Message message) override;

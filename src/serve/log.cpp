@@ -119,7 +119,7 @@ void Log::answered(const Answered& answered) {
   }
 }
 
-/// Whoever comes without a key or does not speak ZMTP is told of; that a peer fell silent is the course of events.
+/// A peer without a key or without ZMTP is a warning; a peer that fell silent is normal.
 void Log::dropped(const Dropped& connection) {
   const Level level = connection.why == "silent" ? Level::info : Level::warn;
   if (level < least_) return;

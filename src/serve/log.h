@@ -25,7 +25,7 @@ class Log final : public Observer {
 
   /// From any thread. `fields` is an object.
   void event(Level level, const char* name, const Fields& fields) noexcept;
-  /// A request: at level debug where it was answered with what it asked for, info where the queue refused it, warn
+  /// A request: at level debug where it was answered as requested, info where the queue refused it, warn
   /// where the request was wrong, error where the server failed.
   void answered(const Answered& answered) override;
   void dropped(const Dropped& connection) override;

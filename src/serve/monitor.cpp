@@ -93,7 +93,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   Response response_;
 };
 
-/// Names are not looked up: what is bound is what stands there.
+/// Names are not resolved: the address is bound as given.
 Result<tcp::endpoint> endpoint_of(const std::string& address, bool insecure) {
   const auto reach = reach_of("tcp://" + address);
   const std::size_t colon = address.rfind(':');

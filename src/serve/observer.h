@@ -44,7 +44,7 @@ struct Dropped {
 /// An answered request.
 struct Answered {
   Received request;
-  const Error* error = nullptr;         // null: answered with what was asked for
+  const Error* error = nullptr;         // null: answered as requested
   Clock::time_point started, finished;  // of the engine; both `request.at` where the engine never saw the request
   Clock::time_point sent;               // handed to the socket
   Timing stages;                        // of the engine, "decode" first; empty where it never saw the request

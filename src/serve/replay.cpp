@@ -79,7 +79,7 @@ std::string interface_of(v1::Description description) {
   return description.SerializeAsString();
 }
 
-/// Whether an answer tells of the moment in which it was given, and so cannot come again.
+/// Whether an answer depends on the load at that moment, so that it cannot be reproduced.
 bool is_of_the_moment(const v1::Response& answer) {
   const v1::Error& error = answer.error();
   switch (error.code()) {

@@ -18,7 +18,7 @@
 namespace vla::serve {
 namespace {
 
-constexpr auto kPatience = std::chrono::seconds(2);  // with a pipe that nobody reads, on the way out
+constexpr auto kPatience = std::chrono::seconds(2);  // with a pipe without a reader, at shutdown
 constexpr int kPollMs = 100;
 
 }  // namespace

@@ -16,10 +16,10 @@
 namespace vla::serve {
 
 /// Opens a file to be written from its start, which must not exist yet where `fresh`. Only its owner may read it, since
-/// it tells what a robot sees and does. Errors: io.
+/// it holds what a robot sees and does. Errors: io.
 Result<int> open_to_write(const std::string& path, bool fresh);
 
-/// Writes to a file or a pipe from a thread of its own, so that whoever has something to write never waits for a disk
+/// Writes to a file or a pipe from a thread of its own, so that the caller never waits for a disk
 /// or for a reader. Pieces are written whole and in order; one that finds the line full is dropped and counted.
 class Writer {
  public:

@@ -75,7 +75,7 @@ def published(request):
         d_action=24,
         d_robot=7,
         horizon=50,
-        n_slot=3,
+        max_views=3,
         n_step=50,
         time_scale=999.0,
         dead_rows="zero_attention",

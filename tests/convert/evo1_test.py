@@ -110,7 +110,7 @@ def test_keys_of_the_authors_second_revision(converter):
         "policy.d_action": WIDTH,
         "policy.d_robot": ACTION_DIM,
         "policy.horizon": HORIZON,
-        "policy.n_slot": 3,
+        "policy.max_views": 3,
         "policy.n_token": N_TOKEN,
         "policy.pad_token": FIRST_ADDED,
         "policy.dead_rows": "zero_attention",
@@ -255,7 +255,7 @@ def test_the_command_takes_the_answers(converter, capsys):
     assert main([folder, "-o", converter.out, "--stats", "{}/{}".format(ARM, DATASET), *flags.split()]) == 0
     keys = read_bundle(converter.out).keys
     assert keys["observation.views"] == ["observation.images.front", "observation.images.wrist"]
-    assert (keys["policy.n_slot"], keys["policy.dead_rows"], keys["solver.steps"]) == (2, "causal_attention", 32)
+    assert (keys["policy.max_views"], keys["policy.dead_rows"], keys["solver.steps"]) == (2, "causal_attention", 32)
     assert "the robot's {} action columns".format(ACTION_DIM) in capsys.readouterr().out
 
 

@@ -73,7 +73,7 @@ def sizes(tmp_path_factory):
     problems = Problems("published")
     sizes = read_sizes(RELEASE, CONFIG, str(folder), problems)
     problems.raise_any()
-    sizes.n_slot, sizes.image_width, sizes.image_height = 2, 256, 256
+    sizes.max_views, sizes.image_width, sizes.image_height = 2, 256, 256
     return sizes
 
 
@@ -143,7 +143,7 @@ def test_n1_6_declares_what_its_checkpoint_has(tmp_path):
     config = {"model_type": "Gr00tN1d6", "max_state_dim": 128, "max_action_dim": 128, "action_horizon": 50}
     sizes = read_sizes(release, config, str(tmp_path), problems)
     problems.raise_any()
-    sizes.n_slot, sizes.image_width, sizes.image_height = 2, 252, 252
+    sizes.max_views, sizes.image_width, sizes.image_height = 2, 252, 252
     declared = json.loads(
         subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_6"], capture_output=True, check=True).stdout
     )
@@ -181,7 +181,7 @@ def test_n1_5_declares_what_its_checkpoint_has(tmp_path):
     problems = Problems("published")
     sizes, n_future = gr00t_n1_5.read_sizes(N1_5, str(tmp_path), problems)
     problems.raise_any()
-    sizes.n_slot = 2
+    sizes.max_views = 2
     declared = json.loads(
         subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_5"], capture_output=True, check=True).stdout
     )

@@ -163,4 +163,4 @@ def test_frames_of_several_moments_are_views_of_their_own_the_oldest_first(conve
     bundle = convert(converter, tiny)
     names = ["front@-15", "wrist@-15", "front", "wrist"]
     assert bundle.keys["observation.views"] == ["observation.images." + name for name in names]
-    assert bundle.keys["policy.n_slot"] == 4 and recipe(bundle)["text"][2]["count"] == 4
+    assert bundle.keys["policy.max_views"] == 4 and recipe(bundle)["text"][2]["count"] == 4

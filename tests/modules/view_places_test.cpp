@@ -16,7 +16,7 @@ struct Made {
 };
 
 Made make(const std::string& key, std::vector<std::int64_t> counts, int n_view_token, ViewPlaces::Count count) {
-  const Keys keys({{"policy.n_slot", static_cast<std::int64_t>(2)}, {key, std::move(counts)}});
+  const Keys keys({{"policy.max_views", static_cast<std::int64_t>(2)}, {key, std::move(counts)}});
   ParamList list(keys, nullptr);
   ViewPlaces places(Scope(list, ""), n_view_token, count);
   return {std::move(places), list.report("test", {}).ok()};

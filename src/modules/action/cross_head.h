@@ -37,7 +37,7 @@ class CrossHead {
 
   /// Load rate: puts the keys and values of rows that every observation may need.
   void keep(Graph& g, Tensor rows, Cache& cache) const;
-  /// `count` of the rows that `keep` got, from `first` on, each of which stands for `copies` equal ones.
+  /// `count` of the rows that `keep` got, from `first` on, each repeated `copies` times.
   struct Kept {
     int first, count, copies;
   };

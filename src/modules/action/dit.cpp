@@ -24,7 +24,7 @@ Tensor DitBlock::forward(Graph& g, Tensor x, Tensor modulation, const std::optio
 Dit::Dit(const Scope& s, int d_context, bool alternating)
     : d_model_(s.dim("d_model")),
       d_out_(s.dim("d_out")),
-      text_every_(alternating ? s.dim("text_every", 512) : 1),
+      text_every_n_blocks_(alternating ? s.dim("attend_text_every_n_blocks", 512) : 1),
       out_norm_(s / "out_ada", d_model_, s.number("out_eps", kNormEps), AdaLayerNorm::Order::shift_scale),
       out_(s / "out", d_model_, d_out_, Bias::yes) {
   const int n_layer = s.n_layer("n_layer"), n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff");
@@ -45,7 +45,7 @@ Tensor Dit::modulations(Graph& g, Tensor time) const {
 
 void Dit::prepare(Graph& g, Tensor text, Tensor image, Cache& cache) const {
   for (std::size_t i = 0; i < blocks_.size(); i += 2) {
-    const bool of_text = static_cast<int>(i) % (2 * text_every_) == 0;
+    const bool of_text = static_cast<int>(i) % (2 * text_every_n_blocks_) == 0;
     put(g, cache, blocks_[i].path(), blocks_[i].project()(g, of_text ? text : image));
   }
 }

@@ -53,7 +53,7 @@ class Dit {
   int d_modulations() const { return 2 * d_model_ * (static_cast<int>(blocks_.size()) + 1); }
 
  private:
-  int d_model_, d_out_, text_every_;
+  int d_model_, d_out_, text_every_n_blocks_;
   std::vector<DitBlock> blocks_;
   AdaLayerNorm out_norm_;
   Linear out_;

@@ -13,11 +13,12 @@
 
 namespace vla {
 
-/// What tells the releases' heads apart.
+/// How the heads of the releases differ.
 struct GrootFamily {
   bool future_tokens;  // `policy.n_future` learned tokens between the state's and those of the actions
   bool mixing;         // `vl.n_layer` layers of self-attention over the features
-  bool alternating;    // even layers look at the text or at the images (`dit.text_every`), else at all rows
+  bool alternating;    // even layers look at the text or at the images (`dit.attend_text_every_n_blocks`), else at all
+                       // rows
 };
 
 /// The action head of GR00T: self-attention over the features, a diffusion transformer over tokens of state and

@@ -11,7 +11,7 @@
 
 namespace vla {
 
-/// What tells the families of decoders apart, as their references compute them.
+/// How the families of decoders differ, as their references compute them.
 struct DecoderFamily {
   Activation activation;  // of the gated MLP
   RotaryAngle rope_angle;

@@ -11,7 +11,7 @@
 
 namespace vla {
 
-/// What tells the generations apart, and where features are read.
+/// How the generations differ, and where features are read.
 struct QwenFamily {
   Bias bias;        // of queries, keys and values
   bool head_norms;  // queries and keys are normalized head by head

@@ -31,7 +31,7 @@ class Qwen3Vl {
   Status check(int width, int height, int n_view, int n_token) const;
   /// Load rate: what depends on the weights alone.
   void keep(Graph& g, Cache& cache) const { vision_.keep(g, cache); }
-  /// images [width, height, 3, n_slot], tokens [n] i32 with any ids where images stand -> features [d_model, n].
+  /// images [width, height, 3, max_views], tokens [n] i32 with any ids where images stand -> features [d_model, n].
   Tensor operator()(Graph& g, Tensor images, Tensor tokens, const Cache& cache) const;
 
   const ViewPlaces& places() const { return places_; }

@@ -14,7 +14,7 @@ ViewPlaces::ViewPlaces(const Scope& s, int n_view_token, Count count)
       count_(count),
       counts_(s.integers(count == Count::from_end ? "view_starts_from_end" : "view_starts", kTokenIndex)) {
   const bool back = count_ == Count::from_end;
-  bool apart = n_slot() == s.dim("n_slot", 32);
+  bool apart = max_views() == s.dim("max_views", 32);
   for (const int n : counts_) apart = apart && n > 0;
   if (apart) {
     // Text sees text: the first token is no image's.
@@ -27,7 +27,7 @@ ViewPlaces::ViewPlaces(const Scope& s, int n_view_token, Count count)
     apart = apart && end <= n_least_;
   }
   s.require(apart, back ? "view_starts_from_end" : "view_starts",
-            fmt::format("n_slot places of {} tokens each, behind the first token", n_view_token_),
+            fmt::format("max_views places of {} tokens each, behind the first token", n_view_token_),
             fmt::format("{}", fmt::join(counts_, " ")));
 }
 
@@ -39,9 +39,9 @@ std::vector<int> ViewPlaces::starts(int n_token) const {
 }
 
 Status ViewPlaces::check(int n_view, int n_token) const {
-  if (n_view != n_slot())
-    return Error{Code::bad_bundle, "policy.n_slot", fmt::format("{}, one for each view", n_view),
-                 std::to_string(n_slot())};
+  if (n_view != max_views())
+    return Error{Code::bad_bundle, "policy.max_views", fmt::format("{}, one for each view", n_view),
+                 std::to_string(max_views())};
   if (n_token >= n_least_) return {};
   return Error{Code::bad_bundle, "processor.recipe.text", fmt::format("{} tokens or more, for the views", n_least_),
                std::to_string(n_token)};

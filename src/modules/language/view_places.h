@@ -17,9 +17,9 @@ struct PromptPiece {
   int slot;  // the view's number, or kText
 };
 
-/// Where the views stand among the tokens of a prompt: `policy.n_slot` of them, in order. Where the instruction follows
-/// them, `policy.view_starts` counts from the first token; where it stands before them, `policy.view_starts_from_end`
-/// counts back from the end.
+/// Where the views stand among the tokens of a prompt: `policy.max_views` of them, in order. Where the instruction
+/// follows them, `policy.view_starts` counts from the first token; where it stands before them,
+/// `policy.view_starts_from_end` counts back from the end.
 class ViewPlaces {
  public:
   enum class Count { from_start, from_end };
@@ -31,7 +31,7 @@ class ViewPlaces {
   /// Text and views in the order of the prompt; no piece is empty.
   std::vector<PromptPiece> pieces(int n_token) const;
 
-  /// Views [d, n_view_token, n_slot] at their places among the rows [d, count] that `text` makes: [d, n_token].
+  /// Views [d, n_view_token, max_views] at their places among the rows [d, count] that `text` makes: [d, n_token].
   Tensor arrange(Graph& g, Tensor views, int n_token, const std::function<Tensor(const PromptPiece&)>& text) const;
   /// The rows of the views, and all others.
   struct Rows {
@@ -39,7 +39,7 @@ class ViewPlaces {
   };
   Rows split(Graph& g, Tensor rows) const;
 
-  int n_slot() const { return static_cast<int>(counts_.size()); }
+  int max_views() const { return static_cast<int>(counts_.size()); }
   int n_view_token() const { return n_view_token_; }
   /// Index of the first token of every view.
   std::vector<int> starts(int n_token) const;

@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// InternViT, the vision tower of InternVL, every view in one batch. A class token stands in front of the patches and
+/// InternViT, the vision tower of InternVL, every view in one batch. A class token precedes the patches and
 /// is dropped at the end; there is no final norm. Source: InternVL
 /// internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionModel.
 class InternVit {

@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// The vision tower of Qwen3-VL on single images, every view in one batch. A image stands for two moments that are
+/// The vision tower of Qwen3-VL on single images, every view in one batch. An image is treated as two frames that are
 /// the same, and each has a patch product of its own. Patches come in squares of merge x merge, one square after the
 /// other; they know their place by a learned table and by turning. There is no final norm.
 /// Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.

@@ -123,7 +123,7 @@ struct EnsureSuffixOp final : TextOp {
   }
 };
 
-/// `{instruction}` stands for the text so far, `{state}` for the numbers that `bins` made of the state.
+/// `{instruction}` is replaced by the text so far, `{state}` by the discretized state.
 struct TemplateOp final : TextOp {
   std::string text;
   Result<std::string> apply(std::string instruction, std::span<const int> state) const override {

@@ -40,7 +40,7 @@ std::string fill_template(std::string_view text, std::string_view instruction, s
 bool is_numbered(std::string_view text);
 
 /// `count` pieces in front of the text so far, or behind it, one for each view that the network has a place for: `open`
-/// with the number of the piece, from 1, for `{i}` where it stands, then `token` `repeat` times, then `close`.
+/// with the number of the piece, from 1, for `{i}` if present, then `token` `repeat` times, then `close`.
 /// Source: lerobot policies/evo1/internvl3_embedder.py (_build_multimodal_prompts).
 struct ViewsOp final : TextOp {
   int count = 0;

@@ -82,7 +82,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     metadata = choose(robots, options.embodiment)
     folder = find_backbone(checkpoint, options.backbone, None, "backbone")
     s, n_future = read_sizes(checkpoint.config, folder, problems)
-    s.n_slot = len(config.video)
+    s.max_views = len(config.video)
     s.embodiment = config.index if config.index >= 0 else EMBODIMENTS.get(options.embodiment, -1)
     if not 0 <= s.embodiment < s.n_embodiment:
         expected = "one of {}, or a projector_index below {} in --variant".format(

@@ -35,7 +35,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         "image": source.image,
         "text": [
             {"op": "strip"},
-            view_op(sizes.n_slot, sizes.n_view_token),
+            view_op(sizes.max_views, sizes.n_view_token),
             {"op": "tokenize", "max_tokens": sizes.n_token, "truncate": tokenizer.truncate},
         ],
         "state": source.state,
@@ -69,11 +69,11 @@ def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Pro
             problems.unsupported("{}: {}".format(where, key), "'right'", repr(found), "the views stand in front")
     pad = config.get("pad_token")
     pad = pad.get("content") if isinstance(pad, dict) else pad
-    prompt = read_prompt(tokenizer, str(pad), s.n_slot, s.n_view_token, problems)
+    prompt = read_prompt(tokenizer, str(pad), s.max_views, s.n_view_token, problems)
     if source.image_token not in (None, prompt.image_token):
         problems.add("backbone config.json: image_token_id", "{}, the tokenizer's".format(prompt.image_token), str(source.image_token))
     if prompt.view_starts[-1] + s.n_view_token > s.n_token:
-        expected = "room for {} views of {} tokens".format(s.n_slot, s.n_view_token)
+        expected = "room for {} views of {} tokens".format(s.max_views, s.n_view_token)
         problems.add("prompt", expected, "{} tokens".format(s.n_token), "the reference cannot cut into the views either")
     return prompt
 
@@ -91,19 +91,19 @@ class Prompt(NamedTuple):
     image_token: int
 
 
-def view_op(n_slot: int, n_token: int) -> dict:
+def view_op(max_views: int, n_token: int) -> dict:
     """`n_token`: image tokens of a view."""
-    return {"op": "views", "count": n_slot, **{k: OP[k] for k in ("open", "token")}, "repeat": n_token, "close": OP["close"]}
+    return {"op": "views", "count": max_views, **{k: OP[k] for k in ("open", "token")}, "repeat": n_token, "close": OP["close"]}
 
 
-def read_prompt(tokenizer: TokenizerPlan, pad_token: str, n_slot: int, n_token: int, problems: Problems) -> Prompt:
+def read_prompt(tokenizer: TokenizerPlan, pad_token: str, max_views: int, n_token: int, problems: Problems) -> Prompt:
     keys = tokenizer.keys
     image = special_ids(keys, (IMAGE, OPEN, CLOSE), "--backbone needs the folder of the InternVL3 backbone", problems)[0]
     added = next(key.value for key in keys if key.name == "tokenizer.added")
     pad = next((token["id"] for token in json.loads(added) if token["content"] == pad_token), -1)
     if pad < 0:
         problems.add("tokenizer_config.json: pad_token", "one of the added tokens", repr(pad_token), PAD_HINT)
-    texts = [("\n" if i else "") + OP["open"].replace("{i}", str(i + 1))[: -len(OPEN)] for i in range(n_slot)]
+    texts = [("\n" if i else "") + OP["open"].replace("{i}", str(i + 1))[: -len(OPEN)] for i in range(max_views)]
     check_undivided(keys, (IMAGE, OPEN, CLOSE), (*texts, IMAGE + OPEN + CLOSE), problems)
     encoder = Encoder(keys)
     starts: List[int] = []

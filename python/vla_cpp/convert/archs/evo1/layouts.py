@@ -176,10 +176,10 @@ def _ask(problems: Problems, flag: str, expected: str, found: str) -> None:
 def _check_answers(options: Options, problems: Problems) -> None:
     if options.variant not in REVISIONS:
         _ask(problems, "--variant", "r1 or r2, a revision of the authors' code", options.variant)
-    n_slot, views = options.view_slots, [_view_name(name) for name in options.views]
-    if not 1 <= n_slot <= MAX_SLOTS:
-        _ask(problems, "--view-slots", "a count from 1 to {}".format(MAX_SLOTS), str(n_slot or ""))
-    if not views or len(set(views)) != len(views) or "" in options.views or (n_slot and len(views) > n_slot):
+    max_views, views = options.view_slots, [_view_name(name) for name in options.views]
+    if not 1 <= max_views <= MAX_SLOTS:
+        _ask(problems, "--view-slots", "a count from 1 to {}".format(MAX_SLOTS), str(max_views or ""))
+    if not views or len(set(views)) != len(views) or "" in options.views or (max_views and len(views) > max_views):
         _ask(problems, "--views", "different names, no more than there are slots", ",".join(options.views))
     if options.dead_rows not in ("zero_attention", "causal_attention"):
         _ask(problems, "--dead-rows", "zero_attention or causal_attention", options.dead_rows)
@@ -220,7 +220,7 @@ def _authors_sizes(policy: Section, checkpoint: Checkpoint, options: Options) ->
         d_state=WIDTH,
         d_action=WIDTH,
         horizon=policy.count("horizon"),
-        n_slot=options.view_slots,
+        max_views=options.view_slots,
         n_step=revision.n_step,
         time_scale=revision.time_scale,
         dead_rows=options.dead_rows,
@@ -366,7 +366,7 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
     policy.check_fixed(LEROBOT_FIXED)
     sizes = _lerobot_sizes(policy)
     views, n_empty = read_views(policy, checkpoint)
-    if len(views) > sizes.n_slot:
+    if len(views) > sizes.max_views:
         policy.bad("max_views", "at least the {} cameras".format(len(views)), hint="the reference refuses it too")
     folder = find_backbone(checkpoint, options.backbone, policy.get("vlm_model_name"))
     backbone = read_json(os.path.join(folder, "config.json"))
@@ -416,7 +416,7 @@ def _lerobot_sizes(policy: Section) -> Sizes:
         d_state=policy.count("max_state_dim"),
         d_action=policy.count("max_action_dim"),
         horizon=policy.count("chunk_size"),
-        n_slot=policy.count("max_views", most=32),
+        max_views=policy.count("max_views", most=32),
         n_step=policy.count("num_inference_timesteps"),
         time_scale=999.0,
         dead_rows="unseen",

@@ -107,7 +107,7 @@ class Sizes:
     action_dim: int = 0  # numbers of an action that the robot is sent
     d_robot: int = 0
     horizon: int = 0
-    n_slot: int = 0
+    max_views: int = 0
     n_token: int = 0
     n_step: int = 0
     time_scale: float = 0.0
@@ -205,7 +205,7 @@ def check_head(policy: Section, s: Sizes, embed_dim: int) -> None:
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, d_robot=s.d_robot, n_slot=s.n_slot, n_token=s.n_token)
+    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, d_robot=s.d_robot, max_views=s.max_views, n_token=s.n_token)
     head = dict(n_layer=s.n_head_layer, n_head=s.n_head_head, d_ff=4 * s.lm.d_model, d_hidden=s.d_hidden)
     eps = 1e-5  # torch's default, which the reference leaves as it is
     return keys_of(

@@ -170,7 +170,7 @@ def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
         "policy.d_action": s.d_action,
         "policy.horizon": s.horizon,
         "policy.n_position": s.n_position,
-        "policy.n_slot": s.n_slot,
+        "policy.max_views": s.max_views,
         "vl.n_layer": s.n_vl_layer,
         "vl.n_head": s.n_vl_head,
         "vl.d_ff": s.d_vl_ff,

@@ -90,7 +90,7 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     statistics = read_json(processor_file(checkpoint, STATISTICS))
     robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
     problems.raise_any()
-    s.n_slot = len(robot.cameras)
+    s.max_views = len(robot.cameras)
     area = backbone.read_area(folder, s, problems)
     pictures = read_pictures(processor, area, options, checkpoint.notes, problems)
     if processor.count("max_state_dim") != s.d_state:
@@ -174,13 +174,13 @@ def read_sizes(release: Release, config: dict, folder: str, problems: Problems) 
     policy.refuse_unknown({*release.config, *release.fixed, *IGNORED, *release.ignored})
     policy.check_fixed(release.fixed)
     release.backbone.read(folder, policy.count("select_layer", most=MAX_LAYERS), s, problems)
-    s.d_action, s.text_every = policy.count("max_action_dim"), policy.count("attend_text_every_n_blocks")
+    s.d_action, s.attend_text_every_n_blocks = policy.count("max_action_dim"), policy.count("attend_text_every_n_blocks")
     head.read(policy, s)
     return s
 
 
 def network_keys(release: Release, s: Sizes) -> List[Key]:
-    keys = network_keys_of(release.backbone, s, {"dit.text_every": s.text_every})
+    keys = network_keys_of(release.backbone, s, {"dit.attend_text_every_n_blocks": s.attend_text_every_n_blocks})
     if "vl_self_attention_cfg" in release.config:
         return keys
     return [key for key in keys if key.name not in ("vl.n_layer", "vl.n_head", "vl.d_ff")]

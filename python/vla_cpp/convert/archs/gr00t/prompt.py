@@ -53,7 +53,7 @@ def text_ops(template: Template, formalize: bool, prompt: Prompt, s: Sizes) -> L
     place = {"place": "back"} if template.behind else {}
     return [
         *clean,
-        {"op": "views", "count": s.n_slot, **view, **place},
+        {"op": "views", "count": s.max_views, **view, **place},
         {"op": "template", "text": template.before + "{instruction}" + template.after},
         {"op": "tokenize", "max_tokens": prompt.n_token, "truncate": "right"},
     ]
@@ -74,15 +74,15 @@ def read_prompt(template: Template, tokenizer: TokenizerPlan, hint: str, s: Size
     def count(text: str) -> int:
         return count_tokens(text, special, encoder)
 
-    opens = [template.open.replace("{i}", str(i + 1)) for i in range(s.n_slot)]
+    opens = [template.open.replace("{i}", str(i + 1)) for i in range(s.max_views)]
     view, starts = template.token * s.n_view_token + template.close, []
-    for i in range(s.n_slot):
+    for i in range(s.max_views):
         if template.behind:
             starts.append(count(view + "".join(part + view for part in opens[i + 1 :]) + template.after))
         else:
             starts.append(count(template.before + "".join(part + view for part in opens[:i]) + opens[i]))
     end = count(template.before) + starts[0] if template.behind else starts[-1] + s.n_view_token
     if end + 4 > s.n_context:
-        expected = "room for {} views of {} tokens".format(s.n_slot, s.n_view_token)
+        expected = "room for {} views of {} tokens".format(s.max_views, s.n_view_token)
         problems.add(WHERE + ": text_config: max_position_embeddings", expected, "{} tokens".format(s.n_context))
     return Prompt(starts, template.behind, min(end + 2 + N_INSTRUCTION, s.n_context))

@@ -43,7 +43,7 @@ class Sizes:
     n_dit_layer: int = 0
     n_dit_head: int = 0
     d_out: int = 0
-    text_every: int = 0
+    attend_text_every_n_blocks: int = 0
     n_bucket: int = 0
     d_hidden: int = 0
     d_state: int = 0
@@ -53,7 +53,7 @@ class Sizes:
     n_step: int = 0
     n_embodiment: int = 0
     embodiment: int = 0  # index among them
-    n_slot: int = 0
+    max_views: int = 0
     d_time: int = 256  # a literal of the reference, as is the factor 4 of the feed-forward parts
 
     @property
