@@ -17,12 +17,13 @@ from . import __version__, wire
 from .chunk import Chunk
 from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
+from .handle import Handle, wrong_process
 from .observation import Image, State, check_start
 from .pending import Health, Pending
 from .spec import Spec
 
 
-class Client:
+class Client(Handle):
     """Speaks with a server: `act` sends an observation and returns a chunk.
 
         with vla_cpp.Client("tcp://127.0.0.1:5555") as policy:
@@ -149,6 +150,10 @@ class Client:
                 self._context.term()
                 self._context = None
 
+    def __del__(self) -> None:
+        if getattr(self, "_context", None) is not None:
+            self.close()
+
     # --- requests and answers ------------------------------------------------------------------------------------------------
 
     def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes]) -> Pending:
@@ -184,7 +189,7 @@ class Client:
 
     def _check_process(self) -> None:
         if os.getpid() != self._pid:
-            raise UsageError("Client", "use in the process that made it", "another process", "make one per process")
+            raise wrong_process(self, "use in a child process")
 
     def _settle(self, pending: Pending, seconds: float) -> bool:
         """Whether the request is over, after waiting at most so long. Threads that wait take turns, in short slices."""

@@ -58,7 +58,7 @@ def act_bytes(
     seed: Optional[int],
     noise: object,
     deadline_ms: float,
-    capture_time_ns: Optional[int],
+    capture_time_ns: Optional[int] = None,
 ) -> bytes:
     """A request with an observation, as bytes. Errors: BadObservation, UsageError, TooLarge, by the argument's name."""
     act = request.act
