@@ -9,6 +9,7 @@
 #include <unistd.h>
 #include <xxhash.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cmath>
 #include <cstring>
@@ -128,11 +129,14 @@ Status check_identity(const Keys& keys) {
 }  // namespace
 
 const char* dtype_name(DType type) {
-  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32"};
+  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32", "f64"};
   return kNames[static_cast<int>(type)];
 }
 
-std::size_t dtype_size(DType type) { return type == DType::f32 || type == DType::i32 ? 4 : 2; }
+std::size_t dtype_size(DType type) {
+  constexpr std::size_t kSizes[] = {4, 2, 2, 4, 8};
+  return kSizes[static_cast<int>(type)];
+}
 
 std::int64_t TensorInfo::count() const {
   std::int64_t product = 1;
@@ -195,17 +199,20 @@ const TensorInfo* Bundle::find(std::string_view name) const {
   return found != index_.end() ? &tensors_[found->second] : nullptr;
 }
 
-Result<std::vector<float>> Bundle::stats(std::string_view name) const {
+Result<std::vector<double>> Bundle::stats(std::string_view name) const {
   const std::string where = path_ + ": tensor " + std::string(name);
   const TensorInfo* tensor = find(name);
   if (tensor == nullptr)
     return Error{Code::bad_bundle, where, "statistics", "no such tensor", "convert the checkpoint again"};
-  if (tensor->type != DType::f32 || tensor->shape.size() != 1)
-    return Error{Code::bad_bundle, where, "a one-dimensional f32 tensor",
+  const bool is_wide = tensor->type == DType::f64;
+  if ((tensor->type != DType::f32 && !is_wide) || tensor->shape.size() != 1)
+    return Error{Code::bad_bundle, where, "a one-dimensional f32 or f64 tensor",
                  fmt::format("{} dimensions of {}", tensor->shape.size(), dtype_name(tensor->type))};
-  std::vector<float> values(static_cast<std::size_t>(tensor->count()));
-  std::memcpy(values.data(), tensor->data.data(), tensor->data.size());
-  for (float value : values)
+  std::vector<double> values(static_cast<std::size_t>(tensor->count()));
+  std::vector<float> narrow(is_wide ? 0 : values.size());
+  std::memcpy(is_wide ? static_cast<void*>(values.data()) : narrow.data(), tensor->data.data(), tensor->data.size());
+  std::copy(narrow.begin(), narrow.end(), values.begin());
+  for (const double value : values)
     if (!std::isfinite(value)) return Error{Code::bad_bundle, where, "finite numbers", fmt::format("{}", value)};
   return values;
 }

@@ -15,7 +15,7 @@
 
 namespace vla {
 
-enum class DType { f32, f16, bf16, i32 };
+enum class DType { f32, f16, bf16, i32, f64 };
 
 const char* dtype_name(DType type);
 std::size_t dtype_size(DType type);
@@ -48,8 +48,8 @@ class Bundle {
   const Keys& keys() const { return keys_; }
   const std::vector<TensorInfo>& tensors() const { return tensors_; }
   const TensorInfo* find(std::string_view name) const;
-  /// A one-dimensional f32 tensor of finite values, for statistics. Errors: bad_bundle.
-  Result<std::vector<float>> stats(std::string_view name) const;
+  /// A one-dimensional f32 or f64 tensor of finite values, for statistics. Errors: bad_bundle.
+  Result<std::vector<double>> stats(std::string_view name) const;
   std::size_t file_size() const { return bytes_.size(); }
   /// Gives whole pages of a part of an opened file back to the system, because they are not read any more: of a copy
   /// they are gone, and touching them ends the process.

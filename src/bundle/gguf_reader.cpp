@@ -197,10 +197,12 @@ Result<DType> read_dtype(Cursor& cursor, const std::string& what) {
       return DType::f16;
     case 26:
       return DType::i32;
+    case 28:
+      return DType::f64;
     case 30:
       return DType::bf16;
     default:
-      return cursor.bad(what, "type f32, f16, bf16 or i32", fmt::format("ggml type {}", type));
+      return cursor.bad(what, "type f32, f16, bf16, i32 or f64", fmt::format("ggml type {}", type));
   }
 }
 

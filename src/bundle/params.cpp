@@ -46,7 +46,8 @@ void ParamList::look_up(Param& param) {
   if (tensor->shape != param.shape)
     return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name, shape_text(param.shape),
                                shape_text(tensor->shape)));
-  const bool fits = tensor->type == DType::f32 || (param.storage != Storage::vector && tensor->type != DType::i32);
+  const bool fits = tensor->type == DType::f32 ||
+                    (param.storage != Storage::vector && (tensor->type == DType::f16 || tensor->type == DType::bf16));
   if (!fits)
     return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name,
                                param.storage == Storage::vector ? "f32" : "f32, bf16 or f16",

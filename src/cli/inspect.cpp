@@ -71,7 +71,7 @@ Status print_manifest(const std::string& arch) {
 /// Values of `stats.<feature>.*` beside the names of a feature's numbers.
 struct StatsColumns {
   std::vector<std::string> names;
-  std::vector<std::vector<float>> values;
+  std::vector<std::vector<double>> values;
 };
 
 StatsColumns read_stats(const Bundle& bundle, const std::string& feature) {
@@ -94,7 +94,7 @@ void print_numbers(const std::vector<Description::Number>& numbers, const StatsC
   say(stdout, "\n");
   for (std::size_t i = 0; i < numbers.size(); ++i) {
     say(stdout, "    {:<{}}  {:<10}", numbers[i].name, width, numbers[i].unit.empty() ? "unstated" : numbers[i].unit);
-    for (const auto& column : stats.values) say(stdout, "  {:>12.6g}", i < column.size() ? column[i] : 0.0f);
+    for (const auto& column : stats.values) say(stdout, "  {:>12.6g}", i < column.size() ? column[i] : 0.0);
     say(stdout, "\n");
   }
 }

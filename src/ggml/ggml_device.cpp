@@ -20,6 +20,7 @@ ggml_type type_of(DType type) {
       return GGML_TYPE_F16;
     case DType::i32:
       return GGML_TYPE_I32;
+    case DType::f64:  // of statistics alone, which no graph reads
     case DType::f32:
       break;
   }

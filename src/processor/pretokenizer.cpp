@@ -28,6 +28,17 @@ std::size_t run(std::string_view text, std::uint8_t wanted) {
   return size;
 }
 
+/// Bytes of the longest run of numbers at the start, `most` of them at most.
+std::size_t numbers(std::string_view text, int most) {
+  std::size_t size = 0;
+  for (int i = 0; i < most && size < text.size(); ++i) {
+    const unicode::Char c = unicode::first(text.substr(size));
+    if (kind(c.code_point) != unicode::kNumber) break;
+    size += c.size;
+  }
+  return size;
+}
+
 constexpr std::string_view kContractions[] = {"'s", "'t", "'re", "'ve", "'m", "'ll", "'d"};
 
 std::size_t contraction(std::string_view text) {
@@ -93,13 +104,16 @@ std::size_t gpt2_word(std::string_view text) {
   return white_space(text);
 }
 
-std::size_t qwen2_word(std::string_view text) {
+namespace {
+
+/// `n_digit`: the most numbers that are one word.
+std::size_t word_of(std::string_view text, int n_digit) {
   constexpr std::string_view kLineEnds = "\r\n";
   if (const std::size_t size = contraction_of_any_case(text)) return size;
   const unicode::Char first = unicode::first(text);
   const std::uint8_t first_kind = kind(first.code_point);
   if (first_kind == unicode::kLetter) return run(text, unicode::kLetter);
-  if (first_kind == unicode::kNumber) return first.size;
+  if (first_kind == unicode::kNumber) return numbers(text, n_digit);
   if (kLineEnds.find(text[0]) == std::string_view::npos)
     if (const std::size_t letters = run(text.substr(first.size), unicode::kLetter)) return first.size + letters;
   const std::size_t blank = text[0] == ' ' ? 1 : 0;
@@ -109,6 +123,11 @@ std::size_t qwen2_word(std::string_view text) {
   if (const std::size_t end = spaces.find_last_of(kLineEnds); end != std::string_view::npos) return end + 1;
   return white_space(text);
 }
+
+}  // namespace
+
+std::size_t qwen2_word(std::string_view text) { return word_of(text, 1); }
+std::size_t llama3_word(std::string_view text) { return word_of(text, 3); }
 
 Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
   VLA_TRY(const Json list, parse_json_list(json, kWhere));
@@ -126,8 +145,8 @@ Result<Pretokenizer> Pretokenizer::parse(const std::string& json) {
       VLA_TRY(const bool individual, fields.boolean("individual"));
       pretokenizer.steps_.push_back(individual ? Step::digits_individual : Step::digits_together);
     } else if (type == 1) {
-      VLA_CHECK(fields.choice("pattern", {kQwen2Words}));
-      pretokenizer.steps_.push_back(Step::qwen2_words);
+      VLA_TRY(const int words, fields.choice("pattern", {kQwen2Words, kLlama3Words}));
+      pretokenizer.steps_.push_back(words == 0 ? Step::qwen2_words : Step::llama3_words);
     } else {
       VLA_TRY(pretokenizer.add_prefix_space_, fields.boolean("add_prefix_space"));
       VLA_TRY(pretokenizer.use_regex_, fields.boolean("use_regex"));
@@ -148,6 +167,7 @@ void Pretokenizer::split_from(std::size_t step, std::string_view text,
   if (step == steps_.size()) return split_bytes(text, on_word);
   const auto emit = [&](std::string_view piece) { split_from(step + 1, piece, on_word); };
   if (steps_[step] == Step::qwen2_words) return split_words(qwen2_word, text, emit);
+  if (steps_[step] == Step::llama3_words) return split_words(llama3_word, text, emit);
   split_digits(steps_[step] == Step::digits_individual, text, emit);
 }
 

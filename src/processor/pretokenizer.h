@@ -23,7 +23,7 @@ class Pretokenizer {
   void split(std::string_view text, const std::function<void(std::string_view)>& on_word) const;
 
  private:
-  enum class Step { digits_together, digits_individual, qwen2_words };
+  enum class Step { digits_together, digits_individual, qwen2_words, llama3_words };
 
   void split_from(std::size_t step, std::string_view text, const std::function<void(std::string_view)>& on_word) const;
   void split_bytes(std::string_view text, const std::function<void(std::string_view)>& on_word) const;
@@ -37,11 +37,15 @@ class Pretokenizer {
 /// `'s|'t|'re|'ve|'m|'ll|'d| ?\p{L}+| ?\p{N}+| ?[^\s\p{L}\p{N}]+|\s+(?!\S)|\s+`, which matches everywhere.
 std::size_t gpt2_word(std::string_view text);
 
-/// The splitting expression of Qwen2, the only one that a split step may name.
+/// The splitting expressions of Qwen2 and of Llama 3, which a split step may name: they differ in how many digits are
+/// one word.
 inline constexpr const char* kQwen2Words =
     R"((?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+)";
+inline constexpr const char* kLlama3Words =
+    R"((?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}{1,3}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+)";
 
-/// Bytes of its first match at the start of non-empty, valid UTF-8; it matches everywhere, too.
+/// Bytes of the first match at the start of non-empty, valid UTF-8; both match everywhere, too.
 std::size_t qwen2_word(std::string_view text);
+std::size_t llama3_word(std::string_view text);
 
 }  // namespace vla

@@ -36,11 +36,12 @@ struct Run {
   int start, size;
 };
 
-std::vector<Run> runs_of(std::int32_t token, std::span<const std::int32_t> tokens) {
+/// Of `longest` tokens at most: the next one begins another run.
+std::vector<Run> runs_of(std::int32_t token, std::span<const std::int32_t> tokens, int longest) {
   std::vector<Run> runs;
   for (std::size_t i = 0; i < tokens.size(); ++i) {
     if (tokens[i] != token) continue;
-    if (i == 0 || tokens[i - 1] != token) runs.push_back({static_cast<int>(i), 0});
+    if (i == 0 || tokens[i - 1] != token || runs.back().size == longest) runs.push_back({static_cast<int>(i), 0});
     ++runs.back().size;
   }
   return runs;
@@ -141,7 +142,7 @@ Status Processor::read_view_places(const Keys& keys) {
   const auto prompt = fill_prompt({}, {});
   if (!prompt) return misfit("processor.recipe.text", prompt.error().expected, prompt.error().found);
   VLA_TRY(const std::vector<std::int32_t> tokens, tokenizer_.encode(*prompt, kMaxPrompt));
-  const std::vector<Run> runs = runs_of(view_token_, tokens);
+  const std::vector<Run> runs = runs_of(view_token_, tokens, views->repeat);
   std::vector<int> found;
   const int n_token = static_cast<int>(tokens.size());
   for (const Run& run : runs) found.push_back(views_behind_ ? n_token - run.start : run.start);

@@ -41,4 +41,16 @@ std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int 
 std::vector<std::uint8_t> resample_torch_linear(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                                 int to_height);
 
+/// The same by tf.image.resize with lanczos3 and antialiasing (TensorFlow 2.18): rows first, summed in float32, rounded
+/// half to even. Sources: tensorflow core/kernels/image/scale_and_translate_op.cc, sampling_kernels.h.
+std::vector<std::uint8_t> resample_tensorflow_lanczos3(std::span<const std::uint8_t> rgb, int width, int height,
+                                                       int to_width, int to_height);
+
+/// The middle of an image, `area` of it, stretched to a size by tf.image.crop_and_resize on byte / 255: the corners of
+/// the crop are the corners of the result, pixels are blended without antialiasing, and 255.5 times the result loses
+/// what is behind the point. Sources: tensorflow core/kernels/image/crop_and_resize_op.cc, image_ops_impl.py
+/// (convert_image_dtype); BitVLA experiments/robot/openvla_utils.py (center_crop_image).
+std::vector<std::uint8_t> crop_tensorflow(std::span<const std::uint8_t> rgb, int width, int height, double area,
+                                          int to_width, int to_height);
+
 }  // namespace vla

@@ -82,17 +82,21 @@ Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::strin
   VLA_TRY(model.pretokenizer, Pretokenizer::parse(pre));
   VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, is_added));
   model_ = std::move(model);
-  return {};
+  return keys.has("tokenizer.prefix_ids") ? read_prefix(keys, tokens.size()) : Status();
 }
 
 Status Tokenizer::read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens) {
   VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
-  VLA_TRY(prefix_, keys.integers("tokenizer.prefix_ids", {0, tokens.size() - 1.0}));
-  if (prefix_.size() > kMaxPrefix)
-    return Error{Code::bad_bundle, "tokenizer.prefix_ids", "at most " + std::to_string(kMaxPrefix) + " ids",
-                 std::to_string(prefix_.size())};
+  VLA_CHECK(read_prefix(keys, tokens.size()));
   VLA_TRY(model_, ByteFallbackBpe::create(tokens, merges));
   return {};
+}
+
+Status Tokenizer::read_prefix(const Keys& keys, std::size_t n_token) {
+  VLA_TRY(prefix_, keys.integers("tokenizer.prefix_ids", {0, static_cast<double>(n_token) - 1.0}));
+  if (prefix_.size() <= kMaxPrefix) return {};
+  return Error{Code::bad_bundle, "tokenizer.prefix_ids", "at most " + std::to_string(kMaxPrefix) + " ids",
+               std::to_string(prefix_.size())};
 }
 
 void Tokenizer::encode_piece(std::string_view piece, Ids& ids) const {

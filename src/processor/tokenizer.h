@@ -46,6 +46,7 @@ class Tokenizer {
   Status read_byte_level(const Keys& keys, const std::vector<std::string>& tokens,
                          const std::vector<AddedToken>& added);
   Status read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens);
+  Status read_prefix(const Keys& keys, std::size_t n_token);
   void encode_piece(std::string_view piece, Ids& ids) const;
 
   AddedTokens added_;

@@ -27,8 +27,9 @@ TEST_CASE("normalize and unnormalize equal the reference bit for bit in every ki
     CAPTURE(test["inverse"]);
     const Direction direction = test["inverse"] ? Direction::unnormalize : Direction::normalize;
     std::vector<float> values = floats(test["x"]);
-    Normalizer(norm_rule(test["kind"].get<std::string>()), direction, test["eps"], floats(test["low"]),
-               floats(test["high"]))
+    const std::vector<float> low = floats(test["low"]), high = floats(test["high"]);
+    Normalizer(norm_rule(test["kind"].get<std::string>()), direction, test["eps"], {low.begin(), low.end()},
+               {high.begin(), high.end()})
         .apply(values);
     CHECK(values == floats(test["y"]));
     ++compared;

@@ -67,11 +67,11 @@ TEST_CASE("nine tokenizers give the reference's ids on four and a half thousand 
       ++compared;
     }
   }
-  CHECK(compared == 4500);
+  CHECK(compared == 5000);
 }
 
 TEST_CASE("a word of 64 KiB takes milliseconds") {
-  for (const char* name : {"smol", "tangled", "qwen", "gemma"}) {
+  for (const char* name : {"smol", "tangled", "qwen", "llama", "gemma"}) {
     const Keys keys = tokenizer_keys(name);
     std::string longest, word;  // repeated, the longest token of letters merges most
     const auto tokens = *keys.strings("tokenizer.tokens");

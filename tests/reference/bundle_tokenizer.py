@@ -28,8 +28,11 @@ def byte_level(spec: dict) -> dict:
     steps = pre["pretokenizers"] if pre["type"] == "Sequence" else [pre]
     assert spec["normalizer"] in (None, {"type": "NFC"})
     normalization = {"tokenizer.normalization": "nfc"} if spec["normalizer"] else {}
+    posts = (spec["post_processor"] or {}).get("processors", [spec["post_processor"]])
+    front = [ids for post in posts if post and post["type"] == "TemplateProcessing" for ids in prefix(post)]
     return {
         **normalization,
+        **({"tokenizer.prefix_ids": front} if front else {}),
         "tokenizer.kind": "byte_level_bpe",
         "tokenizer.pre": json.dumps([step_of(step) for step in steps]),
         "tokenizer.ignore_merges": spec["model"]["ignore_merges"],
@@ -40,11 +43,13 @@ def byte_fallback(spec: dict) -> dict:
     """The blank that the pre-tokenizer splits at is gone by then: the normalizer has replaced it."""
     assert spec["normalizer"] == {"type": "Replace", "pattern": {"String": " "}, "content": "\u2581"}
     assert spec["pre_tokenizer"] is None or spec["pre_tokenizer"]["pattern"] == {"String": " "}
-    front = []
-    if spec["post_processor"] is not None:
-        single, special = spec["post_processor"]["single"], spec["post_processor"]["special_tokens"]
-        front = [id for part in single if "SpecialToken" in part for id in special[part["SpecialToken"]["id"]]["ids"]]
+    front = [] if spec["post_processor"] is None else prefix(spec["post_processor"])
     return {"tokenizer.kind": "byte_fallback_bpe", "tokenizer.prefix_ids": front}
+
+
+def prefix(template: dict) -> list:
+    special = template["special_tokens"]
+    return [id for part in template["single"] if "SpecialToken" in part for id in special[part["SpecialToken"]["id"]]["ids"]]
 
 
 def step_of(step: dict) -> dict:

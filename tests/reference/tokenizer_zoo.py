@@ -9,7 +9,7 @@ import random
 import sys
 import unicodedata
 
-from tokenizers import AddedToken, Regex, Tokenizer, models, normalizers, pre_tokenizers, trainers
+from tokenizers import AddedToken, Regex, Tokenizer, models, normalizers, pre_tokenizers, processors, trainers
 
 SENTENCES = """
 pick up the red cube and place it in the bowl
@@ -134,6 +134,7 @@ def tangled() -> Tokenizer:
 
 
 QWEN2 = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
+LLAMA3 = QWEN2.replace(r"|\p{N}|", r"|\p{N}{1,3}|")
 
 
 def qwen() -> Tokenizer:
@@ -143,6 +144,18 @@ def qwen() -> Tokenizer:
     tokenizer.normalizer = normalizers.NFC()
     specials = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>"]
     tokenizer.add_special_tokens([AddedToken(text, normalized=False, special=True) for text in specials])
+    return tokenizer
+
+
+def llama() -> Tokenizer:
+    """The shape of Llama 3's: up to three digits are a word, words that are tokens skip the merges, and a token stands in front."""
+    steps = [pre_tokenizers.Split(Regex(LLAMA3), "isolated"), pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)]
+    tokenizer = train(pre_tokenizers.Sequence(steps), 700, [])
+    tokenizer.model.ignore_merges = True
+    specials = ["<|begin_of_text|>", "<|end_of_text|>", "<|eot_id|>", "<|image_pad|>", "<proprio_pad>"]
+    tokenizer.add_special_tokens([AddedToken(text, normalized=False, special=True) for text in specials])
+    template = processors.TemplateProcessing("<|begin_of_text|> $A", special_tokens=[(specials[0], tokenizer.token_to_id(specials[0]))])
+    tokenizer.post_processor = processors.Sequence([processors.ByteLevel(trim_offsets=True), template])
     return tokenizer
 
 
@@ -240,6 +253,7 @@ ZOO = {
     "tangled": tangled,
     "qwen": qwen,
     "qwen_awkward": qwen_awkward,
+    "llama": llama,
     "gemma": gemma,
     "gemma_awkward": gemma_awkward,
     "gemma_tangled": gemma_tangled,

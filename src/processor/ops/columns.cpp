@@ -35,6 +35,13 @@ void map_columns(const Threshold& op, std::span<float> values) {
   }
 }
 
+void map_columns(const Sign& op, std::span<float> values) {
+  for (const int column : op.columns) {
+    float& value = values[static_cast<std::size_t>(column)];
+    if (value != 0.0f && !std::isnan(value)) value = std::copysign(1.0f, value);
+  }
+}
+
 void hold(const Clip& op, std::span<float> values) {
   for (float& value : values)
     if (std::isfinite(value)) value = std::clamp(value, op.low, op.high);
@@ -52,15 +59,14 @@ std::vector<int> bins(const Bins& op, std::span<const float> values) {
   return numbers;
 }
 
-namespace {
-
-/// The columns that an op names must exist.
 Status check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where) {
   for (const int column : columns)
     if (static_cast<std::size_t>(column) >= width)
       return misfit(where + ".columns", fmt::format("columns below {}", width), std::to_string(column));
   return {};
 }
+
+namespace {
 
 Status read(JsonFields& fields, ColumnAffine& op) {
   VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
@@ -83,6 +89,11 @@ Status read(JsonFields& fields, Threshold& op) {
   VLA_TRY(op.above, fields.number("above", kPlain));
   VLA_TRY(op.then, fields.number("then", kPlain));
   VLA_TRY(op.otherwise, fields.number("else", kPlain));
+  return {};
+}
+
+Status read(JsonFields& fields, Sign& op) {
+  VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
   return {};
 }
 
@@ -183,6 +194,7 @@ Ops columns_ops() {
           {"state", "clip", parse_state_clip},
           {"action", "affine", parse_action<ColumnActionOp<ColumnAffine>>},
           {"action", "threshold", parse_action<ColumnActionOp<Threshold>>},
+          {"action", "sign", parse_action<ColumnActionOp<Sign>>},
           {"action", "clip", parse_action<ClipActionOp>},
           {"action", "add_state", parse_add_state}};
 }

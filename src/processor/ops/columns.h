@@ -3,11 +3,15 @@
 #pragma once
 
 #include <span>
+#include <string>
 #include <vector>
 
 #include "processor/ops/op.h"
 
 namespace vla {
+
+/// The columns that an op names must exist. `where` is the op's place. Errors: bad_bundle.
+Status check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where);
 
 /// `x * scale + shift` in the columns named.
 struct ColumnAffine {
@@ -32,6 +36,11 @@ struct Threshold {
   float above = 0.0f;
   float then = 0.0f;
   float otherwise = 0.0f;
+};
+
+/// In the columns named, -1, 0 or 1.
+struct Sign {
+  std::vector<int> columns;
 };
 
 struct Clip {
@@ -62,6 +71,9 @@ void map_columns(const HornAngle& op, std::span<float> values);
 /// finite number stays, so that it is still found.
 /// Source: lerobot policies/evo1/processor_evo1.py (Evo1ActionProcessorStep).
 void map_columns(const Threshold& op, std::span<float> values);
+
+/// The sign of every value, in place: 0 of 0. What is not a number stays, so that it is still found.
+void map_columns(const Sign& op, std::span<float> values);
 
 /// Every value held between the two of a clip, in place. What is not a finite number stays, so that it is still found.
 void hold(const Clip& op, std::span<float> values);

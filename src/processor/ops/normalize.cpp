@@ -7,8 +7,10 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <optional>
 #include <utility>
 
+#include "processor/ops/columns.h"
 #include "processor/recipe.h"
 
 namespace vla {
@@ -39,9 +41,9 @@ double spread_of(const NormRule& rule, bool divides, T low, T high, T eps) {
   return rule.eps == Eps::replaces_zero && spread == 0 ? eps : spread;
 }
 
-Result<std::vector<float>> read_statistics(const Bundle& bundle, const std::string& name, int width,
-                                           const std::string& where) {
-  VLA_TRY(std::vector<float> values, bundle.stats(name));
+Result<std::vector<double>> read_statistics(const Bundle& bundle, const std::string& name, int width,
+                                            const std::string& where) {
+  VLA_TRY(std::vector<double> values, bundle.stats(name));
   if (values.size() == static_cast<std::size_t>(width)) return values;
   return Error{Code::bad_bundle, name, fmt::format("{} numbers for {}", width, where), std::to_string(values.size())};
 }
@@ -54,19 +56,21 @@ const NormRule& norm_rule(std::string_view kind) {
   return *std::find_if(std::begin(kRules), std::end(kRules), [&](const NormRule& rule) { return rule.kind == kind; });
 }
 
-Normalizer::Normalizer(const NormRule& rule, Direction direction, double eps, std::vector<float> low,
-                       const std::vector<float>& high)
+Normalizer::Normalizer(const NormRule& rule, Direction direction, double eps, std::vector<double> low,
+                       const std::vector<double>& high)
     : rule_(&rule), direction_(direction), low_(std::move(low)) {
   const bool divides = direction == Direction::normalize;
   for (std::size_t i = 0; i < low_.size(); ++i)
     spread_.push_back(rule.wide ? spread_of<double>(rule, divides, low_[i], high[i], eps)
-                                : spread_of<float>(rule, divides, low_[i], high[i], static_cast<float>(eps)));
+                                : spread_of<float>(rule, divides, static_cast<float>(low_[i]),
+                                                   static_cast<float>(high[i]), static_cast<float>(eps)));
 }
 
 Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormRule& rule, const std::string& stats, double eps,
                                       Direction direction, int width, const std::string& where) {
-  VLA_TRY(std::vector<float> low, read_statistics(bundle, fmt::format("{}.{}", stats, rule.low), width, where));
-  VLA_TRY(const std::vector<float> high, read_statistics(bundle, fmt::format("{}.{}", stats, rule.high), width, where));
+  VLA_TRY(std::vector<double> low, read_statistics(bundle, fmt::format("{}.{}", stats, rule.low), width, where));
+  VLA_TRY(const std::vector<double> high,
+          read_statistics(bundle, fmt::format("{}.{}", stats, rule.high), width, where));
   Normalizer normalizer(rule, direction, eps, std::move(low), high);
   if (direction == Direction::unnormalize) return normalizer;
   for (std::size_t i = 0; i < normalizer.spread_.size(); ++i) {
@@ -80,7 +84,7 @@ Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormRule& rule
 
 template <class T>
 T Normalizer::mapped(T x, std::size_t column) const {
-  const T low = low_[column], spread = static_cast<T>(spread_[column]);
+  const T low = static_cast<T>(low_[column]), spread = static_cast<T>(spread_[column]);
   const bool range = rule_->spread == Spread::range, normalize = direction_ == Direction::normalize;
   if (spread == 0 && rule_->eps == Eps::none && (normalize || !range)) return range ? T{0} : x;
   if (normalize) return range ? 2 * (x - low) / spread - 1 : (x - low) / spread;
@@ -178,16 +182,21 @@ Status parse_normalize(JsonFields& fields, Recipe& recipe) {
 class UnnormalizeOp final : public ActionOp {
  public:
   Fields fields;
+  std::optional<std::vector<int>> columns;  // the others pass
 
   Status bind(ActionLayout& layout, const std::string& where) override {
     if (fields.rule == nullptr) return {};
+    if (columns) VLA_CHECK(check_columns(*columns, static_cast<std::size_t>(layout.width), where));
     VLA_TRY(Normalizer normalizer, Normalizer::create(layout.bundle, *fields.rule, fields.stats, fields.eps,
                                                       Normalizer::Direction::unnormalize, layout.width, where));
     normalizer_.push_back(std::move(normalizer));
     return {};
   }
   void apply(std::vector<float>& row, std::span<const float>) const override {
-    for (const Normalizer& normalizer : normalizer_) normalizer.apply(row);
+    std::vector<float> mapped = row;
+    for (const Normalizer& normalizer : normalizer_) normalizer.apply(mapped);
+    if (!columns) return row.swap(mapped);
+    for (const int column : *columns) row[static_cast<std::size_t>(column)] = mapped[static_cast<std::size_t>(column)];
   }
   bool reads(const std::string& tensor) const override { return fields.reads(tensor); }
 
@@ -199,6 +208,9 @@ Status parse_unnormalize(JsonFields& fields, Recipe& recipe) {
   auto op = std::make_unique<UnnormalizeOp>();
   VLA_CHECK(read(fields, op->fields));
   if (!op->fields.feature.empty()) return fields.wrong("feature", "no such field here");
+  if (fields.has("columns")) {
+    VLA_TRY(op->columns, fields.integers("columns", 0, kMaxVector - 1));
+  }
   recipe.action.push_back(std::move(op));
   return {};
 }

@@ -48,8 +48,8 @@ class Normalizer {
   static Result<Normalizer> create(const Bundle& bundle, const NormRule& rule, const std::string& stats, double eps,
                                    Direction direction, int width, const std::string& where);
   /// The same with the two statistics given, of equal length.
-  Normalizer(const NormRule& rule, Direction direction, double eps, std::vector<float> low,
-             const std::vector<float>& high);
+  Normalizer(const NormRule& rule, Direction direction, double eps, std::vector<double> low,
+             const std::vector<double>& high);
 
   /// In place; as many values as columns.
   void apply(std::span<float> values) const;
@@ -60,7 +60,7 @@ class Normalizer {
 
   const NormRule* rule_;
   Direction direction_;
-  std::vector<float> low_;
+  std::vector<double> low_;
   std::vector<double> spread_;  // in the precision of the rule
 };
 

@@ -90,6 +90,10 @@ Image applied(const ByteOp& op, const Image& from, int width, int height) {
     return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
   if (const auto* resize = std::get_if<ByteResize>(&op)) return {width, height, resized(from, *resize)};
   if (const auto* crop = std::get_if<CenterCrop>(&op)) return cropped(from, *crop);
+  if (const auto* crop = std::get_if<CropAndResize>(&op))
+    return {width, height, crop_tensorflow(from.rgb, from.width, from.height, crop->area, width, height)};
+  if (std::holds_alternative<Lanczos3>(op))
+    return {width, height, resample_tensorflow_lanczos3(from.rgb, from.width, from.height, width, height)};
   return centred(from, width, height);
 }
 
@@ -173,6 +177,14 @@ Status parse_crop_fraction(JsonFields& fields, Recipe& recipe) {
   return add(fields, recipe, op);
 }
 
+Status parse_crop_and_resize(JsonFields& fields, Recipe& recipe) {
+  CropAndResize op;
+  VLA_TRY(op.area, fields.wide_number("area", {1e-6, 1}));
+  VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
+  VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
+  return add(fields, recipe, op);
+}
+
 template <class Op>
 Status parse_stated_size(JsonFields& fields, Recipe& recipe) {
   Op op;
@@ -207,6 +219,8 @@ Ops pipeline_ops() {
   return {{"image", "square_pad", parse_square_pad},
           {"image", "smallest_side", parse_smallest_side},
           {"image", "crop_fraction", parse_crop_fraction},
+          {"image", "crop_and_resize", parse_crop_and_resize},
+          {"image", "lanczos3", parse_stated_size<Lanczos3>},
           {"image", "camera_size", parse_stated_size<CameraSize>},
           {"image", "center_crop", parse_stated_size<CenterCrop>},
           {"image", "size", parse_size}};

@@ -47,7 +47,21 @@ struct CenterCrop {
   int height = 0;
 };
 
-using ByteOp = std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop>;
+/// A size whatever the aspect, by `resample_tensorflow_lanczos3`.
+struct Lanczos3 {
+  int width = 0;
+  int height = 0;
+};
+
+/// `crop_tensorflow`.
+struct CropAndResize {
+  double area = 0.0;
+  int width = 0;
+  int height = 0;
+};
+
+using ByteOp =
+    std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop, Lanczos3, CropAndResize>;
 
 /// Ops on 8-bit images one after the other, and the size at which they must come out.
 struct Pipeline {
