@@ -86,7 +86,7 @@ REFUSED = {
     "post_processor: expected a template of special tokens and then the text": spec(
         post_processor={"type": "TemplateProcessing", "single": AFTER, "special_tokens": {}}
     ),
-    "post_processor.special_tokens: expected ids below": lambda tiny: tiny.tokenizer["post_processor"].update(
+    "post_processor.special_tokens: expected an id below": lambda tiny: tiny.tokenizer["post_processor"].update(
         special_tokens={"<bos>": {"ids": [N_VOCAB]}}
     ),
     "add_eos_token: expected False, found True": config(add_eos_token=True),

@@ -11,7 +11,7 @@ from tiny import N_VOCAB, SPECIAL, write_json
 from vla_cpp.convert import Code
 from vla_cpp.convert.errors import ConvertError, Problems
 from vla_cpp.convert.tokenizer import read_tokenizer
-from vla_cpp.convert.tokenizer_byte_level import QWEN2_WORDS, SPLIT
+from vla_cpp.convert.tokenizer_byte_level import QWEN2_WORDS, SPLITS
 
 BYTES = {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": False}
 STEPS = [
@@ -24,7 +24,7 @@ NAMED = dict.fromkeys(("unk_token", "bos_token", "eos_token", "pad_token"), SPEC
 @pytest.fixture
 def qwen(tiny):
     tiny.tokenizer["normalizer"] = {"type": "NFC"}
-    tiny.tokenizer["pre_tokenizer"] = {"type": "Sequence", "pretokenizers": [SPLIT, BYTES]}
+    tiny.tokenizer["pre_tokenizer"] = {"type": "Sequence", "pretokenizers": [SPLITS[QWEN2_WORDS], BYTES]}
     return tiny
 
 
@@ -49,9 +49,9 @@ def test_the_qwen2_class_brings_its_own_splitting(converter, tiny):
 
 @pytest.mark.parametrize("change", [{"behavior": "Removed"}, {"invert": True}, {"pattern": {"Regex": "\\\\s+"}}])
 def test_another_split_is_refused(converter, qwen, change):
-    qwen.tokenizer["pre_tokenizer"]["pretokenizers"][0] = {**SPLIT, **change}
+    qwen.tokenizer["pre_tokenizer"]["pretokenizers"][0] = {**SPLITS[QWEN2_WORDS], **change}
     error = converter.refusal(qwen)
-    assert error.code == Code.UNSUPPORTED and "expected Digits, the Split of Qwen2 and ByteLevel" in error.message()
+    assert error.code == Code.UNSUPPORTED and "expected Digits, the Split of Qwen2 or Llama 3 and ByteLevel" in error.message()
 
 
 def write_vocab_files(folder, spec, **changes):

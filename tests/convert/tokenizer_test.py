@@ -189,20 +189,21 @@ CASES = {
     "model.continuing_subword_prefix: expected None, found '##'": (model(continuing_subword_prefix="##"), UNSUPPORTED),
     "model.end_of_word_suffix: expected None, found '</w>'": (model(end_of_word_suffix="</w>"), UNSUPPORTED),
     "normalizer: expected none or NFC, found": (spec(normalizer={"type": "NFKC"}), UNSUPPORTED),
-    'pre_tokenizer: expected Digits, the Split of Qwen2 and ByteLevel, found {"type":"Metaspace"': (
+    'pre_tokenizer: expected Digits, the Split of Qwen2 or Llama 3 and ByteLevel, found {"type":"Metaspace"': (
         spec(pre_tokenizer={"type": "Metaspace"}),
         UNSUPPORTED,
     ),
-    "pre_tokenizer: expected Digits, the Split of Qwen2 and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
+    "pre_tokenizer: expected Digits, the Split of Qwen2 or Llama 3 and ByteLevel, found null": (spec(pre_tokenizer=None), UNSUPPORTED),
     "pre_tokenizer: expected ByteLevel once, as the last step": (spec(pre_tokenizer=SEQUENCE), UNSUPPORTED),
-    "post_processor: expected none, ByteLevel, or a template of the text alone": (
-        spec(post_processor={"type": "TemplateProcessing", "single": BOS}),
+    "post_processor: expected a template of special tokens and then the text": (
+        spec(post_processor={"type": "TemplateProcessing", "single": BOS[::-1]}),
         UNSUPPORTED,
     ),
+    "post_processor.special_tokens: expected an id below": (spec(post_processor={"type": "TemplateProcessing", "single": BOS}), BAD),
     "added_tokens: expected tokens with id and content": (spec(added_tokens=[{"id": "0", "content": "x"}]), BAD),
     "tokenizer_class: expected TokenizersBackend or": (settings(tokenizer_class="LlamaTokenizer"), UNSUPPORTED),
     "truncation_side: expected 'left' or 'right', found 'middle'": (settings(truncation_side="middle"), UNSUPPORTED),
-    "add_bos_token: expected False, found True": (settings(add_bos_token=True), UNSUPPORTED),
+    "add_bos_token: expected False, as the template of tokenizer.json has it, found True": (settings(add_bos_token=True), BAD),
     "split_special_tokens: expected False, found True": (settings(split_special_tokens=True), UNSUPPORTED),
     "pad_token: expected a token among the added tokens of tokenizer.json, found '<pad>'": (
         settings(pad_token="<pad>"),

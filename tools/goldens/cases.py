@@ -79,8 +79,8 @@ def conversion_options(folder):
 
 
 def backbone_folder(checkpoint):
-    """What the hub keeps in another repository: the backbone of SmolVLA, the tokenizer of pi0."""
-    return next(p for p in (Path(checkpoint) / "vlm", Path(checkpoint) / "tokenizer") if p.is_dir())
+    """What the hub keeps in another repository: the backbone of SmolVLA, the tokenizer of pi0; None where everything is in one."""
+    return next((p for p in (Path(checkpoint) / "vlm", Path(checkpoint) / "tokenizer") if p.is_dir()), None)
 
 
 def write_bundle(folder, out=None, dtype="bf16"):
@@ -88,7 +88,8 @@ def write_bundle(folder, out=None, dtype="bf16"):
     from vla_cpp.convert import cli
 
     checkpoint = folder / "checkpoint"
-    code = cli.main([str(checkpoint), "--backbone", str(backbone_folder(checkpoint)), "-o", str(out or folder / "bundle.gguf"),
+    backbone = backbone_folder(checkpoint)
+    code = cli.main([str(checkpoint), *(["--backbone", str(backbone)] if backbone else []), "-o", str(out or folder / "bundle.gguf"),
                      "--dtype", dtype, "--force", "--quiet", *conversion_options(folder)])
     if code:
         raise SystemExit(code)

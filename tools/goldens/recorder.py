@@ -21,7 +21,7 @@ import numpy as np
 
 from . import family
 
-PACKAGES = ("lerobot", "transformers", "torch", "tokenizers", "pillow", "numpy")
+PACKAGES = ("lerobot", "transformers", "torch", "tensorflow_cpu", "tokenizers", "pillow", "numpy")
 
 
 # --- making the reference importable -----------------------------------------------------------------------------
@@ -78,7 +78,8 @@ def open_reference():
 
 
 def versions() -> str:
-    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+    found = {d.name.lower(): d.version for d in importlib.metadata.distributions() if d.name}
+    return ", ".join(f"{name} {found[name]}" for name in PACKAGES if name in found)
 
 
 # --- the reference, run on one case -------------------------------------------------------------------------------
@@ -87,7 +88,7 @@ def versions() -> str:
 def config_type(checkpoint) -> str:
     """The type that LeRobot's config.json names.  Authors' files have none: GR00T's give the model, Evo-1's nothing."""
     config = json.loads((Path(checkpoint) / "config.json").read_text())
-    return config.get("type") or {"gr00t_n1_5": "gr00t_n1_5", "Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}.get(config.get("model_type"), "evo1")
+    return config.get("type") or {"bitvla": "bitvla", "gr00t_n1_5": "gr00t_n1_5", "Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}.get(config.get("model_type"), "evo1")
 
 
 def described(checkpoint) -> str:
@@ -223,7 +224,7 @@ class ChunkRecorder(Taps):
 
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
-    stages = ("pixels", "tokens", "state", "position_ids", "vision", "deepstack", "connector", "projector", "prefix", "lm",
+    stages = ("pixels", "tokens", "state", "position_ids", "vision", "deepstack", "connector", "connector_down", "projector", "prefix", "lm",
               "vl", "state_in", "state_out", "expert", "head", "dit", "step", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)

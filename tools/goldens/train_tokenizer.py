@@ -22,6 +22,14 @@ QWEN_VL = [f"<|{name}|>" for name in (
     "endoftext", "im_start", "im_end", "object_ref_start", "object_ref_end", "box_start", "box_end", "quad_start", "quad_end",
     "vision_start", "vision_end", "vision_pad", "image_pad", "video_pad")]
 EAGLE = [*QWEN_VL, "<IMG_CONTEXT>", "<img>", "</img>"]
+LLAMA3 = ["<|begin_of_text|>", "<|end_of_text|>", "<|pad|>", *(f"<|reserved_special_token_{i}|>" for i in (1, 2, 3)),
+          "<|start_header_id|>", "<|end_header_id|>", "<|reserved_special_token_4|>", "<|eot_id|>", "<|image_pad|>", "<proprio_pad>",
+          *(f"<action_{i}>" for i in range(4))]
+LLAMA3_WORDS = (r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}{1,3}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+")
+SYSTEM = "System: A robot listens to a human. It answers with motions."
+LLAMA3_TEMPLATE = (
+    "{% set loop_messages = messages %}{% for message in loop_messages %}{% set content = message['role'] | capitalize + ': '"
+    "+ message['content'] | trim + '<|eot_id|>' %}{{ content }}{% endfor %}{% if add_generation_prompt %}{{ 'Assistant: ' }}{% endif %}")
 QWEN_TEMPLATE = (
     "{% for message in messages %}<|im_start|>{{ message.role }}\n{% for part in message.content %}{% if part.type == 'image' %}"
     "<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part.text }}{% endif %}{% endfor %}<|im_end|>\n{% endfor %}"
@@ -119,5 +127,30 @@ def eagle(folder):
     write_slow(spec, folder)
 
 
+def bitvla(folder, n_merge=120):
+    """Llama 3's rules with other merges; the added tokens follow the vocabulary in the published order, with a few action tokens."""
+    from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, processors, trainers
+
+    fast = Tokenizer(models.BPE(ignore_merges=True))
+    fast.pre_tokenizer = pre_tokenizers.Sequence([
+        pre_tokenizers.Split(Regex(LLAMA3_WORDS), "isolated"), pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False)])
+    fast.decoder = decoders.ByteLevel()
+    corpus = [f"{SYSTEM}User: What action should the robot take to {task}?Assistant: " for task in TASKS]
+    fast.train_from_iterator(corpus, trainers.BpeTrainer(
+        vocab_size=256 + n_merge, initial_alphabet=pre_tokenizers.ByteLevel.alphabet(), show_progress=False))
+    fast.add_special_tokens([AddedToken(t, special=True, normalized=False) for t in LLAMA3])
+    front = "<|begin_of_text|>"
+    fast.post_processor = processors.Sequence([processors.ByteLevel(trim_offsets=True), processors.TemplateProcessing(
+        f"{front} $A", special_tokens=[(front, fast.token_to_id(front))])])
+    folder.mkdir(parents=True, exist_ok=True)
+    fast.save(str(folder / "tokenizer.json"))
+    spec = json.loads(fast.to_str())
+    (folder / "tokenizer_config.json").write_text(json.dumps({
+        "added_tokens_decoder": {str(t["id"]): {k: v for k, v in t.items() if k != "id"} for t in spec["added_tokens"]},
+        "bos_token": front, "eos_token": "<|end_of_text|>", "pad_token": "<|pad|>", "clean_up_tokenization_spaces": False,
+        "chat_template": SYSTEM + "<|eot_id|>" + LLAMA3_TEMPLATE, "model_max_length": 2048,
+        "tokenizer_class": "PreTrainedTokenizerFast"}, indent=1) + "\n")
+
+
 if __name__ == "__main__":
-    {"eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))
+    {"bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))

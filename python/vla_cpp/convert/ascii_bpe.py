@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tokens of the words that a prompt brings itself, which no instruction changes: they say where its image tokens stand.
 
-These words are ASCII, so that Qwen2's expression can be written with the classes that Python's `re` has.
+These words are ASCII without digits, so that Qwen2's and Llama 3's expressions can be written with the classes that Python's `re` has.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class Encoder:
 
     def __init__(self, keys: Sequence[Key]) -> None:
         self.symbols = byte_symbols()
+        self.whole_words = _value(keys, "tokenizer.ignore_merges")
         self.id_of = {text: number for number, text in enumerate(_value(keys, "tokenizer.tokens"))}
         merges = _value(keys, "tokenizer.merges")
         self.ranks: Dict[Tuple[str, ...], int] = {tuple(merge.split(" ")): rank for rank, merge in enumerate(merges)}
@@ -60,6 +61,8 @@ class Encoder:
 
     def word(self, word: str) -> List[str]:
         parts = [self.symbols[byte] for byte in word.encode("ascii")]
+        if self.whole_words and "".join(parts) in self.id_of:
+            return ["".join(parts)]
         while len(parts) > 1:
             pairs = list(zip(parts, parts[1:]))
             rank, at = min((self.ranks.get(pair, len(self.ranks)), i) for i, pair in enumerate(pairs))

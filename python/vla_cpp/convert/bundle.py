@@ -45,7 +45,7 @@ def keys_by_type(groups: Dict[str, Dict[str, object]]) -> List[Key]:
 
 
 class TensorInfo(NamedTuple):
-    """A tensor of the bundle: shape as torch has it, dtype f32, bf16 or f16."""
+    """A tensor of the bundle: shape as torch has it, dtype f32, bf16, f16, i8 or f64."""
 
     name: str
     shape: Tuple[int, ...]

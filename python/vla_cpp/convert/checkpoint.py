@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. What lies in the folder says
-whose layout it is: LeRobot's, openpi's, or that of the authors of Evo-1 or GR00T."""
+whose layout it is: LeRobot's, openpi's, or that of the authors of Evo-1, GR00T or BitVLA."""
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional, Tuple
 
@@ -17,13 +18,16 @@ from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_
 from .safetensors_file import Entry, read_safetensors
 from .torch_file import read_torch
 
-LEROBOT, OPENPI, EVO1 = "lerobot", "openpi", "evo1"  # layouts; those of GR00T are called as its releases
+LEROBOT, OPENPI, EVO1, BITVLA = "lerobot", "openpi", "evo1", "bitvla"  # layouts; those of GR00T are called as its releases
 GR00T_MODELS = {"gr00t_n1_5": "gr00t_n1_5", "Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}  # what config.json states as model_type
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
 # What Evo-1's trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.
 TORCH_FILES = {"mp_rank_00_model_states.pt": "module", "checkpoint.pt": "model_state_dict"}
 NORM_STATS = "norm_stats.json"
+# What BitVLA's trainer writes beside the language model, each with the step in its name.
+SIDECARS = ("action_head", "proprio_projector")
+BITVLA_TYPES = ("bitvla", "openvla")  # what config.json may state as model_type
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 # Where releases without processor files kept statistics: "<group>.buffer_<feature, dots as underscores>.<statistic>".
 OLD_GROUPS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets.")
@@ -93,6 +97,27 @@ def _read_torch_file(folder: str) -> Dict[str, Entry]:
     return read_torch(os.path.join(folder, present[0]), TORCH_FILES[present[0]])
 
 
+def _read_sidecars(folder: str, problems: Problems) -> Dict[str, Entry]:
+    """The tensors of both files under their file's name, without what DistributedDataParallel puts in front."""
+    tensors: Dict[str, Entry] = {}
+    steps = {}
+    for part in SIDECARS:
+        pattern = re.compile(re.escape(part) + r"--(.+)_checkpoint\.pt")
+        found = {name: match[1] for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
+        if len(found) != 1:
+            hint = "the reference loads the only one" if found else "download it beside config.json"
+            problems.add("{}--STEP_checkpoint.pt".format(part), "one such file", ", ".join(found) or "none", hint)
+            continue
+        ((name, steps[part]),) = found.items()
+        for stored, entry in read_torch(os.path.join(folder, name), "").items():
+            own = "{}.{}".format(part, stored[len("module.") :] if stored.startswith("module.") else stored)
+            tensors[own] = entry._replace(name=own)
+    if len(set(steps.values())) > 1:
+        (head, proprio), where = (steps[part] for part in SIDECARS), "{}--{}_checkpoint.pt".format
+        problems.add(where(SIDECARS[1], proprio), "the step of " + where(SIDECARS[0], head), proprio, "give the files of one step")
+    return tensors
+
+
 def _read_tensors(folder: str, layout: str, problems: Problems) -> Tuple[Dict[str, Entry], Dict[str, str]]:
     tensors: Dict[str, Entry] = {}
     aliases: Dict[str, str] = {}
@@ -107,6 +132,8 @@ def _read_tensors(folder: str, layout: str, problems: Problems) -> Tuple[Dict[st
             if name in tensors:
                 problems.add("tensor " + name, "one tensor of this name", "a second one in " + file)
             tensors[name] = entry._replace(name=name)
+    if layout == BITVLA:
+        tensors.update(_read_sidecars(folder, problems))
     return tensors, aliases
 
 
@@ -160,6 +187,8 @@ def _layout(folder: str, config: dict, has_assets: bool) -> str:
         return LEROBOT
     if str(config.get("model_type")) in GR00T_MODELS:
         return GR00T_MODELS[config["model_type"]]
+    if config.get("model_type") in BITVLA_TYPES:
+        return BITVLA
     if any(os.path.exists(os.path.join(folder, name)) for name in (*TORCH_FILES, NORM_STATS)):
         return EVO1
     return OPENPI if has_assets or "action_horizon" in config else LEROBOT

@@ -14,7 +14,7 @@ from .conversion import Summary, convert_checkpoint
 from .errors import Code, ConvertError
 
 DESCRIPTION = """\
-Converts a Vision-Language-Action policy, as LeRobot, openpi or the authors of Evo-1 save it, into one self-contained GGUF
+Converts a Vision-Language-Action policy, as LeRobot, openpi or the authors of Evo-1, GR00T or BitVLA save it, into one self-contained GGUF
 bundle for the vla runtime: weights, tokenizer, image recipe, statistics, feature names. Architectures: {archs}.
 It refuses what it does not fully understand and then lists everything at once."""
 
@@ -166,6 +166,10 @@ def report(summary: Summary) -> str:
             "  rounding  "
             + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor))
         )
+    margin, tensor = summary.ternary
+    if tensor:
+        unsure = ": WARNING, so near it depends on how a mean was rounded" if margin < 1e-6 else ""
+        lines.append("  ternary   the codes change {:.2g} from the nearest number, in {}{}".format(margin, tensor, unsure))
     for reason, tensors in summary.dropped.items():
         lines.append(
             "  dropped   {} ({})".format(

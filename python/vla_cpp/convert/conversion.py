@@ -13,12 +13,13 @@ import numpy as np
 
 from .. import __version__
 from . import archs
-from .archs import MATRIX, TABLE, Options, Plan, Weight
+from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
 from .checkpoint import Checkpoint, given_backbone, open_checkpoint
-from .dtypes import BUNDLE_NAME, WEIGHTS, convert
+from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
 from .errors import Code, Problems, refuse
 from .safetensors_file import Entry
+from .ternary import quantize
 
 Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
 
@@ -35,6 +36,7 @@ class Summary:
     dropped: Dict[str, List[str]] = field(default_factory=dict)  # reason -> tensors
     notes: List[str] = field(default_factory=list)
     rounding: Tuple[float, str] = (0.0, "")  # largest |stored - original| and its tensor
+    ternary: Tuple[float, str] = (1.0, "")  # smallest distance of a number from where its code changes, and its tensor
 
 
 def convert_checkpoint(
@@ -110,7 +112,7 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
     if wanted:
         return wanted
     stored = Counter(
-        checkpoint.tensors[weight.source].dtype
+        "BF16" if weight.in_bf16 else checkpoint.tensors[weight.source].dtype
         for weight in plan.weights
         if weight.kind in (MATRIX, TABLE) and not weight.keep_f32
     )
@@ -126,6 +128,8 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
 
 
 def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
+    if weight.kind == TERNARY:
+        return "i8"
     exact = weight.kind not in (MATRIX, TABLE) or (weight.keep_f32 and stored == "F32")
     return "f32" if exact else dtype
 
@@ -136,7 +140,9 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
         TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype))
         for w in plan.weights
     ]
-    tensors += [TensorInfo(name, value.shape, "f32") for name, value in plan.statistics.items()]
+    tensors += [
+        TensorInfo(name, value.shape, "f64" if value.dtype == np.float64 else "f32") for name, value in plan.statistics.items()
+    ]
     total = sum(tensor.n_bytes for tensor in tensors)
     done = 0
     try:
@@ -175,19 +181,18 @@ def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
 def _stream(
     entry: Entry, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems
 ) -> None:
+    if weight.kind in (TERNARY, SCALE):
+        return _stream_ternary(entry, weight, out, summary, problems)
     finite, overflow = True, False
     for raw in _pieces(entry, weight):
         part = convert(raw, entry.dtype, tensor.dtype)
+        if weight.in_bf16:
+            part = convert(from_f32(to_f32(raw, entry.dtype), "bf16"), "BF16", tensor.dtype)
         finite, overflow = finite and part.finite, overflow or part.overflow
         summary.rounding = max(summary.rounding, (part.error, tensor.name))
         out.write(tensor.name, part.data + np.float32(1) if weight.plus_one else part.data)
     if not finite:
-        problems.add(
-            "tensor " + entry.name,
-            "finite numbers",
-            "NaN or infinity",
-            "the training run diverged or the file is damaged",
-        )
+        _not_finite(entry, problems)
     elif overflow:
         problems.add(
             "tensor {} ({})".format(entry.name, tensor.name),
@@ -196,6 +201,22 @@ def _stream(
             "use --dtype " + ("bf16 or f32" if tensor.dtype == "f16" else "f32"),
             Code.UNSUPPORTED,
         )
+
+
+def _stream_ternary(entry: Entry, weight: Weight, out: BundleWriter, summary: Summary, problems: Problems) -> None:
+    found = quantize(entry)
+    if weight.kind == TERNARY:
+        out.write(weight.target, found.codes)
+        summary.ternary = min(summary.ternary, (found.margin, weight.target))
+        return
+    out.write(weight.target, found.scale)
+    if not np.isfinite(found.scale).all():
+        _not_finite(entry, problems)
+
+
+def _not_finite(entry: Entry, problems: Problems) -> None:
+    hint = "the training run diverged or the file is damaged"
+    problems.add("tensor " + entry.name, "finite numbers", "NaN or infinity", hint)
 
 
 def _identity_keys(checkpoint: Checkpoint, summary: Summary) -> List[Key]:

@@ -34,8 +34,8 @@ WEIGHTS = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "BF16": np.dtype("<u2
 STATISTICS = dict(WEIGHTS, F64=np.dtype("<f8"), I64=np.dtype("<i8"), I32=np.dtype("<i4"))
 
 # Storage names of a bundle, with their numbers in ggml's enum ggml_type.
-GGML_TYPES = {"f32": 0, "f16": 1, "bf16": 30}
-BUNDLE_DTYPES = {"f32": np.dtype("<f4"), "f16": np.dtype("<f2"), "bf16": np.dtype("<u2")}
+GGML_TYPES = {"f32": 0, "f16": 1, "i8": 24, "f64": 28, "bf16": 30}
+BUNDLE_DTYPES = {"f32": np.dtype("<f4"), "f16": np.dtype("<f2"), "i8": np.dtype("i1"), "f64": np.dtype("<f8"), "bf16": np.dtype("<u2")}
 BUNDLE_NAME = {"F32": "f32", "F16": "f16", "BF16": "bf16"}
 
 

@@ -16,6 +16,7 @@ HUB_PATTERNS = [
     "*.json",
     "*.safetensors",
     "mp_rank_00_model_states.pt",
+    "*_checkpoint.pt",
     "tokenizer/*",
     "vlm/*.json",
     "vlm/merges.txt",

@@ -14,7 +14,6 @@ from .bundle import Key
 from .errors import Problems
 from .files import member
 from .tokenizer_parts import (
-    CONFIG_FILE,
     GENERIC,
     JSON_FILE,
     Tokenizer,
@@ -22,6 +21,7 @@ from .tokenizer_parts import (
     check_model,
     check_symbols,
     one_or_sequence,
+    prefix_ids,
     to_json,
 )
 
@@ -69,7 +69,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
                 JSON_FILE + ": pre_tokenizer", "none, or Split at blanks, which are gone by then", to_json(step)[:120]
             )
     _check_characters(tokenizer, problems)
-    return [Key("tokenizer.prefix_ids", "u32[]", _prefix(tokenizer, problems))]
+    return [Key("tokenizer.prefix_ids", "u32[]", prefix_ids(tokenizer, problems))]
 
 
 def _needed_bytes(vocab: dict) -> List[str]:
@@ -87,42 +87,3 @@ def _check_characters(tokenizer: Tokenizer, problems: Problems) -> None:
                 "single characters that the model's vocabulary has too",
                 repr(token["content"]),
             )
-
-
-def _prefix(tokenizer: Tokenizer, problems: Problems) -> List[int]:
-    """The ids in front of every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
-    config and then keeps the template all the same; a config that contradicts it may mean another release."""
-    config = tokenizer.config
-    ids = _template(tokenizer, problems)
-    if config.get("add_eos_token", False) not in (False, None):
-        problems.unsupported(CONFIG_FILE + ": add_eos_token", "False", repr(config["add_eos_token"]))
-    if config.get("add_bos_token") is not None and bool(config["add_bos_token"]) != bool(ids):
-        problems.add(
-            CONFIG_FILE + ": add_bos_token",
-            "{}, as the template of {} has it".format(bool(ids), JSON_FILE),
-            repr(config["add_bos_token"]),
-            "load the tokenizer with transformers and save it again",
-        )
-    return ids
-
-
-def _template(tokenizer: Tokenizer, problems: Problems) -> List[int]:
-    post = tokenizer.spec.get("post_processor")
-    if post is None:
-        return []
-    single = post.get("single") if isinstance(post, dict) else None
-    parts = single if isinstance(single, list) and post.get("type") == "TemplateProcessing" else []
-    kinds = [next(iter(part), None) if isinstance(part, dict) else None for part in parts]
-    if kinds != ["SpecialToken"] * (len(parts) - 1) + ["Sequence"]:
-        problems.unsupported(
-            JSON_FILE + ": post_processor", "a template of special tokens and then the text", to_json(post)[:120]
-        )
-        return []
-    special = member(post, "special_tokens", dict, JSON_FILE)
-    ids: List[int] = []
-    for part in parts[:-1]:
-        name = member(part, "SpecialToken", dict, JSON_FILE).get("id")
-        ids += member(member(special, name, dict, JSON_FILE) if isinstance(name, str) else {}, "ids", list, JSON_FILE)
-    if not all(isinstance(i, int) and 0 <= i < tokenizer.n_vocab for i in ids):
-        problems.add(JSON_FILE + ": post_processor.special_tokens", "ids below {}".format(tokenizer.n_vocab), str(ids))
-    return ids

@@ -12,7 +12,6 @@ from typing import List, NamedTuple, Optional
 
 from .bundle import Key
 from .errors import Problems
-from .files import member
 from .tokenizer_parts import (
     CONFIG_FILE,
     GENERIC,
@@ -23,17 +22,22 @@ from .tokenizer_parts import (
     check_model,
     check_symbols,
     one_or_sequence,
+    prefix_ids,
     to_json,
 )
 
 KIND = "byte_level_bpe"
 GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
 QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
-# The splitting expression of Qwen2, as src/processor/pretokenizer.h has it.
+# The splitting expressions of Qwen2 and Llama 3, as src/processor/pretokenizer.h has them.
 QWEN2_WORDS = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 )
-SPLIT = {"type": "Split", "pattern": {"Regex": QWEN2_WORDS}, "behavior": "Isolated", "invert": False}
+LLAMA3_WORDS = QWEN2_WORDS.replace(r"|\p{N}|", r"|\p{N}{1,3}|")
+SPLITS = {
+    words: {"type": "Split", "pattern": {"Regex": words}, "behavior": "Isolated", "invert": False}
+    for words in (QWEN2_WORDS, LLAMA3_WORDS)
+}
 # What a class names where its config is silent.
 DEFAULTS = {
     **dict.fromkeys(GPT2, ("unk_token", "bos_token", "eos_token")),
@@ -70,7 +74,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     check_model(tokenizer.model, MODEL, "byte-level BPE and BPE with byte fallback", problems)
     check_symbols(tokenizer.model, byte_symbols(), problems)
     _check_surroundings(tokenizer, problems)
-    spec, config = tokenizer.spec, tokenizer.config
+    spec, config, prefix = tokenizer.spec, tokenizer.config, prefix_ids(tokenizer, problems)
     splitting = _Splitting(
         _pre_tokenizer(spec.get("pre_tokenizer"), problems), _normalization(spec.get("normalizer"), problems)
     )
@@ -88,6 +92,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     return [
         Key("tokenizer.pre", "string", to_json(splitting.pre)),
         *normalization,
+        *([Key("tokenizer.prefix_ids", "u32[]", prefix)] if prefix else []),
         Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and own is None),
     ]
 
@@ -115,31 +120,8 @@ def _normalization(normalizer, problems: Problems) -> Optional[str]:
 
 
 def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
-    spec, config = tokenizer.spec, tokenizer.config
-    if not _adds_nothing(spec.get("post_processor")):
-        problems.unsupported(
-            JSON_FILE + ": post_processor",
-            "none, ByteLevel, or a template of the text alone",
-            to_json(spec["post_processor"])[:80],
-        )
-    check_class(config, GENERIC + GPT2 + QWEN2, problems)
-    for key in ("add_bos_token", "add_eos_token"):
-        if config.get(key, False) not in (False, None):
-            problems.unsupported("{}: {}".format(CONFIG_FILE, key), "False", repr(config[key]))
+    check_class(tokenizer.config, GENERIC + GPT2 + QWEN2, problems)
     check_ids({token["content"]: token["id"] for token in tokenizer.added}, tokenizer.n_vocab, problems)
-
-
-def _adds_nothing(post) -> bool:
-    """Whether a post-processor leaves the ids alone (ByteLevel only trims offsets)."""
-    if post is None:
-        return True
-    kind = post.get("type") if isinstance(post, dict) else None
-    if kind == "Sequence":
-        return all(_adds_nothing(part) for part in member(post, "processors", list, JSON_FILE))
-    if kind == "TemplateProcessing":
-        single = post.get("single")
-        return single in ([{"Sequence": {"id": "A"}}], [{"Sequence": {"id": "A", "type_id": 0}}])
-    return kind == "ByteLevel"
 
 
 def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
@@ -151,14 +133,14 @@ def _pre_tokenizer(pre, problems: Problems) -> List[dict]:
             steps.append({"type": "digits", "individual": bool(part.get("individual_digits", False))})
         elif kind == "ByteLevel" and set(part) <= {"type", "add_prefix_space", "trim_offsets", "use_regex"}:
             steps.append(_byte_level(bool(part.get("add_prefix_space", True)), bool(part.get("use_regex", True))))
-        elif part == SPLIT:
-            steps.append({"type": "split", "pattern": QWEN2_WORDS})
+        elif part in SPLITS.values():
+            steps.append({"type": "split", "pattern": part["pattern"]["Regex"]})
         else:
             problems.unsupported(
                 JSON_FILE + ": pre_tokenizer",
-                "Digits, the Split of Qwen2 and ByteLevel",
+                "Digits, the Split of Qwen2 or Llama 3 and ByteLevel",
                 to_json(part)[:80],
-                "the runtime implements these three",
+                "the runtime implements these",
             )
             return []
     if [step["type"] for step in steps].count("byte_level") != 1 or steps[-1]["type"] != "byte_level":

@@ -194,3 +194,48 @@ def merges_of(merges, vocab: Dict[str, int], problems: Problems) -> List[str]:
     if not isinstance(merges, list):
         problems.add(JSON_FILE + ": model.merges", "a list", type(merges).__name__)
     return result
+
+
+def prefix_ids(tokenizer: Tokenizer, problems: Problems) -> List[int]:
+    """The ids in front of every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
+    config and then keeps the template all the same; a config that contradicts it may mean another release."""
+    config = tokenizer.config
+    ids = _template(tokenizer, problems)
+    if config.get("add_eos_token", False) not in (False, None):
+        problems.unsupported(CONFIG_FILE + ": add_eos_token", "False", repr(config["add_eos_token"]))
+    if config.get("add_bos_token") is not None and bool(config["add_bos_token"]) != bool(ids):
+        problems.add(
+            CONFIG_FILE + ": add_bos_token",
+            "{}, as the template of {} has it".format(bool(ids), JSON_FILE),
+            repr(config["add_bos_token"]),
+            "load the tokenizer with transformers and save it again",
+        )
+    return ids
+
+
+def _template(tokenizer: Tokenizer, problems: Problems) -> List[int]:
+    # ByteLevel only trims offsets.
+    posts = [post for post in one_or_sequence(tokenizer.spec.get("post_processor"), "processors") if not _is_byte_level(post)]
+    if not posts:
+        return []
+    post = posts[0] if len(posts) == 1 else None
+    single = post.get("single") if isinstance(post, dict) else None
+    parts = single if isinstance(single, list) and post.get("type") == "TemplateProcessing" else []
+    kinds = [next(iter(part), None) if isinstance(part, dict) else None for part in parts]
+    if kinds != ["SpecialToken"] * (len(parts) - 1) + ["Sequence"]:
+        problems.unsupported(
+            JSON_FILE + ": post_processor", "a template of special tokens and then the text", to_json(tokenizer.spec["post_processor"])[:120]
+        )
+        return []
+    special = member(post, "special_tokens", dict, JSON_FILE)
+    ids: List[int] = []
+    for part in parts[:-1]:
+        name = member(part, "SpecialToken", dict, JSON_FILE).get("id")
+        ids += member(member(special, name, dict, JSON_FILE) if isinstance(name, str) else {}, "ids", list, JSON_FILE)
+    if len(ids) < len(parts) - 1 or not all(isinstance(i, int) and 0 <= i < tokenizer.n_vocab for i in ids):
+        problems.add(JSON_FILE + ": post_processor.special_tokens", "an id below {} for each token".format(tokenizer.n_vocab), str(ids))
+    return ids
+
+
+def _is_byte_level(post) -> bool:
+    return isinstance(post, dict) and post.get("type") == "ByteLevel"

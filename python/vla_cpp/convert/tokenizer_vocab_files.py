@@ -12,7 +12,7 @@ from typing import List
 
 from .errors import Code, Problems, refuse
 from .files import MAX_JSON, member, read_json
-from .tokenizer_byte_level import QWEN2, SPLIT
+from .tokenizer_byte_level import QWEN2, QWEN2_WORDS, SPLITS
 from .tokenizer_parts import CONFIG_FILE
 
 VOCAB_FILE, MERGES_FILE, ADDED_FILE = "vocab.json", "merges.txt", "added_tokens.json"
@@ -38,7 +38,7 @@ def read_spec(folder: str, config: dict, problems: Problems) -> dict:
         "normalizer": {"type": "NFC"},
         "pre_tokenizer": {
             "type": "Sequence",
-            "pretokenizers": [SPLIT, {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}],
+            "pretokenizers": [SPLITS[QWEN2_WORDS], {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}],
         },
         "model": {"type": "BPE", "vocab": vocab, "merges": _merges(os.path.join(folder, MERGES_FILE))},
     }

@@ -171,7 +171,7 @@ def _position(path: str, name: str, value, entries: Dict[str, Stored], root: str
 
 
 def read_torch(path: str, member: str) -> Dict[str, Entry]:
-    """The tensors of the state dictionary that the file keeps under `member`; no tensor data is read."""
+    """The tensors of the state dictionary that the file keeps under `member`, or is where that is empty; no tensor data is read."""
     entries = _entries(path)
     roots = [name[: -len("data.pkl")] for name in entries if name.endswith("data.pkl") and name.count("/") == 1]
     if len(roots) != 1:
@@ -181,9 +181,10 @@ def read_torch(path: str, member: str) -> Dict[str, Entry]:
         raise refuse(path + ": byteorder", "little", "another", "save the file on a little-endian machine")
     where = path + ": data.pkl"
     content = read_pickle(_read(path, entries[root + "data.pkl"], where), where, CALLS, _storage)
-    state = content.get(member) if isinstance(content, dict) else None
+    state = content.get(member) if isinstance(content, dict) and member else content
     if not isinstance(state, dict) or not state:
-        raise refuse(where, "a dictionary with the tensors under " + member, describe(content if state is None else state))
+        expected = "a dictionary with the tensors" + (" under " + member if member else "")
+        raise refuse(where, expected, describe(content if state is None else state))
     names = [name for name in state if not isinstance(name, str)]
     if names:
         raise refuse(where + ": " + member, "names of tensors", type(names[0]).__name__)

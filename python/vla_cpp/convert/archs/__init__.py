@@ -12,10 +12,11 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import EVO1, GR00T_MODELS, LEROBOT, OPENPI
+from ..checkpoint import BITVLA, EVO1, GR00T_MODELS, LEROBOT, OPENPI
 from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
+TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
 
 
 class Weight(NamedTuple):
@@ -31,6 +32,7 @@ class Weight(NamedTuple):
     first: Optional[int] = None  # of a source that stacks several tensors: the row at which this one's shape[0] rows begin
     pick: Optional[Tuple[int, int]] = None  # one index of one axis of the source: (axis, index)
     transpose: bool = False  # what is left after `pick`, stored as (in, out)
+    in_bf16: bool = False  # the reference rounds it to bfloat16 when it loads it, whatever it is stored as
     regroup: int = 0  # the last axis is stored as groups of this many numbers: the bundle has all first ones, all second ones, ...
 
 
@@ -52,8 +54,8 @@ class Options:
     identity_stats: Sequence[str] = ()
     position_precision: str = ""
     variant: str = ""  # openpi's name of a training configuration, or the revision of Evo-1's code: checkpoints do not state them
-    stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET
-    views: Sequence[str] = ()  # Evo-1: names of the cameras in the order of the prompt's slots
+    stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET; BitVLA: which of dataset_statistics.json
+    views: Sequence[str] = ()  # Evo-1, BitVLA: names of the cameras in the order of the prompt's slots
     view_slots: int = 0  # Evo-1: places for views in the prompt
     embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
     camera_size: str = ""  # GR00T: WIDTHxHEIGHT of images whose aspect the pipeline keeps; they are square without it
@@ -103,8 +105,8 @@ LAYOUT_OPTIONS = {
     "identity_stats": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
     "position_precision": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
     "variant": ((OPENPI, EVO1, GR00T_MODELS["gr00t_n1_5"]), "a checkpoint of openpi, of Evo-1's authors or of GR00T N1.5"),
-    "stats": ((EVO1,), "a checkpoint of Evo-1's authors"),
-    "views": ((EVO1,), "a checkpoint of Evo-1's authors"),
+    "stats": ((EVO1, BITVLA), "a checkpoint of the authors of Evo-1 or BitVLA"),
+    "views": ((EVO1, BITVLA), "a checkpoint of the authors of Evo-1 or BitVLA"),
     "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "dead_rows": ((EVO1,), "a checkpoint of Evo-1's authors"),
     "embodiment": (GR00T, "a checkpoint of GR00T"),
@@ -116,6 +118,7 @@ LAYOUT_NAMES = {
     LEROBOT: "config.json of type {}, which states everything itself",
     OPENPI: "one of openpi",
     EVO1: "one of Evo-1's authors",
+    BITVLA: "one of BitVLA",
     **dict.fromkeys(GR00T, "one of GR00T"),
 }
 

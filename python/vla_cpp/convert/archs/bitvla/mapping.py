@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Sizes of BitVLA from config.json and the names of its tensors. An absent key means the default of the reference's own class, which
+stands beside the key.
+
+Reference: BitVLA transformers (configuration_llava.py, configuration_bitnet.py, configuration_siglip.py, modeling_siglip.py),
+openvla-oft/prismatic/models (action_heads.py, projectors.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import List
+
+from ...bundle import Key
+from ...errors import Problems
+from ...files import member
+from ...layers import gated_block, linear, norm, siglip, ternary, vector
+from ...networks import Language, Vision, embedding, keys_of, read_language, read_vision
+from ...section import Fixed, Section
+from .. import Dropped, Weight
+
+WHERE = "config.json"
+N_HEAD_LAYER, HEAD_EPS = 2, 1e-5  # literals of the action head, the second torch's
+VISION = {
+    "hidden_size": 768,
+    "intermediate_size": 3072,
+    "num_hidden_layers": 12,
+    "num_attention_heads": 12,
+    "image_size": 224,
+    "patch_size": 16,
+    "layer_norm_eps": 1e-6,
+    "vision_use_head": True,
+}
+# Towers of other numbers are plain ones: to the reference, an absent key means 32 bits.
+VISION_FIXED: Fixed = {
+    "model_type": ("siglip_vision_model", "siglip_vision_model"),
+    "num_channels": (3, 3),
+    "hidden_act": ("gelu_pytorch_tanh", "gelu_pytorch_tanh"),
+}
+BITS: Fixed = {"vit_weight_bits": (32, 1), "vit_act_bits": (32, 8)}
+METHODS = {"vit_weight_quant_method": "absmean", "vit_act_quant_method": "absmax_per_token"}
+TEXT = {
+    "hidden_size": 2560,
+    "intermediate_size": 6912,
+    "num_hidden_layers": 30,
+    "num_attention_heads": 20,
+    "num_key_value_heads": 5,
+    "vocab_size": 128256,
+    "rms_norm_eps": 1e-5,
+    "rope_theta": 500000.0,
+    "max_position_embeddings": 2048,
+}
+TEXT_FIXED: Fixed = {
+    "model_type": (None, "BitNet"),
+    "attention_bias": (False, False),
+    "rope_scaling": (None, None),
+    "use_sliding_window": (False, False),
+}
+TOP_FIXED: Fixed = {
+    "vision_feature_select_strategy": ("default", "full"),
+    "projector_hidden_act": ("gelu", "gelu"),
+    "multimodal_projector_bias": (True, True),
+}
+# Keys of transformers, of training, and those that no forward pass reads: the language model's activation is a literal.
+IGNORED = set(
+    """
+    _name_or_path architectures auto_map model_type image_seq_length image_token_index n_action_bins norm_stats text_config torch_dtype
+    transformers_version vision_config vocab_size tie_word_embeddings pad_token_id bos_token_id eos_token_id _attn_implementation_autoset
+    dtype attention_dropout hidden_act initializer_range max_window_layers sliding_window use_cache head_dim
+    """.split()
+)
+
+
+@dataclass
+class Sizes:
+    vision: Vision = field(default_factory=Vision)
+    lm: Language = field(default_factory=Language)
+    n_stored_layer: int = 0  # of the tower, whose first ones are read
+    n_context: int = 0
+    d_state: int = 0
+    d_action: int = 0
+    horizon: int = 0
+    max_views: int = 0
+    stop_token: int = 0
+
+
+def read_sizes(config: dict, problems: Problems) -> Sizes:
+    s = Sizes()
+    top = Section(WHERE, config, {"vision_feature_layer": -2}, problems)
+    top.refuse_unknown({*TOP_FIXED, *IGNORED, "vision_feature_layer"})
+    top.check_fixed(TOP_FIXED)
+    _read_text(Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems, ("num_key_value_heads",)), s)
+    _read_vision(Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s)
+    layer, n = top.get("vision_feature_layer"), s.n_stored_layer
+    if not isinstance(layer, int) or isinstance(layer, bool) or not -n <= layer <= n or layer == 0:
+        top.bad("vision_feature_layer", "the number of a layer's output, -{0} to {0} and not 0".format(n))
+        layer = -1
+    s.vision.n_layer = layer if layer > 0 else n + 1 + layer  # 0 is what enters the first layer
+    return s
+
+
+def _read_text(text: Section, s: Sizes) -> None:
+    text.check_fixed(TEXT_FIXED, "BitVLA's language model is BitNet b1.58")
+    text.refuse_unknown({*TEXT, *TEXT_FIXED, *IGNORED})
+    s.lm, s.n_context = read_language(text), text.count("max_position_embeddings")
+    s.lm.rope_base, s.lm.d_head = text.number("rope_theta"), s.lm.d_model // s.lm.n_head
+    if s.lm.d_model % s.lm.n_head or s.lm.n_head % s.lm.n_head_kv or s.lm.d_head % 2:
+        expected = "heads of an even width that divide hidden_size {}, in whole groups".format(s.lm.d_model)
+        text.bad("num_attention_heads", expected)
+    _check_widths(text, s.lm)
+
+
+def _read_vision(vision: Section, s: Sizes) -> None:
+    vision.check_fixed(VISION_FIXED)
+    vision.check_fixed(BITS, "a tower of other bits than the language model's 1 and 8 is not supported yet")
+    vision.refuse_unknown({*VISION, *VISION_FIXED, *BITS, *METHODS, *IGNORED})
+    for key, method in METHODS.items():
+        vision.fixed(key, method)
+    s.vision = read_vision(vision, vision.count("image_size"), vision.count("patch_size"))
+    s.n_stored_layer = s.vision.n_layer
+    if s.vision.image_size % s.vision.patch_size:
+        vision.bad("image_size", "a multiple of patch_size {}".format(s.vision.patch_size), unsupported=True)
+    _check_widths(vision, s.vision)
+
+
+def _check_widths(section: Section, sizes) -> None:
+    for key, width in (("hidden_size", sizes.d_model), ("intermediate_size", sizes.d_ff)):
+        if width % 4:
+            section.bad(key, "a multiple of 4, since four numbers share a byte", unsupported=True)
+
+
+def network_keys(s: Sizes) -> List[Key]:
+    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, max_views=s.max_views, stop_token=s.stop_token)
+    return keys_of(
+        {
+            "policy": policy,
+            "vision": {**vars(s.vision), "position_rule": "row_major"},
+            "lm": s.lm,
+            "head": dict(n_layer=N_HEAD_LAYER, norm_eps=HEAD_EPS),
+            "solver": dict(steps=1, kind="direct", noise="none"),
+        }
+    )
+
+
+TOWER, LM, HEAD, PROPRIO = "vision_tower.vision_model.", "language_model.model.", "action_head.model.", "proprio_projector."
+
+
+def weights(s: Sizes) -> List[Weight]:
+    return [*_vision(s.vision, s.vision.n_layer), *_connector(s), *_language(s.lm), *_head(s)]
+
+
+def _vision(v: Vision, n_layer: int) -> List[Weight]:
+    return siglip(TOWER, v.d_model, v.d_ff, n_layer, v.patch_size, v.n_patch, product=ternary, post_norm=False)
+
+
+def _connector(s: Sizes) -> List[Weight]:
+    source, d = "multi_modal_projector.linear_", s.lm.d_model
+    rows = linear("connector_up", source + "1", d, s.vision.d_model, bias=True) + linear("connector_down", source + "2", d, d, bias=True)
+    state = linear("state_in", PROPRIO + "fc1", d, s.d_state, bias=True) + linear("state_out", PROPRIO + "fc2", d, d, bias=True)
+    return rows + [row._replace(in_bf16=True) for row in state]  # trained and stored in float32
+
+
+def _language(lm: Language) -> List[Weight]:
+    rows = [embedding(lm, LM + "embed_tokens.weight")]
+    for i in range(lm.n_layer):
+        target, block = "lm.blk.{}.".format(i), "{}layers.{}.".format(LM, i)
+        parts = gated_block(target, block, lm.d_model, lm.d_q, lm.d_kv, lm.d_model, lm.d_ff, product=ternary)
+        parts["attn_out"] += vector(target + "attn_sub_norm.weight", block + "self_attn.attn_sub_norm.weight", lm.d_q)
+        parts["ffn_down"] += vector(target + "ffn_sub_norm.weight", block + "mlp.ffn_sub_norm.weight", lm.d_ff)
+        rows += [row for part in parts.values() for row in part]
+    return rows + vector("lm.norm.weight", LM + "norm.weight", lm.d_model)
+
+
+def _head(s: Sizes) -> List[Weight]:
+    d, d_in = s.lm.d_model, s.d_action * s.lm.d_model
+    rows = norm("head.in_norm", HEAD + "layer_norm1", d_in) + linear("head.in", HEAD + "fc1", d, d_in, bias=True)
+    for i in range(N_HEAD_LAYER):
+        target, block = "head.blk.{}.".format(i), "{}mlp_resnet_blocks.{}.ffn.".format(HEAD, i)
+        rows += norm(target + "norm", block + "0", d) + linear(target + "linear", block + "1", d, d, bias=True)
+    rows += norm("head.out_norm", HEAD + "layer_norm2", d) + linear("head.out", HEAD + "fc2", s.d_action, d, bias=True)
+    return [row._replace(in_bf16=True) for row in rows]
+
+
+def dropped(s: Sizes) -> List[Dropped]:
+    """What the policy never reads: everything behind the tower's layer, and the language head."""
+    v, d, unread = s.vision, s.vision.d_model, "features are read in front of it"
+    kept = len(_vision(v, v.n_layer))
+    rows = [Dropped(row.source, row.stored, unread) for row in _vision(v, s.n_stored_layer)[kept:]]
+    shapes = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
+    for name, d_out, d_in in (("attention.out_proj", d, d), ("mlp.fc1", v.d_ff, d), ("mlp.fc2", d, v.d_ff)):
+        shapes.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
+    shapes.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
+    rows += [Dropped("{}head.{}".format(TOWER, name), shape, unread) for name, shape in shapes.items()]
+    rows += [Dropped("{}post_layernorm.{}".format(TOWER, part), (d,), unread) for part in ("weight", "bias")]
+    return rows + [Dropped("language_model.lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "no action depends on the language head")]
