@@ -4,7 +4,8 @@
 
 An editable install compiles nothing: it finds the library in the build of the source tree. Environment of a real one:
 
-    VLA_BUILD_DIR   build folder to use or to make (default: build/cpu beside this folder where it was configured, else build/wheel)
+    VLA_BUILD_DIR   build folder to use or to make, below the source tree unless absolute (default: build/cpu where it was configured,
+                    else build/wheel)
     CMAKE_ARGS      for the first configuration of it, e.g. -DVLA_NATIVE=OFF for a wheel that goes to other machines
 """
 
@@ -22,7 +23,7 @@ from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent.parent
 LIBRARY = "libvla.so.1"
-# What every system with Python and NumPy has, and what must not be there twice.
+# Part of every system with Python and NumPy; a second copy would conflict.
 SYSTEM = re.compile(r"linux-vdso|ld-linux|lib(c|m|dl|rt|pthread|stdc\+\+|gcc_s)\.so")
 
 
@@ -32,7 +33,7 @@ def run(*command):
 
 
 def compile_library(build):
-    """pip shows nothing of a build, which takes minutes: what is done is told to the terminal, where there is one."""
+    """pip hides the output of a build that takes minutes, so progress goes to the terminal itself, if there is one."""
     command = ["cmake", "--build", str(build), "--target", "vla_shared", "--parallel", str(os.cpu_count() or 1)]
     print("+", shlex.join(command), flush=True)
     try:
@@ -51,7 +52,7 @@ def compile_library(build):
 
 
 def copy_licence(path, folder):
-    """The licence of a Debian package that a carried library is from, as its terms ask; other systems keep them elsewhere."""
+    """The licence of the Debian package that a carried library is from; other systems keep them elsewhere."""
     real = os.path.realpath(path)
     patterns = [real, real.replace("/usr/lib/", "/lib/", 1)]
     try:
@@ -69,7 +70,7 @@ def build_library(folder):
         raise SystemExit(f"{ROOT}: expected the source tree of vla.cpp around the folder python/, found none")
     configured = ROOT / "build/cpu"
     default = configured if (configured / "CMakeCache.txt").is_file() else ROOT / "build/wheel"
-    build = Path(os.environ.get("VLA_BUILD_DIR") or default).resolve()
+    build = ROOT / (os.environ.get("VLA_BUILD_DIR") or default)
     if not (build / "CMakeCache.txt").is_file():
         arguments = shlex.split(os.environ.get("CMAKE_ARGS", ""))
         run("cmake", "-S", ROOT, "-B", build, "-DCMAKE_BUILD_TYPE=Release", "-DVLA_BUILD_TESTS=OFF",

@@ -92,6 +92,22 @@ def test_an_editable_install_compiles_nothing(tmp_path):
     assert len(list(tmp_path.glob("*.whl"))) == 1 and not list(tree.rglob("*.so*"))
 
 
+def test_a_relative_build_folder_is_one_of_the_source_tree(tmp_path):
+    """pip runs setup.py in the folder of the package."""
+    tree, programs, called = tmp_path / "tree", tmp_path / "bin", tmp_path / "called"
+    shutil.copytree(ROOT / "python", tree / "python", ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
+    (tree / "build/wheel").mkdir(parents=True)
+    (tree / "build/wheel/CMakeCache.txt").touch()
+    shutil.copy(ROOT / "CMakeLists.txt", tree)
+    programs.mkdir()
+    (programs / "cmake").write_text(f'#!/bin/sh\necho "$@" >> {called}\nexit 1\n')
+    (programs / "cmake").chmod(0o755)
+    environment = {**os.environ, "VLA_BUILD_DIR": "build/wheel", "PATH": f"{programs}:{os.environ['PATH']}"}
+    command = [*PIP, "wheel", "--no-deps", "--no-build-isolation", tree / "python", "-w", tmp_path]
+    subprocess.run([str(word) for word in command], capture_output=True, env=environment)
+    assert called.read_text().startswith(f"--build {tree}/build/wheel ")
+
+
 def test_without_the_source_tree_around_it_the_package_says_so(tmp_path):
     shutil.copytree(ROOT / "python", tmp_path / "python", ignore=shutil.ignore_patterns("build", "*.egg-info"))
     command = [*PIP, "wheel", "--no-deps", "--no-build-isolation", tmp_path / "python", "-w", tmp_path]
