@@ -28,7 +28,7 @@ class Policy(Handle):
 
     path     a bundle that vla-convert made
     threads  of the CPU; 0 takes every core that the process may use
-    kernels  "ggml", "avx2", "avx512", "amx", or "float32": the best that does not round to bf16; None: the best for the
+    kernels  "ggml", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to bf16; None: the best for the
              bundle's dtype
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy

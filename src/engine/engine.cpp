@@ -191,8 +191,7 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
 }
 
 std::string Engine::arithmetic() const {
-  return precision() == "bf16" ? "bf16 products on AMX tiles, sums in float32; --kernels float32 avoids them"
-                               : "float32";
+  return precision() == "bf16" ? "bf16 products, sums in float32; --kernels float32 avoids them" : "float32";
 }
 
 MemoryUse Engine::memory() const {

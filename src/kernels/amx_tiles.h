@@ -2,11 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <immintrin.h>
-
-#include <cstdint>
-
-#include "kernels/vec.h"
+#include "kernels/rounding_avx512.h"
 
 /// What every product on AMX's tiles needs. Only files that are compiled for AMX may include this.
 namespace vla::kernels {
@@ -30,12 +26,5 @@ struct AmxSession {
 /// To be called before tiles are loaded: GCC's intrinsic does not say that it reads memory, so that the compiler could
 /// move stores of what is to be read behind it.
 VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }
-
-/// Two vectors to the nearest bf16, ties to even, as PyTorch rounds; a NaN stays one. What bf16 holds only as a
-/// subnormal number becomes zero, as it does in the tiles.
-VLA_INLINE void store_bf16(std::uint16_t* to, Avx512::Float a, Avx512::Float b) {
-  const __m512bh numbers = _mm512_cvtne2ps_pbh(b, a);
-  std::memcpy(to, &numbers, sizeof(numbers));
-}
 
 }  // namespace vla::kernels

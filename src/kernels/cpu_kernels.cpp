@@ -44,6 +44,7 @@ const CpuKernels* cpu_kernels(Isa isa) {
     case Isa::avx2:
       return &kAvx2Kernels;
     case Isa::avx512:
+    case Isa::avx512_bf16:
       return &kAvx512Kernels;
     case Isa::amx:
       return &amx;

@@ -24,13 +24,17 @@ bool may_use_tiles() {
   return syscall(SYS_arch_prctl, kRequestPermission, kTileData) == 0;
 }
 
-/// Tiles of bf16, and the instruction that rounds vectors to it, which every processor with such tiles has.
+bool has_avx512_bf16() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  constexpr unsigned kBf16 = 1U << 5;
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) != 0 && (a & kBf16) != 0;
+}
+
 bool has_amx_bf16() {
   unsigned a = 0, b = 0, c = 0, d = 0;
+  constexpr unsigned kTileBf16 = 1U << 22, kTile = 1U << 24;
   if (__get_cpuid_count(7, 0, &a, &b, &c, &d) == 0) return false;
-  constexpr unsigned kTileBf16 = 1U << 22, kTile = 1U << 24, kVectorBf16 = 1U << 5;
-  if ((d & kTileBf16) == 0 || (d & kTile) == 0) return false;
-  return __get_cpuid_count(7, 1, &a, &b, &c, &d) != 0 && (a & kVectorBf16) != 0 && may_use_tiles();
+  return (d & kTileBf16) != 0 && (d & kTile) != 0 && may_use_tiles();
 }
 
 /// Clang's __builtin_cpu_supports knows no "f16c". The registers are AVX's.
@@ -49,6 +53,8 @@ std::vector<Isa> detect() {
       !__builtin_cpu_supports("avx512dq") || !__builtin_cpu_supports("avx512vl"))
     return found;
   found.push_back(Isa::avx512);
+  if (!has_avx512_bf16()) return found;
+  found.push_back(Isa::avx512_bf16);
   if (has_amx_bf16()) found.push_back(Isa::amx);
   return found;
 }
@@ -59,7 +65,7 @@ std::vector<Isa> detect() { return {Isa::ggml}; }
 
 #endif
 
-constexpr Isa kAll[] = {Isa::ggml, Isa::avx2, Isa::avx512, Isa::amx};
+constexpr Isa kAll[] = {Isa::ggml, Isa::avx2, Isa::avx512, Isa::avx512_bf16, Isa::amx};
 
 }  // namespace
 
@@ -69,6 +75,8 @@ std::string isa_name(Isa isa) {
       return "avx2";
     case Isa::avx512:
       return "avx512";
+    case Isa::avx512_bf16:
+      return "avx512_bf16";
     case Isa::amx:
       return "amx";
     case Isa::ggml:
@@ -82,14 +90,13 @@ const std::vector<Isa>& usable_isas() {
   return usable;
 }
 
-Isa without_rounding(Isa isa) { return isa == Isa::amx ? Isa::avx512 : isa; }
-
 Result<Isa> choose_isa(const std::string& name) {
   const std::vector<Isa>& usable = usable_isas();
   if (name.empty()) return usable.back();
   if (name == "float32") return without_rounding(usable.back());
   const auto known = std::find_if(std::begin(kAll), std::end(kAll), [&](Isa isa) { return isa_name(isa) == name; });
-  if (known == std::end(kAll)) return Error{Code::usage, "kernels", "ggml, avx2, avx512, amx or float32", name};
+  if (known == std::end(kAll))
+    return Error{Code::usage, "kernels", "ggml, avx2, avx512, avx512_bf16, amx or float32", name};
   if (std::find(usable.begin(), usable.end(), *known) != usable.end()) return *known;
   std::vector<std::string> names;
   for (Isa isa : usable) names.push_back(isa_name(isa));

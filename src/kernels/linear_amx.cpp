@@ -12,10 +12,7 @@ struct AmxTile : PairTile {
   using V = Avx512;
   using Session = AmxSession;
 
-  static VLA_INLINE void store_rounded(X* to, V::Float x, std::int64_t left) {
-    const __m256bh numbers = _mm512_cvtneps_pbh(x);
-    std::memcpy(to, &numbers, left >= V::width ? sizeof(numbers) : static_cast<std::size_t>(left) * sizeof(X));
-  }
+  static VLA_INLINE void store_rounded(X* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, X* to, X* rest) {
     for (std::int64_t i = 0; i < n; i += 32) {

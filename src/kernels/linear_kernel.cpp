@@ -5,12 +5,12 @@
 namespace vla::kernels {
 
 #if defined(__x86_64__)
-extern const LinearKernel kLinearAmx, kLinearAvx512, kLinearAvx2;  // each in the file of its name
+extern const LinearKernel kLinearAmx, kLinearAvx512Bf16, kLinearAvx512, kLinearAvx2;  // each in the file of its name
 #endif
 
 std::span<const LinearKernel* const> linear_kernels() {
 #if defined(__x86_64__)
-  static constexpr const LinearKernel* kAll[] = {&kLinearAmx, &kLinearAvx512, &kLinearAvx2};
+  static constexpr const LinearKernel* kAll[] = {&kLinearAmx, &kLinearAvx512Bf16, &kLinearAvx512, &kLinearAvx2};
   return kAll;
 #else
   return {};

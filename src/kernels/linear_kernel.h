@@ -31,6 +31,12 @@ struct LinearKernel {
   std::int64_t max_norm;  // the widest norm of x that it computes on the way
   /// Whether x of so many rows and this depth is rounded to bf16 once, so that it may come as bf16, and y may leave so.
   bool (*rounds)(std::int64_t n_row, std::int64_t d_in);
+  /// What computes products of at most `max_few` rows in its place, from the same packed matrix; null where it does so
+  /// itself.
+  const LinearKernel* few = nullptr;
+  std::int64_t max_few = 0;
+
+  const LinearKernel& for_rows(std::int64_t n_row) const { return n_row <= max_few ? *few : *this; }
 };
 
 /// The implementations, best first.

@@ -56,8 +56,11 @@ class LinearLoop {
 
  public:
   /// The row of the table that this tile makes.
-  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
-    return {name, Layout::packed_size, Layout::pack, supports, cut, run, sizeof(Scratch), Tile::kMaxDepth, rounds};
+  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa),
+                                       const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
+    return {name,   Layout::packed_size, Layout::pack,    supports, cut,
+            run,    sizeof(Scratch),     Tile::kMaxDepth, rounds,   few,
+            max_few};
   }
 
  private:

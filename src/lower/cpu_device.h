@@ -24,7 +24,7 @@ class CpuDevice final : public Device {
   std::string name() const override;
   int n_thread() const override { return executor_->n_thread(); }
   std::string kernels() const override { return isa_name(isa_); }
-  std::string precision() const override { return isa_ == Isa::amx ? "bf16" : "f32"; }
+  std::string precision() const override { return rounds_to_bf16(isa_) ? "bf16" : "f32"; }
   const std::string& linear_kernels() const override { return weights_.text(); }
   std::size_t weights_size() const override { return weights_.size(); }
   std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }

@@ -47,8 +47,9 @@ Status CpuProgram::give_addresses(Lowering& l) {
 
 Status CpuProgram::make_tasks(const Lowering& l) {
   std::size_t scratch = 0;
-  for (const kernels::LinearKernel* kernel : kernels::linear_kernels())
-    if (kernel->name == isa_name(l.isa) || l.isa == Isa::amx) scratch = std::max(scratch, kernel->scratch_size);
+  for (const FusedOp& op : l.ops)
+    if (const auto* linear = std::get_if<LinearOp>(&op.op))
+      scratch = std::max(scratch, kernel_of(l, *linear).scratch_size);
   VLA_CHECK(executor_->reserve(scratch));
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
   phases_.resize(static_cast<std::size_t>(l.n_phase));

@@ -174,9 +174,9 @@ int threads_for(const Lowering& l, const FusedOp& op) { return flop_of_op(op) < 
 
 std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp& linear) {
   auto task = std::make_unique<LinearTask>();
+  task->kernel = &kernel_of(l, linear);
   kernels::LinearJob& job = task->job;
   const Value& x = l.value(linear.x);
-  task->kernel = l.weights.kernel(linear.linears[0]->as<op::Linear>()->weight);
   job.x = address(l, linear.x), job.x_type = x.type, job.x_stride = row_stride(x);
   job.d_in = x.shape[0], job.n_row = count(x.shape) / x.shape[0];
   job.activation = linear.activation, job.gated = linear.gated;

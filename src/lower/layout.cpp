@@ -132,11 +132,12 @@ class Layouts {
     Value& y = l.value(op.writes[0]);
     if (y.home != Value::Home::arena || y.node->tapped || linear.residual != kNone || linear.factor != kNone) return;
     const std::int64_t n_row = count(y.shape) / y.shape[0], d = linear.linears[0]->in[0].dim(0);
-    const auto* kernel = l.weights.kernel(linear.linears[0]->as<op::Linear>()->weight);
-    if (!kernel->rounds(n_row, d)) return;
+    const kernels::LinearKernel& kernel = kernel_of(l, linear);
+    if (!kernel.rounds(n_row, d)) return;
     for (const Node* reader : l.readers[static_cast<std::size_t>(y.node->id)]) {
       const auto* product = reader->as<op::Linear>();
-      if (product == nullptr || l.weights.kernel(product->weight) != kernel || !kernel->rounds(n_row, y.shape[0]))
+      if (product == nullptr || &l.weights.kernel(product->weight)->for_rows(n_row) != &kernel ||
+          !kernel.rounds(n_row, y.shape[0]))
         return;
     }
     y.type = DType::bf16;
@@ -149,6 +150,11 @@ class Layouts {
 };
 
 }  // namespace
+
+const kernels::LinearKernel& kernel_of(const Lowering& l, const LinearOp& op) {
+  const Shape& x = op.linears[0]->in[0].node()->shape;
+  return l.weights.kernel(op.linears[0]->as<op::Linear>()->weight)->for_rows(count(x) / x[0]);
+}
 
 void choose_layouts(Lowering& l) { Layouts(l).run(); }
 

@@ -120,6 +120,8 @@ struct Lowering {
 
 /// Which stage an operation belongs to, by when its node was recorded.
 std::size_t stage_of(const Lowering& l, const FusedOp& op);
+/// What multiplies: all matrices of an operation have the same.
+const kernels::LinearKernel& kernel_of(const Lowering& l, const LinearOp& op);
 /// Strides of numbers that lie one after the other.
 Shape contiguous_strides(const Shape& shape);
 bool is_contiguous(const Value& value);

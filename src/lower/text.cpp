@@ -33,7 +33,7 @@ struct Describe {
     if (op.gated) what += ", gate";
     if (op.factor != kNone) what += ", factor";
     if (op.residual != kNone) what += ", residual";
-    return {what, l.weights.kernel(op.linears[0]->as<op::Linear>()->weight)->name, op.x};
+    return {what, kernel_of(l, op).name, op.x};
   }
   Words operator()(const PackOp& op) const {
     return {prepared(op.k) + "pack keys and values", isa_name(l.isa), op.k.x};
@@ -72,7 +72,7 @@ std::string text_of(const Lowering& l, const FusedOp& op) {
   std::vector<std::string> results;
   for (const ValueId id : op.writes) results.push_back(layout(l, id));
   const Work work = work_of(l, op);
-  return fmt::format("{:>4} {:<8} {:>10.2f} {:>9.3f}  {}  {} -> {}", op.phase, words.kernel, 1e-6 * work.flop,
+  return fmt::format("{:>4} {:<11} {:>10.2f} {:>9.3f}  {}  {} -> {}", op.phase, words.kernel, 1e-6 * work.flop,
                      1e-6 * work.bytes, words.what, layout(l, words.x), fmt::join(results, ", "));
 }
 

@@ -103,7 +103,7 @@ TEST_CASE("avx512" VLA_EVERY_TAP* doctest::skip(lacks(Isa::avx512))) { check_tap
 TEST_CASE("avx2" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx2))) { check_taps("avx2", true); }
 TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx512))) { check_taps("avx512", true); }
 
-// The tiles of amx round activations to bf16, as PyTorch's bf16 does: its error is what is allowed. PyTorch keeps the
+// Kernels of bf16 round activations as PyTorch's bf16 does: its error is what is allowed. PyTorch keeps the
 // projections of state and actions in float32 and rounds every result between two operations, we do neither.
 #define VLA_CHUNK \
   " kernels: with the same bf16 weights the chunk is nearer to the float32 reference than PyTorch's bf16 is"
@@ -111,6 +111,7 @@ TEST_CASE("default" VLA_CHUNK) { check_chunk(""); }
 TEST_CASE("ggml" VLA_CHUNK) { check_chunk("ggml"); }
 TEST_CASE("avx2" VLA_CHUNK* doctest::skip(lacks(Isa::avx2))) { check_chunk("avx2"); }
 TEST_CASE("avx512" VLA_CHUNK* doctest::skip(lacks(Isa::avx512))) { check_chunk("avx512"); }
+TEST_CASE("avx512_bf16" VLA_CHUNK* doctest::skip(lacks(Isa::avx512_bf16))) { check_chunk("avx512_bf16"); }
 TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(Isa::amx))) { check_chunk("amx"); }
 
 TEST_CASE("taps do not change the answer, and without a pattern nothing is recorded") {

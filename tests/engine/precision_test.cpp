@@ -40,19 +40,19 @@ std::string widened(const std::string& tensor) {
 
 }  // namespace
 
-TEST_CASE("a bundle of bf16 matrices is computed on tiles of bf16 where the machine has them") {
+TEST_CASE("a bundle of bf16 matrices is computed in bf16 where the machine has instructions for it") {
   CHECK(isa_of(kBundle, Isa::amx) == Isa::amx);
-  for (Isa isa : {Isa::avx512, Isa::avx2, Isa::ggml}) CHECK(isa_of(kBundle, isa) == isa);
+  for (Isa isa : {Isa::avx512_bf16, Isa::avx512, Isa::avx2, Isa::ggml}) CHECK(isa_of(kBundle, isa) == isa);
 }
 
 TEST_CASE("one matrix of another dtype makes the whole policy float32, and a table does not") {
   CHECK(isa_of(widened("lm.blk.0.attn_q.weight"), Isa::amx) == Isa::avx512);
+  CHECK(isa_of(widened("lm.blk.0.attn_q.weight"), Isa::avx512_bf16) == Isa::avx512);
   CHECK(isa_of(widened("lm.token_embd.weight"), Isa::amx) == Isa::amx);
 }
 
 TEST_CASE("an engine tells the kernels and the precision of its bundle, not those of the machine") {
-  const bool tiles = usable_isas().back() == Isa::amx;
-  CHECK(load_engine(kBundle)->precision() == (tiles ? "bf16" : "f32"));
+  CHECK(load_engine(kBundle)->precision() == (rounds_to_bf16(usable_isas().back()) ? "bf16" : "f32"));
   CHECK(load_engine(kBundle, "", "float32")->precision() == "f32");
   const auto engine = load_engine(widened("lm.blk.0.attn_q.weight"));
   CHECK(engine->precision() == "f32");

@@ -69,7 +69,7 @@ struct Part {
   std::vector<std::byte> packed;
 };
 
-/// What the tiles of amx make of x: bf16, and in products of few rows a second bf16 of what that left.
+/// What kernels of bf16 make of x: bf16, and the tiles of amx in products of few rows a second bf16 of what that left.
 enum class Rounding { none, once, twice };
 
 struct Case {
@@ -81,6 +81,8 @@ struct Case {
   int n_thread = 1;
   DType x_type = DType::f32, y_type = DType::f32;
 };
+
+bool rounds_all(const LinearKernel& kernel) { return std::strstr(kernel.name, "avx512_bf16") != nullptr; }
 
 /// From the second number on.
 std::byte* bytes(std::vector<float>& values) { return reinterpret_cast<std::byte*>(&values[1]); }
@@ -132,9 +134,10 @@ class Trial {
   }
 
   void check() const {
-    const Rounding rounding = std::strstr(kernel_.name, "amx") == nullptr ? Rounding::none
-                              : case_.shape.n_row <= 64                   ? Rounding::twice
-                                                                          : Rounding::once;
+    const bool tiles = std::strstr(kernel_.name, "amx") != nullptr;
+    const Rounding rounding = tiles && case_.shape.n_row <= 64 ? Rounding::twice
+                              : tiles || rounds_all(kernel_)   ? Rounding::once
+                                                               : Rounding::none;
     for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
       const Part& part = parts_[static_cast<std::size_t>(i)];
       CHECK(part.y.front() == kUntouched);
@@ -294,8 +297,8 @@ void check_rounded_after(Activation activation, const LinearKernel& kernel) {
 }
 
 void check_rounded(const LinearKernel& kernel) {
-  CHECK(!kernel.rounds(50, 72));  // few rows keep what rounding leaves
-  CHECK(kernel.rounds(97, 72) == (std::strstr(kernel.name, "amx") != nullptr));
+  CHECK(kernel.rounds(50, 72) == rounds_all(kernel));  // the tiles of amx keep what rounding leaves of few rows
+  CHECK(kernel.rounds(97, 72) == (rounds_all(kernel) || std::strstr(kernel.name, "amx") != nullptr));
   if (!kernel.rounds(97, 72)) return;
   for (Activation activation : kActivations) check_rounded_after(activation, kernel);
 }
@@ -315,8 +318,12 @@ const LinearKernel& row(const std::string& name) {
   TEST_CASE("emulated_amx: " sentence) { check(row("emulated_amx")); }                                   \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(Isa::avx2))) { check(row("avx2")); }       \
   VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                    \
+  VLA_EMULATED_TEST("avx512_bf16", sentence, check(kEmulatedLinearAvx512Bf16))                           \
   VLA_EMULATED_TEST("amx", sentence, check(kEmulatedLinearAmx))                                          \
   TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(Isa::avx512))) { check(row("avx512")); } \
+  TEST_CASE("avx512_bf16: " sentence* doctest::skip(vla::test::lacks(Isa::avx512_bf16))) {               \
+    check(row("avx512_bf16"));                                                                           \
+  }                                                                                                      \
   TEST_CASE("amx: " sentence* doctest::skip(vla::test::lacks(Isa::amx))) { check(row("amx")); }
 
 VLA_LINEAR_TEST("products of any shape and storage type are within float32's rounding", check_shapes_and_types)
@@ -327,13 +334,26 @@ VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_r
 VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
 
 TEST_CASE("every machine takes the first row that it can run, and ggml where there is none") {
-  for (Isa isa : {Isa::ggml, Isa::avx2, Isa::avx512, Isa::amx})
+  for (Isa isa : {Isa::ggml, Isa::avx2, Isa::avx512, Isa::avx512_bf16, Isa::amx})
     for (DType type : {DType::bf16, DType::f16, DType::f32}) {
       const LinearKernel* chosen = choose_linear({type, 768, 3072}, isa);
-      const bool tiles = isa == Isa::amx && type == DType::bf16;
-      const std::string expected = tiles ? "amx" : isa == Isa::amx ? "avx512" : isa_name(isa);
+      const std::string expected = isa_name(type == DType::bf16 ? isa : without_rounding(isa));
       CHECK((chosen == nullptr ? "ggml" : chosen->name) == expected);
     }
+}
+
+TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds nothing") {
+  const MatrixDesc desc = {DType::bf16, 80, 70};
+  for (const LinearKernel* kernel : linear_kernels()) {
+    CHECK(&kernel->for_rows(1000) == kernel);
+    if (kernel->few == nullptr) continue;
+    const LinearKernel& few = kernel->for_rows(kernel->max_few);
+    CHECK(&few == kernel->few);
+    CHECK(&kernel->for_rows(kernel->max_few + 1) == kernel);
+    CHECK(!few.rounds(kernel->max_few, desc.d_in));
+    CHECK((few.pack == kernel->pack));
+    CHECK(few.packed_size(desc) == kernel->packed_size(desc));
+  }
 }
 
 TEST_CASE("x is rounded to the nearest bf16, ties to even, as PyTorch rounds it") {

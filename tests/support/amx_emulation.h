@@ -4,13 +4,15 @@
 
 /// The tiles of AMX in plain C++, as avx512_emulation.h does the vectors.
 /// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, TDPBF16PS and its neighbours.
-#include "support/avx512_emulation.h"
+#include "support/avx512_bf16_emulation.h"
 
 #include <doctest/doctest.h>
 
 #include <cstdint>
 
 namespace vla::test::amx {
+
+using bf16::flush, bf16::multiply_add;
 
 struct Config {
   std::uint8_t palette, start_row, reserved[14];
@@ -50,10 +52,6 @@ inline void store(int tile, void* base, std::size_t stride) {
     std::memcpy(static_cast<std::byte*>(base) + static_cast<std::size_t>(i) * stride, tiles[tile].line[i], bytes(tile));
 }
 
-/// Subnormal numbers are zero, in and out.
-inline float flush(float x) { return std::abs(x) < 0x1p-126f ? std::copysign(0.0f, x) : x; }
-inline float multiply_add(float a, float b, float c) { return flush(std::fma(flush(a), flush(b), flush(c))); }
-
 /// c += a * b, where a line of b holds a pair of numbers for every column of c: even and odd numbers are summed apart.
 inline void multiply(int c, int a, int b) {
   const auto number = [](int tile, int line, int i) {
@@ -76,32 +74,12 @@ inline void multiply(int c, int a, int b) {
     }
 }
 
-/// Numbers of `low` and then of `high` to the nearest bf16, ties to even; subnormal numbers are zero.
-inline __m512bh round_pairs(__m512 high, __m512 low) {
-  std::uint16_t rounded[32];
-  for (int i = 0; i < 32; ++i) {
-    const float x = i < 16 ? low[i] : high[i - 16];
-    const auto bits = std::bit_cast<std::uint32_t>(flush(x));
-    rounded[i] = static_cast<std::uint16_t>(std::isnan(x) ? bits >> 16 | 64 : (bits + 0x7fff + (bits >> 16 & 1)) >> 16);
-  }
-  return std::bit_cast<__m512bh>(rounded);
-}
-
-inline __m256bh round_half_as_many(__m512 x) {
-  const __m512bh rounded = round_pairs(x, x);
-  __m256bh half;
-  std::memcpy(&half, &rounded, sizeof(half));
-  return half;
-}
-
 }  // namespace vla::test::amx
 
 #undef _tile_loadd
 #undef _tile_stored
 #undef _tile_zero
 #undef _tile_dpbf16ps
-#define _mm512_cvtne2ps_pbh vla::test::amx::round_pairs
-#define _mm512_cvtneps_pbh vla::test::amx::round_half_as_many
 #define _tile_loadconfig vla::test::amx::load_config
 #define _tile_release vla::test::amx::release
 #define _tile_loadd vla::test::amx::load

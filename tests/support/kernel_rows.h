@@ -16,10 +16,11 @@ inline bool lacks(Isa isa) { return std::find(usable_isas().begin(), usable_isas
 
 #if defined(__x86_64__)
 namespace vla::kernels {
-/// The sources of avx512 and amx with their instructions emulated, for machines that have AVX2 (avx512_emulation.h).
+/// The sources of avx512, avx512_bf16 and amx with their instructions emulated, for machines that have AVX2
+/// (avx512_emulation.h).
 extern const CpuKernels kEmulatedAvx512Kernels;
 extern const AttentionKernel kEmulatedAttentionAmx;
-extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAmx;
+extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx;
 }  // namespace vla::kernels
 
 #define VLA_EMULATED_TEST(isa, sentence, ...) \

@@ -57,22 +57,26 @@ void multiply_add_any(long n_round) {
   for (const __m512& s : sums) sink = _mm512_cvtss_f32(s);
 }
 
-/// The whole loop in assembler: of the intrinsic, compilers copy every sum, which halves the rate.
-[[gnu::target("avx512f")]] void multiply_add_vnni(long n_round) {
-  if (n_round <= 0) return;
-  __asm__ volatile(
-      "1:\n"
-      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24,25,26,27\n"
-      "vpdpbusd %%zmm30, %%zmm31, %%zmm\\sum\n"
-      ".endr\n"
-      "dec %0\n"
-      "jnz 1b"
-      : "+r"(n_round)
-      :
-      : "cc", "zmm0", "zmm1", "zmm2", "zmm3", "zmm4", "zmm5", "zmm6", "zmm7", "zmm8", "zmm9", "zmm10", "zmm11", "zmm12",
-        "zmm13", "zmm14", "zmm15", "zmm16", "zmm17", "zmm18", "zmm19", "zmm20", "zmm21", "zmm22", "zmm23", "zmm24",
-        "zmm25", "zmm26", "zmm27");
-}
+/// The whole loop in assembler: of the intrinsics, compilers copy every sum, which halves the rate.
+#define VLA_SUM_LOOP(multiply_add)                                                                                  \
+  if (n_round <= 0) return;                                                                                         \
+  __asm__ volatile(                                                                                                 \
+      "1:\n"                                                                                                        \
+      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24,25,26,27\n" multiply_add          \
+      " %%zmm30, %%zmm31, %%zmm\\sum\n"                                                                             \
+      ".endr\n"                                                                                                     \
+      "dec %0\n"                                                                                                    \
+      "jnz 1b"                                                                                                      \
+      : "+r"(n_round)                                                                                               \
+      :                                                                                                             \
+      : "cc", "zmm0", "zmm1", "zmm2", "zmm3", "zmm4", "zmm5", "zmm6", "zmm7", "zmm8", "zmm9", "zmm10", "zmm11",     \
+        "zmm12", "zmm13", "zmm14", "zmm15", "zmm16", "zmm17", "zmm18", "zmm19", "zmm20", "zmm21", "zmm22", "zmm23", \
+        "zmm24", "zmm25", "zmm26", "zmm27")
+
+[[gnu::target("avx512f")]] void multiply_add_vnni(long n_round) { VLA_SUM_LOOP("vpdpbusd"); }
+[[gnu::target("avx512f")]] void multiply_add_pairs(long n_round) { VLA_SUM_LOOP("vdpbf16ps"); }
+
+#undef VLA_SUM_LOOP
 
 /// All eight tiles as 16 rows of 64 bytes, palette 1. Source: Intel Architecture Instruction Set Extensions,
 /// chapter on AMX, LDTILECFG.
@@ -120,6 +124,8 @@ std::vector<PeakProbe> detect() {
     if (__builtin_cpu_supports("avx512vnni"))
       found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
   }
+  if (has(Isa::avx512_bf16))
+    found.push_back({"avx512 bf16", Isa::avx512_bf16, Number::bf16, 28 * 32 * 2, multiply_add_pairs});
   if (has(Isa::amx)) {
     constexpr double kTileProduct = 16 * 16 * 32 * 2;  // of bf16; a tile holds twice as many int8
     found.push_back({"amx bf16", Isa::amx, Number::bf16, 6 * kTileProduct, multiply_add_amx_bf16});
