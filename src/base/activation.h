@@ -4,11 +4,12 @@
 
 namespace vla {
 
-/// Elementwise nonlinearities. Sources: torch gelu(approximate="tanh"), gelu(approximate="none"), silu, relu.
-enum class Activation { none, gelu_tanh, gelu_erf, silu, relu };
+/// Elementwise nonlinearities. Sources: torch gelu(approximate="tanh"), gelu(approximate="none"), silu, relu, and
+/// relu(x)^2.
+enum class Activation { none, gelu_tanh, gelu_erf, silu, relu, relu_squared };
 
 constexpr const char* activation_name(Activation activation) {
-  constexpr const char* kNames[] = {"none", "gelu_tanh", "gelu_erf", "silu", "relu"};
+  constexpr const char* kNames[] = {"none", "gelu_tanh", "gelu_erf", "silu", "relu", "relu_squared"};
   return kNames[static_cast<int>(activation)];
 }
 

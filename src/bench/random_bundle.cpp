@@ -207,6 +207,14 @@ std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
   return bytes;
 }
 
+/// Bytes of four random ternary numbers.
+std::string random_codes(std::size_t count, std::uint64_t seed) {
+  std::string bytes(count, '\0');
+  for (char& four : bytes)
+    for (int i = 0; i < 4; ++i) four = static_cast<char>(four << 2 | static_cast<int>(next_random(seed) % 3));
+  return bytes;
+}
+
 /// Where the values of tensors come from: random ones for matrices and tables; ones for the weights of norms and zeros
 /// for biases, so that numbers stay finite through any depth.
 class Values {
@@ -215,6 +223,7 @@ class Values {
     std::size_t longest = 0;
     for (const Param& param : list.params()) longest = std::max(longest, static_cast<std::size_t>(param.count()));
     pool_ = random_bytes(std::min(longest, kPool), sizes.dtype, sizes.seed);
+    codes_ = random_codes(std::min(longest, kPool) / 4 + 1, sizes.seed);
     const std::vector<float> one(longest_vector(list), 1.0f);
     ones_.assign(reinterpret_cast<const char*>(one.data()), one.size() * sizeof(float));
     zeros_.assign(ones_.size(), '\0');
@@ -223,8 +232,10 @@ class Values {
   /// Calls `use` with the bytes of `param`, in pieces.
   template <class Use>
   void each_piece(const Param& param, std::size_t size, Use use) const {
-    const bool is_vector = param.storage == Storage::vector;
-    const std::string& source = !is_vector ? pool_ : param.name.ends_with("bias") ? zeros_ : ones_;
+    const std::string& source = param.storage == Storage::ternary  ? codes_
+                                : param.storage != Storage::vector ? pool_
+                                : param.name.ends_with("bias")     ? zeros_
+                                                                   : ones_;
     for (std::size_t at = 0; at < size; at += source.size())
       use(std::string_view(source).substr(0, std::min(source.size(), size - at)));
   }
@@ -239,7 +250,7 @@ class Values {
     return static_cast<std::size_t>(longest);
   }
 
-  std::string pool_, ones_, zeros_;
+  std::string pool_, codes_, ones_, zeros_;
 };
 
 /// A growing file in memory with its checksum.
@@ -275,9 +286,9 @@ bool write_bundle(int file, const Keys& keys, const ParamList& list, const Rando
   std::vector<TensorInfo> tensors;
   std::vector<std::byte> nothing;
   for (const Param& param : list.params()) {
-    const DType type = param.storage == Storage::vector ? DType::f32 : sizes.dtype;
-    const std::size_t size = static_cast<std::size_t>(param.count()) * dtype_size(type);
-    tensors.push_back({param.name, type, param.shape, {nothing.data(), size}});
+    const DType type = param.storage == Storage::matrix || param.storage == Storage::table ? sizes.dtype : param.type();
+    const std::size_t size = static_cast<std::size_t>(param.stored_count()) * dtype_size(type);
+    tensors.push_back({param.name, type, param.stored_shape(), {nothing.data(), size}});
   }
   Output out(file);
   const std::string head = write_gguf_head(keys, tensors);

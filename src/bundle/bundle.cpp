@@ -129,12 +129,12 @@ Status check_identity(const Keys& keys) {
 }  // namespace
 
 const char* dtype_name(DType type) {
-  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32", "f64"};
+  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32", "i8", "f64"};
   return kNames[static_cast<int>(type)];
 }
 
 std::size_t dtype_size(DType type) {
-  constexpr std::size_t kSizes[] = {4, 2, 2, 4, 8};
+  constexpr std::size_t kSizes[] = {4, 2, 2, 4, 1, 8};
   return kSizes[static_cast<int>(type)];
 }
 

@@ -15,7 +15,7 @@
 
 namespace vla {
 
-enum class DType { f32, f16, bf16, i32, f64 };
+enum class DType { f32, f16, bf16, i32, i8, f64 };
 
 const char* dtype_name(DType type);
 std::size_t dtype_size(DType type);

@@ -195,6 +195,8 @@ Result<DType> read_dtype(Cursor& cursor, const std::string& what) {
       return DType::f32;
     case 1:
       return DType::f16;
+    case 24:
+      return DType::i8;
     case 26:
       return DType::i32;
     case 28:
@@ -202,7 +204,7 @@ Result<DType> read_dtype(Cursor& cursor, const std::string& what) {
     case 30:
       return DType::bf16;
     default:
-      return cursor.bad(what, "type f32, f16, bf16, i32 or f64", fmt::format("ggml type {}", type));
+      return cursor.bad(what, "type f32, f16, bf16, i32, i8 or f64", fmt::format("ggml type {}", type));
   }
 }
 

@@ -44,7 +44,7 @@ struct PutValue {
 };
 
 std::uint32_t ggml_type_of(DType type) {
-  constexpr std::uint32_t kTypes[] = {0, 1, 30, 26, 28};  // numbers of ggml's enum ggml_type, in the order of DType
+  constexpr std::uint32_t kTypes[] = {0, 1, 30, 26, 24, 28};  // numbers of ggml's enum ggml_type, in the order of DType
   return kTypes[static_cast<int>(type)];
 }
 

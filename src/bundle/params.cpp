@@ -14,10 +14,36 @@ constexpr std::size_t kMaxLines = 50;  // of a report: who has more problems tha
 
 std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
 
+/// The dtypes that a storage allows, for people.
+const char* dtypes_of(Storage storage) {
+  switch (storage) {
+    case Storage::vector:
+      return "f32";
+    case Storage::ternary:
+      return "i8";
+    case Storage::matrix:
+    case Storage::table:
+      break;
+  }
+  return "f32, bf16 or f16";
+}
+
+bool allows(Storage storage, DType type) {
+  if (storage == Storage::ternary) return type == DType::i8;
+  return type == DType::f32 || (storage != Storage::vector && (type == DType::bf16 || type == DType::f16));
+}
+
+/// Whether one of the four codes of a byte is 3, which stands for no number.
+bool has_wrong_code(std::span<const std::byte> codes) {
+  std::byte wrong = {};
+  for (const std::byte four : codes) wrong |= four & four >> 1 & std::byte{0x55};
+  return wrong != std::byte{};
+}
+
 }  // namespace
 
 const char* storage_name(Storage storage) {
-  constexpr const char* kNames[] = {"matrix", "table", "vector"};
+  constexpr const char* kNames[] = {"matrix", "table", "vector", "ternary"};
   return kNames[static_cast<int>(storage)];
 }
 
@@ -25,6 +51,12 @@ std::int64_t Param::count() const {
   std::int64_t product = 1;
   for (std::int64_t dim : shape) product *= dim;
   return product;
+}
+
+std::vector<std::int64_t> Param::stored_shape() const {
+  std::vector<std::int64_t> stored = shape;
+  if (storage == Storage::ternary) stored[0] = (stored[0] + 3) / 4;
+  return stored;
 }
 
 const Param& ParamList::declare(std::string name, Storage storage, std::vector<std::int64_t> shape) {
@@ -41,17 +73,16 @@ const Param& ParamList::declare(std::string name, Storage storage, std::vector<s
 void ParamList::look_up(Param& param) {
   const TensorInfo* tensor = bundle_->find(param.name);
   if (tensor == nullptr)
-    return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.shape),
+    return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.stored_shape()),
                                storage_name(param.storage)));
-  if (tensor->shape != param.shape)
-    return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name, shape_text(param.shape),
-                               shape_text(tensor->shape)));
-  const bool fits = tensor->type == DType::f32 ||
-                    (param.storage != Storage::vector && (tensor->type == DType::f16 || tensor->type == DType::bf16));
-  if (!fits)
-    return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name,
-                               param.storage == Storage::vector ? "f32" : "f32, bf16 or f16",
+  if (tensor->shape != param.stored_shape())
+    return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name,
+                               shape_text(param.stored_shape()), shape_text(tensor->shape)));
+  if (!allows(param.storage, tensor->type))
+    return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name, dtypes_of(param.storage),
                                dtype_name(tensor->type)));
+  if (param.storage == Storage::ternary && has_wrong_code(tensor->data))
+    return problem(fmt::format("wrong code      {:<40} expected 0, 1 or 2, file has 3", param.name));
   param.source = tensor;
 }
 
@@ -122,6 +153,15 @@ void Scope::require(bool holds, const std::string& key, const std::string& expec
 
 const Param* Scope::matrix(const std::string& name, int d_in, int d_out) const {
   return &list_->declare((*this / name).path(), Storage::matrix, {d_in, d_out});
+}
+
+const Param* Scope::ternary(const std::string& name, int d_in, int d_out) const {
+  if (d_in % 4 != 0)
+    list_->problem(
+        fmt::format("wrong size      {:<40} expected rows of whole bytes, four numbers each, "
+                    "there are {}",
+                    (*this / name).path(), d_in));
+  return &list_->declare((*this / name).path(), Storage::ternary, {d_in, d_out});
 }
 
 const Param* Scope::table(const std::string& name, int d_model, int n_row) const {

@@ -13,8 +13,10 @@
 
 namespace vla {
 
-/// How a parameter may be stored: a matrix or a table in any dtype of the bundle, a vector in f32 only.
-enum class Storage { matrix, table, vector };
+/// How a parameter may be stored: a matrix or a table in any float dtype of the bundle, a vector in f32 only. A ternary
+/// matrix is stored as bytes (i8), rows of d_in / 4: element 4 i + j of a row is the code in bits 2 j and 2 j + 1 of
+/// byte i, and codes 0, 1 and 2 stand for -1, 0 and 1.
+enum class Storage { matrix, table, vector, ternary };
 
 const char* storage_name(Storage storage);
 
@@ -27,8 +29,15 @@ struct Param {
   const TensorInfo* source = nullptr;  // set where the bundle has a tensor that fits
 
   std::int64_t count() const;
-  /// As stored; float32 where no bundle gives it.
-  DType type() const { return source != nullptr ? source->type : DType::f32; }
+  bool is_matrix() const { return storage == Storage::matrix || storage == Storage::ternary; }
+  /// As stored; float32 where no bundle gives the numbers of a float.
+  DType type() const {
+    if (storage == Storage::ternary) return DType::i8;
+    return source != nullptr ? source->type : DType::f32;
+  }
+  /// Of the bundle's tensor.
+  std::vector<std::int64_t> stored_shape() const;
+  std::int64_t stored_count() const { return storage == Storage::ternary ? (shape[0] + 3) / 4 * shape[1] : count(); }
 };
 
 /// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they
@@ -88,6 +97,8 @@ class Scope {
   void require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const;
 
   const Param* matrix(const std::string& name, int d_in, int d_out) const;
+  /// d_in must be a multiple of 4.
+  const Param* ternary(const std::string& name, int d_in, int d_out) const;
   const Param* table(const std::string& name, int d_model, int n_row) const;
   const Param* vector(const std::string& name, int size) const;
 

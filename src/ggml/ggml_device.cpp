@@ -20,6 +20,8 @@ ggml_type type_of(DType type) {
       return GGML_TYPE_F16;
     case DType::i32:
       return GGML_TYPE_I32;
+    case DType::i8:
+      return GGML_TYPE_I8;
     case DType::f64:  // of statistics alone, which no graph reads
     case DType::f32:
       break;
@@ -38,7 +40,10 @@ void upload(ggml_tensor* tensor, const Param& param) {
   if (type_of(param.source->type) == tensor->type)
     return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
   std::vector<float> values(static_cast<std::size_t>(param.count()));
-  if (param.source->type == DType::bf16)
+  if (param.storage == Storage::ternary)
+    for (std::size_t i = 0; i < values.size(); ++i)
+      values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
+  else if (param.source->type == DType::bf16)
     ggml_bf16_to_fp32_row(reinterpret_cast<const ggml_bf16_t*>(data), values.data(), param.count());
   else
     ggml_fp16_to_fp32_row(reinterpret_cast<const ggml_fp16_t*>(data), values.data(), param.count());
@@ -80,7 +85,7 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
   VLA_TRY(weight_context_, make_context(params.params().size()));
   int n_matrix = 0;
   for (const Param& param : params.params()) {
-    n_matrix += param.storage == Storage::matrix ? 1 : 0;
+    n_matrix += param.is_matrix() ? 1 : 0;
     weights_.push_back(ggml_new_tensor(weight_context_.get(), resident_type(param),
                                        static_cast<int>(param.shape.size()), param.shape.data()));
   }

@@ -39,8 +39,23 @@ class Translator {
     return ggml_new_tensor(constants_, op.values.index() == 1 ? GGML_TYPE_I32 : GGML_TYPE_F32, 4, node_->shape.data());
   }
   ggml_tensor* translate(const op::Linear& op) {
-    ggml_tensor* y = ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
+    ggml_tensor* y =
+        op.scale != nullptr ? ternary_product(op) : ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
     return op.bias != nullptr ? ggml_add(c, y, device_.weight(op.bias)) : y;
+  }
+  /// Codes are whole numbers in float32, and so small that their sums are exact.
+  ggml_tensor* ternary_product(const op::Linear& op) {
+    constexpr float kRound = 0x1.8p23f;  // adding it rounds to a whole number, ties to even
+    constexpr float kSmallest = 1e-5f;
+    ggml_tensor* x = contiguous(in(0));
+    const int d_in = static_cast<int>(x->ne[0]);
+    ggml_tensor* largest = ggml_pool_1d(c, ggml_abs(c, x), GGML_OP_POOL_MAX, d_in, d_in, 0);  // [1, n, ...]
+    largest = ggml_clamp(c, largest, kSmallest, INFINITY);
+    ggml_tensor* ones = ggml_scale_bias(c, largest, 0.0f, 1.0f);
+    ggml_tensor* s = ggml_scale(c, ggml_div(c, ones, largest), 127.0f);
+    ggml_tensor* codes = ggml_scale_bias(c, ggml_scale_bias(c, ggml_mul(c, x, s), 1.0f, kRound), 1.0f, -kRound);
+    ggml_tensor* step = ggml_div(c, ggml_mul(c, ones, device_.weight(op.scale)), s);
+    return ggml_mul(c, ggml_mul_mat(c, device_.weight(op.weight), codes), step);
   }
   ggml_tensor* translate(const op::Embedding& op) { return ggml_get_rows(c, device_.weight(op.table), in(0)); }
   ggml_tensor* translate(const op::Gather&) { return ggml_get_rows(c, in(0), in(1)); }
@@ -85,6 +100,9 @@ class Translator {
     return ggml_cont_3d(c, mixed, q->ne[0] * q->ne[1], q->ne[2], q->ne[3]);
   }
 
+  /// ggml's own makes zero of NaN; what is not finite stays so.
+  ggml_tensor* relu(ggml_tensor* x) { return ggml_add(c, ggml_relu(c, x), ggml_scale(c, x, 0.0f)); }
+
   ggml_tensor* translate(const op::Activate& op) {
     ggml_tensor* x = contiguous(in(0));
     switch (op.activation) {
@@ -97,8 +115,10 @@ class Translator {
         return ggml_gelu_erf(c, x);
       case Activation::silu:
         return ggml_silu(c, x);
-      case Activation::relu:  // ggml's own makes zero of NaN; what is not finite stays so
-        return ggml_add(c, ggml_relu(c, x), ggml_scale(c, x, 0.0f));
+      case Activation::relu:
+        return relu(x);
+      case Activation::relu_squared:
+        return ggml_sqr(c, relu(x));
       case Activation::none:
         break;
     }

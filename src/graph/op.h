@@ -28,9 +28,15 @@ struct Parameter {
 };
 
 /// x [d_in, n, ...] -> W x + b [d_out, n, ...]; bias may be null.
+///
+/// With `scale` [1] the weight is ternary, -scale, 0 or scale, and x becomes int8 first: of each row a = max |x|, at
+/// least 1e-5, s = (1 / a) * 127, and q = x * s rounded to the nearest, ties to even. Then W x is float(sum of products
+/// of codes) * (scale / s). Every operation is rounded to float32 by itself; the sums are exact.
+/// Source: BitVLA modeling_bitnet.py BitLinear, WeightQuant, ActQuant.
 struct Linear {
   const Param* weight;
   const Param* bias;
+  const Param* scale = nullptr;
 };
 /// ids [n] i32 -> rows of a declared table [d, n].
 struct Embedding {

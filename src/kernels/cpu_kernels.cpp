@@ -17,6 +17,8 @@ RowKernel CpuKernels::activation(Activation activation) const {
       return silu;
     case Activation::relu:
       return relu;
+    case Activation::relu_squared:
+      return relu_squared;
     case Activation::none:
       break;
   }

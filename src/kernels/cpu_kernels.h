@@ -10,7 +10,7 @@ namespace vla::kernels {
 
 /// Everything that is not a matrix product, for one instruction set. Rows are contiguous, and need no alignment.
 struct CpuKernels {
-  RowKernel silu, gelu_tanh, gelu_erf, relu;  // math.h, gelu_erf.h
+  RowKernel silu, gelu_tanh, gelu_erf, relu, relu_squared;  // math.h, gelu_erf.h
   /// y = (x - mean) / sqrt(variance + s) * w + b, and y = x / sqrt(mean(x^2) + s) * w + b; w and b may be null.
   RowKernel layer_norm, rms_norm;
   /// Turns the pairs (x_i, x_{i + n/2}) by n/2 cosines in w and n/2 sines behind them.

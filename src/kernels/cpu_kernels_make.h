@@ -16,17 +16,9 @@ class CpuKernelsMaker {
 
  public:
   static constexpr CpuKernels make() {
-    return {map<Silu>,
-            map<GeluTanh>,
-            map<GeluErf>,
-            map<Relu>,
-            layer_norm,
-            rms_norm,
-            rotate_half,
-            map<Plus>,
-            map<Times>,
-            scaled,
-            AttentionTile<FloatProducts<V, kTile>>::kernel()};
+    return {map<Silu>,        map<GeluTanh>, map<GeluErf>, map<Relu>,
+            map<ReluSquared>, layer_norm,    rms_norm,     rotate_half,
+            map<Plus>,        map<Times>,    scaled,       AttentionTile<FloatProducts<V, kTile>>::kernel()};
   }
 
  private:
@@ -41,6 +33,9 @@ class CpuKernelsMaker {
   };
   struct Relu {
     static VLA_INLINE Float of(Float x, Float) { return relu<V>(x); }
+  };
+  struct ReluSquared {
+    static VLA_INLINE Float of(Float x, Float) { return relu_squared<V>(x); }
   };
 
   struct Plus {

@@ -69,6 +69,24 @@ constexpr Isa kAll[] = {Isa::ggml, Isa::avx2, Isa::avx512, Isa::avx512_bf16, Isa
 
 }  // namespace
 
+#if defined(__x86_64__)
+bool has_avx_vnni() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  constexpr unsigned kAvxVnni = 1U << 4;
+  return __get_cpuid_count(7, 1, &a, &b, &c, &d) != 0 && (a & kAvxVnni) != 0;
+}
+bool has_avx512_vnni() { return __builtin_cpu_supports("avx512vnni") != 0; }
+bool has_amx_int8() {
+  unsigned a = 0, b = 0, c = 0, d = 0;
+  constexpr unsigned kTileInt8 = 1U << 25;
+  return __get_cpuid_count(7, 0, &a, &b, &c, &d) != 0 && (d & kTileInt8) != 0;
+}
+#else
+bool has_avx_vnni() { return false; }
+bool has_avx512_vnni() { return false; }
+bool has_amx_int8() { return false; }
+#endif
+
 std::string isa_name(Isa isa) {
   switch (isa) {
     case Isa::avx2:

@@ -21,6 +21,11 @@ enum class Isa {
 /// The name that `--kernels` takes.
 std::string isa_name(Isa isa);
 
+/// Instructions for products of int8, which a machine of any Isa may have or lack.
+bool has_avx_vnni();
+bool has_avx512_vnni();
+bool has_amx_int8();
+
 /// What this machine can run, `ggml` first and the best last.
 const std::vector<Isa>& usable_isas();
 

@@ -91,7 +91,7 @@ struct Avx2Tile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx2 && desc.type != DType::i32; }
+bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx2 && is_float(desc.type); }
 
 }  // namespace
 

@@ -85,7 +85,7 @@ struct Avx512Tile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx512 && desc.type != DType::i32; }
+bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx512 && is_float(desc.type); }
 
 }  // namespace
 

@@ -60,7 +60,7 @@ struct EmulatedAmxTile : PairTile {
   }
 };
 
-bool any(const MatrixDesc& desc, Isa) { return desc.type != DType::i32; }
+bool any(const MatrixDesc& desc, Isa) { return is_float(desc.type); }
 bool bf16_only(const MatrixDesc& desc, Isa) { return desc.type == DType::bf16; }
 
 constexpr LinearKernel kFloat = LinearLoop<FloatTile>::kernel("emulated", any);

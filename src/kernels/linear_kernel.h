@@ -10,7 +10,8 @@
 
 namespace vla::kernels {
 
-/// A weight matrix as the bundle has it: d_out rows of d_in numbers, one row after the other.
+/// A weight matrix as the bundle has it: d_out rows of d_in numbers, one row after the other. i8 are bytes of four
+/// ternary numbers (Storage::ternary).
 struct MatrixDesc {
   DType type;
   std::int64_t d_in, d_out;
@@ -35,6 +36,8 @@ struct LinearKernel {
   /// itself.
   const LinearKernel* few = nullptr;
   std::int64_t max_few = 0;
+  /// Where x must come as rows of int8 codes (quantized.h): makes one of them, of n numbers. Else null.
+  void (*quantize)(const float* x, std::int64_t n, std::byte* row) = nullptr;
 
   const LinearKernel& for_rows(std::int64_t n_row) const { return n_row <= max_few ? *few : *this; }
 };

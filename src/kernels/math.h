@@ -89,6 +89,12 @@ VLA_INLINE typename V::Float relu(typename V::Float x) {
   return V::max(typename V::Float{}, x);
 }
 
+/// max(x, 0)^2, and NaN for NaN.
+template <class V>
+VLA_INLINE typename V::Float relu_squared(typename V::Float x) {
+  return relu<V>(x) * relu<V>(x);
+}
+
 /// x / (1 + e^-x), within two units in the last place over the whole range. Source: torch silu.
 template <class V>
 VLA_INLINE typename V::Float silu(typename V::Float x) {

@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <cstring>
 
-#include "kernels/linear_kernel.h"
 #include "lower/emit.h"
 
 namespace vla::lower {
@@ -47,9 +46,7 @@ Status CpuProgram::give_addresses(Lowering& l) {
 
 Status CpuProgram::make_tasks(const Lowering& l) {
   std::size_t scratch = 0;
-  for (const FusedOp& op : l.ops)
-    if (const auto* linear = std::get_if<LinearOp>(&op.op))
-      scratch = std::max(scratch, kernel_of(l, *linear).scratch_size);
+  for (const FusedOp& op : l.ops) scratch = std::max(scratch, scratch_of(l, op));
   VLA_CHECK(executor_->reserve(scratch));
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
   phases_.resize(static_cast<std::size_t>(l.n_phase));

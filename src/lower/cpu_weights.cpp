@@ -16,7 +16,7 @@ namespace vla {
 Isa isa_for(const ParamList& list, Isa isa) {
   bool has_matrix = false;
   for (const Param& param : list.params())
-    if (param.storage == Storage::matrix) {
+    if (param.storage == Storage::matrix) {  // products of ternary ones are the same on all machines
       has_matrix = true;
       if (param.type() != DType::bf16) return without_rounding(isa);
     }
@@ -70,9 +70,9 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, Isa isa, int n_thread
   for (const Param& param : list.params()) {
     Place place;
     offsets.push_back(size);
-    if (param.storage == Storage::matrix) {
+    if (param.is_matrix()) {
       place.kernel = kernels::choose_linear(desc_of(param), isa);
-      ++counts[place.kernel->name][dtype_name(desc_of(param).type)];
+      ++counts[place.kernel->name][param.storage == Storage::ternary ? "ternary" : dtype_name(param.type())];
       size += aligned(place.kernel->packed_size(desc_of(param)));
     } else if (param.storage == Storage::vector) {
       size += aligned(static_cast<std::size_t>(param.count()) * sizeof(float));

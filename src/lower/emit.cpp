@@ -36,6 +36,27 @@ struct LinearTask : Task {
   void run(std::int64_t item, Worker& worker) const override { kernel->run(job, item, worker); }
 };
 
+/// An item is some rows of x, or of its norm.
+struct QuantizeTask : Task {
+  kernels::LinearJob::Norm norm;
+  void (*quantize)(const float* x, std::int64_t n, std::byte* row);
+  const float* x;
+  std::byte* codes;
+  std::int64_t d, n_row, x_stride, codes_stride, item_rows;
+
+  void run(std::int64_t item, Worker& worker) const override {
+    for (std::int64_t i = item * item_rows; i < std::min(n_row, (item + 1) * item_rows); ++i) {
+      const float* row = x + i * x_stride;
+      if (norm.run != nullptr) {
+        auto* normed = reinterpret_cast<float*>(worker.scratch);
+        norm.run(row, norm.weight, norm.bias, norm.eps, normed, d);
+        row = normed;
+      }
+      quantize(row, d, codes + i * codes_stride);
+    }
+  }
+};
+
 struct PackTask : Task {
   const kernels::AttentionKernel* kernel;
   kernels::PackJob job;
@@ -172,6 +193,15 @@ double flop_of_op(const FusedOp& op) {
 /// Threads that share an operation.
 int threads_for(const Lowering& l, const FusedOp& op) { return flop_of_op(op) < kMinSharedFlop ? 1 : l.n_thread; }
 
+/// What LinearOp and QuantizeOp do to the rows that they read.
+template <class Reader>
+kernels::LinearJob::Norm norm_of(const Lowering& l, const Reader& op) {
+  if (op.norm == nullptr) return {};
+  const auto& norm = *op.norm->template as<op::Norm>();
+  return {norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm, operand(l, op.norm_weight),
+          operand(l, op.norm_bias), norm.eps};
+}
+
 std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp& linear) {
   auto task = std::make_unique<LinearTask>();
   task->kernel = &kernel_of(l, linear);
@@ -180,18 +210,17 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
   job.x = address(l, linear.x), job.x_type = x.type, job.x_stride = row_stride(x);
   job.d_in = x.shape[0], job.n_row = count(x.shape) / x.shape[0];
   job.activation = linear.activation, job.gated = linear.gated;
-  if (linear.norm != nullptr) {
-    const auto& norm = *linear.norm->as<op::Norm>();
-    job.norm = {norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm, operand(l, linear.norm_weight),
-                operand(l, linear.norm_bias), norm.eps};
-  }
+  job.norm = norm_of(l, linear);
   job.y_type = l.value(op.writes.back()).type;
   for (const Node* node : linear.linears) {
     const auto& product = *node->as<op::Linear>();
     kernels::LinearJob::Part& part = job.part[job.n_part++];
     part.type = product.weight->type();
     part.weight = l.weights.data(product.weight);
-    part.bias = product.bias != nullptr ? reinterpret_cast<const float*>(l.weights.data(product.bias)) : nullptr;
+    const auto vector = [&](const Param* param) {
+      return param != nullptr ? reinterpret_cast<const float*>(l.weights.data(param)) : nullptr;
+    };
+    part.bias = vector(product.bias), part.scale = vector(product.scale);
     part.d_out = product.weight->shape[1];
     // Of gate and up the one result is up's.
     const std::size_t i = linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1);
@@ -200,6 +229,17 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
   kernels::LinearJob::Part& last = job.part[job.n_part - 1];
   last.factor = operand(l, linear.factor), last.residual = operand(l, linear.residual);
   task->n_item = task->kernel->cut(job, threads_for(l, op));
+  return task;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const QuantizeOp& quantize) {
+  auto task = std::make_unique<QuantizeTask>();
+  const Value &x = l.value(quantize.x), &codes = l.value(op.writes[0]);
+  task->norm = norm_of(l, quantize), task->quantize = quantize.kernel->quantize;
+  task->x = floats(l, quantize.x), task->x_stride = row_stride(x);
+  task->codes = address(l, op.writes[0]), task->codes_stride = row_stride(codes);
+  task->d = x.shape[0], task->n_row = count(x.shape) / x.shape[0];
+  task->item_rows = item_rows(l, task->n_row, task->d, task->n_item);
   return task;
 }
 
@@ -312,6 +352,13 @@ std::unique_ptr<Task> emit(const Lowering& l, const FusedOp& op) {
   return std::visit([&](const auto& what) { return make(l, op, what); }, op.op);
 }
 
+std::size_t scratch_of(const Lowering& l, const FusedOp& op) {
+  if (const auto* linear = std::get_if<LinearOp>(&op.op)) return kernel_of(l, *linear).scratch_size;
+  if (const auto* quantize = std::get_if<QuantizeOp>(&op.op))
+    return quantize->norm != nullptr ? static_cast<std::size_t>(l.value(quantize->x).shape[0]) * sizeof(float) : 0;
+  return 0;
+}
+
 Work work_of(const Lowering& l, const FusedOp& op) {
   Work work = {flop_of_op(op), 0};
   const auto* lookup = std::get_if<LookupOp>(&op.op);
@@ -328,7 +375,7 @@ Work work_of(const Lowering& l, const FusedOp& op) {
     for (const Node* node : linear->linears) {
       const auto& product = *node->as<op::Linear>();
       work.bytes +=
-          static_cast<double>(product.weight->count()) * static_cast<double>(dtype_size(product.weight->type()));
+          static_cast<double>(product.weight->stored_count()) * static_cast<double>(dtype_size(product.weight->type()));
       if (product.bias != nullptr) work.bytes += 4.0 * static_cast<double>(product.bias->shape[0]);
     }
   return work;

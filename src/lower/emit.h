@@ -16,6 +16,9 @@ kernels::PackJob pack_sizes(const Lowering& l, const PackOp& op);
 /// What the executor runs for an operation, when every value has its address.
 std::unique_ptr<kernels::Task> emit(const Lowering& l, const FusedOp& op);
 
+/// Bytes of scratch memory that a worker needs for it.
+std::size_t scratch_of(const Lowering& l, const FusedOp& op);
+
 /// Operations and bytes of an operation.
 Work work_of(const Lowering& l, const FusedOp& op);
 /// One line: what is computed, the kernel, shapes and layouts.

@@ -1,8 +1,10 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <map>
 
 #include "kernels/cpu_kernels.h"
+#include "kernels/quantized.h"
 #include "lower/emit.h"
 #include "lower/lowering.h"
 
@@ -61,10 +63,39 @@ class Layouts {
   }
 
   void require_layouts(LinearOp& op) {
-    require(op.x, row_stride(l.value(op.x)) >= 0);
     require_contiguous(op.residual);
+    const kernels::LinearKernel& kernel = kernel_of(l, op);
+    if (kernel.quantize != nullptr) return quantize(op, kernel);
+    require(op.x, row_stride(l.value(op.x)) >= 0);
     require_rows(op.norm_weight);
     require_rows(op.norm_bias);
+  }
+  void require_layouts(QuantizeOp&) {}  // is made here
+
+  /// The product reads x, or its norm, as codes, which are made once, just before the first operation that reads them.
+  void quantize(LinearOp& op, const kernels::LinearKernel& kernel) {
+    const auto [known, is_new] = codes_.try_emplace({op.x, op.norm}, static_cast<ValueId>(l.values.size()));
+    if (is_new) {
+      Value& codes = l.values.emplace_back();
+      codes.base = known->second, codes.type = DType::i8, codes.shape = l.value(op.x).shape;
+      const std::int64_t stride = kernels::quantized_stride(codes.shape[0]);
+      codes.stride = contiguous_strides({stride, codes.shape[1], codes.shape[2], codes.shape[3]});
+      codes.size = static_cast<std::size_t>(codes.stride[3] * codes.shape[3]);
+      QuantizeOp made = {op.x, op.norm, op.norm_weight, op.norm_bias, &kernel};
+      require(made.x, row_stride(l.value(made.x)) >= 0);
+      require_rows(made.norm_weight);
+      require_rows(made.norm_bias);
+      FusedOp& fused = out_.emplace_back();
+      fused.reads = {made.x};
+      for (const ValueId id : {made.norm_weight, made.norm_bias})
+        if (id != kNone) fused.reads.push_back(id);
+      fused.op = made, fused.writes = {known->second}, fused.order = op_->order;
+    }
+    op.x = known->second;
+    op.norm = nullptr, op.norm_weight = op.norm_bias = kNone;
+    op_->reads = {op.x};
+    for (const ValueId id : {op.factor, op.residual})
+      if (id != kNone) op_->reads.push_back(id);
   }
   void require_layouts(PackOp& op) {
     require_rows(op.k);
@@ -147,6 +178,7 @@ class Layouts {
   Lowering& l;
   FusedOp* op_ = nullptr;
   std::vector<FusedOp> out_;
+  std::map<std::pair<ValueId, const Node*>, ValueId> codes_;  // of x, or of its norm
 };
 
 }  // namespace

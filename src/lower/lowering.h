@@ -22,7 +22,7 @@ constexpr ValueId kNone = -1;
 struct Value {
   enum class Home { arena, kept, slot, constant, parameter };
 
-  const Node* node = nullptr;  // none for packed keys and values
+  const Node* node = nullptr;  // none for packed keys and values, and for codes
   DType type = DType::f32;
   Shape shape = {1, 1, 1, 1};
   Shape stride = {1, 1, 1, 1};  // numbers from one index to the next
@@ -51,6 +51,13 @@ struct LinearOp {
   Activation activation = Activation::none;
   bool gated = false;
   ValueId factor = kNone, residual = kNone;
+};
+/// Rows of x as int8 codes with their scales, for products that take them (kernels/quantized.h).
+struct QuantizeOp {
+  ValueId x;
+  const Node* norm = nullptr;  // x is what this node normalizes
+  ValueId norm_weight = kNone, norm_bias = kNone;
+  const kernels::LinearKernel* kernel;
 };
 struct PackOp {
   Prepared k;
@@ -89,7 +96,7 @@ struct PatchesOp {
 
 /// One operation of the program: nodes that were fused.
 struct FusedOp {
-  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
+  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
   std::vector<ValueId> reads, writes;
   int order = 0;           // the id of the node whose result it gives
   bool invariant = false;  // the same from run to run
@@ -133,7 +140,8 @@ void start(Lowering& l);
 /// Makes operations of nodes: norm into product; bias, activation, gate, factor and residual behind it; products of one
 /// x; gate and up; norm and rope into attention. A tapped node is computed for itself.
 void fuse(Lowering& l);
-/// Chooses the dtype of values between products, and copies what its reader needs contiguous.
+/// Chooses the dtype of values between products, makes codes of what ternary ones read, and copies what its reader
+/// needs contiguous.
 void choose_layouts(Lowering& l);
 /// Puts operations that do not depend on each other into one phase, and what stays the same into Program::prepare.
 void schedule(Lowering& l);

@@ -35,6 +35,9 @@ struct Describe {
     if (op.residual != kNone) what += ", residual";
     return {what, kernel_of(l, op).name, op.x};
   }
+  Words operator()(const QuantizeOp& op) const {
+    return {fmt::format("{}quantize", op.norm != nullptr ? "norm, " : ""), op.kernel->name, op.x};
+  }
   Words operator()(const PackOp& op) const {
     return {prepared(op.k) + "pack keys and values", isa_name(l.isa), op.k.x};
   }

@@ -169,6 +169,42 @@ TEST_CASE("bind reports every missing, misshapen and unused tensor and every mis
   CHECK(contains(text, "unused tensor   stats.x"));
 }
 
+TEST_CASE("a ternary matrix is bytes of four codes, none of which is 3") {
+  const auto report = [](DType type, const std::vector<std::int64_t>& shape, const std::string& data) {
+    EditableBundle bundle = small_bundle();
+    bundle.tensors.push_back({"a.weight", type, shape, data});
+    const std::string bytes = bundle.bytes();
+    const auto parsed = parse(bytes);
+    REQUIRE_MESSAGE(parsed.ok(), (parsed ? "" : parsed.error().message()));
+    ParamList list(parsed->keys(), &*parsed);
+    const Param* weight = (Scope(list, "") / "a").ternary("weight", 12, 2);
+    CHECK(weight->type() == DType::i8);
+    CHECK(weight->shape == std::vector<std::int64_t>{12, 2});
+    const Status status = list.report("bitvla", [](const std::string& name) { return name != "a.weight"; });
+    return status.ok() ? "" : status.error().message();
+  };
+  CHECK(report(DType::i8, {3, 2}, std::string("\x00", 1) + "\x55\xAA\x24\x18\x62").empty());
+  for (const char* wrong : {"\x03", "\x0C", "\x30", "\xC0", "\xFF"})
+    CHECK(contains(report(DType::i8, {3, 2}, "\x55\x55\xAA\x24\x18" + std::string(wrong)), "wrong code      a.weight"));
+  CHECK(contains(report(DType::i8, {12, 2}, std::string(24, '\x55')), "wrong shape     a.weight"));
+  CHECK(contains(report(DType::f32, {3, 2}, std::string(24, '\x55')), "wrong dtype     a.weight"));
+  CHECK(contains(report(DType::f32, {3, 2}, std::string(24, '\x55')), "expected i8, file has f32"));
+}
+
+TEST_CASE("bytes are no matrix, table or vector of floats") {
+  EditableBundle bundle = small_bundle();
+  for (const char* name : {"a", "b", "c"}) bundle.tensors.push_back({name, DType::i8, {4}, "abcd"});
+  const std::string bytes = bundle.bytes();
+  const auto parsed = parse(bytes);
+  REQUIRE(parsed.ok());
+  ParamList list(parsed->keys(), &*parsed);
+  list.declare("a", Storage::matrix, {4}), list.declare("b", Storage::table, {4}),
+      list.declare("c", Storage::vector, {4});
+  const Status status = list.report("smolvla", [](const std::string& name) { return name.size() > 1; });
+  REQUIRE_FALSE(status.ok());
+  CHECK(contains(status.error().message(), "3 problems"));
+}
+
 TEST_CASE("a size out of range is a problem and never a loop without end") {
   Keys keys;
   keys.set("lm.n_layer", Value(std::int64_t{2000000000}));

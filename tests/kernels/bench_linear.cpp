@@ -2,7 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How fast each row of the matrix product is on this machine, as a share of the multiply-add peak that is measured
-// beside it. Not a test: what it prints depends on what else the machine does.
+// beside it; of ternary products also how much faster than the float32 kernel that takes turns with them. Not a test:
+// what it prints depends on what else the machine does.
 //
 //   bench_linear [threads] [rounds] [kernel]
 #include <fmt/format.h>
@@ -12,11 +13,16 @@
 #include <cstdlib>
 #include <ctime>
 #include <memory>
+#include <optional>
+#include <string>
+#include <vector>
 
 #include "kernels/executor.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 #include "kernels/probe/probe.h"
+#include "kernels/quantized.h"
+#include "kernels/ternary_kernels.h"
 
 using namespace vla;
 using namespace vla::kernels;
@@ -31,7 +37,12 @@ constexpr Shape kShapes[] = {{1024, 768, 768},   {1024, 768, 3072}, {1024, 3072,
                              {177, 2560, 960},   {50, 720, 2048},   {50, 2048, 720},   {256, 1152, 4304},
                              {560, 2048, 16384}, {1, 2048, 16384}};
 
-/// Memory at a multiple of a page, filled with numbers near 1 in bf16 or float32 as it is read.
+/// Of BitVLA's language model and tower.
+constexpr Shape kTernaryShapes[] = {{640, 2560, 2560}, {300, 2560, 6912}, {640, 2560, 6912}, {640, 6912, 2560},
+                                    {640, 2560, 640},  {512, 1152, 1152}, {512, 1152, 4304}, {512, 4304, 1152},
+                                    {1, 2560, 6912},   {16, 2560, 6912}};
+
+/// Memory at a multiple of a page.
 struct Block {
   explicit Block(std::size_t size)
       : data(static_cast<std::byte*>(std::aligned_alloc(4096, (size + 4095) / 4096 * 4096))), n(size) {}
@@ -70,38 +81,81 @@ double best_time(Executor& executor, const Product& product, double seconds) {
   return best;
 }
 
-void measure(Executor& executor, const LinearKernel& kernel, Isa isa, const Shape& s, int n_round) {
-  const int n_thread = executor.n_thread();
-  const MatrixDesc desc = {DType::bf16, s.d_in, s.d_out};
-  Block x(static_cast<std::size_t>(s.n_row * s.d_in) * 4), y(static_cast<std::size_t>(s.n_row * s.d_out) * 4);
-  Block stored(static_cast<std::size_t>(s.d_in * s.d_out) * 2);
-  for (std::size_t i = 0; i < stored.n; i += 2)
-    reinterpret_cast<std::uint16_t*>(stored.data)[i / 2] = to_bf16(1.0f / static_cast<float>(1 + i % 63));
-  for (std::size_t i = 0; i < x.n; i += 4)
-    reinterpret_cast<float*>(x.data)[i / 4] = 1.0f / static_cast<float>(1 + i % 61);
-  Block packed(kernel.packed_size(desc));
-  const auto start = std::chrono::steady_clock::now();
-  kernel.pack(desc, stored.data, packed.data);
-  const double pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-  LinearJob job = {};
-  job.x = x.data, job.x_stride = s.d_in, job.n_row = s.n_row, job.d_in = s.d_in, job.n_part = 1;
-  job.part[0] = {DType::bf16, packed.data, nullptr, nullptr, nullptr, y.data, s.d_out};
-  const Product product(kernel, job, n_thread);
-  const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
-  std::vector<double> rates, peaks, shares;
-  for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
-    peaks.push_back(measure_peak(peak_probe_of(isa), n_thread, 0.02));
-    rates.push_back(flop / best_time(executor, product, 0.05));
-    shares.push_back(rates.back() / peaks.back());
+/// A product of random numbers with all that it reads and writes.
+struct Trial {
+  Trial(const LinearKernel& kernel, const Shape& s, int n_thread)
+      : desc{kernel.quantize != nullptr ? DType::i8 : DType::bf16, s.d_in, s.d_out},
+        x(static_cast<std::size_t>(s.n_row * quantized_stride(s.d_in)) * 4),
+        y(static_cast<std::size_t>(s.n_row * s.d_out) * 4),
+        stored(static_cast<std::size_t>(s.d_in * s.d_out) * 2 / (kernel.quantize != nullptr ? 8 : 1)),
+        packed(kernel.packed_size(desc)) {
+    LinearJob job = {};
+    std::vector<float> row(static_cast<std::size_t>(s.d_in));
+    for (std::size_t k = 0; k < row.size(); ++k) row[k] = 1.0f / static_cast<float>(1 + k % 61);
+    job.x = x.data, job.x_type = kernel.quantize != nullptr ? DType::i8 : DType::f32;
+    job.x_stride = kernel.quantize != nullptr ? quantized_stride(s.d_in) : s.d_in;
+    for (std::int64_t r = 0; r < s.n_row; ++r)
+      if (kernel.quantize != nullptr)
+        kernel.quantize(row.data(), s.d_in, x.data + r * job.x_stride);
+      else
+        std::memcpy(x.data + 4 * r * s.d_in, row.data(), row.size() * sizeof(float));
+    for (std::size_t i = 0; i + 1 < stored.n; i += 2) {
+      const std::uint16_t bits =
+          kernel.quantize != nullptr ? 0x2412 : to_bf16(1.0f / static_cast<float>(1 + i / 2 % 63));
+      std::memcpy(stored.data + i, &bits, sizeof(bits));
+    }
+    const auto start = std::chrono::steady_clock::now();
+    kernel.pack(desc, stored.data, packed.data);
+    pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+    job.n_row = s.n_row, job.d_in = s.d_in, job.n_part = 1;
+    job.part[0] = {desc.type, packed.data, nullptr, nullptr, nullptr, y.data, s.d_out, &scale};
+    product.emplace(kernel, job, n_thread);
   }
-  std::sort(shares.begin(), shares.end());
+  MatrixDesc desc;
+  Block x, y, stored, packed;
+  float scale = 1;
+  double pack_seconds;
+  std::optional<Product> product;
+};
+
+double median(std::vector<double> values) {
+  std::sort(values.begin(), values.end());
+  return values[values.size() / 2];
+}
+
+/// `versus`: a kernel that takes turns with this one, or null.
+void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& probe, const Shape& s, int n_round,
+             const LinearKernel* versus) {
+  const int n_thread = executor.n_thread();
+  const Trial trial(kernel, s, n_thread);
+  std::optional<Trial> other;
+  if (versus != nullptr) other.emplace(*versus, s, n_thread);
+  const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
+  std::vector<double> rates, peaks, shares, factors;
+  for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
+    peaks.push_back(measure_peak(probe, n_thread, 0.02));
+    rates.push_back(flop / best_time(executor, *trial.product, 0.05));
+    shares.push_back(rates.back() / peaks.back());
+    if (other) factors.push_back(rates.back() / flop * best_time(executor, *other->product, 0.05));
+  }
   const double best = *std::max_element(rates.begin(), rates.end()),
                peak = *std::max_element(peaks.begin(), peaks.end());
-  fmt::print("{:8} {:5} x {:5} x {:5}  {:8.1f} GFLOP/s  {:5.1f} % of {:8.1f}  median {:5.1f} %  reads {:6.1f} GB/s",
-             kernel.name, s.n_row, s.d_in, s.d_out, best * 1e-9, 100 * best / peak, peak * 1e-9,
-             100 * shares[shares.size() / 2], best / flop * static_cast<double>(stored.n) * 1e-9);
-  fmt::print("  packed at {:.1f} GB/s\n", static_cast<double>(stored.n) / pack_seconds * 1e-9);
+  fmt::print("{:12} {:5} x {:5} x {:5}  {:8.1f} G/s  {:5.1f} % of {:8.1f}  median {:5.1f} %  reads {:6.1f} GB/s",
+             kernel.name, s.n_row, s.d_in, s.d_out, best * 1e-9, 100 * best / peak, peak * 1e-9, 100 * median(shares),
+             best / flop * static_cast<double>(trial.stored.n) * 1e-9);
+  fmt::print("  packed at {:.1f} GB/s", static_cast<double>(trial.stored.n) / trial.pack_seconds * 1e-9);
+  if (versus != nullptr) fmt::print("  {:.2f} x {}", median(factors), versus->name);
+  fmt::print("\n");
   std::fflush(stdout);
+}
+
+/// A ternary kernel's loop on registers has its name: `avx2_int8` and `avx2 int8`.
+const PeakProbe* probe_of(const LinearKernel& kernel) {
+  std::string name = kernel.name;
+  std::replace(name.begin(), name.end(), '_', ' ');
+  for (const PeakProbe& probe : peak_probes())
+    if (probe.name == name) return &probe;
+  return nullptr;
 }
 
 }  // namespace
@@ -109,13 +163,21 @@ void measure(Executor& executor, const LinearKernel& kernel, Isa isa, const Shap
 int main(int argc, char** argv) {
   const int n_thread = argc > 1 ? std::atoi(argv[1]) : 1, n_round = argc > 2 ? std::atoi(argv[2]) : 7;
   if (n_thread < 1 || n_round < 1) return fmt::print("usage: bench_linear [threads] [rounds] [kernel]\n"), 1;
-  fmt::print("{} thread(s), best and median of {} rounds, bf16 weights\n", n_thread, n_round);
+  fmt::print("{} thread(s), best and median of {} rounds, bf16 or ternary weights\n", n_thread, n_round);
   const auto executor = Executor::shared(n_thread);
   if (!executor) return fmt::print("{}\n", executor.error().message()), 1;
+  const auto wants = [&](const LinearKernel& kernel) { return argc < 4 || kernel.name == std::string(argv[3]); };
   for (const LinearKernel* kernel : linear_kernels()) {
     if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
     for (Isa isa : usable_isas())
-      if (isa_name(isa) == kernel->name && (argc < 4 || kernel->name == std::string(argv[3])))
-        for (const Shape& shape : kShapes) measure(**executor, *kernel, isa, shape, n_round);
+      if (isa_name(isa) == kernel->name && wants(*kernel))
+        for (const Shape& shape : kShapes) measure(**executor, *kernel, peak_probe_of(isa), shape, n_round, nullptr);
+  }
+  for (const LinearKernel* kernel : ternary_kernels()) {
+    const PeakProbe* probe = probe_of(*kernel);
+    if (probe == nullptr || !wants(*kernel)) continue;
+    if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
+    for (const Shape& shape : kTernaryShapes)
+      measure(**executor, *kernel, *probe, shape, n_round, choose_linear({DType::bf16, 64, 64}, probe->isa));
   }
 }

@@ -32,8 +32,8 @@ constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},    {3, 17,
                              {4, 768, 32}, {33, 40, 70},  {64, 96, 129}, {97, 35, 40},  {300, 33, 530},
                              {270, 5, 9},  {1, 1537, 70}, {7, 760, 1100}};
 
-constexpr Activation kActivations[] = {Activation::none, Activation::gelu_tanh, Activation::gelu_erf, Activation::silu,
-                                       Activation::relu};
+constexpr Activation kActivations[] = {Activation::none, Activation::gelu_tanh, Activation::gelu_erf,
+                                       Activation::silu, Activation::relu,      Activation::relu_squared};
 
 /// Numbers in [-1, 1] that differ from call to call.
 class Numbers {
@@ -59,6 +59,7 @@ double activate(Activation activation, double x) {
     return x / (1 + std::exp(-2 * std::sqrt(2 / M_PI) * (x + 0.044715 * x * x * x)));
   if (activation == Activation::gelu_erf) return x / 2 * std::erfc(-x * M_SQRT1_2);
   if (activation == Activation::relu) return std::max(x, 0.0);
+  if (activation == Activation::relu_squared) return std::max(x, 0.0) * std::max(x, 0.0);
   return x;
 }
 

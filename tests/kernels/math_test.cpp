@@ -84,6 +84,11 @@ void check_relu(const CpuKernels& kernels) {
   CHECK(std::isnan(y.back()));
   y.pop_back();
   CHECK(y == expected);
+  for (float& value : expected) value *= value;
+  kernels.relu_squared(x.data(), nullptr, nullptr, 0, x.data(), static_cast<std::int64_t>(x.size()));
+  CHECK(std::isnan(x.back()));
+  x.pop_back();
+  CHECK(x == expected);
 }
 
 void check_ends(const CpuKernels& kernels) {
@@ -102,7 +107,7 @@ void check_ends(const CpuKernels& kernels) {
 }  // namespace
 
 VLA_KERNEL_TEST("silu and gelu are within two units in the last place over the whole range", check_accuracy)
-VLA_KERNEL_TEST("relu keeps what is above zero, and NaN", check_relu)
+VLA_KERNEL_TEST("relu and its square keep what is above zero, and NaN", check_relu)
 VLA_KERNEL_TEST("what is not finite stays so", check_not_finite)
 VLA_KERNEL_TEST("a row of any length is mapped from its first number to its last, and nothing beyond", check_ends)
 

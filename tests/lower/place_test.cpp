@@ -53,7 +53,8 @@ class RandomGraph {
   }
 
   Tensor step() {
-    const Activation activations[] = {Activation::gelu_tanh, Activation::gelu_erf, Activation::silu, Activation::relu};
+    const Activation activations[] = {Activation::gelu_tanh, Activation::gelu_erf, Activation::silu, Activation::relu,
+                                      Activation::relu_squared};
     const Tensor x = some();
     switch (pick(14)) {
       case 0:

@@ -30,6 +30,7 @@ class ParamSet {
     bundle.set("vla.bundle_version", Value(std::int64_t{1}));
     for (Piece piece : pieces) {
       const auto stored = store_as(piece.type, piece.values);
+      if (piece.type == DType::i8) piece.shape[0] /= 4;
       bundle.tensors.push_back(
           {piece.name, piece.type, piece.shape, {reinterpret_cast<const char*>(stored.data()), stored.size()}});
     }

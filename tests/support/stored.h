@@ -11,8 +11,17 @@
 
 namespace vla::test {
 
-/// Values in a storage type, and what the type made of them.
+/// -1, 0 and 1 as a ternary matrix is stored, whose rows are whole bytes.
+inline std::vector<std::byte> store_ternary(const std::vector<float>& values) {
+  std::vector<std::byte> out(values.size() / 4);
+  for (std::size_t i = 0; i < 4 * out.size(); ++i)
+    out[i / 4] |= static_cast<std::byte>(static_cast<int>(values[i] + 1) << 2 * (i % 4));
+  return out;
+}
+
+/// Values in a storage type, and what the type made of them. i8 is ternary.
 inline std::vector<std::byte> store_as(DType type, std::vector<float>& values) {
+  if (type == DType::i8) return store_ternary(values);
   std::vector<std::byte> out(values.size() * (type == DType::f32 ? 4 : 2));
   for (std::size_t i = 0; i < values.size(); ++i) {
     if (type == DType::f32) {

@@ -10,7 +10,6 @@
 #include "kernels/probe/probe.h"
 
 #if defined(__x86_64__)
-#include <cpuid.h>
 #include <immintrin.h>
 #endif
 
@@ -78,6 +77,37 @@ void multiply_add_any(long n_round) {
 
 #undef VLA_SUM_LOOP
 
+/// Products of bytes in pairs, and their sums in 16 bits: two instructions for 32 multiply-adds.
+[[gnu::target("avx2")]] void multiply_add_bytes(long n_round) {
+  if (n_round <= 0) return;
+  __asm__ volatile(
+      "1:\n"
+      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11\n"
+      "vpmaddubsw %%ymm14, %%ymm15, %%ymm13\n"
+      "vpaddw %%ymm13, %%ymm\\sum, %%ymm\\sum\n"
+      ".endr\n"
+      "dec %0\n"
+      "jnz 1b"
+      : "+r"(n_round)
+      :
+      : "cc", "xmm0", "xmm1", "xmm2", "xmm3", "xmm4", "xmm5", "xmm6", "xmm7", "xmm8", "xmm9", "xmm10", "xmm11",
+        "xmm13");
+}
+
+[[gnu::target("avx2")]] void multiply_add_avxvnni(long n_round) {
+  if (n_round <= 0) return;
+  __asm__ volatile(
+      "1:\n"
+      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11\n"
+      "%{vex%} vpdpbusd %%ymm14, %%ymm15, %%ymm\\sum\n"
+      ".endr\n"
+      "dec %0\n"
+      "jnz 1b"
+      : "+r"(n_round)
+      :
+      : "cc", "xmm0", "xmm1", "xmm2", "xmm3", "xmm4", "xmm5", "xmm6", "xmm7", "xmm8", "xmm9", "xmm10", "xmm11");
+}
+
 /// All eight tiles as 16 rows of 64 bytes, palette 1. Source: Intel Architecture Instruction Set Extensions,
 /// chapter on AMX, LDTILECFG.
 struct alignas(64) TileConfig {
@@ -106,11 +136,6 @@ constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell th
 
 #undef VLA_TILE_LOOP
 
-bool has_amx_int8() {
-  unsigned a = 0, b = 0, c = 0, d = 0;
-  return __get_cpuid_count(7, 0, &a, &b, &c, &d) != 0 && (d & (1U << 25)) != 0;
-}
-
 #endif
 
 std::vector<PeakProbe> detect() {
@@ -118,11 +143,14 @@ std::vector<PeakProbe> detect() {
 #if defined(__x86_64__)
   const std::vector<Isa>& usable = usable_isas();
   const auto has = [&](Isa isa) { return std::find(usable.begin(), usable.end(), isa) != usable.end(); };
-  if (has(Isa::avx2)) found.push_back({"avx2 f32", Isa::avx2, Number::f32, 12 * 8 * 2, multiply_add_avx2});
+  if (has(Isa::avx2)) {
+    found.push_back({"avx2 f32", Isa::avx2, Number::f32, 12 * 8 * 2, multiply_add_avx2});
+    found.push_back({"avx2 int8", Isa::avx2, Number::int8, 12 * 32 * 2, multiply_add_bytes});
+    if (has_avx_vnni()) found.push_back({"avxvnni int8", Isa::avx2, Number::int8, 12 * 32 * 2, multiply_add_avxvnni});
+  }
   if (has(Isa::avx512)) {
     found.push_back({"avx512 f32", Isa::avx512, Number::f32, 28 * 16 * 2, multiply_add_avx512});
-    if (__builtin_cpu_supports("avx512vnni"))
-      found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
+    if (has_avx512_vnni()) found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
   }
   if (has(Isa::avx512_bf16))
     found.push_back({"avx512 bf16", Isa::avx512_bf16, Number::bf16, 28 * 32 * 2, multiply_add_pairs});

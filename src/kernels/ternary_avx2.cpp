@@ -1,0 +1,89 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#if defined(__x86_64__)
+#include "kernels/ternary_loop.h"
+
+namespace vla::kernels {
+namespace {
+
+/// The instruction of AVX-VNNI: sums of products of four bytes, one operand without sign.
+struct FourProducts {
+  static constexpr int kStep = 512;
+
+  static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
+    asm("%{vex%} vpdpbusd %2, %1, %0" : "+x"(sum) : "x"(numbers), "x"(codes));
+  }
+  static VLA_INLINE __m256i total(__m256i sum) { return sum; }
+};
+
+/// Two products of bytes summed to 16 bits, which hold 64 of such pairs: 2 * 2 * 127 each.
+struct TwoProducts {
+  static constexpr int kStep = 256;
+  static_assert(kStep / 4 * 2 * 2 * 127 <= 32767);
+
+  static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
+    __m256i pairs;  // of the intrinsics compilers add pairs to each other first, and run out of registers
+    asm("vpmaddubsw %3, %2, %1\n\tvpaddw %1, %0, %0" : "+x"(sum), "=&x"(pairs) : "x"(numbers), "x"(codes));
+  }
+  static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
+};
+
+/// 6 rows by 2 vectors: 12 sums.
+template <class Products>
+struct Avx2Tile {
+  using V = Avx2;
+  static constexpr int kRows = 6, kColumns = 16, kBlockRows = 216, kStep = Products::kStep;
+  static constexpr bool kEven = true, kRounds = false;
+  struct Session {};
+
+  template <class Strips>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                       std::int32_t* sums, bool add) {
+    using Function = void (*)(const std::byte*, std::int64_t, const Strips&, std::int64_t, std::int32_t*, bool);
+    static constexpr Function kTiles[] = {tile<1, Strips>, tile<2, Strips>, tile<3, Strips>,
+                                          tile<4, Strips>, tile<5, Strips>, tile<6, Strips>};
+    kTiles[n_row - 1](x, x_stride, strips, depth, sums, add);
+  }
+
+ private:
+  template <int kCount, class Strips>
+  static void tile(const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                   std::int32_t* sums, bool add) {
+    __m256i sum[kCount][2];
+#pragma GCC unroll 6
+    for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm256_setzero_si256();
+    for (std::int64_t k = 0; k < depth; k += TernaryPanels::kGroup)
+#pragma GCC unroll 4
+      for (int s = 0; s < 4; ++s, x += 4) {
+        const __m256i left = strips.template load<__m256i>(k, s, 0, 0);
+        const __m256i right = strips.template load<__m256i>(k, s, 0, 32);
+#pragma GCC unroll 6
+        for (int r = 0; r < kCount; ++r) {
+          std::int32_t four;
+          std::memcpy(&four, x + r * x_stride, sizeof(four));
+          const __m256i codes = _mm256_set1_epi32(four);
+          Products::add(sum[r][0], left, codes);
+          Products::add(sum[r][1], right, codes);
+        }
+      }
+#pragma GCC unroll 6
+    for (int r = 0; r < kCount; ++r)
+      for (int i = 0; i < 2; ++i) {
+        auto* place = reinterpret_cast<__m256i*>(sums + r * kColumns + 8 * i);
+        const __m256i total = Products::total(sum[r][i]);
+        _mm256_storeu_si256(place, add ? _mm256_add_epi32(total, _mm256_loadu_si256(place)) : total);
+      }
+  }
+};
+
+}  // namespace
+
+extern const LinearKernel kTernaryAvxVnni, kTernaryAvx2;
+const LinearKernel kTernaryAvxVnni = TernaryLoop<Avx2Tile<FourProducts>>::kernel(
+    "avxvnni_int8",
+    [](const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::avx2 && has_avx_vnni(); });
+const LinearKernel kTernaryAvx2 = TernaryLoop<Avx2Tile<TwoProducts>>::kernel(
+    "avx2_int8", [](const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::avx2; });
+
+}  // namespace vla::kernels
+#endif

@@ -1,0 +1,70 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#if defined(__x86_64__)
+#include "kernels/ternary_loop.h"
+
+namespace vla::kernels {
+namespace {
+
+/// 6 rows by 4 vectors: 24 sums. The instruction of AVX-512 VNNI sums products of four bytes, one operand without sign.
+struct VnniTile {
+  using V = Avx512;
+  static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = 512;
+  static constexpr bool kEven = true, kRounds = false;
+  struct Session {};
+
+  template <class Strips>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                       std::int32_t* sums, bool add) {
+    using Function = void (*)(const std::byte*, std::int64_t, const Strips&, std::int64_t, std::int32_t*, bool);
+    static constexpr Function kTiles[] = {tile<1, Strips>, tile<2, Strips>, tile<3, Strips>,
+                                          tile<4, Strips>, tile<5, Strips>, tile<6, Strips>};
+    kTiles[n_row - 1](x, x_stride, strips, depth, sums, add);
+  }
+
+ private:
+  static constexpr int kStrips = kColumns / TernaryPanels::kColumns;
+
+  template <int kCount, class Strips>
+  static void tile(const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                   std::int32_t* sums, bool add) {
+    __m512i sum[kCount][kStrips];
+#pragma GCC unroll 6
+    for (int r = 0; r < kCount; ++r)
+#pragma GCC unroll 4
+      for (int j = 0; j < kStrips; ++j)
+        sum[r][j] = add ? _mm512_loadu_si512(sums + r * kColumns + 16 * j) : _mm512_setzero_si512();
+    for (std::int64_t k = 0; k < depth; k += TernaryPanels::kGroup)
+#pragma GCC unroll 4
+      for (int s = 0; s < 4; ++s, x += 4) {
+        __m512i numbers[kStrips];
+#pragma GCC unroll 4
+        for (int j = 0; j < kStrips; ++j) numbers[j] = strips.template load<__m512i>(k, s, j, 0);
+#pragma GCC unroll 6
+        for (int r = 0; r < kCount; ++r) {
+          std::int32_t four;
+          std::memcpy(&four, x + r * x_stride, sizeof(four));
+          const __m512i codes = _mm512_set1_epi32(four);
+#pragma GCC unroll 4
+          for (int j = 0; j < kStrips; ++j)  // of the intrinsic compilers copy every sum
+            asm("vpdpbusd %2, %1, %0" : "+v"(sum[r][j]) : "v"(numbers[j]), "v"(codes));
+        }
+      }
+#pragma GCC unroll 6
+    for (int r = 0; r < kCount; ++r)
+#pragma GCC unroll 4
+      for (int j = 0; j < kStrips; ++j) _mm512_storeu_si512(sums + r * kColumns + 16 * j, sum[r][j]);
+  }
+};
+
+bool supports(const MatrixDesc& desc, Isa isa) {
+  return desc.type == DType::i8 && isa >= Isa::avx512 && has_avx512_vnni();
+}
+
+}  // namespace
+
+extern const LinearKernel kTernaryAvx512;
+const LinearKernel kTernaryAvx512 = TernaryLoop<VnniTile>::kernel("avx512_int8", supports);
+
+}  // namespace vla::kernels
+#endif

@@ -1,0 +1,44 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "kernels/ternary_loop.h"
+
+namespace vla::kernels {
+namespace {
+
+/// A tile in plain C++, slow and for every machine.
+struct PlainTile {
+  using V = Portable;
+  static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;
+  static constexpr bool kEven = true, kRounds = false;
+  struct Session {};
+
+  template <class Strips>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& panel, std::int64_t depth,
+                       std::int32_t* sums, bool add) {
+    for (int r = 0; r < n_row; ++r)
+      for (int n = 0; n < kColumns; ++n) {
+        std::int32_t sum = add ? sums[r * kColumns + n] : 0;
+        for (std::int64_t k = 0; k < depth; ++k)
+          sum += static_cast<signed char>(x[r * x_stride + k]) * number(panel, k, n);
+        sums[r * kColumns + n] = sum;
+      }
+  }
+
+ private:
+  /// Number k of column n: a byte of the eight at a multiple of that.
+  template <class Strips>
+  static VLA_INLINE int number(const Strips& panel, std::int64_t k, int n) {
+    const int place = n % 16 * 4 + static_cast<int>(k % 4);
+    const auto eight = panel.template load<Eight>(k / 16 * 16, static_cast<int>(k % 16 / 4), n / 16, place / 8 * 8);
+    return static_cast<int>(eight[0] >> place % 8 * 8 & 3);
+  }
+  typedef std::uint64_t Eight __attribute__((vector_size(8)));
+};
+
+}  // namespace
+
+extern const LinearKernel kTernaryPlain;
+const LinearKernel kTernaryPlain =
+    TernaryLoop<PlainTile>::kernel("plain_int8", [](const MatrixDesc& desc, Isa) { return desc.type == DType::i8; });
+
+}  // namespace vla::kernels

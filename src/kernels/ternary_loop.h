@@ -1,0 +1,182 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "kernels/linear_stripe.h"
+#include "kernels/ternary_panels.h"
+
+/// The loop around a tile of products of ternary weights and int8 codes of x: what an item is, what lies in which
+/// cache.
+///
+/// A panel's columns are taken a step of the depth at a time. Its two bits for a number are expanded to bytes once,
+/// which stay in the first cache while all rows of a block of x pass by; of few rows the tile unpacks them itself. Sums
+/// are whole numbers, so that they are the same in every order.
+namespace vla::kernels {
+
+/// Where a tile reads the numbers of a panel of kStrips: load(k, s, i, byte) is a vector from a byte on of the line
+/// that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they are expanded
+/// (TernaryPanels::expand).
+template <int kStrips>
+struct ExpandedStrips {
+  const std::byte* lines;
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    Vector numbers;
+    std::memcpy(&numbers, lines + (k + 4 * s) * kStrips * 16 + i * TernaryPanels::kLine + byte, sizeof(numbers));
+    return numbers;
+  }
+};
+/// The same with numbers of two bits, and the bytes from one strip to the next.
+template <int kStrips>
+struct PackedStrips {
+  const std::byte* strips;
+  std::int64_t strip;
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    typedef std::uint64_t Words __attribute__((vector_size(sizeof(Vector))));
+    Words words;
+    std::memcpy(&words, strips + i * strip + k * 4 + byte, sizeof(words));
+    return std::bit_cast<Vector>((words >> 2 * s) & 0x0303030303030303U);
+  }
+};
+
+/// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows (of the block of x), kStep (of the
+/// depth, most), kEven (tiles of equal height), kRounds (false), Session (held while a thread works), and
+///   multiply(n_row, x, x_stride, strips, depth, sums, add)
+///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and of PackedStrips. It may read and write
+///     rows up to kRows.
+/// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
+template <class Tile>
+class TernaryLoop {
+  using V = typename Tile::V;
+  using Stripes = LinearStripes<Tile>;
+  static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
+  static constexpr int kStrips = Tile::kColumns / static_cast<int>(TernaryPanels::kColumns);
+  static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks numbers for
+  static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
+  static_assert(kColumns % TernaryPanels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
+
+  struct Scratch {
+    const LinearJob* job;  // stands where LinearLoop notes whose rows it keeps, and tells it that they are gone
+    alignas(64) std::byte panel[Tile::kStep * kColumns];
+    alignas(64) std::int32_t sums[(kBlockRows + kRows) * kColumns];
+    alignas(64) float gates[(kBlockRows + kRows) * kColumns];
+    alignas(64) float scaled[kRows * kColumns];
+  };
+
+ public:
+  /// The row of the table that this tile makes.
+  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
+    LinearKernel row = {name,
+                        TernaryPanels::packed_size,
+                        TernaryPanels::pack,
+                        supports,
+                        cut,
+                        run,
+                        sizeof(Scratch),
+                        kAnyNorm,
+                        [](std::int64_t, std::int64_t) { return false; }};
+    row.quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); };
+    return row;
+  }
+
+ private:
+  static constexpr std::int64_t kAnyNorm = std::int64_t{1} << 62;  // whoever quantizes x computes it
+
+  explicit TernaryLoop(const LinearJob& job)
+      : job_(job),
+        block_rows_(even_block(job.n_row, block_rows(job.x_stride), kRows)),
+        n_block_(ceil_div(job.n_row, block_rows_)),
+        n_panel_(Stripes::n_panel(job)) {}
+
+  /// Rows that stay in the second cache while panels pass by.
+  static std::int64_t block_rows(std::int64_t x_stride) {
+    constexpr std::int64_t kBlockSize = std::int64_t{640} << 10;
+    return min(kBlockRows, round_up(kBlockSize / x_stride + 1, kRows));
+  }
+
+  static std::int64_t cut(LinearJob& job, int n_thread) {
+    const TernaryLoop loop(job);
+    job.n_group = n_thread == 1 ? 1 : min(ceil_div(kMinItems * n_thread, loop.n_block_), loop.n_panel_);
+    return loop.n_block_ * job.n_group;
+  }
+
+  /// Some panels by a block of rows.
+  static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
+    [[maybe_unused]] const typename Tile::Session session;
+    TernaryLoop loop(job);
+    loop.scratch_ = reinterpret_cast<Scratch*>(worker.scratch);
+    loop.scratch_->job = &job;
+    const std::int64_t row = item / job.n_group * loop.block_rows_, group = item % job.n_group;
+    for (std::int64_t panel = loop.n_panel_ * group / job.n_group; panel < loop.n_panel_ * (group + 1) / job.n_group;
+         ++panel) {
+      Stripe stripe = Stripes::of_panel(job, panel);
+      stripe.row = row, stripe.n_row = min(loop.block_rows_, job.n_row - row), stripe.depth = job.d_in;
+      stripe.gates = loop.scratch_->gates;
+      loop.multiply(stripe);
+    }
+  }
+
+  void multiply(const Stripe& s) {
+    if (job_.gated)
+      sum(
+          job_.part[0], s, [](auto, auto) {},
+          [&](std::int64_t r, std::int64_t n_row) { scale(job_.part[0], s, r, n_row, s.gates + r * kColumns); });
+    const LinearJob::Part& part = job_.part[s.part];
+    sum(
+        part, s, [&](std::int64_t r, std::int64_t n_row) { Stripes::fetch(job_, s, r, n_row); },
+        [&](std::int64_t r, std::int64_t n_row) {
+          scale(part, s, r, n_row, scratch_->scaled);
+          Stripes::finish(job_, s, scratch_->scaled, r, n_row);
+        });
+  }
+
+  const std::byte* row_of(const Stripe& s, std::int64_t r) const { return job_.x + (s.row + r) * job_.x_stride; }
+
+  /// Sums of a panel's columns. `before` and `after` are called around the last step of each tile with its first row
+  /// and their number.
+  template <class Before, class After>
+  VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, const Before& before, const After& after) {
+    const std::int64_t strip = TernaryPanels::strip_size(job_.d_in), n_tile = ceil_div(s.n_row, kRows);
+    const std::int64_t depth = quantized_depth(job_.d_in), step = even_block(depth, Tile::kStep, kQuantizedUnit);
+    const std::byte* strips = part.weight + s.column / TernaryPanels::kColumns * strip;
+    for (std::int64_t k = 0; k < depth; k += step, strips += TernaryPanels::strip_size(step)) {
+      const std::int64_t d = min(step, depth - k);
+      if (job_.n_row > kFewRows) TernaryPanels::expand<kStrips>(strips, strip, d, scratch_->panel);
+      for (std::int64_t t = 0; t < n_tile; ++t) {
+        const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
+        std::int32_t* sums = scratch_->sums + r * kColumns;
+        if (k + d == depth) before(r, n_row);
+        const std::byte* x = row_of(s, r) + k;
+        if (job_.n_row > kFewRows)
+          Tile::multiply(static_cast<int>(n_row), x, job_.x_stride, ExpandedStrips<kStrips>{scratch_->panel}, d, sums,
+                         k > 0);
+        else
+          Tile::multiply(static_cast<int>(n_row), x, job_.x_stride, PackedStrips<kStrips>{strips, strip}, d, sums,
+                         k > 0);
+        if (k + d == depth) after(r, n_row);
+      }
+    }
+  }
+
+  /// What the sums of a tile stand for: float(sum) * (scale of W / s of the row).
+  VLA_INLINE void scale(const LinearJob::Part& part, const Stripe& s, std::int64_t r, std::int64_t n_row, float* to) {
+    for (std::int64_t i = 0; i < n_row; ++i, ++r) {
+      const RowScale row = row_scale(row_of(s, r), job_.d_in);
+      const float step = *part.scale / row.s;
+      for (std::int64_t n = 0; n < kColumns; n += V::width) {
+        typename V::Int sums;
+        std::memcpy(&sums, scratch_->sums + r * kColumns + n, sizeof(sums));
+        V::store(to + i * kColumns + n, __builtin_convertvector(sums - row.sum, typename V::Float) * step);
+      }
+    }
+  }
+
+  const LinearJob& job_;
+  Scratch* scratch_ = nullptr;
+  const std::int64_t block_rows_, n_block_, n_panel_;
+};
+
+}  // namespace vla::kernels

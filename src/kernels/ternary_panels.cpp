@@ -1,0 +1,38 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "kernels/ternary_panels.h"
+
+namespace vla::kernels {
+namespace {
+
+constexpr std::int64_t kUnitStrips = 4;
+
+/// Four bytes of four codes each, as four by four numbers of two bits: rows become columns.
+std::uint32_t transposed(std::uint32_t codes) {
+  std::uint32_t moved = (codes ^ codes >> 6) & 0x00CC00CC;
+  codes ^= moved ^ moved << 6;
+  moved = (codes ^ codes >> 12) & 0x0000F0F0;
+  return codes ^ moved ^ moved << 12;
+}
+
+}  // namespace
+
+std::size_t TernaryPanels::packed_size(const MatrixDesc& desc) {
+  return static_cast<std::size_t>(ceil_div(desc.d_out, kColumns * kUnitStrips) * kUnitStrips * strip_size(desc.d_in));
+}
+
+void TernaryPanels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
+  const std::int64_t row = desc.d_in / 4;  // bytes
+  std::memset(packed, 0, packed_size(desc));
+  for (std::int64_t n = 0; n < desc.d_out; ++n, stored += row) {
+    std::byte* to = packed + n / kColumns * strip_size(desc.d_in) + n % kColumns * 4;
+    for (std::int64_t i = 0; i < row; i += 4, to += kLine) {
+      std::uint32_t codes = 0;
+      std::memcpy(&codes, stored + i, static_cast<std::size_t>(min(4, row - i)));
+      codes = transposed(codes);
+      std::memcpy(to, &codes, sizeof(codes));
+    }
+  }
+}
+
+}  // namespace vla::kernels

@@ -1,0 +1,320 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Products of ternary weights and int8 codes: every kernel of this machine against whole numbers and single roundings,
+// bit for bit.
+#include <doctest/doctest.h>
+
+#include <atomic>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <thread>
+
+#include "kernels/quantized.h"
+#include "kernels/ternary_kernels.h"
+#include "support/stored.h"
+
+using namespace vla;
+using namespace vla::kernels;
+
+namespace {
+
+struct Shape {
+  std::int64_t n_row, d_in, d_out;
+};
+
+// One row, few, more than a block of rows; depths beyond a step and between its multiples; columns that no panel
+// divides; the widths of BitVLA's tower.
+constexpr Shape kShapes[] = {{1, 4, 1},      {1, 64, 16},    {2, 12, 31},   {3, 4304, 33}, {32, 260, 65},
+                             {33, 260, 65},  {34, 1152, 64}, {65, 68, 129}, {97, 272, 40}, {241, 4304, 70},
+                             {300, 100, 17}, {513, 516, 9},  {640, 64, 1}};
+
+constexpr float kUntouched = 1234.5f;
+
+class Numbers {
+ public:
+  std::uint32_t next(std::uint32_t n) {
+    state_ = state_ * 1664525u + 1013904223u;
+    return (state_ >> 8) % n;
+  }
+  std::vector<float> floats(std::int64_t count) {
+    std::vector<float> values(static_cast<std::size_t>(count));
+    for (float& value : values) value = static_cast<float>(next(1U << 24)) / 8388608.0f - 1.0f;
+    return values;
+  }
+
+ private:
+  std::uint32_t state_ = 12345;
+};
+
+/// Rows that quantizing may get wrong: zeros; numbers below the smallest scale; halves between codes; one large number.
+std::vector<float> difficult_rows(Numbers& numbers, std::int64_t n_row, std::int64_t d_in) {
+  std::vector<float> x = numbers.floats(n_row * d_in);
+  for (std::int64_t r = 0; r < n_row; ++r) {
+    float* row = &x[static_cast<std::size_t>(r * d_in)];
+    for (std::int64_t k = 0; k < d_in; ++k) {
+      if (r % 7 == 1) row[k] = 0;
+      if (r % 7 == 2) row[k] *= 3e-6f;
+      if (r % 7 == 3) row[k] = static_cast<float>(numbers.next(255)) / 2 - 63;  // with 127: whole codes and halves
+      if (r % 7 == 3 && k == d_in / 2) row[k] = -127;
+      if (r % 7 == 4 && k == 0) row[k] = 3e38f;
+    }
+  }
+  return x;
+}
+
+struct Codes {
+  std::vector<int> q;
+  float s = 0;
+  int sum = 0;
+};
+
+/// The definition, a rounding at a time.
+Codes codes_of(const float* x, std::int64_t n) {
+  float a = 1e-5f;
+  for (std::int64_t k = 0; k < n; ++k) a = std::max(a, std::abs(x[k]));
+  Codes codes = {{}, 1.0f / a * 127.0f, 0};
+  for (std::int64_t k = 0; k < n; ++k) {
+    volatile float product = x[k] * codes.s;  // volatile: rounded before anything else
+    codes.q.push_back(std::min(127, std::max(-128, static_cast<int>(std::nearbyint(product)))));
+    codes.sum += codes.q.back();
+  }
+  return codes;
+}
+
+struct Case {
+  Shape shape;
+  int n_part = 1;
+  bool gated = false, with_bias = false, with_residual = false;
+  int n_thread = 1;
+};
+
+class Trial {
+ public:
+  Trial(const LinearKernel& kernel, const Case& c) : kernel_(kernel), case_(c) {
+    const auto [n_row, d_in, unused] = c.shape;
+    x_ = difficult_rows(numbers_, n_row, d_in);
+    for (std::int64_t r = 0; r < n_row; ++r) codes_.push_back(codes_of(&x_[static_cast<std::size_t>(r * d_in)], d_in));
+    for (int i = 0; i < c.n_part; ++i) parts_.push_back(make_part(d_out(i)));
+  }
+
+  void run() {
+    const auto [n_row, d_in, unused] = case_.shape;
+    const std::int64_t stride = quantized_stride(d_in);
+    std::vector<std::byte> rows(static_cast<std::size_t>(round_up(n_row, 64) * stride), std::byte{0xff});
+    for (std::int64_t r = 0; r < n_row; ++r)
+      kernel_.quantize(&x_[static_cast<std::size_t>(r * d_in)], d_in, rows.data() + r * stride);
+    LinearJob job = {};
+    job.x = rows.data(), job.x_type = DType::i8, job.x_stride = stride;
+    job.n_row = n_row, job.d_in = d_in, job.n_part = case_.n_part, job.gated = case_.gated;
+    for (int i = 0; i < case_.n_part; ++i) {
+      Part& part = parts_[static_cast<std::size_t>(i)];
+      job.part[i] = {DType::i8,
+                     packed(part, {DType::i8, d_in, d_out(i)}),
+                     case_.with_bias ? part.bias.data() : nullptr,
+                     nullptr,
+                     case_.with_residual ? part.residual.data() : nullptr,
+                     reinterpret_cast<std::byte*>(&part.y[1]),
+                     d_out(i),
+                     &part.scale};
+    }
+    const std::int64_t n_item = kernel_.cut(job, case_.n_thread);
+    std::atomic<std::int64_t> next = 0;
+    const auto work = [&](int index) {  // what a thread finds in its scratch memory must not matter
+      const std::int64_t size = round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096);
+      std::unique_ptr<std::byte, decltype(&std::free)> scratch(
+          static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(size))), std::free);
+      std::memset(scratch.get(), 0xff, kernel_.scratch_size);
+      Worker worker = {index, scratch.get(), 1};
+      for (std::int64_t item = next++; item < n_item; item = next++) kernel_.run(job, item, worker);
+    };
+    std::vector<std::thread> threads;
+    for (int i = 1; i < case_.n_thread; ++i) threads.emplace_back(work, i);
+    work(0);
+    for (std::thread& thread : threads) thread.join();
+  }
+
+  void check() const {
+    for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
+      const Part& part = parts_[static_cast<std::size_t>(i)];
+      CHECK(part.y.front() == kUntouched);
+      CHECK(part.y.back() == kUntouched);
+      int wrong = 0;
+      for (std::int64_t row = 0; row < case_.shape.n_row; ++row)
+        for (std::int64_t n = 0; n < d_out(i); ++n) {
+          const float got = part.y[static_cast<std::size_t>(row * d_out(i) + n + 1)];
+          wrong += got != expected(i, row, n);
+        }
+      CHECK(wrong == 0);
+    }
+  }
+
+ private:
+  struct Part {
+    std::vector<float> weight, bias, residual, y;
+    std::vector<std::byte> stored, packed;
+    float scale;
+  };
+
+  std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
+
+  Part make_part(std::int64_t width) {
+    Part part;
+    part.weight.resize(static_cast<std::size_t>(case_.shape.d_in * width));
+    for (float& weight : part.weight) weight = static_cast<float>(numbers_.next(3)) - 1;
+    part.stored = test::store_as(DType::i8, part.weight);
+    part.bias = numbers_.floats(width);
+    part.residual = numbers_.floats(case_.shape.n_row * width);
+    part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, kUntouched);
+    part.scale = 0.01f + 0.3f * static_cast<float>(parts_.size());
+    return part;
+  }
+
+  static const std::byte* packed(Part& part, const MatrixDesc& desc) {
+    const LinearKernel& any = *ternary_kernels().front();
+    part.packed.assign(any.packed_size(desc) + 64, std::byte{0xff});
+    std::byte* place = part.packed.data() + (64 - reinterpret_cast<std::uintptr_t>(part.packed.data()) % 64);
+    any.pack(desc, part.stored.data(), place);
+    return place;
+  }
+
+  float product(int i, std::int64_t row, std::int64_t n) const {
+    const Part& part = parts_[static_cast<std::size_t>(i)];
+    const Codes& codes = codes_[static_cast<std::size_t>(row)];
+    int sum = 0;
+    for (std::int64_t k = 0; k < case_.shape.d_in; ++k)
+      sum += codes.q[static_cast<std::size_t>(k)] *
+             static_cast<int>(part.weight[static_cast<std::size_t>(n * case_.shape.d_in + k)]);
+    volatile float y = static_cast<float>(sum) * (part.scale / codes.s);
+    if (case_.with_bias) y = y + part.bias[static_cast<std::size_t>(n)];
+    return y;
+  }
+
+  float expected(int i, std::int64_t row, std::int64_t n) const {
+    volatile float y = product(i, row, n);
+    if (case_.gated) y = y * product(0, row, n);
+    if (case_.with_residual)
+      y = y + parts_[static_cast<std::size_t>(i)].residual[static_cast<std::size_t>(row * d_out(i) + n)];
+    return y;
+  }
+
+  const LinearKernel& kernel_;
+  Case case_;
+  Numbers numbers_;
+  std::vector<float> x_;
+  std::vector<Codes> codes_;
+  std::vector<Part> parts_;
+};
+
+void check(const LinearKernel& kernel, const Case& c) {
+  CAPTURE(c.shape.n_row);
+  CAPTURE(c.shape.d_in);
+  CAPTURE(c.shape.d_out);
+  CAPTURE(c.n_thread);
+  Trial trial(kernel, c);
+  trial.run();
+  trial.check();
+}
+
+void check_codes(const LinearKernel& kernel) {
+  Numbers numbers;
+  for (const std::int64_t d_in : {1, 4, 15, 16, 63, 64, 65, 272, 4304}) {
+    const std::int64_t n_row = 200;
+    const std::vector<float> x = difficult_rows(numbers, n_row, d_in);
+    for (std::int64_t r = 0; r < n_row; ++r) {
+      const std::int64_t stride = quantized_stride(d_in);
+      std::vector<std::byte> row(static_cast<std::size_t>(stride) + 1, std::byte{0xaa});
+      const float* numbers_of_row = &x[static_cast<std::size_t>(r * d_in)];
+      kernel.quantize(numbers_of_row, d_in, row.data());
+      const Codes expected = codes_of(numbers_of_row, d_in);
+      const RowScale scale = row_scale(row.data(), d_in);
+      int wrong = scale.s != expected.s || scale.sum != expected.sum || row.back() != std::byte{0xaa};
+      for (std::int64_t k = 0; k < quantized_depth(d_in); ++k)
+        wrong += static_cast<signed char>(row[static_cast<std::size_t>(k)]) !=
+                 (k < d_in ? expected.q[static_cast<std::size_t>(k)] : 0);
+      CHECK(wrong == 0);
+    }
+  }
+}
+
+void check_not_finite(const LinearKernel& kernel) {
+  const std::int64_t d_in = 68, d_out = 5;
+  const MatrixDesc desc = {DType::i8, d_in, d_out};
+  std::vector<float> weight(static_cast<std::size_t>(d_in * d_out), 1.0f);
+  const std::vector<std::byte> stored = test::store_as(DType::i8, weight);
+  std::unique_ptr<std::byte, decltype(&std::free)> packed(
+      static_cast<std::byte*>(std::aligned_alloc(64, kernel.packed_size(desc))), std::free);
+  kernel.pack(desc, stored.data(), packed.get());
+  std::unique_ptr<std::byte, decltype(&std::free)> scratch(
+      static_cast<std::byte*>(std::aligned_alloc(64, (kernel.scratch_size + 63) / 64 * 64)), std::free);
+  for (const float bad : {std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::quiet_NaN(),
+                          std::numeric_limits<float>::quiet_NaN()})
+    for (const std::int64_t place : {std::int64_t{0}, std::int64_t{17}, d_in - 1}) {
+      std::vector<float> x(static_cast<std::size_t>(d_in), 1.0f), y(static_cast<std::size_t>(d_out));
+      x[static_cast<std::size_t>(place)] = bad;
+      std::vector<std::byte> row(static_cast<std::size_t>(64 * quantized_stride(d_in)));
+      kernel.quantize(x.data(), d_in, row.data());
+      const float scale = 1;
+      LinearJob job = {};
+      job.x = row.data(), job.x_type = DType::i8, job.x_stride = quantized_stride(d_in);
+      job.n_row = 1, job.d_in = d_in, job.n_part = 1;
+      job.part[0] = {DType::i8, packed.get(), nullptr, nullptr, nullptr, reinterpret_cast<std::byte*>(y.data()),
+                     d_out,     &scale};
+      Worker worker = {0, scratch.get(), 1};
+      CHECK(kernel.cut(job, 1) == 1);
+      kernel.run(job, 0, worker);
+      for (const float number : y) CHECK_FALSE(std::isfinite(number));
+    }
+}
+
+void check_shapes(const LinearKernel& kernel) {
+  for (const Shape& shape : kShapes) check(kernel, {.shape = shape});
+}
+
+void check_epilogues(const LinearKernel& kernel) {
+  for (const Shape& shape : {Shape{1, 64, 16}, Shape{33, 260, 65}, Shape{97, 272, 40}}) {
+    for (const bool bias : {false, true})
+      for (const bool residual : {false, true})
+        check(kernel, {.shape = shape, .with_bias = bias, .with_residual = residual});
+    check(kernel, {.shape = shape, .n_part = 2, .gated = true});
+    check(kernel, {.shape = shape, .n_part = 2, .gated = true, .with_bias = true, .with_residual = true});
+    check(kernel, {.shape = shape, .n_part = 3, .with_bias = true});
+  }
+}
+
+void check_threads(const LinearKernel& kernel) {
+  for (const int n_thread : {2, 3, 64})
+    for (const Shape& shape : {Shape{1, 64, 16}, Shape{97, 272, 140}, Shape{300, 100, 17}}) {
+      check(kernel, {.shape = shape, .with_bias = true, .n_thread = n_thread});
+      check(kernel, {.shape = shape, .n_part = 2, .gated = true, .n_thread = n_thread});
+    }
+}
+
+const LinearKernel& row(const std::string& name) {
+  for (const LinearKernel* kernel : ternary_kernels())
+    if (kernel->name == name) return *kernel;
+  FAIL("no row " << name);
+  return *ternary_kernels().back();
+}
+
+/// For doctest's skip decorator: this machine lacks the instructions of a row.
+bool lacks(const std::string& name) {
+  for (const LinearKernel* kernel : ternary_kernels())
+    if (kernel->name == name) return !kernel->supports({DType::i8, 64, 64}, usable_isas().back());
+  return true;
+}
+
+}  // namespace
+
+#define VLA_TERNARY_TEST(sentence, check)                                                                    \
+  TEST_CASE("plain_int8: " sentence) { check(row("plain_int8")); }                                           \
+  TEST_CASE("avx2_int8: " sentence* doctest::skip(lacks("avx2_int8"))) { check(row("avx2_int8")); }          \
+  TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check(row("avxvnni_int8")); } \
+  TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check(row("avx512_int8")); }
+
+VLA_TERNARY_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)
+VLA_TERNARY_TEST("sums of any shape are exact, and scaled in single roundings", check_shapes)
+VLA_TERNARY_TEST("bias, gate and residual follow the product, each rounded by itself", check_epilogues)
+VLA_TERNARY_TEST("any number of threads computes every number once, and the same", check_threads)
+VLA_TERNARY_TEST("a row that is not finite has no finite product", check_not_finite)
