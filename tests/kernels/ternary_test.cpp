@@ -11,8 +11,10 @@
 #include <limits>
 #include <thread>
 
+#include "base/npy.h"
 #include "kernels/quantized.h"
 #include "kernels/ternary_kernels.h"
+#include "support/editable_bundle.h"
 #include "support/stored.h"
 
 using namespace vla;
@@ -83,6 +85,14 @@ Codes codes_of(const float* x, std::int64_t n) {
   return codes;
 }
 
+using Memory = std::unique_ptr<std::byte, decltype(&std::free)>;
+
+/// At a multiple of a page.
+Memory memory(std::size_t size) {
+  const std::int64_t pages = round_up(static_cast<std::int64_t>(size), 4096);
+  return {static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(pages))), std::free};
+}
+
 struct Case {
   Shape shape;
   int n_part = 1;
@@ -122,9 +132,7 @@ class Trial {
     const std::int64_t n_item = kernel_.cut(job, case_.n_thread);
     std::atomic<std::int64_t> next = 0;
     const auto work = [&](int index) {  // what a thread finds in its scratch memory must not matter
-      const std::int64_t size = round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096);
-      std::unique_ptr<std::byte, decltype(&std::free)> scratch(
-          static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(size))), std::free);
+      const Memory scratch = memory(kernel_.scratch_size);
       std::memset(scratch.get(), 0xff, kernel_.scratch_size);
       Worker worker = {index, scratch.get(), 1};
       for (std::int64_t item = next++; item < n_item; item = next++) kernel_.run(job, item, worker);
@@ -243,11 +251,8 @@ void check_not_finite(const LinearKernel& kernel) {
   const MatrixDesc desc = {DType::i8, d_in, d_out};
   std::vector<float> weight(static_cast<std::size_t>(d_in * d_out), 1.0f);
   const std::vector<std::byte> stored = test::store_as(DType::i8, weight);
-  std::unique_ptr<std::byte, decltype(&std::free)> packed(
-      static_cast<std::byte*>(std::aligned_alloc(64, kernel.packed_size(desc))), std::free);
+  const Memory packed = memory(kernel.packed_size(desc)), scratch = memory(kernel.scratch_size);
   kernel.pack(desc, stored.data(), packed.get());
-  std::unique_ptr<std::byte, decltype(&std::free)> scratch(
-      static_cast<std::byte*>(std::aligned_alloc(64, (kernel.scratch_size + 63) / 64 * 64)), std::free);
   for (const float bad : {std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::quiet_NaN(),
                           std::numeric_limits<float>::quiet_NaN()})
     for (const std::int64_t place : {std::int64_t{0}, std::int64_t{17}, d_in - 1}) {
@@ -266,6 +271,59 @@ void check_not_finite(const LinearKernel& kernel) {
       kernel.run(job, 0, worker);
       for (const float number : y) CHECK_FALSE(std::isfinite(number));
     }
+}
+
+/// tests/kernels/data/ternary.npy, written by tests/reference/make_ternary_data.py.
+struct Golden {
+  static constexpr std::int64_t kRows = 7, kIn = 272, kOut = 17;
+  std::vector<float> x, weight, scale, bias, codes, scales, sums, y;
+
+  Golden() {
+    const std::string file = test::read_text(test::source_path("tests/kernels/data/ternary.npy"));
+    const auto array = parse_npy(std::as_bytes(std::span(file)), "ternary.npy");
+    REQUIRE(array.ok());
+    const auto& all = std::get<std::vector<float>>(array->values);
+    auto at = all.begin();
+    const auto take = [&](std::vector<float>& part, std::int64_t n) { part.assign(at, at + n), at += n; };
+    take(x, kRows * kIn), take(weight, kOut * kIn), take(scale, 1), take(bias, kOut);
+    take(codes, kRows * kIn), take(scales, kRows), take(sums, kRows * kOut), take(y, kRows * kOut);
+    REQUIRE(at == all.end());
+  }
+};
+
+void check_golden(const LinearKernel& kernel) {
+  Golden golden;
+  const std::int64_t stride = quantized_stride(Golden::kIn);
+  const MatrixDesc desc = {DType::i8, Golden::kIn, Golden::kOut};
+  std::vector<std::byte> rows(static_cast<std::size_t>(64 * stride));
+  for (std::int64_t r = 0; r < Golden::kRows; ++r) {
+    std::byte* row = rows.data() + r * stride;
+    kernel.quantize(&golden.x[static_cast<std::size_t>(r * Golden::kIn)], Golden::kIn, row);
+    CHECK(row_scale(row, Golden::kIn).s == golden.scales[static_cast<std::size_t>(r)]);
+    for (std::int64_t k = 0; k < Golden::kIn; ++k)
+      CHECK(static_cast<float>(static_cast<signed char>(row[k])) ==
+            golden.codes[static_cast<std::size_t>(r * Golden::kIn + k)]);
+  }
+  const Memory packed = memory(kernel.packed_size(desc)), scratch = memory(kernel.scratch_size);
+  kernel.pack(desc, test::store_as(DType::i8, golden.weight).data(), packed.get());
+  const auto product = [&](std::int64_t row, std::int64_t n_row, const float* scale, const float* bias) {
+    std::vector<float> y(static_cast<std::size_t>(n_row * Golden::kOut));
+    LinearJob job = {};
+    job.x = rows.data() + row * stride, job.x_type = DType::i8, job.x_stride = stride;
+    job.n_row = n_row, job.d_in = Golden::kIn, job.n_part = 1;
+    job.part[0] = {DType::i8,    packed.get(), bias, nullptr, nullptr, reinterpret_cast<std::byte*>(y.data()),
+                   Golden::kOut, scale};
+    Worker worker = {0, scratch.get(), 1};
+    CHECK(kernel.cut(job, 1) == 1);
+    kernel.run(job, 0, worker);
+    return y;
+  };
+  CHECK(product(0, Golden::kRows, golden.scale.data(), golden.bias.data()) == golden.y);
+  for (std::int64_t r = 0; r < Golden::kRows; ++r) {  // with the scale of the row itself the sum is left
+    const auto first = golden.sums.begin() + r * Golden::kOut;
+    CHECK(product(r, 1, &golden.scales[static_cast<std::size_t>(r)], nullptr) ==
+          std::vector<float>(first, first + Golden::kOut));
+  }
 }
 
 void check_shapes(const LinearKernel& kernel) {
@@ -313,6 +371,7 @@ bool lacks(const std::string& name) {
   TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check(row("avxvnni_int8")); } \
   TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check(row("avx512_int8")); }
 
+VLA_TERNARY_TEST("codes, sums and products are those of BitVLA's quantizers, bit for bit", check_golden)
 VLA_TERNARY_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)
 VLA_TERNARY_TEST("sums of any shape are exact, and scaled in single roundings", check_shapes)
 VLA_TERNARY_TEST("bias, gate and residual follow the product, each rounded by itself", check_epilogues)
