@@ -90,7 +90,7 @@ def test_every_variant_converts(converter, variant):
     bundle = converter.bundle(openpi(variant), variant=variant)
     chosen = VARIANTS[variant]
     assert bundle.keys["vla.arch"] == chosen.arch
-    words = chosen.arch == "pi05" and chosen.state_words
+    words = chosen.arch == "pi05" and chosen.discrete_state
     assert any(op["op"] == "template" for op in recipe(bundle)["text"]) == words
     assert len(bundle.keys["action.names"]) == chosen.robot.n_action
 

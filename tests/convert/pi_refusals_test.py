@@ -76,14 +76,14 @@ def enable(name, value=True):
     return lambda tiny: tiny.step(name)["config"].update(enabled=value)
 
 
-WORDS = "pi05_prepare_state_tokenizer_processor_step"
+DISCRETIZE = "pi05_prepare_state_tokenizer_processor_step"
 ORDERS = {
-    "expected normalization before it and tokenization after it": swap(WORDS, "normalizer_processor"),
+    "expected normalization before it and tokenization after it": swap(DISCRETIZE, "normalizer_processor"),
     "expected the state of the robot, before normalization": swap("relative_actions_processor", "normalizer_processor"),
     "absolute_actions_processor: enabled: expected True": enable("relative_actions_processor"),
     "absolute_actions_processor: enabled: expected False": enable("absolute_actions_processor"),
     "relative_actions_processor: enabled: expected True or False": enable("relative_actions_processor", "yes"),
-    "steps: expected " + WORDS: lambda tiny: tiny.pre["steps"].remove(tiny.step(WORDS)),
+    "steps: expected " + DISCRETIZE: lambda tiny: tiny.pre["steps"].remove(tiny.step(DISCRETIZE)),
     "and not the other family's": lambda tiny: tiny.pre["steps"].insert(0, {"registry_name": "pi0_new_line_processor"}),
 }
 

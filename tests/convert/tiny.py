@@ -72,6 +72,21 @@ BACKBONE = {
 SPECIAL = ["<|end|>", "<image>"]
 
 
+def pipelines(pre, post):
+    """The two processor files of (name, config)."""
+    files = {"normalizer_processor": "pre.safetensors", "unnormalizer_processor": "post.safetensors"}
+
+    def step(name, config):
+        return {"registry_name": name, "config": config, **({"state_file": files[name]} if name in files else {})}
+
+    both = {"policy_preprocessor": pre, "policy_postprocessor": post}
+    return tuple({"name": name, "steps": [step(*s) for s in steps]} for name, steps in both.items())
+
+
+def step_of(tiny, name):
+    return next(step for step in tiny.pre["steps"] + tiny.post["steps"] if step["registry_name"] == name)
+
+
 def byte_alphabet():
     """The 256 symbols of byte-level vocabularies, in the order of the bytes."""
     shown = set(range(33, 127)) | set(range(161, 173)) | set(range(174, 256))

@@ -11,7 +11,7 @@ import os
 import numpy as np
 
 from goldens import files
-from tiny import byte_alphabet, write_json, write_safetensors
+from tiny import byte_alphabet, pipelines, step_of, write_json, write_safetensors
 
 D_VISION, D_VISION_FF, IMAGE, PATCH, N_VIEW_TOKEN = 6, 10, 56, 14, 4
 D_MODEL, D_FF, N_HEAD, N_KV, N_LAYER, N_LAYER_BACKBONE = 12, 14, 3, 1, 2, 3
@@ -346,20 +346,10 @@ class TinyEvo1Lerobot(TinyEvo1):
             ("evo1_action_processor", {"action_dim": ACTION_DIM, **{key: self.config[key] for key in keys.split()}}),
             ("device_processor", {"device": "cpu", "float_dtype": "float32"}),
         ]
-        files = {"normalizer_processor": "pre.safetensors", "unnormalizer_processor": "post.safetensors"}
-        return tuple(
-            {
-                "name": name,
-                "steps": [
-                    {"registry_name": step, "config": c, **({"state_file": files[step]} if step in files else {})}
-                    for step, c in steps
-                ],
-            }
-            for name, steps in (("policy_preprocessor", pre), ("policy_postprocessor", post))
-        )
+        return pipelines(pre, post)
 
     def step(self, name):
-        return next(step for step in self.pre["steps"] + self.post["steps"] if step["registry_name"] == name)
+        return step_of(self, name)
 
     def normalization(self, mode):
         """Of states and actions, everywhere where it is stated."""

@@ -11,7 +11,7 @@ import os
 
 import numpy as np
 
-from tiny import write_json, write_safetensors
+from tiny import pipelines, step_of, write_json, write_safetensors
 
 PWE = "model.paligemma_with_expert."
 VISION = PWE + "paligemma.model.vision_tower.vision_model."
@@ -207,20 +207,10 @@ class TinyPi:
             pre = [*first, relative, ("normalizer_processor", normalizer)]
             pre += [("pi05_prepare_state_tokenizer_processor_step", {}), ("tokenizer_processor", token), device]
         post = [("unnormalizer_processor", copy.deepcopy(normalizer)), ("absolute_actions_processor", {"enabled": False}), device]
-        files = {"normalizer_processor": "pre.safetensors", "unnormalizer_processor": "post.safetensors"}
-        return tuple(
-            {
-                "name": name,
-                "steps": [
-                    {"registry_name": step, "config": c, **({"state_file": files[step]} if step in files else {})}
-                    for step, c in steps
-                ],
-            }
-            for name, steps in (("policy_preprocessor", pre), ("policy_postprocessor", post))
-        )
+        return pipelines(pre, post)
 
     def step(self, name):
-        return next(step for step in self.pre["steps"] + self.post["steps"] if step["registry_name"] == name)
+        return step_of(self, name)
 
     def relative(self, names=None, exclude=("gripper",)):
         self.config["use_relative_actions"] = True

@@ -60,7 +60,7 @@ class Processors:
 
     rename: Dict[str, str] = field(default_factory=dict)  # accepted name -> the policy's name
     newline: bool = False
-    state_words: bool = False  # the state goes into the prompt as whole numbers
+    discrete_state: bool = False  # the discretized state is part of the prompt
     relative: bool = False  # actions are relative to the state
     add_state: Sequence[int] = ()  # in these columns
     max_tokens: int = 0
@@ -152,7 +152,7 @@ class _Reader:
     def _pi05_prepare_state_tokenizer_step(self, where: str, config: dict, step: dict) -> None:
         if "tokenizer_processor" in self.seen or "normalizer_processor" not in self.seen:
             self.problems.unsupported(where, "normalization before it and tokenization after it", "another order")
-        self.result.state_words = True
+        self.result.discrete_state = True
 
     def _relative_actions(self, where: str, config: dict, step: dict) -> None:
         if "normalizer_processor" in self.seen:

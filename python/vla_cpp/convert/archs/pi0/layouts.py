@@ -87,7 +87,7 @@ STEPS: recipe.Steps = {
 }
 CLEAN = [{"op": "strip"}, {"op": "replace", "from": "_", "to": " "}, {"op": "replace", "from": "\n", "to": " "}]
 PROMPT = {"op": "template", "text": "Task: {instruction}, State: {state};\nAction: "}
-WORDS = {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}
+BINS = {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}
 
 
 def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
@@ -152,20 +152,20 @@ def _read_policy(family: Family, policy: Section, s: Sizes) -> None:
 def _check_pipelines(family: Family, policy: Section, processors: recipe.Processors) -> None:
     wanted, found = ("pi0_new_line_processor", processors.newline) if family.state_token else (
         "pi05_prepare_state_tokenizer_processor_step",
-        processors.state_words,
+        processors.discrete_state,
     )
-    if not found or (processors.newline and processors.state_words):
+    if not found or (processors.newline and processors.discrete_state):
         policy.problems.add(recipe.PRE + ": steps", "{}, and not the other family's".format(wanted), "other steps")
     if processors.relative != bool(policy.get("use_relative_actions")):
         policy.bad("use_relative_actions", "{} as the pipelines have it".format(processors.relative))
 
 
 def _text(processors: recipe.Processors) -> List[dict]:
-    return [*CLEAN, PROMPT] if processors.state_words else [{"op": "ensure_suffix", "suffix": "\n"}]
+    return [*CLEAN, PROMPT] if processors.discrete_state else [{"op": "ensure_suffix", "suffix": "\n"}]
 
 
 def _state(family: Family, s: Sizes, processors: recipe.Processors) -> List[dict]:
-    last = {"op": "pad", "size": s.d_state} if family.state_token else WORDS
+    last = {"op": "pad", "size": s.d_state} if family.state_token else BINS
     return [*processors.state.op("normalize", recipe.STATE), last]
 
 
@@ -256,7 +256,7 @@ class Variant:
     asset: str
     horizon: int = 50
     relative: Sequence[int] = ()
-    state_words: bool = True  # of pi05: discrete_state_input
+    discrete_state: bool = True  # of pi05: discrete_state_input
 
 
 LIBERO_ASSET = "physical-intelligence/libero"
@@ -273,7 +273,7 @@ VARIANTS = {
     "pi05_droid": Variant("pi05", DROID, "droid", horizon=15),
     "pi05_droid_finetune": Variant("pi05", DROID, "droid", horizon=16),
     "pi05_full_droid_finetune": Variant("pi05", DROID, "droid", horizon=16, relative=range(7)),
-    "pi05_libero": Variant("pi05", LIBERO, LIBERO_ASSET, horizon=10, state_words=False),
+    "pi05_libero": Variant("pi05", LIBERO, LIBERO_ASSET, horizon=10, discrete_state=False),
 }
 
 
@@ -296,7 +296,7 @@ def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, proble
         sizes=sizes,
         processors=recipe.Processors(),
         image=[recipe.letterbox(*[sizes.vision.image_size] * 2, "center", antialias=True), {"op": "affine", "scale": 2.0, "shift": -1.0}],
-        text=[*CLEAN, PROMPT] if _has_words(family, variant) else [*CLEAN, NEWLINE],
+        text=[*CLEAN, PROMPT] if _state_in_prompt(family, variant) else [*CLEAN, NEWLINE],
         state=[*robot.decode, *(_normalize("normalize", kind, name, state_names) for name in state_names)]
         + [_state_end(family, variant, sizes)],
         action=[
@@ -311,14 +311,14 @@ def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, proble
     )
 
 
-def _has_words(family: Family, variant: Variant) -> bool:
-    return not family.state_token and variant.state_words
+def _state_in_prompt(family: Family, variant: Variant) -> bool:
+    return not family.state_token and variant.discrete_state
 
 
 def _state_end(family: Family, variant: Variant, s: Sizes) -> dict:
     if family.state_token:
         return {"op": "pad", "size": s.d_state}
-    return WORDS if variant.state_words else {"op": "drop"}
+    return BINS if variant.discrete_state else {"op": "drop"}
 
 
 def _normalize(op: str, kind: str, feature: str, features: Sequence[str]) -> dict:
