@@ -170,7 +170,8 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"tokenizer.ignore_merges", false},
       {"processor.recipe", recipe(image, places, max_tokens, d_state, d_robot)},
   });
-  for (const auto& [key, value] : added.all()) keys.set(key, value);
+  for (const auto& [key, value] : added.all())
+    if (!keys.has(key)) keys.set(key, value);
   if (places.count > 0) keys.set(places.behind ? ViewPlaces::kStartsFromEnd : ViewPlaces::kStarts, places.starts());
   return {};
 }

@@ -170,10 +170,9 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   plan->set_x(x);
   record_inputs(chunk.taps);
   clock.lap(chunk.timing, "plan");
-  VLA_CHECK(plan->run_prefix());
+  VLA_CHECK(plan->run_prefix(chunk.taps));
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
   clock.lap(chunk.timing, "prefix");
-  plan->collect_prefix_taps(chunk.taps);
   for (int k = 0; k < solver_.n_step; ++k) {
     VLA_CHECK(plan->run_step(k));
     plan->collect_step_taps(k, chunk.taps);

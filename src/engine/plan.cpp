@@ -75,9 +75,11 @@ void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());
 }
 
-Status Plan::run_prefix() {
+Status Plan::run_prefix(std::vector<Tap>& taps) {
   VLA_CHECK(prefix_->run());
-  return step_->prepare();
+  for (std::size_t i = 0; i < prefix_->taps().size(); ++i)
+    taps.push_back({prefix_->taps()[i].path, dims(prefix_->taps()[i].shape), prefix_->tap(i)});
+  return step_->prepare();  // in the memory that the prefix worked in
 }
 
 Status Plan::run_step(int k) {
@@ -95,11 +97,6 @@ StageWork Plan::work(int n_step) const {
   const Work step = step_->work().front();
   parts.emplace_back("steps", Work{n_step * step.flop, n_step * step.bytes});
   return parts;
-}
-
-void Plan::collect_prefix_taps(std::vector<Tap>& taps) const {
-  for (std::size_t i = 0; i < prefix_->taps().size(); ++i)
-    taps.push_back({prefix_->taps()[i].path, dims(prefix_->taps()[i].shape), prefix_->tap(i)});
 }
 
 void Plan::collect_step_taps(int k, std::vector<Tap>& taps) const {

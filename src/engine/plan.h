@@ -38,8 +38,8 @@ class Plan {
   void set_x(std::span<const float> x) { device_.set(*x_, x.data(), x.size_bytes()); }
   std::vector<float> x() const { return device_.get(*x_); }
 
-  /// Fills the cache, and computes what the steps need of it in another layout.
-  Status run_prefix();
+  /// Fills the cache, appends what was recorded on the way, and computes what the steps need of the cache alone.
+  Status run_prefix(std::vector<Tap>& taps);
   /// Solver step k: x <- the solver's next x.
   Status run_step(int k);
 
@@ -51,8 +51,7 @@ class Plan {
   /// What the network computes for one observation: the prefix, stage by stage, and `n_step` solver steps.
   StageWork work(int n_step) const;
 
-  /// What the last run recorded; of a step the paths are `step.<k>.<path>`.
-  void collect_prefix_taps(std::vector<Tap>& taps) const;
+  /// What the last step recorded, as `step.<k>.<path>`.
   void collect_step_taps(int k, std::vector<Tap>& taps) const;
 
   /// Bytes: slots, constants and the programs themselves.

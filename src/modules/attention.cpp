@@ -49,8 +49,8 @@ Tensor head_rows(Graph& g, Tensor x, int n_head, const std::optional<RmsNorm>& n
 
 KeyValueProjection::KeyValueProjection(const Scope& s, int d_context, const Heads& heads)
     : n_head_(heads.n_head_kv),
-      k_(s / "attn_k", d_context, heads.d_key(), heads.bias),
-      v_(s / "attn_v", d_context, heads.d_key(), heads.bias),
+      k_(s / "attn_k", d_context, heads.d_key(), heads.bias, heads.weights),
+      v_(s / "attn_v", d_context, heads.d_key(), heads.bias, heads.weights),
       norm_(head_norm(s / "attn_k_norm", heads)) {}
 
 KeyValue KeyValueProjection::operator()(Graph& g, Tensor key_context, Tensor value_context, Tensor rotary) const {
@@ -59,14 +59,17 @@ KeyValue KeyValueProjection::operator()(Graph& g, Tensor key_context, Tensor val
 
 Attention::Attention(const Scope& s, int d_model, int d_context, const Heads& heads)
     : heads_(heads),
-      q_(s / "attn_q", d_model, heads.d_query(), heads.bias),
+      q_(s / "attn_q", d_model, heads.d_query(), heads.bias, heads.weights),
       norm_(head_norm(s / "attn_q_norm", heads)),
       kv_(s, d_context, heads),
-      out_(s / "attn_out", heads.d_query(), d_model, heads.out_bias) {}
+      out_(s / "attn_out", heads.d_query(), d_model, heads.out_bias, heads.weights) {
+  if (heads.sub_norm_eps) sub_norm_.emplace(s / "attn_sub_norm", heads.d_query(), *heads.sub_norm_eps);
+}
 
 Tensor Attention::operator()(Graph& g, Tensor x, Tensor rotary, const std::vector<KeyValue>& segments,
                              Tensor mask) const {
-  return out_(g, attention(g, head_rows(g, q_(g, x), heads_.n_head, norm_, rotary), segments, mask));
+  const Tensor y = attention(g, head_rows(g, q_(g, x), heads_.n_head, norm_, rotary), segments, mask);
+  return out_(g, sub_norm_ ? (*sub_norm_)(g, y) : y);
 }
 
 }  // namespace vla

@@ -20,7 +20,9 @@ struct Heads {
   Bias bias = Bias::no;                // of queries, keys and values
   Bias out_bias = Bias::no;            // of the output product
   std::optional<float> norm_eps = {};  // queries and keys pass an RMS norm over the head
-  float rope_base = 0;                 // 0: nothing turns by position alone
+  Weights weights = Weights::floats;
+  std::optional<float> sub_norm_eps = {};  // what all heads give passes an RMS norm before the output product
+  float rope_base = 0;                     // 0: nothing turns by position alone
   RotaryAngle rope_angle = RotaryAngle::product;
 
   int d_query() const { return n_head * d_head; }
@@ -28,7 +30,9 @@ struct Heads {
   /// Reads n_head, n_head_kv, d_head and rope_base of `s`, and checks that they go together.
   static Heads read(const Scope& s, RotaryAngle angle);
   /// Heads that share the model's width evenly, with biases everywhere.
-  static Heads even(int d_model, int n_head) { return {n_head, n_head, d_model / n_head, Bias::yes, Bias::yes}; }
+  static Heads even(int d_model, int n_head, Weights weights = Weights::floats) {
+    return {n_head, n_head, d_model / n_head, Bias::yes, Bias::yes, {}, weights};
+  }
   /// The rotary table of `count` tokens from position `first` on.
   Tensor rotary(Graph& g, int first, int count) const;
 };
@@ -55,7 +59,8 @@ class KeyValueProjection {
 };
 
 /// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves: the products
-/// `attn_q`, `attn_k`, `attn_v` and `attn_out`, with `attn_q_norm` and `attn_k_norm` where heads are normalized.
+/// `attn_q`, `attn_k`, `attn_v` and `attn_out`, with `attn_q_norm` and `attn_k_norm` where heads are normalized, and
+/// `attn_sub_norm` where what they give is.
 class Attention {
  public:
   Attention(const Scope& s, int d_model, int d_context, const Heads& heads);
@@ -75,6 +80,7 @@ class Attention {
   Linear q_;
   std::optional<RmsNorm> norm_;
   KeyValueProjection kv_;
+  std::optional<RmsNorm> sub_norm_;
   Linear out_;
 };
 

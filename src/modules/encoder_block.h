@@ -11,14 +11,17 @@ namespace vla {
 struct EncoderFamily {
   Activation activation;  // of the MLP
   bool scaled;            // attention and MLP are multiplied feature by feature before they are added (LayerScale)
+  Weights weights = Weights::floats;
 };
 constexpr EncoderFamily kPlainEncoder = {Activation::gelu_tanh, false};
 constexpr EncoderFamily kInternEncoder = {Activation::gelu_erf, true};
+constexpr EncoderFamily kTernaryEncoder = {Activation::gelu_tanh, false, Weights::ternary};
 
 /// One pre-norm encoder layer: attention in which all tokens of a view see each other, then a GELU MLP.
 /// Sources: transformers modeling_siglip.py SiglipEncoderLayer, modeling_qwen3_vl.py Qwen3VLVisionBlock; InternVL
 /// internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionEncoderLayer; lerobot
-/// policies/groot/action_head/cross_attention_dit.py BasicTransformerBlock (layer_norm).
+/// policies/groot/action_head/cross_attention_dit.py BasicTransformerBlock (layer_norm); BitVLA modeling_siglip.py
+/// SiglipEncoderLayer (ternary weights).
 class EncoderBlock : public Module<EncoderBlock> {
  public:
   EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family = kPlainEncoder);

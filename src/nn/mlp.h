@@ -2,7 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <optional>
+
 #include "nn/linear.h"
+#include "nn/norm.h"
 #include "nn/tokens.h"
 
 namespace vla {
@@ -11,9 +14,9 @@ namespace vla {
 /// Sources: transformers SiglipMLP (gelu_tanh), InternVLVisionMLP (gelu_erf).
 class Mlp {
  public:
-  Mlp(const Scope& s, int d_model, int d_ff, Activation activation)
-      : up_(s / "ffn_up", d_model, d_ff, Bias::yes),
-        down_(s / "ffn_down", d_ff, d_model, Bias::yes),
+  Mlp(const Scope& s, int d_model, int d_ff, Activation activation, Weights weights = Weights::floats)
+      : up_(s / "ffn_up", d_model, d_ff, Bias::yes, weights),
+        down_(s / "ffn_down", d_ff, d_model, Bias::yes, weights),
         activation_(activation) {}
   Tensor operator()(Graph& g, Tensor x) const { return down_(g, activate(g, up_(g, x), activation_)); }
 
@@ -22,21 +25,27 @@ class Mlp {
   Activation activation_;
 };
 
-/// down(activation(gate(x)) * up(x)), without biases. x [d_model, n] -> the same shape.
-/// Sources: transformers LlamaMLP (silu), GemmaMLP (gelu_tanh).
+/// down(activation(gate(x)) * up(x)), without biases, where `sub_norm_eps` is given with an RMS norm `ffn_sub_norm` in
+/// front of `down`. x [d_model, n] -> the same shape.
+/// Sources: transformers LlamaMLP (silu), GemmaMLP (gelu_tanh); BitVLA modeling_bitnet.py BitNetMLP (relu_squared).
 class GatedMlp {
  public:
-  GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation)
-      : gate_(s / "ffn_gate", d_model, d_ff, Bias::no),
-        up_(s / "ffn_up", d_model, d_ff, Bias::no),
-        down_(s / "ffn_down", d_ff, d_model, Bias::no),
-        activation_(activation) {}
+  GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation, Weights weights = Weights::floats,
+           std::optional<float> sub_norm_eps = {})
+      : gate_(s / "ffn_gate", d_model, d_ff, Bias::no, weights),
+        up_(s / "ffn_up", d_model, d_ff, Bias::no, weights),
+        down_(s / "ffn_down", d_ff, d_model, Bias::no, weights),
+        activation_(activation) {
+    if (sub_norm_eps) sub_norm_.emplace(s / "ffn_sub_norm", d_ff, *sub_norm_eps);
+  }
   Tensor operator()(Graph& g, Tensor x) const {
-    return down_(g, multiply(g, activate(g, gate_(g, x), activation_), up_(g, x)));
+    const Tensor h = multiply(g, activate(g, gate_(g, x), activation_), up_(g, x));
+    return down_(g, sub_norm_ ? (*sub_norm_)(g, h) : h);
   }
 
  private:
   Linear gate_, up_, down_;
+  std::optional<RmsNorm> sub_norm_;
   Activation activation_;
 };
 

@@ -58,6 +58,14 @@ std::vector<Value> absurd(const Value& value) {
 
 }  // namespace
 
+TEST_CASE("a ternary code that stands for no number and a factor that is missing are refused by their tensors") {
+  EditableBundle bundle = EditableBundle::read(golden_path("bitvla/micro") + "/bundle.gguf");
+  bundle.tensor("lm.blk.0.attn_q.weight").data[5] = '\xFF';
+  bundle.erase("vision.blk.0.ffn_up.scale");
+  check_refused(bundle, Code::bad_bundle, "lm.blk.0.attn_q.weight");
+  check_refused(bundle, Code::bad_bundle, "vision.blk.0.ffn_up.scale");
+}
+
 TEST_CASE("a bundle of an architecture that this build does not know is unsupported") {
   EditableBundle bundle = sound_bundle();
   bundle.set("vla.arch", Value(std::string("octo")));

@@ -9,7 +9,7 @@ same bytes on every machine, into build/goldens/ (`python tools/goldens`).
 import importlib
 
 # Architecture -> the module that knows its cases, its checkpoint and its reference.
-FAMILIES = {"smolvla": "smolvla", "pi0": "pi", "pi05": "pi", "evo1": "evo1", "gr00t_n1_5": "gr00t_n1_5", "gr00t_n1_6": "gr00t_n1_6",
+FAMILIES = {"bitvla": "bitvla", "smolvla": "smolvla", "pi0": "pi", "pi05": "pi", "evo1": "evo1", "gr00t_n1_5": "gr00t_n1_5", "gr00t_n1_6": "gr00t_n1_6",
             "gr00t_n1_7": "gr00t_n1_7"}
 
 

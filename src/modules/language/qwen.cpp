@@ -12,18 +12,20 @@ namespace {
 Heads heads_of(const Scope& s, QwenFamily family) {
   Heads heads = Heads::read(s, RotaryAngle::product);
   heads.bias = family.bias;
+  heads.weights = family.weights;
   if (family.head_norms) heads.norm_eps = s.number("norm_eps", kNormEps);
+  if (family.sub_norms) heads.sub_norm_eps = s.number("norm_eps", kNormEps);
   return heads;
 }
 
 }  // namespace
 
-QwenBlock::QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps)
+QwenBlock::QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps, Activation activation)
     : Module(s),
       attn_norm_(s / "attn_norm", d_model, eps),
       attention_(s, d_model, d_model, heads),
       ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(s, d_model, d_ff, Activation::silu) {}
+      mlp_(s, d_model, d_ff, activation, heads.weights, heads.sub_norm_eps) {}
 
 Tensor QwenBlock::forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added) const {
   x = add(g, x, attention_.among(g, attn_norm_(g, x), rotary, mask));
@@ -39,7 +41,7 @@ Qwen::Qwen(const Scope& s, QwenFamily family)
       token_embd_(s / "token_embd", d_model_, s.dim("n_vocab", 1 << 24)) {
   const int n_layer = s.n_layer("n_layer"), d_ff = s.dim("d_ff");
   const float eps = s.number("norm_eps", kNormEps);
-  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, eps);
+  for (int i = 0; i < n_layer; ++i) blocks_.emplace_back(s / "blk" / i, d_model_, d_ff, heads_, eps, family.activation);
   if (family.final_norm) norm_.emplace(s / "norm", d_model_, eps);
 }
 
@@ -63,6 +65,10 @@ Tensor Qwen::operator()(Graph& g, Tensor x, Tensor rotary, Tensor mask, const st
   for (std::size_t i = 0; i < blocks_.size(); ++i)
     x = blocks_[i](g, x, rotary, mask, i < added.size() ? added[i] : Tensor());
   return norm_ ? (*norm_)(g, x) : x;
+}
+
+Tensor Qwen::bidirectional(Graph& g, Tensor x) const {
+  return (*this)(g, x, heads_.rotary(g, 0, static_cast<int>(x.dim(1))), {}, {});
 }
 
 Tensor Qwen::alone(Graph& g, Tensor x) const {

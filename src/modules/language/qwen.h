@@ -13,21 +13,26 @@ namespace vla {
 
 /// How the generations differ, and where features are read.
 struct QwenFamily {
-  Bias bias;        // of queries, keys and values
-  bool head_norms;  // queries and keys are normalized head by head
-  bool final_norm;  // features are read behind it, else they are what the last layer gives
+  Bias bias;                                 // of queries, keys and values
+  bool head_norms;                           // queries and keys are normalized head by head
+  bool final_norm;                           // features are read behind it, else they are what the last layer gives
+  Activation activation = Activation::silu;  // of the gated MLP
+  Weights weights = Weights::floats;
+  bool sub_norms = false;  // both output products have an RMS norm in front
 };
 constexpr QwenFamily kQwen2 = {Bias::yes, false, true};
 constexpr QwenFamily kQwen3 = {Bias::no, true, true};
 constexpr QwenFamily kQwen3Inner = {Bias::no, true, false};
+/// BitNet b1.58. Source: BitVLA modeling_bitnet.py BitNetModel.
+constexpr QwenFamily kBitNet = {Bias::no, false, true, Activation::relu_squared, Weights::ternary, true};
 
 /// One layer: attention, then a gated MLP.
 /// Sources: transformers modeling_qwen2.py Qwen2DecoderLayer, modeling_qwen3.py Qwen3DecoderLayer.
 class QwenBlock : public Module<QwenBlock> {
  public:
-  QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps);
-  /// x [d_model, n], rotary [d_head, n], mask [n, n] -> the shape of x. `added` [d_model, n], or none, is added to the
-  /// layer's result.
+  QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, float eps, Activation activation);
+  /// x [d_model, n], rotary [d_head, n], mask [n, n] or none -> the shape of x. `added` [d_model, n], or none, is added
+  /// to the layer's result.
   Tensor forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added = {}) const;
   /// The same where attention adds nothing: a token for itself.
   Tensor alone(Graph& g, Tensor x) const;
@@ -54,6 +59,8 @@ class Qwen {
   Tensor operator()(Graph& g, Tensor x) const;
   /// The same for tokens at `positions`, mask [n, n].
   Tensor operator()(Graph& g, Tensor x, std::span<const int> positions, Tensor mask) const;
+  /// The same where every token sees all.
+  Tensor bidirectional(Graph& g, Tensor x) const;
   /// The same for tokens that turn by a table [d_head, n]; `added[i]` [d_model, n] is added to the result of layer i.
   Tensor operator()(Graph& g, Tensor x, Tensor rotary, Tensor mask, const std::vector<Tensor>& added) const;
   /// Features of tokens whose attention is cut out of every layer: [d_model, n] -> the same shape.

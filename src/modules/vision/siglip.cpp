@@ -9,18 +9,18 @@
 
 namespace vla {
 
-Siglip::Siglip(const Scope& s)
+Siglip::Siglip(const Scope& s, EncoderFamily family, bool post_norm)
     : d_model_(s.dim("d_model")),
       patch_size_(s.dim("patch_size", 256)),
       n_table_(std::max(1, s.dim("image_size", 16384) / patch_size_)),
       position_rule_(s.string("position_rule")),
       patch_embed_(s / "patch_embed", patch_size_, d_model_),
-      position_(s / "position", d_model_, n_position()),
-      post_norm_(s / "post_norm", d_model_, s.number("norm_eps", kNormEps)) {
+      position_(s / "position", d_model_, n_position()) {
   const int n_head = s.dim("n_head", 1024), d_ff = s.dim("d_ff"), n_layer = s.n_layer("n_layer");
   s.require(d_model_ % n_head == 0, "n_head", fmt::format("a divisor of d_model {}", d_model_), std::to_string(n_head));
   for (int i = 0; i < n_layer; ++i)
-    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps));
+    blocks_.emplace_back(s / "blk" / i, d_model_, n_head, d_ff, s.number("norm_eps", kNormEps), family);
+  if (post_norm) post_norm_.emplace(s / "post_norm", d_model_, s.number("norm_eps", kNormEps));
 }
 
 Status Siglip::check(int width, int height) const {
@@ -38,7 +38,7 @@ Tensor Siglip::operator()(Graph& g, Tensor images) const {
   });
   x = add(g, x, position_(g, ids));
   for (const EncoderBlock& block : blocks_) x = block(g, x);
-  return post_norm_(g, x);
+  return post_norm_ ? (*post_norm_)(g, x) : x;
 }
 
 }  // namespace vla

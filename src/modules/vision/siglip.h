@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -14,7 +15,8 @@ namespace vla {
 /// SmolVLMVisionTransformer.
 class Siglip {
  public:
-  explicit Siglip(const Scope& s);
+  /// `post_norm`: features are read behind a last norm, else they are what the last layer gives.
+  explicit Siglip(const Scope& s, EncoderFamily family = kPlainEncoder, bool post_norm = true);
 
   /// images [width, height, 3, n_view] in [-1, 1] -> [d_model, n_patch, n_view]. `check` must have accepted the size.
   Tensor operator()(Graph& g, Tensor images) const;
@@ -32,7 +34,7 @@ class Siglip {
   PatchEmbed patch_embed_;
   Embedding position_;
   std::vector<EncoderBlock> blocks_;
-  LayerNorm post_norm_;
+  std::optional<LayerNorm> post_norm_;
 };
 
 }  // namespace vla

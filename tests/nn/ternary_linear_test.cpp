@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "nn/bit_linear.h"
+#include "nn/linear.h"
 
 #include <doctest/doctest.h>
 
@@ -42,12 +42,12 @@ std::vector<test::ParamSet::Piece> make_pieces() {
 }
 
 struct Layers {
-  BitLinear a, b, c;
+  Linear a, b, c;
   RmsNorm norm;
   explicit Layers(const Scope& s)
-      : a(s / "a", kModel, kFf, Bias::yes),
-        b(s / "b", kModel, kFf, Bias::yes),
-        c(s / "c", kFf, kModel, Bias::yes),
+      : a(s / "a", kModel, kFf, Bias::yes, Weights::ternary),
+        b(s / "b", kModel, kFf, Bias::yes, Weights::ternary),
+        c(s / "c", kFf, kModel, Bias::yes, Weights::ternary),
         norm(s / "norm", kModel, 1e-5f) {}
 };
 
@@ -137,9 +137,9 @@ TEST_CASE("a tapped norm is an operation of its own, which quantizing reads") {
   }
 }
 
-TEST_CASE("a BitLinear whose rows are no whole bytes is refused") {
+TEST_CASE("a ternary product whose rows are no whole bytes is refused") {
   ParamList list(Keys(), nullptr);
-  const BitLinear layer(Scope(list, "odd"), 35, 8, Bias::no);
+  const Linear layer(Scope(list, "odd"), 35, 8, Bias::no, Weights::ternary);
   const Status fits = list.report("test", {});
   REQUIRE_FALSE(fits.ok());
   CHECK(fits.error().message().find("odd.weight") != std::string::npos);
