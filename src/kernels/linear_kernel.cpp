@@ -7,7 +7,7 @@ namespace vla::kernels {
 #if defined(__x86_64__)
 // Each in the file of its name.
 extern const LinearKernel kLinearAmx, kLinearAvx512Bf16, kLinearAvx512, kLinearAvx2;
-extern const LinearKernel kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
+extern const LinearKernel kTernaryAmx, kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
 #endif
 extern const LinearKernel kTernaryPlain;  // ternary_emulated.cpp
 
@@ -28,7 +28,8 @@ const LinearKernel* choose_linear(const MatrixDesc& desc, Isa isa) {
 
 std::span<const LinearKernel* const> ternary_kernels() {
 #if defined(__x86_64__)
-  static constexpr const LinearKernel* kAll[] = {&kTernaryAvx512, &kTernaryAvxVnni, &kTernaryAvx2, &kTernaryPlain};
+  static constexpr const LinearKernel* kAll[] = {&kTernaryAmx, &kTernaryAvx512, &kTernaryAvxVnni, &kTernaryAvx2,
+                                                 &kTernaryPlain};
 #else
   static constexpr const LinearKernel* kAll[] = {&kTernaryPlain};
 #endif

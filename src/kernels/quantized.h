@@ -13,11 +13,18 @@
 namespace vla::kernels {
 
 constexpr std::int64_t kQuantizedUnit = 64;
+/// A tile of a product may read so many rows, of which x has only some: behind the last there must be memory.
+constexpr int kMaxTernaryRows = 32;
 
 /// Codes of a row with the zeros behind them.
 constexpr VLA_INLINE std::int64_t quantized_depth(std::int64_t d_in) { return round_up(d_in, kQuantizedUnit); }
 /// Bytes from one row to the next.
 constexpr VLA_INLINE std::int64_t quantized_stride(std::int64_t d_in) { return quantized_depth(d_in) + kQuantizedUnit; }
+
+/// Bytes of n_row rows, and of what may be read behind them.
+constexpr VLA_INLINE std::int64_t quantized_size(std::int64_t n_row, std::int64_t d_in) {
+  return (n_row + kMaxTernaryRows - 1) * quantized_stride(d_in);
+}
 
 /// x is code / s. `sum` is that of the codes: weights are multiplied as 0, 1 and 2, which adds it to each product.
 struct RowScale {

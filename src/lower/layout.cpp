@@ -80,7 +80,8 @@ class Layouts {
       codes.base = known->second, codes.type = DType::i8, codes.shape = l.value(op.x).shape;
       const std::int64_t stride = kernels::quantized_stride(codes.shape[0]);
       codes.stride = contiguous_strides({stride, codes.shape[1], codes.shape[2], codes.shape[3]});
-      codes.size = static_cast<std::size_t>(codes.stride[3] * codes.shape[3]);
+      codes.size =
+          static_cast<std::size_t>(kernels::quantized_size(count(codes.shape) / codes.shape[0], codes.shape[0]));
       QuantizeOp made = {op.x, op.norm, op.norm_weight, op.norm_bias, &kernel};
       require(made.x, row_stride(l.value(made.x)) >= 0);
       require_rows(made.norm_weight);

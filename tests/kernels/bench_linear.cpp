@@ -85,7 +85,7 @@ double best_time(Executor& executor, const Product& product, double seconds) {
 struct Trial {
   Trial(const LinearKernel& kernel, const Shape& s, int n_thread)
       : desc{kernel.quantize != nullptr ? DType::i8 : DType::bf16, s.d_in, s.d_out},
-        x(static_cast<std::size_t>(s.n_row * quantized_stride(s.d_in)) * 4),
+        x(static_cast<std::size_t>(quantized_size(s.n_row, s.d_in)) * 4),
         y(static_cast<std::size_t>(s.n_row * s.d_out) * 4),
         stored(static_cast<std::size_t>(s.d_in * s.d_out) * 2 / (kernel.quantize != nullptr ? 8 : 1)),
         packed(kernel.packed_size(desc)) {

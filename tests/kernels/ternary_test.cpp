@@ -15,6 +15,7 @@
 #include "kernels/quantized.h"
 #include "kernels/ternary_kernels.h"
 #include "support/editable_bundle.h"
+#include "support/kernel_rows.h"
 #include "support/stored.h"
 
 using namespace vla;
@@ -112,7 +113,7 @@ class Trial {
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
     const std::int64_t stride = quantized_stride(d_in);
-    std::vector<std::byte> rows(static_cast<std::size_t>(round_up(n_row, 64) * stride), std::byte{0xff});
+    std::vector<std::byte> rows(static_cast<std::size_t>(quantized_size(n_row, d_in)), std::byte{0xff});
     for (std::int64_t r = 0; r < n_row; ++r)
       kernel_.quantize(&x_[static_cast<std::size_t>(r * d_in)], d_in, rows.data() + r * stride);
     LinearJob job = {};
@@ -258,7 +259,7 @@ void check_not_finite(const LinearKernel& kernel) {
     for (const std::int64_t place : {std::int64_t{0}, std::int64_t{17}, d_in - 1}) {
       std::vector<float> x(static_cast<std::size_t>(d_in), 1.0f), y(static_cast<std::size_t>(d_out));
       x[static_cast<std::size_t>(place)] = bad;
-      std::vector<std::byte> row(static_cast<std::size_t>(64 * quantized_stride(d_in)));
+      std::vector<std::byte> row(static_cast<std::size_t>(quantized_size(1, d_in)));
       kernel.quantize(x.data(), d_in, row.data());
       const float scale = 1;
       LinearJob job = {};
@@ -295,7 +296,7 @@ void check_golden(const LinearKernel& kernel) {
   Golden golden;
   const std::int64_t stride = quantized_stride(Golden::kIn);
   const MatrixDesc desc = {DType::i8, Golden::kIn, Golden::kOut};
-  std::vector<std::byte> rows(static_cast<std::size_t>(64 * stride));
+  std::vector<std::byte> rows(static_cast<std::size_t>(quantized_size(Golden::kRows, Golden::kIn)));
   for (std::int64_t r = 0; r < Golden::kRows; ++r) {
     std::byte* row = rows.data() + r * stride;
     kernel.quantize(&golden.x[static_cast<std::size_t>(r * Golden::kIn)], Golden::kIn, row);
@@ -369,7 +370,9 @@ bool lacks(const std::string& name) {
   TEST_CASE("plain_int8: " sentence) { check(row("plain_int8")); }                                           \
   TEST_CASE("avx2_int8: " sentence* doctest::skip(lacks("avx2_int8"))) { check(row("avx2_int8")); }          \
   TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check(row("avxvnni_int8")); } \
-  TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check(row("avx512_int8")); }
+  TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check(row("avx512_int8")); }    \
+  VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx))                                        \
+  TEST_CASE("amx_int8: " sentence* doctest::skip(lacks("amx_int8"))) { check(row("amx_int8")); }
 
 VLA_TERNARY_TEST("codes, sums and products are those of BitVLA's quantizers, bit for bit", check_golden)
 VLA_TERNARY_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)

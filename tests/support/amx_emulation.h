@@ -8,6 +8,7 @@
 
 #include <doctest/doctest.h>
 
+#include <cstddef>
 #include <cstdint>
 
 namespace vla::test::amx {
@@ -74,19 +75,37 @@ inline void multiply(int c, int a, int b) {
     }
 }
 
+/// The same of bytes, four in a line of b for every column of c: signed in a, unsigned in b.
+inline void multiply_bytes(int c, int a, int b) {
+  REQUIRE(bytes(a) / 4 == static_cast<std::size_t>(lines(b)));
+  REQUIRE((lines(a) == lines(c) && bytes(b) == bytes(c)));
+  for (int m = 0; m < lines(c); ++m)
+    for (int n = 0; n < static_cast<int>(bytes(c)) / 4; ++n) {
+      std::int32_t sum;
+      std::memcpy(&sum, tiles[c].line[m] + 4 * n, sizeof(sum));
+      for (int k = 0; k < 4 * lines(b); ++k)
+        sum +=
+            static_cast<signed char>(tiles[a].line[m][k]) * std::to_integer<int>(tiles[b].line[k / 4][4 * n + k % 4]);
+      std::memcpy(tiles[c].line[m] + 4 * n, &sum, sizeof(sum));
+    }
+}
+
 }  // namespace vla::test::amx
 
 #undef _tile_loadd
 #undef _tile_stored
 #undef _tile_zero
 #undef _tile_dpbf16ps
+#undef _tile_dpbsud
 #define _tile_loadconfig vla::test::amx::load_config
 #define _tile_release vla::test::amx::release
 #define _tile_loadd vla::test::amx::load
 #define _tile_stored vla::test::amx::store
 #define _tile_zero vla::test::amx::zero
 #define _tile_dpbf16ps vla::test::amx::multiply
+#define _tile_dpbsud vla::test::amx::multiply_bytes
 
 #define AmxSession EmulatedAmxSession
 #define kLinearAmx kEmulatedLinearAmx
+#define kTernaryAmx kEmulatedTernaryAmx
 #define kAttentionAmx kEmulatedAttentionAmx

@@ -20,7 +20,7 @@ namespace vla::kernels {
 /// (avx512_emulation.h).
 extern const CpuKernels kEmulatedAvx512Kernels;
 extern const AttentionKernel kEmulatedAttentionAmx;
-extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx;
+extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx, kEmulatedTernaryAmx;
 }  // namespace vla::kernels
 
 #define VLA_EMULATED_TEST(isa, sentence, ...) \

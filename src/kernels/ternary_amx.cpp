@@ -1,0 +1,89 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#if defined(__x86_64__)
+#include "kernels/amx_tiles.h"
+#include "kernels/ternary_loop.h"
+
+namespace vla::kernels {
+namespace {
+
+/// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel.
+struct AmxInt8Tile {
+  using V = Avx512;
+  using Session = AmxSession;
+  static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 1024;
+  static constexpr bool kEven = false, kRounds = false;
+
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,
+                       std::int64_t depth, std::int32_t* sums, bool add) {
+    // Rows that x does not have are multiplied too; nobody looks at their sums.
+    open(n_row, sums, add);
+    for (std::int64_t k = 0; k < depth; k += kDepth) add_products(n_row, x + k, x_stride, strips.lines + k * kColumns);
+    close(n_row, sums);
+  }
+
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const PackedStrips<2>& strips,
+                       std::int64_t depth, std::int32_t* sums, bool add) {
+    alignas(64) std::byte lines[kDepth * kColumns];
+    open(n_row, sums, add);
+    for (std::int64_t k = 0; k < depth; k += kDepth) {
+      TernaryPanels::expand<2>(strips.strips + k * 4, strips.strip, kDepth, lines);
+      before_tile_loads();
+      add_products(n_row, x + k, x_stride, lines);
+    }
+    close(n_row, sums);
+  }
+
+ private:
+  static constexpr int kDepth = 64;  // of a tile
+  static constexpr std::size_t kLine = kColumns * sizeof(std::int32_t), kLineOfPair = 2 * TernaryPanels::kLine;
+
+  static VLA_INLINE void open(int n_row, const std::int32_t* sums, bool add) {
+    before_tile_loads();
+    if (!add) {
+      _tile_zero(0);
+      _tile_zero(1);
+      _tile_zero(2);
+      _tile_zero(3);
+      return;
+    }
+    _tile_loadd(0, sums, kLine);
+    _tile_loadd(1, sums + 16, kLine);
+    if (n_row <= 16) return;
+    _tile_loadd(2, sums + 16 * kColumns, kLine);
+    _tile_loadd(3, sums + 16 * kColumns + 16, kLine);
+  }
+
+  /// The first operand has a sign, the second has none.
+  static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines) {
+    _tile_loadd(4, x, static_cast<std::size_t>(x_stride));
+    _tile_loadd(6, lines, kLineOfPair);
+    _tile_loadd(7, lines + TernaryPanels::kLine, kLineOfPair);
+    _tile_dpbsud(0, 4, 6);
+    _tile_dpbsud(1, 4, 7);
+    if (n_row <= 16) return;
+    _tile_loadd(5, x + 16 * x_stride, static_cast<std::size_t>(x_stride));
+    _tile_dpbsud(2, 5, 6);
+    _tile_dpbsud(3, 5, 7);
+  }
+
+  static VLA_INLINE void close(int n_row, std::int32_t* sums) {
+    _tile_stored(0, sums, kLine);
+    _tile_stored(1, sums + 16, kLine);
+    if (n_row > 16) {
+      _tile_stored(2, sums + 16 * kColumns, kLine);
+      _tile_stored(3, sums + 16 * kColumns + 16, kLine);
+    }
+    before_tile_loads();  // nor do loads of the sums move before the stores
+  }
+};
+
+bool supports(const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::amx && has_amx_int8(); }
+
+}  // namespace
+
+extern const LinearKernel kTernaryAmx;
+const LinearKernel kTernaryAmx = TernaryLoop<AmxInt8Tile>::kernel("amx_int8", supports);
+
+}  // namespace vla::kernels
+#endif
