@@ -16,6 +16,7 @@ namespace {
 
 constexpr unsigned kMore = 1, kLong = 2, kCommand = 4;   // flags of a frame
 constexpr unsigned kMoreInside = 1, kCommandInside = 2;  // of what is in a CURVE box
+constexpr int kMaxFrames = 1024;                         // of a message that is read over in order to refuse it
 constexpr std::size_t kGreeting = 64, kMaxCommand = 4096;
 constexpr std::size_t kStep = 256 << 10;     // most bytes that are read at once, so that connections take turns
 constexpr std::size_t kPrefix = 64;          // of a message that is refused: enough for its number
@@ -196,6 +197,8 @@ Result<std::optional<Message>> Session::end_frame() {
     VLA_CHECK(heartbeat(frame_.span()));
     return std::optional<Message>();
   }
+  if (++n_frame_ > kMaxFrames && more)
+    return ended("protocol", fmt::format("at most {} frames in a message", kMaxFrames), "more");
   return end_part(more);
 }
 
@@ -242,7 +245,7 @@ std::optional<Message> Session::end_part(bool more) {
     message_->refused = not_a_request("request", "one frame", "several");
   }
   if (more) return std::nullopt;
-  n_part_ = 0;
+  n_part_ = n_frame_ = 0;
   return std::exchange(message_, std::nullopt);
 }
 

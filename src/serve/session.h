@@ -25,7 +25,7 @@ struct Message {
 
 /// The server's side of ZMTP 3 (ZeroMQ RFC 23) for one connection, without its socket: bytes in, messages out. A frame
 /// takes memory only as its bytes come, one that is not kept takes none, and what follows the first frame of a message
-/// is read over.
+/// is read over, up to a limit.
 class Session {
  public:
   /// Without `keys` peers connect in clear text; else both sides have to prove theirs. `keys` outlive the session.
@@ -77,7 +77,7 @@ class Session {
   Bytes frame_;  // as many of its bytes as are kept
 
   std::optional<Message> message_;
-  int n_part_ = 0;
+  int n_part_ = 0, n_frame_ = 0;  // of `message_`: parts that are kept, and all frames that came
   std::string output_;
   const std::string no_key_;
 };

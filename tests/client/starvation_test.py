@@ -74,8 +74,8 @@ def test_a_message_of_millions_of_frames_takes_no_memory_and_holds_nobody_up(ser
     stopped = threading.Event()
 
     def flood():
-        with hostile.connect(server.address, hostile.HANDSHAKE) as raw, contextlib.suppress(OSError):
-            while not stopped.is_set():
+        while not stopped.is_set():
+            with hostile.connect(server.address, hostile.HANDSHAKE) as raw, contextlib.suppress(OSError):
                 raw.sendall(b"\x01\x00" * 1_000_000)
 
     threads = [threading.Thread(target=flood) for _ in range(2)]
