@@ -16,7 +16,7 @@ help:
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make tsan      build executor and server and run their tests under the thread sanitizer"
-	@echo "make fuzz      build the fuzz targets (clang) and run each for SECONDS=600"
+	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
 	@echo "make clean     remove what was built"
 
@@ -76,7 +76,8 @@ test: build asan
 	$(VENV)/bin/python scripts/test.py
 
 SECONDS ?= 600
-fuzz: packages
+fuzz: $(STAMP)
+	@scripts/packages.sh fuzz
 	@test -f build/fuzz/build.ninja || cmake --preset fuzz $(CMAKE_ARGS)
 	cmake --build --preset fuzz
 	scripts/fuzz.sh $(SECONDS)

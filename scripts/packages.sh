@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # Installs the Debian or Ubuntu packages that the build needs, or says which are missing where that takes a password.
-# `packages.sh demo` adds what the simulator draws with.
+# `packages.sh demo` adds what the simulator draws with, `packages.sh fuzz` the compiler that has libFuzzer.
 set -euo pipefail
 
 packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
@@ -16,6 +16,7 @@ if [ "${1:-}" = demo ]; then
     packages+=(libosmesa6)
   fi
 fi
+if [ "${1:-}" = fuzz ]; then packages+=(clang); fi
 
 if ! command -v dpkg-query >/dev/null; then
   echo "packages: this is not Debian or Ubuntu; install what corresponds to: ${packages[*]}" >&2

@@ -133,7 +133,12 @@ Status Processor::read_view_places(const Keys& keys) {
   views_behind_ = views->behind;
   const std::string key = views_behind_ ? "policy.view_starts_from_end" : "policy.view_starts";
   VLA_TRY(const std::vector<int> starts, keys.integers(key, kTokenIndex));
-  VLA_TRY(const std::vector<std::int32_t> prefixed, tokenizer_.encode(views->token));
+  const auto encode = [&](const std::string& text) -> Result<std::vector<std::int32_t>> {
+    auto tokens = tokenizer_.encode(text, kMaxPrompt);
+    if (!tokens) return misfit("processor.recipe.text", tokens.error().expected, tokens.error().found);
+    return tokens;
+  };
+  VLA_TRY(const std::vector<std::int32_t> prefixed, encode(views->token));
   const std::size_t n_prefix = tokenizer_.prefix().size();
   if (prefixed.size() != n_prefix + 1)
     return misfit(where + ".token", "the text of one token", fmt::format("{} tokens", prefixed.size() - n_prefix));
@@ -141,7 +146,7 @@ Status Processor::read_view_places(const Keys& keys) {
   view_token_text_ = views->token;
   const auto prompt = fill_prompt({}, {});
   if (!prompt) return misfit("processor.recipe.text", prompt.error().expected, prompt.error().found);
-  VLA_TRY(const std::vector<std::int32_t> tokens, tokenizer_.encode(*prompt, kMaxPrompt));
+  VLA_TRY(const std::vector<std::int32_t> tokens, encode(*prompt));
   const std::vector<Run> runs = runs_of(view_token_, tokens, views->repeat);
   std::vector<int> found;
   const int n_token = static_cast<int>(tokens.size());

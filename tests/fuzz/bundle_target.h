@@ -6,6 +6,7 @@
 #include <xxhash.h>
 
 #include <algorithm>
+#include <cstdio>
 #include <cstdlib>
 #include <span>
 #include <string>
@@ -21,10 +22,16 @@ namespace vla::fuzz {
 /// Engine::load makes before it takes memory for weights.
 enum class Depth { refused, parsed, declared };
 
+/// A fuzzer is told by an abort, and whoever reads its log by the message.
+[[noreturn]] inline void unexpected(const Error& error) {
+  std::fprintf(stderr, "unexpected: %s: %s\n", code_name(error.code), error.message().c_str());
+  std::abort();
+}
+
 /// An error must be one that a bundle can cause, and say where and what. Aborts when it is not.
 inline void check_error(const Error& error) {
   const bool is_bundles_fault = error.code == Code::bad_bundle || error.code == Code::unsupported;
-  if (!is_bundles_fault || error.where.empty() || error.found.empty()) std::abort();
+  if (!is_bundles_fault || error.where.empty() || (error.found.empty() && error.expected.empty())) unexpected(error);
 }
 
 template <class T>

@@ -6,7 +6,10 @@
 
 #include <filesystem>
 
+#include "fuzz/file_target.h"
+#include "fuzz/mutate.h"
 #include "fuzz/request_target.h"
+#include "fuzz/session_target.h"
 #include "support/editable_bundle.h"
 
 using namespace vla;
@@ -35,4 +38,47 @@ TEST_CASE("the requests that fuzzing starts from reach every decoder") {
   CHECK(fate(read_text(kFolder + "/hello")).sound);
   CHECK(fate(read_text(kFolder + "/describe")).sound);
   CHECK(fate(read_text(kFolder + "/health")).sound);
+}
+
+TEST_CASE(
+    "sessions from fuzzing get through the handshake, with keys and without, and damaged ones end with a reason") {
+  fuzz::Random random(1);
+  for (const auto& [name, n_message] : {std::pair{"plain", 4}, {"keys", 3}}) {
+    CAPTURE(name);
+    const std::string sound = read_text(source_path("tests/fuzz/regressions/session/") + name);
+    CHECK(fuzz::check_session(sound) == n_message);
+    for (int round = 0; round < 1000; ++round) (void)fuzz::check_session(fuzz::damaged(sound, random));
+  }
+}
+
+TEST_CASE("damaged recordings, taps and key files are read or refused, in bounded time and memory") {
+  const std::string folder = scratch_path("odd_files");
+  std::filesystem::remove_all(folder);
+  {
+    const auto recorder = serve::Recorder::open(folder, 1 << 20);
+    REQUIRE(recorder.ok());
+    (*recorder)->describe({});
+    const std::string act = read_text(kFolder + "/act"), answer = "an answer";
+    for (int i = 0; i < 3; ++i) {
+      serve::Answered answered;
+      answered.request.kind = serve::Kind::act;
+      answered.in = std::as_bytes(std::span(act));
+      answered.out = std::as_bytes(std::span(answer));
+      (*recorder)->answered(answered);
+    }
+  }
+  const std::string recording = read_text(folder + "/" + serve::kRecordingFile);
+  const std::string taps = folder + "/taps";
+  REQUIRE(write_taps({{"a", {2, 3}, {1, 2, 3, 4, 5, 6}}, {"b", {1}, {7}}}, taps).ok());
+  const std::string key = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7";
+  const std::pair<fuzz::FileKind, std::string> sound[] = {
+      {fuzz::FileKind::recording, recording},
+      {fuzz::FileKind::taps, read_text(taps)},
+      {fuzz::FileKind::keys, "# robots\n" + key + " arm\n" + key + "\n"}};
+  fuzz::Random random(1);
+  for (const auto& [kind, bytes] : sound) {
+    CAPTURE(static_cast<int>(kind));
+    CHECK(fuzz::check_file(kind, bytes, folder));
+    for (int round = 0; round < 300; ++round) (void)fuzz::check_file(kind, fuzz::damaged(bytes, random), folder);
+  }
 }

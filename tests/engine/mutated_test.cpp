@@ -1,0 +1,33 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Bundles of every architecture with something odd in them load and act, or are refused: the check of a fuzz target,
+// with a seed instead of a fuzzer.
+#include <doctest/doctest.h>
+
+#include "fuzz/act_target.h"
+#include "fuzz/mutant.h"
+#include "support/editable_bundle.h"
+#include "support/golden_case.h"
+
+using namespace vla;
+using namespace vla::test;
+
+TEST_CASE("an odd bundle of any architecture acts or is refused, in bounded time and memory") {
+  constexpr int kRounds = 25;  // for each architecture
+  fuzz::Random random(1);
+  std::string arch;
+  for (const std::string& path : golden_paths()) {  // those of one architecture follow each other
+    const std::string sound = read_text(GoldenCase::read(path).bundle());
+    const auto bundle = Bundle::parse(std::as_bytes(std::span(sound)), path);
+    REQUIRE(bundle.ok());
+    if (arch == *bundle->keys().string("vla.arch")) continue;
+    arch = *bundle->keys().string("vla.arch");
+    CAPTURE(arch);
+    CHECK(fuzz::check_act(sound));
+    int n_answered = 0;
+    for (int round = 0; round < kRounds; ++round) n_answered += fuzz::check_act(fuzz::mutant(sound, random)) ? 1 : 0;
+    CHECK(n_answered > 0);
+    CHECK(n_answered < kRounds);
+  }
+}
