@@ -165,17 +165,6 @@ class Translator {
 
 bool is_leaf(const Node& node) { return node.in.empty(); }
 
-std::vector<bool> needed_nodes(const Graph& graph) {
-  std::vector<bool> needed(graph.nodes().size(), false);
-  for (auto node = graph.nodes().rbegin(); node != graph.nodes().rend(); ++node) {
-    const auto id = static_cast<std::size_t>(node->id);
-    needed[id] = needed[id] || node->tapped || node->as<op::Write>() != nullptr;
-    if (needed[id])
-      for (Tensor in : node->in) needed[static_cast<std::size_t>(in.node()->id)] = true;
-  }
-  return needed;
-}
-
 Work work_of(const Node& node) {
   Work work = {flop_of(node), 4.0 * static_cast<double>(count(node.shape))};
   for (Tensor in : node.in) work.bytes += 4.0 * static_cast<double>(count(in.shape()));
@@ -197,7 +186,7 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
   program->graph_ = ggml_new_graph_custom(c, n, false);
 
   Translator translate(c, program->constant_context_.get(), device);
-  const std::vector<bool> needed = needed_nodes(graph);
+  const std::vector<bool> needed = graph.needed();
   std::vector<std::pair<ggml_tensor*, const Node*>> constants;
   std::vector<int> stage_end;
   program->work_.resize(n_stage);

@@ -84,4 +84,15 @@ Tensor Graph::name(const std::string& path, Tensor value) {
   return value;
 }
 
+std::vector<bool> Graph::needed() const {
+  std::vector<bool> needed(nodes_.size(), false);
+  for (auto node = nodes_.rbegin(); node != nodes_.rend(); ++node) {
+    const auto id = static_cast<std::size_t>(node->id);
+    needed[id] = needed[id] || node->tapped || node->as<op::Write>() != nullptr;
+    if (needed[id])
+      for (Tensor in : node->in) needed[static_cast<std::size_t>(in.node()->id)] = true;
+  }
+  return needed;
+}
+
 }  // namespace vla

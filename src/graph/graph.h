@@ -87,6 +87,8 @@ class Graph {
 
   const std::deque<Node>& nodes() const { return nodes_; }
   const std::vector<Stage>& stages() const { return stages_; }
+  /// Of each node whether a write or a tap depends on it.
+  std::vector<bool> needed() const;
   /// The first operation whose operands did not fit; empty where all did. A bug of ours, reported when it is lowered.
   const std::string& problem() const { return problem_; }
 

@@ -75,11 +75,12 @@ Status Executor::reserve(std::size_t size) {
   if (!memory)
     return Error{Code::out_of_memory, "scratch memory of threads", "", "the system refused the allocation",
                  "free memory or use fewer threads"};
-  // What a task left in it belongs to a phase; no phase has the number zero.
-  std::memset(memory.get(), 0, size * static_cast<std::size_t>(n_thread_));
   scratch_ = std::move(memory);
   scratch_size_ = size;
   want_large_pages(scratch_.get(), scratch_size());
+  // What a task left in it belongs to the phase that it names at the beginning; no phase has the number zero.
+  for (std::byte* of_worker = scratch_.get(); of_worker < scratch_.get() + scratch_size(); of_worker += size)
+    std::memset(of_worker, 0, 64);
   return {};
 }
 
@@ -134,7 +135,7 @@ bool Executor::work(Worker& worker) {
       worker.phase = left >> kCountBits;
       worker.scratch = scratch_.get() + static_cast<std::size_t>(worker.index) * scratch_size_;
       run_item(stretch.end - static_cast<std::int64_t>(left & kCountMask), worker);
-      finish_item(worker);
+      finish_item();
       worked = true;
       left = stretch.left.load(std::memory_order_acquire);
     }
@@ -149,7 +150,7 @@ void Executor::run_item(std::int64_t item, Worker& worker) {
   }
 }
 
-void Executor::finish_item(Worker&) {
+void Executor::finish_item() {
   if (n_left_.fetch_sub(1, std::memory_order_acq_rel) != 1) return;
   const Phase& phase = phases_[i_phase_];
   if (phase.done != nullptr) *phase.done = std::chrono::steady_clock::now();

@@ -74,7 +74,7 @@ class Executor {
   void serve(int index);
   bool work(Worker& worker);
   void run_item(std::int64_t item, Worker& worker);
-  void finish_item(Worker& worker);
+  void finish_item();
   void open(std::size_t i_phase);
   bool has_work() const;
   template <class Ready>

@@ -113,7 +113,7 @@ struct Lowering {
   std::vector<Value> values;
   std::vector<FusedOp> ops;
   std::vector<std::vector<const Node*>> readers;  // of each node that is needed
-  std::vector<bool> needed;                       // nodes that a write or a tap depends on
+  std::vector<bool> needed;                       // Graph::needed
   std::vector<bool> fused;                        // nodes that are part of an operation of another
   int n_prepare = 0, n_phase = 0;                 // phases of Program::prepare, and of both
   std::size_t arena_size = 0, kept_size = 0;

@@ -108,17 +108,12 @@ Value value_of(const Lowering& l, const Node& node) {
 
 void start(Lowering& l) {
   const auto& nodes = l.graph.nodes();
-  l.needed.assign(nodes.size(), false);
+  l.needed = l.graph.needed();
   l.fused.assign(nodes.size(), false);
   l.readers.resize(nodes.size());
   for (auto node = nodes.rbegin(); node != nodes.rend(); ++node) {
-    const auto id = static_cast<std::size_t>(node->id);
-    l.needed[id] = l.needed[id] || node->tapped || node->as<op::Write>() != nullptr;
-    if (!l.needed[id]) continue;
-    for (Tensor in : node->in) {
-      l.needed[static_cast<std::size_t>(in.node()->id)] = true;
-      l.readers[static_cast<std::size_t>(in.node()->id)].push_back(&*node);
-    }
+    if (!l.needed[static_cast<std::size_t>(node->id)]) continue;
+    for (Tensor in : node->in) l.readers[static_cast<std::size_t>(in.node()->id)].push_back(&*node);
   }
   for (const Node& node : nodes) l.values.push_back(value_of(l, node));
 }
