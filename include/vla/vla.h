@@ -145,6 +145,8 @@ typedef struct vla_description {
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */
 
   size_t noise_rows; /* `horizon`, or more where the robot gets the first rows only of what the network computes */
+  const char* real_time_chunking; /* what the leftover of an observation does: "guided", "inpainted", or empty where
+                                     there must be none */
 } vla_description;
 
 /* NULL only when `policy` is NULL. */
@@ -190,9 +192,16 @@ typedef struct vla_observation {
   size_t n_noise;     /* noise_rows * d_noise */
   uint32_t has_seed;  /* 1: the noise is drawn from `seed`, the same bytes on every machine */
   uint64_t seed;
+  /* Real-time chunking: the next chunk goes on from rows of the chunk before that are not executed yet. NULL: none. */
+  const float* leftover;  /* the last rows of its vla_chunk_normalized */
+  size_t n_leftover;      /* rows * d_action */
+  int32_t leftover_delay; /* how many of these rows will have been executed when the next chunk is there */
+  const char* schedule;   /* of a "guided" policy, and only there: how the weight of the rows after the delay falls,
+                             "zeros", "ones", "linear" or "exp" */
+  double max_guidance;    /* the same: the largest weight of the guidance, above 0 */
 } vla_observation;
 #define VLA_OBSERVATION_INIT \
-  { sizeof(vla_observation), NULL, 0, NULL, 0, NULL, 0, NULL, 0, 0, 0 }
+  { sizeof(vla_observation), NULL, 0, NULL, 0, NULL, 0, NULL, 0, 0, 0, NULL, 0, 0, NULL, 0 }
 
 /* Answers one observation. On failure *out is NULL, and the policy goes on to answer the next. */
 VLA_API vla_status vla_act(vla_policy* policy, const vla_observation* observation, vla_chunk** out);
@@ -202,6 +211,8 @@ VLA_API void vla_chunk_close(vla_chunk* chunk);
 /* The actions, (horizon, d_action) row by row, in the units of the robot; all of them are finite. For a chunk of NULL
  * this and what follows is NULL or 0. */
 VLA_API const float* vla_chunk_actions(const vla_chunk* chunk);
+/* The same as the network answered, before statistics made units of it: what the leftover of an observation takes. */
+VLA_API const float* vla_chunk_normalized(const vla_chunk* chunk);
 VLA_API size_t vla_chunk_horizon(const vla_chunk* chunk);
 VLA_API size_t vla_chunk_d_action(const vla_chunk* chunk);
 /* What the user must know about this answer, e.g. that the instruction was cut. NULL beyond the last. */

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .chunk import Chunk as Chunk
     from .client import Client as Client
     from .errors import *  # noqa: F403
+    from .observation import Leftover as Leftover
     from .policy import Policy as Policy
     from .spec import BundleInfo as BundleInfo
     from .spec import Spec as Spec
@@ -34,6 +35,7 @@ _HOMES = {
     "Client": "client",
     "Policy": "policy",
     "Chunk": "chunk",
+    "Leftover": "observation",
     **dict.fromkeys(("BundleInfo", "Spec", "StateSpec", "ViewSpec"), "spec"),
     **dict.fromkeys(_ERRORS, "errors"),
 }

@@ -91,6 +91,7 @@ class Description(_Struct):
         ("memory_plan", c_uint64),
         ("memory_working", c_uint64),
         ("noise_rows", c_size_t),
+        ("real_time_chunking", c_char_p),
     ]
 
 
@@ -124,6 +125,11 @@ class Observation(_Struct):
         ("n_noise", c_size_t),
         ("has_seed", c_uint32),
         ("seed", c_uint64),
+        ("leftover", c_void_p),
+        ("n_leftover", c_size_t),
+        ("leftover_delay", c_int32),
+        ("schedule", c_char_p),
+        ("max_guidance", c_double),
     ]
 
 
@@ -137,6 +143,7 @@ _FUNCTIONS = {
     "vla_act": (c_int32, [c_void_p, POINTER(Observation), POINTER(c_void_p)]),
     "vla_chunk_close": (None, [c_void_p]),
     "vla_chunk_actions": (POINTER(c_float), [c_void_p]),
+    "vla_chunk_normalized": (POINTER(c_float), [c_void_p]),
     "vla_chunk_n_note": (c_size_t, [c_void_p]),
     "vla_chunk_note": (c_char_p, [c_void_p, c_size_t]),
     "vla_chunk_n_stage": (c_size_t, [c_void_p]),

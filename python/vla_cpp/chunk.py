@@ -17,6 +17,8 @@ class Chunk:
     """Actions for the next `horizon` control steps; `np.asarray(chunk)` is float32 (horizon, d_action) in world units.
 
     names            one per column
+    normalized       the same as the network answered, before statistics made units of it: for a Leftover; None where the policy takes
+                     none
     rate_hz          rows per second that the policy was trained for; 0 where the bundle does not say
     timing           milliseconds per stage, in the order in which they ran
     queue_ms         milliseconds that the request waited at a server; 0 in process
@@ -34,6 +36,7 @@ class Chunk:
     seed: Optional[int] = None
     notes: Tuple[str, ...] = ()
     capture_time_ns: Optional[int] = None
+    normalized: Optional[np.ndarray] = None
 
     def __array__(self, dtype=None, copy=None):
         """NumPy's protocol, that of release 1 (no `copy`) and of release 2."""

@@ -18,7 +18,7 @@ from .chunk import Chunk
 from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
 from .handle import Handle, wrong_process
-from .observation import Image, State, check_start
+from .observation import Image, Leftover, State, check_start
 from .pending import Health, Pending
 from .spec import Spec
 
@@ -89,6 +89,7 @@ class Client(Handle):
         text: str,
         seed: Optional[int] = None,
         noise: object = None,
+        leftover: Optional[Leftover] = None,
         deadline_ms: Optional[float] = None,
         capture_time_ns: Optional[int] = None,
         timeout: Optional[float] = None,
@@ -101,6 +102,7 @@ class Client(Handle):
         text             the instruction, as a person says it
         seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither the server draws a seed and
                          the chunk tells it
+        leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover
         deadline_ms      after so many milliseconds at the server the answer is worthless and not computed; the timeout by default
         capture_time_ns  when the frames were taken; comes back in the chunk
         timeout          seconds, instead of the client's
@@ -109,7 +111,7 @@ class Client(Handle):
         Incompatible, ShuttingDown, and what the runtime itself may raise: BadAction, DeviceError, OutOfMemory, InternalError.
         """
         return self.submit(
-            images=images, state=state, text=text, seed=seed, noise=noise,
+            images=images, state=state, text=text, seed=seed, noise=noise, leftover=leftover,
             deadline_ms=deadline_ms, capture_time_ns=capture_time_ns, timeout=timeout,
         ).result()  # fmt: skip
 

@@ -4,17 +4,35 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Dict, Iterable, Mapping, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
-from .errors import BadObservation, UsageError
-from .spec import StateSpec
+from .errors import BadObservation, Unsupported, UsageError
+from .spec import Spec, StateSpec
 
 Image = Union[np.ndarray, bytes, bytearray, memoryview, None]
 State = Union[Mapping[str, object], Sequence[float], np.ndarray, float]
 
 MAX_SEED = 2**64 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """Real-time chunking: what the robot has not executed yet of the chunk before, from which the next chunk goes on.
+
+    rows          the last rows of its `normalized`
+    delay         how many of them will have been executed when the next chunk is there
+    schedule      of a guided policy (`Spec.real_time_chunking`), and only there: how the weight of the rows after the delay falls,
+                  "zeros", "ones", "linear" or "exp"
+    max_guidance  the same: the largest weight of the guidance
+    """
+
+    rows: object
+    delay: int
+    schedule: Optional[str] = None
+    max_guidance: Optional[float] = None
 
 
 def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
@@ -61,6 +79,24 @@ def noise_of(noise: object, n_row: int, d_noise: int) -> np.ndarray:
     if values.shape != (n_row, d_noise):
         raise BadObservation("noise", f"shape ({n_row}, {d_noise})", str(values.shape))
     return values
+
+
+def leftover_of(leftover: Leftover, spec: Spec) -> np.ndarray:
+    """Its rows as float32 (row, d_action). What is left to check the runtime does, which knows the policy."""
+    if not isinstance(leftover, Leftover):
+        raise UsageError("leftover", "a Leftover", type(leftover).__name__)
+    if not spec.real_time_chunking:
+        raise Unsupported("leftover", "a policy that goes on from the rows of its previous chunk", "one that does not")
+    rows = floats("leftover", leftover.rows, 2)
+    if rows.shape[1] != spec.d_action or not 1 <= len(rows) <= spec.horizon:
+        raise BadObservation("leftover", f"1 to {spec.horizon} rows of {spec.d_action} numbers", f"shape {rows.shape}")
+    if not isinstance(leftover.delay, (int, np.integer)) or not 0 <= leftover.delay <= len(rows):
+        raise BadObservation("leftover.delay", f"0 to {len(rows)}, the rows that are left", repr(leftover.delay))
+    for name, kind in (("schedule", str), ("max_guidance", (int, float))):
+        value = getattr(leftover, name)
+        if value is not None and not isinstance(value, kind):
+            raise BadObservation(f"leftover.{name}", "text" if kind is str else "a number", repr(value))
+    return rows
 
 
 def floats(where: str, values: object, n_dim: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from . import _capi
 from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
 from .handle import Handle, wrong_process
-from .observation import Image, State, check_start, named, noise_of, image_arg, states_of
+from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 
@@ -64,6 +64,7 @@ class Policy(Handle):
         text: str,
         seed: Optional[int] = None,
         noise: object = None,
+        leftover: Optional[Leftover] = None,
         capture_time_ns: Optional[int] = None,
     ) -> Chunk:
         """One observation in, one action chunk out.
@@ -74,6 +75,7 @@ class Policy(Handle):
         text             the instruction, as a person says it
         seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn and the chunk
                          tells it
+        leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover
         capture_time_ns  when the frames were taken; comes back in the chunk
 
         Errors: BadObservation (what the policy cannot take, by name), BadAction, DeviceError, OutOfMemory, InternalError.
@@ -81,7 +83,7 @@ class Policy(Handle):
         check_start(seed, noise)
         if noise is None and seed is None:
             seed = random.SystemRandom().getrandbits(32)
-        call = _Call(self._spec, images, state, text, seed, noise)
+        call = _Call(self._spec, images, state, text, seed, noise, leftover)
         with self._lock:
             self._check_usable()
             answer = ctypes.c_void_p()
@@ -116,7 +118,10 @@ class Policy(Handle):
 
     def _chunk_of(self, answer: ctypes.c_void_p, seed: Optional[int], capture_time_ns: Optional[int]) -> Chunk:
         lib, spec = self._library, self._spec
-        actions = np.ctypeslib.as_array(lib.vla_chunk_actions(answer), (spec.horizon, spec.d_action)).copy()
+        actions, normalized = (
+            np.ctypeslib.as_array(numbers(answer), (spec.horizon, spec.d_action)).copy()
+            for numbers in (lib.vla_chunk_actions, lib.vla_chunk_normalized)
+        )
         stages = range(lib.vla_chunk_n_stage(answer))
         return Chunk(
             actions=actions,
@@ -127,6 +132,7 @@ class Policy(Handle):
             seed=None if seed is None else int(seed),
             notes=tuple(_text(lib.vla_chunk_note(answer, i)) for i in range(lib.vla_chunk_n_note(answer))),
             capture_time_ns=capture_time_ns,
+            normalized=normalized if spec.real_time_chunking else None,
         )
 
 
@@ -134,7 +140,14 @@ class _Call:
     """An observation as the library reads it, together with the arrays that it points into."""
 
     def __init__(
-        self, spec: Spec, images: Mapping[str, Image], state: State, text: str, seed: Optional[int], noise: object
+        self,
+        spec: Spec,
+        images: Mapping[str, Image],
+        state: State,
+        text: str,
+        seed: Optional[int],
+        noise: object,
+        leftover: Optional[Leftover],
     ) -> None:
         self._kept: List[Any] = []
         views = [self._view(name, image) for name, image in named("images", images)]
@@ -157,6 +170,15 @@ class _Call:
         if noise is not None:
             values = noise_of(noise, spec.noise_rows, spec.d_noise)
             self.observation.noise, self.observation.n_noise = self._address(values), values.size
+        if leftover is not None:
+            self._add_leftover(leftover, leftover_of(leftover, spec))
+
+    def _add_leftover(self, leftover: Leftover, rows: np.ndarray) -> None:
+        o = self.observation
+        o.leftover, o.n_leftover, o.leftover_delay = self._address(rows), rows.size, int(leftover.delay)
+        if leftover.schedule is not None:
+            o.schedule = _name_of("leftover.schedule", leftover.schedule)
+        o.max_guidance = leftover.max_guidance or 0.0
 
     def _view(self, name: str, image: Image) -> _capi.View:
         data = image_arg(name, image)[1]
@@ -229,6 +251,7 @@ def _spec_of(d: _capi.Description) -> Spec:
         d_noise=d.d_noise,
         noise_rows=d.noise_rows,
         noise=_text(d.noise),
+        real_time_chunking=_text(d.real_time_chunking),
         rate_hz=d.rate_hz,
         bundle=BundleInfo(
             os.path.basename(_text(d.bundle_path)),

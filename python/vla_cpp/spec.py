@@ -58,6 +58,7 @@ class Spec:
     d_noise       columns of the noise
     noise_rows    its rows: `horizon`, or more where the robot gets the first rows only of what the network computes
     noise         its distribution, e.g. "normal"
+    real_time_chunking  what a Leftover does: "guided", "inpainted", or "" where it is refused
     rate_hz       rows per second that the policy was trained for; 0 where the bundle does not say
     """
 
@@ -76,3 +77,4 @@ class Spec:
     precision: str
     kernels: str
     device: str
+    real_time_chunking: str = ""

@@ -17,7 +17,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from .chunk import Chunk
 from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
-from .observation import Image, State, named, noise_of, image_arg, states_of
+from .observation import Image, Leftover, State, image_arg, leftover_of, named, noise_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 PROTOCOL_VERSION = 1
@@ -57,6 +57,7 @@ def act_bytes(
     text: str,
     seed: Optional[int],
     noise: object,
+    leftover: Optional[Leftover] = None,
     deadline_ms: float,
     capture_time_ns: Optional[int] = None,
 ) -> bytes:
@@ -86,12 +87,24 @@ def act_bytes(
         act.noise.values.extend(values.ravel().tolist())
     elif seed is not None:
         act.seed = int(seed)
+    if leftover is not None:
+        _add_leftover(act, leftover, leftover_of(leftover, spec))
     act.deadline_ms = _milliseconds(deadline_ms)
     if capture_time_ns is not None:
         act.capture_time_ns = _int64("capture_time_ns", capture_time_ns)
     data = b"".join(_with_raw_images(request, raw))
     _check_limits(raw, len(data), limits)
     return data
+
+
+def _add_leftover(act: Any, leftover: Leftover, rows: np.ndarray) -> None:
+    act.leftover.n_row, act.leftover.d_action = rows.shape
+    act.leftover.values.extend(rows.ravel().tolist())
+    act.leftover.delay = int(leftover.delay)
+    if leftover.schedule is not None:
+        act.leftover.schedule = leftover.schedule
+    if leftover.max_guidance is not None:
+        act.leftover.max_guidance = leftover.max_guidance
 
 
 def _with_raw_images(request: Any, raw: Mapping[str, np.ndarray]) -> List[Any]:
@@ -162,6 +175,7 @@ def spec_of(description: Any) -> Spec:
         d_noise=description.d_noise,
         noise_rows=description.noise_rows,
         noise=description.noise_kind,
+        real_time_chunking=description.real_time_chunking,
         rate_hz=description.rate_hz,
         bundle=bundle_of(description.bundle),
         precision=runtime.precision,
@@ -182,6 +196,9 @@ def chunk_of(message: Any) -> Chunk:
         raise BadAction("answer", f"{message.horizon} x {message.d_action} actions", str(actions.size))
     if not np.isfinite(actions).all():
         raise BadAction("answer", "finite actions", "one that is not")
+    normalized = np.array(message.normalized, np.float32)
+    if normalized.size not in (0, actions.size):
+        raise BadAction("answer", f"{actions.size} normalized numbers", str(normalized.size))
     return Chunk(
         actions=actions.reshape(message.horizon, message.d_action),
         names=tuple(message.names),
@@ -192,6 +209,7 @@ def chunk_of(message: Any) -> Chunk:
         seed=message.seed if message.HasField("seed") else None,
         notes=tuple(message.notes),
         capture_time_ns=message.capture_time_ns or None,
+        normalized=normalized.reshape(message.horizon, message.d_action) if normalized.size else None,
     )
 
 

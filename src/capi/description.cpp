@@ -37,7 +37,7 @@ Description::Description(const vla::Description& from) {
   d.action_names = keep_names(from.actions), d.action_units = keep_units(from.actions);
   d.rate_hz = from.rate_hz;
   d.noise_rows = size_of(from.solver_horizon), d.d_noise = size_of(from.d_action_padded);
-  d.noise = keep(from.noise);
+  d.noise = keep(from.noise), d.real_time_chunking = keep(from.real_time_chunking);
   d.bundle_path = keep(from.path), d.arch = keep(from.arch), d.checksum = keep(from.checksum);
   d.source = keep(from.source), d.revision = keep(from.revision), d.converter = keep(from.converter);
   d.dtype = keep(from.dtype), d.precision = keep(from.precision), d.kernels = keep(from.kernels);

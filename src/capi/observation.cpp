@@ -7,7 +7,7 @@
 namespace vla::capi {
 namespace {
 
-constexpr std::size_t kMaxFile = std::size_t{1} << 30;
+constexpr std::size_t kMaxFile = std::size_t{1} << 30, kMaxLeftover = std::size_t{1} << 24;
 
 std::span<const std::byte> bytes_of(const vla_view& view) {
   return {static_cast<const std::byte*>(view.data), view.size};
@@ -106,12 +106,30 @@ Result<Noise> read_noise(const vla_observation& given, const Engine& engine) {
   return Noise(std::vector<float>(given.noise, given.noise + given.n_noise));
 }
 
+/// The engine checks what it says; here only whether it says one thing.
+Result<std::optional<Leftover>> read_leftover(const vla_observation& given) {
+  if (given.leftover == nullptr) {
+    if (given.n_leftover == 0 && given.leftover_delay == 0 && given.schedule == nullptr && given.max_guidance == 0)
+      return std::optional<Leftover>();
+    return usage("observation.leftover", "rows for what is said of them", "NULL");
+  }
+  if (given.n_leftover > kMaxLeftover)
+    return usage("observation.n_leftover", fmt::format("at most {}", kMaxLeftover), std::to_string(given.n_leftover));
+  Leftover leftover{{given.leftover, given.leftover + given.n_leftover}, given.leftover_delay, {}, {}};
+  if (given.schedule != nullptr) {
+    VLA_TRY(leftover.schedule, read_name(given.schedule, "observation.schedule"));
+  }
+  if (given.max_guidance != 0) leftover.max_guidance = given.max_guidance;
+  return std::optional<Leftover>(std::move(leftover));
+}
+
 }  // namespace
 
 Result<Request> read_observation(const vla_observation* given, const Engine& engine) {
   VLA_TRY(const vla_observation known, read_struct<vla_observation>(given, "observation"));
   Request request;
   VLA_TRY(request.noise, read_noise(known, engine));
+  VLA_TRY(request.leftover, read_leftover(known));
   if (known.text_size > Tokenizer::kMaxText)
     return Error{Code::bad_observation, "instruction", fmt::format("at most {} bytes", Tokenizer::kMaxText),
                  std::to_string(known.text_size)};

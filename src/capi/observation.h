@@ -12,6 +12,7 @@ namespace vla::capi {
 struct Request {
   Observation observation;
   Noise noise;
+  std::optional<Leftover> leftover;
 };
 
 /// Checks the form of everything before memory is taken for it, decodes files and copies; what the bundle makes of it

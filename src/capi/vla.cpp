@@ -71,7 +71,7 @@ Status act(vla_policy* policy, const vla_observation* observation, vla_chunk** o
   clock.lap(before, "decode");
   const std::lock_guard<std::mutex> turn(policy->mutex);
   clock.lap(queue, "queue");
-  VLA_TRY(chunk->answer, policy->engine->act(request.observation, request.noise));
+  VLA_TRY(chunk->answer, policy->engine->act(request.observation, request.noise, request.leftover));
   Timing& timing = chunk->answer.timing;
   timing.insert(timing.begin(), before.begin(), before.end());
   chunk->queue_ms = queue.front().second;
@@ -107,6 +107,7 @@ vla_status vla_act(vla_policy* policy, const vla_observation* observation, vla_c
 void vla_chunk_close(vla_chunk* chunk) { delete chunk; }
 
 const float* vla_chunk_actions(const vla_chunk* chunk) { return chunk ? chunk->answer.actions.data() : nullptr; }
+const float* vla_chunk_normalized(const vla_chunk* chunk) { return chunk ? chunk->answer.normalized.data() : nullptr; }
 size_t vla_chunk_horizon(const vla_chunk* chunk) { return chunk ? static_cast<std::size_t>(chunk->answer.horizon) : 0; }
 size_t vla_chunk_d_action(const vla_chunk* chunk) {
   return chunk ? static_cast<std::size_t>(chunk->answer.d_action) : 0;

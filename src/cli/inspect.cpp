@@ -140,6 +140,8 @@ void print_human(const Engine& engine) {
   say(stdout, "checksum     {}\n", d.checksum);
   print_features(d, engine);
   say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
+  say(stdout, "leftover     {}\n",
+      d.real_time_chunking.empty() ? "refused: no real-time chunking" : d.real_time_chunking);
   const Json recipe = Json::parse(*engine.bundle().keys().string("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {
     say(stdout, "recipe       {}\n", list);
@@ -167,6 +169,7 @@ void print_json(const Engine& engine) {
     root["modules"][path] = {{"parameters", size.n_param}, {"stored_bytes", size.stored}};
   root["linear_kernels"] = engine.linear_kernels();
   root["precision"] = engine.precision();
+  root["real_time_chunking"] = kind_name(engine.real_time_chunking().kind);
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};

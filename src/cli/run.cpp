@@ -19,9 +19,11 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 
 struct RunOptions {
-  std::string bundle, text, noise, out, tap, taps_out, kernels;
+  std::string bundle, text, noise, out, tap, taps_out, kernels, leftover, schedule, normalized_out;
   std::vector<std::string> images, states;
   std::optional<std::uint64_t> seed;
+  std::optional<int> delay;
+  std::optional<double> max_guidance;
   int n_thread = 0;
   bool json = false, strict_state = false;
 };
@@ -80,21 +82,38 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   return {};
 }
 
-/// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from; the
-/// reference's own arrays have a batch of one before it.
+/// Float32 rows; the reference's own arrays have a batch of one before them.
+Result<NpyArray> read_rows(const std::string& file) {
+  VLA_TRY(const std::vector<std::byte> bytes, read_file(file, kMaxFile));
+  VLA_TRY(NpyArray array, parse_npy(bytes, file));
+  if (!std::holds_alternative<std::vector<float>>(array.values))
+    return Error{Code::bad_observation, file, "float32 numbers", "uint8"};
+  if (array.shape.size() == 3 && array.shape.front() == 1) array.shape.erase(array.shape.begin());
+  return array;
+}
+
+/// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from.
 Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
   if (options.noise.empty()) return Noise(*options.seed);
-  VLA_TRY(const std::vector<std::byte> bytes, read_file(options.noise, kMaxFile));
-  VLA_TRY(NpyArray array, parse_npy(bytes, options.noise));
-  auto* values = std::get_if<std::vector<float>>(&array.values);
-  if (values == nullptr) return Error{Code::bad_observation, options.noise, "float32 noise", "uint8"};
+  VLA_TRY(NpyArray array, read_rows(options.noise));
   const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.solver_horizon()),
                                           static_cast<std::size_t>(engine.d_action_padded())};
-  if (array.shape.size() == 3 && array.shape.front() == 1) array.shape.erase(array.shape.begin());
   if (array.shape != shape)
     return Error{Code::bad_observation, options.noise, fmt::format("noise of shape ({})", fmt::join(shape, ", ")),
                  fmt::format("({})", fmt::join(array.shape, ", "))};
-  return Noise(std::move(*values));
+  return Noise(std::get<std::vector<float>>(std::move(array.values)));
+}
+
+/// The last rows of a chunk that `--normalized-out` wrote.
+Result<std::optional<Leftover>> read_leftover(const RunOptions& options, const Engine& engine) {
+  if (options.leftover.empty()) return std::optional<Leftover>();
+  VLA_TRY(NpyArray array, read_rows(options.leftover));
+  const std::size_t width = engine.processor().action_names().size();
+  if (array.shape.size() != 2 || array.shape[1] != width)
+    return Error{Code::bad_observation, options.leftover, fmt::format("rows of {} numbers", width),
+                 fmt::format("shape ({})", fmt::join(array.shape, ", "))};
+  return std::optional<Leftover>(Leftover{std::get<std::vector<float>>(std::move(array.values)), *options.delay,
+                                          options.schedule, options.max_guidance});
 }
 
 void print_table(const ActionChunk& chunk, const Engine& engine) {
@@ -143,6 +162,10 @@ Status check(RunOptions& options) {
   if (!options.noise.empty() && options.seed) return Error{Code::usage, "--seed", "--noise or --seed", "both"};
   if (options.tap.empty() != options.taps_out.empty())
     return Error{Code::usage, "--tap", "--tap PATTERN and --taps-out FILE together", "one of them"};
+  if (options.leftover.empty() == options.delay.has_value())
+    return Error{Code::usage, "--leftover", "--leftover FILE and --delay ROWS together", "one of them"};
+  if (options.leftover.empty() && (!options.schedule.empty() || options.max_guidance))
+    return Error{Code::usage, "--leftover", "rows for --schedule and --max-guidance", "none"};
   if (options.noise.empty() && !options.seed) {
     options.seed = std::random_device()();
     say(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
@@ -170,13 +193,17 @@ Status run(RunOptions& options) {
   for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, engine->processor()));
   clock.lap(before, "decode");
   VLA_TRY(const Noise noise, read_noise(options, *engine));
-  VLA_TRY(ActionChunk chunk, engine->act(observation, noise));
+  VLA_TRY(const std::optional<Leftover> leftover, read_leftover(options, *engine));
+  VLA_TRY(ActionChunk chunk, engine->act(observation, noise, leftover));
   chunk.timing.insert(chunk.timing.begin(), before.begin(), before.end());
 
   for (const std::string& note : chunk.notes) say(stderr, "note: {}\n", note);
   if (!options.taps_out.empty()) VLA_CHECK(write_recorded(chunk.taps, options));
   if (!options.out.empty())
     VLA_CHECK(write_npy(options.out, chunk.actions, static_cast<std::size_t>(chunk.horizon),
+                        static_cast<std::size_t>(chunk.d_action)));
+  if (!options.normalized_out.empty())
+    VLA_CHECK(write_npy(options.normalized_out, chunk.normalized, static_cast<std::size_t>(chunk.horizon),
                         static_cast<std::size_t>(chunk.d_action)));
   if (options.json) {
     print_json(chunk, *engine, options);
@@ -227,8 +254,25 @@ Command add_run(CLI::App& app) {
       ->add_option("--seed", options->seed,
                    "Draw the noise, the same on every machine; actions may differ in their last digits")
       ->check(CLI::Validator(check_seed, ""));
+  command
+      ->add_option(
+          "--leftover", options->leftover,
+          "Real-time chunking: go on from these rows of the chunk before, the last ones of its --normalized-out "
+          "(float32 .npy). vla inspect says whether the policy is guided by them or in-paints")
+      ->check(CLI::Validator(check_given, ""));
+  command->add_option("--delay", options->delay, "With --leftover: how many of its rows are executed meanwhile");
+  command
+      ->add_option("--schedule", options->schedule,
+                   "With --leftover, of a guided policy: how the weight of the rows after the delay falls")
+      ->check(CLI::IsMember({"zeros", "ones", "linear", "exp"}));
+  command->add_option("--max-guidance", options->max_guidance,
+                      "With --leftover, of a guided policy: the largest weight of the guidance");
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions")
+      ->check(CLI::Validator(check_given, ""));
+  command
+      ->add_option("--normalized-out", options->normalized_out,
+                   "Also write the chunk as the network answered it, for a later --leftover")
       ->check(CLI::Validator(check_given, ""));
   command
       ->add_option("--tap", options->tap,

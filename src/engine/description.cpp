@@ -48,6 +48,7 @@ Description describe(const Engine& engine) {
   out.noise = engine.solver().noise;
   out.n_step = engine.solver().n_step;
   out.t_start = engine.solver().times.front().value;
+  out.real_time_chunking = kind_name(engine.real_time_chunking().kind);
 
   out.path = engine.bundle().path();
   for (const auto& [key, text] : {std::pair{"arch", &out.arch},

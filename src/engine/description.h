@@ -36,6 +36,7 @@ struct Description {
   std::string solver, noise;            // kinds
   int n_step;
   double t_start;
+  std::string real_time_chunking;  // what an act's leftover does: guided, inpainted, or empty where it is refused
 
   std::string path, arch, dtype, checksum, source, revision, converter;
   std::string precision, kernels, device;

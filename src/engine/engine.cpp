@@ -129,13 +129,26 @@ void Engine::record_inputs(std::vector<Tap>& taps) const {
   if (d_state_ > 0) record(taps, "state", {d_state_}, inputs_.state);
 }
 
-/// `chunk` is what the network answers, cut to the robot's columns; `actions` is the same in world units.
-void Engine::record_chunk(const std::vector<float>& x, ActionChunk& chunk) const {
-  if (tap_pattern_.empty()) return;
+ChunkShape Engine::chunk_shape() const {
+  return {horizon_, d_action_, horizon(), static_cast<int>(processor_.action_names().size())};
+}
+
+RealTimeChunking Engine::real_time_chunking() const {
+  return processor_.relative_actions() ? RealTimeChunking() : policy_->real_time_chunking();
+}
+
+/// What the network answers, cut to the robot's rows and columns.
+std::vector<float> Engine::normalized(const std::vector<float>& x) const {
+  const ChunkShape shape = chunk_shape();
   std::vector<float> cut;
-  for (int row = 0; row < chunk.horizon; ++row)
-    cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + chunk.d_action);
-  record(chunk.taps, "chunk", {chunk.d_action, chunk.horizon}, cut);
+  for (int row = 0; row < shape.n_row; ++row)
+    cut.insert(cut.end(), x.begin() + row * d_action_, x.begin() + row * d_action_ + shape.d_normalized);
+  return cut;
+}
+
+/// `actions` is the same as `chunk`, in world units.
+void Engine::record_chunk(ActionChunk& chunk) const {
+  record(chunk.taps, "chunk", {chunk.d_action, chunk.horizon}, chunk.normalized);
   record(chunk.taps, "actions", {chunk.d_action, chunk.horizon}, chunk.actions);
 }
 
@@ -144,16 +157,18 @@ Result<std::string> Engine::program_text(Part part) {
   return (part == Part::prefix ? plan->prefix() : plan->step()).text();
 }
 
-Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise) noexcept {
+Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
+                                const std::optional<Leftover>& leftover) noexcept {
   // Containers throw where there is no memory: the act is given up, and the next one starts afresh.
   try {
-    return run(observation, noise);
+    return run(observation, noise, leftover);
   } catch (const std::bad_alloc&) {
     return Error{Code::out_of_memory, "act", "", "the system refused an allocation", "free memory"};
   }
 }
 
-Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noise) {
+Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noise,
+                                const std::optional<Leftover>& leftover) {
   ActionChunk chunk;
   StageClock clock;
   VLA_CHECK(processor_.encode_images(observation, inputs_));
@@ -161,19 +176,26 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   clock.lap(chunk.timing, "preprocess");
   VLA_CHECK(processor_.encode_text(observation, inputs_));
   clock.lap(chunk.timing, "tokenize");
-  VLA_TRY(const std::vector<float> x, start(noise));
+  VLA_TRY(std::vector<float> x, start(noise));
+  std::optional<Steering> steering;
+  if (leftover) {
+    VLA_TRY(steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(x)));
+  }
   last_plan_ = nullptr;  // a plan of another shape may take its place
-  VLA_TRY(Plan * plan, plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view,
-                                          static_cast<int>(inputs_.tokens.size()), d_state_, placed(inputs_.views)}));
+  VLA_TRY(Plan * plan,
+          plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view, static_cast<int>(inputs_.tokens.size()),
+                             d_state_, placed(inputs_.views), steering.has_value()}));
   last_plan_ = plan;
   plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
-  plan->set_x(x);
+  plan->set_x(steering ? steering->start : x);
+  if (steering) plan->set_steering(*steering);
   record_inputs(chunk.taps);
   clock.lap(chunk.timing, "plan");
   VLA_CHECK(plan->run_prefix(chunk.taps));
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
   clock.lap(chunk.timing, "prefix");
   for (int k = 0; k < solver_.n_step; ++k) {
+    if (steering) plan->set_steering(*steering, k);
     VLA_CHECK(plan->run_step(k));
     plan->collect_step_taps(k, chunk.taps);
   }
@@ -183,9 +205,10 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   clock.lap(chunk.timing, "postprocess");
   chunk.horizon = horizon();
   chunk.d_action = static_cast<int>(processor_.action_names().size());
+  chunk.normalized = normalized(result);
   chunk.notes = inputs_.notes;
   chunk.is_beyond = inputs_.is_beyond;
-  record_chunk(result, chunk);
+  record_chunk(chunk);
   return chunk;
 }
 

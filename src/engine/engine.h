@@ -7,6 +7,7 @@
 #include <utility>
 #include <vector>
 
+#include "engine/leftover.h"
 #include "engine/noise.h"
 #include "engine/plan.h"
 #include "engine/timing.h"
@@ -27,6 +28,7 @@ struct ActionChunk {
   int horizon = 0;  // rows
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
+  std::vector<float> normalized;   // the same as the network answered: what a Leftover takes
   std::vector<std::string> notes;  // what the user must know about this answer
   bool is_beyond = false;          // one of them: the state is beyond the bundle's bound
   Timing timing;
@@ -50,8 +52,10 @@ class Engine {
 
   /// From now on a state beyond the bundle's bound is refused, as Processor::refuse_beyond.
   void refuse_beyond() { processor_.refuse_beyond(); }
-  /// Errors: bad_observation, bad_action (a number that is not finite came out), device, out_of_memory.
-  Result<ActionChunk> act(const Observation& observation, const Noise& noise) noexcept;
+  /// `leftover`: what the robot has not executed yet of the chunk before, where the next one is to go on from it.
+  /// Errors: bad_observation, bad_action (a number that is not finite came out), unsupported, device, out_of_memory.
+  Result<ActionChunk> act(const Observation& observation, const Noise& noise,
+                          const std::optional<Leftover>& leftover = {}) noexcept;
 
   /// Solves in another number of steps than the bundle asks for, to measure what a step costs. Errors: bad_bundle,
   /// out_of_memory, device.
@@ -68,6 +72,8 @@ class Engine {
   const Device& device() const { return *device_; }
   const Solver& solver() const { return solver_; }
   const ParamList& params() const { return *params_; }
+  /// What `act` does with a leftover: nothing where actions are relative to a state, which the rows would have lost.
+  RealTimeChunking real_time_chunking() const;
   /// Rows of a chunk.
   int horizon() const { return processor_.n_row(horizon_); }
   /// Rows and columns of the solver's start: those of a chunk, or more.
@@ -88,19 +94,21 @@ class Engine {
   Engine(Bundle bundle, Processor processor, std::unique_ptr<Device> device)
       : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
   Status load_policy();
-  Result<ActionChunk> run(const Observation& observation, const Noise& noise);
+  Result<ActionChunk> run(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover);
   Status make_conditions();
   Status run_once(const Graph& graph);
   Status make_constants();
   Status make_plans();
   InputShape largest_shape() const;
+  ChunkShape chunk_shape() const;
   std::uint32_t placed(std::uint32_t views) const;
   Result<std::vector<float>> start(const Noise& noise) const;
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
               const std::vector<T>& values) const;
   void record_inputs(std::vector<Tap>& taps) const;
-  void record_chunk(const std::vector<float>& x, ActionChunk& chunk) const;
+  std::vector<float> normalized(const std::vector<float>& x) const;
+  void record_chunk(ActionChunk& chunk) const;
 
   Bundle bundle_;
   Processor processor_;

@@ -38,8 +38,17 @@ Plan::Plan(const PlanContext& context, const InputShape& shape)
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
       x_(slots_.add_f32({context.d_action, context.horizon, 1, 1})),
       k_(slots_.add_i32({1, 1, 1, 1})),
+      target_(shape.steered ? slots_.add_f32(x_->shape) : nullptr),
+      keep_(shape.steered ? slots_.add_f32({1, context.horizon, 1, 1}) : nullptr),
+      pull_(shape.steered ? slots_.add_f32({1, context.horizon, 1, 1}) : nullptr),
       views_(shape.views),
       cache_(context.constants) {}
+
+/// v' = keep * v + pull * (x - target), row by row.
+Tensor Plan::steered(Graph& g, Tensor x, Tensor velocity) const {
+  const Tensor off = add(g, x, scale(g, g.input(target_), -1));
+  return add(g, multiply(g, velocity, g.input(keep_)), multiply(g, off, g.input(pull_)));
+}
 
 Status Plan::lower(const PlanContext& context) {
   Graph prefix(slots_, prefix_filter(tap_pattern_)), step(slots_, step_filter(tap_pattern_, context.solver.n_step));
@@ -50,14 +59,19 @@ Status Plan::lower(const PlanContext& context) {
   const Tensor x = step.input(x_);
   const Tensor condition =
       context.conditions != nullptr ? column(step, step.input(context.conditions), step.input(k_)) : Tensor();
-  const Tensor answer = context.policy.velocity(step, x, condition, cache_);
+  Tensor answer = context.policy.velocity(step, x, condition, cache_);
+  LowerOptions changing = {{x_, k_}};
+  if (target_ != nullptr) {
+    answer = steered(step, x, answer);
+    changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
+  }
   step.write(step.name("x", context.solver.next(step, x, answer)), x_);
 
   VLA_CHECK(device_.allocate(slots_));
   LowerOptions varying = {{images_, tokens_}};
   if (state_ != nullptr) varying.varying.push_back(state_);
   VLA_TRY(prefix_, device_.lower(prefix, varying));
-  VLA_TRY(step_, device_.lower(step, {{x_, k_}}));
+  VLA_TRY(step_, device_.lower(step, changing));
   return context.dry ? Status() : prefix_->prepare();
 }
 
@@ -73,6 +87,16 @@ void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_
   device_.set(*images_, pixels.data(), pixels.size_bytes());
   device_.set(*tokens_, tokens.data(), tokens.size_bytes());
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());
+}
+
+void Plan::set_steering(const Steering& steering) {
+  device_.set(*target_, steering.target.data(), steering.target.size() * sizeof(float));
+}
+
+void Plan::set_steering(const Steering& steering, int k) {
+  const auto n_row = static_cast<std::size_t>(keep_->shape[1]), first = static_cast<std::size_t>(k) * n_row;
+  device_.set(*keep_, &steering.keep[first], n_row * sizeof(float));
+  device_.set(*pull_, &steering.pull[first], n_row * sizeof(float));
 }
 
 Status Plan::run_prefix(std::vector<Tap>& taps) {

@@ -5,6 +5,7 @@
 #include <map>
 #include <memory>
 
+#include "engine/leftover.h"
 #include "engine/solver.h"
 #include "engine/taps.h"
 #include "graph/device.h"
@@ -37,6 +38,9 @@ class Plan {
   void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
   void set_x(std::span<const float> x) { device_.set(*x_, x.data(), x.size_bytes()); }
   std::vector<float> x() const { return device_.get(*x_); }
+  /// Of a shape that is steered: before the first step, and before each.
+  void set_steering(const Steering& steering);
+  void set_steering(const Steering& steering, int k);
 
   /// Fills the cache, appends what was recorded on the way, and computes what the steps need of the cache alone.
   Status run_prefix(std::vector<Tap>& taps);
@@ -60,11 +64,13 @@ class Plan {
  private:
   Plan(const PlanContext& context, const InputShape& shape);
   Status lower(const PlanContext& context);
+  Tensor steered(Graph& step, Tensor x, Tensor velocity) const;
 
   std::string tap_pattern_;
   Device& device_;
   Slots slots_;
   Slot *images_, *tokens_, *state_, *x_, *k_;  // state may be null
+  Slot *target_, *keep_, *pull_;               // null where nothing is steered
   std::uint32_t views_;
   Cache cache_;
   std::unique_ptr<Program> prefix_, step_;

@@ -32,6 +32,7 @@ Result<Solver> Solver::read(const Keys& keys) {
   VLA_TRY(const double start, keys.number("solver.t_start", {0, 1}));
   VLA_TRY(const double end, keys.number("solver.t_end", {0, 1}));
   const double dt = (end - start) / solver.n_step;
+  solver.t_end = end;
   solver.dt = static_cast<float>(dt);
   float accumulated = static_cast<float>(start);
   for (int k = 0; k < solver.n_step; ++k, accumulated += solver.dt)

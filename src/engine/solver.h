@@ -17,6 +17,7 @@ namespace vla {
 struct Solver {
   int n_step = 0;
   bool direct = false;
+  double t_end = 0;
   float dt = 0;  // (t_end - t_start) / n_step, made in double and rounded once, as the reference scales by it
   /// t_k; t_end is never evaluated. `euler`: t_start + k * dt, made in double and rounded once, as LeRobot.
   /// `euler_float32`: dt added k times in float32, as openpi; of a sine with a period of 4e-3 the 1e-7 between them is

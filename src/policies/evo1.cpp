@@ -78,6 +78,8 @@ class Evo1 final : public Policy {
               std::to_string(d_robot_));
   }
 
+  RealTimeChunking real_time_chunking() const override { return {RealTimeChunking::Kind::guided}; }
+
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
     if (shape.n_view > places_.max_views())

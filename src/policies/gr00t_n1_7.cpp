@@ -15,10 +15,15 @@ namespace {
 class Gr00tN17 final : public Policy {
   Qwen3Vl backbone_;
   GrootHead head_;
+  double ramp_rate_;
 
  public:
   explicit Gr00tN17(const Scope& s)
-      : backbone_(s), head_(s, backbone_.d_model(), {.future_tokens = false, .mixing = true, .alternating = true}) {}
+      : backbone_(s),
+        head_(s, backbone_.d_model(), {.future_tokens = false, .mixing = true, .alternating = true}),
+        ramp_rate_(s.precise("rtc_ramp_rate", {0, 1000})) {}
+
+  RealTimeChunking real_time_chunking() const override { return {RealTimeChunking::Kind::inpainted, ramp_rate_}; }
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(backbone_.check(shape.width, shape.height, shape.n_view, shape.n_text));
@@ -46,7 +51,7 @@ Keys published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 132}, {"policy.d_action", 132}, {"policy.horizon", 40}, {"policy.n_position", 1024},
-      {"policy.max_views", 2}, {"policy.view_starts", std::vector<std::int64_t>{4, 70}},
+      {"policy.rtc_ramp_rate", 6.0}, {"policy.max_views", 2}, {"policy.view_starts", std::vector<std::int64_t>{4, 70}},
       {"vision.d_model", 1024}, {"vision.n_layer", 24}, {"vision.n_head", 16}, {"vision.d_ff", 4096},
       {"vision.patch_size", 16}, {"vision.image_width", 256}, {"vision.image_height", 256},
       {"vision.n_position_side", 48}, {"vision.merge", 2}, {"vision.norm_eps", 1e-6}, {"vision.rope_base", 1e4},

@@ -32,6 +32,8 @@ class Pi0 final : public Policy {
         action_out_(s / "action_out", expert_.d_model(), s.dim("d_action"), Bias::yes),
         time_(s / "time", expert_.d_model()) {}
 
+  RealTimeChunking real_time_chunking() const override { return {RealTimeChunking::Kind::guided}; }
+
   Status check(const InputShape& shape) const override {
     VLA_CHECK(backbone_.check(shape.width, shape.height));
     return check_prefix(shape.n_view, backbone_.n_token(shape.width), shape.n_text + 1);

@@ -30,6 +30,8 @@ class Pi05 final : public Policy {
         time_mlp_out_(s / "time_mlp_out", expert_.d_model(), expert_.d_model(), Bias::yes),
         time_(s / "time", expert_.d_model()) {}
 
+  RealTimeChunking real_time_chunking() const override { return {RealTimeChunking::Kind::guided}; }
+
   Status check(const InputShape& shape) const override {
     VLA_CHECK(backbone_.check(shape.width, shape.height));
     return check_prefix(shape.n_view, backbone_.n_token(shape.width), shape.n_text);

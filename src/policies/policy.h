@@ -28,7 +28,15 @@ struct PrefixInputs {
 struct InputShape {
   int width = 0, height = 0, n_view = 0, n_text = 0, d_state = 0;
   std::uint32_t views = 0;  // as PrefixInputs::views
+  bool steered = false;     // the solver's steps go on from a previous chunk
   auto operator<=>(const InputShape&) const = default;
+};
+
+/// How a reference goes on from the rows of the previous chunk that are not executed yet.
+struct RealTimeChunking {
+  enum class Kind { none, guided, inpainted };
+  Kind kind = Kind::none;
+  double ramp_rate = 0;  // inpainted: how fast the rows after the frozen ones are set free
 };
 
 /// An architecture: which modules run in which order, at which of the three rates. It owns no loop, memory or file. The
@@ -49,6 +57,8 @@ class Policy {
 
   /// Whether it matters which views are present, and not their number alone.
   virtual bool places_views() const { return false; }
+
+  virtual RealTimeChunking real_time_chunking() const { return {}; }
 
   /// Load rate: what depends on the weights alone, put into the cache that every prefix starts from. `absent_view`
   /// makes a view that the robot does not have, as the image recipe does: [width, height, 3, 1].

@@ -45,6 +45,8 @@ class SmolVla final : public Policy {
         text_scale_(s.number("text_scale", kTokenScale)),
         time_(s / "time", expert_.d_model()) {}
 
+  RealTimeChunking real_time_chunking() const override { return {RealTimeChunking::Kind::guided}; }
+
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
     const int side = shape.width / vision_.patch_size();

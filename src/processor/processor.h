@@ -69,6 +69,9 @@ class Processor {
   /// How many rows of a chunk of `horizon` rows are actions: all of them, or the first that the recipe keeps.
   int n_row(int horizon) const { return n_row_ > 0 ? n_row_ : horizon; }
 
+  /// Whether an action is the network's answer added to the state that it was asked with.
+  bool relative_actions() const { return relative_actions_; }
+
   /// chunk (horizon, d_action), in the network's units -> (n_row(horizon), action_names().size()) in world units.
   /// `raw_state` is that of the observation which the chunk answers. Errors: bad_action for a number that is not
   /// finite, naming its row and column.
@@ -128,6 +131,7 @@ class Processor {
   std::size_t n_state_ = 0;  // numbers of all states together
   int d_action_ = 0;         // of the network
   int n_row_ = 0;            // that the recipe keeps; 0: all
+  bool relative_actions_ = false;
 };
 
 }  // namespace vla

@@ -184,6 +184,7 @@ Status Processor::bind_action(const Bundle& bundle) {
   for (std::size_t i = 0; i < recipe_.action.size(); ++i)
     VLA_CHECK(recipe_.action[i]->bind(layout, fmt::format("processor.recipe.action[{}]", i)));
   n_row_ = layout.n_row;
+  relative_actions_ = layout.relative;
   if (static_cast<std::size_t>(layout.width) == action_names_.size()) return {};
   return misfit("action.names", fmt::format("one name for each of the {} columns that the recipe leaves", layout.width),
                 std::to_string(action_names_.size()));

@@ -17,6 +17,7 @@ struct ActLimits {
   std::size_t max_text = 0;     // bytes
   std::size_t max_views = 0;
   int horizon = 0, d_noise = 0;  // of the noise that the policy takes
+  int d_action = 0;              // of a chunk
 };
 
 /// An act, ready for the engine.
@@ -24,6 +25,7 @@ struct ActRequest {
   Observation observation;
   Noise noise;
   std::optional<std::uint64_t> seed;  // that the noise is drawn from: the client's or a fresh one
+  std::optional<Leftover> leftover;
   std::int64_t capture_time_ns = 0;
 };
 

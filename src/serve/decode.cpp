@@ -35,21 +35,23 @@ std::string_view text_of(std::span<const std::byte> bytes) {
 }
 
 /// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, f floats
-/// (packed or not), and a digit for a message, the index of its own row.
-constexpr std::array<const char*, 7> kFields = {
-    "15t3vvv",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms
-    "t2bb4",    // 1 View: name, rgb, jpeg, png, absent
-    "uub",      // 2 RawRgb: width, height, rows
-    "uuf",      // 3 Noise: horizon, d_action, values
-    "",         // 4 Absent
-    "tf",       // 5 State: name, values
-    "uutt",     // 6 Hello: min_version, max_version, client_name, client_version
+/// (packed or not), d double, and a digit for a message, the index of its own row.
+constexpr std::array<const char*, 8> kFields = {
+    "15t3vvv7",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover
+    "t2bb4",     // 1 View: name, rgb, jpeg, png, absent
+    "uub",       // 2 RawRgb: width, height, rows
+    "uuf",       // 3 Noise: horizon, d_action, values
+    "",          // 4 Absent
+    "tf",        // 5 State: name, values
+    "uutt",      // 6 Hello: min_version, max_version, client_name, client_version
+    "uufutd",    // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
 };
 
 /// Whether a field that was read is encoded as its type says.
 bool fits(const Fields& field, char type) {
   if (type == 'v') return field.type == 'v';
   if (type == 'u') return field.type == 'v' && field.varint <= ~std::uint32_t{0};  // Protobuf would cut it off
+  if (type == 'd') return field.type == 'd';
   return field.type == 'b' || (type == 'f' && field.type == 'f');
 }
 
@@ -170,6 +172,24 @@ Status decode_start(const v1::Act& act, const ActLimits& limits, ActRequest& req
   return {};
 }
 
+/// The engine checks its numbers; what it cannot see is whether rows and columns changed places.
+Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& request) {
+  if (!act.has_leftover()) return {};
+  const v1::Leftover& given = act.leftover();
+  const auto d_action = static_cast<std::uint32_t>(limits.d_action),
+             horizon = static_cast<std::uint32_t>(limits.horizon);
+  if (given.d_action() != d_action || given.n_row() > horizon || given.delay() > horizon ||
+      static_cast<std::uint64_t>(given.values_size()) != std::uint64_t{given.n_row()} * d_action)
+    return bad_observation("act.leftover", fmt::format("at most {} rows of {}", horizon, d_action),
+                           fmt::format("{} rows of {}, {} numbers, a delay of {}", given.n_row(), given.d_action(),
+                                       given.values_size(), given.delay()));
+  VLA_CHECK(check_name(given.schedule(), "act.leftover.schedule"));
+  request.leftover = {
+      {given.values().begin(), given.values().end()}, static_cast<int>(given.delay()), given.schedule(), {}};
+  if (given.has_max_guidance()) request.leftover->max_guidance = given.max_guidance();
+  return {};
+}
+
 }  // namespace
 
 Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits& limits) {
@@ -183,6 +203,7 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
   VLA_CHECK(decode_views(act, limits, request.observation));
   VLA_CHECK(decode_states(act, request.observation));
   VLA_CHECK(decode_start(act, limits, request));
+  VLA_CHECK(decode_leftover(act, limits, request));
   return request;
 }
 
@@ -204,6 +225,7 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::strin
   reply.set_max_version(kMaxVersion);
   reply.set_server_name("vla");
   reply.set_server_version(VLA_VERSION);
+  reply.add_features("leftover");
   return reply;
 }
 

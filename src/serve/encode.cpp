@@ -63,6 +63,7 @@ v1::Description describe(const Engine& engine, const v1::Limits& limits) {
   out.set_d_noise(u32(d.d_action_padded));
   out.set_noise_rows(u32(d.solver_horizon));
   out.set_noise_kind(d.noise);
+  out.set_real_time_chunking(d.real_time_chunking);
   out.set_max_text_tokens(u32(d.max_text_tokens));
   *out.mutable_limits() = limits;
   write_bundle(d, *out.mutable_bundle());
@@ -79,6 +80,8 @@ v1::ActionChunk encode_chunk(const ActRequest& request, ActionChunk chunk, const
   out.set_horizon(static_cast<std::uint32_t>(chunk.horizon));
   out.set_d_action(static_cast<std::uint32_t>(chunk.d_action));
   out.mutable_actions()->Add(chunk.actions.begin(), chunk.actions.end());
+  if (!description.real_time_chunking().empty())
+    out.mutable_normalized()->Add(chunk.normalized.begin(), chunk.normalized.end());
   for (const v1::Dimension& action : description.actions()) out.add_names(action.name());
   out.set_rate_hz(description.rate_hz());
   out.set_capture_time_ns(request.capture_time_ns);

@@ -32,7 +32,7 @@ bool Fields::read_value(std::uint32_t wire_type) {
       type = 'v';
       return input_.ReadVarint64(&varint);
     case 1:
-      type = '?';
+      type = 'd';
       return input_.Skip(8);
     case 2:
       type = 'b';

@@ -29,7 +29,7 @@ class Fields {
 
   Fields(std::span<const std::byte> bytes, const char* where);
 
-  /// The field that was read last: its number; its encoding, `v` varint, `b` bytes, `f` four bytes, or `?`; and its
+  /// The field that was read last: its number; its encoding, `v` varint, `b` bytes, `f` four bytes, `d` eight; and its
   /// value where it is a varint or bytes.
   int number = 0;
   char type = '?';

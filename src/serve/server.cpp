@@ -136,13 +136,13 @@ Answer Server::compute(Engine& engine, Job job) const noexcept {
 }
 
 Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Answer& answer) const {
-  const ActLimits limits{options_.max_pixels, options_.max_text, description_.limits().max_views(),
-                         engine.solver_horizon(), engine.d_action_padded()};
+  const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
+                         engine.solver_horizon(), engine.d_action_padded(), description_.actions_size()};
   StageClock clock;
   VLA_TRY(const ActRequest request, decode_act(job.body(), limits));
   Timing& stages = answer.stages;
   clock.lap(stages, "decode");
-  VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise));
+  VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise, request.leftover));
   stages.insert(stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = stages;
   answer.is_beyond = chunk.is_beyond;

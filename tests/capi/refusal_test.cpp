@@ -50,6 +50,7 @@ TEST_CASE("NULL for any argument is refused, never followed") {
   check_error(opened.get(), vla_act(opened.get(), &call.observation, nullptr), VLA_USAGE, "out");
   CHECK(vla_describe(nullptr) == nullptr);
   CHECK(vla_chunk_actions(nullptr) == nullptr);
+  CHECK(vla_chunk_normalized(nullptr) == nullptr);
   CHECK(vla_chunk_horizon(nullptr) + vla_chunk_d_action(nullptr) == 0);
   CHECK(vla_chunk_n_note(nullptr) + vla_chunk_n_stage(nullptr) == 0);
   CHECK(vla_chunk_note(nullptr, 0) == nullptr);
@@ -72,6 +73,20 @@ TEST_CASE("NULL inside an observation is refused by its field") {
   refused([](Call& c) { c.views[1].name = nullptr; }, VLA_USAGE, "observation.views[1].name");
   refused([](Call& c) { c.views[1].data = nullptr; }, VLA_USAGE, "camera2");
   refused([](Call& c) { c.states[0].values = nullptr; }, VLA_USAGE, "observation.states[0].values");
+}
+
+TEST_CASE("a leftover is taken as a whole or refused by its field") {
+  const auto refused = [](auto change, vla_status status, const char* part) {
+    Call call;
+    change(call.observation);
+    check_refused(call, status, part);
+  };
+  static const float rows[7] = {};
+  refused([](vla_observation& o) { o.n_leftover = 7; }, VLA_USAGE, "observation.leftover");
+  refused([](vla_observation& o) { o.schedule = "linear"; }, VLA_USAGE, "observation.leftover");
+  refused([](vla_observation& o) { o.leftover = rows; }, VLA_BAD_OBSERVATION, "leftover: expected 1 to 5 rows of 7");
+  refused([](vla_observation& o) { o.leftover = rows, o.n_leftover = SIZE_MAX; }, VLA_USAGE, "observation.n_leftover");
+  refused([](vla_observation& o) { o.leftover = rows, o.n_leftover = 7; }, VLA_BAD_OBSERVATION, "leftover.schedule");
 }
 
 TEST_CASE("exactly one of noise and seed must be given") {

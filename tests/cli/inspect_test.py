@@ -28,6 +28,7 @@ def test_a_person_reads_features_statistics_recipe_sizes_and_memory(vla):
         "action",
         "instruction",
         "solver",
+        "leftover",
         *["recipe"] * 4,
         "modules",
         "products",

@@ -66,6 +66,42 @@ def test_server_library_and_program_give_the_same_bytes(name, tmp_path):
     assert server.stop() == 0
 
 
+def test_a_leftover_gives_the_same_bytes_from_server_library_and_program(policy, case, tmp_path):
+    observation = {"images": frames(case), "state": case.state, "text": case.text}
+    assert policy.spec.real_time_chunking == "guided"
+    ran(case, tmp_path, "--seed", "5", "--normalized-out", str(tmp_path / "normalized.npy"))
+    before = policy.act(**observation, seed=5)
+    assert before.normalized.tobytes() == np.load(tmp_path / "normalized.npy").tobytes()
+    rows = before.normalized[2:]
+    np.save(tmp_path / "rows.npy", rows)
+    settings = ["--leftover", str(tmp_path / "rows.npy"), "--delay", "1", "--schedule", "exp", "--max-guidance", "2.5"]
+    expected = ran(case, tmp_path, "--seed", "6", *settings)
+    after = policy.act(**observation, seed=6, leftover=vla_cpp.Leftover(rows, 1, "exp", 2.5))
+    assert np.asarray(after).tobytes() == expected.tobytes() != ran(case, tmp_path, "--seed", "6").tobytes()
+    # The row that is executed meanwhile is nearer to what was planned than without it.
+    alone = policy.act(**observation, seed=6)
+    assert np.abs(after.normalized[0] - rows[0]).max() < np.abs(alone.normalized[0] - rows[0]).max() / 2
+
+
+@pytest.mark.parametrize(
+    "change, part",
+    [
+        ({"rows": np.zeros((6, 7))}, "1 to 5 rows of 7"),
+        ({"rows": np.zeros((2, 6))}, "1 to 5 rows of 7"),
+        ({"delay": 3}, "leftover.delay"),
+        ({"delay": 0.5}, "leftover.delay"),
+        ({"schedule": None}, "leftover.schedule"),
+        ({"schedule": "steep"}, "zeros, ones, linear or exp"),
+        ({"max_guidance": None}, "leftover.max_guidance"),
+        ({"max_guidance": -1.0}, "leftover.max_guidance"),
+    ],
+)
+def test_a_leftover_that_cannot_be_meant_is_refused(policy, case, change, part):
+    leftover = {"rows": np.zeros((2, 7)), "delay": 1, "schedule": "linear", "max_guidance": 5.0, **change}
+    with pytest.raises(vla_cpp.BadObservation, match=part):
+        policy.act(images=frames(case), state=case.state, text=case.text, leftover=vla_cpp.Leftover(**leftover))
+
+
 def example(where, case, *more):
     images = [a for view, file in case.images.items() for a in ("--image", f"{view}={file or ''}")]
     state = ",".join(map(repr, case.state))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driver: time, waiting, threads, errors. Clocks are made up; only where threads meet is real time waited for."""
 
+import dataclasses
 import threading
 import time
 
@@ -10,7 +11,7 @@ import pytest
 
 import vla_cpp
 from vla_cpp import BundleInfo, Chunk, Spec, UsageError
-from vla_cpp.control import ChunkLoop, CrossFade
+from vla_cpp.control import ChunkLoop, CrossFade, RealTimeChunking
 
 HORIZON = 10
 SPEC = Spec(
@@ -288,3 +289,42 @@ def test_another_rate_must_be_meant(clock):
 
 def test_a_blend_may_be_given_as_an_object(clock):
     assert loop_of(Remote(clock), clock, blend=CrossFade(3)).schedule._blend.fade_steps == 3
+
+
+class Continuing(Remote):
+    """One that goes on from rows, and tells which it got."""
+
+    def __init__(self, clock, latency=0.0):
+        super().__init__(clock, latency)
+        self.spec, self.leftovers = dataclasses.replace(SPEC, real_time_chunking="guided"), []
+
+    def submit(self, *, state, leftover=None):
+        self.leftovers.append(leftover)
+        answer = super().submit(state=state)
+        answer.outcome = dataclasses.replace(answer.outcome, normalized=answer.outcome.actions * 10)
+        return answer
+
+
+def test_rtc_sends_the_rows_that_are_not_commanded_yet_and_how_many_will_be(clock):
+    policy = Continuing(clock, latency=0.25)
+    loop = loop_of(policy, clock, mode="rtc", rtc=RealTimeChunking(5, "linear", 10.0))
+    loop.begin({"state": 0.0})
+    run(loop, 11)
+    first, second, third = policy.leftovers
+    assert first is None  # there was no chunk yet
+    assert second.rows.ravel().tolist() == [40, 50, 60, 70, 80] and second.delay == 0
+    assert (second.schedule, second.max_guidance) == ("linear", 10.0)
+    # The second chunk, for step 4, came three steps later.
+    assert third.rows.ravel().tolist() == [40, 50, 60, 70, 80] and third.delay == 3 == loop.stats["delay"]
+
+
+def test_rtc_is_refused_without_its_settings_and_without_a_policy_that_does_it(clock):
+    settings = RealTimeChunking(5, "linear", 10.0)
+    with pytest.raises(UsageError, match="rtc"):
+        loop_of(Continuing(clock), clock, mode="rtc")
+    with pytest.raises(UsageError, match="rtc"):
+        loop_of(Continuing(clock), clock, mode="async", rtc=settings)
+    with pytest.raises(UsageError, match="rtc.overlap"):
+        loop_of(Continuing(clock), clock, mode="rtc", rtc=RealTimeChunking(11))
+    with pytest.raises(vla_cpp.Unsupported, match="mode"):
+        loop_of(Remote(clock), clock, mode="rtc", rtc=settings)

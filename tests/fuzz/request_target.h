@@ -20,7 +20,7 @@ struct RequestFate {
 /// Reads bytes as the server does. What is accepted must keep every limit, and what is refused must be refused with a
 /// message of bounded length. Aborts when it is not so.
 inline RequestFate check_request(std::span<const std::byte> bytes) {
-  constexpr serve::ActLimits kLimits{1 << 16, 100, 4, 3, 5};  // small, so that the time goes into the decoders
+  constexpr serve::ActLimits kLimits{1 << 16, 100, 4, 3, 5, 2};  // small, so that the time goes into the decoders
   const auto refuse = [](const Error& error) {
     if (error.message().size() > 4096) std::abort();
     if (error.code != Code::bad_request && error.code != Code::incompatible && error.code != Code::too_large &&

@@ -15,7 +15,7 @@ using namespace vla::serve;
 
 namespace {
 
-const ActLimits kLimits = {10'000, 40, 5, 2, 3};
+const ActLimits kLimits = {10'000, 40, 5, 2, 3, 2};
 
 /// Every field of the schema, one alternative of each choice.
 v1::Act full_act() {
@@ -44,6 +44,13 @@ v1::Act full_act() {
   for (int i = 0; i < 6; ++i) act.mutable_noise()->add_values(static_cast<float>(i));
   act.set_capture_time_ns(-5);
   act.set_deadline_ms(7);
+  v1::Leftover& leftover = *act.mutable_leftover();
+  leftover.set_n_row(2);
+  leftover.set_d_action(2);
+  for (int i = 0; i < 4; ++i) leftover.add_values(static_cast<float>(i));
+  leftover.set_delay(1);
+  leftover.set_schedule("exp");
+  leftover.set_max_guidance(2.5);
   return act;
 }
 
@@ -85,6 +92,30 @@ TEST_CASE("an act with every field of the schema becomes the observation that it
   CHECK(std::get<std::vector<float>>(request->noise) == std::vector<float>{0, 1, 2, 3, 4, 5});
   CHECK_FALSE(request->seed);
   CHECK(request->capture_time_ns == -5);
+  REQUIRE(request->leftover.has_value());
+  CHECK(request->leftover->rows == std::vector<float>{0, 1, 2, 3});
+  CHECK(request->leftover->delay == 1);
+  CHECK(request->leftover->schedule == "exp");
+  CHECK(request->leftover->max_guidance == 2.5);
+}
+
+TEST_CASE("a leftover whose rows and columns do not make its numbers is refused before anything is read of it") {
+  const auto refused = [](auto change) {
+    v1::Act act = full_act();
+    change(*act.mutable_leftover());
+    check_refused(act, Code::bad_observation, "act.leftover");
+  };
+  refused([](v1::Leftover& l) { l.set_n_row(4), l.set_d_action(1); });
+  refused([](v1::Leftover& l) { l.set_n_row(1); });
+  refused([](v1::Leftover& l) { l.set_n_row(0xFFFFFFFF); });
+  refused([](v1::Leftover& l) { l.set_delay(0x80000000); });
+  refused([](v1::Leftover& l) { l.add_values(1.0f); });
+  v1::Act act = full_act();
+  act.mutable_leftover()->clear_schedule();
+  act.mutable_leftover()->clear_max_guidance();
+  CHECK_FALSE(decode(act)->leftover->max_guidance.has_value());
+  act.clear_leftover();
+  CHECK_FALSE(decode(act)->leftover.has_value());
 }
 
 TEST_CASE("a seed is taken as it is, also zero, and without one a fresh seed is drawn each time") {

@@ -5,6 +5,7 @@
     python tools/goldens make              checkpoints and bundles into build/goldens/, where they are not there yet
     python tools/goldens make --accept     the same after a change of checkpoints or converter: states their hashes anew
     python tools/goldens record NAME ...   what the reference computes, into tests/golden/NAME/expected.gguf
+    python tools/goldens leftover NAME ... what it computes when it goes on from rows of a previous chunk
 
 `make` needs numpy and vla_cpp's extra `convert`.  `record` needs torch, lerobot and gguf too; a case without an observation gets a
 random one.  For the cases of Evo-1's authors and of GR00T also opencv-python-headless, for GR00T diffusers.
@@ -40,11 +41,18 @@ def record(name, case):
           f"{np.abs(taps['chunk.bf16'] - taps['chunk']).max() / largest:.1e} away")
 
 
+def record_leftover(name, case):
+    from .rtc import write_leftover
+
+    write_leftover(make() / name, case.seed, RECORDED / name)
+
+
 def main():
     parser = argparse.ArgumentParser(prog="goldens", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("make").add_argument("--accept", action="store_true")
     commands.add_parser("record").add_argument("name", nargs="+", choices=sorted(all_cases()))
+    commands.add_parser("leftover").add_argument("name", nargs="+", choices=sorted(all_cases()))
     args = parser.parse_args()
     if args.command == "make":
         make(args.accept)
@@ -55,7 +63,7 @@ def main():
     open_reference()
     warnings.filterwarnings("ignore")
     for name in args.name:
-        record(name, all_cases()[name])
+        (record if args.command == "record" else record_leftover)(name, all_cases()[name])
 
 
 if __name__ == "__main__":

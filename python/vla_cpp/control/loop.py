@@ -7,11 +7,13 @@ from __future__ import annotations
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, Callable, Dict, Mapping, Optional, Union
 
 import numpy as np
 
-from ..errors import Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout, UsageError, VlaError
+from ..errors import Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout, Unsupported, UsageError, VlaError
+from ..observation import Leftover
 from .blend import Blend, CrossFade, Ensemble
 from .schedule import Action, ChunkSchedule, OnLate, late_rule
 
@@ -20,6 +22,20 @@ Observation = Union[Mapping[str, Any], Callable[[], Mapping[str, Any]]]
 # What another observation may well survive. Everything else would come again, and is raised.
 PASSING = (Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout)
 ACT_DECAY = 0.01
+
+
+@dataclass(frozen=True)
+class RealTimeChunking:
+    """How a chunk goes on from the one before it, in the mode "rtc".
+
+    overlap       rows of the newest chunk, of those that are not commanded yet, which an observation brings along at most
+    schedule      of a guided policy, as `vla_cpp.Leftover` has it
+    max_guidance  the same
+    """
+
+    overlap: int
+    schedule: Optional[str] = None
+    max_guidance: Optional[float] = None
 
 
 class ChunkLoop:
@@ -37,8 +53,10 @@ class ChunkLoop:
                   allow_other_rate is set
     replan_every  rows of a chunk that are commanded before the next observation is taken
     mode          "sync": `step` waits for the chunk; the robot stands meanwhile. "async": the chunk is computed while rows of the
-                  one before are commanded, and those rows of it that are past when it comes are skipped
+                  one before are commanded, and those rows of it that are past when it comes are skipped. "rtc": as "async", and the
+                  policy goes on from the rows of the one before that are not commanded yet
     blend         "replace"; "linear", over `fade_steps` steps; "ensemble", with `decay`; or a Blend
+    rtc           RealTimeChunking, for the mode "rtc"
     on_late       what to command when no chunk has a row: "hold" repeats the last command, which is right for positions and WRONG
                   for velocities and differences; "zero" commands zeros; "stop" raises Late; a function (last command or None, tick)
                   returns the values, or None to command nothing. When a chunk comes, commands go on with its row for this step
@@ -63,30 +81,37 @@ class ChunkLoop:
         on_late: Union[str, OnLate],
         fade_steps: Optional[int] = None,
         decay: float = ACT_DECAY,
+        rtc: Optional[RealTimeChunking] = None,
         max_age: Optional[float] = None,
         max_jump: Union[float, np.ndarray, None] = None,
         allow_other_rate: bool = False,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        if mode not in ("sync", "async"):
-            raise UsageError("mode", '"sync" or "async"', repr(mode))
+        if mode not in ("sync", "async", "rtc"):
+            raise UsageError("mode", '"sync", "async" or "rtc"', repr(mode))
+        if (mode == "rtc") != isinstance(rtc, RealTimeChunking):
+            raise UsageError("rtc", 'a RealTimeChunking with the mode "rtc", and only there', repr(rtc))
         if not 0 < rate_hz < math.inf:
             raise UsageError("rate_hz", "periods per second, above 0", str(rate_hz))
         spec = policy.spec
         if spec.rate_hz > 0 and abs(spec.rate_hz - rate_hz) > 1e-6 * rate_hz and not allow_other_rate:
             hint = "a robot at another rate moves at another speed; allow_other_rate=True if that is meant"
             raise UsageError("rate_hz", f"{spec.rate_hz:g}, that of {spec.bundle.name}", f"{rate_hz:g}", hint)
+        if rtc and not spec.real_time_chunking:
+            raise Unsupported("mode", "a policy that goes on from rows of the chunk before", spec.bundle.name)
+        if rtc and not 1 <= rtc.overlap <= spec.horizon:
+            raise UsageError("rtc.overlap", f"1 to {spec.horizon}, the rows of a chunk", str(rtc.overlap))
         self.schedule = ChunkSchedule(
             horizon=spec.horizon,
             d_action=spec.d_action,
             replan_every=replan_every,
             blend=_blend_of(blend, fade_steps, decay),
             on_late=late_rule(on_late, spec.d_action),
-            max_age=_age_in_ticks(max_age, rate_hz, spec.horizon if mode == "async" else None),
+            max_age=_age_in_ticks(max_age, rate_hz, None if mode == "sync" else spec.horizon),
             max_jump=max_jump,
         )
-        self.rate_hz, self.mode = rate_hz, mode
+        self.rate_hz, self.mode, self.rtc = rate_hz, mode, rtc
         self._policy, self._clock, self._sleep = policy, clock, sleep
         # A client answers without waiting by itself; any other policy computes in a thread of its own.
         self._worker = None if hasattr(policy, "submit") else ThreadPoolExecutor(1, "vla-act")
@@ -169,6 +194,10 @@ class ChunkLoop:
 
     def _submit(self, observation: Observation, tick: int) -> None:
         arguments = observation() if callable(observation) else observation
+        rows = self.schedule.leftover(self.rtc.overlap) if self.rtc else None
+        if rows is not None:
+            delay = min(self.schedule.delay or 0, len(rows))
+            arguments = {**arguments, "leftover": Leftover(rows, delay, self.rtc.schedule, self.rtc.max_guidance)}
         self.schedule.observe(tick)
         try:
             if self._worker:

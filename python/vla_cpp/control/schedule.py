@@ -100,6 +100,15 @@ class ChunkSchedule:
         """Steps that the slowest of the last inferences took; None before one that began while there was something to command."""
         return max(self._delays, default=None)
 
+    def leftover(self, n_row: int) -> Optional[np.ndarray]:
+        """The next rows of the newest chunk, at most `n_row`, as its network answered them; None where it has none."""
+        newest = self._sources[-1] if self._sources else None
+        if newest is None or newest.chunk is None:
+            return None
+        first = self.step - newest.step
+        rows = newest.chunk.normalized[first : first + n_row]
+        return rows if len(rows) else None
+
     def wants(self, tick: int) -> bool:
         """Whether an observation should be taken now: none is under way, and the newest chunk has served its steps, or is gone."""
         self._begin(tick)

@@ -171,6 +171,7 @@ Status parse_action(JsonFields& fields, Recipe& recipe) {
 struct AddStateOp final : ActionOp {
   std::vector<int> columns;
   Status bind(ActionLayout& layout, const std::string& where) override {
+    layout.relative = true;
     return check_columns(columns, std::min(static_cast<std::size_t>(layout.width), layout.n_state), where);
   }
   void apply(std::vector<float>& row, std::span<const float> raw_state) const override {

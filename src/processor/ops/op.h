@@ -82,8 +82,9 @@ class StateOp {
 struct ActionLayout {
   const Bundle& bundle;
   std::size_t n_state;
-  int width;      // columns
-  int n_row = 0;  // rows, 0: all
+  int width;              // columns
+  int n_row = 0;          // rows, 0: all
+  bool relative = false;  // to the state
 };
 
 class ActionOp {

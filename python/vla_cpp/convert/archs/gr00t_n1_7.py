@@ -43,6 +43,7 @@ CONFIG = {
     "num_inference_timesteps": 4,
     "num_timestep_buckets": 1000,
     "max_num_embodiments": 32,
+    "rtc_ramp_rate": 6.0,  # of LeRobot's class; the authors' callers give it
     "model_name": "nvidia/Cosmos-Reason2-2B",
 }
 FIXED: Fixed = {
@@ -57,7 +58,7 @@ FIXED: Fixed = {
     "strict_action_padding_mask": (False, False),
     "use_tactile": (False, False),
 }
-IGNORED = {"rtc_ramp_rate", "use_mean_std", "tactile_state_keys", "tactile_input_shape", "tactile_embed_dim"}
+IGNORED = {"use_mean_std", "tactile_state_keys", "tactile_input_shape", "tactile_embed_dim"}
 KWARGS_FIXED: Fixed = {"model_type": ("qwen", "qwen")}
 EMBODIMENTS = {
     "simpler_env_google": 0,

@@ -49,6 +49,8 @@ def read(policy: Section, s: Sizes) -> None:
         policy.count(key) for key in ("hidden_size", "max_seq_len", "max_num_embodiments")
     )
     s.n_step, s.n_bucket = policy.count("num_inference_timesteps"), policy.count("num_timestep_buckets")
+    if "rtc_ramp_rate" in policy.defaults:
+        s.rtc_ramp_rate = policy.number("rtc_ramp_rate")
     if policy.count("backbone_embedding_dim") != s.d_model:
         policy.bad("backbone_embedding_dim", "the language model's width {}".format(s.d_model))
     if s.n_position < s.horizon:
@@ -184,9 +186,12 @@ def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
         "dit.d_hidden": s.d_hidden,
         "solver.steps": s.n_step,
     }
+    f64: Dict[str, object] = {"solver.t_start": 0.0, "solver.t_end": 1.0}
+    if s.rtc_ramp_rate is not None:
+        f64["policy.rtc_ramp_rate"] = s.rtc_ramp_rate
     return {
         "u32": u32,
         "f32": {"vl.norm_eps": 1e-5, "dit.norm_eps": 1e-5, "dit.out_eps": 1e-6},
-        "f64": {"solver.t_start": 0.0, "solver.t_end": 1.0},
+        "f64": f64,
         "string": {"solver.kind": "euler", "solver.noise": "normal"},
     }

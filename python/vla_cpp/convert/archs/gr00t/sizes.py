@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import List
+from typing import List, Optional
 
 WHERE = "backbone config.json"
 MAX_LAYERS = 1024
@@ -51,6 +51,7 @@ class Sizes:
     horizon: int = 0
     n_position: int = 0
     n_step: int = 0
+    rtc_ramp_rate: Optional[float] = None  # where the release knows real-time chunking
     n_embodiment: int = 0
     embodiment: int = 0  # index among them
     max_views: int = 0

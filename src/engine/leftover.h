@@ -1,0 +1,50 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "engine/solver.h"
+#include "policies/policy.h"
+
+namespace vla {
+
+/// Real-time chunking: the rows of the previous chunk that the robot has not executed when it looks again. The next
+/// chunk goes on from them.
+struct Leftover {
+  std::vector<float> rows;  // the last rows of ActionChunk::normalized, in its columns
+  int delay = 0;            // how many of them the robot will have executed when the next chunk is there
+  /// For a guided policy alone, and then required: how the weight of a row falls from `delay` on (zeros, ones, linear
+  /// or exp), and the largest weight of the guidance.
+  std::string schedule;
+  std::optional<double> max_guidance;
+};
+
+/// "guided", "inpainted", or empty for none.
+const char* kind_name(RealTimeChunking::Kind kind);
+
+/// What a Leftover makes of a solve: a start, and for every step k and row r the velocity
+/// v' = keep * v + pull * (x - target).
+struct Steering {
+  std::vector<float> start;       // (horizon, d_action)
+  std::vector<float> target;      // the leftover, padded with zeros: (horizon, d_action)
+  std::vector<float> keep, pull;  // (n_step, horizon)
+};
+
+/// The sizes of a solve and of a chunk's rows.
+struct ChunkShape {
+  int horizon, d_action;    // of what the network computes
+  int n_row, d_normalized;  // of ActionChunk::normalized
+};
+
+/// `start`: the solver's noise. A guided policy is drawn towards the rows in every step; an inpainted one starts from
+/// them, keeps the first `delay` and moves the others less the nearer they are. Source: lerobot
+/// policies/rtc/modeling_rtc.py RTCProcessor.denoise_step, get_prefix_weights, whose velocity is computed before its
+/// gradients are asked for, so that the correction is the weighted error itself; policies/groot/groot_n1_7.py
+/// get_action_with_features. Errors: unsupported (the policy does not do it), bad_observation.
+Result<Steering> steer(const RealTimeChunking& rtc, const Solver& solver, const Leftover& leftover,
+                       const ChunkShape& shape, std::vector<float> start);
+
+}  // namespace vla
