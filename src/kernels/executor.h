@@ -19,7 +19,7 @@ namespace vla::kernels {
 /// A thread that takes items of a phase.
 struct Worker {
   int index;
-  std::byte* scratch;   // memory of its own, at a multiple of a page
+  std::byte* scratch;   // memory of its own, at a multiple of a page; its first 64 bytes are zeros at first
   std::uint64_t phase;  // the same number as long as one run of one phase lasts, and never again
 };
 

@@ -14,14 +14,13 @@ from golden_cases import FLOAT32, NAMES, Golden, tensors
 def convert(case, out, dtype):
     """vla-convert of the package beside these tests, as a process of its own."""
     checkpoint = case.folder / "checkpoint"
-    backbone = next(p for p in (checkpoint / "vlm", checkpoint / "tokenizer") if p.is_dir())
+    backbone = [p for p in (checkpoint / "vlm", checkpoint / "tokenizer") if p.is_dir()]
     command = [
         sys.executable,
         "-m",
         "vla_cpp.convert.cli",
         checkpoint,
-        "--backbone",
-        backbone,
+        *(["--backbone", backbone[0]] if backbone else []),
         "-o",
         out,
         "--dtype",
