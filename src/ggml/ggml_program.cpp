@@ -215,8 +215,9 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
     program->constant_buffer_.reset(ggml_backend_alloc_ctx_tensors(program->constant_context_.get(), device.backend()));
     if (!program->constant_buffer_) return Error{Code::out_of_memory, "constants", "", "the device refused them"};
     for (const auto& [tensor, node] : constants)
-      std::visit([&](const auto& values) { ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * 4); },
-                 node->as<op::Constant>()->values);
+      std::visit(
+          [to = tensor](const auto& values) { ggml_backend_tensor_set(to, values.data(), 0, values.size() * 4); },
+          node->as<op::Constant>()->values);
     program->size_ += ggml_backend_buffer_get_size(program->constant_buffer_.get());
   }
   program->allocator_.reset(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend())));
