@@ -5,8 +5,9 @@
 #include "kernels/attention_kernel.h"
 #include "kernels/math.h"
 
-/// The two arithmetics that attention computes in. Both products of attention have the same form: rows of numbers
-/// times panels, which hold for each step of the depth one number of every column.
+/// The arithmetics that attention computes in: float32, pairs of bf16 by vector instructions, pairs of bf16 by tiles.
+/// Both products of attention have the same form: rows of numbers times panels, which hold every column's number for
+/// each step of the depth.
 namespace vla::kernels {
 
 /// From one row of a block to the next, where a row may have n numbers: a little apart from powers of two, so that rows
@@ -96,17 +97,13 @@ struct FloatProducts {
   }
 };
 
-/// Numbers rounded to bf16, sums in float32: 32 rows times 32 columns, through a tile type (AMX, or its emulation) that
-/// holds the sums between `open` and `close`, adds 32 of the depth in each `step`, and rounds. Rows of all operands
-/// are kHeadStride apart.
-template <class V, class Tile>
-struct PairProducts {
+/// Numbers rounded to bf16, sums in float32, and how panels hold them. `Pairs` rounds two vectors: store(to, a, b).
+template <class V, class Pairs>
+struct PairPanels {
   using Vector = V;
   using Float = typename V::Float;
   using Number = std::uint16_t;
-  using Session = typename Tile::Session;
-  static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256, kPanel = 32, kMinPanel = 32, kDepth = 32;
-  static constexpr bool kBeside = true;  // products wait for other work to be done beside it
+  static constexpr int kPanel = 32, kMinPanel = 32, kDepth = 32;
 
   /// Weights are 2^x. Rounding errs by a share of a weight, so that weights may as well be up to 2^kSlack: then the
   /// greatest score of a row seldom moves far enough to scale down what was mixed before.
@@ -119,7 +116,7 @@ struct PairProducts {
     return k / 32 * 1024 + n / 16 * 512 + k % 32 / 2 * 32 + n % 16 * 2 + k % 2;
   }
 
-  static VLA_INLINE void store(Number* to, Float a, Float b) { Tile::store(to, a, b); }
+  static VLA_INLINE void store(Number* to, Float a, Float b) { Pairs::store(to, a, b); }
 
   /// A pair of consecutive numbers stays a word, so that a tile is the transpose of 16 rows of words.
   static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
@@ -147,6 +144,67 @@ struct PairProducts {
         store_words(panel + place(i, n + V::width), V::interleave_high(even, odd));
       }
   }
+
+ protected:
+  static VLA_INLINE Float load_words(const Number* p) {
+    Float x;
+    std::memcpy(&x, p, sizeof(x));
+    return x;
+  }
+  static VLA_INLINE void store_words(Number* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
+};
+
+/// A vector instruction adds the products of both numbers of a pair: `Pairs` has add(sum, pairs, pairs). Rows of a tile
+/// times 32 columns, a pair of the row broadcast.
+template <class V, int kRowsOfTile, class Pairs>
+struct VectorPairProducts : PairPanels<V, Pairs> {
+  using Base = PairPanels<V, Pairs>;
+  using typename Base::Float;
+  using typename Base::Number;
+  struct Session {};
+  static constexpr int kTile = kRowsOfTile, kRows = 2 * kTile, kPart = kRows, kKeys = 256;
+  static constexpr bool kBeside = false;
+
+  /// Products, each done at once.
+  struct Work {
+    /// c = a * panel, or c += where `sum`.
+    template <int kStrideA, int kStrideC>
+    VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
+      constexpr int kVectors = Base::kPanel / V::width;
+      Float sums[kTile][kVectors] = {};
+      for (std::int64_t k = 0; k < depth; k += 2) {
+        Float columns[kVectors];
+        for (int n = 0; n < kVectors; ++n) columns[n] = Base::load_words(panel + Base::place(k, n * V::width));
+#pragma GCC unroll 16
+        for (int r = 0; r < kTile; ++r) {
+          float pair;
+          std::memcpy(&pair, a + r * kStrideA + k, sizeof(pair));
+          const Float row = V::set(pair);
+          for (int n = 0; n < kVectors; ++n) sums[r][n] = Pairs::add(sums[r][n], columns[n], row);
+        }
+      }
+      for (int r = 0; r < kTile; ++r)
+        for (int n = 0; n < kVectors; ++n) {
+          float* out = c + r * kStrideC + n * V::width;
+          V::store(out, sum ? V::load(out) + sums[r][n] : sums[r][n]);
+        }
+    }
+    int n_step() const { return 0; }
+    void advance(int) const {}
+    void finish() const {}
+  };
+};
+
+/// 32 rows times 32 columns through a tile type (AMX, or its emulation) that holds the sums between `open` and `close`,
+/// adds 32 of the depth in each `step`, and rounds. Rows of all operands are kHeadStride apart.
+template <class V, class Tile>
+struct PairProducts : PairPanels<V, Tile> {
+  using Base = PairPanels<V, Tile>;
+  using typename Base::Number;
+  using Session = typename Tile::Session;
+  using Base::kDepth, Base::kPanel;
+  static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256;
+  static constexpr bool kBeside = true;  // products wait for other work to be done beside it
 
   /// Products that are done a step at a time between other work: while the vector instructions before and behind a
   /// step wait for each other, the unit of the tiles, which is one of its own, computes. The processor looks some 500
@@ -189,14 +247,6 @@ struct PairProducts {
     int n_waiting_ = 0, n_step_ = 0, first_ = 0, step_ = 0;  // step_: of the first that waits
     Tile tile_;
   };
-
- private:
-  static VLA_INLINE Float load_words(const Number* p) {
-    Float x;
-    std::memcpy(&x, p, sizeof(x));
-    return x;
-  }
-  static VLA_INLINE void store_words(Number* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
 };
 
 }  // namespace vla::kernels

@@ -28,26 +28,27 @@ RowKernel CpuKernels::activation(Activation activation) const {
 #if defined(__x86_64__)
 // Each in the file of its name.
 extern const CpuKernels kAvx2Kernels, kAvx512Kernels;
-extern const AttentionKernel kAttentionAmx;
+extern const AttentionKernel kAttentionAvx512Bf16, kAttentionAmx;
 
 namespace {
 
-CpuKernels amx_kernels() {
+CpuKernels avx512_with(const AttentionKernel& attention) {
   CpuKernels kernels = kAvx512Kernels;
-  kernels.attention = kAttentionAmx;
+  kernels.attention = attention;
   return kernels;
 }
 
 }  // namespace
 
 const CpuKernels* cpu_kernels(Isa isa) {
-  static const CpuKernels amx = amx_kernels();
+  static const CpuKernels avx512_bf16 = avx512_with(kAttentionAvx512Bf16), amx = avx512_with(kAttentionAmx);
   switch (isa) {
     case Isa::avx2:
       return &kAvx2Kernels;
     case Isa::avx512:
-    case Isa::avx512_bf16:
       return &kAvx512Kernels;
+    case Isa::avx512_bf16:
+      return &avx512_bf16;
     case Isa::amx:
       return &amx;
     case Isa::ggml:

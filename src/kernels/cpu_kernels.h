@@ -22,8 +22,8 @@ struct CpuKernels {
   RowKernel activation(Activation activation) const;
 };
 
-/// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used. Those of `amx`
-/// multiply bf16 in attention, with sums in float32, as PyTorch does with a bf16 model.
+/// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used. Those that round
+/// to bf16 (isa.h) do so in attention too, with sums in float32, as PyTorch does with a bf16 model.
 const CpuKernels* cpu_kernels(Isa isa);
 
 /// The same templates without any instruction set: slow, and there to test them at another width.

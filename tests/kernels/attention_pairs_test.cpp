@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Attention of numbers rounded to bf16, as AMX's tiles multiply them.
+// Attention of numbers rounded to bf16, as AVX-512 BF16 and AMX's tiles multiply them.
 #include "kernels/attention_products.h"
 
 #include "support/attention_case.h"
@@ -89,12 +89,16 @@ void check_pair_weights(const AttentionKernel& kernel) {
 
 }  // namespace
 
-/// A test of kernels that round to bf16: the portable instance, the emulated one, and the machine's.
-#define VLA_PAIR_TEST(sentence, check)                                               \
-  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); } \
-  VLA_EMULATED_TEST("amx", sentence, check(kernels::kEmulatedAttentionAmx))          \
-  TEST_CASE("amx: " sentence* doctest::skip(test::lacks(Isa::amx))) {                \
-    check(kernels::cpu_kernels(Isa::amx)->attention);                                \
+/// A test of kernels that round to bf16: the portable instance, the emulated ones, and the machine's.
+#define VLA_PAIR_TEST(sentence, check)                                                     \
+  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); }       \
+  VLA_EMULATED_TEST("avx512_bf16", sentence, check(kernels::kEmulatedAttentionAvx512Bf16)) \
+  TEST_CASE("avx512_bf16: " sentence* doctest::skip(test::lacks(Isa::avx512_bf16))) {      \
+    check(kernels::cpu_kernels(Isa::avx512_bf16)->attention);                              \
+  }                                                                                        \
+  VLA_EMULATED_TEST("amx", sentence, check(kernels::kEmulatedAttentionAmx))                \
+  TEST_CASE("amx: " sentence* doctest::skip(test::lacks(Isa::amx))) {                      \
+    check(kernels::cpu_kernels(Isa::amx)->attention);                                      \
   }
 
 TEST_CASE("a weight for bf16 errs by 2^-18 of itself at most") {

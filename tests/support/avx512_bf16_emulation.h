@@ -53,3 +53,4 @@ inline __m512 add_pairs(__m512 sum, __m512bh a, __m512bh b) {
 #define _mm512_dpbf16_ps vla::test::bf16::add_pairs
 
 #define kLinearAvx512Bf16 kEmulatedLinearAvx512Bf16
+#define kAttentionAvx512Bf16 kEmulatedAttentionAvx512Bf16

@@ -19,7 +19,7 @@ namespace vla::kernels {
 /// The sources of avx512, avx512_bf16 and amx with their instructions emulated, for machines that have AVX2
 /// (avx512_emulation.h).
 extern const CpuKernels kEmulatedAvx512Kernels;
-extern const AttentionKernel kEmulatedAttentionAmx;
+extern const AttentionKernel kEmulatedAttentionAvx512Bf16, kEmulatedAttentionAmx;
 extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx, kEmulatedTernaryAmx;
 }  // namespace vla::kernels
 
