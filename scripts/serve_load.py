@@ -6,9 +6,11 @@
 scripts/serve_load.py overhead     one client, two raw views of 256 x 256: what server and network add to the engine
 scripts/serve_load.py jpeg         the same with JPEG files, and libjpeg-turbo's own time for them
 scripts/serve_load.py many         64 clients, 100,000 acts: lost and crossed answers, fairness, resident memory
+scripts/serve_load.py busy         the shipped policy with default threads: processor time while idle, and one client's
+                                   acts alone and beside four busy loops
 
-The server runs on this machine with a bundle of random weights; its engine takes about a millisecond, so that what is
-measured is not hidden. Needs build/cpu/bin/vla and build/cpu/bin/load_tool. Fails where an answer is lost, wrong, or
+The server runs on this machine, but for `busy` with a bundle of random weights; its engine takes about a millisecond,
+so that what is measured is not hidden. Needs build/cpu/bin/vla and build/cpu/bin/load_tool. Fails where an answer is lost, wrong, or
 another one's. docs/performance.md says what the rows mean.
 """
 
@@ -37,7 +39,8 @@ WARM = 3  # tenths of the acts of `many`, until the allocator holds what 64 clie
 @contextmanager
 def serving(options):
     """(address, process) of a server of its own."""
-    command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", str(options.threads)]
+    threads = ["--threads", options.threads] if options.threads else []
+    command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", *threads]
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
     try:
         line = process.stdout.readline()
@@ -134,31 +137,88 @@ def many(options):
     return {"many": tool, "growth": growth}, rows
 
 
+def processor_seconds(pid):
+    """Of all threads of a process, in user and system mode."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+@contextmanager
+def busy_loops(n):
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(n)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+def round_trips(options, address):
+    """Of one client that acts ten times a second, as a robot does."""
+    import vla_cpp
+
+    milliseconds = []
+    with vla_cpp.Client(address, timeout=60) as client:
+        images = {view.name: image(i) for i, view in enumerate(client.spec.views)}
+        state = {s.name: np.full(s.width, 0.1, np.float32) for s in client.spec.states}
+        for i in range(options.requests):
+            start = time.perf_counter()
+            client.act(images=images, state=state, text="open the drawer", seed=i)
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+            time.sleep(max(0, start + 0.1 - time.perf_counter()))
+    p50, p99 = np.quantile(milliseconds, [0.5, 0.99])
+    return {"p50": p50, "p99": p99}
+
+
+def busy(options):
+    with serving(options) as (address, process):
+        round_trips(options, address)
+        before = processor_seconds(process.pid)
+        time.sleep(10)
+        idle = processor_seconds(process.pid) - before
+        alone = round_trips(options, address)
+        with busy_loops(4):
+            beside = round_trips(options, address)
+    ratio = {q: beside[q] / alone[q] for q in alone}
+    rows = [
+        ("processor time of the idle server in 10 s", f"{idle:.2f} s", "0"),
+        ("round trip alone", spread(alone), ""),
+        ("round trip beside four busy loops", spread(beside), ""),
+        ("the same over alone", f"p50 {ratio['p50']:.2f}, p99 {ratio['p99']:.2f}", "p50 2, p99 5"),
+    ]
+    return {"busy": {"idle": idle, "alone": alone, "beside": beside, "flawless": True}}, rows
+
+
 def spread(quantiles):
     return f"p50 {quantiles['p50']:.3f}, p99 {quantiles['p99']:.3f} ms"
 
 
-FIGURES = {"overhead": (overhead, 2000), "jpeg": (jpegs, 2000), "many": (many, 100_000)}
+FIGURES = {"overhead": (overhead, 2000), "jpeg": (jpegs, 2000), "many": (many, 100_000), "busy": (busy, 100)}
 
 
 def parse():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     binaries = Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla"))
     parser.add_argument("figure", choices=FIGURES)
-    parser.add_argument("--bundle", type=Path, help="default: that of a golden case")
+    parser.add_argument("--bundle", type=Path, help="default: that of a golden case, of `busy` the shipped policy")
     parser.add_argument("--vla", type=Path, default=binaries)
     parser.add_argument("--tool", type=Path, default=os.environ.get("VLA_LOAD_TOOL", binaries.with_name("load_tool")))
-    parser.add_argument("--threads", type=int, default=1, help="of the engine; default: 1")
+    parser.add_argument("--threads", type=int, help="of the engine; default: 1, of `busy` the server's own")
     parser.add_argument("--clients", type=int, default=64, help="of `many`; default: 64")
     parser.add_argument("--side", type=int, default=64, help="of the raw frames of `many`; default: 64 pixels")
-    parser.add_argument("--requests", type=int, help="default: 100,000 of `many`, 2,000 of the others")
+    parser.add_argument("--requests", type=int, help="default: 100,000 of `many`, 100 of `busy`, 2,000 else")
     parser.add_argument("--json", action="store_true")
     return parser.parse_args()
 
 
 def main():
     options = parse()
-    options.bundle = options.bundle or make() / "smolvla/two_views/bundle.gguf"
+    if options.figure == "busy":
+        options.bundle = options.bundle or ROOT / "models/metaworld-tiny.gguf"
+    else:
+        options.bundle = options.bundle or make() / "smolvla/two_views/bundle.gguf"
+        options.threads = options.threads or 1
     measure, requests = FIGURES[options.figure]
     options.requests = options.requests or requests
     report, rows = measure(options)

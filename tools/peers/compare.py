@@ -18,6 +18,7 @@ With --ggml-bench PROGRAM --ggml-weights FILE the benchmark program of another g
 (https://github.com/VinRobotics/vla.cpp, target vla-bench); it times itself, in a process for each round.
 """
 import argparse
+import atexit
 import json
 import os
 import re
@@ -122,7 +123,7 @@ def print_table(args, vla, results):
     peaks = [r["peak_gflops"] for r in report["rounds"]]
     gflop = report["stages"]["network"]["gflop"]
     print(f"{report['cpu']}, {args.threads} threads; {args.views} views, {args.tokens} tokens, {report['conditions']['steps']} steps, batch 1; "
-          f"{len(ours)} interleaved rounds. Peak {report['peak_name']}: {median(peaks):.0f} GFLOP/s (median of rounds, "
+          f"{len(ours)} interleaved rounds beside {args.busy} busy processes. Peak {report['peak_name']}: {median(peaks):.0f} GFLOP/s (median of rounds, "
           f"{min(peaks):.0f} to {max(peaks):.0f}); {gflop:.4g} GFLOP counted for vla.\n")
     print("| program | network, ms: median (fastest) | vision | prefix | steps | its time over vla's, median of rounds | vision | prefix | steps | of the peak |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
@@ -146,6 +147,7 @@ def main():
     parser.add_argument("--tokens", type=int, default=48)
     parser.add_argument("--size", type=int, default=512, help="side of the pictures, for the ggml runtime")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--busy", type=int, default=0, help="endless loops beside every program, as a robot's other work")
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
     parser.add_argument("--kernels", default="", help="as vla bench takes them")
     parser.add_argument("--openvino-folder", type=Path, default=Path(tempfile.gettempdir()) / "openvino_smolvla",
@@ -161,6 +163,8 @@ def main():
         parser.error("--ggml-bench and --ggml-weights go together")
     peers = [PythonPeer(name, args) for name in names] + ([GgmlRuntime(args)] if args.ggml_bench else [])
     vla = Vla(args)
+    for _ in range(args.busy):
+        atexit.register(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
     everyone, results = [vla, *peers], {peer: [] for peer in peers}
     for turn in range(args.rounds + 1):  # the first warms up
         shift = turn % len(everyone)
