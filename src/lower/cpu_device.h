@@ -31,9 +31,9 @@ class CpuDevice final : public Device {
   void touch() override;
 
  private:
-  explicit CpuDevice(Isa isa) : isa_(isa) {}
+  explicit CpuDevice(Isa isa) : isa_(isa), attention_isa_(isa) {}
 
-  Isa isa_;
+  Isa isa_, attention_isa_;
   std::shared_ptr<kernels::Executor> executor_;
   CpuWeights weights_;
   Memory arena_;  // of values that live within a run: programs share it, since one runs at a time

@@ -23,6 +23,12 @@ Isa isa_for(const ParamList& list, Isa isa) {
   return has_matrix ? isa : without_rounding(isa);
 }
 
+Isa attention_isa_for(const ParamList& list, Isa isa) {
+  for (const Param& param : list.params())
+    if (param.storage == Storage::ternary) return without_rounding(isa);
+  return isa_for(list, isa);
+}
+
 namespace lower {
 namespace {
 

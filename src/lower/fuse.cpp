@@ -2,8 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
 #include <map>
+#include <tuple>
 
 #include "lower/lowering.h"
+#include "lower/precision.h"
 
 namespace vla::lower {
 namespace {
@@ -195,13 +197,13 @@ class Fuser {
       if (node != nullptr) l.fused[at(node)] = true;
   }
 
-  ValueId pack(Tensor k, Tensor v, const Node& attention) {
-    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id}, kNone);
+  ValueId pack(Tensor k, Tensor v, const Node& attention, Isa isa) {
+    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id, isa}, kNone);
     if (!is_new) return known->second;
     const ValueId id = static_cast<ValueId>(l.values.size());
     Value& value = l.values.emplace_back();
     value.base = id, value.shape = k.shape();
-    PackOp op = {prepared(k), v.node()->id};
+    PackOp op = {prepared(k), v.node()->id, isa};
     drop(op.k);
     add(std::move(op), attention);
     l.ops.back().writes = {id};
@@ -210,12 +212,15 @@ class Fuser {
 
   void visit_attention(const Node& node) {
     const bool has_mask = node.as<op::Attention>()->has_mask;
-    AttentionOp op;
-    op.node = &node, op.q = prepared(node.in[0]);
+    const std::size_t first = has_mask ? 2 : 1;
+    std::int64_t n_key = 0;
+    for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
+    const Isa isa = n_key < kMinRoundedKeys ? without_rounding(l.isa) : l.attention_isa;
+    AttentionOp op = {&node, prepared(node.in[0]), isa};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;
-    for (std::size_t i = has_mask ? 2 : 1; i < node.in.size(); i += 2) {
-      op.packed.push_back(pack(node.in[i], node.in[i + 1], node));
+    for (std::size_t i = first; i < node.in.size(); i += 2) {
+      op.packed.push_back(pack(node.in[i], node.in[i + 1], node, isa));
       op.n_key.push_back(node.in[i].dim(2));
     }
     add(std::move(op), node);
@@ -286,7 +291,7 @@ class Fuser {
   }
 
   Lowering& l;
-  std::map<std::pair<ValueId, ValueId>, ValueId> packs_;
+  std::map<std::tuple<ValueId, ValueId, Isa>, ValueId> packs_;
 };
 
 }  // namespace

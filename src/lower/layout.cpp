@@ -101,7 +101,7 @@ class Layouts {
   void require_layouts(PackOp& op) {
     require_rows(op.k);
     require_rows(op.v);
-    l.value(op_->writes[0]).size = kernels::cpu_kernels(l.isa)->attention.packed_size(pack_sizes(l, op));
+    l.value(op_->writes[0]).size = kernels::cpu_kernels(op.isa)->attention.packed_size(pack_sizes(l, op));
   }
   void require_layouts(AttentionOp& op) {
     require_rows(op.q);

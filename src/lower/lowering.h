@@ -62,10 +62,12 @@ struct QuantizeOp {
 struct PackOp {
   Prepared k;
   ValueId v;
+  Isa isa;
 };
 struct AttentionOp {
   const Node* node;
   Prepared q;
+  Isa isa;
   ValueId mask = kNone;
   std::vector<ValueId> packed;
   std::vector<std::int64_t> n_key;
@@ -107,7 +109,7 @@ struct Lowering {
   const Graph& graph;
   const LowerOptions& options;
   const CpuWeights& weights;
-  Isa isa;
+  Isa isa, attention_isa;
   int n_thread;
 
   std::vector<Value> values;

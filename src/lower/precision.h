@@ -12,4 +12,12 @@ namespace vla {
 /// none at all, makes everything float32.
 Isa isa_for(const ParamList& list, Isa isa);
 
+/// The same for attention. Between ternary products it rounds nothing: a number that is rounded before it is quantized
+/// may get another code, which is an error of a hundredth and more of a row's greatest.
+Isa attention_isa_for(const ParamList& list, Isa isa);
+
+/// Attention over fewer keys rounds nothing on any machine: it takes little time, and each output mixes so few values
+/// that their errors hardly cancel.
+constexpr std::int64_t kMinRoundedKeys = 128;
+
 }  // namespace vla

@@ -39,12 +39,12 @@ struct Describe {
     return {fmt::format("{}quantize", op.norm != nullptr ? "norm, " : ""), op.kernel->name, op.x};
   }
   Words operator()(const PackOp& op) const {
-    return {prepared(op.k) + "pack keys and values", isa_name(l.isa), op.k.x};
+    return {prepared(op.k) + "pack keys and values", isa_name(op.isa), op.k.x};
   }
   Words operator()(const AttentionOp& op) const {
     return {fmt::format("{}attention {} over {} keys{}", prepared(op.q), path_of(*op.node), fmt::join(op.n_key, " + "),
                         op.mask != kNone ? ", mask" : ""),
-            isa_name(l.isa), op.q.x};
+            isa_name(op.isa), op.q.x};
   }
   Words operator()(const RowOp& op) const {
     return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), isa_name(l.isa), op.x};

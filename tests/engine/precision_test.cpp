@@ -51,6 +51,18 @@ TEST_CASE("one matrix of another dtype makes the whole policy float32, and a tab
   CHECK(isa_of(widened("lm.token_embd.weight"), Isa::amx) == Isa::amx);
 }
 
+TEST_CASE("attention between ternary products rounds nothing; their sums are the same on all machines") {
+  const auto bundle = Bundle::open(golden_path("bitvla/micro/bundle.gguf"));
+  REQUIRE(bundle.ok());
+  ParamList list(bundle->keys(), &*bundle);
+  const auto policy = find_policy("bitvla")->make(list);
+  for (Isa isa : {Isa::amx, Isa::avx512_bf16}) {
+    CHECK(isa_for(list, isa) == isa);
+    CHECK(attention_isa_for(list, isa) == Isa::avx512);
+  }
+  CHECK(attention_isa_for(list, Isa::avx2) == Isa::avx2);
+}
+
 TEST_CASE("an engine tells the kernels and the precision of its bundle, not those of the machine") {
   CHECK(load_engine(kBundle)->precision() == (rounds_to_bf16(usable_isas().back()) ? "bf16" : "f32"));
   CHECK(load_engine(kBundle, "", "float32")->precision() == "f32");

@@ -2,7 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Which operations become one. Whether fused operations compute the same is for ops_test.cpp and place_test.cpp.
+#include <sstream>
+
+#include "lower/precision.h"
 #include "lower_case.h"
+#include "support/kernel_rows.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -98,4 +102,31 @@ VLA_FUSE_TEST("what nobody reads is not computed") {
           p.linear(g, x, 67);
           return p.linear(g, x, 35);
         }) == 1);
+}
+
+TEST_CASE("attention over few keys rounds nothing, and shares no packed keys with one that does" *
+          doctest::skip(lacks(Isa::avx512_bf16))) {
+  const LowerParams params(DType::bf16);
+  GraphRunner runner(params.list(), "avx512_bf16");
+  Graph& g = runner.graph;
+  const int n = kMinRoundedKeys - 1;
+  const Tensor q = input(runner, {8, 3, 2, 1}), k = input(runner, {8, 3, n, 1}), one = input(runner, {8, 3, 1, 1});
+  g.name("result", add(g, attention(g, q, {{k, k}}, {}), attention(g, q, {{k, k}, {one, one}}, {})));
+  const std::string text = runner.lower().text();
+  CAPTURE(text);
+  const auto n_line = [&](const std::string& kernel, const std::string& what) {
+    std::istringstream lines(text);
+    int n_found = 0;
+    for (std::string line; std::getline(lines, line);) {
+      std::istringstream words(line);
+      std::string phase, name;
+      words >> phase >> name;
+      if (name == kernel && line.find(what) != std::string::npos) ++n_found;
+    }
+    return n_found;
+  };
+  CHECK(n_line("avx512", "attention") == 1);
+  CHECK(n_line("avx512", "pack") == 1);
+  CHECK(n_line("avx512_bf16", "attention") == 1);
+  CHECK(n_line("avx512_bf16", "pack") == 2);
 }

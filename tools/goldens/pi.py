@@ -145,7 +145,8 @@ def policy(horizon, steps, side, d_max, n_token, **more):
 
 def published(views, arch="pi0"):
     """The published size: 3.2 G parameters that are used (pi0), and the expert's unused head."""
-    return Checkpoint(arch, {"dtype": "bfloat16"}, vision(1152, 27, 16, 4304), gemma(2048, 18, 8, 1, 256, 16384),
+    config = {"dtype": "bfloat16", "chunk_size": 50, "max_action_dim": 32}
+    return Checkpoint(arch, config, vision(1152, 27, 16, 4304), gemma(2048, 18, 8, 1, 256, 16384),
                       gemma(1024, 18, 8, 1, 256, 4096), views, d_state=8, n_vocab=257152, size="full")
 
 

@@ -131,7 +131,9 @@ def published(views, arch="smolvla"):
               "patch_size": 16}
     text = {"hidden_size": 960, "intermediate_size": 2560, "num_hidden_layers": 32, "num_attention_heads": 15,
             "num_key_value_heads": 5, "head_dim": 64, "max_position_embeddings": 8192}
-    return Checkpoint(vision, text, 4, {"pad_language_to": "max_length", "prefix_length": 0, "num_expert_layers": 0}, views, n_vocab=49280)
+    config = {name: CONFIG[name] for name in ("chunk_size", "max_action_dim")}
+    config |= {"pad_language_to": "max_length", "prefix_length": 0, "num_expert_layers": 0}
+    return Checkpoint(vision, text, 4, config, views, n_vocab=49280)
 
 
 # --- cases -----------------------------------------------------------------------------------------------------------
