@@ -205,8 +205,8 @@ Result<std::vector<double>> Bundle::stats(std::string_view name) const {
   if (tensor == nullptr)
     return Error{Code::bad_bundle, where, "statistics", "no such tensor", "convert the checkpoint again"};
   const bool is_wide = tensor->type == DType::f64;
-  if ((tensor->type != DType::f32 && !is_wide) || tensor->shape.size() != 1)
-    return Error{Code::bad_bundle, where, "a one-dimensional f32 or f64 tensor",
+  if ((tensor->type != DType::f32 && !is_wide) || tensor->shape.empty() || tensor->shape.size() > 2)
+    return Error{Code::bad_bundle, where, "a one- or two-dimensional f32 or f64 tensor",
                  fmt::format("{} dimensions of {}", tensor->shape.size(), dtype_name(tensor->type))};
   std::vector<double> values(static_cast<std::size_t>(tensor->count()));
   std::vector<float> narrow(is_wide ? 0 : values.size());

@@ -48,7 +48,7 @@ class Bundle {
   const Keys& keys() const { return keys_; }
   const std::vector<TensorInfo>& tensors() const { return tensors_; }
   const TensorInfo* find(std::string_view name) const;
-  /// A one-dimensional f32 or f64 tensor of finite values, for statistics. Errors: bad_bundle.
+  /// A one- or two-dimensional f32 or f64 tensor of finite values, for statistics: row by row. Errors: bad_bundle.
   Result<std::vector<double>> stats(std::string_view name) const;
   std::size_t file_size() const { return bytes_.size(); }
   /// Gives whole pages of a part of an opened file back to the system, because they are not read any more: of a copy

@@ -80,7 +80,7 @@ StatsColumns read_stats(const Bundle& bundle, const std::string& feature) {
   for (const TensorInfo& tensor : bundle.tensors())
     if (tensor.name.starts_with(prefix))
       if (auto values = bundle.stats(tensor.name)) {
-        columns.names.push_back(tensor.name.substr(prefix.size()));
+        columns.names.push_back(tensor.name.substr(prefix.size()) + (tensor.shape.size() > 1 ? " (row 0)" : ""));
         columns.values.push_back(*values);
       }
   return columns;

@@ -178,13 +178,13 @@ std::string Processor::state_place(std::size_t i) const {
 }
 
 /// Tells the user, or refuses, where normalized numbers of the state are far from everything that the policy has seen.
-Status Processor::check_bound(std::span<const float> normalized, Inputs& inputs) const {
-  const auto is_beyond = [this](float value) { return std::abs(static_cast<double>(value)) > state_bound_; };
-  const auto first = std::find_if(normalized.begin(), normalized.end(), is_beyond);
-  if (first == normalized.end()) return {};
-  const auto i = static_cast<std::size_t>(&*first - inputs.state.data());
-  const auto n_other = std::count_if(first, normalized.end(), is_beyond) - 1;
-  const std::string found = fmt::format("{}, which is {:.3g} when normalized{}", inputs.raw_state[i], *first,
+Status Processor::check_bound(const StateOp& op, Inputs& inputs) const {
+  std::vector<std::size_t> beyond;
+  for (std::size_t i = 0; i < inputs.state.size(); ++i)
+    if (op.normalizes(i) && std::abs(static_cast<double>(inputs.state[i])) > state_bound_) beyond.push_back(i);
+  if (beyond.empty()) return {};
+  const std::size_t i = beyond.front(), n_other = beyond.size() - 1;
+  const std::string found = fmt::format("{}, which is {:.3g} when normalized{}", inputs.raw_state[i], inputs.state[i],
                                         n_other > 0 ? fmt::format(", and {} more such numbers", n_other) : "");
   if (refuses_beyond_)
     return bad_observation(state_place(i), fmt::format("at most {} when normalized", state_bound_), found,
@@ -203,23 +203,21 @@ Status Processor::encode_state(const Observation& observation, Inputs& inputs) c
     inputs.notes.push_back("DEGRADED: " + feature +
                            " passes unnormalized, as --identity-stats allowed when converting");
   VLA_CHECK(gather_states(observation, inputs.state));
-  const StateOp* end = nullptr;
   bool raw = true;
   for (const auto& op : recipe_.state) {
     if (raw && op->stage() != Stage::convention) {
       inputs.raw_state = inputs.state;
       raw = false;
     }
-    if (op->stage() == Stage::end) end = op.get();
     op->apply(inputs.state);
-    VLA_CHECK(check_bound(op->normalized(inputs.state), inputs));
+    VLA_CHECK(check_bound(*op, inputs));
   }
   if (raw) inputs.raw_state = inputs.state;
   if (const std::size_t bad = first_bad(inputs.state); bad < inputs.state.size())
     return bad_observation(state_place(bad), "a number that stays finite when normalized",
                            fmt::format("{}", inputs.state[bad]));
   inputs.discretized_state.clear();
-  if (end != nullptr) end->finish(inputs.state, inputs.discretized_state);
+  for (const auto& op : recipe_.state) op->finish(inputs.state, inputs.discretized_state);
   return {};
 }
 
@@ -230,17 +228,18 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
     return Error{Code::internal, "action chunk", fmt::format("({}, {}) and {} states", horizon, d_action_, n_state_),
                  fmt::format("{} numbers in rows of {} and {} states", chunk.size(), d_action, raw_state.size())};
   const std::size_t width = action_names_.size();
-  std::vector<float> actions, row;
+  std::vector<float> actions;
+  std::vector<double> row;
   actions.reserve(static_cast<std::size_t>(n_row(horizon)) * width);
   for (int i = 0; i < n_row(horizon); ++i) {
     const auto numbers = chunk.subspan(static_cast<std::size_t>(i) * static_cast<std::size_t>(d_action),
                                        static_cast<std::size_t>(d_action));
     row.assign(numbers.begin(), numbers.end());
-    for (const auto& op : recipe_.action) op->apply(row, raw_state);
-    if (const std::size_t bad = first_bad(row); bad < width)
+    for (const auto& op : recipe_.action) op->apply(row, {static_cast<std::size_t>(i), raw_state});
+    actions.insert(actions.end(), row.begin(), row.end());
+    if (const std::size_t bad = first_bad(std::span(actions).last(width)); bad < width)
       return Error{Code::bad_action, fmt::format("actions[{}][\"{}\"]", i, action_names_[bad]), "a finite number",
                    fmt::format("{}", row[bad])};
-    actions.insert(actions.end(), row.begin(), row.end());
   }
   return actions;
 }

@@ -110,7 +110,7 @@ class Processor {
   void cut_tokens(std::vector<std::int32_t>& tokens) const;
   Status read_degraded(const Keys& keys);
   std::string state_place(std::size_t i) const;
-  Status check_bound(std::span<const float> normalized, Inputs& inputs) const;
+  Status check_bound(const StateOp& op, Inputs& inputs) const;
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;

@@ -168,14 +168,13 @@ Status Processor::read_view_places(const Keys& keys) {
 
 Status Processor::bind_state(const Bundle& bundle) {
   n_state_ = static_cast<std::size_t>(total_dims(state_dims_));
-  const StateLayout layout{bundle, states_, state_dims_, n_state_};
+  StateLayout layout{bundle, states_, state_dims_, n_state_, n_state_};
   for (std::size_t i = 0; i < recipe_.state.size(); ++i)
     VLA_CHECK(recipe_.state[i]->bind(layout, fmt::format("processor.recipe.state[{}]", i)));
-  const std::size_t left = recipe_.state.empty() ? n_state_ : recipe_.state.back()->d_state(n_state_);
   VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state", {0, kMaxVector}));
-  if (left == static_cast<std::size_t>(d_state)) return {};
+  if (layout.width == static_cast<std::size_t>(d_state)) return {};
   return misfit("processor.recipe.state", fmt::format("{} numbers at the end (policy.d_state)", d_state),
-                std::to_string(left));
+                std::to_string(layout.width));
 }
 
 Status Processor::bind_action(const Bundle& bundle) {

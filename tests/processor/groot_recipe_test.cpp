@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Ops of a policy whose images keep their aspect and whose instruction is cleaned: GR00T N1.7.
+#include <cmath>
+
 #include "processor/ops/normalize.h"
 #include "processor/ops/pipeline.h"
 #include "processor/python_text.h"
@@ -67,13 +69,120 @@ TEST_CASE("text is lower-cased and cleaned as Python does it") {
 
 TEST_CASE("the kinds of GR00T have no epsilon and leave what has no spread") {
   using Direction = Normalizer::Direction;
-  std::vector<float> x = {2.0f, 5.0f};
-  Normalizer(norm_rule("groot_min_max"), Direction::normalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
-  CHECK(x == std::vector<float>{-0.5f, 0.0f});
-  Normalizer(norm_rule("groot_min_max"), Direction::unnormalize, 0.0, {0.0f, 1.0f}, {8.0f, 1.0f}).apply(x);
-  CHECK(x == std::vector<float>{2.0f, 1.0f});
-  Normalizer(norm_rule("groot_mean_std"), Direction::normalize, 0.0, {1.0f, 7.0f}, {2.0f, 0.0f}).apply(x);
-  CHECK(x == std::vector<float>{0.5f, 1.0f});
+  const auto map = [](const char* kind, Direction direction, double low, double high, float x) {
+    return Normalizer(norm_rule(kind), direction, 0.0, {low}, {high}).map(x, 0);
+  };
+  for (const char* kind : {"groot_min_max", "groot_n1_5_min_max", "groot_n1_5_quantiles"}) {
+    CHECK(map(kind, Direction::normalize, 0.0, 8.0, 2.0f) == -0.5);
+    CHECK(map(kind, Direction::unnormalize, 0.0, 8.0, -0.5f) == 2.0);
+    CHECK(map(kind, Direction::unnormalize, 1.0, 1.0, 5.0f) == 1.0);
+  }
+  CHECK(map("groot_min_max", Direction::normalize, 1.0, 1.0, 5.0f) == 0.0);
+  CHECK(map("groot_n1_5_min_max", Direction::normalize, 1.0, 1.0, 5.0f) == 0.0);
+  CHECK(map("groot_n1_5_quantiles", Direction::normalize, 1.0, 1.0, 5.0f) == 5.0);
+  CHECK(map("groot_mean_std", Direction::normalize, 1.0, 2.0, 2.0f) == 0.5);
+  CHECK(map("groot_mean_std", Direction::normalize, 7.0, 0.0, 3.0f) == 3.0);
+  CHECK(map("groot_mean_std", Direction::unnormalize, 7.0, 0.0, 3.0f) == 3.0);
+  CHECK(map("groot_n1_5_mean_std", Direction::normalize, 7.0, 0.0, 3.0f) == 3.0);
+  CHECK(map("groot_n1_5_mean_std", Direction::unnormalize, 7.0, 0.0, 3.0f) == 7.0);
+}
+
+TEST_CASE("a range of N1.6 and N1.7 is applied in float64, and what has no statistic in it in float32") {
+  const Normalizer up(norm_rule("groot_min_max"), Normalizer::Direction::normalize, 0.0, {0.1}, {0.7});
+  CHECK(up.map(0.4f, 0) == 2 * static_cast<float>((0.4f - 0.1) / (0.7 - 0.1)) - 1);
+  const Normalizer down(norm_rule("groot_min_max"), Normalizer::Direction::unnormalize, 0.0, {0.1}, {0.7});
+  CHECK(down.map(0.3f, 0) == static_cast<double>((0.3f + 1) / 2) * (0.7 - 0.1) + 0.1);
+}
+
+TEST_CASE("keys of a state and of an action are normalized each in its own way") {
+  EditableBundle bundle = groot();
+  Json recipe = Json::parse(kRecipe);
+  const Json range = {
+      {"op", "normalize"}, {"kind", "groot_min_max"}, {"stats", "stats.observation.state"}, {"eps", 0.0}};
+  Json first = range, second = range, action = range;
+  first["columns"] = {0};
+  second["kind"] = "groot_mean_std", second["columns"] = {1};
+  recipe["state"] = {
+      first, second, {{"op", "clip"}, {"low", -1.0}, {"high", 1.0}, {"columns", {0}}}, recipe["state"][2]};
+  recipe["action"][2]["columns"] = {0};
+  recipe["action"][3]["columns"] = {0};
+  bundle.set("processor.recipe", recipe.dump());
+  add_stats(bundle, "stats.observation.state.mean", {0.0f, 1.0f});
+  add_stats(bundle, "stats.observation.state.std", {0.0f, 0.5f});
+  const Processor processor = make(bundle);
+  Observation observation;
+  observation.states["state"] = {9.0f, 3.0f};
+  Inputs inputs;
+  REQUIRE(processor.encode_state(observation, inputs).ok());
+  CHECK(inputs.state == std::vector<float>{1, 4, 0, 0});
+  CHECK(*processor.decode(std::vector<float>{3, 3, 0, 0, -1, 7, 0, 0, 0, 0, 0, 0}, 3, 4, inputs.raw_state) ==
+        std::vector<float>{3, 3, -1, 7});
+  recipe["state"][1]["columns"] = {2};
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle),
+                 "processor.recipe.state[1].columns: expected columns below 2"));
+}
+
+TEST_CASE("actions may have ranges of their own for each row of a chunk") {
+  EditableBundle bundle = groot();
+  for (const char* name : {"stats.action.min", "stats.action.max"}) bundle.erase(name);
+  add_stats(bundle, "stats.action.min", {0, 0, 0, 0});
+  add_stats(bundle, "stats.action.max", {2, 4, 20, 40});
+  const std::vector<float> chunk = {0, 1, 9, 9, 0, 1, 9, 9, 0, 1, 9, 9};
+  CHECK(*make(bundle).decode(chunk, 3, 4, std::vector<float>{0, 0}) == std::vector<float>{1, 4, 10, 40});
+  bundle.erase("stats.action.max");
+  add_stats(bundle, "stats.action.max", {2, 4, 20, 40, 60, 80});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "stats.action.max: expected 2 numbers, or 2 rows of them"));
+  bundle.erase("stats.action.max");
+  add_stats(bundle, "stats.action.max", {2, 4});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "stats.action.max: expected 4 numbers"));
+}
+
+TEST_CASE("an action is added to the columns of the state that the recipe names") {
+  EditableBundle bundle = groot();
+  Json recipe = Json::parse(kRecipe);
+  recipe["action"].push_back({{"op", "add_state"}, {"columns", {1}}, {"state_columns", {0}}});
+  bundle.set("processor.recipe", recipe.dump());
+  const Processor processor = make(bundle);
+  CHECK(processor.relative_actions());
+  CHECK(*processor.decode(std::vector<float>(12, 1.0f), 3, 4, std::vector<float>{5, 7}) ==
+        std::vector<float>{3, 5, 3, 5});
+  recipe["action"].back()["state_columns"] = {2};
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(
+      contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.action[4]: expected columns of the state"));
+  CHECK(contains(refused(with("/action/3", {{"op", "add_state"}, {"columns", {1}}, {"state_columns", {0, 1}}})),
+                 "processor.recipe.action[3].state_columns: expected as many as columns"));
+}
+
+TEST_CASE("angles become sines and cosines, feature by feature") {
+  EditableBundle bundle = groot();
+  bundle.set("observation.states", std::vector<std::string>{"state.grip", "state.arm"});
+  bundle.set("observation.state_dims", std::vector<std::int64_t>{1, 2});
+  bundle.set("observation.state_names", std::vector<std::string>{"g", "a", "b"});
+  bundle.set("observation.state_units", std::vector<std::string>{"", "", ""});
+  Json recipe = Json::parse(kRecipe);
+  recipe["state"] = {{{"op", "threshold"}, {"columns", {0}}, {"above", 0.5}, {"then", 1.0}, {"else", 0.0}},
+                     {{"op", "sin_cos"}, {"columns", {1, 2}}},
+                     {{"op", "pad"}, {"size", 6}}};
+  bundle.set("processor.recipe", recipe.dump());
+  bundle.set("policy.d_state", std::int64_t{6});
+  Observation observation;
+  observation.states = {{"grip", {0.75f}}, {"arm", {0.5f, -2.0f}}};
+  Inputs inputs;
+  REQUIRE(make(bundle).encode_state(observation, inputs).ok());
+  const auto sine = [](double x) { return static_cast<float>(std::sin(x)); };
+  const auto cosine = [](double x) { return static_cast<float>(std::cos(x)); };
+  CHECK(inputs.state == std::vector<float>{1, sine(0.5), sine(-2), cosine(0.5), cosine(-2), 0});
+  CHECK(inputs.raw_state == std::vector<float>{1, 0.5f, -2});
+  recipe["state"][2]["size"] = 4;
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.state[2].size: expected at least the 5"));
+  recipe["state"][1]["columns"] = {2};
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(
+      refusal(create(bundle), Code::bad_bundle),
+      "processor.recipe.state[1].columns: expected all 2 columns of a feature from column 1, found 1 of them"));
 }
 
 TEST_CASE("ops on images end in size, and rows come first") {

@@ -52,9 +52,12 @@ TEST_CASE("the recipe of the document is read op by op") {
   CHECK(recipe->state[0]->reads("stats.observation.state.mean"));
   CHECK(recipe->state[0]->reads("stats.observation.state.std"));
   CHECK_FALSE(recipe->state[0]->reads("stats.observation.state.min"));
-  CHECK(recipe->state[1]->d_state(6) == 32);
+  std::vector<float> state(6);
+  std::vector<int> no_bins;
+  recipe->state[1]->finish(state, no_bins);
+  CHECK(state.size() == 32);
   REQUIRE(recipe->action.size() == 2);
-  std::vector<float> row(32);
+  std::vector<double> row(32);
   recipe->action[0]->apply(row, {});
   CHECK(row.size() == 7);
   CHECK(recipe->action[1]->reads("stats.action.min"));
@@ -222,10 +225,10 @@ TEST_CASE("ops of robots and of prompts with a state are read") {
   recipe->state.at(3)->finish(normalized, discretized);
   CHECK(discretized == std::vector<int>{-1, 128, 255});
   CHECK(normalized.empty());
-  std::vector<float> row(7, 1.0f);
-  recipe->action.at(2)->apply(row, state);
+  std::vector<double> row(7, 1.0);
+  recipe->action.at(2)->apply(row, {0, state});
   CHECK(row[1] == 0.25f);
-  recipe->action.at(3)->apply(row, state);
+  recipe->action.at(3)->apply(row, {0, state});
   CHECK(row[6] == 2.0f);
 }
 

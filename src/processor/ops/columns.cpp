@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "processor/ops/planes.h"
 #include "processor/recipe.h"
@@ -43,8 +44,10 @@ void map_columns(const Sign& op, std::span<float> values) {
 }
 
 void hold(const Clip& op, std::span<float> values) {
-  for (float& value : values)
+  for (const int column : chosen_columns(op.columns, values.size())) {
+    float& value = values[static_cast<std::size_t>(column)];
     if (std::isfinite(value)) value = std::clamp(value, op.low, op.high);
+  }
 }
 
 std::vector<int> bins(const Bins& op, std::span<const float> values) {
@@ -64,6 +67,19 @@ Status check_columns(const std::vector<int>& columns, std::size_t width, const s
     if (static_cast<std::size_t>(column) >= width)
       return misfit(where + ".columns", fmt::format("columns below {}", width), std::to_string(column));
   return {};
+}
+
+Result<SomeColumns> read_some_columns(JsonFields& fields) {
+  if (!fields.has("columns")) return SomeColumns();
+  VLA_TRY(std::vector<int> columns, fields.integers("columns", 0, kMaxVector - 1));
+  return SomeColumns(std::move(columns));
+}
+
+std::vector<int> chosen_columns(const SomeColumns& columns, std::size_t width) {
+  if (columns) return *columns;
+  std::vector<int> all(width);
+  std::iota(all.begin(), all.end(), 0);
+  return all;
 }
 
 namespace {
@@ -100,6 +116,7 @@ Status read(JsonFields& fields, Sign& op) {
 Status read(JsonFields& fields, Clip& op) {
   VLA_TRY(op.low, fields.number("low", kPlain));
   VLA_TRY(op.high, fields.number("high", kPlain));
+  VLA_TRY(op.columns, read_some_columns(fields));
   return op.low > op.high ? fields.wrong("high", "a number that is not below low") : Status();
 }
 
@@ -112,7 +129,7 @@ template <class Params>
 struct ColumnStateOp final : StateOp {
   Params params;
   Stage stage() const override { return Stage::convention; }
-  Status bind(const StateLayout& layout, const std::string& where) override {
+  Status bind(StateLayout& layout, const std::string& where) override {
     return check_columns(params.columns, layout.n_state, where);
   }
   void apply(std::span<float> state) const override { map_columns(params, state); }
@@ -132,7 +149,13 @@ Status parse_state(JsonFields& fields, Recipe& recipe) {
 struct ClipStateOp final : StateOp {
   Clip params;
   Stage stage() const override { return Stage::clipped; }
-  void apply(std::span<float> state) const override { clip(state, params.low, params.high); }
+  Status bind(StateLayout& layout, const std::string& where) override {
+    return check_columns(chosen_columns(params.columns, layout.n_state), layout.n_state, where);
+  }
+  void apply(std::span<float> state) const override {
+    for (const int column : chosen_columns(params.columns, state.size()))
+      clip(state.subspan(static_cast<std::size_t>(column), 1), params.low, params.high);
+  }
 };
 
 Status parse_state_clip(JsonFields& fields, Recipe& recipe) {
@@ -150,13 +173,24 @@ struct ColumnActionOp final : ActionOp {
   Status bind(ActionLayout& layout, const std::string& where) override {
     return check_columns(params.columns, static_cast<std::size_t>(layout.width), where);
   }
-  void apply(std::vector<float>& row, std::span<const float>) const override { map_columns(params, row); }
+  void apply(std::vector<double>& row, const RowPlace&) const override {
+    std::vector<float> rounded(row.begin(), row.end());
+    map_columns(params, rounded);
+    row.assign(rounded.begin(), rounded.end());
+  }
 };
 
 struct ClipActionOp final : ActionOp {
   Clip params;
-  Status bind(ActionLayout&, const std::string&) override { return {}; }
-  void apply(std::vector<float>& row, std::span<const float>) const override { hold(params, row); }
+  Status bind(ActionLayout& layout, const std::string& where) override {
+    const auto width = static_cast<std::size_t>(layout.width);
+    return check_columns(chosen_columns(params.columns, width), width, where);
+  }
+  void apply(std::vector<double>& row, const RowPlace&) const override {
+    std::vector<float> rounded(row.begin(), row.end());
+    hold(params, rounded);
+    row.assign(rounded.begin(), rounded.end());
+  }
 };
 
 template <class Op>
@@ -167,22 +201,31 @@ Status parse_action(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Adds the state, as it is before its normalization, to the columns named.
+/// Adds the state, as it is before its normalization, to the columns named. The sum is not rounded.
 struct AddStateOp final : ActionOp {
-  std::vector<int> columns;
+  std::vector<int> columns, state_columns;  // where nothing says otherwise these are the same
   Status bind(ActionLayout& layout, const std::string& where) override {
     layout.relative = true;
-    return check_columns(columns, std::min(static_cast<std::size_t>(layout.width), layout.n_state), where);
+    VLA_CHECK(check_columns(columns, static_cast<std::size_t>(layout.width), where));
+    for (const int column : state_columns)
+      if (static_cast<std::size_t>(column) >= layout.n_state)
+        return misfit(where, fmt::format("columns of the state below {}", layout.n_state), std::to_string(column));
+    return {};
   }
-  void apply(std::vector<float>& row, std::span<const float> raw_state) const override {
-    for (const int column : columns)
-      row[static_cast<std::size_t>(column)] += raw_state[static_cast<std::size_t>(column)];
+  void apply(std::vector<double>& row, const RowPlace& place) const override {
+    for (std::size_t i = 0; i < columns.size(); ++i)
+      row[static_cast<std::size_t>(columns[i])] += place.raw_state[static_cast<std::size_t>(state_columns[i])];
   }
 };
 
 Status parse_add_state(JsonFields& fields, Recipe& recipe) {
   auto op = std::make_unique<AddStateOp>();
   VLA_TRY(op->columns, fields.integers("columns", 0, kMaxVector - 1));
+  op->state_columns = op->columns;
+  if (fields.has("state_columns")) {
+    VLA_TRY(op->state_columns, fields.integers("state_columns", 0, kMaxVector - 1));
+  }
+  if (op->state_columns.size() != op->columns.size()) return fields.wrong("state_columns", "as many as columns");
   recipe.action.push_back(std::move(op));
   return {};
 }
@@ -192,6 +235,7 @@ Status parse_add_state(JsonFields& fields, Recipe& recipe) {
 Ops columns_ops() {
   return {{"state", "affine", parse_state<ColumnAffine>},
           {"state", "horn_angle", parse_state<HornAngle>},
+          {"state", "threshold", parse_state<Threshold>},
           {"state", "clip", parse_state_clip},
           {"action", "affine", parse_action<ColumnActionOp<ColumnAffine>>},
           {"action", "threshold", parse_action<ColumnActionOp<Threshold>>},

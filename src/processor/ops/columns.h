@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
@@ -12,6 +13,12 @@ namespace vla {
 
 /// The columns that an op names must exist. `where` is the op's place. Errors: bad_bundle.
 Status check_columns(const std::vector<int>& columns, std::size_t width, const std::string& where);
+
+/// The field "columns" where an op has it; without it the op works on all columns.
+using SomeColumns = std::optional<std::vector<int>>;
+Result<SomeColumns> read_some_columns(JsonFields& fields);
+/// The columns that are meant of `width`.
+std::vector<int> chosen_columns(const SomeColumns& columns, std::size_t width);
 
 /// `x * scale + shift` in the columns named.
 struct ColumnAffine {
@@ -46,6 +53,7 @@ struct Sign {
 struct Clip {
   float low = 0.0f;
   float high = 0.0f;
+  SomeColumns columns = {};
 };
 
 /// Numbers to whole numbers: how many of `count` evenly spaced edges from `low` on (`high` left out) are not above,
@@ -75,7 +83,8 @@ void map_columns(const Threshold& op, std::span<float> values);
 /// The sign of every value, in place: 0 of 0. What is not a number stays, so that it is still found.
 void map_columns(const Sign& op, std::span<float> values);
 
-/// Every value held between the two of a clip, in place. What is not a finite number stays, so that it is still found.
+/// Every value of its columns held between the two of a clip, in place. What is not a finite number stays, so that it
+/// is still found.
 void hold(const Clip& op, std::span<float> values);
 
 /// The whole number of each value: how many edges low + i * (high - low) / count, i in [0, count), are not above it,

@@ -19,18 +19,23 @@ namespace {
 using Spread = NormRule::Spread;
 using Eps = NormRule::Eps;
 
+using enum NormRule::Arithmetic;
+
 constexpr NormRule kRules[] = {
-    {"mean_std", "mean", "std", Spread::value, Eps::divides, false, false},
-    {"min_max", "min", "max", Spread::range, Eps::replaces_zero, false, false},
-    {"quantiles", "q01", "q99", Spread::range, Eps::replaces_zero, false, false},
-    {"quantile10", "q10", "q90", Spread::range, Eps::replaces_zero, false, false},
-    {"openpi_mean_std", "mean", "std", Spread::value, Eps::added, true, false},
-    {"openpi_quantiles", "q01", "q99", Spread::range, Eps::added, true, false},
-    {"evo1_mean_std", "mean", "std", Spread::value, Eps::added, false, false},
-    {"evo1_min_max", "min", "max", Spread::range, Eps::added, false, false},
-    {"evo1_quantiles", "q01", "q99", Spread::range, Eps::added, false, false},
-    {"groot_min_max", "min", "max", Spread::range, Eps::none, false, true},
-    {"groot_mean_std", "mean", "std", Spread::value, Eps::none, true, true},
+    {"mean_std", "mean", "std", Spread::value, Eps::divides, float32, false},
+    {"min_max", "min", "max", Spread::range, Eps::replaces_zero, float32, false},
+    {"quantiles", "q01", "q99", Spread::range, Eps::replaces_zero, float32, false},
+    {"quantile10", "q10", "q90", Spread::range, Eps::replaces_zero, float32, false},
+    {"openpi_mean_std", "mean", "std", Spread::value, Eps::added, float64, false},
+    {"openpi_quantiles", "q01", "q99", Spread::range, Eps::added, float64, false},
+    {"evo1_mean_std", "mean", "std", Spread::value, Eps::added, float32, false},
+    {"evo1_min_max", "min", "max", Spread::range, Eps::added, float32, false},
+    {"evo1_quantiles", "q01", "q99", Spread::range, Eps::added, float32, false},
+    {"groot_min_max", "min", "max", Spread::range, Eps::zero, numpy, true},
+    {"groot_mean_std", "mean", "std", Spread::value, Eps::kept_both_ways, numpy, true},
+    {"groot_n1_5_min_max", "min", "max", Spread::range, Eps::zero, float32, true},
+    {"groot_n1_5_quantiles", "q01", "q99", Spread::range, Eps::kept, float32, true},
+    {"groot_n1_5_mean_std", "mean", "std", Spread::value, Eps::kept, float32, true},
 };
 
 /// The spread in the precision of the rule.
@@ -41,11 +46,13 @@ double spread_of(const NormRule& rule, bool divides, T low, T high, T eps) {
   return rule.eps == Eps::replaces_zero && spread == 0 ? eps : spread;
 }
 
-Result<std::vector<double>> read_statistics(const Bundle& bundle, const std::string& name, int width,
-                                            const std::string& where) {
+Result<std::vector<double>> read_statistics(const Bundle& bundle, const std::string& name, std::size_t width,
+                                            std::size_t n_row, const std::string& where) {
   VLA_TRY(std::vector<double> values, bundle.stats(name));
-  if (values.size() == static_cast<std::size_t>(width)) return values;
-  return Error{Code::bad_bundle, name, fmt::format("{} numbers for {}", width, where), std::to_string(values.size())};
+  if (values.size() == width || values.size() == n_row * width) return values;
+  const std::string rows = n_row > 1 ? fmt::format(", or {} rows of them", n_row) : "";
+  return Error{Code::bad_bundle, name, fmt::format("{} numbers{} for {}", width, rows, where),
+               std::to_string(values.size())};
 }
 
 }  // namespace
@@ -61,21 +68,30 @@ Normalizer::Normalizer(const NormRule& rule, Direction direction, double eps, st
     : rule_(&rule), direction_(direction), low_(std::move(low)) {
   const bool divides = direction == Direction::normalize;
   for (std::size_t i = 0; i < low_.size(); ++i)
-    spread_.push_back(rule.wide ? spread_of<double>(rule, divides, low_[i], high[i], eps)
-                                : spread_of<float>(rule, divides, static_cast<float>(low_[i]),
-                                                   static_cast<float>(high[i]), static_cast<float>(eps)));
+    spread_.push_back(rule.arithmetic == float32
+                          ? spread_of<float>(rule, divides, static_cast<float>(low_[i]), static_cast<float>(high[i]),
+                                             static_cast<float>(eps))
+                          : spread_of<double>(rule, divides, low_[i], high[i], eps));
 }
 
 Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormRule& rule, const std::string& stats, double eps,
-                                      Direction direction, int width, const std::string& where) {
-  VLA_TRY(std::vector<double> low, read_statistics(bundle, fmt::format("{}.{}", stats, rule.low), width, where));
-  VLA_TRY(const std::vector<double> high,
-          read_statistics(bundle, fmt::format("{}.{}", stats, rule.high), width, where));
+                                      Direction direction, int width, const std::string& where, int n_row) {
+  const auto n_column = static_cast<std::size_t>(width);
+  const auto read = [&](const char* statistic) {
+    return read_statistics(bundle, fmt::format("{}.{}", stats, statistic), n_column, static_cast<std::size_t>(n_row),
+                           where);
+  };
+  VLA_TRY(std::vector<double> low, read(rule.low));
+  VLA_TRY(const std::vector<double> high, read(rule.high));
+  if (low.size() != high.size())
+    return Error{Code::bad_bundle, fmt::format("{}.{}", stats, rule.high), fmt::format("{} numbers", low.size()),
+                 std::to_string(high.size())};
   Normalizer normalizer(rule, direction, eps, std::move(low), high);
+  normalizer.row_step_ = high.size() > n_column ? n_column : 0;
   if (direction == Direction::unnormalize) return normalizer;
   for (std::size_t i = 0; i < normalizer.spread_.size(); ++i) {
     const auto divisor = static_cast<float>(normalizer.spread_[i]);
-    if ((divisor == 0.0f && rule.eps != Eps::none) || !std::isfinite(divisor))
+    if ((divisor == 0.0f && rule.has_eps()) || !std::isfinite(divisor))
       return Error{Code::bad_bundle, stats, fmt::format("a spread to divide by in column {}", i),
                    fmt::format("{} with eps {}", divisor, eps)};
   }
@@ -83,17 +99,26 @@ Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormRule& rule
 }
 
 template <class T>
-T Normalizer::mapped(T x, std::size_t column) const {
-  const T low = static_cast<T>(low_[column]), spread = static_cast<T>(spread_[column]);
-  const bool range = rule_->spread == Spread::range, normalize = direction_ == Direction::normalize;
-  if (spread == 0 && rule_->eps == Eps::none && (normalize || !range)) return range ? T{0} : x;
-  if (normalize) return range ? 2 * (x - low) / spread - 1 : (x - low) / spread;
+T Normalizer::mapped(T x, std::size_t i) const {
+  const T low = static_cast<T>(low_[i]), spread = static_cast<T>(spread_[i]);
+  const bool range = rule_->spread == Spread::range;
+  if (direction_ == Direction::normalize) return range ? 2 * (x - low) / spread - 1 : (x - low) / spread;
   return range ? (x + 1) / 2 * spread + low : x * spread + low;
 }
 
-void Normalizer::apply(std::span<float> values) const {
-  for (std::size_t i = 0; i < values.size(); ++i)
-    values[i] = rule_->wide ? static_cast<float>(mapped<double>(values[i], i)) : mapped<float>(values[i], i);
+double Normalizer::mapped_by_numpy(float x, std::size_t i) const {
+  if (rule_->spread == Spread::value) return static_cast<float>(mapped<double>(x, i));
+  if (direction_ == Direction::normalize) return 2 * static_cast<float>((x - low_[i]) / spread_[i]) - 1;
+  return static_cast<double>((x + 1) / 2) * spread_[i] + low_[i];
+}
+
+double Normalizer::map(float x, std::size_t column, std::size_t row) const {
+  const std::size_t i = row * row_step_ + column;
+  const bool normalize = direction_ == Direction::normalize;
+  if (spread_[i] == 0 && !rule_->has_eps() && (normalize || rule_->eps == Eps::kept_both_ways))
+    return rule_->eps == Eps::zero ? 0.0f : x;
+  if (rule_->arithmetic == numpy) return mapped_by_numpy(x, i);
+  return rule_->arithmetic == float64 ? static_cast<float>(mapped<double>(x, i)) : mapped<float>(x, i);
 }
 
 // --- the ops "normalize" and "unnormalize" --------------------------------------------------------------------------
@@ -105,6 +130,7 @@ struct Fields {
   std::string stats;               // prefix of the statistics' tensor names
   double eps = 0.0;
   std::string feature;  // full name of the state feature that it works on; empty: the whole vector
+  SomeColumns columns;  // of what it works on; the others pass
 
   bool reads(const std::string& tensor) const {
     return rule != nullptr &&
@@ -123,11 +149,12 @@ Status read(JsonFields& fields, Fields& op) {
   if (op.rule != nullptr || fields.has("eps")) {
     VLA_TRY(op.eps, fields.wide_number("eps", {0, 1}));
   }
-  if (op.rule != nullptr && op.rule->eps == Eps::none && op.eps != 0.0)
+  if (op.rule != nullptr && !op.rule->has_eps() && op.eps != 0.0)
     return fields.wrong("eps", "0, since these kinds have none");
   if (fields.has("feature")) {
     VLA_TRY(op.feature, fields.string("feature"));
   }
+  VLA_TRY(op.columns, read_some_columns(fields));
   return {};
 }
 
@@ -136,22 +163,22 @@ class NormalizeOp final : public StateOp {
   Fields fields;
 
   Stage stage() const override { return Stage::normalized; }
-  Status bind(const StateLayout& layout, const std::string& where) override;
+  Status bind(StateLayout& layout, const std::string& where) override;
   void apply(std::span<float> state) const override {
-    for (const Normalizer& normalizer : normalizer_) normalizer.apply(state.subspan(offset_, width_));
+    for (std::size_t i = 0; i < state.size(); ++i)
+      if (normalizes(i)) state[i] = static_cast<float>(normalizer_->map(state[i], i - offset_));
   }
-  std::span<const float> normalized(std::span<const float> state) const override {
-    return normalizer_.empty() ? std::span<const float>() : state.subspan(offset_, width_);
-  }
+  bool normalizes(std::size_t column) const override { return column < chosen_.size() && chosen_[column]; }
   bool reads(const std::string& tensor) const override { return fields.reads(tensor); }
 
  private:
-  std::vector<Normalizer> normalizer_;  // none for identity
-  std::size_t offset_ = 0, width_ = 0;  // of the columns that it works on
+  std::optional<Normalizer> normalizer_;  // none for identity
+  std::size_t offset_ = 0;                // column of the first statistic
+  std::vector<bool> chosen_;              // of each number whether it is normalized
 };
 
-Status NormalizeOp::bind(const StateLayout& layout, const std::string& where) {
-  width_ = layout.n_state;
+Status NormalizeOp::bind(StateLayout& layout, const std::string& where) {
+  std::size_t width = layout.n_state;
   const auto& names = layout.features.names();
   const bool joint = fields.rule != nullptr && fields.rule->joint;
   if (!fields.feature.empty() || (names.size() > 1 && !joint)) {
@@ -160,19 +187,22 @@ Status NormalizeOp::bind(const StateLayout& layout, const std::string& where) {
       return misfit(where + ".feature", "one of " + layout.features.listed(), "\"" + fields.feature + "\"");
     const auto before = layout.dims.first(index);
     offset_ = static_cast<std::size_t>(std::accumulate(before.begin(), before.end(), 0));
-    width_ = static_cast<std::size_t>(layout.dims[index]);
+    width = static_cast<std::size_t>(layout.dims[index]);
   }
   if (fields.rule == nullptr) return {};
-  VLA_TRY(Normalizer normalizer, Normalizer::create(layout.bundle, *fields.rule, fields.stats, fields.eps,
-                                                    Normalizer::Direction::normalize, static_cast<int>(width_), where));
-  normalizer_.push_back(std::move(normalizer));
+  const std::vector<int> columns = chosen_columns(fields.columns, width);
+  VLA_CHECK(check_columns(columns, width, where));
+  chosen_.resize(layout.n_state);
+  for (const int column : columns) chosen_[offset_ + static_cast<std::size_t>(column)] = true;
+  VLA_TRY(normalizer_, Normalizer::create(layout.bundle, *fields.rule, fields.stats, fields.eps,
+                                          Normalizer::Direction::normalize, static_cast<int>(width), where));
   return {};
 }
 
 Status parse_normalize(JsonFields& fields, Recipe& recipe) {
   const auto last = recipe.state.empty() ? StateOp::Stage::convention : recipe.state.back()->stage();
   if (last == StateOp::Stage::end) return misplaced(fields, "nothing after pad, bins or drop");
-  if (last == StateOp::Stage::clipped) return misplaced(fields, "normalize before clip");
+  if (last >= StateOp::Stage::clipped) return misplaced(fields, "normalize before clip and sin_cos");
   auto op = std::make_unique<NormalizeOp>();
   VLA_CHECK(read(fields, op->fields));
   recipe.state.push_back(std::move(op));
@@ -182,35 +212,34 @@ Status parse_normalize(JsonFields& fields, Recipe& recipe) {
 class UnnormalizeOp final : public ActionOp {
  public:
   Fields fields;
-  std::optional<std::vector<int>> columns;  // the others pass
 
   Status bind(ActionLayout& layout, const std::string& where) override {
     if (fields.rule == nullptr) return {};
-    if (columns) VLA_CHECK(check_columns(*columns, static_cast<std::size_t>(layout.width), where));
-    VLA_TRY(Normalizer normalizer, Normalizer::create(layout.bundle, *fields.rule, fields.stats, fields.eps,
-                                                      Normalizer::Direction::unnormalize, layout.width, where));
-    normalizer_.push_back(std::move(normalizer));
+    const auto width = static_cast<std::size_t>(layout.width);
+    columns_ = chosen_columns(fields.columns, width);
+    VLA_CHECK(check_columns(columns_, width, where));
+    VLA_TRY(normalizer_,
+            Normalizer::create(layout.bundle, *fields.rule, fields.stats, fields.eps,
+                               Normalizer::Direction::unnormalize, layout.width, where, std::max(1, layout.n_row)));
     return {};
   }
-  void apply(std::vector<float>& row, std::span<const float>) const override {
-    std::vector<float> mapped = row;
-    for (const Normalizer& normalizer : normalizer_) normalizer.apply(mapped);
-    if (!columns) return row.swap(mapped);
-    for (const int column : *columns) row[static_cast<std::size_t>(column)] = mapped[static_cast<std::size_t>(column)];
+  void apply(std::vector<double>& row, const RowPlace& place) const override {
+    for (const int column : columns_) {
+      const auto i = static_cast<std::size_t>(column);
+      row[i] = normalizer_->map(static_cast<float>(row[i]), i, place.index);
+    }
   }
   bool reads(const std::string& tensor) const override { return fields.reads(tensor); }
 
  private:
-  std::vector<Normalizer> normalizer_;  // none for identity
+  std::optional<Normalizer> normalizer_;  // none for identity
+  std::vector<int> columns_;
 };
 
 Status parse_unnormalize(JsonFields& fields, Recipe& recipe) {
   auto op = std::make_unique<UnnormalizeOp>();
   VLA_CHECK(read(fields, op->fields));
   if (!op->fields.feature.empty()) return fields.wrong("feature", "no such field here");
-  if (fields.has("columns")) {
-    VLA_TRY(op->columns, fields.integers("columns", 0, kMaxVector - 1));
-  }
   recipe.action.push_back(std::move(op));
   return {};
 }

@@ -58,23 +58,24 @@ struct StateLayout {
   const FeatureNames& features;
   std::span<const int> dims;  // of each feature
   std::size_t n_state;        // numbers of all features together
+  std::size_t width;          // what the ops so far leave of them
 };
 
 class StateOp {
  public:
   /// The order in which the kinds of ops may follow each other; only the last op is of kind `end`.
-  enum class Stage { convention, normalized, clipped, end };
+  enum class Stage { convention, normalized, clipped, widened, end };
 
   virtual ~StateOp() = default;
   virtual Stage stage() const = 0;
-  /// Reads statistics and checks sizes. `where` is the op's place in the recipe. Errors: bad_bundle.
-  virtual Status bind(const StateLayout&, const std::string& /*where*/) { return {}; }
+  /// Reads statistics, checks sizes, and changes the layout's width where the op does. `where` is the op's place in the
+  /// recipe. Errors: bad_bundle.
+  virtual Status bind(StateLayout&, const std::string& /*where*/) { return {}; }
   virtual void apply(std::span<float> /*state*/) const {}
-  /// The part of a state that `apply` has normalized by statistics.
-  virtual std::span<const float> normalized(std::span<const float> /*state*/) const { return {}; }
-  /// Of kind `end`: what the network sees of the state, and what goes into the prompt.
+  /// Whether `apply` has normalized this number by statistics.
+  virtual bool normalizes(std::size_t /*column*/) const { return false; }
+  /// Of kinds `widened` and `end`: what the network sees of the state, and what goes into the prompt.
   virtual void finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const {}
-  virtual std::size_t d_state(std::size_t n_state) const { return n_state; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 
@@ -87,13 +88,19 @@ struct ActionLayout {
   bool relative = false;  // to the state
 };
 
+/// What a row of a chunk belongs to.
+struct RowPlace {
+  std::size_t index;                 // in the chunk
+  std::span<const float> raw_state;  // the state before its normalization
+};
+
 class ActionOp {
  public:
   virtual ~ActionOp() = default;
   /// Reads statistics, checks sizes, and changes the layout where the op does. Errors: bad_bundle.
   virtual Status bind(ActionLayout& layout, const std::string& where) = 0;
-  /// One row, in place. `raw_state` is the state before its normalization.
-  virtual void apply(std::vector<float>& row, std::span<const float> raw_state) const = 0;
+  /// One row, in place. Its numbers are float32, but for those of an op that says otherwise; the last are rounded.
+  virtual void apply(std::vector<double>& row, const RowPlace& place) const = 0;
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 

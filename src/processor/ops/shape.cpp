@@ -4,6 +4,8 @@
 // What ends the list of a state, and what of a chunk is for the robot.
 #include <fmt/format.h>
 
+#include <utility>
+
 #include "processor/ops/columns.h"
 #include "processor/recipe.h"
 
@@ -14,31 +16,38 @@ struct PadOp final : StateOp {
   int size = 0;
   float value = 0.0f;
   Stage stage() const override { return Stage::end; }
-  Status bind(const StateLayout& layout, const std::string& where) override {
-    if (static_cast<std::size_t>(size) >= layout.n_state) return {};
-    return misfit(where + ".size", fmt::format("at least the {} numbers of the state", layout.n_state),
-                  std::to_string(size));
+  Status bind(StateLayout& layout, const std::string& where) override {
+    const std::size_t before = std::exchange(layout.width, static_cast<std::size_t>(size));
+    if (layout.width >= before) return {};
+    return misfit(where + ".size", fmt::format("at least the {} numbers of the state", before), std::to_string(size));
   }
-  void finish(std::vector<float>& state, std::vector<int>&) const override { state.resize(d_state(0), value); }
-  std::size_t d_state(std::size_t) const override { return static_cast<std::size_t>(size); }
+  void finish(std::vector<float>& state, std::vector<int>&) const override {
+    state.resize(static_cast<std::size_t>(size), value);
+  }
 };
 
 /// The state goes into the prompt as whole numbers.
 struct BinsOp final : StateOp {
   Bins params;
   Stage stage() const override { return Stage::end; }
+  Status bind(StateLayout& layout, const std::string& where) override {
+    if (std::exchange(layout.width, 0) == layout.n_state) return {};
+    return misfit(where, "bins of the state's own numbers", "them behind sin_cos");
+  }
   void finish(std::vector<float>& state, std::vector<int>& discretized) const override {
     discretized = bins(params, state);
     state.clear();
   }
-  std::size_t d_state(std::size_t) const override { return 0; }
 };
 
 /// The network sees no state.
 struct DropOp final : StateOp {
   Stage stage() const override { return Stage::end; }
+  Status bind(StateLayout& layout, const std::string&) override {
+    layout.width = 0;
+    return {};
+  }
   void finish(std::vector<float>& state, std::vector<int>&) const override { state.clear(); }
-  std::size_t d_state(std::size_t) const override { return 0; }
 };
 
 Status read(JsonFields& fields, PadOp& op) {
@@ -78,9 +87,7 @@ struct TakeOp final : ActionOp {
     layout.width = size;
     return {};
   }
-  void apply(std::vector<float>& row, std::span<const float>) const override {
-    row.resize(static_cast<std::size_t>(size));
-  }
+  void apply(std::vector<double>& row, const RowPlace&) const override { row.resize(static_cast<std::size_t>(size)); }
 };
 
 Status parse_take(JsonFields& fields, Recipe& recipe) {
@@ -101,7 +108,7 @@ struct RowsOp final : ActionOp {
     layout.n_row = count;
     return {};
   }
-  void apply(std::vector<float>&, std::span<const float>) const override {}
+  void apply(std::vector<double>&, const RowPlace&) const override {}
 };
 
 Status parse_rows(JsonFields& fields, Recipe& recipe) {
