@@ -79,6 +79,22 @@ def test_n1_5_takes_the_row_and_the_statistics_that_its_data_config_names(conver
     assert found["text"][1]["text"].endswith("{instruction}<|im_end|>\n<|im_start|>assistant\n")
 
 
+def test_keys_of_n1_5_have_modes_of_their_own(converter):
+    modes = {"x": "mean_std", "y": "q99", "z": "sin_cos", "roll": "binary", "pitch": None}
+    bundle = converter.bundle(Changed(N1_5, DATA, lambda c: c["state"].update(modes)), **N1_5.options)
+    normalize = {"op": "normalize", "stats": "stats.observation.state", "eps": 0.0}
+    assert recipe(bundle)["state"] == [
+        {"op": "threshold", "columns": [3], "above": 0.5, "then": 1.0, "else": 0.0},
+        {**normalize, "kind": "groot_n1_5_min_max", "columns": [5, 6, 7]},
+        {**normalize, "kind": "groot_n1_5_quantiles", "columns": [1]},
+        {**normalize, "kind": "groot_n1_5_mean_std", "columns": [0]},
+        {"op": "clip", "low": -1.0, "high": 1.0, "columns": [1]},
+        {"op": "sin_cos", "columns": [2]},
+        {"op": "pad", "size": 14},
+    ]
+    assert np.count_nonzero(bundle.tensors["stats.observation.state.mean"]) == 1
+
+
 DATA, META = "data_config.json", "experiment_cfg/metadata.json"
 REFUSED = {
     "config.json: backbone_cfg: project_to_dim: expected None, found 1536": (
@@ -86,8 +102,9 @@ REFUSED = {
     "action_head_cfg: num_target_vision_tokens: expected a whole number": (
         "config.json", lambda c: c["action_head_cfg"].pop("num_target_vision_tokens")),
     "action_head_cfg: new_thing: expected a key": ("config.json", lambda c: c["action_head_cfg"].update(new_thing=1)),
-    "state: expected one mode for all keys, found mean_std, min_max": (DATA, lambda c: c["state"].update(x="mean_std")),
-    "action: expected keys with one of min_max, q99, mean_std": (DATA, lambda c: c["action"].update(gripper="binary")),
+    "action: expected keys with one of min_max, q99, mean_std, binary, null": (DATA, lambda c: c["action"].update(gripper="sin_cos")),
+    "modalities.state.x: expected mode binary for numbers that are not continuous, found min_max": (
+        META, lambda c: c["my_arm"]["modalities"]["state"].update(x={"continuous": False})),
     "statistics.state.y.max: expected finite numbers, found None": (
         META, lambda c: c["my_arm"]["statistics"]["state"]["y"].pop("max")),
     "modalities.video: expected one resolution for the cameras image, wrist_image": (
@@ -104,6 +121,6 @@ def test_what_of_n1_5_changes_numbers_is_refused_by_name(converter, message):
 
 def test_n1_5_asks_for_its_data_config_and_its_robot(converter):
     error = converter.refusal(Changed(N1_5), embodiment="my_arm")
-    assert "--variant: expected one of fourier_gr1_full_upper_body, so100" in error.message() and error.code == Code.USAGE
+    assert "--variant: expected one of fourier_gr1_arms_only, fourier_gr1_arms_waist" in error.message() and error.code == Code.USAGE
     error = converter.refusal(Changed(N1_5), embodiment="nobody", variant=DATA)
     assert "--embodiment: expected the tag of the robot" in error.message() and "my_arm" in error.message()

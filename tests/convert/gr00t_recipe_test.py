@@ -53,7 +53,7 @@ def test_statistics_stand_one_after_the_other_in_the_order_of_keys(converter, pe
     bundle = convert(converter, tiny)
     for feature, kind, keys in ((STATE, "state", ("gripper", "x")), (ACTION, "action", ("x", "gripper"))):
         for ours, theirs in (("min", low), ("max", high)):
-            stored = np.concatenate([tiny.statistics[TAG][kind][key][theirs] for key in keys]).astype(np.float32)
+            stored = np.concatenate([tiny.statistics[TAG][kind][key][theirs] for key in keys])
             np.testing.assert_array_equal(bundle.tensors["{}.{}".format(feature, ours)], stored)
 
 
@@ -68,7 +68,61 @@ def test_relative_actions_of_a_checkpoint_without_them_are_as_good_as_absolute(c
     tiny.kwargs["use_relative_action"] = False
     bundle = convert(converter, tiny)
     assert recipe(bundle)["action"][-1]["op"] == "unnormalize"
-    assert bundle.tensors[ACTION + ".min"][0] == np.float32(tiny.statistics[TAG]["action"]["x"]["q01"][0])
+    assert bundle.tensors[ACTION + ".min"][0] == tiny.statistics[TAG]["action"]["x"]["q01"][0]
+
+
+def test_relative_actions_may_have_ranges_for_each_row_of_which_the_robots_are_kept(converter):
+    tiny = TinyGr00t().relative()
+    tiny.statistics[TAG]["relative_action"]["x"] = {"min": [[-1.0], [-2], [-3], [-4], [-5]], "max": [[1.0], [2], [3], [4], [5]]}
+    low = convert(converter, tiny).tensors[ACTION + ".min"]
+    assert low.shape == (4, 2) and low[:, 0].tolist() == [-1, -2, -3, -4]
+    assert set(low[:, 1]) == {tiny.statistics[TAG]["action"]["gripper"]["q01"][0]}
+
+
+def test_relative_actions_are_added_to_the_columns_of_the_state_that_they_are_relative_to(converter):
+    tiny = TinyGr00t().relative()
+    tiny.robots[TAG]["state"]["modality_keys"].reverse()
+    assert recipe(convert(converter, tiny))["action"][-1] == {"op": "add_state", "columns": [0], "state_columns": [2]}
+
+
+@pytest.mark.parametrize("pose, width", [("XYZ_ROT6D", 9), ("XYZ_ROTVEC", 6)])
+def test_relative_poses_are_composed_with_the_states(converter, pose, width):
+    tiny = TinyGr00t().relative(type="EEF", format=pose)
+    tiny.robots[TAG]["state"]["modality_keys"].reverse()
+    action = tiny.robots[TAG]["action"]
+    action.update(modality_keys=["x"], action_configs=action["action_configs"][:1])
+    wide = {"min": [-1.0] * width, "max": [1.0] * width, "q01": [-1.0] * width, "q99": [1.0] * width}
+    for kind in ("state", "action", "relative_action"):
+        tiny.statistics[TAG][kind]["x"] = wide
+    found = recipe(convert(converter, tiny))["action"][-1]
+    assert found == {"op": "compose_pose", "format": pose.lower(), "column": 0, "state_column": 2}
+
+
+def test_keys_are_normalized_each_in_its_own_way(converter):
+    tiny = TinyGr00t()
+    tiny.kwargs["apply_sincos_state_encoding"] = True
+    tiny.robots[TAG]["state"].update(sin_cos_embedding_keys=["x"], mean_std_embedding_keys=["x", "gripper"])
+    tiny.robots[TAG]["action"]["mean_std_embedding_keys"] = ["gripper"]
+    bundle = convert(converter, tiny)
+    state, action = recipe(bundle)["state"], recipe(bundle)["action"]
+    assert [(op["op"], op.get("kind"), op.get("columns")) for op in state] == [
+        ("normalize", "groot_mean_std", [1, 2]),
+        ("sin_cos", None, [0]),
+        ("pad", None, None),
+    ]
+    assert [(op["op"], op.get("kind"), op.get("columns")) for op in action[2:]] == [
+        ("clip", None, [0]),
+        ("unnormalize", "groot_min_max", [0]),
+        ("unnormalize", "groot_mean_std", [1]),
+    ]
+    assert bundle.tensors[ACTION + ".std"].tolist() == [0.0, tiny.statistics[TAG]["action"]["gripper"]["std"][0]]
+
+
+def test_what_hardly_moved_counts_as_still_where_the_reference_finds_it_close(converter):
+    tiny = TinyGr00t()
+    tiny.statistics[TAG]["state"]["x"].update(q01=[100.0], q99=[100.0005])
+    bundle = convert(converter, tiny)
+    assert bundle.tensors[STATE + ".max"][0] == bundle.tensors[STATE + ".min"][0] == 100.0
 
 
 def test_keys_of_means_and_deviations_are_not_clipped(converter):

@@ -81,11 +81,6 @@ UNSUPPORTED = {
     "processor_config.json: new_thing: expected a key that this converter knows": {"kwargs/new_thing": 1},
     "processor_config.json: image_target_size: expected [side, side] or null": {"kwargs/image_target_size": [12, 16]},
     "arm.state: delta_indices: expected [0]": {ARM + "state/delta_indices": [-1, 0]},
-    "arm.state: sin_cos_embedding_keys: expected none": {
-        ARM + "state/sin_cos_embedding_keys": ["x"],
-        "kwargs/apply_sincos_state_encoding": True,
-    },
-    "arm.state: mean_std_embedding_keys: expected all keys or none": {ARM + "state/mean_std_embedding_keys": ["x"]},
     "arm.state: new_thing: expected a key that this converter knows": {ARM + "state/new_thing": 1},
     "rope_scaling: mrope_interleaved: expected True": {"backbone/text_config/rope_scaling/mrope_interleaved": False},
     "rope_scaling: rope_type: expected 'default'": {"backbone/text_config/rope_scaling/rope_type": "yarn"},
@@ -130,8 +125,20 @@ BAD = {
     "arm.action: delta_indices: expected a list of steps": {ARM + "action/delta_indices": []},
     "statistics.json: arm: expected statistics, found none": {"statistics/" + TAG: REMOVED},
     "statistics.json: arm.state.x.q01: expected numbers, found none": {STATS + "state/x/q01": REMOVED},
-    "statistics.json: arm.state.gripper: expected 2 numbers, found 2 and 1": {STATS + "state/gripper/q99": [1.0]},
-    "statistics.json: arm.action.x.q99: expected finite numbers, found inf": {STATS + "action/x/q99": [1e39]},
+    "statistics.json: arm.state.gripper: expected statistics of one shape, found (2,) and (1,)": {STATS + "state/gripper/q99": [1.0]},
+    "statistics.json: arm.state.x.std: expected numbers, found none": {
+        ARM + "state/mean_std_embedding_keys": ["x"],
+        STATS + "state/x/std": REMOVED,
+    },
+    "statistics.json: state: expected at most max_state_dim 11 numbers, found 12": {
+        ARM + "state/sin_cos_embedding_keys": ["gripper"],
+        "kwargs/apply_sincos_state_encoding": True,
+        STATS + "state/gripper/q01": [0.0] * 5,
+        STATS + "state/gripper/q99": [1.0] * 5,
+        STATS + "state/x/q01": [0.0] * 2,
+        STATS + "state/x/q99": [1.0] * 2,
+    },
+    "statistics.json: arm.action.x.q99: expected numbers that float32 holds, found 1e+39": {STATS + "action/x/q99": [1e39]},
     "statistics.json: state: expected at most max_state_dim 11 numbers, found 13": {
         STATS + "state/gripper/q01": [0.0] * 12,
         STATS + "state/gripper/q99": [1.0] * 12,
@@ -169,7 +176,10 @@ def test_what_changes_numbers_is_refused_by_name(converter, message):
 @pytest.mark.parametrize(
     "how, message",
     [
-        (dict(type="EEF", format="XYZ_ROT6D"), "(x): type: expected NON_EEF, found 'EEF'"),
+        (dict(type="EEF", format="XYZ_ROT6D"), "(x): format: expected a key of 9 numbers, found XYZ_ROT6D of 1"),
+        (dict(type="EEF", format="DEFAULT"), "(x): format: expected XYZ_ROT6D or XYZ_ROTVEC, found 'DEFAULT'"),
+        (dict(type="WHEEL"), "(x): type: expected EEF or NON_EEF, found 'WHEEL'"),
+        (dict(format="XYZ_ROT6D"), "(x): format: expected DEFAULT, since the type is NON_EEF"),
         (dict(state_key=["x"]), "(x): state_key: expected a state of 1 numbers, found none"),
         (dict(state_key="nobody"), "(x): state_key: expected a state of 1 numbers, found none"),
         (dict(state_key="gripper"), "(x): state_key: expected a state of 1 numbers, found 2 numbers"),
@@ -179,18 +189,20 @@ def test_relative_actions_that_the_recipe_cannot_hold_are_refused(converter, how
     assert message in converter.refusal(TinyGr00t().relative(**how), embodiment=TAG).message()
 
 
-def test_ranges_for_each_step_are_refused(converter):
+@pytest.mark.parametrize(
+    "low, high, message",
+    [
+        ([[-1.0]] * 3, [[1.0]] * 3, "relative_action.x.min: expected a row for each of 4 actions, found 3 rows"),
+        ([[-1.0]] * 4, [1.0], "relative_action.x: expected statistics of one shape, found (4, 1) and (1,)"),
+        ([[-1.0], []] * 2, [[1.0]] * 4, "relative_action.x.min: expected numbers, found [[-1.0], []"),
+        ([[-1.0, 0.0]] * 4, [[1.0, 2.0]] * 4, "relative_action.x: expected 1 numbers, found 2"),
+        ([[-1.0]] * 4, [[1e39]] * 4, "relative_action.x.max: expected numbers that float32 holds, found 1e+39"),
+    ],
+)
+def test_statistics_for_each_row_that_do_not_fit_are_refused(converter, low, high, message):
     tiny = TinyGr00t().relative()
-    tiny.statistics[TAG]["relative_action"]["x"] = {"min": [[-1.0]] * 4, "max": [[1.0]] * 4}
-    error = converter.refusal(tiny, embodiment=TAG)
-    assert "relative_action.x: expected a number for each column, found 4 rows" in error.message()
-    assert error.code == Code.UNSUPPORTED and len(error.problems) == 1
-
-
-def test_actions_relative_to_other_columns_are_refused(converter):
-    tiny = TinyGr00t().relative()
-    tiny.robots[TAG]["state"]["modality_keys"].reverse()
-    assert "relative action x: state x: expected in the columns" in converter.refusal(tiny, embodiment=TAG).message()
+    tiny.statistics[TAG]["relative_action"]["x"] = {"min": low, "max": high}
+    assert message in converter.refusal(tiny, embodiment=TAG).message()
 
 
 def test_missing_extra_and_misplaced_tensors_are_refused(converter):

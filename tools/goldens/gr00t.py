@@ -36,6 +36,10 @@ class Robot:
     relative: dict = field(default_factory=dict)  # action key -> the state key that it is added to, None: of the same name
     zero_spread: tuple = ()
     moments: tuple = (0,)  # steps at which frames are taken
+    poses: dict = field(default_factory=dict)  # relative action key -> format of the pose that it is
+    mean_std: tuple = ()  # keys of states and actions
+    sin_cos: tuple = ()  # keys of states
+    per_step: bool = False  # relative actions have statistics for each row
 
     def statistics(self, seed):
         return statistics(sum(self.states.values()), sum(self.actions.values()), seed, self.zero_spread)
@@ -149,7 +153,8 @@ class Checkpoint:
             "color_jitter_params": None, "shortest_image_edge": None, "crop_fraction": None, "letter_box_transform": False,
             "model_name": self.CONFIG["model_name"], "model_type": self.CONFIG["backbone_model_type"], "formalize_language": True,
             "max_state_dim": self.head["max_state_dim"], "max_action_dim": self.head["max_action_dim"], "max_action_horizon": self.head["action_horizon"],
-            "use_percentiles": self.percentiles, "use_mean_std": False, "clip_outliers": True, "apply_sincos_state_encoding": False,
+            "use_percentiles": self.percentiles, "use_mean_std": False, "clip_outliers": True,
+            "apply_sincos_state_encoding": any(robot.sin_cos for _, robot in self.robots.values()),
             "use_relative_action": any(robot.relative for _, robot in self.robots.values()), "exclude_state": False,
             "state_dropout_prob": 0.2}
         return {"processor_class": self.PROCESSOR_CLASS, "processor_kwargs": settings | self.SETTINGS | self.image}
@@ -157,21 +162,27 @@ class Checkpoint:
     def statistics(self, seed):
         out = {}
         for i, (tag, (_, robot)) in enumerate(self.robots.items()):
-            flat, changes = robot.statistics(seed + i), robot.statistics(seed + i + 1000)["action"]
-            relative = per_key(changes, robot.actions)
+            flat = robot.statistics(seed + i)
+            steps = [per_key(robot.statistics(seed + i + 1000 + t)["action"], robot.actions) for t in range(robot.rows)]
+            relative = steps[0]
+            if robot.per_step:
+                relative = {key: {name: [step[key][name] for step in steps] for name in steps[0][key]} for key in robot.actions}
             out[tag] = {"state": per_key(flat["observation.state"], robot.states), "action": per_key(flat["action"], robot.actions),
                         "relative_action": {key: relative[key] for key in robot.relative}}
         return out
 
 
 def modalities(robot):
-    def part(keys, deltas, actions=None):
-        return {"delta_indices": deltas, "modality_keys": list(keys), "sin_cos_embedding_keys": None, "mean_std_embedding_keys": None,
-                "action_configs": actions}
+    def part(keys, deltas, actions=None, sin_cos=(), mean_std=()):
+        return {"delta_indices": deltas, "modality_keys": list(keys), "sin_cos_embedding_keys": list(sin_cos) or None,
+                "mean_std_embedding_keys": [key for key in keys if key in mean_std] or None, "action_configs": actions}
 
-    configs = [RELATIVE | {"state_key": robot.relative[k]} if k in robot.relative else ABSOLUTE for k in robot.actions]
-    return {"video": part(robot.views, list(robot.moments)), "state": part(robot.states, [0]),
-            "action": part(robot.actions, list(range(robot.rows)), configs),
+    def config(key):
+        pose = {"type": "EEF", "format": robot.poses[key]} if key in robot.poses else {}
+        return RELATIVE | {"state_key": robot.relative[key]} | pose if key in robot.relative else ABSOLUTE
+
+    return {"video": part(robot.views, list(robot.moments)), "state": part(robot.states, [0], None, robot.sin_cos, robot.mean_std),
+            "action": part(robot.actions, list(range(robot.rows)), [config(key) for key in robot.actions], (), robot.mean_std),
             "language": part(["annotation.human.action.task_description"], [0])}
 
 

@@ -24,6 +24,7 @@ from .parameters import linear, norm, siglip
 ROOT = "backbone.eagle_model."
 INDEX = 1  # of the robot among those of the weights
 MODES = {"min_max": ("min", "max"), "q99": ("q01", "q99"), "mean_std": ("mean", "std")}
+UNSCALED = {"binary": lambda x: (x > 0.5).astype(np.float32), "sin_cos": lambda x: np.concatenate([np.sin(x), np.cos(x)]), None: lambda x: x}
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ class Checkpoint(gr00t.Checkpoint):
                   for tag, part in self.statistics(seed).items()}
         write_json(Path(folder) / "experiment_cfg/metadata.json", robots, indent=1)
         write_json(Path(folder) / "data_config.json", {
-            "video": list(self.robot.views), "state": dict.fromkeys(self.robot.states, self.image["state"]),
-            "action": dict.fromkeys(self.robot.actions, self.image["action"]), "horizon": self.robot.rows, "crop": self.image["crop"],
+            "video": list(self.robot.views), "state": modes(self.robot.states, self.image["state"]),
+            "action": modes(self.robot.actions, self.image["action"]), "horizon": self.robot.rows, "crop": self.image["crop"],
             "projector_index": INDEX}, indent=1)
         return n
 
@@ -82,6 +83,11 @@ class Checkpoint(gr00t.Checkpoint):
             "architectures": ["Eagle2_5_VLForConditionalGeneration"], "model_type": "eagle_2_5_vl", "downsample_ratio": 0.5,
             "image_token_index": TOKENS["<IMG_CONTEXT>"], "mlp_connector_layers": 1, "select_layer": -1, "use_pixel_shuffle": False,
             "text_config": text_config(self.text), "vision_config": vision}, indent=2)
+
+
+def modes(keys, mode):
+    """mode: of all keys, or a dictionary of them; a key that it leaves out passes as it is."""
+    return {key: mode.get(key) for key in keys} if isinstance(mode, dict) else dict.fromkeys(keys, mode)
 
 
 # --- cases -----------------------------------------------------------------------------------------------------------
@@ -120,6 +126,14 @@ CASES = {
     "gr00t_n1_5/faint": arm(84, {"camera": (32, 32, "png")}, "Go on", Checkpoint(
         "my_arm", INDEX, Robot(("camera",), {"x": 1, "hand": 3}, {"x": 1, "hand": 2}, 3),
         vision(16, 2, 2, 24, 28), text(24, 4, 3, 1, 8, 32), head(3, (4, 2, 10), (1, 3, 8), 14, 6, 5, 4), camera(32, 32), faint=True)),
+    # Every mode in which a key may be normalized, in one robot; numbers beyond their ranges.
+    "gr00t_n1_5/modes": arm(85, {"camera": (32, 32, "png")}, "wipe the table", Checkpoint(
+        "my_arm", INDEX, Robot(("camera",), {"arm": 3, "hand": 2, "pose": 3, "grip": 2, "base": 1, "lift": 1},
+                               {"base": 1, "grip": 2, "hand": 2, "pose": 2, "arm": 2}, 3),
+        vision(16, 2, 2, 24, 28), text(24, 4, 3, 1, 8, 32), head(3, (4, 2, 10), (1, 3, 8), 14, 16, 11, 4),
+        camera(32, 32, {"arm": "sin_cos", "hand": "mean_std", "pose": "q99", "grip": "binary", "lift": "min_max"},
+               {"grip": "binary", "hand": "mean_std", "pose": "q99", "arm": "min_max"})),
+        state=(0.5, -3.25, 2.5, 0.75, -2.0, 3.5, -4.0, 0.1, 0.75, 0.25, -1.5, 2.0)),
 }
 
 # --- the reference ---------------------------------------------------------------------------------------------------
@@ -213,17 +227,24 @@ class Reference:
         return (np.asarray(self.statistics[kind][key][name], np.float32) for name in MODES[self.robot[kind][key]])
 
     def normalized(self, key, x):
+        mode = self.robot["state"][key]
+        if mode in UNSCALED:
+            return UNSCALED[mode](x)
         low, high = self.limits("state", key)
-        if self.robot["state"][key] == "mean_std":
+        if mode == "mean_std":
             return np.where(high == 0, x, (x - low) / np.where(high == 0, 1, high))
-        y = np.where(high == low, 0, 2 * (x - low) / np.where(high == low, 1, high - low) - 1)
-        return np.clip(y, -1, 1) if self.robot["state"][key] == "q99" else y
+        y = 2 * (x - low) / np.where(high == low, 1, high - low) - 1
+        return np.clip(np.where(high == low, x, y), -1, 1) if mode == "q99" else np.where(high == low, 0, y)
 
     def actions(self, chunk):
         out = []
         for key, x in self.parts("action", chunk):
+            mode = self.robot["action"][key]
+            if mode in UNSCALED:
+                out.append(UNSCALED[mode](x))
+                continue
             low, high = self.limits("action", key)
-            out.append(x * high + low if self.robot["action"][key] == "mean_std" else (x + 1) / 2 * (high - low) + low)
+            out.append(x * high + low if mode == "mean_std" else (x + 1) / 2 * (high - low) + low)
         return np.concatenate(out, -1).astype(np.float32)
 
     @property

@@ -133,6 +133,14 @@ CASES = {
         "oxe_google", 1, Robot(("camera",), {"x": 1, "hand": 3}, {"x": 1, "hand": 2}, 3),
         vision(16, 2, 2, 24, 3), text(24, 4, 3, 1, 8, 32), head(3, (5, 2, 10), None, 14, 6, 5, 4),
         {"shortest_image_edge": 16, "crop_fraction": 0.9}, faint=True)),
+    # Every way in which a key may be normalized, in one robot: ranges, percentiles apart, means and deviations, sines and cosines; poses
+    # by rotation vectors relative to the state, with one range for all rows.
+    "gr00t_n1_6/mixed": case(65, {"camera": (16, 16, "png")}, "wipe the table", Checkpoint(
+        "behavior_r1_pro", 2, Robot(
+            ("camera",), {"arm": 3, "hand": 2, "wrist_pose": 6, "base": 2}, {"base": 2, "hand_pose": 6, "hand": 2, "arm": 3}, 3,
+            {"hand_pose": "wrist_pose", "arm": None}, poses={"hand_pose": "XYZ_ROTVEC"}, mean_std=("hand",), sin_cos=("arm",)),
+        vision(16, 2, 2, 24, 3), text(24, 4, 3, 1, 8, 32), head(3, (5, 2, 10), None, 14, 18, 14, 4),
+        {"shortest_image_edge": 16, "crop_fraction": 0.9})),
 }
 
 # --- the reference ---------------------------------------------------------------------------------------------------
@@ -309,8 +317,17 @@ class RobotNumbers:
                 y = np.where(table["std"] == 0, x, x * table["std"] + table["mean"])
             else:
                 y = (np.clip(x, -1, 1) + 1) / 2 * (high - low) + low
-            out.append(y + states[how["state_key"] or key] if relative else y)
+            reference = states[how["state_key"] or key]
+            out.append(y if not relative else y + reference if how["type"] == "NON_EEF" else composed(reference, y))
         return np.concatenate(out, -1).astype(np.float32)
+
+
+def composed(reference, poses):
+    """Poses by rotation vectors, as seen from where the reference pose is."""
+    from scipy.spatial.transform import Rotation
+
+    turn, turns = Rotation.from_rotvec(reference[3:]), Rotation.from_rotvec(poses[:, 3:])
+    return np.concatenate([turn.apply(poses[:, :3]) + reference[:3], (turn * turns).as_rotvec()], -1)
 
 
 def load(checkpoint, dtype="float32"):

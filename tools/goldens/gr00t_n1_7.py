@@ -153,6 +153,14 @@ CASES = {
         "xdof", 1, Robot(("front", "wrist"), {"joints": 4}, {"joints": 4}, 4, moments=(-15, 0)),
         vision(16, 3, 2, 24, 5, (0, 1, 2)), text(24, 5, 3, 1, 8, 32, (2, 1, 1)),
         head(4, (4, 2, 10), (1, 3, 8), 14, 6, 5, 5), {"image_target_size": [16, 16], "image_crop_size": [15, 15]}, 16)),
+    # A pose and joints relative to the state, with ranges for each row of the chunk, beside a gripper that is absolute; the pose's
+    # columns are not those of the state.
+    "gr00t_n1_7/poses": case(48, {"front": (20, 20, "png")}, "stack the cups", Checkpoint(
+        "oxe_droid_relative_eef_relative_joint", 2, Robot(
+            ("front",), {"joint_position": 3, "gripper_position": 1, "eef_9d": 9}, {"eef_9d": 9, "gripper_position": 1, "joint_position": 3}, 4,
+            {"eef_9d": None, "joint_position": None}, poses={"eef_9d": "XYZ_ROT6D"}, per_step=True),
+        vision(16, 3, 2, 24, 5, (0, 1, 2)), text(24, 5, 3, 1, 8, 32, (2, 1, 1)),
+        head(4, (4, 2, 10), (1, 3, 8), 14, 15, 14, 5), {"image_target_size": [16, 16], "image_crop_size": [15, 15]}, 16, percentiles=True)),
 }
 
 # --- the reference ---------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ server starts: here --variant names it, or a JSON file with the same content.
 from __future__ import annotations
 
 import os
-from typing import Dict, List, NamedTuple, Tuple
+from typing import Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from .gr00t import head
 from .gr00t.eagle import EAGLE_2_5
 from .gr00t.pictures import STANDARDIZE, Pictures
 from .gr00t.plan import Parts, assemble, network_keys_of
-from .gr00t.robot import Group, Robot, choose
+from .gr00t.robot import BINARY, SIN_COS, Group, Robot, choose
 from .gr00t.sizes import MAX_LAYERS, Sizes
 
 POLICY, METADATA = "config.json", os.path.join("experiment_cfg", "metadata.json")
@@ -44,7 +44,15 @@ HEAD_IGNORED = set(
     detection_coeff freeze_decode_layer expand_batch vl_self_attention_dtype model_type""".split()
 )
 EMBODIMENTS = {"new_embodiment": 31, "oxe_droid": 17, "agibot_genie1": 26, "gr1": 24}
-NAMES = {"min_max": ("min", "max"), "q99": ("q01", "q99"), "mean_std": ("mean", "std")}
+# Modes of a key with the recipe's kind and the statistics that it takes; a key without a mode passes as it is.
+MODES = {
+    "min_max": ("groot_n1_5_min_max", ("min", "max")),
+    "q99": ("groot_n1_5_quantiles", ("q01", "q99")),
+    "mean_std": ("groot_n1_5_mean_std", ("mean", "std")),
+    "binary": (BINARY, ("min", "max")),
+    "sin_cos": (SIN_COS, ("min", "max")),
+    None: ("", ("min", "max")),
+}
 EDGE, CROP, HORIZON = 224, 0.95, 16
 
 
@@ -52,26 +60,32 @@ class DataConfig(NamedTuple):
     """What a robot sends and gets, and how its numbers are normalized."""
 
     video: Tuple[str, ...]
-    state: Dict[str, str]  # key -> mode
-    action: Dict[str, str]
+    state: Dict[str, Optional[str]]  # key -> mode
+    action: Dict[str, Optional[str]]
     horizon: int = HORIZON
     crop: float = CROP
     index: int = -1  # of the robot among those of the weights, where its tag does not say it
 
 
-def _all(keys: str, mode: str = "min_max") -> Dict[str, str]:
+def _all(keys: str, mode: str = "min_max") -> Dict[str, Optional[str]]:
     return dict.fromkeys(keys.split(), mode)
 
 
 ARMS = "left_arm right_arm left_hand right_hand"
 XYZ = "x y z roll pitch yaw"
-# gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py of Isaac-GR00T: those that normalize all keys in one way.
+AGIBOT = "left_arm_joint_position right_arm_joint_position left_effector_position right_effector_position head_position waist_position"
+# gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py of Isaac-GR00T: those that convert no rotations.
 CONFIGS = {
+    "fourier_gr1_arms_only": DataConfig(("ego_view",), _all(ARMS, "sin_cos"), _all(ARMS)),
+    "fourier_gr1_arms_waist": DataConfig(("ego_view",), _all(ARMS + " waist", "sin_cos"), _all(ARMS + " waist")),
     "fourier_gr1_full_upper_body": DataConfig(("front_view",), _all(ARMS + " waist neck"), _all(ARMS + " waist neck")),
     "so100": DataConfig(("webcam",), _all("single_arm gripper"), _all("single_arm gripper")),
     "so100_dualcam": DataConfig(("front", "wrist"), _all("single_arm gripper"), _all("single_arm gripper")),
     "unitree_g1": DataConfig(("rs_view",), _all(ARMS), _all(ARMS)),
     "unitree_g1_full_body": DataConfig(("rs_view",), _all("left_leg right_leg waist " + ARMS), _all(ARMS)),
+    "agibot_genie1": DataConfig(
+        ("top_head", "hand_left", "hand_right"), _all(AGIBOT), _all(AGIBOT + " robot_velocity")
+    ),
     "libero": DataConfig(("image", "wrist_image"), _all(XYZ + " gripper"), _all(XYZ + " gripper")),
 }
 
@@ -92,7 +106,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     robot = _robot(config, metadata, min(config.horizon, s.horizon), problems)
     pictures = _pictures(config, metadata, s, problems)
     problems.raise_any()
-    parts = Parts(EAGLE_2_5, folder, robot, pictures, clip_states=robot.clips, clip_actions=False, formalize=False)
+    parts = Parts(EAGLE_2_5, folder, robot, pictures, formalize=False)
     return assemble(parts, network_keys(s, n_future), weights(s, n_future), checkpoint, options, s, problems)
 
 
@@ -125,10 +139,10 @@ def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
     video = [view for view in member(section.values, "video", list, name) if isinstance(view, str)]
     modes = [member(section.values, part, dict, name) for part in ("state", "action")]
     for part, keys in zip(("state", "action"), modes):
-        if not keys or not all(mode in NAMES for mode in keys.values()):
-            section.bad(part, "keys with one of " + ", ".join(NAMES), str(keys)[:80], unsupported=True)
-        elif len(set(keys.values())) > 1:
-            section.bad(part, "one mode for all keys", ", ".join(sorted(set(keys.values()))), unsupported=True)
+        allowed = [mode for mode in MODES if part == "state" or mode != "sin_cos"]
+        if not keys or not all(mode in allowed for mode in keys.values()):
+            expected = "keys with one of " + ", ".join(mode or "null" for mode in allowed)
+            section.bad(part, expected, str(keys)[:80], unsupported=True)
     crop = section.number("crop")
     if not video or crop > 1:
         section.bad("video", "names of cameras, and a crop of at most 1", str(video))
@@ -156,18 +170,18 @@ def read_sizes(config: dict, folder: str, problems: Problems) -> Tuple[Sizes, in
 
 
 def _robot(config: DataConfig, metadata: dict, n_row: int, problems: Problems) -> Robot:
-    statistics = member(metadata, "statistics", dict, METADATA)
     groups = []
     for part, modes in (("state", config.state), ("action", config.action)):
-        table = member(statistics, part, dict, METADATA)
-        groups.append([_group(part, key, mode, table, problems) for key, mode in modes.items()])
-    return Robot(list(config.video), groups[0], groups[1], n_row, set(config.state.values()) == {"q99"})
+        groups.append([_group(part, key, mode, metadata, problems) for key, mode in modes.items()])
+    return Robot(list(config.video), groups[0], groups[1], n_row)
 
 
-def _group(part: str, key: str, mode: str, table: dict, problems: Problems) -> Group:
+def _group(part: str, key: str, mode: Optional[str], metadata: dict, problems: Problems) -> Group:
     where = "{}: statistics.{}.{}".format(METADATA, part, key)
+    table = member(member(metadata, "statistics", dict, METADATA), part, dict, METADATA)
+    kind, names = MODES[mode]
     columns = []
-    for name in NAMES[mode]:
+    for name in names:
         values = member(table, key, dict, where).get(name)
         numbers = isinstance(values, list) and values and all(type(v) in (int, float) for v in values)
         columns.append(np.asarray(values if numbers else [0.0], np.float32))
@@ -177,10 +191,11 @@ def _group(part: str, key: str, mode: str, table: dict, problems: Problems) -> G
     if low.size != high.size:
         problems.add(where, "statistics of one width", "{} and {}".format(low.size, high.size))
         high = low
-    # In a range without width the reference leaves q99 states as they are, and gives the mean of actions.
-    if (mode == "q99" or (mode == "mean_std" and part == "action")) and (high == (low if mode == "q99" else 0)).any():
-        problems.unsupported(where, "numbers that move", "one that never did")
-    return Group(key, low.size, low, high, mode == "mean_std")
+    described = member(member(metadata, "modalities", dict, METADATA), part, dict, METADATA)
+    if member(described, key, dict, METADATA).get("continuous") is False and mode not in ("binary", None):
+        place = "{}: modalities.{}.{}".format(METADATA, part, key)
+        problems.add(place, "mode binary for numbers that are not continuous", str(mode))
+    return Group(key, low.size, kind, low, high, part == "state" and mode == "q99")
 
 
 def _pictures(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) -> Pictures:

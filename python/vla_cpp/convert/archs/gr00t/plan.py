@@ -96,8 +96,7 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     if processor.count("max_state_dim") != s.d_state:
         processor.bad("max_state_dim", "{} as in config.json".format(s.d_state))
     s.image_width, s.image_height = pictures.width, pictures.height
-    clip, formalize = processor.get("clip_outliers"), processor.get("formalize_language")
-    parts = Parts(backbone, folder, robot, pictures, clip, True, formalize)
+    parts = Parts(backbone, folder, robot, pictures, processor.get("formalize_language"))
     return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
 
 
@@ -108,8 +107,6 @@ class Parts(NamedTuple):
     folder: str  # the backbone's
     robot: Robot
     pictures: Pictures
-    clip_states: bool
-    clip_actions: bool
     formalize: bool  # instructions are cleaned
 
 
@@ -130,8 +127,8 @@ def assemble(
     document = {
         "image": parts.pictures.ops,
         "text": text_ops(backbone.TEMPLATE, parts.formalize, prompt, s),
-        "state": state_ops(robot, parts.clip_states, s, problems),
-        "action": action_ops(robot, parts.clip_actions, s, problems),
+        "state": state_ops(robot, s, problems),
+        "action": action_ops(robot, s, problems),
     }
     if options.gripper_sign:
         document["action"] += gripper_ops(robot, options.gripper_sign, problems)
@@ -174,7 +171,10 @@ def read_sizes(release: Release, config: dict, folder: str, problems: Problems) 
     policy.refuse_unknown({*release.config, *release.fixed, *IGNORED, *release.ignored})
     policy.check_fixed(release.fixed)
     release.backbone.read(folder, policy.count("select_layer", most=MAX_LAYERS), s, problems)
-    s.d_action, s.attend_text_every_n_blocks = policy.count("max_action_dim"), policy.count("attend_text_every_n_blocks")
+    s.d_action, s.attend_text_every_n_blocks = (
+        policy.count("max_action_dim"),
+        policy.count("attend_text_every_n_blocks"),
+    )
     head.read(policy, s)
     return s
 

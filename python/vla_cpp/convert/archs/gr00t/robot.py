@@ -8,7 +8,7 @@ Reference: Isaac-GR00T gr00t/data/state_action/state_action_processor.py, gr00t/
 from __future__ import annotations
 
 import os
-from typing import Dict, List, NamedTuple, Sequence
+from typing import Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -23,15 +23,23 @@ MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_st
 MAX_WIDTH = 1 << 16
 
 
+# How the numbers of a key are normalized: a kind of the recipe's ops normalize and unnormalize, one of these, or "" for as they are.
+SIN_COS, BINARY = "sin_cos", "binary"
+RANGE, DEVIATION = "groot_min_max", "groot_mean_std"
+POSES = {"XYZ_ROT6D": 9, "XYZ_ROTVEC": 6}  # formats of poses, and how many numbers they have
+
+
 class Group(NamedTuple):
     """The numbers that stand under one key of states or actions."""
 
     key: str
     width: int
-    low: np.ndarray  # min, the lower quantile, or mean
+    kind: str
+    low: np.ndarray  # min, the lower quantile, or mean: (width,), or (row of a chunk, width)
     high: np.ndarray  # max, the upper quantile, or std
-    mean_std: bool = False
-    reference: str = ""  # of a relative action: the state's key that it is added to
+    clips: bool = False  # normalized they are held between -1 and 1
+    reference: str = ""  # of a relative action: the state's key that it is relative to
+    pose: str = ""  # of a relative pose: its format
 
 
 class Robot(NamedTuple):
@@ -39,7 +47,6 @@ class Robot(NamedTuple):
     states: List[Group]
     actions: List[Group]
     n_row: int  # actions of a chunk that are meant for this robot
-    clips: bool = False  # states are held between -1 and 1
 
 
 def processor_file(checkpoint: Checkpoint, name: str) -> str:
@@ -100,6 +107,7 @@ class _Reader:
     def __init__(self, tag: str, config: dict, statistics: dict, processor: Section, problems: Problems) -> None:
         self.tag, self.config, self.problems, self.processor = tag, config, problems, processor
         self.percentiles, self.relative = processor.get("use_percentiles"), processor.get("use_relative_action")
+        self.clips, self.sin_cos = processor.get("clip_outliers"), processor.get("apply_sincos_state_encoding")
         self.statistics = member(statistics, tag, dict, STATISTICS)
         if tag not in statistics:
             problems.add(
@@ -135,64 +143,54 @@ class _Reader:
     def listed(self, section: Section, name: str) -> List[str]:
         return [key for key in member(section.values, name, list, section.where) if isinstance(key, str)]
 
-    def group(self, kind: str, key: str, mean_std: bool, reference: str = "", width: int = 0) -> Group:
-        """`width`: of the same key's absolute actions, where these statistics are of relative ones."""
-        names = (
-            ("mean", "std") if mean_std else ("q01", "q99") if self.percentiles and not reference else ("min", "max")
-        )
-        where = "{}: {}.{}.{}".format(STATISTICS, self.tag, kind, key)
-        stated = member(member(self.statistics, kind, dict, where), key, dict, where)
-        if self.per_step(where, stated.get(names[0])):
-            return Group(key, width, np.zeros(width, np.float32), np.ones(width, np.float32))
-        low, high = (self.numbers("{}.{}".format(where, name), stated.get(name)) for name in names)
-        if low.size != high.size or (width and low.size != width):
-            self.problems.add(where, "{} numbers".format(width or low.size), "{} and {}".format(low.size, high.size))
-            high = low
-        if mean_std and (high < 0).any():
-            self.problems.add(where + ".std", "numbers >= 0", str(high.min()))
-        return Group(key, low.size, low, high, mean_std, reference)
+    def statistic(self, part: str, key: str, names: Tuple[str, str], n_row: int = 0) -> List[np.ndarray]:
+        """Two statistics of a key. `n_row`: how many rows they must have at least where there is one for each action of a chunk."""
+        where = "{}: {}.{}.{}".format(STATISTICS, self.tag, part, key)
+        stated = member(member(self.statistics, part, dict, where), key, dict, where)
+        found = [self.numbers("{}.{}".format(where, name), stated.get(name), n_row) for name in names]
+        if found[0].shape != found[1].shape:
+            self.problems.add(where, "statistics of one shape", "{} and {}".format(*(x.shape for x in found)))
+            found[1] = found[0]
+        if names == ("mean", "std") and (found[1] < 0).any():
+            self.problems.add(where + ".std", "numbers >= 0", str(found[1].min()))
+        return found
 
-    def per_step(self, where: str, values) -> bool:
-        nested = isinstance(values, list) and any(isinstance(value, list) for value in values)
-        if nested:
-            hint = "ranges of their own for each step of a chunk are not supported yet"
-            self.problems.unsupported(where, "a number for each column", "{} rows".format(len(values)), hint)
-        return nested
-
-    def numbers(self, where: str, values) -> np.ndarray:
-        numbers = isinstance(values, list) and all(
-            isinstance(v, (int, float)) and not isinstance(v, bool) for v in values
+    def numbers(self, where: str, values, n_row: int) -> np.ndarray:
+        nested = n_row > 0 and isinstance(values, list) and any(isinstance(row, list) for row in values)
+        rows = values if nested else [values]
+        sound = all(
+            isinstance(row, list) and row and len(row) == len(rows[0]) and all(type(v) in (int, float) for v in row)
+            for row in rows
         )
-        if not numbers or not 1 <= len(values) <= MAX_WIDTH:
+        if not sound or len(rows[0]) > MAX_WIDTH:
             self.problems.add(where, "numbers", "none" if not values else str(values)[:80])
-            return np.zeros(1, np.float32)
+            return np.zeros(1)
+        if nested and len(rows) < n_row:
+            self.problems.add(where, "a row for each of {} actions".format(n_row), "{} rows".format(len(rows)))
         with np.errstate(over="ignore"):  # told below
-            chosen = np.asarray(values, np.float64).astype(np.float32)
-        if not np.isfinite(chosen).all():
-            self.problems.add(where, "finite numbers", str(chosen[~np.isfinite(chosen)][0]))
-        return chosen
+            fits = np.isfinite(np.asarray(rows, np.float64).astype(np.float32))
+        if not fits.all():
+            self.problems.add(where, "numbers that float32 holds", str(np.asarray(rows)[~fits][0]))
+        return np.asarray(rows[:n_row] if nested else rows[0], np.float64)
+
+    def range_names(self) -> Tuple[str, str]:
+        return ("q01", "q99") if self.percentiles else ("min", "max")
 
     def states(self) -> List[Group]:
         section = self.modality("state")
         self.one_step(section, "states")
-        if self.processor.get("apply_sincos_state_encoding") and self.listed(section, "sin_cos_embedding_keys"):
-            section.bad(
-                "sin_cos_embedding_keys",
-                "none",
-                hint="sines and cosines of states are not supported yet",
-                unsupported=True,
-            )
         mean_std = self.listed(section, "mean_std_embedding_keys")
-        groups = [self.group("state", key, key in mean_std) for key in section.get("modality_keys")]
-        self.check_one_kind(section, groups)
+        turns = self.listed(section, "sin_cos_embedding_keys") if self.sin_cos else []
+        groups = []
+        for key in section.get("modality_keys"):
+            kind = SIN_COS if key in turns else DEVIATION if key in mean_std else RANGE
+            low, high = self.statistic("state", key, ("mean", "std") if kind == DEVIATION else self.range_names())
+            if kind == RANGE:  # the reference gives 0 where it finds the two close, which is by their size
+                high = np.where(np.isclose(high, low), low, high)
+            groups.append(Group(key, low.size, kind, low, high, kind == RANGE and self.clips))
         return groups
 
-    def check_one_kind(self, section: Section, groups: Sequence[Group]) -> None:
-        if len({group.mean_std for group in groups}) > 1:
-            hint = "ranges for some keys and standard deviations for others are not supported yet"
-            section.bad("mean_std_embedding_keys", "all keys or none", hint=hint, unsupported=True)
-
-    def actions(self, states: Sequence[Group]) -> List[Group]:
+    def actions(self, states: Sequence[Group], n_row: int) -> List[Group]:
         section = self.modality("action")
         configs = member(section.values, "action_configs", list, section.where)
         keys, mean_std = section.get("modality_keys"), self.listed(section, "mean_std_embedding_keys")
@@ -205,32 +203,47 @@ class _Reader:
         groups = []
         for i, key in enumerate(keys):
             how = Section("{}: action_configs[{}] ({})".format(section.where, i, key), configs[i], {}, self.problems)
-            group = self.group("action", key, key in mean_std)
-            if self.is_relative(how, key in mean_std):
-                reference = str(how.get("state_key") or key)
-                group = self.group("relative_action", key, False, reference, group.width)
-                if widths.get(reference) != group.width:
-                    found = "none" if reference not in widths else "{} numbers".format(widths[reference])
-                    how.bad("state_key", "a state of {} numbers".format(group.width), found)
-            groups.append(group)
-        self.check_one_kind(section, groups)
+            kind, names = (DEVIATION, ("mean", "std")) if key in mean_std else (RANGE, self.range_names())
+            low, high = self.statistic("action", key, names)
+            group = Group(key, low.size, kind, low, high, kind == RANGE)
+            groups.append(self.relative_group(group, how, widths, n_row) if self.is_relative(how) else group)
         return groups
 
-    def is_relative(self, how: Section, mean_std: bool) -> bool:
+    def relative_group(self, group: Group, how: Section, widths: Dict[str, int], n_row: int) -> Group:
+        """The same key by the statistics of its relative actions, which are never percentiles. `widths`: of the states."""
+        reference, pose = str(how.get("state_key") or group.key), self.pose(how, group.width)
+        names = ("mean", "std") if group.kind == DEVIATION else ("min", "max")
+        low, high = self.statistic("relative_action", group.key, names, n_row)
+        if low.shape[-1] != group.width:
+            where = "{}: {}.relative_action.{}".format(STATISTICS, self.tag, group.key)
+            self.problems.add(where, "{} numbers".format(group.width), str(low.shape[-1]))
+        if widths.get(reference) != group.width:
+            found = "none" if reference not in widths else "{} numbers".format(widths[reference])
+            how.bad("state_key", "a state of {} numbers".format(group.width), found)
+        return group._replace(low=low, high=high, reference=reference, pose=pose)
+
+    def is_relative(self, how: Section) -> bool:
         for key in sorted(set(how.values) - {"rep", "type", "format", "state_key"}):
             how.bad(key, "a key that this converter knows", unsupported=True)
-        rep, kind = how.get("rep"), how.get("type")
+        rep = how.get("rep")
         if rep not in ("ABSOLUTE", "DELTA", "RELATIVE"):
             how.bad("rep", "ABSOLUTE, DELTA or RELATIVE", unsupported=True)
-        if rep != "RELATIVE" or not self.relative:
-            return False
-        if kind != "NON_EEF":
-            how.bad(
-                "type", "NON_EEF", hint="poses relative to the end effector's are not supported yet", unsupported=True
-            )
-        if mean_std:
-            how.bad("rep", "ABSOLUTE where mean_std_embedding_keys names the key", unsupported=True)
-        return True
+        return rep == "RELATIVE" and bool(self.relative)
+
+    def pose(self, how: Section, width: int) -> str:
+        """The format of a relative pose; "" where the numbers are added one by one."""
+        kind, pose = how.get("type"), how.get("format")
+        if kind == "NON_EEF":
+            if pose != "DEFAULT":
+                how.bad("format", "DEFAULT, since the type is NON_EEF", unsupported=True)
+            return ""
+        if kind != "EEF":
+            how.bad("type", "EEF or NON_EEF", unsupported=True)
+        elif pose not in POSES:
+            how.bad("format", " or ".join(POSES), unsupported=True)
+        elif POSES[pose] != width:
+            how.bad("format", "a key of {} numbers".format(POSES[pose]), "{} of {}".format(pose, width))
+        return str(pose).lower()
 
 
 def views(video: Section) -> List[str]:
@@ -249,10 +262,9 @@ def read_robot(tag: str, config: dict, statistics: dict, processor: Section, hor
     reader = _Reader(tag, config, statistics, processor, problems)
     video = reader.modality("video")
     cameras = views(video)
-    states = reader.states()
-    actions = reader.actions(states)
     steps = reader.modality("action").get("delta_indices")
     if not isinstance(steps, list) or not steps:
         problems.add("{}: {}.action: delta_indices".format(PROCESSOR, tag), "a list of steps", repr(steps)[:80])
         steps = [0]
-    return Robot(cameras, states, actions, min(len(steps), horizon))
+    n_row, states = min(len(steps), horizon), reader.states()
+    return Robot(cameras, states, reader.actions(states, n_row), n_row)

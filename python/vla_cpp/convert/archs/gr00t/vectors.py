@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List, Sequence
+from typing import Callable, Dict, List, Sequence
 
 import numpy as np
 
@@ -13,39 +13,79 @@ from ...bundle import Key
 from ...errors import Code, Problems
 from ...features import feature_keys
 from .. import Options
-from .robot import PROCESSOR, STATISTICS, Group, Robot
+from .robot import BINARY, DEVIATION, PROCESSOR, RANGE, SIN_COS, STATISTICS, Group, Robot
 from .sizes import Sizes
+
+# The statistics that a kind of normalization reads.
+NAMES = {
+    RANGE: ("min", "max"),
+    DEVIATION: ("mean", "std"),
+    "groot_n1_5_min_max": ("min", "max"),
+    "groot_n1_5_quantiles": ("q01", "q99"),
+    "groot_n1_5_mean_std": ("mean", "std"),
+}
 
 
 def _total(groups: Sequence[Group]) -> int:
     return sum(group.width for group in groups)
 
 
-def _op(name: str, feature: str, groups: Sequence[Group]) -> dict:
-    kind = "groot_mean_std" if groups[0].mean_std else "groot_min_max"
-    return {"op": name, "kind": kind, "stats": "stats." + feature, "eps": 0.0}
+def _columns(groups: Sequence[Group], holds: Callable[[Group], bool]) -> List[int]:
+    starts = _starts(groups)
+    return [starts[group.key] + i for group in groups if holds(group) for i in range(group.width)]
 
 
-def state_ops(robot: Robot, clip_outliers: bool, s: Sizes, problems: Problems) -> List[dict]:
-    if _total(robot.states) > s.d_state:
-        problems.add(
-            STATISTICS + ": state", "at most max_state_dim {} numbers".format(s.d_state), str(_total(robot.states))
-        )
-    clip = clip_outliers and not robot.states[0].mean_std
-    limits = [{"op": "clip", "low": -1.0, "high": 1.0}] if clip else []
-    return [_op("normalize", recipe.STATE, robot.states), *limits, {"op": "pad", "size": s.d_state}]
+def _on(groups: Sequence[Group], holds: Callable[[Group], bool], op: dict) -> List[dict]:
+    """The op on the columns of the groups that it is meant for; nothing where there are none."""
+    columns = _columns(groups, holds)
+    if not columns:
+        return []
+    return [op if len(columns) == _total(groups) else {**op, "columns": columns}]
 
 
-def action_ops(robot: Robot, clip: bool, s: Sizes, problems: Problems) -> List[dict]:
+def _normalize(name: str, feature: str, groups: Sequence[Group]) -> List[dict]:
+    ops: List[dict] = []
+    for kind in NAMES:
+        op = {"op": name, "kind": kind, "stats": "stats." + feature, "eps": 0.0}
+        ops += _on(groups, lambda group, kind=kind: group.kind == kind, op)
+    return ops
+
+
+def _binary(groups: Sequence[Group]) -> List[dict]:
+    columns = _columns(groups, lambda group: group.kind == BINARY)
+    return [{"op": "threshold", "columns": columns, "above": 0.5, "then": 1.0, "else": 0.0}] if columns else []
+
+
+def _clip(groups: Sequence[Group]) -> List[dict]:
+    return _on(groups, lambda group: group.clips, {"op": "clip", "low": -1.0, "high": 1.0})
+
+
+def state_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
+    turns = _columns(robot.states, lambda group: group.kind == SIN_COS)
+    width = _total(robot.states) + len(turns)
+    if width > s.d_state:
+        problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(s.d_state), str(width))
+    return [
+        *_binary(robot.states),
+        *_normalize("normalize", recipe.STATE, robot.states),
+        *_clip(robot.states),
+        *([{"op": "sin_cos", "columns": turns}] if turns else []),
+        {"op": "pad", "size": s.d_state},
+    ]
+
+
+def action_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
     width = _total(robot.actions)
     if width > s.d_action:
         problems.add(STATISTICS + ": action", "at most max_action_dim {} numbers".format(s.d_action), str(width))
-    held = clip and not robot.actions[0].mean_std
-    limits = [{"op": "clip", "low": -1.0, "high": 1.0}] if held else []
-    ops = [{"op": "rows", "count": robot.n_row}, {"op": "take", "size": width}, *limits]
-    columns = _relative_columns(robot, problems)
-    added = [{"op": "add_state", "columns": columns}] if columns else []
-    return [*ops, _op("unnormalize", recipe.ACTION, robot.actions), *added]
+    return [
+        {"op": "rows", "count": robot.n_row},
+        {"op": "take", "size": width},
+        *_clip(robot.actions),
+        *_normalize("unnormalize", recipe.ACTION, robot.actions),
+        *_binary(robot.actions),
+        *_relative_ops(robot),
+    ]
 
 
 def gripper_ops(robot: Robot, key: str, problems: Problems) -> List[dict]:
@@ -64,23 +104,22 @@ def _starts(groups: Sequence[Group]) -> Dict[str, int]:
     return {group.key: int(start) for group, start in zip(groups, ends)}
 
 
-def _relative_columns(robot: Robot, problems: Problems) -> List[int]:
-    """Columns of actions that are relative to the state's number in the same column."""
+def _relative_ops(robot: Robot) -> List[dict]:
     actions, states = _starts(robot.actions), _starts(robot.states)
     columns: List[int] = []
+    state_columns: List[int] = []
+    poses: List[dict] = []
     for group in robot.actions:
-        if group.reference and states[group.reference] != actions[group.key]:
-            expected = "in the columns of the action, from {}".format(actions[group.key])
-            hint = "actions relative to other columns of the state are not supported yet"
-            problems.unsupported(
-                "relative action {}: state {}".format(group.key, group.reference),
-                expected,
-                str(states[group.reference]),
-                hint,
-            )
-        elif group.reference:
-            columns += range(actions[group.key], actions[group.key] + group.width)
-    return columns
+        if not group.reference:
+            continue
+        start, state = actions[group.key], states.get(group.reference, 0)  # a state that is not there is told elsewhere
+        if group.pose:
+            poses.append({"op": "compose_pose", "format": group.pose, "column": start, "state_column": state})
+        else:
+            columns += range(start, start + group.width)
+            state_columns += range(state, state + group.width)
+    others = {} if state_columns == columns else {"state_columns": state_columns}
+    return [*([{"op": "add_state", "columns": columns, **others}] if columns else []), *poses]
 
 
 def _view(key: str) -> str:
@@ -113,7 +152,18 @@ def feature_description(robot: Robot, options: Options, notes: List[str], proble
 
 
 def statistics_of(feature: str, groups: Sequence[Group]) -> Dict[str, np.ndarray]:
-    """Of all keys, one after the other, by the name of the bundle's tensor."""
-    names = ("mean", "std") if groups[0].mean_std else ("min", "max")
-    columns = ([group.low for group in groups], [group.high for group in groups])
-    return {"stats.{}.{}".format(feature, name): np.concatenate(parts) for name, parts in zip(names, columns)}
+    """Of all keys, one after the other, by the name of the bundle's tensor: 0 for a key that is normalized in another way, and a row for
+    each action of a chunk where a key has such."""
+    found: Dict[str, np.ndarray] = {}
+    for kind, names in NAMES.items():
+        chosen = [group for group in groups if group.kind == kind]
+        for name, values in zip(names, ([g.low for g in chosen], [g.high for g in chosen])):
+            if not chosen:
+                continue
+            shape = (*max((value.shape[:-1] for value in values), key=len), _total(groups))
+            whole = np.zeros(shape, values[0].dtype)
+            starts = _starts(groups)
+            for group, value in zip(chosen, values):
+                whole[..., starts[group.key] : starts[group.key] + group.width] = value
+            found["stats.{}.{}".format(feature, name)] = whole
+    return found
