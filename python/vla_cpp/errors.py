@@ -14,13 +14,14 @@ class VlaError(Exception):
     code      the class of the problem, e.g. "bad_observation"
     where     file, feature or address
     expected  may be empty when `found` says it all
-    found     what was there instead
+    found     what was there instead, "nothing" for an empty text
     hint      the next move, if there is one
     """
 
     code = "internal"
 
     def __init__(self, where: str, expected: str = "", found: str = "", hint: str = "", code: str = "") -> None:
+        found = found or ("nothing" if expected else "")
         super().__init__(where, expected, found, hint)
         self.where, self.expected, self.found, self.hint = where, expected, found, hint
         if code:

@@ -47,8 +47,16 @@ struct Error {
   Code code = Code::internal;
   std::string where;     // file, key, tensor path or feature name
   std::string expected;  // may be empty when the finding says it all
-  std::string found;
-  std::string hint = {};  // the next move, if there is one
+  std::string found;     // `nothing` where something was expected and an empty text came
+  std::string hint;      // the next move, if there is one
+
+  Error() = default;
+  Error(Code c, std::string place, std::string wanted, std::string finding, std::string next = {})
+      : code(c),
+        where(std::move(place)),
+        expected(std::move(wanted)),
+        found(finding.empty() && !expected.empty() ? "nothing" : std::move(finding)),
+        hint(std::move(next)) {}
 
   /// `where: expected E, found F; hint`
   std::string message() const {

@@ -31,7 +31,7 @@ enum class Depth { refused, parsed, declared };
 /// An error must be one that a bundle can cause, and say where and what. Aborts when it is not.
 inline void check_error(const Error& error) {
   const bool is_bundles_fault = error.code == Code::bad_bundle || error.code == Code::unsupported;
-  if (!is_bundles_fault || error.where.empty() || (error.found.empty() && error.expected.empty())) unexpected(error);
+  if (!is_bundles_fault || error.where.empty() || error.found.empty()) unexpected(error);
 }
 
 template <class T>
