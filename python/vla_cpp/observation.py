@@ -10,7 +10,7 @@ from typing import Any, Dict, Iterable, Mapping, Optional, Sequence, Tuple, Unio
 import numpy as np
 
 from .errors import BadObservation, Unsupported, UsageError
-from .spec import Spec, StateSpec
+from .spec import Spec, StateSpec, ViewSpec
 
 Image = Union[np.ndarray, bytes, bytearray, memoryview, None]
 State = Union[Mapping[str, object], Sequence[float], np.ndarray, float]
@@ -42,9 +42,17 @@ def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
     return mapping.items()
 
 
-def image_arg(name: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
+def place(kind: str, given: str, features: Sequence[Union[ViewSpec, StateSpec]]) -> str:
+    """Where an error about what was given under this name is, as the runtime says it: the feature's full name, or `view "x"`."""
+    names = {f.name: (f.name, *getattr(f, "aliases", ())) for f in features}
+    whole = [name for name, known in names.items() if given in known]
+    part = [name for name, known in names.items() if given in (k.rsplit(".", 1)[-1] for k in known)]
+    found = whole or part
+    return found[0] if len(found) == 1 else f'{kind} "{given}"'
+
+
+def image_arg(where: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, None]]:
     """("rgb", contiguous uint8 array (height, width, 3)), ("jpeg" or "png", the file's bytes), or ("absent", None)."""
-    where = f'images["{name}"]'
     if image is None:
         return "absent", None
     if isinstance(image, (bytes, bytearray, memoryview)):
@@ -66,11 +74,11 @@ def image_arg(name: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, No
 def states_of(state: State, specs: Sequence[StateSpec]) -> Dict[str, np.ndarray]:
     """Float32 vectors by name. One array stands for the only state of a policy."""
     if isinstance(state, Mapping):
-        return {str(name): floats(f'state["{name}"]', values, 1) for name, values in state.items()}
+        return {str(name): floats(place("state", str(name), specs), values, 1) for name, values in state.items()}
     if len(specs) != 1:
         names = ", ".join(s.name for s in specs) or "none"
         raise BadObservation("state", f"a dict with {names}", type(state).__name__)
-    return {specs[0].name: floats("state", state, 1)}
+    return {specs[0].name: floats(specs[0].name, state, 1)}
 
 
 def noise_of(noise: object, n_row: int, d_noise: int) -> np.ndarray:
@@ -118,6 +126,7 @@ def floats(where: str, values: object, n_dim: int) -> np.ndarray:
         raise BadObservation(where, f"{n_dim} dimension{'s' if n_dim > 1 else ''}", f"shape {given.shape}")
     if not np.isfinite(array).all():
         at = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        where += f"[{at[0]}]" if n_dim == 1 else ""
         raise BadObservation(where, "finite float32 numbers", f"{given.reshape(array.shape)[at]} at {list(at)}")
     return np.ascontiguousarray(array)
 

@@ -16,7 +16,7 @@ from . import _capi
 from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
 from .handle import Handle, wrong_process
-from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, states_of
+from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, place, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 
@@ -150,13 +150,13 @@ class _Call:
         leftover: Optional[Leftover],
     ) -> None:
         self._kept: List[Any] = []
-        views = [self._view(name, image) for name, image in named("images", images)]
+        views = [self._view(name, image, place("view", name, spec.views)) for name, image in named("images", images)]
         states = [
             _capi.State(name=_name_of("state", name), values=self._address(values), n_value=values.size)
             for name, values in states_of(state, spec.states).items()
         ]
         self._kept += [views, states]
-        sentence = _encoded("text", text, BadObservation)
+        sentence = _encoded("instruction", text, BadObservation)
         self.observation = _capi.Observation(
             views=(_capi.View * len(views))(*views),
             n_view=len(views),
@@ -180,8 +180,8 @@ class _Call:
             o.schedule = _name_of("leftover.schedule", leftover.schedule)
         o.max_guidance = leftover.max_guidance or 0.0
 
-    def _view(self, name: str, image: Image) -> _capi.View:
-        data = image_arg(name, image)[1]
+    def _view(self, name: str, image: Image, where: str) -> _capi.View:
+        data = image_arg(where, image)[1]
         view = _capi.View(name=_name_of("images", name), kind=_capi.IMAGE_ABSENT)
         if isinstance(data, bytes):
             view.kind, data = _capi.IMAGE_FILE, np.frombuffer(data, np.uint8)

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional
+from typing import Any, Dict, List, Mapping, Optional, Sequence
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from .chunk import Chunk
 from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
-from .observation import Image, Leftover, State, image_arg, leftover_of, named, noise_of, states_of
+from .observation import Image, Leftover, State, image_arg, leftover_of, named, noise_of, place, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 PROTOCOL_VERSION = 1
@@ -66,7 +66,7 @@ def act_bytes(
     act.SetInParent()
     raw: Dict[str, np.ndarray] = {}
     for name, image in named("images", images):
-        kind, data = image_arg(name, image)
+        kind, data = image_arg(place("view", name, spec.views), image)
         if kind == "rgb":
             raw[name] = np.asarray(data)
         elif kind == "absent":
@@ -76,11 +76,11 @@ def act_bytes(
     for name, values in states_of(state, spec.states).items():
         act.states.add(name=name).values.extend(values.tolist())
     if not isinstance(text, str):
-        raise BadObservation("text", "a str", type(text).__name__)
+        raise BadObservation("instruction", "a str", type(text).__name__)
     try:
         act.text = text
     except (ValueError, UnicodeError):
-        raise BadObservation("text", "characters that UTF-8 can write", repr(text)[:80]) from None
+        raise BadObservation("instruction", "characters that UTF-8 can write", repr(text)[:80]) from None
     if noise is not None:
         values = noise_of(noise, spec.noise_rows, spec.d_noise)
         act.noise.horizon, act.noise.d_action = values.shape
@@ -93,7 +93,7 @@ def act_bytes(
     if capture_time_ns is not None:
         act.capture_time_ns = _int64("capture_time_ns", capture_time_ns)
     data = b"".join(_with_raw_images(request, raw))
-    _check_limits(raw, len(data), limits)
+    _check_limits(raw, len(data), limits, spec.views)
     return data
 
 
@@ -146,12 +146,12 @@ def _int64(where: str, value: int) -> int:
     return int(value)
 
 
-def _check_limits(raw: Mapping[str, np.ndarray], size: int, limits: Any) -> None:
+def _check_limits(raw: Mapping[str, np.ndarray], size: int, limits: Any, views: Sequence[ViewSpec]) -> None:
     """Refuses what the server would refuse; it would read all of a message that is too large before it says so."""
     for name, rows in raw.items():
         pixels = rows.shape[0] * rows.shape[1]
         if pixels > limits.max_pixels > 0:
-            raise TooLarge(f'images["{name}"]', f"at most {limits.max_pixels} pixels", str(pixels))
+            raise TooLarge(place("view", name, views), f"at most {limits.max_pixels} pixels", str(pixels))
     if size > limits.max_message_bytes > 0:
         hint = "send smaller frames, or JPEG; the server's option --max-message sets the limit"
         raise TooLarge("observation", f"at most {limits.max_message_bytes} bytes", str(size), hint)

@@ -54,13 +54,13 @@ Result<std::optional<Frame>> read_view(const vla_view& view, const std::string& 
   return std::optional<Frame>(std::move(frame));
 }
 
-Status read_views(const vla_observation& given, Observation& observation) {
+Status read_views(const vla_observation& given, const FeatureNames& features, Observation& observation) {
   VLA_TRY(const std::vector<vla_view> views, read_structs(given.views, given.n_view, "observation.views"));
   for (std::size_t i = 0; i < views.size(); ++i) {
     VLA_TRY(const std::string name, read_name(views[i].name, fmt::format("observation.views[{}].name", i)));
-    VLA_TRY(std::optional<Frame> frame, read_view(views[i], "image " + name));
+    VLA_TRY(std::optional<Frame> frame, read_view(views[i], features.place(name)));
     if (!observation.views.emplace(name, std::move(frame)).second)
-      return Error{Code::bad_observation, "image " + name, "each view once", "a second one"};
+      return Error{Code::bad_observation, features.place(name), "each view once", "a second one"};
   }
   return {};
 }
@@ -79,11 +79,11 @@ Status read_states(const vla_observation& given, const FeatureNames& features, O
     const std::string where = fmt::format("observation.states[{}]", i);
     VLA_TRY(const std::string name, state_name(state, features, where + ".name"));
     if (state.n_value > kMaxVector)
-      return Error{Code::bad_observation, name, fmt::format("at most {} numbers", kMaxVector),
+      return Error{Code::bad_observation, features.place(name), fmt::format("at most {} numbers", kMaxVector),
                    std::to_string(state.n_value)};
     if (state.values == nullptr) return usage(where + ".values", "numbers", "NULL");
     if (!observation.states.emplace(name, std::vector<float>(state.values, state.values + state.n_value)).second)
-      return Error{Code::bad_observation, name, "each state once", "a second one"};
+      return Error{Code::bad_observation, features.place(name), "each state once", "a second one"};
   }
   return {};
 }
@@ -136,7 +136,7 @@ Result<Request> read_observation(const vla_observation* given, const Engine& eng
   if (known.text == nullptr) return usage("observation.text", "an instruction", "NULL");
   request.observation.text.assign(known.text, known.text_size);
   VLA_CHECK(read_states(known, engine.processor().states(), request.observation));
-  VLA_CHECK(read_views(known, request.observation));
+  VLA_CHECK(read_views(known, engine.processor().views(), request.observation));
   return request;
 }
 

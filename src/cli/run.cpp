@@ -53,12 +53,12 @@ Result<std::vector<float>> parse_numbers(const std::string& text) {
   return values;
 }
 
-Status add_image(Observation& observation, const std::string& argument) {
+Status add_image(Observation& observation, const std::string& argument, const FeatureNames& features) {
   VLA_TRY(const NameValue image, split("--image", argument));
   std::optional<Frame> frame;  // `NAME=`: declared absent
   if (!image.value.empty()) {
     VLA_TRY(const std::vector<std::byte> bytes, read_file(image.value, kMaxFile));
-    VLA_TRY(frame, decode_image(bytes, fmt::format("image {} ({})", image.name, image.value)));
+    VLA_TRY(frame, decode_image(bytes, features.place(image.name)));
   }
   if (!observation.views.emplace(image.name, std::move(frame)).second)
     return Error{Code::usage, "--image", "each view once", image.name + " twice"};
@@ -83,11 +83,11 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
 }
 
 /// Float32 rows; the reference's own arrays have a batch of one before them.
-Result<NpyArray> read_rows(const std::string& file) {
+Result<NpyArray> read_rows(const std::string& file, const std::string& where) {
   VLA_TRY(const std::vector<std::byte> bytes, read_file(file, kMaxFile));
-  VLA_TRY(NpyArray array, parse_npy(bytes, file));
+  VLA_TRY(NpyArray array, parse_npy(bytes, where));
   if (!std::holds_alternative<std::vector<float>>(array.values))
-    return Error{Code::bad_observation, file, "float32 numbers", "uint8"};
+    return Error{Code::bad_observation, where, "float32 numbers", "uint8"};
   if (array.shape.size() == 3 && array.shape.front() == 1) array.shape.erase(array.shape.begin());
   return array;
 }
@@ -95,11 +95,11 @@ Result<NpyArray> read_rows(const std::string& file) {
 /// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from.
 Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
   if (options.noise.empty()) return Noise(*options.seed);
-  VLA_TRY(NpyArray array, read_rows(options.noise));
+  VLA_TRY(NpyArray array, read_rows(options.noise, "noise"));
   const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.solver_horizon()),
                                           static_cast<std::size_t>(engine.d_action_padded())};
   if (array.shape != shape)
-    return Error{Code::bad_observation, options.noise, fmt::format("noise of shape ({})", fmt::join(shape, ", ")),
+    return Error{Code::bad_observation, "noise", fmt::format("shape ({})", fmt::join(shape, ", ")),
                  fmt::format("({})", fmt::join(array.shape, ", "))};
   return Noise(std::get<std::vector<float>>(std::move(array.values)));
 }
@@ -107,10 +107,10 @@ Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
 /// The last rows of a chunk that `--normalized-out` wrote.
 Result<std::optional<Leftover>> read_leftover(const RunOptions& options, const Engine& engine) {
   if (options.leftover.empty()) return std::optional<Leftover>();
-  VLA_TRY(NpyArray array, read_rows(options.leftover));
+  VLA_TRY(NpyArray array, read_rows(options.leftover, "leftover"));
   const std::size_t width = engine.processor().action_names().size();
   if (array.shape.size() != 2 || array.shape[1] != width)
-    return Error{Code::bad_observation, options.leftover, fmt::format("rows of {} numbers", width),
+    return Error{Code::bad_observation, "leftover", fmt::format("rows of {} numbers", width),
                  fmt::format("shape ({})", fmt::join(array.shape, ", "))};
   return std::optional<Leftover>(Leftover{std::get<std::vector<float>>(std::move(array.values)), *options.delay,
                                           options.schedule, options.max_guidance});
@@ -189,7 +189,7 @@ Status run(RunOptions& options) {
   clock.lap(before, "load");
   Observation observation;
   observation.text = options.text;
-  for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image));
+  for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image, engine->processor().views()));
   for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, engine->processor()));
   clock.lap(before, "decode");
   VLA_TRY(const Noise noise, read_noise(options, *engine));

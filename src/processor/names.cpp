@@ -23,10 +23,15 @@ Result<int> FeatureNames::find(std::string_view given) const {
   }
   const std::vector<int>& found = whole.empty() ? part : whole;
   if (found.size() == 1) return found[0];
-  const std::string where = fmt::format("observation {} \"{}\"", kind_, given);
+  const std::string where = fmt::format("{} \"{}\"", kind_, given);
   if (found.empty()) return Error{Code::bad_observation, where, "one of " + listed(), "no such " + kind_};
   return Error{Code::bad_observation, where, "one of " + listed(), "a name that several of them share",
                "give the full name"};
+}
+
+std::string FeatureNames::place(std::string_view given) const {
+  const auto index = find(given);
+  return index ? names_[static_cast<std::size_t>(*index)] : index.error().where;
 }
 
 std::string FeatureNames::listed() const {

@@ -62,8 +62,7 @@ Result<std::vector<Processor::PresentView>> Processor::present_views(const Obser
     if (given[i] != nullptr && *given[i]) present.push_back({i, &name, &**given[i]});
   }
   if (present.size() < static_cast<std::size_t>(min_views_))
-    return bad_observation("observation.images",
-                           fmt::format("at least {} of the views {}", min_views_, views_.listed()),
+    return bad_observation("views", fmt::format("at least {} of the views {}", min_views_, views_.listed()),
                            fmt::format("{} present", present.size()));
   return present;
 }

@@ -29,9 +29,10 @@ struct ActRequest {
   std::int64_t capture_time_ns = 0;
 };
 
-/// A serialized Act -> what the engine takes; images are decoded. Errors: bad_request (not an Act), too_large,
-/// bad_observation.
-Result<ActRequest> decode_act(std::span<const std::byte> act, const ActLimits& limits);
+/// A serialized Act -> what the engine takes; images are decoded. `views` and `states` name features in errors. Errors:
+/// bad_request (not an Act), too_large, bad_observation.
+Result<ActRequest> decode_act(std::span<const std::byte> act, const ActLimits& limits, const FeatureNames& views,
+                              const FeatureNames& states);
 
 /// A serialized Hello -> the reply; `client` is how the client calls itself. Errors: bad_request, incompatible.
 Result<v1::HelloReply> answer_hello(std::span<const std::byte> hello, std::string* client = nullptr);

@@ -126,13 +126,14 @@ Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string
   return frame;
 }
 
-Status decode_views(const v1::Act& act, const ActLimits& limits, Observation& observation) {
+Status decode_views(const v1::Act& act, const ActLimits& limits, const FeatureNames& features,
+                    Observation& observation) {
   ActLimits left = limits;  // an act costs what its images cost together
   if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
-    return too_large("act.views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
+    return too_large("views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
   for (const v1::View& view : act.views()) {
-    VLA_CHECK(check_name(view.name(), "act.views"));
-    const std::string where = fmt::format("act.views[\"{}\"]", view.name());
+    VLA_CHECK(check_name(view.name(), "views"));
+    const std::string where = features.place(view.name());
     if (observation.views.contains(view.name())) return bad_observation(where, "each view once", "a second one");
     VLA_TRY(std::optional<Frame> frame, decode_view(view, where, left));
     if (frame) left.max_pixels -= std::int64_t{frame->width} * frame->height;
@@ -141,13 +142,12 @@ Status decode_views(const v1::Act& act, const ActLimits& limits, Observation& ob
   return {};
 }
 
-Status decode_states(const v1::Act& act, Observation& observation) {
+Status decode_states(const v1::Act& act, const FeatureNames& features, Observation& observation) {
   for (const v1::State& state : act.states()) {
-    VLA_CHECK(check_name(state.name(), "act.states"));
-    const std::string where = fmt::format("act.states[\"{}\"]", state.name());
+    VLA_CHECK(check_name(state.name(), "states"));
     std::vector<float> values(state.values().begin(), state.values().end());
     if (!observation.states.emplace(state.name(), std::move(values)).second)
-      return bad_observation(where, "each state once", "a second one");
+      return bad_observation(features.place(state.name()), "each state once", "a second one");
   }
   return {};
 }
@@ -166,7 +166,7 @@ Status decode_start(const v1::Act& act, const ActLimits& limits, ActRequest& req
   const v1::Noise& noise = act.noise();
   const auto horizon = static_cast<std::uint32_t>(limits.horizon), d_noise = static_cast<std::uint32_t>(limits.d_noise);
   if (noise.horizon() != horizon || noise.d_action() != d_noise)
-    return bad_observation("act.noise", fmt::format("{} rows of {}", horizon, d_noise),
+    return bad_observation("noise", fmt::format("{} rows of {}", horizon, d_noise),
                            fmt::format("{} rows of {}", noise.horizon(), noise.d_action()));
   request.noise = std::vector<float>(noise.values().begin(), noise.values().end());  // the engine checks its numbers
   return {};
@@ -180,10 +180,10 @@ Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& 
              horizon = static_cast<std::uint32_t>(limits.horizon);
   if (given.d_action() != d_action || given.n_row() > horizon || given.delay() > horizon ||
       static_cast<std::uint64_t>(given.values_size()) != std::uint64_t{given.n_row()} * d_action)
-    return bad_observation("act.leftover", fmt::format("at most {} rows of {}", horizon, d_action),
+    return bad_observation("leftover", fmt::format("at most {} rows of {}", horizon, d_action),
                            fmt::format("{} rows of {}, {} numbers, a delay of {}", given.n_row(), given.d_action(),
                                        given.values_size(), given.delay()));
-  VLA_CHECK(check_name(given.schedule(), "act.leftover.schedule"));
+  VLA_CHECK(check_name(given.schedule(), "leftover.schedule"));
   request.leftover = {
       {given.values().begin(), given.values().end()}, static_cast<int>(given.delay()), given.schedule(), {}};
   if (given.has_max_guidance()) request.leftover->max_guidance = given.max_guidance();
@@ -192,16 +192,17 @@ Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& 
 
 }  // namespace
 
-Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits& limits) {
+Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits& limits, const FeatureNames& views,
+                              const FeatureNames& states) {
   VLA_TRY(v1::Act act, parse<v1::Act>(bytes, 0, "act"));
   if (act.text().size() > limits.max_text)
-    return too_large("act.text", fmt::format("at most {} bytes", limits.max_text),
+    return too_large("instruction", fmt::format("at most {} bytes", limits.max_text),
                      fmt::format("{} bytes", act.text().size()));
   ActRequest request;
   request.observation.text = std::move(*act.mutable_text());
   request.capture_time_ns = act.capture_time_ns();
-  VLA_CHECK(decode_views(act, limits, request.observation));
-  VLA_CHECK(decode_states(act, request.observation));
+  VLA_CHECK(decode_views(act, limits, views, request.observation));
+  VLA_CHECK(decode_states(act, states, request.observation));
   VLA_CHECK(decode_start(act, limits, request));
   VLA_CHECK(decode_leftover(act, limits, request));
   return request;

@@ -130,7 +130,7 @@ void Io::queue(Job job) {
     return refuse(std::move(job), {Code::shutting_down, "act", "", "the server drains before it stops"});
   if (const auto deadline = job.envelope.deadline_ms) {
     if (*deadline == 0 || *deadline > kMaxDeadlineMs)
-      return refuse(std::move(job), {Code::bad_observation, "act.deadline_ms", fmt::format("1 to {}", kMaxDeadlineMs),
+      return refuse(std::move(job), {Code::bad_observation, "deadline_ms", fmt::format("1 to {}", kMaxDeadlineMs),
                                      std::to_string(*deadline)});
     job.deadline = job.at + std::chrono::milliseconds(*deadline);
   }
@@ -201,7 +201,7 @@ void Io::deliver_waiting() {
     const std::uint64_t connection = job->connection, request_id = job->request_id;
     const bool delimiter = job->delimiter;
     try {
-      const Error error{Code::late, "act.deadline_ms", fmt::format("its turn within {} ms", *job->envelope.deadline_ms),
+      const Error error{Code::late, "deadline_ms", fmt::format("its turn within {} ms", *job->envelope.deadline_ms),
                         "later", "ask less often, or allow more time"};
       refuse(std::move(*job), error);
     } catch (const std::bad_alloc&) {

@@ -139,7 +139,8 @@ Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Answer& answ
   const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
                          engine.solver_horizon(), engine.d_action_padded(), description_.actions_size()};
   StageClock clock;
-  VLA_TRY(const ActRequest request, decode_act(job.body(), limits));
+  VLA_TRY(const ActRequest request,
+          decode_act(job.body(), limits, engine.processor().views(), engine.processor().states()));
   Timing& stages = answer.stages;
   clock.lap(stages, "decode");
   VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise, request.leftover));

@@ -21,7 +21,7 @@ def frame_refused(refused, golden, tmp_path):
     def check(data, *parts, code="bad_observation"):
         path = tmp_path / "frame"
         path.write_bytes(data)
-        return refused(code, "camera1", str(path), *parts, images=golden.with_image("camera1", path))
+        return refused(code, "observation.images.camera1: ", *parts, images=golden.with_image("camera1", path))
 
     return check
 
@@ -33,7 +33,7 @@ def test_an_unknown_view_is_refused_with_the_names_that_there_are(refused, golde
     images = {**golden.images, "camera3": golden.images["camera1"]}
     refused(
         "bad_observation",
-        '"camera3": expected one of observation.images.camera1, observation.images.camera2',
+        'view "camera3": expected one of observation.images.camera1, observation.images.camera2',
         images=images,
     )
 
@@ -57,7 +57,7 @@ def test_no_view_at_all_is_refused(refused):
 
 
 def test_a_wrong_name_of_the_state_is_refused(refused):
-    refused("bad_observation", '"gripper": expected one of observation.state', state="gripper=0,0,0,0,0,0")
+    refused("bad_observation", 'state "gripper": expected one of observation.state', state="gripper=0,0,0,0,0,0")
 
 
 @pytest.mark.parametrize("count", [1, 5, 7, 1000])
@@ -85,14 +85,14 @@ def saved(tmp_path, noise):
 def test_noise_of_another_shape_is_refused_even_when_its_count_fits(refused, tmp_path, shape):
     refused(
         "bad_observation",
-        "noise.npy: expected noise of shape (5, 8), found",
+        "noise: expected shape (5, 8), found",
         noise=saved(tmp_path, np.zeros(shape, np.float32)),
     )
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float16, np.uint8, np.int32])
 def test_noise_of_another_type_is_refused(refused, tmp_path, dtype):
-    refused("bad_observation", "noise.npy: expected", noise=saved(tmp_path, np.zeros((5, 8), dtype)))
+    refused("bad_observation", "noise: expected", noise=saved(tmp_path, np.zeros((5, 8), dtype)))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

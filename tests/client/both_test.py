@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from golden_cases import NAMES, Golden
-from server_process import SECONDS, Server, frames, ran
+from server_process import SECONDS, VLA, Server, frames, ran
 
 import vla_cpp
 from vla_cpp.control import ChunkLoop
@@ -64,6 +64,49 @@ def test_server_library_and_program_give_the_same_bytes(name, tmp_path):
             for policy in (client, library):
                 assert np.asarray(policy.act(**observation, **start)).tobytes() == expected.tobytes()
     assert server.stop() == 0
+
+
+BAD_PARTS = {  # what is wrong, and the place that every door tells
+    "observation.images.camera1": dict(images={"camera1": b"\x89PNG\r\n\x1a\nbroken", "camera2": None}),
+    "observation.images.camera2": dict(images={"camera1": None}),
+    "views": dict(images={"camera1": None, "camera2": None}),
+    'view "nose"': dict(images={"nose": None}),
+    "observation.state": dict(state=[0.0] * 5),
+    "observation.state[4]": dict(state=[0.0] * 4 + [float("nan"), 0.0]),
+    'state "arm"': dict(state={"arm": [0.0] * 6}),
+    "instruction": dict(text=""),
+    "noise": dict(noise=np.zeros((8, 5), np.float32)),
+    "leftover": dict(leftover=vla_cpp.Leftover(np.zeros((6, 7), np.float32), 0, "linear", 5.0)),
+}
+
+
+@pytest.mark.parametrize("part", BAD_PARTS)
+def test_server_and_library_name_the_part_of_an_observation_that_is_wrong(policy, case, part):
+    observation = {"images": frames(case), "state": case.state, "text": case.text, **BAD_PARTS[part]}
+    with pytest.raises(vla_cpp.BadObservation) as caught:
+        policy.act(**observation)
+    assert caught.value.where == part
+
+
+@pytest.mark.parametrize("part", BAD_PARTS)
+def test_vla_run_names_it_alike(case, tmp_path, part):
+    given, more = dict(BAD_PARTS[part]), []
+    if leftover := given.pop("leftover", None):
+        np.save(tmp_path / "rows.npy", leftover.rows)
+        more = ["--leftover", tmp_path / "rows.npy", "--delay", "0", "--schedule", "linear", "--max-guidance", "5"]
+    if "noise" in given:
+        np.save(tmp_path / "noise.npy", given["noise"])
+        given["noise"] = tmp_path / "noise.npy"
+    if state := given.get("state"):
+        by_name = state.items() if isinstance(state, dict) else [("state", state)]
+        given["state"] = ";".join(f"{name}={','.join(map(str, numbers))}" for name, numbers in by_name)
+    for view, data in given.get("images", {}).items():
+        if data is not None:
+            (tmp_path / view).write_bytes(data)
+            given["images"] = {**given["images"], view: tmp_path / view}
+    call = [VLA, *case.arguments(**given, options=more)]
+    result = subprocess.run(list(map(str, call)), capture_output=True, text=True)
+    assert result.returncode == 4 and result.stderr.startswith(f"error: bad_observation: {part}: "), result.stderr
 
 
 def test_a_leftover_gives_the_same_bytes_from_server_library_and_program(policy, case, tmp_path):

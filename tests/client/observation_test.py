@@ -5,8 +5,8 @@
 import numpy as np
 import pytest
 
-from vla_cpp import BadObservation, StateSpec, UsageError
-from vla_cpp.observation import check_start, noise_of, image_arg, states_of
+from vla_cpp import BadObservation, StateSpec, UsageError, ViewSpec
+from vla_cpp.observation import check_start, image_arg, noise_of, place, states_of
 
 JOINTS = (StateSpec("observation.state", 2),)
 JPEG, PNG = b"\xff\xd8\xff\xe0rest", b"\x89PNG\r\n\x1a\nrest"
@@ -43,10 +43,10 @@ def test_none_declares_a_view_absent():
         ("top.png", "str"),
     ],
 )
-def test_another_image_is_refused_by_the_view_name(image, found):
+def test_another_image_is_refused_by_the_view(image, found):
     with pytest.raises(BadObservation) as caught:
         image_arg("wrist", image)
-    assert caught.value.where == 'images["wrist"]' and found in caught.value.found
+    assert caught.value.where == "wrist" and found in caught.value.found
 
 
 @pytest.mark.parametrize(
@@ -64,9 +64,6 @@ def test_one_number_is_a_state_of_one():
 @pytest.mark.parametrize(
     "state, found",
     [
-        ([0, float("nan")], "nan at [1]"),
-        ([0, float("inf")], "inf at [1]"),
-        (np.array([0, 1e300]), "1e+300 at [1]"),
         ([[1, 2], [3, 4]], "(2, 2)"),
         (["1", "2"], "list"),
         ("12", "str"),
@@ -78,9 +75,36 @@ def test_one_number_is_a_state_of_one():
 def test_a_state_that_is_no_vector_of_finite_numbers_is_refused(state, found):
     with pytest.raises(BadObservation) as caught:
         states_of(state, JOINTS)
-    assert found in caught.value.found and caught.value.where == "state"
-    with pytest.raises(BadObservation, match=r'state\["arm"\]'):
+    assert found in caught.value.found and caught.value.where == "observation.state"
+    with pytest.raises(BadObservation, match='^state "arm"'):
         states_of({"arm": state}, JOINTS)
+
+
+@pytest.mark.parametrize(
+    "state, found", [([0, float("nan")], "nan"), ([0, float("inf")], "inf"), (np.array([0, 1e300]), "1e+300")]
+)
+def test_a_number_that_is_not_finite_is_refused_by_its_place(state, found):
+    with pytest.raises(BadObservation) as caught:
+        states_of(state, JOINTS)
+    assert found in caught.value.found and caught.value.where == "observation.state[1]"
+
+
+CAMERAS = (ViewSpec("observation.images.top", False, 8, 8, ("camera1",)), ViewSpec("rig.left", False, 8, 8))
+
+
+@pytest.mark.parametrize(
+    "given, where",
+    [
+        ("top", "observation.images.top"),
+        ("camera1", "observation.images.top"),
+        ("rig.left", "rig.left"),
+        ("left", "rig.left"),
+        ("right", 'view "right"'),
+        ("", 'view ""'),
+    ],
+)
+def test_an_error_names_a_view_as_the_runtime_does(given, where):
+    assert place("view", given, CAMERAS) == where
 
 
 @pytest.mark.parametrize("specs", [(), (StateSpec("a", 1), StateSpec("b", 1))])

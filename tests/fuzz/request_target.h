@@ -40,7 +40,8 @@ inline RequestFate check_request(std::span<const std::byte> bytes) {
     const Status empty = serve::check_empty(envelope.body(bytes));
     if (!empty) return refuse(empty.error()), fate;
   } else {
-    const auto act = serve::decode_act(envelope.body(bytes), kLimits);
+    const auto act =
+        serve::decode_act(envelope.body(bytes), kLimits, FeatureNames("view", {}, {}), FeatureNames("state", {}, {}));
     if (!act) return refuse(act.error()), fate;
     if (act->observation.text.size() > kLimits.max_text || act->observation.views.size() > kLimits.max_views)
       std::abort();

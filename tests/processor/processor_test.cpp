@@ -87,8 +87,7 @@ TEST_CASE("inputs that are filled again keep their memory and drop what they hel
 TEST_CASE("views that are unknown, doubled, missing or too few are refused with the bundle's names") {
   Observation bad = observation();
   bad.views["front"] = grey(0);
-  CHECK(contains(refused(bad),
-                 "observation view \"front\": expected one of observation.images.top, observation.images.wrist"));
+  CHECK(contains(refused(bad), "view \"front\": expected one of observation.images.top, observation.images.wrist"));
   bad = observation();
   bad.views["hand"] = grey(0);
   CHECK(contains(refused(bad), "observation.images.wrist: expected one value, found a second one"));
@@ -154,7 +153,7 @@ TEST_CASE("states that are missing, unknown, of another width or not finite are 
   CHECK(contains(refused(bad), "observation.state: expected 2 numbers, found nothing"));
   bad = observation();
   bad.states["gripper"] = {0.0f};
-  CHECK(contains(refused(bad), "observation state \"gripper\": expected one of observation.state"));
+  CHECK(contains(refused(bad), "state \"gripper\": expected one of observation.state"));
   bad = observation();
   bad.states["observation.state"] = {0.0f, 0.0f};
   CHECK(contains(refused(bad), "a second one"));

@@ -16,6 +16,7 @@ using namespace vla::serve;
 namespace {
 
 const ActLimits kLimits = {10'000, 40, 5, 2, 3, 2};
+const FeatureNames kViews("view", {"observation.images.png"}, {""}), kStates("state", {"robot.arm"}, {""});
 
 /// Every field of the schema, one alternative of each choice.
 v1::Act full_act() {
@@ -54,7 +55,9 @@ v1::Act full_act() {
   return act;
 }
 
-Result<ActRequest> decode(const std::string& bytes) { return decode_act(std::as_bytes(std::span(bytes)), kLimits); }
+Result<ActRequest> decode(const std::string& bytes) {
+  return decode_act(std::as_bytes(std::span(bytes)), kLimits, kViews, kStates);
+}
 Result<ActRequest> decode(const v1::Act& act) { return decode(act.SerializeAsString()); }
 
 void check_refused(const v1::Act& act, Code code, const std::string& where) {
@@ -103,7 +106,7 @@ TEST_CASE("a leftover whose rows and columns do not make its numbers is refused 
   const auto refused = [](auto change) {
     v1::Act act = full_act();
     change(*act.mutable_leftover());
-    check_refused(act, Code::bad_observation, "act.leftover");
+    check_refused(act, Code::bad_observation, "leftover");
   };
   refused([](v1::Leftover& l) { l.set_n_row(4), l.set_d_action(1); });
   refused([](v1::Leftover& l) { l.set_n_row(1); });
@@ -132,28 +135,28 @@ TEST_CASE("a seed is taken as it is, also zero, and without one a fresh seed is 
 TEST_CASE("what is over a limit is told apart from what is wrong") {
   v1::Act act = full_act();
   act.set_text(std::string(41, 'a'));
-  check_refused(act, Code::too_large, "act.text");
+  check_refused(act, Code::too_large, "instruction");
   act = full_act();
   for (const char* name : {"e", "f"}) act.add_views()->set_name(name);
-  check_refused(act, Code::too_large, "act.views");
+  check_refused(act, Code::too_large, "views");
   act = full_act();
   act.mutable_views(0)->mutable_rgb()->set_width(4'000'000'000u);
   act.mutable_views(0)->mutable_rgb()->set_height(4'000'000'000u);
-  check_refused(act, Code::too_large, "act.views[\"raw\"]");
+  check_refused(act, Code::too_large, "view \"raw\"");
   act = full_act();
   act.mutable_views(1)->set_jpeg(test::read_text(test::source_path("tests/processor/data/images/bad_huge.jpg")));
-  check_refused(act, Code::too_large, "act.views[\"jpeg\"]");
+  check_refused(act, Code::too_large, "view \"jpeg\"");
   act.mutable_views(1)->set_png(test::read_text(test::source_path("tests/processor/data/images/bad_huge.png")));
-  check_refused(act, Code::too_large, "act.views[\"jpeg\"]");
+  check_refused(act, Code::too_large, "view \"jpeg\"");
 }
 
 TEST_CASE("a name that would make an error long is refused without being told back") {
   v1::Act act = full_act();
   act.mutable_views(0)->set_name(std::string(257, 'n'));
-  check_refused(act, Code::too_large, "act.views");
+  check_refused(act, Code::too_large, "views");
   act = full_act();
   act.mutable_states(0)->set_name(std::string(257, 'n'));
-  check_refused(act, Code::too_large, "act.states");
+  check_refused(act, Code::too_large, "states");
 }
 
 TEST_CASE("an error is text even where it tells of bytes that are none") {
@@ -165,34 +168,34 @@ TEST_CASE("an error is text even where it tells of bytes that are none") {
 TEST_CASE("a view is refused by name: no image, another format, other bytes than its size says, twice") {
   v1::Act act = full_act();
   act.mutable_views(0)->clear_image();
-  check_refused(act, Code::bad_observation, "act.views[\"raw\"]");
+  check_refused(act, Code::bad_observation, "view \"raw\"");
   act = full_act();
   act.mutable_views(0)->mutable_rgb()->set_height(2);
-  check_refused(act, Code::bad_observation, "act.views[\"raw\"]");
+  check_refused(act, Code::bad_observation, "view \"raw\"");
   act.mutable_views(0)->mutable_rgb()->set_height(0);
-  check_refused(act, Code::bad_observation, "act.views[\"raw\"]");
+  check_refused(act, Code::bad_observation, "view \"raw\"");
   act = full_act();
   act.mutable_views(1)->set_png(full_act().views(1).jpeg());
-  check_refused(act, Code::bad_observation, "act.views[\"jpeg\"]");
+  check_refused(act, Code::bad_observation, "view \"jpeg\"");
   act = full_act();
   act.mutable_views(2)->mutable_png()->resize(60);
-  check_refused(act, Code::bad_observation, "act.views[\"png\"]");
+  check_refused(act, Code::bad_observation, "observation.images.png");
   act = full_act();
   act.mutable_views(2)->set_png("");
-  check_refused(act, Code::bad_observation, "act.views[\"png\"]");
+  check_refused(act, Code::bad_observation, "observation.images.png");
   act = full_act();
   act.mutable_views(1)->set_name("raw");
-  check_refused(act, Code::bad_observation, "act.views[\"raw\"]");
+  check_refused(act, Code::bad_observation, "view \"raw\"");
 }
 
 TEST_CASE("a state that is given twice and noise of another shape are refused") {
   v1::Act act = full_act();
   *act.add_states() = act.states(0);
-  check_refused(act, Code::bad_observation, "act.states[\"arm\"]");
+  check_refused(act, Code::bad_observation, "robot.arm");
   act = full_act();
   act.mutable_noise()->set_horizon(3);
   act.mutable_noise()->set_d_action(2);
-  check_refused(act, Code::bad_observation, "act.noise");
+  check_refused(act, Code::bad_observation, "noise");
 }
 
 TEST_CASE("a field that this version does not know is refused in every message of an act, not skipped") {

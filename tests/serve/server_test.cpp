@@ -94,19 +94,18 @@ TEST_CASE("whatever is wrong with an act is refused with its code and place, and
   const std::vector<Case> cases = {
       {"INCOMPATIBLE", "request.protocol_version", [](auto& r) { r.set_protocol_version(2); }},
       {"BAD_REQUEST", "request", [](auto& r) { r.clear_kind(); }},
-      {"BAD_OBSERVATION", "act.deadline_ms", [](auto& r) { r.mutable_act()->set_deadline_ms(0); }},
-      {"BAD_OBSERVATION", "act.deadline_ms", [](auto& r) { r.mutable_act()->set_deadline_ms(~std::uint64_t{0}); }},
-      {"BAD_OBSERVATION", "act.views[\"camera1\"]",
+      {"BAD_OBSERVATION", "deadline_ms", [](auto& r) { r.mutable_act()->set_deadline_ms(0); }},
+      {"BAD_OBSERVATION", "deadline_ms", [](auto& r) { r.mutable_act()->set_deadline_ms(~std::uint64_t{0}); }},
+      {"BAD_OBSERVATION", "observation.images.camera1",
        [](auto& r) { r.mutable_act()->mutable_views(0)->mutable_rgb()->set_width(3); }},
-      {"BAD_OBSERVATION", "observation view \"nose\"",
-       [](auto& r) { r.mutable_act()->mutable_views(0)->set_name("nose"); }},
+      {"BAD_OBSERVATION", "view \"nose\"", [](auto& r) { r.mutable_act()->mutable_views(0)->set_name("nose"); }},
       {"BAD_OBSERVATION", "observation.state[1]",
        [](auto& r) { r.mutable_act()->mutable_states(0)->set_values(1, std::nanf("")); }},
       {"BAD_OBSERVATION", "observation.state", [](auto& r) { r.mutable_act()->mutable_states(0)->add_values(0); }},
       {"BAD_OBSERVATION", "observation.state", [](auto& r) { r.mutable_act()->clear_states(); }},
       {"BAD_OBSERVATION", "instruction", [](auto& r) { r.mutable_act()->clear_text(); }},
-      {"BAD_OBSERVATION", "act.noise", [](auto& r) { r.mutable_act()->mutable_noise()->set_horizon(1); }},
-      {"TOO_LARGE", "act.text", [](auto& r) { r.mutable_act()->set_text(std::string(5000, 'x')); }},
+      {"BAD_OBSERVATION", "noise", [](auto& r) { r.mutable_act()->mutable_noise()->set_horizon(1); }},
+      {"TOO_LARGE", "instruction", [](auto& r) { r.mutable_act()->set_text(std::string(5000, 'x')); }},
   };
   for (const Case& c : cases) {
     CAPTURE(c.where);
