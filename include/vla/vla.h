@@ -87,9 +87,11 @@ typedef struct vla_options {
   int32_t n_thread;    /* CPU threads, at most 512; 0: every core that the process may use */
   const char* kernels; /* "ggml", "avx2", "avx512", "amx", or "float32": the best that does not round to bf16; NULL: the
                           best for the bundle's dtype, which rounds to bf16 if the bundle and the machine have it */
+  int32_t strict_state; /* 1: an observation whose state is far beyond what the policy has seen is refused with
+                           VLA_BAD_OBSERVATION; 0: it is answered with a note */
 } vla_options;
 #define VLA_OPTIONS_INIT \
-  { sizeof(vla_options), 0, NULL }
+  { sizeof(vla_options), 0, NULL, 0 }
 
 /* Opens, checks and loads a bundle. `options` may be NULL: then they are as VLA_OPTIONS_INIT has them. On failure *out
  * is NULL. */

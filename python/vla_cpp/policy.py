@@ -30,6 +30,7 @@ class Policy(Handle):
     threads  of the CPU; 0 takes every core that the process may use
     kernels  "ggml", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to bf16; None: the best for the
              bundle's dtype
+    strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
     of its parent, since the threads that compute stay behind, nor can it be pickled.
@@ -37,7 +38,14 @@ class Policy(Handle):
     Errors: IoError, BadBundle, Unsupported, OutOfMemory, DeviceError, UsageError.
     """
 
-    def __init__(self, path: Union[str, os.PathLike], *, threads: int = 0, kernels: Optional[str] = None) -> None:
+    def __init__(
+        self,
+        path: Union[str, os.PathLike],
+        *,
+        threads: int = 0,
+        kernels: Optional[str] = None,
+        strict_state: bool = False,
+    ) -> None:
         self._handle = ctypes.c_void_p()
         self._lock = threading.Lock()
         self._pid = os.getpid()
@@ -45,7 +53,9 @@ class Policy(Handle):
         if not isinstance(threads, int) or not 0 <= threads <= 512:
             raise UsageError("threads", "a whole number from 0 to 512", repr(threads))
         options = _capi.Options(
-            n_thread=threads, kernels=None if kernels is None else _encoded("kernels", kernels, UsageError)
+            n_thread=threads,
+            kernels=None if kernels is None else _encoded("kernels", kernels, UsageError),
+            strict_state=bool(strict_state),
         )
         if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
             raise self._last_error(None)

@@ -37,14 +37,21 @@ static_assert(VLA_INTERNAL == exit_code(Code::internal) && VLA_USAGE == exit_cod
 
 constexpr int kMaxThread = 512;
 
-Result<EngineOptions> read_options(const vla_options* given) {
-  if (given == nullptr) return EngineOptions{};
+struct Options {
+  EngineOptions engine;
+  bool strict_state = false;
+};
+
+Result<Options> read_options(const vla_options* given) {
+  if (given == nullptr) return Options{};
   VLA_TRY(const vla_options known, read_struct<vla_options>(given, "options"));
   if (known.n_thread < 0 || known.n_thread > kMaxThread)
     return usage("options.n_thread", fmt::format("0 to {}", kMaxThread), std::to_string(known.n_thread));
-  EngineOptions options{.n_thread = known.n_thread};
+  if (known.strict_state != 0 && known.strict_state != 1)
+    return usage("options.strict_state", "0 or 1", std::to_string(known.strict_state));
+  Options options{{.n_thread = known.n_thread}, known.strict_state == 1};
   if (known.kernels != nullptr) {
-    VLA_TRY(options.kernels, read_name(known.kernels, "options.kernels"));
+    VLA_TRY(options.engine.kernels, read_name(known.kernels, "options.kernels"));
   }
   return options;
 }
@@ -53,8 +60,9 @@ Status open(const char* path, const vla_options* options, vla_policy** out) {
   if (out == nullptr) return usage("out", "a place for the policy", "NULL");
   *out = nullptr;
   VLA_TRY(const std::string file, read_name(path, "path"));
-  VLA_TRY(const EngineOptions engine_options, read_options(options));
-  VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(file, engine_options));
+  VLA_TRY(const Options known, read_options(options));
+  VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(file, known.engine));
+  if (known.strict_state) engine->refuse_beyond();
   *out = new vla_policy(std::move(engine));
   return {};
 }

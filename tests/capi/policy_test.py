@@ -154,6 +154,15 @@ def test_what_the_policy_cannot_take_is_an_exception_of_its_class_and_the_next_c
 
 
 def test_an_error_carries_all_its_parts(act):
+def test_a_state_far_beyond_what_the_policy_has_seen_is_noted_or_refused(golden):
+    observation = dict(images=frames(golden), state=[*golden.state[:-1], 1e30], text=golden.text, seed=1)
+    with vla_cpp.Policy(golden.bundle, threads=1) as policy:
+        assert "far from what the policy has seen" in policy.act(**observation).notes[0]
+    with vla_cpp.Policy(golden.bundle, threads=1, strict_state=True) as policy:
+        with pytest.raises(vla_cpp.BadObservation, match="at most 10 when normalized"):
+            policy.act(**observation)
+
+
     with pytest.raises(vla_cpp.BadObservation) as caught:
         act(state=[0.0] * 5)
     error = caught.value

@@ -157,6 +157,26 @@ TEST_CASE("what the engine refuses comes with all its parts") {
   CHECK(std::string(error.message) == "observation.state: expected 6 numbers, found 5");
 }
 
+TEST_CASE("a state far beyond what the policy has seen is answered with a note, or refused where that is asked for") {
+  Call call;
+  std::vector<float> values(call.states[0].values, call.states[0].values + call.states[0].n_value);
+  values.back() = 1e30f;
+  call.states[0].values = values.data();
+  for (const int strict : {0, 1}) {
+    vla_options options = VLA_OPTIONS_INIT;
+    options.n_thread = 1;
+    options.strict_state = strict;
+    vla_policy* opened = nullptr;
+    REQUIRE(vla_open(call.golden.bundle().c_str(), &options, &opened) == VLA_OK);
+    const PolicyHandle policy(opened);
+    vla_chunk* answer = nullptr;
+    const vla_status status = vla_act(policy.get(), &call.observation, &answer);
+    const ChunkHandle chunk(answer);
+    CHECK(status == (strict == 1 ? VLA_BAD_OBSERVATION : VLA_OK));
+    CHECK(vla_chunk_n_note(chunk.get()) == (strict == 1 ? 0 : 1));
+  }
+}
+
 TEST_CASE("a file that cannot be read or is no bundle is a typed error, and options are checked") {
   vla_policy* policy = nullptr;
   check_error(nullptr, vla_open("/nonexistent/policy.gguf", nullptr, &policy), VLA_IO, "/nonexistent/policy.gguf");
@@ -167,6 +187,9 @@ TEST_CASE("a file that cannot be read or is no bundle is a typed error, and opti
     options.n_thread = n_thread;
     check_error(nullptr, vla_open(file.c_str(), &options, &policy), VLA_USAGE, "options.n_thread");
   }
+  options = VLA_OPTIONS_INIT;
+  options.strict_state = 2;
+  check_error(nullptr, vla_open(file.c_str(), &options, &policy), VLA_USAGE, "options.strict_state");
   const Call sound;
   options = VLA_OPTIONS_INIT;
   options.kernels = "abacus";
