@@ -51,6 +51,17 @@ def test_a_server_counts_states_beyond_their_bound_or_refuses_them(vla, golden, 
         server.process.communicate()
 
 
+def test_the_bound_is_what_the_converter_was_told(vla, golden, tmp_path):
+    case = copy.copy(golden)
+    case.said = {**golden.said, "state_bound": 1e9}
+    case.state = [*golden.state[:-1], 1e4]
+    (note,) = vla(*case.arguments()).json()["notes"]
+    assert "more than 10 is far" in note
+    case.bundle = convert(case, tmp_path / "policy.gguf", "bf16")
+    assert vla(*case.arguments()).json()["notes"] == []
+    assert json.loads(vla("inspect", case.bundle, "--json").out)["keys"]["observation.state_bound"] == 1e9
+
+
 @pytest.fixture
 def degraded(golden, tmp_path):
     """The bundle of the golden checkpoint without statistics of its state."""

@@ -71,6 +71,13 @@ def test_a_hub_without_a_network_is_an_io_error_that_says_what_to_do(tmp_path):
     assert "download it and give the folder" in result.stderr
 
 
+@pytest.mark.parametrize("bound", ["0.5", "-10", "1e10", "nan"])
+def test_a_bound_that_makes_no_sense_is_a_usage_error(converter, tiny, bound, capsys):
+    assert main([converter.save(tiny), "-o", converter.out, "--state-bound=" + bound]) == 2
+    assert capsys.readouterr().err.startswith("error: --state-bound: expected 1 to 1e9, found ")
+    assert not os.path.exists(converter.out)
+
+
 @pytest.mark.parametrize("args", [[], ["only"], ["a", "-o", "b", "--dtype", "int3"], ["a", "-o", "b", "--frobnicate"]])
 def test_wrong_arguments_are_a_usage_error(args, capsys):
     with pytest.raises(SystemExit) as info:

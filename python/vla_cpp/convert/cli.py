@@ -76,6 +76,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="let FEATURE (observation.state or action) pass unnormalised when its statistics are missing",
     )
     add(
+        "--state-bound",
+        metavar="N",
+        type=float,
+        help="a number of the state that is beyond N when normalized is told in every answer, or refused with --strict-state; the"
+        " runtime takes 10 where the bundle does not say",
+    )
+    add(
         "--position-precision",
         choices=("float32", "bfloat16", "shifted"),
         default="",
@@ -186,6 +193,7 @@ def main(argv=None) -> int:
         dtype=args.dtype,
         dataset_info=args.dataset_info,
         identity_stats=args.identity_stats,
+        state_bound=args.state_bound,
         position_precision=args.position_precision,
         variant=args.variant,
         stats=args.stats,

@@ -44,12 +44,15 @@ def convert_checkpoint(
 ) -> Summary:
     """Writes `out` or raises ConvertError and leaves nothing behind."""
     _check_out(out, force)
+    _check_state_bound(options)
     checkpoint = open_checkpoint(source)
     options = replace(options, backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
     plan = archs.load(arch).plan(checkpoint, options, problems)
+    if options.state_bound is not None:
+        plan.keys.append(Key("observation.state_bound", "f32", options.state_bound))
     dropped = _match(checkpoint, plan, problems)
     problems.raise_any()
     dtype = _choose_dtype(checkpoint, plan, options.dtype)
@@ -66,6 +69,11 @@ def _check_out(out: str, force: bool) -> None:
         raise refuse("-o " + out, "a name that is free", "an existing file", "--force overwrites it", Code.USAGE)
     if not os.path.isdir(os.path.dirname(os.path.abspath(out))):
         raise refuse("-o " + out, "an existing folder", "none", code=Code.IO)
+
+
+def _check_state_bound(options: Options) -> None:
+    if options.state_bound is not None and not 1 <= options.state_bound <= 1e9:
+        raise refuse("--state-bound", "1 to 1e9", "{:g}".format(options.state_bound), code=Code.USAGE)
 
 
 def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, List[str]]:

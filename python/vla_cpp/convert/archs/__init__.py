@@ -52,6 +52,7 @@ class Options:
     dtype: str = ""
     dataset_info: str = ""
     identity_stats: Sequence[str] = ()
+    state_bound: Optional[float] = None  # of a normalized number of the state; the runtime's own where it is not said
     position_precision: str = ""
     variant: str = ""  # openpi's name of a training configuration, or the revision of Evo-1's code: checkpoints do not state them
     stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET; BitVLA: which of dataset_statistics.json
