@@ -173,7 +173,11 @@ void print_json(const Engine& engine) {
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
-  say_lines(stdout, text_of(root, 2) + "\n");
+  auto exact = nlohmann::ordered_json::parse(text_of(root));  // its numbers are double
+  for (const TensorInfo& tensor : engine.bundle().tensors())
+    if (tensor.name.starts_with("stats.") && tensor.type == DType::f64)
+      exact["stats"][tensor.name] = *engine.bundle().stats(tensor.name);
+  say_lines(stdout, exact.dump(2, ' ', true, Json::error_handler_t::replace) + "\n");
 }
 
 Status print_graph(Engine& engine, const std::string& part) {
