@@ -81,12 +81,17 @@ bool guarded_layout(PngReader& reader) {
   return true;
 }
 
+/// Memory for the pixels is reserved, and written as rows come: a file of few bytes cannot have all of it cleared. Each
+/// pass of an interlaced file needs all rows.
 bool guarded_pixels(PngReader& reader) {
   if (setjmp(png_jmpbuf(reader.png)) != 0) return false;
   const std::size_t row_size = png_get_rowbytes(reader.png, reader.info);
+  const std::size_t size = row_size * png_get_image_height(reader.png, reader.info);
   for (int pass = png_set_interlace_handling(reader.png); pass > 0; --pass)
-    for (png_bytep row = reader.pixels.data(); row != reader.pixels.data() + reader.pixels.size(); row += row_size)
-      png_read_row(reader.png, row, nullptr);
+    for (std::size_t at = 0; at != size; at += row_size) {
+      if (at == reader.pixels.size()) reader.pixels.resize(at + row_size);
+      png_read_row(reader.png, reader.pixels.data() + at, nullptr);
+    }
   png_read_end(reader.png, nullptr);
   return true;
 }
@@ -235,7 +240,7 @@ Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits
   const bool palette = png_get_color_type(reader.png, reader.info) == PNG_COLOR_TYPE_PALETTE;
   const std::size_t row_size = png_get_rowbytes(reader.png, reader.info);
   if (row_size != width * (palette ? 1 : 3)) return corrupt(reader, where);
-  reader.pixels.resize(row_size * height);
+  reader.pixels.reserve(row_size * height);
   if (!guarded_pixels(reader)) return corrupt(reader, where);
   if (palette && !expand_palette(reader)) return refused(where, "a whole PNG image", "a pixel beyond its palette");
 

@@ -55,6 +55,13 @@ std::string png_with(const std::string& chunks) {
   return read_text(data_path("images/rgb.png")).insert(kHeader, chunks);
 }
 
+/// A black image that announces `height` rows and brings `n_row`.
+std::string grey_png(std::size_t width, std::size_t height, std::size_t n_row) {
+  const std::string head = "IHDR" + big_endian(width) + big_endian(height) + std::string("\x08\0\0\0\0", 5);
+  const std::string rows = packed(std::string((width + 1) * n_row, '\0'));
+  return "\x89PNG\r\n\x1A\n" + chunk(head) + chunk("IDAT" + rows) + chunk("IEND");
+}
+
 /// The most memory that this process has had, in bytes.
 std::size_t peak_memory() {
   rusage usage = {};
@@ -118,16 +125,21 @@ TEST_CASE("a damaged text is passed over") {
 }
 
 TEST_CASE("a PNG of many short rows takes no memory beside its pixels") {
-  const std::string zero(1, '\0');
   constexpr std::size_t kHeight = 4 << 20;
-  std::string head("IHDR");
-  head += big_endian(1) + big_endian(kHeight) + std::string("\x08\0\0\0\0", 5);  // grey
-  const std::string file =
-      "\x89PNG\r\n\x1A\n" + chunk(head) + chunk("IDAT" + packed(std::string(2 * kHeight, '\0'))) + chunk("IEND");
+  const std::string file = grey_png(1, kHeight, kHeight);
   const std::size_t before = peak_memory();
   const auto frame = decode_image(bytes_of(file), "top");
   REQUIRE_MESSAGE(frame.ok(), frame.error().message());
   CHECK(peak_memory() - before < 2 * 3 * kHeight);
+}
+
+TEST_CASE("a PNG that announces 64 million pixels and brings one row takes memory for one row") {
+  const std::string file = grey_png(8000, 8000, 1);
+  const std::size_t before = peak_memory();
+  const auto frame = decode_image(bytes_of(file), "top");
+  REQUIRE_FALSE(frame.ok());
+  CHECK(contains(frame.error().message(), "expected a whole PNG image"));
+  CHECK(peak_memory() - before < std::size_t{64} << 20);  // the pixels are 192 MB
 }
 
 TEST_CASE("every readable PNG and JPEG decodes to Pillow's pixels") {
