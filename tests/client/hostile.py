@@ -50,10 +50,10 @@ GARBAGE = {
 }
 
 
-def connect(address, data=b""):
-    """A TCP connection to `tcp://HOST:PORT` that has sent `data`."""
+def connect(address, data=b"", source=""):
+    """A TCP connection to `tcp://HOST:PORT` that has sent `data`, from an address of one's own."""
     where = urlsplit(address)
-    raw = socket.create_connection((where.hostname, where.port), timeout=20)
+    raw = socket.create_connection((where.hostname, where.port), timeout=20, source_address=(source, 0))
     try:
         raw.sendall(data)
     except OSError:  # the server may have had enough of it

@@ -1,0 +1,416 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a client that behaves gets from `vla serve` while other peers attack it, as rows of a Markdown table.
+
+scripts/serve_attacked.py                 the shipped policy, 20 seconds quiet and 20 under every attack at once
+scripts/serve_attacked.py --attack half_sent --attack flood
+scripts/serve_attacked.py --real-time    on a machine that does other work beside it
+
+The attackers come from 127.0.0.2 and run at the lowest priority, since they are to attack the server and not the cores that it
+shares with them here. Fails where an answer is lost or wrong, or a row misses its bar. docs/security.md says what is promised.
+"""
+
+import argparse
+import contextlib
+import io
+import itertools
+import json
+import os
+import re
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+import zlib
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import zmq
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tests/client")]
+import hostile  # noqa: E402
+
+import vla_cpp  # noqa: E402
+from vla_cpp import wire  # noqa: E402
+
+ATTACKER = "127.0.0.2"
+MAX_MESSAGE_MIB = 32
+HEALTH_MS, LATE_MS, ACT_RATIO = 20, 20, 2  # the bars
+PERIOD = 0.03  # seconds between the acts of a robot that behaves
+
+
+# --- attacks: each runs in a process of its own until that is ended --------------------------------------------------
+
+
+def again_and_again(*steps):
+    """Each step in a thread of its own, begun again when the server has ended its connection."""
+
+    def repeat(step):
+        while True:
+            with contextlib.suppress(OSError):
+                step()
+
+    for step in steps:
+        threading.Thread(target=repeat, args=(step,), daemon=True).start()
+    threading.Event().wait()
+
+
+def connect(target, data=b""):
+    return hostile.connect(target.address, data, source=ATTACKER)
+
+
+def half_sent(target):
+    """40 requests of 30 MB, of which 20 MB come, as fast as a network of 1 Gbit brings them."""
+
+    def one():
+        with connect(target, hostile.HANDSHAKE + hostile.long_frame(30_000_000)) as raw:
+            for _ in range(20):
+                raw.sendall(bytes(1_000_000))
+                time.sleep(0.3)
+            while raw.recv(1 << 16):
+                pass
+
+    again_and_again(*[one] * 40)
+
+
+def flood(target):
+    """Messages of a million frames, and of requests without end whose answers nobody reads."""
+    health = request("health")
+
+    def frames():
+        with connect(target, hostile.HANDSHAKE) as raw:
+            raw.sendall(b"\x01\x00" * 1_000_000)
+
+    def unread():
+        with connect(target, hostile.HANDSHAKE) as raw:
+            while True:
+                raw.sendall((bytes([0, len(health)]) + health) * 100)
+
+    again_and_again(frames, frames, unread, unread)
+
+
+def connections(target):
+    """200 connections that say nothing, or half a greeting."""
+
+    def one(data):
+        with connect(target, data) as raw:
+            while raw.recv(1 << 16):
+                pass
+
+    again_and_again(*[lambda: one(b"")] * 100, *[lambda: one(hostile.GREETING[:40])] * 100)
+
+
+def drip(target):
+    """20 peers that send requests byte by byte."""
+    health = request("health")
+
+    def one():
+        with connect(target, hostile.HANDSHAKE) as raw:
+            while True:
+                for byte in bytes([0, len(health)]) + health:
+                    raw.sendall(bytes([byte]))
+                    time.sleep(0.005)
+
+    again_and_again(*[one] * 20)
+
+
+def drip_http(target):
+    """60 HTTP requests that come a byte at a time, and take the page a byte at a time."""
+    host = urlsplit(target.metrics)
+
+    def one():
+        raw = socket.create_connection((host.hostname, host.port), timeout=20, source_address=(ATTACKER, 0))
+        with raw:
+            for byte in b"GET /metrics HTTP/1.1\r\nHost: robot\r\nX-Long: " + b"x" * 1000:
+                raw.sendall(bytes([byte]))
+                time.sleep(0.01)
+
+    again_and_again(*[one] * 60)
+
+
+def hostile_png(target):
+    """70 connections of one peer that ask for acts all the time: an image with 200 compressed texts that would be 8 MB each, and one
+    with fewer rows than it announces."""
+    with vla_cpp.Client(target.address, timeout=20) as client:
+        view = client.spec.views[0].name
+    acts = []
+    for image in (png(8, 8, texts=200), png(4000, 4000, rows=1)):
+        message = wire.Request(protocol_version=1, request_id=1)
+        message.act.views.add(name=view, png=image)
+        acts.append(message.SerializeToString())
+    poller = zmq.Poller()
+    for n in range(70):
+        s = zmq.Context.instance().socket(zmq.DEALER)
+        s.linger = 0
+        s.connect(target.address.replace("tcp://", f"tcp://{ATTACKER}:0;"))
+        s.send(acts[n % 2])
+        poller.register(s, zmq.POLLIN)
+    for n in itertools.count():
+        for s, _ in poller.poll():
+            s.recv()
+            s.send(acts[n % 2])
+
+
+ATTACKS = {f.__name__: f for f in (half_sent, flood, connections, drip, drip_http, hostile_png)}
+
+
+def request(kind):
+    message = wire.Request(protocol_version=1, request_id=1)
+    getattr(message, kind).SetInParent()
+    return message.SerializeToString()
+
+
+def png(width, height, rows=None, texts=0):
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    text = b"Comment\0\0" + zlib.compress(bytes(8_000_000))
+    pixels = zlib.compress(bytes((3 * width + 1) * (height if rows is None else rows)))
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"zTXt", text) * texts + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+# --- who behaves -------------------------------------------------------------------------------------------------------
+
+
+class Target:
+    """A server of its own, or where it is."""
+
+    def __init__(self, options):
+        command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", "--metrics", "127.0.0.1:0"]
+        command += ["--threads", str(options.threads), "--max-message", str(MAX_MESSAGE_MIB)]
+        self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        line = self.process.stdout.readline()
+        self.address = re.search(r"address='?(tcp://[^\s']+)", line)[1]
+        self.metrics = "http://" + re.search(r"metrics='?([^\s']+)", line)[1]
+
+    def memory_mib(self, what="VmRSS"):
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(re.search(rf"{what}:\s+(\d+)", status)[1]) / 1024
+
+
+class Behaved:
+    """A robot that asks for an act in each of its periods, and a probe of health, over ZeroMQ and HTTP."""
+
+    def __init__(self, target):
+        self._target = target
+        self._robot, self._probe = (vla_cpp.Client(target.address, timeout=20) for _ in range(2))
+        spec = self._robot.spec
+        rng = np.random.default_rng(1)
+        self._observation = {
+            "images": {v.name: rng.integers(0, 255, (v.height, v.width, 3), np.uint8) for v in spec.views},
+            "state": {s.name: np.full(s.width, 0.1, np.float32) for s in spec.states},
+            "text": "open the drawer",
+        }
+        self._expected = self._robot.act(**self._observation, seed=1).actions.tobytes()
+
+    def watch(self, seconds):
+        """Milliseconds of acts, of health, of /healthz, and then how long after its deadline LATE came."""
+        self._until = time.monotonic() + seconds
+        times = {"act": [], "health": [], "healthz": [], "late": []}
+        threads = [
+            threading.Thread(target=self._repeat, args=(times[name], what, period))
+            for name, what, period in (
+                ("act", self._act, PERIOD), ("health", self._probe.health, 0.02), ("healthz", self._healthz, 0.02)
+            )
+        ]  # fmt: skip
+        self._failed = []
+        [thread.start() for thread in threads]
+        [thread.join() for thread in threads]
+        if self._failed:
+            raise self._failed[0]
+        while time.monotonic() < self._until + seconds / 4:
+            times["late"] += late_after(self._target.address, self._robot.spec, self._observation)
+        return times
+
+    def _repeat(self, times, what, period):
+        try:
+            while time.monotonic() < self._until:
+                start = time.perf_counter()
+                what()
+                took = time.perf_counter() - start
+                times.append(1e3 * took)
+                time.sleep(max(0, period - took))
+        except Exception as failure:
+            self._failed.append(failure)
+
+    def _act(self):
+        chunk = self._robot.act(**self._observation, seed=1)
+        assert chunk.actions.tobytes() == self._expected, "the actions of another observation"
+
+    def _healthz(self):
+        with urllib.request.urlopen(self._target.metrics + "/healthz", timeout=20) as page:
+            assert page.status == 200
+
+
+def late_after(address, spec, observation, n=8, deadline_ms=2):
+    """Several connections of a third peer ask at once, and cannot all be served before the deadline: milliseconds after it at
+    which those that are late were told so."""
+    sockets = []
+    with zmq.Context() as context:
+        for i in range(n):
+            s = context.socket(zmq.DEALER)
+            s.linger, s.rcvtimeo = 0, 20_000
+            s.connect(address.replace("tcp://", "tcp://127.0.0.3:0;"))
+            s.send(request("health"))
+            sockets.append(s)
+        [s.recv() for s in sockets]
+        message = wire.Request(protocol_version=1, request_id=2)
+        limits = wire.MESSAGES["Limits"]()
+        data = wire.act_bytes(message, spec, limits, **observation, seed=1, noise=None, deadline_ms=deadline_ms)
+        sent, poller, late = {}, zmq.Poller(), []
+        for s in sockets:
+            sent[s] = time.perf_counter()
+            s.send(data)
+            poller.register(s, zmq.POLLIN)
+        while sent:
+            came = poller.poll(20_000)
+            assert came, "an act was not answered"
+            for s, _ in came:
+                answer = wire.Response.FromString(s.recv())
+                if answer.error.code == 16:
+                    late.append(1e3 * (time.perf_counter() - sent[s]) - deadline_ms)
+                poller.unregister(s)
+                del sent[s]
+        [s.close() for s in sockets]
+    return late
+
+
+def slow_upload(target, seconds, outcome):
+    """A robot on a bad line: its act takes that long to come, and is answered."""
+    with vla_cpp.Client(target.address, timeout=20) as client:
+        spec = client.spec
+    message = wire.Request(protocol_version=1, request_id=7)
+    for view in spec.views:
+        pixels = np.zeros((view.height, view.width, 3), np.uint8)
+        rgb = message.act.views.add(name=view.name).rgb
+        rgb.width, rgb.height, rgb.rows = view.width, view.height, pixels.tobytes()
+    for s in spec.states:
+        message.act.states.add(name=s.name).values.extend([0.1] * s.width)
+    message.act.text = "go"
+    data = message.SerializeToString()
+    try:
+        with hostile.connect(target.address, hostile.HANDSHAKE, source="127.0.0.4") as raw:
+            data = hostile.long_frame(len(data), data)
+            for piece in np.array_split(np.frombuffer(data, np.uint8), 50):
+                raw.sendall(piece.tobytes())
+                time.sleep(seconds / 50)
+            raw.settimeout(20)
+            came = io.BytesIO()
+            while b"\x08\x01\x10\x07\x2a" not in came.getvalue():  # version 1, number 7, a chunk
+                part = raw.recv(1 << 16)
+                assert part, "the connection was closed"
+                came.write(part)
+        outcome.append(True)
+    except (OSError, AssertionError) as failure:
+        print(f"slow upload: {failure!r}", file=sys.stderr)
+
+
+# --- the table ---------------------------------------------------------------------------------------------------------
+
+
+def p(values, percent):
+    return float(np.percentile(values, percent)) if values else float("nan")
+
+
+def last_of_all():
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.nice(19)
+
+
+def measure(options):
+    if options.real_time:  # the server inherits it
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    target = Target(options)
+    attackers = []
+    try:
+        behaved = Behaved(target)
+        behaved.watch(1)  # warm
+        quiet = behaved.watch(options.seconds)
+        before = target.memory_mib()
+        for name in options.attack or ATTACKS:
+            command = [sys.executable, __file__, "--as", name, target.address, target.metrics]
+            attackers.append(subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=last_of_all))
+        [attacker.stdout.readline() for attacker in attackers]
+        time.sleep(1)
+        uploaded = []
+        upload = threading.Thread(target=slow_upload, args=(target, options.seconds * 0.8, uploaded))
+        upload.start()
+        attacked = behaved.watch(options.seconds)
+        upload.join()
+        ended = [name for name, a in zip(options.attack or ATTACKS, attackers) if a.poll() is not None]
+        grown = target.memory_mib("VmHWM") - before
+    finally:
+        [a.kill() for a in attackers]
+        [a.wait() for a in attackers]
+        target.process.terminate()
+    status = target.process.wait(20)
+    return quiet, attacked, dict(grown_mib=grown, uploaded=bool(uploaded), ended=ended, status=status)
+
+
+def rows_of(options, quiet, attacked, rest):
+    """(what, measured when quiet, under attack, bar, whether it holds)"""
+    act, loose = {q: p(quiet["act"], q) for q in (50, 95)}, options.loose
+    memory = 12 * MAX_MESSAGE_MIB + 15 * 16 + 10  # docs/security.md
+    rows = []
+    for q in (50, 95):
+        ratio = p(attacked["act"], q) / act[q]
+        rows.append((f"act p{q}, ms", f"{act[q]:.1f}", f"{p(attacked['act'], q):.1f} ({ratio:.2f}x)",
+                     f"{ACT_RATIO * loose:g}x", ratio <= ACT_RATIO * loose))  # fmt: skip
+    for name, bar in (("health", HEALTH_MS), ("healthz", HEALTH_MS), ("late", LATE_MS)):
+        worst = p(attacked[name], 95)
+        what = "LATE after its deadline" if name == "late" else name
+        rows.append((f"{what} p95 (largest), ms", f"{p(quiet[name], 95):.1f} ({max(quiet[name], default=0):.1f})",
+                     f"{worst:.1f} ({max(attacked[name], default=0):.1f})", f"{bar * loose:g}", worst <= bar * loose))  # fmt: skip
+    rows += [
+        ("memory beyond the policy, MiB", "", f"{rest['grown_mib']:.0f}", f"{memory}", rest["grown_mib"] <= memory),
+        ("a slow upload is answered", "", str(rest["uploaded"]), "True", rest["uploaded"]),
+        ("attacks that gave up", "", ", ".join(rest["ended"]) or "none", "none", not rest["ended"]),
+        ("exit status", "", str(rest["status"]), "0", rest["status"] == 0),
+    ]
+    return rows
+
+
+def parse():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--bundle", type=Path, default=ROOT / "models/metaworld-tiny.gguf")
+    parser.add_argument("--vla", type=Path, default=Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla")))
+    parser.add_argument("--threads", type=int, default=1, help="of the engine; default: 1")
+    parser.add_argument("--seconds", type=float, default=20, help="of each measurement; default: 20")
+    parser.add_argument("--attack", action="append", choices=ATTACKS, help="default: all at once")
+    parser.add_argument("--loose", type=float, default=1, help="factor on the bars of time, for a machine with other work")
+    parser.add_argument(
+        "--real-time", action="store_true", help="server and robot have their cores before all other work of the machine; takes root"
+    )
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--as", dest="role", nargs=3, help=argparse.SUPPRESS)  # attack, address, metrics
+    return parser.parse_args()
+
+
+def main():
+    options = parse()
+    if options.role:
+        attack, address, metrics = options.role
+        print("attacking", flush=True)
+        return ATTACKS[attack](argparse.Namespace(address=address, metrics=metrics))
+    quiet, attacked, rest = measure(options)
+    rows = rows_of(options, quiet, attacked, rest)
+    if options.json:
+        print(json.dumps({"quiet": quiet, "attacked": attacked, **rest}))
+    else:
+        print("| | quiet | under attack | bar |\n| --- | --- | --- | --- |")
+        for what, before, under, bar, holds in rows:
+            print(f"| {what} | {before} | {under} | {bar}{'' if holds else ' **missed**'} |")
+        counts = ", ".join(f"{len(attacked[name])} {name}" for name in attacked)
+        print(f"\nUnder attack: {counts}.")
+    return 0 if all(row[-1] for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
