@@ -2,16 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the programs write: whole or not at all, and readable by those only whom it concerns."""
 
+import json
 import os
 import resource
 import signal
 import stat
 import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
 import wire
+from conftest import ROOT
 from serve_test import Server
+
+sys.path.append(str(ROOT / "tests/client"))
+import hostile  # noqa: E402
 
 LOCAL = ("--bind", "tcp://127.0.0.1:0", "--threads", "1")
 MODE = 0o777
@@ -72,6 +79,51 @@ def test_recordings_and_traces_are_for_their_owner_only(vla, golden, tmp_path):
         assert server.stop(signal.SIGTERM)[0] == 0
     finally:
         server.process.kill()
+
+
+def test_a_server_on_a_full_disk_stops_recording_and_answers_on(vla, golden, tmp_path):
+    files = ("--record", tmp_path / "recording", "--trace", tmp_path / "trace.json")
+    server = Server(vla, golden.bundle, *LOCAL, *files, "--log", "json", limit=20_000)
+    peer = wire.Peer(server.ready["address"])
+    try:
+        for i in range(5):  # each is larger than the disk
+            assert wire.kind(peer.ask(wire.act(i, golden, seed=i))) == "chunk"
+    finally:
+        peer.close()
+    code, _, log = server.stop(signal.SIGTERM)
+    events = [json.loads(line)["event"] for line in log.splitlines()]
+    assert code == 0 and events.count("record_stopped") == 1
+    assert all(file.stat().st_size <= 20_000 for file in tmp_path.rglob("*") if file.is_file())
+
+
+@pytest.mark.skipif("asan" in os.environ.get("VLA_BINARY", ""), reason="the address sanitizer takes terabytes of address space")
+def test_threads_that_the_system_does_not_give_are_an_error(vla, golden):
+    """Their stacks are larger than what is left of the address space."""
+    arguments = ["256" if a == "2" else str(a) for a in golden.arguments()]
+    answer = subprocess.run(
+        [vla.path, *arguments], env=vla.environment, capture_output=True, text=True, timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (800 << 20, 800 << 20)),
+    )  # fmt: skip
+    assert answer.returncode == 8 and answer.stderr.startswith("error: device: threads: expected 256, found ")
+
+
+def test_two_signals_end_a_server_within_a_second_though_peers_are_in_the_midst_of_their_requests(vla, golden):
+    server = Server(vla, golden.bundle, *LOCAL)
+    peer = wire.Peer(server.ready["address"])
+    half = [hostile.connect(server.ready["address"], data) for data in hostile.HALF_SENT.values()]
+    try:
+        for i in range(20):
+            peer.socket.send(wire.act(i, golden, seed=i))
+        start = time.monotonic()
+        server.process.send_signal(signal.SIGINT)
+        server.process.send_signal(signal.SIGTERM)
+        server.process.wait(20)
+        assert time.monotonic() - start < 1
+    finally:
+        peer.close()
+        [raw.close() for raw in half]
+        server.process.kill()
+        server.process.communicate()
 
 
 def test_a_recording_that_is_a_pipe_is_refused_at_once(vla, tmp_path):

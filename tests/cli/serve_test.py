@@ -4,6 +4,7 @@
 the wire is tested in tests/serve/."""
 
 import re
+import resource
 import selectors
 import shlex
 import signal
@@ -15,12 +16,12 @@ import pytest
 
 
 class Server:
-    """A running `vla serve` on a free port; `ready` has the fields of its ready line."""
+    """A running `vla serve` on a free port; `ready` has the fields of its ready line. limit: of the size of files, as a full disk."""
 
-    def __init__(self, vla, *args):
+    def __init__(self, vla, *args, limit=None):
         self.process = subprocess.Popen(
-            [vla.path, "serve", *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env=vla.environment,
+            [vla.path, "serve", *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=vla.environment,
+            preexec_fn=limit and (lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))),
         )
         with selectors.DefaultSelector() as selector:
             selector.register(self.process.stdout, selectors.EVENT_READ)

@@ -113,6 +113,21 @@ def problems(root):
     return found
 
 
+def untested_rows(root, text):
+    """Rows of the tables whose last column is `test in tests/` that name no test there, or one that does not exist."""
+    rows, in_table = [], False
+    for line in text.splitlines():
+        if line.endswith("| test in `tests/` |"):
+            in_table = True
+        elif not line.startswith("|"):
+            in_table = False
+        elif in_table and not line.startswith("| ---"):
+            named = re.findall(r"`([^`]+)`", line.rstrip("| ").rsplit("|", 1)[-1] if not line.endswith("| |") else "")
+            if not named or not all((root / "tests" / name).is_file() for name in named):
+                rows.append(line)
+    return rows
+
+
 def command_problems(root, command, targets):
     words = command.split()
     if words[0] == "make":
@@ -140,6 +155,14 @@ class Documents(unittest.TestCase):
     def test_every_path_flag_and_target_that_a_document_names_exists(self):
         found = problems(ROOT)
         self.assertFalse(found, "\n" + "\n".join(found))
+
+    def test_every_limit_and_fault_of_security_names_the_test_that_holds_it(self):
+        text = (ROOT / "docs/security.md").read_text(encoding="utf-8")
+        self.assertEqual(untested_rows(ROOT, text), [])
+        row = "| what | test in `tests/` |\n| --- | --- |\n| a | `serve/queue_test.cpp` |\n"
+        self.assertEqual(untested_rows(ROOT, row), [])
+        gone, none = "| b | `serve/queue_test.cpp`, `serve/gone_test.cpp` |", "| c | |"
+        self.assertEqual(untested_rows(ROOT, f"{row}{gone}\n{none}\n"), [gone, none])
 
     def test_a_path_that_is_gone_is_named(self):
         self.assertEqual(self.check("see `src/engine/gone.cpp`"), ["README.md: names src/engine/gone.cpp, which does not exist"])

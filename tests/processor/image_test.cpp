@@ -5,7 +5,11 @@
 #include <sys/resource.h>
 #include <zlib.h>
 
+#include <cstdio>  // jpeglib.h needs FILE
+#include <cstdlib>
 #include <filesystem>
+
+#include <jpeglib.h>
 
 #include "processor/support.h"
 
@@ -60,6 +64,39 @@ std::string grey_png(std::size_t width, std::size_t height, std::size_t n_row) {
   const std::string head = "IHDR" + big_endian(width) + big_endian(height) + std::string("\x08\0\0\0\0", 5);
   const std::string rows = packed(std::string((width + 1) * n_row, '\0'));
   return "\x89PNG\r\n\x1A\n" + chunk(head) + chunk("IDAT" + rows) + chunk("IEND");
+}
+
+/// A grey image of 8 x 8 whose coefficients come one by one, first without their last bits and then bit by bit.
+std::string jpeg_of_scans(int n_bit) {
+  std::vector<jpeg_scan_info> scans = {{1, {0}, 0, 0, 0, 0}};
+  for (int k = 1; k < 64; ++k) scans.push_back({1, {0}, k, k, 0, n_bit});
+  for (int bit = n_bit; bit > 0; --bit)
+    for (int k = 1; k < 64; ++k) scans.push_back({1, {0}, k, k, bit, bit - 1});
+  jpeg_compress_struct jpeg = {};
+  jpeg_error_mgr errors = {};
+  jpeg.err = jpeg_std_error(&errors);
+  jpeg_create_compress(&jpeg);
+  unsigned char* out = nullptr;
+  unsigned long size = 0;
+  jpeg_mem_dest(&jpeg, &out, &size);
+  jpeg.image_width = jpeg.image_height = 8;
+  jpeg.input_components = 1;
+  jpeg.in_color_space = JCS_GRAYSCALE;
+  jpeg_set_defaults(&jpeg);
+  jpeg.scan_info = scans.data();
+  jpeg.num_scans = static_cast<int>(scans.size());
+  jpeg_start_compress(&jpeg, TRUE);
+  for (int y = 0; y < 8; ++y) {
+    JSAMPLE row[8] = {};
+    for (int x = 0; x < 8; ++x) row[x] = static_cast<JSAMPLE>(31 * x * y);
+    JSAMPROW rows[] = {row};
+    jpeg_write_scanlines(&jpeg, rows, 1);
+  }
+  jpeg_finish_compress(&jpeg);
+  jpeg_destroy_compress(&jpeg);
+  const std::string file(reinterpret_cast<const char*>(out), size);
+  std::free(out);
+  return file;
 }
 
 /// The most memory that this process has had, in bytes.
@@ -180,6 +217,15 @@ TEST_CASE("truncated and damaged images are refused") {
     CHECK(contains(refusal_of(name), "expected a whole JPEG image"));
   CHECK(contains(refusal_of("bad_palette_index.png"), "beyond its palette"));
   CHECK(contains(refusal_of("bad_exif.jpg"), "EXIF"));
+}
+
+TEST_CASE("a JPEG of more than 200 scans is refused when it has come so far") {
+  const std::string many = jpeg_of_scans(3), most = jpeg_of_scans(2);  // 253 and 190
+  const auto frame = decode_image(bytes_of(most), "top");
+  REQUIRE_MESSAGE(frame.ok(), frame.error().message());
+  const auto refused = decode_image(bytes_of(many), "top");
+  REQUIRE_FALSE(refused.ok());
+  CHECK(contains(refused.error().message(), "too many scans"));
 }
 
 TEST_CASE("an image that is cut anywhere is refused") {
