@@ -24,7 +24,8 @@ constexpr const char* kFooter = R"(Start here:
 
 Bundles are made with vla-convert (docs/converting.md).
 Exit codes: 0 done, 1 internal, 2 usage, 3 bad_bundle, 4 bad_observation, 5 bad_action, 6 unsupported, 7 out_of_memory,
-8 device, 9 io, 10 mismatch; 11 and up are answers of a server (docs/protocol.md).)";
+8 device, 9 io, 10 mismatch, 11 bad_request (of vla replay, a damaged recording too); 12 and up are answers of a server
+(docs/protocol.md).)";
 
 /// Further lines of an error are indented; a line end in a text that it quotes is none.
 int fail(const vla::Error& error) {

@@ -127,6 +127,7 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
         (dict(images={"camera1": b"\xff\xd8\xff\xe0"}), vla_cpp.BadObservation, "camera1"),
         (dict(images={"cam\0era1": None}), vla_cpp.BadObservation, "images"),
         (dict(images={"\ud800": None}), vla_cpp.BadObservation, "images"),
+        (dict(images=None), vla_cpp.BadObservation, "images: expected a dict by name, found None"),
         (dict(images={"camera1": None, "camera2": None}), vla_cpp.BadObservation, "at least 1"),
         (dict(state=[0.0] * 5), vla_cpp.BadObservation, "observation.state"),
         (dict(state=[0.0] * 5 + [float("nan")]), vla_cpp.BadObservation, "nan"),
@@ -153,7 +154,6 @@ def test_what_the_policy_cannot_take_is_an_exception_of_its_class_and_the_next_c
     assert np.isfinite(act()).all()
 
 
-def test_an_error_carries_all_its_parts(act):
 def test_a_state_far_beyond_what_the_policy_has_seen_is_noted_or_refused(golden):
     observation = dict(images=frames(golden), state=[*golden.state[:-1], 1e30], text=golden.text, seed=1)
     with vla_cpp.Policy(golden.bundle, threads=1) as policy:
@@ -163,6 +163,7 @@ def test_a_state_far_beyond_what_the_policy_has_seen_is_noted_or_refused(golden)
             policy.act(**observation)
 
 
+def test_an_error_carries_all_its_parts(act):
     with pytest.raises(vla_cpp.BadObservation) as caught:
         act(state=[0.0] * 5)
     error = caught.value

@@ -160,3 +160,10 @@ def test_a_bundle_that_is_none_is_reported_with_what_the_server_says(binary, tmp
     (tmp_path / "no.gguf").write_bytes(b"no")
     assert main(["null", "--bundle", str(tmp_path / "no.gguf"), "--vla", str(binary), "--out", str(tmp_path), "--quiet"]) == 9
     assert "bad_bundle" in capsys.readouterr().err
+
+
+def test_a_package_that_is_missing_is_named_with_what_installs_it():
+    script = "import sys; sys.modules['rich'] = None; from vla_cpp.eval.cli import main; sys.exit(main(['demo']))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    result = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+    assert result.returncode == 9 and result.stderr == "vla-eval: the module rich is missing: pip install 'vla-cpp[eval]'\n"

@@ -47,6 +47,12 @@ TEST_CASE("what is no endpoint is refused with an example of one") {
   }
 }
 
+TEST_CASE("a name of a host is refused with the reason") {
+  CHECK(reach_of("tcp://localhost:5555").error().message() ==
+        "--bind: expected an address or an interface, since names are not looked up, found 'localhost'; for example "
+        "tcp://127.0.0.1:5555");
+}
+
 TEST_CASE("an ipc path where a file lies is refused, not removed") {
   const std::string file = test::write_file("not_a_socket", "precious");
   const Status free = check_free("ipc://" + file);

@@ -186,7 +186,8 @@ def main(argv: Optional[List[str]] = None) -> int:
             return demo.play(a)
         data = replan(a) if a.command == "replan" else evaluate(a.command, a)
     except ModuleNotFoundError as error:
-        print(f"vla-eval: the module {error.name} is missing: pip install 'vla-cpp[eval]'", file=sys.stderr)
+        package = str(error.name).partition(".")[0]
+        print(f"vla-eval: the module {package} is missing: pip install 'vla-cpp[eval]'", file=sys.stderr)
         return 9
     except (RunFailed, JournalMismatch, EnvironmentFault, MissingSimulator, ServerFailed) as error:
         print(f"vla-eval: {error}", file=sys.stderr)
