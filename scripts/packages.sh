@@ -16,7 +16,12 @@ if [ "${1:-}" = demo ]; then
     packages+=(libosmesa6)
   fi
 fi
-if [ "${1:-}" = fuzz ]; then packages+=(clang); fi
+if [ "${1:-}" = fuzz ]; then
+  packages+=(clang)
+  # Newer releases only recommend the libraries behind -fsanitize, libFuzzer's too.
+  version=$(apt-cache depends clang 2>/dev/null | sed -n 's/^ *Depends: clang-\([0-9]*\)$/\1/p')
+  if apt-cache show "libclang-rt-$version-dev" >/dev/null 2>&1; then packages+=("libclang-rt-$version-dev"); fi
+fi
 
 if ! command -v dpkg-query >/dev/null; then
   echo "packages: this is not Debian or Ubuntu; install what corresponds to: ${packages[*]}" >&2
