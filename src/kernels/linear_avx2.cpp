@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
 #include "kernels/linear_loop.h"
+#include "kernels/tile_heights.h"
 
 namespace vla::kernels {
 namespace {
@@ -21,15 +22,14 @@ struct Avx2Tile {
 
   static void multiply(DType type, int n_row, const float* x, const float*, const std::byte* panel, std::int64_t depth,
                        float* c, bool add, const Ahead& ahead) {
-    using Function = void (*)(const float*, const std::byte*, std::int64_t, float*, bool, const std::byte*);
-    static constexpr Function kPairs[] = {tile<1, Pairs>, tile<2, Pairs>, tile<3, Pairs>,
-                                          tile<4, Pairs>, tile<5, Pairs>, tile<6, Pairs>};
-    static constexpr Function kHalves[] = {tile<1, Halves>, tile<2, Halves>, tile<3, Halves>,
-                                           tile<4, Halves>, tile<5, Halves>, tile<6, Halves>};
-    static constexpr Function kFloats[] = {tile<1, Floats>, tile<2, Floats>, tile<3, Floats>,
-                                           tile<4, Floats>, tile<5, Floats>, tile<6, Floats>};
-    const Function* tiles = type == DType::bf16 ? kPairs : type == DType::f16 ? kHalves : kFloats;
-    tiles[n_row - 1](x, panel, depth, c, add, ahead.from);
+    with_height<kRows>(n_row, [&]<int n>() {
+      if (type == DType::bf16)
+        tile<n, Pairs>(x, panel, depth, c, add, ahead.from);
+      else if (type == DType::f16)
+        tile<n, Halves>(x, panel, depth, c, add, ahead.from);
+      else
+        tile<n, Floats>(x, panel, depth, c, add, ahead.from);
+    });
   }
 
  private:

@@ -1,11 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
+#include "kernels/linear_avx512_tile.h"
 #include "kernels/linear_pairs.h"
 #include "kernels/rounding_avx512.h"
-
-#define VLA_TILES \
-  tile<1>, tile<2>, tile<3>, tile<4>, tile<5>, tile<6>, tile<7>, tile<8>, tile<9>, tile<10>, tile<11>, tile<12>
 
 namespace vla::kernels {
 namespace {
@@ -15,7 +13,7 @@ namespace {
 struct Avx512Bf16Tile {
   using V = Avx512;
   using X = std::uint16_t;
-  static constexpr int kRows = 12, kColumns = 32;
+  static constexpr int kRows = kAvx512Rows, kColumns = 32;
   static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 384, kBlockRows = 192, kSplitRows = 0;
   static constexpr int kXStride = kMaxDepth + 32;
   static constexpr bool kEven = true, kRounds = true;
@@ -30,52 +28,27 @@ struct Avx512Bf16Tile {
 
   static void multiply(DType, int n_row, const X* x, const X*, const std::byte* panel, std::int64_t depth, float* c,
                        bool add, const Ahead& ahead) {
-    using Function = void (*)(const X*, const std::byte*, std::int64_t, float*, bool, const Ahead&);
-    static constexpr Function kTiles[] = {VLA_TILES};
-    kTiles[n_row - 1](x, panel, depth, c, add, ahead);
+    multiply_rows<Pairs>(n_row, x, panel, depth, c, add, ahead);
   }
 
  private:
-  static VLA_INLINE __m512bh pairs(const void* p) {
-    __m512bh x;
-    std::memcpy(&x, p, sizeof(x));
-    return x;
-  }
-  /// A pair of x for every column.
-  static VLA_INLINE __m512i everywhere(const X* x) {
-    std::int32_t pair;
-    std::memcpy(&pair, x, sizeof(pair));
-    return _mm512_set1_epi32(pair);
-  }
-
-  template <int kCount>
-  static void tile(const X* x, const std::byte* panel, std::int64_t depth, float* c, bool add, const Ahead& ahead) {
-    const std::int64_t n_line = ceil_div(ahead.size, 8 * depth);  // of the cache, for each 8 of the depth
-    const std::byte* next = ahead.from;
-    __m512 sum[kCount][2];
-    for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm512_setzero_ps();
-    for (std::int64_t block = 0; block < depth; block += kPanelDepth, panel += 2 * kPanelBlock)
-      for (int i = 0; i < kPanelDepth; i += 8, x += 8) {
-        for (std::int64_t line = 0; line < n_line; ++line, next += 64) __builtin_prefetch(next, 0, 2);  // to L2
-#pragma GCC unroll 4
-        for (int k = 0; k < 8; k += 2) {
-          const __m512bh left = pairs(panel + 32 * (i + k)), right = pairs(panel + kPanelBlock + 32 * (i + k));
-#pragma GCC unroll 12
-          for (int r = 0; r < kCount; ++r) {
-            __m512i pair = everywhere(x + k + r * kXStride);
-            asm("" : "+v"(pair));  // one load for both products
-            sum[r][0] = _mm512_dpbf16_ps(sum[r][0], left, std::bit_cast<__m512bh>(pair));
-            sum[r][1] = _mm512_dpbf16_ps(sum[r][1], right, std::bit_cast<__m512bh>(pair));
-          }
-        }
-      }
-#pragma GCC unroll 12
-    for (int r = 0; r < kCount; ++r)
-      for (int i = 0; i < 2; ++i) {
-        float* place = c + r * kColumns + 16 * i;
-        _mm512_storeu_ps(place, add ? _mm512_add_ps(sum[r][i], _mm512_loadu_ps(place)) : sum[r][i]);
-      }
-  }
+  struct Pairs {
+    using X = std::uint16_t;
+    static constexpr int kCount = 2, kXStride = Avx512Bf16Tile::kXStride, kBlock = 32, kSize = 2;
+    static VLA_INLINE __m512bh load(const std::byte* p, int k) {
+      __m512bh pairs;
+      std::memcpy(&pairs, p + 64 * k, sizeof(pairs));
+      return pairs;
+    }
+    static VLA_INLINE __m512i everywhere(const X* x) {
+      std::int32_t pair;
+      std::memcpy(&pair, x, sizeof(pair));
+      return _mm512_set1_epi32(pair);
+    }
+    static VLA_INLINE void add(__m512& sum, __m512i pair, __m512bh numbers) {
+      sum = _mm512_dpbf16_ps(sum, numbers, std::bit_cast<__m512bh>(pair));
+    }
+  };
 };
 
 /// Few rows are bound by reading weights: x stays as it is there.

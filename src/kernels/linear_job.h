@@ -23,7 +23,7 @@ struct LinearJob {
     const float* residual;
     std::byte* y;
     std::int64_t d_out;
-    const float* scale = nullptr;  // of a ternary weight
+    const float* scale = nullptr;  // of a ternary weight, or of each column of an int8 one
   };
   static constexpr int kMaxPart = 3;
 

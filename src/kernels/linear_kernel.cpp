@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/ternary_kernels.h"
+#include "kernels/int8_kernels.h"
 
 namespace vla::kernels {
 
@@ -8,8 +8,9 @@ namespace vla::kernels {
 // Each in the file of its name.
 extern const LinearKernel kLinearAmx, kLinearAvx512Bf16, kLinearAvx512, kLinearAvx2;
 extern const LinearKernel kTernaryAmx, kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
+extern const LinearKernel kInt8Amx, kInt8Avx512, kInt8AvxVnni, kInt8Avx2;
 #endif
-extern const LinearKernel kTernaryPlain;  // ternary_emulated.cpp
+extern const LinearKernel kTernaryPlain, kInt8Plain;  // int8_emulated.cpp
 
 std::span<const LinearKernel* const> linear_kernels() {
 #if defined(__x86_64__)
@@ -21,7 +22,8 @@ std::span<const LinearKernel* const> linear_kernels() {
 }
 
 const LinearKernel* choose_linear(const MatrixDesc& desc, Isa isa) {
-  for (const LinearKernel* kernel : desc.type == DType::i8 ? ternary_kernels() : linear_kernels())
+  const auto kernels = desc.is_ternary ? ternary_kernels() : desc.type == DType::i8 ? int8_kernels() : linear_kernels();
+  for (const LinearKernel* kernel : kernels)
     if (kernel->supports(desc, isa)) return kernel;
   return nullptr;
 }
@@ -32,6 +34,15 @@ std::span<const LinearKernel* const> ternary_kernels() {
                                                  &kTernaryPlain};
 #else
   static constexpr const LinearKernel* kAll[] = {&kTernaryPlain};
+#endif
+  return kAll;
+}
+
+std::span<const LinearKernel* const> int8_kernels() {
+#if defined(__x86_64__)
+  static constexpr const LinearKernel* kAll[] = {&kInt8Amx, &kInt8Avx512, &kInt8AvxVnni, &kInt8Avx2, &kInt8Plain};
+#else
+  static constexpr const LinearKernel* kAll[] = {&kInt8Plain};
 #endif
   return kAll;
 }

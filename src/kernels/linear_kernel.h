@@ -10,12 +10,14 @@
 
 namespace vla::kernels {
 
-/// A weight matrix as the bundle has it: d_out rows of d_in numbers, one row after the other. i8 are bytes of four
-/// ternary numbers (Storage::ternary).
+/// A weight matrix as the bundle has it: d_out rows of d_in numbers, one row after the other. A ternary one is of i8
+/// with four numbers a byte (Storage::ternary).
 struct MatrixDesc {
   DType type;
   std::int64_t d_in, d_out;
+  bool is_ternary = false;
 };
+constexpr MatrixDesc ternary_desc(std::int64_t d_in, std::int64_t d_out) { return {DType::i8, d_in, d_out, true}; }
 
 /// One implementation of the matrix product. Whatever it computes with, sums are float32.
 struct LinearKernel {

@@ -8,8 +8,8 @@
 #include "kernels/sizes.h"
 #include "kernels/vec.h"
 
-/// Rows of x as int8 codes, as products of ternary matrices read them: d_in codes, zeros up to a multiple of 64, and 64
-/// bytes that begin with the row's scale.
+/// Rows of x as int8 codes, as products of ternary and int8 matrices read them: d_in codes, zeros up to a multiple of
+/// 64, and 64 bytes that begin with the row's scale.
 namespace vla::kernels {
 
 constexpr std::int64_t kQuantizedUnit = 64;
@@ -26,7 +26,8 @@ constexpr VLA_INLINE std::int64_t quantized_size(std::int64_t n_row, std::int64_
   return (n_row + kMaxTernaryRows - 1) * quantized_stride(d_in);
 }
 
-/// x is code / s. `sum` is that of the codes: weights are multiplied as 0, 1 and 2, which adds it to each product.
+/// x is code / s. `sum` is that of the codes: weights are multiplied with an offset (int8_panels.h), which adds its
+/// multiple to each product.
 struct RowScale {
   float s;
   std::int32_t sum;

@@ -32,7 +32,9 @@ Isa attention_isa_for(const ParamList& list, Isa isa) {
 namespace lower {
 namespace {
 
-kernels::MatrixDesc desc_of(const Param& param) { return {param.type(), param.shape[0], param.shape[1]}; }
+kernels::MatrixDesc desc_of(const Param& param) {
+  return {param.type(), param.shape[0], param.shape[1], param.storage == Storage::ternary};
+}
 
 /// Packs parameter `item`, and gives its pages of the file back, so that file and weights do not stand in memory
 /// together.

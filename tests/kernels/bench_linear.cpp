@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How fast each row of the matrix product is on this machine, as a share of the multiply-add peak that is measured
-// beside it; of ternary products also how much faster than the float32 kernel that takes turns with them. Not a test:
-// what it prints depends on what else the machine does.
+// beside it; of products of ternary and int8 weights also how much faster than the float32 kernel that takes turns with
+// them. Not a test: what it prints depends on what else the machine does.
 //
 //   bench_linear [threads] [rounds] [kernel]
 #include <fmt/format.h>
@@ -18,11 +18,11 @@
 #include <vector>
 
 #include "kernels/executor.h"
+#include "kernels/int8_kernels.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 #include "kernels/probe/probe.h"
 #include "kernels/quantized.h"
-#include "kernels/ternary_kernels.h"
 
 using namespace vla;
 using namespace vla::kernels;
@@ -38,9 +38,9 @@ constexpr Shape kShapes[] = {{1024, 768, 768},   {1024, 768, 3072}, {1024, 3072,
                              {560, 2048, 16384}, {1, 2048, 16384}};
 
 /// Of BitVLA's language model and tower.
-constexpr Shape kTernaryShapes[] = {{640, 2560, 2560}, {300, 2560, 6912}, {640, 2560, 6912}, {640, 6912, 2560},
-                                    {640, 2560, 640},  {512, 1152, 1152}, {512, 1152, 4304}, {512, 4304, 1152},
-                                    {1, 2560, 6912},   {16, 2560, 6912}};
+constexpr Shape kInt8Shapes[] = {{640, 2560, 2560}, {300, 2560, 6912}, {640, 2560, 6912}, {640, 6912, 2560},
+                                 {640, 2560, 640},  {512, 1152, 1152}, {512, 1152, 4304}, {512, 4304, 1152},
+                                 {1, 2560, 6912},   {16, 2560, 6912}};
 
 /// Memory at a multiple of a page.
 struct Block {
@@ -83,11 +83,13 @@ double best_time(Executor& executor, const Product& product, double seconds) {
 
 /// A product of random numbers with all that it reads and writes.
 struct Trial {
-  Trial(const LinearKernel& kernel, const Shape& s, int n_thread)
-      : desc{kernel.quantize != nullptr ? DType::i8 : DType::bf16, s.d_in, s.d_out},
+  Trial(const LinearKernel& kernel, const MatrixDesc& d, std::int64_t n_row, int n_thread)
+      : desc(d),
+        s{n_row, d.d_in, d.d_out},
         x(static_cast<std::size_t>(quantized_size(s.n_row, s.d_in)) * 4),
         y(static_cast<std::size_t>(s.n_row * s.d_out) * 4),
-        stored(static_cast<std::size_t>(s.d_in * s.d_out) * 2 / (kernel.quantize != nullptr ? 8 : 1)),
+        stored(static_cast<std::size_t>(s.d_in * s.d_out) * dtype_size(d.type) / (d.is_ternary ? 4 : 1)),
+        scale(static_cast<std::size_t>(s.d_out), 1.0f),
         packed(kernel.packed_size(desc)) {
     LinearJob job = {};
     std::vector<float> row(static_cast<std::size_t>(s.d_in));
@@ -108,12 +110,13 @@ struct Trial {
     kernel.pack(desc, stored.data, packed.data);
     pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     job.n_row = s.n_row, job.d_in = s.d_in, job.n_part = 1;
-    job.part[0] = {desc.type, packed.data, nullptr, nullptr, nullptr, y.data, s.d_out, &scale};
+    job.part[0] = {desc.type, packed.data, nullptr, nullptr, nullptr, y.data, s.d_out, scale.data()};
     product.emplace(kernel, job, n_thread);
   }
   MatrixDesc desc;
+  Shape s;
   Block x, y, stored, packed;
-  float scale = 1;
+  std::vector<float> scale;
   double pack_seconds;
   std::optional<Product> product;
 };
@@ -124,12 +127,13 @@ double median(std::vector<double> values) {
 }
 
 /// `versus`: a kernel that takes turns with this one, or null.
-void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& probe, const Shape& s, int n_round,
-             const LinearKernel* versus) {
+void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& probe, const MatrixDesc& desc,
+             std::int64_t n_row, int n_round, const LinearKernel* versus) {
   const int n_thread = executor.n_thread();
-  const Trial trial(kernel, s, n_thread);
+  const Trial trial(kernel, desc, n_row, n_thread);
+  const Shape& s = trial.s;
   std::optional<Trial> other;
-  if (versus != nullptr) other.emplace(*versus, s, n_thread);
+  if (versus != nullptr) other.emplace(*versus, MatrixDesc{DType::bf16, s.d_in, s.d_out}, s.n_row, n_thread);
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
   std::vector<double> rates, peaks, shares, factors;
   for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
@@ -140,8 +144,9 @@ void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& pr
   }
   const double best = *std::max_element(rates.begin(), rates.end()),
                peak = *std::max_element(peaks.begin(), peaks.end());
-  fmt::print("{:12} {:5} x {:5} x {:5}  {:8.1f} G/s  {:5.1f} % of {:8.1f}  median {:5.1f} %  reads {:6.1f} GB/s",
-             kernel.name, s.n_row, s.d_in, s.d_out, best * 1e-9, 100 * best / peak, peak * 1e-9, 100 * median(shares),
+  fmt::print("{:12} {:7} {:5} x {:5} x {:5}  {:8.1f} G/s  {:5.1f} % of {:8.1f}  median {:5.1f} %  reads {:6.1f} GB/s",
+             kernel.name, desc.is_ternary ? "ternary" : dtype_name(desc.type), s.n_row, s.d_in, s.d_out, best * 1e-9,
+             100 * best / peak, peak * 1e-9, 100 * median(shares),
              best / flop * static_cast<double>(trial.stored.n) * 1e-9);
   fmt::print("  packed at {:.1f} GB/s", static_cast<double>(trial.stored.n) / trial.pack_seconds * 1e-9);
   if (versus != nullptr) fmt::print("  {:.2f} x {}", median(factors), versus->name);
@@ -149,7 +154,7 @@ void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& pr
   std::fflush(stdout);
 }
 
-/// A ternary kernel's loop on registers has its name: `avx2_int8` and `avx2 int8`.
+/// An int8 kernel's loop on registers has its name: `avx2_int8` and `avx2 int8`.
 const PeakProbe* probe_of(const LinearKernel& kernel) {
   std::string name = kernel.name;
   std::replace(name.begin(), name.end(), '_', ' ');
@@ -163,7 +168,7 @@ const PeakProbe* probe_of(const LinearKernel& kernel) {
 int main(int argc, char** argv) {
   const int n_thread = argc > 1 ? std::atoi(argv[1]) : 1, n_round = argc > 2 ? std::atoi(argv[2]) : 7;
   if (n_thread < 1 || n_round < 1) return fmt::print("usage: bench_linear [threads] [rounds] [kernel]\n"), 1;
-  fmt::print("{} thread(s), best and median of {} rounds, bf16 or ternary weights\n", n_thread, n_round);
+  fmt::print("{} thread(s), best and median of {} rounds, bf16, ternary or int8 weights\n", n_thread, n_round);
   const auto executor = Executor::shared(n_thread);
   if (!executor) return fmt::print("{}\n", executor.error().message()), 1;
   const auto wants = [&](const LinearKernel& kernel) { return argc < 4 || kernel.name == std::string(argv[3]); };
@@ -171,13 +176,17 @@ int main(int argc, char** argv) {
     if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
     for (Isa isa : usable_isas())
       if (isa_name(isa) == kernel->name && wants(*kernel))
-        for (const Shape& shape : kShapes) measure(**executor, *kernel, peak_probe_of(isa), shape, n_round, nullptr);
+        for (const Shape& shape : kShapes)
+          measure(**executor, *kernel, peak_probe_of(isa), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row, n_round,
+                  nullptr);
   }
-  for (const LinearKernel* kernel : ternary_kernels()) {
-    const PeakProbe* probe = probe_of(*kernel);
-    if (probe == nullptr || !wants(*kernel)) continue;
-    if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
-    for (const Shape& shape : kTernaryShapes)
-      measure(**executor, *kernel, *probe, shape, n_round, choose_linear({DType::bf16, 64, 64}, probe->isa));
-  }
+  for (const bool ternary : {true, false})
+    for (const LinearKernel* kernel : ternary ? ternary_kernels() : int8_kernels()) {
+      const PeakProbe* probe = probe_of(*kernel);
+      if (probe == nullptr || !wants(*kernel)) continue;
+      if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
+      for (const Shape& shape : kInt8Shapes)
+        measure(**executor, *kernel, *probe, {DType::i8, shape.d_in, shape.d_out, ternary}, shape.n_row, n_round,
+                choose_linear({DType::bf16, 64, 64}, probe->isa));
+    }
 }

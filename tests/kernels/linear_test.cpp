@@ -4,16 +4,15 @@
 // Every implementation of the matrix product against a sum in double precision, on one list of awkward shapes.
 #include <doctest/doctest.h>
 
-#include <atomic>
 #include <cmath>
 #include <cstring>
 #include <limits>
-#include <thread>
 
 #include "kernels/cpu_kernels.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
 #include "support/kernel_rows.h"
+#include "support/product.h"
 #include "support/stored.h"
 
 using namespace vla;
@@ -21,9 +20,7 @@ using namespace vla::kernels;
 
 namespace {
 
-struct Shape {
-  std::int64_t n_row, d_in, d_out;
-};
+using Shape = test::ProductShape;
 
 // One row, a few, more than a block of rows or of columns; widths that no vector divides; depths beyond one block and
 // of one number.
@@ -35,22 +32,9 @@ constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},    {3, 17,
 constexpr Activation kActivations[] = {Activation::none, Activation::gelu_tanh, Activation::gelu_erf,
                                        Activation::silu, Activation::relu,      Activation::relu_squared};
 
-/// Numbers in [-1, 1] that differ from call to call.
-class Numbers {
- public:
-  float next() {
-    state_ = state_ * 1664525u + 1013904223u;
-    return static_cast<float>(state_ >> 8) / 8388608.0f - 1.0f;
-  }
-  /// `count` numbers behind one that is skipped, so that the first is at no round address.
-  std::vector<float> some(std::int64_t count) {
-    std::vector<float> values(static_cast<std::size_t>(count) + 1);
-    for (float& value : values) value = next();
-    return values;
-  }
-
- private:
-  std::uint32_t state_ = 12345;
+/// Numbers behind one that is skipped, so that the first is at no round address.
+struct Numbers : test::Numbers {
+  std::vector<float> some(std::int64_t count) { return floats(count + 1); }
 };
 
 double activate(Activation activation, double x) {
@@ -67,7 +51,7 @@ double activate(Activation activation, double x) {
 struct Part {
   std::vector<float> weight, bias, factor, residual, y;
   std::vector<std::byte> stored;
-  std::vector<std::byte> packed;
+  test::Pages packed = {nullptr, std::free};
 };
 
 /// What kernels of bf16 make of x: bf16, and the tiles of amx in products of few rows a second bf16 of what that left.
@@ -108,30 +92,17 @@ class Trial {
     job.x_type = case_.x_type, job.y_type = case_.y_type;
     for (int i = 0; i < case_.n_part; ++i) {
       Part& part = parts_[static_cast<std::size_t>(i)];
+      const std::byte* stored = part.stored.data() + number_size(case_.type);  // at no round address
+      part.packed = test::packed(kernel_, {case_.type, d_in, d_out(i)}, stored);
       job.part[i] = {case_.type,
-                     packed(part, {case_.type, d_in, d_out(i)}),
+                     part.packed.get(),
                      case_.with_bias ? &part.bias[1] : nullptr,
                      case_.with_factor ? &part.factor[1] : nullptr,
                      case_.with_residual ? &part.residual[1] : nullptr,
                      bytes(part.y),
                      d_out(i)};
     }
-    const std::int64_t n_item = kernel_.cut(job, case_.n_thread);
-    CHECK(n_item >= 1);
-    std::atomic<std::int64_t> next = 0;
-    const auto work = [&](int index) {
-      // What a thread finds in its scratch memory must not matter: all ones are NaN.
-      const std::int64_t size = round_up(static_cast<std::int64_t>(kernel_.scratch_size), 4096);
-      std::unique_ptr<std::byte, decltype(&std::free)> scratch(
-          static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(size))), std::free);
-      std::memset(scratch.get(), 0xff, kernel_.scratch_size);
-      Worker worker = {index, scratch.get(), 1};
-      for (std::int64_t item = next++; item < n_item; item = next++) kernel_.run(job, item, worker);
-    };
-    std::vector<std::thread> threads;
-    for (int i = 1; i < case_.n_thread; ++i) threads.emplace_back(work, i);
-    work(0);
-    for (std::thread& thread : threads) thread.join();
+    test::run_job(kernel_, job, case_.n_thread);
   }
 
   void check() const {
@@ -160,14 +131,6 @@ class Trial {
   struct Expected {
     double value, tolerance;
   };
-
-  /// The weight as the kernel wants it, at a multiple of 64 bytes; the stored one begins at no round address.
-  const std::byte* packed(Part& part, const MatrixDesc& desc) const {
-    part.packed.assign(kernel_.packed_size(desc) + 64, std::byte{0xff});
-    std::byte* place = part.packed.data() + (64 - reinterpret_cast<std::uintptr_t>(part.packed.data()) % 64);
-    kernel_.pack(desc, part.stored.data() + number_size(desc.type), place);
-    return place;
-  }
 
   /// Parts differ in width, so that items cross from one to the next; a gate and its up do not.
   std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }

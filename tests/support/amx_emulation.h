@@ -108,4 +108,5 @@ inline void multiply_bytes(int c, int a, int b) {
 #define AmxSession EmulatedAmxSession
 #define kLinearAmx kEmulatedLinearAmx
 #define kTernaryAmx kEmulatedTernaryAmx
+#define kInt8Amx kEmulatedInt8Amx
 #define kAttentionAmx kEmulatedAttentionAmx

@@ -20,7 +20,8 @@ namespace vla::kernels {
 /// (avx512_emulation.h).
 extern const CpuKernels kEmulatedAvx512Kernels;
 extern const AttentionKernel kEmulatedAttentionAvx512Bf16, kEmulatedAttentionAmx;
-extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx, kEmulatedTernaryAmx;
+extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx;
+extern const LinearKernel kEmulatedTernaryAmx, kEmulatedInt8Amx;
 }  // namespace vla::kernels
 
 #define VLA_EMULATED_TEST(isa, sentence, ...) \

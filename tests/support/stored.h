@@ -19,6 +19,13 @@ inline std::vector<std::byte> store_ternary(const std::vector<float>& values) {
   return out;
 }
 
+/// Whole numbers as a matrix of int8 is stored.
+inline std::vector<std::byte> store_int8(const std::vector<float>& values) {
+  std::vector<std::byte> out;
+  for (const float value : values) out.push_back(static_cast<std::byte>(static_cast<signed char>(value)));
+  return out;
+}
+
 /// Values in a storage type, and what the type made of them. i8 is ternary.
 inline std::vector<std::byte> store_as(DType type, std::vector<float>& values) {
   if (type == DType::i8) return store_ternary(values);

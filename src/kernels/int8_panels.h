@@ -5,17 +5,37 @@
 #include "kernels/linear_kernel.h"
 #include "kernels/quantized.h"
 
-/// How a ternary matrix lies in memory for the kernels, from load on: two bits for a number.
+/// How a ternary matrix, or one of int8, lies in memory for the kernels, from load on.
 ///
-/// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in), 64 bytes for each 16 of it. A
-/// byte holds four numbers of a column: byte 4 n + i has numbers i, 4 + i, 8 + i and 12 + i of column n, the first in
-/// its lowest bits. So what is left of the 64 bytes after a shift by 2 s and a mask are four consecutive numbers of
-/// every column, as instructions that sum products of four bytes take them. Numbers are 0, 1 and 2 for -1, 0 and 1.
-/// Zeros fill strips up to four, and the depth up to 64, where x has zeros.
+/// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply a line of 64
+/// bytes at a time, four consecutive numbers of every column, as instructions that sum products of four bytes take
+/// them: one operand has no sign, so that numbers are stored with an offset, which comes off the sums again. Zeros fill
+/// strips up to four, and the depth up to 64, where x has zeros.
 namespace vla::kernels {
 
-struct TernaryPanels {
+struct Int8Panels {
   static constexpr std::int64_t kColumns = 16, kGroup = 16, kLine = 64;
+};
+
+/// Lines as they are multiplied; -128 to 127 plus 128.
+struct BytePanels : Int8Panels {
+  static constexpr int kOffset = 128;
+  /// A scale for each column.
+  static constexpr bool kManyScales = true;
+
+  static constexpr VLA_INLINE std::int64_t strip_size(std::int64_t d_in) { return quantized_depth(d_in) * kColumns; }
+
+  // A LinearKernel's functions.
+  static std::size_t packed_size(const MatrixDesc& desc);
+  static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
+};
+
+/// Two bits for a number, -1 to 1 plus 1: byte 4 n + i of a line has numbers i, 4 + i, 8 + i and 12 + i of column n,
+/// the first in its lowest bits. So what is left of the line after a shift by 2 s and a mask is one as it is
+/// multiplied.
+struct TernaryPanels : Int8Panels {
+  static constexpr int kOffset = 1;
+  static constexpr bool kManyScales = false;
 
   static constexpr VLA_INLINE std::int64_t strip_size(std::int64_t d_in) {
     return quantized_depth(d_in) / kGroup * kLine;

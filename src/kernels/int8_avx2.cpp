@@ -1,14 +1,15 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
-#include "kernels/ternary_loop.h"
+#include "kernels/int8_loop.h"
 
 namespace vla::kernels {
 namespace {
 
 /// The instruction of AVX-VNNI: sums of products of four bytes, one operand without sign.
 struct FourProducts {
-  static constexpr int kStep = 512;
+  static constexpr int kRows = 6, kStep = 512;
+  static constexpr bool kSigned = false;
 
   static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
     asm("%{vex%} vpdpbusd %2, %1, %0" : "+x"(sum) : "x"(numbers), "x"(codes));
@@ -16,9 +17,10 @@ struct FourProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return sum; }
 };
 
-/// Two products of bytes summed to 16 bits, which hold 64 of such pairs: 2 * 2 * 127 each.
+/// Of ternary weights: two products of bytes summed to 16 bits, which hold 64 of such pairs: 2 * 2 * 127 each.
 struct TwoProducts {
-  static constexpr int kStep = 256;
+  static constexpr int kRows = 6, kStep = 256;
+  static constexpr bool kSigned = false;
   static_assert(kStep / 4 * 2 * 2 * 127 <= 32767);
 
   static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
@@ -28,21 +30,33 @@ struct TwoProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
 };
 
-/// 6 rows by 2 vectors: 12 sums.
+/// Of int8 weights: a pair of bytes up to 255 by codes would not fit into 16 bits. So the weight gives its sign to the
+/// code, which is never -128, and is at most 128 itself; pairs are then summed to 32 bits at once.
+struct SignedProducts {
+  static constexpr int kRows = 4, kStep = 512;
+  static constexpr bool kSigned = true;
+  static_assert(2 * 128 * 127 <= 32767);
+
+  static VLA_INLINE void add(__m256i& sum, __m256i numbers, __m256i codes) {
+    const __m256i weights = _mm256_xor_si256(numbers, _mm256_set1_epi8(-128));
+    const __m256i pairs = _mm256_maddubs_epi16(_mm256_abs_epi8(weights), _mm256_sign_epi8(codes, weights));
+    sum = _mm256_add_epi32(sum, _mm256_madd_epi16(pairs, _mm256_set1_epi16(1)));
+  }
+  static VLA_INLINE __m256i total(__m256i sum) { return sum; }
+};
+
+/// Rows by 2 vectors of sums.
 template <class Products>
 struct Avx2Tile {
   using V = Avx2;
-  static constexpr int kRows = 6, kColumns = 16, kBlockRows = 216, kStep = Products::kStep;
-  static constexpr bool kEven = true, kRounds = false;
+  static constexpr int kRows = Products::kRows, kColumns = 16, kBlockRows = 216, kStep = Products::kStep;
+  static constexpr bool kEven = true, kRounds = false, kSigned = Products::kSigned;
   struct Session {};
 
   template <class Strips>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                        std::int32_t* sums, bool add) {
-    using Function = void (*)(const std::byte*, std::int64_t, const Strips&, std::int64_t, std::int32_t*, bool);
-    static constexpr Function kTiles[] = {tile<1, Strips>, tile<2, Strips>, tile<3, Strips>,
-                                          tile<4, Strips>, tile<5, Strips>, tile<6, Strips>};
-    kTiles[n_row - 1](x, x_stride, strips, depth, sums, add);
+    with_height<kRows>(n_row, [&]<int n>() { tile<n>(x, x_stride, strips, depth, sums, add); });
   }
 
  private:
@@ -52,7 +66,7 @@ struct Avx2Tile {
     __m256i sum[kCount][2];
 #pragma GCC unroll 6
     for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm256_setzero_si256();
-    for (std::int64_t k = 0; k < depth; k += TernaryPanels::kGroup)
+    for (std::int64_t k = 0; k < depth; k += Int8Panels::kGroup)
 #pragma GCC unroll 4
       for (int s = 0; s < 4; ++s, x += 4) {
         const __m256i left = strips.template load<__m256i>(k, s, 0, 0);
@@ -76,14 +90,19 @@ struct Avx2Tile {
   }
 };
 
+bool supports_vnni(const MatrixDesc& desc, Isa isa) {
+  return desc.type == DType::i8 && isa >= Isa::avx2 && has_avx_vnni();
+}
+bool supports(const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::avx2; }
+
 }  // namespace
 
-extern const LinearKernel kTernaryAvxVnni, kTernaryAvx2;
-const LinearKernel kTernaryAvxVnni = TernaryLoop<Avx2Tile<FourProducts>>::kernel(
-    "avxvnni_int8",
-    [](const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::avx2 && has_avx_vnni(); });
-const LinearKernel kTernaryAvx2 = TernaryLoop<Avx2Tile<TwoProducts>>::kernel(
-    "avx2_int8", [](const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::avx2; });
+extern const LinearKernel kTernaryAvxVnni, kTernaryAvx2, kInt8AvxVnni, kInt8Avx2;
+const LinearKernel kTernaryAvxVnni =
+    Int8Loop<Avx2Tile<FourProducts>, TernaryPanels>::kernel("avxvnni_int8", supports_vnni);
+const LinearKernel kTernaryAvx2 = Int8Loop<Avx2Tile<TwoProducts>, TernaryPanels>::kernel("avx2_int8", supports);
+const LinearKernel kInt8AvxVnni = Int8Loop<Avx2Tile<FourProducts>, BytePanels>::kernel("avxvnni_int8", supports_vnni);
+const LinearKernel kInt8Avx2 = Int8Loop<Avx2Tile<SignedProducts>, BytePanels>::kernel("avx2_int8", supports);
 
 }  // namespace vla::kernels
 #endif

@@ -2,19 +2,20 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include "kernels/int8_panels.h"
 #include "kernels/linear_stripe.h"
-#include "kernels/ternary_panels.h"
+#include "kernels/tile_heights.h"
 
-/// The loop around a tile of products of ternary weights and int8 codes of x: what an item is, what lies in which
-/// cache.
+/// The loop around a tile of products of int8 codes of x and weights that are ternary or int8: what an item is, what
+/// lies in which cache.
 ///
-/// A panel's columns are taken a step of the depth at a time. Its two bits for a number are expanded to bytes once,
-/// which stay in the first cache while all rows of a block of x pass by; of few rows the tile unpacks them itself. Sums
-/// are whole numbers, so that they are the same in every order.
+/// A panel's columns are taken a step of the depth at a time, which stays in the first cache while all rows of a block
+/// of x pass by. Two bits for a number are expanded to bytes once for them; of few rows the tile unpacks them itself.
+/// Sums are whole numbers, so that they are the same in every order.
 namespace vla::kernels {
 
-/// Where a tile reads the numbers of a panel of kStrips: load(k, s, i, byte) is a vector from a byte on of the line
-/// that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they are expanded
+/// Where a tile reads the numbers of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a byte
+/// on of the line that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they are expanded
 /// (TernaryPanels::expand).
 template <int kStrips>
 struct ExpandedStrips {
@@ -42,25 +43,42 @@ struct PackedStrips {
   }
 };
 
+/// The same of numbers that lie as they are multiplied.
+template <int kStrips>
+struct ByteStrips {
+  const std::byte* strips;
+  std::int64_t strip;
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    Vector numbers;
+    std::memcpy(&numbers, strips + i * strip + (k + 4 * s) * 16 + byte, sizeof(numbers));
+    return numbers;
+  }
+};
+
 /// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows (of the block of x), kStep (of the
-/// depth, most), kEven (tiles of equal height), kRounds (false), Session (held while a thread works), and
+/// depth, most), kEven (tiles of equal height), kRounds (false), Session (held while a thread works), kSigned (sums are
+/// of the weights themselves, without their offset), and
 ///   multiply(n_row, x, x_stride, strips, depth, sums, add)
-///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and of PackedStrips. It may read and write
-///     rows up to kRows.
+///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and PackedStrips for TernaryPanels, of
+///     ByteStrips for BytePanels. It may read and write rows up to kRows.
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
-template <class Tile>
-class TernaryLoop {
+template <class Tile, class Weights>
+class Int8Loop {
   using V = typename Tile::V;
   using Stripes = LinearStripes<Tile>;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
-  static constexpr int kStrips = Tile::kColumns / static_cast<int>(TernaryPanels::kColumns);
+  static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
   static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks numbers for
   static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
-  static_assert(kColumns % TernaryPanels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
+  static constexpr bool kTernary = std::is_same_v<Weights, TernaryPanels>;
+  static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
+  static_assert(kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
 
   struct Scratch {
     const LinearJob* job;  // stands where LinearLoop notes whose rows it keeps, and tells it that they are gone
-    alignas(64) std::byte panel[Tile::kStep * kColumns];
+    alignas(64) std::byte panel[kTernary ? Tile::kStep * kColumns : 1];
     alignas(64) std::int32_t sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kColumns];
     alignas(64) float scaled[kRows * kColumns];
@@ -70,8 +88,8 @@ class TernaryLoop {
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
     LinearKernel row = {name,
-                        TernaryPanels::packed_size,
-                        TernaryPanels::pack,
+                        Weights::packed_size,
+                        Weights::pack,
                         supports,
                         cut,
                         run,
@@ -85,7 +103,7 @@ class TernaryLoop {
  private:
   static constexpr std::int64_t kAnyNorm = std::int64_t{1} << 62;  // whoever quantizes x computes it
 
-  explicit TernaryLoop(const LinearJob& job)
+  explicit Int8Loop(const LinearJob& job)
       : job_(job),
         block_rows_(even_block(job.n_row, block_rows(job.x_stride), kRows)),
         n_block_(ceil_div(job.n_row, block_rows_)),
@@ -98,7 +116,7 @@ class TernaryLoop {
   }
 
   static std::int64_t cut(LinearJob& job, int n_thread) {
-    const TernaryLoop loop(job);
+    const Int8Loop loop(job);
     job.n_group = n_thread == 1 ? 1 : min(ceil_div(kMinItems * n_thread, loop.n_block_), loop.n_panel_);
     return loop.n_block_ * job.n_group;
   }
@@ -106,7 +124,7 @@ class TernaryLoop {
   /// Some panels by a block of rows.
   static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
     [[maybe_unused]] const typename Tile::Session session;
-    TernaryLoop loop(job);
+    Int8Loop loop(job);
     loop.scratch_ = reinterpret_cast<Scratch*>(worker.scratch);
     loop.scratch_->job = &job;
     const std::int64_t row = item / job.n_group * loop.block_rows_, group = item % job.n_group;
@@ -139,37 +157,45 @@ class TernaryLoop {
   /// and their number.
   template <class Before, class After>
   VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, const Before& before, const After& after) {
-    const std::int64_t strip = TernaryPanels::strip_size(job_.d_in), n_tile = ceil_div(s.n_row, kRows);
+    const std::int64_t strip = Weights::strip_size(job_.d_in), n_tile = ceil_div(s.n_row, kRows);
     const std::int64_t depth = quantized_depth(job_.d_in), step = even_block(depth, Tile::kStep, kQuantizedUnit);
-    const std::byte* strips = part.weight + s.column / TernaryPanels::kColumns * strip;
-    for (std::int64_t k = 0; k < depth; k += step, strips += TernaryPanels::strip_size(step)) {
+    const std::byte* strips = part.weight + s.column / Int8Panels::kColumns * strip;
+    for (std::int64_t k = 0; k < depth; k += step, strips += Weights::strip_size(step)) {
       const std::int64_t d = min(step, depth - k);
-      if (job_.n_row > kFewRows) TernaryPanels::expand<kStrips>(strips, strip, d, scratch_->panel);
+      const bool expands = kTernary && job_.n_row > kFewRows;
+      if constexpr (kTernary)
+        if (expands) TernaryPanels::expand<kStrips>(strips, strip, d, scratch_->panel);
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         std::int32_t* sums = scratch_->sums + r * kColumns;
         if (k + d == depth) before(r, n_row);
-        const std::byte* x = row_of(s, r) + k;
-        if (job_.n_row > kFewRows)
-          Tile::multiply(static_cast<int>(n_row), x, job_.x_stride, ExpandedStrips<kStrips>{scratch_->panel}, d, sums,
-                         k > 0);
+        const auto multiply = [&](const auto& numbers) {
+          Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, numbers, d, sums, k > 0);
+        };
+        if constexpr (!kTernary)
+          multiply(ByteStrips<kStrips>{strips, strip});
+        else if (expands)
+          multiply(ExpandedStrips<kStrips>{scratch_->panel});
         else
-          Tile::multiply(static_cast<int>(n_row), x, job_.x_stride, PackedStrips<kStrips>{strips, strip}, d, sums,
-                         k > 0);
+          multiply(PackedStrips<kStrips>{strips, strip});
         if (k + d == depth) after(r, n_row);
       }
     }
   }
 
-  /// What the sums of a tile stand for: float(sum) * (scale of W / s of the row).
+  /// What the sums of a tile stand for: float(sum) * (scale of W, or of its column / s of the row).
   VLA_INLINE void scale(const LinearJob::Part& part, const Stripe& s, std::int64_t r, std::int64_t n_row, float* to) {
     for (std::int64_t i = 0; i < n_row; ++i, ++r) {
       const RowScale row = row_scale(row_of(s, r), job_.d_in);
-      const float step = *part.scale / row.s;
       for (std::int64_t n = 0; n < kColumns; n += V::width) {
         typename V::Int sums;
         std::memcpy(&sums, scratch_->sums + r * kColumns + n, sizeof(sums));
-        V::store(to + i * kColumns + n, __builtin_convertvector(sums - row.sum, typename V::Float) * step);
+        typename V::Float step;
+        if constexpr (Weights::kManyScales)
+          step = load<V>(part.scale + s.column + n, s.n_column > n ? s.n_column - n : 0) / row.s;
+        else
+          step = V::set(*part.scale / row.s);
+        V::store(to + i * kColumns + n, __builtin_convertvector(sums - kOffset * row.sum, typename V::Float) * step);
       }
     }
   }

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/ternary_loop.h"
+#include "kernels/int8_loop.h"
 
 namespace vla::kernels {
 namespace {
@@ -9,7 +9,7 @@ namespace {
 struct PlainTile {
   using V = Portable;
   static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;
-  static constexpr bool kEven = true, kRounds = false;
+  static constexpr bool kEven = true, kRounds = false, kSigned = false;
   struct Session {};
 
   template <class Strips>
@@ -30,15 +30,17 @@ struct PlainTile {
   static VLA_INLINE int number(const Strips& panel, std::int64_t k, int n) {
     const int place = n % 16 * 4 + static_cast<int>(k % 4);
     const auto eight = panel.template load<Eight>(k / 16 * 16, static_cast<int>(k % 16 / 4), n / 16, place / 8 * 8);
-    return static_cast<int>(eight[0] >> place % 8 * 8 & 3);
+    return static_cast<int>(eight[0] >> place % 8 * 8 & 255);
   }
   typedef std::uint64_t Eight __attribute__((vector_size(8)));
 };
 
+bool supports(const MatrixDesc& desc, Isa) { return desc.type == DType::i8; }
+
 }  // namespace
 
-extern const LinearKernel kTernaryPlain;
-const LinearKernel kTernaryPlain =
-    TernaryLoop<PlainTile>::kernel("plain_int8", [](const MatrixDesc& desc, Isa) { return desc.type == DType::i8; });
+extern const LinearKernel kTernaryPlain, kInt8Plain;
+const LinearKernel kTernaryPlain = Int8Loop<PlainTile, TernaryPanels>::kernel("plain_int8", supports);
+const LinearKernel kInt8Plain = Int8Loop<PlainTile, BytePanels>::kernel("plain_int8", supports);
 
 }  // namespace vla::kernels

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
-#include "kernels/ternary_loop.h"
+#include "kernels/int8_loop.h"
 
 namespace vla::kernels {
 namespace {
@@ -10,20 +10,17 @@ namespace {
 struct VnniTile {
   using V = Avx512;
   static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = 512;
-  static constexpr bool kEven = true, kRounds = false;
+  static constexpr bool kEven = true, kRounds = false, kSigned = false;
   struct Session {};
 
   template <class Strips>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                        std::int32_t* sums, bool add) {
-    using Function = void (*)(const std::byte*, std::int64_t, const Strips&, std::int64_t, std::int32_t*, bool);
-    static constexpr Function kTiles[] = {tile<1, Strips>, tile<2, Strips>, tile<3, Strips>,
-                                          tile<4, Strips>, tile<5, Strips>, tile<6, Strips>};
-    kTiles[n_row - 1](x, x_stride, strips, depth, sums, add);
+    with_height<kRows>(n_row, [&]<int n>() { tile<n>(x, x_stride, strips, depth, sums, add); });
   }
 
  private:
-  static constexpr int kStrips = kColumns / TernaryPanels::kColumns;
+  static constexpr int kStrips = kColumns / Int8Panels::kColumns;
 
   template <int kCount, class Strips>
   static void tile(const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
@@ -34,7 +31,7 @@ struct VnniTile {
 #pragma GCC unroll 4
       for (int j = 0; j < kStrips; ++j)
         sum[r][j] = add ? _mm512_loadu_si512(sums + r * kColumns + 16 * j) : _mm512_setzero_si512();
-    for (std::int64_t k = 0; k < depth; k += TernaryPanels::kGroup)
+    for (std::int64_t k = 0; k < depth; k += Int8Panels::kGroup)
 #pragma GCC unroll 4
       for (int s = 0; s < 4; ++s, x += 4) {
         __m512i numbers[kStrips];
@@ -63,8 +60,9 @@ bool supports(const MatrixDesc& desc, Isa isa) {
 
 }  // namespace
 
-extern const LinearKernel kTernaryAvx512;
-const LinearKernel kTernaryAvx512 = TernaryLoop<VnniTile>::kernel("avx512_int8", supports);
+extern const LinearKernel kTernaryAvx512, kInt8Avx512;
+const LinearKernel kTernaryAvx512 = Int8Loop<VnniTile, TernaryPanels>::kernel("avx512_int8", supports);
+const LinearKernel kInt8Avx512 = Int8Loop<VnniTile, BytePanels>::kernel("avx512_int8", supports);
 
 }  // namespace vla::kernels
 #endif

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
 #include "kernels/amx_tiles.h"
-#include "kernels/ternary_loop.h"
+#include "kernels/int8_loop.h"
 
 namespace vla::kernels {
 namespace {
@@ -12,13 +12,14 @@ struct AmxInt8Tile {
   using V = Avx512;
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 1024;
-  static constexpr bool kEven = false, kRounds = false;
+  static constexpr bool kEven = false, kRounds = false, kSigned = false;
 
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add) {
     // Rows that x does not have are multiplied too; nobody looks at their sums.
     open(n_row, sums, add);
-    for (std::int64_t k = 0; k < depth; k += kDepth) add_products(n_row, x + k, x_stride, strips.lines + k * kColumns);
+    for (std::int64_t k = 0; k < depth; k += kDepth)
+      add_products(n_row, x + k, x_stride, strips.lines + k * kColumns, kLineOfPair, Int8Panels::kLine);
     close(n_row, sums);
   }
 
@@ -29,14 +30,22 @@ struct AmxInt8Tile {
     for (std::int64_t k = 0; k < depth; k += kDepth) {
       TernaryPanels::expand<2>(strips.strips + k * 4, strips.strip, kDepth, lines);
       before_tile_loads();
-      add_products(n_row, x + k, x_stride, lines);
+      add_products(n_row, x + k, x_stride, lines, kLineOfPair, Int8Panels::kLine);
     }
+    close(n_row, sums);
+  }
+
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ByteStrips<2>& strips,
+                       std::int64_t depth, std::int32_t* sums, bool add) {
+    open(n_row, sums, add);
+    for (std::int64_t k = 0; k < depth; k += kDepth)
+      add_products(n_row, x + k, x_stride, strips.strips + k * Int8Panels::kColumns, Int8Panels::kLine, strips.strip);
     close(n_row, sums);
   }
 
  private:
   static constexpr int kDepth = 64;  // of a tile
-  static constexpr std::size_t kLine = kColumns * sizeof(std::int32_t), kLineOfPair = 2 * TernaryPanels::kLine;
+  static constexpr std::size_t kLine = kColumns * sizeof(std::int32_t), kLineOfPair = 2 * Int8Panels::kLine;
 
   static VLA_INLINE void open(int n_row, const std::int32_t* sums, bool add) {
     before_tile_loads();
@@ -54,11 +63,12 @@ struct AmxInt8Tile {
     _tile_loadd(3, sums + 16 * kColumns + 16, kLine);
   }
 
-  /// The first operand has a sign, the second has none.
-  static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines) {
+  /// The first operand has a sign, the second has none: lines of two strips, with their distances.
+  static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines,
+                                      std::size_t line, std::int64_t strip) {
     _tile_loadd(4, x, static_cast<std::size_t>(x_stride));
-    _tile_loadd(6, lines, kLineOfPair);
-    _tile_loadd(7, lines + TernaryPanels::kLine, kLineOfPair);
+    _tile_loadd(6, lines, line);
+    _tile_loadd(7, lines + strip, line);
     _tile_dpbsud(0, 4, 6);
     _tile_dpbsud(1, 4, 7);
     if (n_row <= 16) return;
@@ -82,8 +92,9 @@ bool supports(const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 &
 
 }  // namespace
 
-extern const LinearKernel kTernaryAmx;
-const LinearKernel kTernaryAmx = TernaryLoop<AmxInt8Tile>::kernel("amx_int8", supports);
+extern const LinearKernel kTernaryAmx, kInt8Amx;
+const LinearKernel kTernaryAmx = Int8Loop<AmxInt8Tile, TernaryPanels>::kernel("amx_int8", supports);
+const LinearKernel kInt8Amx = Int8Loop<AmxInt8Tile, BytePanels>::kernel("amx_int8", supports);
 
 }  // namespace vla::kernels
 #endif

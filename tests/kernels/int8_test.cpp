@@ -1,21 +1,20 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Products of ternary weights and int8 codes: every kernel of this machine against whole numbers and single roundings,
-// bit for bit.
+// Products of int8 codes and of weights that are ternary or int8: every kernel of this machine against whole numbers
+// and single roundings, bit for bit.
 #include <doctest/doctest.h>
 
-#include <atomic>
 #include <cmath>
 #include <cstring>
 #include <limits>
-#include <thread>
 
 #include "base/npy.h"
+#include "kernels/int8_kernels.h"
 #include "kernels/quantized.h"
-#include "kernels/ternary_kernels.h"
 #include "support/editable_bundle.h"
 #include "support/kernel_rows.h"
+#include "support/product.h"
 #include "support/stored.h"
 
 using namespace vla;
@@ -23,9 +22,8 @@ using namespace vla::kernels;
 
 namespace {
 
-struct Shape {
-  std::int64_t n_row, d_in, d_out;
-};
+using Shape = test::ProductShape;
+using test::Numbers;
 
 // One row, few, more than a block of rows; depths beyond a step and between its multiples; columns that no panel
 // divides; the widths of BitVLA's tower.
@@ -35,22 +33,6 @@ constexpr Shape kShapes[] = {{1, 4, 1},      {1, 64, 16},    {2, 12, 31},   {3, 
 
 constexpr float kUntouched = 1234.5f;
 
-class Numbers {
- public:
-  std::uint32_t next(std::uint32_t n) {
-    state_ = state_ * 1664525u + 1013904223u;
-    return (state_ >> 8) % n;
-  }
-  std::vector<float> floats(std::int64_t count) {
-    std::vector<float> values(static_cast<std::size_t>(count));
-    for (float& value : values) value = static_cast<float>(next(1U << 24)) / 8388608.0f - 1.0f;
-    return values;
-  }
-
- private:
-  std::uint32_t state_ = 12345;
-};
-
 /// Rows that quantizing may get wrong: zeros; numbers below the smallest scale; halves between codes; one large number.
 std::vector<float> difficult_rows(Numbers& numbers, std::int64_t n_row, std::int64_t d_in) {
   std::vector<float> x = numbers.floats(n_row * d_in);
@@ -59,7 +41,7 @@ std::vector<float> difficult_rows(Numbers& numbers, std::int64_t n_row, std::int
     for (std::int64_t k = 0; k < d_in; ++k) {
       if (r % 7 == 1) row[k] = 0;
       if (r % 7 == 2) row[k] *= 3e-6f;
-      if (r % 7 == 3) row[k] = static_cast<float>(numbers.next(255)) / 2 - 63;  // with 127: whole codes and halves
+      if (r % 7 == 3) row[k] = static_cast<float>(numbers.below(255)) / 2 - 63;  // with 127: whole codes and halves
       if (r % 7 == 3 && k == d_in / 2) row[k] = -127;
       if (r % 7 == 4 && k == 0) row[k] = 3e38f;
     }
@@ -86,12 +68,15 @@ Codes codes_of(const float* x, std::int64_t n) {
   return codes;
 }
 
-using Memory = std::unique_ptr<std::byte, decltype(&std::free)>;
+enum class Weights { ternary, int8 };
 
-/// At a multiple of a page.
-Memory memory(std::size_t size) {
-  const std::int64_t pages = round_up(static_cast<std::int64_t>(size), 4096);
-  return {static_cast<std::byte*>(std::aligned_alloc(4096, static_cast<std::size_t>(pages))), std::free};
+MatrixDesc desc_of(Weights weights, std::int64_t d_in, std::int64_t d_out) {
+  return {DType::i8, d_in, d_out, weights == Weights::ternary};
+}
+
+/// Whose packed matrix all kernels read.
+Weights weights_of(const LinearKernel& kernel) {
+  return kernel.pack == ternary_kernels().back()->pack ? Weights::ternary : Weights::int8;
 }
 
 struct Case {
@@ -103,7 +88,7 @@ struct Case {
 
 class Trial {
  public:
-  Trial(const LinearKernel& kernel, const Case& c) : kernel_(kernel), case_(c) {
+  Trial(const LinearKernel& kernel, const Case& c) : kernel_(kernel), weights_(weights_of(kernel)), case_(c) {
     const auto [n_row, d_in, unused] = c.shape;
     x_ = difficult_rows(numbers_, n_row, d_in);
     for (std::int64_t r = 0; r < n_row; ++r) codes_.push_back(codes_of(&x_[static_cast<std::size_t>(r * d_in)], d_in));
@@ -122,26 +107,15 @@ class Trial {
     for (int i = 0; i < case_.n_part; ++i) {
       Part& part = parts_[static_cast<std::size_t>(i)];
       job.part[i] = {DType::i8,
-                     packed(part, {DType::i8, d_in, d_out(i)}),
+                     part.packed.get(),
                      case_.with_bias ? part.bias.data() : nullptr,
                      nullptr,
                      case_.with_residual ? part.residual.data() : nullptr,
                      reinterpret_cast<std::byte*>(&part.y[1]),
                      d_out(i),
-                     &part.scale};
+                     part.scale.data()};
     }
-    const std::int64_t n_item = kernel_.cut(job, case_.n_thread);
-    std::atomic<std::int64_t> next = 0;
-    const auto work = [&](int index) {  // what a thread finds in its scratch memory must not matter
-      const Memory scratch = memory(kernel_.scratch_size);
-      std::memset(scratch.get(), 0xff, kernel_.scratch_size);
-      Worker worker = {index, scratch.get(), 1};
-      for (std::int64_t item = next++; item < n_item; item = next++) kernel_.run(job, item, worker);
-    };
-    std::vector<std::thread> threads;
-    for (int i = 1; i < case_.n_thread; ++i) threads.emplace_back(work, i);
-    work(0);
-    for (std::thread& thread : threads) thread.join();
+    test::run_job(kernel_, job, case_.n_thread);
   }
 
   void check() const {
@@ -161,9 +135,8 @@ class Trial {
 
  private:
   struct Part {
-    std::vector<float> weight, bias, residual, y;
-    std::vector<std::byte> stored, packed;
-    float scale;
+    std::vector<float> weight, bias, residual, y, scale;  // one scale, or one for each column
+    test::Pages packed = {nullptr, std::free};
   };
 
   std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
@@ -171,21 +144,17 @@ class Trial {
   Part make_part(std::int64_t width) {
     Part part;
     part.weight.resize(static_cast<std::size_t>(case_.shape.d_in * width));
-    for (float& weight : part.weight) weight = static_cast<float>(numbers_.next(3)) - 1;
-    part.stored = test::store_as(DType::i8, part.weight);
+    const bool ternary = weights_ == Weights::ternary;
+    for (float& weight : part.weight)
+      weight = ternary ? static_cast<float>(numbers_.below(3)) - 1 : static_cast<float>(numbers_.below(256)) - 128;
     part.bias = numbers_.floats(width);
     part.residual = numbers_.floats(case_.shape.n_row * width);
     part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, kUntouched);
-    part.scale = 0.01f + 0.3f * static_cast<float>(parts_.size());
+    part.scale = numbers_.floats(ternary ? 1 : width);
+    const std::vector<std::byte> stored = ternary ? test::store_ternary(part.weight) : test::store_int8(part.weight);
+    const auto all = ternary ? ternary_kernels() : int8_kernels();
+    part.packed = test::packed(*all.front(), desc_of(weights_, case_.shape.d_in, width), stored.data());
     return part;
-  }
-
-  static const std::byte* packed(Part& part, const MatrixDesc& desc) {
-    const LinearKernel& any = *ternary_kernels().front();
-    part.packed.assign(any.packed_size(desc) + 64, std::byte{0xff});
-    std::byte* place = part.packed.data() + (64 - reinterpret_cast<std::uintptr_t>(part.packed.data()) % 64);
-    any.pack(desc, part.stored.data(), place);
-    return place;
   }
 
   float product(int i, std::int64_t row, std::int64_t n) const {
@@ -195,7 +164,8 @@ class Trial {
     for (std::int64_t k = 0; k < case_.shape.d_in; ++k)
       sum += codes.q[static_cast<std::size_t>(k)] *
              static_cast<int>(part.weight[static_cast<std::size_t>(n * case_.shape.d_in + k)]);
-    volatile float y = static_cast<float>(sum) * (part.scale / codes.s);
+    const float scale = part.scale[weights_ == Weights::ternary ? 0 : static_cast<std::size_t>(n)];
+    volatile float y = static_cast<float>(sum) * (scale / codes.s);
     if (case_.with_bias) y = y + part.bias[static_cast<std::size_t>(n)];
     return y;
   }
@@ -209,6 +179,7 @@ class Trial {
   }
 
   const LinearKernel& kernel_;
+  Weights weights_;
   Case case_;
   Numbers numbers_;
   std::vector<float> x_;
@@ -249,11 +220,10 @@ void check_codes(const LinearKernel& kernel) {
 
 void check_not_finite(const LinearKernel& kernel) {
   const std::int64_t d_in = 68, d_out = 5;
-  const MatrixDesc desc = {DType::i8, d_in, d_out};
-  std::vector<float> weight(static_cast<std::size_t>(d_in * d_out), 1.0f);
-  const std::vector<std::byte> stored = test::store_as(DType::i8, weight);
-  const Memory packed = memory(kernel.packed_size(desc)), scratch = memory(kernel.scratch_size);
-  kernel.pack(desc, stored.data(), packed.get());
+  const std::vector<float> weight(static_cast<std::size_t>(d_in * d_out), 1.0f), scale(d_out, 1.0f);
+  const bool ternary = weights_of(kernel) == Weights::ternary;
+  const std::vector<std::byte> stored = ternary ? test::store_ternary(weight) : test::store_int8(weight);
+  const test::Pages packed = test::packed(kernel, desc_of(weights_of(kernel), d_in, d_out), stored.data());
   for (const float bad : {std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::quiet_NaN(),
                           std::numeric_limits<float>::quiet_NaN()})
     for (const std::int64_t place : {std::int64_t{0}, std::int64_t{17}, d_in - 1}) {
@@ -261,15 +231,12 @@ void check_not_finite(const LinearKernel& kernel) {
       x[static_cast<std::size_t>(place)] = bad;
       std::vector<std::byte> row(static_cast<std::size_t>(quantized_size(1, d_in)));
       kernel.quantize(x.data(), d_in, row.data());
-      const float scale = 1;
       LinearJob job = {};
       job.x = row.data(), job.x_type = DType::i8, job.x_stride = quantized_stride(d_in);
       job.n_row = 1, job.d_in = d_in, job.n_part = 1;
       job.part[0] = {DType::i8, packed.get(), nullptr, nullptr, nullptr, reinterpret_cast<std::byte*>(y.data()),
-                     d_out,     &scale};
-      Worker worker = {0, scratch.get(), 1};
-      CHECK(kernel.cut(job, 1) == 1);
-      kernel.run(job, 0, worker);
+                     d_out,     scale.data()};
+      test::run_job(kernel, job, 1);
       for (const float number : y) CHECK_FALSE(std::isfinite(number));
     }
 }
@@ -295,7 +262,6 @@ struct Golden {
 void check_golden(const LinearKernel& kernel) {
   Golden golden;
   const std::int64_t stride = quantized_stride(Golden::kIn);
-  const MatrixDesc desc = {DType::i8, Golden::kIn, Golden::kOut};
   std::vector<std::byte> rows(static_cast<std::size_t>(quantized_size(Golden::kRows, Golden::kIn)));
   for (std::int64_t r = 0; r < Golden::kRows; ++r) {
     std::byte* row = rows.data() + r * stride;
@@ -305,8 +271,8 @@ void check_golden(const LinearKernel& kernel) {
       CHECK(static_cast<float>(static_cast<signed char>(row[k])) ==
             golden.codes[static_cast<std::size_t>(r * Golden::kIn + k)]);
   }
-  const Memory packed = memory(kernel.packed_size(desc)), scratch = memory(kernel.scratch_size);
-  kernel.pack(desc, test::store_as(DType::i8, golden.weight).data(), packed.get());
+  const std::vector<std::byte> stored = test::store_ternary(golden.weight);
+  const test::Pages packed = test::packed(kernel, ternary_desc(Golden::kIn, Golden::kOut), stored.data());
   const auto product = [&](std::int64_t row, std::int64_t n_row, const float* scale, const float* bias) {
     std::vector<float> y(static_cast<std::size_t>(n_row * Golden::kOut));
     LinearJob job = {};
@@ -314,9 +280,7 @@ void check_golden(const LinearKernel& kernel) {
     job.n_row = n_row, job.d_in = Golden::kIn, job.n_part = 1;
     job.part[0] = {DType::i8,    packed.get(), bias, nullptr, nullptr, reinterpret_cast<std::byte*>(y.data()),
                    Golden::kOut, scale};
-    Worker worker = {0, scratch.get(), 1};
-    CHECK(kernel.cut(job, 1) == 1);
-    kernel.run(job, 0, worker);
+    test::run_job(kernel, job, 1);
     return y;
   };
   CHECK(product(0, Golden::kRows, golden.scale.data(), golden.bias.data()) == golden.y);
@@ -324,6 +288,32 @@ void check_golden(const LinearKernel& kernel) {
     const auto first = golden.sums.begin() + r * Golden::kOut;
     CHECK(product(r, 1, &golden.scales[static_cast<std::size_t>(r)], nullptr) ==
           std::vector<float>(first, first + Golden::kOut));
+  }
+}
+
+/// Codes and weights as large as they get, which overflow 16 bits where pairs of products are summed to them.
+void check_extremes(const LinearKernel& kernel) {
+  const std::int64_t d_in = 4304, d_out = 33, n_row = 40;
+  const bool ternary = weights_of(kernel) == Weights::ternary;
+  for (const float extreme : {-128.0f, 127.0f}) {
+    const float number = ternary ? std::copysign(1.0f, extreme) : extreme;
+    const std::vector<float> weight(static_cast<std::size_t>(d_in * d_out), number), scale(d_out, 127.0f);
+    const std::vector<std::byte> stored = ternary ? test::store_ternary(weight) : test::store_int8(weight);
+    const test::Pages packed = test::packed(kernel, desc_of(weights_of(kernel), d_in, d_out), stored.data());
+    std::vector<std::byte> rows(static_cast<std::size_t>(quantized_size(n_row, d_in)));
+    for (std::int64_t r = 0; r < n_row; ++r) {
+      const std::vector<float> x(static_cast<std::size_t>(d_in), r % 2 == 0 ? 1.0f : -1.0f);
+      kernel.quantize(x.data(), d_in, rows.data() + r * quantized_stride(d_in));
+    }
+    std::vector<float> y(static_cast<std::size_t>(n_row * d_out));
+    LinearJob job = {};
+    job.x = rows.data(), job.x_type = DType::i8, job.x_stride = quantized_stride(d_in);
+    job.n_row = n_row, job.d_in = d_in, job.n_part = 1;
+    job.part[0] = {DType::i8, packed.get(), nullptr, nullptr, nullptr, reinterpret_cast<std::byte*>(y.data()),
+                   d_out,     scale.data()};
+    test::run_job(kernel, job, 1);
+    for (std::int64_t i = 0; i < n_row * d_out; ++i)
+      CHECK(y[static_cast<std::size_t>(i)] == (i / d_out % 2 == 0 ? 127 : -127) * static_cast<float>(d_in) * number);
   }
 }
 
@@ -350,33 +340,44 @@ void check_threads(const LinearKernel& kernel) {
     }
 }
 
-const LinearKernel& row(const std::string& name) {
-  for (const LinearKernel* kernel : ternary_kernels())
-    if (kernel->name == name) return *kernel;
-  FAIL("no row " << name);
-  return *ternary_kernels().back();
+const LinearKernel* row(std::span<const LinearKernel* const> kernels, const std::string& name) {
+  for (const LinearKernel* kernel : kernels)
+    if (kernel->name == name) return kernel;
+  return nullptr;
+}
+/// Of ternary weights and of int8 ones.
+void check_both(const std::string& name, void (*check)(const LinearKernel& kernel)) {
+  for (const auto& kernels : {ternary_kernels(), int8_kernels()}) {
+    REQUIRE(row(kernels, name) != nullptr);
+    check(*row(kernels, name));
+  }
 }
 
 /// For doctest's skip decorator: this machine lacks the instructions of a row.
 bool lacks(const std::string& name) {
-  for (const LinearKernel* kernel : ternary_kernels())
-    if (kernel->name == name) return !kernel->supports({DType::i8, 64, 64}, usable_isas().back());
-  return true;
+  const LinearKernel* kernel = row(ternary_kernels(), name);
+  return kernel == nullptr || !kernel->supports(ternary_desc(64, 64), usable_isas().back());
 }
 
 }  // namespace
 
-#define VLA_TERNARY_TEST(sentence, check)                                                                    \
-  TEST_CASE("plain_int8: " sentence) { check(row("plain_int8")); }                                           \
-  TEST_CASE("avx2_int8: " sentence* doctest::skip(lacks("avx2_int8"))) { check(row("avx2_int8")); }          \
-  TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check(row("avxvnni_int8")); } \
-  TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check(row("avx512_int8")); }    \
-  VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx))                                        \
-  TEST_CASE("amx_int8: " sentence* doctest::skip(lacks("amx_int8"))) { check(row("amx_int8")); }
+#define VLA_INT8_TEST_OF(sentence, check, check_named)                                                        \
+  TEST_CASE("plain_int8: " sentence) { check_named("plain_int8"); }                                           \
+  TEST_CASE("avx2_int8: " sentence* doctest::skip(lacks("avx2_int8"))) { check_named("avx2_int8"); }          \
+  TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check_named("avxvnni_int8"); } \
+  TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check_named("avx512_int8"); }    \
+  TEST_CASE("amx_int8: " sentence* doctest::skip(lacks("amx_int8"))) { check_named("amx_int8"); }
+#define VLA_TERNARY_TEST(sentence, check)                                                           \
+  VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check(*row(ternary_kernels(), name)); }) \
+  VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx))
+#define VLA_INT8_TEST(sentence, check)                                                 \
+  VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check_both(name, check); }) \
+  VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx); check(kEmulatedInt8Amx))
 
 VLA_TERNARY_TEST("codes, sums and products are those of BitVLA's quantizers, bit for bit", check_golden)
-VLA_TERNARY_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)
-VLA_TERNARY_TEST("sums of any shape are exact, and scaled in single roundings", check_shapes)
-VLA_TERNARY_TEST("bias, gate and residual follow the product, each rounded by itself", check_epilogues)
-VLA_TERNARY_TEST("any number of threads computes every number once, and the same", check_threads)
-VLA_TERNARY_TEST("a row that is not finite has no finite product", check_not_finite)
+VLA_INT8_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)
+VLA_INT8_TEST("sums of any shape are exact, and scaled in single roundings", check_shapes)
+VLA_INT8_TEST("the largest sums are exact", check_extremes)
+VLA_INT8_TEST("bias, gate and residual follow the product, each rounded by itself", check_epilogues)
+VLA_INT8_TEST("any number of threads computes every number once, and the same", check_threads)
+VLA_INT8_TEST("a row that is not finite has no finite product", check_not_finite)

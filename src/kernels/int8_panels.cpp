@@ -1,11 +1,17 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/ternary_panels.h"
+#include "kernels/int8_panels.h"
 
 namespace vla::kernels {
 namespace {
 
 constexpr std::int64_t kUnitStrips = 4;
+
+template <class Panels>
+std::size_t size_of(const MatrixDesc& desc) {
+  return static_cast<std::size_t>(ceil_div(desc.d_out, Panels::kColumns * kUnitStrips) * kUnitStrips *
+                                  Panels::strip_size(desc.d_in));
+}
 
 /// Four bytes of four codes each, as four by four numbers of two bits: rows become columns.
 std::uint32_t transposed(std::uint32_t codes) {
@@ -17,9 +23,17 @@ std::uint32_t transposed(std::uint32_t codes) {
 
 }  // namespace
 
-std::size_t TernaryPanels::packed_size(const MatrixDesc& desc) {
-  return static_cast<std::size_t>(ceil_div(desc.d_out, kColumns * kUnitStrips) * kUnitStrips * strip_size(desc.d_in));
+std::size_t BytePanels::packed_size(const MatrixDesc& desc) { return size_of<BytePanels>(desc); }
+
+void BytePanels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
+  std::memset(packed, 0, packed_size(desc));
+  for (std::int64_t n = 0; n < desc.d_out; ++n, stored += desc.d_in) {
+    std::byte* to = packed + n / kColumns * strip_size(desc.d_in) + n % kColumns * 4;
+    for (std::int64_t k = 0; k < desc.d_in; ++k) to[k / 4 * kLine + k % 4] = stored[k] ^ std::byte{kOffset};
+  }
 }
+
+std::size_t TernaryPanels::packed_size(const MatrixDesc& desc) { return size_of<TernaryPanels>(desc); }
 
 void TernaryPanels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
   const std::int64_t row = desc.d_in / 4;  // bytes

@@ -1,0 +1,14 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "kernels/linear_kernel.h"
+
+namespace vla::kernels {
+
+/// The implementations of products of ternary matrices and of int8 ones, best first; the last runs on every machine.
+/// All of a list read the same packed weights and the same codes, and give the same bits up to the activation.
+std::span<const LinearKernel* const> ternary_kernels();
+std::span<const LinearKernel* const> int8_kernels();
+
+}  // namespace vla::kernels
