@@ -59,7 +59,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   Timing load;
   VLA_TRY(const std::unique_ptr<Engine> engine,
           Engine::load(random ? random->path() : request.bundle,
-                       {.n_thread = request.n_thread, .kernels = request.kernels, .map = random.has_value()}));
+                       {.n_thread = request.n_thread, .kernels = request.kernels}));
   clock.lap(load, "load");
   report.load = load.front().second;
 

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "base/result.h"
+#include "bundle/content.h"
 #include "bundle/keys.h"
 
 namespace vla {
@@ -20,7 +21,8 @@ enum class DType { f32, f16, bf16, i32, i8, f64 };
 const char* dtype_name(DType type);
 std::size_t dtype_size(DType type);
 
-/// A tensor as stored in the file. `shape` follows ggml: fastest dimension first.
+/// A tensor as stored in the file. `shape` follows ggml: fastest dimension first. `data` of an opened bundle is read by
+/// Bundle::read.
 struct TensorInfo {
   std::string name;
   DType type;
@@ -34,13 +36,8 @@ struct TensorInfo {
 /// it was used, so that a truncated or hostile file is refused instead of read.
 class Bundle {
  public:
-  /// How a file comes into memory. A copy is what its checksum says, whatever happens to the file afterwards. A mapping
-  /// takes no memory of the process, but who changes the file changes what it holds, and who makes it shorter ends the
-  /// process (SIGBUS).
-  enum class Access { copy, map };
-
-  /// Reads or maps the file, parses it, and compares checksum and version. Errors: io, bad_bundle, out_of_memory.
-  static Result<Bundle> open(const std::string& path, Access access = Access::copy);
+  /// Parses the file and compares checksum and version. Tensors stay in it. Errors: io, bad_bundle, out_of_memory.
+  static Result<Bundle> open(const std::string& path);
   /// The same on bytes in memory, which must outlive the bundle.
   static Result<Bundle> parse(std::span<const std::byte> bytes, std::string name);
 
@@ -50,20 +47,18 @@ class Bundle {
   const TensorInfo* find(std::string_view name) const;
   /// A one- or two-dimensional f32 or f64 tensor of finite values, for statistics: row by row. Errors: bad_bundle.
   Result<std::vector<double>> stats(std::string_view name) const;
-  std::size_t file_size() const { return bytes_.size(); }
-  /// Gives whole pages of a part of an opened file back to the system, because they are not read any more: of a copy
-  /// they are gone, and touching them ends the process.
-  void release_pages(std::span<const std::byte> part) const;
-  /// Reads a part of a mapped file into memory now, instead of page by page when it is used.
-  void keep_pages(std::span<const std::byte> part) const;
-  /// Keeps an opened file's bytes where they are for as long as somebody holds this; null for bytes of `parse`.
-  const std::shared_ptr<const void>& mapping() const { return mapping_; }
+  std::size_t file_size() const { return content_->bytes().size(); }
+  /// The bytes of a tensor or of a part of it, in `room` where they come from a file. Errors: bad_bundle, where the
+  /// file has been changed since it was opened.
+  Result<std::span<const std::byte>> read(std::span<const std::byte> part, Room& room) const;
+  /// Where tensors are read, also when the bundle is gone.
+  const std::shared_ptr<const Content>& content() const { return content_; }
 
  private:
+  static Result<Bundle> parse(const std::shared_ptr<Content>& content, std::string name);
+
   std::string path_;
-  Access access_ = Access::map;
-  std::shared_ptr<const void> mapping_;
-  std::span<const std::byte> bytes_;
+  std::shared_ptr<const Content> content_;
   Keys keys_;
   std::vector<TensorInfo> tensors_;
   std::unordered_map<std::string, std::size_t> index_;  // of tensors_, by name

@@ -22,10 +22,13 @@ constexpr std::uint64_t kMaxDims = 4;
 constexpr std::uint64_t kMaxNameLength =
     65535;  // of keys and tensor names, as the format's own description limits them
 
+using Show = std::function<Status(std::size_t n)>;
+
 /// Walks over the bytes. Every read checks what is left; after the first failure the reader stays failed.
 class Cursor {
  public:
-  Cursor(std::span<const std::byte> bytes, const std::string& name) : bytes_(bytes), name_(name) {}
+  Cursor(std::span<const std::byte> bytes, const std::string& name, const Show& show)
+      : bytes_(bytes), name_(name), show_(show) {}
 
   template <class T>
   Result<T> scalar(const std::string& what) {
@@ -46,7 +49,7 @@ class Cursor {
   }
 
   Status need(std::uint64_t count, const std::string& what) const {
-    if (count <= left()) return {};
+    if (count <= left()) return show_ ? show_(position_ + count) : Status();
     return bad(what, fmt::format("{} more bytes at offset {}", count, position_), fmt::format("{}", left()),
                "the file is truncated: copy or convert it again");
   }
@@ -62,6 +65,7 @@ class Cursor {
  private:
   std::span<const std::byte> bytes_;
   const std::string& name_;
+  const Show& show_;
   std::uint64_t position_ = 0;
 };
 
@@ -272,8 +276,8 @@ Status place(std::span<const std::byte> bytes, const Cursor& cursor, std::uint64
 
 }  // namespace
 
-Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::string& name) {
-  Cursor cursor(bytes, name);
+Result<GgufContent> read_gguf(std::span<const std::byte> bytes, const std::string& name, const Show& show) {
+  Cursor cursor(bytes, name, show);
   VLA_TRY(const std::uint32_t magic, cursor.scalar<std::uint32_t>("header"));
   if (magic != 0x46554747)
     return cursor.bad("header", "a GGUF file", "other first bytes", "make a bundle with vla-convert");

@@ -40,6 +40,17 @@ bool has_wrong_code(std::span<const std::byte> codes) {
   return wrong != std::byte{};
 }
 
+/// The same of a tensor, read part by part.
+Result<bool> has_wrong_code(const Bundle& bundle, std::span<const std::byte> codes) {
+  constexpr std::size_t kPart = std::size_t{1} << 20;
+  Room room;
+  for (std::size_t i = 0; i < codes.size(); i += kPart) {
+    VLA_TRY(const auto part, bundle.read(codes.subspan(i, std::min(kPart, codes.size() - i)), room));
+    if (has_wrong_code(part)) return true;
+  }
+  return false;
+}
+
 }  // namespace
 
 const char* storage_name(Storage storage) {
@@ -81,8 +92,11 @@ void ParamList::look_up(Param& param) {
   if (!allows(param.storage, tensor->type))
     return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name, dtypes_of(param.storage),
                                dtype_name(tensor->type)));
-  if (param.storage == Storage::ternary && has_wrong_code(tensor->data))
-    return problem(fmt::format("wrong code      {:<40} expected 0, 1 or 2, file has 3", param.name));
+  if (param.storage == Storage::ternary) {
+    const Result<bool> wrong = has_wrong_code(*bundle_, tensor->data);
+    if (!wrong) return problem(wrong.error());
+    if (*wrong) return problem(fmt::format("wrong code      {:<40} expected 0, 1 or 2, file has 3", param.name));
+  }
   param.source = tensor;
 }
 

@@ -17,7 +17,7 @@ constexpr int kMaxHorizon = 4096;
 }  // namespace
 
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
-  VLA_TRY(Bundle bundle, Bundle::open(path, options.map || options.dry ? Bundle::Access::map : Bundle::Access::copy));
+  VLA_TRY(Bundle bundle, Bundle::open(path));
   VLA_TRY(Processor processor, Processor::create(bundle));
   VLA_TRY(std::unique_ptr<Device> device, open_device(options.n_thread, options.kernels));
   std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));

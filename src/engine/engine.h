@@ -19,7 +19,6 @@ struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
   std::string kernels;      // as choose_isa takes them; empty: the best that the machine has for the bundle's dtype
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
-  bool map = false;         // the bundle is used in place, as Bundle::Access::map describes
   bool dry = false;         // reserve memory without filling it: sizes are exact, and `act` must not be called
 };
 

@@ -35,8 +35,7 @@ ggml_type resident_type(const Param& param) {
   return param.storage == Storage::table && param.source != nullptr ? type_of(param.source->type) : GGML_TYPE_F32;
 }
 
-void upload(ggml_tensor* tensor, const Param& param) {
-  const std::byte* data = param.source->data.data();
+void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
   if (type_of(param.source->type) == tensor->type)
     return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
   std::vector<float> values(static_cast<std::size_t>(param.count()));
@@ -93,10 +92,11 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
   if (weights_.empty()) return {};
   weight_buffer_.reset(ggml_backend_alloc_ctx_tensors(weight_context_.get(), backend_.get()));
   if (!weight_buffer_) return refused("weights");
+  Room room;
   for (const Param& param : params.params()) {
     if (!fill) break;
-    upload(weight(&param), param);
-    params.bundle()->release_pages(param.source->data);  // so that file and weights do not stand in memory together
+    VLA_TRY(const auto data, params.bundle()->read(param.source->data, room));
+    upload(weight(&param), param, data.data());
   }
   return {};
 }

@@ -20,9 +20,10 @@ class Program {
   using Time = std::chrono::steady_clock::time_point;
   virtual ~Program() = default;
 
-  /// Computes what depends on inputs that stay the same from run to run (LowerOptions::varying). Errors: device.
+  /// Computes what depends on inputs that stay the same from run to run (LowerOptions::varying). Errors: device, and
+  /// bad_bundle where rows of a table are read from a file that has been changed since it was opened.
   virtual Status prepare() { return {}; }
-  /// Errors: device.
+  /// Errors: those of `prepare`.
   virtual Status run() = 0;
 
   struct Stage {
@@ -60,7 +61,7 @@ class Device {
 
   /// Makes the parameters resident, laid out for this device. Every one must have its source: call ParamList::report
   /// first. `fill` false reserves memory without touching it, which is enough to learn sizes; no source is needed.
-  /// Errors: out_of_memory.
+  /// Errors: out_of_memory, bad_bundle.
   virtual Status load(const ParamList& params, bool fill) = 0;
   /// Gives slots memory, filled with zeros. Errors: out_of_memory.
   virtual Status allocate(Slots& slots) = 0;
@@ -79,7 +80,7 @@ class Device {
   virtual std::string precision() const = 0;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   virtual const std::string& linear_kernels() const = 0;
-  /// Bytes of parameters, those of the mapped file included, and of what programs share while they run.
+  /// Bytes of parameters, and of what programs share while they run.
   virtual std::size_t weights_size() const = 0;
   virtual std::size_t working_size() const = 0;
   /// Has the system back the shared memory now, so that no request waits for it.

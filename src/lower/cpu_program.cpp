@@ -15,7 +15,7 @@ Result<std::unique_ptr<Program>> CpuProgram::make(Lowering& l, const Memory& are
                                                   std::shared_ptr<kernels::Executor> executor) {
   std::unique_ptr<CpuProgram> program(new CpuProgram);
   program->executor_ = std::move(executor);
-  program->arena_ = arena;
+  program->arena_ = arena, program->tables_ = l.weights.tables();
   VLA_CHECK(program->give_addresses(l));
   VLA_CHECK(program->make_tasks(l));
   program->make_taps(l);
@@ -80,13 +80,12 @@ void CpuProgram::make_taps(const Lowering& l) {
   }
 }
 
-Status CpuProgram::prepare() {
-  executor_->run(std::span(phases_).first(n_prepare_));
-  return {};
-}
+Status CpuProgram::prepare() { return run(std::span(phases_).first(n_prepare_)); }
+Status CpuProgram::run() { return run(std::span(phases_).subspan(n_prepare_)); }
 
-Status CpuProgram::run() {
-  executor_->run(std::span(phases_).subspan(n_prepare_));
+Status CpuProgram::run(std::span<const kernels::Phase> phases) {
+  executor_->run(phases);
+  for (const auto& [param, rows] : *tables_) VLA_CHECK(rows->status());
   return {};
 }
 

@@ -30,11 +30,13 @@ class CpuProgram final : public Program {
     const float* data;
     Shape shape, stride;
   };
+  Status run(std::span<const kernels::Phase> phases);
   Status give_addresses(Lowering& l);
   Status make_tasks(const Lowering& l);
   void make_taps(const Lowering& l);
 
   std::shared_ptr<kernels::Executor> executor_;
+  std::shared_ptr<const Tables> tables_;
   Memory arena_, own_;  // own: constants, and what prepare leaves
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;

@@ -5,10 +5,13 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
+#include <atomic>
 #include <cstring>
 #include <map>
 
 #include "kernels/executor.h"
+#include "kernels/sizes.h"
 #include "lower/precision.h"
 
 namespace vla {
@@ -36,25 +39,50 @@ kernels::MatrixDesc desc_of(const Param& param) {
   return {param.type(), param.shape[0], param.shape[1], param.storage == Storage::ternary};
 }
 
-/// Packs parameter `item`, and gives its pages of the file back, so that file and weights do not stand in memory
-/// together.
+/// Rows of a matrix in a part that is read and packed at a time: whole panels of every kernel.
+constexpr std::int64_t kPartRows = 64;
+/// Bytes of a part, at least; a worker has one in memory.
+constexpr std::int64_t kPartSize = 1 << 20;
+
+/// Parts of parameters from the bundle's file to their places, so that no more than a part for each worker stands in
+/// memory twice.
 struct PackTask : kernels::Task {
-  struct Copy {
-    const Param* param;
-    const kernels::LinearKernel* kernel;
+  struct Part {
+    kernels::MatrixDesc desc;
+    std::span<const std::byte> from;
+    const kernels::LinearKernel* kernel;  // null: a copy
     std::byte* to;
   };
-  std::vector<Copy> copies;
   const Bundle* bundle;
+  std::vector<Part> parts;
+  mutable std::vector<Room> rooms;  // of each worker
+  mutable std::atomic<bool> has_failed = false;
 
-  void run(std::int64_t item, kernels::Worker&) const override {
-    const auto& [param, kernel, to] = copies[static_cast<std::size_t>(item)];
-    const std::span<const std::byte> from = param->source->data;
-    if (kernel != nullptr)
-      kernel->pack(desc_of(*param), from.data(), to);
+  void add(const Param& param, const kernels::LinearKernel* kernel, std::byte* to) {
+    const std::span<const std::byte> all = param.source->data;
+    if (kernel == nullptr) return parts.push_back({{}, all, nullptr, to});
+    kernels::MatrixDesc desc = desc_of(param);
+    const std::int64_t n_row = desc.d_out, row = static_cast<std::int64_t>(all.size()) / n_row;
+    const std::int64_t step = kernels::round_up(kPartSize / row + 1, kPartRows);
+    for (std::int64_t first = 0; first < n_row; first += step) {
+      desc.d_out = first;
+      std::byte* const place = to + kernel->packed_size(desc);
+      desc.d_out = std::min(step, n_row - first);
+      parts.push_back({desc,
+                       all.subspan(static_cast<std::size_t>(first * row), static_cast<std::size_t>(desc.d_out * row)),
+                       kernel, place});
+    }
+  }
+
+  void run(std::int64_t item, kernels::Worker& worker) const override {
+    const auto& [desc, from, kernel, to] = parts[static_cast<std::size_t>(item)];
+    const std::byte* read = bundle->content()->read(from, rooms[static_cast<std::size_t>(worker.index)]);
+    if (read == nullptr)
+      has_failed = true;
+    else if (kernel != nullptr)
+      kernel->pack(desc, read, to);
     else
-      std::memcpy(to, from.data(), from.size());
-    bundle->release_pages(from);
+      std::memcpy(to, read, from.size());
   }
 };
 
@@ -74,6 +102,8 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, Isa isa, int n_thread
   CpuWeights weights;
   std::map<std::string, std::map<std::string, int>> counts;
   std::vector<std::size_t> offsets;
+  const auto tables = std::make_shared<Tables>();
+  weights.tables_ = tables;
   std::size_t size = 0;
   for (const Param& param : list.params()) {
     Place place;
@@ -85,31 +115,32 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, Isa isa, int n_thread
     } else if (param.storage == Storage::vector) {
       size += aligned(static_cast<std::size_t>(param.count()) * sizeof(float));
     } else if (param.source != nullptr) {
-      place.data = param.source->data.data();
-      weights.table_size_ += param.source->data.size();
+      VLA_TRY(std::unique_ptr<TableRows> rows, TableRows::make(*list.bundle(), param));
+      weights.table_size_ += rows->size();
+      tables->emplace(&param, std::move(rows));
     }
     weights.places_.push_back(place);
   }
   VLA_TRY(weights.memory_, Memory::allocate(size, "weights"));
   weights.text_ = describe(counts);
-  if (list.bundle() != nullptr) weights.file_ = list.bundle()->mapping();
   PackTask task;
   task.bundle = list.bundle();
   for (const Param& param : list.params()) {
+    if (param.storage == Storage::table) continue;
     Place& place = weights.places_[static_cast<std::size_t>(param.id)];
-    if (param.storage == Storage::table) {
-      if (fill) list.bundle()->keep_pages(param.source->data);
-      continue;
-    }
-    std::byte* to = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
-    place.data = to;
-    task.copies.push_back({&param, place.kernel, to});
+    place.data = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
+    if (fill) task.add(param, place.kernel, weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)]);
   }
-  if (!fill || task.copies.empty()) return weights;
-  task.n_item = static_cast<std::int64_t>(task.copies.size());
+  if (task.parts.empty()) return weights;
   VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(n_thread));
+  task.rooms.resize(static_cast<std::size_t>(executor->n_thread()));
+  for (const PackTask::Part& part : task.parts)
+    for (Room& room : task.rooms)
+      room.take(Content::room_for(part.from.size()));  // a worker must not run out of memory
+  task.n_item = static_cast<std::int64_t>(task.parts.size());
   const kernels::Phase phase = {{&task}, nullptr};
   executor->run({&phase, 1});
+  if (task.has_failed) return list.bundle()->content()->changed();
   return weights;
 }
 

@@ -2,21 +2,26 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <map>
 #include <memory>
 #include <string>
 #include <vector>
 
 #include "bundle/params.h"
 #include "kernels/linear_kernel.h"
-#include "lower/memory.h"
+#include "lower/table_rows.h"
 
 namespace vla::lower {
+
+/// The tables of a policy's bundle.
+using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 
 /// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in the bundle's dtype, in panels;
 /// vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
 class CpuWeights {
  public:
-  /// Every parameter must have its source. Without `fill` memory is reserved and never touched. Errors: out_of_memory.
+  /// Every parameter must have its source. Without `fill` memory is reserved and never touched. Errors: out_of_memory,
+  /// bad_bundle where the file has been changed since it was opened.
   static Result<CpuWeights> load(const ParamList& list, Isa isa, int n_thread, bool fill);
 
   const std::byte* data(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].data; }
@@ -24,7 +29,14 @@ class CpuWeights {
   const kernels::LinearKernel* kernel(const Param* param) const {
     return places_[static_cast<std::size_t>(param->id)].kernel;
   }
-  /// Bytes in memory, those of the bundle's tables included.
+  /// All tables that have their source.
+  const std::shared_ptr<const Tables>& tables() const { return tables_; }
+  /// Of one of them; null where it has no source.
+  TableRows* rows(const Param* table) const {
+    const auto found = tables_->find(table);
+    return found != tables_->end() ? found->second.get() : nullptr;
+  }
+  /// Bytes in memory; of tables those of the rows that may be kept.
   std::size_t size() const { return memory_.size() + table_size_; }
   /// Which kernel multiplies how many matrices, for display: `avx2 (98 bf16)`.
   const std::string& text() const { return text_; }
@@ -36,7 +48,7 @@ class CpuWeights {
   };
 
   Memory memory_;
-  std::shared_ptr<const void> file_;  // of the tables
+  std::shared_ptr<const Tables> tables_;
   std::size_t table_size_ = 0;
   std::vector<Place> places_;
   std::string text_;

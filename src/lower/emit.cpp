@@ -121,22 +121,35 @@ struct CopyTask : Task {
   }
 };
 
-/// Rows of a table, widened to float32.
-struct LookupTask : Task {
-  const std::byte* table;
+/// Rows of a parameter, widened to float32 where they will lie: a row of two bytes a number fills the second half of
+/// its place first.
+struct EmbeddingTask : Task {
+  TableRows* table;
   DType type;
+  const std::int32_t* ids;
+  float* y;
+  std::int64_t d, n;
+
+  void run(std::int64_t, Worker&) const override {
+    for (std::int64_t i = 0; i < n; ++i) {
+      float* const to = y + i * d;
+      std::byte* const stored = reinterpret_cast<std::byte*>(to + d) - table->row_size();
+      table->copy(ids[i], stored);
+      for (std::int64_t j = 0; type != DType::f32 && j < d; ++j) to[j] = kernels::stored_number(type, stored, j);
+    }
+  }
+};
+
+/// Rows of a value.
+struct GatherTask : Task {
+  const float* rows;
   const std::int32_t* ids;
   float* y;
   std::int64_t d, n, item_rows, row_stride;
 
   void run(std::int64_t item, Worker&) const override {
-    for (std::int64_t i = item * item_rows; i < std::min(n, (item + 1) * item_rows); ++i) {
-      const std::byte* row = table + ids[i] * row_stride * kernels::number_size(type);
-      if (type == DType::f32)
-        std::memcpy(y + i * d, row, static_cast<std::size_t>(d) * sizeof(float));
-      else
-        for (std::int64_t j = 0; j < d; ++j) y[i * d + j] = kernels::stored_number(type, row, j);
-    }
+    for (std::int64_t i = item * item_rows; i < std::min(n, (item + 1) * item_rows); ++i)
+      std::memcpy(y + i * d, rows + ids[i] * row_stride, static_cast<std::size_t>(d) * sizeof(float));
   }
 };
 
@@ -313,17 +326,18 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const CopyOp& c
 }
 
 std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LookupOp& lookup) {
-  auto task = std::make_unique<LookupTask>();
   const Node& node = *lookup.node;
+  const auto* ids = reinterpret_cast<const std::int32_t*>(address(l, lookup.ids));
+  float* const y = floats(l, op.writes[0]);
   if (const auto* embedding = node.as<op::Embedding>()) {
-    task->table = l.weights.data(embedding->table), task->type = embedding->table->type();
-    task->row_stride = node.shape[0];
-  } else {
-    task->table = address(l, lookup.table), task->type = DType::f32;
-    task->row_stride = l.value(lookup.table).stride[1];
+    auto task = std::make_unique<EmbeddingTask>();
+    task->table = l.weights.rows(embedding->table), task->type = embedding->table->type();
+    task->ids = ids, task->y = y, task->d = node.shape[0], task->n = node.shape[1], task->n_item = 1;
+    return task;
   }
-  task->ids = reinterpret_cast<const std::int32_t*>(address(l, lookup.ids));
-  task->y = floats(l, op.writes[0]), task->d = node.shape[0], task->n = node.shape[1];
+  auto task = std::make_unique<GatherTask>();
+  task->rows = floats(l, lookup.table), task->row_stride = l.value(lookup.table).stride[1];
+  task->ids = ids, task->y = y, task->d = node.shape[0], task->n = node.shape[1];
   task->item_rows = item_rows(l, task->n, task->d, task->n_item);
   return task;
 }

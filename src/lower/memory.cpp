@@ -9,7 +9,7 @@
 
 namespace vla::lower {
 
-Result<Memory> Memory::allocate(std::size_t size, const char* what) {
+Result<Memory> Memory::allocate(std::size_t size, const std::string& what) {
   Memory memory;
   if (size == 0) return memory;
   void* data = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);

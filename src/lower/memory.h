@@ -4,6 +4,7 @@
 
 #include <cstddef>
 #include <memory>
+#include <string>
 
 #include "base/result.h"
 
@@ -18,7 +19,7 @@ class Memory {
  public:
   Memory() = default;
   /// `what` is for the error. Errors: out_of_memory.
-  static Result<Memory> allocate(std::size_t size, const char* what);
+  static Result<Memory> allocate(std::size_t size, const std::string& what);
 
   std::byte* data() const { return data_.get(); }
   std::size_t size() const { return size_; }

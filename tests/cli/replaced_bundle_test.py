@@ -50,6 +50,28 @@ def test_a_server_answers_with_the_bytes_that_it_has_loaded(vla, golden, tmp_pat
         server.process.communicate()
 
 
+@pytest.mark.parametrize("change", [written_over, turned, lambda path, other: os.truncate(path, 4096)])
+def test_a_row_of_the_vocabulary_that_has_changed_is_refused(vla, golden, tmp_path, change):
+    """Rows of embeddings stay in the file: an instruction of other words is not answered with other bytes."""
+    path, other = tmp_path / "policy.gguf", tmp_path / "other.gguf"
+    shutil.copy(golden.bundle, path)
+    other.write_bytes(golden.bundle.read_bytes()[:50_000])
+    server = Server(vla, path, "--bind", "tcp://127.0.0.1:0", "--threads", "1")
+    peer = wire.Peer(server.ready["address"])
+    try:
+        before = wire.actions(peer.ask(wire.act(1, golden, seed=1)))
+        change(path, other)
+        refused = peer.ask(wire.act(2, golden, seed=1, text="0123456789 quick brown foxes"))
+        assert wire.kind(refused) == "error"
+        assert b"renaming a new file over it" in refused
+        assert server.process.poll() is None
+        assert wire.actions(peer.ask(wire.act(1, golden, seed=1))) == before
+    finally:
+        peer.close()
+        server.process.kill()
+        server.process.communicate()
+
+
 def test_a_file_that_is_cut_while_it_is_read_is_refused(vla, golden, tmp_path):
     """Half of it is there when the program looks at its size, and nothing but that half when it reads."""
     path = tmp_path / "policy.gguf"

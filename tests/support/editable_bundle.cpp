@@ -20,11 +20,13 @@ EditableBundle EditableBundle::read(const std::string& path) {
   REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
   EditableBundle copy;
   copy.keys = bundle->keys();
-  for (const TensorInfo& tensor : bundle->tensors())
-    copy.tensors.push_back({tensor.name,
-                            tensor.type,
-                            tensor.shape,
-                            {reinterpret_cast<const char*>(tensor.data.data()), tensor.data.size()}});
+  Room room;
+  for (const TensorInfo& tensor : bundle->tensors()) {
+    const auto data = bundle->read(tensor.data, room);
+    REQUIRE(data.ok());
+    copy.tensors.push_back(
+        {tensor.name, tensor.type, tensor.shape, {reinterpret_cast<const char*>(data->data()), data->size()}});
+  }
   return copy;
 }
 

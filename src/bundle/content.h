@@ -1,0 +1,75 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "base/result.h"
+
+namespace vla {
+
+/// Memory that parts of a file are read into, again and again.
+class Room {
+ public:
+  /// At least `size` bytes, at a multiple of 64. Throws std::bad_alloc.
+  std::byte* take(std::size_t size) {
+    if (size > lines_.size() * sizeof(Line)) lines_.resize((size + sizeof(Line) - 1) / sizeof(Line));
+    return lines_.empty() ? nullptr : lines_.front().bytes;
+  }
+
+ private:
+  struct alignas(64) Line {
+    std::byte bytes[64];
+  };
+  std::vector<Line> lines_;
+};
+
+/// The bytes of a bundle: in memory of its owner, or in a file that is read part by part and never as a whole.
+///
+/// Somebody may write to the file meanwhile. So a first pass over it, `seal`, notes a checksum of every block, and what
+/// is read later is compared with it: bytes are those that the bundle's own checksum stands for, or refused.
+class Content {
+ public:
+  static constexpr std::size_t kBlock = 4096;
+
+  explicit Content(std::span<const std::byte> memory) : bytes_(memory), shown_(memory.size()) {}
+  /// Errors: io, bad_bundle (an empty file), out_of_memory (of addresses).
+  static Result<std::shared_ptr<Content>> open(const std::string& path);
+  Content(const Content&) = delete;
+  Content& operator=(const Content&) = delete;
+  ~Content();
+
+  /// All bytes. Of a file these are addresses: only the first ones, which were shown, may be read there.
+  std::span<const std::byte> bytes() const { return bytes_; }
+  /// Reads a file's first bytes, `n` or more. Errors: io, bad_bundle.
+  Status show(std::size_t n);
+  std::span<const std::byte> shown() const { return bytes_.first(shown_); }
+
+  /// Passes all bytes to `see`, one part after the other, and ends what is shown. Errors: io, bad_bundle.
+  Status seal(const std::function<void(std::span<const std::byte>)>& see);
+
+  /// A part of `bytes()`, in `room` where there is a file; null where the file has not these bytes any more. Once
+  /// `room` is as large as `room_for` the part, this takes no memory. Threads may read at a time.
+  const std::byte* read(std::span<const std::byte> part, Room& room) const;
+  static constexpr std::size_t room_for(std::size_t size) { return (size / kBlock + 2) * kBlock; }
+  /// What to say where `read` gave null.
+  Error changed() const;
+
+ private:
+  Content(int file, std::string path) : file_(file), path_(std::move(path)) {}
+  Status fill(std::size_t offset, std::span<std::byte> to) const;
+
+  int file_ = -1;
+  std::string path_;
+  std::span<const std::byte> bytes_;
+  std::size_t shown_ = 0;
+  std::vector<std::uint64_t> sums_;  // of the blocks of a file
+};
+
+}  // namespace vla
