@@ -19,7 +19,7 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 
 struct RunOptions {
-  std::string bundle, text, noise, out, tap, taps_out, kernels, leftover, schedule, normalized_out;
+  std::string bundle, text, noise, out, tap, taps_out, inject, kernels, leftover, schedule, normalized_out;
   std::vector<std::string> images, states;
   std::optional<std::uint64_t> seed;
   std::optional<int> delay;
@@ -183,8 +183,12 @@ Status run(RunOptions& options) {
   VLA_CHECK(check(options));
   StageClock clock;
   Timing before;
+  std::vector<Tap> inject;
+  if (!options.inject.empty()) {
+    VLA_TRY(inject, read_taps(options.inject));
+  }
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle, {options.n_thread, options.kernels, options.tap}));
+          Engine::load(options.bundle, {options.n_thread, options.kernels, options.tap, std::move(inject)}));
   if (options.strict_state) engine->refuse_beyond();
   clock.lap(before, "load");
   Observation observation;
@@ -279,6 +283,11 @@ Command add_run(CLI::App& app) {
                    "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns")
       ->check(CLI::Validator(check_given, ""));
   command->add_option("--taps-out", options->taps_out, "Where the recorded values go (GGUF), for vla compare")
+      ->check(CLI::Validator(check_given, ""));
+  command
+      ->add_option("--inject", options->inject,
+                   "Go on from these values in place of the computed ones: a GGUF file of named values, as --taps-out "
+                   "writes it")
       ->check(CLI::Validator(check_given, ""));
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))

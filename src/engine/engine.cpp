@@ -24,6 +24,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   engine->tap_pattern_ = options.tap_pattern;
   engine->dry_ = options.dry;
   VLA_CHECK(engine->load_policy());
+  VLA_CHECK(engine->take_injected(options.inject));
   VLA_CHECK(engine->make_conditions());
   VLA_CHECK(engine->make_constants());
   VLA_CHECK(engine->make_plans());
@@ -94,7 +95,34 @@ Status Engine::make_plans() {
   plans_ = std::make_unique<Plans>(
       PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_, horizon_, tap_pattern_, dry_});
   const auto plan = plans_->for_shape(largest_shape());
-  return plan ? Status() : Status(plan.error());
+  if (!plan) return plan.error();
+  if (injected_.empty()) return {};
+  plans_ =
+      std::make_unique<Plans>(PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_, horizon_,
+                                          tap_pattern_, dry_, &injected_});  // fits the shape of its observation
+  return {};
+}
+
+/// What the host reads and writes has names too, beside those of the network.
+Status Engine::take_injected(const std::vector<Tap>& given) {
+  for (const Tap& tap : given) {
+    if (tap.path == "chunk" || tap.path == "actions" || tap.path == "tokens")
+      return Error{Code::bad_observation, "injected " + tap.path, "a value of the network, pixels or state",
+                   tap.path == "tokens" ? "what the instruction gives" : "a result"};
+    (tap.path == "pixels" || tap.path == "state" ? injected_input_ : injected_).push_back(tap);
+  }
+  return {};
+}
+
+Status Engine::inject_inputs() {
+  for (const Tap& tap : injected_input_) {
+    std::vector<float>& input = tap.path == "state" ? inputs_.state : inputs_.pixels;
+    if (tap.values.size() != input.size())
+      return Error{Code::bad_observation, "injected " + tap.path, fmt::format("{} numbers", input.size()),
+                   std::to_string(tap.values.size())};
+    input = tap.values;
+  }
+  return {};
 }
 
 Status Engine::set_steps(int n_step) {
@@ -177,6 +205,7 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   VLA_CHECK(processor_.encode_text(observation, inputs_));
   clock.lap(chunk.timing, "tokenize");
   VLA_TRY(std::vector<float> x, start(noise));
+  VLA_CHECK(inject_inputs());
   std::optional<Steering> steering;
   if (leftover) {
     VLA_TRY(steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(x)));
@@ -208,6 +237,8 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   chunk.normalized = normalized(result);
   chunk.notes = inputs_.notes;
   chunk.is_beyond = inputs_.is_beyond;
+  for (const auto* taps : {&injected_input_, &injected_})
+    for (const Tap& tap : *taps) chunk.notes.push_back(tap.path + " was injected, not computed");
   record_chunk(chunk);
   return chunk;
 }

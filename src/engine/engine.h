@@ -19,7 +19,9 @@ struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
   std::string kernels;      // as choose_isa takes them; empty: the best that the machine has for the bundle's dtype
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
-  bool dry = false;         // reserve memory without filling it: sizes are exact, and `act` must not be called
+  /// Values at taps that take the place of the computed ones: as the network's own, or as `pixels` and `state`.
+  std::vector<Tap> inject = {};
+  bool dry = false;  // reserve memory without filling it: sizes are exact, and `act` must not be called
 };
 
 /// What a policy answers to one observation.
@@ -99,6 +101,8 @@ class Engine {
   Status make_constants();
   Status make_plans();
   InputShape largest_shape() const;
+  Status take_injected(const std::vector<Tap>& given);
+  Status inject_inputs();
   ChunkShape chunk_shape() const;
   std::uint32_t placed(std::uint32_t views) const;
   Result<std::vector<float>> start(const Noise& noise) const;
@@ -116,6 +120,8 @@ class Engine {
   int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   std::string tap_pattern_;
   bool dry_ = false;
+  std::vector<Tap> injected_;        // of the network
+  std::vector<Tap> injected_input_;  // of what it reads
   std::unique_ptr<ParamList> params_;
   std::unique_ptr<Policy> policy_;
   std::unique_ptr<Slots> tables_;

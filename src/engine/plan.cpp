@@ -42,7 +42,8 @@ Plan::Plan(const PlanContext& context, const InputShape& shape)
       keep_(shape.steered ? slots_.add_f32({1, context.horizon, 1, 1}) : nullptr),
       pull_(shape.steered ? slots_.add_f32({1, context.horizon, 1, 1}) : nullptr),
       views_(shape.views),
-      cache_(context.constants) {}
+      cache_(context.constants),
+      injection_(context.injected, slots_) {}
 
 /// v' = keep * v + pull * (x - target), row by row.
 Tensor Plan::steered(Graph& g, Tensor x, Tensor velocity) const {
@@ -51,7 +52,8 @@ Tensor Plan::steered(Graph& g, Tensor x, Tensor velocity) const {
 }
 
 Status Plan::lower(const PlanContext& context) {
-  Graph prefix(slots_, prefix_filter(tap_pattern_)), step(slots_, step_filter(tap_pattern_, context.solver.n_step));
+  Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
+  Graph step(slots_, step_filter(tap_pattern_, context.solver.n_step), injection_.of_step(context.solver.n_step));
   context.policy.prefix(
       prefix,
       {prefix.input(images_), prefix.input(tokens_), state_ != nullptr ? prefix.input(state_) : Tensor(), views_},
@@ -67,9 +69,11 @@ Status Plan::lower(const PlanContext& context) {
   }
   step.write(step.name("x", context.solver.next(step, x, answer)), x_);
 
+  VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
   LowerOptions varying = {{images_, tokens_}};
   if (state_ != nullptr) varying.varying.push_back(state_);
+  for (const Slot* slot : injection_.slots()) varying.varying.push_back(slot), changing.varying.push_back(slot);
   VLA_TRY(prefix_, device_.lower(prefix, varying));
   VLA_TRY(step_, device_.lower(step, changing));
   return context.dry ? Status() : prefix_->prepare();
@@ -100,6 +104,7 @@ void Plan::set_steering(const Steering& steering, int k) {
 }
 
 Status Plan::run_prefix(std::vector<Tap>& taps) {
+  injection_.set(device_, 0);
   VLA_CHECK(prefix_->run());
   for (std::size_t i = 0; i < prefix_->taps().size(); ++i)
     taps.push_back({prefix_->taps()[i].path, dims(prefix_->taps()[i].shape), prefix_->tap(i)});
@@ -109,6 +114,7 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
 Status Plan::run_step(int k) {
   const std::int32_t index = k;
   device_.set(*k_, &index, sizeof(index));
+  if (k > 0) injection_.set(device_, k);
   return step_->run();
 }
 

@@ -5,6 +5,7 @@
 #include <map>
 #include <memory>
 
+#include "engine/injection.h"
 #include "engine/leftover.h"
 #include "engine/solver.h"
 #include "engine/taps.h"
@@ -25,14 +26,15 @@ struct PlanContext {
   const Cache& constants;  // what depends on the weights alone
   int d_action, horizon;
   std::string tap_pattern;
-  bool dry;  // nothing is computed
+  bool dry;                               // nothing is computed
+  const std::vector<Tap>* injected = {};  // null: nothing
 };
 
 /// The two programs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
 /// replayed.
 class Plan {
  public:
-  /// Errors: out_of_memory, internal.
+  /// Errors: out_of_memory, internal, bad_observation (values to be injected that have no place).
   static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape);
 
   void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
@@ -73,6 +75,7 @@ class Plan {
   Slot *target_, *keep_, *pull_;               // null where nothing is steered
   std::uint32_t views_;
   Cache cache_;
+  Injection injection_;
   std::unique_ptr<Program> prefix_, step_;
 };
 

@@ -16,7 +16,8 @@ class Cache {
   /// Keeps `value` under its path, which is a tap too. Called while the graph that computes it is recorded.
   void put(Graph& g, const std::string& path, Tensor value) {
     Slot* slot = g.slots().add_f32(value.shape());
-    g.write(g.name(path, value), slot);
+    value = g.name(path, value);
+    g.write(value, slot);
     entries_[path] = {slot, g.serial(), value};
   }
   bool has(const std::string& path) const { return entries_.count(path) != 0; }

@@ -26,7 +26,8 @@ const char* op_name(const Op& op) {
   return kNames[op.index()];
 }
 
-Graph::Graph(Slots& slots, TapFilter filter) : slots_(slots), filter_(std::move(filter)) {
+Graph::Graph(Slots& slots, TapFilter filter, Injector injector)
+    : slots_(slots), filter_(std::move(filter)), injector_(std::move(injector)) {
   static std::atomic<std::uint64_t> n_graph = 0;
   serial_ = ++n_graph;
 }
@@ -71,6 +72,7 @@ Tensor Graph::constant(std::vector<float> values, const Shape& shape) {
 }
 
 Tensor Graph::name(const std::string& path, Tensor value) {
+  if (const Slot* slot = injector_ ? injector_(path, value) : nullptr) value = input(slot);
   Node& node = *value.node();
   if (node.path.empty()) node.path = path;
   if (!filter_ || !filter_(path)) return value;

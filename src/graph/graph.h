@@ -51,12 +51,14 @@ inline const Shape& Tensor::shape() const { return node_->shape; }
 
 /// Says of a path whether its values are to be recorded. An empty function records nothing.
 using TapFilter = std::function<bool(const std::string& path)>;
+/// Says of a value with a path which slot is read in its place; null leaves it as it is.
+using Injector = std::function<const Slot*(const std::string& path, Tensor value)>;
 
 /// A list of operations in the order in which they are recorded. It knows no device: a lowering makes a Program of it.
 class Graph {
  public:
   /// What outlives a run and is made on the way goes to `slots`.
-  explicit Graph(Slots& slots, TapFilter filter = {});
+  explicit Graph(Slots& slots, TapFilter filter = {}, Injector injector = {});
   Graph(const Graph&) = delete;
   Graph& operator=(const Graph&) = delete;
 
@@ -71,7 +73,8 @@ class Graph {
   /// Values without other readers.
   Tensor constant(std::vector<float> values, const Shape& shape);
 
-  /// Gives `value` its path, under which it is recorded where the filter wants it.
+  /// Gives `value` its path, under which it is recorded where the filter wants it. What is computed from it must be
+  /// computed from the result, which may be another value: that of the injector.
   Tensor name(const std::string& path, Tensor value);
   void write(Tensor value, Slot* slot) { add(op::Write{slot}, {value}); }
   Slots& slots() const { return slots_; }
@@ -95,6 +98,7 @@ class Graph {
  private:
   Slots& slots_;
   TapFilter filter_;
+  Injector injector_;
   std::uint64_t serial_;
   std::deque<Node> nodes_;  // a deque: tensors point to them
   std::vector<Stage> stages_;

@@ -5,8 +5,9 @@
 import re
 import shutil
 
-import numpy as np
+import gguf
 import image_files
+import numpy as np
 import pytest
 from golden_cases import FLOAT32, NAMES, Golden, tensors
 
@@ -35,6 +36,36 @@ def test_json_is_the_last_line_and_one_object_with_the_promised_members(vla, gol
     assert (bundle["path"], bundle["arch"], bundle["dtype"]) == (str(golden.bundle), "smolvla", "bf16")
     assert re.fullmatch("xxh3:[0-9a-f]{16}", bundle["checksum"])
     assert result.err == ""
+
+
+def write_taps(file, **taps):
+    writer = gguf.GGUFWriter(str(file), "vla-taps")
+    for name, values in taps.items():
+        writer.add_tensor(name, np.ascontiguousarray(values, np.float32))
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_tensors_to_file()
+    writer.close()
+
+
+def test_a_recorded_value_is_gone_on_from_and_told(vla, golden, tmp_path):
+    recorded, changed, out = tmp_path / "recorded.gguf", tmp_path / "changed.gguf", ["--json", *FLOAT32]
+    tap = ["--tap", "prefix", "--taps-out", recorded]
+    before = actions(vla(*golden.arguments(options=[*out, *tap])))
+    same = vla(*golden.arguments(options=[*out, "--inject", recorded]))
+    assert np.abs(actions(same) - before).max() <= 1e-5 * np.abs(before).max()
+    assert same.json()["notes"] == ["prefix was injected, not computed"] and "prefix was injected" in same.err
+    write_taps(changed, prefix=tensors(recorded)["prefix"][::-1])
+    other = actions(vla(*golden.arguments(options=[*out, "--inject", changed])))
+    assert np.abs(other - before).max() > 1e-3 * np.abs(before).max()
+
+
+def test_a_value_that_there_is_not_and_what_is_no_file_of_values_are_refused(vla, golden, tmp_path):
+    wrong = tmp_path / "wrong.gguf"
+    write_taps(wrong, prefiks=np.zeros((2, 3)))
+    vla(*golden.arguments(options=["--inject", wrong])).refused("bad_observation", "injected prefiks", "prefix")
+    vla(*golden.arguments(options=["--inject", golden.noise])).refused("bad_bundle", "a GGUF file")
+    vla(*golden.arguments(options=["--inject", tmp_path / "none.gguf"])).refused("io", "none.gguf")
 
 
 def test_out_writes_the_numbers_of_the_json(vla, golden, tmp_path):

@@ -57,8 +57,9 @@ std::vector<std::string> golden_paths() {
   return paths;
 }
 
-std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps, const std::string& kernels) {
-  auto engine = Engine::load(bundle, {.n_thread = 2, .kernels = kernels, .tap_pattern = taps});
+std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps, const std::string& kernels,
+                                    const std::vector<Tap>& inject) {
+  auto engine = Engine::load(bundle, {.n_thread = 2, .kernels = kernels, .tap_pattern = taps, .inject = inject});
   REQUIRE_MESSAGE(engine.ok(), (engine ? "" : engine.error().message()));
   return std::move(*engine);
 }

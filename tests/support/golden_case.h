@@ -26,7 +26,7 @@ std::vector<std::string> golden_paths();
 
 /// A loaded engine; fails the test where loading fails.
 std::unique_ptr<Engine> load_engine(const std::string& bundle, const std::string& taps = "",
-                                    const std::string& kernels = "");
+                                    const std::string& kernels = "", const std::vector<Tap>& inject = {});
 const Tap& find_tap(const std::vector<Tap>& taps, const std::string& path);
 
 }  // namespace vla::test
