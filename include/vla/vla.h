@@ -141,7 +141,7 @@ typedef struct vla_description {
   const char* revision;  /* its revision, or empty */
   const char* converter; /* what made the bundle */
   const char* dtype;     /* how matrices are stored: "f32", "bf16" or "f16" */
-  const char* precision; /* of the large products: "f32", or "bf16" with sums in float32 */
+  const char* precision; /* of the large products: "f32", "bf16" with sums in float32, or "int8" */
   const char* kernels;   /* what computes them: "ggml", "avx2", ... */
   const char* device;
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */

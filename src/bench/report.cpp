@@ -11,6 +11,17 @@ namespace {
 using Json =
     nlohmann::basic_json<nlohmann::ordered_map, std::vector, std::string, bool, std::int64_t, std::uint64_t, float>;
 
+double median_of(const std::vector<Round>& rounds, double Round::*value) {
+  std::vector<double> values;
+  for (const Round& round : rounds) values.push_back(round.*value);
+  return quantile(values, 0.5);
+}
+
+/// Seconds of arithmetic at these rates.
+double time_at(const Work& work, double peak, double int8_peak) {
+  return (work.flop - work.int8) / peak + work.int8 / (int8_peak > 0 ? int8_peak : peak);
+}
+
 /// One row from the times and the work of each round.
 StageRow make_row(const std::string& name, const std::vector<double>& times, const Work& work, const Report& report) {
   StageRow row{name, quantile(times, 0.5), quantile(times, 0.9), quantile(times, 0), work};
@@ -18,14 +29,17 @@ StageRow make_row(const std::string& name, const std::vector<double>& times, con
   row.flop_rate = work.flop / (1e-3 * row.p50);
   row.byte_rate = work.bytes / (1e-3 * row.p50);
   // A probe that something disturbed would flatter its round: no round's peak counts for less than their median.
-  std::vector<double> peaks, shares;
-  for (const Round& round : report.rounds) peaks.push_back(round.peak);
-  const double median_peak = quantile(peaks, 0.5);
-  for (std::size_t i = 0; i < times.size(); ++i)
-    shares.push_back(work.flop / (1e-3 * times[i]) / std::max(peaks[i], median_peak));
+  const double least = median_of(report.rounds, &Round::peak), least_int8 = median_of(report.rounds, &Round::int8_peak);
+  std::vector<double> shares;
+  for (std::size_t i = 0; i < times.size(); ++i) {
+    const Round& round = report.rounds[i];
+    const double best = time_at(work, std::max(round.peak, least), std::max(round.int8_peak, least_int8));
+    shares.push_back(best / (1e-3 * times[i]));
+  }
   row.share_of_peak = quantile(shares, 1);
   row.share_of_peak_p50 = quantile(shares, 0.5);
   row.share_of_bandwidth = row.byte_rate / report.bandwidth();
+  row.floor = 1e3 * std::max(report.arithmetic_time(work), work.weights / report.bandwidth());
   return row;
 }
 
@@ -44,6 +58,8 @@ Json stage_json(const StageRow& row, const Report& report) {
   json["share_of_peak"] = row.share_of_peak;
   json["share_of_peak_p50"] = row.share_of_peak_p50;
   json["share_of_bandwidth"] = row.share_of_bandwidth;
+  json["floor_ms"] = row.floor;
+  json["above_floor"] = row.above_floor();
   return json;
 }
 
@@ -61,7 +77,11 @@ Json peaks_json(const Report& report) {
 Json rounds_json(const Report& report) {
   Json rounds = Json::array();
   for (const Round& round : report.rounds) {
-    Json json = {{"total_ms", round.total()}, {"peak_gflops", 1e-9 * round.peak}, {"cores", round.cores}};
+    Json json = {{"total_ms", round.total()},
+                 {"peak_gflops", 1e-9 * round.peak},
+                 {"cores", round.cores},
+                 {"disturbed", report.is_disturbed(round)}};
+    if (round.int8_peak > 0) json["int8_peak_gops"] = 1e-9 * round.int8_peak;
     for (const auto& [stage, ms] : round.stages) json["stages"][stage] = ms;
     rounds.push_back(std::move(json));
   }
@@ -72,14 +92,25 @@ Json rounds_json(const Report& report) {
 
 double Report::peak(const std::string& name) const {
   double best = std::max(before.peak(name), after.peak(name));
-  if (name == peak_name)
-    for (const Round& round : rounds) best = std::max(best, round.peak);
+  for (const Round& round : rounds) {
+    if (name == peak_name) best = std::max(best, round.peak);
+    if (name == int8_peak_name) best = std::max(best, round.int8_peak);
+  }
   return best;
+}
+
+double Report::arithmetic_time(const Work& work) const { return time_at(work, peak(), peak(int8_peak_name)); }
+
+bool Report::is_disturbed(const Round& round) const {
+  constexpr double kMost = 0.9;
+  for (const auto value : {&Round::peak, &Round::int8_peak, &Round::cores})
+    if (round.*value < kMost * median_of(rounds, value)) return true;
+  return false;
 }
 
 std::string Report::regime(const StageRow& row) const {
   if (row.work.flop == 0) return "host";
-  return row.intensity() >= ridge() ? "compute" : "memory";
+  return arithmetic_time(row.work) >= row.work.bytes / bandwidth() ? "compute" : "memory";
 }
 
 const StageRow* Report::find(const std::string& stage) const {
@@ -90,7 +121,7 @@ const StageRow* Report::find(const std::string& stage) const {
 
 void summarize(const Series& series, Report& report) {
   report.rounds = series.rounds;
-  report.peak_name = series.peak_name;
+  report.peak_name = series.peak_name, report.int8_peak_name = series.int8_peak_name;
   std::vector<double> network(series.rounds.size()), total(series.rounds.size());
   Work all;
   for (const auto& [stage, ms] : series.rounds.front().stages) {
@@ -120,6 +151,10 @@ std::string to_json(const Report& report) {
   root["share_of_peak_p50"] = network.share_of_peak_p50;
   root["peak_gflops"] = 1e-9 * report.peak();
   root["peak_name"] = report.peak_name;
+  if (!report.int8_peak_name.empty()) {
+    root["int8_peak_gops"] = 1e-9 * report.peak(report.int8_peak_name);
+    root["int8_peak_name"] = report.int8_peak_name;
+  }
   root["stages"] = std::move(stages);
   root["kernels"] = c.kernels;
   root["precision"] = report.precision;

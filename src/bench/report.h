@@ -19,7 +19,8 @@ struct Conditions {
 };
 
 /// One line of the report: a stage, or `network` (the stages that compute on the device), or `total`. Rates and shares
-/// are of the median time; shares of the peak compare each round with the peak beside it.
+/// are of the median time; shares of the peak compare each round with the peaks beside it: how long its arithmetic
+/// would take at those of its products, in floats and in int8, over how long it took.
 struct StageRow {
   std::string name;
   double p50 = 0, p90 = 0, min = 0;     // ms
@@ -28,16 +29,20 @@ struct StageRow {
   double share_of_peak = 0;             // of the best round
   double share_of_peak_p50 = 0;
   double share_of_bandwidth = 0;
+  double floor = 0;  // ms: arithmetic at peak, or weights at bandwidth, whichever is longer
 
+  /// How many times the floor the median is; 0 where there is none.
+  double above_floor() const { return floor > 0 ? p50 / floor : 0; }
   /// Operations per byte; 0 where nothing is counted.
   double intensity() const { return work.bytes > 0 ? work.flop / work.bytes : 0; }
 };
 
 struct Report {
   Conditions conditions;
-  std::string cpu, peak_name;         // the probe that shares refer to
-  std::string precision, arithmetic;  // of the large products, for programs and in plain words
-  double load = 0;                    // ms, from opening the bundle to being ready
+  std::string cpu;
+  std::string peak_name, int8_peak_name;  // the probes that shares refer to; no second where there are no int8 products
+  std::string precision, arithmetic;      // of the large products, for programs and in plain words
+  double load = 0;                        // ms, from opening the bundle to being ready
   Roofs before, after;
   MemoryUse predicted;
   ProcessMemory process;
@@ -49,10 +54,15 @@ struct Report {
   /// between and after the runs. Operations and bytes per second.
   double peak(const std::string& name) const;
   double peak() const { return peak(peak_name); }
+  /// Seconds of a stage's arithmetic at the machine's peaks.
+  double arithmetic_time(const Work& work) const;
+  /// Whether something else had a part of the machine meanwhile: fewer cores or a lower peak than in most rounds.
+  bool is_disturbed(const Round& round) const;
   double bandwidth() const { return std::max(before.bandwidth, after.bandwidth); }
   /// Where the roofline bends: a stage with fewer operations per byte is bound by memory.
   double ridge() const { return peak() / bandwidth(); }
-  /// "compute", "memory", or "host" for a stage without counted work.
+  /// "compute", "memory", or "host" for a stage without counted work: which of its operands or its arithmetic takes
+  /// longer at the machine's rates.
   std::string regime(const StageRow& row) const;
   const StageRow* find(const std::string& stage) const;
 };

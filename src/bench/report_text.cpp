@@ -8,8 +8,9 @@
 namespace vla::bench {
 namespace {
 
-constexpr const char* kColumns[] = {"stage",  "p50 ms",  "p90 ms",         "min ms", "GFLOP",        "GB",
-                                    "FLOP/B", "GFLOP/s", "of peak (best)", "GB/s",   "of bandwidth", "bound by"};
+constexpr const char* kColumns[] = {"stage",          "p50 ms", "p90 ms",       "min ms",  "floor ms",
+                                    "above",          "GFLOP",  "GB",           "FLOP/B",  "GFLOP/s",
+                                    "of peak (best)", "GB/s",   "of bandwidth", "bound by"};
 
 std::vector<std::string> cells(const StageRow& row, const Report& report) {
   std::vector<std::string> cells = {row.name, fmt::format("{:.2f}", row.p50), fmt::format("{:.2f}", row.p90),
@@ -19,7 +20,8 @@ std::vector<std::string> cells(const StageRow& row, const Report& report) {
     cells.back() = "host";
     return cells;
   }
-  for (std::string cell : {fmt::format("{:.3g}", 1e-9 * row.work.flop), fmt::format("{:.3g}", 1e-9 * row.work.bytes),
+  for (std::string cell : {fmt::format("{:.2f}", row.floor), fmt::format("{:.2f} x", row.above_floor()),
+                           fmt::format("{:.3g}", 1e-9 * row.work.flop), fmt::format("{:.3g}", 1e-9 * row.work.bytes),
                            fmt::format("{:.1f}", row.intensity()), fmt::format("{:.1f}", 1e-9 * row.flop_rate),
                            fmt::format("{:.1f} % ({:.1f} %)", 100 * row.share_of_peak_p50, 100 * row.share_of_peak),
                            fmt::format("{:.1f}", 1e-9 * row.byte_rate),
@@ -37,9 +39,10 @@ std::vector<std::string> around(const Report& report) {
                   report.arithmetic)};
   for (std::size_t i = 0; i < report.before.peaks.size(); ++i) {
     const Roofs::Peak &before = report.before.peaks[i], &after = report.after.peaks[i];
-    lines.push_back(fmt::format("peak {}: {:.1f} G/s before the runs, {:.1f} after; one thread {:.1f}, {:.1f}{}",
-                                before.name, 1e-9 * before.all, 1e-9 * after.all, 1e-9 * before.one, 1e-9 * after.one,
-                                before.name == report.peak_name ? " (what shares refer to)" : ""));
+    lines.push_back(fmt::format(
+        "peak {}: {:.1f} G/s before the runs, {:.1f} after; one thread {:.1f}, {:.1f}{}", before.name,
+        1e-9 * before.all, 1e-9 * after.all, 1e-9 * before.one, 1e-9 * after.one,
+        before.name == report.peak_name || before.name == report.int8_peak_name ? " (what shares refer to)" : ""));
   }
   lines.push_back(
       fmt::format("memory bandwidth: {:.1f} GB/s before the runs, {:.1f} after; compute-bound from {:.1f} FLOP/B",
@@ -49,6 +52,12 @@ std::vector<std::string> around(const Report& report) {
   lines.push_back(
       fmt::format("measured rounds: {}, each beside its own peak ({:.1f} to {:.1f} GFLOP/s), on {:.2f} cores (median)",
                   report.rounds.size(), quantile(peaks, 0), quantile(peaks, 1), quantile(cores, 0.5)));
+  std::vector<std::size_t> disturbed;
+  for (std::size_t i = 0; i < report.rounds.size(); ++i)
+    if (report.is_disturbed(report.rounds[i])) disturbed.push_back(i + 1);
+  if (!disturbed.empty())
+    lines.push_back(fmt::format("disturbed: round{} {}, with fewer cores or a lower peak than most: measure again",
+                                disturbed.size() == 1 ? "" : "s", fmt::join(disturbed, ", ")));
   lines.push_back(fmt::format("loaded in {:.0f} ms; memory: {:.0f} MB predicted, {:.0f} MB at the most, {:.0f} MB now",
                               report.load, 1e-6 * static_cast<double>(report.predicted.total()),
                               1e-6 * static_cast<double>(report.process.peak),

@@ -46,9 +46,15 @@ double Round::total() const {
 }
 
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher) {
-  const kernels::PeakProbe& probe = kernels::peak_probe_of(*choose_isa(engine.kernels()));
-  const auto measure_peak = [&] { return kernels::measure_peak(probe, engine.device().n_thread(), kProbeSeconds); };
-  Series series{engine.solver().n_step, probe.name, {}, {}};
+  const Isa isa = *choose_isa(engine.kernels());
+  const kernels::PeakProbe& probe = kernels::peak_probe_of(isa);
+  const kernels::PeakProbe* int8 = engine.precision() == "int8" ? kernels::int8_probe_of(isa) : nullptr;
+  const auto measure_peaks = [&](Round& round) {  // half of what is before and after
+    const int n_thread = engine.device().n_thread();
+    round.peak += kernels::measure_peak(probe, n_thread, kProbeSeconds) / 2;
+    if (int8 != nullptr) round.int8_peak += kernels::measure_peak(*int8, n_thread, kProbeSeconds) / 2;
+  };
+  Series series{engine.solver().n_step, probe.name, int8 != nullptr ? int8->name : "", {}, {}};
   for (int i = 0; i < n_warmup; ++i) {
     VLA_CHECK(watcher.before_round());
     VLA_TRY(const Round round, run_round(engine, workload));
@@ -56,12 +62,14 @@ Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int 
   }
   for (int i = 0; i < n_round; ++i) {
     VLA_CHECK(watcher.before_round());
-    const double before = measure_peak();
+    Round peaks;
+    measure_peaks(peaks);
     VLA_TRY(Round round, run_round(engine, workload));
-    const double after = measure_peak();
-    round.peak = (before + after) / 2;
-    watcher.tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores, peak {:.1f} GFLOP/s", i + 1, n_round,
-                             round.total(), round.cores, 1e-9 * round.peak));
+    measure_peaks(peaks);
+    round.peak = peaks.peak, round.int8_peak = peaks.int8_peak;
+    watcher.tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores, peak {:.1f} GFLOP/s{}", i + 1, n_round,
+                             round.total(), round.cores, 1e-9 * round.peak,
+                             int8 != nullptr ? fmt::format(", int8 {:.1f} GOP/s", 1e-9 * round.int8_peak) : ""));
     series.rounds.push_back(std::move(round));
   }
   series.work = engine.work();

@@ -13,9 +13,10 @@ namespace vla::bench {
 
 /// One observation, timed, between two short probes of the machine's peak.
 struct Round {
-  Timing stages;     // ms; "decode" first
-  double peak = 0;   // operations per second of all threads, the mean of before and after
-  double cores = 0;  // CPU time over wall time: how many cores the run really had
+  Timing stages;         // ms; "decode" first
+  double peak = 0;       // operations per second of all threads, the mean of before and after
+  double cores = 0;      // CPU time over wall time: how many cores the run really had
+  double int8_peak = 0;  // the same of int8 products, where the network has any
 
   double total() const;  // ms
 };
@@ -23,7 +24,7 @@ struct Round {
 /// Rounds of one number of solver steps.
 struct Series {
   int n_step = 0;
-  std::string peak_name;  // of the probe between the rounds
+  std::string peak_name, int8_peak_name;  // of the probes between the rounds
   std::vector<Round> rounds;
   StageWork work;  // of the network's stages
 };

@@ -93,10 +93,12 @@ Each round is one observation (PNG frames, state, instruction in; actions out) b
   GFLOP      work of the stage: two for each multiply-add of matrix and attention products, nothing for the rest
   GB         operands and results of its operations, in their stored dtype; caches serve a part of them
   FLOP/B     operational intensity, the first over the second; below the machine's own ratio memory is the bound
-  of peak    achieved rate over the multiply-add peak measured beside each round: median (best round)
+  floor      arithmetic at the machine's peak, or weights at its bandwidth, whichever is longer; "above": the median over it
+  of peak    achieved rate over the multiply-add peak measured beside each round: median (best round). Ternary products
+             refer to the peak of int8 products, all others to that of the kernels' floats
   network    the stages that compute on the device; total has the host's decoding and pre- and postprocessing too
 Times are medians (p50) beside the 90th percentile and the fastest. Other programs on the machine make every figure
-worse: "cores" says how many cores the rounds really had.)";
+worse: "cores" says how many cores the rounds really had, and rounds that had fewer than most, or a lower peak, are named.)";
 
 }  // namespace
 

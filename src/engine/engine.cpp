@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cmath>
 #include <new>
 
@@ -23,8 +24,8 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
   engine->tap_pattern_ = options.tap_pattern;
   engine->dry_ = options.dry;
-  VLA_CHECK(engine->load_policy());
   VLA_CHECK(engine->take_injected(options.inject));
+  VLA_CHECK(engine->load_policy());
   VLA_CHECK(engine->make_conditions());
   VLA_CHECK(engine->make_constants());
   VLA_CHECK(engine->make_plans());
@@ -204,8 +205,8 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   clock.lap(chunk.timing, "preprocess");
   VLA_CHECK(processor_.encode_text(observation, inputs_));
   clock.lap(chunk.timing, "tokenize");
-  VLA_TRY(std::vector<float> x, start(noise));
   VLA_CHECK(inject_inputs());
+  VLA_TRY(std::vector<float> x, start(noise));
   std::optional<Steering> steering;
   if (leftover) {
     VLA_TRY(steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(x)));
@@ -236,14 +237,22 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   chunk.d_action = static_cast<int>(processor_.action_names().size());
   chunk.normalized = normalized(result);
   chunk.notes = inputs_.notes;
-  chunk.is_beyond = inputs_.is_beyond;
   for (const auto* taps : {&injected_input_, &injected_})
     for (const Tap& tap : *taps) chunk.notes.push_back(tap.path + " was injected, not computed");
+  chunk.is_beyond = inputs_.is_beyond;
   record_chunk(chunk);
   return chunk;
 }
 
+std::string Engine::precision() const {
+  const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
+  const auto& all = params_->params();
+  return std::any_of(all.begin(), all.end(), is_ternary) ? "int8" : device_->precision();
+}
+
 std::string Engine::arithmetic() const {
+  const std::string floats = device_->precision();
+  if (precision() == "int8") return "ternary products of int8, others " + floats;
   return precision() == "bf16" ? "bf16 products, sums in float32; --kernels float32 avoids them" : "float32";
 }
 

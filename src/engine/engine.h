@@ -86,8 +86,9 @@ class Engine {
   /// The kernels in use, as `--kernels` names them: those of the machine, or others where the bundle's dtype asks for
   /// float32.
   std::string kernels() const { return device_->kernels(); }
-  /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
-  std::string precision() const { return device_->precision(); }
+  /// Of the large products: "int8" where weights are ternary and activations int8, "bf16" where activations are rounded
+  /// to it (sums are float32), else "f32".
+  std::string precision() const;
   /// The same as text for display.
   std::string arithmetic() const;
 
@@ -100,9 +101,9 @@ class Engine {
   Status run_once(const Graph& graph);
   Status make_constants();
   Status make_plans();
-  InputShape largest_shape() const;
   Status take_injected(const std::vector<Tap>& given);
   Status inject_inputs();
+  InputShape largest_shape() const;
   ChunkShape chunk_shape() const;
   std::uint32_t placed(std::uint32_t views) const;
   Result<std::vector<float>> start(const Noise& noise) const;
@@ -119,9 +120,9 @@ class Engine {
   Solver solver_;
   int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   std::string tap_pattern_;
-  bool dry_ = false;
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
+  bool dry_ = false;
   std::unique_ptr<ParamList> params_;
   std::unique_ptr<Policy> policy_;
   std::unique_ptr<Slots> tables_;

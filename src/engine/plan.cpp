@@ -124,8 +124,7 @@ StageWork Plan::work(int n_step) const {
   parts.emplace_back("prefix", Work());
   const std::vector<Work> prefix = prefix_->work();
   for (std::size_t i = 0; i < prefix.size(); ++i) parts[i].second = prefix[i];
-  const Work step = step_->work().front();
-  parts.emplace_back("steps", Work{n_step * step.flop, n_step * step.bytes});
+  parts.emplace_back("steps", step_->work().front().times(n_step));
   return parts;
 }
 

@@ -166,9 +166,10 @@ class Translator {
 bool is_leaf(const Node& node) { return node.in.empty(); }
 
 Work work_of(const Node& node) {
-  Work work = {flop_of(node), 4.0 * static_cast<double>(count(node.shape))};
+  Work work;
+  if (const auto* linear = node.as<op::Linear>()) work.weights = 4.0 * static_cast<double>(linear->weight->count());
+  work.flop = flop_of(node), work.bytes = work.weights + 4.0 * static_cast<double>(count(node.shape));
   for (Tensor in : node.in) work.bytes += 4.0 * static_cast<double>(count(in.shape()));
-  if (const auto* linear = node.as<op::Linear>()) work.bytes += 4.0 * static_cast<double>(linear->weight->count());
   return work;
 }
 

@@ -11,12 +11,18 @@ namespace vla {
 /// result once per operation of the program, in its stored dtype, so that a fused operation asks for less.
 struct Work {
   double flop = 0, bytes = 0;
+  double int8 = 0;     // of flop: products of int8 codes
+  double weights = 0;  // of bytes: parameters, which no cache holds from run to run
 
   Work& operator+=(const Work& other) {
     flop += other.flop;
     bytes += other.bytes;
+    int8 += other.int8;
+    weights += other.weights;
     return *this;
   }
+  /// The same n times.
+  Work times(int n) const { return {n * flop, n * bytes, n * int8, n * weights}; }
 };
 
 /// The products of a node, from its shapes.

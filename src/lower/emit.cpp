@@ -374,7 +374,8 @@ std::size_t scratch_of(const Lowering& l, const FusedOp& op) {
 }
 
 Work work_of(const Lowering& l, const FusedOp& op) {
-  Work work = {flop_of_op(op), 0};
+  Work work;
+  work.flop = flop_of_op(op);
   const auto* lookup = std::get_if<LookupOp>(&op.op);
   for (const ValueId id : op.reads) {
     // Of a table only the rows that are looked up are read.
@@ -385,13 +386,16 @@ Work work_of(const Lowering& l, const FusedOp& op) {
     const Value& value = l.value(id);
     work.bytes += static_cast<double>(value.node != nullptr ? bytes_of(value) : value.size);
   }
-  if (const auto* linear = std::get_if<LinearOp>(&op.op))
+  if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
     for (const Node* node : linear->linears) {
       const auto& product = *node->as<op::Linear>();
-      work.bytes +=
+      work.weights +=
           static_cast<double>(product.weight->stored_count()) * static_cast<double>(dtype_size(product.weight->type()));
-      if (product.bias != nullptr) work.bytes += 4.0 * static_cast<double>(product.bias->shape[0]);
+      if (product.bias != nullptr) work.weights += 4.0 * static_cast<double>(product.bias->shape[0]);
     }
+    work.bytes += work.weights;
+    if (kernel_of(l, *linear).quantize != nullptr) work.int8 = work.flop;
+  }
   return work;
 }
 

@@ -83,6 +83,44 @@ TEST_CASE("rates and shares follow from work, time and the peak beside each roun
   CHECK(report.find("network")->work.flop == doctest::Approx(14e9));
 }
 
+TEST_CASE("the floor of a stage is its arithmetic at peak or its weights at bandwidth, whichever is longer") {
+  Series series = series_of(10);
+  CHECK(report_of(series).find("prefix")->floor == doctest::Approx(2));  // 4e9 operations at 2e12 a second
+  CHECK(report_of(series).find("prefix")->above_floor() == doctest::Approx(2.5));
+  series.work[1].second.weights = 1e10;  // at 1e12 bytes a second
+  CHECK(report_of(series).find("steps")->floor == doctest::Approx(10));
+  CHECK(report_of(series).find("decode")->floor == 0);
+  CHECK(to_text(report_of(series)).find("2.50 x") != std::string::npos);
+}
+
+TEST_CASE("products of int8 codes refer to a peak of their own") {
+  Series series = series_of(10);
+  series.int8_peak_name = "some int8";
+  for (Round& round : series.rounds) round.int8_peak = 6e12;
+  series.work[0].second.int8 = 3e9;  // of 4e9: half a millisecond at each peak
+  const Report report = report_of(series);
+  CHECK(report.find("prefix")->floor == doctest::Approx(1));
+  CHECK(report.find("prefix")->share_of_peak_p50 == doctest::Approx(0.2));
+  CHECK(report.find("steps")->floor == doctest::Approx(5));
+  CHECK(to_json(report).find("\"int8_peak_gops\":6000.0") != std::string::npos);
+}
+
+TEST_CASE("rounds that had less of the machine than most are named") {
+  Series series = series_of(10);
+  const auto marked = [&] {
+    const Report report = report_of(series);
+    std::vector<bool> all;
+    for (const Round& round : report.rounds) all.push_back(report.is_disturbed(round));
+    return all;
+  };
+  CHECK(marked() == std::vector<bool>{false, false, false});
+  CHECK(to_text(report_of(series)).find("disturbed") == std::string::npos);
+  series.rounds[1].cores = 1.7;
+  series.rounds[2].peak = 1.7e12;
+  CHECK(marked() == std::vector<bool>{false, true, true});
+  CHECK(to_text(report_of(series)).find("disturbed: rounds 2, 3") != std::string::npos);
+}
+
 TEST_CASE("a peak that was disturbed does not flatter its round") {
   Series series = series_of(10);
   series.rounds[0].peak /= 2;

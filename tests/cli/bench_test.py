@@ -44,7 +44,7 @@ def test_the_stages_of_every_round_add_up_to_its_total(report):
     for run in report["rounds"]:
         assert list(run["stages"]) == STAGES
         assert sum(run["stages"].values()) == pytest.approx(run["total_ms"], rel=1e-4)
-        assert run["peak_gflops"] > 0 and run["cores"] > 0
+        assert run["peak_gflops"] > 0 and run["cores"] > 0 and run["disturbed"] in (True, False)
     assert list(report["stages"]) == [*STAGES, "network", "total"]
     totals = [run["total_ms"] for run in report["rounds"]]
     assert report["total_ms"] == pytest.approx(sum(totals) / 2, rel=1e-4)  # the median of two
@@ -58,6 +58,7 @@ def test_rates_follow_from_work_and_time(report):
         assert row["intensity"] == pytest.approx(row["gflop"] / row["gbytes"], rel=1e-3)
         assert row["regime"] == ("compute" if row["intensity"] >= report["ridge"] else "memory")
         assert 0 < row["share_of_peak_p50"] <= row["share_of_peak"]
+        assert row["floor_ms"] > 0 and row["above_floor"] == pytest.approx(row["p50_ms"] / row["floor_ms"], rel=1e-3)
     network = report["stages"]["network"]
     assert network["gflop"] == pytest.approx(sum(report["stages"][s]["gflop"] for s in NETWORK), rel=1e-4)
     assert report["share_of_peak"] == network["share_of_peak"]

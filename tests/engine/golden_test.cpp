@@ -85,7 +85,7 @@ void check_chunk(const std::string& kernels) {
           &bf16 = find_tap(expected, "chunk.bf16").values;
     CHECK(rms_difference(ours, reference) <= rms_difference(bf16, reference));
     CHECK(max_difference(ours, reference) <= max_difference(bf16, reference));
-    if (engine->precision() == "f32")
+    if (engine->device().precision() == "f32")
       CHECK(compare_taps({find_tap(expected, "chunk")}, {find_tap(chunk->taps, "chunk")}).front().within(kTolerance));
   }
 }

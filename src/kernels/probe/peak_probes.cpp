@@ -179,4 +179,11 @@ const PeakProbe& peak_probe_of(Isa isa) {
   return *best;
 }
 
+const PeakProbe* int8_probe_of(Isa isa) {
+  const PeakProbe* best = nullptr;
+  for (const PeakProbe& probe : peak_probes())
+    if (probe.number == Number::int8 && probe.isa <= isa) best = &probe;
+  return best;
+}
+
 }  // namespace vla::kernels

@@ -26,6 +26,8 @@ const std::vector<PeakProbe>& peak_probes();
 /// The loop in whose rate the speed of these kernels is measured: that of the kernels' own products, and the fastest in
 /// float32 for `ggml`, which is compiled for this machine as a whole.
 const PeakProbe& peak_probe_of(Isa isa);
+/// The same of their products of int8 codes; null where these are made without such instructions.
+const PeakProbe* int8_probe_of(Isa isa);
 
 /// Operations per second of `n_thread` threads that run the loop side by side, in wall time. The best of many short
 /// bursts within about `seconds`: what the machine can do now, not what other programs leave of it.
