@@ -69,8 +69,9 @@ def child(command):
     return out, usage.ru_maxrss * 1024
 
 
-def run_vla(vla, case, bundle, pattern, taps_file, threads):
-    """(taps that match the pattern and the actions, milliseconds by stage, peak bytes) of `vla run` on a case."""
+def run_vla(vla, case, bundle, pattern, taps_file, threads, inject=None):
+    """(taps that match the pattern and the actions, milliseconds by stage, peak bytes) of `vla run` on a case.  `inject`: a file of
+    values that it goes on from."""
     import gguf
 
     observation = json.loads((case / "observation.json").read_text())
@@ -81,6 +82,7 @@ def run_vla(vla, case, bundle, pattern, taps_file, threads):
     for name, numbers in (states if isinstance(states, dict) else {"state": states}).items():
         command += ["--state", f"{name}={','.join(map(repr, numbers))}"]
     command += ["--text", observation["text"], "--tap", pattern, "--taps-out", taps_file]
+    command += ["--inject", inject] if inject else []
     out, peak = child(command)
     answer = json.loads(out.splitlines()[-1])
     taps = {t.name: np.array(t.data) for t in gguf.GGUFReader(str(taps_file)).tensors}

@@ -9,13 +9,18 @@ attention mode (of smolvla), relative actions (of pi0 and pi05).  Its checkpoint
 A configuration that the reference cannot run must be refused, with a reason, by vla-convert or by vla.  Ends with exit
 code 1 if a block differs by more than 1e-4 of its largest magnitude, or if only one side answers.
 
+bitvla: a code that rounding moves changes all that follows, so that each part is run on the reference's own input (vla run --inject).
+Products must agree within 1e-6, other parts within 1e-5; whole blocks, inside of which a code may move, by their root mean square.
+
 With --bf16 the weights are float32 numbers that bfloat16 rounds and the bundle is in bf16: its actions must not lie further from
 the reference's in float32 than those of the reference in the dtypes of a published file.
 """
 import argparse
 import contextlib
 import io
+import json
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -23,7 +28,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import cases, pi, recorder, smolvla
+from goldens import bitvla, cases, pi, recorder, smolvla
 from parity_full import ROOT, distance, run_vla
 from vla_cpp.convert import cli
 
@@ -91,6 +96,83 @@ def draw_pi(arch, seed):
     return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
 
 
+def draw_bitvla(seed):
+    """(case, spelling of the model's type): micro and tiny sizes, one view or two, files of one process and of several."""
+    r = random.Random(seed)
+
+    def tower(n_head, d_head, **others):
+        return bitvla.sizes(n_head * d_head, 4 * r.choice((6, 7, 12, 17, 68, 92)), r.randint(1, 3), n_head, **others)
+
+    vision = tower(r.choice((1, 2, 3, 6)), r.choice((4, 8, 12, 24)), image_size=14 * r.choice((1, 2, 3, 4)))
+    kv = r.choice((1, 2, 3))
+    text = tower(kv * r.choice((1, 2, 4)), r.choice((4, 8, 16)), num_key_value_heads=kv)
+    prefixes = tuple(r.choice(("", "module.")) for _ in range(2))
+    checkpoint = bitvla.Checkpoint(vision, text, n_shard=r.choice((1, 2, 3)), prefixes=prefixes)
+    cameras = r.choice((("image", "image2"), ("wrist",)))
+    options = {} if len(cameras) == 2 else {"views": list(cameras)}
+    words = r.choice(("open the drawer", "Put the WHITE mug on the plate", "don't 12345 stop!", "naïve café 漢字", "a", "word " * 20))
+    return bitvla.case(seed, cameras, words, checkpoint, **options), r.choice(("bitvla", "openvla"))
+
+
+# Of what a part of BitVLA reads: names of values that the reference records. A whole block starts from the one before.
+INPUTS = [(r"(.*)\.attn_[qkv]", r"\1.attn_norm"), (r"(lm\..*)\.attn_out", r"\1.attn_sub_norm"), (r"(.*)\.ffn_(up|gate)", r"\1.ffn_norm"),
+          (r"(lm\..*)\.ffn_down", r"\1.ffn_sub_norm"), (r"lm\.blk\.0(\.attn_norm)?", "prefix"), (r"vision\.patch_embed", "pixels"),
+          (r"state_out", "state"), (r"step\.0\.head\.in", "step.0.head.in_norm"), (r"step\.0\.head\.blk\.0", "step.0.head.in"),
+          (r"step\.0\.head\.out", "step.0.head.out_norm")]
+PRODUCT = re.compile(r"(vision|lm)\.blk\.0\.(attn_[qkv]|ffn_(up|gate|down))|lm\.blk\.0\.attn_out")
+BLOCK = re.compile(r"(vision|lm)\.blk\.\d+")
+
+
+def input_of(name, taps):
+    before = re.fullmatch(r"(.*\.blk\.)(\d+)", name)
+    if before and before[2] != "0":
+        return before[1] + str(int(before[2]) - 1)
+    last = {"connector_down": "vision.blk.", "lm.norm": "lm.blk.", "step.0.head.out_norm": "step.0.head.blk."}.get(name)
+    if last:
+        return max((n for n in taps if re.fullmatch(re.escape(last) + r"\d+", n)), key=lambda n: int(n.rpartition(".")[2]))
+    return next((re.sub(pattern, found, name) for pattern, found in INPUTS if re.fullmatch(pattern, name)), None)
+
+
+def write_taps(file, taps):
+    import gguf
+
+    writer = gguf.GGUFWriter(str(file), "vla-taps")
+    for name, values in taps.items():
+        writer.add_tensor(name, np.ascontiguousarray(values, dtype=np.float32))
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_tensors_to_file()
+    writer.close()
+
+
+def compare_bitvla(seed, vla, folder):
+    case, spelling = draw_bitvla(seed)
+    bitvla.MARGIN = -1.0  # parts are compared, each on its own input
+    expected, stopped = run_reference(case, folder)
+    config = folder / "checkpoint" / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "model_type": spelling}))
+    got, refused = run_runtime(vla, folder, "bf16")
+    if expected is None or got is None:
+        return expected is None and got is None, f"reference: {stopped or 'runs'}; {refused or 'the runtime runs'}"
+    parts = {}
+    for name in expected:
+        if found := input_of(name, expected):
+            parts.setdefault(found, []).append(name)
+    far = {"product": (0.0, "none"), "part": (0.0, "none"), "block": (0.0, "none")}
+    for given, names in parts.items():
+        write_taps(folder / "inject.gguf", {given: expected[given]})
+        taps = run_vla(vla, folder, folder / "bundle.gguf", ",".join(names), folder / "taps.gguf", 1, folder / "inject.gguf")[0]
+        for name in names:
+            kind = "product" if PRODUCT.fullmatch(name) else "block" if BLOCK.fullmatch(name) else "part"
+            ours, theirs = taps[name].ravel().astype(float), expected[name].ravel().astype(float)
+            off = np.sqrt(((ours - theirs) ** 2).mean() / (theirs**2).mean()) if kind == "block" else distance(ours, theirs)[1]
+            far[kind] = max(far[kind], (float(off), name))
+    agree = far["product"][0] <= 1e-6 and far["part"][0] <= 1e-5 and far["block"][0] <= 2e-2
+    end = distance(got["chunk"].ravel(), expected["chunk"].ravel())[1]
+    text = ", ".join(f"{kind} {off:.1e} at {name}" for kind, (off, name) in far.items())
+    return agree, f"{sum(map(len, parts.values()))} parts, worst {text}; chunk end to end {end:.1e} ({spelling}, {case.checkpoint.prefixes})"
+
+
 def add_low_bits(file, seed):
     """Moves every weight by up to half a percent, to float32 numbers such as training leaves."""
     import torch
@@ -116,9 +198,10 @@ def run_reference(case, folder, low_bits=False):
 def run_runtime(vla, folder, dtype="f32"):
     """(taps, None), or (None, who refuses and why)."""
     checkpoint, message = folder / "checkpoint", io.StringIO()
+    backbone = cases.backbone_folder(checkpoint)
     with contextlib.redirect_stderr(message):
-        code = cli.main([str(checkpoint), "--backbone", str(cases.backbone_folder(checkpoint)), "-o", str(folder / "bundle.gguf"),
-                         "--dtype", dtype, "--quiet"])
+        code = cli.main([str(checkpoint), *(["--backbone", str(backbone)] if backbone else []), "-o", str(folder / "bundle.gguf"),
+                         "--dtype", dtype, "--quiet", *cases.conversion_options(folder)])
     if code:
         return None, f"vla-convert ({code}): {message.getvalue().strip()[:200]}"
     try:
@@ -146,6 +229,8 @@ def judge_bf16(expected, got, published):
 
 
 def compare(arch, seed, vla, folder, bf16):
+    if arch == "bitvla":
+        return compare_bitvla(seed, vla, folder)
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
         expected, stopped = run_reference(draw(seed) if arch == "smolvla" else draw_pi(arch, seed), folder, bf16)
         published = recorder.run_case(folder, "published") if bf16 and expected else None
@@ -157,14 +242,15 @@ def compare(arch, seed, vla, folder, bf16):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05"))
+    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05", "bitvla"))
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
     parser.add_argument("--bf16", action="store_true", help="what rounding the weights costs, instead of every block")
     parser.add_argument("--keep", type=Path, help="folder for the cases, instead of one that is removed")
     args = parser.parse_args()
-    recorder.open_reference()
+    if args.arch != "bitvla":
+        recorder.open_reference()
     warnings.filterwarnings("ignore")
     n_wrong = 0
     with tempfile.TemporaryDirectory() as scratch:

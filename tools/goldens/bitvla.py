@@ -43,6 +43,7 @@ class Checkpoint:
     zero_spread: tuple = ()
     policy: dict = field(default_factory=lambda: {"chunk_size": CHUNK, "max_action_dim": 7})
     n_shard: int = 3
+    prefixes: tuple = ("module.", "")  # of names in the files of the head and of the state's projector
 
     def shapes(self):
         """By the file that has them."""
@@ -87,7 +88,7 @@ class Checkpoint:
             "vision_feature_select_strategy": "full"}, indent=1)
         write_json(folder / "dataset_statistics.json", {STATISTICS: self.statistics(seed)}, indent=1)
         self.write_shards(shapes["model"], seed, folder)
-        for file, prefix, bits in (("action_head", "module.", bfloat16_bits), ("proprio_projector", "", lambda x: x)):
+        for file, prefix, bits in (("action_head", self.prefixes[0], bfloat16_bits), ("proprio_projector", self.prefixes[1], lambda x: x)):
             tensors = {prefix + name: bits(self.value(file, name, shape, seed)) for name, shape in shapes[file].items()}
             values, data = state_dict(tensors)
             write_archive(folder / f"{file}--{STEP}_checkpoint.pt", values, data)
