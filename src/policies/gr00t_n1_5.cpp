@@ -29,7 +29,7 @@ class Gr00tN15 final : public Policy {
         lm_(s / "lm", kQwen3),
         projector_(s / "projector", vision_.d_model(), lm_.d_model(), Bias::yes),
         places_(s, vision_.n_position()),
-        head_(s, lm_.d_model(), {.future_tokens = true, .mixing = true, .alternating = false}) {}
+        head_(s, lm_.d_model(), {.state_rows = false, .future_tokens = true, .mixing = true, .alternating = false}) {}
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));

@@ -29,7 +29,7 @@ class Gr00tN16 final : public Policy {
         lm_(s / "lm", kQwen3),
         connector_(s / "connector", vision_.d_model(), lm_.d_model(), vision_.n_row(), vision_.n_column()),
         places_(s, connector_.n_token(), ViewPlaces::Count::from_end),
-        head_(s, lm_.d_model(), {.future_tokens = false, .mixing = false, .alternating = true}) {}
+        head_(s, lm_.d_model(), {.state_rows = true, .future_tokens = false, .mixing = false, .alternating = true}) {}
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
@@ -60,7 +60,7 @@ Keys published() {
   // clang-format off
   return Keys({
       {"policy.d_state", 128}, {"policy.d_action", 128}, {"policy.horizon", 50}, {"policy.n_position", 1024},
-      {"policy.max_views", 2}, {"policy.view_starts_from_end", std::vector<std::int64_t>{172, 84}},
+      {"policy.n_state_row", 1}, {"policy.max_views", 2}, {"policy.view_starts_from_end", std::vector<std::int64_t>{172, 84}},
       {"vision.d_model", 1152}, {"vision.n_layer", 27}, {"vision.n_head", 16}, {"vision.d_ff", 4304},
       {"vision.image_width", 252}, {"vision.image_height", 252}, {"vision.patch_size", 14},
       {"vision.n_position_side", 16}, {"vision.norm_eps", 1e-6}, {"connector.factor", 2}, {"connector.norm_eps", 1e-5},

@@ -20,7 +20,8 @@ class Gr00tN17 final : public Policy {
  public:
   explicit Gr00tN17(const Scope& s)
       : backbone_(s),
-        head_(s, backbone_.d_model(), {.future_tokens = false, .mixing = true, .alternating = true}),
+        head_(s, backbone_.d_model(),
+              {.state_rows = false, .future_tokens = false, .mixing = true, .alternating = true}),
         ramp_rate_(s.precise("rtc_ramp_rate", {0, 1000})) {}
 
   RealTimeChunking real_time_chunking() const override { return {RealTimeChunking::Kind::inpainted, ramp_rate_}; }

@@ -60,6 +60,13 @@ def test_images_and_prompt_of_n1_6_are_those_of_its_collator(converter):
     assert len(bundle.keys["policy.view_starts_from_end"]) == 2 and bundle.keys["policy.view_starts_from_end"][1] == 16 + 3
 
 
+def test_each_moment_of_the_state_is_a_token_of_n1_6(converter):
+    bundle = converter.bundle(Changed(gr00t_n1_6.CASES["gr00t_n1_6/history"]), embodiment="unitree_g1")
+    assert bundle.keys["policy.n_state_row"] == 3 and bundle.keys["policy.d_state"] == 3 * 6
+    assert bundle.keys["observation.states"][:2] == ["state.hand@-4", "state.arm@-4"]
+    assert bundle.tensors["state_in.weight"].shape == (14, 6)
+
+
 def test_n1_5_takes_the_row_and_the_statistics_that_its_data_config_names(converter):
     bundle = converter.bundle(Changed(N1_5), dtype="f32", **N1_5.options)
     shape = (3, 14, 20)

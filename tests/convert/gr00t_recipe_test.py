@@ -118,6 +118,20 @@ def test_keys_are_normalized_each_in_its_own_way(converter):
     assert bundle.tensors[ACTION + ".std"].tolist() == [0.0, tiny.statistics[TAG]["action"]["gripper"]["std"][0]]
 
 
+def test_states_of_several_moments_are_features_of_their_own_and_one_token(converter):
+    tiny = TinyGr00t().relative()
+    tiny.config["state_history_length"] = 2
+    tiny.robots[TAG]["state"]["delta_indices"] = [-3, 0]
+    name = "action_head.state_encoder.layer1.W"
+    tiny.tensors[name] = np.concatenate([tiny.tensors[name], -tiny.tensors[name]], axis=1)
+    bundle = convert(converter, tiny)
+    assert bundle.keys["observation.states"] == ["state.x@-3", "state.gripper@-3", "state.x", "state.gripper"]
+    assert bundle.keys["policy.d_state"] == 2 * D_STATE
+    assert recipe(bundle)["state"][-1] == {"op": "pad", "size": 2 * D_STATE, "rows": 2}
+    assert recipe(bundle)["action"][-1] == {"op": "add_state", "columns": [0], "state_columns": [3]}
+    assert bundle.tensors[STATE + ".min"].shape == (6,)
+
+
 def test_what_hardly_moved_counts_as_still_where_the_reference_finds_it_close(converter):
     tiny = TinyGr00t()
     tiny.statistics[TAG]["state"]["x"].update(q01=[100.0], q99=[100.0005])

@@ -58,7 +58,6 @@ ARM = "robots/{}/".format(TAG)
 STATS = "statistics/{}/".format(TAG)
 UNSUPPORTED = {
     "config.json: use_alternate_vl_dit: expected True, found False": {"config/use_alternate_vl_dit": False},
-    "config.json: state_history_length: expected 1, found 2": {"config/state_history_length": 2},
     "config.json: exclude_state: expected False": {"config/exclude_state": True},
     "config.json: use_vlln: expected True": {"config/use_vlln": False},
     "config.json: add_pos_embed: expected True": {"config/add_pos_embed": False},
@@ -80,7 +79,6 @@ UNSUPPORTED = {
     "processor_config.json: exclude_state: expected False": {"kwargs/exclude_state": True},
     "processor_config.json: new_thing: expected a key that this converter knows": {"kwargs/new_thing": 1},
     "processor_config.json: image_target_size: expected [side, side] or null": {"kwargs/image_target_size": [12, 16]},
-    "arm.state: delta_indices: expected [0]": {ARM + "state/delta_indices": [-1, 0]},
     "arm.state: new_thing: expected a key that this converter knows": {ARM + "state/new_thing": 1},
     "rope_scaling: mrope_interleaved: expected True": {"backbone/text_config/rope_scaling/mrope_interleaved": False},
     "rope_scaling: rope_type: expected 'default'": {"backbone/text_config/rope_scaling/rope_type": "yarn"},
@@ -95,6 +93,9 @@ BAD = {
     "arm.video: delta_indices: expected rising numbers of steps from -1000 to 0, found [0, -15]": {
         ARM + "video/delta_indices": [0, -15]
     },
+    "arm.state: delta_indices: expected rising numbers of steps from -1000 to 0, found [1]": {ARM + "state/delta_indices": [1]},
+    "arm.state: delta_indices: expected state_history_length 1 moments, found 2": {ARM + "state/delta_indices": [-1, 0]},
+    "arm.state: delta_indices: expected state_history_length 2 moments, found 1": {"config/state_history_length": 2},
     "config.json: select_layer: expected a whole number from 1": {"config/select_layer": -1},
     "config.json: backbone_embedding_dim: expected the language model's width 12": {
         "config/backbone_embedding_dim": 13

@@ -185,6 +185,23 @@ TEST_CASE("angles become sines and cosines, feature by feature") {
       "processor.recipe.state[1].columns: expected all 2 columns of a feature from column 1, found 1 of them"));
 }
 
+TEST_CASE("a state of several moments is padded row by row") {
+  EditableBundle bundle = groot();
+  Json recipe = Json::parse(kRecipe);
+  recipe["state"] = {{{"op", "pad"}, {"size", 6}, {"rows", 2}}};
+  bundle.set("processor.recipe", recipe.dump());
+  bundle.set("policy.d_state", std::int64_t{6});
+  Observation observation;
+  observation.states = {{"state", {3, 4}}};
+  Inputs inputs;
+  REQUIRE(make(bundle).encode_state(observation, inputs).ok());
+  CHECK(inputs.state == std::vector<float>{3, 0, 0, 4, 0, 0});
+  recipe["state"][0]["rows"] = 4;
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle),
+                 "processor.recipe.state[0].rows: expected a divisor of 2 and 6"));
+}
+
 TEST_CASE("ops on images end in size, and rows come first") {
   CHECK(parse_recipe(kRecipe).ok());
   Json recipe = Json::parse(kRecipe);

@@ -36,6 +36,7 @@ class Robot:
     relative: dict = field(default_factory=dict)  # action key -> the state key that it is added to, None: of the same name
     zero_spread: tuple = ()
     moments: tuple = (0,)  # steps at which frames are taken
+    state_moments: tuple = (0,)
     poses: dict = field(default_factory=dict)  # relative action key -> format of the pose that it is
     mean_std: tuple = ()  # keys of states and actions
     sin_cos: tuple = ()  # keys of states
@@ -74,7 +75,7 @@ class Checkpoint:
 
     @property
     def states(self):
-        return self.robot.states
+        return {f"{key}@{t}" if t else key: n for t in self.robot.state_moments for key, n in self.robot.states.items()}
 
     @property
     def zero_spread(self):
@@ -181,7 +182,7 @@ def modalities(robot):
         pose = {"type": "EEF", "format": robot.poses[key]} if key in robot.poses else {}
         return RELATIVE | {"state_key": robot.relative[key]} | pose if key in robot.relative else ABSOLUTE
 
-    return {"video": part(robot.views, list(robot.moments)), "state": part(robot.states, [0], None, robot.sin_cos, robot.mean_std),
+    return {"video": part(robot.views, list(robot.moments)), "state": part(robot.states, list(robot.state_moments), None, robot.sin_cos, robot.mean_std),
             "action": part(robot.actions, list(range(robot.rows)), [config(key) for key in robot.actions], (), robot.mean_std),
             "language": part(["annotation.human.action.task_description"], [0])}
 
@@ -227,7 +228,7 @@ class HeadTaps(Taps):
     n_front = 1  # tokens in front of those of the actions
 
     def action_head(self, head):
-        self.before(head.state_encoder, lambda x: self.put("state", x[0, 0]))
+        self.before(head.state_encoder, lambda x: self.put("state", x[0].flatten()))
         self.after(head.state_encoder, lambda x: self.put("state_out", x[0]))
         self.before(head.action_encoder, self.on_step)
         dit = head.model

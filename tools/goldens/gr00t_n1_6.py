@@ -141,6 +141,11 @@ CASES = {
             {"hand_pose": "wrist_pose", "arm": None}, poses={"hand_pose": "XYZ_ROTVEC"}, mean_std=("hand",), sin_cos=("arm",)),
         vision(16, 2, 2, 24, 3), text(24, 4, 3, 1, 8, 32), head(3, (5, 2, 10), None, 14, 18, 14, 4),
         {"shortest_image_edge": 16, "crop_fraction": 0.9})),
+    # States of three moments, each a token of its own; joints relative to the newest.
+    "gr00t_n1_6/history": case(66, {"camera": (16, 16, "png")}, "wipe the table", Checkpoint(
+        "unitree_g1", 1, Robot(("camera",), {"hand": 1, "arm": 3}, {"arm": 3, "hand": 1}, 3, {"arm": None}, state_moments=(-4, -1, 0)),
+        vision(16, 2, 2, 24, 3), text(24, 4, 3, 1, 8, 32), head(3, (5, 2, 10), None, 14, 6, 5, 4),
+        {"shortest_image_edge": 16, "crop_fraction": 0.9})),
 }
 
 # --- the reference ---------------------------------------------------------------------------------------------------
@@ -212,8 +217,9 @@ class Reference:
         text = re.sub(r"[^\w\s]", "", batch["task"].lower())
         places = "".join(f"<image {i + 1}><img>{'<IMG_CONTEXT>' * (x[0].numel() // (2 * self.patch) ** 2)}</img>" for i, x in enumerate(images))
         prompt = f"<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n<|im_start|>user\n{text}{places}<|im_end|>\n"
-        state = self.robot.normalized(batch["observation.state"].numpy(), self.head["max_state_dim"])
-        return {"ids": torch.tensor([self.tokenizer(prompt)["input_ids"]]), "images": images, "state": torch.from_numpy(state)[None, None]}
+        rows = self.robot.moments(batch["observation.state"].numpy())
+        state = np.stack([self.robot.normalized(row, self.head["max_state_dim"]) for row in rows])
+        return {"ids": torch.tensor([self.tokenizer(prompt)["input_ids"]]), "images": images, "state": torch.from_numpy(state)[None]}
 
     def features(self, ids, images):
         """images: (3, height, width) each; every one is seen alone."""
@@ -245,7 +251,9 @@ class Reference:
                                      "backbone_attention_mask": torch.ones_like(batch["ids"], dtype=torch.bool),
                                      "image_mask": batch["ids"] == self.image_token})
                 asked = BatchFeature({"state": batch["state"].to(self.dtype), "embodiment_id": torch.tensor([self.robot.index])})
-                return self.model.action_head.get_action(seen, asked)["action_pred"]
+                head = self.model.action_head  # whose own get_action() takes one moment of the state
+                context, tokens = head.process_backbone_output(seen).backbone_features, head.state_encoder(asked.state, asked.embodiment_id)
+                return head.get_action_with_features(context, tokens, asked.embodiment_id, seen, asked)["action_pred"]
         finally:
             torch.randn = draw
 
@@ -267,6 +275,10 @@ class RobotNumbers:
         self.robot, self.letterbox = self.settings["modality_configs"][tag], options.get("letterbox", False)
         self.views, self.rows = self.robot["video"]["modality_keys"], len(self.robot["action"]["delta_indices"])
         self.d_action = sum(len(self.statistics["action"][key]["min"]) for key in self.robot["action"]["modality_keys"])
+
+    def moments(self, state):
+        """A row for each, the oldest first."""
+        return state.reshape(len(self.robot["state"]["delta_indices"]), -1)
 
     def transform(self, frame):
         from lerobot.policies.groot.processor_groot import _transform_n1_7_image_for_vlm_albumentations as transform
@@ -306,7 +318,7 @@ class RobotNumbers:
     def actions(self, chunk, state):
         """The robot's part of a chunk, and the state before its normalization -> what the robot does."""
         out = []
-        states = {key: x for key, _, _, x in self.parts("state", state)}
+        states = {key: x for key, _, _, x in self.parts("state", self.moments(state)[-1])}
         configs = self.robot["action"]["action_configs"]
         for (key, table, by_deviation, x), how in zip(self.parts("action", chunk), configs, strict=True):
             relative = self.settings["use_relative_action"] and how["rep"] == "RELATIVE"
@@ -370,7 +382,7 @@ class Recorder(HeadTaps):
 
         self.put("tokens", batch["ids"][0])
         self.put("pixels", torch.stack(batch["images"]))
-        self.image = batch["ids"][0] == self.reference.image_token
+        self.image, self.n_front = batch["ids"][0] == self.reference.image_token, batch["state"].shape[1]
         chunk, robot = self.reference.predict_action_chunk(batch, noise)[0], self.reference.robot
         self.put(f"step.{self.step}.x", chunk)
         self.put("chunk", chunk[: robot.rows, : robot.d_action])  # what the robot gets of it

@@ -10,7 +10,8 @@ namespace vla {
 
 GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
     : vl_norm_(s / "vl" / "norm", d_context, (s / "vl").number("norm_eps", kNormEps)),
-      state_in_(s / "state_in", s.dim("d_state"), (s / "dit").dim("d_hidden"), Bias::yes),
+      n_state_row_(family.state_rows ? s.dim("n_state_row", 64) : 1),
+      state_in_(s / "state_in", s.dim("d_state") / n_state_row_, (s / "dit").dim("d_hidden"), Bias::yes),
       state_out_(s / "state_out", (s / "dit").dim("d_hidden"), (s / "dit").dim("d_model"), Bias::yes),
       n_future_(family.future_tokens ? s.dim("n_future", 4096) : 0),
       dit_(s / "dit", d_context, family.alternating),
@@ -34,6 +35,8 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
     vl.require(n_layer == 0 || d_context % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_context),
                std::to_string(n_head));
   }
+  s.require(s.dim("d_state") % n_state_row_ == 0, "n_state_row",
+            fmt::format("a divisor of policy.d_state {}", s.dim("d_state")), std::to_string(n_state_row_));
   s.require(horizon_ <= s.dim("n_position"), "n_position", fmt::format("at least the horizon {}", horizon_),
             std::to_string(s.dim("n_position")));
   (s / "dit").require(d_time_ % 2 == 0 && d_time_ > 2, "d_time", "an even number above 2", std::to_string(d_time_));
@@ -60,8 +63,9 @@ Tensor GrootHead::context(Graph& g, Tensor features) const {
 
 void GrootHead::prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const {
   dit_.prepare(g, text, image, cache);
-  const Tensor hidden = activate(g, state_in_(g, state), Activation::relu);
-  cache.put(g, state_out_.path(), state_out_.forward(g, hidden));  // [d_dit, 1]
+  const Tensor rows = n_state_row_ > 1 ? columns(g, state, state.dim(0) / n_state_row_) : state;
+  const Tensor hidden = activate(g, state_in_(g, rows), Activation::relu);
+  cache.put(g, state_out_.path(), state_out_.forward(g, hidden));  // [d_dit, n_state_row]
   if (future_) cache.put(g, future_->path(), future_->forward(g, arange(g, n_future_)));
 }
 
@@ -75,8 +79,8 @@ Tensor GrootHead::velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& 
   if (future_) tokens.push_back(cache.get(g, future_->path()));
   tokens.push_back(g.name(action_token_.path(), placed));
   const Tensor x = dit_(g, concat_tokens(g, tokens), condition, cache);
-  const Tensor out = slice_tokens(g, x, 1 + n_future_, horizon_);            // [d_out, horizon]
-  return decode_out_(g, activate(g, decode_in_(g, out), Activation::relu));  // [d_action, horizon]
+  const Tensor out = slice_tokens(g, x, n_state_row_ + n_future_, horizon_);  // [d_out, horizon]
+  return decode_out_(g, activate(g, decode_in_(g, out), Activation::relu));   // [d_action, horizon]
 }
 
 }  // namespace vla

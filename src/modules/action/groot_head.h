@@ -15,6 +15,7 @@ namespace vla {
 
 /// How the heads of the releases differ.
 struct GrootFamily {
+  bool state_rows;     // the state is `policy.n_state_row` rows, one for each moment, and each becomes a token
   bool future_tokens;  // `policy.n_future` learned tokens between the state's and those of the actions
   bool mixing;         // `vl.n_layer` layers of self-attention over the features
   bool alternating;    // even layers look at the text or at the images (`dit.attend_text_every_n_blocks`), else at all
@@ -42,6 +43,7 @@ class GrootHead {
  private:
   LayerNorm vl_norm_;  // observation rate
   std::vector<EncoderBlock> vl_blocks_;
+  int n_state_row_;
   Linear state_in_, state_out_;
   std::optional<Embedding> future_;
   int n_future_;

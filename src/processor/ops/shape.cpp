@@ -13,16 +13,21 @@ namespace vla {
 namespace {
 
 struct PadOp final : StateOp {
-  int size = 0;
+  int size = 0, n_row = 1;
   float value = 0.0f;
   Stage stage() const override { return Stage::end; }
   Status bind(StateLayout& layout, const std::string& where) override {
     const std::size_t before = std::exchange(layout.width, static_cast<std::size_t>(size));
+    const auto rows = static_cast<std::size_t>(n_row);
+    if (before % rows != 0 || layout.width % rows != 0)
+      return misfit(where + ".rows", fmt::format("a divisor of {} and {}", before, size), std::to_string(n_row));
     if (layout.width >= before) return {};
     return misfit(where + ".size", fmt::format("at least the {} numbers of the state", before), std::to_string(size));
   }
   void finish(std::vector<float>& state, std::vector<int>&) const override {
-    state.resize(static_cast<std::size_t>(size), value);
+    const auto width = static_cast<std::ptrdiff_t>(state.size()) / n_row;
+    const auto n_pad = static_cast<std::size_t>(size / n_row - width);
+    for (int row = n_row; row > 0; --row) state.insert(state.begin() + row * width, n_pad, value);
   }
 };
 
@@ -54,6 +59,9 @@ Status read(JsonFields& fields, PadOp& op) {
   VLA_TRY(op.size, fields.integer("size", 1, kMaxVector));
   if (fields.has("value")) {
     VLA_TRY(op.value, fields.number("value", kPlain));
+  }
+  if (fields.has("rows")) {
+    VLA_TRY(op.n_row, fields.integer("rows", 1, kMaxVector));
   }
   return {};
 }

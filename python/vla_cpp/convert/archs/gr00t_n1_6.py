@@ -62,7 +62,7 @@ EMBODIMENTS = {
     "gr1": 20,
     "behavior_r1_pro": 24,
 }
-RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d6Processor", KWARGS_FIXED, EMBODIMENTS, EAGLE_3)
+RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d6Processor", KWARGS_FIXED, EMBODIMENTS, True, EAGLE_3)
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:

@@ -32,6 +32,7 @@ CONFIG = {
     "select_layer": 12,
     "backbone_embedding_dim": 2048,
     "max_state_dim": 132,
+    "state_history_length": 1,
     "max_action_dim": 132,
     "action_horizon": 40,
     "hidden_size": 1024,
@@ -50,7 +51,6 @@ FIXED: Fixed = {
     "model_type": (None, "Gr00tN1d7"),
     "backbone_model_type": ("qwen", "qwen"),
     "reproject_vision": (False, False),
-    "state_history_length": (1, 1),
     "add_pos_embed": (True, True),
     "use_vlln": (True, True),
     "use_alternate_vl_dit": (True, True),
@@ -78,7 +78,7 @@ EMBODIMENTS = {
     "xdof_relative_eef_relative_joint": 27,
     "xdof_relative_eef_relative_joint_subtask": 27,
 }
-RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d7Processor", KWARGS_FIXED, EMBODIMENTS, qwen3_vl)
+RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d7Processor", KWARGS_FIXED, EMBODIMENTS, False, qwen3_vl)
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:

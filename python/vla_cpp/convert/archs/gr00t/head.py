@@ -44,7 +44,9 @@ TRANSFORMER_IGNORED = {
 
 def read(policy: Section, s: Sizes) -> None:
     """`policy`: the members that describe the head; the language model's sizes are read already."""
-    s.d_state, s.horizon = policy.count("max_state_dim"), policy.count("action_horizon")
+    if "state_history_length" in policy.defaults:
+        s.state_history = policy.count("state_history_length", most=64)
+    s.d_state, s.horizon = policy.count("max_state_dim") * s.state_history, policy.count("action_horizon")
     s.d_hidden, s.n_position, s.n_embodiment = (
         policy.count(key) for key in ("hidden_size", "max_seq_len", "max_num_embodiments")
     )
@@ -168,7 +170,7 @@ def _robot(s: Sizes) -> List[Weight]:
 def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
     """By type. Numbers that no config states are literals of the reference."""
     u32 = {
-        "policy.d_state": s.d_state,
+        "policy.d_state": s.d_state * s.n_state_row,
         "policy.d_action": s.d_action,
         "policy.horizon": s.horizon,
         "policy.n_position": s.n_position,

@@ -77,6 +77,7 @@ class Release(NamedTuple):
     processor_class: str
     kwargs_fixed: Fixed
     embodiments: Dict[str, int]  # indices of tags that embodiment_id.json does not have
+    state_rows: bool  # each moment of the state is a token of its own; else all of them are one
     backbone: Any  # read, read_area, read_prompt, weights, keys, dropped, LM, TEMPLATE
 
 
@@ -91,10 +92,15 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
     problems.raise_any()
     s.max_views = len(robot.cameras)
+    if release.state_rows:
+        s.n_state_row = robot.n_moment
+    elif robot.n_moment != s.state_history:
+        where = "{}: {}.state: delta_indices".format(PROCESSOR, options.embodiment)
+        problems.add(where, "state_history_length {} moments".format(s.state_history), str(robot.n_moment))
     area = backbone.read_area(folder, s, problems)
     pictures = read_pictures(processor, area, options, checkpoint.notes, problems)
-    if processor.count("max_state_dim") != s.d_state:
-        processor.bad("max_state_dim", "{} as in config.json".format(s.d_state))
+    if processor.count("max_state_dim") * s.state_history != s.d_state:
+        processor.bad("max_state_dim", "{} as in config.json".format(s.d_state // s.state_history))
     s.image_width, s.image_height = pictures.width, pictures.height
     parts = Parts(backbone, folder, robot, pictures, processor.get("formalize_language"))
     return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
@@ -180,7 +186,10 @@ def read_sizes(release: Release, config: dict, folder: str, problems: Problems) 
 
 
 def network_keys(release: Release, s: Sizes) -> List[Key]:
-    keys = network_keys_of(release.backbone, s, {"dit.attend_text_every_n_blocks": s.attend_text_every_n_blocks})
+    own: Dict[str, object] = {"dit.attend_text_every_n_blocks": s.attend_text_every_n_blocks}
+    if release.state_rows:
+        own["policy.n_state_row"] = s.n_state_row
+    keys = network_keys_of(release.backbone, s, own)
     if "vl_self_attention_cfg" in release.config:
         return keys
     return [key for key in keys if key.name not in ("vl.n_layer", "vl.n_head", "vl.d_ff")]

@@ -47,6 +47,7 @@ class Robot(NamedTuple):
     states: List[Group]
     actions: List[Group]
     n_row: int  # actions of a chunk that are meant for this robot
+    n_moment: int = 1  # at which states are taken: the groups of each follow those of the one before
 
 
 def processor_file(checkpoint: Checkpoint, name: str) -> str:
@@ -131,15 +132,6 @@ class _Reader:
             section.values = {**section.values, "modality_keys": []}
         return section
 
-    def one_step(self, section: Section, what: str) -> None:
-        if section.get("delta_indices") != [0]:
-            section.bad(
-                "delta_indices",
-                "[0]",
-                hint="{} of several moments are not supported yet".format(what),
-                unsupported=True,
-            )
-
     def listed(self, section: Section, name: str) -> List[str]:
         return [key for key in member(section.values, name, list, section.where) if isinstance(key, str)]
 
@@ -178,7 +170,7 @@ class _Reader:
 
     def states(self) -> List[Group]:
         section = self.modality("state")
-        self.one_step(section, "states")
+        suffixes = [moment_suffix(t) for t in moments(section)]
         mean_std = self.listed(section, "mean_std_embedding_keys")
         turns = self.listed(section, "sin_cos_embedding_keys") if self.sin_cos else []
         groups = []
@@ -188,7 +180,8 @@ class _Reader:
             if kind == RANGE:  # the reference gives 0 where it finds the two close, which is by their size
                 high = np.where(np.isclose(high, low), low, high)
             groups.append(Group(key, low.size, kind, low, high, kind == RANGE and self.clips))
-        return groups
+        # Actions are relative to the newest state, which is found by its key alone where it is of now.
+        return [group._replace(key=group.key + suffix) for suffix in suffixes for group in groups]
 
     def actions(self, states: Sequence[Group], n_row: int) -> List[Group]:
         section = self.modality("action")
@@ -211,7 +204,8 @@ class _Reader:
 
     def relative_group(self, group: Group, how: Section, widths: Dict[str, int], n_row: int) -> Group:
         """The same key by the statistics of its relative actions, which are never percentiles. `widths`: of the states."""
-        reference, pose = str(how.get("state_key") or group.key), self.pose(how, group.width)
+        reference = str(how.get("state_key") or group.key) + moment_suffix(moments(self.modality("state"))[-1])
+        pose = self.pose(how, group.width)
         names = ("mean", "std") if group.kind == DEVIATION else ("min", "max")
         low, high = self.statistic("relative_action", group.key, names, n_row)
         if low.shape[-1] != group.width:
@@ -246,15 +240,24 @@ class _Reader:
         return str(pose).lower()
 
 
+def moments(section: Section) -> List[int]:
+    """When frames or states are taken, in control steps from now on."""
+    steps = section.get("delta_indices")
+    sound = isinstance(steps, list) and steps and all(type(t) is int and -1000 <= t <= 0 for t in steps)
+    if sound and sorted(set(steps)) == steps:
+        return steps
+    section.bad("delta_indices", "rising numbers of steps from -1000 to 0")
+    return [0]
+
+
+def moment_suffix(step: int) -> str:
+    """A frame or a state of 15 steps ago is a feature of its own, name@-15."""
+    return "@{}".format(step) if step else ""
+
+
 def views(video: Section) -> List[str]:
-    """Every camera at every moment, the moments in the order of `delta_indices` and in each the cameras: a frame that was taken 15 steps
-    ago is a view of its own, camera@-15."""
-    moments = video.get("delta_indices")
-    sound = isinstance(moments, list) and moments and all(type(t) is int and -1000 <= t <= 0 for t in moments)
-    if not sound or sorted(set(moments)) != moments:
-        video.bad("delta_indices", "rising numbers of steps from -1000 to 0")
-        moments = [0]
-    return ["{}@{}".format(key, t) if t else key for t in moments for key in video.get("modality_keys")]
+    """Every camera at every moment, the moments in the order of `delta_indices` and in each the cameras."""
+    return [key + moment_suffix(t) for t in moments(video) for key in video.get("modality_keys")]
 
 
 def read_robot(tag: str, config: dict, statistics: dict, processor: Section, horizon: int, problems: Problems) -> Robot:
@@ -267,4 +270,4 @@ def read_robot(tag: str, config: dict, statistics: dict, processor: Section, hor
         problems.add("{}: {}.action: delta_indices".format(PROCESSOR, tag), "a list of steps", repr(steps)[:80])
         steps = [0]
     n_row, states = min(len(steps), horizon), reader.states()
-    return Robot(cameras, states, reader.actions(states, n_row), n_row)
+    return Robot(cameras, states, reader.actions(states, n_row), n_row, len(moments(reader.modality("state"))))

@@ -46,7 +46,9 @@ class Sizes:
     attend_text_every_n_blocks: int = 0
     n_bucket: int = 0
     d_hidden: int = 0
-    d_state: int = 0
+    d_state: int = 0  # of what becomes a token: all moments of state_history_length
+    state_history: int = 1
+    n_state_row: int = 1  # tokens of the state, where each moment is one
     d_action: int = 0
     horizon: int = 0
     n_position: int = 0

@@ -62,15 +62,16 @@ def _clip(groups: Sequence[Group]) -> List[dict]:
 
 def state_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
     turns = _columns(robot.states, lambda group: group.kind == SIN_COS)
-    width = _total(robot.states) + len(turns)
-    if width > s.d_state:
-        problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(s.d_state), str(width))
+    width, most = (_total(robot.states) + len(turns)) // robot.n_moment, s.d_state // s.state_history
+    if width > most:
+        problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(most), str(width))
+    rows = {"rows": robot.n_moment} if robot.n_moment > 1 else {}
     return [
         *_binary(robot.states),
         *_normalize("normalize", recipe.STATE, robot.states),
         *_clip(robot.states),
         *([{"op": "sin_cos", "columns": turns}] if turns else []),
-        {"op": "pad", "size": s.d_state},
+        {"op": "pad", "size": s.d_state * s.n_state_row, **rows},
     ]
 
 
