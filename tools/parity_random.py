@@ -5,7 +5,7 @@
     python tools/parity_random.py ARCH FIRST LAST [--vla build/cpu/bin/vla] [--keep DIR]
 
 A seed draws everything: depths, heads, widths, patches, grid and table, views, frames, absent views, text, normalization, solver,
-attention mode (of smolvla), relative actions (of pi0 and pi05).  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
+attention mode (of smolvla), relative actions (of pi0, pi05 and GR00T), poses and moments (of GR00T).  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
 A configuration that the reference cannot run must be refused, with a reason, by vla-convert or by vla.  Ends with exit
 code 1 if a block differs by more than 1e-4 of its largest magnitude, or if only one side answers.
 
@@ -28,7 +28,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import bitvla, cases, pi, recorder, smolvla
+from goldens import bitvla, cases, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, smolvla
 from parity_full import ROOT, distance, run_vla
 from vla_cpp.convert import cli
 
@@ -173,6 +173,60 @@ def compare_bitvla(seed, vla, folder):
     return agree, f"{sum(map(len, parts.values()))} parts, worst {text}; chunk end to end {end:.1e} ({spelling}, {case.checkpoint.prefixes})"
 
 
+def draw_gr00t_robot(arch, r, n_view):
+    widths = {f"k{i}": r.choice((1, 2, 3, 4)) for i in range(r.randint(1, 4))}
+    actions, relative, poses = dict(widths), {}, {}
+    if arch != "gr00t_n1_5":
+        relative = {key: None for key in widths if r.random() < 0.5}
+        if r.random() < 0.4:
+            kind = "XYZ_ROTVEC" if arch == "gr00t_n1_6" else "XYZ_ROT6D"
+            widths["pose"] = actions["pose"] = 6 if kind == "XYZ_ROTVEC" else 9
+            relative["pose"], poses["pose"] = None, kind
+    mixed = arch == "gr00t_n1_6"  # LeRobot's N1.7 does not read these lists, and takes one moment of the state
+    moments = r.choice(((0,), (0,), (-2, 0))) if mixed else (0,)
+    mean_std = tuple(k for k in widths if mixed and k not in poses and r.random() < 0.3)
+    return gr00t.Robot(tuple(f"cam{i}" for i in range(n_view)), widths, dict(r.sample(sorted(actions.items()), len(actions))), r.randint(1, 6), relative,
+                       poses=poses, mean_std=mean_std, sin_cos=tuple(k for k in widths if mixed and r.random() < 0.2), per_step=r.random() < 0.5,
+                       state_moments=moments)
+
+
+def draw_gr00t(arch, seed):
+    """The same for GR00T: square cameras, since an instruction's letters are cleaned and an aspect is checked elsewhere."""
+    r = random.Random(f"{arch} {seed}")
+    heads, kv, d_head = r.choice(((4, 2, 8), (3, 1, 12), (6, 3, 8), (5, 5, 8), (2, 2, 16)))
+    vl_heads = r.choice((2, 3, 4))
+    d_model, n_view = vl_heads * 2 * r.choice((4, 5, 6)), r.randint(1, 3)
+    robot = draw_gr00t_robot(arch, r, n_view)
+    every, steps = r.choice((1, 2, 2, 3)), r.choice((1, 2, 4, 5))
+    vl = None if arch == "gr00t_n1_6" else (r.choice((1, 2, 3)), vl_heads, d_model // vl_heads)
+    more = {} if arch == "gr00t_n1_5" else {"attend_text_every_n_blocks": every}
+    kept, vision_heads = r.choice((4, 5)), r.choice((1, 2, 3))
+    sizes = gr00t.head(kept, (r.randint(2, 7), r.choice((2, 3, 4)), 2 * r.choice((3, 4, 5))), vl, 2 * r.randint(4, 12),
+                       2 * sum(robot.states.values()) + r.randint(0, 3), sum(robot.actions.values()) + r.randint(0, 3), robot.rows + r.randint(0, 3),
+                       num_inference_timesteps=steps, **more)
+    side, crop, camera = 8 * r.choice((2, 3, 4)), r.choice((0.8, 0.9, 0.95)), r.randint(12, 70)
+    tower = vision_heads * 4 * r.choice((2, 3, 4)), r.randint(3, 5), vision_heads, 2 * r.randint(8, 20)
+    text_sizes = d_model, kept + r.randint(0, 2), heads, kv, d_head, r.choice((32, 50))
+    options = {}
+    if arch == "gr00t_n1_7":
+        sections = {8: (2, 1, 1), 12: (2, 2, 2), 16: (4, 2, 2)}[d_head]
+        deepstack = sorted(r.sample(range(tower[1]), 3))
+        parts = gr00t_n1_7.vision(*tower, r.randint(3, 7), deepstack), gr00t_n1_7.text(*text_sizes, sections)
+        image = {"image_target_size": [side] * 2, "shortest_image_edge": side, "crop_fraction": crop}
+        checkpoint = gr00t_n1_7.Checkpoint("robot", 1, robot, *parts, sizes, image, side, percentiles=r.random() < 0.5)
+    elif arch == "gr00t_n1_6":
+        parts = gr00t_n1_6.vision(*tower, r.randint(3, 9)), gr00t_n1_6.text(*text_sizes)
+        image = {"shortest_image_edge": side + r.randint(-3, 3), "crop_fraction": crop}
+        checkpoint = gr00t_n1_6.Checkpoint("robot", 1, robot, *parts, sizes, image, percentiles=r.random() < 0.5)
+    else:
+        parts = gr00t_n1_5.vision(*tower, 14 * r.choice((1, 2, 3)), r.choice((7, 14))), gr00t_n1_5.text(*text_sizes)
+        modes = {key: r.choice(("min_max", "q99", "mean_std", None)) for key in robot.states}
+        checkpoint = gr00t_n1_5.Checkpoint("robot", 1, robot, *parts, sizes, gr00t_n1_5.camera(camera, camera, modes, modes, crop), n_future=r.randint(1, 6))
+        options = {"variant": "data_config.json"}
+    frames = {view: (camera, camera, r.choice(("png", "png", "jpg"))) for view in robot.views}
+    return gr00t.case(seed, frames, r.choice(("go", "Pick up the red cube!", "naïve café 漢字 n° 5", "word " * 20)), checkpoint, options=options)
+
+
 def add_low_bits(file, seed):
     """Moves every weight by up to half a percent, to float32 numbers such as training leaves."""
     import torch
@@ -232,7 +286,8 @@ def compare(arch, seed, vla, folder, bf16):
     if arch == "bitvla":
         return compare_bitvla(seed, vla, folder)
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
-        expected, stopped = run_reference(draw(seed) if arch == "smolvla" else draw_pi(arch, seed), folder, bf16)
+        drawn = draw(seed) if arch == "smolvla" else draw_pi(arch, seed) if arch.startswith("pi") else draw_gr00t(arch, seed)
+        expected, stopped = run_reference(drawn, folder, bf16)
         published = recorder.run_case(folder, "published") if bf16 and expected else None
     got, refused = run_runtime(vla, folder, "bf16" if bf16 else "f32")
     if expected is None or got is None:
@@ -242,7 +297,7 @@ def compare(arch, seed, vla, folder, bf16):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05", "bitvla"))
+    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05", "gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7", "bitvla"))
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")

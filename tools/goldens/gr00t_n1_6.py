@@ -323,8 +323,9 @@ class RobotNumbers:
         for (key, table, by_deviation, x), how in zip(self.parts("action", chunk), configs, strict=True):
             relative = self.settings["use_relative_action"] and how["rep"] == "RELATIVE"
             low, high = self.limits(table)
-            if relative:
-                low, high = (np.asarray(self.statistics["relative_action"][key][name]) for name in ("min", "max"))
+            if relative:  # statistics of its own, which are never percentiles
+                table = {name: np.asarray(v) for name, v in self.statistics["relative_action"][key].items()}
+                low, high = table["min"], table["max"]
             if by_deviation:
                 y = np.where(table["std"] == 0, x, x * table["std"] + table["mean"])
             else:
