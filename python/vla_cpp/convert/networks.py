@@ -59,14 +59,21 @@ DOUBLES = ("policy.time_scale", "time.min_period", "time.max_period", "solver.t_
 KINDS = {int: "u32", float: "f32", str: "string"}
 
 
-def keys_of(modules: Mapping[str, Union[Vision, Language, Mapping[str, object]]]) -> List[Key]:
+Modules = Mapping[str, Union[Vision, Language, Mapping[str, object]]]
+
+
+def typed(modules: Modules) -> Dict[str, Dict[str, object]]:
     """Numbers and names of modules, by type."""
     groups: Dict[str, Dict[str, object]] = {"u32": {}, "f32": {}, "f64": {}, "string": {}}
     for module, fields in modules.items():
         for name, value in (fields if isinstance(fields, Mapping) else vars(fields)).items():
             key = "{}.{}".format(module, name)
             groups["f64" if key in DOUBLES else KINDS[type(value)]][key] = value
-    return keys_by_type(groups)
+    return groups
+
+
+def keys_of(modules: Modules) -> List[Key]:
+    return keys_by_type(typed(modules))
 
 
 def read_vision(section: Section, image_size: int, patch_size: int) -> Vision:

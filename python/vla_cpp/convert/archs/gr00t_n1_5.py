@@ -18,14 +18,15 @@ from ..bundle import Key
 from ..checkpoint import Checkpoint, find_backbone
 from ..errors import Code, Problems, refuse
 from ..files import member, read_json
+from ..networks import MAX_LAYERS
 from ..section import Fixed, Section
 from . import TABLE, Options, Plan, Weight
 from .gr00t import head
 from .gr00t.eagle import EAGLE_2_5
-from .gr00t.pictures import STANDARDIZE, Pictures
+from .gr00t.images import STANDARDIZE, Images
 from .gr00t.plan import Parts, assemble, network_keys_of
 from .gr00t.robot import BINARY, SIN_COS, Group, Robot, choose
-from .gr00t.sizes import MAX_LAYERS, Sizes
+from .gr00t.sizes import Sizes
 
 POLICY, METADATA = "config.json", os.path.join("experiment_cfg", "metadata.json")
 TOP_FIXED: Fixed = {"model_type": (None, "gr00t_n1_5")}
@@ -104,9 +105,9 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         )
         problems.add("--embodiment " + options.embodiment, expected, str(s.embodiment), code=Code.USAGE)
     robot = _robot(config, metadata, min(config.horizon, s.horizon), problems)
-    pictures = _pictures(config, metadata, s, problems)
+    images = _images(config, metadata, s, problems)
     problems.raise_any()
-    parts = Parts(EAGLE_2_5, folder, robot, pictures, formalize=False)
+    parts = Parts(EAGLE_2_5, folder, robot, images, formalize=False)
     return assemble(parts, network_keys(s, n_future), weights(s, n_future), checkpoint, options, s, problems)
 
 
@@ -198,7 +199,7 @@ def _group(part: str, key: str, mode: Optional[str], metadata: dict, problems: P
     return Group(key, low.size, kind, low, high, part == "state" and mode == "q99")
 
 
-def _pictures(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) -> Pictures:
+def _images(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) -> Images:
     video = member(member(metadata, "modalities", dict, METADATA), "video", dict, METADATA)
     sizes: List[object] = [member(video, view, dict, METADATA).get("resolution") for view in config.video]
     size = sizes[0]
@@ -218,4 +219,4 @@ def _pictures(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) 
         resize,
         {"op": "size", "width": side, "height": side},
     ]
-    return Pictures(side, side, [*ops, STANDARDIZE])
+    return Images(side, side, [*ops, STANDARDIZE])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T N1.6: Eagle 3 as the prefix, a diffusion transformer that reads its text and its pictures in turns.
+"""GR00T N1.6: Eagle 3 as the prefix, a diffusion transformer that reads its text and its images in turns.
 
 The layout is the authors' (Isaac-GR00T), as of N1.7. An absent key of config.json means the default of their own class.
 """

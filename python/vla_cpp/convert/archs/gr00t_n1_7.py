@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""GR00T N1.7: Qwen3-VL as the prefix, a diffusion transformer that reads its text and its pictures in turns.
+"""GR00T N1.7: Qwen3-VL as the prefix, a diffusion transformer that reads its text and its images in turns.
 
 A checkpoint holds several robots, a bundle one of them, chosen by --embodiment. The layout is the authors' (Isaac-GR00T).
 

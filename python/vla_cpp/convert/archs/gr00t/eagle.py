@@ -16,14 +16,15 @@ from ...ascii_bpe import special_ids
 from ...errors import Problems
 from ...files import member, read_json
 from ...layers import linear, norm, siglip, vector
+from ...networks import read_vision
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
 from .. import MATRIX, Dropped, Weight
 from . import language
 from . import prompt as prompts
-from .pictures import Area
+from .images import Area
 from .prompt import END, START, Prompt, Template
-from .sizes import MAX_LAYERS, WHERE, Sizes
+from .sizes import WHERE, Sizes
 
 IMAGE = "<IMG_CONTEXT>"
 SYSTEM = START + "system\nYou are a helpful assistant." + END + "\n" + START + "user\n"
@@ -94,7 +95,7 @@ class Eagle:
         rope.refuse_unknown({"rope_type", "type", "rope_theta"})
         if rope.get("rope_type") not in (None, "default") or rope.get("type") not in (None, "default"):
             rope.bad("rope_type", "'default'", unsupported=True)
-        s.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
+        s.lm.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
         s.merge = self.merge
         self._read_vision(
             Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s
@@ -102,17 +103,13 @@ class Eagle:
 
     def _read_vision(self, vision: Section, s: Sizes) -> None:
         vision.check_fixed(VISION_FIXED)
-        s.patch_size, s.n_vision_layer = vision.count("patch_size"), vision.count("num_hidden_layers", most=MAX_LAYERS)
-        s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-        s.n_vision_head, s.vision_eps = vision.count("num_attention_heads"), vision.number("layer_norm_eps")
-        if s.d_vision % s.n_vision_head:
-            vision.bad("num_attention_heads", "a divisor of hidden_size {}".format(s.d_vision))
+        s.vision = read_vision(vision, 0, vision.count("patch_size"))
         if self.merge == 1:
             side = vision.count("image_size")
             s.image_width = s.image_height = side
-            s.n_position_side = side // s.patch_size
-            if side % s.patch_size:
-                vision.bad("image_size", "a multiple of patch_size {}".format(s.patch_size))
+            s.n_position_side = side // s.vision.patch_size
+            if side % s.vision.patch_size:
+                vision.bad("image_size", "a multiple of patch_size {}".format(s.vision.patch_size))
             return
         s.n_position_side = math.isqrt(vision.count("num_patches"))
         if s.n_position_side**2 != vision.get("num_patches"):
@@ -122,7 +119,7 @@ class Eagle:
         """What smart_resize of its processor leaves alone, and what it makes of other sizes."""
         path = os.path.join(folder, FILE)
         Section("backbone " + FILE, read_json(path), {}, problems).check_fixed(IMAGE_FIXED)
-        side = self.merge * s.patch_size
+        side = self.merge * s.vision.patch_size
         return Area(FILE, "pillow_bicubic", side, side, 4 * side**2, 4096 * side**2)
 
     def read_prompt(self, tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems) -> Prompt:
@@ -136,60 +133,60 @@ class Eagle:
 
     def weights(self, s: Sizes) -> List[Weight]:
         vision = self.root + "vision_model.vision_model."
-        rows = siglip(vision, s.d_vision, s.d_vision_ff, s.n_vision_layer, s.patch_size, s.n_position_side**2)
+        rows = siglip(vision, s.vision.d_model, s.vision.d_ff, s.vision.n_layer, s.vision.patch_size, s.n_position_side**2)
         if self.merge > 1:
             # Patches are flattened pixel by pixel there, channel by channel here.
-            source, shape = vision + "embeddings.patch_embedding.weight", (s.d_vision, 3 * s.patch_size**2)
+            source, shape = vision + "embeddings.patch_embedding.weight", (s.vision.d_model, 3 * s.vision.patch_size**2)
             rows[0] = Weight("vision.patch_embed.weight", source, MATRIX, shape, shape, regroup=3)
         return [
             *rows,
             *self._connector(s),
             *language.weights(s, self.LM),
-            *vector("lm.norm.weight", self.LM + "norm.weight", s.d_model),
+            *vector("lm.norm.weight", self.LM + "norm.weight", s.lm.d_model),
         ]
 
     def _connector(self, s: Sizes) -> List[Weight]:
         source = self.root + "mlp1."
         if self.merge == 1:
-            return linear("projector", source + "0", s.d_model, s.d_vision, bias=True)
+            return linear("projector", source + "0", s.lm.d_model, s.vision.d_model, bias=True)
         # The patches of a square stand side by side for each feature there, the features of each patch here.
-        n_patch, d = self.merge**2, self.merge**2 * s.d_vision
-        up = linear("connector.up", source + "1", s.d_model, d, bias=True)
+        n_patch, d = self.merge**2, self.merge**2 * s.vision.d_model
+        up = linear("connector.up", source + "1", s.lm.d_model, d, bias=True)
         return [
             *(row._replace(regroup=n_patch) for row in norm("connector.norm", source + "0", d)),
             up[0]._replace(regroup=n_patch),
             up[1],
-            *linear("connector.down", source + "3", s.d_model, s.d_model, bias=True),
+            *linear("connector.down", source + "3", s.lm.d_model, s.lm.d_model, bias=True),
         ]
 
     def dropped(self, s: Sizes) -> List[Dropped]:
-        head, d = self.root + "vision_model.vision_model.head.", s.d_vision
+        head, d = self.root + "vision_model.vision_model.head.", s.vision.d_model
         pool = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
         for name, d_out, d_in in (
             ("attention.out_proj", d, d),
-            ("mlp.fc1", s.d_vision_ff, d),
-            ("mlp.fc2", d, s.d_vision_ff),
+            ("mlp.fc1", s.vision.d_ff, d),
+            ("mlp.fc2", d, s.vision.d_ff),
         ):
             pool.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
         pool.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
         rows = [Dropped(head + name, shape, "pooling head of the tower") for name, shape in pool.items()]
-        lm_head = Dropped(self.root + "language_model.lm_head.weight", (s.n_vocab, s.d_model), "language head")
+        lm_head = Dropped(self.root + "language_model.lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "language head")
         mask = Dropped("action_head.mask_token", (1, 1, s.d_dit), "stands for the state in training")
         return [*rows, lm_head, mask]
 
     def keys(self, s: Sizes) -> Dict[str, Dict[str, object]]:
         u32 = {
-            "vision.d_model": s.d_vision,
-            "vision.n_layer": s.n_vision_layer,
-            "vision.n_head": s.n_vision_head,
-            "vision.d_ff": s.d_vision_ff,
-            "vision.patch_size": s.patch_size,
+            "vision.d_model": s.vision.d_model,
+            "vision.n_layer": s.vision.n_layer,
+            "vision.n_head": s.vision.n_head,
+            "vision.d_ff": s.vision.d_ff,
+            "vision.patch_size": s.vision.patch_size,
         }
         if self.merge == 1:
             u32["vision.image_size"] = s.image_width
             return {
                 "u32": u32,
-                "f32": {"vision.norm_eps": s.vision_eps},
+                "f32": {"vision.norm_eps": s.vision.norm_eps},
                 "string": {"vision.position_rule": "row_major"},
             }
         u32.update(
@@ -200,7 +197,7 @@ class Eagle:
                 "connector.factor": self.merge,
             }
         )
-        return {"u32": u32, "f32": {"vision.norm_eps": s.vision_eps, "connector.norm_eps": 1e-5}}
+        return {"u32": u32, "f32": {"vision.norm_eps": s.vision.norm_eps, "connector.norm_eps": 1e-5}}
 
 
 EAGLE_2_5 = Eagle(

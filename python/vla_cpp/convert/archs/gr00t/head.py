@@ -12,9 +12,10 @@ from typing import Dict, List
 
 from ...files import member
 from ...layers import linear, norm
+from ...networks import MAX_LAYERS
 from ...section import Fixed, Section
 from .. import MATRIX, TABLE, VECTOR, Weight
-from .sizes import MAX_LAYERS, Sizes
+from .sizes import Sizes
 
 HEAD = "action_head."
 # DiT and SelfAttentionTransformer of gr00t/model/modules/dit.py.
@@ -53,8 +54,8 @@ def read(policy: Section, s: Sizes) -> None:
     s.n_step, s.n_bucket = policy.count("num_inference_timesteps"), policy.count("num_timestep_buckets")
     if "rtc_ramp_rate" in policy.defaults:
         s.rtc_ramp_rate = policy.number("rtc_ramp_rate")
-    if policy.count("backbone_embedding_dim") != s.d_model:
-        policy.bad("backbone_embedding_dim", "the language model's width {}".format(s.d_model))
+    if policy.count("backbone_embedding_dim") != s.lm.d_model:
+        policy.bad("backbone_embedding_dim", "the language model's width {}".format(s.lm.d_model))
     if s.n_position < s.horizon:
         policy.bad("max_seq_len", "a row for each of the {} actions".format(s.horizon))
     _read_transformer(policy, s)
@@ -90,8 +91,8 @@ def _read_attention(policy: Section, s: Sizes) -> None:
     if not s.n_vl_layer:
         return
     s.n_vl_head = attention.count("num_attention_heads")
-    if s.n_vl_head * attention.count("attention_head_dim") != s.d_model:
-        attention.bad("num_attention_heads", "heads that make the language model's width {}".format(s.d_model))
+    if s.n_vl_head * attention.count("attention_head_dim") != s.lm.d_model:
+        attention.bad("num_attention_heads", "heads that make the language model's width {}".format(s.lm.d_model))
 
 
 def weights(s: Sizes) -> List[Weight]:
@@ -113,7 +114,7 @@ def _attention_and_ffn(target: str, block: str, d: int, d_in: int, d_ff: int) ->
 
 
 def _features(s: Sizes) -> List[Weight]:
-    d, rows = s.d_model, norm("vl.norm", HEAD + "vlln", s.d_model)
+    d, rows = s.lm.d_model, norm("vl.norm", HEAD + "vlln", s.lm.d_model)
     for i in range(s.n_vl_layer):
         target, block = "vl.blk.{}.".format(i), "{}vl_self_attention.transformer_blocks.{}.".format(HEAD, i)
         rows += norm(target + "attn_norm", block + "norm1", d) + norm(target + "ffn_norm", block + "norm3", d)
@@ -131,7 +132,7 @@ def _transformer_rows(s: Sizes) -> List[Weight]:
         target, block = "dit.blk.{}.".format(i), "{}transformer_blocks.{}.".format(source, i)
         rows += linear(target + "ada", block + "norm1.linear", 2 * d, d, bias=True)
         # Even blocks read the features, odd ones themselves.
-        rows += _attention_and_ffn(target, block, d, d if i % 2 else s.d_model, s.d_dit_ff)
+        rows += _attention_and_ffn(target, block, d, d if i % 2 else s.lm.d_model, s.d_dit_ff)
     rows += linear("dit.out_ada", source + "proj_out_1", 2 * d, d, bias=True)
     return rows + linear("dit.out", source + "proj_out_2", s.d_out, d, bias=True)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of GR00T N1.6 and N1.7: the pipeline of their processor, and the size that comes out.
+"""Images of GR00T N1.6 and N1.7: the pipeline of their processor, and the size that comes out.
 
 Reference: Isaac-GR00T gr00t/model/gr00t_n1d7/image_augmentations.py, which lerobot policies/groot/processor_groot.py
 (_transform_n1_7_image_for_vlm_albumentations) equals.
@@ -21,24 +21,24 @@ STANDARDIZE = {"op": "standardize", "mean": [0.5] * 3, "std": [0.5] * 3, "arithm
 MAX_SIDE = 8192
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     width: int
     height: int
     ops: List[dict]
 
 
 class Area(NamedTuple):
-    """The sides and areas of pictures that the backbone's image processor leaves alone."""
+    """The sides and areas of images that the backbone's image processor leaves alone."""
 
     file: str  # that states them
     filter: str  # by which it resizes others
-    shortest: int  # side of a picture
+    shortest: int  # side of an image
     multiple: int
     least: int
     most: int
 
 
-def read_pictures(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Pictures:
+def read_images(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Images:
     """`processor`: the members of processor_kwargs."""
     edge, fraction = _edge(processor), _fraction(processor)
     pad, camera_size = options.letterbox or processor.get("letter_box_transform") is True, options.camera_size
@@ -57,11 +57,11 @@ def read_pictures(processor: Section, area: Area, options: Options, notes: List[
     ops += [{"op": "size", "width": width, "height": height}, STANDARDIZE]
     if not pad:
         notes.append(
-            "pictures keep their aspect: those of {} are taken, others are refused ({})".format(
+            "images keep their aspect: those of {} are taken, others are refused ({})".format(
                 camera_size or "square cameras", DOCS
             )
         )
-    return Pictures(width, height, ops)
+    return Images(width, height, ops)
 
 
 def _pair(processor: Section, key: str) -> int:
@@ -105,7 +105,7 @@ def _fraction(processor: Section) -> float:
 
 
 def _camera(given: str, edge: int, pad: bool) -> Tuple[int, int]:
-    """Width and height at which pictures come to the pipeline, all that matters of them being their aspect."""
+    """Width and height at which images come to the pipeline, all that matters of them being their aspect."""
     if not given or pad:
         return edge, edge
     parts = given.lower().split("x")
@@ -122,7 +122,7 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
 
 
 def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int, int]:
-    """The size that the backbone's image processor makes of a picture (smart_resize)."""
+    """The size that the backbone's image processor makes of an image (smart_resize)."""
     unit = area.multiple
     sides = [max(area.shortest, round(side / unit) * unit) for side in (width, height)]
     size = sides[0] * sides[1]
@@ -134,6 +134,6 @@ def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int,
         sides = [math.ceil(side * grow / unit) * unit for side in (width, height)]
     if max(width, height) > 200 * min(width, height) or max(sides) > MAX_SIDE:
         problems.unsupported(
-            "--camera-size", "pictures of at most 200 times the other side", "{}x{}".format(width, height)
+            "--camera-size", "images of at most 200 times the other side", "{}x{}".format(width, height)
         )
     return sides[0], sides[1]

@@ -15,18 +15,19 @@ from ...bundle import Key, keys_by_type
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import member, read_json
+from ...networks import MAX_LAYERS
 from ...section import Fixed, Section
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan, Weight
 from . import head, language
-from .pictures import Pictures, read_pictures
+from .images import Images, read_images
 from .prompt import text_ops
 from .robot import PROCESSOR, STATISTICS, Robot, choose, embodiment_index, processor_file, read_robot
-from .sizes import MAX_LAYERS, Sizes
+from .sizes import Sizes
 from .vectors import action_ops, feature_description, gripper_ops, state_ops, statistics_of
 
 POLICY = "config.json"
-# Gr00tN1d7Processor of Isaac-GR00T. LeRobot reads an absent size of pictures otherwise, so that these must be stated, if only as null.
+# Gr00tN1d7Processor of Isaac-GR00T. LeRobot reads an absent size of images otherwise, so that these must be stated, if only as null.
 KWARGS = {
     "modality_configs": None,
     "use_percentiles": False,
@@ -53,7 +54,7 @@ KWARGS_IGNORED = set(
 )
 
 
-# Keys of training, of precision and of transformers, and those of pictures, text and statistics, which processor_config.json states for
+# Keys of training, of precision and of transformers, and those of images, text and statistics, which processor_config.json states for
 # the processor: that is where the reference reads them.
 IGNORED = set(
     """
@@ -98,11 +99,11 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
         where = "{}: {}.state: delta_indices".format(PROCESSOR, options.embodiment)
         problems.add(where, "state_history_length {} moments".format(s.state_history), str(robot.n_moment))
     area = backbone.read_area(folder, s, problems)
-    pictures = read_pictures(processor, area, options, checkpoint.notes, problems)
+    images = read_images(processor, area, options, checkpoint.notes, problems)
     if processor.count("max_state_dim") * s.state_history != s.d_state:
         processor.bad("max_state_dim", "{} as in config.json".format(s.d_state // s.state_history))
-    s.image_width, s.image_height = pictures.width, pictures.height
-    parts = Parts(backbone, folder, robot, pictures, processor.get("formalize_language"))
+    s.image_width, s.image_height = images.width, images.height
+    parts = Parts(backbone, folder, robot, images, processor.get("formalize_language"))
     return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
 
 
@@ -112,7 +113,7 @@ class Parts(NamedTuple):
     backbone: Any
     folder: str  # the backbone's
     robot: Robot
-    pictures: Pictures
+    images: Images
     formalize: bool  # instructions are cleaned
 
 
@@ -127,11 +128,11 @@ def assemble(
 ) -> Plan:
     """`keys`, `rows`: the network's."""
     robot, backbone = parts.robot, parts.backbone
-    tokenizer = read_tokenizer(parts.folder, s.n_vocab, problems, checkpoint.notes)
+    tokenizer = read_tokenizer(parts.folder, s.lm.n_vocab, problems, checkpoint.notes)
     problems.raise_any()  # a prompt takes a sound tokenizer
     prompt = backbone.read_prompt(tokenizer, parts.folder, s, problems)
     document = {
-        "image": parts.pictures.ops,
+        "image": parts.images.ops,
         "text": text_ops(backbone.TEMPLATE, parts.formalize, prompt, s),
         "state": state_ops(robot, s, problems),
         "action": action_ops(robot, s, problems),
@@ -210,6 +211,6 @@ def weights(release: Release, s: Sizes) -> List[Weight]:
 
 def _hints(backbone: Any, s: Sizes) -> Dict[str, str]:
     return {
-        backbone.LM + "layers.": "select_layer keeps {} language layers, 0 to {}".format(s.n_layer, s.n_layer - 1),
+        backbone.LM + "layers.": "select_layer keeps {} language layers, 0 to {}".format(s.lm.n_layer, s.lm.n_layer - 1),
         "action_head.vl_self_attention.": "vl_self_attention_cfg of config.json has {} layers".format(s.n_vl_layer),
     }

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The backbone of GR00T N1.7, a Qwen3-VL: its config.json, its tensors, its keys, and the areas of the pictures that it takes.
+"""The backbone of GR00T N1.7, a Qwen3-VL: its config.json, its tensors, its keys, and the areas of the images that it takes.
 
 Keys of the config that its classes do not read stay without effect there too.
 """
@@ -15,18 +15,19 @@ from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
 from ...files import member, read_json
 from ...layers import linear, norm, vector
+from ...networks import MAX_LAYERS
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
 from .. import MATRIX, TABLE, VECTOR, Dropped, Weight
 from . import language
 from . import prompt as prompts
-from .pictures import Area
+from .images import Area
 from .prompt import END, START, Prompt, Template
-from .sizes import MAX_LAYERS, WHERE, Sizes
+from .sizes import WHERE, Sizes
 
 VISUAL, LM = "backbone.model.model.visual.", "backbone.model.model.language_model."
 OPEN, CLOSE, IMAGE = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"
-# One turn without a system turn, the pictures before the instruction.
+# One turn without a system turn, the images before the instruction.
 TEMPLATE = Template(START + "user\n", END + "\n", OPEN, IMAGE, CLOSE)
 FOLDER = "--backbone needs the folder of nvidia/Cosmos-Reason2-2B"
 # Qwen3VLVisionConfig, Qwen3VLTextConfig and Qwen3VLConfig of transformers.
@@ -93,25 +94,25 @@ def _read_vision(vision: Section, s: Sizes) -> None:
     side = vision.get("patch_size")
     if isinstance(side, list) and len(side) == 2 and side[0] == side[1]:
         vision.values = {**vision.values, "patch_size": side[0]}
-    s.patch_size, s.n_vision_layer = vision.count("patch_size"), vision.count("depth", most=MAX_LAYERS)
-    s.d_vision, s.d_vision_ff = vision.count("hidden_size"), vision.count("intermediate_size")
-    s.n_vision_head = vision.count("num_heads")
+    s.vision.patch_size, s.vision.n_layer = vision.count("patch_size"), vision.count("depth", most=MAX_LAYERS)
+    s.vision.d_model, s.vision.d_ff = vision.count("hidden_size"), vision.count("intermediate_size")
+    s.vision.n_head = vision.count("num_heads")
     s.n_position_side = math.isqrt(vision.count("num_position_embeddings"))
-    if s.d_vision % s.n_vision_head or s.d_vision // s.n_vision_head % 4:
-        vision.bad("num_heads", "heads of a multiple of 4, which divide hidden_size {}".format(s.d_vision))
+    if s.vision.d_model % s.vision.n_head or s.vision.d_model // s.vision.n_head % 4:
+        vision.bad("num_heads", "heads of a multiple of 4, which divide hidden_size {}".format(s.vision.d_model))
     if s.n_position_side**2 != vision.get("num_position_embeddings"):
         vision.bad("num_position_embeddings", "a square")
-    if vision.count("out_hidden_size") != s.d_model:
-        vision.bad("out_hidden_size", "the language model's width {}".format(s.d_model))
+    if vision.count("out_hidden_size") != s.lm.d_model:
+        vision.bad("out_hidden_size", "the language model's width {}".format(s.lm.d_model))
     layers = vision.get("deepstack_visual_indexes")
     if (
         not isinstance(layers, list)
-        or any(type(i) is not int or not 0 <= i < s.n_vision_layer for i in layers)
+        or any(type(i) is not int or not 0 <= i < s.vision.n_layer for i in layers)
         or sorted(set(layers)) != layers
-        or not 1 <= len(layers) <= s.n_layer
+        or not 1 <= len(layers) <= s.lm.n_layer
     ):
         expected = "rising numbers of layers below {}, no more than the {} language layers".format(
-            s.n_vision_layer, s.n_layer
+            s.vision.n_layer, s.lm.n_layer
         )
         vision.bad("deepstack_visual_indexes", expected)
         layers = []
@@ -124,11 +125,11 @@ def _read_rope(text: Section, s: Sizes) -> None:
     if rope.get("rope_type") not in (None, "default") or rope.get("type") not in (None, "default", "mrope"):
         rope.bad("rope_type", "'default'", unsupported=True)
     rope.check_fixed({"mrope_interleaved": (True, True)})
-    s.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
+    s.lm.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
     sections = rope.get("mrope_section")
     counts = isinstance(sections, list) and len(sections) == 3 and all(type(n) is int and n > 0 for n in sections)
-    if not counts or sum(sections) != s.d_head // 2 or 3 * max(sections[1:]) > s.d_head // 2:
-        expected = "three counts for time, height and width that make {}, half a head's width".format(s.d_head // 2)
+    if not counts or sum(sections) != s.lm.d_head // 2 or 3 * max(sections[1:]) > s.lm.d_head // 2:
+        expected = "three counts for time, height and width that make {}, half a head's width".format(s.lm.d_head // 2)
         rope.bad("mrope_section", expected)
         sections = [1, 1, 1]
     s.rope_sections = sections
@@ -138,13 +139,13 @@ def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
     """What smart_resize of its image processor leaves alone."""
     path = os.path.join(folder, FILE)
     if not os.path.exists(path):
-        hint = "it lies beside the backbone's config.json, and says to which sizes pictures are held"
+        hint = "it lies beside the backbone's config.json, and says to which sizes images are held"
         raise refuse(path, "the backbone's image processor", "none", hint, Code.IO)
     section = Section("backbone " + FILE, read_json(path), SIZES, problems)
     section.refuse_unknown({*SIZES, *IMAGE_FIXED, *IMAGE_IGNORED, "patch_size"})
     section.check_fixed(IMAGE_FIXED)
-    if section.get("patch_size") != s.patch_size:
-        section.bad("patch_size", "{} as in the backbone's vision_config".format(s.patch_size))
+    if section.get("patch_size") != s.vision.patch_size:
+        section.bad("patch_size", "{} as in the backbone's vision_config".format(s.vision.patch_size))
     size = section.get("size") if isinstance(section.get("size"), dict) else {}
     limits = []
     for own, key in (("min_pixels", "shortest_edge"), ("max_pixels", "longest_edge")):
@@ -153,7 +154,7 @@ def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
             section.bad("size", "shortest_edge and longest_edge, counts of pixels")
             stated = 1
         limits.append(stated)
-    return Area(FILE, "torch_bicubic_16bit", 0, 2 * s.patch_size, *limits)
+    return Area(FILE, "torch_bicubic_16bit", 0, 2 * s.vision.patch_size, *limits)
 
 
 def weights(s: Sizes) -> List[Weight]:
@@ -162,8 +163,8 @@ def weights(s: Sizes) -> List[Weight]:
 
 def _patch(target: str, s: Sizes, time: int) -> Weight:
     """One time slice of the convolution, whose stride is its kernel: a matrix over channel, row, column."""
-    side, source = s.patch_size, VISUAL + "patch_embed.proj.weight"
-    return Weight(target, source, MATRIX, (s.d_vision, 3, 2, side, side), (s.d_vision, 3 * side**2), pick=(2, time))
+    side, source = s.vision.patch_size, VISUAL + "patch_embed.proj.weight"
+    return Weight(target, source, MATRIX, (s.vision.d_model, 3, 2, side, side), (s.vision.d_model, 3 * side**2), pick=(2, time))
 
 
 def _third(target: str, source: str, d: int, i: int) -> List[Weight]:
@@ -175,31 +176,31 @@ def _third(target: str, source: str, d: int, i: int) -> List[Weight]:
 
 
 def _merger(target: str, source: str, s: Sizes, d_norm: int) -> List[Weight]:
-    d = 4 * s.d_vision
+    d = 4 * s.vision.d_model
     return [
         *norm(target + "norm", source + "norm", d_norm),
         *linear(target + "up", source + "linear_fc1", d, d, bias=True),
-        *linear(target + "down", source + "linear_fc2", s.d_model, d, bias=True),
+        *linear(target + "down", source + "linear_fc2", s.lm.d_model, d, bias=True),
     ]
 
 
 def _vision(s: Sizes) -> List[Weight]:
-    d, table = s.d_vision, (s.n_position_side**2, s.d_vision)
+    d, table = s.vision.d_model, (s.n_position_side**2, s.vision.d_model)
     rows = [
         _patch("vision.patch_embed.weight", s, 0),
         _patch("vision.patch_embed_next.weight", s, 1),
         *vector("vision.patch_embed.bias", VISUAL + "patch_embed.proj.bias", d),
         Weight("vision.position.weight", VISUAL + "pos_embed.weight", TABLE, table, table),
     ]
-    for i in range(s.n_vision_layer):
+    for i in range(s.vision.n_layer):
         target, block = "vision.blk.{}.".format(i), "{}blocks.{}.".format(VISUAL, i)
         rows += norm(target + "attn_norm", block + "norm1", d)
         for part, name in enumerate(("attn_q", "attn_k", "attn_v")):
             rows += _third(target + name, block + "attn.qkv", d, part)
         rows += linear(target + "attn_out", block + "attn.proj", d, d, bias=True)
         rows += norm(target + "ffn_norm", block + "norm2", d)
-        rows += linear(target + "ffn_up", block + "mlp.linear_fc1", s.d_vision_ff, d, bias=True)
-        rows += linear(target + "ffn_down", block + "mlp.linear_fc2", d, s.d_vision_ff, bias=True)
+        rows += linear(target + "ffn_up", block + "mlp.linear_fc1", s.vision.d_ff, d, bias=True)
+        rows += linear(target + "ffn_down", block + "mlp.linear_fc2", d, s.vision.d_ff, bias=True)
     rows += _merger("connector.", VISUAL + "merger.", s, d)
     for k in range(len(s.deepstack_layers)):
         rows += _merger("deepstack.{}.".format(k), "{}deepstack_merger_list.{}.".format(VISUAL, k), s, 4 * d)
@@ -208,11 +209,11 @@ def _vision(s: Sizes) -> List[Weight]:
 
 def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
     u32 = {
-        "vision.d_model": s.d_vision,
-        "vision.n_layer": s.n_vision_layer,
-        "vision.n_head": s.n_vision_head,
-        "vision.d_ff": s.d_vision_ff,
-        "vision.patch_size": s.patch_size,
+        "vision.d_model": s.vision.d_model,
+        "vision.n_layer": s.vision.n_layer,
+        "vision.n_head": s.vision.n_head,
+        "vision.d_ff": s.vision.d_ff,
+        "vision.patch_size": s.vision.patch_size,
         "vision.image_width": s.image_width,
         "vision.image_height": s.image_height,
         "vision.n_position_side": s.n_position_side,
@@ -262,5 +263,5 @@ def _check_template(folder: str, problems: Problems) -> None:
 
 def dropped(s: Sizes) -> List[Dropped]:
     reason = "final language norm: the action head reads the last layer as it is before it"
-    head = Dropped("backbone.model.lm_head.weight", (s.n_vocab, s.d_model), "language head")
-    return [Dropped(LM + "norm.weight", (s.d_model,), reason), head]
+    head = Dropped("backbone.model.lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "language head")
+    return [Dropped(LM + "norm.weight", (s.lm.d_model,), reason), head]

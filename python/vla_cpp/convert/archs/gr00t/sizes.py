@@ -7,35 +7,23 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import List, Optional
 
+from ...networks import Language, Vision
+
 WHERE = "backbone config.json"
-MAX_LAYERS = 1024
 
 
 @dataclass
 class Sizes:
     """Widths and counts; the names are those of the bundle's keys."""
 
-    d_vision: int = 0
-    n_vision_layer: int = 0
-    n_vision_head: int = 0
-    d_vision_ff: int = 0
-    patch_size: int = 0
+    vision: Vision = field(default_factory=Vision)
     image_width: int = 0
     image_height: int = 0
     n_position_side: int = 0
     merge: int = 2  # patches on a side of what becomes one token
     deepstack_layers: List[int] = field(default_factory=list)
-    d_model: int = 0
-    n_layer: int = 0
-    n_head: int = 0
-    n_head_kv: int = 0
-    d_head: int = 0
-    d_ff: int = 0
-    n_vocab: int = 0
+    lm: Language = field(default_factory=Language)
     n_context: int = 0
-    vision_eps: float = 0.0
-    lm_eps: float = 0.0
-    rope_base: float = 0.0
     rope_sections: List[int] = field(default_factory=list)
     n_vl_layer: int = 0
     n_vl_head: int = 1
@@ -61,7 +49,7 @@ class Sizes:
 
     @property
     def d_vl_ff(self) -> int:
-        return 4 * self.d_model
+        return 4 * self.lm.d_model
 
     @property
     def d_dit_ff(self) -> int:
@@ -69,5 +57,5 @@ class Sizes:
 
     @property
     def n_view_token(self) -> int:
-        side = self.merge * self.patch_size
+        side = self.merge * self.vision.patch_size
         return self.image_width // side * (self.image_height // side)
