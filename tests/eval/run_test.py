@@ -133,6 +133,25 @@ def test_a_pair_that_differs_is_told_episode_by_episode(call, tmp_path, capsys):
     assert all(row["max"] > 0 for row in data["differences"])
 
 
+# Eight steps of each chunk; where the robot waits, three more at each look but the first.
+@pytest.mark.parametrize("mode, n_look", [("sync", 4), ("async", 5), ("rtc", 5)])
+def test_chunks_that_come_late_cost_the_robot_the_steps_that_the_mode_says(call, tmp_path, mode, n_look):
+    late = ["--mode", mode, "--latency-ms", "300", "--task", "still"]  # three steps at 10 Hz
+    assert main(call(mode, *late, episodes=2)) == 0
+    assert main(call(mode + "-again", *late, "--workers", "1", episodes=2)) == 0
+    assert outcomes(tmp_path / mode) == outcomes(tmp_path / (mode + "-again"))
+    for row in rows_of(tmp_path / mode):
+        assert row["steps"] == 40 and row["round_trip_ms"] == [300.0] * n_look
+        assert row["facts"]["held"] == 0  # the chunk before had rows enough
+
+
+def test_a_chunk_later_than_the_one_before_lasts_leaves_the_robot_without_an_action(call, tmp_path):
+    assert main(call("late", "--mode", "async", "--latency-ms", "1500", "--task", "still", episodes=1)) == 0
+    (row,) = rows_of(tmp_path / "late")
+    assert row["facts"]["held"] > 0
+    assert json.loads((tmp_path / "late/episodes.jsonl").read_text().splitlines()[0])["run"]["latency_ms"] == 1500
+
+
 def test_the_replan_study_has_a_row_for_each_interval(bundle, binary, tmp_path, capsys):
     call = ["replan", "--environment", "null", "--bundle", str(bundle), "--vla", str(binary), "--intervals", "4,16", "--task", "still"]
     assert main([*call, "--episodes", "2", "--out", str(tmp_path), "--quiet", "--json"]) == 0
@@ -148,6 +167,8 @@ def test_the_replan_study_has_a_row_for_each_interval(bundle, binary, tmp_path, 
         (["--episodes", "0"], "take 1 or more"),
         (["--against", "random"], "go together"),
         (["--swap"], "has an opposite"),
+        (["--latency-ms", "-1"], "--latency-ms: expected 0 or more, found -1"),
+        (["--mode", "rtc", "--film", "all"], "--mode and --latency-ms go with --bundle or --server"),
     ],
 )
 def test_a_wrong_call_says_what_is_wrong(call, more, told, capsys):

@@ -52,6 +52,8 @@ def build_parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=(find(name).__doc__ or text), formatter_class=formatter)
         _common(command)
         command.add_argument("--replan-every", type=int, default=0, metavar="S", help="steps executed of a chunk (default: the environment's)")
+        command.add_argument("--mode", choices=("sync", "async", "rtc"), default="sync", help="how chunks follow each other: the robot waits for each; it goes on with the one before meanwhile; the same, and the policy goes on from its rows (default sync)")
+        command.add_argument("--latency-ms", type=float, default=0.0, metavar="MS", help="let this time of the simulator pass between an observation and its chunk (default 0)")
         command.add_argument("--against", metavar="POLICY", help="compare with torch:DIR, another bundle, a server's address, or random")
         command.add_argument("--paired", action="store_true", help="with --against: the same seeds and noise, and every chunk of both at the same looks")
         command.add_argument("--swap", action="store_true", help="give each task the sentence of its opposite: solving the scene's own task is then a fault")
@@ -102,6 +104,11 @@ def evaluate(name: str, a: argparse.Namespace) -> Dict[str, Any]:
 
     if a.paired != bool(a.against):
         raise SystemExit(_usage("--against POLICY and --paired go together"))
+    if not 0 <= a.latency_ms < 1e5:
+        raise SystemExit(_usage(f"--latency-ms: expected 0 or more, found {a.latency_ms:g}"))
+    delayed = a.mode != "sync" or a.latency_ms > 0
+    if delayed and (a.against or a.film != "none" or a.torch or a.random):
+        raise SystemExit(_usage("--mode and --latency-ms go with --bundle or --server, and not with --against and --film"))
     jobs = _jobs(name, a)
     if a.swap:
         jobs = _swapped(name, jobs)
@@ -112,7 +119,8 @@ def evaluate(name: str, a: argparse.Namespace) -> Dict[str, Any]:
         if other:
             jobs = jobs + [Job(job.task, job.seed, "b", job.sentence) for job in jobs]
         data = runs.run(
-            name, driver, jobs, folder, b=other, replan_every=a.replan_every, workers=a.workers, title=name, fault=policies.fault, quiet=a.quiet
+            name, driver, jobs, folder, b=other, replan_every=a.replan_every, mode=a.mode, latency_ms=a.latency_ms, workers=a.workers, title=name,
+            fault=policies.fault, quiet=a.quiet,
         )  # fmt: skip
         runs.write_report(data, folder)
         if a.film != "none":

@@ -109,7 +109,7 @@ def run_episode(
             if out.solved or out.steps == guard.declaration.limit:
                 break
     out.clipped = guard.clipped
-    out.facts = _facts(guard)
+    out.facts = facts_of(guard)
     return out
 
 
@@ -124,6 +124,6 @@ def _look(guard: Guard, policy: EvalPolicy, text: str, noise: np.ndarray, out: O
     return Look(out.steps, observation, answer)
 
 
-def _facts(guard: Guard) -> Dict[str, Any]:
+def facts_of(guard: Guard) -> Dict[str, Any]:
     facts = getattr(guard.inner, "facts", None)
     return facts() if facts else {}

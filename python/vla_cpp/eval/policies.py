@@ -47,8 +47,12 @@ class ServedPolicy(EvalPolicy):
         self.identity = self.spec.bundle.checksum
         self.noise_shape = (self.spec.noise_rows, self.spec.d_noise)
 
+    def chunk(self, observation: Observation, text: str, noise: np.ndarray, leftover: Any = None) -> Any:
+        """The client's chunk; `leftover`: rows of the one before, where it is to go on from them."""
+        return self._client.act(images=observation.frames, state=observation.state, text=text, noise=noise, leftover=leftover)
+
     def act(self, observation: Observation, text: str, noise: np.ndarray) -> Answer:
-        chunk = self._client.act(images=observation.frames, state=observation.state, text=text, noise=noise)
+        chunk = self.chunk(observation, text, noise)
         return Answer(np.asarray(chunk), sum(chunk.timing.values()), dict(chunk.timing))
 
     def close(self) -> None:

@@ -94,6 +94,8 @@ def run(
     *,
     b: Optional[Driver] = None,
     replan_every: int = 0,
+    mode: str = "sync",
+    latency_ms: float = 0.0,
     workers: int,
     title: str,
     fault: Callable[[], Optional[str]] = no_fault,
@@ -108,7 +110,9 @@ def run(
         "replan_every": replan_every, **{key: declaration[key] for key in ("limit", "rate_hz", "conventions")},
     }  # fmt: skip
     drivers = {"a": a.description, **({"b": b.description} if b else {})}
-    plan = Plan(name, options, drivers, "b" if b else None, replan_every)
+    plan = Plan(name, options, drivers, "b" if b else None, replan_every, mode, latency_ms / 1e3)
+    if not plan.waits:
+        head.update(mode=mode, latency_ms=latency_ms)
     journal = Journal(folder, head)
     try:
         with progress(title, len(jobs), journal.outcomes, quiet) as on_episode:

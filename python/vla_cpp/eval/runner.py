@@ -15,6 +15,7 @@ from typing import Any, Callable, Dict, List, Optional
 from .environment import EnvironmentFault, Guard
 from .episode import Job, Outcome, run_episode
 from .journal import Journal
+from .policies import EvalPolicy
 from .serving import die_with_parent
 
 
@@ -31,6 +32,21 @@ class Plan:
     policies: Dict[str, Dict[str, Any]]
     shadow: Optional[str]
     replan_every: int
+    mode: str = "sync"
+    latency: float = 0.0  # seconds; with any, or a mode other than sync, the simulator does not wait for the policy
+
+    @property
+    def waits(self) -> bool:
+        return self.mode == "sync" and self.latency == 0
+
+
+def _run(plan: Plan, guard: Guard, policies: Dict[str, EvalPolicy], job: Job) -> Outcome:
+    if not plan.waits:
+        from .delayed import run_delayed
+
+        return run_delayed(guard, policies[job.driver], job, plan.replan_every, plan.mode, plan.latency)
+    shadow = policies[plan.shadow] if plan.shadow and plan.shadow != job.driver else None
+    return run_episode(guard, policies[job.driver], job, plan.replan_every, shadow)
 
 
 def _work(plan: Plan, jobs: Any, results: Any) -> None:
@@ -53,8 +69,7 @@ def _work(plan: Plan, jobs: Any, results: Any) -> None:
                 break
             if job.task not in guards:
                 guards[job.task] = Guard(make(plan.environment, job.task, **plan.options))
-            shadow = policies[plan.shadow] if plan.shadow and plan.shadow != job.driver else None
-            results.put(("done", run_episode(guards[job.task], policies[job.driver], job, plan.replan_every, shadow)))
+            results.put(("done", _run(plan, guards[job.task], policies, job)))
         results.put(("end", None))
     except (EnvironmentFault, MissingSimulator, ImportError, ValueError) as error:
         results.put(("fault", f"{_where(job)}{error}"))
