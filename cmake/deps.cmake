@@ -40,6 +40,11 @@ set(vla_ggml_tree ${VLA_GGML_DIR})
 if(NOT vla_ggml_tree)
   vla_fetch_ggml(vla_ggml_tree)
 endif()
+# What a library that carries a ggml of its own must have been built from (src/ggml/backend_library.h).
+set(VLA_BACKEND_BUILD "vla ${PROJECT_VERSION}, ggml of ${VLA_GGML_ARCHIVE}")
+if(VLA_GGML_DIR)
+  set(VLA_BACKEND_BUILD "vla ${PROJECT_VERSION}, ggml in ${VLA_GGML_DIR}")
+endif()
 set(BUILD_SHARED_LIBS OFF)
 set(GGML_NATIVE ${VLA_NATIVE} CACHE BOOL "" FORCE)
 set(GGML_OPENMP OFF CACHE BOOL "" FORCE)
@@ -47,6 +52,7 @@ set(GGML_LLAMAFILE ON CACHE BOOL "" FORCE)    # blocked float32 products
 set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle uses
 set(GGML_BUILD_TESTS OFF CACHE BOOL "" FORCE)
 set(GGML_BUILD_EXAMPLES OFF CACHE BOOL "" FORCE)
+set(GGML_VULKAN ${VLA_VULKAN} CACHE BOOL "" FORCE)
 add_subdirectory(${vla_ggml_tree} ${CMAKE_BINARY_DIR}/ggml EXCLUDE_FROM_ALL)
 foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about
   get_target_property(headers ${target} INTERFACE_INCLUDE_DIRECTORIES)

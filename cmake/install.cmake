@@ -4,7 +4,6 @@
 # `cmake --install`: the program, the shared library with its one header, and what find_package(vla) and pkg-config read.
 
 include(CMakePackageConfigHelpers)
-include(GNUInstallDirs)
 
 # Libraries that lie beside libvla.so go before the system's, also for what they need themselves: a Python wheel carries them.
 set_target_properties(vla_shared PROPERTIES INSTALL_RPATH "$ORIGIN")

@@ -89,9 +89,11 @@ typedef struct vla_options {
                           best for the bundle's dtype, which rounds to bf16 if the bundle and the machine have it */
   int32_t strict_state; /* 1: an observation whose state is far beyond what the policy has seen is refused with
                            VLA_BAD_OBSERVATION; 0: it is answered with a note */
+  const char* device; /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". Nothing takes the place of a device that
+                         is absent: opening fails with VLA_DEVICE, and `expected` lists what is there */
 } vla_options;
 #define VLA_OPTIONS_INIT \
-  { sizeof(vla_options), 0, NULL, 0 }
+  { sizeof(vla_options), 0, NULL, 0, NULL }
 
 /* Opens, checks and loads a bundle. `options` may be NULL: then they are as VLA_OPTIONS_INIT has them. On failure *out
  * is NULL. */
@@ -143,7 +145,7 @@ typedef struct vla_description {
   const char* dtype;     /* how matrices are stored: "f32", "bf16" or "f16" */
   const char* precision; /* of the large products: "f32", "bf16" with sums in float32, or "int8" */
   const char* kernels;   /* what computes them: "ggml", "avx2", ... */
-  const char* device;
+  const char* device;    /* "cpu, 8 threads", "vulkan:0, " and the name that its driver gives it */
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */
 
   size_t noise_rows; /* `horizon`, or more where the robot gets the first rows only of what the network computes */

@@ -37,7 +37,7 @@ class Error(_Struct):
 
 
 class Options(_Struct):
-    _fields_ = [("struct_size", c_size_t), ("n_thread", c_int32), ("kernels", c_char_p), ("strict_state", c_int32)]
+    _fields_ = [("struct_size", c_size_t), ("n_thread", c_int32), ("kernels", c_char_p), ("strict_state", c_int32), ("device", c_char_p)]
 
 
 class ViewInfo(_Struct):

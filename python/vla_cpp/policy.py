@@ -31,6 +31,7 @@ class Policy(Handle):
     kernels  "ggml", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to bf16; None: the best for the
              bundle's dtype
     strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
+    device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". A device that is absent is a DeviceError, which lists what is there
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
     of its parent, since the threads that compute stay behind, nor can it be pickled.
@@ -45,6 +46,7 @@ class Policy(Handle):
         threads: int = 0,
         kernels: Optional[str] = None,
         strict_state: bool = False,
+        device: Optional[str] = None,
     ) -> None:
         self._handle = ctypes.c_void_p()
         self._lock = threading.Lock()
@@ -56,6 +58,7 @@ class Policy(Handle):
             n_thread=threads,
             kernels=None if kernels is None else _encoded("kernels", kernels, UsageError),
             strict_state=bool(strict_state),
+            device=None if device is None else _encoded("device", device, UsageError),
         )
         if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
             raise self._last_error(None)

@@ -24,7 +24,7 @@ Conditions conditions_of(const Engine& engine, const Workload& workload, int n_s
   const auto text = [&](const char* key) { return *engine.bundle().keys().string(key); };  // every bundle has them
   return {text("vla.arch"),           text("vla.dtype"), text("vla.source.name"), workload.n_view(),
           workload.width(),           workload.height(), workload.n_text(),       n_step,
-          engine.device().n_thread(), engine.kernels()};
+          engine.device().n_thread(), engine.kernels(),  engine.device().name()};
 }
 
 /// Rounds of every number of steps.
@@ -44,7 +44,7 @@ Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const st
 
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher) {
-  VLA_TRY(const std::unique_ptr<Device> device, open_device(request.n_thread, request.kernels));
+  VLA_TRY(const std::unique_ptr<Device> device, open_device(request.n_thread, request.kernels, request.device));
   std::optional<RandomBundle> random;
   if (request.bundle.empty()) {
     VLA_TRY(RandomBundle made, make_random(request, watcher));
@@ -59,7 +59,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   Timing load;
   VLA_TRY(const std::unique_ptr<Engine> engine,
           Engine::load(random ? random->path() : request.bundle,
-                       {.n_thread = request.n_thread, .kernels = request.kernels}));
+                       {.n_thread = request.n_thread, .kernels = request.kernels, .device = request.device}));
   clock.lap(load, "load");
   report.load = load.front().second;
 

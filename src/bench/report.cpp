@@ -28,6 +28,7 @@ StageRow make_row(const std::string& name, const std::vector<double>& times, con
   if (row.p50 <= 0) return row;
   row.flop_rate = work.flop / (1e-3 * row.p50);
   row.byte_rate = work.bytes / (1e-3 * row.p50);
+  if (!report.conditions.on_cpu()) return row;  // the probes measure the CPU
   // A probe that something disturbed would flatter its round: no round's peak counts for less than their median.
   const double least = median_of(report.rounds, &Round::peak), least_int8 = median_of(report.rounds, &Round::int8_peak);
   std::vector<double> shares;
@@ -110,6 +111,7 @@ bool Report::is_disturbed(const Round& round) const {
 
 std::string Report::regime(const StageRow& row) const {
   if (row.work.flop == 0) return "host";
+  if (!conditions.on_cpu()) return "device";
   return arithmetic_time(row.work) >= row.work.bytes / bandwidth() ? "compute" : "memory";
 }
 
@@ -157,6 +159,7 @@ std::string to_json(const Report& report) {
   }
   root["stages"] = std::move(stages);
   root["kernels"] = c.kernels;
+  root["device"] = c.device;
   root["precision"] = report.precision;
   root["threads"] = c.n_thread;
   root["cpu"] = report.cpu;

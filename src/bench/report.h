@@ -15,7 +15,8 @@ namespace vla::bench {
 struct Conditions {
   std::string policy, weights, source;  // architecture, dtype, where the bundle's weights come from
   int n_view = 0, width = 0, height = 0, n_text = 0, n_step = 0, n_thread = 0;
-  std::string kernels;
+  std::string kernels, device;
+  bool on_cpu() const { return device.starts_with("cpu"); }
 };
 
 /// One line of the report: a stage, or `network` (the stages that compute on the device), or `total`. Rates and shares
@@ -26,7 +27,7 @@ struct StageRow {
   double p50 = 0, p90 = 0, min = 0;     // ms
   Work work;                            // zero for the host's stages
   double flop_rate = 0, byte_rate = 0;  // per second
-  double share_of_peak = 0;             // of the best round
+  double share_of_peak = 0;             // of the best round; shares are the CPU's alone
   double share_of_peak_p50 = 0;
   double share_of_bandwidth = 0;
   double floor = 0;  // ms: arithmetic at peak, or weights at bandwidth, whichever is longer

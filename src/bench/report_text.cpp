@@ -20,12 +20,15 @@ std::vector<std::string> cells(const StageRow& row, const Report& report) {
     cells.back() = "host";
     return cells;
   }
-  for (std::string cell : {fmt::format("{:.2f}", row.floor), fmt::format("{:.2f} x", row.above_floor()),
-                           fmt::format("{:.3g}", 1e-9 * row.work.flop), fmt::format("{:.3g}", 1e-9 * row.work.bytes),
-                           fmt::format("{:.1f}", row.intensity()), fmt::format("{:.1f}", 1e-9 * row.flop_rate),
-                           fmt::format("{:.1f} % ({:.1f} %)", 100 * row.share_of_peak_p50, 100 * row.share_of_peak),
-                           fmt::format("{:.1f}", 1e-9 * row.byte_rate),
-                           fmt::format("{:.0f} %", 100 * row.share_of_bandwidth), report.regime(row)})
+  // The probes measure the CPU, and say nothing of another device.
+  const auto on_cpu = [&](std::string cell) { return report.conditions.on_cpu() ? std::move(cell) : std::string(); };
+  for (std::string cell :
+       {on_cpu(fmt::format("{:.2f}", row.floor)), on_cpu(fmt::format("{:.2f} x", row.above_floor())),
+        fmt::format("{:.3g}", 1e-9 * row.work.flop), fmt::format("{:.3g}", 1e-9 * row.work.bytes),
+        fmt::format("{:.1f}", row.intensity()), fmt::format("{:.1f}", 1e-9 * row.flop_rate),
+        on_cpu(fmt::format("{:.1f} % ({:.1f} %)", 100 * row.share_of_peak_p50, 100 * row.share_of_peak)),
+        fmt::format("{:.1f}", 1e-9 * row.byte_rate), on_cpu(fmt::format("{:.0f} %", 100 * row.share_of_bandwidth)),
+        report.regime(row)})
     cells.push_back(std::move(cell));
   return cells;
 }
@@ -35,8 +38,8 @@ std::vector<std::string> around(const Report& report) {
   std::vector<std::string> lines = {
       fmt::format("{}, {} weights ({}): {} view{} of {} x {}, {} tokens, {} steps, batch 1", c.policy, c.weights,
                   c.source, c.n_view, c.n_view == 1 ? "" : "s", c.width, c.height, c.n_text, c.n_step),
-      fmt::format("{}, {} thread{}, kernels: {}, {}", report.cpu, c.n_thread, c.n_thread == 1 ? "" : "s", c.kernels,
-                  report.arithmetic)};
+      fmt::format("{}, {} thread{}, kernels: {}, {}", c.on_cpu() ? report.cpu : c.device + " beside " + report.cpu,
+                  c.n_thread, c.n_thread == 1 ? "" : "s", c.kernels, report.arithmetic)};
   for (std::size_t i = 0; i < report.before.peaks.size(); ++i) {
     const Roofs::Peak &before = report.before.peaks[i], &after = report.after.peaks[i];
     lines.push_back(fmt::format(

@@ -37,8 +37,9 @@ Result<Earlier> Earlier::read(const std::string& path) {
   try {  // the library throws where something is missing or of another type
     const Json root = Json::parse(last_line(bytes));
     const Json& c = root.at("conditions");
-    earlier.conditions_ = {c.at("policy"), c.at("weights"), c.at("source"), c.at("views"),      c.at("width"),
-                           c.at("height"), c.at("tokens"),  c.at("steps"),  root.at("threads"), root.at("kernels")};
+    earlier.conditions_ = {c.at("policy"),     c.at("weights"),    c.at("source"),          c.at("views"),
+                           c.at("width"),      c.at("height"),     c.at("tokens"),          c.at("steps"),
+                           root.at("threads"), root.at("kernels"), root.value("device", "")};
     earlier.cpu_ = root.at("cpu");
     earlier.peak_ = 1e9 * root.at("peak_gflops").get<double>();
     for (const auto& [stage, row] : root.at("stages").items())

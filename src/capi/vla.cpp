@@ -53,6 +53,9 @@ Result<Options> read_options(const vla_options* given) {
   if (known.kernels != nullptr) {
     VLA_TRY(options.engine.kernels, read_name(known.kernels, "options.kernels"));
   }
+  if (known.device != nullptr) {
+    VLA_TRY(options.engine.device, read_name(known.device, "options.device"));
+  }
   return options;
 }
 

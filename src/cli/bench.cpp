@@ -16,7 +16,7 @@ namespace vla::cli {
 namespace {
 
 struct BenchOptions {
-  std::string bundle, arch, size, dtype = "bf16", image_size, kernels, plot, vs;
+  std::string bundle, arch, size, dtype = "bf16", image_size, kernels, device, plot, vs;
   std::optional<int> n_view, n_text;
   std::vector<int> steps;
   int n_thread = 0, n_round = 7, n_warmup = 1;
@@ -28,6 +28,8 @@ Status check(const BenchOptions& options) {
     return Error{Code::usage, "bench", "BUNDLE or --arch ARCH", options.bundle.empty() ? "neither" : "both"};
   if (options.arch.empty() != options.size.empty())
     return Error{Code::usage, "--size", "--arch and --size together", "one of them"};
+  if (!options.plot.empty() && !options.device.empty() && options.device != "cpu")
+    return Error{Code::usage, "--plot", "the CPU, whose roofline is measured", "--device " + options.device};
   if (options.json && options.markdown)
     return Error{Code::usage, "--json", "--json or --markdown", "both", "run it twice to have both"};
   return {};
@@ -60,9 +62,9 @@ Status wait_for_line() {
 
 Status run_bench(const BenchOptions& options) {
   VLA_CHECK(check(options));
-  bench::Request request{options.bundle, options.arch,    dtype_of(options.dtype), {},
-                         options.steps,  options.n_round, options.n_warmup,        options.n_thread,
-                         options.kernels};
+  bench::Request request{options.bundle,  options.arch,    dtype_of(options.dtype), {},
+                         options.steps,   options.n_round, options.n_warmup,        options.n_thread,
+                         options.kernels, options.device};
   request.sizes = {options.n_view, 0, 0, options.n_text};
   if (!options.image_size.empty()) VLA_CHECK(parse_size(options.image_size, request.sizes));
   std::optional<bench::Earlier> earlier;
@@ -135,6 +137,7 @@ Command add_bench(CLI::App& app) {
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
   command->add_option("--kernels", options->kernels, kKernelsHelp);
+  command->add_option("--device", options->device, std::string(kDeviceHelp) + ". Shares of a peak are the CPU's alone");
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");
   command->add_option("--plot", options->plot, "Also draw the roofline into this SVG file");

@@ -15,6 +15,11 @@ constexpr const char* kKernelsHelp =
     "the bundle's "
     "dtype, which multiplies bf16 (by avx512_bf16 or amx) if the bundle is stored as bf16";
 
+/// Of --device, wherever a policy is loaded.
+constexpr const char* kDeviceHelp =
+    "cpu, or vulkan[:N] or cuda[:N] where vla inspect --devices lists it; not given: cpu. Nothing takes the place of a "
+    "device that is absent";
+
 /// Of --strict-state, wherever observations come in.
 constexpr const char* kStrictStateHelp =
     "Refuse a state that is far beyond what the policy has seen, instead of answering with a note";

@@ -14,8 +14,8 @@ namespace vla::cli {
 namespace {
 
 struct InspectOptions {
-  std::string bundle, manifest, graph, kernels;
-  bool json = false;
+  std::string bundle, manifest, graph, kernels, device;
+  bool json = false, devices = false;
 };
 
 std::string human_size(double bytes) {
@@ -148,6 +148,7 @@ void print_human(const Engine& engine) {
     for (const Json& op : ops) say(stdout, "    {}\n", text_of(op));
   }
   print_modules(engine);
+  say(stdout, "device       {}\n", d.device);
   say(stdout, "products     {}: {}\n", engine.linear_kernels(), engine.arithmetic());
   say(stdout, "memory       {} in all: weights {}, inputs and cache {}, working memory {}\n", size(d.memory.total()),
       size(d.memory.weights), size(d.memory.plan), size(d.memory.working));
@@ -167,6 +168,7 @@ void print_json(const Engine& engine) {
   root["modules"] = Json::object();
   for (const auto& [path, size] : module_sizes(engine.params()))
     root["modules"][path] = {{"parameters", size.n_param}, {"stored_bytes", size.stored}};
+  root["device"] = engine.device().name();
   root["linear_kernels"] = engine.linear_kernels();
   root["precision"] = engine.precision();
   root["real_time_chunking"] = kind_name(engine.real_time_chunking().kind);
@@ -180,6 +182,31 @@ void print_json(const Engine& engine) {
   say_lines(stdout, exact.dump(2, ' ', true, Json::error_handler_t::replace) + "\n");
 }
 
+Status print_devices() {
+  const DeviceList list = Engine::devices();
+  say(stdout, "{:<9}  {:>10}  {:>10}  {:<9}  {}\n", "device", "memory", "free", "products", "description");
+  const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
+  for (const DeviceInfo& device : list.devices)
+    say(stdout, "{:<9}  {:>10}  {:>10}  {:<9}  {}\n", device.name, size(device.memory), size(device.free),
+        device.precision, device.description);
+  for (const auto& [kind, reason] : list.absent) say(stdout, "no {}: {}\n", kind, reason);
+  return {};
+}
+
+Status print_devices_json() {
+  const DeviceList list = Engine::devices();
+  Json root = {{"devices", Json::array()}, {"absent", Json::object()}};
+  for (const DeviceInfo& device : list.devices)
+    root["devices"].push_back({{"name", device.name},
+                               {"description", device.description},
+                               {"memory_bytes", device.memory},
+                               {"free_bytes", device.free},
+                               {"products", device.precision}});
+  for (const auto& [kind, reason] : list.absent) root["absent"][kind] = reason;
+  say_lines(stdout, text_of(root, 2) + "\n");
+  return {};
+}
+
 Status print_graph(Engine& engine, const std::string& part) {
   VLA_TRY(const std::string text, engine.program_text(part == "prefix" ? Engine::Part::prefix : Engine::Part::step));
   fmt::print("phase kernel        MFLOP        MB  operation: operand -> results\n{}", text);
@@ -187,12 +214,15 @@ Status print_graph(Engine& engine, const std::string& part) {
 }
 
 Status inspect(const InspectOptions& options) {
-  if (options.manifest.empty() == options.bundle.empty())
-    return Error{Code::usage, "inspect", "BUNDLE or --manifest ARCH", options.bundle.empty() ? "neither" : "both"};
+  const int n_asked = !options.manifest.empty() + !options.bundle.empty() + options.devices;
+  if (n_asked != 1)
+    return Error{Code::usage, "inspect", "one of BUNDLE, --manifest ARCH and --devices",
+                 n_asked == 0 ? "none" : "several"};
+  if (options.devices) return options.json ? print_devices_json() : print_devices();
   if (!options.manifest.empty()) return print_manifest(options.manifest);
   // A dry load checks everything that a run would check and reserves the memory that it would take, without filling it.
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle, {.kernels = options.kernels, .dry = true}));
+          Engine::load(options.bundle, {.kernels = options.kernels, .device = options.device, .dry = true}));
   if (!options.graph.empty()) return print_graph(*engine, options.graph);
   options.json ? print_json(*engine) : print_human(*engine);
   return {};
@@ -206,7 +236,8 @@ Command add_inspect(CLI::App& app) {
       app.add_subcommand("inspect", "Show what a bundle is: features, statistics, recipe, sizes, memory");
   command->footer(
       "  vla inspect policy.gguf\n  vla inspect policy.gguf --json\n  vla inspect policy.gguf --graph step    # the "
-      "program that runs in every solver step\n  vla inspect --manifest smolvla    # parameters at the published size");
+      "program that runs in every solver step\n  vla inspect --manifest smolvla    # parameters at the published "
+      "size\n  vla inspect --devices");
   command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert");
   command->add_option("--manifest", options->manifest,
                       "Print the keys and parameters that an architecture declares, as JSON");
@@ -217,6 +248,8 @@ Command add_inspect(CLI::App& app) {
                    "shapes with their layout (@slot: outlives a run, @kept: made once per observation)")
       ->check(CLI::IsMember({"prefix", "step"}));
   command->add_option("--kernels", options->kernels, "As for vla run: what the program is made of");
+  command->add_option("--device", options->device, "As for vla run: whose memory and program are shown");
+  command->add_flag("--devices", options->devices, "List what --device may name here, and why the others are absent");
   command->add_flag("--json", options->json, "Print JSON for machines");
   return [options] { return inspect(*options); };
 }

@@ -16,7 +16,7 @@ namespace vla::cli {
 namespace {
 
 struct ReplayOptions {
-  std::string folder, bundle, kernels, connect;
+  std::string folder, bundle, kernels, device, connect;
   int n_thread = 0;
   serve::ReplayOptions replay;
 };
@@ -62,7 +62,8 @@ serve::ServerOptions limits_of(const v1::Limits& limits) {
 Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOptions& options) {
   VLA_TRY(const std::unique_ptr<serve::Server> server,
           serve::Server::open(limits_of(recording.description().limits())));
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          Engine::load(options.bundle, {options.n_thread, options.kernels, options.device}));
   options.replay.address = server->addresses().front();
   std::optional<Result<serve::ReplayReport>> result;
   VLA_TRY(std::thread client, start_thread("replay", [&]() noexcept {
@@ -100,6 +101,7 @@ Command add_replay(CLI::App& app) {
   CLI::Option* bundle = command->add_option("--bundle", options->bundle, "Serve this bundle for the replay instead");
   bundle->excludes(connect);
   command->add_option("--kernels", options->kernels, std::string(kKernelsHelp) + "; with --bundle")->needs(bundle);
+  command->add_option("--device", options->device, std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
   command->add_option("--threads", options->n_thread, "CPU threads, with --bundle; 0 takes every core")
       ->needs(bundle)
       ->check(CLI::Range(0, 512));

@@ -19,7 +19,7 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 
 struct RunOptions {
-  std::string bundle, text, noise, out, tap, taps_out, inject, kernels, leftover, schedule, normalized_out;
+  std::string bundle, text, noise, out, tap, taps_out, inject, kernels, device, leftover, schedule, normalized_out;
   std::vector<std::string> images, states;
   std::optional<std::uint64_t> seed;
   std::optional<int> delay;
@@ -134,8 +134,9 @@ void print_table(const ActionChunk& chunk, const Engine& engine) {
 void print_timing(const Timing& timing, const Engine& engine) {
   std::vector<std::string> parts;
   for (const auto& [stage, ms] : timing) parts.push_back(fmt::format("{} {:.1f}", stage, ms));
-  say(stdout, "ms: {}\nkernels: {}, {}\n", fmt::format("{}", fmt::join(parts, ", ")), engine.kernels(),
-      engine.arithmetic());
+  const std::string device = engine.device().name();
+  say(stdout, "ms: {}\nkernels: {}, {}{}\n", fmt::format("{}", fmt::join(parts, ", ")), engine.kernels(),
+      engine.arithmetic(), device.starts_with("cpu") ? "" : ", on " + device);
 }
 
 void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions& options) {
@@ -152,6 +153,7 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   root["timing_ms"] = std::move(timing);
   root["bundle"] = identity_json(engine.bundle());
   root["kernels"] = engine.kernels();
+  root["device"] = engine.device().name();
   root["precision"] = engine.precision();
   root["notes"] = chunk.notes;
   if (options.seed && options.noise.empty()) root["seed"] = *options.seed;
@@ -188,7 +190,8 @@ Status run(RunOptions& options) {
     VLA_TRY(inject, read_taps(options.inject));
   }
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle, {options.n_thread, options.kernels, options.tap, std::move(inject)}));
+          Engine::load(options.bundle,
+                       {options.n_thread, options.kernels, options.device, options.tap, std::move(inject)}));
   if (options.strict_state) engine->refuse_beyond();
   clock.lap(before, "load");
   Observation observation;
@@ -293,6 +296,7 @@ Command add_run(CLI::App& app) {
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
   command->add_option("--kernels", options->kernels, kKernelsHelp)->check(CLI::Validator(check_given, ""));
+  command->add_option("--device", options->device, kDeviceHelp)->check(CLI::Validator(check_given, ""));
   command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   return [options] { return run(*options); };
 }

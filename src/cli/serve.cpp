@@ -19,7 +19,7 @@ namespace vla::cli {
 namespace {
 
 struct ServeOptions {
-  std::string bundle, kernels;
+  std::string bundle, kernels, device;
   int n_thread = 0;
   bool strict_state = false;
   std::size_t max_message_mb = 32;
@@ -83,7 +83,8 @@ Status serve(ServeOptions& options) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Watch> watch, Watch::start(options.watch, *server, options.server.insecure));
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {options.n_thread, options.kernels}));
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          Engine::load(options.bundle, {options.n_thread, options.kernels, options.device}));
   watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   if (options.strict_state) engine->refuse_beyond();  // not before, as warming up takes any numbers
@@ -114,9 +115,11 @@ Command add_serve(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels, kKernelsHelp)->check([](const std::string& text) {
+  const auto check_given = [](const std::string& text) {
     return text.empty() ? "expected a value, found empty text" : "";
-  });
+  };
+  command->add_option("--kernels", options->kernels, kKernelsHelp)->check(check_given);
+  command->add_option("--device", options->device, kDeviceHelp)->check(check_given);
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();

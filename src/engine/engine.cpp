@@ -8,8 +8,6 @@
 #include <cmath>
 #include <new>
 
-#include "lower/open.h"
-
 namespace vla {
 namespace {
 
@@ -20,7 +18,7 @@ constexpr int kMaxHorizon = 4096;
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
   VLA_TRY(Bundle bundle, Bundle::open(path));
   VLA_TRY(Processor processor, Processor::create(bundle));
-  VLA_TRY(std::unique_ptr<Device> device, open_device(options.n_thread, options.kernels));
+  VLA_TRY(std::unique_ptr<Device> device, open_device(options.n_thread, options.kernels, options.device));
   std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
   engine->tap_pattern_ = options.tap_pattern;
   engine->dry_ = options.dry;
@@ -231,6 +229,7 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   }
   clock.lap(chunk.timing, "steps");
   const std::vector<float> result = plan->x();
+  VLA_CHECK(device_->failure());
   VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs_.raw_state));
   clock.lap(chunk.timing, "postprocess");
   chunk.horizon = horizon();

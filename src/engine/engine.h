@@ -11,6 +11,7 @@
 #include "engine/noise.h"
 #include "engine/plan.h"
 #include "engine/timing.h"
+#include "lower/open.h"
 #include "processor/processor.h"
 
 namespace vla {
@@ -18,6 +19,7 @@ namespace vla {
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
   std::string kernels;      // as choose_isa takes them; empty: the best that the machine has for the bundle's dtype
+  std::string device;       // cpu, vulkan:N or cuda:N, as open_device takes them; empty: the CPU
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
   /// Values at taps that take the place of the computed ones: as the network's own, or as `pixels` and `state`.
   std::vector<Tap> inject = {};
@@ -50,6 +52,9 @@ class Engine {
   /// Opens, checks and loads a bundle, and builds the largest plan. Errors: io, bad_bundle, unsupported, out_of_memory,
   /// device.
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
+
+  /// What `device` of the options may name on this machine.
+  static DeviceList devices() { return list_devices(); }
 
   /// From now on a state beyond the bundle's bound is refused, as Processor::refuse_beyond.
   void refuse_beyond() { processor_.refuse_beyond(); }

@@ -29,12 +29,6 @@ ggml_type type_of(DType type) {
   return GGML_TYPE_F32;
 }
 
-/// ggml's products of bf16 and f16 would round the activations first, so that matrices are widened. Rows of a table are
-/// widened exactly when they are looked up.
-ggml_type resident_type(const Param& param) {
-  return param.storage == Storage::table && param.source != nullptr ? type_of(param.source->type) : GGML_TYPE_F32;
-}
-
 void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
   if (type_of(param.source->type) == tensor->type)
     return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
@@ -49,18 +43,7 @@ void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
   ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * sizeof(float));
 }
 
-Error refused(const char* what) {
-  return {Code::out_of_memory, what, "", "the device refused the allocation", "free memory or use a smaller model"};
-}
-
 }  // namespace
-
-Result<ggml_context_ptr> make_context(std::size_t n, std::size_t extra) {
-  ggml_context_ptr context(
-      ggml_init({.mem_size = n * ggml_tensor_overhead() + extra, .mem_buffer = nullptr, .no_alloc = true}));
-  if (context) return context;
-  return refused("graph");
-}
 
 void GgmlDevice::FreePool::operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
 
@@ -68,6 +51,7 @@ Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
   ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);  // failures become an Error instead
   auto device = std::make_unique<GgmlDevice>();
   device->n_thread_ = n_thread;
+  device->text_ = fmt::format("cpu, {} thread{}", n_thread, n_thread == 1 ? "" : "s");
   device->backend_.reset(ggml_backend_cpu_init());
   if (!device->backend_) return Error{Code::device, "cpu", "a backend", "the system refused it"};
   ggml_threadpool_params params = ggml_threadpool_params_default(n_thread);
@@ -75,28 +59,53 @@ Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
   device->pool_.reset(ggml_threadpool_new(&params));
   ggml_backend_cpu_set_threadpool(device->backend_.get(), device->pool_.get());
   ggml_backend_cpu_set_n_threads(device->backend_.get(), n_thread);
+  device->memory_.emplace("cpu", ggml_backend_get_default_buffer_type(device->backend_.get()), nullptr);
   return std::unique_ptr<Device>(std::move(device));
 }
 
-std::string GgmlDevice::name() const { return fmt::format("cpu, {} thread{}", n_thread_, n_thread_ == 1 ? "" : "s"); }
+Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name) {
+  ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);
+  VLA_TRY(ggml_backend_dev_t found, find_device(name));
+  auto device = std::make_unique<GgmlDevice>();
+  device->n_thread_ = 1;  // the one that calls
+  device->text_ = fmt::format("{}, {}", name.text(), ggml_backend_dev_description(found));
+  device->keeps_f16_ = name.kind == "vulkan";
+  VLA_CHECK(device->guarded([&] { device->backend_.reset(ggml_backend_dev_init(found, nullptr)); }));
+  if (!device->backend_) return Error{Code::device, name.text(), "a device that starts", "its driver refused it"};
+  device->memory_.emplace(name.text(), ggml_backend_dev_buffer_type(found), found);
+  return std::unique_ptr<Device>(std::move(device));
+}
+
+/// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened. Rows of a table
+/// are widened exactly when they are looked up.
+ggml_type GgmlDevice::resident_type(const Param& param) const {
+  if (param.source == nullptr) return GGML_TYPE_F32;
+  const ggml_type stored = type_of(param.source->type);
+  const bool exact = param.storage == Storage::table || (param.is_matrix() && stored == GGML_TYPE_F16 && keeps_f16_);
+  return exact ? stored : GGML_TYPE_F32;
+}
 
 Status GgmlDevice::load(const ParamList& params, bool fill) {
+  if (!fill) memory_->set_dry();
   VLA_TRY(weight_context_, make_context(params.params().size()));
-  int n_matrix = 0;
+  int n_f32 = 0, n_f16 = 0;
   for (const Param& param : params.params()) {
-    n_matrix += param.is_matrix() ? 1 : 0;
-    weights_.push_back(ggml_new_tensor(weight_context_.get(), resident_type(param),
-                                       static_cast<int>(param.shape.size()), param.shape.data()));
+    const ggml_type type = resident_type(param);
+    if (param.is_matrix()) ++(type == GGML_TYPE_F16 ? n_f16 : n_f32);
+    weights_.push_back(
+        ggml_new_tensor(weight_context_.get(), type, static_cast<int>(param.shape.size()), param.shape.data()));
+    ggml_set_name(weights_.back(), param.name.c_str());
   }
-  text_ = n_matrix > 0 ? fmt::format("ggml ({} f32)", n_matrix) : "";
+  for (const auto& [n, type] : {std::pair{n_f32, "f32"}, {n_f16, "f16"}})
+    if (n > 0) linear_text_ += fmt::format("{}{} {}", linear_text_.empty() ? "ggml (" : " + ", n, type);
+  if (!linear_text_.empty()) linear_text_ += ")";
   if (weights_.empty()) return {};
-  weight_buffer_.reset(ggml_backend_alloc_ctx_tensors(weight_context_.get(), backend_.get()));
-  if (!weight_buffer_) return refused("weights");
+  VLA_TRY(weights_size_, memory_->place(weight_context_.get(), "weights", &weight_memory_));
   Room room;
   for (const Param& param : params.params()) {
     if (!fill) break;
     VLA_TRY(const auto data, params.bundle()->read(param.source->data, room));
-    upload(weight(&param), param, data.data());
+    VLA_CHECK(guarded([&] { upload(weight(&param), param, data.data()); }));
   }
   return {};
 }
@@ -104,25 +113,60 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
 Status GgmlDevice::allocate(Slots& slots) {
   struct Memory {
     ggml_context_ptr context;
-    ggml_backend_buffer_ptr buffer;
+    std::shared_ptr<void> buffers;
   };
   if (slots.all().empty()) return {};
   auto memory = std::make_shared<Memory>();
   VLA_TRY(memory->context, make_context(slots.all().size()));
   for (Slot& slot : slots.all())
     slot.place = ggml_new_tensor(memory->context.get(), type_of(slot.type), 4, slot.shape.data());
-  memory->buffer.reset(ggml_backend_alloc_ctx_tensors(memory->context.get(), backend_.get()));
-  if (!memory->buffer) return refused("inputs and cache");
-  ggml_backend_buffer_clear(memory->buffer.get(), 0);
-  slots.hold(memory, ggml_backend_buffer_get_size(memory->buffer.get()));
-  return {};
+  VLA_TRY(const std::size_t size, memory_->place(memory->context.get(), "inputs and cache", &memory->buffers));
+  slots.hold(memory, size);
+  if (memory_->is_dry()) return {};
+  return guarded([&] {
+    for (Slot& slot : slots.all()) {
+      auto* tensor = static_cast<ggml_tensor*>(slot.place);
+      ggml_backend_tensor_memset(tensor, 0, 0, ggml_nbytes(tensor));
+    }
+  });
 }
 
 void GgmlDevice::set(const Slot& slot, const void* data, std::size_t size) {
-  ggml_backend_tensor_set(static_cast<ggml_tensor*>(slot.place), data, 0, size);
+  const Status done = guarded([&] { ggml_backend_tensor_set(static_cast<ggml_tensor*>(slot.place), data, 0, size); });
+  if (!done) failure_ = done.error();
 }
+
 void GgmlDevice::get(const Slot& slot, void* data, std::size_t size) const {
-  ggml_backend_tensor_get(static_cast<const ggml_tensor*>(slot.place), data, 0, size);
+  const Status done =
+      guarded([&] { ggml_backend_tensor_get(static_cast<const ggml_tensor*>(slot.place), data, 0, size); });
+  if (!done) failure_ = done.error();
+}
+
+Status GgmlDevice::failure() const { return failure_ ? Status(*failure_) : Status(); }
+
+Error GgmlDevice::lost(const std::string& what) const {
+  return {Code::device, text_, "a device that answers", what, "load the bundle again; the system's log may say more"};
+}
+
+Result<std::shared_ptr<ggml_gallocr>> GgmlDevice::place(ggml_cgraph* graph) {
+  const auto make = [&] { return std::shared_ptr<ggml_gallocr>(ggml_gallocr_new(memory_->type()), ggml_gallocr_free); };
+  std::shared_ptr<ggml_gallocr> places = make();
+  std::size_t size = 0;
+  ggml_gallocr_reserve_n_size(places.get(), graph, nullptr, nullptr, &size);
+  // Places that are shared must lie in one buffer: only then is it certain that nobody's move.
+  const bool fits = !working_.empty() && size <= working_.back().size &&
+                    working_.back().size <= ggml_backend_buft_get_max_size(memory_->type());
+  if (!fits) {
+    VLA_CHECK(memory_->check_free(size, "working memory"));
+    working_.push_back({make(), size});
+  }
+  places = working_.back().places;
+  if (memory_->is_dry()) return places;
+  bool done = false;
+  VLA_CHECK(guarded([&] { done = ggml_gallocr_alloc_graph(places.get(), graph); }));
+  if (done) return places;
+  if (!fits) working_.pop_back();
+  return memory_->refused(size, "working memory");
 }
 
 Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const LowerOptions&) {
@@ -131,8 +175,10 @@ Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const Low
   return GgmlProgram::make(graph, *this);
 }
 
-std::size_t GgmlDevice::weights_size() const {
-  return weight_buffer_ ? ggml_backend_buffer_get_size(weight_buffer_.get()) : 0;
+std::size_t GgmlDevice::working_size() const {
+  std::size_t size = 0;
+  for (const Working& working : working_) size += working.size;
+  return size;
 }
 
 }  // namespace vla

@@ -2,11 +2,16 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <ggml-alloc.h>
 #include <ggml-cpp.h>
 
-#include <map>
+#include <exception>
 #include <memory>
+#include <new>
+#include <optional>
 
+#include "ggml/backends.h"
+#include "ggml/ggml_memory.h"
 #include "graph/device.h"
 
 namespace vla {
@@ -17,40 +22,69 @@ class GgmlDevice final : public Device {
  public:
   /// Errors: device.
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
+  /// A device of another kind. Errors: device.
+  static Result<std::unique_ptr<Device>> open(const DeviceName& name);
 
   Status load(const ParamList& params, bool fill) override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;
+  Status failure() const override;
   Result<std::unique_ptr<Program>> lower(const Graph& graph, const LowerOptions& options) override;
 
-  std::string name() const override;
+  std::string name() const override { return text_; }
   int n_thread() const override { return n_thread_; }
   std::string kernels() const override { return "ggml"; }
   std::string precision() const override { return "f32"; }
-  const std::string& linear_kernels() const override { return text_; }
-  std::size_t weights_size() const override;
-  std::size_t working_size() const override { return 0; }  // programs have memory of their own
+  const std::string& linear_kernels() const override { return linear_text_; }
+  std::size_t weights_size() const override { return weights_size_; }
+  std::size_t working_size() const override;
 
   ggml_backend_t backend() const { return backend_.get(); }
   ggml_tensor* weight(const Param* param) const { return weights_[static_cast<std::size_t>(param->id)]; }
+  GgmlMemory& memory() { return *memory_; }
+  /// Gives the values of a graph their places in memory that programs share, since one runs at a time. What comes back
+  /// keeps it. Errors: out_of_memory.
+  Result<std::shared_ptr<ggml_gallocr>> place(ggml_cgraph* graph);
+
+  /// Calls a function of the backend, whose driver may throw. Errors: device, out_of_memory.
+  template <class F>
+  Status guarded(const F& call) const {
+    try {
+      call();
+      return {};
+    } catch (const std::bad_alloc&) {
+      return Error{Code::out_of_memory, text_, "", "the system refused an allocation", "free memory"};
+    } catch (const std::exception& exception) {
+      return lost(exception.what());
+    }
+  }
+  Error lost(const std::string& what) const;
 
  private:
   struct FreePool {
     void operator()(ggml_threadpool* pool) const;
   };
+  struct Working {
+    std::shared_ptr<ggml_gallocr> places;
+    std::size_t size;
+  };
+  ggml_type resident_type(const Param& param) const;
 
   // What threads share during a run; without one of ours ggml makes and frees one in every run.
   std::unique_ptr<ggml_threadpool, FreePool> pool_;
   ggml_backend_ptr backend_;
-  ggml_context_ptr weight_context_;
-  ggml_backend_buffer_ptr weight_buffer_;
-  std::vector<ggml_tensor*> weights_;
   std::string text_;
   int n_thread_ = 0;
+  bool keeps_f16_ = false;  // its products of f16 weights are as exact as those of float32
+  std::optional<GgmlMemory> memory_;
+  ggml_context_ptr weight_context_;
+  std::shared_ptr<void> weight_memory_;
+  std::size_t weights_size_ = 0;
+  std::vector<ggml_tensor*> weights_;
+  std::string linear_text_;
+  std::vector<Working> working_;  // the last serves new programs; those before it belong to older ones
+  mutable std::optional<Error> failure_;
 };
-
-/// A context for `n` tensors without memory. Errors: out_of_memory.
-Result<ggml_context_ptr> make_context(std::size_t n, std::size_t extra = 0);
 
 }  // namespace vla

@@ -13,8 +13,11 @@ namespace {
 /// digits it is composed of exact ones.
 class Translator {
  public:
-  Translator(ggml_context* context, ggml_context* constants, const GgmlDevice& device)
-      : c(context), constants_(constants), device_(device) {}
+  Translator(ggml_context* context, ggml_context* constants, GgmlDevice& device)
+      : c(context),
+        constants_(constants),
+        device_(device),
+        alignment_(ggml_backend_buft_get_alignment(device.memory().type())) {}
 
   ggml_tensor* operator()(const Node& n) {
     node_ = &n;
@@ -24,9 +27,10 @@ class Translator {
 
  private:
   ggml_tensor* in(std::size_t i) const { return made_[static_cast<std::size_t>(node_->in[i].node()->id)]; }
-  /// Not every operation takes the strides that a view may have in dimensions of size one.
+  /// Not every operation takes the strides that a view may have in dimensions of size one, nor a view that begins where
+  /// the backend would place no tensor.
   ggml_tensor* contiguous(ggml_tensor* x) const {
-    if (!ggml_is_contiguous(x)) return ggml_cont(c, x);
+    if (!ggml_is_contiguous(x) || x->view_offs % alignment_ != 0) return ggml_cont(c, x);
     return x->view_src != nullptr ? ggml_reshape(c, x, x) : x;
   }
   ggml_tensor* reshaped(ggml_tensor* x, const Shape& s) const {
@@ -159,6 +163,7 @@ class Translator {
 
   ggml_context *c, *constants_;
   const GgmlDevice& device_;
+  std::size_t alignment_;
   const Node* node_ = nullptr;
   std::vector<ggml_tensor*> made_;  // by Node::id
 };
@@ -171,6 +176,19 @@ Work work_of(const Node& node) {
   work.flop = flop_of(node), work.bytes = work.weights + 4.0 * static_cast<double>(count(node.shape));
   for (Tensor in : node.in) work.bytes += 4.0 * static_cast<double>(count(in.shape()));
   return work;
+}
+
+/// Of the operations that a node became, those that the backend lacks.
+Status check_supported(const GgmlDevice& device, ggml_cgraph* graph, int first, const Node& node) {
+  for (int i = first; i < ggml_graph_n_nodes(graph); ++i) {
+    const ggml_tensor* made = ggml_graph_node(graph, i);
+    if (ggml_backend_supports_op(device.backend(), made)) continue;
+    return Error{Code::unsupported, node.path.empty() ? op_name(node.op) : node.path,
+                 "an operation that " + device.name() + " has",
+                 fmt::format("{} of {:.1f} MB", ggml_op_desc(made), 1e-6 * static_cast<double>(ggml_nbytes(made))),
+                 "use --device cpu"};
+  }
+  return {};
 }
 
 }  // namespace
@@ -206,24 +224,24 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
       program->tap_tensors_.push_back(made);
     }
     if (is_leaf(node) && !node.tapped) continue;
+    const int n_before = ggml_graph_n_nodes(program->graph_);
     ggml_build_forward_expand(program->graph_, made);
+    VLA_CHECK(check_supported(device, program->graph_, n_before, node));
     program->work_[stage_end.size()] += work_of(node);
   }
   while (stage_end.size() < n_stage) stage_end.push_back(ggml_graph_n_nodes(program->graph_));
   for (const Graph::Stage& stage : graph.stages()) program->stages_.push_back({stage.name, {}});
 
-  if (!constants.empty()) {
-    program->constant_buffer_.reset(ggml_backend_alloc_ctx_tensors(program->constant_context_.get(), device.backend()));
-    if (!program->constant_buffer_) return Error{Code::out_of_memory, "constants", "", "the device refused them"};
-    for (const auto& [tensor, node] : constants)
-      std::visit(
-          [to = tensor](const auto& values) { ggml_backend_tensor_set(to, values.data(), 0, values.size() * 4); },
-          node->as<op::Constant>()->values);
-    program->size_ += ggml_backend_buffer_get_size(program->constant_buffer_.get());
+  VLA_TRY(const std::size_t n_constant,
+          device.memory().place(program->constant_context_.get(), "constants", &program->constant_memory_));
+  for (const auto& [tensor, node] : constants) {
+    if (device.memory().is_dry()) break;
+    VLA_CHECK(device.guarded([&, to = tensor, from = node] {
+      std::visit([to](const auto& values) { ggml_backend_tensor_set(to, values.data(), 0, values.size() * 4); },
+                 from->as<op::Constant>()->values);
+    }));
   }
-  program->allocator_.reset(ggml_gallocr_new(ggml_backend_get_default_buffer_type(device.backend())));
-  if (!ggml_gallocr_alloc_graph(program->allocator_.get(), program->graph_))
-    return Error{Code::out_of_memory, "working memory", "", "the device refused the allocation"};
+  VLA_TRY(program->places_, device.place(program->graph_));
   int begin = 0;
   for (const int end : stage_end) {
     ggml_cgraph* part = ggml_new_graph_custom(c, static_cast<std::size_t>(end - begin) + 1, false);
@@ -236,25 +254,29 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
     program->parts_.push_back(part);
     begin = end;
   }
-  program->size_ += ggml_used_mem(c) + ggml_gallocr_get_buffer_size(program->allocator_.get(), 0);
+  if (program->parts_.size() == 1) program->parts_.front() = program->graph_;  // which knows what a backend may fuse
+  program->size_ = n_constant + ggml_used_mem(c);
   return std::unique_ptr<Program>(std::move(program));
 }
 
 Status GgmlProgram::run() {
+  VLA_CHECK(device_.failure());
   for (std::size_t i = 0; i < parts_.size(); ++i) {
-    const ggml_status status = ggml_backend_graph_compute(device_.backend(), parts_[i]);
+    ggml_status status = GGML_STATUS_FAILED;
+    VLA_CHECK(device_.guarded([&] { status = ggml_backend_graph_compute(device_.backend(), parts_[i]); }));
     if (status == GGML_STATUS_ALLOC_FAILED)
       return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
-    if (status != GGML_STATUS_SUCCESS)
-      return Error{Code::device, "graph", "a finished run", ggml_status_to_string(status)};
+    if (status != GGML_STATUS_SUCCESS) return device_.lost(ggml_status_to_string(status));
     if (i < stages_.size()) stages_[i].done = std::chrono::steady_clock::now();
   }
   return {};
 }
 
 std::vector<float> GgmlProgram::tap(std::size_t i) const {
+  Slot slot;
+  slot.place = tap_tensors_[i];
   std::vector<float> values(static_cast<std::size_t>(ggml_nelements(tap_tensors_[i])));
-  ggml_backend_tensor_get(tap_tensors_[i], values.data(), 0, values.size() * sizeof(float));
+  device_.get(slot, values.data(), values.size() * sizeof(float));
   return values;
 }
 

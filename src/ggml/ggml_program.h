@@ -9,7 +9,7 @@ namespace vla {
 /// A graph as plain ggml operations, one after the other as they were recorded.
 class GgmlProgram final : public Program {
  public:
-  /// Errors: out_of_memory.
+  /// Errors: out_of_memory, device, unsupported where the backend lacks an operation.
   static Result<std::unique_ptr<Program>> make(const Graph& graph, GgmlDevice& device);
 
   Status run() override;
@@ -25,8 +25,8 @@ class GgmlProgram final : public Program {
 
   GgmlDevice& device_;
   ggml_context_ptr context_, constant_context_;
-  ggml_backend_buffer_ptr constant_buffer_;
-  ggml_gallocr_ptr allocator_;  // of all other values
+  std::shared_ptr<void> constant_memory_;
+  std::shared_ptr<ggml_gallocr> places_;  // of all other values
   ggml_cgraph* graph_ = nullptr;
   std::vector<ggml_cgraph*> parts_;  // of the graph, stage by stage
   std::vector<Stage> stages_;

@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 #include <sched.h>
+#include <unistd.h>
 
 #include "ggml/ggml_device.h"
 #include "lower/cpu_device.h"
@@ -20,12 +21,30 @@ int usable_cores() {
 
 }  // namespace
 
-Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels) {
+Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device) {
+  VLA_TRY(const DeviceName name, DeviceName::parse(device));
+  if (name.kind != "cpu") {
+    if (kernels.empty() || kernels == isa_name(Isa::ggml)) return GgmlDevice::open(name);
+    return Error{Code::usage, "kernels", fmt::format("none or ggml with device {}", name.text()), kernels,
+                 "other kernels are the CPU's"};
+  }
   VLA_TRY(const Isa isa, choose_isa(kernels));
   if (n_thread <= 0) n_thread = usable_cores();
   if (n_thread > kMaxThreads)
     return Error{Code::device, "threads", fmt::format("at most {}", kMaxThreads), std::to_string(n_thread)};
   return isa == Isa::ggml ? GgmlDevice::cpu(n_thread) : lower::CpuDevice::open(n_thread, isa);
+}
+
+DeviceList list_devices() {
+  DeviceList list = backend_devices();
+  const auto pages = [](int which) {
+    return static_cast<std::size_t>(sysconf(which)) * static_cast<std::size_t>(sysconf(_SC_PAGESIZE));
+  };
+  const Isa best = usable_isas().back();
+  DeviceInfo cpu = {"cpu", fmt::format("{} threads, {}", usable_cores(), isa_name(best)), pages(_SC_PHYS_PAGES),
+                    pages(_SC_AVPHYS_PAGES), rounds_to_bf16(best) ? "f32, bf16" : "f32"};
+  list.devices.insert(list.devices.begin(), std::move(cpu));
+  return list;
 }
 
 }  // namespace vla

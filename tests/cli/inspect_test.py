@@ -31,6 +31,7 @@ def test_a_person_reads_features_statistics_recipe_sizes_and_memory(vla):
         "leftover",
         *["recipe"] * 4,
         "modules",
+        "device",
         "products",
         "memory",
     ]

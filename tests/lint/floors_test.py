@@ -22,6 +22,7 @@ ROOMS = {
     "graph": {"base", "bundle"},
     "kernels": {"base", "bundle"},
     "ggml": GRAPH,
+    "vulkan": GRAPH | {"ggml"},  # compiled into a library of its own
     "lower": GRAPH | {"kernels", "ggml"},
     "nn": GRAPH,
     "processor": {"base", "bundle"},
@@ -36,7 +37,8 @@ ROOMS = {
 # Libraries that belong to some rooms. The engine's taps are a GGUF file of tensors.
 LIBRARIES = [
     (re.compile(r"gguf\.h"), {"bundle", "engine"}),
-    (re.compile(r"ggml(-.*)?\.h"), {"ggml"}),
+    (re.compile(r"ggml(-.*)?\.h"), {"ggml", "vulkan"}),
+    (re.compile(r"vulkan/.*"), {"vulkan"}),
     (re.compile(r"CLI/.*"), {"cli"}),
     (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve", "bench"}),
     (re.compile(r"jpeglib\.h"), {"processor"}),

@@ -1,0 +1,22 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <ggml-backend.h>
+
+namespace vla {
+
+/// What a library such as libvla-vulkan.so exports. It carries a ggml of its own, so that it needs no symbol of the
+/// program that loads it, and no other program's ggml can be mistaken for ours. Objects of the one ggml are used
+/// through the other: `build` makes sure that both have the same layout.
+struct BackendLibrary {
+  const char* build;                                    // VLA_BACKEND_BUILD
+  ggml_backend_reg_t (*open)();                         // null where the driver is missing
+  void (*log)(ggml_log_callback callback, void* data);  // of the library's ggml
+};
+
+constexpr const char* kBackendSymbol = "vla_backend_library";
+
+}  // namespace vla
+
+extern "C" __attribute__((visibility("default"))) const vla::BackendLibrary* vla_backend_library();

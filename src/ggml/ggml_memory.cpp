@@ -1,0 +1,108 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "ggml/ggml_memory.h"
+
+#include <fmt/format.h>
+#include <ggml-alloc.h>
+
+#include <algorithm>
+#include <cstdint>
+#include <iterator>
+
+namespace vla {
+namespace {
+
+/// Where a tensor seems to be that has no memory. ggml takes null for a tensor that it has to place.
+void* const kNowhere = reinterpret_cast<void*>(std::uintptr_t{4096});
+
+std::string size_text(std::size_t bytes) {
+  const auto size = static_cast<double>(bytes);
+  return size >= 1e6 ? fmt::format("{:.1f} MB", 1e-6 * size) : fmt::format("{:.1f} kB", 1e-3 * size);
+}
+
+}  // namespace
+
+Result<ggml_context_ptr> make_context(std::size_t n, std::size_t extra) {
+  ggml_context_ptr context(
+      ggml_init({.mem_size = n * ggml_tensor_overhead() + extra, .mem_buffer = nullptr, .no_alloc = true}));
+  if (context) return context;
+  return Error{Code::out_of_memory, "graph", "", "the system refused the allocation", "free memory"};
+}
+
+Error GgmlMemory::refused(std::size_t size, const char* what) const {
+  return {Code::out_of_memory, what, fmt::format("{} on {}", size_text(size), name_),
+          "the device refused the allocation", "free memory or use a smaller model"};
+}
+
+/// A tensor lies in one buffer. Backends say how large buffers should be, and take larger ones up to the driver's
+/// limit.
+Error GgmlMemory::refused(const Part& part, const char* what) const {
+  const std::size_t most = ggml_backend_buft_get_max_size(type_);
+  if (part.size <= most) return refused(part.size, what);
+  return {Code::unsupported, part.tensors.front()->name,
+          fmt::format("at most {}, a buffer of {}", size_text(most), name_), size_text(part.size),
+          "use another device"};
+}
+
+Status GgmlMemory::check_free(std::size_t size, const char* what) const {
+  if (device_ == nullptr || dry_) return {};
+  std::size_t free = 0, total = 0;
+  ggml_backend_dev_memory(device_, &free, &total);
+  for (const auto& buffer : *kept_) free += ggml_backend_buffer_get_size(buffer.get());
+  if (size <= free) return {};
+  return Error{Code::out_of_memory, what, fmt::format("{} free on {}", size_text(size), name_),
+               fmt::format("{} of {}", size_text(free), size_text(total)),
+               "free memory of the device or use a smaller model"};
+}
+
+/// A buffer that was given back and fits without much waste.
+ggml_backend_buffer_t GgmlMemory::take(std::size_t size) const {
+  const auto fits = [&](const ggml_backend_buffer_ptr& buffer) {
+    const std::size_t has = ggml_backend_buffer_get_size(buffer.get());
+    return has >= size && has <= 2 * size + 65536;
+  };
+  const auto found = std::find_if(kept_->begin(), kept_->end(), fits);
+  if (found == kept_->end()) return ggml_backend_buft_alloc_buffer(type_, size);
+  ggml_backend_buffer_t buffer = found->release();
+  kept_->erase(found);
+  return buffer;
+}
+
+Result<std::size_t> GgmlMemory::place(ggml_context* tensors, const char* what, std::shared_ptr<void>* holder) {
+  const std::vector<Part> parts = cut(tensors);
+  std::size_t total = 0;
+  for (const Part& part : parts) total += part.size;
+  VLA_CHECK(check_free(total, what));
+  const std::shared_ptr<Buffers> buffers(new Buffers, [kept = kept_](Buffers* given) {
+    std::move(given->begin(), given->end(), std::back_inserter(*kept));
+    delete given;
+  });
+  *holder = buffers;
+  for (const Part& part : parts) {
+    if (dry_) {
+      for (ggml_tensor* tensor : part.tensors) tensor->data = kNowhere;
+      continue;
+    }
+    ggml_backend_buffer_t buffer = take(part.size);
+    if (buffer == nullptr) return refused(part, what);
+    buffers->emplace_back(buffer);
+    ggml_tallocr places = ggml_tallocr_new(buffer);
+    for (ggml_tensor* tensor : part.tensors) ggml_tallocr_alloc(&places, tensor);
+  }
+  return total;
+}
+
+/// Tensors one after the other, as many as a buffer holds.
+std::vector<GgmlMemory::Part> GgmlMemory::cut(ggml_context* tensors) const {
+  const std::size_t alignment = ggml_backend_buft_get_alignment(type_), most = ggml_backend_buft_get_max_size(type_);
+  std::vector<Part> parts;
+  for (ggml_tensor* t = ggml_get_first_tensor(tensors); t != nullptr; t = ggml_get_next_tensor(tensors, t)) {
+    const std::size_t size = GGML_PAD(ggml_backend_buft_get_alloc_size(type_, t), alignment);
+    if (parts.empty() || parts.back().size + size > most) parts.emplace_back();
+    parts.back().size += size;
+    parts.back().tensors.push_back(t);
+  }
+  return parts;
+}
+
+}  // namespace vla

@@ -1,0 +1,45 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Included before ggml-vulkan.cpp by the compiler's command line, so that ggml stays as it is.
+#pragma once
+
+#include <vulkan/vulkan_core.h>
+
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <initializer_list>
+
+/// What ggml reads from the environment. Settings that change numbers are ours: products are computed in float32.
+/// Without them shaders round operands to float16 wherever the device has it.
+inline char* vla_vulkan_setting(const char* name) {
+  static char yes[] = "1";
+  for (const char* ours : {"GGML_VK_DISABLE_F16", "GGML_VK_DISABLE_BFLOAT16", "GGML_VK_DISABLE_COOPMAT",
+                           "GGML_VK_DISABLE_COOPMAT2", "GGML_VK_DISABLE_DOT2"})
+    if (std::strcmp(name, ours) == 0) return yes;
+  return std::getenv(name);
+}
+#define getenv(name) vla_vulkan_setting(name)
+
+// Settings of the debugging layer came with headers 1.3.272. ggml names their types in code that a release never runs:
+// here they have the layout of the extension and set nothing.
+#ifndef VK_EXT_LAYER_SETTINGS_EXTENSION_NAME
+namespace vk {
+enum class LayerSettingTypeEXT : int { eBool32 };
+struct LayerSettingEXT {
+  const char *layer, *setting;
+  LayerSettingTypeEXT type;
+  std::uint32_t n_value;
+  const void* values;
+};
+struct LayerSettingsCreateInfoEXT {
+  template <class Settings>
+  explicit LayerSettingsCreateInfoEXT(const Settings&) {}
+  VkStructureType sType = static_cast<VkStructureType>(1000496000);
+  const void* pNext = nullptr;
+  std::uint32_t n_setting = 0;
+  const LayerSettingEXT* settings = nullptr;
+};
+}  // namespace vk
+#endif
