@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo test build wheel packages asan tsan fuzz format clean
+.PHONY: help demo test build vulkan wheel packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -14,6 +14,7 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
+	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make tsan      build executor and server and run their tests under the thread sanitizer"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
@@ -32,6 +33,12 @@ $(STAMP): python/pyproject.toml python/requirements-test.txt
 build: packages $(STAMP)
 	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
 	cmake --build --preset cpu
+
+# libvla-vulkan.so for build/cpu, where its packages are to be had; without it the tests of Vulkan skip by name.
+vulkan: build
+	@if scripts/packages.sh vulkan; then \
+	  cmake build/cpu -DVLA_VULKAN=ON >/dev/null && cmake --build --preset cpu --target vla_vulkan; \
+	else echo "make: libvla-vulkan.so is not built"; fi
 
 # A wheel for any x86-64 machine with a system as old as this one's: pip installs it in seconds.
 wheel: packages $(STAMP)
@@ -72,7 +79,7 @@ tsan: packages
 	cmake --build --preset tsan
 	ctest --preset tsan --no-tests=error
 
-test: build asan
+test: build vulkan asan
 	$(VENV)/bin/python scripts/test.py
 
 SECONDS ?= 600

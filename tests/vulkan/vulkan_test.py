@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""--device vulkan: every golden case, all doors, limits and refusals. One process for each case, as a robot has one."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from golden_cases import FLOAT32, NAMES, ROOT, Golden
+from program import EXIT
+
+VULKAN = ["--device", "vulkan"]
+LIMIT = 300  # seconds, where every shader is compiled for the first time
+# Sums in another order, and a driver's own exp, sin and division: 1e-6 to 1e-5 of the largest in each operation.
+TOLERANCE = 1e-4
+
+
+def actions(answer):
+    return np.array(answer.json()["actions"], np.float32)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_tap_of_a_golden_case_matches_the_reference_within_1e_4(vla, name, tmp_path):
+    case, got = Golden(name), tmp_path / "got.gguf"
+    run = vla(*case.arguments(options=["--json", *VULKAN, "--tap", "*", "--taps-out", got]), limit=LIMIT)
+    assert run.json()["device"].startswith("vulkan:0, "), run.err
+    compared = vla("compare", case.expected, got, "--tolerance", TOLERANCE)
+    assert compared.code == 0, compared.out + compared.err
+
+
+@pytest.mark.parametrize("name", ["smolvla/two_views", "bitvla/" + next(n for n in NAMES if "bitvla" in n).split("/")[1]])
+def test_without_taps_the_chunk_is_the_cpus_within_1e_4(vla, name):
+    case = Golden(name)
+    cpu, vulkan = (actions(vla(*case.arguments(options=["--json", *o]), limit=LIMIT)) for o in (FLOAT32, VULKAN))
+    assert np.abs(cpu - vulkan).max() <= TOLERANCE * np.abs(cpu).max()
+
+
+def test_a_process_answers_again_and_other_shapes_through_the_c_interface(vla, golden):
+    """Plans of two lengths of text, taking turns: the same observation gives the same bytes."""
+    program = f"""
+import sys
+sys.path[:0] = [{str(ROOT / "python")!r}]
+import vla_cpp
+images = {{ {", ".join(f"{view!r}: open({str(file)!r}, 'rb').read()" for view, file in golden.images.items())} }}
+with vla_cpp.Policy({str(golden.bundle)!r}, device="vulkan:0") as policy:
+    print(policy.spec.device, policy.spec.precision, sep=";")
+    act = lambda text: policy.act(images=images, state={golden.state!r}, text=text, seed=1).actions.tobytes().hex()
+    first, short = act({golden.text!r}), act("go")
+    print(first == act({golden.text!r}), short == act("go"), first != short, sep=";")
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT)
+    assert result.returncode == 0, result.stderr
+    device, same = result.stdout.splitlines()
+    assert device.startswith("vulkan:0, ") and device.endswith(";f32")
+    assert same == "True;True;True"
+
+
+def test_a_server_answers_with_the_chunk_of_vla_run_and_tells_the_device(vla, golden):
+    import vla_cpp
+
+    command = [vla.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *VULKAN]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            line = server.stdout.readline()
+            assert "device='vulkan:0, " in line and "precision=f32" in line, line
+            with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=LIMIT) as client:
+                images = {view: file.read_bytes() for view, file in golden.images.items()}
+                chunk = client.act(images=images, state=golden.state, text=golden.text, noise=np.load(golden.noise))
+        finally:
+            server.terminate()
+    run = actions(vla(*golden.arguments(options=["--json", *VULKAN]), limit=LIMIT))
+    assert np.array_equal(chunk.actions.astype(np.float32), run)
+
+
+def with_environment(vla, **environment):
+    import copy
+
+    changed = copy.copy(vla)
+    changed.environment = {**vla.environment, **environment}
+    return changed
+
+
+def test_weights_are_spread_over_buffers_where_one_cannot_hold_them(vla, golden):
+    plain = vla(*golden.arguments(options=["--json", *VULKAN]), limit=LIMIT)
+    small = with_environment(vla, GGML_VK_FORCE_MAX_ALLOCATION_SIZE="100000", GGML_VK_FORCE_MAX_BUFFER_SIZE="100000")
+    split = small(*golden.arguments(options=["--json", *VULKAN]), limit=LIMIT)
+    assert np.array_equal(actions(split), actions(plain))
+
+
+def test_a_matrix_that_no_buffer_can_hold_is_refused_by_name_with_both_sizes(vla, golden):
+    small = with_environment(vla, GGML_VK_FORCE_MAX_ALLOCATION_SIZE="5000", GGML_VK_FORCE_MAX_BUFFER_SIZE="5000")
+    answer = small(*golden.arguments(options=VULKAN), limit=LIMIT)
+    assert answer.code == EXIT["unsupported"] and answer.out == ""  # ggml writes lines of its own before ours
+    assert re.fullmatch(
+        r"error: unsupported: [\w.]+\.weight: expected at most 5\.0 kB, a buffer of vulkan:0, found [\d.]+ kB; use another device",
+        answer.err.splitlines()[-1],
+    ), answer.err
+
+
+def test_what_inspect_predicts_is_what_a_server_takes(vla, golden):
+    predicted = json.loads(vla("inspect", golden.bundle, "--json", *VULKAN).out)
+    assert predicted["device"].startswith("vulkan:0, ")
+    program = f"""
+import sys
+sys.path[:0] = [{str(ROOT / "python")!r}]
+import vla_cpp
+with vla_cpp.Policy({str(golden.bundle)!r}, device="vulkan") as policy:
+    d = policy._library.vla_describe(policy._handle).contents
+    print(d.memory_weights, d.memory_plan, d.memory_working)
+"""
+    taken = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT, check=True)
+    sizes = [predicted["memory_bytes"][part] for part in ("weights", "plan", "working")]
+    assert list(map(int, taken.stdout.split())) == sizes
+
+
+def test_devices_are_listed_with_memory_and_precision(vla):
+    listed = json.loads(vla("inspect", "--devices", "--json").out)
+    cpu, vulkan = listed["devices"][:2]
+    assert (cpu["name"], vulkan["name"], vulkan["products"]) == ("cpu", "vulkan:0", "f32")
+    assert 0 < vulkan["free_bytes"] <= vulkan["memory_bytes"] and vulkan["description"]
+
+
+def test_a_number_beyond_the_devices_is_refused_with_the_list(vla, golden):
+    answer = vla(*golden.arguments(options=["--device", "vulkan:7"]))
+    answer.refused("device", "vulkan:7: expected one of cpu, vulkan:0 (", "found none with this number")
+
+
+def test_a_machine_without_a_driver_says_so_and_runs_the_cpu(vla, golden):
+    without = with_environment(vla, VK_DRIVER_FILES=os.devnull, VK_ICD_FILENAMES=os.devnull)
+    without(*golden.arguments(options=VULKAN)).refused("device", "vulkan:0: expected one of cpu, found ", "driver")
+    assert without(*golden.arguments()).code == 0
+
+
+@pytest.mark.parametrize("kernels", ["avx2", "float32"])
+def test_kernels_of_the_cpu_are_refused(vla, golden, kernels):
+    answer = vla(*golden.arguments(options=[*VULKAN, "--kernels", kernels]))
+    answer.refused("usage", "kernels: expected none or ggml with device vulkan:0, found " + kernels)
+
+
+def test_bench_tells_the_device_and_no_share_of_the_cpus_peak(vla, golden):
+    report = vla("bench", golden.bundle, "--runs", 1, "--warmup", 0, "--json", *VULKAN, limit=LIMIT).json()
+    assert report["device"].startswith("vulkan:0, ") and report["share_of_peak"] == 0
