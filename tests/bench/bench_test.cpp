@@ -29,7 +29,8 @@ Series series_of(int n_step) {
 
 Report report_of(const Series& series) {
   Report report;
-  report.conditions = {"smolvla", "bf16", "a <source> & more", 2, 512, 512, 48, series.n_step, 2, "avx2"};
+  report.conditions = {"smolvla", "bf16", "a <source> & more", 2, 512, 512, 48, series.n_step,
+                       2,         "avx2", "cpu, 2 threads"};
   report.cpu = "a processor";
   report.before.peaks = {{"other f32", 1e11, 2e11}, {"some f32", 1e12, 2e12}};
   report.before.bandwidth = 1e12;

@@ -17,6 +17,7 @@ TEST_CASE("an odd bundle of any architecture acts or is refused, in bounded time
   constexpr int kRounds = 25;  // for each architecture
   fuzz::Random random(1);
   std::string arch;
+  int n_mutant = 0, n_answered = 0;
   for (const std::string& path : golden_paths()) {  // those of one architecture follow each other
     const std::string sound = read_text(GoldenCase::read(path).bundle());
     const auto bundle = Bundle::parse(std::as_bytes(std::span(sound)), path);
@@ -25,9 +26,9 @@ TEST_CASE("an odd bundle of any architecture acts or is refused, in bounded time
     arch = *bundle->keys().string("vla.arch");
     CAPTURE(arch);
     CHECK(fuzz::check_act(sound));
-    int n_answered = 0;
-    for (int round = 0; round < kRounds; ++round) n_answered += fuzz::check_act(fuzz::mutant(sound, random)) ? 1 : 0;
-    CHECK(n_answered > 0);
-    CHECK(n_answered < kRounds);
+    for (int round = 0; round < kRounds; ++round, ++n_mutant)
+      n_answered += fuzz::check_act(fuzz::mutant(sound, random)) ? 1 : 0;
   }
+  CHECK(n_answered > 0);
+  CHECK(n_answered < n_mutant / 2);
 }
