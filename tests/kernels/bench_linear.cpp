@@ -89,8 +89,8 @@ struct Trial {
         x(static_cast<std::size_t>(quantized_size(s.n_row, s.d_in)) * 4),
         y(static_cast<std::size_t>(s.n_row * s.d_out) * 4),
         stored(static_cast<std::size_t>(s.d_in * s.d_out) * dtype_size(d.type) / (d.is_ternary ? 4 : 1)),
-        scale(static_cast<std::size_t>(s.d_out), 1.0f),
-        packed(kernel.packed_size(desc)) {
+        packed(kernel.packed_size(desc)),
+        scale(static_cast<std::size_t>(s.d_out), 1.0f) {
     LinearJob job = {};
     std::vector<float> row(static_cast<std::size_t>(s.d_in));
     for (std::size_t k = 0; k < row.size(); ++k) row[k] = 1.0f / static_cast<float>(1 + k % 61);
