@@ -76,20 +76,28 @@ def jpeg(seed):
     return data.getvalue()
 
 
-def python_client(options, address):
-    """Round trip minus engine time of the package's own client, numpy in and numpy out."""
+def acts(options, address):
+    """(milliseconds, answer) of the package's own client, numpy in and numpy out, for one act after the other."""
     import vla_cpp
 
-    milliseconds = []
     with vla_cpp.Client(address, timeout=60) as client:
         images = {view.name: image(i) for i, view in enumerate(client.spec.views)}
         state = {s.name: np.full(s.width, 0.1, np.float32) for s in client.spec.states}
         for i in range(options.requests):
             start = time.perf_counter()
             chunk = client.act(images=images, state=state, text="open the drawer", seed=i)
-            milliseconds.append(1e3 * (time.perf_counter() - start) - sum(chunk.timing.values()))
+            yield 1e3 * (time.perf_counter() - start), chunk
+
+
+def quantiles(milliseconds):
     p50, p99 = np.quantile(milliseconds, [0.5, 0.99])
-    return {"overhead_ms": {"p50": p50, "p99": p99}, "requests": options.requests, "flawless": True}
+    return {"p50": p50, "p99": p99}
+
+
+def python_client(options, address):
+    """Round trip minus engine time."""
+    milliseconds = [ms - sum(chunk.timing.values()) for ms, chunk in acts(options, address)]
+    return {"overhead_ms": quantiles(milliseconds), "requests": options.requests, "flawless": True}
 
 
 def overhead(options):
@@ -156,19 +164,11 @@ def busy_loops(n):
 
 def round_trips(options, address):
     """Of one client that acts ten times a second, as a robot does."""
-    import vla_cpp
-
     milliseconds = []
-    with vla_cpp.Client(address, timeout=60) as client:
-        images = {view.name: image(i) for i, view in enumerate(client.spec.views)}
-        state = {s.name: np.full(s.width, 0.1, np.float32) for s in client.spec.states}
-        for i in range(options.requests):
-            start = time.perf_counter()
-            client.act(images=images, state=state, text="open the drawer", seed=i)
-            milliseconds.append(1e3 * (time.perf_counter() - start))
-            time.sleep(max(0, start + 0.1 - time.perf_counter()))
-    p50, p99 = np.quantile(milliseconds, [0.5, 0.99])
-    return {"p50": p50, "p99": p99}
+    for ms, _ in acts(options, address):
+        milliseconds.append(ms)
+        time.sleep(max(0, 0.1 - 1e-3 * ms))
+    return quantiles(milliseconds)
 
 
 def busy(options):
@@ -190,8 +190,8 @@ def busy(options):
     return {"busy": {"idle": idle, "alone": alone, "beside": beside, "flawless": True}}, rows
 
 
-def spread(quantiles):
-    return f"p50 {quantiles['p50']:.3f}, p99 {quantiles['p99']:.3f} ms"
+def spread(figures):
+    return f"p50 {figures['p50']:.3f}, p99 {figures['p99']:.3f} ms"
 
 
 FIGURES = {"overhead": (overhead, 2000), "jpeg": (jpegs, 2000), "many": (many, 100_000), "busy": (busy, 100)}
