@@ -15,6 +15,7 @@ from collections import Counter
 
 # What the test programs print about themselves; ctest -V passes it on with a number in front of each line.
 DOCTEST = re.compile(r"\[doctest\] test cases:\s*(\d+)\s*\|\s*(\d+) passed\s*\|\s*(\d+) failed\s*\|\s*(\d+) skipped")
+FAILED = re.compile(r"^\s*\d+/\d+ Test\s+#(\d+): (\S+) \.*\*\*\*.*", re.M)
 PYTEST = re.compile(r"^\d+: (?:=+ )?(\d+ (?:passed|failed|skipped|deselected|error).*) in [\d.]+s", re.M)
 
 
@@ -40,9 +41,19 @@ def run_preset(preset):
         for number, outcome in re.findall(r"(\d+) (passed|failed|skipped|error)", summary):
             counts["failed" if outcome == "error" else outcome] += int(number)
     if not content:
-        print(text[-20000:])
+        print_failures(text)
         counts["failed"] = max(counts["failed"], 1)
     return counts, content
+
+
+def print_failures(text, n_line=150):
+    """The end of what each failed suite printed, for a reader who has nothing but the end of a log."""
+    for failed in FAILED.finditer(text):
+        number, suite = failed[1], failed[2]
+        lines = re.findall(rf"^{number}: .*", text, re.M)
+        print(f"-- {suite}: the last {n_line} of its {len(lines)} lines", *lines[-n_line:], failed[0].strip(), sep="\n")
+    if not FAILED.search(text):
+        print(text[-20000:])
 
 
 def main():
