@@ -84,7 +84,7 @@ def test_silence_ends_with_a_timeout_and_the_next_call_has_a_fresh_socket(faulty
     start = time.monotonic()
     with pytest.raises(vla_cpp.Timeout) as caught:
         client.act(**OBSERVATION, timeout=0.3)
-    assert 0.3 <= time.monotonic() - start < 1
+    assert 0.3 <= time.monotonic() - start < 5
     assert caught.value.where == faulty.address and "0.3 s" in str(caught.value)
     client.health()
     assert len(faulty.peers) == 2 and faulty.kinds[-3:] == ["hello", "describe", "health"]
@@ -236,10 +236,10 @@ def test_submitting_never_waits_once_the_policy_is_known(faulty, client):
     assert client.spec.d_action == 2
     faulty.on_act = lambda request: []
     start = time.monotonic()
-    pending = client.submit(**OBSERVATION, timeout=0.5)
+    pending = client.submit(**OBSERVATION, timeout=2)
     for _ in range(5):
         assert not pending.done()
-    assert time.monotonic() - start < 0.2
+    assert time.monotonic() - start < 1
     with pytest.raises(vla_cpp.Timeout):
         pending.result()
     assert pending.done()
