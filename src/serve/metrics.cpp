@@ -106,8 +106,8 @@ void Metrics::answered(const Answered& answered) try {
   const int code = answered.error == nullptr ? 0 : exit_code(answered.error->code);
   prometheus::Counter*& count = request_[{request.kind, code}];
   if (count == nullptr) count = &requests_.Add({{"kind", kind_name(request.kind)}, {"code", answered.code()}});
-  count->Increment();
   if (answered.is_beyond) beyond_.Increment();
+  count->Increment();
   if (answered.stages.empty()) return;
   observe("queue", seconds(answered.started - request.at));
   for (const auto& [stage, ms] : answered.stages) observe(stage, ms / 1e3);

@@ -69,6 +69,16 @@ def samples(text):
     }
 
 
+def scrape(server, enough):
+    """The first scrape that has enough: an answer is counted after it is sent."""
+    for _ in range(200):
+        found = samples(get(server.ready["metrics"], "/metrics")[1])
+        if enough(found):
+            break
+        time.sleep(0.05)
+    return found
+
+
 # --- metrics -----------------------------------------------------------------------------------------------------------------
 
 
@@ -77,12 +87,16 @@ def test_a_scrape_counts_requests_by_kind_and_code_and_times_every_stage(serve, 
     act = wire.act(1, golden, seed=1)
     requests = [act, act, wire.act(2, golden, text=""), wire.health(3), b"\xff\xff garbage"]
     assert talk(server, *requests) == ["chunk", "chunk", "error", "health", "error"]
-    status, text, content_type = get(server.ready["metrics"], "/metrics")
+    status, _, content_type = get(server.ready["metrics"], "/metrics")
     assert status == 200 and content_type.startswith("text/plain; version=0.0.4")
-    found = samples(text)
+
+    def name(kind, code):
+        return "vla_requests_total", (("code", code), ("kind", kind))
+
+    found = scrape(server, lambda found: found.get(name("unknown", "bad_request")))
 
     def count(kind, code):
-        return found.get(("vla_requests_total", (("code", code), ("kind", kind))))
+        return found.get(name(kind, code))
 
     assert count("act", "ok") == 2 and count("act", "bad_observation") == 1
     assert count("health", "ok") == 1 and count("unknown", "bad_request") == 1
@@ -106,7 +120,8 @@ def test_http_has_three_pages_and_reads_only(serve):
     assert get(address, "/metrics", "HEAD")[:2] == (200, "")
 
 
-def test_readiness_is_denied_until_the_bundle_is_loaded_and_warm_and_again_while_the_server_drains(vla, golden):
+def readiness(vla, golden):
+    """What /readyz says from the start of a server to its end, while forty clients wait for it to drain."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         address = "127.0.0.1:%d" % probe.getsockname()[1]
     process = subprocess.Popen(
@@ -126,8 +141,7 @@ def test_readiness_is_denied_until_the_bundle_is_loaded_and_warm_and_again_while
         while not seen or seen[-1][0] != 200:
             assert look() or process.poll() is None
         line = process.stdout.readline()
-        assert seen[0] in [(503, "loading\n"), (503, "warming up\n")] and line.startswith("ready ")
-        assert seen[-1] == (200, "ready\n") and get(address, "/healthz")[0] == 200
+        assert line.startswith("ready ") and get(address, "/healthz")[0] == 200
         peers = [wire.Peer(line.split("address=")[1].split()[0]) for _ in range(40)]
         for i, peer in enumerate(peers):
             peer.socket.send(wire.act(i, golden, seed=1))
@@ -135,13 +149,23 @@ def test_readiness_is_denied_until_the_bundle_is_loaded_and_warm_and_again_while
         process.send_signal(signal.SIGTERM)
         while look():
             pass
-        assert (503, "draining\n") in seen
         assert process.wait(30) == 0
     finally:
         process.kill()
         process.communicate()
         for peer in peers:
             peer.close()
+    return seen
+
+
+def test_readiness_is_denied_until_the_bundle_is_loaded_and_warm_and_again_while_the_server_drains(vla, golden):
+    states = [(503, "loading\n"), (503, "warming up\n"), (200, "ready\n"), (503, "draining\n")]
+    for _ in range(10):  # on a busy machine a look may come after a state has passed
+        seen = list(dict.fromkeys(readiness(vla, golden)))
+        assert seen == [state for state in states if state in seen]
+        if seen[0][0] == 503 and seen[-1] == states[-1]:
+            return
+    pytest.fail(f"expected a server that is not ready before and after, found {seen}")
 
 
 def test_http_that_others_reach_needs_insecure_and_an_address_that_is_one(vla, golden):
@@ -273,11 +297,8 @@ def test_a_client_whose_key_is_not_listed_is_logged_and_counted(vla, serve, tmp_
     client.curve_publickey, client.curve_secretkey = zmq.curve_keypair()
     client.curve_serverkey = Path(public).read_bytes().split()[0]
     client.connect(server.ready["address"])
-    for _ in range(200):
-        n = samples(get(server.ready["metrics"], "/metrics")[1])["vla_refused_clients_total", ()]
-        if n > 0:
-            break
-        time.sleep(0.05)
+    refused_clients = "vla_refused_clients_total", ()
+    n = scrape(server, lambda found: found[refused_clients] > 0)[refused_clients]
     client.close()
     refused = [event for event in map(json.loads, log_of(server)) if event["event"] == "dropped"]
     assert n >= 1 and refused[0] == {**refused[0], "level": "warn", "why": "key", "peer": "127.0.0.1"}

@@ -5,11 +5,11 @@
 import copy
 import json
 import shutil
-import urllib.request
 
 import pytest
 import wire
 from convert_and_run_test import convert
+from serve_observe_test import scrape
 from serve_test import Server
 
 LOCAL = ("--bind", "tcp://127.0.0.1:0", "--threads", "2")
@@ -31,20 +31,15 @@ def test_a_state_beyond_its_bound_is_told_in_the_notes_and_refused_where_that_is
     assert vla(*golden.arguments(options=["--strict-state", "--json"])).json()["notes"] == []
 
 
-def beyond(server):
-    """What the server counts."""
-    with urllib.request.urlopen(f"http://{server.ready['metrics']}/metrics", timeout=20) as answer:
-        lines = answer.read().decode().splitlines()
-    return [line.split()[1] for line in lines if line.startswith("vla_state_beyond_total ")]
-
-
-@pytest.mark.parametrize("options, kinds, count", [((), ["chunk", "chunk"], ["1"]), (("--strict-state",), ["chunk", "error"], ["0"])])
+@pytest.mark.parametrize("options, kinds, count", [((), ["chunk", "chunk"], 1), (("--strict-state",), ["chunk", "error"], 0)])
 def test_a_server_counts_states_beyond_their_bound_or_refuses_them(vla, golden, degrees, options, kinds, count):
     server = Server(vla, golden.bundle, *LOCAL, "--metrics", "127.0.0.1:0", *options)
     peer = wire.Peer(server.ready["address"])
     try:
         assert [wire.kind(peer.ask(wire.act(i, case, seed=1))) for i, case in enumerate([golden, degrees])] == kinds
-        assert beyond(server) == count
+        answered = "vla_requests_total", (("code", "bad_observation" if options else "ok"), ("kind", "act"))
+        found = scrape(server, lambda found: found.get(answered) == (1 if options else 2))
+        assert found["vla_state_beyond_total", ()] == count
     finally:
         peer.close()
         server.process.kill()
