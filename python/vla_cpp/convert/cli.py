@@ -118,8 +118,14 @@ def _add_evo1(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_gr00t(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("checkpoints of GR00T", "which hold several robots; a bundle is for one").add_argument
-    add("--embodiment", metavar="TAG", default="", help="the robot, by its tag in processor_config.json; asked for always")
+    add = parser.add_argument_group("checkpoints of GR00T", "which hold several robots").add_argument
+    add(
+        "--embodiment",
+        metavar="TAG",
+        default="",
+        help="the robot, by its tag in processor_config.json; asked for always. A,B,... for several in one bundle, all for every one"
+        " that has statistics",
+    )
     add(
         "--camera-size",
         metavar="WxH",

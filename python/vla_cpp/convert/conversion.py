@@ -17,6 +17,7 @@ from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
 from .checkpoint import Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
+from .embodiments import plan_robots
 from .errors import Code, Problems, refuse
 from .safetensors_file import Entry
 from .ternary import quantize
@@ -50,7 +51,7 @@ def convert_checkpoint(
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
-    plan = archs.load(arch).plan(checkpoint, options, problems)
+    plan = plan_robots(archs.load(arch), checkpoint, options, problems)
     if options.state_bound is not None:
         plan.keys.append(Key("observation.state_bound", "f32", options.state_bound))
     dropped = _match(checkpoint, plan, problems)

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""One package or module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`."""
+"""One package or module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`,
+and `embodiments(checkpoint)`, their tags, where a checkpoint holds several robots."""
 
 from __future__ import annotations
 
@@ -58,7 +59,7 @@ class Options:
     stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET; BitVLA: which of dataset_statistics.json
     views: Sequence[str] = ()  # Evo-1, BitVLA: names of the cameras in the order of the prompt's slots
     view_slots: int = 0  # Evo-1: places for views in the prompt
-    embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint
+    embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint; several with commas, or `all`
     camera_size: str = ""  # GR00T: WIDTHxHEIGHT of images whose aspect the pipeline keeps; they are square without it
     gripper_sign: str = ""  # GR00T: the key of a gripper's actions, which become -1 where it opens and 1 where it closes
     letterbox: bool = False  # GR00T: images are padded to squares, as the authors' later servers do

@@ -111,6 +111,11 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     return assemble(parts, network_keys(s, n_future), weights(s, n_future), checkpoint, options, s, problems)
 
 
+def embodiments(checkpoint: Checkpoint) -> List[str]:
+    """Tags of the robots that the checkpoint describes."""
+    return list(read_json(checkpoint.path(METADATA)))
+
+
 def network_keys(s: Sizes, n_future: int) -> List[Key]:
     return network_keys_of(EAGLE_2_5, s, {"policy.n_future": n_future})
 

@@ -7,12 +7,14 @@ The layout is the authors' (Isaac-GR00T), as of N1.7. An absent key of config.js
 
 from __future__ import annotations
 
+from typing import List
+
 from ..checkpoint import Checkpoint
 from ..errors import Problems
 from ..section import Fixed
 from . import Options, Plan
 from .gr00t.eagle import EAGLE_3
-from .gr00t.plan import Release, make_plan
+from .gr00t.plan import Release, described, make_plan
 
 # gr00t/configs/model/gr00t_n1d6.py of Isaac-GR00T.
 CONFIG = {
@@ -67,3 +69,7 @@ RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d6Processor", KWARGS_FIXED, EM
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     return make_plan(RELEASE, checkpoint, options, problems)
+
+
+def embodiments(checkpoint: Checkpoint) -> List[str]:
+    return described(RELEASE, checkpoint)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """GR00T N1.7: Qwen3-VL as the prefix, a diffusion transformer that reads its text and its images in turns.
 
-A checkpoint holds several robots, a bundle one of them, chosen by --embodiment. The layout is the authors' (Isaac-GR00T).
+A checkpoint holds several robots, a bundle those that --embodiment names. The layout is the authors' (Isaac-GR00T).
 
 An absent key of config.json means the default of the authors' own class, which is stated here beside the key. LeRobot's copy of that
 class has other defaults for `select_layer`, `diffusion_model_cfg` and `vl_self_attention_cfg`, those of the published checkpoint; where a
@@ -11,12 +11,14 @@ checkpoint leaves one of them out, its tensors fit the one or the other, and wha
 
 from __future__ import annotations
 
+from typing import List
+
 from ..checkpoint import Checkpoint
 from ..errors import Problems
 from ..section import Fixed
 from . import Options, Plan
 from .gr00t import qwen3_vl
-from .gr00t.plan import Release, make_plan
+from .gr00t.plan import Release, described, make_plan
 
 # gr00t/configs/model/gr00t_n1d7.py of Isaac-GR00T.
 DIT_DEFAULT = {
@@ -83,3 +85,7 @@ RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d7Processor", KWARGS_FIXED, EM
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     return make_plan(RELEASE, checkpoint, options, problems)
+
+
+def embodiments(checkpoint: Checkpoint) -> List[str]:
+    return described(RELEASE, checkpoint)

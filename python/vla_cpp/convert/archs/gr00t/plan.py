@@ -107,6 +107,16 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
 
 
+def described(release: Release, checkpoint: Checkpoint) -> List[str]:
+    """Tags of the robots that the checkpoint was trained for, which is what has statistics."""
+    problems = Problems(checkpoint.name)
+    configs = member(_processor(release, checkpoint, problems).values, "modality_configs", dict, PROCESSOR)
+    problems.raise_any()
+    statistics = read_json(processor_file(checkpoint, STATISTICS))
+    checkpoint.notes += ["{}: left out, {} has no statistics".format(tag, STATISTICS) for tag in configs if tag not in statistics]
+    return [tag for tag in configs if tag in statistics]
+
+
 class Parts(NamedTuple):
     """What a bundle is made of beside the network."""
 
