@@ -58,8 +58,10 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   StageClock clock;
   Timing load;
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(random ? random->path() : request.bundle,
-                       {.n_thread = request.n_thread, .kernels = request.kernels, .device = request.device}));
+          Engine::load(random ? random->path() : request.bundle, {.n_thread = request.n_thread,
+                                                                  .kernels = request.kernels,
+                                                                  .device = request.device,
+                                                                  .embodiment = request.embodiment}));
   clock.lap(load, "load");
   report.load = load.front().second;
 

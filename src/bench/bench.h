@@ -16,7 +16,7 @@ struct Request {
   std::vector<int> steps;  // the report is of the last, and has a fit where there are several; empty: the bundle's own
   int n_round = 7, n_warmup = 1;
   int n_thread = 0;  // as EngineOptions has them
-  std::string kernels, device;
+  std::string kernels, device, embodiment;
 };
 
 /// Measures the machine, then the policy, then the machine again. `accept` sees the conditions before the first round

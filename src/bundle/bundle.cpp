@@ -3,11 +3,13 @@
 #include "bundle/bundle.h"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 #include <xxhash.h>
 
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <set>
 #include <utility>
 
 #include "bundle/gguf_reader.h"
@@ -19,6 +21,7 @@ constexpr int kBundleVersion = 1;
 constexpr std::string_view kChecksumKey = "vla.checksum";
 constexpr std::string_view kChecksumPrefix = "xxh3:";
 constexpr std::size_t kDigits = 16;
+constexpr std::string_view kEmbodimentsKey = "embodiments", kEmbodimentPrefix = "embodiment.";
 
 /// XXH3-64 of a file that comes part by part, with the digits at `digits` read as '0'.
 class Checksum {
@@ -77,6 +80,54 @@ Status check_identity(const Keys& keys) {
   return Error{Code::bad_bundle, "vla.dtype", "f32, bf16 or f16", dtype};
 }
 
+Status check_tags(const std::vector<std::string>& tags, const std::string& where) {
+  const std::set<std::string> unique(tags.begin(), tags.end());
+  if (tags.size() < 2 || unique.size() != tags.size())
+    return Error{Code::bad_bundle, where, "at least two different tags", fmt::format("{}", fmt::join(tags, ", "))};
+  for (const std::string& tag : tags)
+    if (tag.empty() || tag.find('.') != std::string::npos)
+      return Error{Code::bad_bundle, where, "tags without a dot", "\"" + tag + "\""};
+  return {};
+}
+
+/// The tag in a name of the form embodiment.<tag>.<name>, and the name behind it; both empty for other names.
+std::pair<std::string, std::string> split_name(const std::string& name) {
+  if (!name.starts_with(kEmbodimentPrefix)) return {};
+  const std::size_t first = kEmbodimentPrefix.size(), dot = std::min(name.find('.', first), name.size());
+  return {name.substr(first, dot - first), name.substr(std::min(dot + 1, name.size()))};
+}
+
+/// A name that is one robot's own has a tag that is listed, and no robot shares it.
+Status check_own_name(const std::string& full, const std::vector<std::string>& tags,
+                      const std::function<bool(const std::string&)>& is_shared, const std::string& where) {
+  if (!full.starts_with(kEmbodimentPrefix)) return {};
+  const auto [tag, name] = split_name(full);
+  if (std::find(tags.begin(), tags.end(), tag) == tags.end() || name.empty())
+    return Error{Code::bad_bundle, where + full,
+                 tags.empty() ? "no such name, since there is no key embodiments"
+                              : fmt::format("embodiment.<tag>.<name> with a tag of {}", fmt::join(tags, ", ")),
+                 name.empty() ? "no name" : "tag " + tag, "convert the checkpoint again"};
+  if (!is_shared(name)) return {};
+  return Error{Code::bad_bundle, where + full, "a name that is not shared by all robots", "both", "convert it again"};
+}
+
+/// The robots of a bundle, and whether everything that is one robot's own can be told from what they share.
+Result<std::vector<std::string>> read_embodiments(const GgufContent& content, const std::string& name) {
+  std::vector<std::string> tags;
+  if (content.keys.has(kEmbodimentsKey)) {
+    VLA_TRY(tags, content.keys.strings(kEmbodimentsKey));
+    VLA_CHECK(check_tags(tags, name + ": " + std::string(kEmbodimentsKey)));
+  }
+  const auto is_key = [&](const std::string& key) { return content.keys.has(key); };
+  for (const auto& [key, value] : content.keys.all()) VLA_CHECK(check_own_name(key, tags, is_key, name + ": "));
+  std::set<std::string> names;
+  for (const TensorInfo& tensor : content.tensors) names.insert(tensor.name);
+  const auto is_tensor = [&](const std::string& tensor) { return names.contains(tensor); };
+  for (const TensorInfo& tensor : content.tensors)
+    VLA_CHECK(check_own_name(tensor.name, tags, is_tensor, name + ": tensor "));
+  return tags;
+}
+
 }  // namespace
 
 const char* dtype_name(DType type) {
@@ -112,13 +163,47 @@ Result<Bundle> Bundle::parse(const std::shared_ptr<Content>& content, std::strin
   VLA_CHECK(check_version(parsed.keys, name));
   VLA_CHECK(check_sum(*content, parsed.keys, name));
   VLA_CHECK(check_identity(parsed.keys));
+  VLA_TRY(std::vector<std::string> embodiments, read_embodiments(parsed, name));
   Bundle bundle;
   bundle.path_ = std::move(name);
   bundle.content_ = content;
   bundle.keys_ = std::move(parsed.keys);
   bundle.tensors_ = std::move(parsed.tensors);
-  for (std::size_t i = 0; i < bundle.tensors_.size(); ++i) bundle.index_.emplace(bundle.tensors_[i].name, i);
+  bundle.embodiments_ = std::move(embodiments);
+  bundle.index();
   return bundle;
+}
+
+void Bundle::index() {
+  index_.clear();
+  for (std::size_t i = 0; i < tensors_.size(); ++i) index_.emplace(tensors_[i].name, i);
+}
+
+Status Bundle::choose(const std::string& tag) {
+  if (embodiments_.empty()) {
+    if (tag.empty()) return {};
+    return Error{Code::usage, "embodiment", "none, since " + path_ + " is for one robot, which it does not name", tag,
+                 "leave it out"};
+  }
+  if (std::find(embodiments_.begin(), embodiments_.end(), tag) == embodiments_.end())
+    return Error{Code::usage, "embodiment", fmt::format("one of {}", fmt::join(embodiments_, ", ")),
+                 tag.empty() ? "none" : tag, path_ + " is for several robots: name yours"};
+  embodiment_ = tag;
+  std::map<std::string, Value, std::less<>> values;
+  for (const auto& [key, value] : keys_.all())
+    if (const auto [owner, name] = split_name(key); owner == tag || (owner.empty() && key != kEmbodimentsKey))
+      values.emplace(owner.empty() ? key : name, value);
+  keys_ = Keys(std::move(values));
+  std::vector<TensorInfo> tensors;
+  for (TensorInfo& tensor : tensors_) {
+    const auto [owner, name] = split_name(tensor.name);
+    if (!owner.empty() && owner != tag) continue;
+    if (!owner.empty()) tensor.name = name;
+    tensors.push_back(std::move(tensor));
+  }
+  tensors_ = std::move(tensors);
+  index();
+  return {};
 }
 
 Result<std::span<const std::byte>> Bundle::read(std::span<const std::byte> part, Room& room) const {

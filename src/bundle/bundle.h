@@ -41,6 +41,14 @@ class Bundle {
   /// The same on bytes in memory, which must outlive the bundle.
   static Result<Bundle> parse(std::span<const std::byte> bytes, std::string name);
 
+  /// Tags of the robots that the bundle is for; none where it is for one robot, which it does not name.
+  const std::vector<std::string>& embodiments() const { return embodiments_; }
+  /// From now on this is the bundle of one of its robots: what is under its tag has its plain name, and what is under
+  /// other tags is gone. `tag` is empty where `embodiments` is. Errors: usage, with the tags that there are.
+  Status choose(const std::string& tag);
+  /// The robot that was chosen, or empty.
+  const std::string& embodiment() const { return embodiment_; }
+
   const std::string& path() const { return path_; }
   const Keys& keys() const { return keys_; }
   const std::vector<TensorInfo>& tensors() const { return tensors_; }
@@ -57,7 +65,10 @@ class Bundle {
  private:
   static Result<Bundle> parse(const std::shared_ptr<Content>& content, std::string name);
 
-  std::string path_;
+  void index();
+
+  std::string path_, embodiment_;
+  std::vector<std::string> embodiments_;
   std::shared_ptr<const Content> content_;
   Keys keys_;
   std::vector<TensorInfo> tensors_;

@@ -70,7 +70,28 @@ std::vector<std::int64_t> Param::stored_shape() const {
   return stored;
 }
 
+void ParamList::go_on(const Bundle& bundle) {
+  keys_ = &bundle.keys();
+  bundle_ = &bundle;
+  names_.clear();
+  for (const Param& param : params_)
+    if (param.source != nullptr) by_source_.emplace(param.source->data.data(), &param);
+}
+
+/// The parameter of a robot before this one that is the same tensor of the file, or null.
+const Param* ParamList::shared(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const {
+  const TensorInfo* tensor = bundle_ != nullptr ? bundle_->find(name) : nullptr;
+  const auto found = tensor != nullptr ? by_source_.find(tensor->data.data()) : by_source_.end();
+  if (found == by_source_.end()) return nullptr;
+  const Param& param = *found->second;
+  return param.name == name && param.storage == storage && param.shape == shape ? &param : nullptr;
+}
+
 const Param& ParamList::declare(std::string name, Storage storage, std::vector<std::int64_t> shape) {
+  if (const Param* param = shared(name, storage, shape)) {
+    names_.insert(std::move(name));
+    return *param;
+  }
   Param& param = params_.emplace_back();
   param.id = static_cast<int>(params_.size()) - 1;
   param.name = std::move(name);

@@ -5,6 +5,7 @@
 #include <deque>
 #include <functional>
 #include <initializer_list>
+#include <map>
 #include <set>
 #include <string>
 #include <vector>
@@ -45,9 +46,13 @@ struct Param {
 class ParamList {
  public:
   /// `bundle` may be null: then the list is a manifest of what the keys ask for, and tensors are not looked up.
-  ParamList(const Keys& keys, const Bundle* bundle) : keys_(keys), bundle_(bundle) {}
+  ParamList(const Keys& keys, const Bundle* bundle) : keys_(&keys), bundle_(bundle) {}
 
-  const Keys& keys() const { return keys_; }
+  /// From now on parameters are those of another robot of the same file. What it shares with robots before it is not
+  /// declared again: `declare` gives the parameter that there is. Call `report` first. `bundle` must outlive this.
+  void go_on(const Bundle& bundle);
+
+  const Keys& keys() const { return *keys_; }
   const std::deque<Param>& params() const { return params_; }
   const Bundle* bundle() const { return bundle_; }
 
@@ -62,9 +67,12 @@ class ParamList {
  private:
   void look_up(Param& param);
 
-  const Keys& keys_;
+  const Param* shared(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const;
+
+  const Keys* keys_;
   const Bundle* bundle_;
-  std::deque<Param> params_;  // a deque: modules keep pointers to their parameters
+  std::deque<Param> params_;                            // a deque: modules keep pointers to their parameters
+  std::map<const std::byte*, const Param*> by_source_;  // of robots before the one that is declared now
   std::set<std::string> names_;
   std::vector<std::string> problems_;
 };

@@ -16,7 +16,7 @@ namespace vla::cli {
 namespace {
 
 struct BenchOptions {
-  std::string bundle, arch, size, dtype = "bf16", image_size, kernels, device, plot, vs;
+  std::string bundle, arch, size, dtype = "bf16", image_size, kernels, device, plot, vs, embodiment;
   std::optional<int> n_view, n_text;
   std::vector<int> steps;
   int n_thread = 0, n_round = 7, n_warmup = 1;
@@ -64,7 +64,7 @@ Status run_bench(const BenchOptions& options) {
   VLA_CHECK(check(options));
   bench::Request request{options.bundle,  options.arch,    dtype_of(options.dtype), {},
                          options.steps,   options.n_round, options.n_warmup,        options.n_thread,
-                         options.kernels, options.device};
+                         options.kernels, options.device,  options.embodiment};
   request.sizes = {options.n_view, 0, 0, options.n_text};
   if (!options.image_size.empty()) VLA_CHECK(parse_size(options.image_size, request.sizes));
   std::optional<bench::Earlier> earlier;
@@ -138,6 +138,7 @@ Command add_bench(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--kernels", options->kernels, kKernelsHelp);
   command->add_option("--device", options->device, std::string(kDeviceHelp) + ". Shares of a peak are the CPU's alone");
+  command->add_option("--embodiment", options->embodiment, kEmbodimentHelp);
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");
   command->add_option("--plot", options->plot, "Also draw the roofline into this SVG file");

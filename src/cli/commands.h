@@ -20,6 +20,10 @@ constexpr const char* kDeviceHelp =
     "cpu, or vulkan[:N] or cuda[:N] where vla inspect --devices lists it; not given: cpu. Nothing takes the place of a "
     "device that is absent";
 
+/// Of --embodiment, wherever a policy is loaded.
+constexpr const char* kEmbodimentHelp =
+    "The robot, by its tag, where the bundle is for several; a wrong one is answered with the list";
+
 /// Of --strict-state, wherever observations come in.
 constexpr const char* kStrictStateHelp =
     "Refuse a state that is far beyond what the policy has seen, instead of answering with a note";

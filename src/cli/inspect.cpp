@@ -14,7 +14,7 @@ namespace vla::cli {
 namespace {
 
 struct InspectOptions {
-  std::string bundle, manifest, graph, kernels, device;
+  std::string bundle, manifest, graph, kernels, device, embodiment;
   bool json = false, devices = false;
 };
 
@@ -131,6 +131,9 @@ void print_human(const Engine& engine) {
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
   say(stdout, "bundle       {}\n", d.path);
   say(stdout, "policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(engine.bundle().file_size()));
+  if (!d.embodiment.empty())
+    say(stdout, "embodiment   {}, one of {}\n", d.embodiment,
+        fmt::format("{}", fmt::join(engine.bundle().embodiments(), ", ")));
   for (const std::string& feature : engine.processor().degraded())
     say(stdout, "DEGRADED     {} passes unnormalized, as --identity-stats allowed when converting\n", feature);
   say(stdout, "source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
@@ -157,6 +160,7 @@ void print_human(const Engine& engine) {
 void print_json(const Engine& engine) {
   Json root;
   root["bundle"] = identity_json(engine.bundle());
+  if (!engine.bundle().embodiment().empty()) root["embodiments"] = engine.bundle().embodiments();
   root["keys"] = Json::object();
   for (const auto& [key, value] : engine.bundle().keys().all())
     if (!key.starts_with("tokenizer."))  // tens of thousands of tokens serve no reader
@@ -222,7 +226,9 @@ Status inspect(const InspectOptions& options) {
   if (!options.manifest.empty()) return print_manifest(options.manifest);
   // A dry load checks everything that a run would check and reserves the memory that it would take, without filling it.
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle, {.kernels = options.kernels, .device = options.device, .dry = true}));
+          Engine::load(
+              options.bundle,
+              {.kernels = options.kernels, .device = options.device, .dry = true, .embodiment = options.embodiment}));
   if (!options.graph.empty()) return print_graph(*engine, options.graph);
   options.json ? print_json(*engine) : print_human(*engine);
   return {};
@@ -249,6 +255,7 @@ Command add_inspect(CLI::App& app) {
       ->check(CLI::IsMember({"prefix", "step"}));
   command->add_option("--kernels", options->kernels, "As for vla run: what the program is made of");
   command->add_option("--device", options->device, "As for vla run: whose memory and program are shown");
+  command->add_option("--embodiment", options->embodiment, kEmbodimentHelp);
   command->add_flag("--devices", options->devices, "List what --device may name here, and why the others are absent");
   command->add_flag("--json", options->json, "Print JSON for machines");
   return [options] { return inspect(*options); };

@@ -22,6 +22,7 @@ inline std::string text_of(const Json& json, int indent = -1) {
 inline Json identity_json(const Bundle& bundle) {
   Json identity;
   identity["path"] = bundle.path();
+  if (!bundle.embodiment().empty()) identity["embodiment"] = bundle.embodiment();
   for (const char* key :
        {"vla.arch", "vla.dtype", "vla.checksum", "vla.source.name", "vla.source.revision", "vla.source.converter"})
     identity[std::string(key).substr(4)] = *bundle.keys().string(key);

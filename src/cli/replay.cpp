@@ -16,7 +16,7 @@ namespace vla::cli {
 namespace {
 
 struct ReplayOptions {
-  std::string folder, bundle, kernels, device, connect;
+  std::string folder, bundle, kernels, device, embodiment, connect;
   int n_thread = 0;
   serve::ReplayOptions replay;
 };
@@ -62,8 +62,11 @@ serve::ServerOptions limits_of(const v1::Limits& limits) {
 Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOptions& options) {
   VLA_TRY(const std::unique_ptr<serve::Server> server,
           serve::Server::open(limits_of(recording.description().limits())));
-  VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle, {options.n_thread, options.kernels, options.device}));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
+                                                                              .kernels = options.kernels,
+                                                                              .device = options.device,
+                                                                              .embodiment = options.embodiment,
+                                                                              .all_robots = true}));
   options.replay.address = server->addresses().front();
   std::optional<Result<serve::ReplayReport>> result;
   VLA_TRY(std::thread client, start_thread("replay", [&]() noexcept {
@@ -102,6 +105,7 @@ Command add_replay(CLI::App& app) {
   bundle->excludes(connect);
   command->add_option("--kernels", options->kernels, std::string(kKernelsHelp) + "; with --bundle")->needs(bundle);
   command->add_option("--device", options->device, std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
+  command->add_option("--embodiment", options->embodiment, "As for vla serve; with --bundle")->needs(bundle);
   command->add_option("--threads", options->n_thread, "CPU threads, with --bundle; 0 takes every core")
       ->needs(bundle)
       ->check(CLI::Range(0, 512));

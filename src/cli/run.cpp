@@ -19,7 +19,8 @@ namespace {
 constexpr std::size_t kMaxFile = std::size_t{1} << 30;
 
 struct RunOptions {
-  std::string bundle, text, noise, out, tap, taps_out, inject, kernels, device, leftover, schedule, normalized_out;
+  std::string bundle, text, noise, out, tap, taps_out, inject, kernels, device, leftover, schedule, normalized_out,
+      embodiment;
   std::vector<std::string> images, states;
   std::optional<std::uint64_t> seed;
   std::optional<int> delay;
@@ -189,9 +190,12 @@ Status run(RunOptions& options) {
   if (!options.inject.empty()) {
     VLA_TRY(inject, read_taps(options.inject));
   }
-  VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle,
-                       {options.n_thread, options.kernels, options.device, options.tap, std::move(inject)}));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
+                                                                              .kernels = options.kernels,
+                                                                              .device = options.device,
+                                                                              .tap_pattern = options.tap,
+                                                                              .inject = std::move(inject),
+                                                                              .embodiment = options.embodiment}));
   if (options.strict_state) engine->refuse_beyond();
   clock.lap(before, "load");
   Observation observation;
@@ -297,6 +301,7 @@ Command add_run(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--kernels", options->kernels, kKernelsHelp)->check(CLI::Validator(check_given, ""));
   command->add_option("--device", options->device, kDeviceHelp)->check(CLI::Validator(check_given, ""));
+  command->add_option("--embodiment", options->embodiment, kEmbodimentHelp)->check(CLI::Validator(check_given, ""));
   command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   return [options] { return run(*options); };
 }

@@ -19,7 +19,7 @@ namespace vla::cli {
 namespace {
 
 struct ServeOptions {
-  std::string bundle, kernels, device;
+  std::string bundle, kernels, device, embodiment;
   int n_thread = 0;
   bool strict_state = false;
   std::size_t max_message_mb = 32;
@@ -56,9 +56,17 @@ std::string quoted(const std::string& value) {
 
 /// One line that programs can split as a shell would.
 void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const std::string& metrics) {
-  const Processor& processor = engine.processor();
-  std::vector<std::string> features = processor.views().names();
-  features.insert(features.end(), processor.states().names().begin(), processor.states().names().end());
+  std::vector<std::string> features, tags, degraded;  // of all robots
+  const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
+    for (const std::string& text : some)
+      if (!text.empty() && std::find(all.begin(), all.end(), text) == all.end()) all.push_back(text);
+  };
+  for (const Engine* robot : engine.robots()) {
+    add_new(features, robot->processor().views().names());
+    add_new(features, robot->processor().states().names());
+    add_new(degraded, robot->processor().degraded());
+    add_new(tags, {robot->bundle().embodiment()});
+  }
   const v1::Description description = serve::describe(engine, {});
   std::string line = "ready";
   const auto add = [&](const char* name, const std::string& value) {
@@ -67,6 +75,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("address", fmt::format("{}", fmt::join(server.addresses(), ",")));
   add("bundle", description.bundle().name());
   add("arch", description.bundle().arch());
+  if (!tags.empty()) add("embodiments", fmt::format("{}", fmt::join(tags, ",")));
   add("device", description.runtime().device());
   add("precision", description.runtime().precision());
   add("kernels", description.runtime().kernels());
@@ -74,7 +83,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("features", fmt::format("{}", fmt::join(features, ",")));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
   if (!metrics.empty()) add("metrics", metrics);
-  if (!processor.degraded().empty()) add("DEGRADED", fmt::format("{}", fmt::join(processor.degraded(), ",")));
+  if (!degraded.empty()) add("DEGRADED", fmt::format("{}", fmt::join(degraded, ",")));
   say(stdout, "{}\n", line);
   std::fflush(stdout);
 }
@@ -83,8 +92,11 @@ Status serve(ServeOptions& options) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Watch> watch, Watch::start(options.watch, *server, options.server.insecure));
-  VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(options.bundle, {options.n_thread, options.kernels, options.device}));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
+                                                                              .kernels = options.kernels,
+                                                                              .device = options.device,
+                                                                              .embodiment = options.embodiment,
+                                                                              .all_robots = true}));
   watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   if (options.strict_state) engine->refuse_beyond();  // not before, as warming up takes any numbers
@@ -120,6 +132,10 @@ Command add_serve(CLI::App& app) {
   };
   command->add_option("--kernels", options->kernels, kKernelsHelp)->check(check_given);
   command->add_option("--device", options->device, kDeviceHelp)->check(check_given);
+  command
+      ->add_option("--embodiment", options->embodiment,
+                   "Answer this robot of a bundle of several alone; not given: all")
+      ->check(check_given);
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();

@@ -50,6 +50,7 @@ Description describe(const Engine& engine) {
   out.t_start = engine.solver().times.front().value;
   out.real_time_chunking = kind_name(engine.real_time_chunking().kind);
 
+  out.embodiment = engine.bundle().embodiment();
   out.path = engine.bundle().path();
   for (const auto& [key, text] : {std::pair{"arch", &out.arch},
                                   {"dtype", &out.dtype},

@@ -38,6 +38,7 @@ struct Description {
   double t_start;
   std::string real_time_chunking;  // what an act's leftover does: guided, inpainted, or empty where it is refused
 
+  std::string embodiment;  // the robot's tag, empty where the bundle is for one and does not name it
   std::string path, arch, dtype, checksum, source, revision, converter;
   std::string precision, kernels, device;
   MemoryUse memory;

@@ -3,9 +3,11 @@
 #include "engine/engine.h"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <new>
 
 namespace vla {
@@ -16,33 +18,89 @@ constexpr int kMaxHorizon = 4096;
 }  // namespace
 
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
-  VLA_TRY(Bundle bundle, Bundle::open(path));
-  VLA_TRY(Processor processor, Processor::create(bundle));
-  VLA_TRY(std::unique_ptr<Device> device, open_device(options.n_thread, options.kernels, options.device));
-  std::unique_ptr<Engine> engine(new Engine(std::move(bundle), std::move(processor), std::move(device)));
-  engine->tap_pattern_ = options.tap_pattern;
-  engine->dry_ = options.dry;
-  VLA_CHECK(engine->take_injected(options.inject));
-  VLA_CHECK(engine->load_policy());
-  VLA_CHECK(engine->make_conditions());
-  VLA_CHECK(engine->make_constants());
-  VLA_CHECK(engine->make_plans());
-  if (!options.dry) engine->device_->touch();
-  return engine;
+  VLA_TRY(Bundle file, Bundle::open(path));
+  VLA_TRY(std::vector<std::unique_ptr<Engine>> robots, open_robots(std::move(file), options));
+  VLA_TRY(const std::shared_ptr<Device> device, open_device(options.n_thread, options.kernels, options.device));
+  std::shared_ptr<ParamList> params;
+  for (const auto& robot : robots) {
+    robot->device_ = device;
+    robot->tap_pattern_ = options.tap_pattern;
+    robot->dry_ = options.dry;
+    VLA_CHECK(robot->take_injected(options.inject));
+    VLA_CHECK(robot->load_policy(params));
+  }
+  VLA_CHECK(device->load(*params, !options.dry));
+  for (const auto& robot : robots) VLA_CHECK(robot->make_graphs());
+  if (!options.dry) device->touch();
+  std::unique_ptr<Engine> first = std::move(robots.front());
+  first->others_.assign(std::move_iterator(robots.begin() + 1), std::move_iterator(robots.end()));
+  return first;
 }
 
-Status Engine::load_policy() {
+/// Each with the bundle and the processor that it would have alone.
+Result<std::vector<std::unique_ptr<Engine>>> Engine::open_robots(Bundle file, const EngineOptions& options) {
+  std::vector<std::string> tags = {options.embodiment};
+  if (options.all_robots && options.embodiment.empty() && !file.embodiments().empty()) tags = file.embodiments();
+  std::vector<std::unique_ptr<Engine>> robots;
+  for (const std::string& tag : tags) {
+    Bundle bundle = robots.size() + 1 < tags.size() ? file : std::move(file);
+    VLA_CHECK(bundle.choose(tag));
+    VLA_TRY(Processor processor, Processor::create(bundle));
+    robots.emplace_back(new Engine(std::move(bundle), std::move(processor)));
+  }
+  return robots;
+}
+
+void Engine::refuse_beyond() {
+  processor_.refuse_beyond();
+  for (const auto& other : others_) other->refuse_beyond();
+}
+
+std::vector<const Engine*> Engine::robots() const {
+  std::vector<const Engine*> all = {this};
+  for (const auto& other : others_) all.push_back(other.get());
+  return all;
+}
+
+Result<const Engine*> Engine::robot(const std::string& tag) const {
+  const std::string& own = bundle_.embodiment();
+  if (tag == own || (tag.empty() && others_.empty())) return this;
+  std::vector<std::string> tags = {own};
+  for (const auto& other : others_) {
+    if (other->bundle_.embodiment() == tag) return static_cast<const Engine*>(other.get());
+    tags.push_back(other->bundle_.embodiment());
+  }
+  if (own.empty())
+    return Error{Code::bad_observation, "embodiment", "none, since the policy is for one robot, which it does not name",
+                 tag, "leave it out"};
+  return Error{Code::bad_observation, "embodiment", fmt::format("one of {}", fmt::join(tags, ", ")),
+               tag.empty() ? "none" : tag, "name the robot that the observation is of"};
+}
+
+/// `params`: those of the robots before this one, and null for the first.
+Status Engine::load_policy(std::shared_ptr<ParamList>& params) {
   const Keys& keys = bundle_.keys();
   VLA_TRY(const std::string arch, keys.string("vla.arch"));
   VLA_TRY(const PolicyEntry entry, find_policy(arch));
-  params_ = std::make_unique<ParamList>(keys, &bundle_);
+  if (params == nullptr)
+    params = std::make_shared<ParamList>(keys, &bundle_);
+  else
+    params->go_on(bundle_);
+  params_ = params;
   policy_ = entry.make(*params_);
   VLA_CHECK(params_->report(arch, [this](const std::string& tensor) { return processor_.reads(tensor); }));
   VLA_TRY(solver_, Solver::read(keys));
   VLA_TRY(horizon_, keys.integer("policy.horizon", {1, kMaxHorizon}));
   VLA_TRY(d_action_, keys.integer("policy.d_action", {1, kMaxVector}));
   VLA_TRY(d_state_, keys.integer("policy.d_state", {0, kMaxVector}));
-  return device_->load(*params_, !dry_);
+  return {};
+}
+
+/// When weights are loaded.
+Status Engine::make_graphs() {
+  VLA_CHECK(make_conditions());
+  VLA_CHECK(make_constants());
+  return make_plans();
 }
 
 /// Load rate: lowers a graph that is used once, and runs it.
@@ -188,6 +246,9 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
                                 const std::optional<Leftover>& leftover) noexcept {
   // Containers throw where there is no memory: the act is given up, and the next one starts afresh.
   try {
+    VLA_TRY(const Engine* chosen, robot(observation.embodiment));
+    for (const auto& other : others_)
+      if (other.get() == chosen) return other->run(observation, noise, leftover);
     return run(observation, noise, leftover);
   } catch (const std::bad_alloc&) {
     return Error{Code::out_of_memory, "act", "", "the system refused an allocation", "free memory"};
@@ -256,7 +317,14 @@ std::string Engine::arithmetic() const {
 }
 
 MemoryUse Engine::memory() const {
-  return {device_->weights_size() + tables_->size() + constant_slots_->size(), plans_->size(), device_->working_size()};
+  MemoryUse use = {device_->weights_size(), 0, device_->working_size()};
+  const auto add = [&use](const Engine& robot) {
+    use.weights += robot.tables_->size() + robot.constant_slots_->size();
+    use.plan += robot.plans_->size();
+  };
+  add(*this);
+  for (const auto& other : others_) add(*other);
+  return use;
 }
 
 }  // namespace vla

@@ -23,7 +23,9 @@ struct EngineOptions {
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
   /// Values at taps that take the place of the computed ones: as the network's own, or as `pixels` and `state`.
   std::vector<Tap> inject = {};
-  bool dry = false;  // reserve memory without filling it: sizes are exact, and `act` must not be called
+  bool dry = false;             // reserve memory without filling it: sizes are exact, and `act` must not be called
+  std::string embodiment = {};  // the robot, by its tag; empty where the bundle is for one
+  bool all_robots = false;      // without a tag: every robot of a bundle of several
 };
 
 /// What a policy answers to one observation.
@@ -47,6 +49,8 @@ struct MemoryUse {
 
 /// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps,
 /// unnormalize. One thread at a time may call it.
+///
+/// Where it has several robots, this is the first of them and keeps the others: they share weights and working memory.
 class Engine {
  public:
   /// Opens, checks and loads a bundle, and builds the largest plan. Errors: io, bad_bundle, unsupported, out_of_memory,
@@ -56,10 +60,16 @@ class Engine {
   /// What `device` of the options may name on this machine.
   static DeviceList devices() { return list_devices(); }
 
-  /// From now on a state beyond the bundle's bound is refused, as Processor::refuse_beyond.
-  void refuse_beyond() { processor_.refuse_beyond(); }
-  /// `leftover`: what the robot has not executed yet of the chunk before, where the next one is to go on from it.
-  /// Errors: bad_observation, bad_action (a number that is not finite came out), unsupported, device, out_of_memory.
+  /// Of all robots: from now on a state beyond the bundle's bound is refused, as Processor::refuse_beyond.
+  void refuse_beyond();
+  /// This robot and the others.
+  std::vector<const Engine*> robots() const;
+  /// The robot that answers to this tag; an empty one where there is one robot. Errors: bad_observation, with the tags
+  /// that there are.
+  Result<const Engine*> robot(const std::string& tag) const;
+  /// The robot that the observation names answers. `leftover`: what the robot has not executed yet of the chunk before,
+  /// where the next one is to go on from it. Errors: bad_observation, bad_action (a number that is not finite came
+  /// out), unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
 
@@ -98,9 +108,10 @@ class Engine {
   std::string arithmetic() const;
 
  private:
-  Engine(Bundle bundle, Processor processor, std::unique_ptr<Device> device)
-      : bundle_(std::move(bundle)), processor_(std::move(processor)), device_(std::move(device)) {}
-  Status load_policy();
+  Engine(Bundle bundle, Processor processor) : bundle_(std::move(bundle)), processor_(std::move(processor)) {}
+  static Result<std::vector<std::unique_ptr<Engine>>> open_robots(Bundle file, const EngineOptions& options);
+  Status load_policy(std::shared_ptr<ParamList>& params);
+  Status make_graphs();
   Result<ActionChunk> run(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover);
   Status make_conditions();
   Status run_once(const Graph& graph);
@@ -121,14 +132,15 @@ class Engine {
 
   Bundle bundle_;
   Processor processor_;
-  std::unique_ptr<Device> device_;
+  std::vector<std::unique_ptr<Engine>> others_;  // of the first robot
+  std::shared_ptr<Device> device_;
   Solver solver_;
   int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   std::string tap_pattern_;
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   bool dry_ = false;
-  std::unique_ptr<ParamList> params_;
+  std::shared_ptr<ParamList> params_;  // of all robots
   std::unique_ptr<Policy> policy_;
   std::unique_ptr<Slots> tables_;
   const Slot* conditions_ = nullptr;  // in tables_

@@ -23,6 +23,7 @@ struct Observation {
   std::map<std::string, std::optional<Frame>> views;  // nullopt: declared absent
   std::map<std::string, std::vector<float>> states;   // world units
   std::string text;                                   // the instruction, UTF-8
+  std::string embodiment = {};                        // the robot's tag; empty where the policy is for one
 };
 
 /// The host side of one observation, as the network reads it. Vectors keep their memory when filled again.

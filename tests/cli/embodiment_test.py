@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A bundle for several robots: each acts as its bundle alone does, and has to be named."""
+
+import json
+
+import pytest
+from convert_and_run_test import convert
+from golden_cases import Golden
+
+OTHER = "new_embodiment"  # the second robot of every golden checkpoint of GR00T
+
+
+def joint(name, folder):
+    """(case, its robot, a bundle of it and the other robot)."""
+    case = Golden(name)
+    tag = case.said["embodiment"]
+    case.said["embodiment"] = f"{OTHER},{tag}"
+    return case, tag, convert(case, folder / "both.gguf", "bf16")
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    return joint("gr00t_n1_7/libero", tmp_path_factory.mktemp("both"))
+
+
+def answer_of(vla, case, *options, **arguments):
+    answer = vla(*case.arguments(options=["--json", *options], **arguments)).json()
+    return answer["actions"], answer["action_names"]
+
+
+@pytest.mark.parametrize("name", ["gr00t_n1_6/libero", "gr00t_n1_7/libero", "gr00t_n1_7/two_moments"])
+def test_a_robot_of_a_bundle_of_two_answers_the_bits_of_its_bundle_alone(vla, tmp_path, name):
+    case, tag, bundle = joint(name, tmp_path)
+    assert answer_of(vla, case, "--embodiment", tag, bundle=bundle) == answer_of(vla, case)
+
+
+@pytest.mark.parametrize("command", ["run", "bench", "inspect"])
+@pytest.mark.parametrize("given, found", [([], "none"), (["--embodiment", "dog"], "dog")])
+def test_a_robot_that_is_not_named_or_not_there_is_refused_with_the_list(vla, both, command, given, found):
+    case, tag, bundle = both
+    arguments = case.arguments(bundle=bundle) if command == "run" else [command, bundle]
+    answer = vla(*arguments, *given)
+    assert answer.code == 2
+    assert f"embodiment: expected one of {OTHER}, {tag}, found {found}" in answer.err
+
+
+def test_serving_a_robot_that_is_not_there_is_refused_with_the_list(vla, both):
+    case, tag, bundle = both
+    answer = vla("serve", bundle, "--bind", "tcp://127.0.0.1:0", "--embodiment", "dog")
+    assert answer.code == 2 and f"expected one of {OTHER}, {tag}, found dog" in answer.err
+
+
+def test_a_bundle_of_one_robot_takes_no_tag(vla, both):
+    case, tag, _ = both
+    answer = vla("inspect", case.bundle, "--embodiment", tag)
+    assert answer.code == 2 and "is for one robot, which it does not name, found " + tag in answer.err
+
+
+def test_inspect_lists_the_robots_and_shows_the_one_that_is_named(vla, both):
+    case, tag, bundle = both
+    alone = json.loads(vla("inspect", case.bundle, "--json").out)
+    shown = json.loads(vla("inspect", bundle, "--embodiment", tag, "--json").out)
+    assert shown["embodiments"] == [OTHER, tag] and shown["bundle"]["embodiment"] == tag
+    for part in ("stats", "modules", "memory_bytes"):
+        assert shown[part] == alone[part]
+    checksums = {keys.pop("vla.checksum") for keys in (shown["keys"], alone["keys"])}
+    assert shown["keys"] == alone["keys"] and len(checksums) == 2
+    text = vla("inspect", bundle, "--embodiment", OTHER).out
+    assert f"embodiment   {OTHER}, one of {OTHER}, {tag}\n" in text and "ego_view" in text
