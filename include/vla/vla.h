@@ -91,9 +91,11 @@ typedef struct vla_options {
                            VLA_BAD_OBSERVATION; 0: it is answered with a note */
   const char* device; /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". Nothing takes the place of a device that
                          is absent: opening fails with VLA_DEVICE, and `expected` lists what is there */
+  const char* embodiment; /* of a bundle for several robots: tag of the one that is loaded; NULL: all of them. A tag that
+                             the bundle does not have fails with VLA_USAGE, and `expected` lists them */
 } vla_options;
 #define VLA_OPTIONS_INIT \
-  { sizeof(vla_options), 0, NULL, 0, NULL }
+  { sizeof(vla_options), 0, NULL, 0, NULL, NULL }
 
 /* Opens, checks and loads a bundle. `options` may be NULL: then they are as VLA_OPTIONS_INIT has them. On failure *out
  * is NULL. */
@@ -120,7 +122,8 @@ typedef struct vla_state_info {
 } vla_state_info;
 
 /* What a policy takes and gives. */
-typedef struct vla_description {
+typedef struct vla_description vla_description;
+struct vla_description {
   size_t struct_size;
 
   size_t n_view, min_views;          /* at least min_views of the views must be present in an observation */
@@ -151,7 +154,12 @@ typedef struct vla_description {
   size_t noise_rows; /* `horizon`, or more where the robot gets the first rows only of what the network computes */
   const char* real_time_chunking; /* what the leftover of an observation does: "guided", "inpainted", or empty where
                                      there must be none */
-} vla_description;
+  const char* embodiment; /* tag of the robot; empty where the bundle is for one, which it does not name */
+  /* Of a policy with several robots: a description of each, with its tag. Views, states, actions, horizon, noise and
+   * leftover are then theirs alone: here they are 0 and empty. */
+  size_t n_embodiment;
+  const vla_description* const* embodiments;
+};
 
 /* NULL only when `policy` is NULL. */
 VLA_API const vla_description* vla_describe(const vla_policy* policy);
@@ -203,9 +211,10 @@ typedef struct vla_observation {
   const char* schedule;   /* of a "guided" policy, and only there: how the weight of the rows after the delay falls,
                              "zeros", "ones", "linear" or "exp" */
   double max_guidance;    /* the same: the largest weight of the guidance, above 0 */
+  const char* embodiment; /* tag of the robot that the observation is of; NULL where the policy has one */
 } vla_observation;
 #define VLA_OBSERVATION_INIT \
-  { sizeof(vla_observation), NULL, 0, NULL, 0, NULL, 0, NULL, 0, 0, 0, NULL, 0, 0, NULL, 0 }
+  { sizeof(vla_observation), NULL, 0, NULL, 0, NULL, 0, NULL, 0, 0, 0, NULL, 0, 0, NULL, 0, NULL }
 
 /* Answers one observation. On failure *out is NULL, and the policy goes on to answer the next. */
 VLA_API vla_status vla_act(vla_policy* policy, const vla_observation* observation, vla_chunk** out);

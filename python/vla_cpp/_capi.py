@@ -37,7 +37,14 @@ class Error(_Struct):
 
 
 class Options(_Struct):
-    _fields_ = [("struct_size", c_size_t), ("n_thread", c_int32), ("kernels", c_char_p), ("strict_state", c_int32), ("device", c_char_p)]
+    _fields_ = [
+        ("struct_size", c_size_t),
+        ("n_thread", c_int32),
+        ("kernels", c_char_p),
+        ("strict_state", c_int32),
+        ("device", c_char_p),
+        ("embodiment", c_char_p),
+    ]
 
 
 class ViewInfo(_Struct):
@@ -92,6 +99,9 @@ class Description(_Struct):
         ("memory_working", c_uint64),
         ("noise_rows", c_size_t),
         ("real_time_chunking", c_char_p),
+        ("embodiment", c_char_p),
+        ("n_embodiment", c_size_t),
+        ("embodiments", POINTER(c_void_p)),  # of Description
     ]
 
 
@@ -130,6 +140,7 @@ class Observation(_Struct):
         ("leftover_delay", c_int32),
         ("schedule", c_char_p),
         ("max_guidance", c_double),
+        ("embodiment", c_char_p),
     ]
 
 

@@ -18,7 +18,7 @@ from .chunk import Chunk
 from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
 from .handle import Handle, wrong_process
-from .observation import Image, Leftover, State, check_start
+from .observation import Image, Leftover, State, check_start, robot_of
 from .pending import Health, Pending
 from .spec import Spec
 
@@ -93,6 +93,7 @@ class Client(Handle):
         deadline_ms: Optional[float] = None,
         capture_time_ns: Optional[int] = None,
         timeout: Optional[float] = None,
+        embodiment: Optional[str] = None,
     ) -> Chunk:
         """One observation in, one action chunk out.
 
@@ -106,13 +107,14 @@ class Client(Handle):
         deadline_ms      after so many milliseconds at the server the answer is worthless and not computed; the timeout by default
         capture_time_ns  when the frames were taken; comes back in the chunk
         timeout          seconds, instead of the client's
+        embodiment       tag of the robot, where `spec.robots` has several
 
         Errors: BadObservation (what the policy cannot take, by name), Timeout, Disconnected, Superseded, Late, Busy, TooLarge,
         Incompatible, ShuttingDown, and what the runtime itself may raise: BadAction, DeviceError, OutOfMemory, InternalError.
         """
         return self.submit(
             images=images, state=state, text=text, seed=seed, noise=noise, leftover=leftover,
-            deadline_ms=deadline_ms, capture_time_ns=capture_time_ns, timeout=timeout,
+            deadline_ms=deadline_ms, capture_time_ns=capture_time_ns, timeout=timeout, embodiment=embodiment,
         ).result()  # fmt: skip
 
     def submit(
@@ -122,6 +124,7 @@ class Client(Handle):
         noise: object = None,
         deadline_ms: Optional[float] = None,
         timeout: Optional[float] = None,
+        embodiment: Optional[str] = None,
         **observation: Any,
     ) -> Pending:
         """Takes the arguments of `act`, sends them and returns at once: `done()` of the result never waits, `result()` is the chunk.
@@ -130,7 +133,7 @@ class Client(Handle):
         """
         check_start(seed, noise)
         timeout = self.timeout if timeout is None else timeout
-        spec, limits = self.spec, self._limits
+        spec, limits = robot_of(self.spec, embodiment), self._limits
         deadline_ms = timeout * 1000 if deadline_ms is None else deadline_ms
 
         def write(request: Any) -> bytes:

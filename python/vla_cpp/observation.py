@@ -42,6 +42,17 @@ def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
     return mapping.items()
 
 
+def robot_of(spec: Spec, embodiment: Optional[str]) -> Spec:
+    """What the robot of this tag takes; None where there is one. Errors: BadObservation, with the tags that there are."""
+    tags = tuple(spec.robots) or ((spec.embodiment,) if spec.embodiment else ())
+    if embodiment in tags:
+        return spec.robots.get(embodiment, spec)
+    if embodiment is None and not spec.robots:
+        return spec
+    expected = "one of " + ", ".join(tags) if tags else "none, since the policy is for one robot, which it does not name"
+    raise BadObservation("embodiment", expected, "none" if embodiment is None else str(embodiment)[:80])
+
+
 def place(kind: str, given: str, features: Sequence[Union[ViewSpec, StateSpec]]) -> str:
     """Where an error about what was given under this name is, as the runtime says it: the feature's full name, or `view "x"`."""
     names = {f.name: (f.name, *getattr(f, "aliases", ())) for f in features}

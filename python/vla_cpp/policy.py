@@ -16,7 +16,7 @@ from . import _capi
 from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
 from .handle import Handle, wrong_process
-from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, place, states_of
+from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, place, robot_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 
@@ -32,6 +32,7 @@ class Policy(Handle):
              bundle's dtype
     strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
     device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". A device that is absent is a DeviceError, which lists what is there
+    embodiment  of a bundle for several robots, the tag of the one to load; None: all of them, and each `act` names its robot
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
     of its parent, since the threads that compute stay behind, nor can it be pickled.
@@ -47,6 +48,7 @@ class Policy(Handle):
         kernels: Optional[str] = None,
         strict_state: bool = False,
         device: Optional[str] = None,
+        embodiment: Optional[str] = None,
     ) -> None:
         self._handle = ctypes.c_void_p()
         self._lock = threading.Lock()
@@ -59,6 +61,7 @@ class Policy(Handle):
             kernels=None if kernels is None else _encoded("kernels", kernels, UsageError),
             strict_state=bool(strict_state),
             device=None if device is None else _encoded("device", device, UsageError),
+            embodiment=None if embodiment is None else _encoded("embodiment", embodiment, UsageError),
         )
         if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
             raise self._last_error(None)
@@ -79,6 +82,7 @@ class Policy(Handle):
         noise: object = None,
         leftover: Optional[Leftover] = None,
         capture_time_ns: Optional[int] = None,
+        embodiment: Optional[str] = None,
     ) -> Chunk:
         """One observation in, one action chunk out.
 
@@ -90,20 +94,22 @@ class Policy(Handle):
                          tells it
         leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover
         capture_time_ns  when the frames were taken; comes back in the chunk
+        embodiment       tag of the robot, where `spec.robots` has several
 
         Errors: BadObservation (what the policy cannot take, by name), BadAction, DeviceError, OutOfMemory, InternalError.
         """
         check_start(seed, noise)
         if noise is None and seed is None:
             seed = random.SystemRandom().getrandbits(32)
-        call = _Call(self._spec, images, state, text, seed, noise, leftover)
+        spec = robot_of(self._spec, embodiment)
+        call = _Call(spec, images, state, text, seed, noise, leftover)
         with self._lock:
             self._check_usable()
             answer = ctypes.c_void_p()
             if self._library.vla_act(self._handle, call.observation, ctypes.byref(answer)):
                 raise self._last_error(self._handle)
         try:
-            return self._chunk_of(answer, seed, capture_time_ns)
+            return self._chunk_of(answer, spec, seed, capture_time_ns)
         finally:
             self._library.vla_chunk_close(answer)
 
@@ -129,8 +135,8 @@ class Policy(Handle):
         error = self._library.vla_last_error(handle).contents
         return error_of(*(_text(getattr(error, part)) for part in ("code_name", "where", "expected", "found", "hint")))
 
-    def _chunk_of(self, answer: ctypes.c_void_p, seed: Optional[int], capture_time_ns: Optional[int]) -> Chunk:
-        lib, spec = self._library, self._spec
+    def _chunk_of(self, answer: ctypes.c_void_p, spec: Spec, seed: Optional[int], capture_time_ns: Optional[int]) -> Chunk:
+        lib = self._library
         actions, normalized = (
             np.ctypeslib.as_array(numbers(answer), (spec.horizon, spec.d_action)).copy()
             for numbers in (lib.vla_chunk_actions, lib.vla_chunk_normalized)
@@ -180,6 +186,8 @@ class _Call:
             has_seed=seed is not None,
             seed=0 if seed is None else int(seed),
         )
+        if spec.embodiment:
+            self.observation.embodiment = spec.embodiment.encode()
         if noise is not None:
             values = noise_of(noise, spec.noise_rows, spec.d_noise)
             self.observation.noise, self.observation.n_noise = self._address(values), values.size
@@ -247,6 +255,7 @@ def _texts(pointers: Any, count: int) -> Tuple[str, ...]:
 def _spec_of(d: _capi.Description) -> Spec:
     views = [d.views[i].contents for i in range(d.n_view)]
     states = [d.states[i].contents for i in range(d.n_state)]
+    robots = [_spec_of(_capi.Description.from_address(d.embodiments[i])) for i in range(d.n_embodiment)]
     source, revision = _text(d.source), _text(d.revision)
     return Spec(
         views=tuple(
@@ -275,4 +284,6 @@ def _spec_of(d: _capi.Description) -> Spec:
         precision=_text(d.precision),
         kernels=_text(d.kernels),
         device=_text(d.device),
+        embodiment=_text(d.embodiment),
+        robots={robot.embodiment: robot for robot in robots},
     )

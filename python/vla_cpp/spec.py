@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Tuple
+from dataclasses import dataclass, field
+from typing import Mapping, Tuple
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,9 @@ class Spec:
     noise_rows    its rows: `horizon`, or more where the robot gets the first rows only of what the network computes
     noise         its distribution, e.g. "normal"
     real_time_chunking  what a Leftover does: "guided", "inpainted", or "" where it is refused
+    embodiment    tag of the robot, where the bundle is for several; else ""
+    robots        of a policy with several: each one's own Spec by its tag. Views, states, actions, horizon and noise are then theirs
+                  alone, and empty here
     rate_hz       rows per second that the policy was trained for; 0 where the bundle does not say
     """
 
@@ -78,3 +81,5 @@ class Spec:
     kernels: str
     device: str
     real_time_chunking: str = ""
+    embodiment: str = ""
+    robots: Mapping[str, Spec] = field(default_factory=dict)

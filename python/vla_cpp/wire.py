@@ -89,6 +89,8 @@ def act_bytes(
         act.seed = int(seed)
     if leftover is not None:
         _add_leftover(act, leftover, leftover_of(leftover, spec))
+    if spec.embodiment:
+        act.embodiment = spec.embodiment
     act.deadline_ms = _milliseconds(deadline_ms)
     if capture_time_ns is not None:
         act.capture_time_ns = _int64("capture_time_ns", capture_time_ns)
@@ -176,6 +178,8 @@ def spec_of(description: Any) -> Spec:
         noise_rows=description.noise_rows,
         noise=description.noise_kind,
         real_time_chunking=description.real_time_chunking,
+        embodiment=description.embodiment,
+        robots={robot.embodiment: spec_of(robot) for robot in description.embodiments},
         rate_hz=description.rate_hz,
         bundle=bundle_of(description.bundle),
         precision=runtime.precision,

@@ -5,6 +5,7 @@
 #include <vla/vla.h>
 
 #include <deque>
+#include <memory>
 
 #include "engine/description.h"
 
@@ -13,7 +14,8 @@ namespace vla::capi {
 /// What `vla_describe` returns, with the memory that its pointers point into; therefore it stays where it was made.
 class Description {
  public:
-  explicit Description(const vla::Description& d);
+  /// One robot, or several.
+  explicit Description(const std::vector<vla::Description>& robots);
   Description(const Description&) = delete;
   Description& operator=(const Description&) = delete;
 
@@ -22,6 +24,9 @@ class Description {
  private:
   using Texts = std::vector<const char*>;
 
+  explicit Description(const vla::Description& d) { fill_common(d), fill_robot(d); }
+  void fill_common(const vla::Description& d);
+  void fill_robot(const vla::Description& d);
   const char* keep(const std::string& text) { return kept_.emplace_back(text).c_str(); }
   /// Names and units of numbers as arrays of pointers.
   const char* const* keep_names(const std::vector<vla::Description::Number>& numbers);
@@ -34,6 +39,8 @@ class Description {
   std::vector<vla_state_info> state_infos_;
   std::vector<const vla_view_info*> views_;
   std::vector<const vla_state_info*> states_;
+  std::vector<std::unique_ptr<Description>> robots_;
+  std::vector<const vla_description*> robot_pointers_;
   vla_description description_{};
 };
 

@@ -128,15 +128,19 @@ Result<std::optional<Leftover>> read_leftover(const vla_observation& given) {
 Result<Request> read_observation(const vla_observation* given, const Engine& engine) {
   VLA_TRY(const vla_observation known, read_struct<vla_observation>(given, "observation"));
   Request request;
-  VLA_TRY(request.noise, read_noise(known, engine));
+  if (known.embodiment != nullptr) {
+    VLA_TRY(request.observation.embodiment, read_name(known.embodiment, "observation.embodiment"));
+  }
+  VLA_TRY(const Engine* robot, engine.robot(request.observation.embodiment));
+  VLA_TRY(request.noise, read_noise(known, *robot));
   VLA_TRY(request.leftover, read_leftover(known));
   if (known.text_size > Tokenizer::kMaxText)
     return Error{Code::bad_observation, "instruction", fmt::format("at most {} bytes", Tokenizer::kMaxText),
                  std::to_string(known.text_size)};
   if (known.text == nullptr) return usage("observation.text", "an instruction", "NULL");
   request.observation.text.assign(known.text, known.text_size);
-  VLA_CHECK(read_states(known, engine.processor().states(), request.observation));
-  VLA_CHECK(read_views(known, engine.processor().views(), request.observation));
+  VLA_CHECK(read_states(known, robot->processor().states(), request.observation));
+  VLA_CHECK(read_views(known, robot->processor().views(), request.observation));
   return request;
 }
 

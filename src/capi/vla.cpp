@@ -14,7 +14,12 @@
 
 struct vla_policy {
   explicit vla_policy(std::unique_ptr<vla::Engine> loaded)
-      : engine(std::move(loaded)), description(vla::describe(*engine)) {}
+      : engine(std::move(loaded)), description(describe_robots(*engine)) {}
+  static std::vector<vla::Description> describe_robots(const vla::Engine& engine) {
+    std::vector<vla::Description> robots;
+    for (const vla::Engine* robot : engine.robots()) robots.push_back(vla::describe(*robot));
+    return robots;
+  }
   std::unique_ptr<vla::Engine> engine;
   vla::capi::Description description;
   std::mutex mutex;  // the engine answers one observation at a time
@@ -43,18 +48,21 @@ struct Options {
 };
 
 Result<Options> read_options(const vla_options* given) {
-  if (given == nullptr) return Options{};
+  if (given == nullptr) return Options{{.all_robots = true}};
   VLA_TRY(const vla_options known, read_struct<vla_options>(given, "options"));
   if (known.n_thread < 0 || known.n_thread > kMaxThread)
     return usage("options.n_thread", fmt::format("0 to {}", kMaxThread), std::to_string(known.n_thread));
   if (known.strict_state != 0 && known.strict_state != 1)
     return usage("options.strict_state", "0 or 1", std::to_string(known.strict_state));
-  Options options{{.n_thread = known.n_thread}, known.strict_state == 1};
+  Options options{{.n_thread = known.n_thread, .all_robots = true}, known.strict_state == 1};
   if (known.kernels != nullptr) {
     VLA_TRY(options.engine.kernels, read_name(known.kernels, "options.kernels"));
   }
   if (known.device != nullptr) {
     VLA_TRY(options.engine.device, read_name(known.device, "options.device"));
+  }
+  if (known.embodiment != nullptr) {
+    VLA_TRY(options.engine.embodiment, read_name(known.embodiment, "options.embodiment"));
   }
   return options;
 }

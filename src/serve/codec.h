@@ -40,8 +40,13 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> hello, std::strin
 /// Whether the body of a Describe or Health is the empty message that it has to be. Errors: bad_request.
 Status check_empty(std::span<const std::byte> body);
 
+/// Which robot a serialized Act names, or empty text. Errors: bad_request, too_large.
+Result<std::string> named_embodiment(std::span<const std::byte> act);
+
 /// What stays the same in every answer, made once from a loaded engine.
 v1::Description describe(const Engine& engine, const v1::Limits& limits);
+/// The part of it that is one robot's; all of it where there is one.
+const v1::Description& description_of(const v1::Description& all, const std::string& embodiment);
 
 /// A chunk of the engine -> its message. `stages` has the server's own stages in it; `names` and so on come from
 /// `description`.

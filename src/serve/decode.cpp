@@ -37,14 +37,14 @@ std::string_view text_of(std::span<const std::byte> bytes) {
 /// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, f floats
 /// (packed or not), d double, and a digit for a message, the index of its own row.
 constexpr std::array<const char*, 8> kFields = {
-    "15t3vvv7",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover
-    "t2bb4",     // 1 View: name, rgb, jpeg, png, absent
-    "uub",       // 2 RawRgb: width, height, rows
-    "uuf",       // 3 Noise: horizon, d_action, values
-    "",          // 4 Absent
-    "tf",        // 5 State: name, values
-    "uutt",      // 6 Hello: min_version, max_version, client_name, client_version
-    "uufutd",    // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
+    "15t3vvv7t",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover, embodiment
+    "t2bb4",      // 1 View: name, rgb, jpeg, png, absent
+    "uub",        // 2 RawRgb: width, height, rows
+    "uuf",        // 3 Noise: horizon, d_action, values
+    "",           // 4 Absent
+    "tf",         // 5 State: name, values
+    "uutt",       // 6 Hello: min_version, max_version, client_name, client_version
+    "uufutd",     // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
 };
 
 /// Whether a field that was read is encoded as its type says.
@@ -200,12 +200,23 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
                      fmt::format("{} bytes", act.text().size()));
   ActRequest request;
   request.observation.text = std::move(*act.mutable_text());
+  request.observation.embodiment = std::move(*act.mutable_embodiment());
   request.capture_time_ns = act.capture_time_ns();
   VLA_CHECK(decode_views(act, limits, views, request.observation));
   VLA_CHECK(decode_states(act, states, request.observation));
   VLA_CHECK(decode_start(act, limits, request));
   VLA_CHECK(decode_leftover(act, limits, request));
   return request;
+}
+
+Result<std::string> named_embodiment(std::span<const std::byte> act) {
+  std::string tag;
+  for (Fields field(act, "act");;) {
+    VLA_TRY(const bool more, field.next());
+    if (!more) return tag;
+    if (field.number == v1::Act::kEmbodimentFieldNumber && field.type == 'b') tag = text_of(field.value);
+    VLA_CHECK(check_name(tag, "embodiment"));
+  }
 }
 
 Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::string* client) {
@@ -227,6 +238,7 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::strin
   reply.set_server_name("vla");
   reply.set_server_version(VLA_VERSION);
   reply.add_features("leftover");
+  reply.add_features("embodiment");
   return reply;
 }
 

@@ -52,19 +52,8 @@ void write_bundle(const Description& d, v1::Bundle& out) {
   out.set_converter(d.converter);
 }
 
-}  // namespace
-
-v1::Description describe(const Engine& engine, const v1::Limits& limits) {
-  const Description d = vla::describe(engine);
-  v1::Description out;
-  write_features(d, out);
-  out.set_horizon(u32(d.horizon));
-  out.set_rate_hz(d.rate_hz);
-  out.set_d_noise(u32(d.d_action_padded));
-  out.set_noise_rows(u32(d.solver_horizon));
-  out.set_noise_kind(d.noise);
-  out.set_real_time_chunking(d.real_time_chunking);
-  out.set_max_text_tokens(u32(d.max_text_tokens));
+/// What is the same for all robots.
+void write_common(const Description& d, const v1::Limits& limits, v1::Description& out) {
   *out.mutable_limits() = limits;
   write_bundle(d, *out.mutable_bundle());
   v1::Runtime& runtime = *out.mutable_runtime();
@@ -72,7 +61,39 @@ v1::Description describe(const Engine& engine, const v1::Limits& limits) {
   runtime.set_device(d.device);
   runtime.set_precision(d.precision);
   runtime.set_kernels(d.kernels);
+}
+
+void write_robot(const Description& d, v1::Description& out) {
+  write_features(d, out);
+  out.set_horizon(u32(d.horizon));
+  out.set_rate_hz(d.rate_hz);
+  out.set_d_noise(u32(d.d_action_padded));
+  out.set_noise_rows(u32(d.solver_horizon));
+  out.set_noise_kind(d.noise);
+  out.set_real_time_chunking(d.real_time_chunking);
+  out.set_embodiment(d.embodiment);
+  out.set_max_text_tokens(u32(d.max_text_tokens));
+}
+
+}  // namespace
+
+v1::Description describe(const Engine& engine, const v1::Limits& limits) {
+  v1::Description out;
+  const std::vector<const Engine*> robots = engine.robots();
+  for (const Engine* robot : robots) {
+    const Description d = vla::describe(*robot);
+    v1::Description& own = robots.size() > 1 ? *out.add_embodiments() : out;
+    write_common(d, limits, own);
+    write_robot(d, own);
+    if (robots.size() > 1) write_common(d, limits, out);
+  }
   return out;
+}
+
+const v1::Description& description_of(const v1::Description& all, const std::string& embodiment) {
+  for (const v1::Description& robot : all.embodiments())
+    if (robot.embodiment() == embodiment) return robot;
+  return all;
 }
 
 v1::ActionChunk encode_chunk(const ActRequest& request, ActionChunk chunk, const v1::Description& description) {

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/server.h"
 
+#include <algorithm>
 #include <exception>
 #include <new>
 
@@ -21,28 +22,42 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   limits.set_max_message_bytes(options.max_message);
   limits.set_max_pixels(static_cast<std::uint64_t>(options.max_pixels));
   limits.set_max_text_bytes(static_cast<std::uint32_t>(options.max_text));
-  limits.set_max_views(static_cast<std::uint32_t>(engine.processor().views().names().size()));
+  std::size_t most = 0;
+  for (const Engine* robot : engine.robots()) most = std::max(most, robot->processor().views().names().size());
+  limits.set_max_views(static_cast<std::uint32_t>(most));
   limits.set_max_queue(static_cast<std::uint32_t>(options.max_queue));
   return limits;
 }
 
 }  // namespace
 
-Result<double> warm_up(Engine& engine) {
-  const Recipe& recipe = engine.processor().recipe();
+namespace {
+
+/// An observation of a robot with every view and the longest text.
+Observation largest_observation(const Engine& robot) {
+  const Processor& processor = robot.processor();
+  const Recipe& recipe = processor.recipe();
   const int width = recipe.width, height = recipe.height;
   const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
   Observation observation;
-  for (const std::string& view : engine.processor().views().names())
-    observation.views.emplace(view, Frame{width, height, grey});
-  for (std::size_t i = 0; i < engine.processor().states().names().size(); ++i)
-    observation.states.emplace(engine.processor().states().names()[i],
-                               std::vector<float>(static_cast<std::size_t>(engine.processor().state_dims()[i])));
+  for (const std::string& view : processor.views().names()) observation.views.emplace(view, Frame{width, height, grey});
+  for (std::size_t i = 0; i < processor.states().names().size(); ++i)
+    observation.states.emplace(processor.states().names()[i],
+                               std::vector<float>(static_cast<std::size_t>(processor.state_dims()[i])));
   for (int i = 0; i < recipe.max_tokens; ++i) observation.text += "go ";
+  observation.embodiment = robot.bundle().embodiment();
+  return observation;
+}
+
+}  // namespace
+
+Result<double> warm_up(Engine& engine) {
   const auto start = Clock::now();
-  const auto chunk = engine.act(observation, Noise(std::uint64_t{0}));
-  if (!chunk && chunk.error().code != Code::bad_observation && chunk.error().code != Code::bad_action)
-    return chunk.error();
+  for (const Engine* robot : engine.robots()) {
+    const auto chunk = engine.act(largest_observation(*robot), Noise(std::uint64_t{0}));
+    if (!chunk && chunk.error().code != Code::bad_observation && chunk.error().code != Code::bad_action)
+      return chunk.error();
+  }
   return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
 }
 
@@ -136,18 +151,21 @@ Answer Server::compute(Engine& engine, Job job) const noexcept {
 }
 
 Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Answer& answer) const {
+  VLA_TRY(const std::string embodiment, named_embodiment(job.body()));
+  VLA_TRY(const Engine* robot, engine.robot(embodiment));
+  const v1::Description& description = description_of(description_, robot->bundle().embodiment());
   const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
-                         engine.solver_horizon(), engine.d_action_padded(), description_.actions_size()};
+                         robot->solver_horizon(), robot->d_action_padded(), description.actions_size()};
   StageClock clock;
   VLA_TRY(const ActRequest request,
-          decode_act(job.body(), limits, engine.processor().views(), engine.processor().states()));
+          decode_act(job.body(), limits, robot->processor().views(), robot->processor().states()));
   Timing& stages = answer.stages;
   clock.lap(stages, "decode");
   VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise, request.leftover));
   stages.insert(stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = stages;
   answer.is_beyond = chunk.is_beyond;
-  return encode_chunk(request, std::move(chunk), description_);
+  return encode_chunk(request, std::move(chunk), description);
 }
 
 }  // namespace vla::serve

@@ -282,6 +282,22 @@ TEST_CASE("an envelope with no kind, two kinds, an unknown field or broken bytes
   }
 }
 
+TEST_CASE("which robot an act names is read before the rest of it") {
+  const auto named = [](const std::string& bytes) { return named_embodiment(std::as_bytes(std::span(bytes))); };
+  v1::Act act;
+  act.set_text("go");
+  CHECK(named(act.SerializeAsString())->empty());
+  act.set_embodiment("arm");
+  const std::string bytes = act.SerializeAsString();
+  CHECK(*named(bytes) == "arm");
+  v1::Act later;
+  later.set_embodiment("dog");
+  CHECK(*named(bytes + later.SerializeAsString()) == "dog");  // as Protobuf reads a field that comes twice
+  CHECK(named(bytes.substr(0, bytes.size() - 1)).error().code == Code::bad_request);
+  later.set_embodiment(std::string(100'000, 'x'));
+  CHECK(named(later.SerializeAsString()).error().code == Code::too_large);
+}
+
 TEST_CASE("a hello is answered where a common version exists and refused with both ranges where there is none") {
   const auto answer = [](std::uint32_t min, std::uint32_t max) {
     v1::Hello hello;
