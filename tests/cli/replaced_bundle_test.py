@@ -23,53 +23,56 @@ def turned(path, other):
         file.write(data)
 
 
-@pytest.mark.parametrize(
-    "change", [written_over, turned, lambda path, other: os.truncate(path, 0), lambda path, other: path.unlink()]
-)
-def test_a_server_answers_with_the_bytes_that_it_has_loaded(vla, golden, tmp_path, change):
+@pytest.fixture
+def bundles(golden, tmp_path):
+    """The bundle that is served, and other bytes."""
     path, other = tmp_path / "policy.gguf", tmp_path / "other.gguf"
     shutil.copy(golden.bundle, path)
     other.write_bytes(golden.bundle.read_bytes()[:50_000])
-    server = Server(vla, path, "--bind", "tcp://127.0.0.1:0", "--threads", "1")
-    peer = wire.Peer(server.ready["address"])
+    return path, other
 
+
+@pytest.fixture
+def server(vla, bundles):
+    server = Server(vla, bundles[0], "--bind", "tcp://127.0.0.1:0", "--threads", "1")
+    yield server
+    server.process.kill()
+    server.process.communicate()
+
+
+@pytest.fixture
+def peer(server):
+    peer = wire.Peer(server.ready["address"])
+    yield peer
+    peer.close()
+
+
+@pytest.mark.parametrize(
+    "change", [written_over, turned, lambda path, other: os.truncate(path, 0), lambda path, other: path.unlink()]
+)
+def test_a_server_answers_with_the_bytes_that_it_has_loaded(golden, bundles, server, peer, change):
     def chunk(i):
         """The actions of the answer: what follows its request id up to the timings."""
         answer = peer.ask(wire.act(1, golden, seed=i))
         assert wire.kind(answer) == "chunk"
         return wire.actions(answer)
 
-    try:
-        before = [chunk(i) for i in range(3)]
-        change(path, other)
-        assert [chunk(i) for i in range(3)] == before
-        assert server.process.poll() is None
-    finally:
-        peer.close()
-        server.process.kill()
-        server.process.communicate()
+    before = [chunk(i) for i in range(3)]
+    change(*bundles)
+    assert [chunk(i) for i in range(3)] == before
+    assert server.process.poll() is None
 
 
 @pytest.mark.parametrize("change", [written_over, turned, lambda path, other: os.truncate(path, 4096)])
-def test_a_row_of_the_vocabulary_that_has_changed_is_refused(vla, golden, tmp_path, change):
+def test_a_row_of_the_vocabulary_that_has_changed_is_refused(golden, bundles, server, peer, change):
     """Rows of embeddings stay in the file: an instruction of other words is not answered with other bytes."""
-    path, other = tmp_path / "policy.gguf", tmp_path / "other.gguf"
-    shutil.copy(golden.bundle, path)
-    other.write_bytes(golden.bundle.read_bytes()[:50_000])
-    server = Server(vla, path, "--bind", "tcp://127.0.0.1:0", "--threads", "1")
-    peer = wire.Peer(server.ready["address"])
-    try:
-        before = wire.actions(peer.ask(wire.act(1, golden, seed=1)))
-        change(path, other)
-        refused = peer.ask(wire.act(2, golden, seed=1, text="0123456789 quick brown foxes"))
-        assert wire.kind(refused) == "error"
-        assert b"renaming a new file over it" in refused
-        assert server.process.poll() is None
-        assert wire.actions(peer.ask(wire.act(1, golden, seed=1))) == before
-    finally:
-        peer.close()
-        server.process.kill()
-        server.process.communicate()
+    before = wire.actions(peer.ask(wire.act(1, golden, seed=1)))
+    change(*bundles)
+    refused = peer.ask(wire.act(2, golden, seed=1, text="0123456789 quick brown foxes"))
+    assert wire.kind(refused) == "error"
+    assert b"renaming a new file over it" in refused
+    assert server.process.poll() is None
+    assert wire.actions(peer.ask(wire.act(1, golden, seed=1))) == before
 
 
 def test_a_file_that_is_cut_while_it_is_read_is_refused(vla, golden, tmp_path):
