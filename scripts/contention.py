@@ -16,21 +16,16 @@ import os
 import statistics
 import subprocess
 import sys
+from pathlib import Path
 
-
-def busy():
-    return subprocess.Popen([sys.executable, "-c", "while True: pass"])
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+from busy_loops import busy_loops  # noqa: E402
 
 
 def network_ms(command, n_busy):
     """Median milliseconds of the network's stages over the rounds of one process."""
-    others = [busy() for _ in range(n_busy)]
-    try:
+    with busy_loops(n_busy):
         result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-    finally:
-        for other in others:
-            other.kill()
-            other.wait()
     return json.loads(result.stdout.splitlines()[-1])["stages"]["network"]["p50_ms"]
 
 

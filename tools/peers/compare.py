@@ -18,7 +18,6 @@ With --ggml-bench PROGRAM --ggml-weights FILE the benchmark program of another g
 (https://github.com/VinRobotics/vla.cpp, target vla-bench); it times itself, in a process for each round.
 """
 import argparse
-import atexit
 import json
 import os
 import re
@@ -30,6 +29,7 @@ import time
 from pathlib import Path
 
 from peer import ROOT, STAGES
+from busy_loops import busy_loops  # isort: skip
 
 HERE = Path(__file__).resolve().parent
 TORCH = {"torch-f32": ["--dtype", "float32"], "torch-bf16": ["--dtype", "published"],
@@ -163,17 +163,16 @@ def main():
         parser.error("--ggml-bench and --ggml-weights go together")
     peers = [PythonPeer(name, args) for name in names] + ([GgmlRuntime(args)] if args.ggml_bench else [])
     vla = Vla(args)
-    for _ in range(args.busy):
-        atexit.register(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
     everyone, results = [vla, *peers], {peer: [] for peer in peers}
-    for turn in range(args.rounds + 1):  # the first warms up
-        shift = turn % len(everyone)
-        for peer in everyone[shift:] + everyone[:shift]:
-            time.sleep(0.5)  # threads of the one before may spin for a while before they sleep
-            stages = peer.run()
-            if turn and peer is not vla:
-                results[peer].append(stages)
-        print(f"round {turn}/{args.rounds}", file=sys.stderr, flush=True)
+    with busy_loops(args.busy):
+        for turn in range(args.rounds + 1):  # the first warms up
+            shift = turn % len(everyone)
+            for peer in everyone[shift:] + everyone[:shift]:
+                time.sleep(0.5)  # threads of the one before may spin for a while before they sleep
+                stages = peer.run()
+                if turn and peer is not vla:
+                    results[peer].append(stages)
+            print(f"round {turn}/{args.rounds}", file=sys.stderr, flush=True)
     for peer in everyone:
         peer.end()
     print_table(args, vla, {peer.name: rounds for peer, rounds in results.items()})
