@@ -133,18 +133,6 @@ def input_of(name, taps):
     return next((re.sub(pattern, found, name) for pattern, found in INPUTS if re.fullmatch(pattern, name)), None)
 
 
-def write_taps(file, taps):
-    import gguf
-
-    writer = gguf.GGUFWriter(str(file), "vla-taps")
-    for name, values in taps.items():
-        writer.add_tensor(name, np.ascontiguousarray(values, dtype=np.float32))
-    writer.write_header_to_file()
-    writer.write_kv_data_to_file()
-    writer.write_tensors_to_file()
-    writer.close()
-
-
 def compare_bitvla(seed, vla, folder):
     case, spelling = draw_bitvla(seed)
     bitvla.MARGIN = -1.0  # parts are compared, each on its own input
@@ -160,7 +148,7 @@ def compare_bitvla(seed, vla, folder):
             parts.setdefault(found, []).append(name)
     far = {"product": (0.0, "none"), "part": (0.0, "none"), "block": (0.0, "none")}
     for given, names in parts.items():
-        write_taps(folder / "inject.gguf", {given: expected[given]})
+        recorder.write_taps(folder / "inject.gguf", {given: expected[given]}, "vla-taps")
         taps = run_vla(vla, folder, folder / "bundle.gguf", ",".join(names), folder / "taps.gguf", 1, folder / "inject.gguf")[0]
         for name in names:
             kind = "product" if PRODUCT.fullmatch(name) else "block" if BLOCK.fullmatch(name) else "part"

@@ -117,24 +117,21 @@ def chunks(case, rule_ids):
 
 def write_rules(case):
     """position_rules.gguf of a case whose grid fills its table."""
-    import gguf
     import torch
 
     policy, _, _ = golden.load(case / "checkpoint")
     grid = policy.model.vlm_with_expert.get_vlm_model().vision_model.embeddings.num_patches_per_side
     axes = {f"bucketize_{d}": torch.tensor(reference_index(grid, grid, d)) for d in DTYPES}
     axes["bucketize_shifted"] = shifted(grid)
-    writer = gguf.GGUFWriter(case / "position_rules.gguf", "golden")
-    writer.add_string("golden.versions", golden.versions())
+    tensors = {}
     results = {rule: chunks(case, (a[:, None] * grid + a[None]).flatten()) for rule, a in axes.items()}
     right = results["bucketize_float32"]
     for rule, a in axes.items():
-        writer.add_tensor(f"{rule}.position_ids", (a[:, None] * grid + a[None]).flatten().float().numpy())
-        for steps, chunk in results[rule].items():
-            writer.add_tensor(f"{rule}.steps.{steps}.chunk", np.ascontiguousarray(chunk, dtype=np.float32))
+        tensors[f"{rule}.position_ids"] = (a[:, None] * grid + a[None]).flatten().float().numpy()
+        tensors |= {f"{rule}.steps.{steps}.chunk": chunk for steps, chunk in results[rule].items()}
         moved = [np.abs(results[rule][s] - right[s]).max() / np.abs(right[s]).max() for s in STEPS]
         print(rule, "moves the chunk, by steps:", ", ".join(f"{s}: {m:.1e}" for s, m in zip(STEPS, moved)))
-    writer.write_header_to_file(), writer.write_kv_data_to_file(), writer.write_tensors_to_file(), writer.close()
+    golden.write_taps(case / "position_rules.gguf", tensors, golden__versions=golden.versions())
 
 
 def main():

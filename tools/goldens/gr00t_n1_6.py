@@ -19,7 +19,7 @@ from . import gr00t
 from .cases import backbone_folder, copy_tokenizer
 from .draw import bfloat16
 from .files import write_json
-from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
+from .gr00t import POSE, HeadTaps, Robot, case, embodiment, given_noise, head
 from .parameters import decoder_layer, linear, norm, rms_norm, siglip
 from .train_tokenizer import EAGLE
 
@@ -161,7 +161,6 @@ def described(checkpoint):
 
 def network(checkpoint):
     """The modules by the authors' names, with the checkpoint's weights."""
-    import torch
     from lerobot.policies.groot.groot_n1_7 import GR00TN17ActionHead, GR00TN17Config
     from safetensors.torch import load_file
     from torch import nn
@@ -241,21 +240,14 @@ class Reference:
         import torch
         from transformers import BatchFeature
 
-        def given(size, dtype, device):
-            return noise.reshape(size).to(dtype)
-
-        draw, torch.randn = torch.randn, given
-        try:
-            with torch.inference_mode():
-                seen = BatchFeature({"backbone_features": self.features(batch["ids"], batch["images"]),
-                                     "backbone_attention_mask": torch.ones_like(batch["ids"], dtype=torch.bool),
-                                     "image_mask": batch["ids"] == self.image_token})
-                asked = BatchFeature({"state": batch["state"].to(self.dtype), "embodiment_id": torch.tensor([self.robot.index])})
-                head = self.model.action_head  # whose own get_action() takes one moment of the state
-                context, tokens = head.process_backbone_output(seen).backbone_features, head.state_encoder(asked.state, asked.embodiment_id)
-                return head.get_action_with_features(context, tokens, asked.embodiment_id, seen, asked)["action_pred"]
-        finally:
-            torch.randn = draw
+        with given_noise(noise):
+            seen = BatchFeature({"backbone_features": self.features(batch["ids"], batch["images"]),
+                                 "backbone_attention_mask": torch.ones_like(batch["ids"], dtype=torch.bool),
+                                 "image_mask": batch["ids"] == self.image_token})
+            asked = BatchFeature({"state": batch["state"].to(self.dtype), "embodiment_id": torch.tensor([self.robot.index])})
+            head = self.model.action_head  # whose own get_action() takes one moment of the state
+            context, tokens = head.process_backbone_output(seen).backbone_features, head.state_encoder(asked.state, asked.embodiment_id)
+            return head.get_action_with_features(context, tokens, asked.embodiment_id, seen, asked)["action_pred"]
 
 
 def whole_tokens(side, unit):

@@ -16,7 +16,7 @@ from pathlib import Path
 from . import gr00t
 from .cases import backbone_folder, copy_tokenizer
 from .files import write_json
-from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
+from .gr00t import POSE, HeadTaps, Robot, case, embodiment, given_noise, head
 from .parameters import decoder_layer, linear, norm, rms_norm
 from .train_tokenizer import QWEN_VL
 
@@ -264,17 +264,8 @@ class Reference:
         self.config, self.policy, self.model = types.SimpleNamespace(type="gr00t_n1_7"), policy, policy._groot_model
 
     def predict_action_chunk(self, batch, noise):
-        import torch
-
-        def given(size, dtype, device):
-            return noise.reshape(size).to(dtype)
-
-        draw, torch.randn = torch.randn, given
-        try:
-            with torch.inference_mode():
-                return self.policy.predict_action_chunk(dict(batch))
-        finally:
-            torch.randn = draw
+        with given_noise(noise):
+            return self.policy.predict_action_chunk(dict(batch))
 
 
 # --- recording ----------------------------------------------------------------------------------------------------

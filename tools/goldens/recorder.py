@@ -245,23 +245,28 @@ def run_case(case, dtype="float32"):
     return taps
 
 
-def write_expected(case, seed, out):
-    """Writes `expected.gguf` into the folder `out`; returns what went into it."""
+def write_taps(file, taps, kind="golden", **keys):
+    """A GGUF file of float32 tensors. keys: text, whole numbers or float64 numbers; a dot in a name is written __."""
     import gguf
 
-    taps = run_case(case)
-    published = run_case(case, "published")
-    taps |= {f"{name}.bf16": published[name] for name in ("position_ids", "chunk") if name in taps}
-    writer = gguf.GGUFWriter(out / "expected.gguf", "golden")
-    writer.add_string("golden.arch", config_type(case / "checkpoint"))
-    writer.add_string("golden.case", case.name)
-    writer.add_string("golden.reference", f"{described(case / 'checkpoint')}, float32, CPU, 1 thread")
-    writer.add_string("golden.versions", versions())
-    writer.add_uint32("golden.seed", seed)
-    for name, value in taps.items():
-        writer.add_tensor(name, np.ascontiguousarray(value, dtype=np.float32))
+    writer = gguf.GGUFWriter(str(file), kind)
+    for name, value in keys.items():
+        add = {str: writer.add_string, int: writer.add_uint32, float: writer.add_float64}[type(value)]
+        add(name.replace("__", "."), value)
+    for name, values in taps.items():
+        writer.add_tensor(name, np.ascontiguousarray(values, dtype=np.float32))
     writer.write_header_to_file()
     writer.write_kv_data_to_file()
     writer.write_tensors_to_file()
     writer.close()
+
+
+def write_expected(case, seed, out):
+    """Writes `expected.gguf` into the folder `out`; returns what went into it."""
+    taps = run_case(case)
+    published = run_case(case, "published")
+    taps |= {f"{name}.bf16": published[name] for name in ("position_ids", "chunk") if name in taps}
+    reference = f"{described(case / 'checkpoint')}, float32, CPU, 1 thread"
+    write_taps(out / "expected.gguf", taps, golden__arch=config_type(case / "checkpoint"), golden__case=case.name,
+               golden__reference=reference, golden__versions=versions(), golden__seed=seed)
     return taps

@@ -9,7 +9,7 @@ of its policies/rtc, or for GR00T N1.7 `chunk`, which the head in-paints itself.
 import numpy as np
 
 from .draw import Generator
-from .recorder import load, read_observation
+from .recorder import load, read_observation, write_taps
 
 SCHEDULES = ("linear", "exp", "ones", "zeros")
 N_ROW, DELAY, MAX_GUIDANCE = 4, 2, 5.0
@@ -57,13 +57,6 @@ def write_leftover(case, seed, out):
     previous = (Generator(seed + 7).normal(N_ROW, recorded.shape[1]) * np.float32(0.5)).astype(np.float32)
     schedules = (None,) if "gr00t" in case.parent.name else SCHEDULES
     chunks = {f"chunk.{schedule}" if schedule else "chunk": chunk_of(case, previous, schedule) for schedule in schedules}
-    writer = gguf.GGUFWriter(out / "leftover.gguf", "golden")
-    writer.add_uint32("leftover.delay", DELAY)
-    writer.add_float64("leftover.max_guidance", MAX_GUIDANCE)
-    for name, value in {"previous": previous, **chunks}.items():
-        print(f"{case.parent.name}/{case.name} {name}" + (f": moved by {np.abs(value - recorded).max():.2f}" if name in chunks else ""))
-        writer.add_tensor(name, np.ascontiguousarray(value, dtype=np.float32))
-    writer.write_header_to_file()
-    writer.write_kv_data_to_file()
-    writer.write_tensors_to_file()
-    writer.close()
+    for name, value in chunks.items():
+        print(f"{case.parent.name}/{case.name} {name}: moved by {np.abs(value - recorded).max():.2f}")
+    write_taps(out / "leftover.gguf", {"previous": previous, **chunks}, leftover__delay=DELAY, leftover__max_guidance=MAX_GUIDANCE)
