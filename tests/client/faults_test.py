@@ -3,7 +3,6 @@
 """What a peer that breaks the rules costs others: nothing. A client that behaves acts while it goes on, and each of its
 acts must be answered, with its own bytes, in about the time that it takes when nobody disturbs."""
 
-import contextlib
 import os
 import re
 import resource

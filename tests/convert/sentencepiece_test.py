@@ -95,7 +95,7 @@ def test_the_best_piece_is_merged_first_and_runs_grow_from_the_left(tmp_path, mo
 @pytest.mark.parametrize("name", tokenizer_sentencepiece.FILES)
 def test_a_checkpoint_converts_with_the_model_alone(converter, name):
     tiny = TinyPi("pi0")
-    folder = tiny.save(converter.folder)
+    tiny.save(converter.folder)
     for file in ("tokenizer.json", "tokenizer_config.json"):
         (converter.folder / "tokenizer" / file).unlink()
     (converter.folder / "tokenizer" / name).write_bytes(train(["pick up the cup"], vocab_size=N_VOCAB, user_defined_symbols=["<mask>", "\n"]))

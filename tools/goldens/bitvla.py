@@ -11,7 +11,6 @@ chosen so that every code is far from where it changes: `Recorder` asserts it.
 """
 
 import importlib.machinery
-import json
 import os
 import sys
 import types

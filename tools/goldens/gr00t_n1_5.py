@@ -19,7 +19,7 @@ from .cases import backbone_folder, copy_tokenizer
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
 from .gr00t_n1_6 import TOKENS, language_shapes, text, text_config
-from .parameters import linear, norm, siglip
+from .parameters import linear, siglip
 
 ROOT = "backbone.eagle_model."
 INDEX = 1  # of the robot among those of the weights

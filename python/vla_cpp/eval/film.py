@@ -13,7 +13,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from .episode import Look, Outcome, Watcher
 
-Colour = Tuple[int, int, int]
 INK, FAINT, GRID, PAPER = (32, 36, 44), (122, 130, 142), (226, 229, 234), (255, 255, 255)
 BLUE, PALE, GOOD, BAD = (19, 98, 196), (186, 209, 239), (20, 130, 70), (200, 40, 40)
 CURVES = [(19, 98, 196), (224, 123, 31), (20, 130, 70), (150, 60, 160), (200, 40, 40), (90, 90, 90), (0, 150, 160), (160, 120, 0)]

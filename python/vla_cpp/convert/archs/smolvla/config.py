@@ -15,7 +15,7 @@ from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import member, read_json
 from ...lerobot import check_keys, check_widths, read_views, vector_dim
-from ...networks import MAX_LAYERS, Language, Vision, read_language, read_vision
+from ...networks import Language, Vision, read_language, read_vision
 from ...recipe import ACTION, STATE
 from ...section import ANY_INT, Section
 from .. import Options
