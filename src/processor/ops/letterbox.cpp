@@ -153,18 +153,6 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
 
 namespace {
 
-class LetterboxFit final : public Fit {
- public:
-  explicit LetterboxFit(const Letterbox& box) : box_(box) {}
-  const char* described() const override { return "letterboxed"; }
-  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
-    return letterbox(frame, box_, planes, where);
-  }
-
- private:
-  Letterbox box_;
-};
-
 Result<Letterbox> read_letterbox(JsonFields& fields) {
   Letterbox op;
   VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
@@ -180,7 +168,7 @@ Result<Letterbox> read_letterbox(JsonFields& fields) {
 Status parse(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return misplaced(fields, "a letterbox as the first and only op on images of any size");
   VLA_TRY(const Letterbox op, read_letterbox(fields));
-  recipe.fit = std::make_unique<LetterboxFit>(op);
+  recipe.fit = std::make_unique<OneFit<Letterbox>>("letterboxed", letterbox, op);
   recipe.width = op.width;
   recipe.height = op.height;
   return {};

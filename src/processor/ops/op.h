@@ -38,6 +38,25 @@ class Fit {
   virtual Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const = 0;
 };
 
+/// A fit by one function of what the recipe says.
+template <class Op>
+class OneFit final : public Fit {
+ public:
+  using Run = Status(const Frame& frame, const Op& op, std::span<float> planes, const std::string& where);
+
+  OneFit(const char* described, Run* run, Op given = {}) : op(std::move(given)), described_(described), run_(run) {}
+  const char* described() const override { return described_; }
+  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
+    return run_(frame, op, planes, where);
+  }
+
+  Op op;
+
+ private:
+  const char* described_;
+  Run* run_;
+};
+
 /// Works on planes (3, height, width).
 class PlaneOp {
  public:

@@ -138,21 +138,12 @@ namespace {
 
 constexpr std::size_t kMaxByteOps = 16;
 
-class PipelineFit final : public Fit {
- public:
-  const char* described() const override { return "padded, scaled and cropped as the recipe says"; }
-  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
-    return run_pipeline(frame, pipeline, planes, where);
-  }
-
-  Pipeline pipeline;
-};
-
 /// The pipeline that the next op belongs to.
 Result<Pipeline*> open_pipeline(const JsonFields& fields, Recipe& recipe) {
   if (recipe.width > 0) return misplaced(fields, "images of any size before size, letterbox or resize");
-  if (recipe.fit == nullptr) recipe.fit = std::make_unique<PipelineFit>();
-  return &static_cast<PipelineFit&>(*recipe.fit).pipeline;  // every other fit has stated the size
+  if (recipe.fit == nullptr)
+    recipe.fit = std::make_unique<OneFit<Pipeline>>("padded, scaled and cropped as the recipe says", run_pipeline);
+  return &static_cast<OneFit<Pipeline>&>(*recipe.fit).op;  // every other fit has stated the size
 }
 
 Status add(const JsonFields& fields, Recipe& recipe, ByteOp op) {

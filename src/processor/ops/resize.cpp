@@ -31,18 +31,6 @@ Status resize(const Frame& frame, const Resize& to, std::span<float> out, const 
 
 namespace {
 
-class ResizeFit final : public Fit {
- public:
-  explicit ResizeFit(const Resize& to) : to_(to) {}
-  const char* described() const override { return "resized"; }
-  Status apply(const Frame& frame, std::span<float> planes, const std::string& where) const override {
-    return resize(frame, to_, planes, where);
-  }
-
- private:
-  Resize to_;
-};
-
 Result<Resize> read_resize(JsonFields& fields) {
   constexpr int kMinSide = 2;  // torch reads the wrong rows for an image of one column
   Resize op;
@@ -57,7 +45,7 @@ Result<Resize> read_resize(JsonFields& fields) {
 Status parse(JsonFields& fields, Recipe& recipe) {
   if (recipe.fit != nullptr) return parse_byte_resize(fields, recipe);
   VLA_TRY(const Resize op, read_resize(fields));
-  recipe.fit = std::make_unique<ResizeFit>(op);
+  recipe.fit = std::make_unique<OneFit<Resize>>("resized", resize, op);
   recipe.width = op.width;
   recipe.height = op.height;
   return {};
