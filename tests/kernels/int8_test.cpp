@@ -31,8 +31,6 @@ constexpr Shape kShapes[] = {{1, 4, 1},      {1, 64, 16},    {2, 12, 31},   {3, 
                              {33, 260, 65},  {34, 1152, 64}, {65, 68, 129}, {97, 272, 40}, {241, 4304, 70},
                              {300, 100, 17}, {513, 516, 9},  {640, 64, 1}};
 
-constexpr float kUntouched = 1234.5f;
-
 /// Rows that quantizing may get wrong: zeros; numbers below the smallest scale; halves between codes; one large number.
 std::vector<float> difficult_rows(Numbers& numbers, std::int64_t n_row, std::int64_t d_in) {
   std::vector<float> x = numbers.floats(n_row * d_in);
@@ -120,16 +118,8 @@ class Trial {
 
   void check() const {
     for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
-      const Part& part = parts_[static_cast<std::size_t>(i)];
-      CHECK(part.y.front() == kUntouched);
-      CHECK(part.y.back() == kUntouched);
-      int wrong = 0;
-      for (std::int64_t row = 0; row < case_.shape.n_row; ++row)
-        for (std::int64_t n = 0; n < d_out(i); ++n) {
-          const float got = part.y[static_cast<std::size_t>(row * d_out(i) + n + 1)];
-          wrong += got != expected(i, row, n);
-        }
-      CHECK(wrong == 0);
+      const auto is_right = [&](std::int64_t row, std::int64_t n, float y) { return y == expected(i, row, n); };
+      test::check_rows(parts_[static_cast<std::size_t>(i)].y, case_.shape.n_row, d_out(i), is_right);
     }
   }
 
@@ -149,7 +139,7 @@ class Trial {
       weight = ternary ? static_cast<float>(numbers_.below(3)) - 1 : static_cast<float>(numbers_.below(256)) - 128;
     part.bias = numbers_.floats(width);
     part.residual = numbers_.floats(case_.shape.n_row * width);
-    part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, kUntouched);
+    part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, test::kUntouched);
     part.scale = numbers_.floats(ternary ? 1 : width);
     const std::vector<std::byte> stored = ternary ? test::store_ternary(part.weight) : test::store_int8(part.weight);
     const auto all = ternary ? ternary_kernels() : int8_kernels();

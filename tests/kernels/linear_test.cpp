@@ -72,8 +72,6 @@ bool rounds_all(const LinearKernel& kernel) { return std::strstr(kernel.name, "a
 /// From the second number on.
 std::byte* bytes(std::vector<float>& values) { return reinterpret_cast<std::byte*>(&values[1]); }
 
-constexpr float kUntouched = 1234.5f;
-
 class Trial {
  public:
   Trial(const LinearKernel& kernel, const Case& c) : kernel_(kernel), case_(c) {
@@ -111,17 +109,11 @@ class Trial {
                               : tiles || rounds_all(kernel_)   ? Rounding::once
                                                                : Rounding::none;
     for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
-      const Part& part = parts_[static_cast<std::size_t>(i)];
-      CHECK(part.y.front() == kUntouched);
-      CHECK(part.y.back() == kUntouched);
-      int wrong = 0;
-      for (std::int64_t row = 0; row < case_.shape.n_row; ++row)
-        for (std::int64_t n = 0; n < d_out(i); ++n) {
-          const auto place = static_cast<std::size_t>(row * d_out(i) + n + 1);
-          const auto [expected, tolerance] = reference(i, row, n, rounding);
-          wrong += !(std::abs(part.y[place] - expected) <= tolerance);
-        }
-      CHECK(wrong == 0);
+      const auto is_right = [&](std::int64_t row, std::int64_t n, float y) {
+        const auto [expected, tolerance] = reference(i, row, n, rounding);
+        return std::abs(y - expected) <= tolerance;
+      };
+      test::check_rows(y(i), case_.shape.n_row, d_out(i), is_right);
     }
   }
 
@@ -142,7 +134,7 @@ class Trial {
     part.bias = numbers_.some(width);
     part.factor = numbers_.some(width);
     part.residual = numbers_.some(case_.shape.n_row * width);
-    part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, kUntouched);
+    part.y.assign(static_cast<std::size_t>(case_.shape.n_row * width) + 2, test::kUntouched);
     return part;
   }
 

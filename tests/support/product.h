@@ -56,6 +56,21 @@ inline Pages packed(const kernels::LinearKernel& kernel, const kernels::MatrixDe
   return memory;
 }
 
+/// Stands before and behind the rows of a y, and in them until they are computed.
+constexpr float kUntouched = 1234.5f;
+
+/// Compares rows that lie between two untouched numbers: is_right(row, n, value).
+template <class IsRight>
+void check_rows(const std::vector<float>& y, std::int64_t n_row, std::int64_t d_out, const IsRight& is_right) {
+  CHECK(y.front() == kUntouched);
+  CHECK(y.back() == kUntouched);
+  int wrong = 0;
+  for (std::int64_t row = 0; row < n_row; ++row)
+    for (std::int64_t n = 0; n < d_out; ++n)
+      wrong += !is_right(row, n, y[static_cast<std::size_t>(row * d_out + n + 1)]);
+  CHECK(wrong == 0);
+}
+
 /// Items are taken by whichever thread comes first.
 inline void run_job(const kernels::LinearKernel& kernel, kernels::LinearJob& job, int n_thread) {
   const std::int64_t n_item = kernel.cut(job, n_thread);
