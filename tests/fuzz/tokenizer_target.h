@@ -4,13 +4,13 @@
 
 #include <cstdlib>
 #include <fstream>
-#include <nlohmann/json.hpp>
 #include <span>
 #include <string>
 
 #include "processor/recipe.h"
 #include "processor/tokenizer.h"
 #include "processor/unicode.h"
+#include "support/tokenizer_keys.h"
 
 namespace vla::fuzz {
 
@@ -18,19 +18,7 @@ constexpr int kVocab = 4096;
 
 inline Tokenizer load_tokenizer(const std::string& name) {
   std::ifstream file(VLA_SOURCE_DIR "/tests/processor/data/tokenizer_" + name + ".json");
-  const auto document = nlohmann::json::parse(file, nullptr, false);
-  Keys keys;
-  for (const auto& item : document.items()) {
-    if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
-    if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (!item.value().is_array()) continue;
-    if (item.key() == "tokenizer.prefix_ids") {
-      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
-    } else {
-      keys.set(item.key(), item.value().get<std::vector<std::string>>());
-    }
-  }
-  auto tokenizer = Tokenizer::create(keys, kVocab);
+  auto tokenizer = Tokenizer::create(test::keys_of(nlohmann::json::parse(file, nullptr, false)), kVocab);
   if (!tokenizer) std::abort();
   return std::move(*tokenizer);
 }

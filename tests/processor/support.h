@@ -11,6 +11,7 @@
 #include "bundle/keys.h"
 #include "processor/image.h"
 #include "support/editable_bundle.h"
+#include "support/tokenizer_keys.h"
 
 /// Helpers of this room's tests. The data files are written by tests/reference/make_processor_data.py.
 namespace vla::test {
@@ -27,21 +28,7 @@ inline Result<Frame> decode_data(const std::string& name, const ImageLimits& lim
 }
 
 /// The tokenizer.* keys of a data file.
-inline Keys tokenizer_keys(const std::string& name) {
-  Keys keys;
-  const nlohmann::json document = data_json("tokenizer_" + name + ".json");
-  for (const auto& item : document.items()) {
-    if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
-    if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (!item.value().is_array()) continue;
-    if (item.key() == "tokenizer.prefix_ids") {
-      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
-    } else {
-      keys.set(item.key(), item.value().get<std::vector<std::string>>());
-    }
-  }
-  return keys;
-}
+inline Keys tokenizer_keys(const std::string& name) { return keys_of(data_json("tokenizer_" + name + ".json")); }
 
 inline bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 

@@ -12,12 +12,13 @@
 #include <cstring>
 #include <fstream>
 #include <iterator>
-#include <nlohmann/json.hpp>
 
 #include "processor/image.h"
 #include "processor/ops/letterbox.h"
+#include "processor/ops/planes.h"
 #include "processor/ops/resize.h"
 #include "processor/tokenizer.h"
+#include "support/tokenizer_keys.h"
 
 namespace {
 
@@ -36,25 +37,10 @@ void write_items(const std::vector<T>& items) {
   std::fflush(stdout);
 }
 
-vla::Keys read_keys(const char* path) {
-  std::ifstream file(path);
-  const auto object = nlohmann::json::parse(file, nullptr, false);
-  vla::Keys keys;
-  for (const auto& item : object.items()) {
-    if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
-    if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
-    if (!item.value().is_array()) continue;
-    if (item.key() == "tokenizer.prefix_ids") {
-      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
-    } else {
-      keys.set(item.key(), item.value().get<std::vector<std::string>>());
-    }
-  }
-  return keys;
-}
-
 int tokenize(const char* path) {
-  auto tokenizer = vla::Tokenizer::create(read_keys(path), 1 << 20);
+  std::ifstream file(path);
+  const auto keys = vla::test::keys_of(nlohmann::json::parse(file, nullptr, false));
+  auto tokenizer = vla::Tokenizer::create(keys, 1 << 20);
   if (!tokenizer) return std::fprintf(stderr, "%s\n", tokenizer.error().message().c_str()), 1;
   std::string text;
   while (read_item(text)) {

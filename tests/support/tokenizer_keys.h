@@ -1,0 +1,29 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+#include <vector>
+
+#include "bundle/keys.h"
+
+namespace vla::test {
+
+/// The tokenizer.* keys of a bundle, written as one JSON object.
+inline Keys keys_of(const nlohmann::json& document) {
+  Keys keys;
+  for (const auto& item : document.items()) {
+    if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
+    if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
+    if (!item.value().is_array()) continue;
+    if (item.key() == "tokenizer.prefix_ids") {
+      keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
+    } else {
+      keys.set(item.key(), item.value().get<std::vector<std::string>>());
+    }
+  }
+  return keys;
+}
+
+}  // namespace vla::test
