@@ -4,6 +4,7 @@
 
 #include <doctest/doctest.h>
 
+#include <chrono>
 #include <condition_variable>
 #include <mutex>
 #include <optional>
@@ -79,11 +80,15 @@ class Peer {
     REQUIRE(response.ParseFromArray(message.data(), static_cast<int>(message.size())));
     return response;
   }
-  v1::Response ask(const std::string& bytes) {
-    send(bytes);
+  /// The next answer; fails the test where none comes.
+  v1::Response answer() {
     auto response = receive();
     REQUIRE(response.has_value());
     return *response;
+  }
+  v1::Response ask(const std::string& bytes) {
+    send(bytes);
+    return answer();
   }
   v1::Response ask(const v1::Request& request) { return ask(request.SerializeAsString()); }
 
@@ -113,13 +118,15 @@ class Brake : public serve::Observer {
   /// Waits until the n-th act is about to be computed.
   void await(int n) {
     std::unique_lock lock(mutex_);
-    changed_.wait(lock, [&] { return n_started_ >= n; });
+    REQUIRE(changed_.wait_for(lock, std::chrono::seconds(20), [&] { return n_started_ >= n; }));
   }
   void let_go(int n = 1) {
     const std::lock_guard lock(mutex_);
     n_let_go_ += n;
     changed_.notify_all();
   }
+  /// From now on holds nothing.
+  void release() { let_go(1 << 30); }
 
  private:
   std::mutex mutex_;
@@ -127,11 +134,13 @@ class Brake : public serve::Observer {
   int n_started_ = 0, n_let_go_ = 0;
 };
 
-/// A server on a free port, with a thread of its own.
+/// A server on a free port, with a thread of its own, which a brake may hold.
 class Running {
  public:
-  explicit Running(serve::ServerOptions options = {}, std::vector<serve::Observer*> observers = {})
-      : engine(load_engine(kGolden + "/bundle.gguf")), observers_(std::move(observers)) {
+  explicit Running(serve::ServerOptions options = {}, std::vector<serve::Observer*> observers = {},
+                   Brake* brake = nullptr)
+      : engine(load_engine(kGolden + "/bundle.gguf")), observers_(std::move(observers)), brake_(brake) {
+    if (brake_ != nullptr) observers_.push_back(brake_);
     if (options.bind == serve::ServerOptions().bind) options.bind = {"tcp://127.0.0.1:0"};
     auto opened = serve::Server::open(options);
     REQUIRE_MESSAGE(opened.ok(), (opened ? "" : opened.error().message()));
@@ -139,6 +148,7 @@ class Running {
     thread_ = std::thread([this] { status_ = server->run(*engine, observers_); });
   }
   ~Running() {
+    if (brake_ != nullptr) brake_->release();  // a test that failed has not let go
     server->stop();
     CHECK(join().ok());
   }
@@ -153,6 +163,7 @@ class Running {
 
  private:
   std::vector<serve::Observer*> observers_;
+  Brake* brake_;
   std::thread thread_;
   Status status_;
 };
