@@ -65,8 +65,12 @@ std::string source_path(const std::string& path) { return std::string(VLA_SOURCE
 
 std::string golden_path(const std::string& name) {
   static const bool made = std::system((source_path("scripts/goldens.sh")).c_str()) == 0;
-  if (!made) std::exit(1);  // the script has said why
-  return source_path("build/goldens/") + name;
+  const std::string path = source_path("build/goldens/") + name;
+  if (!made) {  // the script has said why, if it is there; threads of the test are not waited for
+    fmt::print(stderr, "error: {}: expected golden cases, which scripts/goldens.sh makes; it failed\n", path);
+    std::_Exit(1);
+  }
+  return path;
 }
 
 std::string scratch_path(const std::string& file_name) {

@@ -13,7 +13,6 @@ import json
 import os
 import shutil
 import sys
-from pathlib import Path
 
 from . import all_cases
 from .cases import RECORDED, ROOT, write_bundle, write_checkpoint
@@ -54,7 +53,11 @@ def make(accept=False):
     """Makes what is not there.  accept: states the hashes that come out instead of comparing them.  Returns the folder."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     with open(FOLDER / "lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(f"waiting for {lock.name}: another program makes the golden cases", file=sys.stderr)
+            fcntl.flock(lock, fcntl.LOCK_EX)
         stamp = FOLDER / "stamp"
         if not accept and stamp.is_file() and stamp.read_text() == state():
             return FOLDER
