@@ -205,47 +205,35 @@ def test_a_chunk_that_comes_when_its_rows_are_used_up_or_too_old_is_dropped_and_
     assert s.counts["stale"] == 1 and s.wants(4) and s.next(4).held
 
 
-def test_a_linear_fade_takes_equal_steps_from_the_old_chunk_to_the_new():
-    s = schedule_of(blend=CrossFade(3))
+def between_chunks(tick, **options):
+    """A schedule at a tick where ones follow the zeros of the chunk before."""
+    s = schedule_of(**options)
     s.observe(0)
     s.receive(np.zeros((10, 1)), 0)
-    for t in range(4):
+    for t in range(tick):
         s.next(t)
-    s.observe(4)
-    s.receive(np.ones((10, 1)), 4)
+    s.observe(tick)
+    s.receive(np.ones((10, 1)), tick)
+    return s
+
+
+def test_a_linear_fade_takes_equal_steps_from_the_old_chunk_to_the_new():
+    s = between_chunks(4, blend=CrossFade(3))
     assert [s.next(t).values[0] for t in range(4, 9)] == [0.25, 0.5, 0.75, 1, 1]
 
 
 def test_a_fade_is_no_longer_than_what_is_left_of_the_old_chunk():
-    s = schedule_of(blend=CrossFade(6), replan_every=8)
-    s.observe(0)
-    s.receive(np.zeros((10, 1)), 0)
-    for t in range(8):
-        s.next(t)
-    s.observe(8)
-    s.receive(np.ones((10, 1)), 8)
+    s = between_chunks(8, blend=CrossFade(6), replan_every=8)
     assert [s.next(t).values[0] for t in range(8, 11)] == pytest.approx([1 / 3, 2 / 3, 1])
 
 
 def test_a_fade_is_done_when_the_old_chunk_becomes_too_old():
-    s = schedule_of(blend=CrossFade(6), max_age=6)
-    s.observe(0)
-    s.receive(np.zeros((10, 1)), 0)
-    for t in range(4):
-        s.next(t)
-    s.observe(4)
-    s.receive(np.ones((10, 1)), 4)
+    s = between_chunks(4, blend=CrossFade(6), max_age=6)
     assert [s.next(t).values[0] for t in range(4, 8)] == pytest.approx([0.25, 0.5, 0.75, 1])
 
 
 def test_an_ensemble_trusts_the_oldest_most():
-    s = schedule_of(blend=Ensemble(1.0))
-    s.observe(0)
-    s.receive(np.zeros((10, 1)), 0)
-    for t in range(4):
-        s.next(t)
-    s.observe(4)
-    s.receive(np.ones((10, 1)), 4)
+    s = between_chunks(4, blend=Ensemble(1.0))
     assert s.next(4).values[0] == pytest.approx(np.exp(-1) / (1 + np.exp(-1)))
 
 

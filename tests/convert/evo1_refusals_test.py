@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 
+from tiny import REMOVED, changed
 from tiny_evo1 import ANSWERS, ARM, DATASET, N_LAYER, STATE_DIM, TinyEvo1, TinyEvo1Lerobot
 from vla_cpp.convert.errors import Code
 
@@ -49,28 +50,12 @@ def test_answers_for_the_authors_layout_are_refused_for_lerobots(converter, name
 
 
 def authors(**changes):
-    """A checkpoint of the authors with other values at dotted paths of its attributes."""
-    return changed(TinyEvo1(), changes)
+    """A checkpoint of the authors with other values at paths of its attributes."""
+    return changed(TinyEvo1(), changes, "__")
 
 
 def lerobot(**changes):
-    return changed(TinyEvo1Lerobot(), changes)
-
-
-REMOVED = object()
-
-
-def changed(tiny, changes):
-    for path, value in changes.items():
-        *parents, last = path.split("__")
-        place = getattr(tiny, parents[0])
-        for parent in parents[1:]:
-            place = place[parent]
-        if value is REMOVED:
-            del place[last]
-        else:
-            place[last] = value
-    return tiny
+    return changed(TinyEvo1Lerobot(), changes, "__")
 
 
 AUTHORS = {

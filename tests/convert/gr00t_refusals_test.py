@@ -4,27 +4,9 @@
 
 import pytest
 
-from tiny import write_json
+from tiny import REMOVED, changed, write_json
 from tiny_gr00t import HORIZON, OTHER, TAG, TinyGr00t
 from vla_cpp.convert.errors import Code
-
-REMOVED = object()
-
-
-def changed(changes):
-    """A checkpoint with other values at dotted paths of its attributes."""
-    tiny = TinyGr00t()
-    for path, value in changes.items():
-        *parents, last = path.split("/")
-        place = getattr(tiny, parents[0])
-        for parent in parents[1:]:
-            place = place[parent]
-        if value is REMOVED:
-            del place[last]
-        else:
-            place[last] = value
-    return tiny
-
 
 @pytest.mark.parametrize("tag, found", [("", "none"), ("libero_sim", "libero_sim")])
 def test_the_robot_is_asked_for_with_the_tags_and_cameras_that_there_are(converter, tag, found):
@@ -168,7 +150,7 @@ BAD = {
 
 @pytest.mark.parametrize("message", [*UNSUPPORTED, *BAD])
 def test_what_changes_numbers_is_refused_by_name(converter, message):
-    tiny = changed(UNSUPPORTED.get(message) or BAD[message])
+    tiny = changed(TinyGr00t(), UNSUPPORTED.get(message) or BAD[message])
     error = converter.refusal(tiny, embodiment=TAG)
     assert message in error.message()
     assert error.code == (Code.UNSUPPORTED if message in UNSUPPORTED else Code.BAD_BUNDLE)

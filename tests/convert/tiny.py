@@ -19,6 +19,23 @@ D_VISION, D_VISION_FF, PATCH, IMAGE, FACTOR = 8, 12, 4, 16, 2
 D_MODEL, D_FF, N_HEAD, N_KV, D_HEAD, N_VOCAB = 12, 10, 3, 1, 4, 300
 N_LAYER, N_LAYER_BACKBONE, D_EXPERT, D_EXPERT_FF = 2, 3, 6, 256
 
+REMOVED = object()
+
+
+def changed(tiny, changes, separator="/"):
+    """A checkpoint with other values at paths of its attributes."""
+    for path, value in changes.items():
+        *parents, last = path.split(separator)
+        place = getattr(tiny, parents[0])
+        for parent in parents[1:]:
+            place = place[parent]
+        if value is REMOVED:
+            del place[last]
+        else:
+            place[last] = value
+    return tiny
+
+
 CONFIG = {
     "type": "smolvla",
     "n_obs_steps": 1,
