@@ -8,7 +8,6 @@
 
 #include <algorithm>
 #include <cstdlib>
-#include <cstring>
 #include <map>
 #include <system_error>
 
@@ -78,9 +77,6 @@ Status Executor::reserve(std::size_t size) {
   scratch_ = std::move(memory);
   scratch_size_ = size;
   want_large_pages(scratch_.get(), scratch_size());
-  // What a task left in it belongs to the phase that it names at the beginning; no phase has the number zero.
-  for (std::byte* of_worker = scratch_.get(); of_worker < scratch_.get() + scratch_size(); of_worker += size)
-    std::memset(of_worker, 0, 64);
   return {};
 }
 
@@ -89,10 +85,10 @@ void Executor::touch() { want_memory_now(scratch_.get(), scratch_size()); }
 void Executor::run(std::span<const Phase> phases) {
   if (phases.empty()) return;
   const std::lock_guard lock(turn_);
-  Worker self = {0, scratch_.get(), 0};
+  Worker self(0);
   if (n_thread_ == 1) {  // no queue
     for (const Phase& phase : phases) {
-      self.phase = ++ticket_;
+      self.begin(++ticket_, scratch_.get());
       for (const Task* task : phase.tasks)
         for (std::int64_t item = 0; item < task->n_item; ++item) task->run(item, self);
       if (phase.done != nullptr) *phase.done = std::chrono::steady_clock::now();
@@ -110,8 +106,7 @@ void Executor::run(std::span<const Phase> phases) {
 
 void Executor::serve(int index) {
   while (!stop_) {
-    // The scratch memory may have grown since the last run, but not while an item is held.
-    Worker self = {index, nullptr, 0};
+    Worker self(index);
     if (work(self)) continue;
     wait(opened_, n_sleeping_, [this] { return has_work() || stop_.load(std::memory_order_relaxed); });
   }
@@ -132,8 +127,8 @@ bool Executor::work(Worker& worker) {
     while ((left & kCountMask) != 0) {
       if (!stretch.left.compare_exchange_weak(left, left - 1, std::memory_order_acq_rel)) continue;
       // From here to finish_item the phase cannot end.
-      worker.phase = left >> kCountBits;
-      worker.scratch = scratch_.get() + static_cast<std::size_t>(worker.index) * scratch_size_;
+      // The scratch memory may have grown since the last run, but not while an item is held.
+      worker.begin(left >> kCountBits, scratch_.get() + static_cast<std::size_t>(worker.index) * scratch_size_);
       run_item(stretch.end - static_cast<std::int64_t>(left & kCountMask), worker);
       finish_item();
       worked = true;

@@ -10,17 +10,45 @@
 #include <mutex>
 #include <span>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #include "base/result.h"
 
 namespace vla::kernels {
 
-/// A thread that takes items of a phase.
-struct Worker {
-  int index;
-  std::byte* scratch;   // memory of its own, at a multiple of a page; its first 64 bytes are zeros at first
-  std::uint64_t phase;  // the same number as long as one run of one phase lasts, and never again
+/// A thread that takes items of a phase, with scratch memory of its own at a multiple of a page. An item must not rely
+/// on what lies there, unless items of its own job left it: the memory is the job's until another one takes it.
+class Worker {
+ public:
+  explicit Worker(int i) : index(i) {}
+
+  /// phase: the same number as long as one run of one phase lasts, and never again.
+  void begin(std::uint64_t phase, std::byte* memory) { phase_ = phase, memory_ = memory; }
+
+  /// Scratch memory for one item.
+  template <class T>
+  T* scratch() {
+    owner_ = {};
+    return reinterpret_cast<T*>(memory_);
+  }
+  /// Scratch memory for items of one job that follow each other, and whether the last item left its own there.
+  template <class T>
+  std::pair<T*, bool> scratch_of(const void* job) {
+    const bool kept = owner_.job == job && owner_.phase == phase_;
+    owner_ = {job, phase_};
+    return {reinterpret_cast<T*>(memory_), kept};
+  }
+
+  const int index;
+
+ private:
+  std::uint64_t phase_ = 0;
+  std::byte* memory_ = nullptr;
+  struct Owner {
+    const void* job = nullptr;
+    std::uint64_t phase = 0;
+  } owner_;
 };
 
 /// Work that is cut into items, which any worker may take in any order.

@@ -77,7 +77,6 @@ class Int8Loop {
   static_assert(kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
 
   struct Scratch {
-    const LinearJob* job;  // stands where LinearLoop notes whose rows it keeps, and tells it that they are gone
     alignas(64) std::byte panel[kTernary ? Tile::kStep * kColumns : 1];
     alignas(64) std::int32_t sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kColumns];
@@ -125,8 +124,7 @@ class Int8Loop {
   static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
     [[maybe_unused]] const typename Tile::Session session;
     Int8Loop loop(job);
-    loop.scratch_ = reinterpret_cast<Scratch*>(worker.scratch);
-    loop.scratch_->job = &job;
+    loop.scratch_ = worker.scratch<Scratch>();
     const std::int64_t row = item / job.n_group * loop.block_rows_, group = item % job.n_group;
     for (std::int64_t panel = loop.n_panel_ * group / job.n_group; panel < loop.n_panel_ * (group + 1) / job.n_group;
          ++panel) {

@@ -43,10 +43,8 @@ class LinearLoop {
   static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0 && Tile::kSplitRows <= kBlockRows / 2);
 
   struct Scratch {
-    // Which rows of x the block holds, from which depth on, of which job in which phase: items of one block follow each
-    // other, so that a worker copies it once.
-    const LinearJob* job;
-    std::uint64_t phase;
+    // Which rows of x the block holds, and from which depth on: items of one block follow each other, so that a worker
+    // copies it once.
     std::int64_t row, depth;
     alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
     alignas(64) float normed[Tile::kMaxDepth];
@@ -78,10 +76,9 @@ class LinearLoop {
   static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
     [[maybe_unused]] const typename Tile::Session session;
     LinearLoop loop(job);
-    loop.scratch_ = reinterpret_cast<Scratch*>(worker.scratch);
-    Scratch& scratch = *loop.scratch_;
-    if (scratch.phase != worker.phase || scratch.job != &job)
-      scratch.phase = worker.phase, scratch.job = &job, scratch.row = -1;
+    const auto [scratch, kept] = worker.scratch_of<Scratch>(&job);
+    if (!kept) scratch->row = -1;
+    loop.scratch_ = scratch;
     loop.item(item);
   }
 

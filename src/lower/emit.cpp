@@ -48,7 +48,7 @@ struct QuantizeTask : Task {
     for (std::int64_t i = item * item_rows; i < std::min(n_row, (item + 1) * item_rows); ++i) {
       const float* row = x + i * x_stride;
       if (norm.run != nullptr) {
-        auto* normed = reinterpret_cast<float*>(worker.scratch);
+        auto* normed = worker.scratch<float>();
         norm.run(row, norm.weight, norm.bias, norm.eps, normed, d);
         row = normed;
       }

@@ -116,41 +116,56 @@ TEST_CASE("engines that ask for the same number of threads share them, and other
   CHECK(n == 600);
 }
 
-TEST_CASE("each worker has scratch memory of its own, which begins with zeros") {
+TEST_CASE("each worker has scratch memory of its own") {
   constexpr std::size_t kSize = 10000;
-  const auto executor = std::make_shared<Executor>(1);
-  REQUIRE(executor->reserve(kSize).ok());
-  CHECK(executor->scratch_size() >= kSize);
-  const FunctionTask zeros(1, [&](std::int64_t, Worker& worker) {
-    for (std::size_t i = 0; i < 64; ++i) REQUIRE(worker.scratch[i] == std::byte{0});
-  });
-  const Phase phase = {{&zeros}, nullptr};
-  executor->run(std::span(&phase, 1));
-
   const auto three = open(3);
   REQUIRE(three->reserve(kSize).ok());
+  CHECK(three->scratch_size() >= 3 * kSize);
   std::mutex mutex;
   std::set<std::pair<int, std::byte*>> seen;
-  std::set<std::uint64_t> numbers;  // of phases
   const FunctionTask task(64, [&](std::int64_t item, Worker& worker) {
     // Whoever shares this memory would write another item's number between these lines.
-    for (std::size_t i = 0; i < kSize; ++i) worker.scratch[i] = static_cast<std::byte>(item);
+    auto* scratch = worker.scratch<std::byte>();
+    for (std::size_t i = 0; i < kSize; ++i) scratch[i] = static_cast<std::byte>(item);
     std::this_thread::yield();
     for (std::size_t i = 0; i < kSize; ++i)
-      if (worker.scratch[i] != static_cast<std::byte>(item)) FAIL_CHECK("shared scratch");
+      if (scratch[i] != static_cast<std::byte>(item)) FAIL_CHECK("shared scratch");
     const std::lock_guard lock(mutex);
-    seen.insert({worker.index, worker.scratch});
-    numbers.insert(worker.phase);
+    seen.insert({worker.index, scratch});
   });
   const Phase phases[] = {{{&task}, nullptr}, {{&task}, nullptr}};
   three->run(phases);
   three->run(phases);
-  CHECK(numbers.size() == 4);
-  CHECK(numbers.count(0) == 0);
   std::set<int> workers;
   for (const auto& [index, memory] : seen) {
     CHECK(reinterpret_cast<std::uintptr_t>(memory) % 4096 == 0);
     CHECK(workers.insert(index).second);
+  }
+}
+
+TEST_CASE("scratch memory stays a job's from item to item, until another task takes it or the phase ends") {
+  for (const int n_thread : {1, 2}) {
+    CAPTURE(n_thread);
+    const auto executor = open(n_thread);
+    REQUIRE(executor->reserve(64).ok());
+    const int job = 0, other = 0;
+    std::mutex mutex;
+    int n_first = 0;  // items that found nothing of their job
+    const auto keeps = [&](const int& whose) {
+      return FunctionTask(40, [&](std::int64_t, Worker& worker) {
+        const auto [memory, kept] = worker.scratch_of<const void*>(&whose);
+        if (kept && *memory != &whose) FAIL_CHECK("kept by another job");
+        *memory = &whose;
+        const std::lock_guard lock(mutex);
+        n_first += !kept;
+      });
+    };
+    const FunctionTask one = keeps(job), two = keeps(other);
+    const FunctionTask alone(40, [](std::int64_t, Worker& worker) { *worker.scratch<const void*>() = nullptr; });
+    const Phase phases[] = {{{&one}, nullptr}, {{&one, &alone, &one, &two}, nullptr}, {{&one}, nullptr}};
+    executor->run(phases);
+    executor->run(phases);
+    if (n_thread == 1) CHECK(n_first == 2 * 5);  // several workers share items as it comes
   }
 }
 

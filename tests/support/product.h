@@ -78,7 +78,8 @@ inline void run_job(const kernels::LinearKernel& kernel, kernels::LinearJob& job
   std::atomic<std::int64_t> next = 0;
   const auto work = [&](int index) {
     const Pages scratch = pages(kernel.scratch_size);
-    kernels::Worker worker = {index, scratch.get(), 1};
+    kernels::Worker worker(index);
+    worker.begin(1, scratch.get());
     for (std::int64_t item = next++; item < n_item; item = next++) kernel.run(job, item, worker);
   };
   std::vector<std::thread> threads;
