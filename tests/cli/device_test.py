@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""--device where there is none but the CPU; tests/vulkan has the rest."""
+"""--device where there is none but the CPU; tests/gpu has the rest."""
 
 import json
 import shutil

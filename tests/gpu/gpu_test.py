@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""--device vulkan: every golden case, all doors, limits and refusals. One process for each case, as a robot has one."""
+"""--device vulkan or cuda: every golden case, all doors, limits and refusals. One process for each case, as a robot has one."""
 
 import json
 import os
@@ -11,9 +11,11 @@ import sys
 import numpy as np
 import pytest
 from golden_cases import FLOAT32, NAMES, ROOT, Golden
+from conftest import KIND
 from program import EXIT
 
-VULKAN = ["--device", "vulkan"]
+DEVICE = ["--device", KIND]
+LIMITS_OF_VULKAN = pytest.mark.skipif(KIND != "vulkan", reason="only Vulkan's buffers can be made small")
 LIMIT = 300  # seconds, where every shader is compiled for the first time
 # Sums in another order, and a driver's own exp, sin and division: 1e-6 to 1e-5 of the largest in each operation.
 TOLERANCE = 1e-4
@@ -26,8 +28,8 @@ def actions(answer):
 @pytest.mark.parametrize("name", NAMES)
 def test_every_tap_of_a_golden_case_matches_the_reference_within_1e_4(vla, name, tmp_path):
     case, got = Golden(name), tmp_path / "got.gguf"
-    run = vla(*case.arguments(options=["--json", *VULKAN, "--tap", "*", "--taps-out", got]), limit=LIMIT)
-    assert run.json()["device"].startswith("vulkan:0, "), run.err
+    run = vla(*case.arguments(options=["--json", *DEVICE, "--tap", "*", "--taps-out", got]), limit=LIMIT)
+    assert run.json()["device"].startswith(f"{KIND}:0, "), run.err
     compared = vla("compare", case.expected, got, "--tolerance", TOLERANCE)
     assert compared.code == 0, compared.out + compared.err
 
@@ -35,8 +37,8 @@ def test_every_tap_of_a_golden_case_matches_the_reference_within_1e_4(vla, name,
 @pytest.mark.parametrize("name", ["smolvla/two_views", "bitvla/" + next(n for n in NAMES if "bitvla" in n).split("/")[1]])
 def test_without_taps_the_chunk_is_the_cpus_within_1e_4(vla, name):
     case = Golden(name)
-    cpu, vulkan = (actions(vla(*case.arguments(options=["--json", *o]), limit=LIMIT)) for o in (FLOAT32, VULKAN))
-    assert np.abs(cpu - vulkan).max() <= TOLERANCE * np.abs(cpu).max()
+    cpu, gpu = (actions(vla(*case.arguments(options=["--json", *o]), limit=LIMIT)) for o in (FLOAT32, DEVICE))
+    assert np.abs(cpu - gpu).max() <= TOLERANCE * np.abs(cpu).max()
 
 
 def test_a_process_answers_again_and_other_shapes_through_the_c_interface(vla, golden):
@@ -46,7 +48,7 @@ import sys
 sys.path[:0] = [{str(ROOT / "python")!r}]
 import vla_cpp
 images = {{ {", ".join(f"{view!r}: open({str(file)!r}, 'rb').read()" for view, file in golden.images.items())} }}
-with vla_cpp.Policy({str(golden.bundle)!r}, device="vulkan:0") as policy:
+with vla_cpp.Policy({str(golden.bundle)!r}, device="{KIND}:0") as policy:
     print(policy.spec.device, policy.spec.precision, sep=";")
     act = lambda text: policy.act(images=images, state={golden.state!r}, text=text, seed=1).actions.tobytes().hex()
     first, short = act({golden.text!r}), act("go")
@@ -55,24 +57,24 @@ with vla_cpp.Policy({str(golden.bundle)!r}, device="vulkan:0") as policy:
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT)
     assert result.returncode == 0, result.stderr
     device, same = result.stdout.splitlines()
-    assert device.startswith("vulkan:0, ") and device.endswith(";f32")
+    assert device.startswith(f"{KIND}:0, ") and device.endswith(";f32")
     assert same == "True;True;True"
 
 
 def test_a_server_answers_with_the_chunk_of_vla_run_and_tells_the_device(vla, golden):
     import vla_cpp
 
-    command = [vla.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *VULKAN]
+    command = [vla.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *DEVICE]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             line = server.stdout.readline()
-            assert "device='vulkan:0, " in line and "precision=f32" in line, line
+            assert f"device='{KIND}:0, " in line and "precision=f32" in line, line
             with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=LIMIT) as client:
                 images = {view: file.read_bytes() for view, file in golden.images.items()}
                 chunk = client.act(images=images, state=golden.state, text=golden.text, noise=np.load(golden.noise))
         finally:
             server.terminate()
-    run = actions(vla(*golden.arguments(options=["--json", *VULKAN]), limit=LIMIT))
+    run = actions(vla(*golden.arguments(options=["--json", *DEVICE]), limit=LIMIT))
     assert np.array_equal(chunk.actions.astype(np.float32), run)
 
 
@@ -84,16 +86,18 @@ def with_environment(vla, **environment):
     return changed
 
 
+@LIMITS_OF_VULKAN
 def test_weights_are_spread_over_buffers_where_one_cannot_hold_them(vla, golden):
-    plain = vla(*golden.arguments(options=["--json", *VULKAN]), limit=LIMIT)
+    plain = vla(*golden.arguments(options=["--json", *DEVICE]), limit=LIMIT)
     small = with_environment(vla, GGML_VK_FORCE_MAX_ALLOCATION_SIZE="100000", GGML_VK_FORCE_MAX_BUFFER_SIZE="100000")
-    split = small(*golden.arguments(options=["--json", *VULKAN]), limit=LIMIT)
+    split = small(*golden.arguments(options=["--json", *DEVICE]), limit=LIMIT)
     assert np.array_equal(actions(split), actions(plain))
 
 
+@LIMITS_OF_VULKAN
 def test_a_matrix_that_no_buffer_can_hold_is_refused_by_name_with_both_sizes(vla, golden):
     small = with_environment(vla, GGML_VK_FORCE_MAX_ALLOCATION_SIZE="5000", GGML_VK_FORCE_MAX_BUFFER_SIZE="5000")
-    answer = small(*golden.arguments(options=VULKAN), limit=LIMIT)
+    answer = small(*golden.arguments(options=DEVICE), limit=LIMIT)
     assert answer.code == EXIT["unsupported"] and answer.out == ""  # ggml writes lines of its own before ours
     assert re.fullmatch(
         r"error: unsupported: [\w.]+\.weight: expected at most 5\.0 kB, a buffer of vulkan:0, found [\d.]+ kB; use another device",
@@ -102,13 +106,13 @@ def test_a_matrix_that_no_buffer_can_hold_is_refused_by_name_with_both_sizes(vla
 
 
 def test_what_inspect_predicts_is_what_a_server_takes(vla, golden):
-    predicted = json.loads(vla("inspect", golden.bundle, "--json", *VULKAN).out)
-    assert predicted["device"].startswith("vulkan:0, ")
+    predicted = json.loads(vla("inspect", golden.bundle, "--json", *DEVICE).out)
+    assert predicted["device"].startswith(f"{KIND}:0, ")
     program = f"""
 import sys
 sys.path[:0] = [{str(ROOT / "python")!r}]
 import vla_cpp
-with vla_cpp.Policy({str(golden.bundle)!r}, device="vulkan") as policy:
+with vla_cpp.Policy({str(golden.bundle)!r}, device="{KIND}") as policy:
     d = policy._library.vla_describe(policy._handle).contents
     print(d.memory_weights, d.memory_plan, d.memory_working)
 """
@@ -119,28 +123,35 @@ with vla_cpp.Policy({str(golden.bundle)!r}, device="vulkan") as policy:
 
 def test_devices_are_listed_with_memory_and_precision(vla):
     listed = json.loads(vla("inspect", "--devices", "--json").out)
-    cpu, vulkan = listed["devices"][:2]
-    assert (cpu["name"], vulkan["name"], vulkan["products"]) == ("cpu", "vulkan:0", "f32")
-    assert 0 < vulkan["free_bytes"] <= vulkan["memory_bytes"] and vulkan["description"]
+    gpu = next(device for device in listed["devices"] if device["name"] == f"{KIND}:0")
+    assert listed["devices"][0]["name"] == "cpu" and gpu["products"] == "f32"
+    assert 0 < gpu["free_bytes"] <= gpu["memory_bytes"] and gpu["description"]
 
 
 def test_a_number_beyond_the_devices_is_refused_with_the_list(vla, golden):
-    answer = vla(*golden.arguments(options=["--device", "vulkan:7"]))
-    answer.refused("device", "vulkan:7: expected one of cpu, vulkan:0 (", "found none with this number")
+    answer = vla(*golden.arguments(options=["--device", f"{KIND}:77"]))
+    answer.refused("device", f"{KIND}:77: expected one of cpu, ", f"{KIND}:0 (", "found none with this number")
 
 
-def test_a_machine_without_a_driver_says_so_and_runs_the_cpu(vla, golden):
-    without = with_environment(vla, VK_DRIVER_FILES=os.devnull, VK_ICD_FILENAMES=os.devnull)
-    without(*golden.arguments(options=VULKAN)).refused("device", "vulkan:0: expected one of cpu, found ", "driver")
+NO_DRIVER = {"VK_DRIVER_FILES": os.devnull, "VK_ICD_FILENAMES": os.devnull, "CUDA_VISIBLE_DEVICES": ""}
+
+
+def test_a_machine_without_a_device_says_so_and_runs_the_cpu(with_library, golden):
+    without = with_environment(with_library, **NO_DRIVER)
+    reason = f"no {KIND}: "
+    line = next(line for line in without("inspect", "--devices").out.splitlines() if line.startswith(reason))
+    assert re.search("driver|no CUDA-capable device", line), line
+    answer = without(*golden.arguments(options=DEVICE))
+    answer.refused("device", f"{KIND}:0: expected one of cpu", ", found " + line.removeprefix(reason))
     assert without(*golden.arguments()).code == 0
 
 
 @pytest.mark.parametrize("kernels", ["avx2", "float32"])
 def test_kernels_of_the_cpu_are_refused(vla, golden, kernels):
-    answer = vla(*golden.arguments(options=[*VULKAN, "--kernels", kernels]))
-    answer.refused("usage", "kernels: expected none or ggml with device vulkan:0, found " + kernels)
+    answer = vla(*golden.arguments(options=[*DEVICE, "--kernels", kernels]))
+    answer.refused("usage", f"kernels: expected none or ggml with device {KIND}:0, found {kernels}")
 
 
 def test_bench_tells_the_device_and_no_share_of_the_cpus_peak(vla, golden):
-    report = vla("bench", golden.bundle, "--runs", 1, "--warmup", 0, "--json", *VULKAN, limit=LIMIT).json()
-    assert report["device"].startswith("vulkan:0, ") and report["share_of_peak"] == 0
+    report = vla("bench", golden.bundle, "--runs", 1, "--warmup", 0, "--json", *DEVICE, limit=LIMIT).json()
+    assert report["device"].startswith(f"{KIND}:0, ") and report["share_of_peak"] == 0

@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""One suite for every kind of device: VLA_TEST_DEVICE names it, vulkan or cuda.
+
+Vulkan without a GPU: Mesa's lavapipe computes on the CPU. VK_DRIVER_FILES names another driver.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT / "tests/cli"), str(ROOT / "tests/gpu"), str(ROOT / "python")]
+
+from golden_cases import Golden  # noqa: E402
+from program import Program  # noqa: E402
+
+BINARY = Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla"))
+LAVAPIPE = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd.*json"))
+if LAVAPIPE and "VK_DRIVER_FILES" not in os.environ:
+    os.environ["VK_DRIVER_FILES"] = str(LAVAPIPE[0])
+    os.environ["GGML_VK_VISIBLE_DEVICES"] = "0"  # ggml passes over a device that is a CPU unless it is named
+# Compiling a shader takes lavapipe up to seconds; kept ones make the next run short.
+os.environ.setdefault("MESA_SHADER_CACHE_DIR", str(ROOT / "build/shaders"))
+
+
+KIND = os.environ.get("VLA_TEST_DEVICE", "vulkan")
+
+
+@pytest.fixture(scope="session")
+def listed():
+    """What `vla inspect --devices` tells about this kind."""
+    lines = Program(BINARY)("inspect", "--devices").out.splitlines()
+    return next(line for line in lines if line.startswith((f"{KIND}:0 ", f"no {KIND}: ")))
+
+
+@pytest.fixture(scope="session")
+def with_library(listed):
+    if f": no libvla-{KIND}.so in " in listed:
+        pytest.skip("no library: " + listed)
+    return Program(BINARY)
+
+
+@pytest.fixture(scope="session")
+def vla(listed, with_library):
+    if listed.startswith("no "):
+        pytest.skip("no device: " + listed)
+    return with_library
+
+
+@pytest.fixture
+def golden():
+    return Golden("two_views")
