@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo test build vulkan wheel packages asan tsan fuzz format clean
+.PHONY: help demo test build vulkan cuda wheel packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -15,6 +15,7 @@ help:
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
+	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 525 MB of NVIDIA's compiler and libraries)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make tsan      build executor and server and run their tests under the thread sanitizer"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
@@ -39,6 +40,11 @@ vulkan: build
 	@if scripts/packages.sh vulkan; then \
 	  cmake build/cpu -DVLA_VULKAN=ON >/dev/null && cmake --build --preset cpu --target vla_vulkan; \
 	else echo "make: libvla-vulkan.so is not built"; fi
+
+# libvla-cuda.so for build/cpu. No other target asks for it, as it downloads NVIDIA's compiler.
+cuda: build
+	cmake build/cpu -DVLA_CUDA=ON >/dev/null
+	cmake --build --preset cpu --target vla_cuda
 
 # A wheel for any x86-64 machine with a system as old as this one's: pip installs it in seconds.
 wheel: packages $(STAMP)

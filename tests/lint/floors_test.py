@@ -22,7 +22,8 @@ ROOMS = {
     "graph": {"base", "bundle"},
     "kernels": {"base", "bundle"},
     "ggml": GRAPH,
-    "vulkan": GRAPH | {"ggml"},  # compiled into a library of its own
+    "vulkan": GRAPH | {"ggml"},  # compiled into a library of its own, as is the next
+    "cuda": GRAPH | {"ggml"},
     "lower": GRAPH | {"kernels", "ggml"},
     "nn": GRAPH,
     "processor": {"base", "bundle"},
@@ -37,8 +38,9 @@ ROOMS = {
 # Libraries that belong to some rooms. The engine's taps are a GGUF file of tensors.
 LIBRARIES = [
     (re.compile(r"gguf\.h"), {"bundle", "engine"}),
-    (re.compile(r"ggml(-.*)?\.h"), {"ggml", "vulkan"}),
+    (re.compile(r"ggml(-.*)?\.h"), {"ggml", "vulkan", "cuda"}),
     (re.compile(r"vulkan/.*"), {"vulkan"}),
+    (re.compile(r"cuda_runtime_api\.h|cublas_v2\.h"), {"cuda"}),
     (re.compile(r"CLI/.*"), {"cli"}),
     (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve", "bench"}),
     (re.compile(r"jpeglib\.h"), {"processor"}),

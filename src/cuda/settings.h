@@ -1,0 +1,21 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Included before every CUDA source of ggml by the compiler's command line, so that ggml stays as it is. What changes
+// numbers is settled here: products are computed in float32.
+#pragma once
+
+#include <cublas_v2.h>
+
+#include <cstdlib>
+#include <cstring>
+
+/// What ggml reads from the environment: the type that products of f16 and bf16 are computed in is not asked for there.
+inline char* vla_cuda_setting(const char* name) {
+  static char f32[] = "f32";
+  return std::strcmp(name, "GGML_CUDA_CUBLAS_COMPUTE_TYPE") == 0 ? f32 : std::getenv(name);
+}
+#define getenv(name) vla_cuda_setting(name)
+
+// ggml lets cuBLAS round the operands of float32 products to TF32, 10 bits of mantissa.
+#define CUBLAS_TF32_TENSOR_OP_MATH CUBLAS_DEFAULT_MATH
