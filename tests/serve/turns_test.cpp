@@ -158,8 +158,7 @@ TEST_CASE("seventy connections of one peer leave a place and a turn to another p
     many.push_back(std::make_unique<Peer>("tcp://127.0.0.2:0;" + address));
     many.back()->send(act_request(golden(), 100 + i));
   }
-  v1::Request health = request_of(9);
-  health.mutable_health();
+  const v1::Request health = health_request();
   while (first.ask(health).health().queue_depth() < 64) {
   }
   Peer one(running.address());
@@ -209,8 +208,7 @@ TEST_CASE("a server that is told to stop answers what waits, takes nothing new, 
   Peer b(running.address()), c(running.address());
   b.send(act_request(golden(), 2));
   await_queue(b);
-  v1::Request health = request_of(9);
-  health.mutable_health();
+  const v1::Request health = health_request();
   CHECK(c.ask(health).health().ready());
   running.server->stop();
   while (c.ask(health).health().ready()) {
