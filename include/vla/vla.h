@@ -91,8 +91,8 @@ typedef struct vla_options {
                            VLA_BAD_OBSERVATION; 0: it is answered with a note */
   const char* device; /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". Nothing takes the place of a device that
                          is absent: opening fails with VLA_DEVICE, and `expected` lists what is there */
-  const char* embodiment; /* of a bundle for several robots: tag of the one that is loaded; NULL: all of them. A tag that
-                             the bundle does not have fails with VLA_USAGE, and `expected` lists them */
+  const char* embodiment; /* of a bundle for several robots: tag of the one that is loaded; NULL: all of them. A tag
+                             that the bundle does not have fails with VLA_USAGE, and `expected` lists them */
 } vla_options;
 #define VLA_OPTIONS_INIT \
   { sizeof(vla_options), 0, NULL, 0, NULL, NULL }
@@ -154,7 +154,7 @@ struct vla_description {
   size_t noise_rows; /* `horizon`, or more where the robot gets the first rows only of what the network computes */
   const char* real_time_chunking; /* what the leftover of an observation does: "guided", "inpainted", or empty where
                                      there must be none */
-  const char* embodiment; /* tag of the robot; empty where the bundle is for one, which it does not name */
+  const char* embodiment;         /* tag of the robot; empty where the bundle is for one, which it does not name */
   /* Of a policy with several robots: a description of each, with its tag. Views, states, actions, horizon, noise and
    * leftover are then theirs alone: here they are 0 and empty. */
   size_t n_embodiment;
