@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 from .errors import UsageError
+from .observation import robot_of
 
 Self = TypeVar("Self", bound="Handle")
 
@@ -17,6 +19,11 @@ class Handle:
     def close(self) -> None:
         raise NotImplementedError
 
+    def robot(self, embodiment: str) -> Robot:
+        """One robot of a policy with several, as a policy of its own, e.g. for a ChunkLoop. Errors: BadObservation, with the tags that
+        there are."""
+        return Robot(self, embodiment)
+
     def __enter__(self: Self) -> Self:
         return self
 
@@ -25,6 +32,16 @@ class Handle:
 
     def __reduce__(self):
         raise wrong_process(self, "an attempt to pickle it")
+
+
+class Robot:
+    """`spec`, `act` and, of a Client, `submit` of one robot."""
+
+    def __init__(self, policy: Any, embodiment: str) -> None:
+        self.spec = robot_of(policy.spec, embodiment)
+        self.act = partial(policy.act, embodiment=embodiment)
+        if hasattr(policy, "submit"):
+            self.submit = partial(policy.submit, embodiment=embodiment)
 
 
 def wrong_process(handle: Handle, found: str) -> UsageError:

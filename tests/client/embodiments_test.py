@@ -9,6 +9,7 @@ from golden_cases import Golden
 from server_process import SECONDS, Server
 
 import vla_cpp
+from vla_cpp.control import ChunkLoop
 
 CASE, OTHER = "gr00t_n1_7/libero", "new_embodiment"
 TAG = Golden(CASE).said["embodiment"]
@@ -66,6 +67,18 @@ def test_each_robot_has_the_spec_and_the_chunk_of_its_bundle_alone(policy, bundl
             chunk, expected = policy.act(**observation(spec), embodiment=tag), alone.act(**observation(spec))
             assert np.asarray(chunk).tobytes() == np.asarray(expected).tobytes()
             assert chunk.names == expected.names
+
+
+def test_a_control_loop_runs_one_of_the_robots(policy):
+    robot = policy.robot(OTHER)
+    taken = observation(robot.spec)
+    first = np.asarray(policy.act(**taken, embodiment=OTHER))[0]
+    for mode in ("sync", "async"):
+        with ChunkLoop(robot, rate_hz=robot.spec.rate_hz or 10, replan_every=1, mode=mode, blend="replace", on_late="hold") as loop:
+            loop.begin(taken)
+            assert np.array_equal(loop.step(taken).values, first)
+    with pytest.raises(vla_cpp.BadObservation, match=f"expected one of {TAG}, {OTHER}, found dog"):
+        policy.robot("dog")
 
 
 def test_the_specs_of_both_doors_are_equal(both, server):
