@@ -49,6 +49,9 @@ class Bundle {
   /// The robot that was chosen, or empty.
   const std::string& embodiment() const { return embodiment_; }
 
+  /// Removes keys that nobody reads any more, as a vocabulary takes megabytes.
+  void forget(std::string_view prefix) { keys_.forget(prefix); }
+
   const std::string& path() const { return path_; }
   const Keys& keys() const { return keys_; }
   const std::vector<TensorInfo>& tensors() const { return tensors_; }

@@ -60,4 +60,18 @@ Result<std::vector<int>> Keys::integers(std::string_view key, Range range) const
   return narrow;
 }
 
+bool Keys::same(std::string_view prefix, const Keys& other) const {
+  auto mine = values_.lower_bound(prefix), theirs = other.values_.lower_bound(prefix);
+  const auto goes_on = [&](auto at, const Keys& keys) {
+    return at != keys.values_.end() && at->first.starts_with(prefix);
+  };
+  for (; goes_on(mine, *this) && goes_on(theirs, other); ++mine, ++theirs)
+    if (*mine != *theirs) return false;
+  return !goes_on(mine, *this) && !goes_on(theirs, other);
+}
+
+void Keys::forget(std::string_view prefix) {
+  std::erase_if(values_, [&](const auto& entry) { return entry.first.starts_with(prefix); });
+}
+
 }  // namespace vla

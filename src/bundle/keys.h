@@ -45,6 +45,10 @@ class Keys {
   bool has(std::string_view key) const { return values_.find(key) != values_.end(); }
   const std::map<std::string, Value, std::less<>>& all() const { return values_; }
   void set(std::string key, Value value) { values_.insert_or_assign(std::move(key), std::move(value)); }
+  /// Whether both have the same keys that start so, with the same values.
+  bool same(std::string_view prefix, const Keys& other) const;
+  /// Removes the keys that start so.
+  void forget(std::string_view prefix);
 
   Result<bool> boolean(std::string_view key) const;
   /// `range` must lie within kAnySize.

@@ -45,9 +45,14 @@ Result<std::vector<std::unique_ptr<Engine>>> Engine::open_robots(Bundle file, co
   for (const std::string& tag : tags) {
     Bundle bundle = robots.size() + 1 < tags.size() ? file : std::move(file);
     VLA_CHECK(bundle.choose(tag));
-    VLA_TRY(Processor processor, Processor::create(bundle));
+    const Engine* first = robots.empty() ? nullptr : robots.front().get();
+    const bool same_text = first != nullptr && bundle.keys().same("tokenizer.", first->bundle_.keys()) &&
+                           bundle.keys().same("lm.n_vocab", first->bundle_.keys());
+    VLA_TRY(Processor processor, Processor::create(bundle, same_text ? first->processor_.tokenizer() : nullptr));
+    if (first != nullptr) bundle.forget("tokenizer.");
     robots.emplace_back(new Engine(std::move(bundle), std::move(processor)));
   }
+  robots.front()->bundle_.forget("tokenizer.");  // with it the others were compared
   return robots;
 }
 

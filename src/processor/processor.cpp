@@ -110,14 +110,14 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   if (observation.text.empty()) return bad_observation("instruction", "a sentence", "empty text");
   if (observation.text.size() > Tokenizer::kMaxText ||
       unicode::valid_prefix(observation.text) < observation.text.size())
-    return tokenizer_.encode(observation.text).error();  // before anything reads it as characters
+    return tokenizer_->encode(observation.text).error();  // before anything reads it as characters
   if (recipe_.discretizes_state && inputs.discretized_state.size() != n_state_)
     return Error{Code::internal, "instruction", "the state to be encoded before the text", "no state"};
   VLA_TRY(const std::string prompt, fill_prompt(observation.text, inputs.discretized_state));
   if (recipe_.drops_punctuation && prompt == *fill_prompt({}, inputs.discretized_state))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");
-  VLA_TRY(inputs.tokens, tokenizer_.encode(prompt, kMaxPrompt));
+  VLA_TRY(inputs.tokens, tokenizer_->encode(prompt, kMaxPrompt));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
     inputs.notes.push_back(fmt::format("instruction: {} tokens, cut to the {} {}", inputs.tokens.size(),
@@ -144,7 +144,7 @@ Status Processor::check_view_places(std::span<const std::int32_t> tokens) const 
 void Processor::cut_tokens(std::vector<std::int32_t>& tokens) const {
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (recipe_.keep_last) {
-    const auto front = tokens.begin() + static_cast<std::ptrdiff_t>(std::min(tokenizer_.prefix().size(), limit));
+    const auto front = tokens.begin() + static_cast<std::ptrdiff_t>(std::min(tokenizer_->prefix().size(), limit));
     tokens.erase(front, front + static_cast<std::ptrdiff_t>(tokens.size() - limit));
   }
   tokens.resize(limit);

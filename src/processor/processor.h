@@ -4,6 +4,7 @@
 
 #include <cstdint>
 #include <map>
+#include <memory>
 #include <optional>
 #include <span>
 #include <string>
@@ -50,7 +51,8 @@ class Processor {
   /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state`,
   /// `policy.d_action`, where the text has places for views where they are, and where rows are cut off
   /// `policy.horizon`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
-  static Result<Processor> create(const Bundle& bundle);
+  /// `tokenizer`: that of a processor with the same `tokenizer.*` and `lm.n_vocab`, instead of one more.
+  static Result<Processor> create(const Bundle& bundle, std::shared_ptr<const Tokenizer> tokenizer = nullptr);
 
   /// From now on a state beyond its bound is refused. Without it the state is taken and a note says so.
   void refuse_beyond() { refuses_beyond_ = true; }
@@ -90,6 +92,7 @@ class Processor {
   /// Tokens that every prompt has around its places for views; 0 where the text has no such places.
   int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
+  const std::shared_ptr<const Tokenizer>& tokenizer() const { return tokenizer_; }
   /// Features that pass unnormalized because --identity-stats allowed it. Every answer has to say so.
   const std::vector<std::string>& degraded() const { return degraded_; }
 
@@ -122,7 +125,7 @@ class Processor {
   double state_bound_ = kStateBound;
   bool refuses_beyond_ = false;
   Recipe recipe_;
-  Tokenizer tokenizer_;
+  std::shared_ptr<const Tokenizer> tokenizer_;
   /// Where the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
   /// and the token of a place.
   std::vector<std::int32_t> view_tokens_;

@@ -49,7 +49,7 @@ std::vector<Run> runs_of(std::int32_t token, std::span<const std::int32_t> token
 
 }  // namespace
 
-Result<Processor> Processor::create(const Bundle& bundle) {
+Result<Processor> Processor::create(const Bundle& bundle, std::shared_ptr<const Tokenizer> tokenizer) {
   const Keys& keys = bundle.keys();
   Processor processor;
   VLA_TRY(const std::string recipe, keys.string("processor.recipe"));
@@ -57,8 +57,12 @@ Result<Processor> Processor::create(const Bundle& bundle) {
   VLA_CHECK(processor.read_features(bundle));
   VLA_CHECK(processor.bind_state(bundle));
   VLA_CHECK(processor.bind_action(bundle));
-  VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
-  VLA_TRY(processor.tokenizer_, Tokenizer::create(keys, n_vocab));
+  processor.tokenizer_ = std::move(tokenizer);
+  if (processor.tokenizer_ == nullptr) {
+    VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
+    VLA_TRY(Tokenizer read, Tokenizer::create(keys, n_vocab));
+    processor.tokenizer_ = std::make_shared<const Tokenizer>(std::move(read));
+  }
   VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens", {1, kMaxVector}));
   if (processor.recipe_.max_tokens > max_text_tokens)
     return misfit("processor.recipe.text",
@@ -134,12 +138,12 @@ Status Processor::read_view_places(const Keys& keys) {
   const std::string key = views_behind_ ? "policy.view_starts_from_end" : "policy.view_starts";
   VLA_TRY(const std::vector<int> starts, keys.integers(key, kTokenIndex));
   const auto encode = [&](const std::string& text) -> Result<std::vector<std::int32_t>> {
-    auto tokens = tokenizer_.encode(text, kMaxPrompt);
+    auto tokens = tokenizer_->encode(text, kMaxPrompt);
     if (!tokens) return misfit("processor.recipe.text", tokens.error().expected, tokens.error().found);
     return tokens;
   };
   VLA_TRY(const std::vector<std::int32_t> prefixed, encode(views->token));
-  const std::size_t n_prefix = tokenizer_.prefix().size();
+  const std::size_t n_prefix = tokenizer_->prefix().size();
   if (prefixed.size() != n_prefix + 1)
     return misfit(where + ".token", "the text of one token", fmt::format("{} tokens", prefixed.size() - n_prefix));
   view_token_ = prefixed.back();

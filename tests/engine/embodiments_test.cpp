@@ -99,6 +99,20 @@ TEST_CASE("what robots share is in memory once") {
   CHECK(engine->memory().plan == 2 * alone->memory().plan);
 }
 
+TEST_CASE("robots whose tokenizers are described alike have one, and its description is not kept") {
+  EditableBundle bundle = both();
+  const std::string added = *bundle.keys.string("tokenizer.added");
+  bundle.remove_key("tokenizer.added");
+  for (const bool alike : {true, false}) {
+    bundle.set("embodiment.arm.tokenizer.added", Value(added));
+    bundle.set("embodiment.dog.tokenizer.added", Value(added + (alike ? "" : " ")));
+    const auto engine = load(bundle, "both.gguf", {.dry = true, .all_robots = true});
+    const std::vector<const Engine*> robots = engine->robots();
+    CHECK((robots[0]->processor().tokenizer() == robots[1]->processor().tokenizer()) == alike);
+    for (const Engine* robot : robots) CHECK_FALSE(robot->bundle().keys().has("tokenizer.tokens"));
+  }
+}
+
 TEST_CASE("an observation of no robot, or of one that is not there, is refused with the list") {
   const GoldenCase golden = GoldenCase::read(golden_path(kCase));
   const auto engine = load(both(), "both.gguf", {.all_robots = true});
