@@ -4,6 +4,9 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
+#include <utility>
+
 namespace vla {
 namespace {
 
@@ -61,13 +64,13 @@ Result<std::vector<int>> Keys::integers(std::string_view key, Range range) const
 }
 
 bool Keys::same(std::string_view prefix, const Keys& other) const {
-  auto mine = values_.lower_bound(prefix), theirs = other.values_.lower_bound(prefix);
-  const auto goes_on = [&](auto at, const Keys& keys) {
-    return at != keys.values_.end() && at->first.starts_with(prefix);
+  const auto part = [&](const Keys& keys) {
+    const auto first = keys.values_.lower_bound(prefix);
+    const auto is_behind = [&](const auto& entry) { return !entry.first.starts_with(prefix); };
+    return std::pair(first, std::find_if(first, keys.values_.end(), is_behind));
   };
-  for (; goes_on(mine, *this) && goes_on(theirs, other); ++mine, ++theirs)
-    if (*mine != *theirs) return false;
-  return !goes_on(mine, *this) && !goes_on(theirs, other);
+  const auto mine = part(*this), theirs = part(other);
+  return std::equal(mine.first, mine.second, theirs.first, theirs.second);
 }
 
 void Keys::forget(std::string_view prefix) {
