@@ -214,7 +214,8 @@ Result<std::string> named_embodiment(std::span<const std::byte> act) {
   for (Fields field(act, "act");;) {
     VLA_TRY(const bool more, field.next());
     if (!more) return tag;
-    if (field.number == v1::Act::kEmbodimentFieldNumber && field.type == 'b') tag = text_of(field.value);
+    if (field.number != v1::Act::kEmbodimentFieldNumber || field.type != 'b') continue;
+    tag = text_of(field.value);
     VLA_CHECK(check_name(tag, "embodiment"));
   }
 }
