@@ -29,10 +29,6 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   return limits;
 }
 
-}  // namespace
-
-namespace {
-
 /// An observation of a robot with every view and the longest text.
 Observation largest_observation(const Engine& robot) {
   const Processor& processor = robot.processor();

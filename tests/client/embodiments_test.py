@@ -40,8 +40,8 @@ def server(both):
 
 @pytest.fixture(params=["server", "process"])
 def policy(request, both, server):
-    where = server.address if request.param == "server" else None
-    with vla_cpp.Client(where, timeout=SECONDS) if where else vla_cpp.Policy(both.bundle, threads=1) as policy:
+    at_server = request.param == "server"
+    with vla_cpp.Client(server.address, timeout=SECONDS) if at_server else vla_cpp.Policy(both.bundle, threads=1) as policy:
         yield policy
 
 
