@@ -320,7 +320,7 @@ def p(values, percent):
 
 
 def last_of_all():
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     os.nice(19)
 
 
