@@ -7,7 +7,8 @@
 DIR is a case as tools/goldens/recorder.py describes it: checkpoint/, observation.json, frames, noise.npy.  Where it has no
 checkpoint, one of the published size with random weights is written, for two cameras: smolvla 450 M parameters, 0.9 GB of
 disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 20 GB of memory while PyTorch runs in float32; evo1 775 M
-parameters in the authors' layout, the third slot of the prompt empty.
+parameters in the authors' layout, the third slot of the prompt empty; gr00t_n1_5, gr00t_n1_6 and gr00t_n1_7 about 3 G parameters,
+12 GB of disk with the bundle and 14 GB of memory.
 Every program runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert,
 vla.  The table that is printed goes to docs/models.md; the memory of vla is that of its answer, with --blocks of every
 block beside it.  Times are of one cold inference beside other work: no benchmark.
@@ -33,9 +34,10 @@ FRAMES = {"camera1": (480, 640, "png"), "camera2": (480, 480, "png")}
 
 def write_case(case, arch):
     """The published size with random weights, two smooth frames, a state, noise."""
-    module, views = family(arch), {view: frame[:2] for view, frame in FRAMES.items()}
-    text, options = "pick up the red cube and place it in the basket", getattr(module, "OPTIONS", {})
-    described = cases.Case(SEED, FRAMES, text, module.published(views, arch), options=options)
+    module = family(arch)
+    frames, options = getattr(module, "FRAMES", FRAMES), getattr(module, "OPTIONS", {})
+    text, views = "pick up the red cube and place it in the basket", {view: frame[:2] for view, frame in frames.items()}
+    described = cases.Case(SEED, frames, text, module.published(views, arch), options=options)
     cases.write_observation(described, case)
     print(f"{cases.write_checkpoint(described, case):,} random parameters")
 

@@ -228,6 +228,15 @@ def case(seed, frames, instruction, description, **more):
 
 POSE = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1)
 
+FRAMES = {view: (256, 256, "png") for view in ("image", "wrist_image")}  # of a case of the published size
+
+
+def published(checkpoint, views, tag, index, vision, text, head, *how, **more):
+    """The published size, for a robot of LIBERO's with these views."""
+    robot = Robot(tuple(views), POSE | {"gripper": 2}, POSE | {"gripper": 1}, 16)
+    head |= {"max_seq_len": 1024, "max_num_embodiments": 32}
+    return checkpoint(tag, index, robot, vision, text, head, *how, **more)
+
 
 # --- the reference ---------------------------------------------------------------------------------------------------
 

@@ -136,6 +136,19 @@ CASES = {
         state=(0.5, -3.25, 2.5, 0.75, -2.0, 3.5, -4.0, 0.1, 0.75, 0.25, -1.5, 2.0)),
 }
 
+
+OPTIONS = {"variant": "data_config.json", "embodiment": "my_arm"}
+FRAMES = gr00t.FRAMES
+
+
+def published(views, arch="gr00t_n1_5"):
+    """The published size: 2.7 G parameters."""
+    height, width = next(iter(views.values()))
+    return gr00t.published(
+        Checkpoint, views, "my_arm", INDEX, vision(1152, 27, 16, 4304, 224), text(2048, 28, 16, 8, 128, 6144) | {"vocab_size": 151680},
+        head(12, (16, 32, 48), (4, 32, 64), 1024, 64, 32, 16), camera(width, height), n_future=32)
+
+
 # --- the reference ---------------------------------------------------------------------------------------------------
 
 

@@ -25,7 +25,7 @@ from .train_tokenizer import EAGLE
 
 N_MERGE = 60
 TOKENS = {name: 256 + N_MERGE + i for i, name in enumerate(EAGLE)}
-N_DEAD = 3  # rows of the embedding behind the last token
+N_VOCAB = max(TOKENS.values()) + 1 + 3  # the embedding has rows behind the last token
 ROOT = "backbone.model."
 CONFIG = {
     "model_dtype": "bfloat16", "model_name": "nvidia/Eagle-Block2A-2B-v2", "backbone_model_type": "eagle", "model_revision": None,
@@ -75,7 +75,7 @@ class Checkpoint(gr00t.Checkpoint):
 
 def language_shapes(at, text, kept):
     d, d_head = text["hidden_size"], text["head_dim"]
-    out = {f"{at}embed_tokens.weight": (max(TOKENS.values()) + 1 + N_DEAD, d)} | rms_norm(f"{at}norm", d)
+    out = {f"{at}embed_tokens.weight": (text.get("vocab_size", N_VOCAB), d)} | rms_norm(f"{at}norm", d)
     for i in range(kept):
         layer = f"{at}layers.{i}."
         out |= decoder_layer(layer, d, text["intermediate_size"], text["num_attention_heads"], text["num_key_value_heads"], d_head)
@@ -84,7 +84,7 @@ def language_shapes(at, text, kept):
 
 
 def text_config(text):
-    return {"architectures": ["Qwen3ForCausalLM"], "model_type": "qwen3", "vocab_size": max(TOKENS.values()) + 1 + N_DEAD,
+    return {"architectures": ["Qwen3ForCausalLM"], "model_type": "qwen3", "vocab_size": N_VOCAB,
             "max_position_embeddings": 1024, "rope_theta": 1000000, "rope_scaling": None, "rms_norm_eps": 1e-6, "attention_bias": False,
             "tie_word_embeddings": True, "hidden_act": "silu", "bos_token_id": TOKENS["<|endoftext|>"],
             "eos_token_id": TOKENS["<|im_end|>"], "use_sliding_window": False} | text
@@ -147,6 +147,18 @@ CASES = {
         vision(16, 2, 2, 24, 3), text(24, 4, 3, 1, 8, 32), head(3, (5, 2, 10), None, 14, 6, 5, 4),
         {"shortest_image_edge": 16, "crop_fraction": 0.9})),
 }
+
+
+OPTIONS = {"embodiment": "libero_panda"}
+FRAMES = gr00t.FRAMES
+
+
+def published(views, arch="gr00t_n1_6"):
+    """The published size: 3.1 G parameters."""
+    return gr00t.published(
+        Checkpoint, views, "libero_panda", 2, vision(1152, 27, 16, 4304, 16, 14), text(2048, 28, 16, 8, 128, 6144) | {"vocab_size": 151680},
+        head(16, (32, 32, 48), None, 1024, 128, 128, 50), {"shortest_image_edge": 256, "crop_fraction": 0.95})
+
 
 # --- the reference ---------------------------------------------------------------------------------------------------
 

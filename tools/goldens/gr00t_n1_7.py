@@ -23,7 +23,7 @@ from .train_tokenizer import QWEN_VL
 HUB_NAME = "nvidia/Cosmos-Reason2-2B"
 N_MERGE = 60
 TOKENS = {name: 256 + N_MERGE + i for i, name in enumerate(QWEN_VL)}
-N_DEAD = 5  # rows of the embedding behind the last token
+N_VOCAB = max(TOKENS.values()) + 1 + 5  # the embedding has rows behind the last token
 CONFIG = {
     "model_dtype": "bfloat16", "model_name": HUB_NAME, "backbone_model_type": "qwen", "model_revision": None, "tune_top_llm_layers": 0,
     "tune_llm": False, "tune_visual": False, "reproject_vision": False, "use_flash_attention": False, "load_bf16": False,
@@ -55,7 +55,7 @@ class Checkpoint(gr00t.Checkpoint):
             out |= norm(f"{at}{merger}.norm", d_norm) | linear(f"{at}{merger}.linear_fc1", 4 * d, 4 * d)
             out |= linear(f"{at}{merger}.linear_fc2", d_model, 4 * d)
         at, d_head = "backbone.model.model.language_model.", t["head_dim"]
-        out |= {f"{at}embed_tokens.weight": (max(TOKENS.values()) + 1 + N_DEAD, d_model)} | rms_norm(f"{at}norm", d_model)
+        out |= {f"{at}embed_tokens.weight": (t.get("vocab_size", N_VOCAB), d_model)} | rms_norm(f"{at}norm", d_model)
         for i in range(self.head["select_layer"]):
             layer = f"{at}layers.{i}."
             out |= decoder_layer(layer, d_model, t["intermediate_size"], t["num_attention_heads"], t["num_key_value_heads"], d_head)
@@ -65,7 +65,7 @@ class Checkpoint(gr00t.Checkpoint):
     def write_backbone(self, folder):
         """What the hub keeps in the backbone's repository, without weights."""
         copy_tokenizer("gr00t", folder)
-        text = {"model_type": "qwen3_vl_text", "vocab_size": max(TOKENS.values()) + 1 + N_DEAD, "rms_norm_eps": 1e-6,
+        text = {"model_type": "qwen3_vl_text", "vocab_size": N_VOCAB, "rms_norm_eps": 1e-6,
                 "rope_theta": 5000000, "max_position_embeddings": 512, "hidden_act": "silu", "attention_bias": False,
                 "attention_dropout": 0.0, "bos_token_id": TOKENS["<|endoftext|>"], "eos_token_id": TOKENS["<|im_end|>"],
                 "tie_word_embeddings": True} | self.text
@@ -163,6 +163,19 @@ CASES = {
         head(4, (4, 2, 10), (1, 3, 8), 14, 15, 14, 5), {"image_target_size": [16, 16], "image_crop_size": [15, 15]}, 16, percentiles=True)),
 }
 
+
+OPTIONS = {"embodiment": "libero_sim"}
+FRAMES = gr00t.FRAMES
+
+
+def published(views, arch="gr00t_n1_7"):
+    """The published size: 3.1 G parameters."""
+    return gr00t.published(
+        Checkpoint, views, "libero_sim", 2, vision(1024, 24, 16, 4096, 48, (5, 11, 17), 16),
+        text(2048, 28, 16, 8, 128, 6144, (24, 20, 20)) | {"vocab_size": 151936}, head(16, (32, 32, 48), (4, 32, 64), 1024, 132, 132, 40),
+        {"image_target_size": [256, 256], "shortest_image_edge": 256, "crop_fraction": 0.95}, 256)
+
+
 # --- the reference ---------------------------------------------------------------------------------------------------
 
 
@@ -215,14 +228,16 @@ def policy_config(checkpoint, tag):
 def check_weights(model, checkpoint):
     """LeRobot's loader warns of a tensor that it misses and goes on."""
     import torch
-    from safetensors.torch import load_file
+    from safetensors import safe_open
 
-    stored = {}
+    parameters = dict(model.named_parameters())
     for shard in sorted(checkpoint.glob("model-*.safetensors")):
-        stored |= load_file(shard)
-    for name, p in model.named_parameters():
-        if not torch.equal(p, stored[name].float()):
-            raise ValueError(f"{checkpoint}: {name} was not read")
+        with safe_open(shard, "pt") as stored:
+            for name in parameters.keys() & stored.keys():
+                if torch.equal(parameters[name], stored.get_tensor(name).float()):
+                    del parameters[name]
+    if parameters:
+        raise ValueError(f"{checkpoint}: {', '.join(sorted(parameters)[:9])} were not read")
     for name, table in model.named_buffers():
         if table.is_floating_point() and table.dtype != torch.float32:
             raise ValueError(f"{name} is {table.dtype}")

@@ -10,16 +10,14 @@ run one inference of two views and a prompt of the same length, and the ratio of
 time that each took, which other work on the machine changes less.
 """
 import argparse
-import json
 import os
-import statistics
-import subprocess
 import sys
 import time
 import warnings
 from pathlib import Path
 
-from peer import ROOT, STAGES, serve
+import in_turn
+from peer import ROOT, serve
 
 TOKENS, VIEWS, PATCHES = 48, 2, 256
 IMAGE, STATE, STOP = 128010, 128011, 128001
@@ -77,26 +75,6 @@ def reference(n_thread):
     serve(run, name=f"PyTorch {torch.__version__}, bfloat16, {sum(p.numel() for p in model.parameters()):,} parameters")
 
 
-class Child:
-    """A program that runs once for each line on its standard input and then says so."""
-
-    def __init__(self, command, stream):
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE if stream == "stderr" else None}
-        self.process = subprocess.Popen([str(c) for c in command], text=True, **pipes)
-        self.stream = getattr(self.process, stream)
-
-    def wait_for(self, start):
-        for line in self.stream:
-            if line.startswith(start):
-                return line
-        raise SystemExit(f"error: {' '.join(self.process.args)} ended early")
-
-    def run(self, start):
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        return self.wait_for(start)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
@@ -106,24 +84,8 @@ def main():
     args = parser.parse_args()
     if args.reference:
         return reference(args.threads)
-    theirs = Child([sys.executable, __file__, "--reference", "--threads", args.threads], "stdout")
-    print(json.loads(theirs.wait_for("{"))["name"], flush=True)
-    ours = Child([args.vla, "bench", "--arch", "bitvla", "--size", "full", "--paced", "--json", "--warmup", 1, "--runs", args.rounds,
-                  "--threads", args.threads, "--tokens", TOKENS], "stderr")
-    times = []
-    for turn in range(args.rounds + 1):  # the first warms up
-        ours.run(("warm-up ", "round "))
-        answer = json.loads(theirs.run("{"))
-        print(f"round {turn}: PyTorch {answer['ms']:.0f} ms, {answer['cpu_ms']:.0f} ms of the processor", flush=True)
-        times += [answer] if turn else []
-    report = json.loads(ours.process.communicate()[0].splitlines()[-1])
-    rounds = [{"ms": sum(r["stages"][s] for s in STAGES), "cpu_ms": r["cores"] * r["total_ms"]} for r in report["rounds"]]
-    print(f"{report['cpu']}, {args.threads} threads, kernels: {report['kernels']}")
-    for what, text in (("ms", "wall time, network"), ("cpu_ms", "processor time")):
-        ratios = [a[what] / b[what] for a, b in zip(times, rounds)]
-        print(f"{text}: vla {statistics.median(r[what] for r in rounds):.0f} ms, PyTorch {statistics.median(t[what] for t in times):.0f} ms, "
-              f"PyTorch over vla {statistics.median(ratios):.1f} ({min(ratios):.1f} to {max(ratios):.1f})")
-    print(f"vla: {report['memory_bytes']['peak'] / 1e6:.0f} MB at the most")
+    bench = [args.vla, "bench", "--arch", "bitvla", "--size", "full", "--tokens", TOKENS]
+    in_turn.compare([sys.executable, __file__, "--reference", "--threads", args.threads], bench, args.rounds, args.threads)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The reference of a case in PyTorch, in float32 and without its processor, and vla in turn.
+
+    python tools/peers/case.py --case DIR [--rounds 5] [--kernels float32]
+
+DIR is what tools/parity_full.py leaves: checkpoint/, frames, an observation, noise.npy and bundle.gguf.  vla runs as many views and as
+many tokens of text.  In each round both run one inference, and the ratio of a round is printed, of wall time and of the processor time
+that each took, which other work on the machine changes less.
+"""
+import argparse
+import json
+import os
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import in_turn
+from peer import ROOT, serve
+
+
+def reference(case, n_thread):
+    import numpy as np
+    import torch
+    from goldens import recorder
+
+    recorder.open_reference()
+    warnings.filterwarnings("ignore")
+    torch.set_num_threads(n_thread)
+    policy, before, _ = recorder.load(case / "checkpoint", "float32")
+    noise, batch = torch.from_numpy(np.load(case / "noise.npy"))[None], before(recorder.read_observation(case))
+
+    def run():
+        start, at_work = time.perf_counter(), time.process_time()
+        with torch.inference_mode():
+            policy.predict_action_chunk(dict(batch), noise=noise.clone())
+        return {"ms": 1e3 * (time.perf_counter() - start), "cpu_ms": 1e3 * (time.process_time() - at_work)}
+
+    serve(run, name=f"PyTorch {torch.__version__}, float32, {recorder.described(case / 'checkpoint')}")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--case", type=Path, required=True)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--tokens", type=int, default=32, help="of text")
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--kernels", default="float32", help="as vla bench takes them")
+    parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
+    parser.add_argument("--reference", action="store_true", help=argparse.SUPPRESS)  # in a process of its own
+    args = parser.parse_args()
+    case = args.case.resolve()
+    if args.reference:
+        return reference(case, args.threads)
+    views = json.loads((case / "observation.json").read_text())["images"]
+    bench = [args.vla, "bench", case / "bundle.gguf", "--kernels", args.kernels, "--views", len(views), "--tokens", args.tokens]
+    in_turn.compare([sys.executable, __file__, "--case", case, "--threads", args.threads, "--reference"], bench, args.rounds, args.threads)
+
+
+if __name__ == "__main__":
+    main()
