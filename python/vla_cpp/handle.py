@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Optional, TypeVar
 
 from .errors import UsageError
 from .observation import robot_of
@@ -19,9 +19,9 @@ class Handle:
     def close(self) -> None:
         raise NotImplementedError
 
-    def robot(self, embodiment: str) -> Robot:
-        """One robot of a policy with several, as a policy of its own, e.g. for a ChunkLoop. Errors: BadObservation, with the tags that
-        there are."""
+    def robot(self, embodiment: Optional[str]) -> Robot:
+        """One robot of a policy with several, as a policy of its own, e.g. for a ChunkLoop; None where there is one. Errors:
+        BadObservation, with the tags that there are."""
         return Robot(self, embodiment)
 
     def __enter__(self: Self) -> Self:
@@ -37,7 +37,7 @@ class Handle:
 class Robot:
     """`spec`, `act` and, of a Client, `submit` of one robot."""
 
-    def __init__(self, policy: Any, embodiment: str) -> None:
+    def __init__(self, policy: Any, embodiment: Optional[str]) -> None:
         self.spec = robot_of(policy.spec, embodiment)
         self.act = partial(policy.act, embodiment=embodiment)
         if hasattr(policy, "submit"):

@@ -4,15 +4,40 @@ import os
 import sys
 from pathlib import Path
 
+import gguf
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "python")]
 
+from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle  # noqa: E402
+
 
 @pytest.fixture(scope="session")
 def bundle():
     return ROOT / "models/metaworld-tiny.gguf"
+
+
+@pytest.fixture(scope="session")
+def robots(bundle, tmp_path_factory):
+    """The same weights for two robots, whose camera has different names."""
+    kinds = {4: "u32", 6: "f32", 7: "bool", 8: "string", 12: "f64"}
+    keys = [Key("embodiments", "string[]", ["left", "right"])]
+    for name, field in gguf.GGUFReader(bundle).fields.items():
+        if name.startswith("GGUF.") or name == "vla.checksum":
+            continue
+        kind = kinds[field.types[-1]] + ("[]" if field.types[0] == 9 else "")
+        if name == "observation.views":
+            keys += [Key(f"embodiment.{tag}.{name}", kind, [f"observation.images.{tag}"]) for tag in ("left", "right")]
+        else:
+            keys.append(Key(name, kind, field.contents()))
+    content = read_bundle(bundle)
+    tensors = [TensorInfo(name, data.shape, content.dtypes[name]) for name, data in content.tensors.items()]
+    path = tmp_path_factory.mktemp("robots") / "two.gguf"
+    with BundleWriter(str(path), keys, tensors) as out:
+        for name, data in content.tensors.items():
+            out.write(name, data)
+    return path
 
 
 @pytest.fixture(scope="session")

@@ -126,6 +126,30 @@ def test_a_bundle_paired_with_itself_agrees_in_every_chunk(call, bundle, tmp_pat
     assert data["differences"] and all(row["max"] == 0 for row in data["differences"])
 
 
+@pytest.mark.parametrize("more", [[], ["--mode", "rtc", "--latency-ms", "300"]])
+def test_one_robot_of_several_is_evaluated_as_its_bundle_alone(call, robots, tmp_path, more):
+    two = ["--bundle", str(robots), "--embodiment"]
+    assert main(call("alone", *more)) == main(call("left", *two, "left", *more)) == 0
+    told = [[{**row, "bundle": ""} for row in outcomes(tmp_path / out)] for out in ("alone", "left")]
+    assert told[0] == told[1]
+    assert main(call("left", *two, "right", *more)) == 9  # episodes of another robot are not mixed in
+
+
+def test_a_pair_of_robots_is_two_of_the_same_tag(call, robots, capsys):
+    assert main([*call("pair", "--bundle", str(robots), "--embodiment", "left", "--against", str(robots), "--paired"), "--json"]) == 0
+    data = last_object(capsys.readouterr().out)
+    assert data["run"]["a"].startswith("two.gguf for left, computed in")
+    assert all(row["max"] == 0 for row in data["differences"])
+
+
+@pytest.mark.parametrize("command", ["null", "replan", "demo"])
+@pytest.mark.parametrize("given, found", [([], "none"), (["--embodiment", "cat"], "cat")])
+def test_a_robot_that_is_not_named_or_not_there_is_refused_with_the_list(robots, binary, tmp_path, capsys, command, given, found):
+    call = [command, "--bundle", str(robots), "--vla", str(binary), "--out", str(tmp_path), *given]
+    assert main([*call, *(["--environment", "null"] if command == "replan" else [])]) == 2
+    assert f"vla-eval: embodiment: expected one of left, right, found {found}; vla-eval --help" in capsys.readouterr().err
+
+
 def test_a_pair_that_differs_is_told_episode_by_episode(call, tmp_path, capsys):
     assert main([*call("random", "--against", "random", "--paired"), "--json"]) == 0
     data = last_object(capsys.readouterr().out)
@@ -167,6 +191,7 @@ def test_the_replan_study_has_a_row_for_each_interval(bundle, binary, tmp_path, 
         (["--episodes", "0"], "take 1 or more"),
         (["--against", "random"], "go together"),
         (["--swap"], "has an opposite"),
+        (["--server", "", "--bundle", "", "--random", "--embodiment", "left"], "--embodiment goes with --bundle or --server"),
         (["--latency-ms", "-1"], "--latency-ms: expected 0 or more, found -1"),
         (["--mode", "rtc", "--film", "all"], "--mode and --latency-ms go with --bundle or --server"),
     ],

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any, Dict, List, Optional
 
+from ..errors import BadObservation
 from .environment import EnvironmentFault
 from .environments import NAMES, MissingSimulator, find
 from .episode import Job
@@ -30,6 +31,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
     who.add_argument("--bundle", metavar="FILE", help="serve this bundle for the run")
     who.add_argument("--server", metavar="ADDRESS", help="use a running `vla serve`, e.g. tcp://127.0.0.1:5555")
     who.add_argument("--torch", metavar="DIR", help="a LeRobot checkpoint, in PyTorch float32")
+    who.add_argument("--embodiment", metavar="TAG", help="the robot, where the bundle is for several")
     who.add_argument("--random", action="store_true", help="uniform actions: the floor that a policy must leave")
     parser.add_argument("--episodes", type=int, default=20, help="of each task (default 20)")
     parser.add_argument("--task", action="append", metavar="NAME", help="only this task; may be given again (default: all)")
@@ -72,6 +74,8 @@ def _driver(policies: Any, a: argparse.Namespace) -> Any:
     given = [x for x in (a.bundle, a.server, a.torch and f"torch:{a.torch}", "random" if a.random else None) if x]
     if len(given) != 1:
         raise SystemExit(_usage("give one of --bundle, --server, --torch and --random"))
+    if a.embodiment is not None and not (a.bundle or a.server):
+        raise SystemExit(_usage("--embodiment goes with --bundle or --server"))
     return policies.named(given[0])
 
 
@@ -202,6 +206,8 @@ def main(argv: Optional[List[str]] = None) -> int:
         if isinstance(error, RunFailed):
             print("vla-eval: episodes that ended are kept; the same command runs the missing ones", file=sys.stderr)
         return 9
+    except BadObservation as error:
+        return _usage(str(error))
     except KeyboardInterrupt:
         print("vla-eval: stopped; the same command goes on", file=sys.stderr)
         return 130

@@ -22,6 +22,7 @@ def add_command(commands: Any) -> None:
         "writes a film and a contact sheet, then counts a few more layouts.",
     )  # fmt: skip
     parser.add_argument("--bundle", default="models/metaworld-tiny.gguf", metavar="FILE")
+    parser.add_argument("--embodiment", metavar="TAG", help="the robot, where the bundle is for several")
     parser.add_argument("--text", default="open the faucet", help="the sentence (default: open the faucet)")
     parser.add_argument("--task", choices=list(SENTENCES), help="the scene (default: the one that the sentence belongs to)")
     parser.add_argument("--seed", type=int, default=910000, help="of the layout that is filmed (default 910000)")

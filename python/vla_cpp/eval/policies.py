@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Dict, Tuple
+from typing import Any, Dict, Optional, Tuple
 
 import numpy as np
 
@@ -37,19 +37,20 @@ class EvalPolicy:
 
 
 class ServedPolicy(EvalPolicy):
-    """A bundle at `vla serve`, through the public client."""
+    """A bundle at `vla serve`, through the public client. embodiment: the tag of its robot, where it is for several."""
 
-    def __init__(self, address: str, timeout: float) -> None:
+    def __init__(self, address: str, timeout: float, embodiment: Optional[str] = None) -> None:
         import vla_cpp
 
         self._client = vla_cpp.Client(address, timeout=timeout)
-        self.spec = self._client.spec
+        self._robot = self._client.robot(embodiment)
+        self.spec = self._robot.spec
         self.identity = self.spec.bundle.checksum
         self.noise_shape = (self.spec.noise_rows, self.spec.d_noise)
 
     def chunk(self, observation: Observation, text: str, noise: np.ndarray, leftover: Any = None) -> Any:
         """The client's chunk; `leftover`: rows of the one before, where it is to go on from them."""
-        return self._client.act(images=observation.frames, state=observation.state, text=text, noise=noise, leftover=leftover)
+        return self._robot.act(images=observation.frames, state=observation.state, text=text, noise=noise, leftover=leftover)
 
     def act(self, observation: Observation, text: str, noise: np.ndarray) -> Answer:
         chunk = self.chunk(observation, text, noise)
@@ -100,7 +101,7 @@ def make_policy(description: Dict[str, Any]) -> EvalPolicy:
     """A policy from what a worker process was told: {"kind": "served", "address": ...} and so on."""
     kind = description["kind"]
     if kind == "served":
-        return ServedPolicy(description["address"], description["timeout"])
+        return ServedPolicy(description["address"], description["timeout"], description["embodiment"])
     if kind == "torch":
         return TorchPolicy(description["checkpoint"])
     return RandomPolicy(description["horizon"], description["d_action"])

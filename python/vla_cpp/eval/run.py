@@ -52,13 +52,15 @@ class Policies(contextlib.ExitStack):
         return self.served(server.address)
 
     def served(self, address: str) -> Driver:
-        description = {"kind": "served", "address": address, "timeout": TIMEOUT}
+        """Errors: BadObservation, for a robot that the policy does not have, or none of several."""
+        robot = self._arguments.embodiment
+        description = {"kind": "served", "address": address, "timeout": TIMEOUT, "embodiment": robot}
         policy = make_policy(description)
         assert isinstance(policy, ServedPolicy)
         spec = policy.spec
         policy.close()
         precision = {"f32": "float32", "bf16": "bfloat16", "f16": "float16"}.get(spec.precision, spec.precision)
-        label = f"{spec.bundle.name}, computed in {precision} with {spec.kernels} kernels"
+        label = f"{spec.bundle.name}{f' for {robot}' if robot else ''}, computed in {precision} with {spec.kernels} kernels"
         return Driver(description, label, spec.bundle.checksum, spec)
 
     def torch(self, checkpoint: str) -> Driver:
