@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several robots of a GR00T checkpoint in one bundle."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -107,3 +109,36 @@ def test_a_robot_without_statistics_is_refused_by_name(converter):
     assert "statistics.json: humanoid: expected statistics, found none" in converter.refusal(
         tiny, embodiment=",".join(TAGS)
     ).message()
+
+
+def test_an_option_may_differ_by_robot(converter, tmp_path):
+    tiny = TinyGr00t()
+    tiny.kwargs["letter_box_transform"] = False
+    info = tmp_path / "info.json"
+    info.write_text(json.dumps({"fps": 20, "features": {}}))
+    own = {
+        "gripper_sign": {TAG: "gripper", OTHER: ""},
+        "camera_size": {TAG: "640x480", OTHER: "1280x720"},
+        "dataset_info": {TAG: "", OTHER: str(info)},
+    }
+    joint = {name: ",".join(f"{tag}={value}" for tag, value in values.items() if value) for name, values in own.items()}
+    both = converter.bundle(tiny, embodiment=",".join(TAGS), **joint)
+    for tag in TAGS:
+        alone = converter.bundle(tiny, embodiment=tag, **{name: values[tag] for name, values in own.items()})
+        assert unsealed(view_of(both, tag)[0]) == unsealed(alone.keys)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ("arm=gripper,gripper", "--gripper-sign: expected TAG=VALUE once for each of some of the robots arm, humanoid"),
+        ("arm=gripper,arm=x", "--gripper-sign: expected TAG=VALUE once for each"),
+        ("arm=gripper,dog=x", "--gripper-sign: expected TAG=VALUE once for each"),
+        ("arm=", "--gripper-sign: expected TAG=VALUE once for each"),
+        ("dog=gripper", "arm: --gripper-sign: expected a key of the actions: x, gripper, found dog=gripper"),
+        ("humanoid=claw", "humanoid: --gripper-sign: expected a key of the actions: "),
+    ],
+)
+def test_an_option_that_fits_no_robot_or_not_one_of_them_is_refused_by_name(converter, given, message):
+    error = converter.refusal(TinyGr00t(), embodiment=",".join(TAGS), gripper_sign=given)
+    assert error.message().startswith(message) and error.code == Code.USAGE

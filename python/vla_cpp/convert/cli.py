@@ -118,7 +118,8 @@ def _add_evo1(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_gr00t(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("checkpoints of GR00T", "which hold several robots").add_argument
+    about = "which hold several robots; --variant, --camera-size, --gripper-sign and --dataset-info take TAG=VALUE,... where these differ"
+    add = parser.add_argument_group("checkpoints of GR00T", about).add_argument
     add(
         "--embodiment",
         metavar="TAG",

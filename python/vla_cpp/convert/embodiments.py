@@ -12,24 +12,18 @@ import numpy as np
 from .archs import Options, Plan
 from .bundle import Key
 from .checkpoint import Checkpoint
-from .errors import Code, Problems, refuse
+from .errors import Code, ConvertError, Problems, refuse
 
 ALL = "all"
+OWN_OPTIONS = ("variant", "gripper_sign", "camera_size", "dataset_info")  # of which each robot may have its own
 
 
 def plan_robots(module: Any, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     """`module`: of the architecture. Each robot's part is what a conversion for it alone writes. Errors: usage, and those of the plans."""
     tags = _tags(module, checkpoint, options)
     if len(tags) == 1:
-        return module.plan(checkpoint, replace(options, embodiment=tags[0]), problems)
-    variants = options.variant.split(",")
-    if len(variants) not in (1, len(tags)):
-        expected = "one for all robots, or {} in the order of --embodiment {}".format(len(tags), ",".join(tags))
-        raise refuse("--variant", expected, options.variant, code=Code.USAGE)
-    plans = [
-        module.plan(checkpoint, replace(options, embodiment=tag, variant=variants[i % len(variants)]), problems)
-        for i, tag in enumerate(tags)
-    ]
+        return module.plan(checkpoint, options_of(tags[0], tags, options), problems)
+    plans = [_plan(module, checkpoint, options_of(tag, tags, options), problems) for tag in tags]
     checkpoint.notes[:] = dict.fromkeys(checkpoint.notes)  # each plan makes those of the checkpoint
     return merge(tags, plans)
 
@@ -39,6 +33,33 @@ def _tags(module: Any, checkpoint: Checkpoint, options: Options) -> List[str]:
     if len(tags) > 1 and (len(set(tags)) < len(tags) or any("." in tag for tag in tags)):
         raise refuse("--embodiment", "different tags without dots", ",".join(tags), code=Code.USAGE)
     return tags or [""]
+
+
+def options_of(tag: str, tags: Sequence[str], options: Options) -> Options:
+    """What one of the robots is converted with. Errors: usage."""
+    own = {name: _value_of(tag, tags, name, getattr(options, name)) for name in OWN_OPTIONS}
+    return replace(options, embodiment=tag, **own)
+
+
+def _value_of(tag: str, tags: Sequence[str], name: str, given: str) -> str:
+    """A value for all robots, or TAG=VALUE,... for those that are named."""
+    if given.partition("=")[0] not in tags or "=" not in given:
+        return given
+    pairs = [part.partition("=") for part in given.split(",")]
+    values = {robot: value for robot, _, value in pairs}
+    if len(values) < len(pairs) or not all(robot in tags and value for robot, value in values.items()):
+        expected = "TAG=VALUE once for each of some of the robots " + ", ".join(tags)
+        raise refuse("--" + name.replace("_", "-"), expected, given, code=Code.USAGE)
+    return values.get(tag, "")
+
+
+def _plan(module: Any, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    """The plan of one of several robots, whose refusal names it."""
+    try:
+        return module.plan(checkpoint, options, problems)
+    except ConvertError as error:
+        named = [p._replace(where="{}: {}".format(options.embodiment, p.where)) for p in error.problems]
+        raise ConvertError(named, error.subject)
 
 
 def merge(tags: Sequence[str], plans: Sequence[Plan]) -> Plan:
