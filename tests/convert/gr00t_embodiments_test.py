@@ -58,6 +58,14 @@ def test_what_robots_share_stands_once(converter):
     assert "state_in.weight" not in bundle.tensors and "processor.recipe" not in bundle.keys
 
 
+def test_robots_are_normalized_each_in_its_own_way(converter):
+    tiny = TinyGr00t()
+    tiny.robots[TAG]["state"]["mean_std_embedding_keys"] = ["x"]
+    bundle = converter.bundle(tiny, embodiment=",".join(TAGS))
+    means = [name for name in bundle.tensors if name.endswith("stats.observation.state.mean")]
+    assert means == ["embodiment.{}.stats.observation.state.mean".format(TAG)]
+
+
 def test_robots_of_one_index_share_its_weights_too(converter):
     tiny = TinyGr00t()
     tiny.embodiments[OTHER] = IDS[TAG]

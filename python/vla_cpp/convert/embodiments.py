@@ -87,6 +87,6 @@ def _merged(tags: Sequence[str], parts: Sequence[Dict[str, Any]]) -> Dict[str, A
 
 
 def _same(one: Any, other: Any) -> bool:
-    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-        return one.dtype == other.dtype and np.array_equal(one, other)
+    if isinstance(other, np.ndarray):
+        return isinstance(one, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
     return one == other
