@@ -216,7 +216,7 @@ Status Processor::encode_state(const Observation& observation, Inputs& inputs) c
     return bad_observation(state_place(bad), "a number that stays finite when normalized",
                            fmt::format("{}", inputs.state[bad]));
   inputs.discretized_state.clear();
-  for (const auto& op : recipe_.state) op->finish(inputs.state, inputs.discretized_state);
+  for (const auto& op : recipe_.state) VLA_CHECK(op->finish(inputs.state, inputs.discretized_state));
   return {};
 }
 

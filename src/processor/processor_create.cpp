@@ -172,7 +172,7 @@ Status Processor::read_view_places(const Keys& keys) {
 
 Status Processor::bind_state(const Bundle& bundle) {
   n_state_ = static_cast<std::size_t>(total_dims(state_dims_));
-  StateLayout layout{bundle, states_, state_dims_, n_state_, n_state_};
+  StateLayout layout{bundle, states_, state_dims_, n_state_, n_state_, n_state_};
   for (std::size_t i = 0; i < recipe_.state.size(); ++i)
     VLA_CHECK(recipe_.state[i]->bind(layout, fmt::format("processor.recipe.state[{}]", i)));
   VLA_TRY(const int d_state, bundle.keys().integer("policy.d_state", {0, kMaxVector}));

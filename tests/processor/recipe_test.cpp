@@ -54,7 +54,7 @@ TEST_CASE("the recipe of the document is read op by op") {
   CHECK_FALSE(recipe->state[0]->reads("stats.observation.state.min"));
   std::vector<float> state(6);
   std::vector<int> no_bins;
-  recipe->state[1]->finish(state, no_bins);
+  CHECK(recipe->state[1]->finish(state, no_bins).ok());
   CHECK(state.size() == 32);
   REQUIRE(recipe->action.size() == 2);
   std::vector<double> row(32);
@@ -222,7 +222,7 @@ TEST_CASE("ops of robots and of prompts with a state are read") {
   CHECK(recipe->state.at(2)->reads("stats.observation.state.q99"));
   std::vector<float> normalized = {-2.0f, 0.0f, 2.0f};
   std::vector<int> discretized;
-  recipe->state.at(3)->finish(normalized, discretized);
+  CHECK(recipe->state.at(3)->finish(normalized, discretized).ok());
   CHECK(discretized == std::vector<int>{-1, 128, 255});
   CHECK(normalized.empty());
   std::vector<double> row(7, 1.0);

@@ -78,6 +78,7 @@ struct StateLayout {
   std::span<const int> dims;  // of each feature
   std::size_t n_state;        // numbers of all features together
   std::size_t width;          // what the ops so far leave of them
+  std::size_t n_unmoved;      // the first numbers, which ops that widen a state leave at their places
 };
 
 class StateOp {
@@ -93,8 +94,9 @@ class StateOp {
   virtual void apply(std::span<float> /*state*/) const {}
   /// Whether `apply` has normalized this number by statistics.
   virtual bool normalizes(std::size_t /*column*/) const { return false; }
-  /// Of kinds `widened` and `end`: what the network sees of the state, and what goes into the prompt.
-  virtual void finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const {}
+  /// Of kinds `widened` and `end`: what the network sees of the state, and what goes into the prompt. Errors:
+  /// bad_observation.
+  virtual Status finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const { return {}; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 

@@ -24,10 +24,11 @@ struct PadOp final : StateOp {
     if (layout.width >= before) return {};
     return misfit(where + ".size", fmt::format("at least the {} numbers of the state", before), std::to_string(size));
   }
-  void finish(std::vector<float>& state, std::vector<int>&) const override {
+  Status finish(std::vector<float>& state, std::vector<int>&) const override {
     const auto width = static_cast<std::ptrdiff_t>(state.size()) / n_row;
     const auto n_pad = static_cast<std::size_t>(size / n_row - width);
     for (int row = n_row; row > 0; --row) state.insert(state.begin() + row * width, n_pad, value);
+    return {};
   }
 };
 
@@ -37,11 +38,12 @@ struct BinsOp final : StateOp {
   Stage stage() const override { return Stage::end; }
   Status bind(StateLayout& layout, const std::string& where) override {
     if (std::exchange(layout.width, 0) == layout.n_state) return {};
-    return misfit(where, "bins of the state's own numbers", "them behind sin_cos");
+    return misfit(where, "bins of the state's own numbers", "them behind sin_cos or rotation");
   }
-  void finish(std::vector<float>& state, std::vector<int>& discretized) const override {
+  Status finish(std::vector<float>& state, std::vector<int>& discretized) const override {
     discretized = bins(params, state);
     state.clear();
+    return {};
   }
 };
 
@@ -52,7 +54,10 @@ struct DropOp final : StateOp {
     layout.width = 0;
     return {};
   }
-  void finish(std::vector<float>& state, std::vector<int>&) const override { state.clear(); }
+  Status finish(std::vector<float>& state, std::vector<int>&) const override {
+    state.clear();
+    return {};
+  }
 };
 
 Status read(JsonFields& fields, PadOp& op) {

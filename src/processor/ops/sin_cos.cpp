@@ -31,13 +31,14 @@ struct SinCosOp final : StateOp {
         return misfit(where + ".columns", fmt::format("all {} columns of a feature from column {}", width, first),
                       fmt::format("{} of them", n));
       spans_.push_back({width, n != 0});
+      if (n != 0) layout.n_unmoved = std::min(layout.n_unmoved, first);
       first += width;
       n_named += n;
     }
     layout.width += n_named;
     return {};
   }
-  void finish(std::vector<float>& state, std::vector<int>&) const override {
+  Status finish(std::vector<float>& state, std::vector<int>&) const override {
     std::vector<float> wide;
     auto from = state.begin();
     for (const Span& span : spans_) {
@@ -51,6 +52,7 @@ struct SinCosOp final : StateOp {
       from = to;
     }
     state.swap(wide);
+    return {};
   }
 
  private:
