@@ -9,9 +9,12 @@ import pytest
 
 from goldens import gr00t_n1_5, gr00t_n1_6
 from goldens.parameters import parameter
+from vla_cpp.convert.archs import gr00t_n1_5 as n1_5
+from vla_cpp.convert.archs.gr00t_n1_5 import CONFIGS
 from vla_cpp.convert.errors import Code
 
 N1_5, N1_6 = gr00t_n1_5.CASES["gr00t_n1_5/libero"], gr00t_n1_6.CASES["gr00t_n1_6/libero"]
+DATA, META = "data_config.json", "experiment_cfg/metadata.json"
 
 
 class Changed:
@@ -102,7 +105,102 @@ def test_keys_of_n1_5_have_modes_of_their_own(converter):
     assert np.count_nonzero(bundle.tensors["stats.observation.state.mean"]) == 1
 
 
-DATA, META = "data_config.json", "experiment_cfg/metadata.json"
+def turned(rotation_type, part="state", key="turn", mode=None, target="rotation_6d", width=3, **described):
+    """A robot with a rotation in front of its other keys."""
+
+    class Turned(Changed):
+        def save(self, folder):
+            super().save(folder)
+            meta = json.loads((folder / META).read_text())
+            robot = meta["my_arm"]
+            like = next(iter(robot["statistics"][part].values()))
+            robot["statistics"][part] = {key: {name: [2.0 * i + (name in ("max", "q99", "std")) for i in range(width)] for name in like}, **robot["statistics"][part]}
+            robot["modalities"].setdefault(part, {})[key] = {"rotation_type": rotation_type, "absolute": True, "continuous": True, **described}
+            (folder / META).write_text(json.dumps(meta))
+            data = json.loads((folder / DATA).read_text())
+            data[part] = {key: mode, **data[part]}
+            data["rotations"] = {f"{part}.{key}": target}
+            (folder / DATA).write_text(json.dumps(data))
+
+    return Turned(N1_5)
+
+
+@pytest.mark.parametrize("rotation_type, width", [("quaternion", 4), ("axis_angle", 3), ("euler_angles_yrp", 3)])
+@pytest.mark.parametrize("mode, normalize", [(None, "identity"), ("min_max", "groot_n1_5_min_max")])
+def test_a_rotation_of_n1_5s_state_becomes_rows_of_its_matrix(converter, rotation_type, width, mode, normalize):
+    bundle = converter.bundle(turned(rotation_type, width=width, mode=mode), **N1_5.options)
+    n = bundle.tensors["stats.observation.state.min"].size
+    assert recipe(bundle)["state"] == [
+        {"op": "normalize", "kind": "groot_n1_5_min_max", "stats": "stats.observation.state", "eps": 0.0, "columns": list(range(width, n))},
+        {"op": "rotation", "from": rotation_type, "to": "rotation_6d", "normalize": normalize, "column": 0},
+        {"op": "pad", "size": 14},
+    ]
+
+
+def test_a_rotation_of_n1_5s_actions_is_given_back_as_the_robot_has_it(converter):
+    bundle = converter.bundle(turned("euler_angles_rpy", "action", mode="min_max", target="axis_angle"), **N1_5.options)
+    assert recipe(bundle)["action"][-1] == {"op": "rotation", "from": "axis_angle", "to": "euler_angles_rpy", "column": 0}
+    for name, bound in (("min", -np.pi), ("max", np.pi)):
+        assert bundle.tensors["stats.action." + name][:3].tolist() == [np.float32(bound)] * 3
+    raw = converter.bundle(turned("euler_angles_rpy", "action", target="axis_angle", absolute=False), **N1_5.options)
+    assert recipe(raw)["action"][-2]["columns"][0] == 3
+
+
+def test_a_rotation_that_n1_5s_network_has_as_the_robot_is_normalized_as_any_key(converter):
+    for target in ("rotation_6d", "axis_angle"):
+        bundle = converter.bundle(turned(target, width=3, mode="min_max", target=target), **N1_5.options)
+        assert [op["op"] for op in recipe(bundle)["state"]] == ["normalize", "pad"]
+
+
+PLACE = "experiment_cfg/metadata.json: modalities."
+
+
+@pytest.mark.parametrize(
+    "rotation, message",
+    [
+        (turned("quaternion", width=3), PLACE + "state.turn: expected 4 numbers of a quaternion, found 3"),
+        (turned("euler_angles_rpy", target="axis_angle"), PLACE + "state.turn.rotation_type: expected states: quaternion, axis_angle, "),
+        (turned("matrix", width=9), "found matrix as rotation_6d"),
+        (turned(None), "found None as rotation_6d"),
+        (turned("quaternion", "action", target="axis_angle"), "found quaternion as axis_angle"),
+        (turned("euler_angles_rpy", mode="q99"), "found q99, absolute: True"),
+        (turned("euler_angles_rpy", mode="min_max", absolute=False), "found min_max, absolute: False"),
+    ],
+)
+def test_a_rotation_that_n1_5s_reference_cannot_convert_is_refused_by_name(converter, rotation, message):
+    assert message in converter.refusal(rotation, **N1_5.options).message()
+
+
+def test_rotations_of_keys_that_n1_5s_robot_lacks_are_refused(converter):
+    changed = Changed(N1_5, DATA, lambda c: c.update(rotations={"state.nothing": "rotation_6d"}))
+    assert "data_config.json: rotations: expected state.KEY or action.KEY" in converter.refusal(changed, **N1_5.options).message()
+
+
+def test_rotations_and_sines_of_states_do_not_go_together(converter):
+    one = turned("axis_angle")
+    one.file, one.change = DATA, lambda c: c["state"].update(x="sin_cos")
+    assert "--variant: expected rotations of states, or sines of states, found both" in converter.refusal(one, **N1_5.options).message()
+
+
+@pytest.mark.parametrize("name", [name for name, config in CONFIGS.items() if config.rotations])
+def test_data_configs_of_n1_5_with_rotations_are_those_of_the_authors(converter, monkeypatch, name):
+    config, case = CONFIGS[name], gr00t_n1_5.CASES["gr00t_n1_5/modes"]
+    given = {"rotation_6d": ("quaternion", 4), "axis_angle": ("euler_angles_rpy", 3), None: (None, 1)}
+    robot = {"statistics": {}, "modalities": {"video": {view: {"resolution": [40, 30]} for view in config.video}}}
+    for part, keys in (("state", config.state), ("action", config.action)):
+        have = {key: given[config.rotations.get(f"{part}.{key}")] for key in keys}
+        robot["statistics"][part] = {key: {"min": [-1.0] * width, "max": [1.0] * width} for key, (_, width) in have.items()}
+        robot["modalities"][part] = {key: {"rotation_type": kind, "absolute": True, "continuous": True} for key, (kind, _) in have.items()}
+    monkeypatch.setattr(n1_5, "EMBODIMENTS", {"new_embodiment": 1})
+    bundle = converter.bundle(Changed(case, META, lambda c: c.update(new_embodiment=robot)), **{**case.options, "embodiment": "new_embodiment", "variant": name})
+    turned = [key for key in config.rotations if key.startswith("state.")]
+    ops = [op for op in recipe(bundle)["state"] if op["op"] == "rotation"]
+    assert len(ops) == len(turned) and {op["normalize"] for op in ops} == {"groot_n1_5_min_max" if name == "single_panda_gripper" else "identity"}
+    states, dims = bundle.keys["observation.states"], bundle.keys["observation.state_dims"]
+    assert [sum(dims[: states.index(key)]) for key in turned] == sorted(op["column"] for op in ops)
+    assert any(op["op"] == "rotation" for op in recipe(bundle)["action"]) == (name == "oxe_droid")
+
+
 REFUSED = {
     "config.json: backbone_cfg: project_to_dim: expected None, found 1536": (
         "config.json", lambda c: c["backbone_cfg"].update(project_to_dim=1536)),

@@ -10,7 +10,8 @@ server starts: here --variant names it, or a JSON file with the same content.
 from __future__ import annotations
 
 import os
-from typing import Dict, List, NamedTuple, Optional, Tuple
+from types import MappingProxyType
+from typing import Dict, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -54,6 +55,8 @@ MODES = {
     "sin_cos": (SIN_COS, ("min", "max")),
     None: ("", ("min", "max")),
 }
+EULER = tuple("euler_angles_" + order for order in "rpy ryp pry pyr yrp ypr".split())
+ROTATIONS = {"quaternion": 4, **dict.fromkeys(("axis_angle", *EULER), 3)}  # representations, and how many numbers they have
 EDGE, CROP, HORIZON = 224, 0.95, 16
 
 
@@ -66,6 +69,12 @@ class DataConfig(NamedTuple):
     horizon: int = HORIZON
     crop: float = CROP
     index: int = -1  # of the robot among those of the weights, where its tag does not say it
+    rotations: Mapping[str, str] = MappingProxyType({})  # state.KEY or action.KEY -> what the network has it as
+
+
+def _modes(keys: str) -> Dict[str, Optional[str]]:
+    """KEY or KEY:MODE, one after the other."""
+    return {key: mode or None for key, _, mode in (entry.partition(":") for entry in keys.split())}
 
 
 def _all(keys: str, mode: str = "min_max") -> Dict[str, Optional[str]]:
@@ -75,7 +84,8 @@ def _all(keys: str, mode: str = "min_max") -> Dict[str, Optional[str]]:
 ARMS = "left_arm right_arm left_hand right_hand"
 XYZ = "x y z roll pitch yaw"
 AGIBOT = "left_arm_joint_position right_arm_joint_position left_effector_position right_effector_position head_position waist_position"
-# gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py of Isaac-GR00T: those that convert no rotations.
+TWO_ARMS = dict.fromkeys(("state.right_arm_eef_quat", "state.left_arm_eef_quat"), "rotation_6d")
+# gr00t/experiment/data_config.py and examples/Libero/custom_data_config.py of Isaac-GR00T.
 CONFIGS = {
     "fourier_gr1_arms_only": DataConfig(("ego_view",), _all(ARMS, "sin_cos"), _all(ARMS)),
     "fourier_gr1_arms_waist": DataConfig(("ego_view",), _all(ARMS + " waist", "sin_cos"), _all(ARMS + " waist")),
@@ -86,6 +96,44 @@ CONFIGS = {
     "unitree_g1_full_body": DataConfig(("rs_view",), _all("left_leg right_leg waist " + ARMS), _all(ARMS)),
     "agibot_genie1": DataConfig(
         ("top_head", "hand_left", "hand_right"), _all(AGIBOT), _all(AGIBOT + " robot_velocity")
+    ),
+    "bimanual_panda_gripper": DataConfig(
+        ("right_wrist_view", "left_wrist_view", "front_view"),
+        _modes(
+            "right_arm_eef_pos:min_max right_arm_eef_quat right_gripper_qpos:min_max"
+            " left_arm_eef_pos:min_max left_arm_eef_quat left_gripper_qpos:min_max"
+        ),
+        _modes(
+            "right_arm_eef_pos right_arm_eef_rot right_gripper_close:binary"
+            " left_arm_eef_pos left_arm_eef_rot left_gripper_close:binary"
+        ),
+        rotations=TWO_ARMS,
+    ),
+    "bimanual_panda_hand": DataConfig(
+        ("right_wrist_view", "left_wrist_view", "ego_view"),
+        _modes(
+            "right_arm_eef_pos:min_max right_arm_eef_quat right_hand:min_max"
+            " left_arm_eef_pos:min_max left_arm_eef_quat left_hand:min_max"
+        ),
+        _modes(
+            "right_arm_eef_pos right_arm_eef_rot right_hand:min_max left_arm_eef_pos left_arm_eef_rot left_hand:min_max"
+        ),
+        rotations=TWO_ARMS,
+    ),
+    "single_panda_gripper": DataConfig(
+        ("left_view", "right_view", "wrist_view"),
+        _all("end_effector_position_relative end_effector_rotation_relative gripper_qpos base_position base_rotation"),
+        _modes(
+            "end_effector_position:min_max end_effector_rotation:min_max gripper_close:binary base_motion:min_max"
+            " control_mode:binary"
+        ),
+        rotations=dict.fromkeys(("state.end_effector_rotation_relative", "state.base_rotation"), "rotation_6d"),
+    ),
+    "oxe_droid": DataConfig(
+        ("exterior_image_1", "exterior_image_2", "wrist_image"),
+        _modes("eef_position:min_max eef_rotation gripper_position:min_max"),
+        _modes("eef_position_delta eef_rotation_delta gripper_position:binary"),
+        rotations={"state.eef_rotation": "rotation_6d", "action.eef_rotation_delta": "axis_angle"},
     ),
     "libero": DataConfig(("image", "wrist_image"), _all(XYZ + " gripper"), _all(XYZ + " gripper")),
 }
@@ -138,10 +186,10 @@ def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
     section = Section(
         name,
         read_json(name if os.path.exists(name) else checkpoint.path(name)),
-        {"horizon": HORIZON, "crop": CROP, "projector_index": 0},
+        {"horizon": HORIZON, "crop": CROP, "projector_index": 0, "rotations": {}},
         problems,
     )
-    section.refuse_unknown({"video", "state", "action", "horizon", "crop", "projector_index"})
+    section.refuse_unknown({"video", "state", "action", "horizon", "crop", "projector_index", "rotations"})
     video = [view for view in member(section.values, "video", list, name) if isinstance(view, str)]
     modes = [member(section.values, part, dict, name) for part in ("state", "action")]
     for part, keys in zip(("state", "action"), modes):
@@ -149,13 +197,17 @@ def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
         if not keys or not all(mode in allowed for mode in keys.values()):
             expected = "keys with one of " + ", ".join(mode or "null" for mode in allowed)
             section.bad(part, expected, str(keys)[:80], unsupported=True)
+    rotations = member(section.values, "rotations", dict, name)
+    keys = {"{}.{}".format(part, key) for part, known in zip(("state", "action"), modes) for key in known}
+    if not all(key in keys and isinstance(target, str) for key, target in rotations.items()):
+        section.bad("rotations", "state.KEY or action.KEY with a representation", str(rotations)[:80])
     crop = section.number("crop")
     if not video or crop > 1:
         section.bad("video", "names of cameras, and a crop of at most 1", str(video))
     horizon, index = section.count("horizon", most=4096), section.count("projector_index", least=0)
     problems.raise_any()
     return DataConfig(
-        tuple(video), modes[0], modes[1], horizon, crop, index if "projector_index" in section.values else -1
+        tuple(video), modes[0], modes[1], horizon, crop, index if "projector_index" in section.values else -1, rotations
     )
 
 
@@ -178,11 +230,15 @@ def read_sizes(config: dict, folder: str, problems: Problems) -> Tuple[Sizes, in
 def _robot(config: DataConfig, metadata: dict, n_row: int, problems: Problems) -> Robot:
     groups = []
     for part, modes in (("state", config.state), ("action", config.action)):
-        groups.append([_group(part, key, mode, metadata, problems) for key, mode in modes.items()])
+        groups.append([_group(part, key, mode, metadata, config.rotations, problems) for key, mode in modes.items()])
+    if any(group.rotation for group in groups[0]) and any(group.kind == SIN_COS for group in groups[0]):
+        problems.unsupported("--variant", "rotations of states, or sines of states", "both")
     return Robot(list(config.video), groups[0], groups[1], n_row)
 
 
-def _group(part: str, key: str, mode: Optional[str], metadata: dict, problems: Problems) -> Group:
+def _group(
+    part: str, key: str, mode: Optional[str], metadata: dict, rotations: Mapping[str, str], problems: Problems
+) -> Group:
     where = "{}: statistics.{}.{}".format(METADATA, part, key)
     table = member(member(metadata, "statistics", dict, METADATA), part, dict, METADATA)
     kind, names = MODES[mode]
@@ -197,11 +253,40 @@ def _group(part: str, key: str, mode: Optional[str], metadata: dict, problems: P
     if low.size != high.size:
         problems.add(where, "statistics of one width", "{} and {}".format(low.size, high.size))
         high = low
-    described = member(member(metadata, "modalities", dict, METADATA), part, dict, METADATA)
-    if member(described, key, dict, METADATA).get("continuous") is False and mode not in ("binary", None):
-        place = "{}: modalities.{}.{}".format(METADATA, part, key)
+    group = Group(key, low.size, kind, low, high, part == "state" and mode == "q99")
+    modalities = member(member(metadata, "modalities", dict, METADATA), part, dict, METADATA)
+    described, place = member(modalities, key, dict, METADATA), "{}: modalities.{}.{}".format(METADATA, part, key)
+    target = rotations.get("{}.{}".format(part, key))
+    if target is not None and target != described.get("rotation_type"):
+        return _converted(group, part, mode, target, described, place, problems)
+    if described.get("continuous") is False and mode not in ("binary", None):
         problems.add(place, "mode binary for numbers that are not continuous", str(mode))
-    return Group(key, low.size, kind, low, high, part == "state" and mode == "q99")
+    return group
+
+
+def _converted(
+    group: Group, part: str, mode: Optional[str], target: str, described: dict, place: str, problems: Problems
+) -> Group:
+    """A rotation that the network has in another representation than the robot. Statistics are those of the robot's, so that only an
+    absolute one is normalized, by the bounds of the network's. On other pairs the reference fails, mostly since it counts with the
+    robot's width, but for other pairs of Euler angles and axis_angle, which no data config of it has."""
+    source = described.get("rotation_type")
+    pairs = {("state", name, "rotation_6d"): width for name, width in ROTATIONS.items()}
+    pairs.update({("action", name, "axis_angle"): 3 for name in EULER})
+    width = pairs.get((part, source, target))
+    if width is None:
+        expected = "states: {} as rotation_6d; actions: {} as axis_angle".format(", ".join(ROTATIONS), ", ".join(EULER))
+        problems.unsupported(place + ".rotation_type", expected, "{} as {}".format(source, target))
+    elif group.width != width:
+        problems.add(place, "{} numbers of a {}".format(width, source), str(group.width))
+    if mode is not None and (mode != "min_max" or described.get("absolute") is not True):
+        found = "{}, absolute: {}".format(mode, described.get("absolute"))
+        problems.add(place, "min_max for an absolute rotation that is converted, no mode for another", found)
+    if part == "action":
+        turn, bound = {"from": target, "to": str(source)}, np.full(3, np.pi, np.float32)
+        return group._replace(low=-bound, high=bound, rotation=turn)
+    turn = {"from": str(source), "to": target, "normalize": MODES["min_max"][0] if mode else "identity"}
+    return group._replace(kind="", rotation=turn)
 
 
 def _images(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) -> Images:

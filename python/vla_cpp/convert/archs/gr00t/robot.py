@@ -8,7 +8,7 @@ Reference: Isaac-GR00T gr00t/data/state_action/state_action_processor.py, gr00t/
 from __future__ import annotations
 
 import os
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class Group(NamedTuple):
     clips: bool = False  # normalized they are held between -1 and 1
     reference: str = ""  # of a relative action: the state's key that it is relative to
     pose: str = ""  # of a relative pose: its format
+    rotation: Optional[Dict[str, str]] = None  # of a key that the network has in another representation: fields of the op
 
 
 class Robot(NamedTuple):

@@ -25,6 +25,8 @@ NAMES = {
     "groot_n1_5_mean_std": ("mean", "std"),
 }
 
+ROTATION_6D = 6  # the first two rows of a rotation's matrix
+
 
 def _total(groups: Sequence[Group]) -> int:
     return sum(group.width for group in groups)
@@ -56,13 +58,19 @@ def _binary(groups: Sequence[Group]) -> List[dict]:
     return [{"op": "threshold", "columns": columns, "above": 0.5, "then": 1.0, "else": 0.0}] if columns else []
 
 
+def _rotations(groups: Sequence[Group]) -> List[dict]:
+    starts = _starts(groups)
+    return [{"op": "rotation", **group.rotation, "column": starts[group.key]} for group in groups if group.rotation]
+
+
 def _clip(groups: Sequence[Group]) -> List[dict]:
     return _on(groups, lambda group: group.clips, {"op": "clip", "low": -1.0, "high": 1.0})
 
 
 def state_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
     turns = _columns(robot.states, lambda group: group.kind == SIN_COS)
-    width, most = (_total(robot.states) + len(turns)) // robot.n_moment, s.d_state // s.state_history
+    wider = sum(ROTATION_6D - group.width for group in robot.states if group.rotation)
+    width, most = (_total(robot.states) + len(turns) + wider) // robot.n_moment, s.d_state // s.state_history
     if width > most:
         problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(most), str(width))
     rows = {"rows": robot.n_moment} if robot.n_moment > 1 else {}
@@ -71,6 +79,7 @@ def state_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
         *_normalize("normalize", recipe.STATE, robot.states),
         *_clip(robot.states),
         *([{"op": "sin_cos", "columns": turns}] if turns else []),
+        *reversed(_rotations(robot.states)),  # of which each moves what is behind it
         {"op": "pad", "size": s.d_state * s.n_state_row, **rows},
     ]
 
@@ -85,6 +94,7 @@ def action_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
         *_clip(robot.actions),
         *_normalize("unnormalize", recipe.ACTION, robot.actions),
         *_binary(robot.actions),
+        *_rotations(robot.actions),
         *_relative_ops(robot),
     ]
 
