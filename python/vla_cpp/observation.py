@@ -38,7 +38,7 @@ class Leftover:
 def named(where: str, mapping: Mapping[str, Any]) -> Iterable[Tuple[str, Any]]:
     """The items of a dict by name."""
     if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
-        raise BadObservation(where, "a dict by name", repr(mapping)[:80])
+        raise BadObservation(where, "a dict by name", "None" if mapping is None else type(mapping).__name__)
     return mapping.items()
 
 
@@ -74,7 +74,8 @@ def image_arg(where: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, N
             return "png", data
         raise BadObservation(where, "the bytes of a JPEG or PNG file", f"{len(data)} bytes that start otherwise")
     if not isinstance(image, np.ndarray):
-        raise BadObservation(where, "a uint8 array, the bytes of a JPEG or PNG file, or None", type(image).__name__)
+        hint = "numpy.asarray(image) of a picture, open(path, 'rb').read() of a file"
+        raise BadObservation(where, "a uint8 array, the bytes of a JPEG or PNG file, or None", type(image).__name__, hint)
     if image.dtype != np.uint8:
         raise BadObservation(where, "uint8 pixels", str(image.dtype), "give 0 to 255, not 0 to 1")
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:

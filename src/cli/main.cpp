@@ -3,6 +3,7 @@
 //
 // One binary, one file per subcommand. This file parses, prints errors and chooses the exit code.
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -36,13 +37,16 @@ int fail(const vla::Error& error) {
   return vla::exit_code(error.code);
 }
 
-/// What CLI11 says of a wrong call, in one line and with the help that explains it.
+/// What CLI11 says of a wrong call, in one line and with the help that explains it. A misspelled option is one too many
+/// and often one too few as well; the former says what to mend.
 int fail_usage(const CLI::App& app, const CLI::ParseError& parse_error) {
-  std::string what = parse_error.what();
-  std::replace(what.begin(), what.end(), '\n', ' ');
   const auto chosen = app.get_subcommands();
-  const std::string help = chosen.empty() ? "vla --help" : "vla " + chosen.front()->get_name() + " --help";
-  return fail({vla::Code::usage, "arguments", "a call as " + help + " explains it", what});
+  const std::string command = chosen.empty() ? "vla" : "vla " + chosen.front()->get_name();
+  const std::vector<std::string> unknown = app.remaining(true);
+  std::string what =
+      unknown.empty() ? parse_error.what() : fmt::format("{} does not know {}", command, fmt::join(unknown, " "));
+  std::replace(what.begin(), what.end(), '\n', ' ');
+  return fail({vla::Code::usage, "arguments", "", what, "see " + command + " --help"});
 }
 
 /// A script must not take an answer for whole that a full disk or a closed pipe cut off.

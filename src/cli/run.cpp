@@ -33,10 +33,11 @@ struct NameValue {
   std::string name, value;
 };
 
-/// `NAME=VALUE`, split at the first `=`.
-Result<NameValue> split(const std::string& option, const std::string& argument) {
+/// `NAME=VALUE`, split at the first `=`. `form` is what the option's help calls it.
+Result<NameValue> split(const std::string& option, const std::string& form, const std::string& argument) {
   const std::size_t equals = argument.find('=');
-  if (equals == std::string::npos || equals == 0) return Error{Code::usage, option, "NAME=VALUE", argument};
+  if (equals == std::string::npos || equals == 0)
+    return Error{Code::usage, option, form, argument, "vla inspect lists the names of a bundle"};
   return NameValue{argument.substr(0, equals), argument.substr(equals + 1)};
 }
 
@@ -55,7 +56,7 @@ Result<std::vector<float>> parse_numbers(const std::string& text) {
 }
 
 Status add_image(Observation& observation, const std::string& argument, const FeatureNames& features) {
-  VLA_TRY(const NameValue image, split("--image", argument));
+  VLA_TRY(const NameValue image, split("--image", "NAME=FILE", argument));
   std::optional<Frame> frame;  // `NAME=`: declared absent
   if (!image.value.empty()) {
     VLA_TRY(const std::vector<std::byte> bytes, read_file(image.value, kMaxFile));
@@ -70,7 +71,7 @@ Status add_state(Observation& observation, const std::string& argument, const Pr
   // Without a name the numbers are the only state feature that there is.
   std::string name, numbers = argument;
   if (argument.find('=') != std::string::npos) {
-    VLA_TRY(const NameValue state, split("--state", argument));
+    VLA_TRY(const NameValue state, split("--state", "NAME=v,v,...", argument));
     name = state.name, numbers = state.value;
   } else if (processor.states().names().size() == 1) {
     name = processor.states().names().front();
@@ -161,7 +162,7 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   say(stdout, "{}\n", text_of(root));
 }
 
-Status check(RunOptions& options) {
+Status check(const RunOptions& options) {
   if (!options.noise.empty() && options.seed) return Error{Code::usage, "--seed", "--noise or --seed", "both"};
   if (options.tap.empty() != options.taps_out.empty())
     return Error{Code::usage, "--tap", "--tap PATTERN and --taps-out FILE together", "one of them"};
@@ -169,10 +170,6 @@ Status check(RunOptions& options) {
     return Error{Code::usage, "--leftover", "--leftover FILE and --delay ROWS together", "one of them"};
   if (options.leftover.empty() && (!options.schedule.empty() || options.max_guidance))
     return Error{Code::usage, "--leftover", "rows for --schedule and --max-guidance", "none"};
-  if (options.noise.empty() && !options.seed) {
-    options.seed = std::random_device()();
-    say(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
-  }
   return {};
 }
 
@@ -184,6 +181,8 @@ Status write_recorded(const std::vector<Tap>& taps, const RunOptions& options) {
 
 Status run(RunOptions& options) {
   VLA_CHECK(check(options));
+  const bool drawn = options.noise.empty() && !options.seed;
+  if (drawn) options.seed = std::random_device()();
   StageClock clock;
   Timing before;
   std::vector<Tap> inject;
@@ -208,6 +207,8 @@ Status run(RunOptions& options) {
   VLA_TRY(ActionChunk chunk, engine->act(observation, noise, leftover));
   chunk.timing.insert(chunk.timing.begin(), before.begin(), before.end());
 
+  if (drawn)
+    say(stderr, "note: the noise is drawn with --seed {}; pass it to get the same chunk again\n", *options.seed);
   for (const std::string& note : chunk.notes) say(stderr, "note: {}\n", note);
   if (!options.taps_out.empty()) VLA_CHECK(write_recorded(chunk.taps, options));
   if (!options.out.empty())

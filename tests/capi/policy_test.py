@@ -128,6 +128,8 @@ def test_the_spec_is_what_the_program_says_of_the_bundle(vla, policy, golden):
         (dict(images={"cam\0era1": None}), vla_cpp.BadObservation, "images"),
         (dict(images={"\ud800": None}), vla_cpp.BadObservation, "images"),
         (dict(images=None), vla_cpp.BadObservation, "images: expected a dict by name, found None"),
+        (dict(images=np.zeros((8, 8, 3), np.uint8)), vla_cpp.BadObservation, "images: expected a dict by name, found ndarray"),
+        (dict(images={"camera1": "top.png"}), vla_cpp.BadObservation, "found str; numpy.asarray(image) of a picture, open("),
         (dict(images={"camera1": None, "camera2": None}), vla_cpp.BadObservation, "at least 1"),
         (dict(state=[0.0] * 5), vla_cpp.BadObservation, "observation.state"),
         (dict(state=[0.0] * 5 + [float("nan")]), vla_cpp.BadObservation, "nan"),

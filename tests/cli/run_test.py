@@ -113,6 +113,11 @@ def test_without_noise_and_seed_the_seed_that_was_drawn_gives_the_chunk_again(vl
     assert np.array_equal(actions(free), actions(seeded(vla, golden, "--seed", seed)))
 
 
+def test_a_call_that_is_refused_says_nothing_of_a_seed(vla, golden):
+    answer = seeded(vla, golden, "--kernels", "none")
+    assert answer.code == 2 and answer.err.startswith("error: ") and answer.err.count("\n") == 1
+
+
 def test_the_largest_seed_is_a_seed(vla, golden):
     assert seeded(vla, golden, "--seed", 2**64 - 1).json()["seed"] == 2**64 - 1
 

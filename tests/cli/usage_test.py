@@ -67,6 +67,20 @@ def test_run_without_an_image_a_state_or_a_text_is_a_usage_error_that_names_it(v
     assert answer.code == 2 and answer.out == "" and left_out in answer.err and answer.err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "arguments, unknown",
+    [
+        (["runn"], "vla does not know runn; see vla --help"),
+        (["run", "policy.gguf", "--images", "top=top.png"], "vla run does not know --images top=top.png; see vla run --help"),
+        (["serve", "policy.gguf", "--port", "5555"], "vla serve does not know --port 5555; see vla serve --help"),
+    ],
+    ids=str,
+)
+def test_a_word_that_the_command_does_not_know_is_named_before_one_that_it_misses(vla, arguments, unknown):
+    answer = vla(*arguments)
+    assert answer.code == 2 and answer.err == f"error: usage: arguments: {unknown}\n"
+
+
 @pytest.mark.parametrize("seed", ["-1", "1.5", "x", "", str(2**64)])
 def test_a_seed_that_is_no_unsigned_integer_is_a_usage_error(vla, golden, seed):
     arguments = [a for a in golden.arguments() if a not in ("--noise", golden.noise)]

@@ -64,6 +64,19 @@ def test_a_checkpoint_that_is_not_there_is_an_io_error(tmp_path, capsys):
     assert "expected a checkpoint folder or hub:OWNER/NAME@REVISION" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "source, hint",
+    [
+        ("lerobot/smolvla_base", "hub:lerobot/smolvla_base@main fetches it from the hub"),
+        ("policy.gguf", "a bundle is converted already: vla run takes it"),
+        (__file__, "give the folder that holds the file"),
+    ],
+)
+def test_a_checkpoint_that_is_something_else_is_refused_with_what_to_give(source, hint, tmp_path, capsys):
+    assert main([source, "-o", str(tmp_path / "o.gguf")]) == 9
+    assert capsys.readouterr().err.endswith("found neither; " + hint + "\n")
+
+
 def test_a_hub_without_a_network_is_an_io_error_that_says_what_to_do(tmp_path):
     result = run("hub:nobody/nothing@main", "-o", tmp_path / "o.gguf", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
     assert result.returncode == 9

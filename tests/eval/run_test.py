@@ -212,4 +212,4 @@ def test_a_package_that_is_missing_is_named_with_what_installs_it():
     script = "import sys; sys.modules['rich'] = None; from vla_cpp.eval.cli import main; sys.exit(main(['demo']))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     result = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
-    assert result.returncode == 9 and result.stderr == "vla-eval: the module rich is missing: pip install 'vla-cpp[eval]'\n"
+    assert result.returncode == 9 and result.stderr == "vla-eval: the module rich is missing; at the root of vla.cpp: pip install './python[eval]'\n"

@@ -267,7 +267,7 @@ CASES = {
         {"agentview": (56, 56), "wrist": (45, 71)}),
         state=(0.5, -1.25, 0.25, 2.0, -0.125, -3.0, 0.0625, 0.75),
         options=said("r2", "zero_attention", ("agentview", "wrist"))),
-    # The first revision: 32 steps, another scale of time, pixels normalised in float32, -1 where the state is filled up. The
+    # The first revision: 32 steps, another scale of time, pixels normalized in float32, -1 where the state is filled up. The
     # slot in the middle is empty; 6 x 6 patches; many pads; a state number that never moved in the data.
     "evo1/first_revision": Case(32, {"front": (70, 52, "png"), "left": None, "wrist": (84, 84, "png")}, "push the plate slowly",
         Checkpoint(
@@ -302,7 +302,7 @@ CASES = {
         "lerobot", 84, vision(40, 2, 5, 36), text(36, 4, 3, 1, 64), 3, head(2, 3, 30, 26),
         policy(6, 80, 10, 9, num_inference_timesteps=8, vlm_dtype="float32", max_views=3, binarize_gripper=True, empty_cameras=1),
         {"front": (52, 90), "wrist": (61, 97)})),
-    # As published files say: pixels normalised in bfloat16. One frame of the network's size; means and quantiles; a state number
+    # As published files say: pixels normalized in bfloat16. One frame of the network's size; means and quantiles; a state number
     # that never moved in the data; an instruction beyond the limit.
     "evo1/lerobot_bfloat16": Case(37, {"wrist": (56, 56, "png"), "base": (80, 43, "png"), "empty_camera_0": None},
         "close the bottom drawer, and then stack the green block on the yellow block", Checkpoint(

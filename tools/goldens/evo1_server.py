@@ -209,7 +209,7 @@ class Server:
         return rows.float()
 
     def predict_action_chunk(self, batch):
-        """(1, horizon, WIDTH), normalised."""
+        """(1, horizon, WIDTH), normalized."""
         import torch
 
         head, who = self.head, torch.zeros(1, dtype=torch.long)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Converts checkpoints into bundles (docs/converting.md). Needs the extra: pip install 'vla-cpp[convert]'."""
+"""Converts checkpoints into bundles (docs/converting.md). Needs the extra: pip install './python[convert]'."""
 
 from .archs import Options
 from .bundle import read_bundle

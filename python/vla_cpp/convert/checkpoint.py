@@ -14,7 +14,7 @@ import numpy as np
 
 from .dtypes import STATISTICS, to_f32
 from .errors import Code, Problems, refuse
-from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_name, read_json
+from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_NAME, HUB_PATTERNS, hub_folder, plain_name, read_json
 from .safetensors_file import Entry, read_safetensors
 from .torch_file import read_torch
 
@@ -49,7 +49,7 @@ class Checkpoint:
     layout: str = LEROBOT
     notes: List[str] = field(default_factory=list)
     backbone: str = ""  # the repository and commit that --backbone fetched
-    degraded: List[str] = field(default_factory=list)  # features that pass unnormalised because --identity-stats allows it
+    degraded: List[str] = field(default_factory=list)  # features that pass unnormalized because --identity-stats allows it
 
     def path(self, name: str) -> str:
         return os.path.join(self.folder, name)
@@ -162,7 +162,7 @@ def open_checkpoint(source: str) -> Checkpoint:
     """A folder, or a repository as hub_folder() reads it. Errors: io, bad_bundle."""
     hub = hub_folder(source, HUB_PATTERNS)
     if hub is None and not os.path.isdir(source):
-        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", code=Code.IO)
+        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", _instead(source), Code.IO)
     folder, revision = (hub.folder, hub.commit) if hub else (source, "")
     name = hub.repo if hub else os.path.basename(os.path.abspath(folder))
     inner = os.path.join(folder, "pretrained_model")
@@ -179,6 +179,15 @@ def open_checkpoint(source: str) -> Checkpoint:
     old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
     weights = {key: entry for key, entry in tensors.items() if key not in old}
     return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder), layout)
+
+
+def _instead(source: str) -> str:
+    """What a source that is no folder was probably meant to be."""
+    if source.endswith(".gguf"):
+        return "a bundle is converted already: vla run takes it"
+    if os.path.isfile(source):
+        return "give the folder that holds the file"
+    return "hub:{}@main fetches it from the hub".format(source) if re.fullmatch(HUB_NAME, source) else ""
 
 
 def _layout(folder: str, config: dict, has_assets: bool) -> str:

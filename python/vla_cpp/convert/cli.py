@@ -7,11 +7,13 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import contextmanager
+from dataclasses import fields
 
 from .. import __version__
 from .archs import Options, names
 from .conversion import Summary, convert_checkpoint
 from .errors import Code, ConvertError
+from .files import missing_extra
 
 DESCRIPTION = """\
 Converts a Vision-Language-Action policy, as LeRobot, openpi or the authors of Evo-1, GR00T or BitVLA save it, into one self-contained GGUF
@@ -30,7 +32,8 @@ code before 9 April 2026, r2 the code since (steps, time index, pixel rounding a
 zero_attention where the policy ran with flash-attn installed, which is what the authors ask for. docs/converting.md says how
 to find out.
 
-exit codes: 0 done, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot be read or written."""
+exit codes: 0 done, 1 a fault of the converter, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot
+be read or written."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -73,7 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="FEATURE",
         action="append",
         default=[],
-        help="let FEATURE (observation.state or action) pass unnormalised when its statistics are missing",
+        help="let FEATURE (observation.state or action) pass unnormalized when its statistics are missing",
     )
     add(
         "--state-bound",
@@ -106,8 +109,14 @@ def build_parser() -> argparse.ArgumentParser:
 def _add_evo1(parser: argparse.ArgumentParser) -> None:
     about = "what their folder (config.json, norm_stats.json, *.pt) does not state, so that it must be said; see below"
     add = parser.add_argument_group("checkpoints of Evo-1's authors", about).add_argument
-    add("--stats", metavar="ARM/DATASET", default="", help="the entry of norm_stats.json to normalise with, where there are several")
-    add("--views", metavar="A,B,...", default="", help="names of the cameras in the order of the prompt's slots")
+    add("--stats", metavar="ARM/DATASET", default="", help="the entry of norm_stats.json to normalize with, where there are several")
+    add(
+        "--views",
+        metavar="A,B,...",
+        type=lambda text: text.split(","),
+        default=(),
+        help="names of the cameras in the order of the prompt's slots",
+    )
     add("--view-slots", metavar="N", type=int, default=0, help="places for views in the prompt; the authors' server has 3")
     add(
         "--dead-rows",
@@ -195,23 +204,7 @@ def report(summary: Summary) -> str:
 
 def main(argv=None) -> int:
     args = build_parser().parse_args(argv)
-    options = Options(
-        backbone=args.backbone,
-        dtype=args.dtype,
-        dataset_info=args.dataset_info,
-        identity_stats=args.identity_stats,
-        state_bound=args.state_bound,
-        position_precision=args.position_precision,
-        variant=args.variant,
-        stats=args.stats,
-        views=args.views.split(",") if args.views else (),
-        view_slots=args.view_slots,
-        dead_rows=args.dead_rows,
-        embodiment=args.embodiment,
-        camera_size=args.camera_size,
-        letterbox=args.letterbox,
-        gripper_sign=args.gripper_sign,
-    )
+    options = Options(**{field.name: getattr(args, field.name) for field in fields(Options)})
     try:
         with _progress(args.quiet) as progress:
             summary = convert_checkpoint(args.checkpoint, args.out, options, args.force, progress)
@@ -219,12 +212,7 @@ def main(argv=None) -> int:
         print("error: " + error.message(), file=sys.stderr)
         return int(error.code)
     except ImportError as error:
-        print(
-            "error: vla-convert: expected the packages of the extra, found no {}; pip install 'vla-cpp[convert]'".format(
-                error.name
-            ),
-            file=sys.stderr,
-        )
+        print("error: " + missing_extra(str(error.name)).message(), file=sys.stderr)
         return int(Code.USAGE)
     except KeyboardInterrupt:
         return 130  # what shells report for an interrupt; the unfinished file is gone

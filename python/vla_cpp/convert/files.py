@@ -77,6 +77,7 @@ def plain_name(name) -> bool:
 
 HUB = "hub:"
 HUB_FORM = "hub:OWNER/NAME@REVISION"
+HUB_NAME = r"\w[\w.-]*/\w[\w.-]*"
 
 
 class HubFolder(NamedTuple):
@@ -91,9 +92,9 @@ def hub_folder(source: str, patterns) -> Optional[HubFolder]:
     """None for a source that is a folder. Nothing is ever downloaded that does not say so, revision included. Errors: usage, io."""
     if not source.startswith(HUB):
         return None
-    found = re.fullmatch(r"(\w[\w.-]*/\w[\w.-]*)@(\w[\w./-]*)", source[len(HUB) :])
+    found = re.fullmatch("({})@(\\w[\\w./-]*)".format(HUB_NAME), source[len(HUB) :])
     if not found:
-        hint = "a revision is a commit, tag or branch; the bundle records the commit"
+        hint = "a revision is a commit, tag or branch, such as main; the bundle records the commit"
         raise refuse(source, HUB_FORM, "another form", hint, Code.USAGE)
     folder = _download(source, found[1], found[2], patterns)
     return HubFolder(folder, found[1], os.path.basename(folder))
@@ -113,5 +114,8 @@ def _download(source: str, repo: str, revision: str, patterns) -> str:
         )
 
 
+EXTRA = "at the root of vla.cpp: pip install './python[convert]'"
+
+
 def missing_extra(package: str) -> ConvertError:
-    return refuse("vla-convert", "the package " + package, "none", "pip install 'vla-cpp[convert]'", Code.USAGE)
+    return refuse("vla-convert", "the package " + package, "none", EXTRA, Code.USAGE)

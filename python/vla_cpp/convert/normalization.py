@@ -82,7 +82,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
             "statistics of {}: {}".format(feature, name),
             "{} numbers for {}".format(dim, mode),
             "none" + _others(found.features),
-            "fine-tune or save the policy with its data set's statistics, or accept unnormalised numbers by --identity-stats "
+            "fine-tune or save the policy with its data set's statistics, or accept unnormalized numbers by --identity-stats "
             + feature,
         )
     chosen = {name: found.values[name] for name in names if name in found.values}

@@ -220,7 +220,7 @@ class _Reader:
                 where + ": norm_map.VISUAL",
                 "IDENTITY",
                 str(modes["VISUAL"]),
-                "the recipe does not normalise pixels by statistics",
+                "the recipe does not normalize pixels by statistics",
             )
         stated = member(self.checkpoint.config, "normalization_mapping", dict, "config.json")
         for key in (kind, "VISUAL"):

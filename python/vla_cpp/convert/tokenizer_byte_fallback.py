@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """BPE with byte fallback: what Gemma and PaliGemma publish.
 
-Text is normalised by one rule, blanks to U+2581, and is not split at all: the pre-tokenizer of the published file splits at blanks,
+Text is normalized by one rule, blanks to U+2581, and is not split at all: the pre-tokenizer of the published file splits at blanks,
 of which none are left. transformers' GemmaTokenizer builds the same around vocabulary and merges.
 """
 
@@ -61,7 +61,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
             JSON_FILE + ": normalizer",
             "blanks replaced by U+2581 and nothing else",
             to_json(spec.get("normalizer"))[:120],
-            "the runtime does not normalise text otherwise",
+            "the runtime does not normalize text otherwise",
         )
     for step in one_or_sequence(spec.get("pre_tokenizer"), "pretokenizers"):
         if not isinstance(step, dict) or step.get("type") != "Split" or step.get("pattern") != BLANK:

@@ -90,7 +90,7 @@ def _parse(path: str):
 
 
 def _check_settings(model, name: str, problems: Problems) -> None:
-    """Those of Gemma. With others a text is cut or normalised in ways that the runtime does not follow."""
+    """Those of Gemma. With others a text is cut or normalized in ways that the runtime does not follow."""
     trainer, normalizer = model.trainer_spec, model.normalizer_spec
     found = {
         "trainer_spec.model_type": (trainer.model_type, BPE),

@@ -199,7 +199,7 @@ def main(argv: Optional[List[str]] = None) -> int:
         data = replan(a) if a.command == "replan" else evaluate(a.command, a)
     except ModuleNotFoundError as error:
         package = str(error.name).partition(".")[0]
-        print(f"vla-eval: the module {package} is missing: pip install 'vla-cpp[eval]'", file=sys.stderr)
+        print(f"vla-eval: the module {package} is missing; at the root of vla.cpp: pip install './python[eval]'", file=sys.stderr)
         return 9
     except (RunFailed, JournalMismatch, EnvironmentFault, MissingSimulator, ServerFailed) as error:
         print(f"vla-eval: {error}", file=sys.stderr)
