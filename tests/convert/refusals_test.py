@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tiny import EXPERT, STATE_DIM, VLM, Tiny, write_json
-from vla_cpp.convert import Code
+from vla_cpp.convert import Code, archs
 
 
 def set_in(path, value):
@@ -39,9 +39,10 @@ def vision(**values):
 
 
 UNSUPPORTED, BAD = Code.UNSUPPORTED, Code.BAD_BUNDLE
+ARCHS = ", ".join(archs.names())
 CASES = {  # what the message must contain: (change, class)
-    "config.json: type: expected one of bitvla, evo1, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi0, pi05, smolvla, found pi9": (config(type="pi9"), UNSUPPORTED),
-    "config.json: type: expected one of bitvla, evo1, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi0, pi05, smolvla, found ['smolvla']": (config(type=["smolvla"]), UNSUPPORTED),
+    "config.json: type: expected one of " + ARCHS + ", found pi9": (config(type="pi9"), UNSUPPORTED),
+    "config.json: type: expected one of " + ARCHS + ", found ['smolvla']": (config(type=["smolvla"]), UNSUPPORTED),
     "config.json: temperature: expected a key of SmolVLAConfig": (config(temperature=2.0), UNSUPPORTED),
     "config.json: add_image_special_tokens: expected False, found True": (
         config(add_image_special_tokens=True),

@@ -6,18 +6,22 @@ tests/golden/ keeps observations and the recorded taps.  Checkpoints and bundles
 same bytes on every machine, into build/goldens/ (`python tools/goldens`).
 """
 
+import functools
 import importlib
+import pkgutil
 
-# Architecture -> the module that knows its cases, its checkpoint and its reference.
-FAMILIES = {"bitvla": "bitvla", "smolvla": "smolvla", "pi0": "pi", "pi05": "pi", "evo1": "evo1", "gr00t_n1_5": "gr00t_n1_5", "gr00t_n1_6": "gr00t_n1_6",
-            "gr00t_n1_7": "gr00t_n1_7"}
+
+@functools.cache
+def families():
+    """Architecture -> the module that knows its cases, its checkpoint and its reference: the one that states its CASES."""
+    modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__) if found.name != "__main__"]
+    return {name.split("/")[0]: module for module in modules for name in getattr(module, "CASES", ())}
 
 
 def family(arch):
-    return importlib.import_module(f"{__name__}.{FAMILIES[arch]}")
+    return families()[arch]
 
 
 def all_cases():
     """Every case by its name, `arch/name`."""
-    return {name: case for module in dict.fromkeys(FAMILIES.values()) for name, case in
-            importlib.import_module(f"{__name__}.{module}").CASES.items()}
+    return {name: case for module in families().values() for name, case in module.CASES.items()}

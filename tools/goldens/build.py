@@ -66,7 +66,7 @@ def make(accept=False):
         found = {name: make_case(name, case) for name, case in all_cases().items()}
         stated = json.loads(HASHES.read_text())
         if accept:
-            HASHES.write_text(json.dumps(found, indent=1) + "\n")
+            HASHES.write_text(json.dumps(dict(sorted(found.items())), indent=1) + "\n")
         elif found != stated:
             differ = [f"{name} ({what})" for name in found for what in found[name] if found[name][what] != stated.get(name, {}).get(what)]
             raise SystemExit(f"error: {HASHES}: other bytes came out for {', '.join(differ)}; where that is meant, run "

@@ -86,9 +86,11 @@ def versions() -> str:
 
 
 def config_type(checkpoint) -> str:
-    """The type that LeRobot's config.json names.  Authors' files have none: GR00T's give the model, Evo-1's nothing."""
+    """The architecture: LeRobot's config.json names it as its type, authors' files state a model_type; Evo-1's nothing."""
+    from vla_cpp.convert.archs import authors
+
     config = json.loads((Path(checkpoint) / "config.json").read_text())
-    return config.get("type") or {"bitvla": "bitvla", "gr00t_n1_5": "gr00t_n1_5", "Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}.get(config.get("model_type"), "evo1")
+    return config.get("type") or next((arch for arch, layout in authors().items() if config.get("model_type") in layout.model_types), "evo1")
 
 
 def described(checkpoint) -> str:

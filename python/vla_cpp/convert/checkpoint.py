@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. What lies in the folder says
-whose layout it is: LeRobot's, openpi's, or that of the authors of Evo-1, GR00T or BitVLA."""
+whose layout it is: LeRobot's, openpi's, or that of an architecture's authors."""
 
 from __future__ import annotations
 
 import os
 import re
 from dataclasses import dataclass, field
-from typing import Dict, List, Optional, Tuple
+from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -16,22 +16,17 @@ from .dtypes import STATISTICS, to_f32
 from .errors import Code, Problems, refuse
 from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_NAME, HUB_PATTERNS, hub_folder, plain_name, read_json
 from .safetensors_file import Entry, read_safetensors
-from .torch_file import read_torch
 
-LEROBOT, OPENPI, EVO1, BITVLA = "lerobot", "openpi", "evo1", "bitvla"  # layouts; those of GR00T are called as its releases
-GR00T_MODELS = {"gr00t_n1_5": "gr00t_n1_5", "Gr00tN1d6": "gr00t_n1_6", "Gr00tN1d7": "gr00t_n1_7"}  # what config.json states as model_type
+LEROBOT, OPENPI = "lerobot", "openpi"  # layouts; that of an architecture's authors is called as the architecture
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
-# What Evo-1's trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.
-TORCH_FILES = {"mp_rank_00_model_states.pt": "module", "checkpoint.pt": "model_state_dict"}
-NORM_STATS = "norm_stats.json"
-# What BitVLA's trainer writes beside the language model, each with the step in its name.
-SIDECARS = ("action_head", "proprio_projector")
-BITVLA_TYPES = ("bitvla", "openvla")  # what config.json may state as model_type
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 # Where releases without processor files kept statistics: "<group>.buffer_<feature, dots as underscores>.<statistic>".
 OLD_GROUPS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets.")
 MAX_STATISTIC = 1 << 24  # bytes; a statistic has one number per joint, or per pixel channel
+
+
+Tensors = Tuple[Dict[str, Entry], Dict[str, str]]  # by name; a tensor that was not stored because it shares memory -> the one that was
 
 
 @dataclass
@@ -43,7 +38,7 @@ class Checkpoint:
     revision: str
     config: dict
     tensors: Dict[str, Entry]
-    aliases: Dict[str, str]  # a tensor that was not stored because it shares memory -> the one that was
+    aliases: Dict[str, str]  # as of Tensors
     old_statistics: Dict[str, Entry]
     processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
     layout: str = LEROBOT
@@ -89,40 +84,10 @@ def _weight_files(folder: str, problems: Problems) -> List[str]:
     return [WEIGHTS] if single else _shards(folder, problems)
 
 
-def _read_torch_file(folder: str) -> Dict[str, Entry]:
-    present = [name for name in TORCH_FILES if os.path.exists(os.path.join(folder, name))]
-    if len(present) != 1:
-        found, code = ("no such file", Code.IO) if not present else ("both", Code.BAD_BUNDLE)
-        raise refuse(folder, "either " + " or ".join(TORCH_FILES), found, "give the folder of one training step", code)
-    return read_torch(os.path.join(folder, present[0]), TORCH_FILES[present[0]])
-
-
-def _read_sidecars(folder: str, problems: Problems) -> Dict[str, Entry]:
-    """The tensors of both files under their file's name, without what DistributedDataParallel puts in front."""
-    tensors: Dict[str, Entry] = {}
-    steps = {}
-    for part in SIDECARS:
-        pattern = re.compile(re.escape(part) + r"--(.+)_checkpoint\.pt")
-        found = {name: match[1] for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
-        if len(found) != 1:
-            hint = "the reference loads the only one" if found else "download it beside config.json"
-            problems.add("{}--STEP_checkpoint.pt".format(part), "one such file", ", ".join(found) or "none", hint)
-            continue
-        ((name, steps[part]),) = found.items()
-        for stored, entry in read_torch(os.path.join(folder, name), "").items():
-            own = "{}.{}".format(part, stored[len("module.") :] if stored.startswith("module.") else stored)
-            tensors[own] = entry._replace(name=own)
-    if len(set(steps.values())) > 1:
-        (head, proprio), where = (steps[part] for part in SIDECARS), "{}--{}_checkpoint.pt".format
-        problems.add(where(SIDECARS[1], proprio), "the step of " + where(SIDECARS[0], head), proprio, "give the files of one step")
-    return tensors
-
-
-def _read_tensors(folder: str, layout: str, problems: Problems) -> Tuple[Dict[str, Entry], Dict[str, str]]:
+def read_stored(folder: str, problems: Problems) -> Tensors:
+    """The tensors of model.safetensors or its shards."""
     tensors: Dict[str, Entry] = {}
     aliases: Dict[str, str] = {}
-    if layout == EVO1:
-        return _read_torch_file(folder), aliases
     for file in _weight_files(folder, problems):
         content = read_safetensors(os.path.join(folder, file))
         # Every key of the metadata that names a stored tensor as its value is a shared tensor that was left out.
@@ -132,9 +97,17 @@ def _read_tensors(folder: str, layout: str, problems: Problems) -> Tuple[Dict[st
             if name in tensors:
                 problems.add("tensor " + name, "one tensor of this name", "a second one in " + file)
             tensors[name] = entry._replace(name=name)
-    if layout == BITVLA:
-        tensors.update(_read_sidecars(folder, problems))
     return tensors, aliases
+
+
+class Layout(NamedTuple):
+    """How a checkpoint is saved, and how that is told."""
+
+    name: str  # whose it is, as in "a checkpoint of ..."
+    options: Tuple[str, ...]  # of archs.Options: what such a checkpoint leaves open, of what others state or do not have
+    model_types: Tuple[str, ...] = ()  # what config.json states as model_type
+    files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not
+    read: Callable[[str, Problems], Tensors] = read_stored  # tensors of the folder, and those that share the memory of one
 
 
 def clean(name: str) -> str:
@@ -158,8 +131,8 @@ def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
     return read_json(os.path.join(folder, PROCESSORS[0])), read_json(os.path.join(folder, PROCESSORS[1]))
 
 
-def open_checkpoint(source: str) -> Checkpoint:
-    """A folder, or a repository as hub_folder() reads it. Errors: io, bad_bundle."""
+def open_checkpoint(source: str, authors: Mapping[str, Layout]) -> Checkpoint:
+    """A folder, or a repository as hub_folder() reads it. `authors`: layouts by architecture. Errors: io, bad_bundle."""
     hub = hub_folder(source, HUB_PATTERNS)
     if hub is None and not os.path.isdir(source):
         raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", _instead(source), Code.IO)
@@ -172,9 +145,10 @@ def open_checkpoint(source: str) -> Checkpoint:
     has_assets = os.path.isdir(os.path.join(folder, "assets"))
     has_config = os.path.exists(os.path.join(folder, "config.json"))
     config = read_json(os.path.join(folder, "config.json")) if has_config or not has_assets else {}
-    layout = _layout(folder, config, has_assets)
+    layout = _layout(folder, config, has_assets, authors)
     problems = Problems(name)
-    tensors, aliases = _read_tensors(folder, layout, problems)
+    read = authors[layout].read if layout in authors else read_stored
+    tensors, aliases = read(folder, problems)
     problems.raise_any()
     old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
     weights = {key: entry for key, entry in tensors.items() if key not in old}
@@ -190,16 +164,16 @@ def _instead(source: str) -> str:
     return "hub:{}@main fetches it from the hub".format(source) if re.fullmatch(HUB_NAME, source) else ""
 
 
-def _layout(folder: str, config: dict, has_assets: bool) -> str:
+def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:
     """LeRobot's config states a type, and none of the others does."""
     if "type" in config:
         return LEROBOT
-    if str(config.get("model_type")) in GR00T_MODELS:
-        return GR00T_MODELS[config["model_type"]]
-    if config.get("model_type") in BITVLA_TYPES:
-        return BITVLA
-    if any(os.path.exists(os.path.join(folder, name)) for name in (*TORCH_FILES, NORM_STATS)):
-        return EVO1
+    for arch, layout in authors.items():
+        if config.get("model_type") in layout.model_types:
+            return arch
+    for arch, layout in authors.items():
+        if any(os.path.exists(os.path.join(folder, name)) for name in layout.files):
+            return arch
     return OPENPI if has_assets or "action_horizon" in config else LEROBOT
 
 

@@ -46,7 +46,7 @@ def convert_checkpoint(
     """Writes `out` or raises ConvertError and leaves nothing behind."""
     _check_out(out, force)
     _check_state_bound(options)
-    checkpoint = open_checkpoint(source)
+    checkpoint = open_checkpoint(source, archs.authors())
     options = replace(options, backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """One package or module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`,
-and `embodiments(checkpoint)`, their tags, where a checkpoint holds several robots."""
+`embodiments(checkpoint)`, their tags, where a checkpoint holds several robots, and `LAYOUT` where its authors do not save it as LeRobot does."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import BITVLA, EVO1, GR00T_MODELS, LEROBOT, OPENPI
+from ..checkpoint import LEROBOT, OPENPI, Layout
 from ..errors import Code, Problems, refuse
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
@@ -101,47 +101,37 @@ def load(name):
     return _module(name)
 
 
-GR00T = tuple(GR00T_MODELS.values())
-# Options that only some layouts leave open, with what the other layouts do instead.
-LAYOUT_OPTIONS = {
-    "identity_stats": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
-    "position_precision": ((LEROBOT, OPENPI), "a checkpoint of LeRobot"),
-    "variant": ((OPENPI, EVO1, GR00T_MODELS["gr00t_n1_5"]), "a checkpoint of openpi, of Evo-1's authors or of GR00T N1.5"),
-    "stats": ((EVO1, BITVLA), "a checkpoint of the authors of Evo-1 or BitVLA"),
-    "views": ((EVO1, BITVLA), "a checkpoint of the authors of Evo-1 or BitVLA"),
-    "view_slots": ((EVO1,), "a checkpoint of Evo-1's authors"),
-    "dead_rows": ((EVO1,), "a checkpoint of Evo-1's authors"),
-    "embodiment": (GR00T, "a checkpoint of GR00T"),
-    "camera_size": (GR00T, "a checkpoint of GR00T"),
-    "letterbox": (GR00T, "a checkpoint of GR00T"),
-    "gripper_sign": (GR00T, "a checkpoint of GR00T"),
+LAYOUTS = {
+    LEROBOT: Layout("LeRobot", ("identity_stats", "position_precision")),
+    OPENPI: Layout("openpi", ("variant",)),
 }
-LAYOUT_NAMES = {
-    LEROBOT: "config.json of type {}, which states everything itself",
-    OPENPI: "one of openpi",
-    EVO1: "one of Evo-1's authors",
-    BITVLA: "one of BitVLA",
-    **dict.fromkeys(GR00T, "one of GR00T"),
-}
+
+
+def authors() -> Dict[str, Layout]:
+    """Layouts of the authors, by architecture."""
+    return {name: _module(name).LAYOUT for name in names() if hasattr(_module(name), "LAYOUT")}
 
 
 def check_options(layout: str, config: dict, options: Options) -> None:
     """Refuses options that a layout does not leave open. Errors: usage."""
-    problems = Problems("arguments")
-    for name, (layouts, wanted) in LAYOUT_OPTIONS.items():
-        if getattr(options, name) and layout not in layouts:
-            flag = "--" + name.replace("_", "-")
-            found = LAYOUT_NAMES[layout].format(config.get("type"))
-            problems.add(flag, wanted, found, "leave the option out", Code.USAGE)
+    problems, layouts = Problems("arguments"), {**LAYOUTS, **authors()}
+    for name in dict.fromkeys(option for each in layouts.values() for option in each.options):
+        if getattr(options, name) and name not in layouts[layout].options:
+            *most, last = [each.name for each in layouts.values() if name in each.options]
+            wanted = "a checkpoint of " + ", ".join(most) + (" or " if most else "") + last
+            found = "one of " + layouts[layout].name
+            if layout == LEROBOT:
+                found = "config.json of type {}, which states everything itself".format(config.get("type"))
+            problems.add("--" + name.replace("_", "-"), wanted, found, "leave the option out", Code.USAGE)
     problems.raise_any()
 
 
 def arch_of(config: dict, layout: str, variant: str) -> str:
     """LeRobot states the architecture; in an openpi checkpoint nothing does, and `variant` names the configuration that it
     was trained with. Errors: usage, unsupported."""
-    if layout == LEROBOT and "type" not in config and str(config.get("model_type")).lower().startswith("gr00t"):
-        found = str(config["model_type"])
-        raise refuse("config.json: model_type", " or ".join(GR00T_MODELS), found, "another release of GR00T", Code.UNSUPPORTED)
+    if layout == LEROBOT and "type" not in config and "model_type" in config:
+        known = [name for each in authors().values() for name in each.model_types]
+        raise refuse("config.json: model_type", "one of " + ", ".join(known), str(config["model_type"]), "", Code.UNSUPPORTED)
     if layout != OPENPI:
         return config.get("type") if layout == LEROBOT else layout
     variants = {name: arch for arch in names() for name in getattr(load(arch), "VARIANTS", ())}

@@ -16,7 +16,7 @@ from typing import Dict, List, Mapping, NamedTuple, Optional, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import Checkpoint, find_backbone
+from ..checkpoint import Checkpoint, Layout, find_backbone
 from ..errors import Code, Problems, refuse
 from ..files import member, read_json
 from ..networks import MAX_LAYERS
@@ -26,9 +26,10 @@ from .gr00t import head
 from .gr00t.eagle import EAGLE_2_5
 from .gr00t.images import STANDARDIZE, Images
 from .gr00t.plan import Parts, assemble, network_keys_of
-from .gr00t.robot import BINARY, SIN_COS, Group, Robot, choose
+from .gr00t.robot import BINARY, ROBOT_OPTIONS, SIN_COS, Group, Robot, choose
 from .gr00t.sizes import Sizes
 
+LAYOUT = Layout("GR00T N1.5", (*ROBOT_OPTIONS, "variant"), model_types=("gr00t_n1_5",))
 POLICY, METADATA = "config.json", os.path.join("experiment_cfg", "metadata.json")
 TOP_FIXED: Fixed = {"model_type": (None, "gr00t_n1_5")}
 TOP_IGNORED = set(

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from typing import List
 
-from ..checkpoint import Checkpoint
+from ..checkpoint import Checkpoint, Layout
 from ..errors import Problems
 from ..section import Fixed
 from . import Options, Plan
 from .gr00t.eagle import EAGLE_3
 from .gr00t.plan import Release, described, make_plan
+from .gr00t.robot import ROBOT_OPTIONS
 
+LAYOUT = Layout("GR00T N1.6", ROBOT_OPTIONS, model_types=("Gr00tN1d6",))
 # gr00t/configs/model/gr00t_n1d6.py of Isaac-GR00T.
 CONFIG = {
     "select_layer": 16,

@@ -13,13 +13,15 @@ from __future__ import annotations
 
 from typing import List
 
-from ..checkpoint import Checkpoint
+from ..checkpoint import Checkpoint, Layout
 from ..errors import Problems
 from ..section import Fixed
 from . import Options, Plan
 from .gr00t import qwen3_vl
 from .gr00t.plan import Release, described, make_plan
+from .gr00t.robot import ROBOT_OPTIONS
 
+LAYOUT = Layout("GR00T N1.7", ROBOT_OPTIONS, model_types=("Gr00tN1d7",))
 # gr00t/configs/model/gr00t_n1d7.py of Isaac-GR00T.
 DIT_DEFAULT = {
     "positional_embeddings": None,

@@ -22,16 +22,19 @@ import numpy as np
 from ... import recipe
 from ...ascii_bpe import Encoder, check_undivided, special_ids
 from ...bundle import Key
-from ...checkpoint import Checkpoint
+from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
 from ...errors import Problems, refuse
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
 from ...section import Fixed, Section
+from ...torch_file import read_torch
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from .. import Options, Plan
 from .mapping import HEAD, PROPRIO, Sizes, dropped, network_keys, read_sizes, weights
 
 STATISTICS, PROCESSOR, IMAGES = "dataset_statistics.json", "processor_config.json", "preprocessor_config.json"
+# What the trainer writes beside the language model, each with the step in its name.
+SIDECARS = ("action_head", "proprio_projector")
 HORIZONS = {(8, 7): 8}  # of LIBERO, by numbers of states and actions
 GRIPPER = 6  # from 0, closed, to 1, open; LIBERO's simulator opens it by -1
 CROP, EPS = 0.9, 1e-8
@@ -103,6 +106,30 @@ def image_ops(side: int) -> List[dict]:
         {"op": "size", **size},
         {"op": "standardize", "mean": half, "std": half, "arithmetic": "float32_then_bfloat16"},
     ]
+
+
+def _read_tensors(folder: str, problems: Problems) -> Tensors:
+    """The language model's, and those of both files under their file's name, without what DistributedDataParallel puts in front."""
+    tensors, aliases = read_stored(folder, problems)
+    steps = {}
+    for part in SIDECARS:
+        pattern = re.compile(re.escape(part) + r"--(.+)_checkpoint\.pt")
+        found = {name: match[1] for name in sorted(os.listdir(folder)) for match in [pattern.fullmatch(name)] if match}
+        if len(found) != 1:
+            hint = "the reference loads the only one" if found else "download it beside config.json"
+            problems.add("{}--STEP_checkpoint.pt".format(part), "one such file", ", ".join(found) or "none", hint)
+            continue
+        ((name, steps[part]),) = found.items()
+        for stored, entry in read_torch(os.path.join(folder, name), "").items():
+            own = "{}.{}".format(part, stored[len("module.") :] if stored.startswith("module.") else stored)
+            tensors[own] = entry._replace(name=own)
+    if len(set(steps.values())) > 1:
+        (head, proprio), where = (steps[part] for part in SIDECARS), "{}--{}_checkpoint.pt".format
+        problems.add(where(SIDECARS[1], proprio), "the step of " + where(SIDECARS[0], head), proprio, "give the files of one step")
+    return tensors, aliases
+
+
+LAYOUT = Layout("BitVLA's authors", ("stats", "views"), model_types=("bitvla", "openvla"), read=_read_tensors)
 
 
 def _read_robot(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:

@@ -13,18 +13,18 @@ from typing import List, NamedTuple
 
 from ...ascii_bpe import Encoder, check_undivided, special_ids
 from ...bundle import Key
-from ...checkpoint import EVO1, Checkpoint
+from ...checkpoint import LEROBOT, Checkpoint
 from ...errors import Problems
 from ...files import read_json
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from ...tokenizer_byte_level import with_defaults
 from .. import Options, Plan
-from .layouts import Source, read_authors, read_lerobot
+from .layouts import LAYOUT as LAYOUT, Source, read_authors, read_lerobot
 from .mapping import network_keys, weights
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    read = read_authors if checkpoint.layout == EVO1 else read_lerobot
+    read = read_lerobot if checkpoint.layout == LEROBOT else read_authors
     source = read(checkpoint, options, problems)
     problems.raise_any()
     sizes = source.sizes

@@ -24,14 +24,15 @@ import numpy as np
 
 from ... import recipe
 from ...bundle import Key
-from ...checkpoint import NORM_STATS, Checkpoint, find_backbone
-from ...errors import Code, Problems
+from ...checkpoint import Checkpoint, Layout, Tensors, find_backbone
+from ...errors import Code, Problems, refuse
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
 from ...lerobot import check_keys, check_widths, read_views, vector_dim
 from ...networks import MAX_LAYERS
 from ...normalization import Normalization
 from ...section import Section
+from ...torch_file import read_torch
 from .. import Options
 from .mapping import (
     AUTHORS,
@@ -72,6 +73,23 @@ def pad_op(size: int, value: float) -> dict:
 
 
 # --- the authors' layout ---------------------------------------------------------------------------------------------------------------
+
+# What the trainer writes, with and without DeepSpeed, and the member that holds the policy's tensors.
+TORCH_FILES = {"mp_rank_00_model_states.pt": "module", "checkpoint.pt": "model_state_dict"}
+NORM_STATS = "norm_stats.json"
+
+
+def _read_tensors(folder: str, _problems: Problems) -> Tensors:
+    present = [name for name in TORCH_FILES if os.path.exists(os.path.join(folder, name))]
+    if len(present) != 1:
+        found, code = ("no such file", Code.IO) if not present else ("both", Code.BAD_BUNDLE)
+        raise refuse(folder, "either " + " or ".join(TORCH_FILES), found, "give the folder of one training step", code)
+    return read_torch(os.path.join(folder, present[0]), TORCH_FILES[present[0]]), {}
+
+
+LAYOUT = Layout(
+    "Evo-1's authors", ("variant", "stats", "views", "view_slots", "dead_rows"), files=(*TORCH_FILES, NORM_STATS), read=_read_tensors
+)
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server
 EPS = 1e-8

@@ -21,6 +21,7 @@ PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json",
 DOCS = "docs/converting.md, GR00T"
 MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"}
 MAX_WIDTH = 1 << 16
+ROBOT_OPTIONS = ("embodiment", "camera_size", "letterbox", "gripper_sign")  # what every release leaves open
 
 
 # How the numbers of a key are normalized: a kind of the recipe's ops normalize and unnormalize, one of these, or "" for as they are.

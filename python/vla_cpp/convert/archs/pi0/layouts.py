@@ -288,7 +288,7 @@ def read_openpi(family: Family, checkpoint: Checkpoint, options: Options, proble
     for key in sorted(set(policy.values) - set(policy.defaults)):
         policy.bad(key, "a key that openpi writes", unsupported=True)
     sizes = _openpi_sizes(family, policy, checkpoint, variant, problems)
-    statistics = _statistics(family, checkpoint, variant, options.identity_stats, problems)
+    statistics = _statistics(family, checkpoint, variant, problems)
     problems.raise_any()
     kind = "openpi_mean_std" if family.state_token else "openpi_quantiles"
     state_names = ["observation." + name for name, _ in robot.states]
@@ -342,12 +342,8 @@ def _openpi_sizes(family: Family, policy: Section, checkpoint: Checkpoint, varia
     return s
 
 
-def _statistics(
-    family: Family, checkpoint: Checkpoint, variant: Variant, identity: Sequence[str], problems: Problems
-) -> Dict[str, np.ndarray]:
+def _statistics(family: Family, checkpoint: Checkpoint, variant: Variant, problems: Problems) -> Dict[str, np.ndarray]:
     """By the name of the bundle's tensor, cut to the robot's widths (the files pad them). They are doubles in the file."""
-    for feature in identity:
-        problems.add("--identity-stats " + feature, "a checkpoint of LeRobot", "one of openpi, which always normalizes")
     path = os.path.join(checkpoint.path("assets"), *variant.asset.split("/"), STATS_FILE)
     where = os.path.relpath(path, checkpoint.folder)
     if not os.path.exists(path):
