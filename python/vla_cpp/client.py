@@ -101,8 +101,8 @@ class Client(Handle):
                          camera that the robot does not have
         state            world units: vectors by name, or one vector where the policy has one state
         text             the instruction, as a person says it
-        seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither the server draws a seed and
-                         the chunk tells it
+        seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn, and the
+                         chunk tells it
         leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover
         deadline_ms      after so many milliseconds at the server the answer is worthless and not computed; the timeout by default
         capture_time_ns  when the frames were taken; comes back in the chunk

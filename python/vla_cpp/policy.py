@@ -84,17 +84,7 @@ class Policy(Handle):
         capture_time_ns: Optional[int] = None,
         embodiment: Optional[str] = None,
     ) -> Chunk:
-        """One observation in, one action chunk out.
-
-        images           frames by view: uint8 (height, width, 3) RGB of any size, the bytes of a JPEG or PNG file, or None for a
-                         camera that the robot does not have
-        state            world units: vectors by name, or one vector where the policy has one state
-        text             the instruction, as a person says it
-        seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn and the chunk
-                         tells it
-        leftover         real-time chunking: the rows of the chunk before that are not executed yet; see Leftover
-        capture_time_ns  when the frames were taken; comes back in the chunk
-        embodiment       tag of the robot, where `spec.robots` has several
+        """One observation in, one action chunk out. The arguments are those of `Client.act`.
 
         Errors: BadObservation (what the policy cannot take, by name), BadAction, DeviceError, OutOfMemory, InternalError.
         """

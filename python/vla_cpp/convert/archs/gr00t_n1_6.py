@@ -7,12 +7,10 @@ The layout is the authors' (Isaac-GR00T), as of N1.7. An absent key of config.js
 
 from __future__ import annotations
 
-from typing import List
+from functools import partial
 
-from ..checkpoint import Checkpoint, Layout
-from ..errors import Problems
+from ..checkpoint import Layout
 from ..section import Fixed
-from . import Options, Plan
 from .gr00t.eagle import EAGLE_3
 from .gr00t.plan import Release, described, make_plan
 from .gr00t.robot import ROBOT_OPTIONS
@@ -67,11 +65,5 @@ EMBODIMENTS = {
     "behavior_r1_pro": 24,
 }
 RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d6Processor", KWARGS_FIXED, EMBODIMENTS, True, EAGLE_3)
-
-
-def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    return make_plan(RELEASE, checkpoint, options, problems)
-
-
-def embodiments(checkpoint: Checkpoint) -> List[str]:
-    return described(RELEASE, checkpoint)
+plan = partial(make_plan, RELEASE)
+embodiments = partial(described, RELEASE)

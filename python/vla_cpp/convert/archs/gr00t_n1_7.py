@@ -11,12 +11,10 @@ checkpoint leaves one of them out, its tensors fit the one or the other, and wha
 
 from __future__ import annotations
 
-from typing import List
+from functools import partial
 
-from ..checkpoint import Checkpoint, Layout
-from ..errors import Problems
+from ..checkpoint import Layout
 from ..section import Fixed
-from . import Options, Plan
 from .gr00t import qwen3_vl
 from .gr00t.plan import Release, described, make_plan
 from .gr00t.robot import ROBOT_OPTIONS
@@ -83,11 +81,5 @@ EMBODIMENTS = {
     "xdof_relative_eef_relative_joint_subtask": 27,
 }
 RELEASE = Release(CONFIG, FIXED, IGNORED, "Gr00tN1d7Processor", KWARGS_FIXED, EMBODIMENTS, False, qwen3_vl)
-
-
-def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    return make_plan(RELEASE, checkpoint, options, problems)
-
-
-def embodiments(checkpoint: Checkpoint) -> List[str]:
-    return described(RELEASE, checkpoint)
+plan = partial(make_plan, RELEASE)
+embodiments = partial(described, RELEASE)

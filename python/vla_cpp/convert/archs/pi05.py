@@ -7,9 +7,8 @@ Reference: lerobot src/lerobot/policies/pi05 and openpi src/openpi/models_pytorc
 
 from __future__ import annotations
 
-from ..checkpoint import Checkpoint
-from ..errors import Problems
-from . import Options, Plan
+from functools import partial
+
 from .pi0 import make_plan
 from .pi0.layouts import variants_of
 from .pi0.mapping import Family
@@ -22,7 +21,4 @@ FAMILY = Family(
     other_time_mlp="action_time_mlp",
 )
 VARIANTS = variants_of("pi05")
-
-
-def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    return make_plan(FAMILY, checkpoint, options, problems)
+plan = partial(make_plan, FAMILY)

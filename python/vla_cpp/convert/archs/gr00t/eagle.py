@@ -46,18 +46,7 @@ VISION_FIXED: Fixed = {
     "use_rope": (False, False),
     "use_windows_attn": (False, False),
 }
-TEXT = {
-    "vocab_size": 151936,
-    "hidden_size": 4096,
-    "intermediate_size": 22016,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 32,
-    "num_key_value_heads": 32,
-    "head_dim": 128,
-    "max_position_embeddings": 32768,
-    "rms_norm_eps": 1e-6,
-    "rope_theta": 10000.0,
-}
+TEXT = {**language.TEXT, "max_position_embeddings": 32768, "rope_theta": 10000.0}
 TEXT_FIXED: Fixed = {"use_sliding_window": (False, False)}
 IMAGE_FIXED: Fixed = {
     "do_resize": (None, False),

@@ -13,6 +13,17 @@ from ...section import Fixed, Section
 from .. import Weight
 from .sizes import Sizes
 
+# Qwen3Config and Qwen3VLTextConfig of transformers, which differ in two keys more.
+TEXT = {
+    "vocab_size": 151936,
+    "hidden_size": 4096,
+    "intermediate_size": 22016,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "num_key_value_heads": 32,
+    "head_dim": 128,
+    "rms_norm_eps": 1e-6,
+}
 TEXT_FIXED: Fixed = {"hidden_act": ("silu", "silu"), "attention_bias": (False, False)}
 
 

@@ -47,18 +47,7 @@ VISION_FIXED: Fixed = {
     "spatial_merge_size": (2, 2),
     "temporal_patch_size": (2, 2),
 }
-TEXT = {
-    "vocab_size": 151936,
-    "hidden_size": 4096,
-    "intermediate_size": 22016,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 32,
-    "num_key_value_heads": 32,
-    "head_dim": 128,
-    "max_position_embeddings": 128000,
-    "rms_norm_eps": 1e-6,
-    "rope_theta": 500000.0,
-}
+TEXT = {**language.TEXT, "max_position_embeddings": 128000, "rope_theta": 500000.0}
 FILE = "preprocessor_config.json"
 # Qwen2VLImageProcessor of transformers. What is None there must be stated, since its own default is of another model.
 SIZES = {"size": None, "min_pixels": None, "max_pixels": None}

@@ -8,6 +8,7 @@ Reference: lerobot src/lerobot/policies/pi0 and openpi src/openpi/models_pytorch
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import List
 
 from ... import recipe
@@ -85,7 +86,4 @@ FAMILY = Family(
     other_time_mlp="time_mlp",
 )
 VARIANTS = variants_of("pi0")
-
-
-def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
-    return make_plan(FAMILY, checkpoint, options, problems)
+plan = partial(make_plan, FAMILY)
