@@ -24,6 +24,15 @@ for target in build/fuzz/bin/*_fuzz; do
       bundle=$(find "$arch" -name bundle.gguf | sort | head -1)
       cp "$bundle" "$corpus/$(basename "$arch")"
     done
+    two=$(mktemp -d)  # and one for two robots
+    .venv/bin/python - "$two" <<'EOF'
+import pathlib, sys
+sys.path.insert(0, "tests/cli")
+import embodiment_test
+embodiment_test.joint("gr00t_n1_6/faint", pathlib.Path(sys.argv[1]))
+EOF
+    cp "$two"/*.gguf "$corpus/two_robots"
+    rm -r "$two"
     longest=400000
   fi
   echo "== $name, $seconds s"

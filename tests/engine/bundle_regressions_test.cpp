@@ -7,7 +7,7 @@
 #include <filesystem>
 
 #include "fuzz/bundle_target.h"
-#include "support/editable_bundle.h"
+#include "support/joint_bundle.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -37,6 +37,11 @@ EditableBundle smallest_bundle() {
   return bundle;
 }
 
+/// The same for two robots, each with its own recipe and statistics.
+EditableBundle smallest_of_two() {
+  return joint_bundle({{"arm", smallest_bundle()}, {"dog", smallest_bundle()}}, is_robots_own);
+}
+
 }  // namespace
 
 TEST_CASE("the fuzz target follows a golden bundle through every check before memory is taken") {
@@ -47,11 +52,21 @@ TEST_CASE("the fuzz target follows a golden bundle through every check before me
   CHECK(depth(bytes.substr(0, bytes.size() / 2)) == Depth::refused);
 }
 
-TEST_CASE("the bundle that fuzzing starts from is whole") {
-  const std::string bytes = smallest_bundle().bytes();
-  CHECK(depth(bytes) == Depth::declared);
-  CHECK_MESSAGE(read_text(kFolder + "/smallest") == bytes,
-                "the layout of bundles changed: copy " << write_file("smallest", bytes) << " to " << kFolder);
+TEST_CASE("the bundles that fuzzing starts from are whole") {
+  for (const auto& [name, bundle] :
+       {std::pair("smallest", smallest_bundle()), {"smallest_of_two", smallest_of_two()}}) {
+    const std::string bytes = bundle.bytes();
+    CHECK(depth(bytes) == Depth::declared);
+    CHECK(bytes.size() < 20000);  // what scripts/fuzz.sh lets a fuzzer read
+    CHECK_MESSAGE(read_text(kFolder + "/" + name) == bytes,
+                  "the layout of bundles changed: copy " << write_file(name, bytes) << " to " << kFolder);
+  }
+}
+
+TEST_CASE("the fuzz target loads every robot of a bundle") {
+  EditableBundle bundle = smallest_of_two();
+  bundle.remove_key("embodiment.dog.processor.recipe");
+  CHECK(depth(bundle.bytes()) == Depth::parsed);
 }
 
 TEST_CASE("bundles from fuzzing load or are refused") {

@@ -8,6 +8,7 @@
 
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
+#include "support/joint_bundle.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -15,12 +16,6 @@ using namespace vla::test;
 namespace {
 
 const std::string kCase = "gr00t_n1_7/libero";
-
-bool is_own(const std::string& name) {
-  for (const char* prefix : {"state_", "action_in", "decode_", "stats.", "observation.state", "processor.recipe"})
-    if (name.starts_with(prefix)) return true;
-  return false;
-}
 
 /// The golden bundle, and one whose robot has other weights and a state of another name.
 EditableBundle arm() { return EditableBundle::read(golden_path(kCase) + "/bundle.gguf"); }
@@ -34,22 +29,7 @@ EditableBundle dog() {
   return bundle;
 }
 
-EditableBundle both() {
-  EditableBundle joint = arm();
-  const EditableBundle one = joint, other = dog();
-  joint.set("embodiments", Value(std::vector<std::string>{"arm", "dog"}));
-  std::erase_if(joint.tensors, [](const auto& tensor) { return is_own(tensor.name); });
-  for (const auto& [key, value] : one.keys.all())
-    if (is_own(key)) joint.remove_key(key);
-  for (const auto& [tag, robot] : {std::pair("arm", &one), {"dog", &other}}) {
-    const std::string own = std::string("embodiment.") + tag + ".";
-    for (const auto& [key, value] : robot->keys.all())
-      if (is_own(key)) joint.set(own + key, value);
-    for (EditableBundle::Piece tensor : robot->tensors)
-      if (is_own(tensor.name)) tensor.name = own + tensor.name, joint.tensors.push_back(tensor);
-  }
-  return joint;
-}
+EditableBundle both() { return joint_bundle({{"arm", arm()}, {"dog", dog()}}, is_robots_own); }
 
 std::unique_ptr<Engine> load(const EditableBundle& bundle, const std::string& file, EngineOptions options) {
   options.n_thread = 1;

@@ -9,12 +9,18 @@
 #include "fuzz/mutant.h"
 #include "support/editable_bundle.h"
 #include "support/golden_case.h"
+#include "support/joint_bundle.h"
 
 using namespace vla;
 using namespace vla::test;
 
+namespace {
+
+constexpr int kRounds = 25;  // for each architecture
+
+}  // namespace
+
 TEST_CASE("an odd bundle of any architecture acts or is refused, in bounded time and memory") {
-  constexpr int kRounds = 25;  // for each architecture
   fuzz::Random random(1);
   std::string arch;
   int n_mutant = 0, n_answered = 0;
@@ -31,4 +37,15 @@ TEST_CASE("an odd bundle of any architecture acts or is refused, in bounded time
   }
   CHECK(n_answered > 0);
   CHECK(n_answered < n_mutant / 2);
+}
+
+TEST_CASE("an odd bundle for two robots lets both act, or is refused") {
+  fuzz::Random random(1);
+  const EditableBundle robot = EditableBundle::read(golden_path("gr00t_n1_6/faint") + "/bundle.gguf");
+  const std::string sound = joint_bundle({{"arm", robot}, {"dog", robot}}, is_robots_own).bytes();
+  CHECK(fuzz::check_act(sound));
+  int n_answered = 0;
+  for (int round = 0; round < kRounds; ++round) n_answered += fuzz::check_act(fuzz::mutant(sound, random)) ? 1 : 0;
+  CHECK(n_answered > 0);
+  CHECK(n_answered < kRounds);
 }

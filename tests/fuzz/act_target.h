@@ -26,24 +26,18 @@ inline Observation plain_observation(const Processor& processor, int width = 24,
   return observation;
 }
 
-/// Loads a bundle with the checksum that fits it and lets it act once. Aborts when it is refused for a reason that no
-/// bundle can be, or answers with numbers that are not finite. Returns whether it answered.
-inline bool check_act(const std::string& bytes) {
-  const Budget budget(20, 1024);
-  const std::string fitted = sealed(bytes);
-  const int file = ::memfd_create("fuzzed bundle", MFD_CLOEXEC);
-  if (file < 0 || ::write(file, fitted.data(), fitted.size()) != static_cast<ssize_t>(fitted.size())) std::abort();
-  const auto engine = Engine::load("/proc/self/fd/" + std::to_string(file), {.n_thread = 1});
-  ::close(file);
-  if (!engine) {
-    if (engine.error().code != Code::out_of_memory) check_error(engine.error());
-    return false;
-  }
-  const Processor& processor = (*engine)->processor();
-  auto chunk = (*engine)->act(plain_observation(processor), std::uint64_t{1});
+/// One act of one robot. Aborts when it is refused for a reason that no bundle can be, or answers with numbers that are
+/// not finite. Returns whether it answered.
+inline bool check_robot(Engine& engine, const Engine& robot) {
+  const auto act = [&](auto... size) {
+    Observation observation = plain_observation(robot.processor(), size...);
+    observation.embodiment = robot.bundle().embodiment();
+    return engine.act(observation, std::uint64_t{1});
+  };
+  auto chunk = act();
   int width = 0, height = 0;  // some policies take the images of one camera only
   if (!chunk && std::sscanf(chunk.error().expected.c_str(), "an image of %d x %d", &width, &height) == 2)
-    chunk = (*engine)->act(plain_observation(processor, width, height), std::uint64_t{1});
+    chunk = act(width, height);
   if (!chunk) {
     const Code code = chunk.error().code;
     if (code != Code::bad_observation && code != Code::bad_action && code != Code::unsupported)
@@ -53,6 +47,24 @@ inline bool check_act(const std::string& bytes) {
   for (const float number : chunk->actions)
     if (!std::isfinite(number)) std::abort();
   return true;
+}
+
+/// Loads a bundle with the checksum that fits it and lets each of its robots act once. Aborts when it is refused for a
+/// reason that no bundle can be. Returns whether all answered.
+inline bool check_act(const std::string& bytes) {
+  const Budget budget(20, 1024);
+  const std::string fitted = sealed(bytes);
+  const int file = ::memfd_create("fuzzed bundle", MFD_CLOEXEC);
+  if (file < 0 || ::write(file, fitted.data(), fitted.size()) != static_cast<ssize_t>(fitted.size())) std::abort();
+  const auto engine = Engine::load("/proc/self/fd/" + std::to_string(file), {.n_thread = 1, .all_robots = true});
+  ::close(file);
+  if (!engine) {
+    if (engine.error().code != Code::out_of_memory) check_error(engine.error());
+    return false;
+  }
+  bool answered = true;
+  for (const Engine* robot : (*engine)->robots()) answered &= check_robot(**engine, *robot);
+  return answered;
 }
 
 }  // namespace vla::fuzz

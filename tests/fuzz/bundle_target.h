@@ -70,11 +70,20 @@ inline Depth check_load(const Bundle& bundle) {
   return accepted(policy->check(shape)) ? Depth::declared : Depth::parsed;
 }
 
+/// Of a bundle for several robots how far the first of them that is refused got.
 inline Depth check_bytes(std::span<const std::byte> bytes) {
   const auto bundle = Bundle::parse(bytes, "fuzz.gguf");
   if (!accepted(bundle)) return Depth::refused;
   check_tensors(*bundle, bytes);
-  return check_load(*bundle);
+  if (bundle->embodiments().empty()) return check_load(*bundle);
+  Depth depth = Depth::declared;
+  for (const std::string& tag : bundle->embodiments()) {
+    Bundle robot = *bundle;
+    if (const Status chosen = robot.choose(tag); !chosen) unexpected(chosen.error());
+    check_tensors(robot, bytes);
+    depth = std::min(depth, check_load(robot));
+  }
+  return depth;
 }
 
 /// The bytes with the checksum that fits them, so that what lies behind that check is reached. Without a place for a
