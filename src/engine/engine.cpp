@@ -22,10 +22,12 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   VLA_TRY(std::vector<std::unique_ptr<Engine>> robots, open_robots(std::move(file), options));
   VLA_TRY(const std::shared_ptr<Device> device, open_device(options.n_thread, options.kernels, options.device));
   std::shared_ptr<ParamList> params;
+  const auto all_plans = std::make_shared<std::vector<Plans*>>();
   for (const auto& robot : robots) {
     robot->device_ = device;
     robot->tap_pattern_ = options.tap_pattern;
     robot->dry_ = options.dry;
+    robot->all_plans_ = all_plans;
     VLA_CHECK(robot->take_injected(options.inject));
     VLA_CHECK(robot->load_policy(params));
   }
@@ -153,15 +155,16 @@ Status Engine::make_constants() {
 
 /// Builds the largest plan, so that the working memory is known before the first request and does not grow after it.
 Status Engine::make_plans() {
-  last_plan_ = nullptr;
+  last_shape_.reset();
   plans_ = std::make_unique<Plans>(
-      PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_, horizon_, tap_pattern_, dry_});
+      PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_, horizon_, tap_pattern_, dry_},
+      all_plans_);
   const auto plan = plans_->for_shape(largest_shape());
   if (!plan) return plan.error();
   if (injected_.empty()) return {};
-  plans_ =
-      std::make_unique<Plans>(PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_, horizon_,
-                                          tap_pattern_, dry_, &injected_});  // fits the shape of its observation
+  plans_ = std::make_unique<Plans>(PlanContext{*policy_, *device_, solver_, conditions_, constants_, d_action_,
+                                               horizon_, tap_pattern_, dry_, &injected_},
+                                   all_plans_);  // fits the shape of its observation
   return {};
 }
 
@@ -275,11 +278,9 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   if (leftover) {
     VLA_TRY(steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(x)));
   }
-  last_plan_ = nullptr;  // a plan of another shape may take its place
-  VLA_TRY(Plan * plan,
-          plans_->for_shape({inputs_.width, inputs_.height, inputs_.n_view, static_cast<int>(inputs_.tokens.size()),
-                             d_state_, placed(inputs_.views), steering.has_value()}));
-  last_plan_ = plan;
+  last_shape_ = {inputs_.width, inputs_.height,        inputs_.n_view,      static_cast<int>(inputs_.tokens.size()),
+                 d_state_,      placed(inputs_.views), steering.has_value()};
+  VLA_TRY(Plan * plan, plans_->for_shape(*last_shape_));
   plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
   plan->set_x(steering ? steering->start : x);
   if (steering) plan->set_steering(*steering);
@@ -307,6 +308,11 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   chunk.is_beyond = inputs_.is_beyond;
   record_chunk(chunk);
   return chunk;
+}
+
+StageWork Engine::work() const {
+  const Plan* plan = last_shape_ ? plans_->find(*last_shape_) : nullptr;
+  return plan != nullptr ? plan->work(solver_.n_step) : StageWork();
 }
 
 std::string Engine::precision() const {

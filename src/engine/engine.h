@@ -3,6 +3,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -80,8 +81,8 @@ class Engine {
   /// MB, what is computed, and how its operand and results lie in memory. Errors: out_of_memory.
   enum class Part { prefix, step };
   Result<std::string> program_text(Part part);
-  /// What the network computed for the last observation; empty before the first.
-  StageWork work() const { return last_plan_ != nullptr ? last_plan_->work(solver_.n_step) : StageWork(); }
+  /// What the network computed for the last observation; empty before the first, and where its plan is gone.
+  StageWork work() const;
 
   const Bundle& bundle() const { return bundle_; }
   const Processor& processor() const { return processor_; }
@@ -145,9 +146,10 @@ class Engine {
   std::unique_ptr<Slots> tables_;
   const Slot* conditions_ = nullptr;  // in tables_
   std::unique_ptr<Slots> constant_slots_;
-  Cache constants_;  // in constant_slots_
+  Cache constants_;       // in constant_slots_
+  Plans::All all_plans_;  // of all robots
   std::unique_ptr<Plans> plans_;
-  const Plan* last_plan_ = nullptr;
+  std::optional<InputShape> last_shape_;
   Inputs inputs_;  // of the last observation; its vectors keep their memory
 };
 

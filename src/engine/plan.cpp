@@ -9,8 +9,8 @@
 namespace vla {
 namespace {
 
-/// Memory that all plans together may take. A robot uses a few instructions of a few lengths; the limit is for the
-/// others.
+/// Memory that all plans of an engine together may take. A robot uses a few instructions of a few lengths; the limit is
+/// for the others.
 constexpr std::size_t kMaxPlanBytes = std::size_t{256} << 20;
 
 TapFilter prefix_filter(const std::string& pattern) {
@@ -135,9 +135,21 @@ void Plan::collect_step_taps(int k, std::vector<Tap>& taps) const {
   }
 }
 
+Plans::Plans(PlanContext context, All all) : context_(std::move(context)), all_(std::move(all)) {
+  all_->push_back(this);
+}
+
+const Plan* Plans::find(const InputShape& shape) const {
+  const auto found = plans_.find(shape);
+  return found != plans_.end() ? found->second.get() : nullptr;
+}
+
 Result<Plan*> Plans::for_shape(const InputShape& shape) {
   if (const auto found = plans_.find(shape); found != plans_.end()) return found->second.get();
-  if (size() > kMaxPlanBytes) plans_.clear();
+  std::size_t bytes = 0;
+  for (const Plans* robot : *all_) bytes += robot->size();
+  if (bytes > kMaxPlanBytes)
+    for (Plans* robot : *all_) robot->plans_.clear();
   VLA_TRY(std::unique_ptr<Plan> plan, Plan::build(context_, shape));
   return (plans_[shape] = std::move(plan)).get();
 }

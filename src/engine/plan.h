@@ -79,16 +79,25 @@ class Plan {
   std::unique_ptr<Program> prefix_, step_;
 };
 
-/// The plans that exist, as many as memory allows them.
+/// A robot's plans that exist, as many as memory allows it and the other robots of an engine together.
 class Plans {
  public:
-  explicit Plans(PlanContext context) : context_(std::move(context)) {}
+  using All = std::shared_ptr<std::vector<Plans*>>;
+  explicit Plans(PlanContext context, All all = std::make_shared<std::vector<Plans*>>());
+  ~Plans() { std::erase(*all_, this); }
+  Plans(const Plans&) = delete;
+  Plans& operator=(const Plans&) = delete;
+
+  /// Where there is no such plan yet and memory is short, all other plans go, also those of other robots.
   Result<Plan*> for_shape(const InputShape& shape);
+  /// Null where there is none.
+  const Plan* find(const InputShape& shape) const;
   /// Bytes of all plans.
   std::size_t size() const;
 
  private:
   PlanContext context_;
+  All all_;  // these plans and the other robots'
   std::map<InputShape, std::unique_ptr<Plan>> plans_;
 };
 
