@@ -54,13 +54,13 @@ class Queue {
         result.refused.push_back(std::move(job));
         return result;
       }
+      result.refused.reserve(result.refused.size() + 1);  // before it is taken out of the line
       result.refused.push_back(take(last));
     }
-    bytes_ += job.size - freed;
     if (older == line_.end()) {
-      if (std::find(turns_.begin(), turns_.end(), job.peer) == turns_.end()) turns_.push_back(job.peer);
-      line_.push_back(std::move(job));
+      wait(std::move(job));
     } else {
+      bytes_ += job.size - freed;
       result.superseded = std::exchange(*older, std::move(job));
     }
     return result;
@@ -93,6 +93,17 @@ class Queue {
   template <class Wanted>
   Place find(Wanted wanted) {
     return std::find_if(line_.begin(), line_.end(), wanted);
+  }
+
+  /// Takes all memory before it changes anything: where there is none, the queue stays as it was.
+  void wait(Job job) {
+    const bool has_turn = std::find(turns_.begin(), turns_.end(), job.peer) != turns_.end();
+    std::list<std::string> turn(has_turn ? 0 : 1, job.peer);
+    std::list<Job> last;
+    last.push_back(std::move(job));
+    bytes_ += last.back().size;
+    turns_.splice(turns_.end(), turn);
+    line_.splice(line_.end(), last);
   }
 
   /// The last job of the peer whose jobs amount to most, where that is more than `peer` would have with `added`.
