@@ -106,7 +106,7 @@ void Watch::ready(double warm_up_ms) {
 void Watch::ended(const Status& status) {
   const serve::Health health = server_.health();
   serve::Log::Fields fields = {{"chunks", health.n_chunk}, {"errors", health.n_error}, {"uptime_s", health.uptime_s}};
-  if (!status) fields["error"] = status.error().message();
+  if (!status) fields.emplace_back("error", status.error().message());
   log_.event(status ? Level::info : Level::error, "shutdown", fields);
 }
 

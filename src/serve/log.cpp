@@ -24,18 +24,15 @@ std::string now() {
                      utc.tm_hour, utc.tm_min, utc.tm_sec, ms);
 }
 
-/// One line of ASCII, whatever the text holds: a terminal must not obey what a client sends.
-std::string dump(const Log::Fields& json) { return json.dump(-1, ' ', true, Log::Fields::error_handler_t::replace); }
-
 /// A word as it is, anything else in quotes.
-std::string plain(const Log::Fields& value) {
-  if (!value.is_string()) return dump(value);
-  const auto& text = value.get_ref<const std::string&>();
+std::string plain(const std::string& json) {
   const auto is_plain = [](unsigned char c) {
-    return c < 0x80 && (std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-' || c == ':' || c == '/' || c == '[' ||
-                        c == ']' || c == ',');
+    return std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-' || c == ':' || c == '/' || c == '[' || c == ']' ||
+           c == ',';
   };
-  return !text.empty() && std::all_of(text.begin(), text.end(), is_plain) ? text : dump(value);
+  const bool is_word =
+      json.size() > 2 && json.front() == '"' && std::all_of(json.begin() + 1, json.end() - 1, is_plain);
+  return is_word ? json.substr(1, json.size() - 2) : json;
 }
 
 Level level_of(const Error* error) {
@@ -71,14 +68,13 @@ Log::~Log() {
 
 std::string Log::line(Level level, const char* name, const Fields& fields) const {
   const char* level_name = kLevelNames[static_cast<int>(level)];
-  if (format_ == LogFormat::json) {
-    Fields object = {{"time", now()}, {"level", level_name}, {"event", name}};
-    for (const auto& [key, value] : fields.items()) object[key] = value;
-    return dump(object) + '\n';
-  }
-  std::string text = fmt::format("{} {:5} {}", now(), level_name, name);
-  for (const auto& [key, value] : fields.items()) text += fmt::format(" {}={}", key, plain(value));
-  return text + '\n';
+  std::string text = format_ == LogFormat::json
+                         ? fmt::format(R"({{"time":"{}","level":"{}","event":"{}")", now(), level_name, name)
+                         : fmt::format("{} {:5} {}", now(), level_name, name);
+  for (const Field& field : fields)
+    text += format_ == LogFormat::json ? fmt::format(R"(,"{}":{})", field.name, field.json)
+                                       : fmt::format(" {}={}", field.name, plain(field.json));
+  return text + (format_ == LogFormat::json ? "}\n" : "\n");
 }
 
 void Log::event(Level level, const char* name, const Fields& fields) noexcept {
@@ -109,10 +105,10 @@ void Log::answered(const Answered& answered) {
                      {"engine_ms", ms(answered.finished - answered.started)},
                      {"total_ms", ms(answered.sent - request.at)}};
     if (const Error* error = answered.error) {
-      fields["where"] = error->where;
-      fields["expected"] = error->expected;
-      fields["found"] = error->found;
-      fields["hint"] = error->hint;
+      fields.emplace_back("where", error->where);
+      fields.emplace_back("expected", error->expected);
+      fields.emplace_back("found", error->found);
+      fields.emplace_back("hint", error->hint);
     }
     event(level, "request", fields);
   } catch (const std::exception&) {  // as above

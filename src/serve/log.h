@@ -3,6 +3,7 @@
 #pragma once
 
 #include <nlohmann/json.hpp>
+#include <vector>
 
 #include "serve/observer.h"
 #include "serve/writer.h"
@@ -18,12 +19,20 @@ enum class LogFormat { text, json };
 /// as text for people. Whatever a client sends stays inside its field. docs/serving.md lists events and fields.
 class Log final : public Observer {
  public:
-  using Fields = nlohmann::ordered_json;
+  /// A name of our own, and a value as JSON of ASCII characters: a terminal must not obey what a client sends. Kept as
+  /// text, because the library's objects take memory even to be destroyed, and end the process where there is none.
+  struct Field {
+    template <class Value>
+    Field(const char* its_name, const Value& value)
+        : name(its_name), json(nlohmann::json(value).dump(-1, ' ', true, nlohmann::json::error_handler_t::replace)) {}
+    std::string name, json;
+  };
+  using Fields = std::vector<Field>;
   /// Writes events of at least `least` to `fd`, which stays open.
   Log(int fd, LogFormat format, Level least);
   ~Log() override;
 
-  /// From any thread. `fields` is an object.
+  /// From any thread.
   void event(Level level, const char* name, const Fields& fields) noexcept;
   /// A request: at level debug where it was answered as requested, info where the queue refused it, warn
   /// where the request was wrong, error where the server failed.

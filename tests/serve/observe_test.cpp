@@ -180,7 +180,7 @@ TEST_CASE("a log line is one JSON object whatever its fields hold") {
   const std::string hostile = "a\n\x1b[2J\"\xff\xfe\x80{}";
   {
     Log log(pipe.fd[1], LogFormat::json, Level::info);
-    log.event(Level::debug, "left_out", Log::Fields::object());
+    log.event(Level::debug, "left_out", {});
     log.event(Level::info, "event", {{"text", hostile}});
     Sample sample;
     sample.error.found = hostile;
