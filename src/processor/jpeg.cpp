@@ -6,6 +6,8 @@
 
 #include <jpeglib.h>
 
+#include <jerror.h>
+
 #include "processor/image_codecs.h"
 
 namespace vla::codecs {
@@ -93,6 +95,8 @@ void read_metadata(const JpegReader& reader, Image& image) {
 }
 
 Error corrupt(const JpegReader& reader, const std::string& where) {
+  if (reader.errors.msg_code == JERR_OUT_OF_MEMORY)
+    return {Code::out_of_memory, where, "", "no memory for the JPEG decoder"};
   return refused(where, "a whole JPEG image", reader.message[0] != 0 ? reader.message : "a damaged one");
 }
 

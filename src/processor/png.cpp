@@ -6,7 +6,9 @@
 
 #include <algorithm>
 #include <csetjmp>
+#include <cstdlib>
 #include <cstring>
+#include <new>
 
 #include "processor/image_codecs.h"
 
@@ -24,6 +26,7 @@ struct PngReader {
   Bytes file;
   std::size_t position = 0;
   char message[128] = {};
+  bool lacked_memory = false;
   std::vector<std::uint8_t> pixels;
 
   explicit PngReader(Bytes bytes) : file(bytes) {}
@@ -48,8 +51,18 @@ void on_read(png_structp png, png_bytep data, std::size_t size) {
   reader->position += size;
 }
 
+/// libpng's message for a damaged stream and for one without memory to unpack it may be the same.
+png_voidp on_take(png_structp png, png_alloc_size_t size) {
+  void* memory = std::malloc(size);
+  if (memory == nullptr) static_cast<PngReader*>(png_get_mem_ptr(png))->lacked_memory = true;
+  return memory;
+}
+
+void on_free(png_structp, png_voidp memory) { std::free(memory); }
+
 bool open(PngReader& reader) {
-  reader.png = png_create_read_struct(PNG_LIBPNG_VER_STRING, &reader, on_error, on_warning);
+  reader.png =
+      png_create_read_struct_2(PNG_LIBPNG_VER_STRING, &reader, on_error, on_warning, &reader, on_take, on_free);
   if (reader.png == nullptr) return false;
   reader.info = png_create_info_struct(reader.png);
   return reader.info != nullptr;
@@ -154,6 +167,7 @@ std::string unpacked(std::string_view packed, std::size_t& left) {
   uLongf size = left;
   const int found = uncompress(reinterpret_cast<Bytef*>(text.data()), &size,
                                reinterpret_cast<const Bytef*>(packed.data()), packed.size());
+  if (found == Z_MEM_ERROR) throw std::bad_alloc();  // not a text that is passed over: the image would not be turned
   left -= std::min<std::size_t>(left, size);
   text.resize(found == Z_OK ? size : 0);
   return text;
@@ -211,7 +225,10 @@ const char* damage(Bytes file, Bytes& exif, Texts& texts) {
   return "a truncated one";
 }
 
+Error no_memory(const std::string& where) { return {Code::out_of_memory, where, "", "no memory for the PNG decoder"}; }
+
 Error corrupt(const PngReader& reader, const std::string& where) {
+  if (reader.lacked_memory) return no_memory(where);
   return refused(where, "a whole PNG image", reader.message[0] != 0 ? reader.message : "a damaged one");
 }
 
@@ -226,7 +243,7 @@ Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits
   Texts texts;
   if (const char* found = damage(file, exif, texts)) return refused(where, "a whole PNG image", found);
   PngReader reader(file);
-  if (!open(reader)) return Error{Code::out_of_memory, where, "", "no memory for the PNG decoder"};
+  if (!open(reader)) return no_memory(where);
   if (!guarded_header(reader)) return corrupt(reader, where);
 
   const std::size_t width = png_get_image_width(reader.png, reader.info);
