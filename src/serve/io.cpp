@@ -94,11 +94,11 @@ void Io::answer_without_memory(std::uint64_t connection, std::uint64_t request_i
 }
 
 void Io::handle(Client& client, Job job, const Status& sound) {
-  if (!sound) return refuse(std::move(job), sound.error());
+  if (!sound) return refuse(std::move(job), [&] { return sound.error(); });
   if (job.kind == Kind::act) return queue(std::move(job));
   auto response = answer_now(client, job);
   job.name = client.name;  // a hello tells it
-  if (!response) return refuse(std::move(job), response.error());
+  if (!response) return refuse(std::move(job), [&] { return response.error(); });
   const Clock::time_point at = job.at;
   deliver({std::move(job), response->SerializeAsString(), std::nullopt, at, at, {}});
 }
@@ -125,88 +125,100 @@ Result<v1::Response> Io::answer_now(Client& client, const Job& job) const {
   return response;
 }
 
+/// An act that waits has its answer still to come, so nothing may throw once it is in line.
 void Io::queue(Job job) {
   if (vitals_.stopping)
-    return refuse(std::move(job), {Code::shutting_down, "act", "", "the server drains before it stops"});
+    return refuse(std::move(job), [] {
+      return Error{Code::shutting_down, "act", "", "the server drains before it stops"};
+    });
   if (const auto deadline = job.envelope.deadline_ms) {
     if (*deadline == 0 || *deadline > kMaxDeadlineMs)
-      return refuse(std::move(job), {Code::bad_observation, "deadline_ms", fmt::format("1 to {}", kMaxDeadlineMs),
-                                     std::to_string(*deadline)});
+      return refuse(std::move(job), [&] {
+        return Error{Code::bad_observation, "deadline_ms", fmt::format("1 to {}", kMaxDeadlineMs),
+                     std::to_string(*deadline)};
+      });
     job.deadline = job.at + std::chrono::milliseconds(*deadline);
   }
   deliver_waiting();  // acts that are late must not keep a place from one that can still be answered
   const std::uint64_t request_id = job.request_id;
   Exchange::Jobs::Pushed pushed = exchange_.push(std::move(job));
   if (pushed.superseded)
-    refuse(
-        std::move(*pushed.superseded),
-        {Code::superseded, "act", "", fmt::format("request {} of this client came while this one waited", request_id),
-         "act on the newer one's answer"});
+    refuse(std::move(*pushed.superseded), [&] {
+      return Error{Code::superseded, "act", "",
+                   fmt::format("request {} of this client came while this one waited", request_id),
+                   "act on the newer one's answer"};
+    });
   for (Job& refused : pushed.refused)
-    refuse(std::move(refused), {Code::busy, "act", "room in the queue",
-                                fmt::format("{} acts of other clients that wait", exchange_.n_waiting()),
-                                "ask again later, or less often"});
+    refuse(std::move(refused), [&] {
+      return Error{Code::busy, "act", "room in the queue",
+                   fmt::format("{} acts of other clients that wait", exchange_.n_waiting()),
+                   "ask again later, or less often"};
+    });
 }
 
-void Io::refuse(Job job, const Error& error) {
-  const Clock::time_point at = job.at;
-  refuse(Answer{std::move(job), {}, error, at, at, {}});
+/// Makes the error only where the memory for it may be lacking.
+template <class MakeError>
+void Io::refuse(Job job, MakeError error) noexcept {
+  const std::uint64_t connection = job.connection, request_id = job.request_id;
+  const bool delimiter = job.delimiter;
+  try {
+    Answer answer;
+    answer.error = error();
+    answer.started = answer.finished = job.at;
+    answer.job = std::move(job);
+    settle(std::move(answer));
+  } catch (const std::exception&) {
+    answer_without_memory(connection, request_id, delimiter);
+  }
 }
 
-void Io::refuse(Answer answer) {
-  v1::Response response = response_to(answer.job.request_id);
-  *response.mutable_error() = encode_error(*answer.error);
-  answer.response = response.SerializeAsString();
-  deliver(std::move(answer));
+/// Sends an answer. A client whose answer there is no memory for hears of that.
+void Io::settle(Answer answer) noexcept {
+  const std::uint64_t connection = answer.job.connection, request_id = answer.job.request_id;
+  const bool delimiter = answer.job.delimiter;
+  try {
+    if (answer.error) {
+      v1::Response response = response_to(request_id);
+      *response.mutable_error() = encode_error(*answer.error);
+      answer.response = response.SerializeAsString();
+    }
+    deliver(std::move(answer));
+  } catch (const std::exception&) {
+    answer_without_memory(connection, request_id, delimiter);
+  }
 }
 
 /// A peer that is gone, or that does not read and has its share of answers waiting, loses this one; nothing waits for
-/// it.
+/// it. What can fail comes before it is sent, so that nobody gets two answers.
 void Io::deliver(Answer answer) {
   const Job& job = answer.job;
+  Answered answered{job,
+                    answer.error ? &*answer.error : nullptr,
+                    answer.started,
+                    answer.finished,
+                    {},
+                    std::move(answer.stages),
+                    job.request(),
+                    std::as_bytes(std::span(answer.response)),
+                    answer.is_beyond};
+  hub_.send(job.connection, answer.response, job.delimiter);
   if (answer.error) {
     ++vitals_.n_error;
   } else if (job.kind == Kind::act) {
     ++vitals_.n_chunk;
   }
-  hub_.send(job.connection, answer.response, job.delimiter);
-  if (observers_.empty()) return;
-  const Answered answered{job,
-                          answer.error ? &*answer.error : nullptr,
-                          answer.started,
-                          answer.finished,
-                          Clock::now(),
-                          std::move(answer.stages),
-                          job.request(),
-                          std::as_bytes(std::span(answer.response)),
-                          answer.is_beyond};
+  answered.sent = Clock::now();
   for (Observer* observer : observers_) observer->answered(answered);
 }
 
 void Io::deliver_waiting() {
-  while (std::optional<Answer> answer = exchange_.take_answer()) {
-    const std::uint64_t connection = answer->job.connection, request_id = answer->job.request_id;
-    const bool delimiter = answer->job.delimiter;
-    try {
-      if (answer->error) {
-        refuse(std::move(*answer));
-      } else {
-        deliver(std::move(*answer));
-      }
-    } catch (const std::bad_alloc&) {
-      answer_without_memory(connection, request_id, delimiter);
-    }
-  }
+  while (std::optional<Answer> answer = exchange_.take_answer()) settle(std::move(*answer));
   while (std::optional<Job> job = exchange_.take_late(Clock::now())) {
-    const std::uint64_t connection = job->connection, request_id = job->request_id;
-    const bool delimiter = job->delimiter;
-    try {
-      const Error error{Code::late, "deadline_ms", fmt::format("its turn within {} ms", *job->envelope.deadline_ms),
-                        "later", "ask less often, or allow more time"};
-      refuse(std::move(*job), error);
-    } catch (const std::bad_alloc&) {
-      answer_without_memory(connection, request_id, delimiter);
-    }
+    const std::uint64_t allowed = *job->envelope.deadline_ms;
+    refuse(std::move(*job), [allowed] {
+      return Error{Code::late, "deadline_ms", fmt::format("its turn within {} ms", allowed), "later",
+                   "ask less often, or allow more time"};
+    });
   }
 }
 

@@ -38,8 +38,9 @@ class Io final : public Hub::Handler {
   void handle(Client& client, Job job, const Status& sound);
   Result<v1::Response> answer_now(Client& client, const Job& job) const;
   void queue(Job job);
-  void refuse(Job job, const Error& error);
-  void refuse(Answer answer);
+  template <class MakeError>
+  void refuse(Job job, MakeError error) noexcept;
+  void settle(Answer answer) noexcept;
   void deliver(Answer answer);
   void deliver_waiting();
   void answer_without_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;

@@ -109,9 +109,12 @@ void Recorder::add(std::span<const std::byte> in, std::span<const std::byte> out
   ++n_piece_;
 }
 
-void Recorder::stop(const std::string& why) {
+void Recorder::stop(const char* why) {
   stopped_ = true;
-  if (tell_) tell_(why, n_piece_ == 0 ? 0 : n_piece_ - 1);
+  try {
+    if (tell_) tell_(why, n_piece_ == 0 ? 0 : n_piece_ - 1);
+  } catch (const std::exception&) {  // no memory to tell it
+  }
 }
 
 Error Recording::damaged(const std::string& expected, const std::string& found) const {

@@ -38,7 +38,7 @@ class Recorder final : public Observer {
  private:
   Recorder(std::string path, int fd, std::uint64_t max_bytes);
   void add(std::span<const std::byte> in, std::span<const std::byte> out);
-  void stop(const std::string& why);
+  void stop(const char* why);
 
   const std::string path_;
   const std::uint64_t max_bytes_;
