@@ -23,6 +23,9 @@ constexpr std::string_view kChecksumPrefix = "xxh3:";
 constexpr std::size_t kDigits = 16;
 constexpr std::string_view kEmbodimentsKey = "embodiments", kEmbodimentPrefix = "embodiment.";
 
+constexpr std::size_t kMaxRobots = 64;  // the published checkpoints have room for 32
+constexpr std::size_t kMaxTag = 256;    // bytes; no longer one can be sent in an act
+
 /// XXH3-64 of a file that comes part by part, with the digits at `digits` read as '0'.
 class Checksum {
  public:
@@ -82,12 +85,14 @@ Status check_identity(const Keys& keys) {
 
 Status check_tags(const std::vector<std::string>& tags, const std::string& where) {
   const std::set<std::string> unique(tags.begin(), tags.end());
-  if (tags.size() < 2 || unique.size() != tags.size())
-    return Error{Code::bad_bundle, where, "at least two different tags", fmt::format("{}", fmt::join(tags, ", "))};
+  if (tags.size() < 2 || tags.size() > kMaxRobots)
+    return Error{Code::bad_bundle, where, fmt::format("2 to {} tags", kMaxRobots), std::to_string(tags.size())};
   for (const std::string& tag : tags)
-    if (tag.empty() || tag.find('.') != std::string::npos)
-      return Error{Code::bad_bundle, where, "tags without a dot", "\"" + tag + "\""};
-  return {};
+    if (tag.empty() || tag.size() > kMaxTag || tag.find('.') != std::string::npos)
+      return Error{Code::bad_bundle, where, fmt::format("tags of 1 to {} bytes without a dot", kMaxTag),
+                   "\"" + tag.substr(0, kMaxTag) + "\""};
+  if (unique.size() == tags.size()) return {};
+  return Error{Code::bad_bundle, where, "different tags", fmt::format("{}", fmt::join(tags, ", "))};
 }
 
 /// The tag in a name of the form embodiment.<tag>.<name>, and the name behind it; both empty for other names.

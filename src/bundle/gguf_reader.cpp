@@ -167,12 +167,15 @@ Status check_shown(const Cursor& cursor, const std::string& what, const std::str
                             : cursor.bad(printable(what), "text without control characters", printable(text));
 }
 
-/// Metadata that is displayed: the source, and names of features, numbers and units.
+/// Whether the texts of a key, maybe of one robot of several, are for the machine alone: a vocabulary, or JSON.
+bool is_for_machine(std::string_view key) {
+  if (key.starts_with("embodiment.")) key.remove_prefix(std::min(key.size(), key.find('.', 11) + 1));
+  return key.starts_with("tokenizer.") || key.starts_with("processor.");
+}
+
+/// Everything else may be displayed: the source, tags, and names of features, numbers and units.
 Status check_shown(const Cursor& cursor, const std::string& key, const Value& value) {
-  constexpr std::string_view kShown[] = {"general.", "vla.", "observation.", "action."};
-  if (std::none_of(std::begin(kShown), std::end(kShown),
-                   [&](std::string_view prefix) { return key.starts_with(prefix); }))
-    return {};
+  if (is_for_machine(key)) return {};
   if (const auto* text = std::get_if<std::string>(&value)) return check_shown(cursor, key, *text);
   if (const auto* list = std::get_if<std::vector<std::string>>(&value))
     for (const std::string& text : *list) VLA_CHECK(check_shown(cursor, key, text));

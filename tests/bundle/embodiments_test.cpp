@@ -131,6 +131,33 @@ TEST_CASE("tags are at least two, all different, none empty or with a dot") {
   }
 }
 
+TEST_CASE("tags are few and short: every robot is loaded for itself, and refusals list them") {
+  EditableBundle bundle = two_robots();
+  std::vector<std::string> tags = kTags;
+  for (int i = 0; i < 62; ++i) tags.push_back("robot " + std::to_string(i));
+  bundle.set("embodiments", Value(tags));
+  CHECK(parse(bundle.bytes()).ok());
+  tags.push_back("one more");
+  bundle.set("embodiments", Value(tags));
+  CHECK(contains(refusal(bundle), "embodiments: expected 2 to 64 tags, found 65"));
+  tags = kTags;
+  tags.emplace_back(257, 'x');
+  bundle.set("embodiments", Value(tags));
+  CHECK(contains(refusal(bundle), "embodiments: expected tags of 1 to 256 bytes"));
+}
+
+TEST_CASE("tags, and names that are one robot's own, have no control characters") {
+  EditableBundle tag = two_robots();
+  tag.set("embodiments", Value(std::vector<std::string>{"arm", "humanoid", "\x1b[2J"}));
+  CHECK(contains(refusal(tag), "embodiments: expected text without control characters"));
+  EditableBundle name = two_robots();
+  name.set("embodiment.arm.action.names", Value(std::vector<std::string>{"x\nready address=y"}));
+  CHECK(contains(refusal(name), "embodiment.arm.action.names: expected text without control characters"));
+  EditableBundle prompt = two_robots();
+  prompt.set("embodiment.arm.processor.recipe", Value(std::string("{\n}")));
+  CHECK(parse(prompt.bytes()).ok());
+}
+
 TEST_CASE("a parameter that robots share is declared once, and one of their own for each") {
   const std::string bytes = two_robots().bytes();
   auto arm = parse(bytes), humanoid = parse(bytes);
