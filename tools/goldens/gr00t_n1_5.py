@@ -142,7 +142,7 @@ FRAMES = gr00t.FRAMES
 
 
 def published(views, arch="gr00t_n1_5"):
-    """The published size: 2.7 G parameters."""
+    """The published size: 2.4 G parameters."""
     height, width = next(iter(views.values()))
     return gr00t.published(
         Checkpoint, views, "my_arm", INDEX, vision(1152, 27, 16, 4304, 224), text(2048, 28, 16, 8, 128, 6144) | {"vocab_size": 151680},

@@ -154,7 +154,7 @@ FRAMES = gr00t.FRAMES
 
 
 def published(views, arch="gr00t_n1_6"):
-    """The published size: 3.1 G parameters."""
+    """The published size: 3.0 G parameters."""
     return gr00t.published(
         Checkpoint, views, "libero_panda", 2, vision(1152, 27, 16, 4304, 16, 14), text(2048, 28, 16, 8, 128, 6144) | {"vocab_size": 151680},
         head(16, (32, 32, 48), None, 1024, 128, 128, 50), {"shortest_image_edge": 256, "crop_fraction": 0.95})
