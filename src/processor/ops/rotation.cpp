@@ -96,8 +96,7 @@ void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out
   out[2] = outer_angle(last, middle, {m[3 * first], m[3 * first + 1], m[3 * first + 2]}, true);
 }
 
-// --- the ops "rotation"
-// -----------------------------------------------------------------------------------------------
+// --- the ops "rotation" ---------------------------------------------------------------------------------------------
 
 /// What a state feature is, and the first two rows of its matrix in its place.
 struct RotationStateOp final : StateOp {
