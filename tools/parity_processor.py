@@ -7,10 +7,12 @@
 A seed draws a robot: its keys, how each is normalized, statistics (some of numbers that never or hardly moved, some with a row for each
 action), relative joints and poses, a camera of odd size.  Its checkpoint has a tiny random network; what the network answers is decoded by
 both sides.  States lie far beyond their ranges.  DIR holds the authors' code (Isaac-GR00T, of the release's time): numbers come from its
-StateActionProcessor, for N1.5 from its Normalizer; images from LeRobot's copy of the transform, for N1.5 from torchvision.
+StateActionProcessor, for N1.5 from its Normalizer and its RotationTransform, which wants pytorch3d (0.7.6) on the path; images from
+LeRobot's copy of the transform, for N1.5 from torchvision.
 
 Ends with exit code 1 if a pixel differs, or a number by more than one unit in the last place; a number of a composed pose by more than one
-of the largest number of its position or rotation.
+of the largest number of its position or rotation; a matrix of a converted rotation by more than 2e-6, since torch's sines of angles of
+several turns are that rough.
 """
 import argparse
 import ast
@@ -30,6 +32,9 @@ from parity_full import ROOT
 
 SIDE = 16
 N1_5_MODES = ("min_max", "q99", "mean_std", "binary", None)
+EULER = tuple("euler_angles_" + order for order in ("rpy", "ryp", "pry", "pyr", "yrp", "ypr"))
+ROTATIONS = {("state", 3): ("rotation_6d", ("axis_angle", *EULER)), ("state", 4): ("rotation_6d", ("quaternion",)), ("action", 3): ("axis_angle", EULER)}
+BOUNDS = {"rotation_6d": 6 * [1.0], "axis_angle": 3 * [np.pi]}  # by which the authors normalize a rotation that they convert
 
 
 # --- a random robot --------------------------------------------------------------------------------------------------
@@ -37,7 +42,7 @@ N1_5_MODES = ("min_max", "q99", "mean_std", "binary", None)
 
 def draw_robot(r, arch):
     """Keys of random widths; with N1.6 and N1.7 some of the actions relative to a state of the same width."""
-    states = {f"s{i}": r.choice((1, 1, 2, 3, 9, 9)) for i in range(r.randint(1, 5))}
+    states = {f"s{i}": r.choice((1, 2, 3, 3, 4, 9) if arch == "gr00t_n1_5" else (1, 1, 2, 3, 9, 9)) for i in range(r.randint(1, 5))}
     actions = {f"a{i}": r.choice((1, 2, 3)) for i in range(r.randint(0, 3))}
     relative, poses, rows = {}, {}, r.randint(2, 5)
     if arch != "gr00t_n1_5":
@@ -97,6 +102,8 @@ def disturb(checkpoint, arch, r):
                         table[high][i] = table[low][i] + (0 if kind < 0.1 else 3e-6 * abs(table[low][i]))
                 if kind < 0.1:
                     table["std"][i] = 0.0
+    if arch == "gr00t_n1_5":
+        turn(checkpoint, stated["robot"], r)
     file.write_text(json.dumps(stated))
     if arch != "gr00t_n1_5":
         file = checkpoint / "processor_config.json"
@@ -105,11 +112,29 @@ def disturb(checkpoint, arch, r):
         file.write_text(json.dumps(config))
 
 
+def turn(checkpoint, robot, r):
+    """Some keys of N1.5 are rotations that the network has in another representation."""
+    file = checkpoint / "data_config.json"
+    data = json.loads(file.read_text()) | {"rotations": {}}
+    if r.random() < 0.3:
+        return
+    data["state"] = {key: None if mode == "sin_cos" else mode for key, mode in data["state"].items()}  # which does not go beside rotations
+    for part in ("state", "action"):
+        for key in data[part]:
+            target, sources = ROTATIONS.get((part, len(robot["statistics"][part][key]["min"])), (None, None))
+            if target and r.random() < 0.8:
+                data["rotations"][f"{part}.{key}"], data[part][key] = target, r.choice((None, "min_max"))
+                robot["modalities"][part][key] = {"rotation_type": r.choice(sources), "absolute": True, "continuous": True}
+    file.write_text(json.dumps(data))
+
+
 # --- the authors' processors -----------------------------------------------------------------------------------------
 
 
 class Isaac:
     """StateActionProcessor of N1.6 and N1.7, on one robot of a checkpoint."""
+
+    turned = {"state": {}, "action": {}}  # what rotations are converted
 
     def __init__(self, code, checkpoint):
         sys.path.insert(0, str(code))
@@ -138,20 +163,30 @@ class Isaac:
 
 
 class IsaacN15:
-    """Normalizer of N1.5, key by key, in torch's float32."""
+    """Normalizer and RotationTransform of N1.5, key by key, in torch's float32."""
 
     def __init__(self, code, checkpoint):
+        import functools
         import torch
+        from pytorch3d import transforms
 
         source = ast.parse((code / "gr00t/data/transform/state_action.py").read_text())
-        only = [node for node in source.body if isinstance(node, ast.ClassDef) and node.name == "Normalizer"]
-        names = {"torch": torch}
-        exec(compile(ast.Module(only, []), "Normalizer", "exec"), names)
-        statistics = json.loads((checkpoint / "experiment_cfg/metadata.json").read_text())["robot"]["statistics"]
+        only = [node for node in source.body if isinstance(node, ast.ClassDef) and node.name in ("Normalizer", "RotationTransform")]
+        names = {"torch": torch, "pt": transforms, "functools": functools}
+        exec(compile(ast.Module(only, []), "state_action.py", "exec"), names)
+        robot = json.loads((checkpoint / "experiment_cfg/metadata.json").read_text())["robot"]
+        statistics = robot["statistics"]
         self.modes = json.loads((checkpoint / "data_config.json").read_text())
         self.widths = {part: {k: len(statistics[part][k]["min"]) for k in self.modes[part]} for part in ("state", "action")}
         self.torch, self.by_key = torch, {(part, k): names["Normalizer"](mode, dict(statistics[part][k]))
                                           for part in ("state", "action") for k, mode in self.modes[part].items() if mode not in (None, "sin_cos")}
+        self.turned = {"state": {}, "action": {}}
+        for name, target in self.modes.get("rotations", {}).items():
+            part, key = name.split(".")
+            self.turned[part][key] = names["RotationTransform"](robot["modalities"][part][key]["rotation_type"], target)
+            if (part, key) in self.by_key:
+                bounds = {"min": [-x for x in BOUNDS[target]], "max": list(BOUNDS[target])}
+                self.by_key[part, key] = names["Normalizer"]("min_max", bounds)
 
     def state(self, state):
         out = []
@@ -159,13 +194,18 @@ class IsaacN15:
             x = self.torch.from_numpy(x)
             if self.modes["state"][key] == "sin_cos":
                 x = self.torch.cat([x.sin(), x.cos()])
+            if key in self.turned["state"]:
+                x = self.turned["state"][key].forward(x[None])[0]
             out.append(self.by_key["state", key].forward(x) if ("state", key) in self.by_key else x)
         return self.torch.cat(out).numpy()
 
     def actions(self, chunk, _):
         parts = np.split(chunk, np.cumsum(list(self.widths["action"].values())), axis=1)
-        return np.concatenate([self.by_key["action", k].inverse(self.torch.from_numpy(x)).numpy() if ("action", k) in self.by_key else x
-                               for k, x in zip(self.widths["action"], parts)], -1)
+        out = []
+        for key, x in zip(self.widths["action"], map(self.torch.from_numpy, parts)):
+            x = self.by_key["action", key].inverse(x) if ("action", key) in self.by_key else x
+            out.append(self.turned["action"][key].inverse(x) if key in self.turned["action"] else x)
+        return self.torch.cat(out, -1).numpy()
 
 
 def reference_pixels(arch, folder, frame):
@@ -215,15 +255,26 @@ def off_by_of_pose(ours, theirs):
                ((ours[:, :3], theirs[:, :3]), (ours[:, 3:], theirs[:, 3:])))
 
 
+def off_by_of_angles(ours, theirs):
+    """Of Euler angles how far their rotations are apart, in units of 2e-6: where the middle angle is a right one the others mean little."""
+    turns = np.abs((ours.astype(np.float64) - theirs + np.pi) % (2 * np.pi) - np.pi)
+    return float((turns * np.abs(np.cos(theirs[:, 1:2]))).max() / 2e-6)
+
+
 def compare(isaac, case, state, taps):
     """{what: its distance} of one observation."""
     expected, chunk = isaac.state(state), taps["chunk"].reshape(case.checkpoint.robot.rows, -1)
     actions, ours = isaac.actions(chunk, state), taps["actions"].reshape(chunk.shape)
-    found, start = {"states": off_by(taps["state"].ravel()[: expected.size], expected), "actions": 0.0, "poses": 0.0}, 0
+    found, start, got = {"states": 0.0, "actions": 0.0, "poses": 0.0, "rotations": 0.0}, 0, taps["state"].ravel()[: expected.size]
+    turned = np.concatenate([np.full(6 if k in isaac.turned["state"] else n, k in isaac.turned["state"]) for k, n in isaac.widths["state"].items()])
+    if turned.any():
+        found["rotations"] = float(np.abs(got - expected)[turned].max() / 2e-6)
+        got, expected = got[~turned], expected[~turned]
+    found["states"] = off_by(got, expected)
     for key, width in case.checkpoint.robot.actions.items():
         part = ours[:, start : start + width], actions[:, start : start + width]
-        kind = "poses" if key in case.checkpoint.robot.poses else "actions"
-        found[kind] = max(found[kind], (off_by_of_pose if kind == "poses" else off_by)(*part))
+        kind = "poses" if key in case.checkpoint.robot.poses else "rotations" if key in isaac.turned["action"] else "actions"
+        found[kind] = max(found[kind], {"poses": off_by_of_pose, "rotations": off_by_of_angles, "actions": off_by}[kind](*part))
         start += width
     return found
 
@@ -270,7 +321,7 @@ def main():
         every += found
     wrong = sum(max(one.values()) > 1 or one["pixels"] > 0 for one in every)
     same = sum(max(one.values()) == 0 for one in every)
-    print(f"{len(every)} observations: {same} equal to the bit, {len(every) - same - wrong} within one unit in the last place, {wrong} beyond")
+    print(f"{len(every)} observations: {same} equal to the bit, {len(every) - same - wrong} within the bounds above, {wrong} beyond")
     sys.exit(1 if wrong else 0)
 
 
