@@ -2,8 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // One binary, one file per subcommand. This file parses, prints errors and chooses the exit code.
+#include <fcntl.h>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -55,6 +57,13 @@ int finish() {
   return fail({vla::Code::io, "standard output", "a place that can be written", std::strerror(errno)});
 }
 
+/// A stream that the caller has closed stays unusable: the next file that is opened, maybe a recording, would take its
+/// place and get what is printed.
+void keep_standard_streams() {
+  for (const int stream : {STDIN_FILENO, STDOUT_FILENO, STDERR_FILENO})
+    if (::fcntl(stream, F_GETFD) < 0) ::open("/dev/null", stream == STDIN_FILENO ? O_WRONLY : O_RDONLY);
+}
+
 int run(int argc, char** argv) {
   CLI::App app("vla: Vision-Language-Action policies, from camera frames and a sentence to robot actions.", "vla");
   app.footer(kFooter);
@@ -89,13 +98,14 @@ int run(int argc, char** argv) {
 }  // namespace
 
 int main(int argc, char** argv) {
+  keep_standard_streams();
   std::signal(SIGXFSZ, SIG_IGN);  // a file over the user's limit is an error like a full disk
   try {                           // what libraries may throw ends here
     return run(argc, argv);
   } catch (const std::bad_alloc&) {
     return fail(
         {vla::Code::out_of_memory, "vla", "", "the system has no memory left", "use a smaller model or free memory"});
-  } catch (const std::system_error& exception) {  // fmt throws it where printing fails
+  } catch (const std::system_error& exception) {
     if (std::ferror(stdout) == 0) return fail({vla::Code::internal, "vla", "", exception.what(), "please report this"});
     return fail({vla::Code::io, "standard output", "a place that can be written", exception.what()});
   } catch (const std::exception& exception) {

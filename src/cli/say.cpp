@@ -2,7 +2,15 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "cli/say.h"
 
+#include <cerrno>
+#include <system_error>
+
 namespace vla::cli {
+
+void put(std::FILE* to, std::string_view text) {
+  if (std::fwrite(text.data(), 1, text.size(), to) == text.size() || to == stderr) return;
+  throw std::system_error(errno, std::generic_category());
+}
 
 void say_lines(std::FILE* to, std::string_view text) {
   std::string out;
@@ -11,7 +19,7 @@ void say_lines(std::FILE* to, std::string_view text) {
     out += printable(text.substr(0, end));
     if (end < text.size()) out += '\n';
   }
-  fmt::print(to, "{}", out);
+  put(to, out);
 }
 
 }  // namespace vla::cli

@@ -23,11 +23,15 @@ decltype(auto) shown(const T& value) {
   }
 }
 
+/// Writes text as it is. Throws std::system_error where standard output cannot be written. Where standard error cannot,
+/// nobody is there to be told, and the exit code says what happened.
+void put(std::FILE* to, std::string_view text);
+
 /// The way to standard output and standard error. Line ends of the format are kept, those in arguments are not.
 template <class... Args>
 void say(std::FILE* to, fmt::format_string<decltype(shown(std::declval<const Args&>()))...> format,
          const Args&... args) {
-  fmt::print(to, format, shown(args)...);
+  put(to, fmt::format(format, shown(args)...));
 }
 
 /// The same for a text of several lines that was put together here.

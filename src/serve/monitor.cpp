@@ -174,7 +174,12 @@ Monitor::~Monitor() = default;
 const std::string& Monitor::address() const { return http_->address(); }
 
 Result<std::unique_ptr<Monitor>> Monitor::open(const std::string& address, bool insecure, Sources sources) {
-  auto http = std::make_unique<Http>(std::move(sources));
+  std::unique_ptr<Http> http;
+  try {
+    http = std::make_unique<Http>(std::move(sources));
+  } catch (const boost::system::system_error& error) {
+    return Error{Code::io, "--metrics", "what sockets need of the system", error.code().message()};
+  }
   VLA_CHECK(http->start(address, insecure));
   return std::unique_ptr<Monitor>(new Monitor(std::move(http)));
 }

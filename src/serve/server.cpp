@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <exception>
 #include <new>
+#include <stdexcept>
 
 #include "base/thread.h"
 #include "serve/codec.h"
@@ -66,7 +67,11 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) {
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
   VLA_CHECK(server->guard());
   const Hub::Limits limits{options.max_message, options.max_connections, kReceiptMessages * options.max_message};
-  server->hub_ = std::make_unique<Hub>(limits, server->keys_ ? &*server->keys_ : nullptr);
+  try {
+    server->hub_ = std::make_unique<Hub>(limits, server->keys_ ? &*server->keys_ : nullptr);
+  } catch (const std::runtime_error& no_descriptor) {  // of Asio
+    return Error{Code::io, "sockets", "what they need of the system", no_descriptor.what()};
+  }
   VLA_CHECK(server->bind());
   return server;
 }

@@ -148,3 +148,48 @@ def test_a_second_signal_ends_a_server_at_once_though_it_is_another_one(vla, gol
     finally:
         server.process.kill()
         server.process.communicate()
+
+
+@pytest.mark.parametrize("what", ["note", "error", "usage"])
+def test_a_standard_error_that_cannot_be_written_changes_no_exit_code(vla, golden, what):
+    arguments = {"note": list(map(str, golden.arguments())), "error": ["inspect", "/nowhere"], "usage": ["inspect"]}[what]
+    if what == "note":
+        at = arguments.index("--noise")
+        del arguments[at : at + 2]  # a seed is drawn, and told
+    call = dict(args=[vla.path, *arguments], env=vla.environment, stdout=subprocess.DEVNULL, timeout=60)
+    expected = {"note": 0, "error": 9, "usage": 2}[what]
+    with open("/dev/full", "w") as full:
+        assert subprocess.run(stderr=full, **call).returncode == expected
+    assert subprocess.run(preexec_fn=lambda: os.close(2), **call).returncode == expected
+
+
+def test_no_file_takes_the_place_of_a_closed_stream(vla, golden, tmp_path):
+    """A server without standard output and standard error, that records: what it prints must not end up in its files."""
+    address = f"ipc://{tmp_path}/socket"
+    options = ["--bind", address, "--threads", "1", "--record", tmp_path / "recording", "--trace", tmp_path / "trace.json"]
+    process = subprocess.Popen(
+        [vla.path, "serve", *map(str, [golden.bundle, *options]), "--log", "json", "--log-level", "debug"],
+        env=vla.environment, preexec_fn=lambda: [os.close(stream) for stream in (0, 1, 2)],
+    )  # fmt: skip
+    try:
+        peer = wire.Peer(address)
+        assert wire.kind(peer.ask(wire.act(1, golden, seed=1))) == "chunk"
+        peer.close()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 9  # the ready line could not be written
+    finally:
+        process.kill()
+    json.loads((tmp_path / "trace.json").read_text())
+    assert vla("replay", tmp_path / "recording", "--bundle", golden.bundle, "--threads", "1").code == 0
+
+
+@pytest.mark.skipif("asan" in os.environ.get("VLA_BINARY", ""), reason="the sanitizer looks at memory through descriptors of its own")
+def test_sockets_that_the_system_does_not_give_are_an_error(vla, golden):
+    """For each number of file descriptors, up to the one that suffices."""
+    for n in range(8, 3, -1):
+        answer = subprocess.run(
+            [vla.path, "serve", str(golden.bundle), *LOCAL, "--metrics", "127.0.0.1:0"],
+            env=vla.environment, capture_output=True, text=True, timeout=60,
+            preexec_fn=lambda n=n: resource.setrlimit(resource.RLIMIT_NOFILE, (n, n)),
+        )  # fmt: skip
+        assert answer.returncode == 9 and answer.stderr.startswith("error: io: "), (n, answer)
