@@ -20,7 +20,8 @@ enum GgufType : std::uint32_t { u8, i8, u16, i16, u32, i32, f32, boolean, string
 
 constexpr std::uint64_t kMaxDims = 4;
 constexpr std::uint64_t kMaxNameLength =
-    65535;  // of keys and tensor names, as the format's own description limits them
+    65535;                               // of keys and tensor names, as the format's own description limits them
+constexpr std::size_t kMaxShown = 4096;  // bytes of a text that is shown; a path may have as many
 
 using Show = std::function<Status(std::size_t n)>;
 
@@ -161,8 +162,11 @@ Result<Value> read_value(Cursor& cursor, const std::string& what) {
   return cursor.bad(what, "a GGUF value type from 0 to 12", std::to_string(type));
 }
 
-/// Names are displayed and sent to clients: they must not control a terminal or start a new line.
+/// Names are displayed and sent to clients: they must not control a terminal, start a new line, or fill a log.
 Status check_shown(const Cursor& cursor, const std::string& what, const std::string& text) {
+  if (text.size() > kMaxShown)
+    return cursor.bad(printable(what.substr(0, kMaxShown)), fmt::format("text of at most {} bytes", kMaxShown),
+                      fmt::format("{} bytes", text.size()));
   return is_printable(text) ? Status()
                             : cursor.bad(printable(what), "text without control characters", printable(text));
 }

@@ -290,3 +290,12 @@ TEST_CASE("a bundle that is opened takes the memory of its keys, not of its tens
   REQUIRE_MESSAGE(bundle.ok(), (bundle ? "" : bundle.error().message()));
   CHECK(resident() < before + (8 << 20) / 4096);
 }
+
+TEST_CASE("a text that is shown is at most 4096 bytes long, and a vocabulary as long as it is") {
+  EditableBundle bundle = small_bundle();
+  bundle.set("action.names", Value(std::vector<std::string>{std::string(4097, 'x')}));
+  CHECK(contains(refusal(bundle.bytes()), "action.names: expected text of at most 4096 bytes, found 4097 bytes"));
+  bundle.set("action.names", Value(std::vector<std::string>{std::string(4096, 'x')}));
+  bundle.set("tokenizer.pre", Value(std::string(5000, 'x')));
+  CHECK(parse(bundle.bytes()).ok());
+}
