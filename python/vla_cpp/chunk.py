@@ -17,13 +17,12 @@ class Chunk:
     """Actions for the next `horizon` control steps; `np.asarray(chunk)` is float32 (horizon, d_action) in world units.
 
     names            one per column
-    normalized       the same as the network answered, before statistics made units of it: for a Leftover; None where the policy takes
-                     none
+    normalized       the network's output before unnormalization, for a Leftover; None where the policy takes none
     rate_hz          rows per second that the policy was trained for; 0 where the bundle does not say
     timing           milliseconds per stage, in the order in which they ran
     queue_ms         milliseconds that the request waited at a server; 0 in process
-    seed             what the noise was drawn from; None where the noise was given
-    notes            what the user must be told, e.g. that the instruction was cut
+    seed             of the noise; None where the noise was given
+    notes            warnings, e.g. that the instruction was truncated
     capture_time_ns  as given with the observation; None where it was not
     """
 

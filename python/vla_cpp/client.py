@@ -34,7 +34,7 @@ class Client(Handle):
     server_key          for a server with CURVE: its public key, and with it
     secret_key          this client's secret key: 40 characters each, or the files of `vla keygen` (server.public, robot.secret)
 
-    The first call connects. When the server goes away, or does not answer in time, the call raises and the next one connects anew,
+    The first call connects. When the server goes away, or does not answer in time, the call raises and the next one reconnects,
     so that a program survives a restart of its server; a server that comes back with other weights is refused with Incompatible.
 
     Threads may share a client; their calls take turns. But a server keeps only the newest waiting observation of each client, so
@@ -206,7 +206,7 @@ class Client(Handle):
                 hint = "is the server up, and its address right? `health()` tells; or give more time"
                 pending._error = Timeout(self.address, f"an answer within {pending._timeout:g} s", "none", hint)
                 del self._pending[pending._id]
-                if not self._pending:  # a fresh socket for what comes next: this one may lead to a host that is gone
+                if not self._pending:  # a new socket for the next request: the host of this one may be down
                     self._drop(pending._error)
             return pending._is_over
 

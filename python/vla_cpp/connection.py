@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""One connection to a server: a DEALER socket, and a monitor that tells when the other side is gone.
+"""One connection to a server: a DEALER socket, and a monitor that reports when the server disconnects.
 
 A connection is never repaired. After a loss or a timeout it is closed and a fresh one made, so that nothing that was meant for an
 earlier request can come out of it.
@@ -67,7 +67,7 @@ class Connection:
             raise UsageError(address, "an address like tcp://127.0.0.1:5555", str(error)) from None
 
     def send(self, data: bytes) -> None:
-        """Never waits: what has no connection yet lies in the socket's queue. Errors: Disconnected for a full queue."""
+        """Never waits: without a connection yet, the socket queues the message. Errors: Disconnected for a full queue."""
         try:
             self._socket.send(data, zmq.DONTWAIT, copy=False)
         except zmq.Again:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a caller may give as an observation, brought into one form or refused by name."""
+"""What a caller may give as an observation: checked, and converted to one form."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ MAX_SEED = 2**64 - 1
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """Real-time chunking: what the robot has not executed yet of the chunk before, from which the next chunk goes on.
+    """Real-time chunking: the rows of the previous chunk that are not executed yet, which the next chunk continues.
 
     rows          the last rows of its `normalized`
-    delay         how many of them will have been executed when the next chunk is there
+    delay         how many of them will be executed when the next chunk arrives
     schedule      of a guided policy (`Spec.real_time_chunking`), and only there: how the weight of the rows after the delay falls,
                   "zeros", "ones", "linear" or "exp"
     max_guidance  the same: the largest weight of the guidance

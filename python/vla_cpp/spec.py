@@ -49,7 +49,7 @@ class BundleInfo:
 
 @dataclass(frozen=True)
 class Spec:
-    """A policy from outside: what `act` takes and what it returns.
+    """What `act` takes and what it returns.
 
     min_views     how many views must be present at least
     action_units  one text per action, empty where the bundle does not say

@@ -252,7 +252,7 @@ Result<std::string> Engine::program_text(Part part) {
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
                                 const std::optional<Leftover>& leftover) noexcept {
-  // Containers throw where there is no memory: the act is given up, and the next one starts afresh.
+  // Containers throw where there is no memory: the act fails, and the next one starts from scratch.
   try {
     VLA_TRY(const Engine* chosen, robot(observation.embodiment));
     for (const auto& other : others_)

@@ -29,13 +29,13 @@ struct EngineOptions {
   bool all_robots = false;      // without a tag: every robot of a bundle of several
 };
 
-/// What a policy answers to one observation.
+/// The answer to one observation.
 struct ActionChunk {
   int horizon = 0;  // rows
   int d_action = 0;
   std::vector<float> actions;      // (horizon, d_action) in the robot's own units
-  std::vector<float> normalized;   // the same as the network answered: what a Leftover takes
-  std::vector<std::string> notes;  // what the user must know about this answer
+  std::vector<float> normalized;   // before unnormalization: what a Leftover takes
+  std::vector<std::string> notes;  // warnings about this answer
   bool is_beyond = false;          // one of them: the state is beyond the bundle's bound
   Timing timing;
   std::vector<Tap> taps;
@@ -68,8 +68,8 @@ class Engine {
   /// The robot that answers to this tag; an empty one where there is one robot. Errors: bad_observation, with the tags
   /// that there are.
   Result<const Engine*> robot(const std::string& tag) const;
-  /// The robot that the observation names answers. `leftover`: what the robot has not executed yet of the chunk before,
-  /// where the next one is to go on from it. Errors: bad_observation, bad_action (a number that is not finite came
+  /// Computes the chunk of the robot that the observation names. `leftover`: rows of the previous chunk that are not
+  /// executed yet, which the new chunk continues. Errors: bad_observation, bad_action (a number that is not finite came
   /// out), unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;

@@ -19,7 +19,7 @@ class Injection {
   /// For the graphs of a plan, while they are recorded. Values of a step are given for every step.
   Injector of_prefix();
   Injector of_step(int n_step);
-  /// When both are recorded. Errors: bad_observation, naming what was given in vain, or in the wrong shape.
+  /// When both are recorded. Errors: bad_observation, naming what has no place or a wrong shape.
   Status check() const;
   /// When slots have memory: the values of the prefix and of step k.
   void set(Device& device, int k) const;

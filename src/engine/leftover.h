@@ -11,11 +11,11 @@
 
 namespace vla {
 
-/// Real-time chunking: the rows of the previous chunk that the robot has not executed when it looks again. The next
-/// chunk goes on from them.
+/// Real-time chunking: the rows of the previous chunk that are not executed at the time of the observation. The next
+/// chunk continues them.
 struct Leftover {
   std::vector<float> rows;  // the last rows of ActionChunk::normalized, in its columns
-  int delay = 0;            // how many of them the robot will have executed when the next chunk is there
+  int delay = 0;            // how many of them will be executed when the next chunk arrives
   /// For a guided policy alone, and then required: how the weight of a row falls from `delay` on (zeros, ones, linear
   /// or exp), and the largest weight of the guidance.
   std::string schedule;
@@ -39,8 +39,8 @@ struct ChunkShape {
   int n_row, d_normalized;  // of ActionChunk::normalized
 };
 
-/// `start`: the solver's noise. A guided policy is drawn towards the rows in every step; an inpainted one starts from
-/// them, keeps the first `delay` and moves the others less the nearer they are. Source: lerobot
+/// `start`: the solver's noise. A guided policy is pulled towards the rows in every step; an inpainted one starts from
+/// them, keeps the first `delay`, and changes a later row more the further it is from those. Source: lerobot
 /// policies/rtc/modeling_rtc.py RTCProcessor.denoise_step, get_prefix_weights, whose velocity is computed before its
 /// gradients are asked for, so that the correction is the weighted error itself; policies/groot/groot_n1_7.py
 /// get_action_with_features. Errors: unsupported (the policy does not do it), bad_observation.

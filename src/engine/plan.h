@@ -79,7 +79,7 @@ class Plan {
   std::unique_ptr<Program> prefix_, step_;
 };
 
-/// A robot's plans that exist, as many as memory allows it and the other robots of an engine together.
+/// A robot's cached plans, within the memory limit that all robots of an engine share.
 class Plans {
  public:
   using All = std::shared_ptr<std::vector<Plans*>>;

@@ -18,7 +18,7 @@ using TokenIds = std::unordered_map<std::string_view, std::int32_t>;
 /// Errors: bad_bundle for an empty text or one that two ids share.
 Result<TokenIds> index_tokens(const std::vector<std::string>& tokens);
 
-/// The merges of a byte-pair encoding, whatever its alphabet.
+/// The merges of a byte-pair encoding of any alphabet.
 /// Source: tokenizers models/bpe/model.rs and word.rs (merge_all).
 class Merges {
  public:

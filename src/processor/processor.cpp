@@ -127,7 +127,7 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   return view_tokens_.empty() ? Status() : check_view_places(inputs.tokens);
 }
 
-/// The network puts images where the bundle says that their places are, whatever the prompt says.
+/// The network puts images at the places that the bundle states: the prompt must have its image tokens there.
 Status Processor::check_view_places(std::span<const std::int32_t> tokens) const {
   const std::size_t n = view_tokens_.size(), n_rest = tokens.size() - std::min(n, tokens.size());
   const auto placed = views_behind_ ? tokens.subspan(n_rest) : tokens.first(tokens.size() - n_rest);
@@ -176,7 +176,7 @@ std::string Processor::state_place(std::size_t i) const {
   return fmt::format("{}[{}] (\"{}\")", states_.names()[feature], i - first, state_names_[i]);
 }
 
-/// Tells the user, or refuses, where normalized numbers of the state are far from everything that the policy has seen.
+/// Adds a note, or refuses, where normalized state values are far outside the training range.
 Status Processor::check_bound(const StateOp& op, Inputs& inputs) const {
   std::vector<std::size_t> beyond;
   for (std::size_t i = 0; i < inputs.state.size(); ++i)

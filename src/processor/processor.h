@@ -38,45 +38,45 @@ struct Inputs {
   std::vector<int> discretized_state;  // where the prompt has a place for it
   std::vector<float> raw_state;        // before its normalization, which actions may be relative to
   bool is_beyond = false;              // the state has a number beyond the bundle's bound, as a note says
-  std::vector<std::string> notes;      // what the user must know, e.g. that the instruction was cut
+  std::vector<std::string> notes;      // warnings, e.g. that the instruction was truncated
 };
 
-/// How large a normalized number of the state may be before the user is told, where the bundle says nothing else: ten
-/// standard deviations, or five times the range of what the policy has seen. Degrees instead of radians are beyond.
+/// The default bound of a normalized state value, beyond which an answer has a note: ten standard deviations, or five
+/// times the range of the training data. Degrees in place of radians exceed it.
 inline constexpr double kStateBound = 10.0;
 
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
  public:
   /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state`,
-  /// `policy.d_action`, where the text has places for views where they are, and where rows are cut off
-  /// `policy.horizon`, and checks that they fit each other. The bundle may go afterwards. Errors: bad_bundle.
-  /// `tokenizer`: that of a processor with the same `tokenizer.*` and `lm.n_vocab`, instead of one more.
+  /// `policy.d_action`, `policy.view_starts*` if the text has places for views, `policy.horizon` if the recipe drops
+  /// rows, and checks that they fit each other. The bundle may be closed afterwards. Errors: bad_bundle.
+  /// `tokenizer`: shared with a processor of the same `tokenizer.*` and `lm.n_vocab`; null makes one.
   static Result<Processor> create(const Bundle& bundle, std::shared_ptr<const Tokenizer> tokenizer = nullptr);
 
-  /// From now on a state beyond its bound is refused. Without it the state is taken and a note says so.
+  /// From now on a state beyond its bound is refused instead of answered with a note.
   void refuse_beyond() { refuses_beyond_ = true; }
 
   /// All three parts below. Errors: bad_observation.
   Result<Inputs> encode(const Observation& observation) const;
 
-  /// Each fills its own fields of `inputs`; they are apart so that they can be timed apart. A prompt may hold the
-  /// state: `encode_text` comes after `encode_state`.
+  /// Each fills its own fields of `inputs`, and is timed on its own. A prompt may contain the state, so `encode_text`
+  /// comes after `encode_state`.
   Status encode_images(const Observation& observation, Inputs& inputs) const;
   Status encode_text(const Observation& observation, Inputs& inputs) const;
   Status encode_state(const Observation& observation, Inputs& inputs) const;
 
-  /// Pixels (3, height, width) of a black frame, which some references put in the place of an absent view.
+  /// Pixels (3, height, width) of a black frame, which some references substitute for an absent view.
   std::vector<float> absent_view() const;
 
   /// How many rows of a chunk of `horizon` rows are actions: all of them, or the first that the recipe keeps.
   int n_row(int horizon) const { return n_row_ > 0 ? n_row_ : horizon; }
 
-  /// Whether an action is the network's answer added to the state that it was asked with.
+  /// Whether actions are relative to the state of the observation.
   bool relative_actions() const { return relative_actions_; }
 
-  /// chunk (horizon, d_action), in the network's units -> (n_row(horizon), action_names().size()) in world units.
-  /// `raw_state` is that of the observation which the chunk answers. Errors: bad_action for a number that is not
+  /// chunk (horizon, d_action), normalized -> (n_row(horizon), action_names().size()) in world units.
+  /// `raw_state` is that of the chunk's observation. Errors: bad_action for a number that is not
   /// finite, naming its row and column.
   Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action,
                                     std::span<const float> raw_state) const;
@@ -93,7 +93,7 @@ class Processor {
   int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
   const std::shared_ptr<const Tokenizer>& tokenizer() const { return tokenizer_; }
-  /// Features that pass unnormalized because --identity-stats allowed it. Every answer has to say so.
+  /// Features that --identity-stats left unnormalized, which every answer reports.
   const std::vector<std::string>& degraded() const { return degraded_; }
 
  private:

@@ -100,7 +100,7 @@ Status Processor::read_features(const Bundle& bundle) {
   return {};
 }
 
-/// Names, units and the rate change no number, but a reader of the answer relies on them.
+/// Names, units and the rate change no number, but clients rely on them.
 Status Processor::check_descriptions(const Keys& keys) const {
   VLA_TRY(const auto action_units, keys.strings("action.units"));
   VLA_TRY(const auto state_names, keys.strings("observation.state_names"));

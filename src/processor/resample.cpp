@@ -31,7 +31,7 @@ int rounded_weight(double weight, int bits) {
   return static_cast<int>((weight < 0.0 ? -0.5 : 0.5) + weight * (1 << bits));
 }
 
-/// Digits behind the point: of 32 bits a pixel takes 8 and headroom 2. torch keeps weights in 16 bits.
+/// Fraction bits of weights: of 32 bits a pixel takes 8 and headroom 2. torch keeps weights in 16 bits.
 int weight_bits(double largest, ByteFilter filter) {
   constexpr int kBits = 22;
   if (filter != ByteFilter::torch_bicubic) return kBits;

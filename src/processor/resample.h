@@ -30,14 +30,14 @@ std::vector<std::uint8_t> resample_opencv_area(std::span<const std::uint8_t> rgb
                                                int to_height);
 
 /// The same by torchvision's resize of an 8-bit tensor, bicubic with antialiasing: summed in float32, columns first,
-/// held in [0, 255] and rounded half to even. Equal to torch 2.13's CPU kernel for AVX2, in whose order numbers are
-/// summed; another machine's kernel differs by a rounding of float32 and so, rarely, in a byte.
+/// clamped to [0, 255] and rounded half to even. Equal to torch 2.13's CPU kernel for AVX2, whose order of summation
+/// it has; kernels of other machines differ by a rounding of float32 and so, rarely, in a byte.
 /// Source: torchvision transforms/_functional_tensor.py resize; torch aten/src/ATen/native/cpu/UpSampleKernel.cpp.
 std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                          int to_height);
 
-/// The same of pixels in [0, 1], byte / 255, bilinear with antialiasing in float32; 255 times the result loses what is
-/// behind the point. Source: Isaac-GR00T gr00t/data/transform/video.py (VideoToTensor, VideoResize, VideoToNumpy).
+/// The same on byte / 255, bilinear with antialiasing in float32; 255 times the result is truncated to bytes.
+/// Source: Isaac-GR00T gr00t/data/transform/video.py (VideoToTensor, VideoResize, VideoToNumpy).
 std::vector<std::uint8_t> resample_torch_linear(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                                 int to_height);
 
@@ -47,8 +47,8 @@ std::vector<std::uint8_t> resample_tensorflow_lanczos3(std::span<const std::uint
                                                        int to_width, int to_height);
 
 /// The middle of an image, `area` of it, stretched to a size by tf.image.crop_and_resize on byte / 255: the corners of
-/// the crop are the corners of the result, pixels are blended without antialiasing, and 255.5 times the result loses
-/// what is behind the point. Sources: tensorflow core/kernels/image/crop_and_resize_op.cc, image_ops_impl.py
+/// the crop are the corners of the result, pixels are blended without antialiasing, and 255.5 times the result is
+/// truncated. Sources: tensorflow core/kernels/image/crop_and_resize_op.cc, image_ops_impl.py
 /// (convert_image_dtype); BitVLA experiments/robot/openvla_utils.py (center_crop_image).
 std::vector<std::uint8_t> crop_tensorflow(std::span<const std::uint8_t> rgb, int width, int height, double area,
                                           int to_width, int to_height);

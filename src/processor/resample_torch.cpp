@@ -74,8 +74,8 @@ inline __attribute__((always_inline)) void add_row(std::span<const float> x, flo
   }
 }
 
-/// One row out of several. Behind the first product the reference's compiler multiplies four at once and adds them one
-/// by one; the products that are left are fused.
+/// One row out of several. After the first product the reference's compiler multiplies four at once and adds them one
+/// by one; the remaining products are fused.
 inline __attribute__((always_inline)) void sum_of_rows(std::span<const float> in, const Window& window,
                                                        std::span<float> out) {
   const std::size_t n_plain = (window.weights.size() - 1) / 4 * 4;
@@ -126,7 +126,7 @@ std::vector<float> widened(std::span<const float> rgb, std::size_t width, std::s
   return out;
 }
 
-/// Half to even: in [0, 255] a sum with 2^23 leaves no digit behind the point. The library's function is a slow call.
+/// Half to even: adding 2^23 to a number in [0, 255] rounds off its fraction. The library's function is a slow call.
 std::uint8_t rounded(float x) {
   constexpr float kNoFraction = 0x1p23f;
   return static_cast<std::uint8_t>(std::clamp(x, 0.0f, 255.0f) + kNoFraction - kNoFraction);

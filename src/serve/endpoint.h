@@ -19,8 +19,8 @@ enum class Reach {
 /// local is remote. Errors: usage.
 Result<Reach> reach_of(const std::string& endpoint);
 
-/// ZeroMQ removes whatever lies at an ipc path before it binds it. What is not a socket that nobody serves is refused
-/// here. Errors: io.
+/// ZeroMQ removes any file at an ipc path before it binds it. Anything but a socket without a server is refused here.
+/// Errors: io.
 Status check_free(const std::string& endpoint);
 
 }  // namespace vla::serve

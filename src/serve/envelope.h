@@ -15,12 +15,12 @@ namespace vla::serve {
 /// The protocol versions that this build speaks.
 constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
 
-/// What the I/O thread knows of a request: enough to queue, answer or refuse it, without looking at a image.
+/// What the I/O thread knows of a request: enough to queue, answer or refuse it, without looking at an image.
 struct Envelope {
   std::uint32_t version = 0;
   std::uint64_t request_id = 0;
   Kind kind = Kind::unknown;
-  std::size_t body_at = 0, body_size = 0;    // where the serialized Hello, Describe, Act or Health lies in the request
+  std::size_t body_at = 0, body_size = 0;    // place of the serialized Hello, Describe, Act or Health in the request
   std::optional<std::uint64_t> deadline_ms;  // of an act
 
   /// Not kept as a span: a message that ZeroMQ stores inside its own object moves with it.

@@ -13,7 +13,7 @@
 
 namespace vla::serve {
 
-/// Whoever is at the other end of a connection.
+/// The peer of a connection.
 struct Client {
   std::uint64_t connection = 0;
   std::string peer;             // with keys, the client's public key; else its address, or `ipc` and its user
@@ -48,7 +48,7 @@ class Hub {
   /// Takes connections and handles what they bring until `fd` can be read or `until` has come, and for one turn at
   /// least. The handler outlives the hub's last call.
   void wait(Handler& handler, int fd, std::optional<Clock::time_point> until);
-  /// An answer to a connection. One that is gone, or that has not read what it was sent, does not get it.
+  /// Sends an answer. A connection that has ended, or that does not read its answers, does not get it.
   void send(std::uint64_t connection, std::string_view response, bool delimiter);
   /// Until every answer has left, and not after `until`.
   void flush(Handler& handler, Clock::time_point until);

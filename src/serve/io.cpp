@@ -188,8 +188,8 @@ void Io::settle(Answer answer) noexcept {
   }
 }
 
-/// A peer that is gone, or that does not read and has its share of answers waiting, loses this one; nothing waits for
-/// it. What can fail comes before it is sent, so that nobody gets two answers.
+/// A peer that has disconnected, or that has too many unread answers, loses this one; the server never waits for a
+/// peer. What can fail comes before it is sent, so that no request gets two answers.
 void Io::deliver(Answer answer) {
   const Job& job = answer.job;
   Answered answered{job,

@@ -16,7 +16,7 @@ constexpr const char* kLevelNames[] = {"debug", "info", "warn", "error"};
 enum class LogFormat { text, json };
 
 /// Events, one in a line: JSON objects with `time` (UTC), `level`, `event` and the fields of the event, or the same
-/// as text for people. Whatever a client sends stays inside its field. docs/serving.md lists events and fields.
+/// as text for people. What a client sends is escaped inside its field. docs/serving.md lists events and fields.
 class Log final : public Observer {
  public:
   /// A name of our own, and a value as JSON of ASCII characters: a terminal must not obey what a client sends. Kept as

@@ -76,8 +76,8 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) {
   return server;
 }
 
-/// Whoever can reach the server can move the robot: others than this machine's own programs need a key, or the user's
-/// word.
+/// Who can reach the server can move the robot: clients on other machines need a key, unless the user allows all with
+/// --insecure.
 Status Server::guard() {
   const bool has_keys = !options_.curve_secret.empty();
   if (has_keys != !options_.curve_clients.empty())
@@ -127,7 +127,7 @@ Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   return {};
 }
 
-/// What a library throws is this request's misfortune, not the server's.
+/// An exception from a library fails this request, not the server.
 Answer Server::compute(Engine& engine, Job job) const noexcept {
   Answer answer;
   answer.started = Clock::now();

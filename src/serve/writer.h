@@ -25,7 +25,7 @@ class Writer {
  public:
   enum class Owns { no, yes };
   /// `fd` is closed at the end where it is owned. At most `max_waiting` bytes wait. Without a thread it has failed from
-  /// the start. A reader that is gone is a failure too, not a signal.
+  /// the start. A closed pipe is a failure too, not a signal.
   Writer(int fd, Owns owns, std::size_t max_waiting);
   /// Writes what waits, then `tail`, for as long as somebody reads.
   ~Writer();

@@ -26,7 +26,7 @@ ACT_DECAY = 0.01
 
 @dataclass(frozen=True)
 class RealTimeChunking:
-    """How a chunk goes on from the one before it, in the mode "rtc".
+    """How a chunk continues the previous one, in the mode "rtc".
 
     overlap       rows of the newest chunk, of those that are not commanded yet, which an observation brings along at most
     schedule      of a guided policy, as `vla_cpp.Leftover` has it

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules of a control loop as a state machine: no clock, no thread, no socket. The same calls give the same actions.
 
-Two counters: a *tick* is a control period, and passes whatever the robot does; a *step* is a row that was commanded. Rows are counted
+Two counters: a *tick* is a control period; a *step* is a row that was commanded. Rows are counted
 in steps. So the delay of an inference is the number of rows that were commanded while it ran; a robot that held still meanwhile has
 not moved on, and misses no row; and the wait for the very first chunk is no delay at all. Age is counted in ticks.
 """
@@ -110,7 +110,7 @@ class ChunkSchedule:
         return rows if len(rows) else None
 
     def wants(self, tick: int) -> bool:
-        """Whether an observation should be taken now: none is under way, and the newest chunk has served its steps, or is gone."""
+        """Whether an observation should be taken now: none is under way, and the newest chunk has been executed for S steps, or there is none."""
         self._begin(tick)
         if self._flight is not None:
             return False

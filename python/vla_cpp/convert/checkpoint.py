@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. What lies in the folder says
+"""A checkpoint folder, opened without reading weights: configs, processors, tensor headers, statistics. The files in the folder say
 whose layout it is: LeRobot's, openpi's, or that of an architecture's authors."""
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def read_stored(folder: str, problems: Problems) -> Tensors:
 
 
 class Layout(NamedTuple):
-    """How a checkpoint is saved, and how that is told."""
+    """How a checkpoint is saved, and how it is recognized."""
 
     name: str  # whose it is, as in "a checkpoint of ..."
     options: Tuple[str, ...]  # of archs.Options: what such a checkpoint leaves open, of what others state or do not have

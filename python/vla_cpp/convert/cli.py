@@ -18,21 +18,20 @@ from .files import missing_extra
 DESCRIPTION = """\
 Converts a Vision-Language-Action policy, as LeRobot, openpi or the authors of Evo-1, GR00T or BitVLA save it, into one self-contained GGUF
 bundle for the vla runtime: weights, tokenizer, image recipe, statistics, feature names. Architectures: {archs}.
-It refuses what it does not fully understand and then lists everything at once."""
+It refuses what it does not fully understand, and lists all problems at once."""
 
 EPILOG = """\
-without --dtype the stored type is kept when all matrices share one; mixed types become f32, which is exact.
+Without --dtype the stored type is kept if all matrices share it; mixed types become f32, which is exact.
 
 --position-precision: the reference computes the rows of the vision position table in the precision of its tower, and that
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
 two agree for grids whose side is a power of two. 'shifted' reproduces transformers 4.55 to 4.57.
 
---variant, --views, --view-slots and --dead-rows are asked for together where a checkpoint of Evo-1's authors is given: r1 is their
-code before 9 April 2026, r2 the code since (steps, time index, pixel rounding and state padding differ); --dead-rows is
-zero_attention where the policy ran with flash-attn installed, which is what the authors ask for. docs/converting.md says how
-to find out.
+A checkpoint of Evo-1's authors needs --variant, --views, --view-slots and --dead-rows: r1 is their code before 9 April 2026, r2 the
+code since (steps, time index, pixel rounding and state padding differ); --dead-rows is zero_attention if the policy ran with
+flash-attn, which the authors ask for. docs/converting.md tells how to find out.
 
-exit codes: 0 done, 1 a fault of the converter, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot
+Exit codes: 0 done, 1 a fault of the converter, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot
 be read or written."""
 
 
@@ -82,8 +81,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--state-bound",
         metavar="N",
         type=float,
-        help="a number of the state that is beyond N when normalized is told in every answer, or refused with --strict-state; the"
-        " runtime takes 10 where the bundle does not say",
+        help="report a normalized state value beyond N in every answer, or refuse it with --strict-state; the runtime's default is 10",
     )
     add(
         "--position-precision",
@@ -95,8 +93,8 @@ def build_parser() -> argparse.ArgumentParser:
         "--variant",
         metavar="NAME",
         default="",
-        help="openpi's configuration that an openpi checkpoint was trained with, e.g. pi05_droid: its robot and recipe; of a"
-        " checkpoint of Evo-1's authors the revision of their code, r1 or r2",
+        help="openpi: the training configuration, e.g. pi05_droid; Evo-1's authors: the revision of their code, r1 or r2; GR00T N1.5: the"
+        " data config, by name or as a JSON file",
     )
     _add_evo1(parser)
     _add_gr00t(parser)
@@ -107,7 +105,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_evo1(parser: argparse.ArgumentParser) -> None:
-    about = "what their folder (config.json, norm_stats.json, *.pt) does not state, so that it must be said; see below"
+    about = "what their folder (config.json, norm_stats.json, *.pt) does not state; see below"
     add = parser.add_argument_group("checkpoints of Evo-1's authors", about).add_argument
     add("--stats", metavar="ARM/DATASET", default="", help="the entry of norm_stats.json to normalize with, where there are several")
     add(
@@ -115,43 +113,43 @@ def _add_evo1(parser: argparse.ArgumentParser) -> None:
         metavar="A,B,...",
         type=lambda text: text.split(","),
         default=(),
-        help="names of the cameras in the order of the prompt's slots",
+        help="names of the cameras, in the order of the prompt's view slots",
     )
-    add("--view-slots", metavar="N", type=int, default=0, help="places for views in the prompt; the authors' server has 3")
+    add("--view-slots", metavar="N", type=int, default=0, help="view slots of the prompt; the authors' server has 3")
     add(
         "--dead-rows",
         choices=("zero_attention", "causal_attention"),
         default="",
-        help="what attention leaves in rows that are masked, which the action head reads: zeros with flash-attn",
+        help="what attention wrote into masked rows, which the action head reads: zeros with flash-attn",
     )
 
 
 def _add_gr00t(parser: argparse.ArgumentParser) -> None:
-    about = "which hold several robots; --variant, --camera-size, --gripper-sign and --dataset-info take TAG=VALUE,... where these differ"
+    about = "a checkpoint holds several robots; --variant, --camera-size, --gripper-sign and --dataset-info take TAG=VALUE,... where these differ"
     add = parser.add_argument_group("checkpoints of GR00T", about).add_argument
     add(
         "--embodiment",
         metavar="TAG",
         default="",
-        help="the robot, by its tag in processor_config.json; asked for always. A,B,... for several in one bundle, all for every one"
-        " that has statistics",
+        help="tag of the robot in processor_config.json; required. A,B,... puts several into one bundle, all every one that has"
+        " statistics",
     )
     add(
         "--camera-size",
         metavar="WxH",
         default="",
-        help="pixels of a camera, for a pipeline that keeps the aspect of images; they are square without it",
+        help="camera resolution, for a pipeline that keeps the aspect ratio; square by default",
     )
     add(
         "--gripper-sign",
         metavar="KEY",
         default="",
-        help="answer -1 where the action KEY is above 0.5 and 1 elsewhere, as LIBERO's simulator wants its gripper",
+        help="map the action KEY to -1 above 0.5 and to 1 elsewhere, as LIBERO's simulator expects its gripper",
     )
     add(
         "--letterbox",
         action="store_true",
-        help="pad images to squares whatever the checkpoint says, as the authors' servers have done since March 2026",
+        help="pad images to squares even if the checkpoint does not say so, as the authors' servers have done since March 2026",
     )
 
 
@@ -216,7 +214,7 @@ def main(argv=None) -> int:
         return int(Code.USAGE)
     except KeyboardInterrupt:
         return 130  # what shells report for an interrupt; the unfinished file is gone
-    except Exception as error:  # noqa: BLE001 - a robot's operator gets one line and a class, whatever we overlooked
+    except Exception as error:  # noqa: BLE001 - the user gets one line and an exit code for bugs too
         print(
             "error: vla-convert: {}: {}; this is a fault of the converter, please report it".format(
                 type(error).__name__, error

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Several robots of a checkpoint in one bundle: what they share is stored once, what is one robot's own under its tag."""
+"""Several robots of a checkpoint in one bundle: what they share is stored once, what differs under each robot's tag."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _plan(module: Any, checkpoint: Checkpoint, options: Options, problems: Probl
 
 
 def merge(tags: Sequence[str], plans: Sequence[Plan]) -> Plan:
-    """A bundle of several robots: a key or tensor that is the same for all of them stands once."""
+    """A bundle of several robots: a key or tensor that is the same for all of them is stored once."""
     keys = _merged(tags, [{key.name: key for key in plan.keys} for plan in plans])
     weights = _merged(tags, [{weight.target: weight for weight in plan.weights} for plan in plans])
     return Plan(

@@ -34,7 +34,7 @@ FIXED = {
 
 
 def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tuple[object, str]]) -> None:
-    """Refuses every key of config.json that nobody has looked at, and values beyond the runtime. `name`: the reference's class."""
+    """Refuses unknown keys of config.json, and values that the runtime does not support. `name`: the reference's class."""
     fixed = {**FIXED, **fixed}
     for key in sorted(set(policy.values) - known - set(fixed) - IGNORED):
         policy.bad(

@@ -35,7 +35,7 @@ OTHERS = set(
     """.split()
 )
 KNOWN = OTHERS.union(ARGUMENTS, CONSTANTS, EMPTY, TUPLES, PUTS, GETS)
-KEYS = (str, int, float, bytes, type(None))  # of dictionaries that are kept; whatever else is a key belongs to nobody here
+KEYS = (str, int, float, bytes, type(None))  # of dictionaries that are kept; entries with other keys are dropped
 
 
 class Global(NamedTuple):
@@ -125,7 +125,7 @@ class _Machine:
                 stack.append({})
             self.update(items)
         elif name in ("ADDITEMS", "FROZENSET"):
-            self.since_mark()  # members of sets belong to nobody here
+            self.since_mark()  # members of sets are dropped
             if name == "FROZENSET":
                 stack.append(Inert("frozenset"))
         elif name == "GLOBAL":

@@ -301,7 +301,7 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
 
 
 def letterbox(width: int, height: int, align: str, antialias: bool = False) -> dict:
-    """Into black: whatever the policy, the reference fills with 0 before it scales."""
+    """Padded with black: for every policy, the reference pads with 0 before it scales."""
     size = {"width": width, "height": height}
     return {"op": "letterbox", **size, "filter": "bilinear", "antialias": antialias, "align": align, "fill": 0.0}
 

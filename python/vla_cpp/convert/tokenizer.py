@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""tokenizer.json, or the older files that stand in its place, as the keys of a bundle, after checking that it is a tokenizer that the runtime implements.
+"""tokenizer.json, or the older files that replace it, as the keys of a bundle, after checking that the runtime implements this tokenizer.
 
 Two kinds are known, each with a module of its own: byte-level BPE and BPE with byte fallback. What they share stands in
 tokenizer_parts.py.
@@ -83,7 +83,7 @@ def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict
 
 
 def _with_rows(added: List[dict], n_vocab: int) -> List[dict]:
-    """PaliGemma's <image> lies beyond the embedding: text that holds it stops the reference, and the runtime refuses it."""
+    """PaliGemma's <image> has no row in the embedding: the reference fails on text with it, the runtime refuses it."""
     return [dict(token, id=token["id"] if token["id"] < n_vocab else NO_ROW) for token in added]
 
 

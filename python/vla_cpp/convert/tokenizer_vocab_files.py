@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vocab.json and merges.txt of Qwen2, which older repositories have in the place of tokenizer.json.
+"""vocab.json and merges.txt of Qwen2, which older repositories have instead of tokenizer.json.
 
 Reference: transformers models/qwen2/tokenization_qwen2.py, whose class says how text is split.
 """

@@ -3,7 +3,7 @@
 """An episode in which every chunk comes a stated time after its observation, as if the policy ran on a slower machine.
 
 Time is the simulator's: a period passes with each of its steps, and the latency is added to it, however long the policy really took. So a
-run repeats itself, whatever else the machine does.
+run is reproducible on a busy machine.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ class Policies(contextlib.ExitStack):
         return self.served(text) if "://" in text else self.bundle(text)
 
     def fault(self) -> Optional[str]:
-        """What became of a server of ours that is gone."""
+        """Why a server that we started ended."""
         return next(filter(None, (server.fault() for server in self._servers)), None)
 
 

@@ -50,7 +50,7 @@ def _run(plan: Plan, guard: Guard, policies: Dict[str, EvalPolicy], job: Job) ->
 
 
 def _work(plan: Plan, jobs: Any, results: Any) -> None:
-    """One process: takes jobs until a None comes. Whatever goes wrong is told, with the job that it happened in."""
+    """One process: takes jobs until a None comes. Failures are reported with their job."""
     die_with_parent()
     # Simulator and policy libraries start threads that would take the cores from the other workers.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -94,7 +94,7 @@ def run_jobs(
     on_episode: Callable[[Outcome], None],
     server_fault: Callable[[], Optional[str]],
 ) -> None:
-    """Runs those jobs that the journal does not hold yet. server_fault tells what became of the server, if it is gone.
+    """Runs those jobs that the journal does not hold yet. server_fault tells why the server ended, if it did.
 
     Errors: RunFailed, with the first thing that went wrong; episodes under way are not counted then.
     """

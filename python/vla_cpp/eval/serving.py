@@ -19,7 +19,7 @@ ADDRESS = re.compile(r"\b(?:tcp|ipc)://\S+")
 
 
 def die_with_parent() -> None:
-    """Called in a child: the system kills it when its parent is gone, however that ended. Linux only; elsewhere nothing happens."""
+    """Called in a child: the system kills it when its parent ends, for whatever reason. Linux only; elsewhere nothing happens."""
     try:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
     except (OSError, AttributeError):
@@ -61,7 +61,7 @@ class Server:
         return self._process.pid
 
     def fault(self) -> Optional[str]:
-        """What became of the server, if it is gone."""
+        """Why the server ended, if it did."""
         code = self._process.poll()
         if code is None:
             return None

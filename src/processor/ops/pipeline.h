@@ -26,7 +26,7 @@ struct CropFraction {
   double fraction = 0.0;
 };
 
-/// A size whatever the aspect.
+/// A size, without keeping the aspect ratio.
 struct ByteResize {
   enum class Filter { pillow_bicubic, torch_bicubic_16bit, torch_bilinear_cut };
 
@@ -47,7 +47,7 @@ struct CenterCrop {
   int height = 0;
 };
 
-/// A size whatever the aspect, by `resample_tensorflow_lanczos3`.
+/// The same by `resample_tensorflow_lanczos3`.
 struct Lanczos3 {
   int width = 0;
   int height = 0;
@@ -63,14 +63,14 @@ struct CropAndResize {
 using ByteOp =
     std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop, Lanczos3, CropAndResize>;
 
-/// Ops on 8-bit images one after the other, and the size at which they must come out.
+/// Ops on 8-bit images in order, and the size that the last one must leave.
 struct Pipeline {
   int width = 0;
   int height = 0;
   std::vector<ByteOp> ops;
 };
 
-/// Writes (3, height, width) float32 to `out`: the bytes that come out, divided by 255. A frame of floats is refused,
+/// Writes (3, height, width) float32 to `out`: the resulting bytes, divided by 255. A frame of floats is refused,
 /// since the reference gets bytes, and so is one whose aspect leads to another size than the network takes.
 /// Source: lerobot policies/groot/processor_groot.py (_transform_n1_7_image_for_vlm_albumentations).
 /// Errors: bad_observation.

@@ -3,7 +3,7 @@
 """GR00T N1.5: Eagle 2.5 as the prefix, self-attention over its features, a diffusion transformer with future tokens.
 
 The layout is the authors' (Isaac-GR00T, last in November 2025): config.json, weights, experiment_cfg/metadata.json with the statistics of
-every robot. Which keys a robot has, in which order, and how they are normalized stands in a class of their code, which is chosen when a
+every robot. Which keys a robot has, in which order, and how they are normalized is defined by a class of their code, chosen when a
 server starts: here --variant names it, or a JSON file with the same content.
 """
 
@@ -176,7 +176,7 @@ def weights(s: Sizes, n_future: int) -> List[Weight]:
 
 
 def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
-    """A JSON file lies where the name says, or in the checkpoint."""
+    """A JSON file: a path, or a file name in the checkpoint."""
     if name in CONFIGS:
         return CONFIGS[name]
     if not name.endswith(".json"):

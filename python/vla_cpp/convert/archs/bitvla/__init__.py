@@ -3,8 +3,8 @@
 """BitVLA: a SigLIP tower and BitNet b1.58, both of ternary weights, that fill the slots of a whole chunk in one pass, and an MLP-ResNet.
 
 A fine-tune is a folder: config.json, bfloat16 master weights, tokenizer and processor files, dataset_statistics.json, and the action head
-and the proprio projector in a file of torch.save each. What the robot is stands in constants of the code, chosen by the command line of
-a training run: the widths of head and projector tell it.
+and the proprio projector in a file of torch.save each. The robot is a set of constants in their code, chosen by the command line of
+a training run; the widths of head and projector identify it.
 
 Reference: ustcwhy/BitVLA openvla-oft (experiments/robot/{bitnet_utils,openvla_utils,robot_utils}.py, prismatic/vla/constants.py,
 bitvla/bitnet_action_tokenizer.py, convert_ckpt.py).

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evo-1: InternVL3 as the prefix, a flow-matching head that reads the whole prompt by cross-attention.
 
-Two layouts, the authors' and LeRobot's (layouts.py); keys and tensors stand in mapping.py.
+Two layouts, the authors' and LeRobot's, are in layouts.py; keys and tensors in mapping.py.
 """
 
 from __future__ import annotations

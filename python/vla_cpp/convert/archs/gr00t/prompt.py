@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The prompt of a chat template around images and an instruction, and where the image tokens stand in it."""
+"""The prompt that a chat template makes of images and an instruction, and the positions of the image tokens."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Robot(NamedTuple):
     states: List[Group]
     actions: List[Group]
     n_row: int  # actions of a chunk that are meant for this robot
-    n_moment: int = 1  # at which states are taken: the groups of each follow those of the one before
+    n_moment: int = 1  # time steps of the state; the groups of each follow those of the previous one
 
 
 def processor_file(checkpoint: Checkpoint, name: str) -> str:

@@ -123,7 +123,7 @@ def _relative_ops(robot: Robot) -> List[dict]:
     for group in robot.actions:
         if not group.reference:
             continue
-        start, state = actions[group.key], states.get(group.reference, 0)  # a state that is not there is told elsewhere
+        start, state = actions[group.key], states.get(group.reference, 0)  # a missing state is reported elsewhere
         if group.pose:
             poses.append({"op": "compose_pose", "format": group.pose, "column": start, "state_column": state})
         else:
