@@ -125,7 +125,7 @@ def test_a_full_disk_is_an_io_error_that_leaves_nothing(converter, tiny, monkeyp
 
 def test_help_names_every_architecture_and_exit_code():
     text = run("--help").stdout
-    for word in ("smolvla", "--backbone", "--identity-stats", "--position-precision", "load_vlm_weights", "exit codes"):
+    for word in ("smolvla", "--backbone", "--identity-stats", "--position-precision", "load_vlm_weights", "Exit codes"):
         assert word in text
 
 

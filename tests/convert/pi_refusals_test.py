@@ -124,3 +124,8 @@ def test_weights_that_are_not_finite_are_refused(converter):
     tiny = TinyPi("pi05")
     tiny.tensors["model.time_mlp_in.weight"][1, 2] = np.inf
     assert "finite numbers" in converter.refusal(tiny).message()
+
+
+def test_position_rows_of_pi_follow_no_precision(converter):
+    error = converter.refusal(TinyPi("pi05"), position_precision="float32")
+    assert error.code == Code.USAGE and "--position-precision: expected a SmolVLA checkpoint, found type pi05" in error.message()

@@ -11,7 +11,7 @@ from . import recipe
 from .archs import Options
 from .bundle import Key
 from .checkpoint import Checkpoint
-from .errors import Problems
+from .errors import Code, Problems
 from .features import views_of
 from .section import Section
 
@@ -53,6 +53,13 @@ def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tup
             hint="real-time chunking changes the velocity",
             unsupported=True,
         )
+
+
+def no_position_rule(policy: Section, options: Options, problems: Problems) -> None:
+    """Of an architecture whose position rows are those of its patches. Errors: usage."""
+    if options.position_precision:
+        found = "type {}".format(policy.get("type"))
+        problems.add("--position-precision", "a SmolVLA checkpoint", found, "leave the option out", Code.USAGE)
 
 
 def _features(policy: Section, key: str) -> dict:

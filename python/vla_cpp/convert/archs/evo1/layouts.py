@@ -28,7 +28,7 @@ from ...checkpoint import Checkpoint, Layout, Tensors, find_backbone
 from ...errors import Code, Problems, refuse
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
-from ...lerobot import check_keys, check_widths, read_views, vector_dim
+from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim
 from ...networks import MAX_LAYERS
 from ...normalization import Normalization
 from ...section import Section
@@ -377,9 +377,8 @@ NEUTRAL = {"mean": 0.0, "std": 1.0, "min": -1.0, "max": 1.0, "q01": -1.0, "q99":
 
 
 def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
-    if options.position_precision:
-        problems.add("--position-precision", "a SmolVLA checkpoint", "type evo1", "leave the option out", Code.USAGE)
     policy = Section("config.json", checkpoint.config, {**LEROBOT_CONFIG, **GRIPPER}, problems)
+    no_position_rule(policy, options, problems)
     check_keys(policy, "Evo1Config", set(LEROBOT_CONFIG) | set(GRIPPER) | set(LEROBOT_FIXED) | LEROBOT_IGNORED, {})
     policy.check_fixed(LEROBOT_FIXED)
     sizes = _lerobot_sizes(policy)

@@ -27,7 +27,7 @@ from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
-from ...lerobot import check_keys, check_widths, read_views, vector_dim, view_keys
+from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim, view_keys
 from ...section import Section
 from .. import Options
 from .mapping import Family, Sizes, check_image, read_towers
@@ -92,6 +92,7 @@ BINS = {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}
 
 def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
     policy = Section("config.json", checkpoint.config, LEROBOT_CONFIG, problems)
+    no_position_rule(policy, options, problems)
     memory = {key for key in policy.values if key.startswith("memory_")}  # of the two kinds that LEROBOT_FIXED refuses
     check_keys(policy, family.config_class, set(LEROBOT_CONFIG) | LEROBOT_IGNORED | memory, LEROBOT_FIXED)
     sizes = read_towers(policy, checkpoint, problems)
