@@ -19,6 +19,15 @@ for target in build/fuzz/bin/*_fuzz; do
   seeds=() longest=20000
   [ -d "tests/fuzz/regressions/$name" ] && seeds+=("tests/fuzz/regressions/$name")
   [ "$name" = image ] && seeds+=(tests/processor/data/images)
+  if [ "$name" = recipe ]; then  # of each golden case
+    .venv/bin/python - "$corpus" "$goldens" <<'EOF'
+import pathlib, sys
+import gguf
+corpus, goldens = map(pathlib.Path, sys.argv[1:])
+for bundle in goldens.glob("*/*/bundle.gguf"):
+    (corpus / "-".join(bundle.parts[-3:-1])).write_text(gguf.GGUFReader(bundle).fields["processor.recipe"].contents())
+EOF
+  fi
   if [ "$name" = act ]; then  # a bundle of each architecture
     for arch in "$goldens"/*/; do
       bundle=$(find "$arch" -name bundle.gguf | sort | head -1)
