@@ -77,8 +77,7 @@ def test_run_without_an_image_a_state_or_a_text_is_a_usage_error_that_names_it(v
     ids=str,
 )
 def test_a_word_that_the_command_does_not_know_is_named_before_one_that_it_misses(vla, arguments, unknown):
-    answer = vla(*arguments)
-    assert answer.code == 2 and answer.err == f"error: usage: arguments: {unknown}\n"
+    vla(*arguments).refused("usage", f"arguments: {unknown}")
 
 
 @pytest.mark.parametrize("seed", ["-1", "1.5", "x", "", str(2**64)])
