@@ -108,8 +108,8 @@ Command add_bench(CLI::App& app) {
   auto options = std::make_shared<BenchOptions>();
   CLI::App* command = app.add_subcommand("bench", "Time a policy, stage by stage, beside what the machine can do");
   command->footer(kFooter);
-  command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert");
-  command->add_option("--arch", options->arch, "Random weights of this architecture instead of a bundle");
+  add_bundle(*command, options->bundle, false);
+  add_text(*command, "--arch", options->arch, "ARCH", "Random weights of this architecture instead of a bundle");
   command->add_option("--size", options->size, "Size of the random weights: full, as published")
       ->check(CLI::IsMember({"full"}));
   command->add_option("--dtype", options->dtype, "Storage of the random weights")
@@ -117,7 +117,7 @@ Command add_bench(CLI::App& app) {
       ->capture_default_str();
   command->add_option("--views", options->n_view, "Camera views; all of the bundle's if not given, 2 with --arch")
       ->check(CLI::Range(1, 16));
-  command->add_option("--image-size", options->image_size, "HxW of the raw frames; the network's own if not given");
+  add_text(*command, "--image-size", options->image_size, "HxW", "Raw frames; the network's own size if not given");
   command
       ->add_option("--tokens", options->n_text,
                    "Tokens of the instruction; the most that the bundle allows if not given, 48 with --arch")
@@ -136,15 +136,16 @@ Command add_bench(CLI::App& app) {
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels, kKernelsHelp);
-  command->add_option("--device", options->device, std::string(kDeviceHelp) + ". Shares of a peak are the CPU's alone");
-  command->add_option("--embodiment", options->embodiment, kEmbodimentHelp);
+  add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
+  add_text(*command, "--device", options->device, "NAME",
+           std::string(kDeviceHelp) + ". Shares of a peak are the CPU's alone");
+  add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");
-  command->add_option("--plot", options->plot, "Also draw the roofline into this SVG file");
+  add_text(*command, "--plot", options->plot, "FILE", "Also draw the roofline into this SVG file");
   command->add_flag("--paced", options->paced,
                     "Wait for a line on standard input before each round, so that programs can alternate");
-  command->add_option("--vs", options->vs, "Compare with an earlier run's --json");
+  add_text(*command, "--vs", options->vs, "FILE", "Compare with an earlier run's --json");
   return [options] { return run_bench(*options); };
 }
 

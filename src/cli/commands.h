@@ -28,6 +28,20 @@ constexpr const char* kEmbodimentHelp =
 constexpr const char* kStrictStateHelp =
     "Refuse a state that is far beyond what the policy has seen, instead of answering with a note";
 
+/// An option with a value that is not empty, which CLI11 would read as not given. `type`: what the help calls the
+/// value.
+inline CLI::Option* add_text(CLI::App& command, const char* name, std::string& value, const char* type,
+                             const std::string& help) {
+  const auto given = [](const std::string& text) {
+    return text.empty() ? "expected a value, found empty text" : std::string();
+  };
+  return command.add_option(name, value, help)->type_name(type)->check(CLI::Validator(given, ""));
+}
+
+inline void add_bundle(CLI::App& command, std::string& bundle, bool required) {
+  command.add_option("BUNDLE", bundle, "The policy, a .gguf file from vla-convert")->type_name("")->required(required);
+}
+
 /// Adds one subcommand. What it returns is run after parsing; its Status becomes the exit code (base/result.h).
 using Command = std::function<Status()>;
 

@@ -65,10 +65,10 @@ Command add_compare(CLI::App& app) {
       "The taps are listed in the order in which the reference computes them, so the first FAIL is where to look.\n"
       "  vla run policy.gguf ... --tap '*' --taps-out got.gguf\n"
       "  vla compare tests/golden/smolvla/two_views/expected.gguf got.gguf");
-  command->add_option("EXPECTED", options->expected, "Taps of the reference (GGUF)")->required();
-  command->add_option("GOT", options->got, "Taps of a run (GGUF)")->required();
-  command->add_option("--only", options->only,
-                      "Compare only these paths; * stands for any characters, commas separate patterns");
+  command->add_option("EXPECTED", options->expected, "Taps of the reference (GGUF)")->type_name("")->required();
+  command->add_option("GOT", options->got, "Taps of a run (GGUF)")->type_name("")->required();
+  add_text(*command, "--only", options->only, "PATTERN",
+           "Compare only these paths; * stands for any characters, commas separate patterns");
   command
       ->add_option("--tolerance", options->tolerance,
                    "Largest difference allowed, relative to the largest expected magnitude of a tap")

@@ -244,18 +244,18 @@ Command add_inspect(CLI::App& app) {
       "  vla inspect policy.gguf\n  vla inspect policy.gguf --json\n  vla inspect policy.gguf --graph step    # the "
       "program that runs in every solver step\n  vla inspect --manifest smolvla    # parameters at the published "
       "size\n  vla inspect --devices");
-  command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert");
-  command->add_option("--manifest", options->manifest,
-                      "Print the keys and parameters that an architecture declares, as JSON");
+  add_bundle(*command, options->bundle, false);
+  add_text(*command, "--manifest", options->manifest, "ARCH",
+           "Print the keys and parameters that an architecture declares, as JSON");
   command
       ->add_option("--graph", options->graph,
                    "Print the program of the prefix or of a step for the largest observation, a line an operation: the "
                    "phase in which it runs (those of one phase run side by side), kernel, work, what was fused, and "
                    "shapes with their layout (@slot: outlives a run, @kept: made once per observation)")
       ->check(CLI::IsMember({"prefix", "step"}));
-  command->add_option("--kernels", options->kernels, "As for vla run: what the program is made of");
-  command->add_option("--device", options->device, "As for vla run: whose memory and program are shown");
-  command->add_option("--embodiment", options->embodiment, kEmbodimentHelp);
+  add_text(*command, "--kernels", options->kernels, "NAME", "As for vla run: what the program is made of");
+  add_text(*command, "--device", options->device, "NAME", "As for vla run: whose memory and program are shown");
+  add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--devices", options->devices, "List what --device may name here, and why the others are absent");
   command->add_flag("--json", options->json, "Print JSON for machines");
   return [options] { return inspect(*options); };

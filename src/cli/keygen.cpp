@@ -15,7 +15,9 @@ Command add_keygen(CLI::App& app) {
       "  vla keygen server      # server.secret stays on the server; clients need server.public\n"
       "  vla keygen robot7      # robot7.secret stays on the robot; robot7.public goes into the server's "
       "--curve-clients");
-  command->add_option("PREFIX", *prefix, "Writes PREFIX.secret and PREFIX.public; neither may exist")->required();
+  command->add_option("PREFIX", *prefix, "Writes PREFIX.secret and PREFIX.public; neither may exist")
+      ->type_name("")
+      ->required();
   return [prefix]() -> Status {
     VLA_CHECK(serve::write_key_pair(*prefix));
     say(stdout, "{0}.secret\n{0}.public\n", *prefix);

@@ -98,14 +98,16 @@ Command add_replay(CLI::App& app) {
       "Recordings are made with vla serve --record (docs/serving.md). Exit code 10: an answer differed.\n"
       "  vla replay recording --bundle policy.gguf\n"
       "  vla replay recording --connect tcp://127.0.0.1:5555");
-  command->add_option("DIR", options->folder, "The recording")->required();
-  CLI::Option* connect = command->add_option("--connect", options->connect,
-                                             "Server to ask; not given, nor --bundle: tcp://127.0.0.1:5555");
-  CLI::Option* bundle = command->add_option("--bundle", options->bundle, "Serve this bundle for the replay instead");
+  command->add_option("DIR", options->folder, "The recording")->type_name("")->required();
+  CLI::Option* connect = add_text(*command, "--connect", options->connect, "ENDPOINT",
+                                  "Server to ask; not given, nor --bundle: tcp://127.0.0.1:5555");
+  CLI::Option* bundle =
+      add_text(*command, "--bundle", options->bundle, "FILE", "Serve this bundle for the replay instead");
   bundle->excludes(connect);
-  command->add_option("--kernels", options->kernels, std::string(kKernelsHelp) + "; with --bundle")->needs(bundle);
-  command->add_option("--device", options->device, std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
-  command->add_option("--embodiment", options->embodiment, "As for vla serve; with --bundle")->needs(bundle);
+  add_text(*command, "--kernels", options->kernels, "NAME", std::string(kKernelsHelp) + "; with --bundle")
+      ->needs(bundle);
+  add_text(*command, "--device", options->device, "NAME", std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
+  add_text(*command, "--embodiment", options->embodiment, "TAG", "As for vla serve; with --bundle")->needs(bundle);
   command->add_option("--threads", options->n_thread, "CPU threads, with --bundle; 0 takes every core")
       ->needs(bundle)
       ->check(CLI::Range(0, 512));

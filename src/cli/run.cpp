@@ -234,8 +234,6 @@ std::string check_seed(const std::string& text) {
   return error == std::errc() && next == end ? "" : "expected an integer from 0 to 2^64 - 1, found '" + text + "'";
 }
 
-std::string check_given(const std::string& text) { return text.empty() ? "expected a value, found empty text" : ""; }
-
 }  // namespace
 
 Command add_run(CLI::App& app) {
@@ -247,62 +245,57 @@ Command add_run(CLI::App& app) {
       "them). NAME= declares a view absent; a view that is simply not mentioned is an error.\n"
       "  vla run policy.gguf --image camera1=top.png --image camera2= --state 0.1,0.2,0.3 --text \"open the drawer\" "
       "--seed 1 --json");
-  command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert")->required();
+  add_bundle(*command, options->bundle, true);
   command
       ->add_option("--image", options->images,
-                   "NAME=FILE: a frame as PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3)")
+                   "A frame: PNG, JPEG, or .npy (uint8 or float32 in [0, 1], height x width x 3)")
+      ->type_name("NAME=FILE")
       ->required()
       ->allow_extra_args(false);
-  command->add_option("--state", options->states, "v,v,... or NAME=v,v,...: the robot's state in its own units")
+  command
+      ->add_option("--state", options->states, "The robot's state in its own units; NAME= where the policy has several")
+      ->type_name("[NAME=]v,v,...")
       ->required()
       ->allow_extra_args(false);
   command->add_option("--text", options->text, "The instruction")->required();
-  command
-      ->add_option(
-          "--noise", options->noise,
-          "The solver's starting noise: a float32 .npy file, horizon x padded action width, or a batch of one of it")
-      ->check(CLI::Validator(check_given, ""));
+  add_text(*command, "--noise", options->noise, "FILE",
+           "The solver's starting noise: a float32 .npy file, horizon x padded action width, or a batch of one of it");
   command
       ->add_option("--seed", options->seed,
                    "Draw the noise, the same on every machine; actions may differ in their last digits")
+      ->type_name("N")
       ->check(CLI::Validator(check_seed, ""));
-  command
-      ->add_option(
-          "--leftover", options->leftover,
-          "Real-time chunking: go on from these rows of the chunk before, the last ones of its --normalized-out "
-          "(float32 .npy). vla inspect says whether the policy is guided by them or in-paints")
-      ->check(CLI::Validator(check_given, ""));
-  command->add_option("--delay", options->delay, "With --leftover: how many of its rows are executed meanwhile");
+  add_text(
+      *command, "--leftover", options->leftover, "FILE",
+      "Real-time chunking: continue these rows of the previous chunk, the last ones of its --normalized-out (float32 "
+      ".npy). vla inspect says whether the policy is guided by them or in-paints");
+  command->add_option("--delay", options->delay, "With --leftover: how many of its rows are executed meanwhile")
+      ->type_name("N");
   command
       ->add_option("--schedule", options->schedule,
                    "With --leftover, of a guided policy: how the weight of the rows after the delay falls")
+      ->type_name("NAME")
       ->check(CLI::IsMember({"zeros", "ones", "linear", "exp"}));
-  command->add_option("--max-guidance", options->max_guidance,
-                      "With --leftover, of a guided policy: the largest weight of the guidance");
+  command
+      ->add_option("--max-guidance", options->max_guidance,
+                   "With --leftover, of a guided policy: the largest weight of the guidance")
+      ->type_name("W");
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
-  command->add_option("--out", options->out, "Also write the chunk as float32 .npy, horizon x actions")
-      ->check(CLI::Validator(check_given, ""));
-  command
-      ->add_option("--normalized-out", options->normalized_out,
-                   "Also write the chunk as the network answered it, for a later --leftover")
-      ->check(CLI::Validator(check_given, ""));
-  command
-      ->add_option("--tap", options->tap,
-                   "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns")
-      ->check(CLI::Validator(check_given, ""));
-  command->add_option("--taps-out", options->taps_out, "Where the recorded values go (GGUF), for vla compare")
-      ->check(CLI::Validator(check_given, ""));
-  command
-      ->add_option("--inject", options->inject,
-                   "Go on from these values in place of the computed ones: a GGUF file of named values, as --taps-out "
-                   "writes it")
-      ->check(CLI::Validator(check_given, ""));
+  add_text(*command, "--out", options->out, "FILE", "Also write the chunk as float32 .npy, horizon x actions");
+  add_text(*command, "--normalized-out", options->normalized_out, "FILE",
+           "Also write the network's output, before unnormalization, for a later --leftover");
+  add_text(*command, "--tap", options->tap, "PATTERN",
+           "Record named values: a path with *, e.g. 'lm.blk.*'; commas separate patterns");
+  add_text(*command, "--taps-out", options->taps_out, "FILE", "Where the recorded values go (GGUF), for vla compare");
+  add_text(*command, "--inject", options->inject, "FILE",
+           "Replace computed values by these: a GGUF file of named values, as --taps-out writes it");
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+      ->type_name("N")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  command->add_option("--kernels", options->kernels, kKernelsHelp)->check(CLI::Validator(check_given, ""));
-  command->add_option("--device", options->device, kDeviceHelp)->check(CLI::Validator(check_given, ""));
-  command->add_option("--embodiment", options->embodiment, kEmbodimentHelp)->check(CLI::Validator(check_given, ""));
+  add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
+  add_text(*command, "--device", options->device, "NAME", kDeviceHelp);
+  add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   return [options] { return run(*options); };
 }

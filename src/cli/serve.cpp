@@ -118,24 +118,20 @@ Command add_serve(CLI::App& app) {
       "Clients: docs/serving.md; the protocol: docs/protocol.md. SIGTERM or Ctrl-C answers what waits, then ends.\n"
       "  vla serve policy.gguf\n"
       "  vla serve policy.gguf --bind tcp://0.0.0.0:5555 --curve-secret server.secret --curve-clients clients.public");
-  command->add_option("BUNDLE", options->bundle, "The policy, a .gguf file from vla-convert")->required();
+  add_bundle(*command, options->bundle, true);
   command
       ->add_option("--bind", server.bind,
                    "tcp://ADDRESS:PORT (port 0: a free one) or ipc://PATH; may be given several times")
+      ->type_name("ENDPOINT")
       ->allow_extra_args(false)
       ->capture_default_str();
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
-  const auto check_given = [](const std::string& text) {
-    return text.empty() ? "expected a value, found empty text" : "";
-  };
-  command->add_option("--kernels", options->kernels, kKernelsHelp)->check(check_given);
-  command->add_option("--device", options->device, kDeviceHelp)->check(check_given);
-  command
-      ->add_option("--embodiment", options->embodiment,
-                   "Answer this robot of a bundle of several alone; not given: all")
-      ->check(check_given);
+  add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
+  add_text(*command, "--device", options->device, "NAME", kDeviceHelp);
+  add_text(*command, "--embodiment", options->embodiment, "TAG",
+           "Serve one robot of a bundle for several; not given: all");
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();
@@ -152,7 +148,7 @@ Command add_serve(CLI::App& app) {
       ->check(CLI::Range(1, 65536))
       ->capture_default_str();
   command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
-  command->add_flag("--insecure", server.insecure, "Let everybody in who can reach an address that is not local");
+  command->add_flag("--insecure", server.insecure, "Allow addresses that other machines reach, without keys");
   command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")
       ->check(CLI::ExistingFile);
   command->add_option("--curve-clients", server.curve_clients, "Public keys of the clients that are let in, one a line")

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <iterator>
 
+#include "cli/commands.h"
 #include "serve/codec.h"
 
 namespace vla::cli {
@@ -24,14 +25,15 @@ Level level_of(const WatchOptions& options) {
 }  // namespace
 
 void add_watch_options(CLI::App& command, WatchOptions& options) {
-  command.add_option("--metrics", options.metrics,
-                     "ADDRESS:PORT (port 0: a free one) for HTTP: /metrics (Prometheus), /healthz, /readyz");
+  add_text(command, "--metrics", options.metrics, "ADDRESS:PORT",
+           "HTTP: /metrics (Prometheus), /healthz, /readyz; port 0 takes a free one");
   command.add_option("--log", options.log, "Form of the log on standard error: text or json")
       ->check(CLI::IsMember({"text", "json"}));
   command.add_option("--log-level", options.level, "debug (every request), info (default with --log), warn, error")
       ->check(CLI::IsMember({"debug", "info", "warn", "error"}));
-  command.add_option("--trace", options.trace, "Write a trace of requests and stages for Perfetto, a .json file");
-  command.add_option("--record", options.record, "Keep requests and answers in this folder, for vla replay");
+  add_text(command, "--trace", options.trace, "FILE",
+           "Write a trace of requests and stages for Perfetto, a .json file");
+  add_text(command, "--record", options.record, "DIR", "Keep requests and answers in this folder, for vla replay");
   command.add_option("--record-limit", options.record_limit_mb, "Most that is kept, in MB")
       ->check(CLI::Range(1, 1 << 20))
       ->capture_default_str();
