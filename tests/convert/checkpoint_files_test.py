@@ -3,6 +3,7 @@
 """Files of a checkpoint that are damaged, missing or contradict each other, and what their refusals say."""
 
 import json
+import os
 
 import pytest
 
@@ -39,6 +40,22 @@ def test_a_missing_file_is_refused_by_its_name(converter, tiny, file):
     (converter.folder / file).unlink()
     error = converter.refusal()
     assert file in error.message() and error.code == IO
+
+
+@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "vlm/tokenizer.json", "pre_5.safetensors"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_is_no_file_is_refused_by_its_name_and_not_waited_for(converter, tiny, file, kind):
+    converter.save(tiny)
+    path = converter.folder / file
+    path.unlink()
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        path.mkdir()
+    error = converter.refusal()
+    assert file in error.message() and "not a regular file" in error.message() and error.code == IO
 
 
 def test_a_shard_that_lacks_what_the_index_promises_is_refused(converter, tiny):

@@ -7,7 +7,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from typing import NamedTuple, Optional
+import stat
+from typing import BinaryIO, NamedTuple, Optional
 
 from .errors import Code, ConvertError, refuse
 
@@ -39,15 +40,41 @@ def _no_constant(name: str):
     raise ValueError("the number {} is not JSON".format(name))
 
 
-def read_json(path: str) -> dict:
-    """A JSON object. Errors: io when it cannot be read, bad_bundle when it is something else."""
+def open_file(path: str) -> BinaryIO:
+    """A regular file, for reading: a pipe would be waited for, and a device has no end. Errors: io."""
     try:
-        if os.path.getsize(path) > MAX_JSON:
-            raise refuse(path, "at most {} bytes".format(MAX_JSON), "{} bytes".format(os.path.getsize(path)))
-        with open(path, "rb") as file:
-            data = file.read()
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # opening a pipe waits for its writer
     except OSError as error:
         raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise refuse(path, "a file", "something that is not a regular file", code=Code.IO)
+    return os.fdopen(descriptor, "rb")
+
+
+def read_file(path: str, most: int = MAX_JSON) -> bytes:
+    """All bytes of a file. Errors: io when it cannot be read, bad_bundle when it is larger than `most`."""
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise refuse(path, "at most {} bytes".format(most), "{} bytes".format(size))
+        try:
+            return file.read(most)
+        except OSError as error:
+            raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
+
+
+def read_text(path: str) -> str:
+    """The same of a file in UTF-8."""
+    try:
+        return read_file(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise refuse(path, "UTF-8 text", str(error))
+
+
+def read_json(path: str) -> dict:
+    """A JSON object. Errors: io when it cannot be read, bad_bundle when it is something else."""
+    data = read_file(path)
     try:
         value = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:

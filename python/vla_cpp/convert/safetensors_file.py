@@ -11,23 +11,17 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from typing import BinaryIO, Dict, Iterator, NamedTuple, Tuple
+from typing import Dict, Iterator, NamedTuple, Tuple
 
 import numpy as np
 
 from .dtypes import SIZES, STATISTICS
-from .errors import Code, refuse
+from .errors import refuse
+from .files import open_file
 
 # The limit that the format's own library sets; a header of a large checkpoint takes less than a megabyte.
 MAX_HEADER = 100_000_000
 CHUNK_BYTES = 8 << 20
-
-
-def open_file(path: str) -> BinaryIO:
-    try:
-        return open(path, "rb")
-    except OSError as error:
-        raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
 
 
 class Entry(NamedTuple):

@@ -13,6 +13,7 @@ import os
 from typing import Dict, List, Optional, Tuple
 
 from .errors import Code, Problems, refuse
+from .files import read_file
 
 FILES = ("tokenizer.model", "paligemma_tokenizer.model")  # the hub's name, and that of openpi's download
 CONFIG = {"tokenizer_class": "GemmaTokenizer"}  # where no tokenizer_config.json stands beside it
@@ -74,14 +75,9 @@ def _parse(path: str):
         )
     model = sentencepiece_model_pb2.ModelProto()
     try:
-        if os.path.getsize(path) > MAX_SIZE:
-            raise refuse(path, "at most {} bytes".format(MAX_SIZE), "{} bytes".format(os.path.getsize(path)))
-        with open(path, "rb") as file:
-            model.ParseFromString(file.read())
+        model.ParseFromString(read_file(path, MAX_SIZE))
         # protobuf gives text that is not UTF-8 as bytes or as an error, according to its release
         sound = all(isinstance(p.piece, str) and p.piece and math.isfinite(p.score) for p in model.pieces)
-    except OSError as error:
-        raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
     except (DecodeError, UnicodeDecodeError) as error:
         raise refuse(path, "a SentencePiece model", str(error)[:80], "the file is damaged: download it again")
     if not sound or not model.pieces:

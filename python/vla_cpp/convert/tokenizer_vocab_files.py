@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 from typing import List
 
-from .errors import Code, Problems, refuse
-from .files import MAX_JSON, member, read_json
+from .errors import Problems, refuse
+from .files import member, read_json, read_text
 from .tokenizer_byte_level import QWEN2, QWEN2_WORDS, SPLITS
 from .tokenizer_parts import CONFIG_FILE
 
@@ -66,15 +66,7 @@ def _added_tokens(folder: str, config: dict, problems: Problems) -> List[dict]:
 
 
 def _merges(path: str) -> List[str]:
-    try:
-        if os.path.getsize(path) > MAX_JSON:
-            raise refuse(path, "at most {} bytes".format(MAX_JSON), "{} bytes".format(os.path.getsize(path)))
-        with open(path, encoding="utf-8", newline="\n") as file:
-            lines = [line.strip() for line in file]
-    except OSError as error:
-        raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
-    except UnicodeDecodeError as error:
-        raise refuse(path, "UTF-8 text", str(error))
+    lines = [line.strip() for line in read_text(path).split("\n")]
     if lines and lines[0].startswith("#version:"):
         lines = lines[1:]
     return [line for line in lines if line]

@@ -15,8 +15,9 @@ from typing import Dict, NamedTuple, Tuple
 
 from .dtypes import SIZES
 from .errors import Code, refuse
+from .files import open_file
 from .pickle_values import MAX_BYTES, Global, describe, ordered_dict, read_pickle
-from .safetensors_file import Entry, open_file
+from .safetensors_file import Entry
 
 STORAGES = {
     "BoolStorage": "BOOL",

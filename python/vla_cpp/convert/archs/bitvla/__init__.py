@@ -25,7 +25,7 @@ from ...bundle import Key
 from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
 from ...errors import Problems, refuse
 from ...features import feature_keys, states_of, views_of
-from ...files import member, read_json
+from ...files import member, read_json, read_text
 from ...section import Fixed, Section
 from ...torch_file import read_torch
 from ...tokenizer import TokenizerPlan, read_tokenizer
@@ -201,8 +201,7 @@ def _system_sentence(checkpoint: Checkpoint, problems: Problems) -> str:
     """What the chat template says before the user does."""
     where = "chat_template.jinja"
     if os.path.exists(checkpoint.path(where)):
-        with open(checkpoint.path(where), encoding="utf-8") as file:
-            stated = file.read()
+        stated = read_text(checkpoint.path(where))
     else:
         where = "tokenizer_config.json: chat_template"
         stated = read_json(checkpoint.path("tokenizer_config.json")).get("chat_template")

@@ -13,7 +13,7 @@ from typing import Dict, List
 
 from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
-from ...files import member, read_json
+from ...files import member, read_json, read_text
 from ...layers import linear, norm, vector
 from ...networks import MAX_LAYERS
 from ...section import Fixed, Section
@@ -237,8 +237,7 @@ def _check_template(folder: str, problems: Problems) -> None:
     """The template is a program of its own; what is looked for here is what would make another prompt of one user's turn."""
     name, text = "chat_template.jinja", None
     if os.path.exists(os.path.join(folder, name)):
-        with open(os.path.join(folder, name), encoding="utf-8", errors="replace") as file:
-            text = file.read()
+        text = read_text(os.path.join(folder, name))
     for name in ("chat_template.json", "tokenizer_config.json"):
         if text is None and os.path.exists(os.path.join(folder, name)):
             text = read_json(os.path.join(folder, name)).get("chat_template")
