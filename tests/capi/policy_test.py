@@ -5,17 +5,22 @@
 import json
 import os
 import pickle
+import resource
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
 from commands import ROOT
 from golden_cases import NAMES, Golden
+from image_files import hostile_pngs
 from PIL import Image
 
 import vla_cpp
+
+FAMILY = hostile_pngs(Golden("two_views").images["camera1"].read_bytes())
 
 
 def frames(case):
@@ -268,3 +273,20 @@ print(vla_cpp.Policy({str(ROOT / "models/metaworld-tiny.gguf")!r}, threads=1).sp
 """)
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) == 2 and result.stdout.endswith("16\n")
+
+
+@pytest.mark.parametrize("what", FAMILY)
+def test_a_hostile_png_takes_neither_memory_nor_time(act, golden, what):
+    def most_memory():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+
+    data, is_image = FAMILY[what]
+    images = {**frames(golden), "camera1": data}
+    act()
+    before, start = most_memory(), time.monotonic()
+    if is_image:
+        assert np.isfinite(np.asarray(act(images=images))).all()
+    else:
+        with pytest.raises(vla_cpp.BadObservation, match="observation.images.camera1"):
+            act(images=images)
+    assert time.monotonic() - start < 5 and most_memory() < before + (64 << 20)

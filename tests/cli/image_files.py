@@ -33,3 +33,23 @@ def jpeg_with_size(data, width, height):
     """A JPEG file whose frame header claims another size."""
     at = next(i for i in range(len(data)) if data[i] == 0xFF and data[i + 1] in (0xC0, 0xC1, 0xC2))
     return data[: at + 5] + struct.pack(">HH", height, width) + data[at + 9 :]
+
+
+def hostile_pngs(sound):
+    """{what: (PNG, whether it is an image all the same)}: a sound one with what would make a reader unpack gigabytes."""
+    bomb = zlib.compress(bytes(8 << 20), 9)
+    after_header = len(png_header(1, 1))
+
+    def with_chunks(*chunks):
+        return sound[:after_header] + b"".join(chunks) + sound[after_header:]
+
+    xmp = b"XML:com.adobe.xmp\0\1\0\0\0" + bomb
+    return {
+        "a thousand packed texts": (with_chunks(*[_chunk(b"zTXt", b"comment\0\0" + bomb)] * 1000), True),
+        "a thousand packed international texts": (with_chunks(*[_chunk(b"iTXt", b"comment\0\1\0\0\0" + bomb)] * 1000), True),
+        "a packed profile": (with_chunks(_chunk(b"iCCP", b"profile\0\0" + bomb)), True),
+        "packed orientations": (with_chunks(*[_chunk(b"iTXt", xmp)] * 200), False),
+        "a text of 2 GiB": (with_chunks(struct.pack(">I", 2**31 - 1) + b"tEXtcomment\0"), False),
+        "a hundred thousand empty chunks": (with_chunks(*[_chunk(b"teSt", b"")] * 100_000), True),
+        "rows that are not there": (png_of_rows(4000, 4000, 1), False),
+    }
