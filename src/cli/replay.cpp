@@ -48,8 +48,14 @@ Status report(const serve::Recording& recording, const serve::ReplayReport& repo
                fmt::format("{} answers differ; this is the first", report.n_different)};
 }
 
-/// The limits that the requests were recorded under.
-serve::ServerOptions limits_of(const v1::Limits& limits) {
+/// The limits that the requests were recorded under, which are some that `vla serve` takes.
+Result<serve::ServerOptions> limits_of(const v1::Limits& limits) {
+  constexpr std::uint64_t kMiB = 1 << 20, kMostMessage = 1024 * kMiB, kMostPixels = 1 << 28, kMostText = kMiB;
+  if (limits.max_message_bytes() < kMiB || limits.max_message_bytes() > kMostMessage ||
+      limits.max_pixels() > kMostPixels || limits.max_text_bytes() > kMostText)
+    return Error{Code::bad_request, "the recorded description", "limits that vla serve takes",
+                 fmt::format("{} bytes, {} pixels, {} bytes of text", limits.max_message_bytes(), limits.max_pixels(),
+                             limits.max_text_bytes())};
   serve::ServerOptions options;
   options.bind = {"tcp://127.0.0.1:0"};
   options.max_message = limits.max_message_bytes();
@@ -60,8 +66,8 @@ serve::ServerOptions limits_of(const v1::Limits& limits) {
 
 /// Serves the bundle in this process, as `vla serve` would, for the time of the replay.
 Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOptions& options) {
-  VLA_TRY(const std::unique_ptr<serve::Server> server,
-          serve::Server::open(limits_of(recording.description().limits())));
+  VLA_TRY(const serve::ServerOptions limits, limits_of(recording.description().limits()));
+  VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(limits));
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
                                                                               .kernels = options.kernels,
                                                                               .device = options.device,

@@ -368,8 +368,8 @@ def test_a_replay_gives_every_answer_again_bit_for_bit(vla, serve, golden, recor
     assert (answer.code, answer.out) == (0, "6 answers the same, 0 different, 1 not compared\n"), answer.err
 
 
-def with_piece(recording, index, change):
-    """Changes the answer of one piece and seals it again, as src/serve/recording.h describes."""
+def with_piece(recording, index, change, of_request=False):
+    """Changes the answer, or the request, of one piece and seals it again, as src/serve/recording.h describes."""
     import struct
 
     import xxhash
@@ -381,13 +381,15 @@ def with_piece(recording, index, change):
         n_in, n_out = struct.unpack_from("<II", data, at + 8)
         at += 24 + n_in + n_out
     n_in, n_out = struct.unpack_from("<II", data, at + 8)
-    start = at + 24 + n_in
-    answer = change(bytes(data[start : start + n_out]))
-    assert len(answer) == n_out
-    data[start : start + n_out] = answer
-    seal = xxhash.xxh3_64_intdigest(bytes(data[at : at + 16]))
-    seal = xxhash.xxh3_64_intdigest(bytes(data[at + 24 : start]), seal)
-    struct.pack_into("<Q", data, at + 16, xxhash.xxh3_64_intdigest(answer, seal))
+    start, middle, end = at + 24, at + 24 + n_in, at + 24 + n_in + n_out
+    part = slice(start, middle) if of_request else slice(middle, end)
+    changed = change(bytes(data[part]))
+    assert len(changed) == part.stop - part.start
+    data[part] = changed
+    seal = 0
+    for sealed in (slice(at, at + 16), slice(start, middle), slice(middle, end)):
+        seal = xxhash.xxh3_64_intdigest(bytes(data[sealed]), seal)
+    struct.pack_into("<Q", data, at + 16, seal)
     path.write_bytes(data)
 
 
@@ -401,6 +403,13 @@ def test_one_bit_of_one_action_is_found_and_told(vla, golden, recording):
     assert answer.code == 10
     assert "5 answers the same, 1 different, 1 not compared" in answer.out and " actions " in answer.out
     assert "request 2: actions" in answer.err and "1 answers differ" in answer.err
+
+
+def test_a_recording_under_limits_that_no_server_has_is_refused(vla, golden, recording):
+    of_32_mib, of_one = b"\x80\x80\x80\x10", b"\x81\x80\x80\x00"  # as Protobuf writes them in four bytes
+    with_piece(recording, 0, lambda description: description.replace(of_32_mib, of_one), of_request=True)
+    answer = vla("replay", recording, "--bundle", golden.bundle, "--threads", 2)
+    assert answer.code == 11 and "limits that vla serve takes, found 1 bytes, 16777216 pixels" in answer.err
 
 
 @pytest.mark.parametrize("place", [0, 3, 20, 40, 5000, -1, -20])
