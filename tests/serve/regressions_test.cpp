@@ -54,6 +54,17 @@ TEST_CASE(
   }
 }
 
+TEST_CASE("the files that fuzzing starts from are read whole") {
+  for (const auto& [name, kind] : {std::pair{"recording", fuzz::FileKind::recording},
+                                   {"taps", fuzz::FileKind::taps},
+                                   {"keys", fuzz::FileKind::keys}}) {
+    CAPTURE(name);
+    const std::string bytes = read_text(source_path("tests/fuzz/regressions/file/") + name);
+    REQUIRE(bytes.front() == static_cast<char>(kind));  // as the fuzz target reads them
+    CHECK(fuzz::check_file(kind, bytes.substr(1), scratch_path("fuzz_files")));
+  }
+}
+
 TEST_CASE("damaged recordings, taps and key files are read or refused, in bounded time and memory") {
   const std::string folder = scratch_path("odd_files");
   std::filesystem::remove_all(folder);

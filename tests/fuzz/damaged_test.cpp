@@ -1,0 +1,81 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// A fuzz target without a fuzzer, for every compiler: what it starts from, and damage done to that, for some seconds.
+// VLA_FUZZ_TARGET is its name.
+#include <doctest/doctest.h>
+
+#include <chrono>
+#include <filesystem>
+#include <set>
+
+#include "bundle/bundle.h"
+#include "fuzz/mutate.h"
+#include "support/editable_bundle.h"
+
+using namespace vla;
+using namespace vla::test;
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size);
+extern "C" [[gnu::weak]] std::size_t LLVMFuzzerCustomMutator(std::uint8_t* data, std::size_t size, std::size_t max_size,
+                                                             unsigned seed);
+
+namespace {
+
+constexpr std::chrono::seconds kTime{20};
+
+void check(const std::string& bytes) {
+  LLVMFuzzerTestOneInput(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size());
+}
+
+std::string mutant(std::string bytes, fuzz::Random& random) {
+  if (LLVMFuzzerCustomMutator == nullptr) return fuzz::damaged(std::move(bytes), random);
+  const std::size_t size = bytes.size();
+  bytes.resize(2 * size);
+  bytes.resize(LLVMFuzzerCustomMutator(reinterpret_cast<std::uint8_t*>(bytes.data()), size, bytes.size(),
+                                       static_cast<unsigned>(random())));
+  return bytes;
+}
+
+/// The first golden bundle of each architecture.
+std::vector<std::string> golden_bundles() {
+  std::set<std::string> paths;
+  for (const auto& arch : std::filesystem::directory_iterator(golden_path())) {
+    if (!arch.is_directory()) continue;
+    std::set<std::string> cases;
+    for (const auto& entry : std::filesystem::directory_iterator(arch)) cases.insert(entry.path());
+    paths.insert(*cases.begin() + "/bundle.gguf");
+  }
+  return {paths.begin(), paths.end()};
+}
+
+/// What scripts/fuzz.sh starts from too.
+std::vector<std::string> seeds(const std::string& target) {
+  std::vector<std::string> files, out;
+  for (const std::string& folder : {source_path("tests/fuzz/regressions/" + target),
+                                    source_path(target == "image" ? "tests/processor/data/images" : "no such folder")})
+    if (std::filesystem::is_directory(folder))
+      for (const auto& entry : std::filesystem::directory_iterator(folder)) files.push_back(entry.path());
+  std::sort(files.begin(), files.end());
+  if (target == "act") files = golden_bundles();
+  for (const std::string& file : files) out.push_back(read_text(file));
+  if (target == "recipe")
+    for (const std::string& bundle : golden_bundles())
+      out.push_back(*EditableBundle::read(bundle).keys.string("processor.recipe"));
+  return out;
+}
+
+}  // namespace
+
+TEST_CASE("damaged seeds of the fuzz target " VLA_FUZZ_TARGET " keep its check") {
+  const auto end = std::chrono::steady_clock::now() + kTime;
+  const std::vector<std::string> sound = seeds(VLA_FUZZ_TARGET);
+  REQUIRE(!sound.empty());
+  for (const std::string& seed : sound) check(seed);
+  fuzz::Random random(1);
+  int n_input = 0;
+  for (; std::chrono::steady_clock::now() < end; ++n_input)
+    check(mutant(sound[fuzz::below(random, sound.size())], random));
+  MESSAGE(n_input << " inputs");
+  CHECK(n_input > 0);
+}
