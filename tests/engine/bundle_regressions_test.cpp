@@ -7,7 +7,6 @@
 #include <filesystem>
 
 #include "fuzz/bundle_target.h"
-#include "fuzz/mutate.h"
 #include "support/joint_bundle.h"
 
 using namespace vla;
@@ -77,12 +76,4 @@ TEST_CASE("bundles from fuzzing load or are refused") {
     ++count;
   }
   CHECK(count > 0);
-}
-
-TEST_CASE("damaged bundles are loaded or refused") {
-  fuzz::Random random(1);
-  for (const char* name : {"smallest", "smallest_of_two"}) {
-    const std::string sound = read_text(kFolder + "/" + name);
-    for (int round = 0; round < 5000; ++round) (void)depth(fuzz::damaged(sound, random));
-  }
 }
