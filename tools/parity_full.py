@@ -26,7 +26,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tools")]
-from goldens import FAMILIES, cases, family, recorder  # noqa: E402
+from goldens import cases, families, family, recorder  # noqa: E402
 
 SEED = 0
 FRAMES = {"camera1": (480, 640, "png"), "camera2": (480, 480, "png")}
@@ -129,7 +129,7 @@ def print_blocks(reference, taps):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", type=Path, required=True, help="folder of the case; written where it has no checkpoint")
-    parser.add_argument("--arch", default="smolvla", choices=sorted(a for a in FAMILIES if hasattr(family(a), "published")), help="of the checkpoint that is written")
+    parser.add_argument("--arch", default="smolvla", choices=sorted(a for a in families() if hasattr(family(a), "published")), help="of the checkpoint that is written")
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
     parser.add_argument("--dtype", default="bf16", choices=("f32", "bf16", "f16"), help="storage of the bundle's matrices")
     parser.add_argument("--threads", type=int, default=os.cpu_count())

@@ -1,0 +1,24 @@
+#!/usr/bin/env python3
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The programs that are run by hand, tools/ and scripts/, still start: each prints its help.  One whose library is not installed here
+skips by name."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAMS = sorted(str(file.relative_to(ROOT)) for folder in ("tools", "tools/peers", "scripts") for file in (ROOT / folder).glob("*.py"))
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_program_that_is_run_by_hand_prints_its_help(program):
+    done = subprocess.run([sys.executable, "-B", ROOT / program, "--help"], capture_output=True, text=True, timeout=120)
+    lacking = re.search(r"^ModuleNotFoundError: No module named '(jax|torch|openvino)", done.stderr, re.M)
+    if lacking:
+        pytest.skip(f"{program}: no {lacking[1]} here")
+    assert done.returncode == 0, done.stderr
