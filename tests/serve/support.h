@@ -66,9 +66,10 @@ class Peer {
  public:
   explicit Peer(const std::string& address, zmq::socket_type type = zmq::socket_type::dealer) : socket(context, type) {
     socket.set(zmq::sockopt::linger, 0);
+    socket.set(zmq::sockopt::sndtimeo, 20'000);
     socket.connect(address);
   }
-  void send(const std::string& bytes) { socket.send(zmq::buffer(bytes)); }
+  void send(const std::string& bytes) { REQUIRE(socket.send(zmq::buffer(bytes)).has_value()); }
   void send(const v1::Request& request) { send(request.SerializeAsString()); }
   /// The next answer, or none within the time.
   std::optional<v1::Response> receive(int timeout_ms = 20'000) {
