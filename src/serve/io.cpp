@@ -32,12 +32,18 @@ Job job_of(const Client& client, Message message) {
 
 }  // namespace
 
+void Vitals::begin() noexcept {
+  ready = true;
+  ready_since = Clock::now().time_since_epoch().count();
+}
+
 Health Vitals::health(const Exchange& exchange) const {
-  const Clock::duration up = Clock::now().time_since_epoch() - Clock::duration(ready_since);
+  const Clock::rep since = ready_since;  // before `ready`, which begin() sets first: up and not ready is draining
+  const Clock::duration up = Clock::now().time_since_epoch() - Clock::duration(since);
   return {ready,
           exchange.n_waiting(),
           exchange.computing(),
-          ready_since == 0 ? 0.0 : std::chrono::duration<double>(up).count(),
+          since == 0 ? 0.0 : std::chrono::duration<double>(up).count(),
           n_chunk,
           n_error};
 }

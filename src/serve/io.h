@@ -17,6 +17,7 @@ struct Vitals {
   std::atomic<std::uint64_t> n_chunk = 0, n_error = 0;
   std::atomic<Clock::rep> ready_since = 0;
 
+  void begin() noexcept;
   Health health(const Exchange& exchange) const;
 };
 

@@ -114,8 +114,7 @@ v1::Description Server::describe(const Engine& engine) const {
 /// Programs run on the thread that calls this.
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   description_ = describe(engine);
-  vitals_.ready_since = Clock::now().time_since_epoch().count();
-  vitals_.ready = true;
+  vitals_.begin();
   Io io(*hub_, exchange_, vitals_, description_, observers);
   VLA_TRY(std::thread thread, start_thread("I/O thread", [&] { io.run(); }));
   while (std::optional<Job> job = exchange_.next()) {

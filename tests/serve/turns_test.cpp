@@ -267,3 +267,17 @@ TEST_CASE("clients that never read, or that go away while their act waits, cost 
   }
   check_serves(peer);
 }
+
+TEST_CASE("a server that begins to take acts never looks as if it drained") {
+  const serve::Exchange exchange({1, 1});
+  for (int round = 0; round < 2000; ++round) {
+    serve::Vitals vitals;
+    std::thread begins([&] { vitals.begin(); });
+    serve::Health health;
+    while ((health = vitals.health(exchange)).uptime_s == 0) {
+    }
+    begins.join();
+    REQUIRE(health.ready);
+    REQUIRE(health.uptime_s < 60);
+  }
+}
