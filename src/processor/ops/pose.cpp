@@ -10,20 +10,13 @@
 #include <algorithm>
 #include <cmath>
 
+#include "processor/ops/matrix.h"
 #include "processor/recipe.h"
 
 namespace vla {
 namespace {
 
-using Matrix = std::array<double, 9>;
-
-Matrix product(const Matrix& a, const Matrix& b) {
-  Matrix out{};
-  for (std::size_t i = 0; i < 3; ++i)
-    for (std::size_t j = 0; j < 3; ++j)
-      for (std::size_t k = 0; k < 3; ++k) out[3 * i + j] += a[3 * i + k] * b[3 * k + j];
-  return out;
-}
+using Matrix = Matrix3<double>;
 
 Matrix transposed(const Matrix& m) { return {m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]}; }
 

@@ -12,12 +12,13 @@
 #include <array>
 #include <cmath>
 
+#include "processor/ops/matrix.h"
 #include "processor/recipe.h"
 
 namespace vla {
 namespace {
 
-using Matrix = std::array<float, 9>;  // row by row
+using Matrix = Matrix3<float>;
 using Axes = std::array<std::size_t, 3>;
 
 constexpr std::size_t kRows = 6;  // numbers of the representation that is the first two rows of a matrix
@@ -35,14 +36,6 @@ float sine(float x) { return static_cast<float>(std::sin(static_cast<double>(x))
 float cosine(float x) { return static_cast<float>(std::cos(static_cast<double>(x))); }
 float arc_tangent(float y, float x) {
   return static_cast<float>(std::atan2(static_cast<double>(y), static_cast<double>(x)));
-}
-
-Matrix product(const Matrix& a, const Matrix& b) {
-  Matrix out{};
-  for (std::size_t i = 0; i < 3; ++i)
-    for (std::size_t j = 0; j < 3; ++j)
-      for (std::size_t k = 0; k < 3; ++k) out[3 * i + j] += a[3 * i + k] * b[3 * k + j];
-  return out;
 }
 
 /// q: the real part, then the three others; of any length.
