@@ -51,9 +51,9 @@ std::vector<std::string> golden_bundles() {
 
 /// What scripts/fuzz.sh starts from too.
 std::vector<std::string> seeds(const std::string& target) {
-  std::vector<std::string> files, out;
-  for (const std::string& folder : {source_path("tests/fuzz/regressions/" + target),
-                                    source_path(target == "image" ? "tests/processor/data/images" : "no such folder")})
+  std::vector<std::string> files, out, folders{source_path("tests/fuzz/regressions/" + target)};
+  if (target == "image") folders.push_back(source_path("tests/processor/data/images"));
+  for (const std::string& folder : folders)
     if (std::filesystem::is_directory(folder))
       for (const auto& entry : std::filesystem::directory_iterator(folder)) files.push_back(entry.path());
   std::sort(files.begin(), files.end());
