@@ -19,8 +19,8 @@ namespace {
 enum GgufType : std::uint32_t { u8, i8, u16, i16, u32, i32, f32, boolean, string, array, u64, i64, f64 };
 
 constexpr std::uint64_t kMaxDims = 4;
-constexpr std::uint64_t kMaxNameLength =
-    65535;                               // of keys and tensor names, as the format's own description limits them
+// Bytes of a key or a tensor's name, as the format's own description limits them.
+constexpr std::uint64_t kMaxNameLength = 65535;
 constexpr std::size_t kMaxShown = 4096;  // bytes of a text that is shown; a path may have as many
 
 using Show = std::function<Status(std::size_t n)>;
