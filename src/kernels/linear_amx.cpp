@@ -2,60 +2,43 @@
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
 #include "kernels/amx_tiles.h"
-#include "kernels/linear_pairs.h"
+#include "kernels/linear_tiles.h"
 
 namespace vla::kernels {
 namespace {
 
-/// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel; sums are float32.
-struct AmxTile : PairTile {
+/// A square of sums is four tiles, one of x two, and so is one of a panel; sums are float32.
+struct AmxTile {
   using V = Avx512;
   using Session = AmxSession;
 
-  static VLA_INLINE void store_rounded(X* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
+  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, X* to, X* rest) {
-    for (std::int64_t i = 0; i < n; i += 32) {
-      const V::Float a = load<V>(from + i, n - i), b = n - i > 16 ? load<V>(from + i + 16, n - i - 16) : V::Float{};
-      store_bf16(to + i, a, b);
-      if (rest != nullptr) store_bf16(rest + i, a - rounded(a), b - rounded(b));
-    }
+  static VLA_INLINE void copy(const float* from, std::int64_t n, std::uint16_t* to) {
+    store_bf16(to, load<V>(from, n), n > 16 ? load<V>(from + 16, n - 16) : V::Float{});
   }
 
-  static void multiply(DType, int n_row, const X* x, const X* rest, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const Ahead& ahead) {
-    // Rows beyond x are multiplied too; their sums are not read.
-    if (rest != nullptr)
-      n_row > 16 ? product<true, true>(x, rest, panel, depth, c, add, ahead.from)
-                 : product<false, true>(x, rest, panel, depth, c, add, ahead.from);
-    else
-      n_row > 16 ? product<true, false>(x, rest, panel, depth, c, add, ahead.from)
-                 : product<false, false>(x, rest, panel, depth, c, add, ahead.from);
+  template <class Between>
+  static VLA_INLINE void multiply(bool half, const std::uint16_t* x, const std::byte* panel, std::int64_t n_square,
+                                  float* c, bool add, Between& between) {
+    half ? product<false>(x, panel, n_square, c, add, between) : product<true>(x, panel, n_square, c, add, between);
   }
 
  private:
-  /// To the nearest bf16, ties to even, as a float.
-  static VLA_INLINE V::Float rounded(V::Float x) {
-    const auto bits = std::bit_cast<V::Int>(x);
-    return std::bit_cast<V::Float>((bits + 0x7fff + ((bits >> 16) & 1)) & ~0xffff);
-  }
+  static constexpr std::size_t kLineX = kSquare * sizeof(std::uint16_t), kLineC = kSquare * sizeof(float);
+  static constexpr std::int64_t kHalf = kSquare / 2 * kSquare;  // numbers of the upper half of a square
 
-  static constexpr std::size_t kLineX = kXStride * sizeof(X), kLineC = kColumns * sizeof(float);
-
-  /// All 32 rows, or the first 16; with what the rounding of x left, or without.
-  template <bool kAll, bool kSplit>
-  static VLA_INLINE void product(const X* x, const X* rest, const std::byte* panel, std::int64_t depth, float* c,
-                                 bool add, const std::byte* ahead) {
-    // Bytes of the panel's next step to ask for with each two blocks: the rows of x share them.
-    constexpr int kAhead = kSplit ? 1024 : 512;
-    float* lower = c + 16 * kColumns;
+  /// All 32 rows, or the first 16.
+  template <bool kAll, class Between>
+  static VLA_INLINE void product(const std::uint16_t* x, const std::byte* panel, std::int64_t n_square, float* c,
+                                 bool add, Between& between) {
     before_tile_loads();
     if (add) {
       _tile_loadd(0, c, kLineC);
       _tile_loadd(1, c + 16, kLineC);
       if constexpr (kAll) {
-        _tile_loadd(2, lower, kLineC);
-        _tile_loadd(3, lower + 16, kLineC);
+        _tile_loadd(2, c + kHalf, kLineC);
+        _tile_loadd(3, c + kHalf + 16, kLineC);
       }
     } else {
       _tile_zero(0);
@@ -63,40 +46,37 @@ struct AmxTile : PairTile {
       _tile_zero(2);
       _tile_zero(3);
     }
-    for (std::int64_t k = 0; k < depth; k += kPanelDepth, panel += 2 * kPanelBlock, ahead += kAhead) {
+    for (std::int64_t i = 0; i < n_square; ++i, x += 2 * kHalf, panel += 2 * kPanelBlock) {
       _tile_loadd(6, panel, 64);
+      _tile_loadd(4, x, kLineX);
       _tile_loadd(7, panel + kPanelBlock, 64);
-      add_products<kAll>(x + k);
-      if constexpr (kSplit) add_products<kAll>(rest + k);
-      for (int line = 0; line < kAhead; line += 64) __builtin_prefetch(ahead + line, 0, 2);  // to the second cache
+      _tile_dpbf16ps(0, 4, 6);
+      if constexpr (kAll) _tile_loadd(5, x + kHalf, kLineX);
+      _tile_dpbf16ps(1, 4, 7);
+      between();
+      if constexpr (kAll) {
+        _tile_dpbf16ps(2, 5, 6);
+        _tile_dpbf16ps(3, 5, 7);
+      }
     }
     _tile_stored(0, c, kLineC);
     _tile_stored(1, c + 16, kLineC);
     if constexpr (kAll) {
-      _tile_stored(2, lower, kLineC);
-      _tile_stored(3, lower + 16, kLineC);
-    }
-  }
-
-  template <bool kAll>
-  static VLA_INLINE void add_products(const X* x) {
-    _tile_loadd(4, x, kLineX);
-    _tile_dpbf16ps(0, 4, 6);
-    _tile_dpbf16ps(1, 4, 7);
-    if constexpr (kAll) {
-      _tile_loadd(5, x + 16 * kXStride, kLineX);
-      _tile_dpbf16ps(2, 5, 6);
-      _tile_dpbf16ps(3, 5, 7);
+      _tile_stored(2, c + kHalf, kLineC);
+      _tile_stored(3, c + kHalf + 16, kLineC);
     }
   }
 };
+
+/// Few rows are bound by reading weights: x stays as it is there.
+constexpr std::int64_t kMaxFew = 16;
 
 bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::amx && desc.type == DType::bf16; }
 
 }  // namespace
 
-extern const LinearKernel kLinearAmx;
-const LinearKernel kLinearAmx = LinearLoop<AmxTile>::kernel("amx", supports);
+extern const LinearKernel kLinearAvx512, kLinearAmx;
+const LinearKernel kLinearAmx = TileLoop<AmxTile>::kernel("amx", supports, &kLinearAvx512, kMaxFew);
 
 }  // namespace vla::kernels
 #endif

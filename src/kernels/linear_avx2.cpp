@@ -13,15 +13,14 @@ struct Avx2Tile {
   using V = Avx2;
   using X = float;
   static constexpr int kRows = 6, kColumns = 16;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 768, kBlockRows = 54, kSplitRows = 0;
+  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 768, kBlockRows = 54;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr bool kEven = true, kRounds = false;
-  struct Session {};
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
+  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
-  static void multiply(DType type, int n_row, const float* x, const float*, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const Ahead& ahead) {
+  static void multiply(DType type, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c,
+                       bool add, const Ahead& ahead) {
     with_height<kRows>(n_row, [&]<int n>() {
       if (type == DType::bf16)
         tile<n, Pairs>(x, panel, depth, c, add, ahead.from);

@@ -12,15 +12,14 @@ struct Avx512Tile {
   using V = Avx512;
   using X = float;
   static constexpr int kRows = kAvx512Rows, kColumns = 32;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1024, kStep = 256, kBlockRows = 144, kSplitRows = 0;
+  static constexpr int kMaxDepth = 2048, kManyDepth = 1024, kStep = 256, kBlockRows = 144;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr bool kEven = true, kRounds = false;
-  struct Session {};
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to, float*) { copy_padded(from, n, to); }
+  static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
-  static void multiply(DType type, int n_row, const float* x, const float*, const std::byte* panel, std::int64_t depth,
-                       float* c, bool add, const Ahead& ahead) {
+  static void multiply(DType type, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c,
+                       bool add, const Ahead& ahead) {
     const auto rows = type == DType::bf16  ? multiply_rows<Pairs>
                       : type == DType::f16 ? multiply_rows<Halves>
                                            : multiply_rows<Floats>;

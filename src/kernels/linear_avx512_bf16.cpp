@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #if defined(__x86_64__)
 #include "kernels/linear_avx512_tile.h"
-#include "kernels/linear_pairs.h"
+#include "kernels/linear_loop.h"
 #include "kernels/rounding_avx512.h"
 
 namespace vla::kernels {
@@ -14,20 +14,19 @@ struct Avx512Bf16Tile {
   using V = Avx512;
   using X = std::uint16_t;
   static constexpr int kRows = kAvx512Rows, kColumns = 32;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 384, kBlockRows = 192, kSplitRows = 0;
+  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 384, kBlockRows = 192;
   static constexpr int kXStride = kMaxDepth + 32;
   static constexpr bool kEven = true, kRounds = true;
-  struct Session {};
 
   static VLA_INLINE void store_rounded(X* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
 
-  static VLA_INLINE void copy(const float* from, std::int64_t n, X* to, X*) {
+  static VLA_INLINE void copy(const float* from, std::int64_t n, X* to) {
     for (std::int64_t i = 0; i < n; i += 32)
       store_bf16(to + i, load<V>(from + i, n - i), n - i > 16 ? load<V>(from + i + 16, n - i - 16) : V::Float{});
   }
 
-  static void multiply(DType, int n_row, const X* x, const X*, const std::byte* panel, std::int64_t depth, float* c,
-                       bool add, const Ahead& ahead) {
+  static void multiply(DType, int n_row, const X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
+                       const Ahead& ahead) {
     multiply_rows<Pairs>(n_row, x, panel, depth, c, add, ahead);
   }
 

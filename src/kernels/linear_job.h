@@ -43,8 +43,8 @@ struct LinearJob {
   Activation activation;
   /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
   bool gated;
-  /// Of x and y: f32, or bf16 where the kernel rounds what it multiplies (LinearKernel::rounds). Of x also i8: rows as
-  /// LinearKernel::quantize makes them, x_stride bytes apart.
+  /// Of x and y: f32, or bf16 where the kernel rounds what it multiplies, laid out as LinearKernel::rounded says. Of x
+  /// also i8: rows as LinearKernel::quantize makes them, x_stride bytes apart.
   DType x_type, y_type;
   std::int64_t n_group;  // of panels, made by LinearKernel::cut
 };

@@ -7,6 +7,7 @@
 #include "kernels/executor.h"
 #include "kernels/isa.h"
 #include "kernels/linear_job.h"
+#include "kernels/rounded.h"
 
 namespace vla::kernels {
 
@@ -32,8 +33,8 @@ struct LinearKernel {
   void (*run)(const LinearJob& job, std::int64_t item, Worker& worker);
   std::size_t scratch_size;
   std::int64_t max_norm;  // the widest norm of x that it computes on the way
-  /// Whether x of so many rows and this depth is rounded to bf16 once, so that it may come as bf16, and y may leave so.
-  bool (*rounds)(std::int64_t n_row, std::int64_t d_in);
+  /// How x of this depth may come, and y leave, as the bf16 that the kernel rounds x to.
+  RoundedLayout (*rounded)(std::int64_t d_in);
   /// What computes products of at most `max_few` rows in its place, from the same packed matrix; null where it does so
   /// itself.
   const LinearKernel* few = nullptr;

@@ -22,25 +22,23 @@ struct Ahead {
 
 /// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
 /// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kManyDepth (the same where there
-/// is more than one block), kStep (of the depth, most), kSplitRows (x of no more rows is split into two bf16, the
-/// number rounded and what that leaves), kRounds (x becomes bf16), kEven (tiles of equal height), Session (held while a
-/// thread works), and
-///   copy(from, n, to, rest)           n numbers of x, zeros up to a multiple of 32; what rounding leaves, or null
+/// is more than one block), kStep (of the depth, most), kRounds (x becomes bf16), kEven (tiles of equal height), and
+///   copy(from, n, to)                 n numbers of x, zeros up to a multiple of 32
 ///   store_rounded(to, vector, left)   y as bf16, where kRounds
-///   multiply(type, n_row, x, rest, panel, depth, c, add, ahead)
+///   multiply(type, n_row, x, panel, depth, c, add, ahead)
 ///     c [kColumns] x n_row <= kRows, += where `add`; prefetches ahead
 template <class Tile>
 class LinearLoop {
   using V = typename Tile::V;
   using X = typename Tile::X;
   using Layout = Panels<Tile::kColumns>;
-  using Stripes = LinearStripes<Tile>;
+  static constexpr RoundedLayout kLayout = Tile::kRounds ? RoundedLayout::rows : RoundedLayout::none;
+  using Stripes = LinearStripes<Tile, kLayout>;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
   static constexpr std::int64_t kMinItems = 16;                // for each thread, where there are so many
-  static constexpr std::int64_t kRest = kBlockRows / 2 * Tile::kXStride;
   static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kManyDepth % kPanelDepth == 0);
-  static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0 && Tile::kSplitRows <= kBlockRows / 2);
+  static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0);
 
   struct Scratch {
     // Which rows of x the block holds, and from which depth on: items of one block follow each other, so that a worker
@@ -57,7 +55,7 @@ class LinearLoop {
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa),
                                        const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
     return {name,   Layout::packed_size, Layout::pack,    supports, cut,
-            run,    sizeof(Scratch),     Tile::kMaxDepth, rounds,   few,
+            run,    sizeof(Scratch),     Tile::kMaxDepth, rounded,  few,
             max_few};
   }
 
@@ -74,7 +72,6 @@ class LinearLoop {
   }
 
   static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
-    [[maybe_unused]] const typename Tile::Session session;
     LinearLoop loop(job);
     const auto [scratch, kept] = worker.scratch_of<Scratch>(&job);
     if (!kept) scratch->row = -1;
@@ -82,9 +79,7 @@ class LinearLoop {
     loop.item(item);
   }
 
-  static bool rounds(std::int64_t n_row, std::int64_t d_in) {
-    return Tile::kRounds && n_row > Tile::kSplitRows && d_in <= Tile::kManyDepth;
-  }
+  static RoundedLayout rounded(std::int64_t d_in) { return d_in <= Tile::kManyDepth ? kLayout : RoundedLayout::none; }
 
   explicit LinearLoop(const LinearJob& job)
       : job_(job),
@@ -122,8 +117,7 @@ class LinearLoop {
       if (Tile::kRounds && job_.x_type == DType::bf16)
         copy_padded(reinterpret_cast<const X*>(job_.x) + place + k, depth, to);
       else
-        Tile::copy(normed(reinterpret_cast<const float*>(job_.x) + place) + k, depth, to,
-                   splits() ? to + kRest : nullptr);
+        Tile::copy(normed(reinterpret_cast<const float*>(job_.x) + place) + k, depth, to);
     }
   }
 
@@ -133,8 +127,6 @@ class LinearLoop {
     norm.run(x, norm.weight, norm.bias, norm.eps, scratch_->normed, job_.d_in);
     return scratch_->normed;
   }
-
-  bool splits() const { return job_.n_row <= Tile::kSplitRows; }
 
   /// y of the stripe (+)= the block of x times the panel. Whatever follows the product is done while a tile of sums
   /// lies in the first cache.
@@ -164,8 +156,7 @@ class LinearLoop {
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         if (k + d == depth) before(r, n_row);
-        const X* x = scratch_->x + r * Tile::kXStride + k;
-        Tile::multiply(part.type, static_cast<int>(n_row), x, splits() ? x + kRest : nullptr, panel, d,
+        Tile::multiply(part.type, static_cast<int>(n_row), scratch_->x + r * Tile::kXStride + k, panel, d,
                        sums + r * kColumns, add || k > 0, {next + size * t / n_tile, size / n_tile});
         if (k + d == depth) after(r, n_row);
       }

@@ -5,6 +5,7 @@
 #include "kernels/gelu_erf.h"
 #include "kernels/linear_job.h"
 #include "kernels/numbers.h"
+#include "kernels/rounded.h"
 #include "kernels/sizes.h"
 
 /// What the loops of products share: how a job is cut into stripes and tiles, and everything that follows a product.
@@ -17,9 +18,9 @@ struct Stripe {
   float* gates;  // [kColumns] x n_row
 };
 
-/// `Tile` as linear_loop.h describes it. It has a type of its own in each file, so that the linker cannot merge what
-/// was compiled for different instructions.
-template <class Tile>
+/// `Tile` as the loop describes it. It has a type of its own in each file, so that the linker cannot merge what was
+/// compiled for different instructions. kLayout: of a y that is rounded, by the tile's store_rounded.
+template <class Tile, RoundedLayout kLayout = RoundedLayout::none>
 struct LinearStripes {
   using V = typename Tile::V;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns;
@@ -53,17 +54,128 @@ struct LinearStripes {
       fetch<0>(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
   }
 
-  /// What becomes of a tile's sums [kColumns] x n_row, rows r to r + n_row of the stripe: behind the last block of the
-  /// depth everything that follows the product, before it partial sums in y.
-  static void finish(const LinearJob& job, const Stripe& s, const float* sums, std::int64_t r, std::int64_t n_row) {
-    const LinearStripes stripes = {job, s, sums, r, n_row};
-    s.n_column == kColumns ? stripes.template finish<true>() : stripes.template finish<false>();
-  }
+  /// What becomes of a tile's sums [kColumns] x n_row, rows first to first + n_row of the stripe: behind the last block
+  /// of the depth everything that follows the product, before it partial sums in y. Some rows of the tile may be
+  /// finished now and others later.
+  class Finish {
+   public:
+    Finish() = default;
+    Finish(const LinearJob& job, const Stripe& s, const float* sums, std::int64_t first, std::int64_t n_row)
+        : job_(&job), s_(s), sums_(sums), first_(first), n_row_(n_row) {
+      rows_ = s.n_column == kColumns ? choose<true>() : choose<false>();
+    }
 
-  const LinearJob& job;
-  const Stripe& s;
-  const float* sums;
-  const std::int64_t first, n_row;
+    std::int64_t n_row() const { return n_row_; }
+    VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
+
+   private:
+    using Rows = void (Finish::*)(std::int64_t begin, std::int64_t end) const;
+
+    /// kWhole: the stripe is kColumns wide.
+    template <bool kWhole>
+    Rows choose() {
+      if (s_.k + s_.depth < job_->d_in) return &Finish::write<kWhole, false, Activation::none>;
+      const LinearJob::Part &part = job_->part[s_.part], &gate = job_->part[0];
+      const auto at_column = [&](const float* vector) { return vector != nullptr ? vector + s_.column : nullptr; };
+      bias_ = at_column(part.bias), factor_ = at_column(part.factor), residual_ = part.residual;
+      if (job_->gated) gates_ = s_.gates, gate_bias_ = at_column(gate.bias);
+      if constexpr (kLayout != RoundedLayout::none)
+        if (job_->y_type == DType::bf16) return activated<kWhole, true>();
+      return activated<kWhole, false>();
+    }
+
+    template <bool kWhole, bool kRounded>
+    Rows activated() const {
+      switch (job_->activation) {
+        case Activation::none:
+          break;
+        case Activation::gelu_tanh:
+          return &Finish::write<kWhole, kRounded, Activation::gelu_tanh>;
+        case Activation::gelu_erf:
+          return &Finish::write<kWhole, kRounded, Activation::gelu_erf>;
+        case Activation::silu:
+          return &Finish::write<kWhole, kRounded, Activation::silu>;
+        case Activation::relu:
+          return &Finish::write<kWhole, kRounded, Activation::relu>;
+        case Activation::relu_squared:
+          return &Finish::write<kWhole, kRounded, Activation::relu_squared>;
+      }
+      return &Finish::write<kWhole, kRounded, Activation::none>;
+    }
+
+    template <bool kRounded, Activation kActivation>
+    static VLA_INLINE typename V::Float activate(typename V::Float x) {
+      if constexpr (kActivation == Activation::gelu_tanh && kRounded) return gelu_tanh_for_bf16<V>(x);
+      if constexpr (kActivation == Activation::gelu_erf && kRounded) return gelu_erf_for_bf16<V>(x);
+      if constexpr (kActivation == Activation::silu && kRounded) return silu_for_bf16<V>(x);
+      if constexpr (kActivation == Activation::gelu_tanh) return gelu_tanh<V>(x);
+      if constexpr (kActivation == Activation::gelu_erf) return gelu_erf<V>(x);
+      if constexpr (kActivation == Activation::silu) return silu<V>(x);
+      if constexpr (kActivation == Activation::relu) return relu<V>(x);
+      if constexpr (kActivation == Activation::relu_squared) return relu_squared<V>(x);
+      return x;
+    }
+
+    template <bool kWhole, bool kRounded, Activation kActivation>
+    void write(std::int64_t begin, std::int64_t end) const {
+      const Finish own = *this;  // which no store through a pointer changes
+      own.write_rows<kWhole, kRounded, kActivation>(begin, end);
+    }
+
+    template <bool kWhole, bool kRounded, Activation kActivation>
+    VLA_INLINE void write_rows(std::int64_t begin, std::int64_t end) const {
+      const LinearJob::Part& part = job_->part[s_.part];
+      const std::int64_t d_out = part.d_out;
+      for (std::int64_t i_row = begin; i_row < end; ++i_row) {
+        const std::int64_t r = first_ + i_row, row = (s_.row + r) * d_out + s_.column;
+        [[maybe_unused]] std::uint16_t* to = nullptr;
+        if constexpr (kRounded) to = rounded_row<kWhole>(s_.row + r, d_out);
+        for (std::int64_t i = 0; i < (kWhole ? kColumns : s_.n_column); i += V::width) {
+          const std::int64_t left = kWhole ? V::width : s_.n_column - i;
+          float* y = reinterpret_cast<float*>(part.y) + row + i;
+          typename V::Float value = V::load(sums_ + i_row * kColumns + i);
+          if (s_.k > 0) value += load<V>(y, left);
+          if (bias_ != nullptr) value += load<V>(bias_ + i, left);
+          if (gates_ != nullptr) {
+            typename V::Float gate = V::load(gates_ + r * kColumns + i);
+            if (gate_bias_ != nullptr) gate += load<V>(gate_bias_ + i, left);
+            value *= activate<kRounded, kActivation>(gate);
+          } else {
+            value = activate<kRounded, kActivation>(value);
+          }
+          if (factor_ != nullptr) value *= load<V>(factor_ + i, left);
+          if (residual_ != nullptr) value += load<V>(residual_ + row + i, left);
+          if constexpr (kRounded)
+            Tile::store_rounded(to + i, value, left);
+          else
+            store<V>(y, value, left);
+        }
+      }
+    }
+
+    /// Where the stripe's numbers of a row go.
+    template <bool kWhole>
+    VLA_INLINE std::uint16_t* rounded_row(std::int64_t row, std::int64_t d_out) const {
+      auto* y = reinterpret_cast<std::uint16_t*>(job_->part[s_.part].y);
+      if constexpr (kLayout == RoundedLayout::rows) return y + row * d_out + s_.column;
+      y += place_in_tiles(row, s_.column, d_out);
+      if constexpr (!kWhole) std::memset(y, 0, kSquare * sizeof(*y));  // what is beyond the last column
+      return y;
+    }
+
+    Rows rows_ = nullptr;
+    const LinearJob* job_ = nullptr;
+    Stripe s_ = {};
+    const float* sums_ = nullptr;
+    std::int64_t first_ = 0, n_row_ = 0;
+    // Of what follows the product, null where nothing does.
+    const float *bias_ = nullptr, *factor_ = nullptr, *residual_ = nullptr, *gates_ = nullptr, *gate_bias_ = nullptr;
+  };
+
+  /// All rows of a tile.
+  static void finish(const LinearJob& job, const Stripe& s, const float* sums, std::int64_t r, std::int64_t n_row) {
+    Finish(job, s, sums, r, n_row)(0, n_row);
+  }
 
  private:
   static int first_part(const LinearJob& job) { return job.gated ? 1 : 0; }
@@ -73,84 +185,6 @@ struct LinearStripes {
   static VLA_INLINE void fetch(const std::byte* tile, std::int64_t n_row, std::int64_t stride) {
     for (std::int64_t r = 0; r < n_row; ++r)
       for (std::int64_t n = 0; n < kColumns; n += 16) __builtin_prefetch(tile + r * stride + 4 * n, kWrite);
-  }
-
-  /// kWhole: the stripe is kColumns wide.
-  template <bool kWhole>
-  void finish() const {
-    if (s.k + s.depth < job.d_in) return write<kWhole, false, Activation::none>({});
-    const LinearJob::Part &part = job.part[s.part], &gate = job.part[0];
-    const After after = {part.bias != nullptr ? part.bias + s.column : nullptr,
-                         part.factor != nullptr ? part.factor + s.column : nullptr, part.residual,
-                         job.gated ? s.gates : nullptr,
-                         job.gated && gate.bias != nullptr ? gate.bias + s.column : nullptr};
-    if constexpr (Tile::kRounds)
-      if (job.y_type == DType::bf16) return write_activated<kWhole, true>(after);
-    write_activated<kWhole, false>(after);
-  }
-
-  /// What follows a product beside its activation; null where nothing does.
-  struct After {
-    const float *bias = nullptr, *factor = nullptr, *residual = nullptr, *gates = nullptr, *gate_bias = nullptr;
-  };
-
-  template <bool kWhole, bool kRounded>
-  void write_activated(const After& after) const {
-    switch (job.activation) {
-      case Activation::none:
-        return write<kWhole, kRounded, Activation::none>(after);
-      case Activation::gelu_tanh:
-        return write<kWhole, kRounded, Activation::gelu_tanh>(after);
-      case Activation::gelu_erf:
-        return write<kWhole, kRounded, Activation::gelu_erf>(after);
-      case Activation::silu:
-        return write<kWhole, kRounded, Activation::silu>(after);
-      case Activation::relu:
-        return write<kWhole, kRounded, Activation::relu>(after);
-      case Activation::relu_squared:
-        return write<kWhole, kRounded, Activation::relu_squared>(after);
-    }
-  }
-
-  template <bool kRounded, Activation kActivation>
-  static VLA_INLINE typename V::Float activate(typename V::Float x) {
-    if constexpr (kActivation == Activation::gelu_tanh && kRounded) return gelu_tanh_for_bf16<V>(x);
-    if constexpr (kActivation == Activation::gelu_erf && kRounded) return gelu_erf_for_bf16<V>(x);
-    if constexpr (kActivation == Activation::silu && kRounded) return silu_for_bf16<V>(x);
-    if constexpr (kActivation == Activation::gelu_tanh) return gelu_tanh<V>(x);
-    if constexpr (kActivation == Activation::gelu_erf) return gelu_erf<V>(x);
-    if constexpr (kActivation == Activation::silu) return silu<V>(x);
-    if constexpr (kActivation == Activation::relu) return relu<V>(x);
-    if constexpr (kActivation == Activation::relu_squared) return relu_squared<V>(x);
-    return x;
-  }
-
-  template <bool kWhole, bool kRounded, Activation kActivation>
-  void write(const After& after) const {
-    const LinearJob::Part& part = job.part[s.part];
-    for (std::int64_t i_row = 0; i_row < n_row; ++i_row) {
-      const std::int64_t r = first + i_row, row = (s.row + r) * part.d_out + s.column;
-      for (std::int64_t i = 0; i < (kWhole ? kColumns : s.n_column); i += V::width) {
-        const std::int64_t left = kWhole ? V::width : s.n_column - i;
-        float* y = reinterpret_cast<float*>(part.y) + row + i;
-        typename V::Float value = V::load(sums + i_row * kColumns + i);
-        if (s.k > 0) value += load<V>(y, left);
-        if (after.bias != nullptr) value += load<V>(after.bias + i, left);
-        if (after.gates != nullptr) {
-          typename V::Float gate = V::load(after.gates + r * kColumns + i);
-          if (after.gate_bias != nullptr) gate += load<V>(after.gate_bias + i, left);
-          value *= activate<kRounded, kActivation>(gate);
-        } else {
-          value = activate<kRounded, kActivation>(value);
-        }
-        if (after.factor != nullptr) value *= load<V>(after.factor + i, left);
-        if (after.residual != nullptr) value += load<V>(after.residual + row + i, left);
-        if constexpr (kRounded)
-          Tile::store_rounded(reinterpret_cast<typename Tile::X*>(part.y) + row + i, value, left);
-        else
-          store<V>(y, value, left);
-      }
-    }
   }
 };
 

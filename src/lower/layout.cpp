@@ -165,15 +165,16 @@ class Layouts {
     if (y.home != Value::Home::arena || y.node->tapped || linear.residual != kNone || linear.factor != kNone) return;
     const std::int64_t n_row = count(y.shape) / y.shape[0], d = linear.linears[0]->in[0].dim(0);
     const kernels::LinearKernel& kernel = kernel_of(l, linear);
-    if (!kernel.rounds(n_row, d)) return;
+    const kernels::RoundedLayout layout = kernel.rounded(d);
+    if (layout == kernels::RoundedLayout::none) return;
     for (const Node* reader : l.readers[static_cast<std::size_t>(y.node->id)]) {
       const auto* product = reader->as<op::Linear>();
       if (product == nullptr || &l.weights.kernel(product->weight)->for_rows(n_row) != &kernel ||
-          !kernel.rounds(n_row, y.shape[0]))
+          kernel.rounded(y.shape[0]) != layout)
         return;
     }
-    y.type = DType::bf16;
-    y.size /= 2;
+    y.type = DType::bf16, y.in_tiles = layout == kernels::RoundedLayout::tiles;
+    y.size = static_cast<std::size_t>(kernels::rounded_count(layout, n_row, y.shape[0])) * 2;
   }
 
   Lowering& l;

@@ -24,10 +24,10 @@ using Shape = test::ProductShape;
 
 // One row, a few, more than a block of rows or of columns; widths that no vector divides; depths beyond one block and
 // of one number.
-constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},    {3, 17, 1},    {5, 31, 33},
-                             {6, 16, 16},  {7, 64, 48},   {17, 100, 65}, {50, 72, 205}, {13, 1151, 3},
-                             {4, 768, 32}, {33, 40, 70},  {64, 96, 129}, {97, 35, 40},  {300, 33, 530},
-                             {270, 5, 9},  {1, 1537, 70}, {7, 760, 1100}};
+constexpr Shape kShapes[] = {{1, 1, 1},    {1, 33, 17},   {2, 3, 31},     {3, 17, 1},    {5, 31, 33},
+                             {6, 16, 16},  {7, 64, 48},   {17, 100, 65},  {50, 72, 205}, {13, 1151, 3},
+                             {4, 768, 32}, {33, 40, 70},  {64, 96, 129},  {97, 35, 40},  {300, 33, 530},
+                             {270, 5, 9},  {1, 1537, 70}, {7, 760, 1100}, {70, 800, 40}};
 
 constexpr Activation kActivations[] = {Activation::none, Activation::gelu_tanh, Activation::gelu_erf,
                                        Activation::silu, Activation::relu,      Activation::relu_squared};
@@ -54,9 +54,6 @@ struct Part {
   test::Pages packed = {nullptr, std::free};
 };
 
-/// What kernels of bf16 make of x: bf16, and the tiles of amx in products of few rows a second bf16 of what that left.
-enum class Rounding { none, once, twice };
-
 struct Case {
   Shape shape;
   DType type = DType::bf16;
@@ -67,7 +64,7 @@ struct Case {
   DType x_type = DType::f32, y_type = DType::f32;
 };
 
-bool rounds_all(const LinearKernel& kernel) { return std::strstr(kernel.name, "avx512_bf16") != nullptr; }
+bool rounds(const LinearKernel& kernel) { return kernel.rounded(1) != RoundedLayout::none; }
 
 /// From the second number on.
 std::byte* bytes(std::vector<float>& values) { return reinterpret_cast<std::byte*>(&values[1]); }
@@ -81,10 +78,13 @@ class Trial {
 
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
-    std::vector<std::uint16_t> rounded;
-    for (float value : x_) rounded.push_back(to_bf16(value));
+    std::vector<std::uint16_t> rounded(
+        static_cast<std::size_t>(rounded_count(kernel_.rounded(d_in), round_up(n_row, kSquare), d_in)));
+    for (std::int64_t row = 0; row < n_row; ++row)
+      for (std::int64_t k = 0; k < d_in; ++k)
+        rounded[place(row, k, d_in)] = to_bf16(x_[static_cast<std::size_t>(row * d_in + k + 1)]);
     LinearJob job = {};
-    job.x = case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(&rounded[1]) : bytes(x_);
+    job.x = case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(rounded.data()) : bytes(x_);
     job.x_stride = d_in, job.n_row = n_row, job.d_in = d_in, job.n_part = case_.n_part;
     job.activation = case_.activation, job.gated = case_.gated;
     job.x_type = case_.x_type, job.y_type = case_.y_type;
@@ -104,13 +104,9 @@ class Trial {
   }
 
   void check() const {
-    const bool tiles = std::strstr(kernel_.name, "amx") != nullptr;
-    const Rounding rounding = tiles && case_.shape.n_row <= 64 ? Rounding::twice
-                              : tiles || rounds_all(kernel_)   ? Rounding::once
-                                                               : Rounding::none;
     for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
       const auto is_right = [&](std::int64_t row, std::int64_t n, float y) {
-        const auto [expected, tolerance] = reference(i, row, n, rounding);
+        const auto [expected, tolerance] = reference(i, row, n);
         return std::abs(y - expected) <= tolerance;
       };
       test::check_rows(y(i), case_.shape.n_row, d_out(i), is_right);
@@ -119,10 +115,23 @@ class Trial {
 
   const std::vector<float>& y(int i) const { return parts_[static_cast<std::size_t>(i)].y; }
 
+  /// Number n of a row of a y that was rounded.
+  float rounded_y(std::int64_t row, std::int64_t n) const {
+    std::uint16_t bits;
+    std::memcpy(&bits, reinterpret_cast<const std::byte*>(&y(0)[1]) + 2 * place(row, n, d_out(0)), sizeof(bits));
+    return from_bf16(bits);
+  }
+
  private:
   struct Expected {
     double value, tolerance;
   };
+
+  /// Where number i of a row lies when it is rounded.
+  std::size_t place(std::int64_t row, std::int64_t i, std::int64_t d) const {
+    return static_cast<std::size_t>(kernel_.rounded(d) == RoundedLayout::tiles ? place_in_tiles(row, i, d)
+                                                                               : row * d + i);
+  }
 
   /// Parts differ in width, so that items cross from one to the next; a gate and its up do not.
   std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
@@ -139,25 +148,24 @@ class Trial {
   }
 
   /// W x + b. Every order of n float32 additions of the products is within n half-units of their absolute sum.
-  Expected product(int i, std::int64_t row, std::int64_t n, Rounding rounding) const {
+  Expected product(int i, std::int64_t row, std::int64_t n) const {
     const Part& part = parts_[static_cast<std::size_t>(i)];
     const std::int64_t d_in = case_.shape.d_in;
     double sum = case_.with_bias ? part.bias[static_cast<std::size_t>(n + 1)] : 0, size = std::abs(sum);
     for (std::int64_t k = 0; k < d_in; ++k) {
       float value = x_[static_cast<std::size_t>(row * d_in + k + 1)];
-      if (rounding == Rounding::once) value = from_bf16(to_bf16(value));
+      if (rounds(kernel_)) value = from_bf16(to_bf16(value));
       const double term = double{value} * part.weight[static_cast<std::size_t>(n * d_in + k + 1)];
       sum += term, size += std::abs(term);
     }
-    const double of_x = rounding == Rounding::twice ? 0x1p-17 : 0;
-    return {sum, (static_cast<double>(d_in + 2) * 0x1p-24 + of_x) * size};
+    return {sum, static_cast<double>(d_in + 2) * 0x1p-24 * size};
   }
 
   /// The activations are at most 1.13 steep and round twice; what follows rounds once each.
-  Expected reference(int i, std::int64_t row, std::int64_t n, Rounding rounding) const {
-    Expected y = product(i, row, n, rounding);
+  Expected reference(int i, std::int64_t row, std::int64_t n) const {
+    Expected y = product(i, row, n);
     if (case_.gated) {
-      const Expected gate = product(0, row, n, rounding);
+      const Expected gate = product(0, row, n);
       const double factor = activate(case_.activation, gate.value),
                    slack = 1.13 * gate.tolerance + 0x1p-22 * std::abs(factor);
       y = {y.value * factor, y.tolerance * (std::abs(factor) + slack) + slack * std::abs(y.value)};
@@ -217,6 +225,19 @@ void check_gates_and_groups(const LinearKernel& kernel) {
   }
 }
 
+/// The depth takes several blocks, of float32 and of bf16, and the panels several items.
+void check_depths(const LinearKernel& kernel) {
+  const Case deep = {.shape = {390, 2080, 33}, .activation = Activation::gelu_tanh, .with_residual = true};
+  check(kernel, deep);
+  Case gated = deep;
+  gated.n_part = 2, gated.gated = true, gated.n_thread = 2;
+  check(kernel, gated);
+  Case wide = deep;
+  wide.shape.d_out = 520;
+  if (rounds(kernel)) wide.x_type = DType::bf16;
+  check(kernel, wide);
+}
+
 void check_threads(const LinearKernel& kernel) {
   for (int n_thread : {2, 3, 7, 64})
     for (const Shape& shape : {Shape{1, 33, 17}, Shape{50, 72, 205}, Shape{300, 33, 530}}) {
@@ -242,20 +263,22 @@ void check_rounded_after(Activation activation, const LinearKernel& kernel) {
   expected.run(), rounded_x.run(), rounded_y.run();
   CHECK(rounded_x.y(0) == expected.y(0));
   int wrong = 0;
-  for (std::size_t i = 0; i < 97 * 205; ++i) {
-    std::uint16_t got;
-    std::memcpy(&got, reinterpret_cast<const std::byte*>(&rounded_y.y(0)[1]) + 2 * i, sizeof(got));
-    // An activation that is rounded next need not be exact before: its bf16 may be the neighbour.
-    const float exact = expected.y(0)[1 + i];
-    wrong += !(std::abs(from_bf16(got) - exact) <= (0x1p-8f + 0x1p-13f) * std::abs(exact) + 0x1p-119f);
-  }
+  for (std::int64_t row = 0; row < 97; ++row)
+    for (std::int64_t n = 0; n < 205; ++n) {
+      // An activation that is rounded next need not be exact before: its bf16 may be the neighbour.
+      const float exact = expected.y(0)[static_cast<std::size_t>(1 + row * 205 + n)];
+      wrong += !(std::abs(rounded_y.rounded_y(row, n) - exact) <= (0x1p-8f + 0x1p-13f) * std::abs(exact) + 0x1p-119f);
+    }
+  // What fills the tiles up to whole ones is multiplied by zeros.
+  if (kernel.rounded(205) == RoundedLayout::tiles)
+    for (std::int64_t row = 0; row < 97; ++row)
+      for (std::int64_t n = 205; n < 224; ++n) wrong += rounded_y.rounded_y(row, n) != 0;
   CHECK(wrong == 0);
 }
 
 void check_rounded(const LinearKernel& kernel) {
-  CHECK(kernel.rounds(50, 72) == rounds_all(kernel));  // the tiles of amx keep what rounding leaves of few rows
-  CHECK(kernel.rounds(97, 72) == (rounds_all(kernel) || std::strstr(kernel.name, "amx") != nullptr));
-  if (!kernel.rounds(97, 72)) return;
+  CHECK(rounds(kernel) == (std::strstr(kernel.name, "avx512_bf16") || std::strstr(kernel.name, "amx")));
+  if (!rounds(kernel)) return;
   for (Activation activation : kActivations) check_rounded_after(activation, kernel);
 }
 
@@ -285,6 +308,7 @@ const LinearKernel& row(const std::string& name) {
 VLA_LINEAR_TEST("products of any shape and storage type are within float32's rounding", check_shapes_and_types)
 VLA_LINEAR_TEST("bias, activation, factor and residual follow the product", check_epilogues)
 VLA_LINEAR_TEST("a gate multiplies, and products of one x stand side by side", check_gates_and_groups)
+VLA_LINEAR_TEST("a product may be deeper than the caches", check_depths)
 VLA_LINEAR_TEST("any number of threads computes every number once", check_threads)
 VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_rounded)
 VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
@@ -306,7 +330,7 @@ TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds 
     const LinearKernel& few = kernel->for_rows(kernel->max_few);
     CHECK(&few == kernel->few);
     CHECK(&kernel->for_rows(kernel->max_few + 1) == kernel);
-    CHECK(!few.rounds(kernel->max_few, desc.d_in));
+    CHECK(few.rounded(desc.d_in) == RoundedLayout::none);
     CHECK((few.pack == kernel->pack));
     CHECK(few.packed_size(desc) == kernel->packed_size(desc));
   }

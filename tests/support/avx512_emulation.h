@@ -121,5 +121,7 @@ inline __m512 widen(unsigned, __m256i x) {
 #endif
 #define asm(...) static_cast<void>(0)  // a hint that names a register of 64 bytes
 #define Avx512 EmulatedAvx512
+#ifndef VLA_EMULATED_MACHINE
 #define kLinearAvx512 kEmulatedLinearAvx512
 #define kAvx512Kernels kEmulatedAvx512Kernels
+#endif

@@ -1,0 +1,28 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "kernels/sizes.h"
+
+/// How activations between two products lie in memory where both would round them to bf16 anyway.
+namespace vla::kernels {
+
+/// rows: one after the other. tiles: squares of 32 rows by 32 numbers, those of the same rows one after the other, as
+/// the tile registers of AMX load them. What stands in rows beyond the last does not matter; numbers beyond the last
+/// of a row are zeros.
+enum class RoundedLayout { none, rows, tiles };
+
+constexpr std::int64_t kSquare = 32;
+
+/// Where number i of a row lies among tiles of rows of d numbers.
+constexpr VLA_INLINE std::int64_t place_in_tiles(std::int64_t row, std::int64_t i, std::int64_t d) {
+  return row / kSquare * kSquare * round_up(d, kSquare) + i / kSquare * kSquare * kSquare + row % kSquare * kSquare +
+         i % kSquare;
+}
+
+/// Numbers that n_row rows of d take.
+constexpr std::int64_t rounded_count(RoundedLayout layout, std::int64_t n_row, std::int64_t d) {
+  return layout == RoundedLayout::tiles ? round_up(n_row, kSquare) * round_up(d, kSquare) : n_row * d;
+}
+
+}  // namespace vla::kernels
