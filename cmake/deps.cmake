@@ -74,6 +74,8 @@ if(VLA_CUDA)
   set(GGML_CUDA_NO_VMM ON CACHE BOOL "" FORCE)  # it would need the driver at link time
 endif()
 add_subdirectory(${vla_ggml_tree} ${CMAKE_BINARY_DIR}/ggml EXCLUDE_FROM_ALL)
+# Where a driver fails, ggml's abort is an exception that leaves its functions (src/ggml/guard.h).
+target_compile_options(ggml-base PRIVATE $<$<COMPILE_LANGUAGE:C>:-fexceptions>)
 foreach(target ggml ggml-base ggml-cpu)  # its headers are not ours to warn about
   get_target_property(headers ${target} INTERFACE_INCLUDE_DIRECTORIES)
   if(headers)

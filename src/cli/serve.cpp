@@ -1,13 +1,19 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include <fcntl.h>
 #include <fmt/format.h>
 #include <fmt/ranges.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cctype>
+#include <cerrno>
 #include <csignal>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
+#include <filesystem>
+#include <fstream>
 
 #include "cli/commands.h"
 #include "cli/say.h"
@@ -21,7 +27,7 @@ namespace {
 struct ServeOptions {
   std::string bundle, kernels, device, embodiment;
   int n_thread = 0;
-  bool strict_state = false;
+  bool strict_state = false, restarts = false;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
   WatchOptions watch;
@@ -88,7 +94,25 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   std::fflush(stdout);
 }
 
-Status serve(ServeOptions& options) {
+/// The program in place of this process, with the same arguments: a driver that has lost its device finds it again in
+/// no other way. Returns where that fails.
+Error start_again() {
+  std::error_code failed;
+  const std::string program = std::filesystem::read_symlink("/proc/self/exe", failed);
+  std::ifstream file("/proc/self/cmdline");
+  std::vector<std::string> arguments;
+  for (std::string argument; std::getline(file, argument, '\0');) arguments.push_back(argument);
+  std::vector<char*> pointers;
+  for (std::string& argument : arguments) pointers.push_back(argument.data());
+  pointers.push_back(nullptr);
+  for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd", failed))  // those of drivers
+    if (const int fd = std::atoi(entry.path().filename().c_str()); fd > STDERR_FILENO) ::fcntl(fd, F_SETFD, FD_CLOEXEC);
+  ::execv(program.c_str(), pointers.data());
+  return {Code::io, program, "a program that starts again", std::strerror(errno)};
+}
+
+/// `ready`: whether it came as far as that.
+Status serve(ServeOptions& options, bool& ready) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Watch> watch, Watch::start(options.watch, *server, options.server.insecure));
@@ -103,6 +127,7 @@ Status serve(ServeOptions& options) {
   stop_on_signals(*server);
   watch->ready(warm_up_ms);
   print_ready(*server, *engine, warm_up_ms, watch->metrics_address());
+  ready = true;
   const Status status = server->run(*engine, watch->observers());
   watch->ended(status);
   return status;
@@ -154,7 +179,16 @@ Command add_serve(CLI::App& app) {
   command->add_option("--curve-clients", server.curve_clients, "Public keys of the clients that are let in, one a line")
       ->check(CLI::ExistingFile);
   add_watch_options(*command, options->watch);
-  return [options] { return serve(*options); };
+  command
+      ->add_flag("--restart-on-device-loss", options->restarts,
+                 "Start again when a GPU is lost; not given: end with exit code 8")
+      ->excludes("--trace", "--record");  // which the second start would find in its way
+  return [options] {
+    bool ready = false;
+    const Status status = serve(*options, ready);
+    const bool lost = ready && !status && status.error().code == Code::device;
+    return lost && options->restarts ? start_again() : status;
+  };
 }
 
 }  // namespace vla::cli

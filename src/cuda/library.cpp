@@ -24,6 +24,6 @@ ggml_backend_reg_t open() {
 }  // namespace
 
 const vla::BackendLibrary* vla_backend_library() {
-  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set};
+  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback};
   return &library;
 }

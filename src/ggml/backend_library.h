@@ -10,9 +10,10 @@ namespace vla {
 /// program that loads it, and no other program's ggml can be mistaken for ours. Objects of the one ggml are used
 /// through the other: `build` makes sure that both have the same layout.
 struct BackendLibrary {
-  const char* build;                                    // VLA_BACKEND_BUILD
-  ggml_backend_reg_t (*open)();                         // null where the driver is missing
-  void (*log)(ggml_log_callback callback, void* data);  // of the library's ggml
+  const char* build;                                        // VLA_BACKEND_BUILD
+  ggml_backend_reg_t (*open)();                             // null where the driver is missing
+  void (*set_log)(ggml_log_callback callback, void* data);  // of the library's ggml, as is the next
+  ggml_abort_callback_t (*set_abort)(ggml_abort_callback_t callback);
 };
 
 constexpr const char* kBackendSymbol = "vla_backend_library";

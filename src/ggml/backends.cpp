@@ -8,12 +8,12 @@
 
 #include <algorithm>
 #include <charconv>
-#include <exception>
 #include <filesystem>
 #include <map>
 #include <mutex>
 
 #include "ggml/backend_library.h"
+#include "ggml/guard.h"
 
 namespace vla {
 namespace {
@@ -57,13 +57,10 @@ Backend open_library(const fs::path& file) {
   if (found == nullptr || std::string(found->build) != VLA_BACKEND_BUILD)
     return {nullptr, fmt::format("{} was built for {}, not for {}", file.string(),
                                  found != nullptr ? found->build : "something else", VLA_BACKEND_BUILD)};
-  found->log([](ggml_log_level, const char*, void*) {}, nullptr);  // failures become an Error instead
+  set_guard(found->set_log, found->set_abort);
   Backend backend;
-  try {
-    backend.devices = found->open();
-  } catch (const std::exception& exception) {
-    return {nullptr, exception.what()};
-  }
+  if (const Status opened = guarded(file.string(), [&] { backend.devices = found->open(); }); !opened)
+    return {nullptr, opened.error().found};
   if (backend.devices == nullptr)
     backend.absent = "no driver of it on this machine";
   else if (ggml_backend_reg_dev_count(backend.devices) == 0)
@@ -93,7 +90,8 @@ const Backend& backend(const std::string& kind) {
 DeviceInfo describe(ggml_backend_reg_t devices, const DeviceName& name) {
   ggml_backend_dev_t device = ggml_backend_reg_dev_get(devices, static_cast<std::size_t>(name.index));
   DeviceInfo info = {name.text(), ggml_backend_dev_description(device), 0, 0, "f32"};
-  ggml_backend_dev_memory(device, &info.free, &info.memory);
+  const Status told = guarded(info.name, [&] { ggml_backend_dev_memory(device, &info.free, &info.memory); });
+  if (!told) info.description += " (" + told.error().found + ")";
   return info;
 }
 

@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <ggml-cpu.h>
 
+#include <atomic>
 #include <vector>
 
 #include "ggml/ggml_program.h"
@@ -48,32 +49,45 @@ void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
 void GgmlDevice::FreePool::operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
 
 Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
-  ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);  // failures become an Error instead
+  set_guard(ggml_log_set, ggml_set_abort_callback);
   auto device = std::make_unique<GgmlDevice>();
+  Held& held = *device->held_;
   device->n_thread_ = n_thread;
   device->text_ = fmt::format("cpu, {} thread{}", n_thread, n_thread == 1 ? "" : "s");
-  device->backend_.reset(ggml_backend_cpu_init());
-  if (!device->backend_) return Error{Code::device, "cpu", "a backend", "the system refused it"};
+  held.backend.reset(ggml_backend_cpu_init());
+  if (!held.backend) return Error{Code::device, "cpu", "a backend", "the system refused it"};
   ggml_threadpool_params params = ggml_threadpool_params_default(n_thread);
   params.poll = 0;  // between two runs its threads sleep
-  device->pool_.reset(ggml_threadpool_new(&params));
-  ggml_backend_cpu_set_threadpool(device->backend_.get(), device->pool_.get());
-  ggml_backend_cpu_set_n_threads(device->backend_.get(), n_thread);
-  device->memory_.emplace("cpu", ggml_backend_get_default_buffer_type(device->backend_.get()), nullptr);
+  held.pool.reset(ggml_threadpool_new(&params));
+  ggml_backend_cpu_set_threadpool(held.backend.get(), held.pool.get());
+  ggml_backend_cpu_set_n_threads(held.backend.get(), n_thread);
+  held.memory.emplace("cpu", ggml_backend_get_default_buffer_type(held.backend.get()), nullptr);
   return std::unique_ptr<Device>(std::move(device));
 }
 
 Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name) {
-  ggml_log_set([](ggml_log_level, const char*, void*) {}, nullptr);
+  set_guard(ggml_log_set, ggml_set_abort_callback);
   VLA_TRY(ggml_backend_dev_t found, find_device(name));
   auto device = std::make_unique<GgmlDevice>();
   device->n_thread_ = 1;  // the one that calls
   device->text_ = fmt::format("{}, {}", name.text(), ggml_backend_dev_description(found));
   device->keeps_f16_ = name.kind == "vulkan";
-  VLA_CHECK(device->guarded([&] { device->backend_.reset(ggml_backend_dev_init(found, nullptr)); }));
-  if (!device->backend_) return Error{Code::device, name.text(), "a device that starts", "its driver refused it"};
-  device->memory_.emplace(name.text(), ggml_backend_dev_buffer_type(found), found);
+  Held& held = *device->held_;
+  VLA_CHECK(device->guarded([&] { held.backend.reset(ggml_backend_dev_init(found, nullptr)); }));
+  if (!held.backend) return Error{Code::device, name.text(), "a device that starts", "its driver refused it"};
+  held.memory.emplace(name.text(), ggml_backend_dev_buffer_type(found), found);
   return std::unique_ptr<Device>(std::move(device));
+}
+
+/// To free what a lost device holds the driver would answer with one more error, which no destructor can report. It is
+/// kept to the end of the process instead, and so are those of other devices whose locks an abort may have left held.
+GgmlDevice::~GgmlDevice() {
+  if (!backend()) return;
+  const Status answers = guarded([&] { ggml_backend_synchronize(backend()); });
+  if (answers && !ggml_aborted()) return;
+  static std::atomic<Held*> kept = nullptr;
+  Held* held = held_.release();
+  held->next = kept.exchange(held);
 }
 
 /// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened. Rows of a table
@@ -86,7 +100,7 @@ ggml_type GgmlDevice::resident_type(const Param& param) const {
 }
 
 Status GgmlDevice::load(const ParamList& params, bool fill) {
-  if (!fill) memory_->set_dry();
+  if (!fill) memory().set_dry();
   VLA_TRY(weight_context_, make_context(params.params().size()));
   int n_f32 = 0, n_f16 = 0;
   for (const Param& param : params.params()) {
@@ -100,7 +114,7 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
     if (n > 0) linear_text_ += fmt::format("{}{} {}", linear_text_.empty() ? "ggml (" : " + ", n, type);
   if (!linear_text_.empty()) linear_text_ += ")";
   if (weights_.empty()) return {};
-  VLA_TRY(weights_size_, memory_->place(weight_context_.get(), "weights", &weight_memory_));
+  VLA_TRY(weights_size_, memory().place(weight_context_.get(), "weights", &weight_memory_));
   Room room;
   for (const Param& param : params.params()) {
     if (!fill) break;
@@ -111,18 +125,18 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
 }
 
 Status GgmlDevice::allocate(Slots& slots) {
-  struct Memory {
+  struct Placed {
     ggml_context_ptr context;
     std::shared_ptr<void> buffers;
   };
   if (slots.all().empty()) return {};
-  auto memory = std::make_shared<Memory>();
-  VLA_TRY(memory->context, make_context(slots.all().size()));
+  auto placed = std::make_shared<Placed>();
+  VLA_TRY(placed->context, make_context(slots.all().size()));
   for (Slot& slot : slots.all())
-    slot.place = ggml_new_tensor(memory->context.get(), type_of(slot.type), 4, slot.shape.data());
-  VLA_TRY(const std::size_t size, memory_->place(memory->context.get(), "inputs and cache", &memory->buffers));
-  slots.hold(memory, size);
-  if (memory_->is_dry()) return {};
+    slot.place = ggml_new_tensor(placed->context.get(), type_of(slot.type), 4, slot.shape.data());
+  VLA_TRY(const std::size_t size, memory().place(placed->context.get(), "inputs and cache", &placed->buffers));
+  slots.hold(placed, size);
+  if (memory().is_dry()) return {};
   return guarded([&] {
     for (Slot& slot : slots.all()) {
       auto* tensor = static_cast<ggml_tensor*>(slot.place);
@@ -132,41 +146,49 @@ Status GgmlDevice::allocate(Slots& slots) {
 }
 
 void GgmlDevice::set(const Slot& slot, const void* data, std::size_t size) {
-  const Status done = guarded([&] { ggml_backend_tensor_set(static_cast<ggml_tensor*>(slot.place), data, 0, size); });
-  if (!done) failure_ = done.error();
+  static_cast<void>(guarded([&] { ggml_backend_tensor_set(static_cast<ggml_tensor*>(slot.place), data, 0, size); }));
 }
 
 void GgmlDevice::get(const Slot& slot, void* data, std::size_t size) const {
-  const Status done =
-      guarded([&] { ggml_backend_tensor_get(static_cast<const ggml_tensor*>(slot.place), data, 0, size); });
-  if (!done) failure_ = done.error();
+  static_cast<void>(
+      guarded([&] { ggml_backend_tensor_get(static_cast<const ggml_tensor*>(slot.place), data, 0, size); }));
 }
 
 Status GgmlDevice::failure() const { return failure_ ? Status(*failure_) : Status(); }
 
-Error GgmlDevice::lost(const std::string& what) const {
-  return {Code::device, text_, "a device that answers", what, "load the bundle again; the system's log may say more"};
+Status GgmlDevice::compute(ggml_cgraph* graph) {
+  ggml_status status = GGML_STATUS_FAILED;
+  const auto run = [&] { status = ggml_backend_graph_compute(backend(), graph); };
+  if (held_->pool) {
+    run();
+  } else {
+    VLA_CHECK(guarded(run));
+  }
+  if (status == GGML_STATUS_ALLOC_FAILED)
+    return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
+  if (status != GGML_STATUS_SUCCESS) failure_ = lost_device(text_, ggml_status_to_string(status));
+  return failure();
 }
 
 Result<std::shared_ptr<ggml_gallocr>> GgmlDevice::place(ggml_cgraph* graph) {
-  const auto make = [&] { return std::shared_ptr<ggml_gallocr>(ggml_gallocr_new(memory_->type()), ggml_gallocr_free); };
+  const auto make = [&] { return std::shared_ptr<ggml_gallocr>(ggml_gallocr_new(memory().type()), ggml_gallocr_free); };
   std::shared_ptr<ggml_gallocr> places = make();
   std::size_t size = 0;
   ggml_gallocr_reserve_n_size(places.get(), graph, nullptr, nullptr, &size);
   // Places that are shared must lie in one buffer: only then is it certain that nobody's move.
-  const bool fits = !working_.empty() && size <= working_.back().size &&
-                    working_.back().size <= ggml_backend_buft_get_max_size(memory_->type());
+  const bool fits = !held_->working.empty() && size <= held_->working.back().size &&
+                    held_->working.back().size <= ggml_backend_buft_get_max_size(memory().type());
   if (!fits) {
-    VLA_CHECK(memory_->check_free(size, "working memory"));
-    working_.push_back({make(), size});
+    VLA_CHECK(memory().check_free(size, "working memory"));
+    held_->working.push_back({make(), size});
   }
-  places = working_.back().places;
-  if (memory_->is_dry()) return places;
+  places = held_->working.back().places;
+  if (memory().is_dry()) return places;
   bool done = false;
   VLA_CHECK(guarded([&] { done = ggml_gallocr_alloc_graph(places.get(), graph); }));
   if (done) return places;
-  if (!fits) working_.pop_back();
-  return memory_->refused(size, "working memory");
+  if (!fits) held_->working.pop_back();
+  return memory().refused(size, "working memory");
 }
 
 Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const LowerOptions&) {
@@ -177,7 +199,7 @@ Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const Low
 
 std::size_t GgmlDevice::working_size() const {
   std::size_t size = 0;
-  for (const Working& working : working_) size += working.size;
+  for (const Working& working : held_->working) size += working.size;
   return size;
 }
 

@@ -5,13 +5,12 @@
 #include <ggml-alloc.h>
 #include <ggml-cpp.h>
 
-#include <exception>
 #include <memory>
-#include <new>
 #include <optional>
 
 #include "ggml/backends.h"
 #include "ggml/ggml_memory.h"
+#include "ggml/guard.h"
 #include "graph/device.h"
 
 namespace vla {
@@ -24,6 +23,7 @@ class GgmlDevice final : public Device {
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
   /// A device of another kind. Errors: device.
   static Result<std::unique_ptr<Device>> open(const DeviceName& name);
+  ~GgmlDevice() override;
 
   Status load(const ParamList& params, bool fill) override;
   Status allocate(Slots& slots) override;
@@ -40,26 +40,24 @@ class GgmlDevice final : public Device {
   std::size_t weights_size() const override { return weights_size_; }
   std::size_t working_size() const override;
 
-  ggml_backend_t backend() const { return backend_.get(); }
+  ggml_backend_t backend() const { return held_->backend.get(); }
   ggml_tensor* weight(const Param* param) const { return weights_[static_cast<std::size_t>(param->id)]; }
-  GgmlMemory& memory() { return *memory_; }
+  GgmlMemory& memory() { return *held_->memory; }
   /// Gives the values of a graph their places in memory that programs share, since one runs at a time. What comes back
   /// keeps it. Errors: out_of_memory.
   Result<std::shared_ptr<ggml_gallocr>> place(ggml_cgraph* graph);
 
-  /// Calls a function of the backend, whose driver may throw. Errors: device, out_of_memory.
+  /// Calls functions of the backend until one fails: from then on every call has that error. Errors: device,
+  /// out_of_memory.
   template <class F>
   Status guarded(const F& call) const {
-    try {
-      call();
-      return {};
-    } catch (const std::bad_alloc&) {
-      return Error{Code::out_of_memory, text_, "", "the system refused an allocation", "free memory"};
-    } catch (const std::exception& exception) {
-      return lost(exception.what());
-    }
+    if (failure_) return *failure_;
+    Status done = vla::guarded(text_, call);
+    if (!done) failure_ = done.error();
+    return done;
   }
-  Error lost(const std::string& what) const;
+  /// Errors: device, out_of_memory.
+  Status compute(ggml_cgraph* graph);
 
  private:
   struct FreePool {
@@ -69,21 +67,26 @@ class GgmlDevice final : public Device {
     std::shared_ptr<ggml_gallocr> places;
     std::size_t size;
   };
+  /// What the driver is asked to free.
+  struct Held {
+    // What threads share during a run; without one of ours ggml makes and frees one in every run.
+    std::unique_ptr<ggml_threadpool, FreePool> pool;
+    ggml_backend_ptr backend;
+    std::optional<GgmlMemory> memory;
+    std::vector<Working> working;  // the last serves new programs; those before it belong to older ones
+    Held* next = nullptr;          // of those that are not freed
+  };
   ggml_type resident_type(const Param& param) const;
 
-  // What threads share during a run; without one of ours ggml makes and frees one in every run.
-  std::unique_ptr<ggml_threadpool, FreePool> pool_;
-  ggml_backend_ptr backend_;
+  std::unique_ptr<Held> held_ = std::make_unique<Held>();
   std::string text_;
   int n_thread_ = 0;
   bool keeps_f16_ = false;  // its products of f16 weights are as exact as those of float32
-  std::optional<GgmlMemory> memory_;
   ggml_context_ptr weight_context_;
   std::shared_ptr<void> weight_memory_;
   std::size_t weights_size_ = 0;
   std::vector<ggml_tensor*> weights_;
   std::string linear_text_;
-  std::vector<Working> working_;  // the last serves new programs; those before it belong to older ones
   mutable std::optional<Error> failure_;
 };
 

@@ -9,6 +9,8 @@
 #include <cstdint>
 #include <iterator>
 
+#include "ggml/guard.h"
+
 namespace vla {
 namespace {
 
@@ -47,7 +49,7 @@ Error GgmlMemory::refused(const Part& part, const char* what) const {
 Status GgmlMemory::check_free(std::size_t size, const char* what) const {
   if (device_ == nullptr || dry_) return {};
   std::size_t free = 0, total = 0;
-  ggml_backend_dev_memory(device_, &free, &total);
+  VLA_CHECK(guarded(name_, [&] { ggml_backend_dev_memory(device_, &free, &total); }));
   for (const auto& buffer : *kept_) free += ggml_backend_buffer_get_size(buffer.get());
   if (size <= free) return {};
   return Error{Code::out_of_memory, what, fmt::format("{} free on {}", size_text(size), name_),
@@ -83,11 +85,14 @@ Result<std::size_t> GgmlMemory::place(ggml_context* tensors, const char* what, s
       for (ggml_tensor* tensor : part.tensors) tensor->data = kNowhere;
       continue;
     }
-    ggml_backend_buffer_t buffer = take(part.size);
+    ggml_backend_buffer_t buffer = nullptr;
+    VLA_CHECK(guarded(name_, [&] { buffer = take(part.size); }));
     if (buffer == nullptr) return refused(part, what);
     buffers->emplace_back(buffer);
     ggml_tallocr places = ggml_tallocr_new(buffer);
-    for (ggml_tensor* tensor : part.tensors) ggml_tallocr_alloc(&places, tensor);
+    VLA_CHECK(guarded(name_, [&] {
+      for (ggml_tensor* tensor : part.tensors) ggml_tallocr_alloc(&places, tensor);
+    }));
   }
   return total;
 }

@@ -262,11 +262,7 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
 Status GgmlProgram::run() {
   VLA_CHECK(device_.failure());
   for (std::size_t i = 0; i < parts_.size(); ++i) {
-    ggml_status status = GGML_STATUS_FAILED;
-    VLA_CHECK(device_.guarded([&] { status = ggml_backend_graph_compute(device_.backend(), parts_[i]); }));
-    if (status == GGML_STATUS_ALLOC_FAILED)
-      return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
-    if (status != GGML_STATUS_SUCCESS) return device_.lost(ggml_status_to_string(status));
+    VLA_CHECK(device_.compute(parts_[i]));
     if (i < stages_.size()) stages_[i].done = std::chrono::steady_clock::now();
   }
   return {};

@@ -67,7 +67,7 @@ class Device {
   virtual Status allocate(Slots& slots) = 0;
   virtual void set(const Slot& slot, const void* data, std::size_t size) = 0;
   virtual void get(const Slot& slot, void* data, std::size_t size) const = 0;
-  /// What went wrong in `set` and `get`, after which values are worth nothing. Errors: device.
+  /// What went wrong once in a call of the device, after which no other succeeds. Errors: device, out_of_memory.
   virtual Status failure() const { return {}; }
   /// The graph's slots must have memory; the graph is not needed afterwards. Errors: out_of_memory, internal,
   /// unsupported for sizes that the device has no kernel for.

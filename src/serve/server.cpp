@@ -120,10 +120,11 @@ Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   while (std::optional<Job> job = exchange_.next()) {
     for (Observer* observer : observers) observer->started(*job);
     exchange_.put(compute(engine, std::move(*job)));
+    if (!engine.device().failure()) stop();  // no act after this one can succeed
   }
   thread.join();
   hub_.reset();
-  return {};
+  return engine.device().failure();
 }
 
 /// An exception from a library fails this request, not the server.

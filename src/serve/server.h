@@ -40,8 +40,9 @@ class Server {
   /// What was bound, ports filled in.
   const std::vector<std::string>& addresses() const { return addresses_; }
 
-  /// Serves on this thread, which computes, and a second one, which talks, until `stop`; then answers what waits and
-  /// returns. Observers outlive the call. Once for each server. Errors: out_of_memory.
+  /// Serves on this thread, which computes, and a second one, which talks, until `stop` or the loss of the
+  /// device; then answers what waits and returns. Observers outlive the call. Once for each server. Errors: device,
+  /// out_of_memory.
   Status run(Engine& engine, std::span<Observer* const> observers = {});
   /// What `describe` is answered with once this engine is served.
   v1::Description describe(const Engine& engine) const;
