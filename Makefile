@@ -38,7 +38,7 @@ build: packages $(STAMP)
 # libvla-vulkan.so for build/cpu, where its packages are to be had; without it the tests of Vulkan skip by name.
 vulkan: build
 	@if scripts/packages.sh vulkan; then \
-	  cmake build/cpu -DVLA_VULKAN=ON >/dev/null && cmake --build --preset cpu --target vla_vulkan; \
+	  cmake build/cpu -DVLA_VULKAN=ON >/dev/null && cmake --build --preset cpu; \
 	else echo "make: libvla-vulkan.so is not built"; fi
 
 # libvla-cuda.so for build/cpu. No other target asks for it, as it downloads NVIDIA's compiler.

@@ -7,11 +7,12 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from golden_cases import FLOAT32, NAMES, ROOT, Golden
-from conftest import KIND
+from conftest import BINARY, KIND
 from program import EXIT
 
 DEVICE = ["--device", KIND]
@@ -103,6 +104,53 @@ def test_a_matrix_that_no_buffer_can_hold_is_refused_by_name_with_both_sizes(vla
         r"error: unsupported: [\w.]+\.weight: expected at most 5\.0 kB, a buffer of vulkan:0, found [\d.]+ kB; use another device",
         answer.err.splitlines()[-1],
     ), answer.err
+
+
+LAYER = Path(BINARY).parents[1] / "layer"
+LOST = re.escape("expected a device that answers, found vk::") + r"[\w:]+: ErrorDeviceLost; start the process again; "
+
+
+@pytest.fixture
+def losing(vla, tmp_path):
+    """The program with a Vulkan layer that counts submissions, or loses the device at the one that is given."""
+    if KIND != "vulkan":
+        pytest.skip("the layer is Vulkan's; tests/faults has a driver of CUDA that fails")
+    if not (LAYER / "lost_layer.json").is_file():
+        pytest.skip(f"no {LAYER}/lost_layer.json: it is built where Vulkan's headers are")
+    layer = {"VK_INSTANCE_LAYERS": "VK_LAYER_VLA_lost", "VK_LAYER_PATH": str(LAYER), "VLA_LOST_COUNTS": str(tmp_path / "n")}
+    return lambda at=0: with_environment(vla, VLA_LOST_AT=str(at), **layer)
+
+
+def test_a_device_that_is_lost_is_an_error_wherever_it_happens(losing, golden, tmp_path):
+    arguments = golden.arguments(options=["--json", *DEVICE])
+    assert losing()(*arguments, limit=LIMIT).code == 0
+    n = (tmp_path / "n").stat().st_size
+    for at in (1, n // 2, n):  # while it is loaded, later, and in the last step
+        answer = losing(at)(*arguments, limit=LIMIT)
+        assert answer.code == EXIT["device"] and answer.out == "", (at, answer.code, answer.err)
+        assert re.search(rf"^error: device: vulkan:0, [^\n]+: {LOST}", answer.err, re.M), (at, answer.err)
+
+
+def test_a_server_whose_device_is_lost_answers_device_and_ends(losing, golden, tmp_path):
+    import vla_cpp
+
+    losing()(*golden.arguments(options=["--json", *DEVICE]), limit=LIMIT)
+    program = losing((tmp_path / "n").stat().st_size + 1)  # after the act that warms it up, in the first or second one
+    command = [program.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *DEVICE]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=program.environment) as server:
+        try:
+            line = server.stdout.readline()
+            images = {view: file.read_bytes() for view, file in golden.images.items()}
+            with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=LIMIT) as client:
+                with pytest.raises(vla_cpp.DeviceError, match="ErrorDeviceLost"):
+                    for _ in range(3):
+                        client.act(images=images, state=golden.state, text=golden.text, noise=np.load(golden.noise))
+            _, err = server.communicate(timeout=60)
+        finally:
+            server.kill()
+    assert server.returncode == EXIT["device"], err
+    assert re.search(rf"^error: device: vulkan:0, [^\n]+: {LOST}", err, re.M), err
 
 
 def test_what_inspect_predicts_is_what_a_server_takes(vla, golden):
