@@ -62,6 +62,36 @@ with vla_cpp.Policy({str(golden.bundle)!r}, device="{KIND}:0") as policy:
     assert same == "True;True;True"
 
 
+def test_two_policies_on_one_device_act_at_the_same_time_and_answer_as_alone(vla, golden):
+    other = Golden(next(name for name in NAMES if name.startswith("pi05/")))
+    program = f"""
+import json, sys, threading
+sys.path[:0] = [{str(ROOT / "python")!r}]
+import vla_cpp
+def observation(images, **rest):
+    return dict(images={{view: file and open(file, "rb").read() for view, file in images.items()}}, seed=1, **rest)
+jobs = []
+for bundle, images, state, text in json.loads(sys.argv[1]):
+    jobs.append((vla_cpp.Policy(bundle, device="{KIND}"), observation(images, state=state, text=text), []))
+alone = [policy.act(**seen).actions.tobytes() for policy, seen, _ in jobs]
+start = threading.Barrier(len(jobs))
+def act(policy, seen, answers):
+    start.wait()
+    answers.extend(policy.act(**seen).actions.tobytes() for _ in range(5))
+threads = [threading.Thread(target=act, args=job) for job in jobs]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print([answers == [expected] * 5 for (_, _, answers), expected in zip(jobs, alone)])
+"""
+    cases = [
+        [str(case.bundle), {view: file and str(file) for view, file in case.images.items()}, case.state, case.text]
+        for case in (golden, other, golden)
+    ]
+    result = subprocess.run([sys.executable, "-c", program, json.dumps(cases)], capture_output=True, text=True, timeout=LIMIT)
+    assert result.returncode == 0, (result.returncode, result.stderr)
+    assert result.stdout.strip() == "[True, True, True]"
+
+
 def test_a_server_answers_with_the_chunk_of_vla_run_and_tells_the_device(vla, golden):
     import vla_cpp
 
