@@ -52,8 +52,31 @@ KWARGS_IGNORED = set(
     """random_rotation_angle color_jitter_params model_name max_action_dim max_action_horizon extra_augmentation_config
     state_dropout_prob transformers_loading_kwargs tactile_state_keys tactile_input_shape tactile_embed_dim""".split()
 )
-
-
+# Defaults of the authors' classes of both releases, in config.json.
+CONFIG = {
+    "backbone_embedding_dim": 2048,
+    "hidden_size": 1024,
+    "input_embedding_dim": 1536,
+    "max_seq_len": 1024,
+    "attend_text_every_n_blocks": 2,
+    "num_inference_timesteps": 4,
+    "num_timestep_buckets": 1000,
+    "max_num_embodiments": 32,
+}
+DIT = {
+    "positional_embeddings": None,
+    "num_attention_heads": 32,
+    "attention_head_dim": 48,
+    "norm_type": "ada_norm",
+    "output_dim": 1024,
+    "interleave_self_attention": True,
+}
+FIXED: Fixed = {
+    "reproject_vision": (False, False),
+    "add_pos_embed": (True, True),
+    "use_vlln": (True, True),
+    "use_alternate_vl_dit": (True, True),
+}
 # Keys of training, of precision and of transformers, and those of images, text and statistics, which processor_config.json states for
 # the processor: that is where the reference reads them.
 IGNORED = set(
@@ -72,14 +95,14 @@ IGNORED = set(
 class Release(NamedTuple):
     """What a release has of its own."""
 
-    config: Dict[str, object]  # keys of config.json with their defaults
-    fixed: Fixed
-    ignored: Collection[str]
-    processor_class: str
-    kwargs_fixed: Fixed
-    embodiments: Dict[str, int]  # indices of tags that embodiment_id.json does not have
-    state_rows: bool  # each moment of the state is a token of its own; else all of them are one
+    model_type: str
+    backbone_type: str  # backbone_model_type of config.json, model_type of the processor
     backbone: Any  # read, read_area, read_prompt, weights, keys, dropped, LM, TEMPLATE
+    config: Dict[str, object]  # keys of config.json with their defaults, beside CONFIG
+    fixed: Fixed  # beside FIXED
+    ignored: Collection[str]
+    embodiments: Dict[str, int]  # indices of tags that embodiment_id.json does not have
+    state_rows: bool = False  # each moment of the state is a token of its own; else all of them are one
 
 
 def make_plan(release: Release, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
@@ -163,19 +186,16 @@ def assemble(
 
 def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> Section:
     config = read_json(processor_file(checkpoint, PROCESSOR))
-    if config.get("processor_class") != release.processor_class:
-        problems.unsupported(
-            PROCESSOR + ": processor_class", repr(release.processor_class), repr(config.get("processor_class"))
-        )
+    name = release.model_type + "Processor"
+    if config.get("processor_class") != name:
+        problems.unsupported(PROCESSOR + ": processor_class", repr(name), repr(config.get("processor_class")))
     section = Section(PROCESSOR, member(config, "processor_kwargs", dict, PROCESSOR), KWARGS, problems)
-    fixed = {**KWARGS_FIXED, **release.kwargs_fixed}
+    fixed = {**KWARGS_FIXED, "model_type": (release.backbone_type,) * 2}
     section.refuse_unknown({*KWARGS, *STATED, *fixed, *KWARGS_IGNORED})
     section.check_fixed(fixed)
     for key in STATED:
         if key not in section.values:
-            section.bad(
-                key, "a value, or null", "no such key", "the reference and LeRobot take different defaults for it"
-            )
+            section.bad(key, "a value, or null", "no such key", "the reference and LeRobot take different defaults for it")
     for key in FLAGS:
         if not isinstance(section.get(key), bool):
             section.bad(key, "true or false")
@@ -184,14 +204,18 @@ def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> 
 
 def read_sizes(release: Release, config: dict, folder: str, problems: Problems) -> Sizes:
     """`folder`: the backbone's."""
-    s, policy = Sizes(), Section(POLICY, config, release.config, problems, nullable=("diffusion_model_cfg",))
-    policy.refuse_unknown({*release.config, *release.fixed, *IGNORED, *release.ignored})
-    policy.check_fixed(release.fixed)
+    defaults = {**CONFIG, **release.config}
+    fixed: Fixed = {
+        "model_type": (None, release.model_type),
+        "backbone_model_type": (release.backbone_type,) * 2,
+        **FIXED,
+        **release.fixed,
+    }
+    s, policy = Sizes(), Section(POLICY, config, defaults, problems, nullable=("diffusion_model_cfg",))
+    policy.refuse_unknown({*defaults, *fixed, *IGNORED, *release.ignored})
+    policy.check_fixed(fixed)
     release.backbone.read(folder, policy.count("select_layer", most=MAX_LAYERS), s, problems)
-    s.d_action, s.attend_text_every_n_blocks = (
-        policy.count("max_action_dim"),
-        policy.count("attend_text_every_n_blocks"),
-    )
+    s.d_action, s.attend_text_every_n_blocks = policy.count("max_action_dim"), policy.count("attend_text_every_n_blocks")
     head.read(policy, s)
     return s
 

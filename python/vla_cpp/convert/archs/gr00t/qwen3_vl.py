@@ -15,10 +15,10 @@ from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
 from ...files import member, read_json, read_text
 from ...layers import linear, norm, vector
-from ...networks import MAX_LAYERS
+from ...networks import MAX_LAYERS, EncoderNames, encoder_block
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
-from .. import MATRIX, TABLE, VECTOR, Dropped, Weight
+from .. import MATRIX, TABLE, Dropped, Weight
 from . import language
 from . import prompt as prompts
 from .images import Area
@@ -26,6 +26,7 @@ from .prompt import END, START, Prompt, Template
 from .sizes import WHERE, Sizes
 
 VISUAL, LM = "backbone.model.model.visual.", "backbone.model.model.language_model."
+BLOCK = EncoderNames(("norm1", "norm2"), ("attn.qkv.",), "attn.proj", "mlp.linear_fc1", "mlp.linear_fc2")
 OPEN, CLOSE, IMAGE = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"
 # One turn without a system turn, the images before the instruction.
 TEMPLATE = Template(START + "user\n", END + "\n", OPEN, IMAGE, CLOSE)
@@ -156,14 +157,6 @@ def _patch(target: str, s: Sizes, time: int) -> Weight:
     return Weight(target, source, MATRIX, (s.vision.d_model, 3, 2, side, side), (s.vision.d_model, 3 * side**2), pick=(2, time))
 
 
-def _third(target: str, source: str, d: int, i: int) -> List[Weight]:
-    """The i-th of q, k and v, which are stacked."""
-    return [
-        Weight(target + ".weight", source + ".weight", MATRIX, (3 * d, d), (d, d), first=i * d),
-        Weight(target + ".bias", source + ".bias", VECTOR, (3 * d,), (d,), first=i * d),
-    ]
-
-
 def _merger(target: str, source: str, s: Sizes, d_norm: int) -> List[Weight]:
     d = 4 * s.vision.d_model
     return [
@@ -182,14 +175,7 @@ def _vision(s: Sizes) -> List[Weight]:
         Weight("vision.position.weight", VISUAL + "pos_embed.weight", TABLE, table, table),
     ]
     for i in range(s.vision.n_layer):
-        target, block = "vision.blk.{}.".format(i), "{}blocks.{}.".format(VISUAL, i)
-        rows += norm(target + "attn_norm", block + "norm1", d)
-        for part, name in enumerate(("attn_q", "attn_k", "attn_v")):
-            rows += _third(target + name, block + "attn.qkv", d, part)
-        rows += linear(target + "attn_out", block + "attn.proj", d, d, bias=True)
-        rows += norm(target + "ffn_norm", block + "norm2", d)
-        rows += linear(target + "ffn_up", block + "mlp.linear_fc1", s.vision.d_ff, d, bias=True)
-        rows += linear(target + "ffn_down", block + "mlp.linear_fc2", d, s.vision.d_ff, bias=True)
+        rows += encoder_block("vision.blk.{}.".format(i), "{}blocks.{}.".format(VISUAL, i), BLOCK, d, s.vision.d_ff)
     rows += _merger("connector.", VISUAL + "merger.", s, d)
     for k in range(len(s.deepstack_layers)):
         rows += _merger("deepstack.{}.".format(k), "{}deepstack_merger_list.{}.".format(VISUAL, k), s, 4 * d)
