@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mapping of BitVLA at the published size: against the published inventory, and against what the runtime declares."""
 
-import json
-import subprocess
-
 import numpy as np
 import pytest
 
-from manifest_test import vla
+from manifests import check_keys, check_parameters
 from vla_cpp.convert.archs import SCALE, TERNARY
 from vla_cpp.convert.archs.bitvla import mapping
 from vla_cpp.convert.errors import Problems
@@ -56,25 +53,15 @@ def test_the_published_config_asks_for_the_published_numbers(published):
     assert sum(count.values()) == pytest.approx(2.885e9, rel=1e-3)
 
 
-@pytest.fixture
-def manifest():
-    answer = subprocess.run([vla(), "inspect", "--manifest", "bitvla"], capture_output=True)
-    if answer.returncode:
-        pytest.skip("this vla program has no bitvla")
-    return json.loads(answer.stdout)
+def declared(row):
+    if row.kind == TERNARY:
+        return list(row.stored), row.kind
+    return list(row.shape), "vector" if row.kind == SCALE else row.kind
 
 
-def test_names_shapes_and_storage_are_those_that_the_runtime_declares(published, manifest):
-    def declared(row):
-        return (list(row.stored), row.kind) if row.kind == TERNARY else (list(row.shape), "vector" if row.kind == SCALE else row.kind)
-
-    ours = {row.target: declared(row) for row in mapping.weights(published)}
-    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(published):
+    check_parameters("bitvla", mapping.weights(published), declared)
 
 
-def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(published, manifest):
-    ours = {key.name: key.value for key in mapping.network_keys(published)}
-    chosen = {"policy.stop_token", "policy.view_starts"}  # of the tokenizer
-    for name, value in manifest["config"].items():
-        if name not in chosen:
-            assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(published):
+    check_keys("bitvla", mapping.network_keys(published), chosen={"policy.stop_token", "policy.view_starts"})  # of the tokenizer

@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mapping of Evo-1 at the published size: against the published inventory, and against what the runtime declares."""
 
-import json
-import subprocess
-
 import numpy as np
 import pytest
 
-from manifest_test import vla
+from manifests import check_keys, check_parameters
 from vla_cpp.convert.archs.evo1 import mapping
 from vla_cpp.convert.archs.evo1.mapping import Sizes, read_chat_backbone, read_hf_backbone
 from vla_cpp.convert.errors import Problems
@@ -100,22 +97,9 @@ def test_the_published_configs_ask_for_the_published_numbers(published):
     assert sum(stored.values()) == sum(count.values())
 
 
-@pytest.fixture
-def manifest():
-    answer = subprocess.run([vla(), "inspect", "--manifest", "evo1"], capture_output=True)
-    if answer.returncode:
-        pytest.skip("this vla program has no evo1")
-    return json.loads(answer.stdout)
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(published):
+    check_parameters("evo1", mapping.weights(*published))
 
 
-def test_names_shapes_and_storage_are_those_that_the_runtime_declares(published, manifest):
-    ours = {row.target: (list(row.shape), row.kind) for row in mapping.weights(*published)}
-    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
-
-
-def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(published, manifest):
-    ours = {key.name: key.value for key in mapping.network_keys(published[0])}
-    chosen = {"policy.pad_token", "policy.view_starts"}  # of the tokenizer
-    for name, value in manifest["config"].items():
-        if name not in chosen:
-            assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(published):
+    check_keys("evo1", mapping.network_keys(published[0]), chosen={"policy.pad_token", "policy.view_starts"})  # of the tokenizer

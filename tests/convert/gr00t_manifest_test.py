@@ -3,14 +3,14 @@
 """The mappings of GR00T at the published sizes: against the published counts, and against what the runtime declares."""
 
 import json
-import subprocess
 
 import numpy as np
 import pytest
 
-from manifest_test import vla
+from manifests import check_keys, check_parameters
 from vla_cpp.convert.archs import gr00t_n1_5, gr00t_n1_6, gr00t_n1_7
 from vla_cpp.convert.archs.gr00t.plan import network_keys, read_sizes, weights
+from vla_cpp.convert.bundle import Key
 from vla_cpp.convert.errors import Problems
 
 CONFIG = {  # of the published checkpoint: what differs from the defaults of its class
@@ -94,22 +94,18 @@ def test_each_part_has_the_published_count_of_parameters(sizes, prefixes, millio
     assert sum(int(np.prod(row.shape)) for row in rows) / 1e6 == pytest.approx(millions, abs=0.06)
 
 
-@pytest.fixture(scope="module")
-def manifest():
-    answer = subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_7"], capture_output=True, check=True)
-    return json.loads(answer.stdout)
+def view_starts(name, *starts):
+    """A key that follows from the prompt's tokens."""
+    return Key("policy." + name, "u32[]", list(starts))
 
 
-def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes, manifest):
-    ours = {row.target: (list(row.shape), row.kind) for row in weights(RELEASE, sizes)}
-    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes):
+    check_parameters("gr00t_n1_7", weights(RELEASE, sizes))
 
 
-def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
-    ours = {key.name: key.value for key in network_keys(RELEASE, sizes)}
-    ours["policy.view_starts"] = [4, 70]  # <|im_start|>, "user", a line's end, <|vision_start|>; 64 image tokens a view
-    for name, value in manifest["config"].items():
-        assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes):
+    # <|im_start|>, "user", a line's end, <|vision_start|>; 64 image tokens a view
+    check_keys("gr00t_n1_7", [*network_keys(RELEASE, sizes), view_starts("view_starts", 4, 70)])
 
 
 EAGLE_3 = {
@@ -144,15 +140,9 @@ def test_n1_6_declares_what_its_checkpoint_has(tmp_path):
     sizes = read_sizes(release, config, str(tmp_path), problems)
     problems.raise_any()
     sizes.max_views, sizes.image_width, sizes.image_height = 2, 252, 252
-    declared = json.loads(
-        subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_6"], capture_output=True, check=True).stdout
-    )
-    ours = {row.target: (list(row.shape), row.kind) for row in weights(release, sizes)}
-    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in declared["parameters"]}
-    keys = {key.name: key.value for key in network_keys(release, sizes)}
-    keys["policy.view_starts_from_end"] = [172, 84]  # 81 tokens a view, its mark and its number; two marks at the end
-    for name, value in declared["config"].items():
-        assert keys[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+    check_parameters("gr00t_n1_6", weights(release, sizes))
+    # 81 tokens a view, its mark and its number; two marks at the end
+    check_keys("gr00t_n1_6", [*network_keys(release, sizes), view_starts("view_starts_from_end", 172, 84)])
     tower = sum(int(np.prod(row.shape)) for row in weights(release, sizes) if row.target.startswith("vision."))
     assert tower / 1e6 == pytest.approx(412.4, abs=0.1)
 
@@ -182,16 +172,10 @@ def test_n1_5_declares_what_its_checkpoint_has(tmp_path):
     sizes, n_future = gr00t_n1_5.read_sizes(N1_5, str(tmp_path), problems)
     problems.raise_any()
     sizes.max_views = 2
-    declared = json.loads(
-        subprocess.run([vla(), "inspect", "--manifest", "gr00t_n1_5"], capture_output=True, check=True).stdout
-    )
     rows = gr00t_n1_5.weights(sizes, n_future)
-    ours = {row.target: (list(row.shape), row.kind) for row in rows}
-    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in declared["parameters"]}
-    keys = {key.name: key.value for key in gr00t_n1_5.network_keys(sizes, n_future)}
-    keys["policy.view_starts"] = [20, 283]  # behind the system's turn, the user's mark and the first view's number
-    for name, value in declared["config"].items():
-        assert keys[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+    check_parameters("gr00t_n1_5", rows)
+    # behind the system's turn, the user's mark and the first view's number
+    check_keys("gr00t_n1_5", [*gr00t_n1_5.network_keys(sizes, n_future), view_starts("view_starts", 20, 283)])
     # What is published, but for the rows of 31 other robots and the pooling head.
     count = sum(int(np.prod(row.shape)) for row in rows)
     assert count / 1e6 == pytest.approx(412.4 + 2.36 + 604.0 + 310.6 + 201.4 + 550.4 + 9.9 + 1.57, abs=0.3)

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The mappings of pi0 and pi0.5 at the published size, against what the runtime declares."""
 
-import json
-import subprocess
-
 import pytest
 
-from manifest_test import vla
+from manifests import check_keys, check_parameters
 from vla_cpp.convert.archs import pi0, pi05
 from vla_cpp.convert.archs.pi0 import mapping
 from vla_cpp.convert.archs.pi0.mapping import network_keys, read_towers
@@ -35,19 +32,10 @@ def sizes(family, tmp_path):
     return sizes
 
 
-@pytest.fixture
-def manifest(family):
-    answer = subprocess.run([vla(), "inspect", "--manifest", family.arch], capture_output=True, check=True)
-    return json.loads(answer.stdout)
-
-
-def test_names_shapes_and_storage_are_those_that_the_runtime_declares(family, sizes, manifest, tmp_path):
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(family, sizes, tmp_path):
     checkpoint = Checkpoint("published", str(tmp_path), "", {}, {}, {}, {}, None)
-    ours = {row.target: (list(row.shape), row.kind) for row in mapping.weights(family, sizes, checkpoint)}
-    assert ours == {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
+    check_parameters(family.arch, mapping.weights(family, sizes, checkpoint))
 
 
-def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
-    ours = {key.name: key.value for key in network_keys(sizes)}
-    for name, value in manifest["config"].items():
-        assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(family, sizes):
+    check_keys(family.arch, network_keys(sizes))

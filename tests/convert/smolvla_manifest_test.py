@@ -1,14 +1,11 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The mapping at the published size: against the published inventory, and against what the runtime declares."""
-
-import json
-import os
-import subprocess
+"""The mapping of SmolVLA at the published size: against the published inventory, and against what the runtime declares."""
 
 import numpy as np
 import pytest
 
+from manifests import check_keys, check_parameters
 from tiny import write_json
 from vla_cpp.convert.archs import Options
 from vla_cpp.convert.archs.smolvla import mapping
@@ -75,35 +72,9 @@ def test_the_published_configs_ask_for_the_published_tensors(sizes):
     assert len({row.source for row in [*weights, *dropped]}) == 500
 
 
-def vla():
-    """The built program, named by VLA_BINARY or where the build puts it."""
-    built = os.path.join(os.path.dirname(__file__), "..", "..", "build", "cpu", "bin", "vla")
-    path = os.environ.get("VLA_BINARY", built)
-    if not os.path.exists(path):
-        pytest.skip("no vla program; build it or name it by VLA_BINARY")
-    return path
+def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes):
+    check_parameters("smolvla", mapping.weights(sizes))
 
 
-@pytest.fixture
-def manifest():
-    return json.loads(
-        subprocess.run([vla(), "inspect", "--manifest", "smolvla"], capture_output=True, check=True).stdout
-    )
-
-
-def test_names_shapes_and_storage_are_those_that_the_runtime_declares(sizes, manifest):
-    ours = {row.target: (list(row.shape), row.kind) for row in mapping.weights(sizes)}
-    theirs = {row["name"]: (row["shape"], row["storage"]) for row in manifest["parameters"]}
-    assert ours == theirs
-
-
-def test_every_config_key_that_the_runtime_reads_is_written(sizes, manifest):
-    ours = {key.name for key in mapping.network_keys(sizes)}
-    assert set(manifest["config"]) - ours == set()
-
-
-def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes, manifest):
-    ours = {key.name: key.value for key in mapping.network_keys(sizes)}
-    for name, value in manifest["config"].items():
-        if name != "vision.position_rule":  # the policy's own precision decides it
-            assert ours[name] == (pytest.approx(value, rel=1e-6) if isinstance(value, float) else value), name
+def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(sizes):
+    check_keys("smolvla", mapping.network_keys(sizes), chosen={"vision.position_rule"})  # the policy's own precision decides it
