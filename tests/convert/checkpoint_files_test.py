@@ -24,7 +24,7 @@ def test_one_processor_file_without_the_other_is_refused(converter, tiny):
 
 
 @pytest.mark.parametrize(
-    "file", ["config.json", "vlm/config.json", "vlm/tokenizer.json", "policy_preprocessor.json", "pre_5.safetensors"]
+    "file", ["config.json", "vlm/config.json", "vlm/tokenizer.json", "policy_preprocessor.json", "pre.safetensors"]
 )
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe", b'{"a": NaN}', b"[" * 100000])
 def test_a_damaged_file_is_refused_by_its_name(converter, tiny, file, content):
@@ -34,7 +34,7 @@ def test_a_damaged_file_is_refused_by_its_name(converter, tiny, file, content):
     assert file.rsplit("/", 1)[-1] in error.message() and error.code == BAD
 
 
-@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "vlm/tokenizer.json", "pre_5.safetensors"])
+@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "vlm/tokenizer.json", "pre.safetensors"])
 def test_a_missing_file_is_refused_by_its_name(converter, tiny, file):
     converter.save(tiny)
     (converter.folder / file).unlink()
@@ -42,7 +42,7 @@ def test_a_missing_file_is_refused_by_its_name(converter, tiny, file):
     assert file in error.message() and error.code == IO
 
 
-@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "vlm/tokenizer.json", "pre_5.safetensors"])
+@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "vlm/tokenizer.json", "pre.safetensors"])
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
 def test_what_is_no_file_is_refused_by_its_name_and_not_waited_for(converter, tiny, file, kind):
     converter.save(tiny)
@@ -124,7 +124,7 @@ def test_without_a_backbone_the_refusal_names_the_option(converter, tiny, monkey
 
 def test_a_statistics_file_with_a_hostile_header_is_refused(converter, tiny):
     folder = converter.save(tiny)
-    write_safetensors(folder + "/pre_5.safetensors", tiny.stats)
-    with open(folder + "/pre_5.safetensors", "r+b") as file:
+    write_safetensors(folder + "/pre.safetensors", tiny.stats)
+    with open(folder + "/pre.safetensors", "r+b") as file:
         file.write((1 << 63).to_bytes(8, "little"))
     assert "expected a safetensors header inside the file" in converter.refusal().message()

@@ -150,7 +150,7 @@ CASES = {  # what the message must contain: (change, class)
         UNSUPPORTED,
     ),
     "normalizer_processor: state_file: expected a file beside the JSON": (
-        set_in("pre.steps.5.state_file", "../pre_5.safetensors"),
+        set_in("pre.steps.5.state_file", "../pre.safetensors"),
         BAD,
     ),
     "normalizer_processor: eps: expected a small number": (step("normalizer_processor", eps="tiny"), BAD),

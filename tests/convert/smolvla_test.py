@@ -170,7 +170,7 @@ def test_identity_mode_leaves_the_state_alone(converter, tiny):
 def test_state_and_action_statistics_come_from_their_own_pipelines(converter, tiny):
     folder = converter.save(tiny)
     other = Tiny(seed=1)
-    write_safetensors(folder + "/post_0.safetensors", other.stats)
+    write_safetensors(folder + "/post.safetensors", other.stats)
     bundle = converter.bundle()
     np.testing.assert_array_equal(bundle.tensors["stats.observation.state.mean"], tiny.stats["observation.state.mean"])
     np.testing.assert_array_equal(bundle.tensors["stats.action.mean"], other.stats["action.mean"])

@@ -10,6 +10,7 @@ import os
 
 import numpy as np
 
+from goldens import lerobot_layout as layout
 from goldens.files import write_json, write_safetensors
 
 VLM = "model.vlm_with_expert.vlm.model."
@@ -36,15 +37,12 @@ def changed(tiny, changes, separator="/"):
     return tiny
 
 
+INPUTS, OUTPUTS = layout.features({"top": (12, 16), "wrist": (16, 16)}, STATE_DIM, ACTION_DIM)
 CONFIG = {
     "type": "smolvla",
     "n_obs_steps": 1,
-    "input_features": {
-        "observation.state": {"type": "STATE", "shape": [STATE_DIM]},
-        "observation.images.top": {"type": "VISUAL", "shape": [3, 12, 16]},
-        "observation.images.wrist": {"type": "VISUAL", "shape": [3, 16, 16]},
-    },
-    "output_features": {"action": {"type": "ACTION", "shape": [ACTION_DIM]}},
+    "input_features": INPUTS,
+    "output_features": OUTPUTS,
     "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"},
     "chunk_size": 6,
     "n_action_steps": 6,
@@ -94,13 +92,20 @@ def pipelines(pre, post):
     files = {"normalizer_processor": "pre.safetensors", "unnormalizer_processor": "post.safetensors"}
 
     def step(name, config):
-        return {"registry_name": name, "config": config, **({"state_file": files[name]} if name in files else {})}
+        return {"registry_name": name, "config": copy.deepcopy(config), **({"state_file": files[name]} if name in files else {})}
 
     both = {"policy_preprocessor": pre, "policy_postprocessor": post}
     return tuple({"name": name, "steps": [step(*s) for s in steps]} for name, steps in both.items())
 
 
+def normalizer(config, name="normalizer_processor"):
+    """The step that reads statistics."""
+    features = copy.deepcopy({**config["input_features"], **config["output_features"]})
+    return name, {"eps": 1e-8, "norm_map": dict(config["normalization_mapping"]), "features": features}
+
+
 def step_of(tiny, name):
+    """The step of either pipeline by its registry name."""
     return next(step for step in tiny.pre["steps"] + tiny.post["steps"] if step["registry_name"] == name)
 
 
@@ -215,51 +220,18 @@ class Tiny:
         self.pre, self.post = self._pipelines()
 
     def _pipelines(self):
-        normalizer = {
-            "eps": 1e-8,
-            "norm_map": dict(self.config["normalization_mapping"]),
-            "features": {
-                **copy.deepcopy(self.config["input_features"]),
-                **copy.deepcopy(self.config["output_features"]),
-            },
-        }
         pre = [
-            ("rename_observations_processor", {"rename_map": {}}, None),
-            ("to_batch_processor", {}, None),
-            ("smolvla_new_line_processor", {}, None),
-            (
-                "tokenizer_processor",
-                {
-                    "max_length": 7,
-                    "task_key": "task",
-                    "padding_side": "right",
-                    "padding": "max_length",
-                    "truncation": True,
-                    "tokenizer_name": "nobody/none",
-                },
-                None,
-            ),
-            ("device_processor", {"device": "cuda", "float_dtype": None}, None),
-            ("normalizer_processor", normalizer, "pre_5.safetensors"),
+            layout.rename({}),
+            layout.BATCH,
+            ("smolvla_new_line_processor", {}),
+            layout.tokenizer("nobody/none", 7),
+            ("device_processor", {"device": "cuda", "float_dtype": None}),
+            normalizer(self.config),
         ]
-        post = [
-            ("unnormalizer_processor", copy.deepcopy(normalizer), "post_0.safetensors"),
-            ("device_processor", {"device": "cpu", "float_dtype": None}, None),
-        ]
-        return tuple(
-            {
-                "name": name,
-                "steps": [
-                    {"registry_name": step, "config": config, **({"state_file": state} if state else {})}
-                    for step, config, state in steps
-                ],
-            }
-            for name, steps in (("policy_preprocessor", pre), ("policy_postprocessor", post))
-        )
+        return pipelines(pre, [normalizer(self.config, "unnormalizer_processor"), layout.device()])
 
     def step(self, name):
-        """The step of either pipeline by its registry name."""
-        return next(step for step in self.pre["steps"] + self.post["steps"] if step["registry_name"] == name)
+        return step_of(self, name)
 
     def normalization(self, mode, kind="STATE"):
         self.config["normalization_mapping"][kind] = mode
@@ -281,26 +253,40 @@ class Tiny:
 
     def save(self, folder, shards=0):
         folder = str(folder)
-        os.makedirs(os.path.join(folder, "vlm"), exist_ok=True)
-        write_json(os.path.join(folder, "config.json"), self.config)
-        write_json(os.path.join(folder, "vlm", "config.json"), self.backbone)
-        write_json(os.path.join(folder, "vlm", "tokenizer.json"), self.tokenizer)
-        write_json(os.path.join(folder, "vlm", "tokenizer_config.json"), self.tokenizer_config)
-        if self.pre is not None:
-            write_json(os.path.join(folder, "policy_preprocessor.json"), self.pre)
-            write_json(os.path.join(folder, "policy_postprocessor.json"), self.post)
-            write_safetensors(os.path.join(folder, "pre_5.safetensors"), self.stats)
-            write_safetensors(os.path.join(folder, "post_0.safetensors"), self.stats)
+        write_jsons(folder, config=self.config)
+        save_vlm(self, folder)
+        save_pipelines(self, folder, self.stats)
         if not shards:
             write_safetensors(os.path.join(folder, "model.safetensors"), self.tensors, self.metadata)
         else:
-            self._save_shards(folder, shards)
+            save_shards(folder, self.tensors, shards)
         return folder
 
-    def _save_shards(self, folder, shards):
-        names, index = sorted(self.tensors), {}
-        for k in range(shards):
-            file = "model-{:05d}-of-{:05d}.safetensors".format(k + 1, shards)
-            index.update(dict.fromkeys(names[k::shards], file))
-            write_safetensors(os.path.join(folder, file), {name: self.tensors[name] for name in names[k::shards]})
-        write_json(os.path.join(folder, "model.safetensors.index.json"), {"metadata": {}, "weight_map": index})
+
+def write_jsons(folder, **values):
+    for name, value in values.items():
+        if value is not None:
+            write_json(os.path.join(folder, name + ".json"), value)
+
+
+def save_vlm(tiny, folder, below="vlm"):
+    """The folder that the hub keeps apart: the backbone's config, where there is one, and the tokenizer."""
+    backbone = getattr(tiny, "backbone", None)
+    write_jsons(os.path.join(folder, below), config=backbone, tokenizer=tiny.tokenizer, tokenizer_config=tiny.tokenizer_config)
+
+
+def save_pipelines(tiny, folder, statistics):
+    if tiny.pre is None:
+        return
+    write_jsons(folder, policy_preprocessor=tiny.pre, policy_postprocessor=tiny.post)
+    for file in ("pre", "post"):
+        write_safetensors(os.path.join(folder, file + ".safetensors"), statistics)
+
+
+def save_shards(folder, tensors, shards):
+    names, index = sorted(tensors), {}
+    for k in range(shards):
+        file = "model-{:05d}-of-{:05d}.safetensors".format(k + 1, shards)
+        index.update(dict.fromkeys(names[k::shards], file))
+        write_safetensors(os.path.join(folder, file), {name: tensors[name] for name in names[k::shards]})
+    write_json(os.path.join(folder, "model.safetensors.index.json"), {"metadata": {}, "weight_map": index})

@@ -11,7 +11,8 @@ import os
 import numpy as np
 
 from goldens import files
-from tiny import byte_alphabet, pipelines, step_of, write_json, write_safetensors
+from goldens import lerobot_layout as layout
+from tiny import byte_alphabet, normalizer, pipelines, save_pipelines, save_vlm, step_of, write_jsons, write_safetensors
 
 D_VISION, D_VISION_FF, IMAGE, PATCH, N_VIEW_TOKEN = 6, 10, 56, 14, 4
 D_MODEL, D_FF, N_HEAD, N_KV, N_LAYER, N_LAYER_BACKBONE = 12, 14, 3, 1, 2, 3
@@ -133,16 +134,13 @@ AUTHORS_CONFIG = {
     "num_inference_timesteps": 7,  # the server counts its own
     "lr": 1e-5,
 }
+INPUTS, OUTPUTS = layout.features({"front": (20, 28), "wrist": (36, 36)}, STATE_DIM, ACTION_DIM)
 LEROBOT_CONFIG = {
     **HEAD,
     "type": "evo1",
     "n_obs_steps": 1,
-    "input_features": {
-        "observation.state": {"type": "STATE", "shape": [STATE_DIM]},
-        "observation.images.front": {"type": "VISUAL", "shape": [3, 20, 28]},
-        "observation.images.wrist": {"type": "VISUAL", "shape": [3, 36, 36]},
-    },
-    "output_features": {"action": {"type": "ACTION", "shape": [ACTION_DIM]}},
+    "input_features": INPUTS,
+    "output_features": OUTPUTS,
     "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": "MIN_MAX", "ACTION": "MIN_MAX"},
     "chunk_size": HORIZON,
     "n_action_steps": HORIZON,
@@ -295,20 +293,12 @@ class TinyEvo1:
         return self.norm_stats[ARM][DATASET]
 
     def save(self, folder):
-        self.save_backbone(folder)
-        write_json(os.path.join(str(folder), "norm_stats.json"), self.norm_stats)
-        if self.dims is not None:
-            write_json(os.path.join(str(folder), "dims.json"), self.dims)
+        folder = str(folder)
+        write_jsons(folder, config=self.config, norm_stats=self.norm_stats, dims=self.dims)
+        save_vlm(self, folder)
         if self.weights:
-            files.write_torch(os.path.join(str(folder), self.weights), self.tensors, self.member, **self.others)
-        return str(folder)
-
-    def save_backbone(self, folder):
-        os.makedirs(os.path.join(str(folder), "vlm"), exist_ok=True)
-        write_json(os.path.join(str(folder), "config.json"), self.config)
-        write_json(os.path.join(str(folder), "vlm", "config.json"), self.backbone)
-        write_json(os.path.join(str(folder), "vlm", "tokenizer.json"), self.tokenizer)
-        write_json(os.path.join(str(folder), "vlm", "tokenizer_config.json"), self.tokenizer_config)
+            files.write_torch(os.path.join(folder, self.weights), self.tensors, self.member, **self.others)
+        return folder
 
 
 class TinyEvo1Lerobot(TinyEvo1):
@@ -328,23 +318,23 @@ class TinyEvo1Lerobot(TinyEvo1):
         self.pre, self.post = self.pipelines()
 
     def pipelines(self):
-        norm_map = dict(self.config["normalization_mapping"])
-        features = {**copy.deepcopy(self.config["input_features"]), **copy.deepcopy(self.config["output_features"])}
+        normalize, unnormalize = (normalizer(self.config, name) for name in ("normalizer_processor", "unnormalizer_processor"))
+        features = normalize[1]["features"]
         features["observation.state"]["shape"], features["action"]["shape"] = [D_STATE], [D_ACTION]
-        normalizer = {"eps": 1e-8, "norm_map": norm_map, "features": features}
+        unnormalize[1]["features"] = {"action": features["action"]}
         keys = "binarize_gripper gripper_index gripper_threshold gripper_below_threshold_value gripper_above_threshold_value"
         pre = [
-            ("rename_observations_processor", {"rename_map": {}}),
-            ("to_batch_processor", {}),
+            layout.rename({}),
+            layout.BATCH,
             ("evo1_pad_state_processor", {"max_state_dim": D_STATE}),
             ("evo1_pad_action_processor", {"max_action_dim": D_ACTION}),
-            ("normalizer_processor", normalizer),
-            ("device_processor", {"device": "cpu", "float_dtype": None}),
+            normalize,
+            layout.device(),
         ]
         post = [
-            ("unnormalizer_processor", {**copy.deepcopy(normalizer), "features": {"action": features["action"]}}),
+            unnormalize,
             ("evo1_action_processor", {"action_dim": ACTION_DIM, **{key: self.config[key] for key in keys.split()}}),
-            ("device_processor", {"device": "cpu", "float_dtype": "float32"}),
+            layout.device("float32"),
         ]
         return pipelines(pre, post)
 
@@ -364,12 +354,9 @@ class TinyEvo1Lerobot(TinyEvo1):
         return self
 
     def save(self, folder):
-        self.save_backbone(folder)
         folder = str(folder)
+        write_jsons(folder, config=self.config)
+        save_vlm(self, folder)
+        save_pipelines(self, folder, self.statistics)
         write_safetensors(os.path.join(folder, "model.safetensors"), self.tensors)
-        if self.pre is not None:
-            write_json(os.path.join(folder, "policy_preprocessor.json"), self.pre)
-            write_json(os.path.join(folder, "policy_postprocessor.json"), self.post)
-            write_safetensors(os.path.join(folder, "pre.safetensors"), self.statistics)
-            write_safetensors(os.path.join(folder, "post.safetensors"), self.statistics)
         return folder

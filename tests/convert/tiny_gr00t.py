@@ -11,7 +11,7 @@ import os
 import numpy as np
 
 import tiny_evo1
-from tiny import write_json, write_safetensors
+from tiny import save_shards, save_vlm, write_jsons
 
 D_VISION, D_VISION_FF, N_VISION_LAYER, PATCH, N_POSITION = 8, 10, 3, 2, 9
 D_MODEL, D_FF, N_HEAD, N_KV, D_HEAD, N_LAYER = 12, 14, 4, 2, 8, 2
@@ -271,31 +271,13 @@ class TinyGr00t:
 
     def save(self, folder, shards=2):
         folder = str(folder)
-        below, vlm = os.path.join(folder, self.below), os.path.join(folder, "vlm")
-        os.makedirs(below, exist_ok=True)
-        os.makedirs(vlm, exist_ok=True)
-        write_json(os.path.join(folder, "config.json"), self.config)
-        for name, value in (
-            ("processor_config", self.processor),
-            ("statistics", self.statistics),
-            ("embodiment_id", self.embodiments),
-        ):
-            write_json(os.path.join(below, name + ".json"), value)
-        for name, value in (
-            ("config", self.backbone),
-            ("tokenizer", self.tokenizer),
-            ("tokenizer_config", self.tokenizer_config),
-        ):
-            write_json(os.path.join(vlm, name + ".json"), value)
-        if self.images is not None:
-            write_json(os.path.join(vlm, "preprocessor_config.json"), self.images)
+        files = {"processor_config": self.processor, "statistics": self.statistics, "embodiment_id": self.embodiments}
+        write_jsons(folder, config=self.config)
+        write_jsons(os.path.join(folder, self.below), **files)
+        save_vlm(self, folder)
+        write_jsons(os.path.join(folder, "vlm"), preprocessor_config=self.images)
         if self.template is not None:
-            with open(os.path.join(vlm, "chat_template.jinja"), "w") as file:
+            with open(os.path.join(folder, "vlm", "chat_template.jinja"), "w") as file:
                 file.write(self.template)
-        names, index = sorted(self.tensors), {}
-        for k in range(shards):
-            file = "model-{:05d}-of-{:05d}.safetensors".format(k + 1, shards)
-            index.update(dict.fromkeys(names[k::shards], file))
-            write_safetensors(os.path.join(folder, file), {name: self.tensors[name] for name in names[k::shards]})
-        write_json(os.path.join(folder, "model.safetensors.index.json"), {"metadata": {}, "weight_map": index})
+        save_shards(folder, self.tensors, shards)
         return folder

@@ -6,12 +6,12 @@ Their shapes are written down here a second time, independently of the converter
 """
 
 import copy
-import json
 import os
 
 import numpy as np
 
-from tiny import pipelines, step_of, write_json, write_safetensors
+from goldens import lerobot_layout as layout
+from tiny import normalizer, pipelines, save_pipelines, save_vlm, step_of, write_jsons, write_safetensors
 
 PWE = "model.paligemma_with_expert."
 VISION = PWE + "paligemma.model.vision_tower.vision_model."
@@ -145,15 +145,12 @@ def shapes(kind, n_position=(IMAGE // PATCH) ** 2):
 
 def config(kind):
     mode = "MEAN_STD" if kind == "pi0" else "QUANTILES"
+    inputs, outputs = layout.features({"base": (20, 28), "wrist": (36, 36)}, STATE_DIM, ACTION_DIM)
     return {
         "type": kind,
         "n_obs_steps": 1,
-        "input_features": {
-            "observation.state": {"type": "STATE", "shape": [STATE_DIM]},
-            "observation.images.base": {"type": "VISUAL", "shape": [3, 20, 28]},
-            "observation.images.wrist": {"type": "VISUAL", "shape": [3, 36, 36]},
-        },
-        "output_features": {"action": {"type": "ACTION", "shape": [ACTION_DIM]}},
+        "input_features": inputs,
+        "output_features": outputs,
         "dtype": "float32",
         "chunk_size": HORIZON,
         "n_action_steps": HORIZON,
@@ -190,23 +187,15 @@ class TinyPi:
         self.pre, self.post = self._pipelines()
 
     def _pipelines(self):
-        normalizer = {
-            "eps": 1e-8,
-            "norm_map": dict(self.config["normalization_mapping"]),
-            "features": {**copy.deepcopy(self.config["input_features"]), **self.config["output_features"]},
-        }
         relative = ("relative_actions_processor", {"enabled": False, "exclude_joints": ["gripper"], "action_names": None})
-        token = {"max_length": 20, "task_key": "task", "padding_side": "right", "padding": "max_length"}
-        token.update(truncation=True, tokenizer_name="google/paligemma-3b-pt-224")
-        first = [("rename_observations_processor", {"rename_map": {}}), ("to_batch_processor", {})]
-        device = ("device_processor", {"device": "cpu", "float_dtype": None})
+        first, device = [layout.rename({}), layout.BATCH], layout.device()
+        tokenize = layout.tokenizer("google/paligemma-3b-pt-224", 20)
+        normalize = normalizer(self.config)
         if self.kind == "pi0":
-            pre = [*first, ("pi0_new_line_processor", {}), ("tokenizer_processor", token), device, relative]
-            pre.append(("normalizer_processor", normalizer))
+            pre = [*first, ("pi0_new_line_processor", {}), tokenize, device, relative, normalize]
         else:
-            pre = [*first, relative, ("normalizer_processor", normalizer)]
-            pre += [("pi05_prepare_state_tokenizer_processor_step", {}), ("tokenizer_processor", token), device]
-        post = [("unnormalizer_processor", copy.deepcopy(normalizer)), ("absolute_actions_processor", {"enabled": False}), device]
+            pre = [*first, relative, normalize, ("pi05_prepare_state_tokenizer_processor_step", {}), tokenize, device]
+        post = [normalizer(self.config, "unnormalizer_processor"), ("absolute_actions_processor", {"enabled": False}), device]
         return pipelines(pre, post)
 
     def step(self, name):
@@ -231,21 +220,13 @@ class TinyPi:
 
     def save(self, folder):
         folder = str(folder)
-        os.makedirs(os.path.join(folder, "tokenizer"), exist_ok=True)
-        write_json(os.path.join(folder, "config.json"), self.config)
-        if self.pre is not None:
-            write_json(os.path.join(folder, "policy_preprocessor.json"), self.pre)
-            write_json(os.path.join(folder, "policy_postprocessor.json"), self.post)
-            write_safetensors(os.path.join(folder, "pre.safetensors"), self.stats)
-            write_safetensors(os.path.join(folder, "post.safetensors"), self.stats)
+        save_pipelines(self, folder, self.stats)
         self._save_rest(folder)
         return folder
 
     def _save_rest(self, folder):
-        if self.dims is not None:
-            write_json(os.path.join(folder, "dims.json"), self.dims)
-        write_json(os.path.join(folder, "tokenizer", "tokenizer.json"), self.tokenizer)
-        write_json(os.path.join(folder, "tokenizer", "tokenizer_config.json"), self.tokenizer_config)
+        write_jsons(folder, config=self.config, dims=self.dims)
+        save_vlm(self, folder, "tokenizer")
         write_safetensors(os.path.join(folder, "model.safetensors"), self.tensors)
 
 
@@ -278,12 +259,6 @@ class TinyOpenpi(TinyPi):
 
     def save(self, folder):
         folder = str(folder)
-        os.makedirs(os.path.join(folder, "tokenizer"), exist_ok=True)
-        if self.config is not None:
-            write_json(os.path.join(folder, "config.json"), self.config)
-        assets = os.path.join(folder, "assets", *self.asset.split("/"))
-        os.makedirs(assets)
-        with open(os.path.join(assets, "norm_stats.json"), "w", encoding="utf-8") as file:
-            json.dump({"norm_stats": self.norm_stats}, file)
+        write_jsons(os.path.join(folder, "assets", *self.asset.split("/")), norm_stats={"norm_stats": self.norm_stats})
         self._save_rest(folder)
         return folder
