@@ -124,6 +124,10 @@ const StageRow* Report::find(const std::string& stage) const {
 void summarize(const Series& series, Report& report) {
   report.rounds = series.rounds;
   report.peak_name = series.peak_name, report.int8_peak_name = series.int8_peak_name;
+  double counted = 0;
+  for (const auto& [kind, seconds] : series.times) counted += seconds;
+  for (const auto& [kind, seconds] : series.times)
+    if (counted > 0) report.shares.emplace_back(kind, seconds / counted);
   std::vector<double> network(series.rounds.size()), total(series.rounds.size());
   Work all;
   for (const auto& [stage, ms] : series.rounds.front().stages) {
@@ -158,6 +162,7 @@ std::string to_json(const Report& report) {
     root["int8_peak_name"] = report.int8_peak_name;
   }
   root["stages"] = std::move(stages);
+  for (const auto& [kind, share] : report.shares) root["shares"][kind] = share;
   root["kernels"] = c.kernels;
   root["device"] = c.device;
   root["precision"] = report.precision;

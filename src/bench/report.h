@@ -49,6 +49,8 @@ struct Report {
   ProcessMemory process;
   std::vector<Round> rounds;
   std::vector<StageRow> stages;  // in order of time, then `network` and `total`
+  /// Of the time that threads worked for the network in the last round before the measured ones. Empty without one.
+  std::vector<std::pair<std::string, double>> shares;
   std::optional<StepFit> fit;
 
   /// What the machine can do, of a probe by name or of the one that shares refer to: the best that was measured before,

@@ -55,6 +55,9 @@ std::vector<std::string> around(const Report& report) {
   lines.push_back(
       fmt::format("measured rounds: {}, each beside its own peak ({:.1f} to {:.1f} GFLOP/s), on {:.2f} cores (median)",
                   report.rounds.size(), quantile(peaks, 0), quantile(peaks, 1), quantile(cores, 0.5)));
+  std::vector<std::string> shares;
+  for (const auto& [kind, share] : report.shares) shares.push_back(fmt::format("{} {:.1f} %", kind, 100 * share));
+  if (!shares.empty()) lines.push_back(fmt::format("time of the threads: {}", fmt::join(shares, ", ")));
   std::vector<std::size_t> disturbed;
   for (std::size_t i = 0; i < report.rounds.size(); ++i)
     if (report.is_disturbed(report.rounds[i])) disturbed.push_back(i + 1);

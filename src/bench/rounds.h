@@ -26,7 +26,8 @@ struct Series {
   int n_step = 0;
   std::string peak_name, int8_peak_name;  // of the probes between the rounds
   std::vector<Round> rounds;
-  StageWork work;  // of the network's stages
+  StageWork work;                                     // of the network's stages
+  std::vector<std::pair<std::string, double>> times;  // of the last round before the measured ones: Device::times
 };
 
 /// Observes a run: gets its messages, and is called before each round, which it may delay or refuse.

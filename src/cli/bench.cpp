@@ -98,6 +98,8 @@ Each round is one observation (PNG frames, state, instruction in; actions out) b
   floor      arithmetic at the machine's peak, or weights at its bandwidth, whichever is longer; "above": the median over it
   of peak    achieved rate over the multiply-add peak measured beside each round: median (best round). Ternary products
              refer to the peak of int8 products, all others to that of the kernels' floats
+  time       of the threads in the round before the measured ones, by kind of operation. Norms that a product computes
+             as it reads its operand are part of the product; those between ternary products make its codes
   network    the stages that compute on the device; total has the host's decoding and pre- and postprocessing too
 Times are medians (p50) beside the 90th percentile and the fastest. Other programs on the machine make every figure
 worse: "cores" says how many cores the rounds really had, and rounds that had fewer than most, or a lower peak, are named.)";

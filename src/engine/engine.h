@@ -87,6 +87,7 @@ class Engine {
   const Bundle& bundle() const { return bundle_; }
   const Processor& processor() const { return processor_; }
   const Device& device() const { return *device_; }
+  Device& device() { return *device_; }
   const Solver& solver() const { return solver_; }
   const ParamList& params() const { return *params_; }
   /// What `act` does with a leftover: nothing where actions are relative to a state, which the rows would have lost.

@@ -85,6 +85,10 @@ class Device {
   /// Bytes of parameters, and of what programs share while they run.
   virtual std::size_t weights_size() const = 0;
   virtual std::size_t working_size() const = 0;
+  /// Counts from now on, from zero, how long each kind of operation takes, or stops counting.
+  virtual void count_times(bool /*on*/) {}
+  /// What was counted: seconds of all threads together. Empty where the device does not know.
+  virtual std::vector<std::pair<std::string, double>> times() const { return {}; }
   /// Has the system back the shared memory now, so that no request waits for it.
   virtual void touch() {}
 

@@ -76,7 +76,19 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
     // Programs made before keep the memory that they were given.
     VLA_TRY(arena_, Memory::allocate(l.arena_size, "working memory"));
   }
-  return CpuProgram::make(l, arena_, executor_);
+  return CpuProgram::make(l, arena_, executor_, clock_);
+}
+
+void CpuDevice::count_times(bool on) {
+  for (auto& time : clock_->nanoseconds) time = on ? 0 : time.load();
+  clock_->runs = on;
+}
+
+std::vector<std::pair<std::string, double>> CpuDevice::times() const {
+  std::vector<std::pair<std::string, double>> times;
+  for (std::size_t i = 0; i < KindClock::count; ++i)
+    times.emplace_back(KindClock::kNames[i], 1e-9 * static_cast<double>(clock_->nanoseconds[i].load()));
+  return times;
 }
 
 void CpuDevice::touch() {

@@ -6,6 +6,7 @@
 #include "kernels/executor.h"
 #include "kernels/isa.h"
 #include "lower/cpu_weights.h"
+#include "lower/kind_clock.h"
 
 namespace vla::lower {
 
@@ -28,6 +29,8 @@ class CpuDevice final : public Device {
   const std::string& linear_kernels() const override { return weights_.text(); }
   std::size_t weights_size() const override { return weights_.size(); }
   std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }
+  void count_times(bool on) override;
+  std::vector<std::pair<std::string, double>> times() const override;
   void touch() override;
 
  private:
@@ -35,6 +38,7 @@ class CpuDevice final : public Device {
 
   Isa isa_, attention_isa_;
   std::shared_ptr<kernels::Executor> executor_;
+  std::shared_ptr<KindClock> clock_ = std::make_shared<KindClock>();
   CpuWeights weights_;
   Memory arena_;  // of values that live within a run: programs share it, since one runs at a time
 };

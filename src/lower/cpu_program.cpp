@@ -12,9 +12,10 @@
 namespace vla::lower {
 
 Result<std::unique_ptr<Program>> CpuProgram::make(Lowering& l, const Memory& arena,
-                                                  std::shared_ptr<kernels::Executor> executor) {
+                                                  std::shared_ptr<kernels::Executor> executor,
+                                                  std::shared_ptr<KindClock> clock) {
   std::unique_ptr<CpuProgram> program(new CpuProgram);
-  program->executor_ = std::move(executor);
+  program->executor_ = std::move(executor), program->clock_ = std::move(clock);
   program->arena_ = arena, program->tables_ = l.weights.tables();
   VLA_CHECK(program->give_addresses(l));
   VLA_CHECK(program->make_tasks(l));
@@ -54,7 +55,7 @@ Status CpuProgram::make_tasks(const Lowering& l) {
   work_.resize(stages.size() + 1);
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
   for (const FusedOp& op : l.ops) {
-    tasks_.push_back(emit(l, op));
+    tasks_.push_back(std::make_unique<TimedTask>(emit(l, op), kind_of(op), clock_));
     const auto phase = static_cast<std::size_t>(op.phase);
     phases_[phase].tasks.push_back(tasks_.back().get());
     text_ += text_of(l, op) + "\n";

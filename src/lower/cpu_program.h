@@ -5,6 +5,7 @@
 #include <deque>
 
 #include "kernels/executor.h"
+#include "lower/kind_clock.h"
 #include "lower/lowering.h"
 
 namespace vla::lower {
@@ -14,7 +15,8 @@ class CpuProgram final : public Program {
  public:
   /// The last pass: addresses and tasks. Errors: out_of_memory.
   static Result<std::unique_ptr<Program>> make(Lowering& l, const Memory& arena,
-                                               std::shared_ptr<kernels::Executor> executor);
+                                               std::shared_ptr<kernels::Executor> executor,
+                                               std::shared_ptr<KindClock> clock);
 
   Status prepare() override;
   Status run() override;
@@ -36,6 +38,7 @@ class CpuProgram final : public Program {
   void make_taps(const Lowering& l);
 
   std::shared_ptr<kernels::Executor> executor_;
+  std::shared_ptr<KindClock> clock_;
   std::shared_ptr<const Tables> tables_;
   Memory arena_, own_;  // own: constants, and what prepare leaves
   std::vector<std::unique_ptr<kernels::Task>> tasks_;

@@ -373,6 +373,14 @@ std::size_t scratch_of(const Lowering& l, const FusedOp& op) {
   return 0;
 }
 
+KindClock::Kind kind_of(const FusedOp& op) {
+  if (std::holds_alternative<LinearOp>(op.op)) return KindClock::products;
+  if (std::holds_alternative<PackOp>(op.op) || std::holds_alternative<AttentionOp>(op.op)) return KindClock::attention;
+  const auto* row = std::get_if<RowOp>(&op.op);
+  const bool is_norm = row != nullptr && row->node->as<op::Norm>() != nullptr;
+  return is_norm || std::holds_alternative<QuantizeOp>(op.op) ? KindClock::norms : KindClock::others;
+}
+
 Work work_of(const Lowering& l, const FusedOp& op) {
   Work work;
   work.flop = flop_of_op(op);

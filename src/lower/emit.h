@@ -6,6 +6,7 @@
 
 #include "kernels/attention_kernel.h"
 #include "kernels/executor.h"
+#include "lower/kind_clock.h"
 #include "lower/lowering.h"
 
 namespace vla::lower {
@@ -21,6 +22,8 @@ std::size_t scratch_of(const Lowering& l, const FusedOp& op);
 
 /// Operations and bytes of an operation.
 Work work_of(const Lowering& l, const FusedOp& op);
+/// What its time counts for. A norm that a product computes as it copies x is part of the product.
+KindClock::Kind kind_of(const FusedOp& op);
 /// One line: what is computed, the kernel, shapes and layouts.
 std::string text_of(const Lowering& l, const FusedOp& op);
 

@@ -94,6 +94,14 @@ TEST_CASE("the floor of a stage is its arithmetic at peak or its weights at band
   CHECK(to_text(report_of(series)).find("2.50 x") != std::string::npos);
 }
 
+TEST_CASE("what the kinds of operations took is reported as shares of all that was counted") {
+  Series series = series_of(10);
+  CHECK(to_text(report_of(series)).find("time of the threads") == std::string::npos);
+  series.times = {{"products", 3.0}, {"attention", 1.0}};
+  CHECK(to_text(report_of(series)).find("time of the threads: products 75.0 %, attention 25.0 %") != std::string::npos);
+  CHECK(to_json(report_of(series)).find(R"("shares":{"products":0.75,"attention":0.25})") != std::string::npos);
+}
+
 TEST_CASE("products of int8 codes refer to a peak of their own") {
   Series series = series_of(10);
   series.int8_peak_name = "some int8";

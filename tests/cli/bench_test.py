@@ -65,6 +65,16 @@ def test_rates_follow_from_work_and_time(report):
     assert all(report["stages"][s]["regime"] == "host" for s in STAGES if s not in NETWORK)
 
 
+def test_the_threads_time_is_divided_among_kinds_of_operations(report):
+    if report["kernels"] == "ggml":
+        assert "shares" not in report
+        return
+    shares = report["shares"]
+    assert list(shares) == ["products", "attention", "norms and codes", "others"]
+    assert sum(shares.values()) == pytest.approx(1, abs=1e-5)
+    assert shares["products"] > 0.2 and shares["attention"] > 0
+
+
 def test_the_machine_is_measured_before_and_after(report):
     assert report["peak_name"] in [peak["name"] for peak in report["peaks"]]
     for peak in report["peaks"]:
