@@ -202,10 +202,8 @@ Keys published() {
   // clang-format on
 }
 
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<Evo1>(Scope(list, "")); }
-
 }  // namespace
 
-PolicyEntry evo1_policy() { return {"evo1", make, published}; }
+PolicyEntry evo1_policy() { return policy_entry<Evo1>("evo1", published); }
 
 }  // namespace vla

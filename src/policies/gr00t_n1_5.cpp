@@ -71,10 +71,8 @@ Keys published() {
   // clang-format on
 }
 
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<Gr00tN15>(Scope(list, "")); }
-
 }  // namespace
 
-PolicyEntry gr00t_n1_5_policy() { return {"gr00t_n1_5", make, published}; }
+PolicyEntry gr00t_n1_5_policy() { return policy_entry<Gr00tN15>("gr00t_n1_5", published); }
 
 }  // namespace vla

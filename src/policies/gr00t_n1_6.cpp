@@ -73,10 +73,8 @@ Keys published() {
   // clang-format on
 }
 
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<Gr00tN16>(Scope(list, "")); }
-
 }  // namespace
 
-PolicyEntry gr00t_n1_6_policy() { return {"gr00t_n1_6", make, published}; }
+PolicyEntry gr00t_n1_6_policy() { return policy_entry<Gr00tN16>("gr00t_n1_6", published); }
 
 }  // namespace vla

@@ -67,10 +67,8 @@ Keys published() {
   // clang-format on
 }
 
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<Gr00tN17>(Scope(list, "")); }
-
 }  // namespace
 
-PolicyEntry gr00t_n1_7_policy() { return {"gr00t_n1_7", make, published}; }
+PolicyEntry gr00t_n1_7_policy() { return policy_entry<Gr00tN17>("gr00t_n1_7", published); }
 
 }  // namespace vla

@@ -58,19 +58,15 @@ class Pi0 final : public Policy {
 
 /// lerobot/pi0_base: 3.2 B parameters. Source: lerobot policies/pi0/configuration_pi0.py, get_gemma_config.
 Keys published() {
-  // clang-format off
-  return PaliGemma::published({
-      {"policy.d_state", 32}, {"policy.d_action", 32}, {"policy.horizon", 50},
-      {"expert.d_model", 1024}, {"expert.n_layer", 18}, {"expert.d_ff", 4096}, {"expert.norm_eps", 1e-6},
-      {"expert.rope_base", 10000.0},
-      {"time.min_period", 4e-3}, {"time.max_period", 4.0}});
-  // clang-format on
+  return PaliGemma::published(GemmaExpert::published({{"policy.d_state", 32},
+                                                      {"policy.d_action", 32},
+                                                      {"policy.horizon", 50},
+                                                      {"time.min_period", 4e-3},
+                                                      {"time.max_period", 4.0}}));
 }
-
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<Pi0>(Scope(list, "")); }
 
 }  // namespace
 
-PolicyEntry pi0_policy() { return {"pi0", make, published}; }
+PolicyEntry pi0_policy() { return policy_entry<Pi0>("pi0", published); }
 
 }  // namespace vla

@@ -53,19 +53,15 @@ class Pi05 final : public Policy {
 
 /// lerobot/pi05_base: 3.4 B parameters. Source: lerobot policies/pi05/configuration_pi05.py, get_gemma_config.
 Keys published() {
-  // clang-format off
-  return PaliGemma::published({
-      {"policy.d_state", 0}, {"policy.d_action", 32}, {"policy.horizon", 50},
-      {"expert.d_model", 1024}, {"expert.n_layer", 18}, {"expert.d_ff", 4096}, {"expert.norm_eps", 1e-6},
-      {"expert.rope_base", 10000.0},
-      {"time.min_period", 4e-3}, {"time.max_period", 4.0}});
-  // clang-format on
+  return PaliGemma::published(GemmaExpert::published({{"policy.d_state", 0},
+                                                      {"policy.d_action", 32},
+                                                      {"policy.horizon", 50},
+                                                      {"time.min_period", 4e-3},
+                                                      {"time.max_period", 4.0}}));
 }
-
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<Pi05>(Scope(list, "")); }
 
 }  // namespace
 
-PolicyEntry pi05_policy() { return {"pi05", make, published}; }
+PolicyEntry pi05_policy() { return policy_entry<Pi05>("pi05", published); }
 
 }  // namespace vla

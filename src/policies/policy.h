@@ -85,6 +85,12 @@ struct PolicyEntry {
   Keys (*published)();
 };
 
+template <class P>
+PolicyEntry policy_entry(std::string name, Keys (*published)()) {
+  const auto make = [](ParamList& list) -> std::unique_ptr<Policy> { return std::make_unique<P>(Scope(list, "")); };
+  return {std::move(name), make, published};
+}
+
 /// Every architecture of src/policies/registry.inc.
 const std::vector<PolicyEntry>& policy_registry();
 /// Errors: unsupported, naming the architectures that there are.

@@ -99,10 +99,8 @@ Keys published() {
   // clang-format on
 }
 
-std::unique_ptr<Policy> make(ParamList& list) { return std::make_unique<SmolVla>(Scope(list, "")); }
-
 }  // namespace
 
-PolicyEntry smolvla_policy() { return {"smolvla", make, published}; }
+PolicyEntry smolvla_policy() { return policy_entry<SmolVla>("smolvla", published); }
 
 }  // namespace vla

@@ -18,30 +18,6 @@ from vla_cpp.control import ChunkLoop
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def case():
-    return Golden("two_views")
-
-
-@pytest.fixture(scope="module")
-def server(case):
-    server = Server(case)
-    yield server
-    server.stop()
-
-
-@pytest.fixture(params=["server", "process"])
-def where(request, case, server):
-    """What the example takes, and `vla_cpp` makes a policy of."""
-    return server.address if request.param == "server" else str(case.bundle)
-
-
-@pytest.fixture
-def policy(where):
-    with vla_cpp.Client(where, timeout=SECONDS) if "://" in where else vla_cpp.Policy(where, threads=1) as policy:
-        yield policy
-
-
 def test_the_specs_are_equal(case, server):
     with vla_cpp.Client(server.address, timeout=SECONDS) as client, vla_cpp.Policy(case.bundle, threads=1) as policy:
         assert client.spec == policy.spec

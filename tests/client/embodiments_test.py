@@ -27,22 +27,9 @@ def bundles(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def both(bundles):
+def case(bundles):
+    """Both robots, which the server has."""
     return bundles[f"{TAG},{OTHER}"]
-
-
-@pytest.fixture(scope="module")
-def server(both):
-    server = Server(both)
-    yield server
-    server.stop()
-
-
-@pytest.fixture(params=["server", "process"])
-def policy(request, both, server):
-    at_server = request.param == "server"
-    with vla_cpp.Client(server.address, timeout=SECONDS) if at_server else vla_cpp.Policy(both.bundle, threads=1) as policy:
-        yield policy
 
 
 def observation(spec):
@@ -81,8 +68,8 @@ def test_a_control_loop_runs_one_of_the_robots(policy):
         policy.robot("dog")
 
 
-def test_the_specs_of_both_doors_are_equal(both, server):
-    with vla_cpp.Client(server.address, timeout=SECONDS) as client, vla_cpp.Policy(both.bundle, threads=1) as policy:
+def test_the_specs_of_both_doors_are_equal(case, server):
+    with vla_cpp.Client(server.address, timeout=SECONDS) as client, vla_cpp.Policy(case.bundle, threads=1) as policy:
         assert client.spec == policy.spec
         assert client.spec.views == () and client.spec.horizon == 0 and client.spec.embodiment == ""
 
@@ -102,23 +89,23 @@ def test_the_server_itself_refuses_what_a_client_did_not_check(server, tag):
             client.act(**observation(spec), embodiment=TAG)
 
 
-def test_the_library_itself_refuses_what_the_package_did_not_check(both):
-    with vla_cpp.Policy(both.bundle, threads=1) as policy:
+def test_the_library_itself_refuses_what_the_package_did_not_check(case):
+    with vla_cpp.Policy(case.bundle, threads=1) as policy:
         spec = policy.spec.robots[TAG]
         object.__setattr__(spec, "embodiment", "")
         with pytest.raises(vla_cpp.BadObservation, match=f"expected one of {TAG}, {OTHER}, found none"):
             policy.act(**observation(spec), embodiment=TAG)
 
 
-def test_one_robot_that_was_chosen_at_load_needs_no_name(both, bundles):
+def test_one_robot_that_was_chosen_at_load_needs_no_name(case, bundles):
     with vla_cpp.Policy(bundles[OTHER].bundle, threads=1) as alone:
         expected = np.asarray(alone.act(**observation(alone.spec))).tobytes()
         with pytest.raises(vla_cpp.BadObservation, match="none, since the policy is for one robot"):
             alone.act(**observation(alone.spec), embodiment=OTHER)
-    server = Server(both, "--embodiment", OTHER)
+    server = Server(case, "--embodiment", OTHER)
     try:
         with vla_cpp.Client(server.address, timeout=SECONDS) as client, vla_cpp.Policy(
-            both.bundle, threads=1, embodiment=OTHER
+            case.bundle, threads=1, embodiment=OTHER
         ) as policy:
             assert client.spec == policy.spec and policy.spec.embodiment == OTHER and not policy.spec.robots
             for one in (client, policy):
@@ -130,6 +117,6 @@ def test_one_robot_that_was_chosen_at_load_needs_no_name(both, bundles):
         server.stop()
 
 
-def test_opening_for_a_robot_that_is_not_there_is_refused_with_the_list(both):
+def test_opening_for_a_robot_that_is_not_there_is_refused_with_the_list(case):
     with pytest.raises(vla_cpp.UsageError, match=f"embodiment: expected one of {TAG}, {OTHER}, found dog"):
-        vla_cpp.Policy(both.bundle, embodiment="dog")
+        vla_cpp.Policy(case.bundle, embodiment="dog")

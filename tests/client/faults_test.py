@@ -6,7 +6,6 @@ acts must be answered, with its own bytes, in about the time that it takes when 
 import os
 import re
 import resource
-import statistics
 import subprocess
 import threading
 import time
@@ -15,8 +14,7 @@ from pathlib import Path
 import hostile
 import pytest
 import zmq
-from golden_cases import Golden
-from server_process import SECONDS, Server, frames
+from server_process import SECONDS, Robot, Server, frames
 
 import vla_cpp
 from vla_cpp import wire
@@ -25,48 +23,10 @@ LIMIT_MIB = 1  # of a message: enough for what is sent here, and quick to go ove
 
 
 @pytest.fixture(scope="module")
-def case():
-    return Golden("two_views")
-
-
-@pytest.fixture(scope="module")
 def server(case):
     server = Server(case, "--max-message", str(LIMIT_MIB))
     yield server
     assert server.stop() == 0
-
-
-@pytest.fixture
-def robot(server, case):
-    with Robot(server.address, case) as robot:
-        yield robot
-
-
-class Robot:
-    """A client that behaves, and checks what it gets."""
-
-    def __init__(self, address, case):
-        self._client = vla_cpp.Client(address, timeout=SECONDS)
-        self._observation = {"images": frames(case), "state": case.state, "text": case.text}
-        self._expected = {seed: self._act(seed).actions.tobytes() for seed in range(4)}
-
-    def _act(self, seed):
-        return self._client.act(**self._observation, seed=seed)
-
-    def acts(self, n=40):
-        """Median seconds of an act. None may be lost or wrong."""
-        seconds = []
-        for i in range(n):
-            start = time.perf_counter()
-            assert self._act(i % 4).actions.tobytes() == self._expected[i % 4]
-            seconds.append(time.perf_counter() - start)
-        return statistics.median(seconds)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self._client.close()
 
 
 def undisturbed(robot, quiet):

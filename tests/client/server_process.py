@@ -1,15 +1,19 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""`vla serve` as a process, and what `vla run` says to the same observation."""
+"""`vla serve` as a process, a robot that asks it, and what `vla run` says to the same observation."""
 
 import os
 import re
 import signal
+import statistics
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+import vla_cpp
 
 ROOT = Path(__file__).resolve().parents[2]
 VLA = Path(os.environ.get("VLA_BINARY", ROOT / "build/cpu/bin/vla"))
@@ -30,6 +34,33 @@ class Server:
         self.process.wait(SECONDS)
         self.process.stdout.close()
         return self.process.returncode
+
+
+class Robot:
+    """A client that behaves, and checks what it gets."""
+
+    def __init__(self, address, case):
+        self._client = vla_cpp.Client(address, timeout=SECONDS)
+        self._observation = {"images": frames(case), "state": case.state, "text": case.text}
+        self._expected = {seed: self._act(seed).actions.tobytes() for seed in range(4)}
+
+    def _act(self, seed):
+        return self._client.act(**self._observation, seed=seed)
+
+    def acts(self, n=40):
+        """Median seconds of an act. None may be lost or wrong."""
+        seconds = []
+        for i in range(n):
+            start = time.perf_counter()
+            assert self._act(i % 4).actions.tobytes() == self._expected[i % 4]
+            seconds.append(time.perf_counter() - start)
+        return statistics.median(seconds)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._client.close()
 
 
 def frames(case):

@@ -19,18 +19,6 @@ from server_process import SECONDS, VLA, Server, frames, ran
 import vla_cpp
 
 
-@pytest.fixture(scope="module")
-def case():
-    return Golden("two_views")
-
-
-@pytest.fixture(scope="module")
-def server(case):
-    server = Server(case)
-    yield server
-    assert server.stop() == 0
-
-
 @pytest.fixture
 def client(server):
     with vla_cpp.Client(server.address, timeout=SECONDS) as client:

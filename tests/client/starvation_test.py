@@ -11,8 +11,7 @@ from urllib.parse import urlsplit
 
 import hostile
 import pytest
-from faults_test import Robot, n_files, request, resident_mib
-from golden_cases import Golden
+from faults_test import n_files, request, resident_mib
 from server_process import SECONDS, Server
 
 import vla_cpp
@@ -20,22 +19,11 @@ import vla_cpp
 HEALTH = request("health")
 
 
-@pytest.fixture(scope="module")
-def case():
-    return Golden("two_views")
-
-
 @pytest.fixture
 def server(case):
     server = Server(case)
     yield server
     assert server.stop() == 0
-
-
-@pytest.fixture
-def robot(server, case):
-    with Robot(server.address, case) as robot:
-        yield robot
 
 
 def half_sent(address, megabytes=20):

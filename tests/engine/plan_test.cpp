@@ -2,29 +2,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "engine/plan.h"
 
-#include <doctest/doctest.h>
-
-#include "lower/open.h"
+#include "support/weightless.h"
 
 using namespace vla;
+using namespace vla::test;
 
 TEST_CASE("the plans of all robots together stay within one limit, and give way to a new one") {
-  const PolicyEntry entry = *find_policy("smolvla");
-  const Keys keys = entry.published();
-  ParamList list(keys, nullptr);
-  const std::unique_ptr<Policy> policy = entry.make(list);
-  REQUIRE(list.report("smolvla", {}).ok());
-  Solver solver;
-  solver.n_step = 1;
-  solver.times.assign(1, {1.0f, 1.0});
-  const auto device = open_device(1, "");
-  REQUIRE(device.ok());
-  REQUIRE((*device)->load(list, false).ok());  // memory that is never touched
-  Slots tables;
-  const Slot* conditions = tables.add_f32({720, 1, 1, 1});
-  REQUIRE((*device)->allocate(tables).ok());
-  const Cache constants;
-  const PlanContext context{*policy, **device, solver, conditions, constants, 32, 50, "", true};
+  const WeightlessSmolVla smolvla(1, "");
+  const PlanContext context = smolvla.context();
   const auto all = std::make_shared<std::vector<Plans*>>();
   Plans one(context, all), other(context, all);
   const InputShape first{512, 512, 2, 1, 32};

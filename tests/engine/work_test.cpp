@@ -2,13 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Operations of SmolVLA's published size, counted by hand from its configuration.
-#include <doctest/doctest.h>
-
-#include "engine/plan.h"
 #include "kernels/isa.h"
-#include "lower/open.h"
+#include "support/weightless.h"
 
 using namespace vla;
+using namespace vla::test;
 
 namespace {
 
@@ -47,24 +45,10 @@ Expected count_by_hand(double n_view, double n_text) {
 }  // namespace
 
 TEST_CASE("the published SmolVLA counts the operations of its configuration, under every choice of kernels") {
-  const PolicyEntry entry = *find_policy("smolvla");
-  const Keys keys = entry.published();
-  ParamList list(keys, nullptr);
-  const std::unique_ptr<Policy> policy = entry.make(list);
-  REQUIRE(list.report("smolvla", {}).ok());
-  Solver solver;
-  solver.n_step = 10;
-  solver.times.assign(10, {1.0f, 1.0});
   for (Isa isa : usable_isas()) {
     CAPTURE(isa_name(isa));
-    const auto device = open_device(1, isa_name(isa));
-    REQUIRE(device.ok());
-    REQUIRE((*device)->load(list, false).ok());  // memory that is never touched
-    Slots tables;
-    const Slot* conditions = tables.add_f32({720, 10, 1, 1});
-    REQUIRE((*device)->allocate(tables).ok());
-    const Cache constants;
-    Plans plans(PlanContext{*policy, **device, solver, conditions, constants, 32, 50, "", true});
+    const WeightlessSmolVla smolvla(10, isa_name(isa));
+    Plans plans(smolvla.context());
     for (const auto& [n_view, n_text] : {std::pair(2, 48), std::pair(1, 5)}) {
       const auto plan = plans.for_shape({512, 512, n_view, n_text, 32});
       REQUIRE(plan.ok());

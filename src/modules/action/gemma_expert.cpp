@@ -105,4 +105,13 @@ Tensor GemmaExpert::operator()(Graph& g, Tensor x, Tensor modulations, const Cac
   return norm_(g, x, part(g, modulations, 2 * blocks_.size())).h;
 }
 
+std::map<std::string, Value, std::less<>> GemmaExpert::published(std::map<std::string, Value, std::less<>> policy) {
+  policy.insert({{"expert.d_model", 1024},
+                 {"expert.n_layer", 18},
+                 {"expert.d_ff", 4096},
+                 {"expert.norm_eps", 1e-6},
+                 {"expert.rope_base", 10000.0}});
+  return policy;
+}
+
 }  // namespace vla

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <map>
+#include <string>
 #include <variant>
 #include <vector>
 
@@ -79,6 +81,9 @@ class GemmaExpert {
   Tensor operator()(Graph& g, Tensor x, Tensor modulations, const Cache& cache) const;
 
   int d_model() const { return d_model_; }
+
+  /// The published size, Gemma 300M, beside a policy's own keys. Source: lerobot get_gemma_config.
+  static std::map<std::string, Value, std::less<>> published(std::map<std::string, Value, std::less<>> policy);
 
  private:
   /// In the order of their modulations: attention and MLP of every layer, then the final one.
