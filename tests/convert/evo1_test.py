@@ -241,7 +241,7 @@ def test_places_of_views_are_those_of_the_tokenizers_own_ids(converter):
     tokenizers = pytest.importorskip("tokenizers")
     tiny = TinyEvo1()
     tiny.dims["prompt_tokens"], tiny.backbone["llm_config"]["max_position_embeddings"] = 400, 400
-    keys = authors(converter, tiny, view_slots=11).keys
+    keys = authors(converter, tiny, max_views=11).keys
     judge = tokenizers.Tokenizer.from_str(json.dumps(tiny.tokenizer))
     prompt = "".join("Image-{}: <img>{}</img>\n".format(i + 1, "<IMG_CONTEXT>" * N_VIEW_TOKEN) for i in range(11))
     ids = judge.encode(prompt + "pick up", add_special_tokens=False).ids
@@ -251,7 +251,7 @@ def test_places_of_views_are_those_of_the_tokenizers_own_ids(converter):
 
 def test_the_command_takes_the_answers(converter, capsys):
     folder = converter.save(TinyEvo1())
-    flags = "--variant r1 --views observation.images.front,wrist --view-slots 2 --dead-rows causal_attention"
+    flags = "--variant r1 --views observation.images.front,wrist --max-views 2 --dead-rows causal_attention"
     assert main([folder, "-o", converter.out, "--stats", "{}/{}".format(ARM, DATASET), *flags.split()]) == 0
     keys = read_bundle(converter.out).keys
     assert keys["observation.views"] == ["observation.images.front", "observation.images.wrist"]

@@ -143,7 +143,7 @@ class Server:
         import torch
 
         frames = [batch.get(f"observation.images.{v}") for v in self.options["views"]]
-        frames += [None] * (self.options["view_slots"] - len(frames))
+        frames += [None] * (self.options["max_views"] - len(frames))
         pixels = torch.stack([self.pixels(f) for f in frames])
         n_view, n_token = len(frames), self.towers.config.image_seq_length
         views = (f"Image-{i + 1}: <img>{'<IMG_CONTEXT>' * n_token}</img>\n" for i in range(n_view))

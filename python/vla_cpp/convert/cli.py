@@ -27,7 +27,7 @@ Without --dtype the stored type is kept if all matrices share it; mixed types be
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
 two agree for grids whose side is a power of two. 'shifted' reproduces transformers 4.55 to 4.57.
 
-A checkpoint of Evo-1's authors needs --variant, --views, --view-slots and --dead-rows: r1 is their code before 9 April 2026, r2 the
+A checkpoint of Evo-1's authors needs --variant, --views, --max-views and --dead-rows: r1 is their code before 9 April 2026, r2 the
 code since (steps, time index, pixel rounding and state padding differ); --dead-rows is zero_attention if the policy ran with
 flash-attn, which the authors ask for. docs/converting.md tells how to find out.
 
@@ -115,7 +115,7 @@ def _add_evo1(parser: argparse.ArgumentParser) -> None:
         default=(),
         help="names of the cameras, in the order of the prompt's view slots",
     )
-    add("--view-slots", metavar="N", type=int, default=0, help="view slots of the prompt; the authors' server has 3")
+    add("--max-views", metavar="N", type=int, default=0, help="view slots of the prompt; the authors' server has 3")
     add(
         "--dead-rows",
         choices=("zero_attention", "causal_attention"),

@@ -52,14 +52,14 @@ def open_file(path: str) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
-def read_file(path: str, most: int = MAX_JSON) -> bytes:
-    """All bytes of a file. Errors: io when it cannot be read, bad_bundle when it is larger than `most`."""
+def read_file(path: str, max_bytes: int = MAX_JSON) -> bytes:
+    """All bytes of a file. Errors: io when it cannot be read, bad_bundle when it is larger than `max_bytes`."""
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > most:
-            raise refuse(path, "at most {} bytes".format(most), "{} bytes".format(size))
+        if size > max_bytes:
+            raise refuse(path, "at most {} bytes".format(max_bytes), "{} bytes".format(size))
         try:
-            return file.read(most)
+            return file.read(max_bytes)
         except OSError as error:
             raise refuse(path, "a readable file", error.strerror or str(error), code=Code.IO)
 

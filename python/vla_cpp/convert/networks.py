@@ -80,7 +80,7 @@ def read_vision(section: Section, image_size: int, patch_size: int) -> Vision:
     """Field names of transformers' vision configs."""
     vision = Vision(
         d_model=section.count("hidden_size"),
-        n_layer=section.count("num_hidden_layers", most=MAX_LAYERS),
+        n_layer=section.count("num_hidden_layers", maximum=MAX_LAYERS),
         n_head=section.count("num_attention_heads"),
         d_ff=section.count("intermediate_size"),
         image_size=image_size,
@@ -101,7 +101,7 @@ def read_language(section: Section) -> Language:
     section.defaults.setdefault("head_dim", d_model // n_head)
     return Language(
         d_model=d_model,
-        n_layer=section.count("num_hidden_layers", most=MAX_LAYERS),
+        n_layer=section.count("num_hidden_layers", maximum=MAX_LAYERS),
         n_head=n_head,
         n_head_kv=section.count("num_key_value_heads"),
         d_head=section.count("head_dim"),

@@ -48,7 +48,7 @@ class Found(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What is asked of statistics: widths by feature, and the features that may do without. `least`: widths of statistics that need
+    """What is asked of statistics: widths by feature, and the features that may do without. `min_widths`: widths of statistics that need
     not reach the padded width. `degraded`: of the latter those that need it."""
 
     dims: Dict[str, int]
@@ -56,7 +56,7 @@ class Context(NamedTuple):
     notes: List[str]
     degraded: List[str]
     problems: Problems
-    least: Dict[str, int]
+    min_widths: Dict[str, int]
 
 
 def choose(feature: str, mode: str, eps: float, found: Found, context: Context) -> Normalization:
@@ -87,7 +87,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
         )
     chosen = {name: found.values[name] for name in names if name in found.values}
     for name, value in chosen.items():
-        widths = (context.least.get(feature, dim), dim)
+        widths = (context.min_widths.get(feature, dim), dim)
         _check_statistic("statistics of {}: {}".format(feature, name), name, value, widths, context)
     return Normalization(kind, eps, chosen)
 

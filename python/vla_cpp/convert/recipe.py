@@ -84,11 +84,11 @@ class _Reader:
         identity: Sequence[str],
         problems: Problems,
         own: Steps,
-        least: Dict[str, int],
+        min_widths: Dict[str, int],
     ) -> None:
         self.steps = {file: {**STEPS[file], **own.get(file, {})} for file in STEPS}
         self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
-        self.context = Context(dims, identity, checkpoint.notes, checkpoint.degraded, problems, least)
+        self.context = Context(dims, identity, checkpoint.notes, checkpoint.degraded, problems, min_widths)
         self.seen: List[str] = []
 
     def pipeline(self, file: str, content: dict) -> None:
@@ -202,7 +202,7 @@ class _Reader:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
         width = self.context.dims[STATE]
-        if stated.get("shape") not in ([width], [self.context.least.get(STATE, width)]) or stated.get("type") != "STATE":
+        if stated.get("shape") not in ([width], [self.context.min_widths.get(STATE, width)]) or stated.get("type") != "STATE":
             self.problems.add(
                 "{}: features.{}".format(where, STATE),
                 "STATE of [{}] as in config.json".format(width),
@@ -259,19 +259,19 @@ def read_processors(
     identity: Sequence[str],
     problems: Problems,
     own: Steps,
-    least: Optional[Dict[str, int]] = None,
+    min_widths: Optional[Dict[str, int]] = None,
 ) -> Processors:
     """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights. `own`: the
-    steps that this architecture has beside those of all policies. `least`: for a policy that pads before it normalizes and whose
+    steps that this architecture has beside those of all policies. `min_widths`: for a policy that pads before it normalizes and whose
     `dims` are the padded widths, those of the robot; such a policy also builds its prompt itself."""
-    reader = _Reader(checkpoint, dims, identity, problems, own, least or {})
+    reader = _Reader(checkpoint, dims, identity, problems, own, min_widths or {})
     for feature in identity:
         if feature not in dims:
             problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
     if checkpoint.processors is None:
         return _from_weights(checkpoint, reader)
     required = {PRE: ["normalizer_processor"], POST: ["unnormalizer_processor"]}
-    if least is None:
+    if min_widths is None:
         required[PRE].insert(0, "tokenizer_processor")
     for file, content in zip((PRE, POST), checkpoint.processors):
         reader.pipeline(file, content)

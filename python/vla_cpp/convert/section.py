@@ -30,12 +30,12 @@ class Section:
             return self.values[key]
         return self.defaults.get(key)
 
-    def count(self, key: str, least: int = 1, most: int = MAX_SIZE) -> int:
+    def count(self, key: str, minimum: int = 1, maximum: int = MAX_SIZE) -> int:
         value = self.get(key)
-        if isinstance(value, int) and not isinstance(value, bool) and least <= value <= most:
+        if isinstance(value, int) and not isinstance(value, bool) and minimum <= value <= maximum:
             return value
-        self.bad(key, "a whole number from {} to {}".format(least, most))
-        return max(least, 1)
+        self.bad(key, "a whole number from {} to {}".format(minimum, maximum))
+        return max(minimum, 1)
 
     def number(self, key: str, above: float = 0.0) -> float:
         value = self.get(key)

@@ -58,7 +58,7 @@ class Options:
     variant: str = ""  # openpi's name of a training configuration, or the revision of Evo-1's code: checkpoints do not state them
     stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET; BitVLA: which of dataset_statistics.json
     views: Sequence[str] = ()  # Evo-1, BitVLA: names of the cameras in the order of the prompt's slots
-    view_slots: int = 0  # Evo-1: places for views in the prompt
+    max_views: int = 0  # Evo-1: places for views in the prompt
     embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint; several with commas, or `all`
     camera_size: str = ""  # GR00T: WIDTHxHEIGHT of images whose aspect the pipeline keeps; they are square without it
     gripper_sign: str = ""  # GR00T: the key of a gripper's actions, which become -1 where it opens and 1 where it closes

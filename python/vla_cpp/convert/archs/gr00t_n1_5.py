@@ -205,7 +205,7 @@ def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
     crop = section.number("crop")
     if not video or crop > 1:
         section.bad("video", "names of cameras, and a crop of at most 1", str(video))
-    horizon, index = section.count("horizon", most=4096), section.count("projector_index", least=0)
+    horizon, index = section.count("horizon", maximum=4096), section.count("projector_index", minimum=0)
     problems.raise_any()
     return DataConfig(
         tuple(video), modes[0], modes[1], horizon, crop, index if "projector_index" in section.values else -1, rotations
@@ -222,10 +222,10 @@ def read_sizes(config: dict, folder: str, problems: Problems) -> Tuple[Sizes, in
     policy = Section(POLICY + ": action_head_cfg", member(config, "action_head_cfg", dict, POLICY), HEAD, problems)
     policy.refuse_unknown({*HEAD, *HEAD_FIXED, *HEAD_IGNORED})
     policy.check_fixed(HEAD_FIXED)
-    EAGLE_2_5.read(folder, backbone.count("select_layer", most=MAX_LAYERS), s, problems)
+    EAGLE_2_5.read(folder, backbone.count("select_layer", maximum=MAX_LAYERS), s, problems)
     s.d_action = policy.count("action_dim")
     head.read(policy, s)
-    return s, policy.count("num_target_vision_tokens", most=4096)
+    return s, policy.count("num_target_vision_tokens", maximum=4096)
 
 
 def _robot(config: DataConfig, metadata: dict, n_row: int, problems: Problems) -> Robot:

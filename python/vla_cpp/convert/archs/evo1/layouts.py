@@ -88,7 +88,7 @@ def _read_tensors(folder: str, _problems: Problems) -> Tensors:
 
 
 LAYOUT = Layout(
-    "Evo-1's authors", ("variant", "stats", "views", "view_slots", "dead_rows"), files=(*TORCH_FILES, NORM_STATS), read=_read_tensors
+    "Evo-1's authors", ("variant", "stats", "views", "max_views", "dead_rows"), files=(*TORCH_FILES, NORM_STATS), read=_read_tensors
 )
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server
@@ -100,7 +100,7 @@ MEANINGS = {
     "--variant": "the authors' code before 9 April 2026 takes other steps, times, pixels and paddings than the code since, and a policy"
     " is served by the one that it was made for: go by the date of the upload, or by what config.json holds",
     "--stats": "the robot and the data set whose numbers the policy sees; the authors' server gets both names from its client",
-    "--view-slots": "the prompt has a slot for every image of a request, black ones too, and the authors' server takes exactly 3",
+    "--max-views": "the prompt has a slot for every image of a request, black ones too, and the authors' server takes exactly 3",
     "--views": "names of the cameras in the order in which the client sends their images; slots behind them stay masked",
     "--dead-rows": "the action head reads masked rows too, and flash-attention leaves zeros in them where other attention does not:"
     " zero_attention where flash-attn was installed, as the authors ask for, causal_attention where it was not",
@@ -194,9 +194,9 @@ def _ask(problems: Problems, flag: str, expected: str, found: str) -> None:
 def _check_answers(options: Options, problems: Problems) -> None:
     if options.variant not in REVISIONS:
         _ask(problems, "--variant", "r1 or r2, a revision of the authors' code", options.variant)
-    max_views, views = options.view_slots, [_view_name(name) for name in options.views]
+    max_views, views = options.max_views, [_view_name(name) for name in options.views]
     if not 1 <= max_views <= MAX_SLOTS:
-        _ask(problems, "--view-slots", "a count from 1 to {}".format(MAX_SLOTS), str(max_views or ""))
+        _ask(problems, "--max-views", "a count from 1 to {}".format(MAX_SLOTS), str(max_views or ""))
     if not views or len(set(views)) != len(views) or "" in options.views or (max_views and len(views) > max_views):
         _ask(problems, "--views", "different names, no more than there are slots", ",".join(options.views))
     if options.dead_rows not in ("zero_attention", "causal_attention"):
@@ -229,16 +229,16 @@ def _authors_sizes(policy: Section, checkpoint: Checkpoint, options: Options) ->
         policy.bad("action_horizon", "horizon {}, or none".format(policy.get("horizon")))
     revision, dims = REVISIONS[options.variant], _dims(checkpoint, policy.problems)
     return Sizes(
-        n_layer=dims.count("language_layers", most=MAX_LAYERS),
+        n_layer=dims.count("language_layers", maximum=MAX_LAYERS),
         n_token=dims.count("prompt_tokens"),
-        n_head_layer=policy.count("num_layers", most=MAX_LAYERS),
+        n_head_layer=policy.count("num_layers", maximum=MAX_LAYERS),
         n_head_head=policy.count("num_heads"),
         d_hidden=policy.count("hidden_dim"),
         d_state_hidden=policy.count("state_hidden_dim"),
         d_state=WIDTH,
         d_action=WIDTH,
         horizon=policy.count("horizon"),
-        max_views=options.view_slots,
+        max_views=options.max_views,
         n_step=revision.n_step,
         time_scale=revision.time_scale,
         dead_rows=options.dead_rows,
@@ -424,16 +424,16 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
 def _lerobot_sizes(policy: Section) -> Sizes:
     """A state or an action that the config does not list has the padded width (Evo1Config.validate_features)."""
     s = Sizes(
-        n_layer=policy.count("vlm_num_layers", most=MAX_LAYERS) if policy.get("vlm_num_layers") is not None else MAX_LAYERS,
+        n_layer=policy.count("vlm_num_layers", maximum=MAX_LAYERS) if policy.get("vlm_num_layers") is not None else MAX_LAYERS,
         n_token=policy.count("max_text_length"),
-        n_head_layer=policy.count("num_layers", most=MAX_LAYERS),
+        n_head_layer=policy.count("num_layers", maximum=MAX_LAYERS),
         n_head_head=policy.count("num_heads"),
         d_hidden=policy.count("hidden_dim"),
         d_state_hidden=policy.count("state_hidden_dim"),
         d_state=policy.count("max_state_dim"),
         d_action=policy.count("max_action_dim"),
         horizon=policy.count("chunk_size"),
-        max_views=policy.count("max_views", most=32),
+        max_views=policy.count("max_views", maximum=32),
         n_step=policy.count("num_inference_timesteps"),
         time_scale=999.0,
         dead_rows="unseen",
@@ -460,8 +460,8 @@ def _read_pipelines(policy: Section, checkpoint: Checkpoint, options: Options, s
         problems.unsupported(recipe.PRE, "the pipelines of LeRobot, with statistics", "none", "save the policy again")
         problems.raise_any()
     dims = {recipe.STATE: s.d_state, recipe.ACTION: s.d_action}
-    least = {recipe.STATE: s.state_dim, recipe.ACTION: s.d_robot}
-    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS, least)
+    min_widths = {recipe.STATE: s.state_dim, recipe.ACTION: s.d_robot}
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS, min_widths)
     problems.raise_any()
     pre, post = (
         [(step.get("registry_name", step.get("class")), step.get("config", {})) for step in file["steps"]]
@@ -523,7 +523,7 @@ def _gripper(policy: Section, width: int) -> List[dict]:
         return []
     if policy.get("binarize_gripper") is not True:
         policy.bad("binarize_gripper", "true or false")
-    column = policy.count("gripper_index", least=0)
+    column = policy.count("gripper_index", minimum=0)
     if column >= width:
         policy.bad("gripper_index", "a column of the action, below {}".format(width), hint="the reference refuses it too")
     above, high, low = (

@@ -46,7 +46,7 @@ TRANSFORMER_IGNORED = {
 def read(policy: Section, s: Sizes) -> None:
     """`policy`: the members that describe the head; the language model's sizes are read already."""
     if "state_history_length" in policy.defaults:
-        s.state_history = policy.count("state_history_length", most=64)
+        s.state_history = policy.count("state_history_length", maximum=64)
     s.d_state, s.horizon = policy.count("max_state_dim") * s.state_history, policy.count("action_horizon")
     s.d_hidden, s.n_position, s.n_embodiment = (
         policy.count(key) for key in ("hidden_size", "max_seq_len", "max_num_embodiments")
@@ -72,7 +72,7 @@ def _transformer(policy: Section, key: str, fixed: Fixed) -> Section:
 
 def _read_transformer(policy: Section, s: Sizes) -> None:
     dit = _transformer(policy, "diffusion_model_cfg", DIT_FIXED)
-    s.n_dit_layer, s.n_dit_head = dit.count("num_layers", most=MAX_LAYERS), dit.count("num_attention_heads")
+    s.n_dit_layer, s.n_dit_head = dit.count("num_layers", maximum=MAX_LAYERS), dit.count("num_attention_heads")
     s.d_dit, s.d_out = s.n_dit_head * dit.count("attention_head_dim"), dit.count("output_dim")
     if policy.count("input_embedding_dim") != s.d_dit:
         policy.bad("input_embedding_dim", "{}, the heads of diffusion_model_cfg side by side".format(s.d_dit))
@@ -87,7 +87,7 @@ def _read_attention(policy: Section, s: Sizes) -> None:
     if not policy.get("vl_self_attention_cfg"):
         return
     attention = _transformer(policy, "vl_self_attention_cfg", TRANSFORMER_FIXED)
-    s.n_vl_layer = attention.count("num_layers", least=0, most=MAX_LAYERS)
+    s.n_vl_layer = attention.count("num_layers", minimum=0, maximum=MAX_LAYERS)
     if not s.n_vl_layer:
         return
     s.n_vl_head = attention.count("num_attention_heads")

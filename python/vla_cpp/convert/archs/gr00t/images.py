@@ -34,8 +34,8 @@ class Area(NamedTuple):
     filter: str  # by which it resizes others
     shortest: int  # side of an image
     multiple: int
-    least: int
-    most: int
+    min_pixels: int
+    max_pixels: int
 
 
 def read_images(processor: Section, area: Area, options: Options, notes: List[str], problems: Problems) -> Images:
@@ -83,7 +83,7 @@ def _pair(processor: Section, key: str) -> int:
 
 def _edge(processor: Section) -> int:
     if processor.get("shortest_image_edge") is not None:
-        return processor.count("shortest_image_edge", most=MAX_SIDE)
+        return processor.count("shortest_image_edge", maximum=MAX_SIDE)
     target = _pair(processor, "image_target_size")
     if not target:
         processor.bad("image_target_size", "a size, since shortest_image_edge is null too")
@@ -126,11 +126,11 @@ def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int,
     unit = area.multiple
     sides = [max(area.shortest, round(side / unit) * unit) for side in (width, height)]
     size = sides[0] * sides[1]
-    if size > area.most:
-        shrink = math.sqrt(width * height / area.most)
+    if size > area.max_pixels:
+        shrink = math.sqrt(width * height / area.max_pixels)
         sides = [max(unit, math.floor(side / shrink / unit) * unit) for side in (width, height)]
-    elif size < area.least:
-        grow = math.sqrt(area.least / (width * height))
+    elif size < area.min_pixels:
+        grow = math.sqrt(area.min_pixels / (width * height))
         sides = [math.ceil(side * grow / unit) * unit for side in (width, height)]
     if max(width, height) > 200 * min(width, height) or max(sides) > MAX_SIDE:
         problems.unsupported(

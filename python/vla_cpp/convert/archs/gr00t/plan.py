@@ -214,7 +214,7 @@ def read_sizes(release: Release, config: dict, folder: str, problems: Problems) 
     s, policy = Sizes(), Section(POLICY, config, defaults, problems, nullable=("diffusion_model_cfg",))
     policy.refuse_unknown({*defaults, *fixed, *IGNORED, *release.ignored})
     policy.check_fixed(fixed)
-    release.backbone.read(folder, policy.count("select_layer", most=MAX_LAYERS), s, problems)
+    release.backbone.read(folder, policy.count("select_layer", maximum=MAX_LAYERS), s, problems)
     s.d_action, s.attend_text_every_n_blocks = policy.count("max_action_dim"), policy.count("attend_text_every_n_blocks")
     head.read(policy, s)
     return s

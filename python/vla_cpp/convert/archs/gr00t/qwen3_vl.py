@@ -84,7 +84,7 @@ def _read_vision(vision: Section, s: Sizes) -> None:
     side = vision.get("patch_size")
     if isinstance(side, list) and len(side) == 2 and side[0] == side[1]:
         vision.values = {**vision.values, "patch_size": side[0]}
-    s.vision.patch_size, s.vision.n_layer = vision.count("patch_size"), vision.count("depth", most=MAX_LAYERS)
+    s.vision.patch_size, s.vision.n_layer = vision.count("patch_size"), vision.count("depth", maximum=MAX_LAYERS)
     s.vision.d_model, s.vision.d_ff = vision.count("hidden_size"), vision.count("intermediate_size")
     s.vision.n_head = vision.count("num_heads")
     s.n_position_side = math.isqrt(vision.count("num_position_embeddings"))

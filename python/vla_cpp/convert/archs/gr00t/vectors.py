@@ -70,9 +70,9 @@ def _clip(groups: Sequence[Group]) -> List[dict]:
 def state_ops(robot: Robot, s: Sizes, problems: Problems) -> List[dict]:
     turns = _columns(robot.states, lambda group: group.kind == SIN_COS)
     wider = sum(ROTATION_6D - group.width for group in robot.states if group.rotation)
-    width, most = (_total(robot.states) + len(turns) + wider) // robot.n_moment, s.d_state // s.state_history
-    if width > most:
-        problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(most), str(width))
+    width, max_width = (_total(robot.states) + len(turns) + wider) // robot.n_moment, s.d_state // s.state_history
+    if width > max_width:
+        problems.add(STATISTICS + ": state", "at most max_state_dim {} numbers".format(max_width), str(width))
     rows = {"rows": robot.n_moment} if robot.n_moment > 1 else {}
     return [
         *_binary(robot.states),

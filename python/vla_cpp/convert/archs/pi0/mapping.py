@@ -96,7 +96,7 @@ def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> 
     tower.norm_eps = EPS
     language = Language(
         d_model=lm.count("width"),
-        n_layer=lm.count("depth", most=MAX_LAYERS),
+        n_layer=lm.count("depth", maximum=MAX_LAYERS),
         n_head=lm.count("num_heads"),
         n_head_kv=lm.count("num_kv_heads"),
         d_head=lm.count("head_dim"),
