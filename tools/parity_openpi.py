@@ -36,7 +36,7 @@ from goldens.train_tokenizer import TASKS  # noqa: E402
 from vla_cpp.convert.archs.pi0.layouts import VARIANTS  # noqa: E402
 
 LM, EXPERT = pi.gemma(40, 3, 8, 1, 8, 72), pi.gemma(32, 3, 8, 1, 8, 48)
-VISION = pi.vision(36, 2, 3, 52)
+VISION = pi.tower(36, 2, 3, 52)
 N_VOCAB = 400
 TEXTS = ("pick up the red_cube \n and place it in the basket", " stack 12 blocks, naïvely! ")
 

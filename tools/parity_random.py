@@ -91,7 +91,7 @@ def draw_pi(arch, seed):
         empty_cameras=n_empty, normalization_mapping=modes, min_period=r.choice((4e-3, 1e-3)), max_period=r.choice((4.0, 2.0)),
         use_relative_actions=d_state >= d_action and r.random() < 0.3)
     lm, expert = (pi.gemma(r.choice((16, 24, 36, 40)), depth, heads, kv, d_head, r.choice((32, 50))) for _ in range(2))
-    vision = pi.vision(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
+    vision = pi.tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
     checkpoint = pi.Checkpoint(arch, policy, vision, lm, expert, views, d_state, d_action)
     return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
 

@@ -16,7 +16,7 @@ from .cases import Case, copy_tokenizer
 from .draw import bfloat16
 from .evo1_server import read_options, towers_from_config
 from .files import bfloat16_bits, write_json, write_stream, write_torch
-from .parameters import decoder_layer, linear, norm, parameter, rms_norm, sines, statistics
+from .parameters import decoder, decoder_layer, linear, norm, parameter, rms_norm, sines, statistics, tower
 from .recorder import Taps
 
 HUB_NAMES = {"authors": "OpenGVLab/InternVL3-1B", "lerobot": "OpenGVLab/InternVL3-1B-hf"}
@@ -227,23 +227,14 @@ def in_lerobot(name):
 
 
 # What the files of the authors do not say, for the published size.
-OPTIONS = {"variant": "r2", "dead_rows": "zero_attention", "views": ["camera1", "camera2"], "view_slots": 3}
+OPTIONS = {"variant": "r2", "dead_rows": "zero_attention", "views": ["camera1", "camera2"], "max_views": 3}
 
 
 def published(views, arch="evo1"):
     """The published size in the authors' layout: 775 M parameters."""
     return Checkpoint(
-        "authors", 448, vision(1024, 24, 16, 4096), text(896, 24, 14, 2, 4864, max_position_embeddings=32768), 14,
+        "authors", 448, tower(1024, 24, 16, 4096), decoder(896, 24, 14, 2, 4864, max_position_embeddings=32768), 14,
         head(8, 8, 1024, 1024), policy(50, 1024), views, n_vocab=151674)
-
-
-def vision(d, layers, heads, ff, **more):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "intermediate_size": ff, **more}
-
-
-def text(d, layers, heads, kv, ff, **more):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "num_key_value_heads": kv,
-            "intermediate_size": ff, **more}
 
 
 def head(layers, heads, d_hidden, d_state_hidden):
@@ -256,14 +247,14 @@ def policy(horizon, n_token, d_state=24, d_action=24, **more):
 
 def said(variant, dead_rows, views, **more):
     """What whoever converts the authors' files has to know."""
-    return {"variant": variant, "dead_rows": dead_rows, "views": list(views), "view_slots": 3, **more}
+    return {"variant": variant, "dead_rows": dead_rows, "views": list(views), "max_views": 3, **more}
 
 
 CASES = {
     # The authors' layout: two views for three slots; one frame of the network's size, one not; pads; numbers of the state
     # beyond their range.
     "evo1/two_views": Case(31, {"agentview": (56, 56, "png"), "wrist": (45, 71, "png")}, "open the middle drawer", Checkpoint(
-        "authors", 56, vision(36, 2, 3, 52), text(48, 3, 6, 2, 64), 2, head(2, 4, 40, 28), policy(5, 64),
+        "authors", 56, tower(36, 2, 3, 52), decoder(48, 3, 6, 2, 64), 2, head(2, 4, 40, 28), policy(5, 64),
         {"agentview": (56, 56), "wrist": (45, 71)}),
         state=(0.5, -1.25, 0.25, 2.0, -0.125, -3.0, 0.0625, 0.75),
         options=said("r2", "zero_attention", ("agentview", "wrist"))),
@@ -271,7 +262,7 @@ CASES = {
     # slot in the middle is empty; 6 x 6 patches; many pads; a state number that never moved in the data.
     "evo1/first_revision": Case(32, {"front": (70, 52, "png"), "left": None, "wrist": (84, 84, "png")}, "push the plate slowly",
         Checkpoint(
-        "authors", 84, vision(30, 3, 5, 44, layer_norm_eps=1e-5), text(32, 3, 4, 1, 56, rope_theta=1e5, rms_norm_eps=1e-5), 2,
+        "authors", 84, tower(30, 3, 5, 44, layer_norm_eps=1e-5), decoder(32, 3, 4, 1, 56, rope_theta=1e5, rms_norm_eps=1e-5), 2,
         head(3, 2, 24, 36), policy(7, 104), {"front": (70, 52), "left": (84, 84), "wrist": (84, 84)}, d_state=9, keys=("sawyer",),
         zero_spread=(2,)),
         options=said("r1", "zero_attention", ("front", "left", "wrist"))),
@@ -279,34 +270,34 @@ CASES = {
     # data sets; as many heads of keys as of queries.
     "evo1/causal_rows": Case(33, {"high": None, "left": (40, 64, "png"), "right": (56, 56, "png")},
         "stack the green block on the yellow block", Checkpoint(
-        "authors", 56, vision(32, 2, 4, 40), text(40, 3, 5, 5, 48), 2, head(2, 5, 44, 20), policy(6, 60),
+        "authors", 56, tower(32, 2, 4, 40), decoder(40, 3, 5, 5, 48), 2, head(2, 5, 44, 20), policy(6, 60),
         {"high": (56, 56), "left": (40, 64), "right": (56, 56)}, d_state=14, d_action=14, normalization="normal",
         keys=("aloha_joint", "robotwin_stack"), other_keys=("robotwin_push",)),
         options=said("r2", "causal_attention", ("high", "left", "right"), stats="aloha_joint/robotwin_stack")),
     # Two slots are empty, the first among them, and share their rows; one pad; numbers so small that every eps shows.
     "evo1/one_view": Case(36, {"left": None, "front": (33, 49, "png"), "right": None}, "go", Checkpoint(
-        "authors", 56, vision(32, 1, 4, 48), text(32, 2, 4, 2, 40), 1, head(2, 2, 36, 44), policy(3, 39),
+        "authors", 56, tower(32, 1, 4, 48), decoder(32, 2, 4, 2, 40), 1, head(2, 2, 36, 44), policy(3, 39),
         {"left": (56, 56), "front": (33, 49), "right": (56, 56)}, d_state=5, d_action=4, faint=True),
         options=said("r2", "zero_attention", ("left", "front", "right"))),
     # Nothing is dead: every view present and an instruction beyond the limit, with capitals, digits, a letter in two parts
     # and lines around it; quantiles; a robot with as many numbers as the network.
     "evo1/long_text": Case(35, {"top": (56, 56, "png"), "left": (38, 50, "png"), "right": (90, 60, "png")},
         "\n O\u0308ffne die Schublade 12: 开抽屉, THEN put the black bowl on top of the stove, and close the bottom drawer\n", Checkpoint(
-        "authors", 56, vision(28, 2, 2, 44), text(32, 2, 4, 2, 72, rope_theta=1e4), 2, head(1, 4, 52, 40), policy(4, 72),
+        "authors", 56, tower(28, 2, 2, 44), decoder(32, 2, 4, 2, 72, rope_theta=1e4), 2, head(1, 4, 52, 40), policy(4, 72),
         {"top": (56, 56), "left": (38, 50), "right": (90, 60)}, d_state=24, d_action=24, normalization="bounds_q99"),
         options=said("r2", "zero_attention", ("top", "left", "right"))),
     # LeRobot's layout: the first of three cameras absent, so that the others move up; a JPEG file; the gripper made one of two
     # numbers. Absent may be as many as are declared as empty ones: one such is there instead.
     "evo1/lerobot": Case(34, {"front": None, "wrist": (61, 97, "jpg"), "empty_camera_0": (90, 84, "png")},
         "Put the black_bowl on top of the stove!", Checkpoint(
-        "lerobot", 84, vision(40, 2, 5, 36), text(36, 4, 3, 1, 64), 3, head(2, 3, 30, 26),
+        "lerobot", 84, tower(40, 2, 5, 36), decoder(36, 4, 3, 1, 64), 3, head(2, 3, 30, 26),
         policy(6, 80, 10, 9, num_inference_timesteps=8, vlm_dtype="float32", max_views=3, binarize_gripper=True, empty_cameras=1),
         {"front": (52, 90), "wrist": (61, 97)})),
     # As published files say: pixels normalized in bfloat16. One frame of the network's size; means and quantiles; a state number
     # that never moved in the data; an instruction beyond the limit.
     "evo1/lerobot_bfloat16": Case(37, {"wrist": (56, 56, "png"), "base": (80, 43, "png"), "empty_camera_0": None},
         "close the bottom drawer, and then stack the green block on the yellow block", Checkpoint(
-        "lerobot", 56, vision(24, 2, 3, 40), text(32, 3, 4, 2, 48), 2, head(2, 4, 20, 24),
+        "lerobot", 56, tower(24, 2, 3, 40), decoder(32, 3, 4, 2, 48), 2, head(2, 4, 20, 24),
         policy(4, 56, 12, 7, num_inference_timesteps=5, vlm_dtype="bfloat16", max_views=3, empty_cameras=1,
                normalization_mapping={"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "QUANTILES"}),
         {"wrist": (56, 56), "base": (80, 43)}, d_state=6, zero_spread=(1,))),

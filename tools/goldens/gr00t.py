@@ -16,7 +16,7 @@ from . import lerobot_layout as layout
 from .cases import Case
 from .draw import bfloat16
 from .files import bfloat16_bits, write_json, write_stream
-from .parameters import linear, norm, parameter, statistics
+from .parameters import decoder_layer, linear, norm, parameter, rms_norm, statistics
 from .recorder import Taps
 
 ABSOLUTE = {"rep": "ABSOLUTE", "type": "NON_EEF", "format": "DEFAULT", "state_key": None}
@@ -65,7 +65,7 @@ OTHER = "new_embodiment", 0, Robot(("ego_view",), {"arm": 3}, {"hand": 1, "arm":
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Sizes of towers and head, robots, how a frame becomes an image.  A release adds CONFIG, PROCESSOR_CLASS, SETTINGS,
+    """Sizes of towers and head, robots, how a frame becomes an image.  A release adds CONFIG, PROCESSOR_CLASS, N_VOCAB,
     backbone_shapes() and write_backbone()."""
 
     tag: str
@@ -103,6 +103,17 @@ class Checkpoint:
     def robots(self):
         other, index, robot = OTHER
         return {self.tag: (self.index, self.robot), other: (index, robot)}
+
+    def language_shapes(self, at):
+        """Qwen3: the layers that the policy keeps."""
+        t = self.text
+        d, d_head = t["hidden_size"], t["head_dim"]
+        out = {f"{at}embed_tokens.weight": (t.get("vocab_size", self.N_VOCAB), d)} | rms_norm(f"{at}norm", d)
+        for i in range(self.head["select_layer"]):
+            layer = f"{at}layers.{i}."
+            out |= decoder_layer(layer, d, t["intermediate_size"], t["num_attention_heads"], t["num_key_value_heads"], d_head)
+            out |= rms_norm(f"{layer}self_attn.q_norm", d_head) | rms_norm(f"{layer}self_attn.k_norm", d_head)
+        return out
 
     def head_shapes(self):
         h, d_model = self.head, self.text["hidden_size"]
@@ -172,7 +183,7 @@ class Checkpoint:
             "apply_sincos_state_encoding": any(robot.sin_cos for _, robot in self.robots.values()),
             "use_relative_action": any(robot.relative for _, robot in self.robots.values()), "exclude_state": False,
             "state_dropout_prob": 0.2}
-        return {"processor_class": self.PROCESSOR_CLASS, "processor_kwargs": settings | self.SETTINGS | self.image}
+        return {"processor_class": self.PROCESSOR_CLASS, "processor_kwargs": settings | self.image}
 
     def statistics(self, seed):
         out = {}
@@ -245,12 +256,36 @@ def embodiment(checkpoint):
     return json.loads((Path(checkpoint).parent / "convert.json").read_text())["embodiment"]
 
 
+def stored_weights(checkpoint, root):
+    """In float32, with one table for embedding and head."""
+    from safetensors.torch import load_file
+
+    stored = {}
+    for shard in sorted(checkpoint.glob("*.safetensors")):
+        stored |= {name: value.float() for name, value in load_file(shard).items()}
+    stored[root + "language_model.lm_head.weight"] = stored[root + "language_model.model.embed_tokens.weight"]
+    return stored
+
+
 class HeadTaps(Taps):
-    """Hooks on LeRobot's action head.  A recorder sets `image`, which says of every token whether it is an image's."""
+    """Hooks on LeRobot's action head and on the language model in front of it.  A recorder sets `image`, which says of every token whether it is an image's."""
 
     n_front = 1  # tokens in front of those of the actions
 
+    def layers_in(self, language):
+        """What enters a layer is what the one before it left."""
+        for i, layer in enumerate(language.layers):
+            self.before(layer, lambda x, name=f"lm.blk.{i - 1}" if i else "prefix": self.put(name, x[0]))
+
+    def normed_language(self, language):
+        self.layers_in(language)
+        self.before(language.norm, lambda x: self.put(f"lm.blk.{len(language.layers) - 1}", x[0]))
+        self.after(language.norm, lambda x: self.put("lm.norm", x[0]))
+
     def action_head(self, head):
+        self.after(head.vlln, lambda x: self.put("vl.norm", x[0]))
+        for i, block in enumerate(getattr(head.vl_self_attention, "transformer_blocks", [])):
+            self.after(block, lambda x, i=i: self.put(f"vl.blk.{i}", x[0]))
         self.before(head.state_encoder, lambda x: self.put("state", x[0].flatten()))
         self.after(head.state_encoder, lambda x: self.put("state_out", x[0]))
         self.before(head.action_encoder, self.on_step)

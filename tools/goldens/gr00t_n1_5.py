@@ -18,8 +18,8 @@ from . import gr00t
 from .cases import backbone_folder, copy_tokenizer
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
-from .gr00t_n1_6 import TOKENS, language_shapes, text, text_config
-from .parameters import linear, siglip
+from .gr00t_n1_6 import N_VOCAB, TOKENS, text, text_config
+from .parameters import linear, siglip, tower
 
 ROOT = "backbone.eagle_model."
 INDEX = 1  # of the robot among those of the weights
@@ -32,6 +32,7 @@ class Checkpoint(gr00t.Checkpoint):
     """head: as N1.7's, taken apart when it is written; image: the size of a camera, the crop, the modes of states and actions."""
 
     CONFIG = {"model_name": "", "backbone_model_type": "eagle"}
+    N_VOCAB = N_VOCAB
     n_future: int = 3
 
     def backbone_shapes(self):
@@ -40,7 +41,7 @@ class Checkpoint(gr00t.Checkpoint):
         out = siglip(ROOT + "vision_model.vision_model.", v["hidden_size"], v["intermediate_size"], v["num_hidden_layers"],
                      v["patch_size"], n_position)
         out |= linear(f"{ROOT}mlp1.0", d_model, v["hidden_size"])
-        return out | language_shapes(ROOT + "language_model.model.", self.text, self.head["select_layer"])
+        return out | self.language_shapes(ROOT + "language_model.model.")
 
     def head_shapes(self):
         return super().head_shapes() | {"action_head.future_tokens.weight": (self.n_future, self.head["input_embedding_dim"])}
@@ -94,8 +95,7 @@ def modes(keys, mode):
 
 
 def vision(d, layers, heads, ff, size, patch=14):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "intermediate_size": ff, "image_size": size,
-            "patch_size": patch}
+    return tower(d, layers, heads, ff, image_size=size, patch_size=patch)
 
 
 def camera(width, height, state="min_max", action="min_max", crop=0.95):
@@ -162,7 +162,6 @@ def described(checkpoint):
 def network(checkpoint, eagle):
     """The modules by the authors' names, with the checkpoint's weights."""
     from lerobot.policies.groot.groot_n1_7 import GR00TN17ActionHead, GR00TN17Config
-    from safetensors.torch import load_file
     from torch import nn
     from transformers import Qwen3Config, Qwen3ForCausalLM, SiglipVisionConfig, SiglipVisionModel
 
@@ -180,13 +179,8 @@ def network(checkpoint, eagle):
     whole.backbone.eagle_model = inner
     inner.vision_model, inner.language_model = SiglipVisionModel(tower), Qwen3ForCausalLM(language)
     inner.mlp1 = nn.Sequential(nn.Linear(tower.hidden_size, language.hidden_size))
-    stored = {}
-    for shard in sorted(checkpoint.glob("*.safetensors")):
-        stored |= {name: value.float() for name, value in load_file(shard).items()}
-    stored[ROOT + "language_model.lm_head.weight"] = stored[ROOT + "language_model.model.embed_tokens.weight"]
-    missing, strange = whole.load_state_dict({k: v for k, v in stored.items() if ".head." not in k}, strict=False)
-    if missing or strange:
-        raise ValueError(f"missing {missing}, unexpected {strange}")
+    stored = gr00t.stored_weights(checkpoint, ROOT)
+    whole.load_state_dict({k: v for k, v in stored.items() if ".head." not in k}, strict=True)
     return whole.float().eval(), config
 
 
@@ -307,13 +301,7 @@ class Recorder(HeadTaps):
             self.after(block, lambda x, i=i: self.put(f"vision.blk.{i}", x))
         self.after(tower.post_layernorm, lambda x: self.put("vision.post_norm", x))
         self.after(inner.mlp1, lambda x: self.put("projector", x))
-        for i, layer in enumerate(language.layers):
-            self.before(layer, lambda x, name=f"lm.blk.{i - 1}" if i else "prefix": self.put(name, x[0]))
-        self.before(language.norm, lambda x: self.put(f"lm.blk.{len(language.layers) - 1}", x[0]))
-        self.after(language.norm, lambda x: self.put("lm.norm", x[0]))
-        self.after(head.vlln, lambda x: self.put("vl.norm", x[0]))
-        for i, block in enumerate(getattr(head.vl_self_attention, "transformer_blocks", [])):
-            self.after(block, lambda x, i=i: self.put(f"vl.blk.{i}", x[0]))
+        self.normed_language(language)
         self.action_head(head)
 
     def run(self, batch, noise):

@@ -20,7 +20,7 @@ from .cases import backbone_folder, copy_tokenizer
 from .draw import bfloat16
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, given_noise, head
-from .parameters import decoder_layer, linear, norm, rms_norm, siglip
+from .parameters import decoder, linear, norm, siglip, tower
 from .train_tokenizer import EAGLE
 
 N_MERGE = 60
@@ -42,7 +42,7 @@ CONFIG = {
 class Checkpoint(gr00t.Checkpoint):
     CONFIG = CONFIG
     PROCESSOR_CLASS = "Gr00tN1d6Processor"
-    SETTINGS = {}
+    N_VOCAB = N_VOCAB
 
     def backbone_shapes(self):
         v, t, at = self.vision, self.text, ROOT + "vision_model.vision_model."
@@ -53,7 +53,7 @@ class Checkpoint(gr00t.Checkpoint):
         out |= linear(f"{at}head.attention.out_proj", d, d) | norm(f"{at}head.layernorm", d)
         out |= linear(f"{at}head.mlp.fc1", v["intermediate_size"], d) | linear(f"{at}head.mlp.fc2", d, v["intermediate_size"])
         out |= norm(f"{ROOT}mlp1.0", 4 * d) | linear(f"{ROOT}mlp1.1", d_model, 4 * d) | linear(f"{ROOT}mlp1.3", d_model, d_model)
-        return out | language_shapes(ROOT + "language_model.model.", t, self.head["select_layer"])
+        return out | self.language_shapes(ROOT + "language_model.model.")
 
     def value(self, name, shape, seed):
         x = super().value(name, shape, seed)
@@ -73,16 +73,6 @@ class Checkpoint(gr00t.Checkpoint):
             "image_mean": [0.5] * 3, "image_std": [0.5] * 3, "rescale_factor": 1 / 255}, indent=2)
 
 
-def language_shapes(at, text, kept):
-    d, d_head = text["hidden_size"], text["head_dim"]
-    out = {f"{at}embed_tokens.weight": (text.get("vocab_size", N_VOCAB), d)} | rms_norm(f"{at}norm", d)
-    for i in range(kept):
-        layer = f"{at}layers.{i}."
-        out |= decoder_layer(layer, d, text["intermediate_size"], text["num_attention_heads"], text["num_key_value_heads"], d_head)
-        out |= rms_norm(f"{layer}self_attn.q_norm", d_head) | rms_norm(f"{layer}self_attn.k_norm", d_head)
-    return out
-
-
 def text_config(text):
     return {"architectures": ["Qwen3ForCausalLM"], "model_type": "qwen3", "vocab_size": N_VOCAB,
             "max_position_embeddings": 1024, "rope_theta": 1000000, "rope_scaling": None, "rms_norm_eps": 1e-6, "attention_bias": False,
@@ -95,13 +85,11 @@ def text_config(text):
 
 def vision(d, layers, heads, ff, side, patch=4):
     """side: of the square table of positions."""
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "intermediate_size": ff, "num_patches": side**2,
-            "patch_size": patch}
+    return tower(d, layers, heads, ff, num_patches=side**2, patch_size=patch)
 
 
 def text(d, layers, heads, kv, d_head, ff):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "num_key_value_heads": kv, "head_dim": d_head,
-            "intermediate_size": ff}
+    return decoder(d, layers, heads, kv, ff, d_head)
 
 
 LETTERBOX = {"options": {"letterbox": True}}
@@ -174,7 +162,6 @@ def described(checkpoint):
 def network(checkpoint):
     """The modules by the authors' names, with the checkpoint's weights."""
     from lerobot.policies.groot.groot_n1_7 import GR00TN17ActionHead, GR00TN17Config
-    from safetensors.torch import load_file
     from torch import nn
     from transformers import Qwen3Config, Qwen3ForCausalLM, Siglip2VisionConfig, Siglip2VisionModel
 
@@ -190,11 +177,7 @@ def network(checkpoint):
     whole.backbone.model = inner
     inner.vision_model, inner.language_model = Siglip2VisionModel(tower), Qwen3ForCausalLM(language)
     inner.mlp1 = nn.Sequential(nn.LayerNorm(wide), nn.Linear(wide, d), nn.GELU(), nn.Linear(d, d))
-    stored = {}
-    for shard in sorted(checkpoint.glob("model-*.safetensors")):
-        stored |= {name: value.float() for name, value in load_file(shard).items()}
-    stored[ROOT + "language_model.lm_head.weight"] = stored[ROOT + "language_model.model.embed_tokens.weight"]
-    whole.load_state_dict(stored, strict=True)
+    whole.load_state_dict(gr00t.stored_weights(checkpoint, ROOT), strict=True)
     return whole.float().eval(), config, eagle["image_token_index"]
 
 
@@ -371,11 +354,7 @@ class Recorder(HeadTaps):
             self.per_view(f"vision.blk.{i}", block)
         self.per_view("vision.post_norm", tower.post_layernorm)
         self.after(inner.mlp1, lambda x: self.put("connector", x))
-        for i, layer in enumerate(language.layers):
-            self.before(layer, lambda x, name=f"lm.blk.{i - 1}" if i else "prefix": self.put(name, x[0]))
-        self.before(language.norm, lambda x: self.put(f"lm.blk.{len(language.layers) - 1}", x[0]))
-        self.after(language.norm, lambda x: self.put("lm.norm", x[0]))
-        self.after(model.action_head.vlln, lambda x: self.put("vl.norm", x[0]))
+        self.normed_language(language)
         self.action_head(model.action_head)
 
     def per_view(self, name, module):

@@ -17,7 +17,7 @@ from . import gr00t
 from .cases import backbone_folder, copy_tokenizer
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, given_noise, head
-from .parameters import decoder_layer, linear, norm, rms_norm
+from .parameters import decoder, linear, norm
 from .train_tokenizer import QWEN_VL
 
 HUB_NAME = "nvidia/Cosmos-Reason2-2B"
@@ -34,11 +34,13 @@ CONFIG = {
     "noise_beta_beta": 1.0, "noise_s": 0.999, "num_timestep_buckets": 1000, "tune_projector": True, "tune_diffusion_model": True,
     "tune_vlln": True, "state_dropout_prob": 0.2, "exclude_state": False, "use_mean_std": False, "rtc_ramp_rate": 6.0,
     "model_type": "Gr00tN1d7", "architectures": ["Gr00tN1d7"], "torch_dtype": "bfloat16", "dtype": "bfloat16"}
+
+
 @dataclass(frozen=True)
 class Checkpoint(gr00t.Checkpoint):
     CONFIG = CONFIG
     PROCESSOR_CLASS = "Gr00tN1d7Processor"
-    SETTINGS = {}
+    N_VOCAB = N_VOCAB
 
     def backbone_shapes(self):
         v, t = self.vision, self.text
@@ -54,13 +56,7 @@ class Checkpoint(gr00t.Checkpoint):
         for merger, d_norm in mergers.items():
             out |= norm(f"{at}{merger}.norm", d_norm) | linear(f"{at}{merger}.linear_fc1", 4 * d, 4 * d)
             out |= linear(f"{at}{merger}.linear_fc2", d_model, 4 * d)
-        at, d_head = "backbone.model.model.language_model.", t["head_dim"]
-        out |= {f"{at}embed_tokens.weight": (t.get("vocab_size", N_VOCAB), d_model)} | rms_norm(f"{at}norm", d_model)
-        for i in range(self.head["select_layer"]):
-            layer = f"{at}layers.{i}."
-            out |= decoder_layer(layer, d_model, t["intermediate_size"], t["num_attention_heads"], t["num_key_value_heads"], d_head)
-            out |= rms_norm(f"{layer}self_attn.q_norm", d_head) | rms_norm(f"{layer}self_attn.k_norm", d_head)
-        return out
+        return out | self.language_shapes("backbone.model.model.language_model.")
 
     def write_backbone(self, folder):
         """What the hub keeps in the backbone's repository, without weights."""
@@ -93,9 +89,8 @@ def vision(d, layers, heads, ff, side, deepstack, patch=4):
 
 
 def text(d, layers, heads, kv, d_head, ff, sections):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "num_key_value_heads": kv,
-            "head_dim": d_head, "intermediate_size": ff,
-            "rope_scaling": {"mrope_interleaved": True, "mrope_section": list(sections), "rope_type": "default"}}
+    rope = {"mrope_interleaved": True, "mrope_section": list(sections), "rope_type": "default"}
+    return decoder(d, layers, heads, kv, ff, d_head, rope_scaling=rope)
 
 
 CASES = {
@@ -300,9 +295,6 @@ class Recorder(HeadTaps):
             self.after(merger, lambda x, k=k: self.views(f"deepstack.{k}", x))
         self.after(visual.merger, lambda x: self.views("connector", x))
         self.language(lm, len(visual.deepstack_merger_list))
-        self.after(head.vlln, lambda x: self.put("vl.norm", x[0]))
-        for i, block in enumerate(getattr(head.vl_self_attention, "transformer_blocks", [])):
-            self.after(block, lambda x, i=i: self.put(f"vl.blk.{i}", x[0]))
         self.action_head(head)
 
     def views(self, name, x):
@@ -313,9 +305,7 @@ class Recorder(HeadTaps):
         if len(lm.layers) <= n_deepstack:
             raise ValueError(f"{n_deepstack} DeepStack features for {len(lm.layers)} layers")
         lm.register_forward_pre_hook(lambda m, args, kw: self.put("position_ids", kw["position_ids"][-3:, 0]), with_kwargs=True)
-        for i, layer in enumerate(lm.layers):
-            name = f"lm.blk.{i - 1}" if i else "prefix"
-            self.before(layer, lambda x, name=name: self.put(name, x[0]))
+        self.layers_in(lm)
         self.after(lm.layers[-1], lambda x: self.put(f"lm.blk.{len(lm.layers) - 1}", x[0]))
 
     def on_batch(self, batch):

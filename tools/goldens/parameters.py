@@ -50,6 +50,19 @@ def sines(shape):
     return bfloat16(out)[None]
 
 
+# --- sizes, by the field names of transformers' configs --------------------------------------------------------------
+
+
+def tower(d, layers, heads, ff, **more):
+    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "intermediate_size": ff, **more}
+
+
+def decoder(d, layers, heads, kv, ff, d_head=None, **more):
+    width = {"head_dim": d_head} if d_head else {}
+    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "num_key_value_heads": kv, **width,
+            "intermediate_size": ff, **more}
+
+
 # --- name -> shape ---------------------------------------------------------------------------------------------------
 
 

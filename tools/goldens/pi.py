@@ -18,7 +18,7 @@ from . import lerobot_layout as layout
 from .cases import Case, copy_tokenizer
 from .draw import bfloat16
 from .files import bfloat16_bits, write_json, write_stream
-from .parameters import decoder_layer, linear, parameter, rms_norm, siglip, statistics
+from .parameters import decoder_layer, linear, parameter, rms_norm, siglip, statistics, tower
 from .recorder import ChunkRecorder
 
 NAMES = {"pi0": "lerobot.policies.pi0.PI0Policy", "pi05": "lerobot.policies.pi05.PI05Policy"}
@@ -134,10 +134,6 @@ def gemma(width, depth, heads, kv, d_head, ff):
     return {"width": width, "depth": depth, "mlp_dim": ff, "num_heads": heads, "num_kv_heads": kv, "head_dim": d_head}
 
 
-def vision(d, layers, heads, ff):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "intermediate_size": ff}
-
-
 def policy(horizon, steps, side, d_max, n_token, **more):
     return {"chunk_size": horizon, "n_action_steps": horizon, "num_inference_steps": steps, "image_resolution": (side, side),
             "max_state_dim": d_max[0], "max_action_dim": d_max[1], "tokenizer_max_length": n_token, **more}
@@ -146,7 +142,7 @@ def policy(horizon, steps, side, d_max, n_token, **more):
 def published(views, arch="pi0"):
     """The published size: 3.2 G parameters that are used (pi0), and the expert's unused head."""
     config = {"dtype": "bfloat16", "chunk_size": 50, "max_action_dim": 32}
-    return Checkpoint(arch, config, vision(1152, 27, 16, 4304), gemma(2048, 18, 8, 1, 256, 16384),
+    return Checkpoint(arch, config, tower(1152, 27, 16, 4304), gemma(2048, 18, 8, 1, 256, 16384),
                       gemma(1024, 18, 8, 1, 256, 4096), views, d_state=8, n_vocab=257152, size="full")
 
 
@@ -154,7 +150,7 @@ CASES = {
     # Two views, one wide and one square; a third is declared and never sent. One key-value head, as published, with heads
     # wider in all than the models.
     "pi0/two_views": Case(11, {"base": (20, 28, "png"), "wrist": (36, 36, "png"), "absent": None}, "open the middle drawer", Checkpoint(
-        "pi0", policy(5, 4, 28, (10, 9), 20), vision(36, 2, 3, 52), gemma(40, 3, 8, 1, 8, 72), gemma(32, 3, 8, 1, 8, 48),
+        "pi0", policy(5, 4, 28, (10, 9), 20), tower(36, 2, 3, 52), gemma(40, 3, 8, 1, 8, 72), gemma(32, 3, 8, 1, 8, 48),
         {"base": (20, 28), "wrist": (36, 36), "absent": (20, 28)}, d_state=8)),
     # Three views of three aspects, one a JPEG file; an instruction beyond the limit; grouped heads; a 3 x 3 grid; quantiles;
     # other periods of the time embedding.
@@ -162,7 +158,7 @@ CASES = {
                           " put the black_bowl on top of the stove, then close the bottom drawer of the cabinet", Checkpoint(
         "pi0", policy(7, 3, 42, (14, 16), 12, min_period=2e-3, max_period=8.0,
                       normalization_mapping={"VISUAL": "IDENTITY", "STATE": "QUANTILES", "ACTION": "QUANTILES"}),
-        vision(30, 1, 5, 64), gemma(36, 2, 6, 2, 12, 80), gemma(28, 2, 6, 2, 12, 56),
+        tower(30, 1, 5, 64), gemma(36, 2, 6, 2, 12, 80), gemma(28, 2, 6, 2, 12, 56),
         {"top": (60, 31), "wrist": (53, 53), "side": (37, 64)}, d_state=14, d_action=14)),
     # One of three views absent in the middle, and one that empty_cameras adds; ten steps; ranges; a state number that never
     # moved in the data; an expert as wide as the language model.
@@ -170,24 +166,24 @@ CASES = {
                             "Öffne die Schublade 12: 开抽屉\n", Checkpoint(
         "pi0", policy(9, 10, 28, (6, 6), 40, empty_cameras=1,
                       normalization_mapping={"VISUAL": "IDENTITY", "STATE": "MIN_MAX", "ACTION": "MIN_MAX"}),
-        vision(32, 3, 4, 40), gemma(32, 4, 4, 1, 8, 56), gemma(32, 4, 4, 1, 8, 40),
+        tower(32, 3, 4, 40), gemma(32, 4, 4, 1, 8, 56), gemma(32, 4, 4, 1, 8, 40),
         {"wrist": (31, 60), "front": (31, 60), "base": (28, 28)}, d_state=5, d_action=3, zero_spread=(2,))),
     # The same towers as pi0/two_views; quantiles, as published; an added empty camera.
     "pi05/two_views": Case(21, {"base": (20, 28, "png"), "wrist": (36, 36, "png"), "empty_camera_0": None}, "open the middle drawer",
                            Checkpoint(
-        "pi05", policy(5, 4, 28, (10, 9), 80, empty_cameras=1), vision(36, 2, 3, 52), gemma(40, 3, 8, 1, 8, 72),
+        "pi05", policy(5, 4, 28, (10, 9), 80, empty_cameras=1), tower(36, 2, 3, 52), gemma(40, 3, 8, 1, 8, 72),
         gemma(32, 3, 8, 1, 8, 48), {"base": (20, 28), "wrist": (36, 36)}, d_state=8)),
     # States below and above the range of the bins; means instead of quantiles; blanks, underscores and a line break around
     # the instruction; grouped heads; ten steps.
     "pi05/wide_state": Case(22, {"front": (48, 27, "png")}, "  close_the\ndrawer 42! ", Checkpoint(
         "pi05", policy(6, 10, 42, (8, 8), 100, max_period=2.0,
                        normalization_mapping={"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}),
-        vision(30, 1, 5, 64), gemma(36, 2, 6, 2, 12, 80), gemma(28, 2, 6, 2, 12, 56), {"front": (48, 27)}, d_state=6, d_action=6),
+        tower(30, 1, 5, 64), gemma(36, 2, 6, 2, 12, 80), gemma(28, 2, 6, 2, 12, 56), {"front": (48, 27)}, d_state=6, d_action=6),
         state=(-3.0, 3.0, 0.0, 0.25, -0.5, 1.5)),
     # A prompt beyond the limit, so that the state is cut off; three views, one absent, one a JPEG file.
     "pi05/long_text": Case(23, {"top": (40, 60, "jpg"), "left": (28, 28, "png"), "right": None},
                            "put the black bowl on top of the stove, then close the bottom drawer of the cabinet", Checkpoint(
-        "pi05", policy(8, 5, 28, (14, 14), 24), vision(32, 3, 4, 40), gemma(32, 4, 4, 1, 8, 56), gemma(32, 4, 4, 1, 8, 40),
+        "pi05", policy(8, 5, 28, (14, 14), 24), tower(32, 3, 4, 40), gemma(32, 4, 4, 1, 8, 56), gemma(32, 4, 4, 1, 8, 40),
         {"top": (40, 60), "left": (28, 28), "right": (28, 28)}, d_state=14, d_action=14)),
 }
 

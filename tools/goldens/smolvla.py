@@ -8,7 +8,7 @@ from pathlib import Path
 from . import lerobot_layout as layout
 from .cases import Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
-from .parameters import decoder_layer, linear, parameter, rms_norm, siglip, statistics
+from .parameters import decoder, decoder_layer, linear, parameter, rms_norm, siglip, statistics, tower
 from .recorder import ChunkRecorder
 
 NAMES = {"smolvla": "lerobot.policies.smolvla.SmolVLAPolicy"}
@@ -127,10 +127,8 @@ class Checkpoint:
 
 def published(views, arch="smolvla"):
     """The published size: 450 M parameters, 500 tensors."""
-    vision = {"hidden_size": 768, "intermediate_size": 3072, "num_hidden_layers": 12, "num_attention_heads": 12, "image_size": 512,
-              "patch_size": 16}
-    text = {"hidden_size": 960, "intermediate_size": 2560, "num_hidden_layers": 32, "num_attention_heads": 15,
-            "num_key_value_heads": 5, "head_dim": 64, "max_position_embeddings": 8192}
+    vision = tower(768, 12, 12, 3072, image_size=512, patch_size=16)
+    text = decoder(960, 32, 15, 5, 2560, 64, max_position_embeddings=8192)
     config = {name: CONFIG[name] for name in ("chunk_size", "max_action_dim")}
     config |= {"pad_language_to": "max_length", "prefix_length": 0, "num_expert_layers": 0}
     return Checkpoint(vision, text, 4, config, views, n_vocab=49280)
@@ -140,13 +138,11 @@ def published(views, arch="smolvla"):
 
 
 def vision(d, layers, heads, ff, image, patch, eps=1e-6):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "intermediate_size": ff,
-            "image_size": image, "patch_size": patch, "layer_norm_eps": eps}
+    return tower(d, layers, heads, ff, image_size=image, patch_size=patch, layer_norm_eps=eps)
 
 
 def text(d, layers, heads, kv, d_head, ff, eps=1e-5):
-    return {"hidden_size": d, "num_hidden_layers": layers, "num_attention_heads": heads, "num_key_value_heads": kv,
-            "head_dim": d_head, "intermediate_size": ff, "rms_norm_eps": eps}
+    return decoder(d, layers, heads, kv, ff, d_head, rms_norm_eps=eps)
 
 
 def policy(horizon, steps, size, width, **more):
