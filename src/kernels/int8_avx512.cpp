@@ -7,9 +7,10 @@ namespace vla::kernels {
 namespace {
 
 /// 6 rows by 4 vectors: 24 sums. The instruction of AVX-512 VNNI sums products of four bytes, one operand without sign.
+template <int kDepth>
 struct VnniTile {
   using V = Avx512;
-  static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = 512;
+  static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = kDepth;
   static constexpr bool kEven = true, kRounds = false, kSigned = false;
   struct Session {};
 
@@ -36,7 +37,7 @@ struct VnniTile {
       for (int s = 0; s < 4; ++s, x += 4) {
         __m512i numbers[kStrips];
 #pragma GCC unroll 4
-        for (int j = 0; j < kStrips; ++j) numbers[j] = strips.template load<__m512i>(k, s, j, 0);
+        for (int j = 0; j < kStrips; ++j) numbers[j] = strips.template load<__m512i>(k, s, j, 0), strips.fetch(k, s, j);
 #pragma GCC unroll 6
         for (int r = 0; r < kCount; ++r) {
           std::int32_t four;
@@ -61,8 +62,8 @@ bool supports(const MatrixDesc& desc, Isa isa) {
 }  // namespace
 
 extern const LinearKernel kTernaryAvx512, kInt8Avx512;
-const LinearKernel kTernaryAvx512 = Int8Loop<VnniTile, TernaryPanels>::kernel("avx512_int8", supports);
-const LinearKernel kInt8Avx512 = Int8Loop<VnniTile, BytePanels>::kernel("avx512_int8", supports);
+const LinearKernel kTernaryAvx512 = Int8Loop<VnniTile<2560>, TernaryPanels>::kernel("avx512_int8", supports);
+const LinearKernel kInt8Avx512 = Int8Loop<VnniTile<512>, BytePanels>::kernel("avx512_int8", supports);
 
 }  // namespace vla::kernels
 #endif

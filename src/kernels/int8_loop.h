@@ -9,23 +9,29 @@
 /// The loop around a tile of products of int8 codes of x and weights that are ternary or int8: what an item is, what
 /// lies in which cache.
 ///
-/// A panel's columns are taken a step of the depth at a time, which stays in the first cache while all rows of a block
-/// of x pass by. Two bits for a number are expanded to bytes once for them; of few rows the tile unpacks them itself.
-/// Sums are whole numbers, so that they are the same in every order.
+/// A panel's columns are taken a step of the depth at a time, which stays in a cache while all rows of a block of x
+/// pass by. Two bits for a number are expanded to bytes once for them; of few rows the tile unpacks them itself. Sums
+/// are whole numbers, so that they are the same in every order.
 namespace vla::kernels {
 
 /// Where a tile reads the numbers of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a byte
 /// on of the line that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they are expanded
-/// (TernaryPanels::expand).
+/// (TernaryPanels::expand). fetch(k, s, i) asks for the line that is loaded kAhead groups of four numbers later: a long
+/// step lies in the second cache.
 template <int kStrips>
 struct ExpandedStrips {
+  static constexpr std::int64_t kAhead = 8;
   const std::byte* lines;
 
   template <class Vector>
   VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
     Vector numbers;
-    std::memcpy(&numbers, lines + (k + 4 * s) * kStrips * 16 + i * TernaryPanels::kLine + byte, sizeof(numbers));
+    std::memcpy(&numbers, line(k + 4 * s, i) + byte, sizeof(numbers));
     return numbers;
+  }
+  VLA_INLINE void fetch(std::int64_t k, int s, int i) const { __builtin_prefetch(line(k + 4 * (s + kAhead), i)); }
+  VLA_INLINE const std::byte* line(std::int64_t k, int i) const {
+    return lines + k * kStrips * 16 + i * TernaryPanels::kLine;
   }
 };
 /// The same with numbers of two bits, and the bytes from one strip to the next.
@@ -41,6 +47,7 @@ struct PackedStrips {
     std::memcpy(&words, strips + i * strip + k * 4 + byte, sizeof(words));
     return std::bit_cast<Vector>((words >> 2 * s) & 0x0303030303030303U);
   }
+  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
 /// The same of numbers that lie as they are multiplied.
@@ -55,6 +62,7 @@ struct ByteStrips {
     std::memcpy(&numbers, strips + i * strip + (k + 4 * s) * 16 + byte, sizeof(numbers));
     return numbers;
   }
+  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
 /// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows (of the block of x), kStep (of the
