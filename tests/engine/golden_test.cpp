@@ -50,7 +50,7 @@ bool is_boundary(const std::string& path) {
   return std::regex_match(path, boundary);
 }
 
-void check_taps(const std::string& kernels, bool boundaries) {
+[[maybe_unused]] void check_taps(const std::string& kernels, bool boundaries) {
   for (const std::string& path : golden_paths()) {
     CAPTURE(path);
     const GoldenCase golden = GoldenCase::read(path);
@@ -94,6 +94,7 @@ bool lacks(Isa isa) { return std::find(usable_isas().begin(), usable_isas().end(
 
 }  // namespace
 
+#ifndef VLA_EMULATED_MACHINE  // these kernels are the same in the other programs
 #define VLA_EVERY_TAP " kernels: every tap of every golden case, from pixels to actions, matches the reference"
 TEST_CASE("ggml" VLA_EVERY_TAP) { check_taps("ggml", false); }
 TEST_CASE("avx2" VLA_EVERY_TAP* doctest::skip(lacks(Isa::avx2))) { check_taps("avx2", false); }
@@ -102,17 +103,20 @@ TEST_CASE("avx512" VLA_EVERY_TAP* doctest::skip(lacks(Isa::avx512))) { check_tap
 #define VLA_BOUNDARIES " kernels: blocks whose operations are fused match the reference where they end"
 TEST_CASE("avx2" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx2))) { check_taps("avx2", true); }
 TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx512))) { check_taps("avx512", true); }
+#endif
 
 // Kernels of bf16 round activations as PyTorch's bf16 does: its error is what is allowed. PyTorch keeps the
 // projections of state and actions in float32 and rounds every result between two operations, we do neither.
 #define VLA_CHUNK \
   " kernels: with the same bf16 weights the chunk is nearer to the float32 reference than PyTorch's bf16 is"
 TEST_CASE("default" VLA_CHUNK) { check_chunk(""); }
+TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(Isa::amx))) { check_chunk("amx"); }
+#ifndef VLA_EMULATED_MACHINE
 TEST_CASE("ggml" VLA_CHUNK) { check_chunk("ggml"); }
 TEST_CASE("avx2" VLA_CHUNK* doctest::skip(lacks(Isa::avx2))) { check_chunk("avx2"); }
 TEST_CASE("avx512" VLA_CHUNK* doctest::skip(lacks(Isa::avx512))) { check_chunk("avx512"); }
 TEST_CASE("avx512_bf16" VLA_CHUNK* doctest::skip(lacks(Isa::avx512_bf16))) { check_chunk("avx512_bf16"); }
-TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(Isa::amx))) { check_chunk("amx"); }
+#endif
 
 TEST_CASE("taps do not change the answer, and without a pattern nothing is recorded") {
   const GoldenCase golden = GoldenCase::read(golden_paths().front());

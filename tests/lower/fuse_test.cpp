@@ -130,20 +130,3 @@ TEST_CASE("attention over few keys rounds nothing, and shares no packed keys wit
   CHECK(n_line("avx512_bf16", "attention") == 1);
   CHECK(n_line("avx512_bf16", "pack") == 2);
 }
-
-TEST_CASE("amx: what products alone read stays in tiles between them, the last of uneven size" *
-          doctest::skip(lacks(Isa::amx))) {
-  const LowerParams params(DType::bf16);
-  const auto run = [&](const char* kernels, int n_row) {
-    GraphRunner runner(params.list(), kernels);
-    Graph& g = runner.graph;
-    const Tensor h = activate(g, params.linear(g, input(runner, {35, n_row, 1, 1}), 67), Activation::gelu_tanh);
-    g.name("result", params.linear(g, h, 35));
-    const std::string text = runner.lower().text();
-    runner.run();
-    return std::pair{text, runner.tap("result")};
-  };
-  CHECK(run("amx", 40).first.find("bf16 tiles [67, 40]") != std::string::npos);
-  CHECK(run("amx", 16).first.find("tiles") == std::string::npos);  // few rows are not rounded
-  check_close(run("amx", 40).second, run("ggml", 40).second, 0x1p-8);
-}
