@@ -15,7 +15,7 @@ namespace vla::serve {
 namespace {
 
 constexpr std::string_view kMagic = "VLAREC1\n";
-constexpr std::size_t kHead = 24, kSealed = 16;  // bytes of a piece before its request; of them under the checksum
+constexpr std::size_t kHead = 24, kSealed = 16;  // bytes of a record before its request; of them under the checksum
 constexpr std::size_t kMaxWaiting = 128 << 20;
 
 using Head = std::array<char, kHead>;
@@ -38,16 +38,16 @@ std::uint64_t seal(const Head& head, std::string_view in, std::string_view out) 
   return XXH3_64bits_withSeed(out.data(), out.size(), XXH3_64bits_withSeed(in.data(), in.size(), of_head));
 }
 
-std::string piece_of(const char* mark, std::uint32_t index, std::string_view in, std::string_view out) {
+std::string record_of(const char* mark, std::uint32_t index, std::string_view in, std::string_view out) {
   Head head;
   std::memcpy(head.data(), mark, 4);
   put(head, 4, index);
   put(head, 8, static_cast<std::uint32_t>(in.size()));
   put(head, 12, static_cast<std::uint32_t>(out.size()));
   put(head, kSealed, seal(head, in, out));
-  std::string piece;
-  piece.reserve(kHead + in.size() + out.size());
-  return piece.append(head.data(), kHead).append(in).append(out);
+  std::string record;
+  record.reserve(kHead + in.size() + out.size());
+  return record.append(head.data(), kHead).append(in).append(out);
 }
 
 std::string_view text(std::span<const std::byte> bytes) {
@@ -79,8 +79,8 @@ Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
 
 /// A server that never got to serve leaves no file in the way of the next one.
 Recorder::~Recorder() {
-  if (n_piece_ > 0) {
-    writer_.set_tail(piece_of("VEND", n_piece_, "", ""));
+  if (n_record_ > 0) {
+    writer_.set_tail(record_of("VEND", n_record_, "", ""));
   } else {
     std::error_code ignored;
     std::filesystem::remove(path_, ignored);
@@ -100,26 +100,26 @@ void Recorder::add(std::span<const std::byte> in, std::span<const std::byte> out
   const std::uint64_t size = kHead + in.size() + out.size();
   if (bytes_ + size > max_bytes_) return stop("it reached its limit");
   try {
-    if (!writer_.put(piece_of("VREC", n_piece_, text(in), text(out))))
+    if (!writer_.put(record_of("VREC", n_record_, text(in), text(out))))
       return stop(writer_.failure() != 0 ? std::strerror(writer_.failure()) : "the disk is too slow");
   } catch (const std::exception&) {
     return stop("no memory");
   }
   bytes_ += size;
-  ++n_piece_;
+  ++n_record_;
 }
 
 void Recorder::stop(const char* why) {
   stopped_ = true;
   try {
-    if (tell_) tell_(why, n_piece_ == 0 ? 0 : n_piece_ - 1);
+    if (tell_) tell_(why, n_record_ == 0 ? 0 : n_record_ - 1);
   } catch (const std::exception&) {  // no memory to tell it
   }
 }
 
 Error Recording::damaged(const std::string& expected, const std::string& found) const {
-  return {Code::bad_request, fmt::format("{}: piece {} at byte {}", path_, n_piece_, at_), expected, found,
-          n_piece_ > 1 ? fmt::format("--first {} replays what comes before it", n_piece_ - 1) : std::string()};
+  return {Code::bad_request, fmt::format("{}: record {} at byte {}", path_, n_record_, at_), expected, found,
+          n_record_ > 1 ? fmt::format("--first {} replays what comes before it", n_record_ - 1) : std::string()};
 }
 
 Result<Recording> Recording::open(const std::string& folder) {
@@ -143,35 +143,35 @@ Result<Recording> Recording::open(const std::string& folder) {
   return recording;
 }
 
-Result<std::optional<Recording::Piece>> Recording::next() {
+Result<std::optional<Recording::Record>> Recording::next() {
   if (is_whole_) {
     if (at_ != size_) return damaged("the end of the file", fmt::format("{} bytes more", size_ - at_));
-    return std::optional<Piece>();
+    return std::optional<Record>();
   }
-  if (at_ == size_) return std::optional<Piece>();
+  if (at_ == size_) return std::optional<Record>();
   Head head;
   const std::uint64_t left = size_ - at_;
   if (left < kHead || !file_.read(head.data(), kHead))
     return damaged(fmt::format("{} bytes", kHead), fmt::format("{} and the end of the file", left));
   const std::string mark(head.data(), 4);
-  if (mark != "VREC" && mark != "VEND") return damaged("the mark of a piece", "other bytes");
-  if (get<std::uint32_t>(head, 4) != n_piece_)
-    return damaged(fmt::format("piece {}", n_piece_), fmt::format("piece {}", get<std::uint32_t>(head, 4)));
+  if (mark != "VREC" && mark != "VEND") return damaged("the mark of a record", "other bytes");
+  if (get<std::uint32_t>(head, 4) != n_record_)
+    return damaged(fmt::format("record {}", n_record_), fmt::format("record {}", get<std::uint32_t>(head, 4)));
   const std::uint64_t n_in = get<std::uint32_t>(head, 8), n_out = get<std::uint32_t>(head, 12);
   if (n_in + n_out > left - kHead)
     return damaged(fmt::format("{} bytes", kHead + n_in + n_out), fmt::format("{} and the end of the file", left));
-  Piece piece{n_piece_, std::string(n_in, '\0'), std::string(n_out, '\0')};
-  file_.read(piece.request.data(), static_cast<std::streamsize>(n_in));
-  file_.read(piece.response.data(), static_cast<std::streamsize>(n_out));
-  if (!file_ || seal(head, piece.request, piece.response) != get<std::uint64_t>(head, kSealed))
+  Record record{n_record_, std::string(n_in, '\0'), std::string(n_out, '\0')};
+  file_.read(record.request.data(), static_cast<std::streamsize>(n_in));
+  file_.read(record.response.data(), static_cast<std::streamsize>(n_out));
+  if (!file_ || seal(head, record.request, record.response) != get<std::uint64_t>(head, kSealed))
     return damaged("bytes of the checksum that was recorded", "bytes of another");
   at_ += kHead + n_in + n_out;
   if (mark == "VEND") {
     is_whole_ = true;
     return next();
   }
-  ++n_piece_;
-  return std::optional<Piece>(std::move(piece));
+  ++n_record_;
+  return std::optional<Record>(std::move(record));
 }
 
 }  // namespace vla::serve

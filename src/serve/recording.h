@@ -14,10 +14,10 @@
 namespace vla::serve {
 
 /// Requests and their answers as they went over the wire, in one file of a folder, in the order of the answers.
-/// The file: 8 bytes `VLAREC1\n`, then pieces. A piece is a mark of 4 bytes (`VREC`, or `VEND` for the last one), three
-/// little-endian u32 (its index from 0, bytes of the request, bytes of the answer), a u64 (XXH3-64, chained over these
-/// 16 bytes, the request and the answer), the Request and the Response. Piece 0 has the server's Description as its
-/// request and no answer.
+/// The file: 8 bytes `VLAREC1\n`, then records. A record is a mark of 4 bytes (`VREC`, or `VEND` for the last one),
+/// three little-endian u32 (its index from 0, bytes of the request, bytes of the answer), a u64 (XXH3-64, chained over
+/// these 16 bytes, the request and the answer), the Request and the Response. Record 0 has the server's Description as
+/// its request and no answer.
 constexpr const char* kRecordingFile = "requests.vlarec";
 
 /// Records what a server answers, up to a size.
@@ -43,16 +43,16 @@ class Recorder final : public Observer {
   const std::string path_;
   const std::uint64_t max_bytes_;
   std::uint64_t bytes_ = 0;
-  std::uint32_t n_piece_ = 0;
+  std::uint32_t n_record_ = 0;
   bool stopped_ = false;
   std::function<void(const std::string&, std::uint64_t)> tell_;
   Writer writer_;
 };
 
-/// Reads a recording, piece by piece. Every size is compared with the file before memory is taken.
+/// Reads a recording, record by record. Every size is compared with the file before memory is taken.
 class Recording {
  public:
-  struct Piece {
+  struct Record {
     std::size_t index = 0;  // from 1
     std::string request, response;
   };
@@ -60,8 +60,8 @@ class Recording {
   static Result<Recording> open(const std::string& folder);
 
   const v1::Description& description() const { return description_; }
-  /// None at the end. Errors: bad_request, with the piece and its place in the file.
-  Result<std::optional<Piece>> next();
+  /// None at the end. Errors: bad_request, with the record and its place in the file.
+  Result<std::optional<Record>> next();
   /// Whether the end that was reached is the one that the server wrote: a server that was killed writes none.
   bool is_whole() const { return is_whole_; }
 
@@ -72,7 +72,7 @@ class Recording {
   std::string path_;
   std::ifstream file_;
   std::uint64_t size_ = 0, at_ = 0;
-  std::uint32_t n_piece_ = 0;
+  std::uint32_t n_record_ = 0;
   bool is_whole_ = false;
   v1::Description description_;
 };

@@ -160,19 +160,19 @@ Result<v1::Description> describe(Line& line) {
   return response.description();
 }
 
-Status compare(Line& line, const Recording::Piece& piece, ReplayReport& report) {
+Status compare(Line& line, const Recording::Record& record, ReplayReport& report) {
   v1::Response recorded;
-  if (!recorded.ParseFromString(piece.response))
-    return Error{Code::bad_request, fmt::format("piece {}", piece.index), "a Response", "bytes that are none"};
+  if (!recorded.ParseFromString(record.response))
+    return Error{Code::bad_request, fmt::format("record {}", record.index), "a Response", "bytes that are none"};
   if (is_of_the_moment(recorded)) {
     ++report.n_skipped;
     return {};
   }
-  VLA_TRY(const v1::Response replayed, line.ask(request_again(piece.request, recorded)));
+  VLA_TRY(const v1::Response replayed, line.ask(request_again(record.request, recorded)));
   std::vector<Difference> differences = compare_answers(recorded, replayed);
   ++(differences.empty() ? report.n_same : report.n_different);
   for (Difference& difference : differences) {
-    difference.index = piece.index;
+    difference.index = record.index;
     difference.request_id = recorded.request_id();
     report.differences.push_back(std::move(difference));
   }
@@ -207,9 +207,9 @@ Result<ReplayReport> replay(Recording& recording, const ReplayOptions& options) 
     ReplayReport report;
     VLA_TRY(report.replayed_by, describe(line));
     for (std::size_t n = 0; options.first == 0 || n < options.first; ++n) {
-      VLA_TRY(const std::optional<Recording::Piece> piece, recording.next());
-      if (!piece) break;
-      VLA_CHECK(compare(line, *piece, report));
+      VLA_TRY(const std::optional<Recording::Record> record, recording.next());
+      if (!record) break;
+      VLA_CHECK(compare(line, *record, report));
     }
     return report;
   } catch (const zmq::error_t& error) {

@@ -368,8 +368,8 @@ def test_a_replay_gives_every_answer_again_bit_for_bit(vla, serve, golden, recor
     assert (answer.code, answer.out) == (0, "6 answers the same, 0 different, 1 not compared\n"), answer.err
 
 
-def with_piece(recording, index, change, of_request=False):
-    """Changes the answer, or the request, of one piece and seals it again, as src/serve/recording.h describes."""
+def with_record(recording, index, change, of_request=False):
+    """Changes the answer, or the request, of one record and seals it again, as src/serve/recording.h describes."""
     import struct
 
     import xxhash
@@ -398,7 +398,7 @@ def test_one_bit_of_one_action_is_found_and_told(vla, golden, recording):
         at = 40  # inside the packed actions, which come after version, number, horizon and width
         return answer[:at] + bytes([answer[at] ^ 1]) + answer[at + 1 :]
 
-    with_piece(recording, 2, flip)
+    with_record(recording, 2, flip)
     answer = vla("replay", recording, "--bundle", golden.bundle, "--threads", 2)
     assert answer.code == 10
     assert "5 answers the same, 1 different, 1 not compared" in answer.out and " actions " in answer.out
@@ -407,7 +407,7 @@ def test_one_bit_of_one_action_is_found_and_told(vla, golden, recording):
 
 def test_a_recording_under_limits_that_no_server_has_is_refused(vla, golden, recording):
     of_32_mib, of_one = b"\x80\x80\x80\x10", b"\x81\x80\x80\x00"  # as Protobuf writes them in four bytes
-    with_piece(recording, 0, lambda description: description.replace(of_32_mib, of_one), of_request=True)
+    with_record(recording, 0, lambda description: description.replace(of_32_mib, of_one), of_request=True)
     answer = vla("replay", recording, "--bundle", golden.bundle, "--threads", 2)
     assert answer.code == 11 and "limits that vla serve takes, found 1 bytes, 16777216 pixels" in answer.err
 
@@ -419,7 +419,7 @@ def test_a_damaged_recording_is_refused_with_its_place(vla, golden, recording, p
     data[place] ^= 1
     path.write_bytes(data)
     answer = vla("replay", recording, "--bundle", golden.bundle, "--threads", 2)
-    assert answer.code == 11 and "requests.vlarec: piece" in answer.err and "at byte" in answer.err
+    assert answer.code == 11 and "requests.vlarec: record" in answer.err and "at byte" in answer.err
 
 
 def test_a_recording_that_was_cut_is_refused_and_its_whole_part_can_be_replayed(vla, golden, recording):

@@ -298,17 +298,17 @@ TEST_CASE("a recording gives back the bytes that went in, and says whether it is
   auto recording = Recording::open(folder / "r");
   REQUIRE(recording.ok());
   CHECK(recording->description().horizon() == 42);
-  auto piece = recording->next();
-  REQUIRE((piece.ok() && piece->has_value()));
-  CHECK((*piece)->request == "abc");
-  CHECK((*piece)->response == "defgh");
-  piece = recording->next();
-  REQUIRE((piece.ok() && piece->has_value()));
-  CHECK((*piece)->request.empty());
+  auto record = recording->next();
+  REQUIRE((record.ok() && record->has_value()));
+  CHECK((*record)->request == "abc");
+  CHECK((*record)->response == "defgh");
+  record = recording->next();
+  REQUIRE((record.ok() && record->has_value()));
+  CHECK((*record)->request.empty());
   CHECK_FALSE(recording->is_whole());
-  piece = recording->next();
-  REQUIRE(piece.ok());
-  CHECK_FALSE(piece->has_value());
+  record = recording->next();
+  REQUIRE(record.ok());
+  CHECK_FALSE(record->has_value());
   CHECK(recording->is_whole());
 }
 
@@ -328,9 +328,9 @@ TEST_CASE(
     auto recording = Recording::open(folder / "r");
     if (!recording) return true;
     for (;;) {
-      const auto piece = recording->next();
-      if (!piece) return true;
-      if (!*piece) return !recording->is_whole();
+      const auto record = recording->next();
+      if (!record) return true;
+      if (!*record) return !recording->is_whole();
     }
   };
   CHECK_FALSE(is_refused(sound));
@@ -362,7 +362,7 @@ TEST_CASE("a recorder stops at its limit, tells once, and what it has stays whol
   auto recording = Recording::open(folder / "r");
   REQUIRE(recording.ok());
   int n = 0;
-  for (auto piece = recording->next(); piece.ok() && *piece; piece = recording->next()) ++n;
+  for (auto record = recording->next(); record.ok() && *record; record = recording->next()) ++n;
   CHECK(n == 3);
   CHECK(recording->is_whole());
 }
