@@ -1,0 +1,81 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "base/file.h"
+
+#include <doctest/doctest.h>
+#include <fmt/format.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <filesystem>
+
+using namespace vla;
+namespace fs = std::filesystem;
+
+namespace {
+
+/// A folder of its own, removed at the end.
+struct Folder {
+  fs::path path = fs::temp_directory_path() / fmt::format("vla-file-test-{}", ::getpid());
+  Folder() { fs::create_directory(path); }
+  ~Folder() { fs::remove_all(path); }
+  std::string operator/(const char* name) const { return (path / name).string(); }
+  std::ptrdiff_t n_entry() const { return std::distance(fs::directory_iterator(path), fs::directory_iterator()); }
+};
+
+std::string text_of(const std::string& file) {
+  const auto bytes = read_file(file, 100);
+  REQUIRE(bytes.ok());
+  return {reinterpret_cast<const char*>(bytes->data()), bytes->size()};
+}
+
+}  // namespace
+
+TEST_CASE("what is written is read back, and replaces a file as a whole") {
+  const Folder folder;
+  const std::string file = folder / "a";
+  REQUIRE(write_file(file, "a longer text").ok());
+  REQUIRE(write_file(file, "short").ok());
+  CHECK(text_of(file) == "short");
+  CHECK(folder.n_entry() == 1);  // the file beside it is gone
+}
+
+TEST_CASE("a link stays a link, and the file behind it is replaced") {
+  const Folder folder;
+  REQUIRE(write_file(folder / "target", "old").ok());
+  fs::create_symlink("target", folder / "link");
+  REQUIRE(write_file(folder / "link", "new").ok());
+  CHECK(fs::is_symlink(folder / "link"));
+  CHECK(text_of(folder / "target") == "new");
+}
+
+TEST_CASE("a new file never replaces one, and has the mode that was asked for") {
+  const Folder folder;
+  const std::string file = folder / "secret", text = "key";
+  const auto bytes = std::as_bytes(std::span(text));
+  REQUIRE(write_new_file(file, bytes, 0600).ok());
+  CHECK((fs::status(file).permissions() & fs::perms::mask) == (fs::perms::owner_read | fs::perms::owner_write));
+  const Status again = write_new_file(file, bytes, 0600);
+  REQUIRE_FALSE(again.ok());
+  CHECK(again.error().code == Code::io);
+  CHECK(again.error().where == file);
+}
+
+TEST_CASE("what cannot be read or written is an io error that names the path, and leaves no file") {
+  const Folder folder;
+  const std::string pipe = folder / "pipe";
+  REQUIRE(::mkfifo(pipe.c_str(), 0600) == 0);
+  REQUIRE(write_file(folder / "large", "0123456789").ok());
+  for (const auto& [path, limit] : {std::pair(folder / "absent", 100), std::pair(pipe, 100),
+                                    std::pair(folder / ".", 100), std::pair(folder / "large", 9)}) {
+    CAPTURE(path);
+    const auto bytes = read_file(path, static_cast<std::size_t>(limit));
+    REQUIRE_FALSE(bytes.ok());
+    CHECK(bytes.error().code == Code::io);
+    CHECK(bytes.error().where == path);
+  }
+  const Status written = write_file(folder / "no/such/folder", "x");
+  REQUIRE_FALSE(written.ok());
+  CHECK(written.error().code == Code::io);
+  CHECK(folder.n_entry() == 2);
+}
