@@ -43,20 +43,20 @@ extern "C" {
 /* Changes when programs must be compiled again; the library's file name carries it too. */
 #define VLA_ABI_VERSION 1
 
-/* The VLA_ABI_VERSION that the library was built with: for programs that load it by hand. */
+/* The VLA_ABI_VERSION that the library was built with: for programs that load it with dlopen. */
 VLA_API uint32_t vla_abi_version(void);
 /* The library's version, "0.1.0". */
 VLA_API const char* vla_version(void);
 
-/* What a call came to; the numbers are the exit codes of the program `vla`. */
+/* The result of a call; the numbers are the exit codes of the program `vla`. */
 typedef int32_t vla_status;
 enum {
   VLA_OK = 0,
   VLA_INTERNAL = 1,        /* a fault of the library: please report it */
-  VLA_USAGE = 2,           /* an argument that no bundle could make right */
+  VLA_USAGE = 2,           /* an argument that is wrong for every bundle */
   VLA_BAD_BUNDLE = 3,      /* the file is damaged or does not fit this library */
   VLA_BAD_OBSERVATION = 4, /* a view, state, text or noise that the bundle does not take */
-  VLA_BAD_ACTION = 5,      /* the network answered a number that is not finite */
+  VLA_BAD_ACTION = 5,      /* the network computed a number that is not finite */
   VLA_UNSUPPORTED = 6,     /* sound, but not known to this library */
   VLA_OUT_OF_MEMORY = 7,
   VLA_DEVICE = 8,
@@ -89,8 +89,8 @@ typedef struct vla_options {
                           best for the bundle's dtype, which rounds to bf16 if the bundle and the machine have it */
   int32_t strict_state; /* 1: an observation whose state is far beyond what the policy has seen is refused with
                            VLA_BAD_OBSERVATION; 0: it is answered with a note */
-  const char* device; /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". Nothing takes the place of a device that
-                         is absent: opening fails with VLA_DEVICE, and `expected` lists what is there */
+  const char* device;   /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". There is no fallback: an absent device
+                           fails with VLA_DEVICE, and `expected` lists what is there */
   const char* embodiment; /* of a bundle for several robots: tag of the one that is loaded; NULL: all of them. A tag
                              that the bundle does not have fails with VLA_USAGE, and `expected` lists them */
 } vla_options;
@@ -103,7 +103,7 @@ VLA_API vla_status vla_open(const char* path, const vla_options* options, vla_po
 /* Frees a policy; NULL is allowed. */
 VLA_API void vla_policy_close(vla_policy* policy);
 
-/* A camera that the policy looks through. */
+/* A camera of the policy. */
 typedef struct vla_view_info {
   size_t struct_size;
   const char* name;      /* in full: "observation.images.top"; the last part, "top", is understood too */
@@ -144,7 +144,7 @@ struct vla_description {
   const char* checksum;  /* "xxh3:..." */
   const char* source;    /* the checkpoint that the bundle was made of */
   const char* revision;  /* its revision, or empty */
-  const char* converter; /* what made the bundle */
+  const char* converter; /* the program that made the bundle, and its version */
   const char* dtype;     /* how matrices are stored: "f32", "bf16" or "f16" */
   const char* precision; /* of the large products: "f32", "bf16" with sums in float32, or "int8" */
   const char* kernels;   /* what computes them: "ggml", "avx2", ... */
@@ -224,11 +224,11 @@ VLA_API void vla_chunk_close(vla_chunk* chunk);
 /* The actions, (horizon, d_action) row by row, in the units of the robot; all of them are finite. For a chunk of NULL
  * this and what follows is NULL or 0. */
 VLA_API const float* vla_chunk_actions(const vla_chunk* chunk);
-/* The same as the network answered, before statistics made units of it: what the leftover of an observation takes. */
+/* The network's output before unnormalization: what the leftover of an observation takes. */
 VLA_API const float* vla_chunk_normalized(const vla_chunk* chunk);
 VLA_API size_t vla_chunk_horizon(const vla_chunk* chunk);
 VLA_API size_t vla_chunk_d_action(const vla_chunk* chunk);
-/* What the user must know about this answer, e.g. that the instruction was cut. NULL beyond the last. */
+/* Warnings about this answer, e.g. that the instruction was truncated. NULL beyond the last. */
 VLA_API size_t vla_chunk_n_note(const vla_chunk* chunk);
 VLA_API const char* vla_chunk_note(const vla_chunk* chunk, size_t i);
 /* Milliseconds per stage, in the order in which the stages ran; NULL and 0 beyond the last. */

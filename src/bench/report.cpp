@@ -30,11 +30,12 @@ StageRow make_row(const std::string& name, const std::vector<double>& times, con
   row.byte_rate = work.bytes / (1e-3 * row.p50);
   if (!report.conditions.on_cpu()) return row;  // the probes measure the CPU
   // A probe that something disturbed would flatter its round: no round's peak counts for less than their median.
-  const double least = median_of(report.rounds, &Round::peak), least_int8 = median_of(report.rounds, &Round::int8_peak);
+  const double min_peak = median_of(report.rounds, &Round::peak),
+               min_int8_peak = median_of(report.rounds, &Round::int8_peak);
   std::vector<double> shares;
   for (std::size_t i = 0; i < times.size(); ++i) {
     const Round& round = report.rounds[i];
-    const double best = time_at(work, std::max(round.peak, least), std::max(round.int8_peak, least_int8));
+    const double best = time_at(work, std::max(round.peak, min_peak), std::max(round.int8_peak, min_int8_peak));
     shares.push_back(best / (1e-3 * times[i]));
   }
   row.share_of_peak = quantile(shares, 1);

@@ -10,7 +10,7 @@
 namespace vla::bench {
 namespace {
 
-/// The picture and the plot in it, in pixels.
+/// The image and the plot in it, in pixels.
 constexpr double kWidth = 1000, kHeight = 640, kLeft = 84, kRight = 690, kTop = 84, kBottom = 566;
 /// Colours that stay apart for colour-blind readers. Source: Okabe and Ito, Color Universal Design.
 constexpr const char* kColours[] = {"#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"};

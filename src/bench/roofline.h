@@ -8,7 +8,7 @@
 
 namespace vla::bench {
 
-/// The roofline of a report as an SVG picture: operations per second over operations per byte, both logarithmic. The
+/// The roofline of a report as an SVG image: operations per second over operations per byte, both logarithmic. The
 /// roofs are what the machine was measured to do, the points what the stages did.
 /// Source of the model: Williams, Waterman and Patterson, Roofline (CACM 52(4), 2009).
 std::string draw_roofline(const Report& report);

@@ -24,7 +24,7 @@ constexpr std::size_t kDigits = 16;
 constexpr std::string_view kEmbodimentsKey = "embodiments", kEmbodimentPrefix = "embodiment.";
 
 constexpr std::size_t kMaxRobots = 64;  // the published checkpoints have room for 32
-constexpr std::size_t kMaxTag = 256;    // bytes; no longer one can be sent in an act
+constexpr std::size_t kMaxTag = 256;    // bytes; an act cannot send a longer one
 
 /// XXH3-64 of a file that comes part by part, with the digits at `digits` read as '0'.
 class Checksum {

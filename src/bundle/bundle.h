@@ -41,10 +41,11 @@ class Bundle {
   /// The same on bytes in memory, which must outlive the bundle.
   static Result<Bundle> parse(std::span<const std::byte> bytes, std::string name);
 
-  /// Tags of the robots that the bundle is for; none where it is for one robot, which it does not name.
+  /// Tags of the bundle's robots; empty for one robot without a name.
   const std::vector<std::string>& embodiments() const { return embodiments_; }
-  /// From now on this is the bundle of one of its robots: what is under its tag has its plain name, and what is under
-  /// other tags is gone. `tag` is empty where `embodiments` is. Errors: usage, with the tags that there are.
+  /// Makes this the bundle of one of its robots: the keys and tensors of that robot lose the prefix with the tag, those
+  /// of the other robots are removed. `tag` is empty where `embodiments` is. Errors: usage, with the tags that there
+  /// are.
   Status choose(const std::string& tag);
   /// The robot that was chosen, or empty.
   const std::string& embodiment() const { return embodiment_; }
@@ -62,7 +63,7 @@ class Bundle {
   /// The bytes of a tensor or of a part of it, in `room` where they come from a file. Errors: bad_bundle, where the
   /// file has been changed since it was opened.
   Result<std::span<const std::byte>> read(std::span<const std::byte> part, Room& room) const;
-  /// Where tensors are read, also when the bundle is gone.
+  /// What tensors are read from; it may outlive the bundle.
   const std::shared_ptr<const Content>& content() const { return content_; }
 
  private:

@@ -17,8 +17,8 @@ namespace vla {
 using Value = std::variant<bool, std::int64_t, double, std::string, std::vector<std::int64_t>, std::vector<double>,
                            std::vector<std::string>>;
 
-/// The values that a number may have, both ends included. The reader of a number states them: what was never tried is
-/// refused at load, not found out by a robot.
+/// The values that a number may have, both ends included. The reader of a number states them: a value that
+/// was never tested is refused at load.
 struct Range {
   double low, high;
   bool holds(double value) const { return value >= low && value <= high; }
@@ -45,9 +45,9 @@ class Keys {
   bool has(std::string_view key) const { return values_.find(key) != values_.end(); }
   const std::map<std::string, Value, std::less<>>& all() const { return values_; }
   void set(std::string key, Value value) { values_.insert_or_assign(std::move(key), std::move(value)); }
-  /// Whether both have the same keys that start so, with the same values.
+  /// Whether both have the same keys with this prefix, and the same values.
   bool same(std::string_view prefix, const Keys& other) const;
-  /// Removes the keys that start so.
+  /// Removes the keys with this prefix.
   void forget(std::string_view prefix);
 
   Result<bool> boolean(std::string_view key) const;

@@ -10,7 +10,7 @@
 namespace vla {
 namespace {
 
-constexpr std::size_t kMaxLines = 50;  // of a report: who has more problems than these has the wrong bundle
+constexpr std::size_t kMaxLines = 50;  // problems in a report; more mean the wrong bundle
 
 std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
 

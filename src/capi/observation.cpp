@@ -23,8 +23,8 @@ Result<Frame> read_rows(const vla_view& view, const std::string& where) {
   if (stride < row || stride > kMaxFile)
     return Error{Code::bad_observation, where + ".stride", fmt::format("{} to {} bytes", row, kMaxFile),
                  std::to_string(stride)};
-  const std::size_t least = stride * (n_row - 1) + row;
-  if (view.size != least && view.size != stride * n_row)
+  const std::size_t min_size = stride * (n_row - 1) + row;
+  if (view.size != min_size && view.size != stride * n_row)
     return Error{Code::bad_observation, where + ".size", fmt::format("{} bytes", stride * n_row),
                  std::to_string(view.size)};
   const auto* from = static_cast<const std::uint8_t*>(view.data);

@@ -12,17 +12,17 @@ namespace vla::cli {
 /// Of --kernels, wherever a policy is loaded.
 constexpr const char* kKernelsHelp =
     "ggml, avx2, avx512, avx512_bf16, amx, or float32: the best that does not round to bf16; not given: the best for "
-    "the bundle's "
-    "dtype, which multiplies bf16 (by avx512_bf16 or amx) if the bundle is stored as bf16";
+    "the bundle's dtype, which multiplies bf16 (by avx512_bf16 or amx) if the bundle is stored as bf16";
 
 /// Of --device, wherever a policy is loaded.
 constexpr const char* kDeviceHelp =
-    "cpu, or vulkan[:N] or cuda[:N] where vla inspect --devices lists it; not given: cpu. Nothing takes the place of a "
-    "device that is absent";
+    "cpu, or vulkan[:N] or cuda[:N] where vla inspect --devices lists it; not given: cpu. An absent device is an "
+    "error: "
+    "there is no fallback";
 
 /// Of --embodiment, wherever a policy is loaded.
 constexpr const char* kEmbodimentHelp =
-    "The robot, by its tag, where the bundle is for several; a wrong one is answered with the list";
+    "The robot, by its tag, where the bundle is for several; an error lists the valid ones";
 
 /// Of --strict-state, wherever observations come in.
 constexpr const char* kStrictStateHelp =

@@ -269,7 +269,9 @@ Command add_run(CLI::App& app) {
       *command, "--leftover", options->leftover, "FILE",
       "Real-time chunking: continue these rows of the previous chunk, the last ones of its --normalized-out (float32 "
       ".npy). vla inspect says whether the policy is guided by them or in-paints");
-  command->add_option("--delay", options->delay, "With --leftover: how many of its rows are executed meanwhile")
+  command
+      ->add_option("--delay", options->delay,
+                   "With --leftover: how many of its rows will be executed before the new chunk arrives")
       ->type_name("N");
   command
       ->add_option("--schedule", options->schedule,

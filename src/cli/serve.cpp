@@ -160,7 +160,7 @@ Command add_serve(CLI::App& app) {
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();
-  command->add_option("--max-pixels", server.max_pixels, "Most pixels that the images of an act have together")
+  command->add_option("--max-pixels", server.max_pixels, "Largest number of pixels of all images of an act together")
       ->check(CLI::Range(1, 1 << 28))
       ->capture_default_str();
   command->add_option("--max-text", server.max_text, "Longest instruction, in bytes")
@@ -169,14 +169,16 @@ Command add_serve(CLI::App& app) {
   command->add_option("--queue", server.max_queue, "Acts that may wait, one for each client; further ones are refused")
       ->check(CLI::Range(1, 4096))
       ->capture_default_str();
-  command->add_option("--connections", server.max_connections, "Connections at once; the longest idle one makes room")
+  command
+      ->add_option("--connections", server.max_connections,
+                   "Largest number of connections; the longest idle one is closed for a new one")
       ->check(CLI::Range(1, 65536))
       ->capture_default_str();
   command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   command->add_flag("--insecure", server.insecure, "Allow addresses that other machines reach, without keys");
   command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")
       ->check(CLI::ExistingFile);
-  command->add_option("--curve-clients", server.curve_clients, "Public keys of the clients that are let in, one a line")
+  command->add_option("--curve-clients", server.curve_clients, "Public keys of the admitted clients, one per line")
       ->check(CLI::ExistingFile);
   add_watch_options(*command, options->watch);
   command

@@ -27,14 +27,14 @@ Level level_of(const WatchOptions& options) {
 void add_watch_options(CLI::App& command, WatchOptions& options) {
   add_text(command, "--metrics", options.metrics, "ADDRESS:PORT",
            "HTTP: /metrics (Prometheus), /healthz, /readyz; port 0 takes a free one");
-  command.add_option("--log", options.log, "Form of the log on standard error: text or json")
+  command.add_option("--log", options.log, "Format of the log on standard error: text or json")
       ->check(CLI::IsMember({"text", "json"}));
   command.add_option("--log-level", options.level, "debug (every request), info (default with --log), warn, error")
       ->check(CLI::IsMember({"debug", "info", "warn", "error"}));
   add_text(command, "--trace", options.trace, "FILE",
            "Write a trace of requests and stages for Perfetto, a .json file");
   add_text(command, "--record", options.record, "DIR", "Keep requests and answers in this folder, for vla replay");
-  command.add_option("--record-limit", options.record_limit_mb, "Most that is kept, in MB")
+  command.add_option("--record-limit", options.record_limit_mb, "Largest size of the recording, in MB")
       ->check(CLI::Range(1, 1 << 20))
       ->capture_default_str();
 }

@@ -259,7 +259,7 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
       if (other.get() == chosen) return other->run(observation, noise, leftover);
     return run(observation, noise, leftover);
   } catch (const std::bad_alloc&) {
-    return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};  // texts that take none themselves
+    return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};  // strings short enough to need none
   }
 }
 

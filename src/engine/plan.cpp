@@ -9,8 +9,8 @@
 namespace vla {
 namespace {
 
-/// Memory that all plans of an engine together may take. A robot uses a few instructions of a few lengths; the limit is
-/// for the others.
+/// Memory that all plans of an engine together may take. A robot uses a few instructions of a few lengths; the limit
+/// bounds clients that send many.
 constexpr std::size_t kMaxPlanBytes = std::size_t{256} << 20;
 
 TapFilter prefix_filter(const std::string& pattern) {

@@ -58,8 +58,8 @@ double ms(Clock::duration time) { return std::chrono::duration<double, std::mill
 
 }  // namespace
 
-Log::Log(int fd, LogFormat format, Level least)
-    : format_(format), least_(least), writer_(fd, Writer::Owns::no, kMaxWaiting) {}
+Log::Log(int fd, LogFormat format, Level min_level)
+    : format_(format), min_level_(min_level), writer_(fd, Writer::Owns::no, kMaxWaiting) {}
 
 Log::~Log() {
   if (writer_.n_dropped() > n_told_)
@@ -78,7 +78,7 @@ std::string Log::line(Level level, const char* name, const Fields& fields) const
 }
 
 void Log::event(Level level, const char* name, const Fields& fields) noexcept {
-  if (level < least_) return;
+  if (level < min_level_) return;
   try {
     const std::uint64_t dropped = writer_.n_dropped();
     const std::uint64_t told = n_told_.exchange(dropped);
@@ -90,7 +90,7 @@ void Log::event(Level level, const char* name, const Fields& fields) noexcept {
 
 void Log::answered(const Answered& answered) {
   const Level level = level_of(answered.error);
-  if (level < least_) return;
+  if (level < min_level_) return;
   const Received& request = answered.request;
   try {
     Fields fields = {{"client", request.client},
@@ -118,7 +118,7 @@ void Log::answered(const Answered& answered) {
 /// A peer without a key or without ZMTP is a warning; a peer that fell silent is normal.
 void Log::dropped(const Dropped& connection) {
   const Level level = connection.why == "silent" ? Level::info : Level::warn;
-  if (level < least_) return;
+  if (level < min_level_) return;
   try {
     event(level, "dropped",
           {{"client", connection.client},

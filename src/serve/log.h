@@ -28,8 +28,8 @@ class Log final : public Observer {
     std::string name, json;
   };
   using Fields = std::vector<Field>;
-  /// Writes events of at least `least` to `fd`, which stays open.
-  Log(int fd, LogFormat format, Level least);
+  /// Writes events of at least `min_level` to `fd`, which stays open.
+  Log(int fd, LogFormat format, Level min_level);
   ~Log() override;
 
   /// From any thread.
@@ -43,7 +43,7 @@ class Log final : public Observer {
   std::string line(Level level, const char* name, const Fields& fields) const;
 
   LogFormat format_;
-  Level least_;
+  Level min_level_;
   Writer writer_;
   std::atomic<std::uint64_t> n_told_ = 0;  // of the lines that were dropped
 };

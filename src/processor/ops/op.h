@@ -13,9 +13,8 @@
 #include "processor/names.h"
 
 /// The kinds of ops of a recipe. An op is read from its fields, checked against the bundle once, and applied to every
-/// observation or chunk. Each file of this folder holds an op, or a few that are close kin, and names them in a
-/// function
-/// `<file>_ops()`; the build puts these functions into one table (src/CMakeLists.txt).
+/// observation or chunk. Each file of this folder holds an op, or a few that are closely related, and names them
+/// in a function `<file>_ops()`; the build puts these functions into one table (src/CMakeLists.txt).
 namespace vla {
 
 struct Recipe;
