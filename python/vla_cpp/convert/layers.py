@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from typing import Dict, List
+from typing import Dict, List, NamedTuple, Sequence
 
 from .archs import MATRIX, SCALE, TABLE, TERNARY, VECTOR, Weight
 
@@ -31,42 +31,67 @@ def norm(target: str, source: str, size: int) -> List[Weight]:
     return vector(target + ".weight", source + ".weight", size) + vector(target + ".bias", source + ".bias", size)
 
 
+class EncoderNames(NamedTuple):
+    """Parts of a layer. `qkv`: three names, or a single one that ends before "weight" where their rows are stacked. `scales`: LayerScale."""
+
+    norms: Sequence[str]
+    qkv: Sequence[str]
+    out: str
+    up: str
+    down: str
+    scales: Sequence[str] = ()
+
+
+def encoder_block(target: str, block: str, names: EncoderNames, d: int, d_ff: int, product=linear) -> List[Weight]:
+    """`product`: the kind of its matrices."""
+
+    def branch(i: int, part: str, rows: List[Weight]) -> List[Weight]:
+        scale = vector(target + part + "_scale.weight", block + names.scales[i], d) if names.scales else []
+        return [*norm(target + part + "_norm", block + names.norms[i], d), *rows, *scale]
+
+    qkv = stacked(target, block + names.qkv[0], d) if len(names.qkv) == 1 else [
+        row for part, name in zip("qkv", names.qkv) for row in product(target + "attn_" + part, block + name, d, d, bias=True)
+    ]
+    up = product(target + "ffn_up", block + names.up, d_ff, d, bias=True)
+    return [
+        *branch(0, "attn", [*qkv, *product(target + "attn_out", block + names.out, d, d, bias=True)]),
+        *branch(1, "ffn", [*up, *product(target + "ffn_down", block + names.down, d, d_ff, bias=True)]),
+    ]
+
+
+def stacked(target: str, source: str, d: int) -> List[Weight]:
+    """q, k and v of width d as thirds of the rows of one matrix and one bias."""
+    rows: List[Weight] = []
+    for i, part in enumerate(("attn_q", "attn_k", "attn_v")):
+        rows += [
+            Weight(target + part + ".weight", source + "weight", MATRIX, (3 * d, d), (d, d), first=i * d),
+            Weight(target + part + ".bias", source + "bias", VECTOR, (3 * d,), (d,), first=i * d),
+        ]
+    return rows
+
+
+SIGLIP = EncoderNames(
+    ("layer_norm1", "layer_norm2"),
+    tuple("self_attn.{}_proj".format(part) for part in "qkv"),
+    "self_attn.out_proj",
+    "mlp.fc1",
+    "mlp.fc2",
+)
+
+
 def siglip(
     source: str, d: int, d_ff: int, n_layer: int, patch_size: int, n_position: int, product=linear, post_norm: bool = True
 ) -> List[Weight]:
     """The tower below `source`, which ends in a dot, as `vision.*`. `product`: the kind of its blocks' matrices."""
-    pixels = 3 * patch_size**2
+    patches, table = source + "embeddings.patch_embedding", (n_position, d)
     rows = [
         # A convolution whose stride is its kernel is a matrix over the flattened patch: channel, row, column.
-        Weight(
-            "vision.patch_embed.weight",
-            source + "embeddings.patch_embedding.weight",
-            MATRIX,
-            (d, 3, patch_size, patch_size),
-            (d, pixels),
-        ),
-        *vector("vision.patch_embed.bias", source + "embeddings.patch_embedding.bias", d),
-        Weight(
-            "vision.position.weight",
-            source + "embeddings.position_embedding.weight",
-            TABLE,
-            (n_position, d),
-            (n_position, d),
-        ),
+        Weight("vision.patch_embed.weight", patches + ".weight", MATRIX, (d, 3, patch_size, patch_size), (d, 3 * patch_size**2)),
+        *vector("vision.patch_embed.bias", patches + ".bias", d),
+        Weight("vision.position.weight", source + "embeddings.position_embedding.weight", TABLE, table, table),
     ]
     for i in range(n_layer):
-        target, block = "vision.blk.{}.".format(i), "{}encoder.layers.{}.".format(source, i)
-        rows += norm(target + "attn_norm", block + "layer_norm1", d)
-        for ours, theirs in (
-            ("attn_q", "q_proj"),
-            ("attn_k", "k_proj"),
-            ("attn_v", "v_proj"),
-            ("attn_out", "out_proj"),
-        ):
-            rows += product(target + ours, block + "self_attn." + theirs, d, d, bias=True)
-        rows += norm(target + "ffn_norm", block + "layer_norm2", d)
-        rows += product(target + "ffn_up", block + "mlp.fc1", d_ff, d, bias=True)
-        rows += product(target + "ffn_down", block + "mlp.fc2", d, d_ff, bias=True)
+        rows += encoder_block("vision.blk.{}.".format(i), "{}encoder.layers.{}.".format(source, i), SIGLIP, d, d_ff, product)
     return rows + (norm("vision.post_norm", source + "post_layernorm", d) if post_norm else [])
 
 

@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, List, Mapping, NamedTuple, Sequence, Union
+from typing import Dict, List, Mapping, Union
 
-from .archs import MATRIX, TABLE, VECTOR, Dropped, Weight
+from .archs import TABLE, Dropped, Weight
 from .bundle import Key, keys_by_type
-from .layers import KEPT_OF_LAST, gated_block, linear, norm, vector
+from .layers import KEPT_OF_LAST, gated_block, vector
 from .section import Section
 
 MAX_LAYERS = 1024
@@ -111,6 +111,23 @@ def read_language(section: Section) -> Language:
     )
 
 
+def check_heads(section: Section, lm: Language) -> None:
+    """Heads must share the width evenly, and be pairs for the rotary embedding."""
+    if lm.d_model % lm.n_head or lm.n_head % lm.n_head_kv or lm.d_model // lm.n_head % 2:
+        expected = "heads of an even width that divide hidden_size {}, in whole groups".format(lm.d_model)
+        section.bad("num_attention_heads", expected)
+
+
+def pooling_head(tower: str, vision: Vision, reason: str) -> List[Dropped]:
+    """Of a SigLIP tower, which no policy reads. `tower`: where it stands, up to the dot."""
+    d = vision.d_model
+    shapes = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
+    for name, d_out, d_in in (("attention.out_proj", d, d), ("mlp.fc1", vision.d_ff, d), ("mlp.fc2", d, vision.d_ff)):
+        shapes.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
+    shapes.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
+    return [Dropped("{}head.{}".format(tower, name), shape, reason) for name, shape in shapes.items()]
+
+
 def plus_one(weights: List[Weight]) -> List[Weight]:
     """Norms of Gemma."""
     return [weight._replace(plus_one=True) for weight in weights]
@@ -152,40 +169,3 @@ def dropped_of_last(lm: Language, source: str) -> List[Dropped]:
         Dropped(source + "norm.weight", (lm.d_model,), "the prefix leaves only keys and values"),
         *(Dropped(weight.source, weight.stored, reason) for weight in rest),
     ]
-
-
-class EncoderNames(NamedTuple):
-    """Parts of a layer. `qkv`: three names, or a single one that ends before "weight" where their rows are stacked. `scales`: LayerScale."""
-
-    norms: Sequence[str]
-    qkv: Sequence[str]
-    out: str
-    up: str
-    down: str
-    scales: Sequence[str] = ()
-
-
-def encoder_block(target: str, block: str, names: EncoderNames, d: int, d_ff: int) -> List[Weight]:
-    def branch(i: int, part: str, rows: List[Weight]) -> List[Weight]:
-        scale = vector(target + part + "_scale.weight", block + names.scales[i], d) if names.scales else []
-        return [*norm(target + part + "_norm", block + names.norms[i], d), *rows, *scale]
-
-    qkv = stacked(target, block + names.qkv[0], d) if len(names.qkv) == 1 else [
-        row for part, name in zip("qkv", names.qkv) for row in linear(target + "attn_" + part, block + name, d, d, bias=True)
-    ]
-    up = linear(target + "ffn_up", block + names.up, d_ff, d, bias=True)
-    return [
-        *branch(0, "attn", [*qkv, *linear(target + "attn_out", block + names.out, d, d, bias=True)]),
-        *branch(1, "ffn", [*up, *linear(target + "ffn_down", block + names.down, d, d_ff, bias=True)]),
-    ]
-
-
-def stacked(target: str, source: str, d: int) -> List[Weight]:
-    """q, k and v of width d as thirds of the rows of one matrix and one bias."""
-    rows: List[Weight] = []
-    for i, part in enumerate(("attn_q", "attn_k", "attn_v")):
-        rows += [
-            Weight(target + part + ".weight", source + "weight", MATRIX, (3 * d, d), (d, d), first=i * d),
-            Weight(target + part + ".bias", source + "bias", VECTOR, (3 * d,), (d,), first=i * d),
-        ]
-    return rows

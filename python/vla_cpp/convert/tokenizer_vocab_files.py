@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from typing import List
 
-from .errors import Problems, refuse
+from .errors import Problems
 from .files import member, read_json, read_text
 from .tokenizer_byte_level import QWEN2, QWEN2_WORDS, SPLITS
 from .tokenizer_parts import CONFIG_FILE

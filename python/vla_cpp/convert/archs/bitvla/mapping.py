@@ -16,7 +16,7 @@ from ...bundle import Key
 from ...errors import Problems
 from ...files import member
 from ...layers import gated_block, linear, norm, siglip, ternary, vector
-from ...networks import Language, Vision, embedding, keys_of, read_language, read_vision
+from ...networks import Language, Vision, check_heads, embedding, keys_of, pooling_head, read_language, read_vision
 from ...section import Fixed, Section
 from .. import Dropped, Weight
 
@@ -105,9 +105,7 @@ def _read_text(text: Section, s: Sizes) -> None:
     text.refuse_unknown({*TEXT, *TEXT_FIXED, *IGNORED})
     s.lm, s.n_context = read_language(text), text.count("max_position_embeddings")
     s.lm.rope_base, s.lm.d_head = text.number("rope_theta"), s.lm.d_model // s.lm.n_head
-    if s.lm.d_model % s.lm.n_head or s.lm.n_head % s.lm.n_head_kv or s.lm.d_head % 2:
-        expected = "heads of an even width that divide hidden_size {}, in whole groups".format(s.lm.d_model)
-        text.bad("num_attention_heads", expected)
+    check_heads(text, s.lm)
     _check_widths(text, s.lm)
 
 
@@ -187,10 +185,6 @@ def dropped(s: Sizes) -> List[Dropped]:
     v, d, unread = s.vision, s.vision.d_model, "features are read in front of it"
     kept = len(_vision(v, v.n_layer))
     rows = [Dropped(row.source, row.stored, unread) for row in _vision(v, s.n_stored_layer)[kept:]]
-    shapes = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
-    for name, d_out, d_in in (("attention.out_proj", d, d), ("mlp.fc1", v.d_ff, d), ("mlp.fc2", d, v.d_ff)):
-        shapes.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
-    shapes.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
-    rows += [Dropped("{}head.{}".format(TOWER, name), shape, unread) for name, shape in shapes.items()]
+    rows += pooling_head(TOWER, v, unread)
     rows += [Dropped("{}post_layernorm.{}".format(TOWER, part), (d,), unread) for part in ("weight", "bias")]
     return rows + [Dropped("language_model.lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "no action depends on the language head")]

@@ -15,8 +15,8 @@ from typing import List, NamedTuple, Sequence
 from ...bundle import Key
 from ...errors import Problems
 from ...files import member
-from ...layers import linear, norm, vector
-from ...networks import EncoderNames, Language, Vision, embedding, encoder_block, keys_of, language_block, read_language, read_vision
+from ...layers import EncoderNames, encoder_block, linear, norm, vector
+from ...networks import Language, Vision, check_heads, embedding, keys_of, language_block, read_language, read_vision
 from ...section import Fixed, Section
 from .. import MATRIX, TABLE, VECTOR, Weight
 
@@ -171,8 +171,7 @@ def _read_text(text: Section, s: Sizes) -> None:
     text.check_fixed(TEXT_FIXED)
     s.lm = lm = read_language(text)
     lm.n_layer, d_head = min(s.n_layer, lm.n_layer), lm.d_model // lm.n_head
-    if lm.d_model % lm.n_head or lm.n_head % lm.n_head_kv or d_head % 2:
-        text.bad("num_attention_heads", "heads of an even width that divide hidden_size {}, in whole groups".format(lm.d_model))
+    check_heads(text, lm)
     if lm.d_head != d_head:
         text.bad("head_dim", "{}, hidden_size by heads".format(d_head), unsupported=True)
     kinds = text.get("layer_types")

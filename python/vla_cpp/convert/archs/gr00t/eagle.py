@@ -16,7 +16,7 @@ from ...ascii_bpe import special_ids
 from ...errors import Problems
 from ...files import member, read_json
 from ...layers import linear, norm, siglip, vector
-from ...networks import read_vision
+from ...networks import pooling_head, read_vision
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
 from .. import MATRIX, Dropped, Weight
@@ -149,28 +149,13 @@ class Eagle:
         ]
 
     def dropped(self, s: Sizes) -> List[Dropped]:
-        head, d = self.root + "vision_model.vision_model.head.", s.vision.d_model
-        pool = {"probe": (1, 1, d), "attention.in_proj_weight": (3 * d, d), "attention.in_proj_bias": (3 * d,)}
-        for name, d_out, d_in in (
-            ("attention.out_proj", d, d),
-            ("mlp.fc1", s.vision.d_ff, d),
-            ("mlp.fc2", d, s.vision.d_ff),
-        ):
-            pool.update({name + ".weight": (d_out, d_in), name + ".bias": (d_out,)})
-        pool.update({"layernorm.weight": (d,), "layernorm.bias": (d,)})
-        rows = [Dropped(head + name, shape, "pooling head of the tower") for name, shape in pool.items()]
+        rows = pooling_head(self.root + "vision_model.vision_model.", s.vision, "pooling head of the tower")
         lm_head = Dropped(self.root + "language_model.lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "language head")
         mask = Dropped("action_head.mask_token", (1, 1, s.d_dit), "stands for the state in training")
         return [*rows, lm_head, mask]
 
     def keys(self, s: Sizes) -> Dict[str, Dict[str, object]]:
-        u32 = {
-            "vision.d_model": s.vision.d_model,
-            "vision.n_layer": s.vision.n_layer,
-            "vision.n_head": s.vision.n_head,
-            "vision.d_ff": s.vision.d_ff,
-            "vision.patch_size": s.vision.patch_size,
-        }
+        u32 = s.vision_keys()
         if self.merge == 1:
             u32["vision.image_size"] = s.image_width
             return {

@@ -14,8 +14,8 @@ from typing import Dict, List
 from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
 from ...files import member, read_json, read_text
-from ...layers import linear, norm, vector
-from ...networks import MAX_LAYERS, EncoderNames, encoder_block
+from ...layers import EncoderNames, encoder_block, linear, norm, vector
+from ...networks import MAX_LAYERS
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
 from .. import MATRIX, TABLE, Dropped, Weight
@@ -184,11 +184,7 @@ def _vision(s: Sizes) -> List[Weight]:
 
 def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
     u32 = {
-        "vision.d_model": s.vision.d_model,
-        "vision.n_layer": s.vision.n_layer,
-        "vision.n_head": s.vision.n_head,
-        "vision.d_ff": s.vision.d_ff,
-        "vision.patch_size": s.vision.patch_size,
+        **s.vision_keys(),
         "vision.image_width": s.image_width,
         "vision.image_height": s.image_height,
         "vision.n_position_side": s.n_position_side,

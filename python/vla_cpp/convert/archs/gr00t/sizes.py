@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import List, Optional
+from typing import Dict, List, Optional
 
 from ...networks import Language, Vision
 
@@ -54,6 +54,10 @@ class Sizes:
     @property
     def d_dit_ff(self) -> int:
         return 4 * self.d_dit
+
+    def vision_keys(self) -> Dict[str, object]:
+        """What the towers of all releases have."""
+        return {"vision." + name: getattr(self.vision, name) for name in ("d_model", "n_layer", "n_head", "d_ff", "patch_size")}
 
     @property
     def n_view_token(self) -> int:
