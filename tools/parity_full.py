@@ -74,8 +74,6 @@ def child(command):
 def run_vla(vla, case, bundle, pattern, taps_file, threads, inject=None):
     """(taps that match the pattern and the actions, milliseconds by stage, peak bytes) of `vla run` on a case.  `inject`: a file of
     values that it goes on from."""
-    import gguf
-
     observation = json.loads((case / "observation.json").read_text())
     command = [vla, "run", bundle, "--json", "--kernels", "float32", "--threads", threads, "--noise", case / "noise.npy"]
     for view, file in observation["images"].items():
@@ -87,7 +85,7 @@ def run_vla(vla, case, bundle, pattern, taps_file, threads, inject=None):
     command += ["--inject", inject] if inject else []
     out, peak = child(command)
     answer = json.loads(out.splitlines()[-1])
-    taps = {t.name: np.array(t.data) for t in gguf.GGUFReader(str(taps_file)).tensors}
+    taps = recorder.read_taps(taps_file)
     timing = {k: v for k, v in answer["timing_ms"].items() if k not in ("load", "decode")}
     taps["actions"] = np.array(answer["actions"], dtype=np.float32)
     return taps, timing, peak

@@ -13,13 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from goldens.build import make
+from goldens.recorder import read_taps
 from parity_full import ROOT, distance, run_vla
-
-
-def read_taps(file):
-    import gguf
-
-    return {t.name: np.array(t.data) for t in gguf.GGUFReader(str(file)).tensors}
 
 
 def row(vla, case, taps_file):

@@ -231,7 +231,6 @@ def reference_pixels(arch, folder, frame):
 
 def run(vla, folder, case, state, frame, seed):
     """{tap: numbers} of one observation."""
-    import gguf
     from PIL import Image
 
     Image.fromarray(frame).save(folder / "frame.png")
@@ -240,7 +239,7 @@ def run(vla, folder, case, state, frame, seed):
     for key, x in state.items():
         command += ["--state", f"state.{key}=" + ",".join(repr(float(v)) for v in x)]
     subprocess.run(command, check=True, capture_output=True)
-    return {t.name: np.array(t.data) for t in gguf.GGUFReader(str(folder / "taps.gguf")).tensors}
+    return recorder.read_taps(folder / "taps.gguf")
 
 
 def off_by(ours, theirs):

@@ -30,7 +30,6 @@ from pathlib import Path
 import numpy as np
 from goldens import bitvla, cases, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, smolvla
 from parity_full import ROOT, distance, run_vla
-from vla_cpp.convert import cli
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
 MODES = ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY")
@@ -239,13 +238,12 @@ def run_reference(case, folder, low_bits=False):
 
 def run_runtime(vla, folder, dtype="f32"):
     """(taps, None), or (None, who refuses and why)."""
-    checkpoint, message = folder / "checkpoint", io.StringIO()
-    backbone = cases.backbone_folder(checkpoint)
-    with contextlib.redirect_stderr(message):
-        code = cli.main([str(checkpoint), *(["--backbone", str(backbone)] if backbone else []), "-o", str(folder / "bundle.gguf"),
-                         "--dtype", dtype, "--quiet", *cases.conversion_options(folder)])
-    if code:
-        return None, f"vla-convert ({code}): {message.getvalue().strip()[:200]}"
+    message = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(message):
+            cases.write_bundle(folder, dtype=dtype)
+    except SystemExit as stopped:
+        return None, f"vla-convert ({stopped.code}): {message.getvalue().strip()[:200]}"
     try:
         return run_vla(vla, folder, folder / "bundle.gguf", "*", folder / "taps.gguf", threads=1)[0], None
     except subprocess.CalledProcessError as error:

@@ -263,6 +263,13 @@ def write_taps(file, taps, kind="golden", **keys):
     writer.close()
 
 
+def read_taps(file):
+    """What `write_taps` or `vla run --taps-out` wrote."""
+    import gguf
+
+    return {t.name: np.array(t.data) for t in gguf.GGUFReader(str(file)).tensors}
+
+
 def write_expected(case, seed, out):
     """Writes `expected.gguf` into the folder `out`; returns what went into it."""
     taps = run_case(case)

@@ -9,7 +9,7 @@ of its policies/rtc, or for GR00T N1.7 `chunk`, which the head in-paints itself.
 import numpy as np
 
 from .draw import Generator
-from .recorder import load, read_observation, write_taps
+from .recorder import load, read_observation, read_taps, write_taps
 
 SCHEDULES = ("linear", "exp", "ones", "zeros")
 N_ROW, DELAY, MAX_GUIDANCE = 4, 2, 5.0
@@ -51,9 +51,7 @@ def settings(schedule, n_row):
 
 def write_leftover(case, seed, out):
     """`leftover.gguf` into the folder `out`; the rows are drawn from the seed."""
-    import gguf
-
-    recorded = {t.name: t.data for t in gguf.GGUFReader(case / "expected.gguf").tensors}["chunk"]
+    recorded = read_taps(case / "expected.gguf")["chunk"]
     previous = (Generator(seed + 7).normal(N_ROW, recorded.shape[1]) * np.float32(0.5)).astype(np.float32)
     schedules = (None,) if "gr00t" in case.parent.name else SCHEDULES
     chunks = {f"chunk.{schedule}" if schedule else "chunk": chunk_of(case, previous, schedule) for schedule in schedules}
