@@ -42,7 +42,7 @@ Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa) {
 std::string CpuDevice::name() const { return fmt::format("cpu, {} thread{}", n_thread(), n_thread() == 1 ? "" : "s"); }
 
 Status CpuDevice::load(const ParamList& params, bool fill) {
-  attention_isa_ = attention_isa_for(params, isa_);
+  min_rounded_keys_ = min_rounded_keys(params);
   isa_ = isa_for(params, isa_);
   VLA_TRY(weights_, CpuWeights::load(params, isa_, n_thread(), fill));
   return {};
@@ -66,7 +66,7 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
   VLA_CHECK(check_attention(graph));
-  Lowering l = {graph, options, weights_, isa_, attention_isa_, n_thread(), {}, {}, {}, {}, {}, 0, 0, 0, 0};
+  Lowering l = {graph, options, weights_, isa_, min_rounded_keys_, n_thread(), {}, {}, {}, {}, {}, 0, 0, 0, 0};
   start(l);
   fuse(l);
   choose_layouts(l);

@@ -34,9 +34,10 @@ class CpuDevice final : public Device {
   void touch() override;
 
  private:
-  explicit CpuDevice(Isa isa) : isa_(isa), attention_isa_(isa) {}
+  explicit CpuDevice(Isa isa) : isa_(isa) {}
 
-  Isa isa_, attention_isa_;
+  Isa isa_;
+  std::int64_t min_rounded_keys_ = 0;
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<KindClock> clock_ = std::make_shared<KindClock>();
   CpuWeights weights_;

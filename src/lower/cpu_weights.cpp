@@ -26,10 +26,10 @@ Isa isa_for(const ParamList& list, Isa isa) {
   return has_matrix ? isa : without_rounding(isa);
 }
 
-Isa attention_isa_for(const ParamList& list, Isa isa) {
-  for (const Param& param : list.params())
-    if (param.storage == Storage::ternary) return without_rounding(isa);
-  return isa_for(list, isa);
+std::int64_t min_rounded_keys(const ParamList& list) {
+  const auto& params = list.params();
+  const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
+  return std::any_of(params.begin(), params.end(), is_ternary) ? 512 : 128;
 }
 
 namespace lower {

@@ -215,7 +215,7 @@ class Fuser {
     const std::size_t first = has_mask ? 2 : 1;
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
-    const Isa isa = n_key < kMinRoundedKeys ? without_rounding(l.isa) : l.attention_isa;
+    const Isa isa = n_key < l.min_rounded_keys ? without_rounding(l.isa) : l.isa;
     AttentionOp op = {&node, prepared(node.in[0]), isa};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;

@@ -110,7 +110,8 @@ struct Lowering {
   const Graph& graph;
   const LowerOptions& options;
   const CpuWeights& weights;
-  Isa isa, attention_isa;
+  Isa isa;
+  std::int64_t min_rounded_keys;
   int n_thread;
 
   std::vector<Value> values;

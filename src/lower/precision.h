@@ -12,12 +12,9 @@ namespace vla {
 /// none at all, makes everything float32.
 Isa isa_for(const ParamList& list, Isa isa);
 
-/// The same for attention. Between ternary products it rounds nothing: a number that is rounded before it is quantized
-/// may get another code, which is an error of a hundredth and more of a row's greatest.
-Isa attention_isa_for(const ParamList& list, Isa isa);
-
 /// Attention over fewer keys rounds nothing on any machine: it takes little time, and each output mixes so few values
-/// that their errors hardly cancel.
-constexpr std::int64_t kMinRoundedKeys = 128;
+/// that their errors hardly cancel. Between ternary products they must cancel better: a number that is rounded before
+/// it is quantized may get another code, which is an error of a hundredth and more of a row's greatest.
+std::int64_t min_rounded_keys(const ParamList& list);
 
 }  // namespace vla

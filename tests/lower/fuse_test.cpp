@@ -109,7 +109,7 @@ TEST_CASE("attention over few keys rounds nothing, and shares no packed keys wit
   const LowerParams params(DType::bf16);
   GraphRunner runner(params.list(), "avx512_bf16");
   Graph& g = runner.graph;
-  const int n = kMinRoundedKeys - 1;
+  const int n = static_cast<int>(min_rounded_keys(params.list())) - 1;
   const Tensor q = input(runner, {8, 3, 2, 1}), k = input(runner, {8, 3, n, 1}), one = input(runner, {8, 3, 1, 1});
   g.name("result", add(g, attention(g, q, {{k, k}}, {}), attention(g, q, {{k, k}, {one, one}}, {})));
   const std::string text = runner.lower().text();
