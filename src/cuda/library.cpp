@@ -12,18 +12,31 @@
 
 namespace {
 
+std::string version_text(int version) {
+  return std::to_string(version / 1000) + "." + std::to_string(version % 1000 / 10);
+}
+
 ggml_backend_reg_t open() {
-  int driver = 0, n_device = 0;
-  if (cudaDriverGetVersion(&driver) != cudaSuccess || driver == 0) return nullptr;
+  int version = 0, n_device = 0;
+  if (cudaDriverGetVersion(&version) != cudaSuccess || version == 0) return nullptr;
   const cudaError_t found = cudaGetDeviceCount(&n_device);
   if (found == cudaSuccess) return ggml_backend_cuda_reg();
-  throw std::runtime_error(std::string(cudaGetErrorString(found)) + " (a driver for CUDA " +
-                           std::to_string(driver / 1000) + "." + std::to_string(driver % 1000 / 10) + ")");
+  throw std::runtime_error(std::string(cudaGetErrorString(found)) + " (a driver for CUDA " + version_text(version) +
+                           ")");
+}
+
+const char* driver(ggml_backend_dev_t) {
+  thread_local std::string text;
+  int newest = 0, runtime = 0;
+  cudaDriverGetVersion(&newest);
+  cudaRuntimeGetVersion(&runtime);
+  text = "driver for CUDA " + version_text(newest) + ", runtime " + version_text(runtime);
+  return text.c_str();
 }
 
 }  // namespace
 
 const vla::BackendLibrary* vla_backend_library() {
-  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback};
+  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback, driver};
   return &library;
 }

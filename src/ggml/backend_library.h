@@ -14,6 +14,7 @@ struct BackendLibrary {
   ggml_backend_reg_t (*open)();                             // null where the driver is missing
   void (*set_log)(ggml_log_callback callback, void* data);  // of the library's ggml, as is the next
   ggml_abort_callback_t (*set_abort)(ggml_abort_callback_t callback);
+  const char* (*driver)(ggml_backend_dev_t device);  // its name and version; valid until this thread's next call
 };
 
 constexpr const char* kBackendSymbol = "vla_backend_library";

@@ -46,6 +46,7 @@ std::vector<fs::path> library_folders() {
 struct Backend {
   ggml_backend_reg_t devices = nullptr;
   std::string absent;
+  const BackendLibrary* library = nullptr;
 };
 
 Backend open_library(const fs::path& file) {
@@ -61,6 +62,7 @@ Backend open_library(const fs::path& file) {
   Backend backend;
   if (const Status opened = guarded(file.string(), [&] { backend.devices = found->open(); }); !opened)
     return {nullptr, opened.error().found};
+  backend.library = found;
   if (backend.devices == nullptr)
     backend.absent = "no driver of it on this machine";
   else if (ggml_backend_reg_dev_count(backend.devices) == 0)
@@ -87,11 +89,15 @@ const Backend& backend(const std::string& kind) {
   return found[kind];
 }
 
-DeviceInfo describe(ggml_backend_reg_t devices, const DeviceName& name) {
-  ggml_backend_dev_t device = ggml_backend_reg_dev_get(devices, static_cast<std::size_t>(name.index));
+/// With driver and version, which a question about wrong numbers starts from.
+DeviceInfo describe(const Backend& found, const DeviceName& name) {
+  ggml_backend_dev_t device = ggml_backend_reg_dev_get(found.devices, static_cast<std::size_t>(name.index));
   DeviceInfo info = {name.text(), ggml_backend_dev_description(device), 0, 0, "f32"};
-  const Status told = guarded(info.name, [&] { ggml_backend_dev_memory(device, &info.free, &info.memory); });
-  if (!told) info.description += " (" + told.error().found + ")";
+  const Status told = guarded(info.name, [&] {
+    info.description += fmt::format("; {}", found.library->driver(device));
+    ggml_backend_dev_memory(device, &info.free, &info.memory);
+  });
+  if (!told) info.description += "; " + told.error().found;
   return info;
 }
 
@@ -128,7 +134,7 @@ DeviceList backend_devices() {
       continue;
     }
     const std::size_t n = ggml_backend_reg_dev_count(found.devices);
-    for (std::size_t i = 0; i < n; ++i) list.devices.push_back(describe(found.devices, {kind, static_cast<int>(i)}));
+    for (std::size_t i = 0; i < n; ++i) list.devices.push_back(describe(found, {kind, static_cast<int>(i)}));
   }
   return list;
 }

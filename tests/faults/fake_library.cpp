@@ -117,6 +117,7 @@ ggml_backend_reg_t open() {
 }  // namespace
 
 const vla::BackendLibrary* vla_backend_library() {
-  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback};
+  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback,
+                                              [](ggml_backend_dev_t) { return "driver fake 1.0"; }};
   return &library;
 }

@@ -203,7 +203,9 @@ def test_devices_are_listed_with_memory_and_precision(vla):
     listed = json.loads(vla("inspect", "--devices", "--json").out)
     gpu = next(device for device in listed["devices"] if device["name"] == f"{KIND}:0")
     assert listed["devices"][0]["name"] == "cpu" and gpu["products"] == "f32"
-    assert 0 < gpu["free_bytes"] <= gpu["memory_bytes"] and gpu["description"]
+    assert 0 < gpu["free_bytes"] <= gpu["memory_bytes"]
+    driver = {"vulkan": r"driver \S.*, Vulkan \d+\.\d+\.\d+", "cuda": r"driver for CUDA \d+\.\d+, runtime \d+\.\d+"}[KIND]
+    assert re.fullmatch(rf"\S.*; {driver}", gpu["description"]), gpu
 
 
 def test_a_number_beyond_the_devices_is_refused_with_the_list(vla, golden):
