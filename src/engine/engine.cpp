@@ -290,7 +290,6 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
   clock.lap(chunk.timing, "prefix");
   for (int k = 0; k < solver_.n_step; ++k) {
-    if (steering) plan->set_steering(*steering, k);
     VLA_CHECK(plan->run_step(k));
     plan->collect_step_taps(k, chunk.taps);
   }

@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include <numeric>
+
 #include "nn/tokens.h"
 
 namespace vla {
@@ -28,6 +30,16 @@ TapFilter step_filter(const std::string& pattern, int n_step) {
   };
 }
 
+/// The k of the step after this one: the device counts, so that nothing is uploaded between steps.
+Tensor after(Graph& g, Tensor k, int n_step) {
+  const Tensor table = g.constant_ids("next step", [n_step] {
+    std::vector<std::int32_t> next(static_cast<std::size_t>(n_step));
+    std::iota(next.begin(), next.end() - 1, 1);  // none follows the last
+    return next;
+  });
+  return column(g, g.add(op::Reshape{}, {table}, {1, n_step, 1, 1}), k);
+}
+
 }  // namespace
 
 Plan::Plan(const PlanContext& context, const InputShape& shape)
@@ -39,16 +51,19 @@ Plan::Plan(const PlanContext& context, const InputShape& shape)
       x_(slots_.add_f32({context.d_action, context.horizon, 1, 1})),
       k_(slots_.add_i32({1, 1, 1, 1})),
       target_(shape.steered ? slots_.add_f32(x_->shape) : nullptr),
-      keep_(shape.steered ? slots_.add_f32({1, context.horizon, 1, 1}) : nullptr),
-      pull_(shape.steered ? slots_.add_f32({1, context.horizon, 1, 1}) : nullptr),
+      keep_(shape.steered ? slots_.add_f32({context.horizon, context.solver.n_step, 1, 1}) : nullptr),
+      pull_(shape.steered ? slots_.add_f32({context.horizon, context.solver.n_step, 1, 1}) : nullptr),
       views_(shape.views),
       cache_(context.constants),
       injection_(context.injected, slots_) {}
 
 /// v' = keep * v + pull * (x - target), row by row.
-Tensor Plan::steered(Graph& g, Tensor x, Tensor velocity) const {
+Tensor Plan::steered(Graph& g, Tensor x, Tensor k, Tensor velocity) const {
+  const auto of_rows = [&](const Slot* table) {
+    return g.add(op::Reshape{}, {column(g, g.input(table), k)}, {1, table->shape[0], 1, 1});
+  };
   const Tensor off = add(g, x, scale(g, g.input(target_), -1));
-  return add(g, multiply(g, velocity, g.input(keep_)), multiply(g, off, g.input(pull_)));
+  return add(g, multiply(g, velocity, of_rows(keep_)), multiply(g, off, of_rows(pull_)));
 }
 
 Status Plan::lower(const PlanContext& context) {
@@ -58,16 +73,16 @@ Status Plan::lower(const PlanContext& context) {
       prefix,
       {prefix.input(images_), prefix.input(tokens_), state_ != nullptr ? prefix.input(state_) : Tensor(), views_},
       cache_);
-  const Tensor x = step.input(x_);
-  const Tensor condition =
-      context.conditions != nullptr ? column(step, step.input(context.conditions), step.input(k_)) : Tensor();
+  const Tensor x = step.input(x_), k = step.input(k_);
+  const Tensor condition = context.conditions != nullptr ? column(step, step.input(context.conditions), k) : Tensor();
   Tensor answer = context.policy.velocity(step, x, condition, cache_);
   LowerOptions changing = {{x_, k_}};
   if (target_ != nullptr) {
-    answer = steered(step, x, answer);
+    answer = steered(step, x, k, answer);
     changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
   }
   step.write(step.name("x", context.solver.next(step, x, answer)), x_);
+  if (condition || target_ != nullptr) step.write(after(step, k, context.solver.n_step), k_);
 
   VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
@@ -93,14 +108,16 @@ void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());
 }
 
-void Plan::set_steering(const Steering& steering) {
-  device_.set(*target_, steering.target.data(), steering.target.size() * sizeof(float));
+void Plan::set_x(std::span<const float> x) {
+  constexpr std::int32_t kFirst = 0;
+  device_.set(*x_, x.data(), x.size_bytes());
+  device_.set(*k_, &kFirst, sizeof(kFirst));
 }
 
-void Plan::set_steering(const Steering& steering, int k) {
-  const auto n_row = static_cast<std::size_t>(keep_->shape[1]), first = static_cast<std::size_t>(k) * n_row;
-  device_.set(*keep_, &steering.keep[first], n_row * sizeof(float));
-  device_.set(*pull_, &steering.pull[first], n_row * sizeof(float));
+void Plan::set_steering(const Steering& steering) {
+  device_.set(*target_, steering.target.data(), steering.target.size() * sizeof(float));
+  device_.set(*keep_, steering.keep.data(), steering.keep.size() * sizeof(float));
+  device_.set(*pull_, steering.pull.data(), steering.pull.size() * sizeof(float));
 }
 
 Status Plan::run_prefix(std::vector<Tap>& taps) {
@@ -112,8 +129,6 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
 }
 
 Status Plan::run_step(int k) {
-  const std::int32_t index = k;
-  device_.set(*k_, &index, sizeof(index));
   if (k > 0) injection_.set(device_, k);
   return step_->run();
 }

@@ -38,15 +38,15 @@ class Plan {
   static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape);
 
   void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
-  void set_x(std::span<const float> x) { device_.set(*x_, x.data(), x.size_bytes()); }
+  /// Where the first step starts.
+  void set_x(std::span<const float> x);
   std::vector<float> x() const { return device_.get(*x_); }
-  /// Of a shape that is steered: before the first step, and before each.
+  /// Of a shape that is steered.
   void set_steering(const Steering& steering);
-  void set_steering(const Steering& steering, int k);
 
   /// Fills the cache, appends what was recorded on the way, and computes what the steps need of the cache alone.
   Status run_prefix(std::vector<Tap>& taps);
-  /// Solver step k: x <- the solver's next x.
+  /// Solver step k, which follows step k - 1: x <- the solver's next x.
   Status run_step(int k);
 
   /// The stages that the policy's prefix names, with the times of the last run.
@@ -66,13 +66,14 @@ class Plan {
  private:
   Plan(const PlanContext& context, const InputShape& shape);
   Status lower(const PlanContext& context);
-  Tensor steered(Graph& step, Tensor x, Tensor velocity) const;
+  Tensor steered(Graph& step, Tensor x, Tensor k, Tensor velocity) const;
 
   std::string tap_pattern_;
   Device& device_;
   Slots slots_;
-  Slot *images_, *tokens_, *state_, *x_, *k_;  // state may be null
-  Slot *target_, *keep_, *pull_;               // null where nothing is steered
+  // What an act sets, side by side in the order in which it does: one upload. The state may be null; the last three are
+  // null where nothing is steered.
+  Slot *images_, *tokens_, *state_, *x_, *k_, *target_, *keep_, *pull_;
   std::uint32_t views_;
   Cache cache_;
   Injection injection_;

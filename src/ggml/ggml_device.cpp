@@ -6,6 +6,7 @@
 #include <ggml-cpu.h>
 
 #include <atomic>
+#include <cstring>
 #include <vector>
 
 #include "ggml/ggml_program.h"
@@ -145,11 +146,67 @@ Status GgmlDevice::allocate(Slots& slots) {
   });
 }
 
+/// Memory of the host from which the device takes what is uploaded, of the driver's own kind where it has one. Null
+/// where there is none.
+std::byte* GgmlDevice::staging(std::size_t size) {
+  ggml_backend_buffer_ptr& staging = held_->staging;
+  if (staging != nullptr && size <= ggml_backend_buffer_get_size(staging.get()))
+    return static_cast<std::byte*>(ggml_backend_buffer_get_base(staging.get()));
+  ggml_backend_dev_t device = ggml_backend_get_device(backend());
+  ggml_backend_buffer_type_t type = ggml_backend_dev_host_buffer_type(device);
+  if (type == nullptr) type = ggml_backend_cpu_buffer_type();
+  ggml_backend_buffer_ptr larger;
+  const Status done = guarded([&] {
+    larger.reset(ggml_backend_buft_alloc_buffer(type, size));
+    if (larger == nullptr) throw std::bad_alloc();
+  });
+  if (!done) return nullptr;
+  void* to = ggml_backend_buffer_get_base(larger.get());
+  if (!uploads_.empty())
+    std::memcpy(to, ggml_backend_buffer_get_base(staging.get()), uploads_.back().begin + uploads_.back().size);
+  staging.swap(larger);
+  return static_cast<std::byte*>(to);
+}
+
 void GgmlDevice::set(const Slot& slot, const void* data, std::size_t size) {
-  static_cast<void>(guarded([&] { ggml_backend_tensor_set(static_cast<ggml_tensor*>(slot.place), data, 0, size); }));
+  if (failure_) return;
+  const auto* tensor = static_cast<const ggml_tensor*>(slot.place);
+  std::size_t begin = 0;
+  bool follows = false;  // the last one, but for the bytes that align it
+  if (!uploads_.empty()) {
+    const Upload& last = uploads_.back();
+    const auto distance = static_cast<std::size_t>(static_cast<const std::byte*>(tensor->data) -
+                                                   static_cast<const std::byte*>(last.first->data));
+    begin = last.begin + last.size;
+    follows = tensor->buffer == last.first->buffer && distance >= last.size &&
+              distance - last.size < ggml_backend_buft_get_alignment(memory().type());
+    if (follows) begin = last.begin + distance;
+  }
+  std::byte* to = staging(begin + size);
+  if (to == nullptr) return;
+  std::memcpy(to + begin, data, size);
+  if (!follows) uploads_.push_back({tensor, begin, 0});
+  uploads_.back().size = begin + size - uploads_.back().begin;
+}
+
+/// Uploads what was set.
+Status GgmlDevice::flush() const {
+  const Status done = guarded([&] {
+    for (const Upload& upload : uploads_) {
+      ggml_tensor bytes = *upload.first;
+      bytes.type = GGML_TYPE_I8;
+      bytes.ne[0] = static_cast<std::int64_t>(upload.size), bytes.ne[1] = bytes.ne[2] = bytes.ne[3] = 1;
+      bytes.nb[0] = 1, bytes.nb[1] = bytes.nb[2] = bytes.nb[3] = upload.size;
+      const void* base = ggml_backend_buffer_get_base(held_->staging.get());
+      ggml_backend_tensor_set(&bytes, static_cast<const std::byte*>(base) + upload.begin, 0, upload.size);
+    }
+  });
+  uploads_.clear();
+  return done;
 }
 
 void GgmlDevice::get(const Slot& slot, void* data, std::size_t size) const {
+  static_cast<void>(flush());
   static_cast<void>(
       guarded([&] { ggml_backend_tensor_get(static_cast<const ggml_tensor*>(slot.place), data, 0, size); }));
 }
@@ -157,6 +214,7 @@ void GgmlDevice::get(const Slot& slot, void* data, std::size_t size) const {
 Status GgmlDevice::failure() const { return failure_ ? Status(*failure_) : Status(); }
 
 Status GgmlDevice::compute(ggml_cgraph* graph) {
+  VLA_CHECK(flush());
   ggml_status status = GGML_STATUS_FAILED;
   const auto run = [&] { status = ggml_backend_graph_compute(backend(), graph); };
   if (held_->pool) {

@@ -67,6 +67,14 @@ class GgmlDevice final : public Device {
     std::shared_ptr<ggml_gallocr> places;
     std::size_t size;
   };
+  /// Bytes for slots that lie side by side, on their way to the device.
+  struct Upload {
+    const ggml_tensor* first;
+    std::size_t begin, size;  // in `Held::staging`
+  };
+  std::byte* staging(std::size_t size);
+  Status flush() const;
+
   /// What the driver is asked to free.
   struct Held {
     // What threads share during a run; without one of ours ggml makes and frees one in every run.
@@ -74,7 +82,8 @@ class GgmlDevice final : public Device {
     ggml_backend_ptr backend;
     std::optional<GgmlMemory> memory;
     std::vector<Working> working;  // the last serves new programs; those before it belong to older ones
-    Held* next = nullptr;          // of those that are not freed
+    ggml_backend_buffer_ptr staging;
+    Held* next = nullptr;  // of those that are not freed
   };
   ggml_type resident_type(const Param& param) const;
 
@@ -87,6 +96,7 @@ class GgmlDevice final : public Device {
   std::size_t weights_size_ = 0;
   std::vector<ggml_tensor*> weights_;
   std::string linear_text_;
+  mutable std::vector<Upload> uploads_;
   mutable std::optional<Error> failure_;
 };
 

@@ -48,8 +48,8 @@ struct Rules {
     return {op.table->storage == Storage::table, {op.table->shape[0], of(0)[0], 1, 1}};
   }
   ShapeCheck operator()(const op::Gather&) const {
-    if (!has(2) || in[0].node()->type != DType::f32 || !is_ids(1)) return {false};
-    return {of(0)[2] == 1 && of(0)[3] == 1, {of(0)[0], of(1)[0], 1, 1}};
+    if (!has(2) || !is_ids(1)) return {false};
+    return {of(0)[2] == 1 && of(0)[3] == 1, {of(0)[0], of(1)[0], 1, 1}, in[0].node()->type};
   }
   ShapeCheck operator()(const op::Norm&) const {
     if (in.empty() || in.size() > 3 || !has(in.size()) || !floats()) return {false};

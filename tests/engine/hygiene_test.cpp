@@ -11,6 +11,7 @@
 #include <atomic>
 #include <limits>
 
+#include "ggml/ggml_device.h"
 #include "kernels/executor.h"
 #include "kernels/isa.h"
 #include "support/golden_case.h"
@@ -110,4 +111,42 @@ TEST_CASE("a second request takes no memory and touches no new page while its gr
     }
     CHECK(fewest_faults == 0);
   }
+}
+
+TEST_CASE("inputs, run and result of a ggml device take no memory the second time but ggml's own" *
+          doctest::skip(!kCounts)) {
+  auto device = GgmlDevice::cpu(1);
+  REQUIRE(device.ok());
+  Slots slots;
+  Slot *a = slots.add_f32({64, 8, 1, 1}), *b = slots.add_f32({3, 1, 1, 1}), *sum = slots.add_f32({64, 8, 1, 1});
+  Graph graph(slots);
+  graph.write(graph.add(op::Add{}, {graph.input(a), graph.input(a)}), sum);
+  const Keys keys;
+  REQUIRE((*device)->load(ParamList(keys, nullptr), true).ok());
+  REQUIRE((*device)->allocate(slots).ok());
+  const auto program = (*device)->lower(graph);
+  REQUIRE(program.ok());
+  std::vector<float> values(64 * 8, 1.5f), result(values.size());
+  bool ran = false;
+  const auto act = [&] {
+    (*device)->set(*a, values.data(), a->size());
+    (*device)->set(*b, values.data(), b->size());
+    ran = (*program)->run().ok();
+    (*device)->get(*sum, result.data(), sum->size());
+  };
+  const auto allocations = [](const auto& call) {
+    call();
+    reset();
+    running = true;
+    call();
+    running = false;
+    return n_allocation.load();
+  };
+  const auto context = make_context(1, ggml_graph_overhead());
+  ggml_cgraph* empty = ggml_new_graph(context->get());
+  ggml_backend_t backend = static_cast<GgmlDevice&>(**device).backend();
+  const long of_ggml = allocations([&] { ggml_backend_graph_compute(backend, empty); });
+  CHECK(allocations(act) == of_ggml);
+  REQUIRE(ran);
+  CHECK(result == std::vector<float>(values.size(), 3.0f));
 }
