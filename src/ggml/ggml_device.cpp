@@ -155,9 +155,10 @@ std::byte* GgmlDevice::staging(std::size_t size) {
   ggml_backend_dev_t device = ggml_backend_get_device(backend());
   ggml_backend_buffer_type_t type = ggml_backend_dev_host_buffer_type(device);
   if (type == nullptr) type = ggml_backend_cpu_buffer_type();
+  constexpr std::size_t kRest = 65536;  // images come first: what follows them fits as well
   ggml_backend_buffer_ptr larger;
   const Status done = guarded([&] {
-    larger.reset(ggml_backend_buft_alloc_buffer(type, size));
+    larger.reset(ggml_backend_buft_alloc_buffer(type, size + kRest));
     if (larger == nullptr) throw std::bad_alloc();
   });
   if (!done) return nullptr;

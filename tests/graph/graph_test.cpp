@@ -50,6 +50,7 @@ TEST_CASE_FIXTURE(Fixture, "products take x of their depth, and look-ups take id
   refuses(op::Embedding{&table}, {f32({3, 1, 1, 1})});
   refuses(op::Embedding{&table}, {i32({3, 2, 1, 1})});
   accepts(op::Gather{}, {f32({4, 9, 1, 1}), i32({3, 1, 1, 1})}, {4, 3, 1, 1});
+  accepts(op::Gather{}, {i32({1, 9, 1, 1}), i32({1, 1, 1, 1})}, {1, 1, 1, 1});
   refuses(op::Gather{}, {f32({4, 9, 2, 1}), i32({3, 1, 1, 1})});
   accepts(op::Parameter{&bias}, {}, {7, 1, 1, 1}, {7, 1, 1, 1});
   refuses(op::Parameter{&weight}, {}, {4, 7, 1, 1});
