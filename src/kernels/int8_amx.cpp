@@ -12,6 +12,7 @@ struct AmxInt8Tile {
   using V = Avx512;
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 1024;
+  static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = false, kRounds = false, kSigned = false;
 
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,

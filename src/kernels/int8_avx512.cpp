@@ -11,6 +11,7 @@ template <int kDepth>
 struct VnniTile {
   using V = Avx512;
   static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = kDepth;
+  static constexpr std::int64_t kBlockKiB = 1600;
   static constexpr bool kEven = true, kRounds = false, kSigned = false;
   struct Session {};
 

@@ -65,9 +65,9 @@ struct ByteStrips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows (of the block of x), kStep (of the
-/// depth, most), kEven (tiles of equal height), kRounds (false), Session (held while a thread works), kSigned (sums are
-/// of the weights themselves, without their offset), and
+/// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (of the block of x,
+/// at most), kStep (of the depth, most), kEven (tiles of equal height), kRounds (false), Session (held while a thread
+/// works), kSigned (sums are of the weights themselves, without their offset), and
 ///   multiply(n_row, x, x_stride, strips, depth, sums, add)
 ///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and PackedStrips for TernaryPanels, of
 ///     ByteStrips for BytePanels. It may read and write rows up to kRows.
@@ -111,10 +111,9 @@ class Int8Loop {
         n_block_(ceil_div(job.n_row, block_rows_)),
         n_panel_(Stripes::n_panel(job)) {}
 
-  /// Rows that stay in the second cache while panels pass by.
+  /// Rows that stay in a cache while panels pass by.
   static std::int64_t block_rows(std::int64_t x_stride) {
-    constexpr std::int64_t kBlockSize = std::int64_t{640} << 10;
-    return min(kBlockRows, round_up(kBlockSize / x_stride + 1, kRows));
+    return min(kBlockRows, round_up((Tile::kBlockKiB << 10) / x_stride + 1, kRows));
   }
 
   static std::int64_t cut(LinearJob& job, int n_thread) {
