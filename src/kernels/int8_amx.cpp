@@ -13,7 +13,7 @@ struct AmxInt8Tile {
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 1024;
   static constexpr std::int64_t kBlockKiB = 640;
-  static constexpr bool kEven = false, kRounds = false, kSigned = false;
+  static constexpr bool kEven = false, kSigned = false;
 
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add) {

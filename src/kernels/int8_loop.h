@@ -66,8 +66,8 @@ struct ByteStrips {
 };
 
 /// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (of the block of x,
-/// at most), kStep (of the depth, most), kEven (tiles of equal height), kRounds (false), Session (held while a thread
-/// works), kSigned (sums are of the weights themselves, without their offset), and
+/// at most), kStep (of the depth, most), kEven (tiles of equal height), Session (held while a thread works), kSigned
+/// (sums are of the weights themselves, without their offset), and
 ///   multiply(n_row, x, x_stride, strips, depth, sums, add)
 ///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and PackedStrips for TernaryPanels, of
 ///     ByteStrips for BytePanels. It may read and write rows up to kRows.
