@@ -32,6 +32,13 @@ struct LinearJob {
     RowKernel run = nullptr;
     const float *weight = nullptr, *bias = nullptr;
     float eps = 0;
+
+    /// The row x of n numbers as it is multiplied, in `room` where it is normed.
+    VLA_INLINE const float* operator()(const float* x, std::int64_t n, float* room) const {
+      if (run == nullptr) return x;
+      run(x, weight, bias, eps, room, n);
+      return room;
+    }
   };
 
   const std::byte* x;     // n_row rows of d_in numbers

@@ -117,15 +117,9 @@ class LinearLoop {
       if (Tile::kRounds && job_.x_type == DType::bf16)
         copy_padded(reinterpret_cast<const X*>(job_.x) + place + k, depth, to);
       else
-        Tile::copy(normed(reinterpret_cast<const float*>(job_.x) + place) + k, depth, to);
+        Tile::copy(job_.norm(reinterpret_cast<const float*>(job_.x) + place, job_.d_in, scratch_->normed) + k, depth,
+                   to);
     }
-  }
-
-  const float* normed(const float* x) {
-    const LinearJob::Norm& norm = job_.norm;
-    if (norm.run == nullptr) return x;
-    norm.run(x, norm.weight, norm.bias, norm.eps, scratch_->normed, job_.d_in);
-    return scratch_->normed;
   }
 
   /// y of the stripe (+)= the block of x times the panel. Whatever follows the product is done while a tile of sums

@@ -117,17 +117,11 @@ class TileLoop {
     if (row_ == scratch_->row && k_ == scratch_->depth) return;
     scratch_->row = row_, scratch_->depth = k_;
     for (std::int64_t r = 0; r < n_row_; ++r) {
-      const float* x = normed(reinterpret_cast<const float*>(job_.x) + (row_ + r) * job_.x_stride) + k_;
+      const float* row = reinterpret_cast<const float*>(job_.x) + (row_ + r) * job_.x_stride;
+      const float* x = job_.norm(row, job_.d_in, scratch_->normed) + k_;
       for (std::int64_t i = 0; i < depth_; i += kSquare)
         Tile::copy(x + i, min(kSquare, depth_ - i), scratch_->x + place_in_tiles(r, i, depth_));
     }
-  }
-
-  const float* normed(const float* x) {
-    const LinearJob::Norm& norm = job_.norm;
-    if (norm.run == nullptr) return x;
-    norm.run(x, norm.weight, norm.bias, norm.eps, scratch_->normed, job_.d_in);
-    return scratch_->normed;
   }
 
   /// The square of x that begins at row r and number k of the block.

@@ -46,12 +46,7 @@ struct QuantizeTask : Task {
 
   void run(std::int64_t item, Worker& worker) const override {
     for (std::int64_t i = item * item_rows; i < std::min(n_row, (item + 1) * item_rows); ++i) {
-      const float* row = x + i * x_stride;
-      if (norm.run != nullptr) {
-        auto* normed = worker.scratch<float>();
-        norm.run(row, norm.weight, norm.bias, norm.eps, normed, d);
-        row = normed;
-      }
+      const float* row = norm(x + i * x_stride, d, worker.scratch<float>());
       quantize(row, d, codes + i * codes_stride);
     }
   }
