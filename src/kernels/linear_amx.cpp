@@ -13,6 +13,7 @@ struct AmxTile {
   using Session = AmxSession;
 
   static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
+  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, V::Float y) { store_bf16(to, x, y); }
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, std::uint16_t* to) {
     store_bf16(to, load<V>(from, n), n > 16 ? load<V>(from + 16, n - 16) : V::Float{});
@@ -28,10 +29,11 @@ struct AmxTile {
   static constexpr std::size_t kLineX = kSquare * sizeof(std::uint16_t), kLineC = kSquare * sizeof(float);
   static constexpr std::int64_t kHalf = kSquare / 2 * kSquare;  // numbers of the upper half of a square
 
-  /// All 32 rows, or the first 16.
+  /// All 32 rows, or the first 16. x streams past the first cache, where the panel stays for the next rows.
   template <bool kAll, class Between>
   static VLA_INLINE void product(const std::uint16_t* x, const std::byte* panel, std::int64_t n_square, float* c,
                                  bool add, Between& between) {
+    AwakeVectors vectors;
     before_tile_loads();
     if (add) {
       _tile_loadd(0, c, kLineC);
@@ -48,11 +50,12 @@ struct AmxTile {
     }
     for (std::int64_t i = 0; i < n_square; ++i, x += 2 * kHalf, panel += 2 * kPanelBlock) {
       _tile_loadd(6, panel, 64);
-      _tile_loadd(4, x, kLineX);
+      _tile_stream_loadd(4, x, kLineX);
       _tile_loadd(7, panel + kPanelBlock, 64);
       _tile_dpbf16ps(0, 4, 6);
-      if constexpr (kAll) _tile_loadd(5, x + kHalf, kLineX);
+      if constexpr (kAll) _tile_stream_loadd(5, x + kHalf, kLineX);
       _tile_dpbf16ps(1, 4, 7);
+      vectors.keep();
       between();
       if constexpr (kAll) {
         _tile_dpbf16ps(2, 5, 6);

@@ -19,7 +19,8 @@ struct Stripe {
 };
 
 /// `Tile` as the loop describes it. It has a type of its own in each file, so that the linker cannot merge what was
-/// compiled for different instructions. kLayout: of a y that is rounded, by the tile's store_rounded.
+/// compiled for different instructions. kLayout: of a y that is rounded, by the tile's store_rounded,
+/// a vector or, where two are kColumns wide, a row at a time.
 template <class Tile, RoundedLayout kLayout = RoundedLayout::none>
 struct LinearStripes {
   using V = typename Tile::V;
@@ -61,12 +62,24 @@ struct LinearStripes {
    public:
     Finish() = default;
     Finish(const LinearJob& job, const Stripe& s, const float* sums, std::int64_t first, std::int64_t n_row)
-        : job_(&job), s_(s), sums_(sums), first_(first), n_row_(n_row) {
+        : job_(&job),
+          s_(s),
+          sums_(sums),
+          first_(first),
+          n_row_(n_row),
+          d_out_(job.part[s.part].d_out),
+          y_(reinterpret_cast<float*>(job.part[s.part].y)) {
       rows_ = s.n_column == kColumns ? choose<true>() : choose<false>();
     }
 
     std::int64_t n_row() const { return n_row_; }
     VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
+
+    /// Asks for what rows begin to end, or those of them that there are, will read and write.
+    VLA_INLINE void fetch(std::int64_t begin, std::int64_t end) const {
+      end = min(end, n_row_);
+      if (begin < end) LinearStripes::fetch(*job_, s_, first_ + begin, end - begin);
+    }
 
    private:
     using Rows = void (Finish::*)(std::int64_t begin, std::int64_t end) const;
@@ -124,39 +137,50 @@ struct LinearStripes {
 
     template <bool kWhole, bool kRounded, Activation kActivation>
     VLA_INLINE void write_rows(std::int64_t begin, std::int64_t end) const {
-      const LinearJob::Part& part = job_->part[s_.part];
-      const std::int64_t d_out = part.d_out;
       for (std::int64_t i_row = begin; i_row < end; ++i_row) {
-        const std::int64_t r = first_ + i_row, row = (s_.row + r) * d_out + s_.column;
+        const std::int64_t row = s_.row + first_ + i_row;
         [[maybe_unused]] std::uint16_t* to = nullptr;
-        if constexpr (kRounded) to = rounded_row<kWhole>(s_.row + r, d_out);
+        if constexpr (kRounded) to = rounded_row<kWhole>(row, d_out_);
+        if constexpr (kRounded && kWhole && kColumns == 2 * V::width && kLayout == RoundedLayout::tiles) {
+          Tile::store_rounded(to, value_at<true, true, kActivation>(i_row, 0),
+                              value_at<true, true, kActivation>(i_row, V::width));
+          continue;
+        }
         for (std::int64_t i = 0; i < (kWhole ? kColumns : s_.n_column); i += V::width) {
           const std::int64_t left = kWhole ? V::width : s_.n_column - i;
-          float* y = reinterpret_cast<float*>(part.y) + row + i;
-          typename V::Float value = V::load(sums_ + i_row * kColumns + i);
-          if (s_.k > 0) value += load<V>(y, left);
-          if (bias_ != nullptr) value += load<V>(bias_ + i, left);
-          if (gates_ != nullptr) {
-            typename V::Float gate = V::load(gates_ + r * kColumns + i);
-            if (gate_bias_ != nullptr) gate += load<V>(gate_bias_ + i, left);
-            value *= activate<kRounded, kActivation>(gate);
-          } else {
-            value = activate<kRounded, kActivation>(value);
-          }
-          if (factor_ != nullptr) value *= load<V>(factor_ + i, left);
-          if (residual_ != nullptr) value += load<V>(residual_ + row + i, left);
+          const typename V::Float value = value_at<kWhole, kRounded, kActivation>(i_row, i);
           if constexpr (kRounded)
             Tile::store_rounded(to + i, value, left);
           else
-            store<V>(y, value, left);
+            store<V>(y_ + row * d_out_ + s_.column + i, value, left);
         }
       }
+    }
+
+    /// The numbers of a row from its column i on.
+    template <bool kWhole, bool kRounded, Activation kActivation>
+    VLA_INLINE typename V::Float value_at(std::int64_t i_row, std::int64_t i) const {
+      const std::int64_t r = first_ + i_row, place = (s_.row + r) * d_out_ + s_.column + i;
+      const std::int64_t left = kWhole ? V::width : s_.n_column - i;
+      typename V::Float value = V::load(sums_ + i_row * kColumns + i);
+      if (s_.k > 0) value += load<V>(y_ + place, left);
+      if (bias_ != nullptr) value += load<V>(bias_ + i, left);
+      if (gates_ != nullptr) {
+        typename V::Float gate = V::load(gates_ + r * kColumns + i);
+        if (gate_bias_ != nullptr) gate += load<V>(gate_bias_ + i, left);
+        value *= activate<kRounded, kActivation>(gate);
+      } else {
+        value = activate<kRounded, kActivation>(value);
+      }
+      if (factor_ != nullptr) value *= load<V>(factor_ + i, left);
+      if (residual_ != nullptr) value += load<V>(residual_ + place, left);
+      return value;
     }
 
     /// Where the stripe's numbers of a row go.
     template <bool kWhole>
     VLA_INLINE std::uint16_t* rounded_row(std::int64_t row, std::int64_t d_out) const {
-      auto* y = reinterpret_cast<std::uint16_t*>(job_->part[s_.part].y);
+      auto* y = reinterpret_cast<std::uint16_t*>(y_);
       if constexpr (kLayout == RoundedLayout::rows) return y + row * d_out + s_.column;
       y += place_in_tiles(row, s_.column, d_out);
       if constexpr (!kWhole) std::memset(y, 0, kSquare * sizeof(*y));  // what is beyond the last column
@@ -167,7 +191,8 @@ struct LinearStripes {
     const LinearJob* job_ = nullptr;
     Stripe s_ = {};
     const float* sums_ = nullptr;
-    std::int64_t first_ = 0, n_row_ = 0;
+    std::int64_t first_ = 0, n_row_ = 0, d_out_ = 0;
+    float* y_ = nullptr;
     // Of what follows the product, null where nothing does.
     const float *bias_ = nullptr, *factor_ = nullptr, *residual_ = nullptr, *gates_ = nullptr, *gate_bias_ = nullptr;
   };

@@ -21,6 +21,7 @@
 #include "kernels/int8_kernels.h"
 #include "kernels/linear_kernel.h"
 #include "kernels/linear_panels.h"
+#include "kernels/pages.h"
 #include "kernels/probe/probe.h"
 #include "kernels/quantized.h"
 
@@ -45,7 +46,9 @@ constexpr Shape kInt8Shapes[] = {{640, 2560, 2560}, {300, 2560, 6912}, {640, 256
 /// Memory at a multiple of a page.
 struct Block {
   explicit Block(std::size_t size)
-      : data(static_cast<std::byte*>(std::aligned_alloc(4096, (size + 4095) / 4096 * 4096))), n(size) {}
+      : data(static_cast<std::byte*>(std::aligned_alloc(4096, (size + 4095) / 4096 * 4096))), n(size) {
+    want_large_pages(data, n);
+  }
   ~Block() { std::free(data); }
   Block(const Block&) = delete;
   Block& operator=(const Block&) = delete;
@@ -83,11 +86,11 @@ double best_time(Executor& executor, const Product& product, double seconds) {
 
 /// A product of random numbers with all that it reads and writes.
 struct Trial {
-  Trial(const LinearKernel& kernel, const MatrixDesc& d, std::int64_t n_row, int n_thread)
+  Trial(const LinearKernel& kernel, const MatrixDesc& d, std::int64_t n_row, int n_thread, bool rounded)
       : desc(d),
         s{n_row, d.d_in, d.d_out},
-        x(static_cast<std::size_t>(quantized_size(s.n_row, s.d_in)) * 4),
-        y(static_cast<std::size_t>(s.n_row * s.d_out) * 4),
+        x(static_cast<std::size_t>(quantized_size(round_up(s.n_row, kSquare), s.d_in)) * 4),
+        y(static_cast<std::size_t>(round_up(s.n_row, kSquare) * round_up(s.d_out, kSquare)) * 4),
         stored(static_cast<std::size_t>(s.d_in * s.d_out) * dtype_size(d.type) / (d.is_ternary ? 4 : 1)),
         packed(kernel.packed_size(desc)),
         scale(static_cast<std::size_t>(s.d_out), 1.0f) {
@@ -95,6 +98,7 @@ struct Trial {
     std::vector<float> row(static_cast<std::size_t>(s.d_in));
     for (std::size_t k = 0; k < row.size(); ++k) row[k] = 1.0f / static_cast<float>(1 + k % 61);
     job.x = x.data, job.x_type = kernel.quantize != nullptr ? DType::i8 : DType::f32;
+    if (rounded) job.x_type = job.y_type = DType::bf16, job.activation = Activation::gelu_tanh;
     job.x_stride = kernel.quantize != nullptr ? quantized_stride(s.d_in) : s.d_in;
     for (std::int64_t r = 0; r < s.n_row; ++r)
       if (kernel.quantize != nullptr)
@@ -126,14 +130,15 @@ double median(std::vector<double> values) {
   return values[values.size() / 2];
 }
 
-/// `versus`: a kernel that takes turns with this one, or null.
+/// `rounded`: x and y lie as this kernel's products leave them for each other, and y has a GELU; else they are float32
+/// rows. `versus`: a kernel that takes turns with this one, or null.
 void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& probe, const MatrixDesc& desc,
-             std::int64_t n_row, int n_round, const LinearKernel* versus) {
+             std::int64_t n_row, int n_round, bool rounded, const LinearKernel* versus) {
   const int n_thread = executor.n_thread();
-  const Trial trial(kernel, desc, n_row, n_thread);
+  const Trial trial(kernel, desc, n_row, n_thread, rounded);
   const Shape& s = trial.s;
   std::optional<Trial> other;
-  if (versus != nullptr) other.emplace(*versus, MatrixDesc{DType::bf16, s.d_in, s.d_out}, s.n_row, n_thread);
+  if (versus != nullptr) other.emplace(*versus, MatrixDesc{DType::bf16, s.d_in, s.d_out}, s.n_row, n_thread, false);
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
   std::vector<double> rates, peaks, shares, factors;
   for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
@@ -149,6 +154,7 @@ void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& pr
              100 * best / peak, peak * 1e-9, 100 * median(shares),
              best / flop * static_cast<double>(trial.stored.n) * 1e-9);
   fmt::print("  packed at {:.1f} GB/s", static_cast<double>(trial.stored.n) / trial.pack_seconds * 1e-9);
+  if (rounded) fmt::print("  rounded, GELU");
   if (versus != nullptr) fmt::print("  {:.2f} x {}", median(factors), versus->name);
   fmt::print("\n");
   std::fflush(stdout);
@@ -177,8 +183,11 @@ int main(int argc, char** argv) {
     for (Isa isa : usable_isas())
       if (isa_name(isa) == kernel->name && wants(*kernel))
         for (const Shape& shape : kShapes)
-          measure(**executor, *kernel, peak_probe_of(isa), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row, n_round,
-                  nullptr);
+          for (const bool rounded : {false, true}) {
+            if (rounded && kernel->rounded(shape.d_in) == RoundedLayout::none) continue;
+            measure(**executor, *kernel, peak_probe_of(isa), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row,
+                    n_round, rounded, nullptr);
+          }
   }
   for (const bool ternary : {true, false})
     for (const LinearKernel* kernel : ternary ? ternary_kernels() : int8_kernels()) {
@@ -186,7 +195,7 @@ int main(int argc, char** argv) {
       if (probe == nullptr || !wants(*kernel)) continue;
       if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
       for (const Shape& shape : kInt8Shapes)
-        measure(**executor, *kernel, *probe, {DType::i8, shape.d_in, shape.d_out, ternary}, shape.n_row, n_round,
+        measure(**executor, *kernel, *probe, {DType::i8, shape.d_in, shape.d_out, ternary}, shape.n_row, n_round, false,
                 choose_linear({DType::bf16, 64, 64}, probe->isa));
     }
 }

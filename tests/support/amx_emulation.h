@@ -93,6 +93,7 @@ inline void multiply_bytes(int c, int a, int b) {
 }  // namespace vla::test::amx
 
 #undef _tile_loadd
+#undef _tile_stream_loadd
 #undef _tile_stored
 #undef _tile_zero
 #undef _tile_dpbf16ps
@@ -100,6 +101,7 @@ inline void multiply_bytes(int c, int a, int b) {
 #define _tile_loadconfig vla::test::amx::load_config
 #define _tile_release vla::test::amx::release
 #define _tile_loadd vla::test::amx::load
+#define _tile_stream_loadd vla::test::amx::load
 #define _tile_stored vla::test::amx::store
 #define _tile_zero vla::test::amx::zero
 #define _tile_dpbf16ps vla::test::amx::multiply
