@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "kernels/rounded.h"
 #include "kernels/row_kernel.h"
 
 namespace vla::kernels {
@@ -45,7 +46,8 @@ struct AttentionJob {
   const float* mask;  // [n_key, n_query] of any numbers but +infinity, or null
   int n_segment;
   Segment segment[kMaxSegment];
-  float* out;               // [d_head, n_head, n_query, n_batch]
+  float* out;               // [d_head, n_head, n_query, n_batch], or bf16 in out_layout
+  RoundedLayout out_layout = RoundedLayout::none;
   std::int64_t block_rows;  // made by AttentionKernel::cut
 
   /// Query heads that share keys and values: their queries are rows of one and the same product.
@@ -64,6 +66,8 @@ struct AttentionKernel {
   /// Cuts a job into items for so many threads, and says how many there are.
   std::int64_t (*cut)(AttentionJob& job, int n_thread);
   void (*run)(const AttentionJob& job, std::int64_t item);
+  /// How `out` may lie instead of float32 rows, its rows a multiple of kSquare long.
+  RoundedLayout rounded;
 };
 
 /// Heads wider than this have no kernel.

@@ -26,6 +26,7 @@ struct FloatProducts {
   static constexpr int kKeys = 128;                                     // of a chunk
   static constexpr int kPanel = 2 * V::width, kMinPanel = V::width, kDepth = 1;  // columns; unit of the depth
   static constexpr bool kBeside = false;
+  static constexpr RoundedLayout kRounded = RoundedLayout::none;
 
   /// Weights are e^x, and relative to the greatest score of their row.
   static constexpr float kLogOfE = 1, kSlack = 0;
@@ -164,6 +165,7 @@ struct VectorPairProducts : PairPanels<V, Pairs> {
   struct Session {};
   static constexpr int kTile = kRowsOfTile, kRows = 2 * kTile, kPart = kRows, kKeys = 256;
   static constexpr bool kBeside = false;
+  static constexpr RoundedLayout kRounded = RoundedLayout::rows;
 
   /// Products, each done at once.
   struct Work {
@@ -205,6 +207,7 @@ struct PairProducts : PairPanels<V, Tile> {
   using Base::kDepth, Base::kPanel;
   static constexpr int kTile = 32, kRows = 64, kPart = 32, kKeys = 256;
   static constexpr bool kBeside = true;  // products wait for other work to be done beside it
+  static constexpr RoundedLayout kRounded = RoundedLayout::tiles;
 
   /// Products that are done a step at a time between other work: while the vector instructions before and behind a
   /// step wait for each other, the unit of the tiles, which is one of its own, computes. The processor looks some 500

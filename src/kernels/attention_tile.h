@@ -33,7 +33,7 @@ class AttentionTile {
   static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
  public:
-  static constexpr AttentionKernel kernel() { return {Panels::packed_size, Panels::n_pack, Panels::pack, cut, run}; }
+  static constexpr AttentionKernel kernel() { return {Panels::packed_size, Panels::n_pack, Panels::pack, cut, run, P::kRounded}; }
 
  private:
   static std::int64_t cut(AttentionJob& job, int n_thread) {
@@ -289,9 +289,30 @@ class AttentionTile {
       }
       for (int r = 0; r < n_row; ++r) {
         const float* row = mixed + r * kHeadStride;
-        float* out = job.out + ((batch * job.n_query + query[r]) * job.n_head + head[r]) * job.d_head;
+        const std::int64_t out_row = batch * job.n_query + query[r], column = head[r] * job.d_head;
+        if constexpr (P::kRounded != RoundedLayout::none)
+          if (job.out_layout == P::kRounded) {
+            write_rounded(row, shrink[r], out_row, column);
+            continue;
+          }
+        float* out = job.out + out_row * job.n_head * job.d_head + column;
         for (std::int64_t i = 0; i < job.d_head; i += kWidth)
           store<V>(out + i, V::load(row + i) * shrink[r], job.d_head - i);
+      }
+    }
+
+    /// The numbers of one head of a row, from a column on.
+    void write_rounded(const float* from, float factor, std::int64_t row, std::int64_t column) const {
+      alignas(64) Number room[kHeadStride];
+      for (std::int64_t i = 0; i < job.d_head; i += 2 * kWidth)
+        P::store(room + i, V::load(from + i) * factor, V::load(from + i + kWidth) * factor);
+      const std::int64_t d = job.n_head * job.d_head;
+      auto* out = reinterpret_cast<Number*>(job.out);
+      for (std::int64_t i = 0, n = 0; i < job.d_head; i += n, column += n) {  // as much as a square holds of them
+        n = min(job.d_head - i, kSquare - column % kSquare);
+        const std::int64_t place =
+            P::kRounded == RoundedLayout::tiles ? place_in_tiles(row, column, d) : row * d + column;
+        std::memcpy(out + place, room + i, static_cast<std::size_t>(n) * sizeof(*room));
       }
     }
   };

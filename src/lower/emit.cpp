@@ -275,7 +275,10 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const Attention
     job.segment[job.n_segment++] = {address(l, attention.packed[i]), attention.n_key[i], job.n_key};
     job.n_key += attention.n_key[i];
   }
+  const Value& out = l.value(op.writes[0]);
   job.out = floats(l, op.writes[0]);
+  if (out.type == DType::bf16)
+    job.out_layout = out.in_tiles ? kernels::RoundedLayout::tiles : kernels::RoundedLayout::rows;
   task->n_item = task->kernel->cut(job, threads_for(l, op));
   return task;
 }

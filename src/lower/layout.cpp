@@ -24,8 +24,10 @@ class Layouts {
     l.ops = std::move(out_);
     for (const Node& node : l.graph.nodes())
       if (node.as<op::Write>() != nullptr) store(node);
-    for (FusedOp& op : l.ops)
+    for (FusedOp& op : l.ops) {
       if (const auto* linear = std::get_if<LinearOp>(&op.op)) round_result(op, *linear);
+      if (const auto* attention = std::get_if<AttentionOp>(&op.op)) round_result(op, *attention);
+    }
   }
 
  private:
@@ -158,19 +160,25 @@ class Layouts {
     return true;
   }
 
-  /// What products alone read is stored as they would round it.
   void round_result(const FusedOp& op, const LinearOp& linear) {
     if (op.writes.size() != 1 || (linear.activation == Activation::none && !linear.gated)) return;
-    Value& y = l.value(op.writes[0]);
-    if (y.home != Value::Home::arena || y.node->tapped || linear.residual != kNone || linear.factor != kNone) return;
-    const std::int64_t n_row = count(y.shape) / y.shape[0], d = linear.linears[0]->in[0].dim(0);
-    const kernels::LinearKernel& kernel = kernel_of(l, linear);
-    const kernels::RoundedLayout layout = kernel.rounded(d);
-    if (layout == kernels::RoundedLayout::none) return;
+    if (linear.residual != kNone || linear.factor != kNone) return;
+    round_result(op.writes[0], kernel_of(l, linear).rounded(linear.linears[0]->in[0].dim(0)));
+  }
+  void round_result(const FusedOp& op, const AttentionOp& attention) {
+    if (l.value(op.writes[0]).shape[0] % kernels::kSquare == 0)
+      round_result(op.writes[0], kernels::cpu_kernels(attention.isa)->attention.rounded);
+  }
+
+  /// What products alone read is stored as they would round it.
+  void round_result(ValueId id, kernels::RoundedLayout layout) {
+    Value& y = l.value(id);
+    if (layout == kernels::RoundedLayout::none || y.home != Value::Home::arena || y.node->tapped) return;
+    const std::int64_t n_row = count(y.shape) / y.shape[0];
     for (const Node* reader : l.readers[static_cast<std::size_t>(y.node->id)]) {
       const auto* product = reader->as<op::Linear>();
-      if (product == nullptr || &l.weights.kernel(product->weight)->for_rows(n_row) != &kernel ||
-          kernel.rounded(y.shape[0]) != layout)
+      if (product == nullptr ||
+          l.weights.kernel(product->weight)->for_rows(n_row).rounded(y.shape[0]) != layout)
         return;
     }
     y.type = DType::bf16, y.in_tiles = layout == kernels::RoundedLayout::tiles;
