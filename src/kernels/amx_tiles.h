@@ -27,9 +27,9 @@ struct AmxSession {
 /// move stores of what is to be read behind it.
 VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }
 
-/// After some 2,300 cycles without 512-bit arithmetic the processor turns off what it needs for that, and the next store
-/// of a tile waits for about 950 cycles (measured on Granite Rapids). A loop of tile instructions that may take so long
-/// keeps it awake by a vector addition in each round.
+/// After some 2,300 cycles without 512-bit arithmetic the processor turns off what it needs for that, and the next
+/// store of a tile waits for about 950 cycles (measured on Granite Rapids). A loop of tile instructions that may take
+/// so long keeps it awake by a vector addition in each round.
 class AwakeVectors {
  public:
   VLA_INLINE ~AwakeVectors() { asm volatile("" ::"m"(sum_)); }  // the compiler does not drop the sum

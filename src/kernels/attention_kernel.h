@@ -46,7 +46,7 @@ struct AttentionJob {
   const float* mask;  // [n_key, n_query] of any numbers but +infinity, or null
   int n_segment;
   Segment segment[kMaxSegment];
-  float* out;               // [d_head, n_head, n_query, n_batch], or bf16 in out_layout
+  float* out;  // [d_head, n_head, n_query, n_batch], or bf16 in out_layout
   RoundedLayout out_layout = RoundedLayout::none;
   std::int64_t block_rows;  // made by AttentionKernel::cut
 

@@ -33,7 +33,9 @@ class AttentionTile {
   static_assert(kRows % kPart == 0 && kPart % kTile == 0 && kKeys % kPanel == 0);
 
  public:
-  static constexpr AttentionKernel kernel() { return {Panels::packed_size, Panels::n_pack, Panels::pack, cut, run, P::kRounded}; }
+  static constexpr AttentionKernel kernel() {
+    return {Panels::packed_size, Panels::n_pack, Panels::pack, cut, run, P::kRounded};
+  }
 
  private:
   static std::int64_t cut(AttentionJob& job, int n_thread) {

@@ -11,36 +11,48 @@ namespace {
 struct AmxInt8Tile {
   using V = Avx512;
   using Session = AmxSession;
-  static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 1024;
+  static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 768;
   static constexpr std::int64_t kBlockKiB = 640;
-  static constexpr bool kEven = false, kSigned = false;
+  static constexpr bool kEven = false, kBeside = true, kSigned = false;
 
+  template <class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,
-                       std::int64_t depth, std::int32_t* sums, bool add) {
+                       std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     // Rows that x does not have are multiplied too; nobody looks at their sums.
+    AwakeVectors vectors;
     open(n_row, sums, add);
-    for (std::int64_t k = 0; k < depth; k += kDepth)
+    for (std::int64_t k = 0; k < depth; k += kDepth) {
       add_products(n_row, x + k, x_stride, strips.lines + k * kColumns, kLineOfPair, Int8Panels::kLine);
+      vectors.keep();
+      between();
+    }
     close(n_row, sums);
   }
 
+  template <class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const PackedStrips<2>& strips,
-                       std::int64_t depth, std::int32_t* sums, bool add) {
+                       std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     alignas(64) std::byte lines[kDepth * kColumns];
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
       TernaryPanels::expand<2>(strips.strips + k * 4, strips.strip, kDepth, lines);
       before_tile_loads();
       add_products(n_row, x + k, x_stride, lines, kLineOfPair, Int8Panels::kLine);
+      between();
     }
     close(n_row, sums);
   }
 
+  template <class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ByteStrips<2>& strips,
-                       std::int64_t depth, std::int32_t* sums, bool add) {
+                       std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
+    AwakeVectors vectors;
     open(n_row, sums, add);
-    for (std::int64_t k = 0; k < depth; k += kDepth)
+    for (std::int64_t k = 0; k < depth; k += kDepth) {
       add_products(n_row, x + k, x_stride, strips.strips + k * Int8Panels::kColumns, Int8Panels::kLine, strips.strip);
+      vectors.keep();
+      between();
+    }
     close(n_row, sums);
   }
 
@@ -64,16 +76,17 @@ struct AmxInt8Tile {
     _tile_loadd(3, sums + 16 * kColumns + 16, kLine);
   }
 
-  /// The first operand has a sign, the second has none: lines of two strips, with their distances.
+  /// x streams past the first cache, where the panel stays. The first operand has a sign, the second has none: lines of
+  /// two strips, with their distances.
   static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines,
                                       std::size_t line, std::int64_t strip) {
-    _tile_loadd(4, x, static_cast<std::size_t>(x_stride));
+    _tile_stream_loadd(4, x, static_cast<std::size_t>(x_stride));
     _tile_loadd(6, lines, line);
     _tile_loadd(7, lines + strip, line);
     _tile_dpbsud(0, 4, 6);
     _tile_dpbsud(1, 4, 7);
     if (n_row <= 16) return;
-    _tile_loadd(5, x + 16 * x_stride, static_cast<std::size_t>(x_stride));
+    _tile_stream_loadd(5, x + 16 * x_stride, static_cast<std::size_t>(x_stride));
     _tile_dpbsud(2, 5, 6);
     _tile_dpbsud(3, 5, 7);
   }

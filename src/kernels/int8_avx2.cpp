@@ -51,7 +51,7 @@ struct Avx2Tile {
   using V = Avx2;
   static constexpr int kRows = Products::kRows, kColumns = 16, kBlockRows = 216, kStep = Products::kStep;
   static constexpr std::int64_t kBlockKiB = 640;
-  static constexpr bool kEven = true, kSigned = Products::kSigned;
+  static constexpr bool kEven = true, kBeside = false, kSigned = Products::kSigned;
   struct Session {};
 
   template <class Strips>

@@ -12,7 +12,7 @@ struct VnniTile {
   using V = Avx512;
   static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = kDepth;
   static constexpr std::int64_t kBlockKiB = 1600;
-  static constexpr bool kEven = true, kSigned = false;
+  static constexpr bool kEven = true, kBeside = false, kSigned = false;
   struct Session {};
 
   template <class Strips>

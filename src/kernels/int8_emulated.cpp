@@ -10,7 +10,7 @@ struct PlainTile {
   using V = Portable;
   static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;
   static constexpr std::int64_t kBlockKiB = 640;
-  static constexpr bool kEven = true, kSigned = false;
+  static constexpr bool kEven = true, kBeside = false, kSigned = false;
   struct Session {};
 
   template <class Strips>

@@ -71,11 +71,14 @@ struct ByteStrips {
 ///   multiply(n_row, x, x_stride, strips, depth, sums, add)
 ///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and PackedStrips for TernaryPanels, of
 ///     ByteStrips for BytePanels. It may read and write rows up to kRows.
+/// Where products have a unit of their own (kBeside), multiply has a last argument between, and calls between() for
+/// every 64 of the depth before it writes sums: some rows of the tile before are finished there.
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
 template <class Tile, class Weights>
 class Int8Loop {
   using V = typename Tile::V;
   using Stripes = LinearStripes<Tile>;
+  using Finish = typename Stripes::Finish;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
   static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks numbers for
@@ -133,30 +136,36 @@ class Int8Loop {
       Stripe stripe = Stripes::of_panel(job, panel);
       stripe.row = row, stripe.n_row = min(loop.block_rows_, job.n_row - row), stripe.depth = job.d_in;
       stripe.gates = loop.scratch_->gates;
-      loop.multiply(stripe);
+      if (job.gated) loop.sum(job.part[0], stripe, true);
+      loop.sum(job.part[stripe.part], stripe, false);
     }
-  }
-
-  void multiply(const Stripe& s) {
-    if (job_.gated)
-      sum(
-          job_.part[0], s, [](auto, auto) {},
-          [&](std::int64_t r, std::int64_t n_row) { scale(job_.part[0], s, r, n_row, s.gates + r * kColumns); });
-    const LinearJob::Part& part = job_.part[s.part];
-    sum(
-        part, s, [&](std::int64_t r, std::int64_t n_row) { Stripes::fetch(job_, s, r, n_row); },
-        [&](std::int64_t r, std::int64_t n_row) {
-          scale(part, s, r, n_row, scratch_->scaled);
-          Stripes::finish(job_, s, scratch_->scaled, r, n_row);
-        });
+    loop.summed_.finish();
   }
 
   const std::byte* row_of(const Stripe& s, std::int64_t r) const { return job_.x + (s.row + r) * job_.x_stride; }
 
-  /// Sums of a panel's columns. `before` and `after` are called around the last step of each tile with its first row
-  /// and their number.
-  template <class Before, class After>
-  VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, const Before& before, const After& after) {
+  /// A tile's sums are complete, and some of its rows are finished: they become the gates, or y.
+  struct Summed {
+    const Int8Loop* loop = nullptr;
+    const LinearJob::Part* part = nullptr;
+    Stripe s = {};
+    bool gate = false;
+    std::int64_t r = 0, n_row = 0, n_finished = 0;
+    Finish to_y = {};
+
+    VLA_INLINE void finish(std::int64_t n) {
+      n = min(n, n_row - n_finished);
+      if (n <= 0) return;
+      float* scaled = gate ? s.gates + (r + n_finished) * kColumns : loop->scratch_->scaled + n_finished * kColumns;
+      loop->scale(*part, s, r + n_finished, n, scaled);
+      if (!gate) to_y(n_finished, n_finished + n);
+      n_finished += n;
+    }
+    void finish() { finish(n_row); }
+  };
+
+  /// Sums of a panel's columns.
+  VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, bool gate) {
     const std::int64_t strip = Weights::strip_size(job_.d_in), n_tile = ceil_div(s.n_row, kRows);
     const std::int64_t depth = quantized_depth(job_.d_in), step = even_block(depth, Tile::kStep, kQuantizedUnit);
     const std::byte* strips = part.weight + s.column / Int8Panels::kColumns * strip;
@@ -168,9 +177,17 @@ class Int8Loop {
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         std::int32_t* sums = scratch_->sums + r * kColumns;
-        if (k + d == depth) before(r, n_row);
-        const auto multiply = [&](const auto& numbers) {
-          Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, numbers, d, sums, k > 0);
+        if (k + d == depth && !gate) Stripes::fetch(job_, s, r, n_row);
+        const auto multiply = [&](const auto& numbers) VLA_LAMBDA {
+          const auto product = [&](const auto&... between) VLA_LAMBDA {
+            Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, numbers, d, sums, k > 0,
+                           between...);
+          };
+          const std::int64_t n_finish = ceil_div(kRows * 64, d);
+          if constexpr (Tile::kBeside)
+            product([&]() VLA_LAMBDA { summed_.finish(n_finish); });
+          else
+            product();
         };
         if constexpr (!kTernary)
           multiply(ByteStrips<kStrips>{strips, strip});
@@ -178,13 +195,16 @@ class Int8Loop {
           multiply(ExpandedStrips<kStrips>{scratch_->panel});
         else
           multiply(PackedStrips<kStrips>{strips, strip});
-        if (k + d == depth) after(r, n_row);
+        if (k + d < depth) continue;
+        summed_ = {this, &part, s, gate, r, n_row, 0, Finish(job_, s, scratch_->scaled, r, n_row)};
+        if constexpr (!Tile::kBeside) summed_.finish();
       }
     }
   }
 
   /// What the sums of a tile stand for: float(sum) * (scale of W, or of its column / s of the row).
-  VLA_INLINE void scale(const LinearJob::Part& part, const Stripe& s, std::int64_t r, std::int64_t n_row, float* to) {
+  VLA_INLINE void scale(const LinearJob::Part& part, const Stripe& s, std::int64_t r, std::int64_t n_row,
+                        float* to) const {
     for (std::int64_t i = 0; i < n_row; ++i, ++r) {
       const RowScale row = row_scale(row_of(s, r), job_.d_in);
       for (std::int64_t n = 0; n < kColumns; n += V::width) {
@@ -202,6 +222,7 @@ class Int8Loop {
 
   const LinearJob& job_;
   Scratch* scratch_ = nullptr;
+  Summed summed_;  // the tile before
   const std::int64_t block_rows_, n_block_, n_panel_;
 };
 

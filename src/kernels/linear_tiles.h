@@ -138,7 +138,8 @@ class TileLoop {
     return reinterpret_cast<const X*>(job_.x) + place_in_tiles(row_ + r, k_ + k, job_.d_in);
   }
 
-  /// One panel, and its gate's, with sums at a place of the scratch. The stripe's depth is all of it, since no partial sum goes to y.
+  /// One panel, and its gate's, with sums at a place of the scratch. The stripe's depth is all of it, since no partial
+  /// sum goes to y.
   void multiply(std::int64_t panel, std::int64_t place) {
     Stripe s = Stripes::of_panel(job_, panel);
     s.row = row_, s.n_row = n_row_, s.depth = job_.d_in, s.gates = scratch_->gates + place;

@@ -177,8 +177,7 @@ class Layouts {
     const std::int64_t n_row = count(y.shape) / y.shape[0];
     for (const Node* reader : l.readers[static_cast<std::size_t>(y.node->id)]) {
       const auto* product = reader->as<op::Linear>();
-      if (product == nullptr ||
-          l.weights.kernel(product->weight)->for_rows(n_row).rounded(y.shape[0]) != layout)
+      if (product == nullptr || l.weights.kernel(product->weight)->for_rows(n_row).rounded(y.shape[0]) != layout)
         return;
     }
     y.type = DType::bf16, y.in_tiles = layout == kernels::RoundedLayout::tiles;
