@@ -198,7 +198,7 @@ struct VectorPairProducts : PairPanels<V, Pairs> {
 };
 
 /// 32 rows times 32 columns through a tile type (AMX, or its emulation) that holds the sums between `open` and `close`,
-/// adds 32 of the depth in each `step`, and rounds. Rows of all operands are kHeadStride apart.
+/// adds 32 of the depth in each `step`, and rounds. Strides are numbers from one row to the next.
 template <class V, class Tile>
 struct PairProducts : PairPanels<V, Tile> {
   using Base = PairPanels<V, Tile>;
@@ -217,8 +217,7 @@ struct PairProducts : PairPanels<V, Tile> {
     /// c = a * panel, or c += where `sum`.
     template <int kStrideA, int kStrideC>
     VLA_INLINE void add(const Number* a, const Number* panel, std::int64_t depth, std::int64_t, float* c, bool sum) {
-      static_assert(kStrideA == kHeadStride && kStrideC == kHeadStride);
-      waiting_[n_waiting_++] = {a, panel, c, static_cast<int>(depth / kDepth), sum};
+      waiting_[n_waiting_++] = {a, panel, c, kStrideA, kStrideC, static_cast<int>(depth / kDepth), sum};
       n_step_ += static_cast<int>(depth / kDepth);
     }
     /// Steps of everything that was added since the last `finish`.
@@ -227,10 +226,10 @@ struct PairProducts : PairPanels<V, Tile> {
     VLA_INLINE void advance(int n) {
       for (; n > 0 && first_ < n_waiting_; --n) {
         const Product& product = waiting_[first_];
-        if (step_ == 0) tile_.open(product.c, product.sum);
-        tile_.step(product.a + step_ * kDepth, product.panel + step_ * kDepth * kPanel);
+        if (step_ == 0) tile_.open(product.c, product.stride_c, product.sum);
+        tile_.step(product.a + step_ * kDepth, product.stride_a, product.panel + step_ * kDepth * kPanel);
         if (++step_ < product.n_step) continue;
-        tile_.close(product.c);
+        tile_.close(product.c, product.stride_c);
         step_ = 0, ++first_;
       }
     }
@@ -243,7 +242,7 @@ struct PairProducts : PairPanels<V, Tile> {
     struct Product {
       const Number *a, *panel;
       float* c;
-      int n_step;
+      int stride_a, stride_c, n_step;
       bool sum;
     };
     Product waiting_[kKeys / kPanel + kMaxHead / kPanel];

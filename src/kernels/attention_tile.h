@@ -63,12 +63,10 @@ class AttentionTile {
     alignas(64) float mixed[kRows * kHeadStride];
     // Of one pass, or of two where the next one's products are computed beside the weights of one.
     static constexpr int kBuffers = P::kBeside ? 2 : 1, kBufferSize = kPart * kKeyStride;
+    // Scores, and weights in their place. Those of rows that no query has are anything: they are multiplied too, into
+    // rows that are not read.
     alignas(64) float score[kBuffers * kBufferSize];
     alignas(64) Number query_number[kRows * kHeadStride];
-    // Weights take the place of the scores, unless they are numbers of another kind. Those of rows that no query has
-    // are anything: they are multiplied too, into rows that are not read.
-    static constexpr bool kInPlace = std::is_same_v<Number, float>;
-    alignas(64) Number rounded_weight[kInPlace ? 1 : kBuffers * kBufferSize];
     static constexpr int kRowVectors = round_up(kRows, kWidth);  // room for whole vectors
     alignas(64) float sum[kRowVectors * kWidth];                 // of a row's weights, lane by lane
     // One number for each row; weights are relative to the score `base`.
@@ -97,12 +95,8 @@ class AttentionTile {
     float* scores(const Pass& pass, int row) {
       return score + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
     }
-    Number* weights(const Pass& pass, int row) {
-      if constexpr (kInPlace)
-        return scores(pass, row);
-      else
-        return rounded_weight + pass.buffer * kBufferSize + (row - pass.first) * kKeyStride;
-    }
+    static constexpr int kWeightStride = kKeyStride * static_cast<int>(sizeof(float) / sizeof(Number));
+    Number* weights(const Pass& pass, int row) { return reinterpret_cast<Number*>(scores(pass, row)); }
 
     void run() {
       start();
@@ -277,7 +271,7 @@ class AttentionTile {
         const std::int64_t width = panels.width(i);
         const Number* panel = values + i * panels.n_key + pass.key * width;
         for (int r = pass.first; r < pass.end; r += kTile)
-          work.template add<kKeyStride, kHeadStride>(weights(pass, r), panel, round_up(pass.n, P::kDepth), width,
+          work.template add<kWeightStride, kHeadStride>(weights(pass, r), panel, round_up(pass.n, P::kDepth), width,
                                                      mixed + r * kHeadStride + i, pass.sum);
       }
     }

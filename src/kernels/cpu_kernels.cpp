@@ -78,19 +78,19 @@ struct EmulatedTile {
       for (int i = 0; i < Portable::width; ++i) *to++ = to_bf16(x[i]);
   }
 
-  void open(const float* c, bool sum) {
+  void open(const float* c, int stride, bool sum) {
     for (int r = 0; r < 32; ++r)
-      for (int n = 0; n < 32; ++n) sums[r][n] = sum ? c[r * kHeadStride + n] : 0.0f;
+      for (int n = 0; n < 32; ++n) sums[r][n] = sum ? c[r * stride + n] : 0.0f;
   }
-  void step(const std::uint16_t* a, const std::uint16_t* panel) {
+  void step(const std::uint16_t* a, int stride, const std::uint16_t* panel) {
     for (int r = 0; r < 32; ++r)
       for (int n = 0; n < 32; ++n)
         for (int k = 0; k < 32; ++k)
           sums[r][n] +=
-              from_bf16(a[r * kHeadStride + k]) * from_bf16(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
+              from_bf16(a[r * stride + k]) * from_bf16(panel[PairProducts<Portable, EmulatedTile>::place(k, n)]);
   }
-  void close(float* c) const {
-    for (int r = 0; r < 32; ++r) std::memcpy(c + r * kHeadStride, sums[r], sizeof(sums[r]));
+  void close(float* c, int stride) const {
+    for (int r = 0; r < 32; ++r) std::memcpy(c + r * stride, sums[r], sizeof(sums[r]));
   }
 
   float sums[32][32];
