@@ -272,7 +272,7 @@ class AttentionTile {
         const Number* panel = values + i * panels.n_key + pass.key * width;
         for (int r = pass.first; r < pass.end; r += kTile)
           work.template add<kWeightStride, kHeadStride>(weights(pass, r), panel, round_up(pass.n, P::kDepth), width,
-                                                     mixed + r * kHeadStride + i, pass.sum);
+                                                        mixed + r * kHeadStride + i, pass.sum);
       }
     }
 
