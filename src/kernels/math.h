@@ -67,9 +67,10 @@ VLA_INLINE typename V::Float slope_of_power(typename V::Float rest) {
   return V::fma(p, rest, V::set(0x1.62e432p-1f));
 }
 
-/// max(x, 0) - y / (1 + 2^(n + rest)) with |rest| <= 0.53, 0 <= n <= 160 and `shifted` = n + kShift.
+/// max(x, 0) - y / (1 + 2^(n + rest)) with |rest| <= 0.53, 0 <= n <= 160 and `shifted` = n + kShift. Where y is the
+/// limit, from which on nothing is subtracted, a zero is: a quotient that underflows costs hundreds of cycles.
 template <class V>
-VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, typename V::Float shifted,
+VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, float limit, typename V::Float shifted,
                                       typename V::Float rest) {
   using Float = typename V::Float;
   const Float p = slope_of_power<V>(rest);
@@ -78,7 +79,8 @@ VLA_INLINE typename V::Float multiply(typename V::Float x, typename V::Float y, 
   const Float lost = V::fma(sum - power, V::set(-1.625f), V::set(1.625f * kUnit));
   const Float divisor = V::fma(p, V::fma(rest, power, lost), sum);
   const Float positive = V::max(x * 0.0f, x);  // x itself where it is not finite
-  return V::fma(V::divide(y, divisor), V::set(-kUnit), positive);
+  const Float dividend = y < limit ? y : Float{};
+  return V::fma(V::divide(dividend, divisor), V::set(-kUnit), positive);
 }
 
 }  // namespace sigmoid
@@ -99,11 +101,12 @@ VLA_INLINE typename V::Float relu_squared(typename V::Float x) {
 template <class V>
 VLA_INLINE typename V::Float silu(typename V::Float x) {
   using Float = typename V::Float;
-  const Float y = sigmoid::size_within<V>(x, 109.0f);  // from there on the results are x and zero
+  constexpr float kLimit = 109.0f;  // from there on the results are x and zero
+  const Float y = sigmoid::size_within<V>(x, kLimit);
   const Float a = V::set(0x1.715476p+0f), low_a = V::set(0x1.4ae0cp-26f);
   const Float shifted = V::fma(y, a, V::set(sigmoid::kShift));
   const Float rest = V::fma(y, low_a, V::fma(y, a, sigmoid::kShift - shifted));
-  return sigmoid::multiply<V>(x, y, shifted, rest);
+  return sigmoid::multiply<V>(x, y, kLimit, shifted, rest);
 }
 
 /// x / 2 * (1 + tanh(u)) with u = sqrt(2/pi) (x + 0.044715 x^3), which is x / (1 + e^-2u); as exact as silu().
@@ -111,7 +114,8 @@ VLA_INLINE typename V::Float silu(typename V::Float x) {
 template <class V>
 VLA_INLINE typename V::Float gelu_tanh(typename V::Float x) {
   using Float = typename V::Float;
-  const Float y = sigmoid::size_within<V>(x, 10.8f);  // from there on the results are x and zero
+  constexpr float kLimit = 10.8f;  // from there on the results are x and zero
+  const Float y = sigmoid::size_within<V>(x, kLimit);
   // y^2, a and b in two parts each. The first ones have so few bits that their a + b y^2 is exact.
   constexpr float kCoarse = 0x1.8p18f;  // adding it rounds to a multiple of 2^-5
   const Float square = V::fma(y, y, V::set(kCoarse)) - kCoarse, low_square = V::fma(y, y, -square);
@@ -120,7 +124,7 @@ VLA_INLINE typename V::Float gelu_tanh(typename V::Float x) {
   low_factor = V::fma(low_square, V::set(0x1.a5a7dp-4f), low_factor);
   const Float shifted = V::fma(y, factor, V::set(sigmoid::kShift));
   const Float rest = V::fma(y, low_factor, V::fma(y, factor, sigmoid::kShift - shifted));
-  return sigmoid::multiply<V>(x, y, shifted, rest);
+  return sigmoid::multiply<V>(x, y, kLimit, shifted, rest);
 }
 
 /// 2^x for what is then rounded to bf16: relative error 2^-18, zero for minus infinity, NaN for NaN.
