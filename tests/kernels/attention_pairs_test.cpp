@@ -4,6 +4,7 @@
 // Attention of numbers rounded to bf16, as AVX-512 BF16 and AMX's tiles multiply them.
 #include "kernels/attention_products.h"
 
+#include "base/bf16.h"
 #include "support/attention_case.h"
 #include "support/kernel_rows.h"
 
@@ -87,6 +88,26 @@ void check_pair_weights(const AttentionKernel& kernel) {
   }
 }
 
+/// A product that rounds what it reads finds the answer rounded, where it looks for it.
+void check_pair_rounded(const AttentionKernel& kernel) {
+  for (const AttentionShape& shape : {AttentionShape{64, 2, 1, 40, 50, 2}, AttentionShape{16, 4, 2, 37, 33, 1},
+                                      AttentionShape{72, 4, 1, 33, 40, 2}, AttentionShape{48, 2, 2, 5, 64, 1}}) {
+    CAPTURE(shape.d_head);
+    const Case c(shape, 2, 0);
+    std::vector<std::uint16_t> rounded;
+    const std::vector<float> floats = run(kernel, c, 2);
+    run(kernel, c, 2, {}, {}, &rounded);
+    const std::int64_t d = shape.n_head * shape.d_head;
+    int n_wrong = 0;
+    for (std::int64_t i = 0; i < static_cast<std::int64_t>(floats.size()); ++i) {
+      const std::int64_t place =
+          kernel.rounded == kernels::RoundedLayout::tiles ? kernels::place_in_tiles(i / d, i % d, d) : i;
+      n_wrong += rounded[static_cast<std::size_t>(place)] != to_bf16(floats[static_cast<std::size_t>(i)]);
+    }
+    CHECK(n_wrong == 0);
+  }
+}
+
 }  // namespace
 
 /// A test of kernels that round to bf16: the portable instance, the emulated ones, and the machine's.
@@ -118,6 +139,7 @@ VLA_PAIR_TEST("attention errs by the rounding of its weights to bf16 alone", che
 VLA_PAIR_TEST("a key with the logarithm of n in the mask is as n equal keys", check_pair_repeated)
 VLA_PAIR_TEST("attention is right whatever the width of a head and the number of keys", check_pair_ends)
 VLA_PAIR_TEST("attention keeps small weights, and greater scores make earlier ones smaller", check_pair_weights)
+VLA_PAIR_TEST("attention's answer may be rounded, as the product behind it reads it", check_pair_rounded)
 VLA_PAIR_TEST("attention skips what a mask hides, and chunks that it hides whole", check_pair_masks)
 VLA_PAIR_TEST("a query that sees nothing, and what is not finite, does not become an answer",
               check_attention_of_not_finite)

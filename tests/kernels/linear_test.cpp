@@ -233,7 +233,7 @@ void check_depths(const LinearKernel& kernel) {
   gated.n_part = 2, gated.gated = true, gated.n_thread = 2;
   check(kernel, gated);
   Case wide = deep;
-  wide.shape.d_out = 520;
+  wide.shape = {270, 2080, 780};
   if (rounds(kernel)) wide.x_type = DType::bf16;
   check(kernel, wide);
 }

@@ -70,9 +70,10 @@ struct Preparation {
 };
 
 /// What the kernel answers with `n_thread` workers, keys and values in segments of `n_key`, which add up to all. Memory
-/// holds NaNs before it is written.
+/// holds NaNs before it is written. The answer goes to `rounded` instead, as the kernel rounds it, if that is given.
 inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int n_thread,
-                              std::vector<std::int64_t> n_key = {}, const Preparation& prep = {}) {
+                              std::vector<std::int64_t> n_key = {}, const Preparation& prep = {},
+                              std::vector<std::uint16_t>* rounded = nullptr) {
   const AttentionShape& s = c.shape;
   if (n_key.empty()) n_key = {s.n_key};
   const float nan = std::numeric_limits<float>::quiet_NaN();
@@ -83,6 +84,12 @@ inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int 
   job.scale = c.scale(), job.q = c.queries(), job.prep = prep.q;
   job.mask = c.mask.empty() ? nullptr : c.mask.data();
   job.out = out.data();
+  if (rounded != nullptr) {
+    job.out_layout = kernel.rounded;
+    const std::int64_t n = kernels::rounded_count(kernel.rounded, s.n_query * s.n_batch, s.n_head * s.d_head);
+    rounded->assign(static_cast<std::size_t>(n), 0xffff);
+    job.out = reinterpret_cast<float*>(rounded->data());
+  }
   std::vector<std::vector<float>> packed;  // a vector keeps its numbers where they are when it moves
   std::int64_t first = 0;
   for (const std::int64_t n : n_key) {
