@@ -32,7 +32,11 @@ struct Avx512Tile {
     static constexpr int kCount = 1, kXStride = Avx512Tile::kXStride;
     static VLA_INLINE __m512 everywhere(const float* x) { return _mm512_set1_ps(*x); }
     static VLA_INLINE void add(__m512& sum, __m512 value, __m512 numbers) {
+#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++, for tests
       sum = _mm512_fmadd_ps(value, numbers, sum);
+#else  // of the intrinsic GCC 12 moves sums from register to register
+      asm("vfmadd231ps %2, %1, %0" : "+v"(sum) : "v"(value), "v"(numbers));
+#endif
     }
   };
   // Number k of 16 columns, as floats. With masks of ones where an instruction without one would do: GCC 12 warns of

@@ -20,6 +20,7 @@ void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64
   const std::int64_t n_line = ceil_div(ahead.size * kDepth, 64 * depth);  // of the cache, for each kDepth of the depth
   const std::byte* next = ahead.from;
   __m512 sum[kCount][2];
+#pragma GCC unroll 12  // or GCC keeps some of the sums in memory
   for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = _mm512_setzero_ps();
   for (std::int64_t block = 0; block < depth; block += Step::kBlock, panel += 2 * kPanelBlock)
     for (int i = 0; i < Step::kBlock; i += kDepth, x += kDepth) {
