@@ -17,6 +17,7 @@ namespace {
 PFN_vkGetInstanceProcAddr next_instance = nullptr;
 PFN_vkGetDeviceProcAddr next_device = nullptr;
 PFN_vkQueueSubmit next_submit = nullptr;
+PFN_vkQueueWaitIdle next_idle = nullptr;
 PFN_vkWaitForFences next_wait = nullptr;
 PFN_vkGetFenceStatus next_status = nullptr;
 std::atomic<long> n_submit = 0;
@@ -60,6 +61,7 @@ VKAPI_ATTR VkResult VKAPI_CALL create_device(VkPhysicalDevice physical, const Vk
       reinterpret_cast<PFN_vkCreateDevice>(instance(nullptr, "vkCreateDevice"))(physical, info, memory, device);
   if (made != VK_SUCCESS) return made;
   next_submit = reinterpret_cast<PFN_vkQueueSubmit>(next_device(*device, "vkQueueSubmit"));
+  next_idle = reinterpret_cast<PFN_vkQueueWaitIdle>(next_device(*device, "vkQueueWaitIdle"));
   next_wait = reinterpret_cast<PFN_vkWaitForFences>(next_device(*device, "vkWaitForFences"));
   next_status = reinterpret_cast<PFN_vkGetFenceStatus>(next_device(*device, "vkGetFenceStatus"));
   return made;
@@ -68,7 +70,9 @@ VKAPI_ATTR VkResult VKAPI_CALL create_device(VkPhysicalDevice physical, const Vk
 VKAPI_ATTR VkResult VKAPI_CALL submit(VkQueue queue, std::uint32_t n, const VkSubmitInfo* infos, VkFence fence) {
   ++n_submit;
   if (counts != nullptr) std::fputc('.', counts), std::fflush(counts);
-  return is_lost() ? VK_ERROR_DEVICE_LOST : next_submit(queue, n, infos, fence);
+  if (!is_lost()) return next_submit(queue, n, infos, fence);
+  next_idle(queue);  // or Mesa's threads go on, which a lost device does not, and read what is freed meanwhile
+  return VK_ERROR_DEVICE_LOST;
 }
 VKAPI_ATTR VkResult VKAPI_CALL wait(VkDevice device, std::uint32_t n, const VkFence* fences, VkBool32 all,
                                     std::uint64_t limit) {
