@@ -72,7 +72,6 @@ struct LinearStripes {
       rows_ = s.n_column == kColumns ? choose<true>() : choose<false>();
     }
 
-    std::int64_t n_row() const { return n_row_; }
     VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
 
     /// Asks for what rows begin to end, or those of them that there are, will read and write.

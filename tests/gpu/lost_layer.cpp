@@ -71,7 +71,8 @@ VKAPI_ATTR VkResult VKAPI_CALL submit(VkQueue queue, std::uint32_t n, const VkSu
   ++n_submit;
   if (counts != nullptr) std::fputc('.', counts), std::fflush(counts);
   if (!is_lost()) return next_submit(queue, n, infos, fence);
-  next_idle(queue);  // or Mesa's threads go on, which a lost device does not, and read what is freed meanwhile
+  // A lost device has stopped. Mesa's threads still compute, and would read memory that the caller frees now.
+  next_idle(queue);
   return VK_ERROR_DEVICE_LOST;
 }
 VKAPI_ATTR VkResult VKAPI_CALL wait(VkDevice device, std::uint32_t n, const VkFence* fences, VkBool32 all,

@@ -117,9 +117,9 @@ inline __m512 widen(unsigned, __m256i x) {
 // What the sources ask the compiler for, and names of their own, so that the program holds the real kernels too.
 #if !defined(__AVX512F__)
 #define __AVX512F__ 1
-#define VLA_EMULATED_INSTRUCTIONS
 #define __AVX512DQ__ 1
 #endif
+#define VLA_EMULATED_INSTRUCTIONS
 #define asm(...) static_cast<void>(0)  // a hint that names a register of 64 bytes
 #define Avx512 EmulatedAvx512
 #ifndef VLA_EMULATED_MACHINE
