@@ -25,7 +25,7 @@ constexpr int kTimes = 1000;  // rows of the reference's time table
 
 class Evo1 final : public Policy {
   /// What becomes of the prompt's pads and of the image tokens of views that are absent.
-  enum class DeadRows {
+  enum class MaskedRows {
     zero_attention,    // flash-attention: a row for itself, which the head sees
     causal_attention,  // any other attention: it sees the rows before it, and the head sees it
     unseen             // the head does not see it
@@ -43,7 +43,7 @@ class Evo1 final : public Policy {
   ViewPlaces places_;
   int d_action_, d_robot_, horizon_, n_token_, pad_token_;
   bool in_place_;
-  DeadRows dead_rows_;
+  MaskedRows masked_rows_;
   double time_scale_;
 
  public:
@@ -70,7 +70,8 @@ class Evo1 final : public Policy {
         n_token_(s.dim("n_token", 8192)),
         pad_token_(s.index("pad_token", (s / "lm").dim("n_vocab", 1 << 24))),
         in_place_(s.choice("absent_views", {"last", "in_place"}) == 1),
-        dead_rows_(static_cast<DeadRows>(s.choice("dead_rows", {"zero_attention", "causal_attention", "unseen"}))),
+        masked_rows_(
+            static_cast<MaskedRows>(s.choice("masked_rows", {"zero_attention", "causal_attention", "unseen"}))),
         time_scale_(s.precise("time_scale", {1, 1e6})) {
     s.require(places_.n_least() <= n_token_, "view_starts", fmt::format("places within {} tokens", n_token_),
               std::to_string(places_.n_least()));
@@ -102,9 +103,9 @@ class Evo1 final : public Policy {
   }
 
   void constants(Graph& g, const std::function<Tensor()>& absent_view, Cache& cache) const override {
-    if (dead_rows_ == DeadRows::unseen) return;
+    if (masked_rows_ == MaskedRows::unseen) return;
     const Tensor image = flatten_views(g, connector_(g, vision_(g, absent_view())));  // [d_model, n_view_token]
-    if (dead_rows_ == DeadRows::causal_attention) return cache.put(g, "absent", image);
+    if (masked_rows_ == MaskedRows::causal_attention) return cache.put(g, "absent", image);
     head_.keep(g, lm_.alone(g, concat_tokens(g, {image, pads(g, 1)})), cache);
   }
 
@@ -169,14 +170,14 @@ class Evo1 final : public Policy {
         rows.add(lm_.embed(g, slice_ids(g, in.tokens, piece.first, piece.count)), piece.first, true);
       else if (view != kAbsent)
         rows.add(one_view(g, image, view), piece.first, true);
-      else if (dead_rows_ == DeadRows::causal_attention)
+      else if (masked_rows_ == MaskedRows::causal_attention)
         rows.add(cache.get(g, "absent"), piece.first, false);
       else
         ++n_absent;
     }
     const int n_pad = n_token_ - n_text;
-    if (dead_rows_ == DeadRows::causal_attention && n_pad > 0) rows.add(pads(g, n_pad), n_text, false);
-    if (dead_rows_ == DeadRows::zero_attention) {
+    if (masked_rows_ == MaskedRows::causal_attention && n_pad > 0) rows.add(pads(g, n_pad), n_text, false);
+    if (masked_rows_ == MaskedRows::zero_attention) {
       if (n_absent > 0) rows.kept.push_back({0, places_.n_view_token(), n_absent});
       if (n_pad > 0) rows.kept.push_back({places_.n_view_token(), 1, n_pad});
     }
@@ -191,7 +192,7 @@ Keys published() {
       {"policy.d_state", 24}, {"policy.d_action", 24}, {"policy.horizon", 50}, {"policy.d_robot", 7},
       {"policy.max_views", 3}, {"policy.n_token", 1024}, {"policy.pad_token", 151643},
       {"policy.view_starts", std::vector<std::int64_t>{6, 270, 534}},
-      {"policy.dead_rows", "zero_attention"}, {"policy.absent_views", "in_place"}, {"policy.time_scale", 999.0},
+      {"policy.masked_rows", "zero_attention"}, {"policy.absent_views", "in_place"}, {"policy.time_scale", 999.0},
       {"vision.d_model", 1024}, {"vision.n_layer", 24}, {"vision.n_head", 16}, {"vision.d_ff", 4096},
       {"vision.image_size", 448}, {"vision.patch_size", 14}, {"vision.norm_eps", 1e-6},
       {"connector.factor", 2}, {"connector.norm_eps", 1e-5},

@@ -11,7 +11,7 @@ from cli_test import mutate
 from tiny_evo1 import TinyEvo1, TinyEvo1Lerobot
 from vla_cpp.convert.cli import main
 
-FLAGS = "--variant r2 --views front,wrist --max-views 3 --dead-rows zero_attention".split()
+FLAGS = "--variant r2 --views front,wrist --max-views 3 --masked-rows zero_attention".split()
 BACKBONE = ["vlm/config.json", "vlm/tokenizer.json", "vlm/tokenizer_config.json"]
 
 

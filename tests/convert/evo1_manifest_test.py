@@ -75,7 +75,7 @@ def published(request):
         max_views=3,
         n_step=50,
         time_scale=999.0,
-        dead_rows="zero_attention",
+        masked_rows="zero_attention",
         absent_views="in_place",
     )
     problems = Problems("published")

@@ -15,7 +15,7 @@ def test_everything_that_the_authors_checkpoint_leaves_open_is_asked_for_at_once
     tiny.norm_stats[ARM]["another"] = tiny.stats
     error = converter.refusal(tiny)
     assert error.code == Code.USAGE and len(error.problems) == 5
-    for flag in ("--stats", "--variant", "--views", "--max-views", "--dead-rows"):
+    for flag in ("--stats", "--variant", "--views", "--max-views", "--masked-rows"):
         problem = next(p for p in error.problems if p.where == flag)
         assert problem.found == "none" and "docs/converting.md" in problem.hint and len(problem.hint) > 60
     assert "{0}/{1}, {0}/another".format(ARM, DATASET) in error.message()
@@ -30,7 +30,7 @@ ANSWERS_THAT_DO_NOT_FIT = {
     ),
     "--views: expected different names, no more than there are slots, found a,b,c,d": dict(views=list("abcd")),
     "--max-views: expected a count from 1 to 32, found -1": dict(max_views=-1),
-    "--dead-rows: expected zero_attention or causal_attention, found unseen": dict(dead_rows="unseen"),
+    "--masked-rows: expected zero_attention or causal_attention, found unseen": dict(masked_rows="unseen"),
     "--stats: expected one of the entries": dict(stats="nobody/nothing"),
     "--identity-stats: expected a checkpoint of LeRobot, found one of Evo-1's authors": dict(identity_stats=["action"]),
     "--position-precision: expected a checkpoint of LeRobot": dict(position_precision="float32"),

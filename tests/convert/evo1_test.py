@@ -113,7 +113,7 @@ def test_keys_of_the_authors_second_revision(converter):
         "policy.max_views": 3,
         "policy.n_token": N_TOKEN,
         "policy.pad_token": FIRST_ADDED,
-        "policy.dead_rows": "zero_attention",
+        "policy.masked_rows": "zero_attention",
         "policy.absent_views": "in_place",
         "policy.time_scale": 999.0,
         "solver.kind": "euler",
@@ -251,11 +251,11 @@ def test_places_of_views_are_those_of_the_tokenizers_own_ids(converter):
 
 def test_the_command_takes_the_answers(converter, capsys):
     folder = converter.save(TinyEvo1())
-    flags = "--variant r1 --views observation.images.front,wrist --max-views 2 --dead-rows causal_attention"
+    flags = "--variant r1 --views observation.images.front,wrist --max-views 2 --masked-rows causal_attention"
     assert main([folder, "-o", converter.out, "--stats", "{}/{}".format(ARM, DATASET), *flags.split()]) == 0
     keys = read_bundle(converter.out).keys
     assert keys["observation.views"] == ["observation.images.front", "observation.images.wrist"]
-    assert (keys["policy.max_views"], keys["policy.dead_rows"], keys["solver.steps"]) == (2, "causal_attention", 32)
+    assert (keys["policy.max_views"], keys["policy.masked_rows"], keys["solver.steps"]) == (2, "causal_attention", 32)
     assert "the robot's {} action columns".format(ACTION_DIM) in capsys.readouterr().out
 
 
@@ -286,7 +286,7 @@ def test_keys_and_recipe_of_lerobots_layout(converter):
         "policy.d_state": D_STATE,
         "policy.d_action": D_ACTION,
         "policy.d_robot": ACTION_DIM,
-        "policy.dead_rows": "unseen",
+        "policy.masked_rows": "unseen",
         "policy.absent_views": "last",
         "policy.time_scale": 999.0,
         "solver.steps": 6,

@@ -22,7 +22,7 @@ D_STATE, D_ACTION = 7, 6  # of LeRobot's, where they are free
 SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<img>", "</img>", "<IMG_CONTEXT>"]
 SPLIT = "(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\\r\\n\\p{L}\\p{N}]?\\p{L}+|\\p{N}| ?[^\\s\\p{L}\\p{N}]+[\\r\\n]*|\\s*[\\r\\n]+|\\s+(?!\\S)|\\s+"
 ARM, DATASET = "franka_ee_pose_delta", "libero_10_no_noops_lerobot"
-ANSWERS = dict(variant="r2", views=["front", "wrist"], max_views=3, dead_rows="zero_attention")
+ANSWERS = dict(variant="r2", views=["front", "wrist"], max_views=3, masked_rows="zero_attention")
 
 
 def tokenizer():

@@ -227,7 +227,7 @@ def in_lerobot(name):
 
 
 # What the files of the authors do not say, for the published size.
-OPTIONS = {"variant": "r2", "dead_rows": "zero_attention", "views": ["camera1", "camera2"], "max_views": 3}
+OPTIONS = {"variant": "r2", "masked_rows": "zero_attention", "views": ["camera1", "camera2"], "max_views": 3}
 
 
 def published(views, arch="evo1"):
@@ -245,9 +245,9 @@ def policy(horizon, n_token, d_state=24, d_action=24, **more):
     return {"chunk_size": horizon, "max_text_length": n_token, "max_state_dim": d_state, "max_action_dim": d_action, **more}
 
 
-def said(variant, dead_rows, views, **more):
+def said(variant, masked_rows, views, **more):
     """What whoever converts the authors' files has to know."""
-    return {"variant": variant, "dead_rows": dead_rows, "views": list(views), "max_views": 3, **more}
+    return {"variant": variant, "masked_rows": masked_rows, "views": list(views), "max_views": 3, **more}
 
 
 CASES = {
@@ -316,7 +316,7 @@ def described(checkpoint):
     import cv2
 
     options = read_options(checkpoint)
-    return f"Evo1_server.py {options['variant']}, {options['dead_rows']}, without its channel swap, cv2 {cv2.__version__}"
+    return f"Evo1_server.py {options['variant']}, {options['masked_rows']}, without its channel swap, cv2 {cv2.__version__}"
 
 
 def in_bfloat16(towers):
@@ -378,7 +378,7 @@ def load_lerobot(checkpoint):
     policy.load_state_dict(load_file(checkpoint / "model.safetensors"), strict=True)
     before, after = make_pre_post_processors(config, pretrained_path=str(checkpoint))
     policy.towers, policy.head = policy.model.embedder.model, policy.model.action_head
-    policy.dead_rows, policy.d_robot = "unseen", config.output_features["action"].shape[0]
+    policy.masked_rows, policy.d_robot = "unseen", config.output_features["action"].shape[0]
     policy.n_step = config.num_inference_timesteps
 
     def widened(chunk):
@@ -429,7 +429,7 @@ class Recorder(Taps):
         n = int(live.nonzero().max()) + 1
         self.put("tokens", ids[:n])
         every, state = torch.arange(len(ids)), torch.tensor([len(ids)])
-        dead = self.policy.dead_rows
+        dead = self.policy.masked_rows
         self.valid = every if dead == "causal_attention" else every[live]
         self.keys = torch.cat([self.valid, state])
         self.twins = [image[~self.present], every[n:, None]] if dead == "zero_attention" else []

@@ -126,7 +126,7 @@ class Server:
         self.config = types.SimpleNamespace(type="evo1")
         options, config = read_options(checkpoint), json.loads((checkpoint / "config.json").read_text())
         self.towers, self.head, self.options = modules["towers"], modules["head"], options
-        self.dead_rows, self.r1 = options["dead_rows"], options["variant"] == "r1"
+        self.masked_rows, self.r1 = options["masked_rows"], options["variant"] == "r1"
         self.n_step, self.time_scale = REVISIONS[options["variant"]]
         self.n_token = read_dims(checkpoint)["prompt_tokens"]
         self.tokenizer = AutoTokenizer.from_pretrained(checkpoint / "vlm")
@@ -197,12 +197,12 @@ class Server:
     def context(self, ids, pixels, mask):
         """Every row of the prompt behind the language model, (1, n_token, d)."""
 
-        def without_dead_rows(module, args, out):
+        def without_masked_rows(module, args, out):
             return out[0] * mask[..., None].to(out[0].dtype), *out[1:]
 
         hooks = []
-        if self.dead_rows == "zero_attention":  # flash attention cuts out rows that are masked, and puts zeros back
-            hooks = [layer.self_attn.register_forward_hook(without_dead_rows) for layer in self.towers.language_model.layers]
+        if self.masked_rows == "zero_attention":  # flash attention cuts out rows that are masked, and puts zeros back
+            hooks = [layer.self_attn.register_forward_hook(without_masked_rows) for layer in self.towers.language_model.layers]
         rows = self.towers(input_ids=ids, pixel_values=pixels, attention_mask=mask, use_cache=False).last_hidden_state
         for hook in hooks:
             hook.remove()

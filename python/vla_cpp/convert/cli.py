@@ -27,8 +27,8 @@ Without --dtype the stored type is kept if all matrices share it; mixed types be
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
 two agree for grids whose side is a power of two. 'shifted' reproduces transformers 4.55 to 4.57.
 
-A checkpoint of Evo-1's authors needs --variant, --views, --max-views and --dead-rows: r1 is their code before 9 April 2026, r2 the
-code since (steps, time index, pixel rounding and state padding differ); --dead-rows is zero_attention if the policy ran with
+A checkpoint of Evo-1's authors needs --variant, --views, --max-views and --masked-rows: r1 is their code before 9 April 2026, r2 the
+code since (steps, time index, pixel rounding and state padding differ); --masked-rows is zero_attention if the policy ran with
 flash-attn, which the authors ask for. docs/converting.md tells how to find out.
 
 Exit codes: 0 done, 1 a fault of the converter, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot
@@ -117,7 +117,7 @@ def _add_evo1(parser: argparse.ArgumentParser) -> None:
     )
     add("--max-views", metavar="N", type=int, default=0, help="view slots of the prompt; the authors' server has 3")
     add(
-        "--dead-rows",
+        "--masked-rows",
         choices=("zero_attention", "causal_attention"),
         default="",
         help="what attention wrote into masked rows, which the action head reads: zeros with flash-attn",

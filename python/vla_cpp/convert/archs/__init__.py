@@ -63,7 +63,7 @@ class Options:
     camera_size: str = ""  # GR00T: WIDTHxHEIGHT of images whose aspect the pipeline keeps; they are square without it
     gripper_sign: str = ""  # GR00T: the key of a gripper's actions, which become -1 where it opens and 1 where it closes
     letterbox: bool = False  # GR00T: images are padded to squares, as the authors' later servers do
-    dead_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
+    masked_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
 
 
 @dataclass

@@ -62,7 +62,7 @@ def _prompt(source: Source, tokenizer: TokenizerPlan, problems: Problems) -> Pro
     s, where = source.sizes, "tokenizer_config.json"
     config = with_defaults(read_json(os.path.join(source.tokenizer, where)))
     sides = {"truncation_side": tokenizer.truncate}
-    if s.dead_rows != "unseen":
+    if s.masked_rows != "unseen":
         sides["padding_side"] = config.get("padding_side", "right")
     for key, found in sides.items():
         if found != "right":

@@ -88,7 +88,7 @@ def _read_tensors(folder: str, _problems: Problems) -> Tensors:
 
 
 LAYOUT = Layout(
-    "Evo-1's authors", ("variant", "stats", "views", "max_views", "dead_rows"), files=(*TORCH_FILES, NORM_STATS), read=_read_tensors
+    "Evo-1's authors", ("variant", "stats", "views", "max_views", "masked_rows"), files=(*TORCH_FILES, NORM_STATS), read=_read_tensors
 )
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server
@@ -102,7 +102,7 @@ MEANINGS = {
     "--stats": "the robot and the data set whose numbers the policy sees; the authors' server gets both names from its client",
     "--max-views": "the prompt has a slot for every image of a request, black ones too, and the authors' server takes exactly 3",
     "--views": "names of the cameras in the order in which the client sends their images; slots behind them stay masked",
-    "--dead-rows": "the action head reads masked rows too, and flash-attention leaves zeros in them where other attention does not:"
+    "--masked-rows": "the action head reads masked rows too, and flash-attention leaves zeros in them where other attention does not:"
     " zero_attention where flash-attn was installed, as the authors ask for, causal_attention where it was not",
 }
 
@@ -199,8 +199,8 @@ def _check_answers(options: Options, problems: Problems) -> None:
         _ask(problems, "--max-views", "a count from 1 to {}".format(MAX_SLOTS), str(max_views or ""))
     if not views or len(set(views)) != len(views) or "" in options.views or (max_views and len(views) > max_views):
         _ask(problems, "--views", "different names, no more than there are slots", ",".join(options.views))
-    if options.dead_rows not in ("zero_attention", "causal_attention"):
-        _ask(problems, "--dead-rows", "zero_attention or causal_attention", options.dead_rows)
+    if options.masked_rows not in ("zero_attention", "causal_attention"):
+        _ask(problems, "--masked-rows", "zero_attention or causal_attention", options.masked_rows)
 
 
 def _find_statistics(checkpoint: Checkpoint, options: Options, problems: Problems) -> dict:
@@ -241,7 +241,7 @@ def _authors_sizes(policy: Section, checkpoint: Checkpoint, options: Options) ->
         max_views=options.max_views,
         n_step=revision.n_step,
         time_scale=revision.time_scale,
-        dead_rows=options.dead_rows,
+        masked_rows=options.masked_rows,
         absent_views="in_place",
     )
 
@@ -436,7 +436,7 @@ def _lerobot_sizes(policy: Section) -> Sizes:
         max_views=policy.count("max_views", maximum=32),
         n_step=policy.count("num_inference_timesteps"),
         time_scale=999.0,
-        dead_rows="unseen",
+        masked_rows="unseen",
         absent_views="last",
     )
     s.state_dim, s.d_robot = s.d_state, s.d_action

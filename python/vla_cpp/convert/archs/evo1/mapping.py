@@ -111,7 +111,7 @@ class Sizes:
     n_token: int = 0
     n_step: int = 0
     time_scale: float = 0.0
-    dead_rows: str = ""
+    masked_rows: str = ""
     absent_views: str = ""
 
     @property
@@ -209,7 +209,7 @@ def network_keys(s: Sizes) -> List[Key]:
     eps = 1e-5  # torch's default, which the reference leaves as it is
     return keys_of(
         {
-            "policy": dict(policy, time_scale=s.time_scale, dead_rows=s.dead_rows, absent_views=s.absent_views),
+            "policy": dict(policy, time_scale=s.time_scale, masked_rows=s.masked_rows, absent_views=s.absent_views),
             "vision": s.vision,
             "connector": dict(factor=2, norm_eps=eps),
             "lm": s.lm,
