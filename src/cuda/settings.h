@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Included before every CUDA source of ggml by the compiler's command line, so that ggml stays as it is. What changes
-// numbers is settled here: products are computed in float32.
+// numbers is settled here: products are computed in the type that their weights have on the device.
 #pragma once
 
 #include <cublas_v2.h>
@@ -10,10 +10,10 @@
 #include <cstdlib>
 #include <cstring>
 
-/// What ggml reads from the environment: the type that products of f16 and bf16 are computed in is not asked for there.
+/// What ggml reads from the environment: the type that products are computed in is not asked for there.
 inline char* vla_cuda_setting(const char* name) {
-  static char f32[] = "f32";
-  return std::strcmp(name, "GGML_CUDA_CUBLAS_COMPUTE_TYPE") == 0 ? f32 : std::getenv(name);
+  static char of_weights[] = "auto";
+  return std::strcmp(name, "GGML_CUDA_CUBLAS_COMPUTE_TYPE") == 0 ? of_weights : std::getenv(name);
 }
 #define getenv(name) vla_cuda_setting(name)
 

@@ -92,7 +92,7 @@ const Backend& backend(const std::string& kind) {
 /// With driver and version, which a question about wrong numbers starts from.
 DeviceInfo describe(const Backend& found, const DeviceName& name) {
   ggml_backend_dev_t device = ggml_backend_reg_dev_get(found.devices, static_cast<std::size_t>(name.index));
-  DeviceInfo info = {name.text(), ggml_backend_dev_description(device), 0, 0, "f32"};
+  DeviceInfo info = {name.text(), ggml_backend_dev_description(device), 0, 0, "f32, bf16"};
   const Status told = guarded(info.name, [&] {
     info.description += fmt::format("; {}", found.library->driver(device));
     ggml_backend_dev_memory(device, &info.free, &info.memory);

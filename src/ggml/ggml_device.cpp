@@ -66,13 +66,13 @@ Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
   return std::unique_ptr<Device>(std::move(device));
 }
 
-Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name) {
+Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name, bool rounds) {
   set_guard(ggml_log_set, ggml_set_abort_callback);
   VLA_TRY(ggml_backend_dev_t found, find_device(name));
   auto device = std::make_unique<GgmlDevice>();
   device->n_thread_ = 1;  // the one that calls
   device->text_ = fmt::format("{}, {}", name.text(), ggml_backend_dev_description(found));
-  device->keeps_f16_ = name.kind == "vulkan";
+  device->keeps_f16_ = name.kind == "vulkan", device->keeps_bf16_ = rounds;
   Held& held = *device->held_;
   VLA_CHECK(device->guarded([&] { held.backend.reset(ggml_backend_dev_init(found, nullptr)); }));
   if (!held.backend) return Error{Code::device, name.text(), "a device that starts", "its driver refused it"};
@@ -91,27 +91,28 @@ GgmlDevice::~GgmlDevice() {
   held->next = kept.exchange(held);
 }
 
-/// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened. Rows of a table
-/// are widened exactly when they are looked up.
+/// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened unless that was
+/// asked for. Rows of a table are widened exactly when they are looked up.
 ggml_type GgmlDevice::resident_type(const Param& param) const {
   if (param.source == nullptr) return GGML_TYPE_F32;
   const ggml_type stored = type_of(param.source->type);
-  const bool exact = param.storage == Storage::table || (param.is_matrix() && stored == GGML_TYPE_F16 && keeps_f16_);
-  return exact ? stored : GGML_TYPE_F32;
+  const bool kept = stored == GGML_TYPE_F16 ? keeps_f16_ : stored == GGML_TYPE_BF16 && keeps_bf16_;
+  return param.storage == Storage::table || (param.is_matrix() && kept) ? stored : GGML_TYPE_F32;
 }
 
 Status GgmlDevice::load(const ParamList& params, bool fill) {
   if (!fill) memory().set_dry();
   VLA_TRY(weight_context_, make_context(params.params().size()));
-  int n_f32 = 0, n_f16 = 0;
+  int n_f32 = 0, n_f16 = 0, n_bf16 = 0;
   for (const Param& param : params.params()) {
     const ggml_type type = resident_type(param);
-    if (param.is_matrix()) ++(type == GGML_TYPE_F16 ? n_f16 : n_f32);
+    if (param.is_matrix()) ++(type == GGML_TYPE_F16 ? n_f16 : type == GGML_TYPE_BF16 ? n_bf16 : n_f32);
     weights_.push_back(
         ggml_new_tensor(weight_context_.get(), type, static_cast<int>(param.shape.size()), param.shape.data()));
     ggml_set_name(weights_.back(), param.name.c_str());
   }
-  for (const auto& [n, type] : {std::pair{n_f32, "f32"}, {n_f16, "f16"}})
+  if (n_bf16 > 0) precision_ = "bf16";
+  for (const auto& [n, type] : {std::pair{n_f32, "f32"}, {n_f16, "f16"}, {n_bf16, "bf16"}})
     if (n > 0) linear_text_ += fmt::format("{}{} {}", linear_text_.empty() ? "ggml (" : " + ", n, type);
   if (!linear_text_.empty()) linear_text_ += ")";
   if (weights_.empty()) return {};

@@ -21,8 +21,8 @@ class GgmlDevice final : public Device {
  public:
   /// Errors: device.
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
-  /// A device of another kind. Errors: device.
-  static Result<std::unique_ptr<Device>> open(const DeviceName& name);
+  /// A device of another kind. `rounds`: what matrices stored as bf16 multiply is rounded to it. Errors: device.
+  static Result<std::unique_ptr<Device>> open(const DeviceName& name, bool rounds);
   ~GgmlDevice() override;
 
   Status load(const ParamList& params, bool fill) override;
@@ -34,8 +34,9 @@ class GgmlDevice final : public Device {
 
   std::string name() const override { return text_; }
   int n_thread() const override { return n_thread_; }
+  bool is_host() const override { return held_->pool != nullptr; }
   std::string kernels() const override { return "ggml"; }
-  std::string precision() const override { return "f32"; }
+  std::string precision() const override { return precision_; }
   const std::string& linear_kernels() const override { return linear_text_; }
   std::size_t weights_size() const override { return weights_size_; }
   std::size_t working_size() const override;
@@ -90,7 +91,9 @@ class GgmlDevice final : public Device {
   std::unique_ptr<Held> held_ = std::make_unique<Held>();
   std::string text_;
   int n_thread_ = 0;
-  bool keeps_f16_ = false;  // its products of f16 weights are as exact as those of float32
+  bool keeps_f16_ = false;   // its products of f16 weights are as exact as those of float32
+  bool keeps_bf16_ = false;  // its products of bf16 weights may round
+  std::string precision_ = "f32";
   ggml_context_ptr weight_context_;
   std::shared_ptr<void> weight_memory_;
   std::size_t weights_size_ = 0;

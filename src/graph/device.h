@@ -76,6 +76,8 @@ class Device {
   /// For display: "cpu, 2 threads".
   virtual std::string name() const = 0;
   virtual int n_thread() const = 0;
+  /// Whether it computes on the cores that also prepare observations.
+  virtual bool is_host() const { return true; }
   /// As `--kernels` names them.
   virtual std::string kernels() const = 0;
   /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".

@@ -35,7 +35,8 @@ inline bool rounds_to_bf16(Isa isa) { return isa >= Isa::avx512_bf16; }
 /// The same, or what takes its place where nothing may be rounded to bf16.
 inline Isa without_rounding(Isa isa) { return rounds_to_bf16(isa) ? Isa::avx512 : isa; }
 
-/// The kernels by name: of an Isa, or "float32" for the best that round nothing to bf16. An empty name takes the best.
+/// The kernels by name: of an Isa, or "float32" for the best that round nothing to bf16, or "bf16" for the best that
+/// do. An empty name takes the best.
 /// Errors: usage for an unknown name, device for one that the machine cannot run.
 Result<Isa> choose_isa(const std::string& name);
 

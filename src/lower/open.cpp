@@ -24,9 +24,11 @@ int usable_cores() {
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device) {
   VLA_TRY(const DeviceName name, DeviceName::parse(device));
   if (name.kind != "cpu") {
-    if (kernels.empty() || kernels == isa_name(Isa::ggml)) return GgmlDevice::open(name);
-    return Error{Code::usage, "kernels", fmt::format("none or ggml with device {}", name.text()), kernels,
-                 "other kernels are the CPU's"};
+    const bool rounds = kernels == "bf16";
+    if (rounds || kernels.empty() || kernels == "float32" || kernels == isa_name(Isa::ggml))
+      return GgmlDevice::open(name, rounds);
+    return Error{Code::usage, "kernels", fmt::format("none, float32, bf16 or ggml with device {}", name.text()),
+                 kernels, "other kernels are the CPU's"};
   }
   VLA_TRY(const Isa isa, choose_isa(kernels));
   if (n_thread <= 0) n_thread = usable_cores();

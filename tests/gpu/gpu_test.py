@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from golden_cases import FLOAT32, NAMES, ROOT, Golden
+from golden_cases import FLOAT32, NAMES, ROOT, Golden, tensors
 from conftest import BINARY, KIND
 from program import EXIT
 
@@ -33,6 +33,18 @@ def test_every_tap_of_a_golden_case_matches_the_reference_within_1e_4(vla, name,
     assert run.json()["device"].startswith(f"{KIND}:0, "), run.err
     compared = vla("compare", case.expected, got, "--tolerance", TOLERANCE)
     assert compared.code == 0, compared.out + compared.err
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_in_bf16_the_chunk_is_nearer_to_float32_than_pytorchs_bf16(vla, name, tmp_path):
+    case, got = Golden(name), tmp_path / "got.gguf"
+    bf16 = [*DEVICE, "--kernels", "bf16", "--tap", "chunk", "--taps-out", got]
+    told = vla(*case.arguments(options=["--json", *bf16]), limit=LIMIT).json()
+    assert told["precision"] == ("int8" if name.startswith("bitvla/") else "bf16"), told
+    expected, ours = tensors(case.expected), tensors(got)["chunk"]
+    error, allowed = (np.abs(chunk - expected["chunk"]) for chunk in (ours, expected["chunk.bf16"]))
+    assert 0 < np.sqrt(np.mean(error**2)) <= np.sqrt(np.mean(allowed**2))
+    assert error.max() <= allowed.max()
 
 
 @pytest.mark.parametrize("name", ["smolvla/two_views", "bitvla/" + next(n for n in NAMES if "bitvla" in n).split("/")[1]])
@@ -202,7 +214,7 @@ with vla_cpp.Policy({str(golden.bundle)!r}, device="{KIND}") as policy:
 def test_devices_are_listed_with_memory_and_precision(vla):
     listed = json.loads(vla("inspect", "--devices", "--json").out)
     gpu = next(device for device in listed["devices"] if device["name"] == f"{KIND}:0")
-    assert listed["devices"][0]["name"] == "cpu" and gpu["products"] == "f32"
+    assert listed["devices"][0]["name"] == "cpu" and gpu["products"] == "f32, bf16"
     assert 0 < gpu["free_bytes"] <= gpu["memory_bytes"]
     driver = {"vulkan": r"driver \S.*, Vulkan \d+\.\d+\.\d+", "cuda": r"driver for CUDA \d+\.\d+, runtime \d+\.\d+"}[KIND]
     assert re.fullmatch(rf"\S.*; {driver}", gpu["description"]), gpu
@@ -226,10 +238,9 @@ def test_a_machine_without_a_device_says_so_and_runs_the_cpu(with_library, golde
     assert without(*golden.arguments()).code == 0
 
 
-@pytest.mark.parametrize("kernels", ["avx2", "float32"])
-def test_kernels_of_the_cpu_are_refused(vla, golden, kernels):
-    answer = vla(*golden.arguments(options=[*DEVICE, "--kernels", kernels]))
-    answer.refused("usage", f"kernels: expected none or ggml with device {KIND}:0, found {kernels}")
+def test_kernels_of_the_cpu_are_refused(vla, golden):
+    answer = vla(*golden.arguments(options=[*DEVICE, "--kernels", "avx2"]))
+    answer.refused("usage", f"kernels: expected none, float32, bf16 or ggml with device {KIND}:0, found avx2")
 
 
 def test_bench_tells_the_device_and_no_share_of_the_cpus_peak(vla, golden):

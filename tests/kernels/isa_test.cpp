@@ -24,6 +24,15 @@ TEST_CASE("float32 means the best that does not round to bf16") {
   CHECK(*choose_isa("float32") == *best);
 }
 
+TEST_CASE("bf16 means the best that rounds to it, and is refused where nothing does") {
+  const auto chosen = choose_isa("bf16");
+  REQUIRE(chosen.ok() == rounds_to_bf16(usable_isas().back()));
+  if (chosen.ok())
+    CHECK(*chosen == usable_isas().back());
+  else
+    CHECK(chosen.error().code == Code::device);
+}
+
 TEST_CASE("an unknown kernel name is refused with the names that there are") {
   const auto chosen = choose_isa("sse2");
   REQUIRE_FALSE(chosen.ok());
