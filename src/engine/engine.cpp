@@ -179,9 +179,9 @@ Status Engine::take_injected(const std::vector<Tap>& given) {
   return {};
 }
 
-Status Engine::inject_inputs() {
+Status Engine::inject_inputs(Inputs& inputs) const {
   for (const Tap& tap : injected_input_) {
-    std::vector<float>& input = tap.path == "state" ? inputs_.state : inputs_.pixels;
+    std::vector<float>& input = tap.path == "state" ? inputs.state : inputs.pixels;
     if (tap.values.size() != input.size())
       return Error{Code::bad_observation, "injected " + tap.path, fmt::format("{} numbers", input.size()),
                    std::to_string(tap.values.size())};
@@ -216,10 +216,10 @@ void Engine::record(std::vector<Tap>& taps, const char* path, std::vector<std::i
   if (match_path(tap_pattern_, path)) taps.push_back({path, std::move(shape), {values.begin(), values.end()}});
 }
 
-void Engine::record_inputs(std::vector<Tap>& taps) const {
-  record(taps, "pixels", {inputs_.width, inputs_.height, 3, inputs_.n_view}, inputs_.pixels);
-  record(taps, "tokens", {static_cast<std::int64_t>(inputs_.tokens.size())}, inputs_.tokens);
-  if (d_state_ > 0) record(taps, "state", {d_state_}, inputs_.state);
+void Engine::record_inputs(std::vector<Tap>& taps, const Inputs& inputs) const {
+  record(taps, "pixels", {inputs.width, inputs.height, 3, inputs.n_view}, inputs.pixels);
+  record(taps, "tokens", {static_cast<std::int64_t>(inputs.tokens.size())}, inputs.tokens);
+  if (d_state_ > 0) record(taps, "state", {d_state_}, inputs.state);
 }
 
 ChunkShape Engine::chunk_shape() const {
@@ -252,39 +252,59 @@ Result<std::string> Engine::program_text(Part part) {
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
                                 const std::optional<Leftover>& leftover) noexcept {
-  // Containers throw where there is no memory: the act fails, and the next one starts from scratch.
-  try {
-    VLA_TRY(const Engine* chosen, robot(observation.embodiment));
-    for (const auto& other : others_)
-      if (other.get() == chosen) return other->run(observation, noise, leftover);
-    return run(observation, noise, leftover);
-  } catch (const std::bad_alloc&) {
-    return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};  // strings short enough to need none
-  }
+  VLA_CHECK(prepare(observation, noise, leftover, prepared_));
+  return act(prepared_);
 }
 
-Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noise,
-                                const std::optional<Leftover>& leftover) {
+// Containers throw where there is no memory: the act fails, and the next one starts from scratch. Strings of the error
+// are short enough to need none.
+
+Status Engine::prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                       Prepared& to) const noexcept try {
+  VLA_TRY(to.robot, robot(observation.embodiment));
+  return to.robot->encode(observation, noise, leftover, to);
+} catch (const std::bad_alloc&) {
+  return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};
+}
+
+Result<ActionChunk> Engine::act(Prepared& prepared) noexcept try {
+  for (const auto& other : others_)
+    if (other.get() == prepared.robot) return other->run(prepared);
+  return run(prepared);
+} catch (const std::bad_alloc&) {
+  return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};
+}
+
+Status Engine::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                      Prepared& to) const {
+  StageClock clock;
+  to.timing.clear(), to.steering.reset();
+  VLA_CHECK(processor_.encode_images(observation, to.inputs));
+  VLA_CHECK(processor_.encode_state(observation, to.inputs));
+  clock.lap(to.timing, "preprocess");
+  VLA_CHECK(processor_.encode_text(observation, to.inputs));
+  VLA_CHECK(inject_inputs(to.inputs));
+  VLA_TRY(to.x, start(noise));
+  if (leftover) {
+    VLA_TRY(to.steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(to.x)));
+  }
+  clock.lap(to.timing, "tokenize");
+  return {};
+}
+
+Result<ActionChunk> Engine::run(Prepared& prepared) {
+  const Inputs& inputs = prepared.inputs;
+  const std::optional<Steering>& steering = prepared.steering;
   ActionChunk chunk;
   StageClock clock;
-  VLA_CHECK(processor_.encode_images(observation, inputs_));
-  VLA_CHECK(processor_.encode_state(observation, inputs_));
-  clock.lap(chunk.timing, "preprocess");
-  VLA_CHECK(processor_.encode_text(observation, inputs_));
-  clock.lap(chunk.timing, "tokenize");
-  VLA_CHECK(inject_inputs());
-  VLA_TRY(std::vector<float> x, start(noise));
-  std::optional<Steering> steering;
-  if (leftover) {
-    VLA_TRY(steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(x)));
-  }
-  last_shape_ = {inputs_.width, inputs_.height,        inputs_.n_view,      static_cast<int>(inputs_.tokens.size()),
-                 d_state_,      placed(inputs_.views), steering.has_value()};
+  chunk.timing = std::move(prepared.timing);
+  last_shape_ = {inputs.width, inputs.height,        inputs.n_view,       static_cast<int>(inputs.tokens.size()),
+                 d_state_,     placed(inputs.views), steering.has_value()};
   VLA_TRY(Plan * plan, plans_->for_shape(*last_shape_));
-  plan->set_inputs(inputs_.pixels, inputs_.tokens, inputs_.state);
-  plan->set_x(steering ? steering->start : x);
+  plan->set_inputs(inputs.pixels, inputs.tokens, inputs.state);
+  plan->set_x(steering ? steering->start : prepared.x);
   if (steering) plan->set_steering(*steering);
-  record_inputs(chunk.taps);
+  record_inputs(chunk.taps, inputs);
   clock.lap(chunk.timing, "plan");
   VLA_CHECK(plan->run_prefix(chunk.taps));
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(chunk.timing, stage.name, stage.done);
@@ -296,15 +316,15 @@ Result<ActionChunk> Engine::run(const Observation& observation, const Noise& noi
   clock.lap(chunk.timing, "steps");
   const std::vector<float> result = plan->x();
   VLA_CHECK(device_->failure());
-  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs_.raw_state));
+  VLA_TRY(chunk.actions, processor_.decode(result, horizon_, d_action_, inputs.raw_state));
   clock.lap(chunk.timing, "postprocess");
   chunk.horizon = horizon();
   chunk.d_action = static_cast<int>(processor_.action_names().size());
   chunk.normalized = normalized(result);
-  chunk.notes = inputs_.notes;
+  chunk.notes = inputs.notes;
   for (const auto* taps : {&injected_input_, &injected_})
     for (const Tap& tap : *taps) chunk.notes.push_back(tap.path + " was injected, not computed");
-  chunk.is_beyond = inputs_.is_beyond;
+  chunk.is_beyond = inputs.is_beyond;
   record_chunk(chunk);
   return chunk;
 }

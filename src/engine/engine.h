@@ -29,6 +29,8 @@ struct EngineOptions {
   bool all_robots = false;      // without a tag: every robot of a bundle of several
 };
 
+class Engine;
+
 /// The answer to one observation.
 struct ActionChunk {
   int horizon = 0;  // rows
@@ -39,6 +41,15 @@ struct ActionChunk {
   bool is_beyond = false;          // one of them: the state is beyond the bundle's bound
   Timing timing;
   std::vector<Tap> taps;
+};
+
+/// What the host makes of one observation before the device is needed. Vectors keep their memory when filled again.
+struct Prepared {
+  const Engine* robot = nullptr;  // that the observation names
+  Inputs inputs;
+  std::vector<float> x;  // what the solver starts from
+  std::optional<Steering> steering;
+  Timing timing;
 };
 
 /// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
@@ -73,6 +84,11 @@ class Engine {
   /// out), unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
+  /// The two halves of it: the host's, and the device's with unnormalization. One thread may prepare an observation
+  /// while another one acts on the one before. Errors: of the first bad_observation, unsupported and out_of_memory.
+  Status prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                 Prepared& to) const noexcept;
+  Result<ActionChunk> act(Prepared& prepared) noexcept;
 
   /// Solves in another number of steps than the bundle asks for, to measure what a step costs. Errors: bad_bundle,
   /// out_of_memory, device.
@@ -114,13 +130,15 @@ class Engine {
   static Result<std::vector<std::unique_ptr<Engine>>> open_robots(Bundle file, const EngineOptions& options);
   Status load_policy(std::shared_ptr<ParamList>& params);
   Status make_graphs();
-  Result<ActionChunk> run(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover);
+  Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                Prepared& to) const;
+  Result<ActionChunk> run(Prepared& prepared);
   Status make_conditions();
   Status run_once(const Graph& graph);
   Status make_constants();
   Status make_plans();
   Status take_injected(const std::vector<Tap>& given);
-  Status inject_inputs();
+  Status inject_inputs(Inputs& inputs) const;
   InputShape largest_shape() const;
   ChunkShape chunk_shape() const;
   std::uint32_t placed(std::uint32_t views) const;
@@ -128,7 +146,7 @@ class Engine {
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
               const std::vector<T>& values) const;
-  void record_inputs(std::vector<Tap>& taps) const;
+  void record_inputs(std::vector<Tap>& taps, const Inputs& inputs) const;
   std::vector<float> normalized(const std::vector<float>& x) const;
   void record_chunk(ActionChunk& chunk) const;
 
@@ -151,7 +169,7 @@ class Engine {
   Plans::All all_plans_;  // of all robots
   std::unique_ptr<Plans> plans_;
   std::optional<InputShape> last_shape_;
-  Inputs inputs_;  // of the last observation; its vectors keep their memory
+  Prepared prepared_;  // of the last observation that came to `act` as a whole
 };
 
 }  // namespace vla

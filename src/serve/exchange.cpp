@@ -32,7 +32,7 @@ std::optional<Job> Exchange::next() {
     if (has_late) {
       wake();  // the I/O thread takes it out and comes back
     } else if (!jobs_.empty()) {
-      computing_ = true;
+      ++n_taken_;
       return jobs_.pop();
     } else if (closed_) {
       return std::nullopt;
@@ -46,7 +46,7 @@ void Exchange::put(Answer answer) noexcept {
     std::unique_lock lock(mutex_);
     work_.wait(lock, [this] { return !answer_; });
     answer_ = std::move(answer);
-    computing_ = false;
+    --n_taken_;
   }
   wake();
 }
@@ -54,19 +54,19 @@ void Exchange::put(Answer answer) noexcept {
 Exchange::Jobs::Pushed Exchange::push(Job job) {
   const std::lock_guard lock(mutex_);
   Jobs::Pushed pushed = jobs_.push(std::move(job));
-  work_.notify_one();
+  work_.notify_all();
   return pushed;
 }
 
 std::optional<Answer> Exchange::take_answer() {
   const std::lock_guard lock(mutex_);
-  work_.notify_one();
+  work_.notify_all();
   return std::exchange(answer_, std::nullopt);
 }
 
 std::optional<Job> Exchange::take_late(Clock::time_point now) {
   const std::lock_guard lock(mutex_);
-  work_.notify_one();
+  work_.notify_all();
   return jobs_.take_late(now);
 }
 
@@ -78,12 +78,12 @@ std::optional<Clock::time_point> Exchange::first_deadline() const {
 void Exchange::close() {
   const std::lock_guard lock(mutex_);
   closed_ = true;
-  work_.notify_one();
+  work_.notify_all();
 }
 
 bool Exchange::drained() const {
   const std::lock_guard lock(mutex_);
-  return jobs_.empty() && !computing_ && !answer_;
+  return jobs_.empty() && n_taken_ == 0 && !answer_;
 }
 
 std::size_t Exchange::n_waiting() const {
@@ -93,7 +93,7 @@ std::size_t Exchange::n_waiting() const {
 
 bool Exchange::computing() const {
   const std::lock_guard lock(mutex_);
-  return computing_;
+  return n_taken_ > 0;
 }
 
 }  // namespace vla::serve

@@ -35,7 +35,7 @@ struct Answer {
   bool is_beyond = false;  // the state is beyond the bundle's bound
 };
 
-/// Where the I/O thread and the engine thread meet: jobs one way, answers the other. Neither holds the lock for longer
+/// Where the I/O thread and those that compute meet: jobs one way, answers the other. None holds the lock for longer
 /// than a move takes. What the I/O thread has to look at is announced by `fd`, which it polls together with its
 /// sockets.
 class Exchange {
@@ -46,8 +46,8 @@ class Exchange {
   Exchange(const Exchange&) = delete;
   Exchange& operator=(const Exchange&) = delete;
 
-  /// For the engine thread; nothing here takes memory. `next` sleeps until there is a job that is not late, and returns
-  /// none when the exchange is closed and empty.
+  /// For one thread that takes jobs and one that answers them, or both in one; nothing here takes memory. `next` sleeps
+  /// until there is a job that is not late, and returns none when the exchange is closed and empty.
   std::optional<Job> next();
   void put(Answer answer) noexcept;
 
@@ -71,7 +71,8 @@ class Exchange {
   std::condition_variable work_;
   Jobs jobs_;
   std::optional<Answer> answer_;  // the next one waits until it was taken
-  bool computing_ = false, closed_ = false;
+  int n_taken_ = 0;               // and not answered yet
+  bool closed_ = false;
 };
 
 }  // namespace vla::serve

@@ -60,7 +60,7 @@ class Observer {
   virtual ~Observer() = default;
   virtual void received(const Received&) {}  // on the I/O thread
   virtual void dropped(const Dropped&) {}    // on the I/O thread
-  virtual void started(const Received&) {}   // on the engine thread, when an act leaves the queue to be computed
+  virtual void started(const Received&) {}   // when an act leaves the queue, on the thread that prepares it
   virtual void answered(const Answered&) {}  // on the I/O thread
 };
 

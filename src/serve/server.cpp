@@ -8,9 +8,9 @@
 #include <stdexcept>
 
 #include "base/thread.h"
-#include "serve/codec.h"
 #include "serve/endpoint.h"
 #include "serve/fields.h"
+#include "serve/relay.h"
 
 namespace vla::serve {
 namespace {
@@ -114,59 +114,94 @@ v1::Description Server::describe(const Engine& engine) const {
 /// Programs run on the thread that calls this.
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   description_ = describe(engine);
+  observers_ = observers;
   vitals_.begin();
   Io io(*hub_, exchange_, vitals_, description_, observers);
-  VLA_TRY(std::thread thread, start_thread("I/O thread", [&] { io.run(); }));
-  while (std::optional<Job> job = exchange_.next()) {
-    for (Observer* observer : observers) observer->started(*job);
-    exchange_.put(compute(engine, std::move(*job)));
-    if (!engine.device().failure()) stop();  // no act after this one can succeed
+  Relay<Act> relay;
+  std::thread preparing;
+  if (!engine.device().is_host()) {
+    VLA_TRY(preparing, start_thread("preparing thread", [&] {
+              while (prepare_next(engine, relay.to_prepare())) relay.prepared();
+              relay.close();
+            }));
   }
-  thread.join();
+  Result<std::thread> talking = start_thread("I/O thread", [&] { io.run(); });
+  if (!talking) exchange_.close();
+  if (preparing.joinable()) {
+    for (Act* act = relay.to_compute(); act != nullptr; act = relay.to_compute()) {
+      act->clock.lap(act->prepared.timing, "wait");
+      compute(engine, *act);
+      relay.computed();
+    }
+    preparing.join();
+  } else {
+    for (Act act; prepare_next(engine, act);) compute(engine, act);
+  }
+  if (!talking) return talking.error();
+  talking->join();
   hub_.reset();
   return engine.device().failure();
 }
 
 /// An exception from a library fails this request, not the server.
-Answer Server::compute(Engine& engine, Job job) const noexcept {
-  Answer answer;
-  answer.started = Clock::now();
+template <class Work>
+void Server::attempt(Act& act, const Work& work) noexcept {
   try {
-    v1::Response response = response_to(job.request_id);
-    auto chunk = act(engine, job, answer);
-    if (chunk) {
-      chunk->set_queue_ms(std::chrono::duration<double, std::milli>(answer.started - job.at).count());
-      *response.mutable_chunk() = std::move(*chunk);
-      answer.response = response.SerializeAsString();
-    } else {
-      answer.error = chunk.error();
-    }
+    if (Status done = work(); !done) act.answer.error = done.error();
   } catch (const std::bad_alloc&) {
-    answer.error = out_of_memory("act");
+    act.answer.error = out_of_memory("act");
   } catch (const std::exception&) {
-    answer.error = Error{Code::internal, "act", "", "an exception", "report this"};
+    act.answer.error = Error{Code::internal, "act", "", "an exception", "report this"};
   }
-  answer.finished = Clock::now();
-  answer.job = std::move(job);
-  return answer;
 }
 
-Result<v1::ActionChunk> Server::act(Engine& engine, const Job& job, Answer& answer) const {
-  VLA_TRY(const std::string embodiment, named_embodiment(job.body()));
+bool Server::prepare_next(const Engine& engine, Act& act) {
+  std::optional<Job> job = exchange_.next();
+  if (!job) return false;
+  for (Observer* observer : observers_) observer->started(*job);
+  act.answer = {};
+  act.answer.job = std::move(*job);
+  act.answer.started = Clock::now();
+  act.clock = {};
+  attempt(act, [&] { return prepare(engine, act); });
+  return true;
+}
+
+void Server::compute(Engine& engine, Act& act) {
+  if (!act.answer.error) attempt(act, [&] { return respond(engine, act); });
+  act.answer.finished = Clock::now();
+  act.request = {};
+  exchange_.put(std::move(act.answer));
+  if (!engine.device().failure()) stop();  // no act after this one can succeed
+}
+
+Status Server::prepare(const Engine& engine, Act& act) const {
+  const std::span<const std::byte> body = act.answer.job.body();
+  VLA_TRY(const std::string embodiment, named_embodiment(body));
   VLA_TRY(const Engine* robot, engine.robot(embodiment));
   const v1::Description& description = description_of(description_, robot->bundle().embodiment());
   const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
                          robot->solver_horizon(), robot->d_action_padded(), description.actions_size()};
-  StageClock clock;
-  VLA_TRY(const ActRequest request,
-          decode_act(job.body(), limits, robot->processor().views(), robot->processor().states()));
-  Timing& stages = answer.stages;
-  clock.lap(stages, "decode");
-  VLA_TRY(ActionChunk chunk, engine.act(request.observation, request.noise, request.leftover));
-  stages.insert(stages.end(), chunk.timing.begin(), chunk.timing.end());
-  chunk.timing = stages;
+  VLA_TRY(act.request, decode_act(body, limits, robot->processor().views(), robot->processor().states()));
+  act.clock.lap(act.answer.stages, "decode");
+  VLA_CHECK(engine.prepare(act.request.observation, act.request.noise, act.request.leftover, act.prepared));
+  act.clock = {};
+  return {};
+}
+
+Status Server::respond(Engine& engine, Act& act) const {
+  Answer& answer = act.answer;
+  VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
+  answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
+  chunk.timing = answer.stages;
   answer.is_beyond = chunk.is_beyond;
-  return encode_chunk(request, std::move(chunk), description);
+  v1::Response response = response_to(answer.job.request_id);
+  const std::string& embodiment = act.prepared.robot->bundle().embodiment();
+  *response.mutable_chunk() = encode_chunk(act.request, std::move(chunk), description_of(description_, embodiment));
+  response.mutable_chunk()->set_queue_ms(
+      std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count());
+  answer.response = response.SerializeAsString();
+  return {};
 }
 
 }  // namespace vla::serve

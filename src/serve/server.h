@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "engine/engine.h"
+#include "serve/codec.h"
 #include "serve/curve.h"
 #include "serve/io.h"
 #include "serve/observer.h"
@@ -41,8 +42,8 @@ class Server {
   const std::vector<std::string>& addresses() const { return addresses_; }
 
   /// Serves on this thread, which computes, and a second one, which talks, until `stop` or the loss of the
-  /// device; then answers what waits and returns. Observers outlive the call. Once for each server. Errors: device,
-  /// out_of_memory.
+  /// device; then answers what waits and returns. Where the policy is on a device of its own, a third thread prepares
+  /// the next act meanwhile. Observers outlive the call. Once for each server. Errors: device, out_of_memory.
   Status run(Engine& engine, std::span<Observer* const> observers = {});
   /// What `describe` is answered with once this engine is served.
   v1::Description describe(const Engine& engine) const;
@@ -57,10 +58,24 @@ class Server {
   static Exchange::Jobs::Limits limits_of(const ServerOptions& options);
   Status guard();
   Status bind();
-  Answer compute(Engine& engine, Job job) const noexcept;
-  Result<v1::ActionChunk> act(Engine& engine, const Job& job, Answer& answer) const;
+
+  /// An act on its way to its answer.
+  struct Act {
+    Answer answer;
+    ActRequest request;
+    Prepared prepared;
+    StageClock clock;
+  };
+  /// False when no act comes any more.
+  bool prepare_next(const Engine& engine, Act& act);
+  void compute(Engine& engine, Act& act);
+  Status prepare(const Engine& engine, Act& act) const;
+  Status respond(Engine& engine, Act& act) const;
+  template <class Work>
+  static void attempt(Act& act, const Work& work) noexcept;
 
   ServerOptions options_;
+  std::span<Observer* const> observers_;
   Vitals vitals_;
   Exchange exchange_;
   v1::Description description_;

@@ -13,7 +13,7 @@ namespace vla::serve {
 namespace {
 
 constexpr std::size_t kMaxWaiting = 16 << 20;
-constexpr int kIo = 1, kEngine = 2;  // tracks
+constexpr int kIo = 1, kEngine = 2, kHost = 3;  // tracks
 
 /// Trace events count in microseconds; three digits keep the nanoseconds, so that what nests still nests.
 std::string us(std::int64_t ns) { return fmt::format("{}.{:03}", ns / 1000, ns % 1000); }
@@ -31,11 +31,33 @@ std::string on_request(std::uint64_t id, const char* name, std::int64_t from, st
   return fmt::format(kEvent, "b", kIo, id, name, us(from), args) + fmt::format(kEvent, "e", kIo, id, name, us(to), "");
 }
 
-/// A slice on the engine's track.
-std::string on_engine(const std::string& name, std::int64_t from, std::int64_t to, const std::string& args = "") {
+/// A slice on a track of its own.
+std::string on_track(int track, const std::string& name, std::int64_t from, std::int64_t to,
+                     const std::string& args = "") {
   return fmt::format(R"({{"ph":"X","pid":1,"tid":{},"cat":"engine","name":"{}","ts":{},"dur":{},"args":{{{}}}}},)"
                      "\n",
-                     kEngine, name, us(from), us(to - from), args);
+                     track, name, us(from), us(to - from), args);
+}
+
+/// The slices of an act: what its thread does, and its stages. An act that waited for the device was prepared on
+/// another thread while the one before was computed.
+std::string on_engine(const Answered& answered, std::int64_t from, std::int64_t end, const std::string& args) {
+  const auto is_wait = [](const auto& stage) { return stage.first == "wait"; };
+  const bool overlaps = std::any_of(answered.stages.begin(), answered.stages.end(), is_wait);
+  std::string act, stages;
+  int track = overlaps ? kHost : kEngine;
+  std::int64_t begin = from;
+  for (const auto& [stage, ms] : answered.stages) {
+    const std::int64_t to = std::min<std::int64_t>(end, from + std::llround(ms * 1e6));
+    if (stage == "wait") {
+      act = on_track(kHost, "prepare", begin, from, args);
+      track = kEngine, begin = to;
+    } else {
+      stages += on_track(track, stage, from, to);
+    }
+    from = to;
+  }
+  return act + on_track(track, kind_name(answered.request.kind), begin, end, args) + stages;
 }
 
 }  // namespace
@@ -49,7 +71,8 @@ Result<std::unique_ptr<Trace>> Trace::open(const std::string& path) {
 }
 
 Trace::Trace(int fd) : writer_(fd, Writer::Owns::yes, kMaxWaiting) {
-  writer_.put("[\n" + name_of_thread(kIo, "requests") + ",\n" + name_of_thread(kEngine, "engine") + ",\n");
+  writer_.put("[\n" + name_of_thread(kIo, "requests") + ",\n" + name_of_thread(kEngine, "engine") + ",\n" +
+              name_of_thread(kHost, "host, beside a device") + ",\n");
 }
 
 /// An array needs an element after the last comma.
@@ -79,13 +102,7 @@ void Trace::answered(const Answered& answered) {
       events += on_request(id, "queue", ns(request.at), started, "");
       events += on_request(id, "compute", started, finished, "");
       events += on_request(id, "send", finished, sent, "");
-      events += on_engine(kind_name(request.kind), started, finished, fmt::format(R"("request":{})", id));
-      std::int64_t from = started;
-      for (const auto& [stage, ms] : answered.stages) {
-        const std::int64_t to = std::min<std::int64_t>(finished, from + std::llround(ms * 1e6));
-        events += on_engine(stage, from, to);
-        from = to;
-      }
+      events += on_engine(answered, started, finished, fmt::format(R"("request":{})", id));
     }
     writer_.put(std::move(events));
   } catch (const std::exception&) {  // no memory for an event: the server goes on without it

@@ -313,7 +313,7 @@ def test_a_trace_is_json_whose_stages_lie_inside_their_act(serve, talk, golden, 
     talk(server, wire.act(1, golden, seed=1), wire.health(2), wire.act(3, golden, seed=2))
     assert server.stop(signal.SIGTERM)[0] == 0
     events = json.loads(path.read_text())
-    assert {e["args"]["name"] for e in events if e["ph"] == "M"} == {"requests", "engine", "vla serve"}
+    assert {e["args"]["name"] for e in events if e["ph"] == "M"} == {"requests", "engine", "host, beside a device", "vla serve"}
     slices = [(e["name"], round(e["ts"] * 1e3), round((e["ts"] + e["dur"]) * 1e3)) for e in events if e["ph"] == "X"]
     acts, stages = ([s for s in slices if (s[0] == "act") == want] for want in (True, False))
     assert len(acts) == 2 and {"decode", "prefix", "steps"} <= {name for name, *_ in stages}

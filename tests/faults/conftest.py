@@ -3,7 +3,9 @@
 """`vla` and libvla.so beside the libvla-cuda.so of fake_library.cpp, whose driver fails when told to. No GPU is needed."""
 
 import os
+import shlex
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +16,8 @@ sys.path[:0] = [str(ROOT / "tests/cli"), str(ROOT / "python")]
 
 from golden_cases import Golden  # noqa: E402
 from program import Program  # noqa: E402
+
+DEVICE = ["--device", "cuda"]
 
 
 class Fake:
@@ -47,3 +51,26 @@ def fake(tmp_path_factory):
 @pytest.fixture
 def golden():
     return Golden("two_views")
+
+
+@pytest.fixture
+def serve(fake, golden):
+    servers = []
+
+    def start(*options, **settings):
+        program = fake.program(**settings)
+        command = [program.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *DEVICE, *options]
+        pipe = subprocess.PIPE
+        servers.append(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=program.environment))
+        return servers[-1]
+
+    yield start
+    for server in servers:
+        server.kill()
+        server.communicate()
+
+
+def address(server):
+    word, *fields = shlex.split(server.stdout.readline())
+    assert word == "ready"
+    return dict(field.split("=", 1) for field in fields)["address"]

@@ -5,13 +5,16 @@
 // as ggml-cuda does: by an abort of the library's own ggml, in every call from the first that fails, freeing too.
 //   VLA_FAKE_FAILS_AT=N    the N-th call (from 1) fails
 //   VLA_FAKE_COMPUTES=no   graphs are not computed
+//   VLA_FAKE_TAKES_MS=N    a graph takes so long, without the processor
 //   VLA_FAKE_COUNTS=FILE   a line for each call: compute, set, get, memset, allocate or free
 #include <ggml-backend-impl.h>
 #include <ggml-cpu.h>
 
+#include <chrono>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <thread>
 
 #include "ggml/backend_library.h"
 
@@ -20,6 +23,7 @@ namespace {
 struct Driver {
   long n_call = 0, fails_at = 0;
   bool computes = true;
+  int takes_ms = 0;
   std::FILE* counts = nullptr;
   // Of ggml's CPU: what is done where nothing fails.
   ggml_backend_i backend;
@@ -43,6 +47,7 @@ void call(const char* what) {
 
 ggml_status compute(ggml_backend_t backend, ggml_cgraph* graph) {
   call("compute");
+  std::this_thread::sleep_for(std::chrono::milliseconds(driver.takes_ms));
   return driver.computes ? driver.backend.graph_compute(backend, graph) : GGML_STATUS_SUCCESS;
 }
 void synchronize(ggml_backend_t) { call("synchronize"); }
@@ -95,8 +100,10 @@ ggml_backend_reg_t open() {
   const char* fails_at = std::getenv("VLA_FAKE_FAILS_AT");
   const char* computes = std::getenv("VLA_FAKE_COMPUTES");
   const char* counts = std::getenv("VLA_FAKE_COUNTS");
+  const char* takes_ms = std::getenv("VLA_FAKE_TAKES_MS");
   if (fails_at != nullptr) driver.fails_at = std::atol(fails_at);
   driver.computes = computes == nullptr || std::strcmp(computes, "no") != 0;
+  if (takes_ms != nullptr) driver.takes_ms = std::atoi(takes_ms);
   if (counts != nullptr) driver.counts = std::fopen(counts, "a");
 
   ggml_backend_reg_t cpu = ggml_backend_cpu_reg();

@@ -4,15 +4,13 @@
 every door, and freeing what the driver no longer knows must not end the process."""
 
 import re
-import shlex
 import subprocess
 import sys
 
 import pytest
-from conftest import ROOT
+from conftest import DEVICE, ROOT, address
 from program import EXIT
 
-DEVICE = ["--device", "cuda"]
 LOST = r"cuda:0[^\n]*: expected a device that answers, found CUDA error: unspecified launch failure; [^\n]*: in {call}; start the process again; "
 
 
@@ -70,29 +68,6 @@ tell(lambda: vla_cpp.Policy({str(golden.bundle)!r}, device="cuda"))
     assert re.match("device " + LOST.format(call="compute"), lines[1]), lines
     assert lines[2] == lines[1]
     assert re.match("device " + LOST.format(call="allocate"), lines[4]), lines
-
-
-@pytest.fixture
-def serve(fake, golden):
-    servers = []
-
-    def start(*options, **settings):
-        program = fake.program(**settings)
-        command = [program.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *DEVICE, *options]
-        pipe = subprocess.PIPE
-        servers.append(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=program.environment))
-        return servers[-1]
-
-    yield start
-    for server in servers:
-        server.kill()
-        server.communicate()
-
-
-def address(server):
-    word, *fields = shlex.split(server.stdout.readline())
-    assert word == "ready"
-    return dict(field.split("=", 1) for field in fields)["address"]
 
 
 @pytest.fixture
