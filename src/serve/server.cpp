@@ -128,11 +128,7 @@ Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   Result<std::thread> talking = start_thread("I/O thread", [&] { io.run(); });
   if (!talking) exchange_.close();
   if (preparing.joinable()) {
-    for (Act* act = relay.to_compute(); act != nullptr; act = relay.to_compute()) {
-      act->clock.lap(act->prepared.timing, "wait");
-      compute(engine, *act);
-      relay.computed();
-    }
+    while (Act* act = relay.to_compute()) compute(engine, *act), relay.computed();
     preparing.join();
   } else {
     for (Act act; prepare_next(engine, act);) compute(engine, act);
@@ -191,6 +187,7 @@ Status Server::prepare(const Engine& engine, Act& act) const {
 
 Status Server::respond(Engine& engine, Act& act) const {
   Answer& answer = act.answer;
+  if (!engine.device().is_host()) act.clock.lap(act.prepared.timing, "wait");
   VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
