@@ -15,6 +15,10 @@ namespace {
 
 constexpr int kMaxHorizon = 4096;
 
+/// Containers throw where there is no memory: the act fails, and the next one starts from scratch. The strings are
+/// short enough to need no memory.
+Error no_memory() { return {Code::out_of_memory, "act", "", "no memory left", "free memory"}; }
+
 }  // namespace
 
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
@@ -256,15 +260,12 @@ Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noi
   return act(prepared_);
 }
 
-// Containers throw where there is no memory: the act fails, and the next one starts from scratch. Strings of the error
-// are short enough to need none.
-
 Status Engine::prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                        Prepared& to) const noexcept try {
   VLA_TRY(to.robot, robot(observation.embodiment));
   return to.robot->encode(observation, noise, leftover, to);
 } catch (const std::bad_alloc&) {
-  return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};
+  return no_memory();
 }
 
 Result<ActionChunk> Engine::act(Prepared& prepared) noexcept try {
@@ -272,7 +273,7 @@ Result<ActionChunk> Engine::act(Prepared& prepared) noexcept try {
     if (other.get() == prepared.robot) return other->run(prepared);
   return run(prepared);
 } catch (const std::bad_alloc&) {
-  return Error{Code::out_of_memory, "act", "", "no memory left", "free memory"};
+  return no_memory();
 }
 
 Status Engine::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,

@@ -29,8 +29,6 @@ struct EngineOptions {
   bool all_robots = false;      // without a tag: every robot of a bundle of several
 };
 
-class Engine;
-
 /// The answer to one observation.
 struct ActionChunk {
   int horizon = 0;  // rows
@@ -42,6 +40,8 @@ struct ActionChunk {
   Timing timing;
   std::vector<Tap> taps;
 };
+
+class Engine;
 
 /// What the host makes of one observation before the device is needed. Vectors keep their memory when filled again.
 struct Prepared {
@@ -60,7 +60,7 @@ struct MemoryUse {
 };
 
 /// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps,
-/// unnormalize. One thread at a time may call it.
+/// unnormalize. One thread at a time may call it, and another one `prepare`.
 ///
 /// Where it has several robots, this is the first of them and keeps the others: they share weights and working memory.
 class Engine {

@@ -113,10 +113,11 @@ Result<Isa> choose_isa(const std::string& name) {
   if (name.empty()) return usable.back();
   if (name == "float32") return without_rounding(usable.back());
   if (name == "bf16" && rounds_to_bf16(usable.back())) return usable.back();
-  const auto known = std::find_if(std::begin(kAll), std::end(kAll), [&](Isa isa) { return isa_name(isa) == name; });
-  if (known == std::end(kAll) && name != "bf16")
+  const auto is_named = [&](Isa isa) { return isa_name(isa) == name; };
+  const auto found = std::find_if(usable.begin(), usable.end(), is_named);
+  if (found != usable.end()) return *found;
+  if (name != "bf16" && std::none_of(std::begin(kAll), std::end(kAll), is_named))
     return Error{Code::usage, "kernels", "ggml, avx2, avx512, avx512_bf16, amx, float32 or bf16", name};
-  if (known != std::end(kAll) && std::find(usable.begin(), usable.end(), *known) != usable.end()) return *known;
   std::vector<std::string> names;
   for (Isa isa : usable) names.push_back(isa_name(isa));
   return Error{Code::device, "kernels", fmt::format("what this machine can run: {}", fmt::join(names, ", ")), name,

@@ -71,7 +71,7 @@ class Exchange {
   std::condition_variable work_;
   Jobs jobs_;
   std::optional<Answer> answer_;  // the next one waits until it was taken
-  int n_taken_ = 0;               // and not answered yet
+  int n_taken_ = 0;               // jobs that `next` gave out and `put` has not answered
   bool closed_ = false;
 };
 

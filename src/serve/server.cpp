@@ -51,7 +51,9 @@ Observation largest_observation(const Engine& robot) {
 Result<double> warm_up(Engine& engine) {
   const auto start = Clock::now();
   for (const Engine* robot : engine.robots()) {
-    const auto chunk = engine.act(largest_observation(*robot), Noise(std::uint64_t{0}));
+    Prepared prepared;  // its memory is not kept: every act that is served brings its own
+    const Status sound = engine.prepare(largest_observation(*robot), Noise(std::uint64_t{0}), {}, prepared);
+    const auto chunk = sound ? engine.act(prepared) : Result<ActionChunk>(sound.error());
     if (!chunk && chunk.error().code != Code::bad_observation && chunk.error().code != Code::bad_action)
       return chunk.error();
   }
@@ -181,7 +183,7 @@ Status Server::prepare(const Engine& engine, Act& act) const {
   VLA_TRY(act.request, decode_act(body, limits, robot->processor().views(), robot->processor().states()));
   act.clock.lap(act.answer.stages, "decode");
   VLA_CHECK(engine.prepare(act.request.observation, act.request.noise, act.request.leftover, act.prepared));
-  act.clock = {};
+  act.clock = {};  // the wait for the device begins
   return {};
 }
 

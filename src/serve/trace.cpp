@@ -39,9 +39,9 @@ std::string on_track(int track, const std::string& name, std::int64_t from, std:
                      track, name, us(from), us(to - from), args);
 }
 
-/// The slices of an act: what its thread does, and its stages. An act that waited for the device was prepared on
-/// another thread while the one before was computed.
-std::string on_engine(const Answered& answered, std::int64_t from, std::int64_t end, const std::string& args) {
+/// The slices of an act: the whole of it and its stages. An act that waited for the device was prepared on another
+/// thread while the one before was computed.
+std::string slices_of_act(const Answered& answered, std::int64_t from, std::int64_t end, const std::string& args) {
   const auto is_wait = [](const auto& stage) { return stage.first == "wait"; };
   const bool overlaps = std::any_of(answered.stages.begin(), answered.stages.end(), is_wait);
   std::string act, stages;
@@ -102,7 +102,7 @@ void Trace::answered(const Answered& answered) {
       events += on_request(id, "queue", ns(request.at), started, "");
       events += on_request(id, "compute", started, finished, "");
       events += on_request(id, "send", finished, sent, "");
-      events += on_engine(answered, started, finished, fmt::format(R"("request":{})", id));
+      events += slices_of_act(answered, started, finished, fmt::format(R"("request":{})", id));
     }
     writer_.put(std::move(events));
   } catch (const std::exception&) {  // no memory for an event: the server goes on without it

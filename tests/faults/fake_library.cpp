@@ -5,7 +5,7 @@
 // as ggml-cuda does: by an abort of the library's own ggml, in every call from the first that fails, freeing too.
 //   VLA_FAKE_FAILS_AT=N    the N-th call (from 1) fails
 //   VLA_FAKE_COMPUTES=no   graphs are not computed
-//   VLA_FAKE_TAKES_MS=N    a graph takes so long, without the processor
+//   VLA_FAKE_TAKES_MS=N    the driver sleeps so long before it computes a graph
 //   VLA_FAKE_COUNTS=FILE   a line for each call: compute, set, get, memset, allocate or free
 #include <ggml-backend-impl.h>
 #include <ggml-cpu.h>

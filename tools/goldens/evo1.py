@@ -429,10 +429,10 @@ class Recorder(Taps):
         n = int(live.nonzero().max()) + 1
         self.put("tokens", ids[:n])
         every, state = torch.arange(len(ids)), torch.tensor([len(ids)])
-        dead = self.policy.masked_rows
-        self.valid = every if dead == "causal_attention" else every[live]
+        masked = self.policy.masked_rows
+        self.valid = every if masked == "causal_attention" else every[live]
         self.keys = torch.cat([self.valid, state])
-        self.twins = [image[~self.present], every[n:, None]] if dead == "zero_attention" else []
+        self.twins = [image[~self.present], every[n:, None]] if masked == "zero_attention" else []
         for rows in self.twins:  # those of all absent views are the same, and so are all pads: one of each stands for them
             self.keys = torch.cat([self.keys, *rows[:1]])
 
