@@ -65,6 +65,25 @@ struct ByteStrips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
+/// Whoever quantizes x computes its norm, of any width.
+constexpr std::int64_t kAnyNorm = std::int64_t{1} << 62;
+
+/// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the row).
+template <class V, class Weights, int kColumns, int kOffset>
+VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const RowScale& row, const std::int32_t* from,
+                           float* to) {
+  for (std::int64_t n = 0; n < kColumns; n += V::width) {
+    typename V::Int sums;
+    std::memcpy(&sums, from + n, sizeof(sums));
+    typename V::Float step;
+    if constexpr (Weights::kManyScales)
+      step = load<V>(part.scale + s.column + n, s.n_column > n ? s.n_column - n : 0) / row.s;
+    else
+      step = V::set(*part.scale / row.s);
+    V::store(to + n, __builtin_convertvector(sums - kOffset * row.sum, typename V::Float) * step);
+  }
+}
+
 /// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (of the block of x,
 /// at most), kStep (of the depth, most), kEven (tiles of equal height), Session (held while a thread works), kSigned
 /// (sums are of the weights themselves, without their offset), and
@@ -106,8 +125,6 @@ class Int8Loop {
   }
 
  private:
-  static constexpr std::int64_t kAnyNorm = std::int64_t{1} << 62;  // whoever quantizes x computes it
-
   explicit Int8Loop(const LinearJob& job)
       : job_(job),
         block_rows_(even_block(job.n_row, block_rows(job.x_stride), kRows)),
@@ -202,22 +219,11 @@ class Int8Loop {
     }
   }
 
-  /// What the sums of a tile stand for: float(sum) * (scale of W, or of its column / s of the row).
   VLA_INLINE void scale(const LinearJob::Part& part, const Stripe& s, std::int64_t r, std::int64_t n_row,
                         float* to) const {
-    for (std::int64_t i = 0; i < n_row; ++i, ++r) {
-      const RowScale row = row_scale(row_of(s, r), job_.d_in);
-      for (std::int64_t n = 0; n < kColumns; n += V::width) {
-        typename V::Int sums;
-        std::memcpy(&sums, scratch_->sums + r * kColumns + n, sizeof(sums));
-        typename V::Float step;
-        if constexpr (Weights::kManyScales)
-          step = load<V>(part.scale + s.column + n, s.n_column > n ? s.n_column - n : 0) / row.s;
-        else
-          step = V::set(*part.scale / row.s);
-        V::store(to + i * kColumns + n, __builtin_convertvector(sums - kOffset * row.sum, typename V::Float) * step);
-      }
-    }
+    for (std::int64_t i = 0; i < n_row; ++i, ++r)
+      scale_sums<V, Weights, kColumns, kOffset>(part, s, row_scale(row_of(s, r), job_.d_in),
+                                                scratch_->sums + r * kColumns, to + i * kColumns);
   }
 
   const LinearJob& job_;

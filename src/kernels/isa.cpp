@@ -76,6 +76,7 @@ bool has_avx_vnni() {
   return __get_cpuid_count(7, 1, &a, &b, &c, &d) != 0 && (a & kAvxVnni) != 0;
 }
 bool has_avx512_vnni() { return __builtin_cpu_supports("avx512vnni") != 0; }
+bool permutes_beside_vnni() { return has_avx512_vnni() && __builtin_cpu_is("amd") != 0; }
 bool has_amx_int8() {
   unsigned a = 0, b = 0, c = 0, d = 0;
   constexpr unsigned kTileInt8 = 1U << 25;
@@ -84,6 +85,7 @@ bool has_amx_int8() {
 #else
 bool has_avx_vnni() { return false; }
 bool has_avx512_vnni() { return false; }
+bool permutes_beside_vnni() { return false; }
 bool has_amx_int8() { return false; }
 #endif
 

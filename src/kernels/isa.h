@@ -25,6 +25,9 @@ std::string isa_name(Isa isa);
 bool has_avx_vnni();
 bool has_avx512_vnni();
 bool has_amx_int8();
+/// Permutations of AVX-512 and the multiplications of VNNI have units of their own: cores of AMD. Those of Intel make
+/// both in the same place.
+bool permutes_beside_vnni();
 
 /// What this machine can run, `ggml` first and the best last.
 const std::vector<Isa>& usable_isas();

@@ -7,7 +7,7 @@ namespace vla::kernels {
 #if defined(__x86_64__)
 // Each in the file of its name.
 extern const LinearKernel kLinearAmx, kLinearAvx512Bf16, kLinearAvx512, kLinearAvx2;
-extern const LinearKernel kTernaryAmx, kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
+extern const LinearKernel kTernaryAmx, kTernaryLookup, kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
 extern const LinearKernel kInt8Amx, kInt8Avx512, kInt8AvxVnni, kInt8Avx2;
 #endif
 extern const LinearKernel kTernaryPlain, kInt8Plain;  // int8_emulated.cpp
@@ -30,8 +30,8 @@ const LinearKernel* choose_linear(const MatrixDesc& desc, Isa isa) {
 
 std::span<const LinearKernel* const> ternary_kernels() {
 #if defined(__x86_64__)
-  static constexpr const LinearKernel* kAll[] = {&kTernaryAmx, &kTernaryAvx512, &kTernaryAvxVnni, &kTernaryAvx2,
-                                                 &kTernaryPlain};
+  static constexpr const LinearKernel* kAll[] = {&kTernaryAmx,     &kTernaryLookup, &kTernaryAvx512,
+                                                 &kTernaryAvxVnni, &kTernaryAvx2,   &kTernaryPlain};
 #else
   static constexpr const LinearKernel* kAll[] = {&kTernaryPlain};
 #endif

@@ -357,10 +357,16 @@ bool lacks(const std::string& name) {
   TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check_named("avxvnni_int8"); } \
   TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check_named("avx512_int8"); }    \
   TEST_CASE("amx_int8: " sentence* doctest::skip(lacks("amx_int8"))) { check_named("amx_int8"); }
+#define VLA_LOOKUP_TEST(sentence, check)                                         \
+  TEST_CASE("avx512_lookup: " sentence* doctest::skip(lacks("avx512_lookup"))) { \
+    check(*row(ternary_kernels(), "avx512_lookup"));                             \
+  }
 #define VLA_TERNARY_TEST(sentence, check)                                                           \
+  VLA_LOOKUP_TEST(sentence, check)                                                                  \
   VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check(*row(ternary_kernels(), name)); }) \
   VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx))
 #define VLA_INT8_TEST(sentence, check)                                                 \
+  VLA_LOOKUP_TEST(sentence, check)                                                     \
   VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check_both(name, check); }) \
   VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx); check(kEmulatedInt8Amx))
 

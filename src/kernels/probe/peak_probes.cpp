@@ -77,6 +77,27 @@ void multiply_add_any(long n_round) {
 
 #undef VLA_SUM_LOOP
 
+/// Sums of three numbers that a permutation looks up, 32 of them, beside VNNI (int8_lookup_avx512.cpp): 96
+/// multiply-adds by each permutation and its addition, two products of 64 meanwhile.
+[[gnu::target("avx512f")]] void multiply_add_lookup(long n_round) {
+  if (n_round <= 0) return;
+  __asm__ volatile(
+      "1:\n"
+      ".irp sum, 0,1,2,3,4,5,6,7\n"
+      "vpermw %%zmm30, %%zmm31, %%zmm29\n"
+      "vpdpbusd %%zmm30, %%zmm31, %%zmm\\sum\n"
+      "vpdpbusd %%zmm30, %%zmm31, %%zmm1\\sum\n"
+      "vpaddw %%zmm29, %%zmm2\\sum, %%zmm2\\sum\n"
+      ".endr\n"
+      "dec %0\n"
+      "jnz 1b"
+      : "+r"(n_round)
+      :
+      : "cc", "zmm0", "zmm1", "zmm2", "zmm3", "zmm4", "zmm5", "zmm6", "zmm7", "zmm10", "zmm11", "zmm12", "zmm13",
+        "zmm14", "zmm15", "zmm16", "zmm17", "zmm20", "zmm21", "zmm22", "zmm23", "zmm24", "zmm25", "zmm26", "zmm27",
+        "zmm29");
+}
+
 /// Products of bytes in pairs, and their sums in 16 bits: two instructions for 32 multiply-adds.
 [[gnu::target("avx2")]] void multiply_add_bytes(long n_round) {
   if (n_round <= 0) return;
@@ -151,6 +172,8 @@ std::vector<PeakProbe> detect() {
   if (has(Isa::avx512)) {
     found.push_back({"avx512 f32", Isa::avx512, Number::f32, 28 * 16 * 2, multiply_add_avx512});
     if (has_avx512_vnni()) found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
+    if (permutes_beside_vnni())
+      found.push_back({"avx512 lookup", Isa::avx512, Number::int8, 8 * (2 * 64 + 96) * 2, multiply_add_lookup});
   }
   if (has(Isa::avx512_bf16))
     found.push_back({"avx512 bf16", Isa::avx512_bf16, Number::bf16, 28 * 32 * 2, multiply_add_pairs});
