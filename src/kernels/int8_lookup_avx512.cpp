@@ -203,8 +203,9 @@ void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, con
 /// block; tables are made of four rows at a time, which all panels share.
 class LookupLoop {
   static constexpr std::int64_t kBlockRows = 108;
-  static constexpr std::int64_t kPanels = 20;   // whose steps and sums lie in the second cache
-  static constexpr std::int64_t kMinItems = 8;  // for each thread, where there are so many
+  static constexpr std::int64_t kPanels = 20;                   // whose steps and sums lie in the second cache
+  static constexpr std::int64_t kManyPanels = 8;                // which make the tables' time small
+  static constexpr std::int64_t kMinItems = 2, kManyItems = 8;  // for each thread, where there are so many
 
   struct Tile {
     using V = kernels::V;
@@ -230,7 +231,9 @@ class LookupLoop {
 
   static std::int64_t cut(LinearJob& job, int n_thread) {
     const std::int64_t n_block = ceil_div(job.n_row, block_rows(job));
-    job.n_group = n_thread == 1 ? 1 : min(ceil_div(kMinItems * n_thread, n_block), Stripes::n_panel(job));
+    const auto groups = [&](std::int64_t items) { return ceil_div(items * n_thread, n_block); };
+    const std::int64_t n_panel = Stripes::n_panel(job), most = min(groups(kManyItems), n_panel / kManyPanels);
+    job.n_group = n_thread == 1 ? 1 : min(most > groups(kMinItems) ? most : groups(kMinItems), n_panel);
     return n_block * job.n_group;
   }
 
@@ -283,6 +286,9 @@ class LookupLoop {
     const std::int64_t strip = TernaryPanels::strip_size(job_.d_in);
     const std::byte* strips = part.weight + column / Int8Panels::kColumns * strip;
     const auto line = [&](std::int64_t k) { return strips + k / Int8Panels::kGroup * Int8Panels::kLine; };
+    for (std::int64_t i = 0; i < kStrips; ++i)
+      for (std::int64_t k = 0; k < step.depth(); k += Int8Panels::kGroup)
+        __builtin_prefetch(line(step.k + step.depth() + k) + i * strip, 0, 2);
     for (std::int64_t k = 0; k < step.n_lookup; k += 16)
       make_indices(line(step.k + 3 * k), strip, numbers.indices + k * kStrips / 2 * kRegister);
     TernaryPanels::expand<kStrips>(line(step.multiplied()), strip, 4 * step.n_group, numbers.multiplied);
