@@ -13,7 +13,8 @@ before and after the network is left out for all.  Beside them stands the machin
 and after each of vla's own runs.
 
 Peers: torch-f32, torch-bf16 (the published dtypes), torch-f32-compiled, torch-bf16-compiled, openvino-f32,
-openvino-bf16, openvino-default.  They need torch and lerobot, and openvino, in the environment that runs this script.
+openvino-bf16, openvino-default, openvino-int8.  They need torch and lerobot, openvino, and nncf for int8, in the environment that runs
+this script.
 With --ggml-bench PROGRAM --ggml-weights FILE the benchmark program of another ggml runtime takes part
 (https://github.com/VinRobotics/vla.cpp, target vla-bench); it times itself, in a process for each round.
 """
@@ -34,7 +35,7 @@ from busy_loops import busy_loops  # isort: skip
 HERE = Path(__file__).resolve().parent
 TORCH = {"torch-f32": ["--dtype", "float32"], "torch-bf16": ["--dtype", "published"],
          "torch-f32-compiled": ["--dtype", "float32", "--compile"], "torch-bf16-compiled": ["--dtype", "published", "--compile"]}
-OPENVINO = {f"openvino-{hint}": ["--hint", hint] for hint in ("f32", "bf16", "default")}
+OPENVINO = {f"openvino-{hint}": ["--hint", hint] for hint in ("f32", "bf16", "default", "int8")}
 
 
 class PythonPeer:

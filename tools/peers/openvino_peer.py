@@ -3,16 +3,19 @@
 """LeRobot's SmolVLA in OpenVINO, one timed inference for each line on standard input.  Run by compare.py.
 
 The network is traced from PyTorch as three models: the tower over all views as one batch, the prefix up to its keys and
-values, one step.  The first run writes them to --folder; later runs read them.  Before the first turn the chunk is
-compared with PyTorch's float32, so that a fast answer is also the right one.
+values, one step.  The first run writes them to --folder; later runs read them.  --hint int8 takes what NNCF quantizes
+them to after training, calibrated on other observations of the same kind.  Before the first turn the chunk is compared
+with PyTorch's float32, so that a fast answer is also the right one.
 """
 import argparse
 import gc
 from pathlib import Path
 
+import numpy as np
 from peer import Laps, load, observation, serve
 
 PARTS = ("vision", "prefix", "step")
+N_CALIBRATION = 3  # observations, of all steps
 
 
 def grow(layer, keys, values, *_, **__):
@@ -83,28 +86,81 @@ def convert(model, inputs, folder):
             openvino.save_model(converted, folder / f"{name}.xml", compress_to_fp16=False)
 
 
+class Network:
+    """The three models as OpenVINO runs them on this CPU."""
+
+    def __init__(self, folder, n_step, options):
+        import openvino
+
+        core = openvino.Core()
+        self.n_step = n_step
+        self.vision, self.prefix, self.step = (core.compile_model(folder / f"{name}.xml", "CPU", options).create_infer_request() for name in PARTS)
+
+    def infer(self, inputs, watch=lambda *_: None):
+        """Milliseconds by stage, and the chunk.  watch(part, inputs) sees what each model is given."""
+        import openvino
+
+        laps = Laps()
+
+        def run(part, *given):
+            watch(part, given)
+            return getattr(self, part).infer(list(given))[0]
+
+        image_tokens = run("vision", inputs["images"])
+        laps.lap("vision")
+        cached = openvino.Tensor(run("prefix", image_tokens, inputs["tokens"], inputs["state"]))
+        laps.lap("prefix")
+        x = inputs["noise"].copy()
+        for k in range(self.n_step):
+            x = x - run("step", x, np.array([1 - k / self.n_step], np.float32), cached) / self.n_step
+        laps.lap("steps")
+        return laps.stages, x
+
+
+def quantize(folder, to, config, args):
+    """NNCF's quantization after training, as its guide has it for transformers."""
+    import nncf
+    import openvino
+
+    seen = {name: [] for name in PARTS}
+    network = Network(folder, config.num_steps, {"INFERENCE_PRECISION_HINT": "f32"})
+    for seed in range(1, 1 + N_CALIBRATION):
+        network.infer(observation(config, args.views, args.tokens, seed),
+                      lambda part, given: seen[part].append([np.array(getattr(x, "data", x)) for x in given]))
+    del network
+    to.mkdir(exist_ok=True)
+    for name in PARTS:
+        data = nncf.Dataset(seen.pop(name))
+        model = nncf.quantize(openvino.Core().read_model(folder / f"{name}.xml"), data, model_type=nncf.ModelType.TRANSFORMER,
+                              preset=nncf.QuantizationPreset.MIXED, subset_size=data.get_length())
+        openvino.save_model(model, to / f"{name}.xml", compress_to_fp16=False)
+
+
+def are_in(folder):
+    return all((folder / f"{name}.bin").exists() for name in PARTS)
+
+
 def main():
-    import numpy as np
     import openvino
     import torch
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint")
     parser.add_argument("--folder", type=Path, required=True, help="where the three models are kept")
-    parser.add_argument("--hint", choices=("f32", "bf16", "default"), required=True, help="precision that OpenVINO is asked for")
+    parser.add_argument("--hint", choices=("f32", "bf16", "default", "int8"), required=True, help="precision that OpenVINO is asked for")
     parser.add_argument("--views", type=int, required=True)
     parser.add_argument("--tokens", type=int, required=True)
     parser.add_argument("--threads", type=int, required=True)
     args = parser.parse_args()
     model = load(args.checkpoint, "float32", args.threads)
-    n_step = model.config.num_steps
-    inputs = observation(model.config, args.views, args.tokens)
+    config = model.config
+    inputs = observation(config, args.views, args.tokens)
     images, tokens, state, noise = (torch.from_numpy(inputs[n]) for n in ("images", "tokens", "state", "noise"))
     with torch.inference_mode():
         expected = model.sample_actions(list(images[:, None]), [torch.ones(1, dtype=torch.bool)] * args.views, tokens,
                                         torch.ones_like(tokens, dtype=torch.bool), state, noise=noise.clone()).numpy()
     folder = args.folder / f"{args.views}_views_{args.tokens}_tokens"
-    if not all((folder / f"{name}.bin").exists() for name in PARTS):
+    if not are_in(folder):
         from transformers.cache_utils import DynamicLayer
 
         DynamicLayer.update = grow
@@ -112,25 +168,16 @@ def main():
     del model
     gc.collect()
     options = {"INFERENCE_NUM_THREADS": args.threads, "PERFORMANCE_HINT": "LATENCY"}
-    if args.hint != "default":
+    if args.hint == "int8":
+        if not are_in(folder / "int8"):
+            quantize(folder, folder / "int8", config, args)
+        folder /= "int8"
+    elif args.hint != "default":
         options["INFERENCE_PRECISION_HINT"] = args.hint
-    core = openvino.Core()
-    vision, prefix, step = (core.compile_model(folder / f"{name}.xml", "CPU", options).create_infer_request() for name in PARTS)
-
-    def infer():
-        laps = Laps()
-        image_tokens = vision.infer([inputs["images"]])[0]
-        laps.lap("vision")
-        cached = openvino.Tensor(prefix.infer([image_tokens, inputs["tokens"], inputs["state"]])[0])
-        laps.lap("prefix")
-        x = inputs["noise"].copy()
-        for k in range(n_step):
-            x = x - step.infer([x, np.array([1 - k / n_step], np.float32), cached])[0] / n_step
-        laps.lap("steps")
-        return laps.stages, x
-
-    off = np.abs(infer()[1] - expected).max() / np.abs(expected).max()
-    serve(lambda: infer()[0], name=f"OpenVINO {openvino.__version__.split('-')[0]}, {args.hint} precision; chunk within {off:.0e} of PyTorch float32")
+    network = Network(folder, config.num_steps, options)
+    off = np.abs(network.infer(inputs)[1] - expected).max() / np.abs(expected).max()
+    serve(lambda: network.infer(inputs)[0],
+          name=f"OpenVINO {openvino.__version__.split('-')[0]}, {args.hint} precision; chunk within {off:.0e} of PyTorch float32")
 
 
 if __name__ == "__main__":
