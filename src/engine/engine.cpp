@@ -335,14 +335,16 @@ StageWork Engine::work() const {
   return plan != nullptr ? plan->work(solver_.n_step) : StageWork();
 }
 
-std::string Engine::precision() const {
+bool Engine::has_ternary() const {
   const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
-  const auto& all = params_->params();
-  return std::any_of(all.begin(), all.end(), is_ternary) ? "int8" : device_->precision();
+  return std::any_of(params_->params().begin(), params_->params().end(), is_ternary);
 }
+
+std::string Engine::precision() const { return has_ternary() ? "int8" : device_->precision(); }
 
 std::string Engine::arithmetic() const {
   const std::string floats = device_->precision();
+  if (floats == "int8") return "int8 products, as asked for: less exact than PyTorch's bf16";
   if (precision() == "int8") return "ternary products of int8, others " + floats;
   return precision() == "bf16" ? "bf16 products, sums in float32; --kernels float32 avoids them" : "float32";
 }

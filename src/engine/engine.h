@@ -119,11 +119,13 @@ class Engine {
   /// The kernels in use, as `--kernels` names them: those of the machine, or others where the bundle's dtype asks for
   /// float32.
   std::string kernels() const { return device_->kernels(); }
-  /// Of the large products: "int8" where weights are ternary and activations int8, "bf16" where activations are rounded
-  /// to it (sums are float32), else "f32".
+  /// Of the large products: "int8" where activations are int8, and weights ternary or quantized because somebody asked
+  /// for it, "bf16" where activations are rounded to it (sums are float32), else "f32".
   std::string precision() const;
   /// The same as text for display.
   std::string arithmetic() const;
+  /// Whether some weights are ternary.
+  bool has_ternary() const;
 
  private:
   Engine(Bundle bundle, Processor processor) : bundle_(std::move(bundle)), processor_(std::move(processor)) {}

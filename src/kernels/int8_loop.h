@@ -68,7 +68,8 @@ struct ByteStrips {
 /// Whoever quantizes x computes its norm, of any width.
 constexpr std::int64_t kAnyNorm = std::int64_t{1} << 62;
 
-/// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the row).
+/// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the
+/// row).
 template <class V, class Weights, int kColumns, int kOffset>
 VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const RowScale& row, const std::int32_t* from,
                            float* to) {

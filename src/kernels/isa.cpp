@@ -119,7 +119,7 @@ Result<Isa> choose_isa(const std::string& name) {
   const auto found = std::find_if(usable.begin(), usable.end(), is_named);
   if (found != usable.end()) return *found;
   if (name != "bf16" && std::none_of(std::begin(kAll), std::end(kAll), is_named))
-    return Error{Code::usage, "kernels", "ggml, avx2, avx512, avx512_bf16, amx, float32 or bf16", name};
+    return Error{Code::usage, "kernels", "ggml, avx2, avx512, avx512_bf16, amx, float32, bf16 or int8", name};
   std::vector<std::string> names;
   for (Isa isa : usable) names.push_back(isa_name(isa));
   return Error{Code::device, "kernels", fmt::format("what this machine can run: {}", fmt::join(names, ", ")), name,

@@ -33,8 +33,8 @@ Status check_attention(const Graph& graph) {
 
 }  // namespace
 
-Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa) {
-  std::unique_ptr<CpuDevice> device(new CpuDevice(isa));
+Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa, bool quantizes) {
+  std::unique_ptr<CpuDevice> device(new CpuDevice(isa, quantizes));
   VLA_TRY(device->executor_, kernels::Executor::shared(n_thread));
   return std::unique_ptr<Device>(std::move(device));
 }
@@ -44,7 +44,10 @@ std::string CpuDevice::name() const { return fmt::format("cpu, {} thread{}", n_t
 Status CpuDevice::load(const ParamList& params, bool fill) {
   min_rounded_keys_ = min_rounded_keys(params);
   isa_ = isa_for(params, isa_);
-  VLA_TRY(weights_, CpuWeights::load(params, isa_, n_thread(), fill));
+  VLA_TRY(weights_, CpuWeights::load(params, {isa_, quantizes_, n_thread(), fill}));
+  if (quantizes_ && !weights_.is_quantized())
+    return Error{Code::unsupported, "kernels", "a policy with matrices of floats that are worth quantizing",
+                 kInt8Kernels, "leave --kernels out"};
   return {};
 }
 

@@ -11,6 +11,7 @@
 #include <map>
 
 #include "kernels/executor.h"
+#include "kernels/quantize_weights.h"
 #include "kernels/sizes.h"
 #include "lower/precision.h"
 
@@ -35,8 +36,18 @@ std::int64_t min_rounded_keys(const ParamList& list) {
 namespace lower {
 namespace {
 
-kernels::MatrixDesc desc_of(const Param& param) {
-  return {param.type(), param.shape[0], param.shape[1], param.storage == Storage::ternary};
+/// Products from or to fewer numbers take no time worth an error. Padded states and actions of robots have up to 132
+/// numbers (GR00T N1.7).
+constexpr std::int64_t kMinQuantized = 144;
+
+bool becomes_int8(const Param& param, bool quantizes) {
+  return quantizes && param.storage == Storage::matrix && std::min(param.shape[0], param.shape[1]) >= kMinQuantized;
+}
+
+/// The matrix as it is multiplied.
+kernels::MatrixDesc desc_of(const Param& param, bool quantizes) {
+  const DType type = becomes_int8(param, quantizes) ? DType::i8 : param.type();
+  return {type, param.shape[0], param.shape[1], param.storage == Storage::ternary};
 }
 
 /// Rows of a matrix in a part that is read and packed at a time: whole panels of every kernel.
@@ -52,16 +63,18 @@ struct PackTask : kernels::Task {
     std::span<const std::byte> from;
     const kernels::LinearKernel* kernel;  // null: a copy
     std::byte* to;
+    DType stored = DType::f32;  // of what is quantized
+    float* scales = nullptr;    // where something is
   };
   const Bundle* bundle;
   std::vector<Part> parts;
-  mutable std::vector<Room> rooms;  // of each worker
+  mutable std::vector<Room> rooms, codes;  // of each worker
   mutable std::atomic<bool> has_failed = false;
 
-  void add(const Param& param, const kernels::LinearKernel* kernel, std::byte* to) {
+  void add(const Param& param, kernels::MatrixDesc desc, const kernels::LinearKernel* kernel, std::byte* to,
+           float* scales) {
     const std::span<const std::byte> all = param.source->data;
     if (kernel == nullptr) return parts.push_back({{}, all, nullptr, to});
-    kernels::MatrixDesc desc = desc_of(param);
     const std::int64_t n_row = desc.d_out, row = static_cast<std::int64_t>(all.size()) / n_row;
     const std::int64_t step = kernels::round_up(kPartSize / row + 1, kPartRows);
     for (std::int64_t first = 0; first < n_row; first += step) {
@@ -70,19 +83,33 @@ struct PackTask : kernels::Task {
       desc.d_out = std::min(step, n_row - first);
       parts.push_back({desc,
                        all.subspan(static_cast<std::size_t>(first * row), static_cast<std::size_t>(desc.d_out * row)),
-                       kernel, place});
+                       kernel, place, param.type(), scales != nullptr ? scales + first : nullptr});
     }
   }
 
   void run(std::int64_t item, kernels::Worker& worker) const override {
-    const auto& [desc, from, kernel, to] = parts[static_cast<std::size_t>(item)];
-    const std::byte* read = bundle->content()->read(from, rooms[static_cast<std::size_t>(worker.index)]);
-    if (read == nullptr)
+    const auto& [desc, from, kernel, to, stored, scales] = parts[static_cast<std::size_t>(item)];
+    const auto i = static_cast<std::size_t>(worker.index);
+    const std::byte* read = bundle->content()->read(from, rooms[i]);
+    if (read == nullptr) {
       has_failed = true;
-    else if (kernel != nullptr)
+    } else if (scales != nullptr) {
+      std::byte* const quantized = codes[i].take(size_of_codes(desc) + row_size(desc));
+      auto* const row = reinterpret_cast<float*>(quantized + size_of_codes(desc));
+      kernels::quantize_weights(stored, read, desc.d_in, desc.d_out, quantized, scales, row);
+      kernel->pack(desc, quantized, to);
+    } else if (kernel != nullptr) {
       kernel->pack(desc, read, to);
-    else
+    } else {
       std::memcpy(to, read, from.size());
+    }
+  }
+
+  static std::size_t size_of_codes(const kernels::MatrixDesc& desc) {
+    return aligned(static_cast<std::size_t>(desc.d_in * desc.d_out));
+  }
+  static std::size_t row_size(const kernels::MatrixDesc& desc) {
+    return static_cast<std::size_t>(desc.d_in) * sizeof(float);
   }
 };
 
@@ -98,7 +125,7 @@ std::string describe(const std::map<std::string, std::map<std::string, int>>& co
 
 }  // namespace
 
-Result<CpuWeights> CpuWeights::load(const ParamList& list, Isa isa, int n_thread, bool fill) {
+Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& options) {
   CpuWeights weights;
   std::map<std::string, std::map<std::string, int>> counts;
   std::vector<std::size_t> offsets;
@@ -109,9 +136,13 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, Isa isa, int n_thread
     Place place;
     offsets.push_back(size);
     if (param.is_matrix()) {
-      place.kernel = kernels::choose_linear(desc_of(param), isa);
+      const kernels::MatrixDesc desc = desc_of(param, options.quantizes);
+      place.kernel = kernels::choose_linear(desc, options.isa);
       ++counts[place.kernel->name][param.storage == Storage::ternary ? "ternary" : dtype_name(param.type())];
-      size += aligned(place.kernel->packed_size(desc_of(param)));
+      size += aligned(place.kernel->packed_size(desc));
+      const bool quantized = becomes_int8(param, options.quantizes);
+      weights.is_quantized_ = weights.is_quantized_ || quantized;
+      if (quantized) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));
     } else if (param.storage == Storage::vector) {
       size += aligned(static_cast<std::size_t>(param.count()) * sizeof(float));
     } else if (param.source != nullptr) {
@@ -129,14 +160,21 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, Isa isa, int n_thread
     if (param.storage == Storage::table) continue;
     Place& place = weights.places_[static_cast<std::size_t>(param.id)];
     place.data = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
-    if (fill) task.add(param, place.kernel, weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)]);
+    const kernels::MatrixDesc desc = desc_of(param, options.quantizes);
+    if (becomes_int8(param, options.quantizes))
+      place.scales = reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc)));
+    if (options.fill) task.add(param, desc, place.kernel, place.data, place.scales);
   }
   if (task.parts.empty()) return weights;
-  VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(n_thread));
+  VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(options.n_thread));
   task.rooms.resize(static_cast<std::size_t>(executor->n_thread()));
-  for (const PackTask::Part& part : task.parts)
-    for (Room& room : task.rooms)
-      room.take(Content::room_for(part.from.size()));  // a worker must not run out of memory
+  task.codes.resize(task.rooms.size());
+  for (const PackTask::Part& part : task.parts)  // a worker must not run out of memory
+    for (std::size_t i = 0; i < task.rooms.size(); ++i) {
+      task.rooms[i].take(Content::room_for(part.from.size()));
+      if (part.scales != nullptr)
+        task.codes[i].take(PackTask::size_of_codes(part.desc) + PackTask::row_size(part.desc));
+    }
   task.n_item = static_cast<std::int64_t>(task.parts.size());
   const kernels::Phase phase = {{&task}, nullptr};
   executor->run({&phase, 1});

@@ -16,15 +16,24 @@ namespace vla::lower {
 /// The tables of a policy's bundle.
 using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 
-/// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in the bundle's dtype, in panels;
-/// vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
+/// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in panels, in the bundle's dtype or
+/// quantized; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
 class CpuWeights {
  public:
-  /// Every parameter must have its source. Without `fill` memory is reserved and never touched. Errors: out_of_memory,
-  /// bad_bundle where the file has been changed since it was opened.
-  static Result<CpuWeights> load(const ParamList& list, Isa isa, int n_thread, bool fill);
+  struct Options {
+    Isa isa;
+    bool quantizes;  // large matrices of floats to int8 (kernels/quantize_weights.h)
+    int n_thread;
+    bool fill = true;  // else memory is reserved and never touched
+  };
+  /// Every parameter must have its source. Errors: out_of_memory, bad_bundle where the file has been changed since it
+  /// was opened.
+  static Result<CpuWeights> load(const ParamList& list, const Options& options);
 
   const std::byte* data(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].data; }
+  bool is_quantized() const { return is_quantized_; }
+  /// Of each column of the product, where the matrix was quantized when it was loaded; else null.
+  const float* scales(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].scales; }
   /// What multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* param) const {
     return places_[static_cast<std::size_t>(param->id)].kernel;
@@ -43,14 +52,16 @@ class CpuWeights {
 
  private:
   struct Place {
-    const std::byte* data = nullptr;
+    std::byte* data = nullptr;
     const kernels::LinearKernel* kernel = nullptr;
+    float* scales = nullptr;
   };
 
   Memory memory_;
   std::shared_ptr<const Tables> tables_;
   std::size_t table_size_ = 0;
   std::vector<Place> places_;
+  bool is_quantized_ = false;  // some matrix
   std::string text_;
 };
 

@@ -228,7 +228,8 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
     const auto vector = [&](const Param* param) {
       return param != nullptr ? reinterpret_cast<const float*>(l.weights.data(param)) : nullptr;
     };
-    part.bias = vector(product.bias), part.scale = vector(product.scale);
+    part.bias = vector(product.bias);
+    part.scale = product.scale != nullptr ? vector(product.scale) : l.weights.scales(product.weight);
     part.d_out = product.weight->shape[1];
     // Of gate and up the one result is up's.
     const std::size_t i = linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1);
@@ -395,8 +396,8 @@ Work work_of(const Lowering& l, const FusedOp& op) {
   if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
     for (const Node* node : linear->linears) {
       const auto& product = *node->as<op::Linear>();
-      work.weights +=
-          static_cast<double>(product.weight->stored_count()) * static_cast<double>(dtype_size(product.weight->type()));
+      const DType type = l.weights.scales(product.weight) != nullptr ? DType::i8 : product.weight->type();
+      work.weights += static_cast<double>(product.weight->stored_count()) * static_cast<double>(dtype_size(type));
       if (product.bias != nullptr) work.weights += 4.0 * static_cast<double>(product.bias->shape[0]);
     }
     work.bytes += work.weights;

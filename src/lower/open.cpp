@@ -30,11 +30,14 @@ Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& ker
     return Error{Code::usage, "kernels", fmt::format("none, float32, bf16 or ggml with device {}", name.text()),
                  kernels, "other kernels are the CPU's"};
   }
-  VLA_TRY(const Isa isa, choose_isa(kernels));
+  const bool quantizes = kernels == kInt8Kernels;
+  VLA_TRY(const Isa isa, choose_isa(quantizes ? "" : kernels));
+  if (quantizes && isa == Isa::ggml)
+    return Error{Code::device, "kernels", "a machine with AVX2", kernels, "leave the choice to the program"};
   if (n_thread <= 0) n_thread = usable_cores();
   if (n_thread > kMaxThreads)
     return Error{Code::device, "threads", fmt::format("at most {}", kMaxThreads), std::to_string(n_thread)};
-  return isa == Isa::ggml ? GgmlDevice::cpu(n_thread) : lower::CpuDevice::open(n_thread, isa);
+  return isa == Isa::ggml ? GgmlDevice::cpu(n_thread) : lower::CpuDevice::open(n_thread, isa, quantizes);
 }
 
 DeviceList list_devices() {

@@ -84,6 +84,22 @@ def test_state_may_be_float64_and_come_by_name_or_alone(act, golden):
         assert np.array_equal(act(state=state), expected)
 
 
+def test_int8_is_near_float32_and_told_and_must_be_asked_for():
+    """The shipped policy on a recorded frame; a chunk's distance in parts of its root mean square."""
+    bundle, frame = ROOT / "models/metaworld-tiny.gguf", ROOT / "examples/metaworld/episodes/faucet-open/step_00.png"
+    observation = dict(images={"corner4": frame.read_bytes()}, state=[0.0045, 0.4003, 0.1957, 1], text="open the faucet", seed=1)
+    chunks, precisions = {}, {}
+    for kernels in ("float32", "int8", None):
+        with vla_cpp.Policy(bundle, threads=1, kernels=kernels) as policy:
+            chunks[kernels], precisions[kernels] = np.asarray(policy.act(**observation)), policy.spec.precision
+    assert precisions["int8"] == "int8" and precisions["float32"] == "f32" and precisions[None] in ("f32", "bf16")
+
+    def distance(kernels):
+        return np.sqrt(np.mean((chunks[kernels] - chunks["float32"]) ** 2) / np.mean(chunks["float32"] ** 2))
+
+    assert distance(None) < distance("int8") < 0.02
+
+
 def test_without_seed_and_noise_the_seed_that_was_drawn_gives_the_chunk_again(act):
     first, second = act(seed=None), act(seed=None)
     assert first.seed != second.seed and not np.array_equal(first, second)

@@ -69,4 +69,13 @@ TEST_CASE("an engine tells the kernels and the precision of its bundle, not thos
   CHECK(engine->precision() == "f32");
   CHECK(engine->arithmetic() == "float32");
   CHECK(engine->kernels() == isa_name(*choose_isa("float32")));
+  CHECK(engine->arithmetic().find("int8") == std::string::npos);
+}
+
+TEST_CASE("an engine tells that matrices were quantized, as somebody asked" *
+          doctest::skip(usable_isas().back() == Isa::ggml)) {
+  const auto engine = load_engine(VLA_SOURCE_DIR "/models/metaworld-tiny.gguf", "", kInt8Kernels);
+  CHECK(engine->precision() == "int8");
+  CHECK(engine->arithmetic().find("as asked") != std::string::npos);
+  CHECK(!engine->has_ternary());
 }

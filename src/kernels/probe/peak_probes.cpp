@@ -173,7 +173,7 @@ std::vector<PeakProbe> detect() {
     found.push_back({"avx512 f32", Isa::avx512, Number::f32, 28 * 16 * 2, multiply_add_avx512});
     if (has_avx512_vnni()) found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
     if (permutes_beside_vnni())
-      found.push_back({"avx512 lookup", Isa::avx512, Number::int8, 8 * (2 * 64 + 96) * 2, multiply_add_lookup});
+      found.push_back({"avx512 lookup", Isa::avx512, Number::ternary, 8 * (2 * 64 + 96) * 2, multiply_add_lookup});
   }
   if (has(Isa::avx512_bf16))
     found.push_back({"avx512 bf16", Isa::avx512_bf16, Number::bf16, 28 * 32 * 2, multiply_add_pairs});
@@ -197,15 +197,15 @@ const std::vector<PeakProbe>& peak_probes() {
 const PeakProbe& peak_probe_of(Isa isa) {
   const PeakProbe* best = &peak_probes().front();
   for (const PeakProbe& probe : peak_probes())
-    if (isa == Isa::ggml ? probe.number == Number::f32 : probe.isa == isa && probe.number != Number::int8)
-      best = &probe;
+    if (isa == Isa::ggml ? probe.number == Number::f32 : probe.isa == isa && probe.number < Number::int8) best = &probe;
   return *best;
 }
 
-const PeakProbe* int8_probe_of(Isa isa) {
+const PeakProbe* int8_probe_of(Isa isa, bool ternary) {
   const PeakProbe* best = nullptr;
   for (const PeakProbe& probe : peak_probes())
-    if (probe.number == Number::int8 && probe.isa <= isa) best = &probe;
+    if ((probe.number == Number::int8 || (ternary && probe.number == Number::ternary)) && probe.isa <= isa)
+      best = &probe;
   return best;
 }
 

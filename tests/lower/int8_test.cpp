@@ -1,0 +1,98 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Matrices of floats that are quantized when they are loaded, because somebody asked for it.
+#include "kernels/isa.h"
+#include "nn/linear.h"
+#include "nn/tokens.h"
+#include "support/graph_runner.h"
+#include "support/param_set.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+constexpr int kWide = 300, kNarrow = 160, kAction = 32;
+
+ParamSet::Piece piece(const std::string& name, const std::vector<std::int64_t>& shape, DType type = DType::bf16) {
+  std::int64_t count = 1;
+  for (const std::int64_t n : shape) count *= n;
+  return {name, shape, ramp(static_cast<std::size_t>(count), 0.1f), type};
+}
+std::vector<ParamSet::Piece> pieces(DType type) {
+  return {piece("up.weight", {kNarrow, kWide}, type),       piece("up.bias", {kWide}, DType::f32),
+          piece("down.weight", {kWide, kNarrow}, type),     piece("down.bias", {kNarrow}, DType::f32),
+          piece("action.weight", {kNarrow, kAction}, type), piece("action.bias", {kAction}, DType::f32)};
+}
+
+/// An MLP with its norm and its residual.
+std::vector<float> mlp(const std::string& kernels, DType type) {
+  ParamSet set(pieces(type));
+  const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
+      action(set.scope("action"), kNarrow, kAction, Bias::yes);
+  return run_graph(
+      set.list(),
+      [&](Graph& g) {
+        const Tensor x = constant(g, ramp(kNarrow * 37, 2.0f), {kNarrow, 37});
+        const Tensor h =
+            g.add(op::Norm{op::NormKind::rms, 1e-5f}, {x, constant(g, std::vector<float>(kNarrow, 1), {kNarrow})});
+        const Tensor y = add(g, x, down(g, activate(g, up(g, h), Activation::gelu_tanh)));
+        return concat(g, {y, action(g, x)}, 0);
+      },
+      kernels);
+}
+
+bool lacks_kernels() { return usable_isas().back() == Isa::ggml; }
+
+}  // namespace
+
+#define VLA_QUANTIZED_TEST(sentence) TEST_CASE(sentence* doctest::skip(lacks_kernels()))
+
+VLA_QUANTIZED_TEST(
+    "large products are near those of float32, whatever the weights are stored as, and small ones the same") {
+  for (const DType type : {DType::bf16, DType::f16, DType::f32}) {
+    CAPTURE(dtype_name(type));
+    const std::vector<float> expected = mlp("float32", type), same = mlp("", type), got = mlp(kInt8Kernels, type);
+    constexpr std::size_t kRow = kNarrow + kAction;
+    double error = 0, size = 0;
+    for (std::size_t i = 0; i < got.size(); ++i) {
+      if (i % kRow >= kNarrow) {
+        CHECK(got[i] == same[i]);
+      } else {
+        error += std::pow(got[i] - expected[i], 2);
+        size += std::pow(expected[i], 2);
+      }
+    }
+    CHECK(std::sqrt(error / size) < 0.02);
+    CHECK(std::sqrt(error / size) > 1e-4);  // something was quantized
+  }
+}
+
+VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number") {
+  ParamSet set(pieces(DType::bf16));
+  const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
+      action(set.scope("action"), kNarrow, kAction, Bias::yes);
+  GraphRunner floats(set.list(), ""), quantized(set.list(), kInt8Kernels);
+  CHECK(quantized.device().precision() == "int8");
+  CHECK(quantized.device().kernels() == floats.device().kernels());
+  CHECK(quantized.device().linear_kernels().find("_int8 (2 bf16)") != std::string::npos);
+  CHECK(quantized.device().weights_size() < 0.7 * static_cast<double>(floats.device().weights_size()));
+}
+
+VLA_QUANTIZED_TEST("a policy with nothing to quantize is refused") {
+  ParamSet set({piece("action.weight", {kNarrow, kAction}), piece("action.bias", {kAction}, DType::f32)});
+  const Linear action(set.scope("action"), kNarrow, kAction, Bias::yes);
+  const auto device = open_device(1, kInt8Kernels);
+  REQUIRE(device.ok());
+  const Status loaded = (*device)->load(set.list(), true);
+  REQUIRE(!loaded.ok());
+  CHECK(loaded.error().code == Code::unsupported);
+  CHECK(loaded.error().message().find("quantizing") != std::string::npos);
+}
+
+TEST_CASE("other devices take no int8") {
+  const auto device = open_device(1, kInt8Kernels, "vulkan");
+  REQUIRE(!device.ok());
+  CHECK(device.error().code == Code::usage);
+}
