@@ -322,6 +322,12 @@ void check_epilogues(const LinearKernel& kernel) {
   }
 }
 
+/// More columns than sums of which are kept at a time.
+void check_wide(const LinearKernel& kernel) {
+  check(kernel, {.shape = {41, 260, 1500}});
+  check(kernel, {.shape = {41, 260, 900}, .n_part = 2, .gated = true, .with_bias = true});
+}
+
 void check_threads(const LinearKernel& kernel) {
   for (const int n_thread : {2, 3, 64})
     for (const Shape& shape : {Shape{1, 64, 16}, Shape{97, 272, 140}, Shape{300, 100, 17}}) {
@@ -372,6 +378,7 @@ bool lacks(const std::string& name) {
 
 VLA_TERNARY_TEST("codes, sums and products are those of BitVLA's quantizers, bit for bit", check_golden)
 VLA_INT8_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)
+VLA_INT8_TEST("products of many columns", check_wide)
 VLA_INT8_TEST("sums of any shape are exact, and scaled in single roundings", check_shapes)
 VLA_INT8_TEST("the largest sums are exact", check_extremes)
 VLA_INT8_TEST("bias, gate and residual follow the product, each rounded by itself", check_epilogues)

@@ -150,6 +150,8 @@ CASES = {
 
 def open_reference():
     """Puts the reference on the path.  Packages whose __init__ imports what trains a policy get an empty one; nothing else changes."""
+    if REFERENCE not in os.environ:
+        raise SystemExit(f"error: {REFERENCE} is not set: give it the folder of a checkout of https://github.com/ustcwhy/BitVLA")
     root = Path(os.environ[REFERENCE])
     oft = root / "openvla-oft"
     if "bitvla" in sys.modules:
