@@ -46,8 +46,8 @@ Status CpuDevice::load(const ParamList& params, bool fill) {
   isa_ = isa_for(params, isa_);
   VLA_TRY(weights_, CpuWeights::load(params, {isa_, quantizes_, n_thread(), fill}));
   if (quantizes_ && !weights_.is_quantized())
-    return Error{Code::unsupported, "kernels", "a policy with matrices of floats that are worth quantizing",
-                 kInt8Kernels, "leave --kernels out"};
+    return Error{Code::unsupported, "kernels int8", "matrices of floats that are worth quantizing", "none",
+                 "leave --kernels out"};
   return {};
 }
 
