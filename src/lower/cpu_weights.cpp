@@ -71,10 +71,10 @@ struct PackTask : kernels::Task {
   mutable std::vector<Room> rooms, codes;  // of each worker
   mutable std::atomic<bool> has_failed = false;
 
-  void add(const Param& param, kernels::MatrixDesc desc, const kernels::LinearKernel* kernel, std::byte* to,
-           float* scales) {
+  void add(const Param& param, const kernels::LinearKernel* kernel, std::byte* to, float* scales) {
     const std::span<const std::byte> all = param.source->data;
     if (kernel == nullptr) return parts.push_back({{}, all, nullptr, to});
+    kernels::MatrixDesc desc = desc_of(param, scales != nullptr);
     const std::int64_t n_row = desc.d_out, row = static_cast<std::int64_t>(all.size()) / n_row;
     const std::int64_t step = kernels::round_up(kPartSize / row + 1, kPartRows);
     for (std::int64_t first = 0; first < n_row; first += step) {
@@ -160,10 +160,9 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
     if (param.storage == Storage::table) continue;
     Place& place = weights.places_[static_cast<std::size_t>(param.id)];
     place.data = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
-    const kernels::MatrixDesc desc = desc_of(param, options.quantizes);
     if (becomes_int8(param, options.quantizes))
-      place.scales = reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc)));
-    if (options.fill) task.add(param, desc, place.kernel, place.data, place.scales);
+      place.scales = reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc_of(param, true))));
+    if (options.fill) task.add(param, place.kernel, place.data, place.scales);
   }
   if (task.parts.empty()) return weights;
   VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(options.n_thread));
