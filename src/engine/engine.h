@@ -19,7 +19,7 @@ namespace vla {
 
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
-  std::string kernels;      // as choose_isa takes them; empty: the best that the machine has for the bundle's dtype
+  std::string kernels;      // as open_device takes them; empty: the best that the machine has for the bundle's dtype
   std::string device;       // cpu, vulkan:N or cuda:N, as open_device takes them; empty: the CPU
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
   /// Values at taps that take the place of the computed ones: as the network's own, or as `pixels` and `state`.

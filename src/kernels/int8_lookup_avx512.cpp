@@ -21,7 +21,7 @@ constexpr std::int64_t kRows = 4, kColumns = 64, kStrips = kColumns / Int8Panels
 constexpr std::int64_t kRegister = 64;  // bytes
 
 /// A part of the depth, from k on: n_lookup times three numbers that are looked up, then n_group times four that are
-/// multiplied. A tile takes one of each at a time, and what groups are left alone.
+/// multiplied. A tile looks up one and multiplies one at a time, and multiplies the groups that are left over alone.
 struct Step {
   std::int64_t k, n_lookup, n_group;
 
@@ -204,7 +204,7 @@ void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, con
 class LookupLoop {
   static constexpr std::int64_t kBlockRows = 108;
   static constexpr std::int64_t kPanels = 20;                   // whose steps and sums lie in the second cache
-  static constexpr std::int64_t kManyPanels = 8;                // which make the tables' time small
+  static constexpr std::int64_t kManyPanels = 8;                // share the time of making tables
   static constexpr std::int64_t kMinItems = 2, kManyItems = 8;  // for each thread, where there are so many
 
   struct Tile {

@@ -25,8 +25,8 @@ std::string isa_name(Isa isa);
 bool has_avx_vnni();
 bool has_avx512_vnni();
 bool has_amx_int8();
-/// Permutations of AVX-512 and the multiplications of VNNI have units of their own: cores of AMD. Those of Intel make
-/// both in the same place.
+/// The processor permutes with AVX-512 and multiplies with VNNI at the same time, as AMD's does; Intel's does one or
+/// the other.
 bool permutes_beside_vnni();
 
 /// What this machine can run, `ggml` first and the best last.

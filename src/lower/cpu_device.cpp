@@ -45,9 +45,6 @@ Status CpuDevice::load(const ParamList& params, bool fill) {
   min_rounded_keys_ = min_rounded_keys(params);
   isa_ = isa_for(params, isa_);
   VLA_TRY(weights_, CpuWeights::load(params, {isa_, quantizes_, n_thread(), fill}));
-  if (quantizes_ && !weights_.is_quantized())
-    return Error{Code::unsupported, "kernels int8", "matrices of floats that are worth quantizing", "none",
-                 "leave --kernels out"};
   return {};
 }
 

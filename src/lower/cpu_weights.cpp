@@ -126,6 +126,11 @@ std::string describe(const std::map<std::string, std::map<std::string, int>>& co
 }  // namespace
 
 Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& options) {
+  const auto& all = list.params();
+  if (options.quantizes &&
+      std::none_of(all.begin(), all.end(), [](const Param& param) { return becomes_int8(param, true); }))
+    return Error{Code::unsupported, "kernels int8", "matrices of floats that are worth quantizing", "none",
+                 "leave --kernels out"};
   CpuWeights weights;
   std::map<std::string, std::map<std::string, int>> counts;
   std::vector<std::size_t> offsets;
@@ -140,9 +145,7 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
       place.kernel = kernels::choose_linear(desc, options.isa);
       ++counts[place.kernel->name][param.storage == Storage::ternary ? "ternary" : dtype_name(param.type())];
       size += aligned(place.kernel->packed_size(desc));
-      const bool quantized = becomes_int8(param, options.quantizes);
-      weights.is_quantized_ = weights.is_quantized_ || quantized;
-      if (quantized) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));
+      if (becomes_int8(param, options.quantizes)) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));
     } else if (param.storage == Storage::vector) {
       size += aligned(static_cast<std::size_t>(param.count()) * sizeof(float));
     } else if (param.source != nullptr) {

@@ -27,11 +27,10 @@ class CpuWeights {
     bool fill = true;  // else memory is reserved and never touched
   };
   /// Every parameter must have its source. Errors: out_of_memory, bad_bundle where the file has been changed since it
-  /// was opened.
+  /// was opened, unsupported where nothing is worth quantizing.
   static Result<CpuWeights> load(const ParamList& list, const Options& options);
 
   const std::byte* data(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].data; }
-  bool is_quantized() const { return is_quantized_; }
   /// Of each column of the product, where the matrix was quantized when it was loaded; else null.
   const float* scales(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].scales; }
   /// What multiplies by a matrix.
@@ -61,7 +60,6 @@ class CpuWeights {
   std::shared_ptr<const Tables> tables_;
   std::size_t table_size_ = 0;
   std::vector<Place> places_;
-  bool is_quantized_ = false;  // some matrix
   std::string text_;
 };
 
