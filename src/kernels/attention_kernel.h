@@ -10,12 +10,20 @@
 
 namespace vla::kernels {
 
-/// Rows of d_head floats, and how many floats lie from one head, token or batch to the next.
+/// Rows of d_head numbers: which one is the first, and how many from one head, token or batch to the next.
 struct HeadRows {
-  const float* data;
-  std::int64_t head, token, batch;
+  const std::byte* data;
+  std::int64_t first, head, token, batch;
+  /// Instead of floats bf16, as a product left rows of `d` numbers: where they lie is as in rows that follow each
+  /// other.
+  RoundedLayout layout = RoundedLayout::none;
+  std::int64_t d = 0;
+
+  std::int64_t place(std::int64_t i_head, std::int64_t i_token, std::int64_t i_batch) const {
+    return first + i_head * head + i_token * token + i_batch * batch;
+  }
   const float* at(std::int64_t i_head, std::int64_t i_token, std::int64_t i_batch) const {
-    return data + i_head * head + i_token * token + i_batch * batch;
+    return reinterpret_cast<const float*>(data) + place(i_head, i_token, i_batch);
   }
 };
 
@@ -46,7 +54,7 @@ struct AttentionJob {
   const float* mask;  // [n_key, n_query] of any numbers but +infinity, or null
   int n_segment;
   Segment segment[kMaxSegment];
-  float* out;  // [d_head, n_head, n_query, n_batch], or bf16 in out_layout
+  std::byte* out;  // floats [d_head, n_head, n_query, n_batch], or bf16 in out_layout
   RoundedLayout out_layout = RoundedLayout::none;
   std::int64_t block_rows;  // made by AttentionKernel::cut
 
@@ -66,7 +74,8 @@ struct AttentionKernel {
   /// Cuts a job into items for so many threads, and says how many there are.
   std::int64_t (*cut)(AttentionJob& job, int n_thread);
   void (*run)(const AttentionJob& job, std::int64_t item);
-  /// How `out` may lie instead of float32 rows, its rows a multiple of kSquare long.
+  /// How `out` may lie instead of float32 rows, its rows a multiple of kSquare long; and queries, keys and values to
+  /// which nothing is done first.
   RoundedLayout rounded;
 };
 

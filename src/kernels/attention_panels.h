@@ -53,29 +53,50 @@ class AttentionPanels {
       P::put_values(rows + i, first, panels.width(i), packed + panels.values(unit) + i * panels.n_key);
   }
 
-  /// The d_head numbers of a row, or of none, and zeros up to `n_padded`. What follows them in steps of two vectors is
-  /// written too.
-  VLA_INLINE void copy_row(const float* from, std::int64_t n_padded, Number* to) const {
-    const std::int64_t n = from != nullptr ? d_head : 0;
+  /// The d_head numbers of a token, and zeros up to `n_padded`. What follows them in steps of two vectors is written
+  /// too.
+  VLA_INLINE void copy_row(const HeadRows& rows, std::int64_t head, std::int64_t token, std::int64_t batch,
+                           const RowPrep& prep, std::int64_t n_padded, Number* to) const {
+    if constexpr (P::kRounded != RoundedLayout::none)
+      if (rows.layout != RoundedLayout::none) return copy_rounded(rows, rows.place(head, token, batch), n_padded, to);
+    alignas(64) float room[kMaxHead];
+    copy_floats(prep(rows.at(head, token, batch), token, d_head, room), d_head, n_padded, to);
+  }
+  VLA_INLINE void copy_nothing(std::int64_t n_padded, Number* to) const { copy_floats(nullptr, 0, n_padded, to); }
+
+ private:
+  VLA_INLINE void copy_floats(const float* from, std::int64_t n, std::int64_t n_padded, Number* to) const {
     std::int64_t i = 0;
     for (; i + 2 * kWidth <= n; i += 2 * kWidth) P::store(to + i, V::load(from + i), V::load(from + i + kWidth));
     const auto part = [&](std::int64_t j) VLA_LAMBDA { return j < n ? load<V>(from + j, n - j) : Float{}; };
     for (; i < n_padded; i += 2 * kWidth) P::store(to + i, part(i), part(i + kWidth));
   }
 
- private:
+  VLA_INLINE void copy_rounded(const HeadRows& rows, std::int64_t place, std::int64_t n_padded, Number* to) const {
+    const auto* from = reinterpret_cast<const Number*>(rows.data);
+    for_pieces(P::kRounded, place / rows.d, place % rows.d, d_head, rows.d,
+               [&](std::int64_t i, std::int64_t at, std::int64_t n) VLA_LAMBDA {
+                 if (n == kSquare)
+                   std::memcpy(to + i, from + at, kSquare * sizeof(*to));
+                 else
+                   std::memcpy(to + i, from + at, static_cast<std::size_t>(n) * sizeof(*to));
+               });
+    if (d_head < n_padded) std::memset(to + d_head, 0, static_cast<std::size_t>(n_padded - d_head) * sizeof(*to));
+  }
+
   /// Keys or values of kPanel tokens from `first` on, as numbers and padded to `n_padded`; missing tokens are zeros.
   /// The next tokens are prefetched: they are too far apart for the hardware prefetcher.
   VLA_INLINE void copy_rows(const PackJob& job, const HeadRows& from, const RowPrep& prep, std::int64_t unit,
                             std::int64_t first, std::int64_t n_padded, Number* rows) const {
     const std::int64_t head = unit % job.n_head_kv, batch = unit / job.n_head_kv;
-    alignas(64) float room[kMaxHead];
     for (std::int64_t j = 0; j < kPanel; ++j) {
-      const float* row = nullptr;
-      if (first + j < job.n_key) row = prep(from.at(head, first + j, batch), first + j, d_head, room);
-      copy_row(row, n_padded, rows + j * kHeadStride);
-      if (first + kPanel + j >= job.n_key) continue;
-      const float* next = from.at(head, first + kPanel + j, batch);
+      const std::int64_t key = first + j;
+      if (key < job.n_key)
+        copy_row(from, head, key, batch, prep, n_padded, rows + j * kHeadStride);
+      else
+        copy_nothing(n_padded, rows + j * kHeadStride);
+      if (key + kPanel >= job.n_key || from.layout != RoundedLayout::none) continue;
+      const float* next = from.at(head, key + kPanel, batch);
       for (std::int64_t i = 0; i < d_head; i += 16) __builtin_prefetch(next + i);
     }
   }

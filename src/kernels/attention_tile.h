@@ -117,11 +117,11 @@ class AttentionTile {
     }
 
     void start() {
-      alignas(64) float room[kMaxHead];
       for (int r = 0; r < n_tiled; ++r)
-        query_panels.copy_row(
-            r < n_row ? job.prep(job.q.at(head[r], query[r], batch), query[r], job.d_head, room) : nullptr,
-            query_panels.key_depth, query_number + r * kHeadStride);
+        if (Number* to = query_number + r * kHeadStride; r < n_row)
+          query_panels.copy_row(job.q, head[r], query[r], batch, job.prep, query_panels.key_depth, to);
+        else
+          query_panels.copy_nothing(query_panels.key_depth, to);
       for (int r = 0; r < kRowVectors; ++r) V::store(sum + r * kWidth, Float{});
       for (int r = 0; r < kRowVectors; r += kWidth) V::store(base + r, V::set(kNever));
     }
@@ -290,7 +290,7 @@ class AttentionTile {
             write_rounded(row, shrink[r], out_row, column);
             continue;
           }
-        float* out = job.out + out_row * job.n_head * job.d_head + column;
+        float* out = reinterpret_cast<float*>(job.out) + out_row * job.n_head * job.d_head + column;
         for (std::int64_t i = 0; i < job.d_head; i += kWidth)
           store<V>(out + i, V::load(row + i) * shrink[r], job.d_head - i);
       }
@@ -301,14 +301,10 @@ class AttentionTile {
       alignas(64) Number room[kHeadStride];
       for (std::int64_t i = 0; i < job.d_head; i += 2 * kWidth)
         P::store(room + i, V::load(from + i) * factor, V::load(from + i + kWidth) * factor);
-      const std::int64_t d = job.n_head * job.d_head;
       auto* out = reinterpret_cast<Number*>(job.out);
-      for (std::int64_t i = 0, n = 0; i < job.d_head; i += n, column += n) {  // as much as a square holds of them
-        n = min(job.d_head - i, kSquare - column % kSquare);
-        const std::int64_t place =
-            P::kRounded == RoundedLayout::tiles ? place_in_tiles(row, column, d) : row * d + column;
-        std::memcpy(out + place, room + i, static_cast<std::size_t>(n) * sizeof(*room));
-      }
+      for_pieces(P::kRounded, row, column, job.d_head, job.n_head * job.d_head,
+                 [&](std::int64_t i, std::int64_t place, std::int64_t n)
+                     VLA_LAMBDA { std::memcpy(out + place, room + i, static_cast<std::size_t>(n) * sizeof(*room)); });
     }
   };
 };

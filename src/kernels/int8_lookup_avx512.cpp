@@ -338,7 +338,6 @@ const LinearKernel kTernaryLookup = {
     .run = LookupLoop::run,
     .scratch_size = LookupLoop::kScratch,
     .max_norm = kAnyNorm,
-    .rounded = [](std::int64_t) { return RoundedLayout::none; },
     .few = &kTernaryAvx512,
     .max_few = kFewRows,
     .quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); },

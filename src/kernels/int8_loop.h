@@ -117,10 +117,7 @@ class Int8Loop {
  public:
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
-    LinearKernel row = {
-        name, Weights::packed_size, Weights::pack, supports, cut, run, sizeof(Scratch), kAnyNorm, [](std::int64_t) {
-          return RoundedLayout::none;
-        }};
+    LinearKernel row = {name, Weights::packed_size, Weights::pack, supports, cut, run, sizeof(Scratch), kAnyNorm};
     row.quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); };
     return row;
   }

@@ -13,7 +13,7 @@ struct Avx2Tile {
   using V = Avx2;
   using X = float;
   static constexpr int kRows = 6, kColumns = 16;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 768, kBlockRows = 54;
+  static constexpr int kMaxDepth = 2048, kStep = 768, kBlockRows = 54;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr bool kEven = true, kRounds = false;
 

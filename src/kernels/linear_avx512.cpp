@@ -12,7 +12,7 @@ struct Avx512Tile {
   using V = Avx512;
   using X = float;
   static constexpr int kRows = kAvx512Rows, kColumns = 32;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1024, kStep = 256, kBlockRows = 144;
+  static constexpr int kMaxDepth = 2048, kStep = 256, kBlockRows = 96;
   static constexpr int kXStride = kMaxDepth + 16;  // not a multiple of a page, so that rows do not share cache lines
   static constexpr bool kEven = true, kRounds = false;
 

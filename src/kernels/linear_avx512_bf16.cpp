@@ -14,7 +14,7 @@ struct Avx512Bf16Tile {
   using V = Avx512;
   using X = std::uint16_t;
   static constexpr int kRows = kAvx512Rows, kColumns = 32;
-  static constexpr int kMaxDepth = 2048, kManyDepth = 1536, kStep = 384, kBlockRows = 192;
+  static constexpr int kMaxDepth = 2048, kStep = 384, kBlockRows = 192;
   static constexpr int kXStride = kMaxDepth + 32;
   static constexpr bool kEven = true, kRounds = true;
 

@@ -14,7 +14,7 @@ struct FloatTile {
   using V = Portable;
   using X = float;
   static constexpr int kRows = 5, kColumns = 16;
-  static constexpr int kMaxDepth = 96, kManyDepth = 64, kStep = 32, kBlockRows = 10;
+  static constexpr int kMaxDepth = 96, kStep = 32, kBlockRows = 10;
   static constexpr int kXStride = kMaxDepth + 1;
   static constexpr bool kEven = true, kRounds = false;
 

@@ -24,6 +24,7 @@ struct LinearJob {
     std::byte* y;
     std::int64_t d_out;
     const float* scale = nullptr;  // of a ternary weight, or of each column of an int8 one
+    DType y_type = DType::f32;     // or bf16, laid out as LinearKernel::rounded says
   };
   static constexpr int kMaxPart = 3;
 
@@ -50,9 +51,9 @@ struct LinearJob {
   Activation activation;
   /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
   bool gated;
-  /// Of x and y: f32, or bf16 where the kernel rounds what it multiplies, laid out as LinearKernel::rounded says. Of x
-  /// also i8: rows as LinearKernel::quantize makes them, x_stride bytes apart.
-  DType x_type, y_type;
+  /// f32, or bf16 where the kernel rounds what it multiplies, laid out as LinearKernel::rounded says, or i8: rows as
+  /// LinearKernel::quantize makes them, x_stride bytes apart.
+  DType x_type;
   std::int64_t n_group;  // of panels, made by LinearKernel::cut
 };
 

@@ -33,8 +33,10 @@ struct LinearKernel {
   void (*run)(const LinearJob& job, std::int64_t item, Worker& worker);
   std::size_t scratch_size;
   std::int64_t max_norm;  // the widest norm of x that it computes on the way
-  /// How x of this depth may come, and y leave, as the bf16 that the kernel rounds x to.
-  RoundedLayout (*rounded)(std::int64_t d_in);
+  /// How x may come, and y leave, as the bf16 that the kernel rounds x to: y of products up to this depth, as partial
+  /// sums of deeper ones lie in y.
+  RoundedLayout rounded = RoundedLayout::none;
+  std::int64_t max_rounded_depth = 0;
   /// What computes products of at most `max_few` rows in its place, from the same packed matrix; null where it does so
   /// itself.
   const LinearKernel* few = nullptr;
@@ -43,6 +45,7 @@ struct LinearKernel {
   void (*quantize)(const float* x, std::int64_t n, std::byte* row) = nullptr;
 
   const LinearKernel& for_rows(std::int64_t n_row) const { return n_row <= max_few ? *few : *this; }
+  RoundedLayout y_layout(std::int64_t d_in) const { return d_in <= max_rounded_depth ? rounded : RoundedLayout::none; }
 };
 
 /// The implementations, best first.

@@ -21,8 +21,8 @@ struct Ahead {
 };
 
 /// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
-/// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kManyDepth (the same where there
-/// is more than one block), kStep (of the depth, most), kRounds (x becomes bf16), kEven (tiles of equal height), and
+/// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kStep (of the depth, most),
+/// kRounds (x becomes bf16), kEven (tiles of equal height), and
 ///   copy(from, n, to)                 n numbers of x, zeros up to a multiple of 32
 ///   store_rounded(to, vector, left)   y as bf16, where kRounds
 ///   multiply(type, n_row, x, panel, depth, c, add, ahead)
@@ -37,7 +37,7 @@ class LinearLoop {
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr std::int64_t kGateColumns = 16 * kColumns;  // of a job whose depth takes more than one block
   static constexpr std::int64_t kMinItems = 16;                // for each thread, where there are so many
-  static_assert(Tile::kMaxDepth % kPanelDepth == 0 && Tile::kManyDepth % kPanelDepth == 0);
+  static_assert(Tile::kMaxDepth % kPanelDepth == 0);
   static_assert(Tile::kStep % kPanelDepth == 0 && kBlockRows % kRows == 0);
 
   struct Scratch {
@@ -54,9 +54,8 @@ class LinearLoop {
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa),
                                        const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
-    return {name,   Layout::packed_size, Layout::pack,    supports, cut,
-            run,    sizeof(Scratch),     Tile::kMaxDepth, rounded,  few,
-            max_few};
+    return {name,    Layout::packed_size, Layout::pack, supports, cut, run, sizeof(Scratch), Tile::kMaxDepth,
+            kLayout, Tile::kMaxDepth,     few,          max_few};
   }
 
  private:
@@ -79,13 +78,11 @@ class LinearLoop {
     loop.item(item);
   }
 
-  static RoundedLayout rounded(std::int64_t d_in) { return d_in <= Tile::kManyDepth ? kLayout : RoundedLayout::none; }
-
   explicit LinearLoop(const LinearJob& job)
       : job_(job),
         block_rows_(even_block(job.n_row, kBlockRows, kRows)),
         n_block_(ceil_div(job.n_row, block_rows_)),
-        block_depth_(even_block(job.d_in, n_block_ == 1 ? Tile::kMaxDepth : Tile::kManyDepth, kPanelDepth)),
+        block_depth_(even_block(job.d_in, Tile::kMaxDepth, kPanelDepth)),
         n_panel_(Stripes::n_panel(job)) {}
 
   bool whole_depth() const { return block_depth_ >= job_.d_in; }

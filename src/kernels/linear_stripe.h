@@ -49,7 +49,7 @@ struct LinearStripes {
   /// Asks for what finish() will read and write of a tile.
   static VLA_INLINE void fetch(const LinearJob& job, const Stripe& s, std::int64_t r, std::int64_t n_row) {
     const LinearJob::Part& part = job.part[s.part];
-    const std::int64_t place = (s.row + r) * part.d_out + s.column, size = number_size(job.y_type);
+    const std::int64_t place = (s.row + r) * part.d_out + s.column, size = number_size(part.y_type);
     fetch<1>(part.y + place * size, n_row, part.d_out * size);
     if (s.k + s.depth == job.d_in && part.residual != nullptr)
       fetch<0>(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
@@ -74,10 +74,11 @@ struct LinearStripes {
 
     VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
 
-    /// Asks for what rows begin to end, or those of them that there are, will read and write.
+    /// Asks for what rows begin to end, or those of them that there are, will read, and write piece by piece.
     VLA_INLINE void fetch(std::int64_t begin, std::int64_t end) const {
       end = min(end, n_row_);
-      if (begin < end) LinearStripes::fetch(*job_, s_, first_ + begin, end - begin);
+      if (begin < end && job_->part[s_.part].y_type == DType::f32)
+        LinearStripes::fetch(*job_, s_, first_ + begin, end - begin);
     }
 
    private:
@@ -92,7 +93,7 @@ struct LinearStripes {
       bias_ = at_column(part.bias), factor_ = at_column(part.factor), residual_ = part.residual;
       if (job_->gated) gates_ = s_.gates, gate_bias_ = at_column(gate.bias);
       if constexpr (kLayout != RoundedLayout::none)
-        if (job_->y_type == DType::bf16) return activated<kWhole, true>();
+        if (part.y_type == DType::bf16) return activated<kWhole, true>();
       return activated<kWhole, false>();
     }
 

@@ -40,6 +40,7 @@ class TileLoop {
   // group reads all of the block of x.
   static constexpr std::int64_t kSplitDepth = 1024, kSplitRows = 256, kMinGroup = 4, kMaxGroup = 24;
   static constexpr std::int64_t kMinSplitItems = 8;
+  static constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;
   static constexpr std::int64_t kMaxSums = kMaxGroup * kSplitRows * kSquare;
 
   struct Scratch {
@@ -54,17 +55,8 @@ class TileLoop {
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa),
                                        const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
-    return {name,
-            Layout::packed_size,
-            Layout::pack,
-            supports,
-            cut,
-            run,
-            sizeof(Scratch),
-            kMaxDepth,
-            [](std::int64_t) { return RoundedLayout::tiles; },
-            few,
-            max_few};
+    return {name,      Layout::packed_size,  Layout::pack, supports, cut,    run, sizeof(Scratch),
+            kMaxDepth, RoundedLayout::tiles, kAnyDepth,    few,      max_few};
   }
 
  private:
@@ -187,7 +179,7 @@ class TileLoop {
       const std::int64_t begin = loop_.n_finished_, end = min(begin + loop_.n_finish_, loop_.n_summed_);
       if (begin == end) return;
       loop_.finish_(begin, end), loop_.n_finished_ = end;
-      if (loop_.job_.y_type == DType::f32) loop_.finish_.fetch(begin + kRowsAhead, end + kRowsAhead);
+      loop_.finish_.fetch(begin + kRowsAhead, end + kRowsAhead);
     }
 
    private:

@@ -20,6 +20,17 @@ constexpr VLA_INLINE std::int64_t place_in_tiles(std::int64_t row, std::int64_t 
          i % kSquare;
 }
 
+/// Calls piece(i, place, count) for the parts of numbers `column` to column + n of a row that lie together: count
+/// numbers from the i-th on are at `place`.
+template <class Piece>
+VLA_INLINE void for_pieces(RoundedLayout layout, std::int64_t row, std::int64_t column, std::int64_t n, std::int64_t d,
+                           const Piece& piece) {
+  for (std::int64_t i = 0, size = 0; i < n; i += size, column += size) {
+    size = min(n - i, kSquare - column % kSquare);
+    piece(i, layout == RoundedLayout::tiles ? place_in_tiles(row, column, d) : row * d + column, size);
+  }
+}
+
 /// Numbers that n_row rows of d take.
 constexpr std::int64_t rounded_count(RoundedLayout layout, std::int64_t n_row, std::int64_t d) {
   return layout == RoundedLayout::tiles ? round_up(n_row, kSquare) * round_up(d, kSquare) : n_row * d;

@@ -184,10 +184,15 @@ kernels::RowPrep prep_of(const Lowering& l, const Prepared& rows) {
   return prep;
 }
 
+kernels::RoundedLayout layout_of(const Value& value) {
+  using kernels::RoundedLayout;
+  return value.type != DType::bf16 ? RoundedLayout::none : value.in_tiles ? RoundedLayout::tiles : RoundedLayout::rows;
+}
+
 /// x [d_head, n_head, n_token, n_batch].
 kernels::HeadRows head_rows(const Lowering& l, ValueId id) {
-  const Value& x = l.value(id);
-  return {floats(l, id), x.stride[1], x.stride[2], x.stride[3]};
+  const Value &x = l.value(id), &base = l.base(id);
+  return {base.data, x.offset, x.stride[1], x.stride[2], x.stride[3], layout_of(x), base.shape[0]};
 }
 
 double flop_of_op(const FusedOp& op) {
@@ -219,7 +224,6 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
   job.d_in = x.shape[0], job.n_row = count(x.shape) / x.shape[0];
   job.activation = linear.activation, job.gated = linear.gated;
   job.norm = norm_of(l, linear);
-  job.y_type = l.value(op.writes.back()).type;
   for (const Node* node : linear.linears) {
     const auto& product = *node->as<op::Linear>();
     kernels::LinearJob::Part& part = job.part[job.n_part++];
@@ -233,7 +237,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
     part.d_out = product.weight->shape[1];
     // Of gate and up the one result is up's.
     const std::size_t i = linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1);
-    part.y = address(l, op.writes[i]);
+    part.y = address(l, op.writes[i]), part.y_type = l.value(op.writes[i]).type;
   }
   kernels::LinearJob::Part& last = job.part[job.n_part - 1];
   last.factor = operand(l, linear.factor), last.residual = operand(l, linear.residual);
@@ -276,10 +280,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const Attention
     job.segment[job.n_segment++] = {address(l, attention.packed[i]), attention.n_key[i], job.n_key};
     job.n_key += attention.n_key[i];
   }
-  const Value& out = l.value(op.writes[0]);
-  job.out = floats(l, op.writes[0]);
-  if (out.type == DType::bf16)
-    job.out_layout = out.in_tiles ? kernels::RoundedLayout::tiles : kernels::RoundedLayout::rows;
+  job.out = address(l, op.writes[0]), job.out_layout = layout_of(l.value(op.writes[0]));
   task->n_item = task->kernel->cut(job, threads_for(l, op));
   return task;
 }

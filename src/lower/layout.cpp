@@ -161,27 +161,55 @@ class Layouts {
   }
 
   void round_result(const FusedOp& op, const LinearOp& linear) {
-    if (op.writes.size() != 1 || (linear.activation == Activation::none && !linear.gated)) return;
     if (linear.residual != kNone || linear.factor != kNone) return;
-    round_result(op.writes[0], kernel_of(l, linear).rounded(linear.linears[0]->in[0].dim(0)));
+    for (const ValueId id : op.writes) round_result(id, kernel_of(l, linear).y_layout(linear.linears[0]->in[0].dim(0)));
   }
   void round_result(const FusedOp& op, const AttentionOp& attention) {
     if (l.value(op.writes[0]).shape[0] % kernels::kSquare == 0)
-      round_result(op.writes[0], kernels::cpu_kernels(attention.isa)->attention.rounded);
+      round_result(op.writes[0], attention_layout(attention.isa));
   }
 
-  /// What products alone read is stored as they would round it.
+  static kernels::RoundedLayout attention_layout(Isa isa) { return kernels::cpu_kernels(isa)->attention.rounded; }
+
+  /// What only products and attention read is stored as they would round it.
   void round_result(ValueId id, kernels::RoundedLayout layout) {
     Value& y = l.value(id);
-    if (layout == kernels::RoundedLayout::none || y.home != Value::Home::arena || y.node->tapped) return;
-    const std::int64_t n_row = count(y.shape) / y.shape[0];
-    for (const Node* reader : l.readers[static_cast<std::size_t>(y.node->id)]) {
-      const auto* product = reader->as<op::Linear>();
-      if (product == nullptr || l.weights.kernel(product->weight)->for_rows(n_row).rounded(y.shape[0]) != layout)
-        return;
+    if (layout == kernels::RoundedLayout::none || y.home != Value::Home::arena) return;
+    std::vector<Value*> views;  // and itself
+    for (Value& value : l.values) {
+      if (value.base != id) continue;
+      if (value.node != nullptr && value.node->tapped) return;
+      views.push_back(&value);
     }
-    y.type = DType::bf16, y.in_tiles = layout == kernels::RoundedLayout::tiles;
-    y.size = static_cast<std::size_t>(kernels::rounded_count(layout, n_row, y.shape[0])) * 2;
+    for (const FusedOp& op : l.ops)
+      for (const ValueId read : op.reads)
+        if (l.value(read).base == id && !takes(op, read, layout)) return;
+    for (Value* value : views) value->type = DType::bf16, value->in_tiles = layout == kernels::RoundedLayout::tiles;
+    y.size = static_cast<std::size_t>(kernels::rounded_count(layout, count(y.shape) / y.shape[0], y.shape[0])) * 2;
+  }
+
+  /// Whether an operation may find a value that it reads, or view of one, rounded: as the product of a whole value, or
+  /// as rows of heads to which attention does nothing first.
+  bool takes(const FusedOp& op, ValueId id, kernels::RoundedLayout layout) const {
+    if (const auto* linear = std::get_if<LinearOp>(&op.op))
+      return id == linear->x && id == l.value(id).base && linear->norm == nullptr && id != linear->residual &&
+             id != linear->factor && kernel_of(l, *linear).rounded == layout;
+    const auto takes_heads = [&](const Prepared& rows, Isa isa) {
+      const bool is_plain = id != rows.x || (rows.norm == nullptr && rows.rope == nullptr);
+      return is_plain && id != rows.table && attention_layout(isa) == layout && lies_in_rows(id);
+    };
+    if (const auto* pack = std::get_if<PackOp>(&op.op)) return takes_heads(pack->k, pack->isa);
+    if (const auto* attention = std::get_if<AttentionOp>(&op.op))
+      return id != attention->mask && takes_heads(attention->q, attention->isa);
+    return false;
+  }
+
+  /// Each head of a token or batch is part of one row of the base.
+  bool lies_in_rows(ValueId id) const {
+    const Value& x = l.value(id);
+    const std::int64_t d = l.base(id).shape[0];
+    return x.stride[2] % d == 0 && x.stride[3] % d == 0 &&
+           x.offset % d + (x.shape[1] - 1) * x.stride[1] + x.shape[0] <= d;
   }
 
   Lowering& l;

@@ -108,6 +108,20 @@ void check_pair_rounded(const AttentionKernel& kernel) {
   }
 }
 
+/// It reads what products left rounded as it would round it itself.
+void check_pair_operands(const AttentionKernel& kernel) {
+  for (const AttentionShape& shape : kShapes)
+    for (const std::vector<std::int64_t>& n_key : {std::vector<std::int64_t>{}, {1, shape.n_key - 1}}) {
+      CAPTURE(shape.d_head);
+      CAPTURE(shape.n_key);
+      if (shape.n_key == 1 && !n_key.empty()) continue;
+      Case c(shape, 2, shape.n_key % 3);
+      const std::vector<float> expected = run(kernel, c, 2, n_key);
+      c.round(kernel.rounded);
+      CHECK(run(kernel, c, 2, n_key) == expected);
+    }
+}
+
 }  // namespace
 
 /// A test of kernels that round to bf16: the portable instance, the emulated ones, and the machine's.
@@ -140,6 +154,7 @@ VLA_PAIR_TEST("a key with the logarithm of n in the mask is as n equal keys", ch
 VLA_PAIR_TEST("attention is right whatever the width of a head and the number of keys", check_pair_ends)
 VLA_PAIR_TEST("attention keeps small weights, and greater scores make earlier ones smaller", check_pair_weights)
 VLA_PAIR_TEST("attention's answer may be rounded, as the product behind it reads it", check_pair_rounded)
+VLA_PAIR_TEST("attention reads rounded queries, keys and values as it rounds them itself", check_pair_operands)
 VLA_PAIR_TEST("attention skips what a mask hides, and chunks that it hides whole", check_pair_masks)
 VLA_PAIR_TEST("a query that sees nothing, and what is not finite, does not become an answer",
               check_attention_of_not_finite)

@@ -64,7 +64,7 @@ void measure(const AttentionKernel& kernel, const std::string& name, const Shape
   const std::vector<float> q = numbers(s.d_head * s.n_head * s.n_query);
   const std::vector<float> k = numbers(s.d_head * s.n_head_kv * s.n_key), v = numbers(s.d_head * s.n_head_kv * s.n_key);
   const auto rows = [&](const std::vector<float>& x, std::int64_t n_head) {
-    return HeadRows{x.data(), s.d_head, s.d_head * n_head, 0};
+    return HeadRows{reinterpret_cast<const std::byte*>(x.data()), 0, s.d_head, s.d_head * n_head, 0};
   };
   PackJob keys = {s.d_head, s.n_head_kv, s.n_key, 1, rows(k, s.n_head_kv), rows(v, s.n_head_kv), {}, nullptr};
   const Memory packed(kernel.packed_size(keys));
@@ -74,7 +74,7 @@ void measure(const AttentionKernel& kernel, const std::string& name, const Shape
   job.d_head = s.d_head, job.n_head = s.n_head, job.n_head_kv = s.n_head_kv;
   job.n_query = s.n_query, job.n_key = s.n_key, job.n_batch = 1;
   job.scale = 1 / std::sqrt(static_cast<float>(s.d_head));
-  job.q = rows(q, s.n_head), job.out = out.data();
+  job.q = rows(q, s.n_head), job.out = reinterpret_cast<std::byte*>(out.data());
   job.n_segment = 1, job.segment[0] = {keys.packed, s.n_key};
   const std::int64_t n_item = kernel.cut(job, 1);
   const double pack = best_time(seconds / 4, [&] {

@@ -99,7 +99,7 @@ struct Trial {
     std::vector<float> row(static_cast<std::size_t>(s.d_in));
     for (std::size_t k = 0; k < row.size(); ++k) row[k] = 1.0f / static_cast<float>(1 + k % 61);
     job.x = x.data, job.x_type = kernel.quantize != nullptr ? DType::i8 : DType::f32;
-    if (rounded) job.x_type = job.y_type = DType::bf16, job.activation = Activation::gelu_tanh;
+    if (rounded) job.x_type = DType::bf16, job.activation = Activation::gelu_tanh;
     job.x_stride = kernel.quantize != nullptr ? quantized_stride(s.d_in) : s.d_in;
     for (std::int64_t r = 0; r < s.n_row; ++r)
       if (kernel.quantize != nullptr)
@@ -116,6 +116,7 @@ struct Trial {
     pack_seconds = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
     job.n_row = s.n_row, job.d_in = s.d_in, job.n_part = 1;
     job.part[0] = {desc.type, packed.data, nullptr, nullptr, nullptr, y.data, s.d_out, scale.data()};
+    if (rounded) job.part[0].y_type = DType::bf16;
     product.emplace(kernel, job, n_thread);
   }
   MatrixDesc desc;
@@ -185,7 +186,7 @@ int main(int argc, char** argv) {
       if (isa_name(isa) == kernel->name && wants(*kernel))
         for (const Shape& shape : kShapes)
           for (const bool rounded : {false, true}) {
-            if (rounded && kernel->rounded(shape.d_in) == RoundedLayout::none) continue;
+            if (rounded && kernel->y_layout(shape.d_in) == RoundedLayout::none) continue;
             measure(**executor, *kernel, peak_probe_of(isa), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row,
                     n_round, rounded, nullptr);
           }

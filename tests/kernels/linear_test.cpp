@@ -64,7 +64,7 @@ struct Case {
   DType x_type = DType::f32, y_type = DType::f32;
 };
 
-bool rounds(const LinearKernel& kernel) { return kernel.rounded(1) != RoundedLayout::none; }
+bool rounds(const LinearKernel& kernel) { return kernel.rounded != RoundedLayout::none; }
 
 /// From the second number on.
 std::byte* bytes(std::vector<float>& values) { return reinterpret_cast<std::byte*>(&values[1]); }
@@ -79,7 +79,7 @@ class Trial {
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
     std::vector<std::uint16_t> rounded(
-        static_cast<std::size_t>(rounded_count(kernel_.rounded(d_in), round_up(n_row, kSquare), d_in)));
+        static_cast<std::size_t>(rounded_count(kernel_.rounded, round_up(n_row, kSquare), d_in)));
     for (std::int64_t row = 0; row < n_row; ++row)
       for (std::int64_t k = 0; k < d_in; ++k)
         rounded[place(row, k, d_in)] = to_bf16(x_[static_cast<std::size_t>(row * d_in + k + 1)]);
@@ -87,7 +87,7 @@ class Trial {
     job.x = case_.x_type == DType::bf16 ? reinterpret_cast<const std::byte*>(rounded.data()) : bytes(x_);
     job.x_stride = d_in, job.n_row = n_row, job.d_in = d_in, job.n_part = case_.n_part;
     job.activation = case_.activation, job.gated = case_.gated;
-    job.x_type = case_.x_type, job.y_type = case_.y_type;
+    job.x_type = case_.x_type;
     for (int i = 0; i < case_.n_part; ++i) {
       Part& part = parts_[static_cast<std::size_t>(i)];
       const std::byte* stored = part.stored.data() + number_size(case_.type);  // at no round address
@@ -98,7 +98,9 @@ class Trial {
                      case_.with_factor ? &part.factor[1] : nullptr,
                      case_.with_residual ? &part.residual[1] : nullptr,
                      bytes(part.y),
-                     d_out(i)};
+                     d_out(i),
+                     nullptr,
+                     case_.y_type};
     }
     test::run_job(kernel_, job, case_.n_thread);
   }
@@ -129,8 +131,7 @@ class Trial {
 
   /// Where number i of a row lies when it is rounded.
   std::size_t place(std::int64_t row, std::int64_t i, std::int64_t d) const {
-    return static_cast<std::size_t>(kernel_.rounded(d) == RoundedLayout::tiles ? place_in_tiles(row, i, d)
-                                                                               : row * d + i);
+    return static_cast<std::size_t>(kernel_.rounded == RoundedLayout::tiles ? place_in_tiles(row, i, d) : row * d + i);
   }
 
   /// Parts differ in width, so that items cross from one to the next; a gate and its up do not.
@@ -270,7 +271,7 @@ void check_rounded_after(Activation activation, const LinearKernel& kernel) {
       wrong += !(std::abs(rounded_y.rounded_y(row, n) - exact) <= (0x1p-8f + 0x1p-13f) * std::abs(exact) + 0x1p-119f);
     }
   // What fills the tiles up to whole ones is multiplied by zeros.
-  if (kernel.rounded(205) == RoundedLayout::tiles)
+  if (kernel.rounded == RoundedLayout::tiles)
     for (std::int64_t row = 0; row < 97; ++row)
       for (std::int64_t n = 205; n < 224; ++n) wrong += rounded_y.rounded_y(row, n) != 0;
   CHECK(wrong == 0);
@@ -330,7 +331,7 @@ TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds 
     const LinearKernel& few = kernel->for_rows(kernel->max_few);
     CHECK(&few == kernel->few);
     CHECK(&kernel->for_rows(kernel->max_few + 1) == kernel);
-    CHECK(few.rounded(desc.d_in) == RoundedLayout::none);
+    CHECK(few.rounded == RoundedLayout::none);
     CHECK((few.pack == kernel->pack));
     CHECK(few.packed_size(desc) == kernel->packed_size(desc));
   }

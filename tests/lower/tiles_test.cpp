@@ -8,6 +8,45 @@
 using namespace vla;
 using namespace vla::test;
 
+namespace {
+
+/// Heads of 12 numbers, two of queries and one of keys and values, which are slices of one product.
+Tensor attend(GraphRunner& r, const LowerParams& params) {
+  Graph& g = r.graph;
+  const Tensor x = input(r, {24, 130, 2, 1}), q = params.linear(g, x, 24), kv = params.linear(g, x, 24, true, 1);
+  g.name("kv", kv);
+  const Tensor k = split_heads(g, slice(g, kv, 0, 0, 12), 1), v = split_heads(g, slice(g, kv, 0, 12, 12), 1);
+  const Tensor attended = attention(g, split_heads(g, q, 2), {{k, v}}, {});
+  return params.linear(g, attended, 48);
+}
+
+void check_operands(const std::string& kernels, const std::string& rounded, const std::string& heads) {
+  const LowerParams params(DType::bf16);
+  const auto run = [&](const char* tapped) {
+    GraphRunner runner(params.list(), kernels,
+                       [=](const std::string& path) { return path == "result" || path == tapped; });
+    runner.graph.name("result", attend(runner, params));
+    const std::string text = runner.lower().text();
+    runner.run();
+    return std::pair{text, runner.tap("result")};
+  };
+  const auto [text, result] = run("");
+  CHECK(text.find("-> " + rounded + ", " + rounded) != std::string::npos);
+  CHECK(text.find("pack keys and values  " + heads) != std::string::npos);
+  const auto [tapped_text, tapped] = run("kv");  // whoever looks on sees floats
+  CHECK(tapped_text.find("-> " + rounded + ", f32[24, 130, 2]") != std::string::npos);
+  CHECK(tapped == result);
+}
+
+}  // namespace
+
+TEST_CASE("amx: queries, keys and values lie in tiles behind the product" * doctest::skip(lacks(Isa::amx))) {
+  check_operands("amx", "bf16 tiles [24, 130, 2]", "bf16 tiles [12, 1, 130, 2]");
+}
+TEST_CASE("avx512_bf16: queries, keys and values are rounded by the product" * doctest::skip(lacks(Isa::avx512_bf16))) {
+  check_operands("avx512_bf16", "bf16[24, 130, 2]", "bf16[12, 1, 130, 2]");
+}
+
 TEST_CASE("amx: what products alone read stays in tiles between them, the last of uneven size" *
           doctest::skip(lacks(Isa::amx))) {
   const LowerParams params(DType::bf16);

@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include "base/bf16.h"
 #include "kernels/attention_kernel.h"
 #include "support/executor.h"
 #include "support/graph_runner.h"
@@ -38,6 +39,8 @@ struct Case {
   AttentionShape shape;
   std::vector<float> q, k, v, mask;
   std::int64_t gap = 0;
+  kernels::RoundedLayout layout = kernels::RoundedLayout::none;
+  std::vector<std::uint16_t> rounded_q, rounded_k, rounded_v;
 
   Case(const AttentionShape& s, float range, std::int64_t row_gap) : shape(s), gap(row_gap) {
     const auto count = [&](std::int64_t n_head, std::int64_t n_token) {
@@ -54,13 +57,33 @@ struct Case {
       for (std::int64_t j = 0; j < shape.n_key; ++j) mask.push_back(value(i, j));
   }
 
-  kernels::HeadRows rows(const std::vector<float>& x, std::int64_t n_head, std::int64_t n_token) const {
-    const std::int64_t row = shape.d_head + gap;
-    return {x.data(), row, row * n_head, row * n_head * n_token};
+  /// Queries, keys and values come as products that round leave them.
+  void round(kernels::RoundedLayout to) {
+    layout = to;
+    rounded_q = rounded(q, shape.n_head), rounded_k = rounded(k, shape.n_head_kv);
+    rounded_v = rounded(v, shape.n_head_kv);
   }
-  kernels::HeadRows queries() const { return rows(q, shape.n_head, shape.n_query); }
-  kernels::HeadRows keys() const { return rows(k, shape.n_head_kv, shape.n_key); }
-  kernels::HeadRows values() const { return rows(v, shape.n_head_kv, shape.n_key); }
+  std::vector<std::uint16_t> rounded(const std::vector<float>& x, std::int64_t n_head) const {
+    const std::int64_t d = (shape.d_head + gap) * n_head, n = static_cast<std::int64_t>(x.size());
+    std::vector<std::uint16_t> result(static_cast<std::size_t>(kernels::rounded_count(layout, n / d, d)), 0xffff);
+    for (std::int64_t i = 0; i < n; ++i) {
+      const bool in_tiles = layout == kernels::RoundedLayout::tiles;
+      const std::int64_t place = in_tiles ? kernels::place_in_tiles(i / d, i % d, d) : i;
+      result[static_cast<std::size_t>(place)] = to_bf16(x[static_cast<std::size_t>(i)]);
+    }
+    return result;
+  }
+
+  kernels::HeadRows rows(const std::vector<float>& x, const std::vector<std::uint16_t>& rounded_x, std::int64_t n_head,
+                         std::int64_t n_token) const {
+    const std::int64_t row = shape.d_head + gap;
+    const auto* data = layout == kernels::RoundedLayout::none ? reinterpret_cast<const std::byte*>(x.data())
+                                                              : reinterpret_cast<const std::byte*>(rounded_x.data());
+    return {data, 0, row, row * n_head, row * n_head * n_token, layout, row * n_head};
+  }
+  kernels::HeadRows queries() const { return rows(q, rounded_q, shape.n_head, shape.n_query); }
+  kernels::HeadRows keys() const { return rows(k, rounded_k, shape.n_head_kv, shape.n_key); }
+  kernels::HeadRows values() const { return rows(v, rounded_v, shape.n_head_kv, shape.n_key); }
   float scale() const { return 1 / std::sqrt(static_cast<float>(shape.d_head)); }
 };
 
@@ -83,18 +106,18 @@ inline std::vector<float> run(const AttentionKernel& kernel, const Case& c, int 
   job.n_query = s.n_query, job.n_key = s.n_key, job.n_batch = s.n_batch;
   job.scale = c.scale(), job.q = c.queries(), job.prep = prep.q;
   job.mask = c.mask.empty() ? nullptr : c.mask.data();
-  job.out = out.data();
+  job.out = reinterpret_cast<std::byte*>(out.data());
   if (rounded != nullptr) {
     job.out_layout = kernel.rounded;
     const std::int64_t n = kernels::rounded_count(kernel.rounded, s.n_query * s.n_batch, s.n_head * s.d_head);
     rounded->assign(static_cast<std::size_t>(n), 0xffff);
-    job.out = reinterpret_cast<float*>(rounded->data());
+    job.out = reinterpret_cast<std::byte*>(rounded->data());
   }
   std::vector<std::vector<float>> packed;  // a vector keeps its numbers where they are when it moves
   std::int64_t first = 0;
   for (const std::int64_t n : n_key) {
     kernels::PackJob pack = {s.d_head, s.n_head_kv, n, s.n_batch, c.keys(), c.values(), prep.k, nullptr};
-    pack.k.data += first * pack.k.token, pack.v.data += first * pack.v.token;
+    pack.k.first += first * pack.k.token, pack.v.first += first * pack.v.token;
     if (pack.prep.table != nullptr) pack.prep.table += first * s.d_head;
     packed.emplace_back(kernel.packed_size(pack) / sizeof(float) + 16, nan);
     void* place = packed.back().data();
