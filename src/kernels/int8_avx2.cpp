@@ -52,11 +52,12 @@ struct Avx2Tile {
   static constexpr int kRows = Products::kRows, kColumns = 16, kBlockRows = 216, kStep = Products::kStep;
   static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = true, kBeside = false, kSigned = Products::kSigned;
+  static constexpr RoundedLayout kLayout = RoundedLayout::none;
   struct Session {};
 
-  template <class Strips>
+  template <class Strips, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
-                       std::int32_t* sums, bool add) {
+                       std::int32_t* sums, bool add, const Between&) {
     with_height<kRows>(n_row, [&]<int n>() { tile<n>(x, x_stride, strips, depth, sums, add); });
   }
 

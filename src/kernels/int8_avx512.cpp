@@ -13,11 +13,12 @@ struct VnniTile {
   static constexpr int kRows = 6, kColumns = 64, kBlockRows = 216, kStep = kDepth;
   static constexpr std::int64_t kBlockKiB = 1600;
   static constexpr bool kEven = true, kBeside = false, kSigned = false;
+  static constexpr RoundedLayout kLayout = RoundedLayout::none;
   struct Session {};
 
-  template <class Strips>
+  template <class Strips, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
-                       std::int32_t* sums, bool add) {
+                       std::int32_t* sums, bool add, const Between&) {
     with_height<kRows>(n_row, [&]<int n>() { tile<n>(x, x_stride, strips, depth, sums, add); });
   }
 

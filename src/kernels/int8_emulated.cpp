@@ -11,11 +11,12 @@ struct PlainTile {
   static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;
   static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = true, kBeside = false, kSigned = false;
+  static constexpr RoundedLayout kLayout = RoundedLayout::none;
   struct Session {};
 
-  template <class Strips>
+  template <class Strips, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& panel, std::int64_t depth,
-                       std::int32_t* sums, bool add) {
+                       std::int32_t* sums, bool add, const Between&) {
     for (int r = 0; r < n_row; ++r)
       for (int n = 0; n < kColumns; ++n) {
         std::int32_t sum = add ? sums[r * kColumns + n] : 0;

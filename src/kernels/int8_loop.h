@@ -66,7 +66,7 @@ struct ByteStrips {
 };
 
 /// Whoever quantizes x computes its norm, of any width.
-constexpr std::int64_t kAnyNorm = std::int64_t{1} << 62;
+constexpr std::int64_t kAnyNorm = kAnyDepth;
 
 /// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the
 /// row).
@@ -87,17 +87,18 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
 
 /// `Tile` has: V (a type of vec.h), kRows and kColumns (of the product), kBlockRows and kBlockKiB (of the block of x,
 /// at most), kStep (of the depth, most), kEven (tiles of equal height), Session (held while a thread works), kSigned
-/// (sums are of the weights themselves, without their offset), and
-///   multiply(n_row, x, x_stride, strips, depth, sums, add)
+/// (sums are of the weights themselves, without their offset), kLayout (of a y that is rounded, as LinearStripes says),
+/// and
+///   multiply(n_row, x, x_stride, strips, depth, sums, add, between)
 ///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and PackedStrips for TernaryPanels, of
 ///     ByteStrips for BytePanels. It may read and write rows up to kRows.
-/// Where products have a unit of their own (kBeside), multiply has a last argument between, and calls between() for
-/// every 64 of the depth before it writes sums: some rows of the tile before are finished there.
+/// Where products have a unit of their own (kBeside), multiply calls between() for every 64 of the depth before it
+/// writes sums: some rows of the tile before are finished there.
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
 template <class Tile, class Weights>
 class Int8Loop {
   using V = typename Tile::V;
-  using Stripes = LinearStripes<Tile>;
+  using Stripes = LinearStripes<Tile, Tile::kLayout>;
   using Finish = typename Stripes::Finish;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
@@ -117,7 +118,8 @@ class Int8Loop {
  public:
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
-    LinearKernel row = {name, Weights::packed_size, Weights::pack, supports, cut, run, sizeof(Scratch), kAnyNorm};
+    LinearKernel row = {name, Weights::packed_size, Weights::pack, supports,      cut,
+                        run,  sizeof(Scratch),      kAnyNorm,      Tile::kLayout, kAnyDepth};
     row.quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); };
     return row;
   }
@@ -193,16 +195,10 @@ class Int8Loop {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         std::int32_t* sums = scratch_->sums + r * kColumns;
         if (k + d == depth && !gate) Stripes::fetch(job_, s, r, n_row);
+        const std::int64_t n_finish = ceil_div(kRows * 64, d);
         const auto multiply = [&](const auto& numbers) VLA_LAMBDA {
-          const auto product = [&](const auto&... between) VLA_LAMBDA {
-            Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, numbers, d, sums, k > 0,
-                           between...);
-          };
-          const std::int64_t n_finish = ceil_div(kRows * 64, d);
-          if constexpr (Tile::kBeside)
-            product([&]() VLA_LAMBDA { summed_.finish(n_finish); });
-          else
-            product();
+          Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, numbers, d, sums, k > 0,
+                         [&]() VLA_LAMBDA { summed_.finish(n_finish); });
         };
         if constexpr (!kTernary)
           multiply(ByteStrips<kStrips>{strips, strip});

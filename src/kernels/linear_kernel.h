@@ -20,6 +20,8 @@ struct MatrixDesc {
 };
 constexpr MatrixDesc ternary_desc(std::int64_t d_in, std::int64_t d_out) { return {DType::i8, d_in, d_out, true}; }
 
+constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;
+
 /// One implementation of the matrix product. Whatever it computes with, sums are float32.
 struct LinearKernel {
   const char* name;
@@ -33,8 +35,8 @@ struct LinearKernel {
   void (*run)(const LinearJob& job, std::int64_t item, Worker& worker);
   std::size_t scratch_size;
   std::int64_t max_norm;  // the widest norm of x that it computes on the way
-  /// How x may come, and y leave, as the bf16 that the kernel rounds x to: y of products up to this depth, as partial
-  /// sums of deeper ones lie in y.
+  /// How x may come, where the kernel would round it to bf16, and y leave, where who reads it would: y of products up
+  /// to this depth, as partial sums of deeper ones lie in y.
   RoundedLayout rounded = RoundedLayout::none;
   std::int64_t max_rounded_depth = 0;
   /// What computes products of at most `max_few` rows in its place, from the same packed matrix; null where it does so

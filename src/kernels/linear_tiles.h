@@ -40,7 +40,6 @@ class TileLoop {
   // group reads all of the block of x.
   static constexpr std::int64_t kSplitDepth = 1024, kSplitRows = 256, kMinGroup = 4, kMaxGroup = 24;
   static constexpr std::int64_t kMinSplitItems = 8;
-  static constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;
   static constexpr std::int64_t kMaxSums = kMaxGroup * kSplitRows * kSquare;
 
   struct Scratch {

@@ -9,6 +9,7 @@
 #include <cstring>
 #include <limits>
 
+#include "base/bf16.h"
 #include "base/npy.h"
 #include "kernels/int8_kernels.h"
 #include "kernels/quantized.h"
@@ -82,6 +83,7 @@ struct Case {
   int n_part = 1;
   bool gated = false, with_bias = false, with_residual = false;
   int n_thread = 1;
+  bool rounded = false;  // y, as the kernel lays it out
 };
 
 class Trial {
@@ -112,13 +114,21 @@ class Trial {
                      reinterpret_cast<std::byte*>(&part.y[1]),
                      d_out(i),
                      part.scale.data()};
+      if (!case_.rounded) continue;
+      part.rounded.resize(static_cast<std::size_t>(rounded_count(kernel_.rounded, n_row, d_out(i))));
+      job.part[i].y = reinterpret_cast<std::byte*>(part.rounded.data()), job.part[i].y_type = DType::bf16;
     }
     test::run_job(kernel_, job, case_.n_thread);
+    for (Part& part : parts_)
+      if (case_.rounded) widen(part, static_cast<std::int64_t>(part.y.size() - 2) / n_row);
   }
 
   void check() const {
     for (int i = case_.gated ? 1 : 0; i < case_.n_part; ++i) {
-      const auto is_right = [&](std::int64_t row, std::int64_t n, float y) { return y == expected(i, row, n); };
+      const auto is_right = [&](std::int64_t row, std::int64_t n, float y) {
+        const float exact = expected(i, row, n);
+        return y == (case_.rounded ? from_bf16(to_bf16(exact)) : exact);
+      };
       test::check_rows(parts_[static_cast<std::size_t>(i)].y, case_.shape.n_row, d_out(i), is_right);
     }
   }
@@ -126,8 +136,16 @@ class Trial {
  private:
   struct Part {
     std::vector<float> weight, bias, residual, y, scale;  // one scale, or one for each column
+    std::vector<std::uint16_t> rounded;
     test::Pages packed = {nullptr, std::free};
   };
+
+  void widen(Part& part, std::int64_t d) {
+    for (std::int64_t i = 0; i < case_.shape.n_row * d; ++i) {
+      const std::int64_t place = kernel_.rounded == RoundedLayout::tiles ? place_in_tiles(i / d, i % d, d) : i;
+      part.y[static_cast<std::size_t>(i + 1)] = from_bf16(part.rounded[static_cast<std::size_t>(place)]);
+    }
+  }
 
   std::int64_t d_out(int i) const { return case_.shape.d_out + (case_.gated ? 0 : 7 * i); }
 
@@ -319,6 +337,8 @@ void check_epilogues(const LinearKernel& kernel) {
     check(kernel, {.shape = shape, .n_part = 2, .gated = true});
     check(kernel, {.shape = shape, .n_part = 2, .gated = true, .with_bias = true, .with_residual = true});
     check(kernel, {.shape = shape, .n_part = 3, .with_bias = true});
+    if (kernel.rounded != RoundedLayout::none)
+      check(kernel, {.shape = shape, .n_part = 3, .with_bias = true, .rounded = true});
   }
 }
 

@@ -3,6 +3,7 @@
 //
 // How activations lie between products on a machine with AMX, or on one that is emulated (test_amx_machine).
 #include "lower_case.h"
+#include "nn/linear.h"
 #include "support/kernel_rows.h"
 
 using namespace vla;
@@ -45,6 +46,33 @@ TEST_CASE("amx: queries, keys and values lie in tiles behind the product" * doct
 }
 TEST_CASE("avx512_bf16: queries, keys and values are rounded by the product" * doctest::skip(lacks(Isa::avx512_bf16))) {
   check_operands("avx512_bf16", "bf16[24, 130, 2]", "bf16[12, 1, 130, 2]");
+}
+
+TEST_CASE("amx: int8 products leave queries, keys and values in tiles too" * doctest::skip(lacks(Isa::amx))) {
+  constexpr int kWidth = 160;
+  std::vector<ParamSet::Piece> pieces;
+  for (const char* name : {"q", "k", "v"})
+    pieces.push_back({std::string(name) + ".weight", {kWidth, kWidth}, ramp(kWidth * kWidth, 0.1f), DType::bf16});
+  ParamSet set(pieces);
+  const auto linear = [&](const char* name) { return Linear(set.scope(name), kWidth, kWidth, Bias::no); };
+  const Linear q = linear("q"), k = linear("k"), v = linear("v");
+  const auto run = [&](const char* tapped) {
+    GraphRunner r(set.list(), kInt8Kernels,
+                  [=](const std::string& path) { return path == "result" || path == tapped; });
+    Graph& g = r.graph;
+    const Tensor x = input(r, {kWidth, 130, 1, 1}), keys = k(g, x);
+    g.name("keys", keys);
+    const Tensor attended =
+        attention(g, split_heads(g, q(g, x), 4), {{split_heads(g, keys, 4), split_heads(g, v(g, x), 4)}}, {});
+    g.name("result", attended);
+    const std::string text = r.lower().text();
+    r.run();
+    return std::pair{text, r.tap("result")};
+  };
+  const auto [text, result] = run("");
+  CHECK(text.find("pack keys and values  bf16 tiles [40, 4, 130]") != std::string::npos);
+  CHECK(text.find("amx_int8") != std::string::npos);
+  CHECK(run("keys").second == result);
 }
 
 TEST_CASE("amx: what products alone read stays in tiles between them, the last of uneven size" *
