@@ -14,8 +14,7 @@ namespace vla::kernels {
 struct HeadRows {
   const std::byte* data;
   std::int64_t first, head, token, batch;
-  /// Instead of floats bf16, as a product left rows of `d` numbers: where they lie is as in rows that follow each
-  /// other.
+  /// Where not none: bf16 instead of floats, in rows of `d` numbers that are laid out so.
   RoundedLayout layout = RoundedLayout::none;
   std::int64_t d = 0;
 

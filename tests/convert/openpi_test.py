@@ -3,6 +3,7 @@
 """Bundles from openpi's PyTorch checkpoints: what a training configuration's name adds, and what is refused."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -110,6 +111,15 @@ def test_an_embedding_that_openpi_left_out_as_shared_is_found(converter):
 def test_without_a_variant_the_known_ones_are_listed(converter):
     error = converter.refusal(openpi("pi0_libero"))
     assert error.code == Code.USAGE and "pi05_droid" in error.message()
+
+
+def test_a_horizon_alone_is_no_openpi_checkpoint(converter):
+    tiny = openpi("pi0_libero")
+    del tiny.config["paligemma_variant"]
+    converter.save(tiny)
+    shutil.rmtree(converter.folder / "assets")
+    error = converter.refusal()
+    assert error.code == Code.UNSUPPORTED and "config.json: type: expected one of" in error.message()
 
 
 def test_a_variant_without_a_recipe_is_refused(converter):

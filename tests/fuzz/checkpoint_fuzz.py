@@ -23,7 +23,7 @@ from golden_cases import NAMES, Golden  # noqa: E402
 from vla_cpp.convert.cli import main as convert  # noqa: E402
 
 MOST_SECONDS, MOST_BYTES = 20, 4 << 30
-REFUSALS = (3, 6, 9)  # bad_bundle, unsupported, io
+REFUSALS = (2, 3, 6, 9)  # usage, as an option may name what the damage hit; bad_bundle, unsupported, io
 ODD = [b"\0", b"\1", b"\x7f", b"\x80", b"\xff", b'"', b"{", b"-1", b"1e400", b"999999999999", b"null", b"[]"]
 
 

@@ -174,7 +174,7 @@ def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, L
     for arch, layout in authors.items():
         if any(os.path.exists(os.path.join(folder, name)) for name in layout.files):
             return arch
-    return OPENPI if has_assets or "action_horizon" in config else LEROBOT
+    return OPENPI if has_assets or "paligemma_variant" in config else LEROBOT
 
 
 def given_backbone(checkpoint: Checkpoint, given: str) -> str:
