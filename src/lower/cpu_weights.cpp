@@ -18,13 +18,11 @@
 namespace vla {
 
 Isa isa_for(const ParamList& list, Isa isa) {
-  bool has_matrix = false;
-  for (const Param& param : list.params())
-    if (param.storage == Storage::matrix) {  // products of ternary ones are the same on all machines
-      has_matrix = true;
-      if (param.type() != DType::bf16) return without_rounding(isa);
-    }
-  return has_matrix ? isa : without_rounding(isa);
+  const auto& params = list.params();
+  const auto rounds = [](const Param& param) {
+    return param.storage == Storage::matrix && param.type() == DType::bf16;
+  };
+  return std::any_of(params.begin(), params.end(), rounds) ? isa : without_rounding(isa);
 }
 
 std::int64_t min_rounded_keys(const ParamList& list) {

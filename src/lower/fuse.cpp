@@ -210,12 +210,21 @@ class Fuser {
     return known->second = id;
   }
 
+  /// Whether a product of a matrix that is wider than bf16 made it.
+  static bool comes_from_floats(Tensor x) {
+    const Node* node = x.node();
+    while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();
+    const auto* product = node->as<op::Linear>();
+    return product != nullptr && (product->weight->type() == DType::f32 || product->weight->type() == DType::f16);
+  }
+
   void visit_attention(const Node& node) {
     const bool has_mask = node.as<op::Attention>()->has_mask;
     const std::size_t first = has_mask ? 2 : 1;
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
-    const Isa isa = n_key < l.min_rounded_keys ? without_rounding(l.isa) : l.isa;
+    const bool rounds = n_key >= l.min_rounded_keys && !comes_from_floats(node.in[0]);
+    const Isa isa = rounds ? l.isa : without_rounding(l.isa);
     AttentionOp op = {&node, prepared(node.in[0]), isa};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;

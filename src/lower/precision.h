@@ -7,9 +7,10 @@
 
 namespace vla {
 
-/// The kernels that compute with these parameters on a machine for `isa`. Tiles of bf16 round whatever they multiply,
-/// attention's operands too. A bundle asks for that by storing its matrices as bf16; one matrix of another dtype, or
-/// none at all, makes everything float32.
+/// The kernels that compute with these parameters on a machine for `isa`. Tiles of bf16 round whatever they multiply.
+/// A bundle asks for that by storing matrices as bf16: those are multiplied so, and attention of queries that they make
+/// rounds too. Matrices of another dtype, and attention of their queries, are float32, as they are in PyTorch: pi0's
+/// tower beside its language model. Without any of bf16 everything is.
 Isa isa_for(const ParamList& list, Isa isa);
 
 /// Attention over fewer keys rounds nothing on any machine: it takes little time, and each output mixes so few values

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How activations lie between products on a machine with AMX, or on one that is emulated (test_amx_machine).
+#include <fmt/format.h>
+
 #include "lower_case.h"
 #include "nn/linear.h"
 #include "support/kernel_rows.h"
@@ -46,6 +48,34 @@ TEST_CASE("amx: queries, keys and values lie in tiles behind the product" * doct
 }
 TEST_CASE("avx512_bf16: queries, keys and values are rounded by the product" * doctest::skip(lacks(Isa::avx512_bf16))) {
   check_operands("avx512_bf16", "bf16[24, 130, 2]", "bf16[12, 1, 130, 2]");
+}
+
+TEST_CASE("attention is computed in float32 where a matrix of float32 made its queries" *
+          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+  constexpr int kWidth = 64;
+  const auto piece = [&](const char* name, DType type) {
+    return ParamSet::Piece{std::string(name) + ".weight", {kWidth, kWidth}, ramp(kWidth * kWidth, 0.1f), type};
+  };
+  ParamSet set({piece("wide", DType::f32), piece("narrow", DType::bf16)});
+  const Linear wide(set.scope("wide"), kWidth, kWidth, Bias::no), narrow(set.scope("narrow"), kWidth, kWidth, Bias::no);
+  GraphRunner r(set.list(), "");
+  Graph& g = r.graph;
+  const Tensor x = input(r, {kWidth, 130, 1, 1});
+  const auto attend_from = [&](const Linear& q) {
+    const Tensor heads = split_heads(g, q(g, x), 2), keys = split_heads(g, narrow(g, x), 2);
+    return attention(g, g.add(op::Rope{}, {heads, constant(g, ramp(32 * 130, 1), {32, 130})}), {{keys, keys}}, {});
+  };
+  const Tensor from_wide = attend_from(wide), from_narrow = attend_from(narrow);
+  g.name("result", concat(g, {from_wide, from_narrow}, 0));
+  const std::string text = r.lower().text(), best = isa_name(usable_isas().back());
+  const auto kernel_of = [&](Tensor attended) {
+    const std::size_t at = text.find(fmt::format("attention %{} ", attended.node()->id));
+    REQUIRE(at != std::string::npos);
+    const std::string line = text.substr(text.rfind('\n', at) + 1);
+    return line.substr(5, line.find(' ', 5) - 5);
+  };
+  CHECK(kernel_of(from_wide) == "avx512");
+  CHECK(kernel_of(from_narrow) == best);
 }
 
 TEST_CASE("amx: int8 products leave queries, keys and values in tiles too" * doctest::skip(lacks(Isa::amx))) {
