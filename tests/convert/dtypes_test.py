@@ -7,6 +7,7 @@ import pytest
 
 from tiny import VLM, Tiny
 from vla_cpp.convert.dtypes import bf16_to_f32, convert, f32_to_bf16
+from vla_cpp.convert.errors import Code
 
 
 def nearest_even_bf16(value):
@@ -125,6 +126,26 @@ def test_one_stored_type_is_kept_and_mixed_types_become_exact_f32(converter):
     np.testing.assert_array_equal(
         bundle.tensors["lm.token_embd.weight"], values[VLM + "text_model.embed_tokens.weight"]
     )
+
+
+def test_each_matrix_keeps_its_stored_type_on_request(converter):
+    tiny = Tiny()
+    tiny.tensors = {name: as_bf16(value) for name, value in tiny.tensors.items()}
+    projection = np.random.default_rng(3).standard_normal(tiny.tensors["model.state_proj.weight"][1].shape, np.float32)
+    tiny.tensors["model.state_proj.weight"] = projection
+    bundle = converter.bundle(tiny, dtype="stored")
+    assert bundle.keys["vla.dtype"] == "bf16" and converter.summary.rounding[0] == 0
+    types = {name: stored for name, stored in bundle.dtypes.items() if bundle.tensors[name].ndim == 2}
+    assert types.pop("state_in.weight") == "f32" and set(types.values()) == {"bf16"}
+    np.testing.assert_array_equal(bundle.tensors["state_in.weight"], projection)
+
+
+def test_more_than_one_narrow_type_is_not_kept(converter):
+    tiny = Tiny()
+    tiny.tensors = {name: as_bf16(value) for name, value in tiny.tensors.items()}
+    tiny.tensors["model.state_proj.weight"] = bf16_to_f32(tiny.tensors["model.state_proj.weight"][1]).astype(np.float16)
+    error = converter.refusal(tiny, dtype="stored")
+    assert error.code == Code.UNSUPPORTED and "--dtype stored: expected float32 and one narrower type" in error.message()
 
 
 def test_f32_and_bf16_files_of_the_same_numbers_give_the_same_bf16_bundle(converter):

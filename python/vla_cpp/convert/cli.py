@@ -11,7 +11,7 @@ from dataclasses import fields
 
 from .. import __version__
 from .archs import Options, names
-from .conversion import Summary, convert_checkpoint
+from .conversion import STORED, Summary, convert_checkpoint
 from .errors import Code, ConvertError
 from .files import missing_extra
 
@@ -21,7 +21,8 @@ bundle for the vla runtime: weights, tokenizer, image recipe, statistics, featur
 It refuses what it does not fully understand, and lists all problems at once."""
 
 EPILOG = """\
-Without --dtype the stored type is kept if all matrices share it; mixed types become f32, which is exact.
+Without --dtype the stored type is kept if all matrices share it; mixed types become f32, which is exact. --dtype stored
+keeps the type of each, which is exact too: matrices of bf16 are then computed in bf16, as PyTorch does, the others in f32.
 
 --position-precision: the reference computes the rows of the vision position table in the precision of its tower, and that
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
@@ -60,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add(
         "--dtype",
-        choices=("f32", "bf16", "f16"),
+        choices=("f32", "bf16", "f16", STORED),
         default="",
         help="storage of matrices and tables; vectors and statistics are always f32",
     )

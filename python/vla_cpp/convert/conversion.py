@@ -22,6 +22,7 @@ from .errors import Code, Problems, refuse
 from .safetensors_file import Entry
 from .ternary import quantize
 
+STORED = "stored"  # --dtype: every matrix as it is stored
 Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
 
 
@@ -58,7 +59,7 @@ def convert_checkpoint(
     problems.raise_any()
     dtype = _choose_dtype(checkpoint, plan, options.dtype)
     summary = Summary(out, arch, dtype, dropped=dropped, notes=checkpoint.notes)
-    _write(checkpoint, plan, summary, problems, progress)
+    _write(checkpoint, plan, summary, problems, options.dtype, progress)
     summary.n_bytes = os.path.getsize(out)
     return summary
 
@@ -117,8 +118,9 @@ def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> N
 
 
 def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
-    """As asked; else the stored one when all matrices that it is for share it; else f32, which holds every stored number."""
-    if wanted:
+    """As asked; else the stored one when all matrices that it is for share it; else f32, which holds every stored number.
+    For `stored` the narrower one, beside which matrices of float32 stay so."""
+    if wanted not in ("", STORED):
         return wanted
     stored = Counter(
         "BF16" if weight.in_bf16 else checkpoint.tensors[weight.source].dtype
@@ -128,25 +130,32 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
     if len(stored) == 1:
         return BUNDLE_NAME[next(iter(stored))]
     mixed = ", ".join("{} {}".format(count, name) for name, count in sorted(stored.items()))
+    narrower = [BUNDLE_NAME[name] for name in stored if name != "F32"]
+    if wanted == STORED and len(narrower) == 1:
+        return narrower[0]
+    if wanted == STORED:
+        raise refuse("--dtype stored", "float32 and one narrower type", mixed, "--dtype f32 is exact", Code.UNSUPPORTED)
     checkpoint.notes.append(
-        "matrices are stored in mixed types ({}): written as f32, which is exact; --dtype bf16 halves the file".format(
-            mixed
-        )
+        "matrices are stored in mixed types ({}): written as f32, which is exact; so is --dtype stored, which keeps each "
+        "type; --dtype bf16 halves the file".format(mixed)
     )
     return "f32"
 
 
-def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
+def _tensor_dtype(weight: Weight, stored: str, dtype: str, wanted: str) -> str:
     if weight.kind == TERNARY:
         return "i8"
-    exact = weight.kind not in (MATRIX, TABLE) or (weight.keep_f32 and stored == "F32")
+    keeps = weight.keep_f32 or (wanted == STORED and not weight.in_bf16)
+    exact = weight.kind not in (MATRIX, TABLE) or (keeps and stored == "F32")
     return "f32" if exact else dtype
 
 
-def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress) -> None:
+def _write(
+    checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, wanted: str, progress: Progress
+) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
     tensors = [
-        TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype))
+        TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype, wanted))
         for w in plan.weights
     ]
     tensors += [
