@@ -71,11 +71,12 @@ def child(command):
     return out, usage.ru_maxrss * 1024
 
 
-def run_vla(vla, case, bundle, pattern, taps_file, threads, inject=None):
+def run_vla(vla, case, bundle, pattern, taps_file, threads, inject=None, kernels="float32"):
     """(taps that match the pattern and the actions, milliseconds by stage, peak bytes) of `vla run` on a case.  `inject`: a file of
-    values that it goes on from."""
+    values that it goes on from; `kernels`: none for the runtime's choice."""
     observation = json.loads((case / "observation.json").read_text())
-    command = [vla, "run", bundle, "--json", "--kernels", "float32", "--threads", threads, "--noise", case / "noise.npy"]
+    command = [vla, "run", bundle, "--json", "--threads", threads, "--noise", case / "noise.npy"]
+    command += ["--kernels", kernels] if kernels else []
     for view, file in observation["images"].items():
         command += ["--image", f"{view}={case / file if file else ''}"]
     states = observation["state"]

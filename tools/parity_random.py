@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random configurations, by the reference and by the runtime: what the golden cases do not happen to contain.
 
-    python tools/parity_random.py ARCH FIRST LAST [--vla build/cpu/bin/vla] [--keep DIR]
+    python tools/parity_random.py ARCH FIRST LAST [--bf16 | --stored] [--vla build/cpu/bin/vla] [--keep DIR]
 
 A seed draws everything: depths, heads, widths, patches, grid and table, views, frames, absent views, text, normalization, solver,
 attention mode (of smolvla), relative actions (of pi0, pi05 and GR00T), poses and moments (of GR00T).  Its checkpoint is run by LeRobot's class, converted by vla-convert and run by vla; every block must agree.
@@ -13,7 +13,8 @@ bitvla: a code that rounding moves changes all that follows, so that each part i
 Products must agree within 1e-6, other parts within 1e-5; whole blocks, inside of which a code may move, by their root mean square.
 
 With --bf16 the weights are float32 numbers that bfloat16 rounds and the bundle is in bf16: its actions must not lie further from
-the reference's in float32 than those of the reference in the dtypes of a published file.
+the reference's in float32 than those of the reference in the dtypes of a published file.  With --stored the checkpoint has the dtypes
+of a published file, so has the bundle (vla-convert --dtype stored), and the runtime chooses its kernels: the same must hold.
 """
 import argparse
 import contextlib
@@ -236,7 +237,7 @@ def run_reference(case, folder, low_bits=False):
         return None, f"{type(error).__name__} {error}".splitlines()[0][:90]
 
 
-def run_runtime(vla, folder, dtype="f32"):
+def run_runtime(vla, folder, dtype="f32", kernels="float32"):
     """(taps, None), or (None, who refuses and why)."""
     message = io.StringIO()
     try:
@@ -245,7 +246,7 @@ def run_runtime(vla, folder, dtype="f32"):
     except SystemExit as stopped:
         return None, f"vla-convert ({stopped.code}): {message.getvalue().strip()[:200]}"
     try:
-        return run_vla(vla, folder, folder / "bundle.gguf", "*", folder / "taps.gguf", threads=1)[0], None
+        return run_vla(vla, folder, folder / "bundle.gguf", "*", folder / "taps.gguf", threads=1, kernels=kernels)[0], None
     except subprocess.CalledProcessError as error:
         if error.returncode < 0:  # a signal is a crash, not a refusal
             raise
@@ -263,22 +264,23 @@ def judge(expected, got):
     return far[worst] <= TOLERANCE, f"actions {far['actions']:.1e}, worst of {len(far)} blocks {far[worst]:.1e} at {worst}"
 
 
-def judge_bf16(expected, got, published):
+def judge_rounding(expected, got, published):
     ours, theirs = (distance(run["actions"].ravel(), expected["actions"].ravel())[1] for run in (got, published))
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-def compare(arch, seed, vla, folder, bf16):
+def compare(arch, seed, vla, folder, dtype):
+    """`dtype` of the bundle: f32, or bf16 or stored to compare what rounding costs."""
     if arch == "bitvla":
         return compare_bitvla(seed, vla, folder)
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
         drawn = draw(seed) if arch == "smolvla" else draw_pi(arch, seed) if arch.startswith("pi") else draw_gr00t(arch, seed)
-        expected, stopped = run_reference(drawn, folder, bf16)
-        published = recorder.run_case(folder, "published") if bf16 and expected else None
-    got, refused = run_runtime(vla, folder, "bf16" if bf16 else "f32")
+        expected, stopped = run_reference(drawn, folder, low_bits=dtype == "bf16")
+        published = recorder.run_case(folder, "published") if dtype != "f32" and expected else None
+    got, refused = run_runtime(vla, folder, dtype, kernels="" if dtype == "stored" else "float32")
     if expected is None or got is None:
         return expected is None and got is None, f"reference: {stopped or 'runs'}; {refused or 'the runtime runs'}"
-    return judge_bf16(expected, got, published) if bf16 else judge(expected, got)
+    return judge_rounding(expected, got, published) if published else judge(expected, got)
 
 
 def main():
@@ -287,7 +289,9 @@ def main():
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
-    parser.add_argument("--bf16", action="store_true", help="what rounding the weights costs, instead of every block")
+    costs = parser.add_mutually_exclusive_group()
+    costs.add_argument("--bf16", action="store_const", const="bf16", dest="dtype", default="f32", help="what rounding the weights costs, instead of every block")
+    costs.add_argument("--stored", action="store_const", const="stored", dest="dtype", help="what rounding activations costs, with weights as published")
     parser.add_argument("--keep", type=Path, help="folder for the cases, instead of one that is removed")
     args = parser.parse_args()
     if args.arch != "bitvla":
@@ -298,7 +302,7 @@ def main():
         for seed in range(args.first, args.last + 1):
             folder = (args.keep or Path(scratch)) / str(seed)
             folder.mkdir(parents=True)
-            agree, what = compare(args.arch, seed, args.vla, folder, args.bf16)
+            agree, what = compare(args.arch, seed, args.vla, folder, args.dtype)
             n_wrong += not agree
             print(f"seed {seed}: {'agree' if agree else 'DIFFER'}; {what}", flush=True)
     print(f"{args.last - args.first + 1 - n_wrong} of {args.last - args.first + 1} seeds agree")
