@@ -36,6 +36,9 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
     VLA_CHECK(robot->load_policy(params));
   }
   VLA_CHECK(device->load(*params, !options.dry));
+  if (options.kernels == "bf16" && device->precision() == "f32")
+    return Error{Code::unsupported, "kernels bf16", "matrices that are stored as bf16", "none",
+                 "vla-convert --dtype bf16 rounds them"};
   for (const auto& robot : robots) VLA_CHECK(robot->make_graphs());
   if (!options.dry) device->touch();
   std::unique_ptr<Engine> first = std::move(robots.front());

@@ -74,6 +74,17 @@ TEST_CASE("an engine tells the kernels and the precision of its bundle, not thos
   CHECK(load_engine(kBundle)->arithmetic().find("int8") == std::string::npos);
 }
 
+TEST_CASE("bf16 that is asked for by name needs matrices of bf16" *
+          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+  EngineOptions options;
+  options.kernels = "bf16";
+  const auto refused = Engine::load(widened("all"), options);
+  REQUIRE(!refused.ok());
+  CHECK(refused.error().code == Code::unsupported);
+  CHECK(refused.error().message().find("kernels bf16: expected matrices that are stored as bf16") != std::string::npos);
+  CHECK(Engine::load(kBundle, options).ok());
+}
+
 TEST_CASE("a matrix of another dtype is multiplied in float32, and the others in bf16 as before" *
           doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
   const auto engine = load_engine(widened("lm.blk.0.attn_q.weight")), all = load_engine(kBundle);
