@@ -23,6 +23,13 @@ struct AmxSession {
   VLA_INLINE ~AmxSession() { _tile_release(); }
 };
 
+/// How products on tiles store y as bf16.
+struct AmxRounding {
+  using V = Avx512;
+  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
+  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, V::Float y) { store_bf16(to, x, y); }
+};
+
 /// To be called before tiles are loaded: GCC's intrinsic does not say that it reads memory, so that the compiler could
 /// move stores of what is to be read behind it.
 VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }

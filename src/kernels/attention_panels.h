@@ -76,7 +76,7 @@ class AttentionPanels {
     const auto* from = reinterpret_cast<const Number*>(rows.data);
     for_pieces(P::kRounded, place / rows.d, place % rows.d, d_head, rows.d,
                [&](std::int64_t i, std::int64_t at, std::int64_t n) VLA_LAMBDA {
-                 if (n == kSquare)
+                 if (n == kSquare)  // a size that the compiler knows
                    std::memcpy(to + i, from + at, kSquare * sizeof(*to));
                  else
                    std::memcpy(to + i, from + at, static_cast<std::size_t>(n) * sizeof(*to));

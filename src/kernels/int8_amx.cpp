@@ -8,16 +8,12 @@ namespace vla::kernels {
 namespace {
 
 /// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel.
-struct AmxInt8Tile {
-  using V = Avx512;
+struct AmxInt8Tile : AmxRounding {
   using Session = AmxSession;
   static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 256, kStep = 768;
   static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = false, kBeside = true, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::tiles;
-
-  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
-  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, V::Float y) { store_bf16(to, x, y); }
 
   template <class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,

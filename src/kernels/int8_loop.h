@@ -65,9 +65,6 @@ struct ByteStrips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// Whoever quantizes x computes its norm, of any width.
-constexpr std::int64_t kAnyNorm = kAnyDepth;
-
 /// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the
 /// row).
 template <class V, class Weights, int kColumns, int kOffset>
@@ -116,10 +113,10 @@ class Int8Loop {
   };
 
  public:
-  /// The row of the table that this tile makes.
+  /// The row of the table that this tile makes. Whoever quantizes x computes its norm, of any width.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
     LinearKernel row = {name, Weights::packed_size, Weights::pack, supports,      cut,
-                        run,  sizeof(Scratch),      kAnyNorm,      Tile::kLayout, kAnyDepth};
+                        run,  sizeof(Scratch),      kAnyDepth,     Tile::kLayout, kAnyDepth};
     row.quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); };
     return row;
   }

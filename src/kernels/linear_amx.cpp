@@ -8,12 +8,8 @@ namespace vla::kernels {
 namespace {
 
 /// A square of sums is four tiles, one of x two, and so is one of a panel; sums are float32.
-struct AmxTile {
-  using V = Avx512;
+struct AmxTile : AmxRounding {
   using Session = AmxSession;
-
-  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, std::int64_t left) { store_bf16(to, x, left); }
-  static VLA_INLINE void store_rounded(std::uint16_t* to, V::Float x, V::Float y) { store_bf16(to, x, y); }
 
   static VLA_INLINE void copy(const float* from, std::int64_t n, std::uint16_t* to) {
     store_bf16(to, load<V>(from, n), n > 16 ? load<V>(from + 16, n - 16) : V::Float{});

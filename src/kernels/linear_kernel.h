@@ -20,6 +20,7 @@ struct MatrixDesc {
 };
 constexpr MatrixDesc ternary_desc(std::int64_t d_in, std::int64_t d_out) { return {DType::i8, d_in, d_out, true}; }
 
+/// No limit of a depth.
 constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;
 
 /// One implementation of the matrix product. Whatever it computes with, sums are float32.

@@ -74,7 +74,7 @@ struct LinearStripes {
 
     VLA_INLINE void operator()(std::int64_t begin, std::int64_t end) const { (this->*rows_)(begin, end); }
 
-    /// Asks for what rows begin to end, or those of them that there are, will read, and write piece by piece.
+    /// Asks for what rows begin to end, or those of them that there are, will read and write as floats.
     VLA_INLINE void fetch(std::int64_t begin, std::int64_t end) const {
       end = min(end, n_row_);
       if (begin < end && job_->part[s_.part].y_type == DType::f32)

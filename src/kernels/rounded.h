@@ -20,6 +20,12 @@ constexpr VLA_INLINE std::int64_t place_in_tiles(std::int64_t row, std::int64_t 
          i % kSquare;
 }
 
+/// Where number i of a row lies among rows of d numbers.
+constexpr VLA_INLINE std::int64_t rounded_place(RoundedLayout layout, std::int64_t row, std::int64_t i,
+                                                std::int64_t d) {
+  return layout == RoundedLayout::tiles ? place_in_tiles(row, i, d) : row * d + i;
+}
+
 /// Calls piece(i, place, count) for the parts of numbers `column` to column + n of a row that lie together: count
 /// numbers from the i-th on are at `place`.
 template <class Piece>
@@ -27,7 +33,7 @@ VLA_INLINE void for_pieces(RoundedLayout layout, std::int64_t row, std::int64_t 
                            const Piece& piece) {
   for (std::int64_t i = 0, size = 0; i < n; i += size, column += size) {
     size = min(n - i, kSquare - column % kSquare);
-    piece(i, layout == RoundedLayout::tiles ? place_in_tiles(row, column, d) : row * d + column, size);
+    piece(i, rounded_place(layout, row, column, d), size);
   }
 }
 

@@ -184,15 +184,10 @@ kernels::RowPrep prep_of(const Lowering& l, const Prepared& rows) {
   return prep;
 }
 
-kernels::RoundedLayout layout_of(const Value& value) {
-  using kernels::RoundedLayout;
-  return value.type != DType::bf16 ? RoundedLayout::none : value.in_tiles ? RoundedLayout::tiles : RoundedLayout::rows;
-}
-
 /// x [d_head, n_head, n_token, n_batch].
 kernels::HeadRows head_rows(const Lowering& l, ValueId id) {
   const Value &x = l.value(id), &base = l.base(id);
-  return {base.data, x.offset, x.stride[1], x.stride[2], x.stride[3], layout_of(x), base.shape[0]};
+  return {base.data, x.offset, x.stride[1], x.stride[2], x.stride[3], x.rounded, base.shape[0]};
 }
 
 double flop_of_op(const FusedOp& op) {
@@ -280,7 +275,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const Attention
     job.segment[job.n_segment++] = {address(l, attention.packed[i]), attention.n_key[i], job.n_key};
     job.n_key += attention.n_key[i];
   }
-  job.out = address(l, op.writes[0]), job.out_layout = layout_of(l.value(op.writes[0]));
+  job.out = address(l, op.writes[0]), job.out_layout = l.value(op.writes[0]).rounded;
   task->n_item = task->kernel->cut(job, threads_for(l, op));
   return task;
 }

@@ -210,7 +210,7 @@ class Fuser {
     return known->second = id;
   }
 
-  /// Whether a product of a matrix that is wider than bf16 made it.
+  /// Whether a matrix that is stored as float32 or float16 made it.
   static bool comes_from_floats(Tensor x) {
     const Node* node = x.node();
     while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();

@@ -24,6 +24,9 @@ class Layouts {
     l.ops = std::move(out_);
     for (const Node& node : l.graph.nodes())
       if (node.as<op::Write>() != nullptr) store(node);
+    for (const FusedOp& op : l.ops)
+      for (const ValueId id : op.reads) reads_[l.value(id).base].push_back({&op, id});
+    for (Value& value : l.values) views_[value.base].push_back(&value);
     for (FusedOp& op : l.ops) {
       if (const auto* linear = std::get_if<LinearOp>(&op.op)) round_result(op, *linear);
       if (const auto* attention = std::get_if<AttentionOp>(&op.op)) round_result(op, *attention);
@@ -175,16 +178,11 @@ class Layouts {
   void round_result(ValueId id, kernels::RoundedLayout layout) {
     Value& y = l.value(id);
     if (layout == kernels::RoundedLayout::none || y.home != Value::Home::arena) return;
-    std::vector<Value*> views;  // and itself
-    for (Value& value : l.values) {
-      if (value.base != id) continue;
-      if (value.node != nullptr && value.node->tapped) return;
-      views.push_back(&value);
-    }
-    for (const FusedOp& op : l.ops)
-      for (const ValueId read : op.reads)
-        if (l.value(read).base == id && !takes(op, read, layout)) return;
-    for (Value* value : views) value->type = DType::bf16, value->in_tiles = layout == kernels::RoundedLayout::tiles;
+    for (const Value* view : views_[id])
+      if (view->node != nullptr && view->node->tapped) return;
+    for (const auto& [op, read] : reads_[id])
+      if (!takes(*op, read, layout)) return;
+    for (Value* view : views_[id]) view->type = DType::bf16, view->rounded = layout;
     y.size = static_cast<std::size_t>(kernels::rounded_count(layout, count(y.shape) / y.shape[0], y.shape[0])) * 2;
   }
 
@@ -216,6 +214,9 @@ class Layouts {
   FusedOp* op_ = nullptr;
   std::vector<FusedOp> out_;
   std::map<std::pair<ValueId, const Node*>, ValueId> codes_;  // of x, or of its norm
+  // Of each base: who reads it or a view of it, and itself with its views.
+  std::map<ValueId, std::vector<std::pair<const FusedOp*, ValueId>>> reads_;
+  std::map<ValueId, std::vector<Value*>> views_;
 };
 
 }  // namespace

@@ -26,9 +26,10 @@ struct Value {
   DType type = DType::f32;
   Shape shape = {1, 1, 1, 1};
   Shape stride = {1, 1, 1, 1};  // numbers from one index to the next
-  bool in_tiles = false;        // instead: as kernels/rounded.h says
   ValueId base = kNone;         // whose memory this is: its own, or that of the value it is a view of
   std::int64_t offset = 0;      // numbers from the beginning of the base
+  /// How bf16 lies that a product or attention has stored: strides are then those of rows that follow each other.
+  kernels::RoundedLayout rounded = kernels::RoundedLayout::none;
 
   // Of a base alone.
   Home home = Home::arena;

@@ -65,8 +65,8 @@ std::string layout(const Lowering& l, ValueId id) {
                                                             : "";
   if (value.node == nullptr && value.size > 0 && value.stride == Shape{1, 1, 1, 1})
     return fmt::format("panels{}", home);
-  return fmt::format("{}{}{}{}", dtype_name(value.type), value.in_tiles ? " tiles " : "", shape_text(value.shape),
-                     home);
+  return fmt::format("{}{}{}{}", dtype_name(value.type),
+                     value.rounded == kernels::RoundedLayout::tiles ? " tiles " : "", shape_text(value.shape), home);
 }
 
 }  // namespace

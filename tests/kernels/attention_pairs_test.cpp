@@ -100,8 +100,7 @@ void check_pair_rounded(const AttentionKernel& kernel) {
     const std::int64_t d = shape.n_head * shape.d_head;
     int n_wrong = 0;
     for (std::int64_t i = 0; i < static_cast<std::int64_t>(floats.size()); ++i) {
-      const std::int64_t place =
-          kernel.rounded == kernels::RoundedLayout::tiles ? kernels::place_in_tiles(i / d, i % d, d) : i;
+      const std::int64_t place = kernels::rounded_place(kernel.rounded, i / d, i % d, d);
       n_wrong += rounded[static_cast<std::size_t>(place)] != to_bf16(floats[static_cast<std::size_t>(i)]);
     }
     CHECK(n_wrong == 0);

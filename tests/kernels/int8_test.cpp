@@ -142,7 +142,7 @@ class Trial {
 
   void widen(Part& part, std::int64_t d) {
     for (std::int64_t i = 0; i < case_.shape.n_row * d; ++i) {
-      const std::int64_t place = kernel_.rounded == RoundedLayout::tiles ? place_in_tiles(i / d, i % d, d) : i;
+      const std::int64_t place = rounded_place(kernel_.rounded, i / d, i % d, d);
       part.y[static_cast<std::size_t>(i + 1)] = from_bf16(part.rounded[static_cast<std::size_t>(place)]);
     }
   }

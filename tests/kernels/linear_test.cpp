@@ -131,7 +131,7 @@ class Trial {
 
   /// Where number i of a row lies when it is rounded.
   std::size_t place(std::int64_t row, std::int64_t i, std::int64_t d) const {
-    return static_cast<std::size_t>(kernel_.rounded == RoundedLayout::tiles ? place_in_tiles(row, i, d) : row * d + i);
+    return static_cast<std::size_t>(rounded_place(kernel_.rounded, row, i, d));
   }
 
   /// Parts differ in width, so that items cross from one to the next; a gate and its up do not.

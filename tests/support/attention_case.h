@@ -67,8 +67,7 @@ struct Case {
     const std::int64_t d = (shape.d_head + gap) * n_head, n = static_cast<std::int64_t>(x.size());
     std::vector<std::uint16_t> result(static_cast<std::size_t>(kernels::rounded_count(layout, n / d, d)), 0xffff);
     for (std::int64_t i = 0; i < n; ++i) {
-      const bool in_tiles = layout == kernels::RoundedLayout::tiles;
-      const std::int64_t place = in_tiles ? kernels::place_in_tiles(i / d, i % d, d) : i;
+      const std::int64_t place = kernels::rounded_place(layout, i / d, i % d, d);
       result[static_cast<std::size_t>(place)] = to_bf16(x[static_cast<std::size_t>(i)]);
     }
     return result;

@@ -58,8 +58,10 @@ def convert_checkpoint(
     dropped = _match(checkpoint, plan, problems)
     problems.raise_any()
     dtype = _choose_dtype(checkpoint, plan, options.dtype)
+    if options.dtype == STORED:
+        plan.weights = [weight._replace(keep_f32=weight.keep_f32 or not weight.in_bf16) for weight in plan.weights]
     summary = Summary(out, arch, dtype, dropped=dropped, notes=checkpoint.notes)
-    _write(checkpoint, plan, summary, problems, options.dtype, progress)
+    _write(checkpoint, plan, summary, problems, progress)
     summary.n_bytes = os.path.getsize(out)
     return summary
 
@@ -142,20 +144,17 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
     return "f32"
 
 
-def _tensor_dtype(weight: Weight, stored: str, dtype: str, wanted: str) -> str:
+def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
     if weight.kind == TERNARY:
         return "i8"
-    keeps = weight.keep_f32 or (wanted == STORED and not weight.in_bf16)
-    exact = weight.kind not in (MATRIX, TABLE) or (keeps and stored == "F32")
+    exact = weight.kind not in (MATRIX, TABLE) or (weight.keep_f32 and stored == "F32")
     return "f32" if exact else dtype
 
 
-def _write(
-    checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, wanted: str, progress: Progress
-) -> None:
+def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
     tensors = [
-        TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype, wanted))
+        TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype))
         for w in plan.weights
     ]
     tensors += [
