@@ -10,7 +10,7 @@ disk; pi0 and pi05 3.5 G parameters, 14 GB of disk with the bundle and 20 GB of 
 parameters in the authors' layout, the third slot of the prompt empty; gr00t_n1_5, gr00t_n1_6 and gr00t_n1_7 about 3 G parameters,
 12 GB of disk with the bundle and 14 GB of memory.
 Every program runs in a process of its own: PyTorch in float32, PyTorch in the dtypes of the published file, vla-convert,
-vla.  The table that is printed goes to docs/models.md; the memory of vla is that of its answer, with --blocks of every
+vla in float32 and with the kernels that it chooses here.  The table that is printed goes to docs/models.md; the memory of vla is that of its answer, with --blocks of every
 block beside it.  Times are of one cold inference beside other work: no benchmark.
 """
 import argparse
@@ -130,7 +130,7 @@ def main():
     parser.add_argument("--case", type=Path, required=True, help="folder of the case; written where it has no checkpoint")
     parser.add_argument("--arch", default="smolvla", choices=sorted(a for a in families() if hasattr(family(a), "published")), help="of the checkpoint that is written")
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")
-    parser.add_argument("--dtype", default="bf16", choices=("f32", "bf16", "f16"), help="storage of the bundle's matrices")
+    parser.add_argument("--dtype", default="bf16", choices=("f32", "bf16", "f16", "stored"), help="storage of the bundle's matrices")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--blocks", action="store_true", help="also compare every block; costs memory and time")
     parser.add_argument("--only", help=argparse.SUPPRESS)  # one part, in a process of its own
@@ -153,10 +153,13 @@ def main():
     start = time.perf_counter()
     _, convert_peak = child([*convert, "--dtype", args.dtype, "--force", *cases.conversion_options(case)])
     convert_seconds = time.perf_counter() - start
-    taps, timing, peak = run_vla(args.vla, case, bundle, "*" if args.blocks else "chunk", case / "taps.gguf", args.threads)
-    chunk = taps["chunk"].reshape(reference["chunk"].shape[0], -1)[:, : reference["chunk"].shape[1]]
     rows = {f"PyTorch {d}": (r["chunk"], r["actions"], float(r["seconds"]), peaks[d]) for d, r in torch_runs.items()}
-    rows[f"vla, {args.dtype} bundle"] = (chunk, taps["actions"], sum(timing.values()) / 1e3, peak)
+    for kernels in (None, "float32"):
+        pattern = "*" if args.blocks and kernels else "chunk"
+        taps, timing, peak = run_vla(args.vla, case, bundle, pattern, case / "taps.gguf", args.threads, kernels=kernels)
+        chunk = taps["chunk"].reshape(reference["chunk"].shape[0], -1)[:, : reference["chunk"].shape[1]]
+        name = f"vla, {args.dtype} bundle, {kernels or 'its choice of'} kernels"
+        rows[name] = (chunk, taps["actions"], sum(timing.values()) / 1e3, peak)
     print_table(reference, rows)
     print(f"\nvla-convert: {convert_seconds:.0f} s, peak {convert_peak / 1e9:.2f} GB, bundle {bundle.stat().st_size / 1e9:.2f} GB")
     print("vla stages, ms: " + ", ".join(f"{k} {v:.0f}" for k, v in timing.items()))
