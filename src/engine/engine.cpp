@@ -31,14 +31,12 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
     robot->device_ = device;
     robot->tap_pattern_ = options.tap_pattern;
     robot->dry_ = options.dry;
+    robot->rounding_ = rounding_of(options.kernels);
     robot->all_plans_ = all_plans;
     VLA_CHECK(robot->take_injected(options.inject));
     VLA_CHECK(robot->load_policy(params));
   }
   VLA_CHECK(device->load(*params, !options.dry));
-  if (options.kernels == "bf16" && device->precision() == "f32")
-    return Error{Code::unsupported, "kernels bf16", "matrices that are stored as bf16", "none",
-                 "vla-convert --dtype bf16 rounds them"};
   for (const auto& robot : robots) VLA_CHECK(robot->make_graphs());
   if (!options.dry) device->touch();
   std::unique_ptr<Engine> first = std::move(robots.front());
@@ -349,7 +347,13 @@ std::string Engine::arithmetic() const {
   const std::string floats = device_->precision();
   if (floats == "int8") return "int8 products, as asked for: less exact than PyTorch's bf16";
   if (precision() == "int8") return "ternary products of int8, others " + floats;
-  return precision() == "bf16" ? "bf16 products, sums in float32; --kernels float32 avoids them" : "float32";
+  if (floats != "bf16") return "float32";
+  const auto& params = params_->params();
+  const auto n = std::count_if(params.begin(), params.end(), [&](const Param& param) {
+    return param.type() != DType::bf16 && resident_dtype(param, rounding_) == DType::bf16;
+  });
+  const std::string rounded = n > 0 ? fmt::format(" ({} matrices rounded to it, as asked for)", n) : "";
+  return fmt::format("bf16 products{}, sums in float32; --kernels float32 avoids them", rounded);
 }
 
 MemoryUse Engine::memory() const {

@@ -5,10 +5,12 @@
 #include <fmt/format.h>
 #include <ggml-cpu.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cstring>
 #include <vector>
 
+#include "base/bf16.h"
 #include "ggml/ggml_program.h"
 
 namespace vla {
@@ -32,17 +34,23 @@ ggml_type type_of(DType type) {
 }
 
 void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
-  if (type_of(param.source->type) == tensor->type)
-    return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
+  const DType type = param.type();
+  if (type_of(type) == tensor->type) return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
   std::vector<float> values(static_cast<std::size_t>(param.count()));
   if (param.storage == Storage::ternary)
     for (std::size_t i = 0; i < values.size(); ++i)
       values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
-  else if (param.source->type == DType::bf16)
+  else if (type == DType::f32)
+    std::memcpy(values.data(), data, param.source->data.size());
+  else if (type == DType::bf16)
     ggml_bf16_to_fp32_row(reinterpret_cast<const ggml_bf16_t*>(data), values.data(), param.count());
   else
     ggml_fp16_to_fp32_row(reinterpret_cast<const ggml_fp16_t*>(data), values.data(), param.count());
-  ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * sizeof(float));
+  if (tensor->type == GGML_TYPE_F32)
+    return ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * sizeof(float));
+  std::vector<std::uint16_t> rounded(values.size());
+  std::transform(values.begin(), values.end(), rounded.begin(), to_bf16);
+  ggml_backend_tensor_set(tensor, rounded.data(), 0, rounded.size() * sizeof(std::uint16_t));
 }
 
 }  // namespace
@@ -66,13 +74,13 @@ Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
   return std::unique_ptr<Device>(std::move(device));
 }
 
-Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name, bool rounds) {
+Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name, Rounding rounding) {
   set_guard(ggml_log_set, ggml_set_abort_callback);
   VLA_TRY(ggml_backend_dev_t found, find_device(name));
   auto device = std::make_unique<GgmlDevice>();
   device->n_thread_ = 1;  // the one that calls
   device->text_ = fmt::format("{}, {}", name.text(), ggml_backend_dev_description(found));
-  device->keeps_f16_ = name.kind == "vulkan", device->keeps_bf16_ = rounds;
+  device->keeps_f16_ = name.kind == "vulkan", device->rounding_ = rounding;
   Held& held = *device->held_;
   VLA_CHECK(device->guarded([&] { held.backend.reset(ggml_backend_dev_init(found, nullptr)); }));
   if (!held.backend) return Error{Code::device, name.text(), "a device that starts", "its driver refused it"};
@@ -94,13 +102,13 @@ GgmlDevice::~GgmlDevice() {
 /// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened unless that was
 /// asked for. Rows of a table are widened exactly when they are looked up.
 ggml_type GgmlDevice::resident_type(const Param& param) const {
-  if (param.source == nullptr) return GGML_TYPE_F32;
-  const ggml_type stored = type_of(param.source->type);
-  const bool kept = stored == GGML_TYPE_F16 ? keeps_f16_ : stored == GGML_TYPE_BF16 && keeps_bf16_;
-  return param.storage == Storage::table || (param.is_matrix() && kept) ? stored : GGML_TYPE_F32;
+  const ggml_type type = type_of(resident_dtype(param, rounding_));
+  const bool kept = type == GGML_TYPE_F16 ? keeps_f16_ : type == GGML_TYPE_BF16 && rounding_ == Rounding::bf16;
+  return param.storage == Storage::table || (param.is_matrix() && kept) ? type : GGML_TYPE_F32;
 }
 
 Status GgmlDevice::load(const ParamList& params, bool fill) {
+  VLA_CHECK(check_rounding(params, rounding_));
   if (!fill) memory().set_dry();
   VLA_TRY(weight_context_, make_context(params.params().size()));
   int n_f32 = 0, n_f16 = 0, n_bf16 = 0;

@@ -12,6 +12,7 @@
 #include "ggml/ggml_memory.h"
 #include "ggml/guard.h"
 #include "graph/device.h"
+#include "graph/rounding.h"
 
 namespace vla {
 
@@ -21,8 +22,9 @@ class GgmlDevice final : public Device {
  public:
   /// Errors: device.
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
-  /// A device of another kind. `rounds`: what matrices stored as bf16 multiply is rounded to it. Errors: device.
-  static Result<std::unique_ptr<Device>> open(const DeviceName& name, bool rounds);
+  /// A device of another kind, with Rounding::none or bf16: then what matrices of bf16 multiply is rounded to it too.
+  /// Errors: device.
+  static Result<std::unique_ptr<Device>> open(const DeviceName& name, Rounding rounding);
   ~GgmlDevice() override;
 
   Status load(const ParamList& params, bool fill) override;
@@ -91,8 +93,8 @@ class GgmlDevice final : public Device {
   std::unique_ptr<Held> held_ = std::make_unique<Held>();
   std::string text_;
   int n_thread_ = 0;
-  bool keeps_f16_ = false;   // its products of f16 weights are as exact as those of float32
-  bool keeps_bf16_ = false;  // its products of bf16 weights may round
+  bool keeps_f16_ = false;  // its products of f16 weights are as exact as those of float32
+  Rounding rounding_ = Rounding::none;
   std::string precision_ = "f32";
   ggml_context_ptr weight_context_;
   std::shared_ptr<void> weight_memory_;

@@ -38,10 +38,6 @@ inline bool rounds_to_bf16(Isa isa) { return isa >= Isa::avx512_bf16; }
 /// The same, or what takes its place where nothing may be rounded to bf16.
 inline Isa without_rounding(Isa isa) { return rounds_to_bf16(isa) ? Isa::avx512 : isa; }
 
-/// A name of `--kernels` beside those of choose_isa: the best of the machine, with int8 products in place of float
-/// ones.
-constexpr const char* kInt8Kernels = "int8";
-
 /// The kernels by name: of an Isa, or "float32" for the best that round nothing to bf16, or "bf16" for the best that
 /// do. An empty name takes the best.
 /// Errors: usage for an unknown name, device for one that the machine cannot run.

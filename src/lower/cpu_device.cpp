@@ -33,8 +33,8 @@ Status check_attention(const Graph& graph) {
 
 }  // namespace
 
-Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa, bool quantizes) {
-  std::unique_ptr<CpuDevice> device(new CpuDevice(isa, quantizes));
+Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa, Rounding rounding) {
+  std::unique_ptr<CpuDevice> device(new CpuDevice(isa, rounding));
   VLA_TRY(device->executor_, kernels::Executor::shared(n_thread));
   return std::unique_ptr<Device>(std::move(device));
 }
@@ -43,8 +43,8 @@ std::string CpuDevice::name() const { return fmt::format("cpu, {} thread{}", n_t
 
 Status CpuDevice::load(const ParamList& params, bool fill) {
   min_rounded_keys_ = min_rounded_keys(params);
-  isa_ = isa_for(params, isa_);
-  VLA_TRY(weights_, CpuWeights::load(params, {isa_, quantizes_, n_thread(), fill}));
+  isa_ = isa_for(params, isa_, rounding_);
+  VLA_TRY(weights_, CpuWeights::load(params, {isa_, rounding_, n_thread(), fill}));
   return {};
 }
 

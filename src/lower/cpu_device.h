@@ -14,7 +14,7 @@ namespace vla::lower {
 class CpuDevice final : public Device {
  public:
   /// Errors: device.
-  static Result<std::unique_ptr<Device>> open(int n_thread, Isa isa, bool quantizes);
+  static Result<std::unique_ptr<Device>> open(int n_thread, Isa isa, Rounding rounding);
 
   Status load(const ParamList& params, bool fill) override;
   Status allocate(Slots& slots) override;
@@ -25,7 +25,9 @@ class CpuDevice final : public Device {
   std::string name() const override;
   int n_thread() const override { return executor_->n_thread(); }
   std::string kernels() const override { return isa_name(isa_); }
-  std::string precision() const override { return quantizes_ ? "int8" : rounds_to_bf16(isa_) ? "bf16" : "f32"; }
+  std::string precision() const override {
+    return rounding_ == Rounding::int8 ? "int8" : rounds_to_bf16(isa_) ? "bf16" : "f32";
+  }
   const std::string& linear_kernels() const override { return weights_.text(); }
   std::size_t weights_size() const override { return weights_.size(); }
   std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }
@@ -34,10 +36,10 @@ class CpuDevice final : public Device {
   void touch() override;
 
  private:
-  CpuDevice(Isa isa, bool quantizes) : isa_(isa), quantizes_(quantizes) {}
+  CpuDevice(Isa isa, Rounding rounding) : isa_(isa), rounding_(rounding) {}
 
   Isa isa_;
-  const bool quantizes_;
+  const Rounding rounding_;
   std::int64_t min_rounded_keys_ = 0;
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<KindClock> clock_ = std::make_shared<KindClock>();

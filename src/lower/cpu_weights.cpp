@@ -17,10 +17,11 @@
 
 namespace vla {
 
-Isa isa_for(const ParamList& list, Isa isa) {
+Isa isa_for(const ParamList& list, Isa isa, Rounding rounding) {
   const auto& params = list.params();
-  const auto rounds = [](const Param& param) {
-    return param.storage == Storage::matrix && param.type() == DType::bf16;
+  const auto rounds = [&](const Param& param) {
+    const DType type = resident_dtype(param, rounding);
+    return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8);
   };
   return std::any_of(params.begin(), params.end(), rounds) ? isa : without_rounding(isa);
 }
@@ -34,18 +35,19 @@ std::int64_t min_rounded_keys(const ParamList& list) {
 namespace lower {
 namespace {
 
-/// Products from or to fewer numbers take no time worth an error. Padded states and actions of robots have up to 132
-/// numbers (GR00T N1.7).
-constexpr std::int64_t kMinQuantized = 144;
-
-bool becomes_int8(const Param& param, bool quantizes) {
-  return quantizes && param.storage == Storage::matrix && std::min(param.shape[0], param.shape[1]) >= kMinQuantized;
+/// The matrix as it is multiplied.
+kernels::MatrixDesc desc_of(const Param& param, DType type) {
+  return {type, param.shape[0], param.shape[1], param.storage == Storage::ternary};
 }
 
-/// The matrix as it is multiplied.
-kernels::MatrixDesc desc_of(const Param& param, bool quantizes) {
-  const DType type = becomes_int8(param, quantizes) ? DType::i8 : param.type();
-  return {type, param.shape[0], param.shape[1], param.storage == Storage::ternary};
+/// Ternary matrices have one scale, which is a parameter.
+bool has_scales(const Param& param, DType type) { return type == DType::i8 && param.storage == Storage::matrix; }
+
+void round_to_bf16(DType type, const std::byte* stored, std::int64_t n, std::byte* to) {
+  for (std::int64_t i = 0; i < n; ++i) {
+    const std::uint16_t rounded = to_bf16(kernels::stored_number(type, stored, i));
+    std::memcpy(to + static_cast<std::int64_t>(sizeof(rounded)) * i, &rounded, sizeof(rounded));
+  }
 }
 
 /// Rows of a matrix in a part that is read and packed at a time: whole panels of every kernel.
@@ -61,18 +63,19 @@ struct PackTask : kernels::Task {
     std::span<const std::byte> from;
     const kernels::LinearKernel* kernel;  // null: a copy
     std::byte* to;
-    DType stored = DType::f32;  // of what is quantized
-    float* scales = nullptr;    // where something is
+    DType stored = DType::f32;
+    float* scales = nullptr;  // of int8
+    bool is_rounded() const { return kernel != nullptr && desc.type != stored; }
   };
   const Bundle* bundle;
   std::vector<Part> parts;
-  mutable std::vector<Room> rooms, codes;  // of each worker
+  mutable std::vector<Room> rooms, rounded;  // of each worker
   mutable std::atomic<bool> has_failed = false;
 
-  void add(const Param& param, const kernels::LinearKernel* kernel, std::byte* to, float* scales) {
+  void add(const Param& param, DType type, const kernels::LinearKernel* kernel, std::byte* to, float* scales) {
     const std::span<const std::byte> all = param.source->data;
     if (kernel == nullptr) return parts.push_back({{}, all, nullptr, to});
-    kernels::MatrixDesc desc = desc_of(param, scales != nullptr);
+    kernels::MatrixDesc desc = desc_of(param, type);
     const std::int64_t n_row = desc.d_out, row = static_cast<std::int64_t>(all.size()) / n_row;
     const std::int64_t step = kernels::round_up(kPartSize / row + 1, kPartRows);
     for (std::int64_t first = 0; first < n_row; first += step) {
@@ -86,16 +89,20 @@ struct PackTask : kernels::Task {
   }
 
   void run(std::int64_t item, kernels::Worker& worker) const override {
-    const auto& [desc, from, kernel, to, stored, scales] = parts[static_cast<std::size_t>(item)];
+    const Part& part = parts[static_cast<std::size_t>(item)];
+    const auto& [desc, from, kernel, to, stored, scales] = part;
     const auto i = static_cast<std::size_t>(worker.index);
     const std::byte* read = bundle->content()->read(from, rooms[i]);
     if (read == nullptr) {
       has_failed = true;
-    } else if (scales != nullptr) {
-      std::byte* const quantized = codes[i].take(size_of_codes(desc) + row_size(desc));
-      auto* const row = reinterpret_cast<float*>(quantized + size_of_codes(desc));
-      kernels::quantize_weights(stored, read, desc.d_in, desc.d_out, quantized, scales, row);
-      kernel->pack(desc, quantized, to);
+    } else if (part.is_rounded()) {
+      std::byte* const numbers = rounded[i].take(rounded_size(desc) + row_size(desc));
+      auto* const row = reinterpret_cast<float*>(numbers + rounded_size(desc));
+      if (scales != nullptr)
+        kernels::quantize_weights(stored, read, desc.d_in, desc.d_out, numbers, scales, row);
+      else
+        round_to_bf16(stored, read, desc.d_in * desc.d_out, numbers);
+      kernel->pack(desc, numbers, to);
     } else if (kernel != nullptr) {
       kernel->pack(desc, read, to);
     } else {
@@ -103,8 +110,8 @@ struct PackTask : kernels::Task {
     }
   }
 
-  static std::size_t size_of_codes(const kernels::MatrixDesc& desc) {
-    return aligned(static_cast<std::size_t>(desc.d_in * desc.d_out));
+  static std::size_t rounded_size(const kernels::MatrixDesc& desc) {
+    return aligned(static_cast<std::size_t>(desc.d_in * desc.d_out) * dtype_size(desc.type));
   }
   static std::size_t row_size(const kernels::MatrixDesc& desc) {
     return static_cast<std::size_t>(desc.d_in) * sizeof(float);
@@ -124,11 +131,7 @@ std::string describe(const std::map<std::string, std::map<std::string, int>>& co
 }  // namespace
 
 Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& options) {
-  const auto& all = list.params();
-  if (options.quantizes &&
-      std::none_of(all.begin(), all.end(), [](const Param& param) { return becomes_int8(param, true); }))
-    return Error{Code::unsupported, "kernels int8", "matrices of floats that are worth quantizing", "none",
-                 "leave --kernels out"};
+  VLA_CHECK(check_rounding(list, options.rounding));
   CpuWeights weights;
   std::map<std::string, std::map<std::string, int>> counts;
   std::vector<std::size_t> offsets;
@@ -139,11 +142,12 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
     Place place;
     offsets.push_back(size);
     if (param.is_matrix()) {
-      const kernels::MatrixDesc desc = desc_of(param, options.quantizes);
+      place.type = resident_dtype(param, options.rounding);
+      const kernels::MatrixDesc desc = desc_of(param, place.type);
       place.kernel = kernels::choose_linear(desc, options.isa);
       ++counts[place.kernel->name][param.storage == Storage::ternary ? "ternary" : dtype_name(param.type())];
       size += aligned(place.kernel->packed_size(desc));
-      if (becomes_int8(param, options.quantizes)) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));
+      if (has_scales(param, place.type)) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));
     } else if (param.storage == Storage::vector) {
       size += aligned(static_cast<std::size_t>(param.count()) * sizeof(float));
     } else if (param.source != nullptr) {
@@ -161,19 +165,19 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
     if (param.storage == Storage::table) continue;
     Place& place = weights.places_[static_cast<std::size_t>(param.id)];
     place.data = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
-    if (becomes_int8(param, options.quantizes))
-      place.scales = reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc_of(param, true))));
-    if (options.fill) task.add(param, place.kernel, place.data, place.scales);
+    if (has_scales(param, place.type))
+      place.scales =
+          reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc_of(param, place.type))));
+    if (options.fill) task.add(param, place.type, place.kernel, place.data, place.scales);
   }
   if (task.parts.empty()) return weights;
   VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(options.n_thread));
   task.rooms.resize(static_cast<std::size_t>(executor->n_thread()));
-  task.codes.resize(task.rooms.size());
+  task.rounded.resize(task.rooms.size());
   for (const PackTask::Part& part : task.parts)  // a worker must not run out of memory
     for (std::size_t i = 0; i < task.rooms.size(); ++i) {
       task.rooms[i].take(Content::room_for(part.from.size()));
-      if (part.scales != nullptr)
-        task.codes[i].take(PackTask::size_of_codes(part.desc) + PackTask::row_size(part.desc));
+      if (part.is_rounded()) task.rounded[i].take(PackTask::rounded_size(part.desc) + PackTask::row_size(part.desc));
     }
   task.n_item = static_cast<std::int64_t>(task.parts.size());
   const kernels::Phase phase = {{&task}, nullptr};

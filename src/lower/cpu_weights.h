@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "bundle/params.h"
+#include "graph/rounding.h"
 #include "kernels/linear_kernel.h"
 #include "lower/table_rows.h"
 
@@ -17,22 +18,24 @@ namespace vla::lower {
 using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 
 /// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in panels, in the bundle's dtype or
-/// quantized; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
+/// rounded; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
 class CpuWeights {
  public:
   struct Options {
     Isa isa;
-    bool quantizes;  // large matrices of floats to int8 (kernels/quantize_weights.h)
+    Rounding rounding;
     int n_thread;
     bool fill = true;  // else memory is reserved and never touched
   };
   /// Every parameter must have its source. Errors: out_of_memory, bad_bundle where the file has been changed since it
-  /// was opened, unsupported where nothing is worth quantizing.
+  /// was opened, unsupported where nothing is worth rounding (graph/rounding.h).
   static Result<CpuWeights> load(const ParamList& list, const Options& options);
 
   const std::byte* data(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].data; }
   /// Of each column of the product, where the matrix was quantized when it was loaded; else null.
   const float* scales(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].scales; }
+  /// Of its numbers in memory.
+  DType type(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].type; }
   /// What multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* param) const {
     return places_[static_cast<std::size_t>(param->id)].kernel;
@@ -52,6 +55,7 @@ class CpuWeights {
  private:
   struct Place {
     std::byte* data = nullptr;
+    DType type = DType::f32;
     const kernels::LinearKernel* kernel = nullptr;
     float* scales = nullptr;
   };

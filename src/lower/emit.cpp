@@ -222,7 +222,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
   for (const Node* node : linear.linears) {
     const auto& product = *node->as<op::Linear>();
     kernels::LinearJob::Part& part = job.part[job.n_part++];
-    part.type = product.weight->type();
+    part.type = l.weights.type(product.weight);
     part.weight = l.weights.data(product.weight);
     const auto vector = [&](const Param* param) {
       return param != nullptr ? reinterpret_cast<const float*>(l.weights.data(param)) : nullptr;
@@ -392,8 +392,8 @@ Work work_of(const Lowering& l, const FusedOp& op) {
   if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
     for (const Node* node : linear->linears) {
       const auto& product = *node->as<op::Linear>();
-      const DType type = l.weights.scales(product.weight) != nullptr ? DType::i8 : product.weight->type();
-      work.weights += static_cast<double>(product.weight->stored_count()) * static_cast<double>(dtype_size(type));
+      work.weights += static_cast<double>(product.weight->stored_count()) *
+                      static_cast<double>(dtype_size(l.weights.type(product.weight)));
       if (product.bias != nullptr) work.weights += 4.0 * static_cast<double>(product.bias->shape[0]);
     }
     work.bytes += work.weights;

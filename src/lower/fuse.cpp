@@ -210,12 +210,14 @@ class Fuser {
     return known->second = id;
   }
 
-  /// Whether a matrix that is stored as float32 or float16 made it.
-  static bool comes_from_floats(Tensor x) {
+  /// Whether a matrix made it that is float32 or float16 in memory.
+  bool comes_from_floats(Tensor x) const {
     const Node* node = x.node();
     while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();
     const auto* product = node->as<op::Linear>();
-    return product != nullptr && (product->weight->type() == DType::f32 || product->weight->type() == DType::f16);
+    if (product == nullptr) return false;
+    const DType type = l.weights.type(product->weight);
+    return type == DType::f32 || type == DType::f16;
   }
 
   void visit_attention(const Node& node) {

@@ -23,21 +23,21 @@ int usable_cores() {
 
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device) {
   VLA_TRY(const DeviceName name, DeviceName::parse(device));
+  const Rounding rounding = rounding_of(kernels);
   if (name.kind != "cpu") {
-    const bool rounds = kernels == "bf16";
-    if (rounds || kernels.empty() || kernels == "float32" || kernels == isa_name(Isa::ggml))
-      return GgmlDevice::open(name, rounds);
+    if (rounding == Rounding::bf16 || kernels.empty() || kernels == "float32" || kernels == isa_name(Isa::ggml))
+      return GgmlDevice::open(name, rounding);
     return Error{Code::usage, "kernels", fmt::format("none, float32, bf16 or ggml with device {}", name.text()),
                  kernels, "other kernels are the CPU's"};
   }
-  const bool quantizes = kernels == kInt8Kernels;
-  VLA_TRY(const Isa isa, choose_isa(quantizes ? "" : kernels));
-  if (quantizes && isa == Isa::ggml)
+  const bool to_int8 = rounding == Rounding::int8;
+  VLA_TRY(const Isa isa, choose_isa(to_int8 ? "" : kernels));
+  if (to_int8 && isa == Isa::ggml)
     return Error{Code::device, "kernels", "a machine with AVX2", kernels, "leave the choice to the program"};
   if (n_thread <= 0) n_thread = usable_cores();
   if (n_thread > kMaxThreads)
     return Error{Code::device, "threads", fmt::format("at most {}", kMaxThreads), std::to_string(n_thread)};
-  return isa == Isa::ggml ? GgmlDevice::cpu(n_thread) : lower::CpuDevice::open(n_thread, isa, quantizes);
+  return isa == Isa::ggml ? GgmlDevice::cpu(n_thread) : lower::CpuDevice::open(n_thread, isa, rounding);
 }
 
 DeviceList list_devices() {

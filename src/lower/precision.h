@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "bundle/params.h"
+#include "graph/rounding.h"
 #include "kernels/isa.h"
 
 namespace vla {
@@ -10,8 +10,8 @@ namespace vla {
 /// The kernels that compute with these parameters on a machine for `isa`. Tiles of bf16 round whatever they multiply.
 /// A bundle asks for that by storing matrices as bf16: those are multiplied so, and attention of queries that they make
 /// rounds too. Matrices of another dtype, and attention of their queries, are float32, as they are in PyTorch: pi0's
-/// tower beside its language model. Without any of bf16 everything is.
-Isa isa_for(const ParamList& list, Isa isa);
+/// tower beside its language model. Without any of bf16 everything is. What is rounded counts as it is in memory.
+Isa isa_for(const ParamList& list, Isa isa, Rounding rounding = Rounding::none);
 
 /// Attention over fewer keys rounds nothing on any machine: it takes little time, and each output mixes so few values
 /// that their errors hardly cancel. Between ternary products they must cancel better: a number that is rounded before

@@ -17,6 +17,8 @@ using namespace vla::test;
 namespace {
 
 const std::string kBundle = golden_path("smolvla/two_views/bundle.gguf");
+/// The shipped policy has matrices that are worth rounding.
+const std::string kShipped = VLA_SOURCE_DIR "/models/metaworld-tiny.gguf";
 
 /// The kernels for a bundle on a machine for `isa`.
 Isa isa_of(const std::string& path, Isa isa) {
@@ -27,9 +29,9 @@ Isa isa_of(const std::string& path, Isa isa) {
   return isa_for(list, isa);
 }
 
-/// The golden bundle, whose matrices are bf16, with the same numbers of one tensor, or of all, in float32.
-std::string widened(const std::string& name) {
-  EditableBundle bundle = EditableBundle::read(kBundle);
+/// A bundle whose matrices are bf16, with the same numbers of one tensor, or of all, in float32.
+std::string widened(const std::string& name, const std::string& path = kBundle) {
+  EditableBundle bundle = EditableBundle::read(path);
   int n = 0;
   for (EditableBundle::Piece& piece : bundle.tensors) {
     if (piece.type != DType::bf16 || (name != "all" && piece.name != name)) continue;
@@ -74,15 +76,20 @@ TEST_CASE("an engine tells the kernels and the precision of its bundle, not thos
   CHECK(load_engine(kBundle)->arithmetic().find("int8") == std::string::npos);
 }
 
-TEST_CASE("bf16 that is asked for by name needs matrices of bf16" *
-          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+TEST_CASE(
+    "bf16 that is asked for by name rounds large matrices, tells it, and is refused where there is nothing to round" *
+    doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
   EngineOptions options;
   options.kernels = "bf16";
   const auto refused = Engine::load(widened("all"), options);
   REQUIRE(!refused.ok());
   CHECK(refused.error().code == Code::unsupported);
-  CHECK(refused.error().message().find("kernels bf16: expected matrices that are stored as bf16") != std::string::npos);
-  CHECK(Engine::load(kBundle, options).ok());
+  CHECK(refused.error().message().find("kernels bf16: expected matrices of bf16") != std::string::npos);
+  CHECK(load_engine(kBundle, "", "bf16")->arithmetic() == load_engine(kBundle)->arithmetic());
+  const auto rounded = load_engine(widened("all", kShipped), "", "bf16");
+  CHECK(rounded->precision() == "bf16");
+  CHECK(rounded->arithmetic().find("63 matrices rounded to it, as asked for") != std::string::npos);
+  CHECK(load_engine(widened("all", kShipped))->arithmetic() == "float32");
 }
 
 TEST_CASE("a matrix of another dtype is multiplied in float32, and the others in bf16 as before" *
@@ -96,7 +103,7 @@ TEST_CASE("a matrix of another dtype is multiplied in float32, and the others in
 
 TEST_CASE("an engine tells that matrices were quantized, as somebody asked" *
           doctest::skip(usable_isas().back() == Isa::ggml)) {
-  const auto engine = load_engine(VLA_SOURCE_DIR "/models/metaworld-tiny.gguf", "", kInt8Kernels);
+  const auto engine = load_engine(kShipped, "", kInt8Kernels);
   CHECK(engine->precision() == "int8");
   CHECK(engine->arithmetic().find("as asked") != std::string::npos);
   CHECK(!engine->has_ternary());

@@ -11,9 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gguf import GGUFReader
 from golden_cases import FLOAT32, NAMES, ROOT, Golden, tensors
 from conftest import BINARY, KIND
 from program import EXIT
+from vla_cpp.convert import read_bundle
+from vla_cpp.convert.bundle import ARRAY, CHECKSUM_KEY, SCALARS, STRING, BundleWriter, Key, TensorInfo
 
 DEVICE = ["--device", KIND]
 LIMITS_OF_VULKAN = pytest.mark.skipif(KIND != "vulkan", reason="only Vulkan's buffers can be made small")
@@ -45,6 +48,38 @@ def test_in_bf16_the_chunk_is_nearer_to_float32_than_pytorchs_bf16(vla, name, tm
     error, allowed = (np.abs(chunk - expected["chunk"]) for chunk in (ours, expected["chunk.bf16"]))
     assert 0 < np.sqrt(np.mean(error**2)) <= np.sqrt(np.mean(allowed**2))
     assert error.max() <= allowed.max()
+
+
+def widened(bundle, path):
+    """A bundle with its bf16 tensors, number by number, in float32."""
+    kinds = {number: kind for kind, (number, _) in SCALARS.items()} | {STRING: "string"}
+    fields = [field for name, field in GGUFReader(bundle).fields.items() if not name.startswith("GGUF.") and name != CHECKSUM_KEY]
+    kind = lambda types: kinds[types[0]] if types[0] != ARRAY else kinds[types[1]] + "[]"  # noqa: E731
+    keys = [Key(field.name, kind([int(t) for t in field.types]), field.contents()) for field in fields]
+    content = read_bundle(str(bundle))
+    wide = {
+        name: (tensor.astype(np.uint32) << 16).view(np.float32) if content.dtypes[name] == "bf16" else tensor
+        for name, tensor in content.tensors.items()
+    }
+    dtypes = {name: "f32" if dtype == "bf16" else dtype for name, dtype in content.dtypes.items()}
+    with BundleWriter(str(path), keys, [TensorInfo(name, t.shape, dtypes[name]) for name, t in wide.items()]) as out:
+        for name, tensor in wide.items():
+            out.write(name, tensor)
+    return path
+
+
+def test_in_bf16_large_matrices_of_float32_are_rounded_and_the_answer_tells_it(vla, tmp_path):
+    stored = ROOT / "models/metaworld-tiny.gguf"
+    wide = widened(stored, tmp_path / "wide.gguf")
+    frame = ROOT / "examples/metaworld/episodes/faucet-open/step_00.png"
+    seen = ["--image", f"corner4={frame}", "--state", "0.0045,0.4003,0.1957,1", "--text", "open the faucet", "--seed", "1"]
+    run = lambda bundle, *options: vla("run", bundle, *seen, *DEVICE, *options, limit=LIMIT)  # noqa: E731
+    rounded, kept = run(wide, "--kernels", "bf16"), run(stored, "--kernels", "bf16")
+    assert "63 matrices rounded to it, as asked for" in rounded.out, rounded.out
+    assert "rounded to it" not in kept.out
+    assert rounded.out.splitlines()[1] != run(wide).out.splitlines()[1]
+    inspected = vla("inspect", wide, *DEVICE, "--kernels", "bf16", limit=LIMIT).out
+    assert "63 bf16" in inspected, inspected
 
 
 @pytest.mark.parametrize("name", ["smolvla/two_views", "bitvla/" + next(n for n in NAMES if "bitvla" in n).split("/")[1]])

@@ -1,7 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// Matrices of floats that are quantized when they are loaded, because somebody asked for it.
+// Matrices of floats that are rounded when they are loaded, because somebody asked for it.
+#include "graph/rounding.h"
 #include "kernels/isa.h"
 #include "nn/linear.h"
 #include "nn/tokens.h"
@@ -15,20 +16,23 @@ namespace {
 
 constexpr int kWide = 300, kNarrow = 160, kAction = 32;
 
+/// Numbers that f16 and float32 hold alike.
 ParamSet::Piece piece(const std::string& name, const std::vector<std::int64_t>& shape, DType type = DType::bf16) {
   std::int64_t count = 1;
   for (const std::int64_t n : shape) count *= n;
-  return {name, shape, ramp(static_cast<std::size_t>(count), 0.1f), type};
+  std::vector<float> values = ramp(static_cast<std::size_t>(count), 0.1f);
+  store_as(DType::f16, values);
+  return {name, shape, std::move(values), type};
 }
-std::vector<ParamSet::Piece> pieces(DType type) {
-  return {piece("up.weight", {kNarrow, kWide}, type),       piece("up.bias", {kWide}, DType::f32),
-          piece("down.weight", {kWide, kNarrow}, type),     piece("down.bias", {kNarrow}, DType::f32),
-          piece("action.weight", {kNarrow, kAction}, type), piece("action.bias", {kAction}, DType::f32)};
+std::vector<ParamSet::Piece> pieces(DType type, DType small) {
+  return {piece("up.weight", {kNarrow, kWide}, type),        piece("up.bias", {kWide}, DType::f32),
+          piece("down.weight", {kWide, kNarrow}, type),      piece("down.bias", {kNarrow}, DType::f32),
+          piece("action.weight", {kNarrow, kAction}, small), piece("action.bias", {kAction}, DType::f32)};
 }
 
 /// An MLP with its norm and its residual.
-std::vector<float> mlp(const std::string& kernels, DType type) {
-  ParamSet set(pieces(type));
+std::vector<float> mlp(const std::string& kernels, DType type, DType small) {
+  ParamSet set(pieces(type, small));
   const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
       action(set.scope("action"), kNarrow, kAction, Bias::yes);
   return run_graph(
@@ -42,6 +46,8 @@ std::vector<float> mlp(const std::string& kernels, DType type) {
       },
       kernels);
 }
+
+std::vector<float> mlp(const std::string& kernels, DType type) { return mlp(kernels, type, type); }
 
 bool lacks_kernels() { return usable_isas().back() == Isa::ggml; }
 
@@ -70,7 +76,7 @@ VLA_QUANTIZED_TEST(
 }
 
 VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number") {
-  ParamSet set(pieces(DType::bf16));
+  ParamSet set(pieces(DType::bf16, DType::bf16));
   const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
       action(set.scope("action"), kNarrow, kAction, Bias::yes);
   GraphRunner floats(set.list(), ""), quantized(set.list(), kInt8Kernels);
@@ -80,15 +86,36 @@ VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number
   CHECK(quantized.device().weights_size() < 0.7 * static_cast<double>(floats.device().weights_size()));
 }
 
-VLA_QUANTIZED_TEST("a policy with nothing to quantize is refused") {
-  ParamSet set({piece("action.weight", {kNarrow, kAction}), piece("action.bias", {kAction}, DType::f32)});
+VLA_QUANTIZED_TEST("a policy with nothing to round is refused, before any memory is taken") {
+  ParamSet set({piece("action.weight", {kNarrow, kAction}, DType::f32), piece("action.bias", {kAction}, DType::f32)});
   const Linear action(set.scope("action"), kNarrow, kAction, Bias::yes);
-  const auto device = open_device(1, kInt8Kernels);
-  REQUIRE(device.ok());
-  const Status loaded = (*device)->load(set.list(), true);
-  REQUIRE(!loaded.ok());
-  CHECK(loaded.error().code == Code::unsupported);
-  CHECK(loaded.error().message().find("quantizing") != std::string::npos);
+  for (const std::string kernels : {kInt8Kernels, kBf16Kernels}) {
+    if (kernels == kBf16Kernels && !rounds_to_bf16(usable_isas().back())) continue;
+    const auto device = open_device(1, kernels);
+    REQUIRE(device.ok());
+    const Status loaded = (*device)->load(set.list(), true);
+    REQUIRE(!loaded.ok());
+    CHECK(loaded.error().code == Code::unsupported);
+    CHECK(loaded.error().message().find("kernels " + kernels) != std::string::npos);
+    CHECK((*device)->weights_size() == 0);
+  }
+}
+
+TEST_CASE("large matrices rounded to bf16 are those of a bundle that stores them so, and small ones stay" *
+          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+  for (const DType type : {DType::f32, DType::f16}) {
+    CAPTURE(dtype_name(type));
+    CHECK(mlp(kBf16Kernels, type) == mlp("", DType::bf16, type));
+    CHECK(mlp("", type) != mlp(kBf16Kernels, type));
+  }
+  ParamSet set(pieces(DType::f32, DType::f32));
+  const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
+      action(set.scope("action"), kNarrow, kAction, Bias::yes);
+  GraphRunner floats(set.list(), ""), rounded(set.list(), kBf16Kernels);
+  CHECK(floats.device().precision() == "f32");
+  CHECK(rounded.device().precision() == "bf16");
+  CHECK(rounded.device().linear_kernels().find(rounded.device().kernels() + " (2 f32)") != std::string::npos);
+  CHECK(rounded.device().weights_size() < 0.6 * static_cast<double>(floats.device().weights_size()));
 }
 
 TEST_CASE("other devices take no int8") {

@@ -4,6 +4,7 @@
 // How activations lie between products on a machine with AMX, or on one that is emulated (test_amx_machine).
 #include <fmt/format.h>
 
+#include "graph/rounding.h"
 #include "lower_case.h"
 #include "nn/linear.h"
 #include "support/kernel_rows.h"

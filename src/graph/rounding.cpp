@@ -1,0 +1,31 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "graph/rounding.h"
+
+#include <algorithm>
+
+namespace vla {
+
+Rounding rounding_of(const std::string& kernels) {
+  return kernels == kInt8Kernels ? Rounding::int8 : kernels == kBf16Kernels ? Rounding::bf16 : Rounding::none;
+}
+
+DType resident_dtype(const Param& param, Rounding rounding) {
+  constexpr std::int64_t kMinRounded = 144;
+  const bool keeps = rounding == Rounding::none || param.storage != Storage::matrix ||
+                     std::min(param.shape[0], param.shape[1]) < kMinRounded;
+  return keeps ? param.type() : rounding == Rounding::int8 ? DType::i8 : DType::bf16;
+}
+
+Status check_rounding(const ParamList& list, Rounding rounding) {
+  if (rounding == Rounding::none) return {};
+  const bool to_int8 = rounding == Rounding::int8;
+  for (const Param& param : list.params())
+    if (param.storage == Storage::matrix && resident_dtype(param, rounding) == (to_int8 ? DType::i8 : DType::bf16))
+      return {};
+  return Error{Code::unsupported, to_int8 ? "kernels int8" : "kernels bf16",
+               to_int8 ? "matrices of floats that are worth quantizing" : "matrices of bf16, or others worth rounding",
+               "none", "leave --kernels out"};
+}
+
+}  // namespace vla
