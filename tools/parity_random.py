@@ -29,7 +29,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import bitvla, cases, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, smolvla
+from goldens import bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, smolvla
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -94,6 +94,37 @@ def draw_pi(arch, seed):
     vision = pi.tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)))
     checkpoint = pi.Checkpoint(arch, policy, vision, lm, expert, views, d_state, d_action)
     return cases.Case(seed, frames, r.choice(TEXTS), checkpoint)
+
+
+def draw_evo1(seed):
+    """The same for Evo-1, in either published layout: three slots for views, rows of absent ones and of pads masked or not."""
+    r = random.Random(f"evo1 {seed}")
+    grid, kv, vision_heads = 2 * r.choice((1, 2, 2, 3)), r.choice((1, 2, 3)), r.choice((1, 2, 3, 5))
+    heads = kv * r.choice((1, 2, 3))
+    d_model = heads * r.choice((8, 12, 16))
+    kept, d_state, d_action = r.randint(1, 4), r.randint(1, 24), r.randint(1, 24)
+    vision = evo1.tower(vision_heads * r.choice((6, 8, 10, 12)), r.randint(1, 3), vision_heads, r.choice((24, 50)), layer_norm_eps=r.choice((1e-6, 1e-5)))
+    text = evo1.decoder(d_model, kept + r.choice((0, 0, 2)), heads, kv, r.choice((32, 50)), rope_theta=r.choice((1e4, 1e6)), rms_norm_eps=r.choice((1e-6, 1e-5)))
+    head = evo1.head(r.randint(1, 3), r.choice([n for n in (1, 2, 3, 4, 6) if d_model % n == 0]), r.choice((20, 44)), r.choice((24, 36)))
+    n_token = 3 * (grid // 2) ** 2 + r.choice((24, 40, 64))
+    views = {f"cam{i}": (r.randint(12, 90), r.randint(12, 90)) for i in range(r.randint(1, 3))}
+    frames = {view: (*size, r.choice(("png", "png", "jpg"))) for view, size in views.items()}
+    if len(frames) > 1 and r.random() < 0.5:
+        frames[r.choice(list(frames))] = None
+    sizes, rest = (14 * grid, vision, text, kept, head), {"d_state": d_state, "d_action": d_action}
+    words = r.choice(("go", "Pick up the red_cube!", "naïve café 漢字 n° 5", "word " * 20))
+    if r.random() < 0.5:
+        n_empty, width = sum(frame is None for frame in frames.values()), r.choice((0, 3))
+        policy = evo1.policy(r.randint(1, 12), n_token, d_state + width, d_action + width, num_inference_timesteps=r.choice((1, 4, 10)),
+                             vlm_dtype=r.choice(("float32", "bfloat16")), max_views=3, empty_cameras=n_empty,
+                             normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)})
+        frames |= {f"empty_camera_{i}": None for i in range(n_empty)}
+        return cases.Case(seed, frames, words, evo1.Checkpoint("lerobot", *sizes, policy, views, **rest))
+    keys, revision = r.choice((("sawyer",), ("aloha_joint", "robotwin_stack"))), r.choice(("r1", "r2"))
+    normalization = r.choice(("bounds", "bounds_q99", "normal")) if len(keys) > 1 and revision == "r2" else "bounds"
+    options = evo1.said(revision, r.choice(("zero_attention", "causal_attention")), views)
+    checkpoint = evo1.Checkpoint("authors", *sizes, evo1.policy(r.randint(1, 12), n_token), views, **rest, normalization=normalization, keys=keys)
+    return cases.Case(seed, frames, words, checkpoint, options=options)
 
 
 def draw_bitvla(seed):
@@ -269,12 +300,18 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
+def drawn_case(arch, seed):
+    if arch in ("smolvla", "evo1"):
+        return (draw if arch == "smolvla" else draw_evo1)(seed)
+    return (draw_pi if arch.startswith("pi") else draw_gr00t)(arch, seed)
+
+
 def compare(arch, seed, vla, folder, dtype):
     """`dtype` of the bundle: f32, or bf16 or stored to compare what rounding costs."""
     if arch == "bitvla":
         return compare_bitvla(seed, vla, folder)
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
-        drawn = draw(seed) if arch == "smolvla" else draw_pi(arch, seed) if arch.startswith("pi") else draw_gr00t(arch, seed)
+        drawn = drawn_case(arch, seed)
         expected, stopped = run_reference(drawn, folder, low_bits=dtype == "bf16")
         published = recorder.run_case(folder, "published") if dtype != "f32" and expected else None
     got, refused = run_runtime(vla, folder, dtype, kernels="" if dtype == "stored" else "float32")
@@ -285,7 +322,7 @@ def compare(arch, seed, vla, folder, dtype):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05", "gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7", "bitvla"))
+    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05", "evo1", "gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7", "bitvla"))
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")

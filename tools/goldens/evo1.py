@@ -446,8 +446,9 @@ class Recorder(Taps):
             return
         d, n_head = attention.embed_dim, attention.num_heads
         both = torch.nn.functional.linear(context[0], attention.in_proj_weight[d:], attention.in_proj_bias[d:])
+        tolerance = 32 * torch.finfo(context.dtype).eps * context.abs().max()  # a product may sum its last rows in another order
         for rows in self.twins:
-            assert all(torch.equal(context[0][rows[0]], context[0][r]) for r in rows)
+            assert all((context[0][rows[0]] - context[0][r]).abs().max() <= tolerance for r in rows)
         for name, x in zip("kv", both.split(d, dim=-1), strict=True):
             self.put(f"head.blk.{i}.{name}", x[self.keys].unflatten(-1, (n_head, -1)))
 

@@ -57,7 +57,9 @@ def open_reference():
     os.environ.setdefault("HF_HUB_OFFLINE", "1")  # a missing file fails at once instead of being sought on a hub
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
     import torch
+    from transformers.utils import logging
 
+    logging.set_verbosity_error()  # a configuration of the authors' own model type is read as transformers' on purpose
     # torchvision's compiled part may be built for CUDA and absent; its Python part describes operators of it on import.
     register = torch.library.register_fake
 
