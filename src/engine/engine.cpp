@@ -31,7 +31,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
     robot->device_ = device;
     robot->tap_pattern_ = options.tap_pattern;
     robot->dry_ = options.dry;
-    robot->rounding_ = rounding_of(options.kernels);
+    robot->asked_kernels_ = options.kernels;
     robot->all_plans_ = all_plans;
     VLA_CHECK(robot->take_injected(options.inject));
     VLA_CHECK(robot->load_policy(params));
@@ -347,13 +347,16 @@ std::string Engine::arithmetic() const {
   const std::string floats = device_->precision();
   if (floats == "int8") return "int8 products, as asked for: less exact than PyTorch's bf16";
   if (precision() == "int8") return "ternary products of int8, others " + floats;
-  if (floats != "bf16") return "float32";
-  const auto& params = params_->params();
-  const auto n = std::count_if(params.begin(), params.end(), [&](const Param& param) {
-    return param.type() != DType::bf16 && resident_dtype(param, rounding_) == DType::bf16;
+  const auto n_rounded = std::ranges::count_if(params_->params(), [](const Param& param) {
+    return param.type() != DType::bf16 && resident_dtype(param, Rounding::bf16) == DType::bf16;
   });
-  const std::string rounded = n > 0 ? fmt::format(" ({} matrices rounded to it, as asked for)", n) : "";
-  return fmt::format("bf16 products{}, sums in float32; --kernels float32 avoids them", rounded);
+  if (floats == "bf16") {
+    const bool rounds = n_rounded > 0 && asked_kernels_ == kBf16Kernels;
+    const std::string rounded = rounds ? fmt::format(" ({} matrices rounded to it, as asked for)", n_rounded) : "";
+    return fmt::format("bf16 products{}, sums in float32; --kernels float32 avoids them", rounded);
+  }
+  const bool could = n_rounded > 0 && asked_kernels_.empty() && device_->has_bf16();
+  return could ? fmt::format("float32; --kernels bf16 is faster and rounds {} matrices", n_rounded) : "float32";
 }
 
 MemoryUse Engine::memory() const {

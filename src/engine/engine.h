@@ -163,7 +163,7 @@ class Engine {
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   bool dry_ = false;
-  Rounding rounding_ = Rounding::none;
+  std::string asked_kernels_;
   std::shared_ptr<ParamList> params_;  // of all robots
   std::unique_ptr<Policy> policy_;
   std::unique_ptr<Slots> tables_;

@@ -39,6 +39,7 @@ class GgmlDevice final : public Device {
   bool is_host() const override { return held_->pool != nullptr; }
   std::string kernels() const override { return "ggml"; }
   std::string precision() const override { return precision_; }
+  bool has_bf16() const override { return !is_host(); }
   const std::string& linear_kernels() const override { return linear_text_; }
   std::size_t weights_size() const override { return weights_size_; }
   std::size_t working_size() const override;

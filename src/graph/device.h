@@ -82,6 +82,8 @@ class Device {
   virtual std::string kernels() const = 0;
   /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
   virtual std::string precision() const = 0;
+  /// Whether it has faster products of bf16, for whoever asks for them (graph/rounding.h).
+  virtual bool has_bf16() const = 0;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   virtual const std::string& linear_kernels() const = 0;
   /// Bytes of parameters, and of what programs share while they run.

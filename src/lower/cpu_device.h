@@ -28,6 +28,7 @@ class CpuDevice final : public Device {
   std::string precision() const override {
     return rounding_ == Rounding::int8 ? "int8" : rounds_to_bf16(isa_) ? "bf16" : "f32";
   }
+  bool has_bf16() const override { return rounds_to_bf16(usable_isas().back()); }
   const std::string& linear_kernels() const override { return weights_.text(); }
   std::size_t weights_size() const override { return weights_.size(); }
   std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }

@@ -89,7 +89,9 @@ TEST_CASE(
   const auto rounded = load_engine(widened("all", kShipped), "", "bf16");
   CHECK(rounded->precision() == "bf16");
   CHECK(rounded->arithmetic().find("63 matrices rounded to it, as asked for") != std::string::npos);
-  CHECK(load_engine(widened("all", kShipped))->arithmetic() == "float32");
+  CHECK(load_engine(widened("all", kShipped))->arithmetic() ==
+        "float32; --kernels bf16 is faster and rounds 63 matrices");
+  CHECK(load_engine(widened("all", kShipped), "", "float32")->arithmetic() == "float32");
 }
 
 TEST_CASE("a matrix of another dtype is multiplied in float32, and the others in bf16 as before" *
