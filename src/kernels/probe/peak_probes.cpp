@@ -56,78 +56,57 @@ void multiply_add_any(long n_round) {
   for (const __m512& s : sums) sink = _mm512_cvtss_f32(s);
 }
 
-/// The whole loop in assembler: of the intrinsics, compilers copy every sum, which halves the rate.
-#define VLA_SUM_LOOP(multiply_add)                                                                                  \
-  if (n_round <= 0) return;                                                                                         \
-  __asm__ volatile(                                                                                                 \
-      "1:\n"                                                                                                        \
-      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,18,19,20,21,22,23,24,25,26,27\n" multiply_add          \
-      " %%zmm30, %%zmm31, %%zmm\\sum\n"                                                                             \
-      ".endr\n"                                                                                                     \
-      "dec %0\n"                                                                                                    \
-      "jnz 1b"                                                                                                      \
-      : "+r"(n_round)                                                                                               \
-      :                                                                                                             \
-      : "cc", "zmm0", "zmm1", "zmm2", "zmm3", "zmm4", "zmm5", "zmm6", "zmm7", "zmm8", "zmm9", "zmm10", "zmm11",     \
-        "zmm12", "zmm13", "zmm14", "zmm15", "zmm16", "zmm17", "zmm18", "zmm19", "zmm20", "zmm21", "zmm22", "zmm23", \
-        "zmm24", "zmm25", "zmm26", "zmm27")
+/// The whole loop in assembler, `body` once for each of `sums`: of the intrinsics, compilers copy every sum, which
+/// halves the rate.
+// clang-format off
+#define VLA_SUM_LOOP(sums, body, ...)                                                       \
+  if (n_round <= 0) return;                                                                 \
+  __asm__ volatile("1:\n.irp sum, " sums "\n" body ".endr\ndec %0\njnz 1b"                  \
+                   : "+r"(n_round) : : "cc", __VA_ARGS__)
+#define VLA_16_REGISTERS                                                                    \
+  "xmm0", "xmm1", "xmm2", "xmm3", "xmm4", "xmm5", "xmm6", "xmm7", "xmm8", "xmm9", "xmm10",  \
+  "xmm11", "xmm12", "xmm13", "xmm14", "xmm15"
+#define VLA_32_REGISTERS                                                                    \
+  VLA_16_REGISTERS, "xmm16", "xmm17", "xmm18", "xmm19", "xmm20", "xmm21", "xmm22", "xmm23", \
+  "xmm24", "xmm25", "xmm26", "xmm27", "xmm28", "xmm29", "xmm30", "xmm31"
+#define VLA_12_SUMS "0,1,2,3,4,5,6,7,8,9,10,11"
+#define VLA_28_SUMS VLA_12_SUMS ",12,13,14,15,16,17,18,19,20,21,22,23,24,25,26,27"
+// clang-format on
 
-[[gnu::target("avx512f")]] void multiply_add_vnni(long n_round) { VLA_SUM_LOOP("vpdpbusd"); }
-[[gnu::target("avx512f")]] void multiply_add_pairs(long n_round) { VLA_SUM_LOOP("vdpbf16ps"); }
-
-#undef VLA_SUM_LOOP
+[[gnu::target("avx512f")]] void multiply_add_vnni(long n_round) {
+  VLA_SUM_LOOP(VLA_28_SUMS, "vpdpbusd %%zmm30, %%zmm31, %%zmm\\sum\n", VLA_32_REGISTERS);
+}
+[[gnu::target("avx512f")]] void multiply_add_pairs(long n_round) {
+  VLA_SUM_LOOP(VLA_28_SUMS, "vdpbf16ps %%zmm30, %%zmm31, %%zmm\\sum\n", VLA_32_REGISTERS);
+}
 
 /// Sums of three numbers that a permutation looks up, 32 of them, beside VNNI (int8_lookup_avx512.cpp): 96
 /// multiply-adds by each permutation and its addition, two products of 64 meanwhile.
 [[gnu::target("avx512f")]] void multiply_add_lookup(long n_round) {
-  if (n_round <= 0) return;
-  __asm__ volatile(
-      "1:\n"
-      ".irp sum, 0,1,2,3,4,5,6,7\n"
-      "vpermw %%zmm30, %%zmm31, %%zmm29\n"
-      "vpdpbusd %%zmm30, %%zmm31, %%zmm\\sum\n"
-      "vpdpbusd %%zmm30, %%zmm31, %%zmm1\\sum\n"
-      "vpaddw %%zmm29, %%zmm2\\sum, %%zmm2\\sum\n"
-      ".endr\n"
-      "dec %0\n"
-      "jnz 1b"
-      : "+r"(n_round)
-      :
-      : "cc", "zmm0", "zmm1", "zmm2", "zmm3", "zmm4", "zmm5", "zmm6", "zmm7", "zmm10", "zmm11", "zmm12", "zmm13",
-        "zmm14", "zmm15", "zmm16", "zmm17", "zmm20", "zmm21", "zmm22", "zmm23", "zmm24", "zmm25", "zmm26", "zmm27",
-        "zmm29");
+  VLA_SUM_LOOP("0,1,2,3,4,5,6,7",
+               "vpermw %%zmm30, %%zmm31, %%zmm29\n"
+               "vpdpbusd %%zmm30, %%zmm31, %%zmm\\sum\n"
+               "vpdpbusd %%zmm30, %%zmm31, %%zmm1\\sum\n"
+               "vpaddw %%zmm29, %%zmm2\\sum, %%zmm2\\sum\n",
+               VLA_32_REGISTERS);
 }
 
 /// Products of bytes in pairs, and their sums in 16 bits: two instructions for 32 multiply-adds.
 [[gnu::target("avx2")]] void multiply_add_bytes(long n_round) {
-  if (n_round <= 0) return;
-  __asm__ volatile(
-      "1:\n"
-      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11\n"
-      "vpmaddubsw %%ymm14, %%ymm15, %%ymm13\n"
-      "vpaddw %%ymm13, %%ymm\\sum, %%ymm\\sum\n"
-      ".endr\n"
-      "dec %0\n"
-      "jnz 1b"
-      : "+r"(n_round)
-      :
-      : "cc", "xmm0", "xmm1", "xmm2", "xmm3", "xmm4", "xmm5", "xmm6", "xmm7", "xmm8", "xmm9", "xmm10", "xmm11",
-        "xmm13");
+  VLA_SUM_LOOP(VLA_12_SUMS,
+               "vpmaddubsw %%ymm14, %%ymm15, %%ymm13\n"
+               "vpaddw %%ymm13, %%ymm\\sum, %%ymm\\sum\n",
+               VLA_16_REGISTERS);
+}
+[[gnu::target("avx2")]] void multiply_add_avxvnni(long n_round) {
+  VLA_SUM_LOOP(VLA_12_SUMS, "%{vex%} vpdpbusd %%ymm14, %%ymm15, %%ymm\\sum\n", VLA_16_REGISTERS);
 }
 
-[[gnu::target("avx2")]] void multiply_add_avxvnni(long n_round) {
-  if (n_round <= 0) return;
-  __asm__ volatile(
-      "1:\n"
-      ".irp sum, 0,1,2,3,4,5,6,7,8,9,10,11\n"
-      "%{vex%} vpdpbusd %%ymm14, %%ymm15, %%ymm\\sum\n"
-      ".endr\n"
-      "dec %0\n"
-      "jnz 1b"
-      : "+r"(n_round)
-      :
-      : "cc", "xmm0", "xmm1", "xmm2", "xmm3", "xmm4", "xmm5", "xmm6", "xmm7", "xmm8", "xmm9", "xmm10", "xmm11");
-}
+#undef VLA_SUM_LOOP
+#undef VLA_16_REGISTERS
+#undef VLA_32_REGISTERS
+#undef VLA_12_SUMS
+#undef VLA_28_SUMS
 
 /// All eight tiles as 16 rows of 64 bytes, palette 1. Source: Intel Architecture Instruction Set Extensions,
 /// chapter on AMX, LDTILECFG.
@@ -139,7 +118,8 @@ struct alignas(64) TileConfig {
 
 constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell the compiler that it reads all of it
 
-/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero: the time does not depend on the values.
+/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero. With numbers that differ the same loop has 86 % of this
+/// rate on Granite Rapids (docs/performance.md), so that no product reaches it.
 // clang-format off
 #define VLA_TILE_LOOP(multiply_add)                                                \
   _tile_loadconfig(&kTiles);                                                       \
