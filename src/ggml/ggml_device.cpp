@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 #include <ggml-cpu.h>
 
-#include <algorithm>
 #include <atomic>
 #include <cstring>
 #include <vector>
@@ -49,7 +48,7 @@ void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
   if (tensor->type == GGML_TYPE_F32)
     return ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * sizeof(float));
   std::vector<std::uint16_t> rounded(values.size());
-  std::transform(values.begin(), values.end(), rounded.begin(), to_bf16);
+  for (std::size_t i = 0; i < values.size(); ++i) rounded[i] = to_bf16(values[i]);
   ggml_backend_tensor_set(tensor, rounded.data(), 0, rounded.size() * sizeof(std::uint16_t));
 }
 
