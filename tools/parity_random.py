@@ -18,6 +18,7 @@ of a published file, so has the bundle (vla-convert --dtype stored), and the run
 """
 import argparse
 import contextlib
+import functools
 import io
 import json
 import random
@@ -300,10 +301,9 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-def drawn_case(arch, seed):
-    if arch in ("smolvla", "evo1"):
-        return (draw if arch == "smolvla" else draw_evo1)(seed)
-    return (draw_pi if arch.startswith("pi") else draw_gr00t)(arch, seed)
+DRAWN = {"smolvla": draw, "evo1": draw_evo1} | {
+    arch: functools.partial(draw_family, arch)
+    for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 
 
 def compare(arch, seed, vla, folder, dtype):
@@ -311,7 +311,7 @@ def compare(arch, seed, vla, folder, dtype):
     if arch == "bitvla":
         return compare_bitvla(seed, vla, folder)
     with contextlib.redirect_stdout(io.StringIO()):  # the reference tells how many layers it keeps
-        drawn = drawn_case(arch, seed)
+        drawn = DRAWN[arch](seed)
         expected, stopped = run_reference(drawn, folder, low_bits=dtype == "bf16")
         published = recorder.run_case(folder, "published") if dtype != "f32" and expected else None
     got, refused = run_runtime(vla, folder, dtype, kernels="" if dtype == "stored" else "float32")
@@ -322,7 +322,7 @@ def compare(arch, seed, vla, folder, dtype):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("arch", choices=("smolvla", "pi0", "pi05", "evo1", "gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7", "bitvla"))
+    parser.add_argument("arch", choices=(*DRAWN, "bitvla"))
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--vla", type=Path, default=ROOT / "build/cpu/bin/vla")

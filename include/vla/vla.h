@@ -88,8 +88,8 @@ typedef struct vla_options {
   const char* kernels;  /* "ggml", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to
                            bf16, or "bf16": the best that does, with large matrices rounded to it, or "int8": the best,
                            with large matrices quantized, faster and less exact. NULL: on the CPU the best for the
-                           bundle's dtype, which rounds to bf16  if the bundle and the machine have it. Other devices
-                           take  "float32", as NULL does, and  "bf16" */
+                           bundle's dtype, which rounds to bf16 if the bundle and the machine have it. Other devices
+                           take "float32", as NULL does, and "bf16" */
   int32_t strict_state; /* 1: an observation whose state is far beyond what the policy has seen is refused with
                            VLA_BAD_OBSERVATION; 0: it is answered with a note */
   const char* device;   /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". There is no fallback: an absent device

@@ -20,9 +20,9 @@ DType resident_dtype(const Param& param, Rounding rounding) {
 Status check_rounding(const ParamList& list, Rounding rounding) {
   if (rounding == Rounding::none) return {};
   const bool to_int8 = rounding == Rounding::int8;
+  const DType wanted = to_int8 ? DType::i8 : DType::bf16;
   for (const Param& param : list.params())
-    if (param.storage == Storage::matrix && resident_dtype(param, rounding) == (to_int8 ? DType::i8 : DType::bf16))
-      return {};
+    if (param.storage == Storage::matrix && resident_dtype(param, rounding) == wanted) return {};
   return Error{Code::unsupported, to_int8 ? "kernels int8" : "kernels bf16",
                to_int8 ? "matrices of floats that are worth quantizing" : "matrices of bf16, or others worth rounding",
                "none", "leave --kernels out"};

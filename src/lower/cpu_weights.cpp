@@ -13,26 +13,8 @@
 #include "kernels/executor.h"
 #include "kernels/quantize_weights.h"
 #include "kernels/sizes.h"
-#include "lower/precision.h"
 
-namespace vla {
-
-Isa isa_for(const ParamList& list, Isa isa, Rounding rounding) {
-  const auto& params = list.params();
-  const auto rounds = [&](const Param& param) {
-    const DType type = resident_dtype(param, rounding);
-    return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8);
-  };
-  return std::any_of(params.begin(), params.end(), rounds) ? isa : without_rounding(isa);
-}
-
-std::int64_t min_rounded_keys(const ParamList& list) {
-  const auto& params = list.params();
-  const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
-  return std::any_of(params.begin(), params.end(), is_ternary) ? 512 : 128;
-}
-
-namespace lower {
+namespace vla::lower {
 namespace {
 
 /// The matrix as it is multiplied.
@@ -186,5 +168,4 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
   return weights;
 }
 
-}  // namespace lower
-}  // namespace vla
+}  // namespace vla::lower

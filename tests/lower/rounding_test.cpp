@@ -30,19 +30,25 @@ std::vector<ParamSet::Piece> pieces(DType type, DType small) {
           piece("action.weight", {kNarrow, kAction}, small), piece("action.bias", {kAction}, DType::f32)};
 }
 
-/// An MLP with its norm and its residual.
+struct Parameters {
+  Parameters(DType type, DType small) : set(pieces(type, small)) {}
+
+  ParamSet set;
+  Linear up{set.scope("up"), kNarrow, kWide, Bias::yes}, down{set.scope("down"), kWide, kNarrow, Bias::yes},
+      action{set.scope("action"), kNarrow, kAction, Bias::yes};
+};
+
+/// An MLP with its norm and its residual, and a small product.
 std::vector<float> mlp(const std::string& kernels, DType type, DType small) {
-  ParamSet set(pieces(type, small));
-  const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
-      action(set.scope("action"), kNarrow, kAction, Bias::yes);
+  Parameters params(type, small);
   return run_graph(
-      set.list(),
+      params.set.list(),
       [&](Graph& g) {
         const Tensor x = constant(g, ramp(kNarrow * 37, 2.0f), {kNarrow, 37});
         const Tensor h =
             g.add(op::Norm{op::NormKind::rms, 1e-5f}, {x, constant(g, std::vector<float>(kNarrow, 1), {kNarrow})});
-        const Tensor y = add(g, x, down(g, activate(g, up(g, h), Activation::gelu_tanh)));
-        return concat(g, {y, action(g, x)}, 0);
+        const Tensor y = add(g, x, params.down(g, activate(g, params.up(g, h), Activation::gelu_tanh)));
+        return concat(g, {y, params.action(g, x)}, 0);
       },
       kernels);
 }
@@ -76,10 +82,8 @@ VLA_QUANTIZED_TEST(
 }
 
 VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number") {
-  ParamSet set(pieces(DType::bf16, DType::bf16));
-  const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
-      action(set.scope("action"), kNarrow, kAction, Bias::yes);
-  GraphRunner floats(set.list(), ""), quantized(set.list(), kInt8Kernels);
+  Parameters params(DType::bf16, DType::bf16);
+  GraphRunner floats(params.set.list(), ""), quantized(params.set.list(), kInt8Kernels);
   CHECK(quantized.device().precision() == "int8");
   CHECK(quantized.device().kernels() == floats.device().kernels());
   CHECK(quantized.device().linear_kernels().find("_int8 (2 bf16)") != std::string::npos);
@@ -87,16 +91,21 @@ VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number
 }
 
 VLA_QUANTIZED_TEST("a policy with nothing to round is refused, before any memory is taken") {
-  ParamSet set({piece("action.weight", {kNarrow, kAction}, DType::f32), piece("action.bias", {kAction}, DType::f32)});
-  const Linear action(set.scope("action"), kNarrow, kAction, Bias::yes);
-  for (const std::string kernels : {kInt8Kernels, kBf16Kernels}) {
+  struct {
+    std::string kernels, verb;
+    DType small;
+  } const cases[] = {{kInt8Kernels, "quantizing", DType::bf16}, {kBf16Kernels, "rounding", DType::f32}};
+  for (const auto& [kernels, verb, small] : cases) {
     if (kernels == kBf16Kernels && !rounds_to_bf16(usable_isas().back())) continue;
+    ParamSet set({piece("action.weight", {kNarrow, kAction}, small), piece("action.bias", {kAction}, DType::f32)});
+    const Linear action(set.scope("action"), kNarrow, kAction, Bias::yes);
     const auto device = open_device(1, kernels);
     REQUIRE(device.ok());
     const Status loaded = (*device)->load(set.list(), true);
     REQUIRE(!loaded.ok());
     CHECK(loaded.error().code == Code::unsupported);
     CHECK(loaded.error().message().find("kernels " + kernels) != std::string::npos);
+    CHECK(loaded.error().message().find(verb) != std::string::npos);
     CHECK((*device)->weights_size() == 0);
   }
 }
@@ -108,10 +117,8 @@ TEST_CASE("large matrices rounded to bf16 are those of a bundle that stores them
     CHECK(mlp(kBf16Kernels, type) == mlp("", DType::bf16, type));
     CHECK(mlp("", type) != mlp(kBf16Kernels, type));
   }
-  ParamSet set(pieces(DType::f32, DType::f32));
-  const Linear up(set.scope("up"), kNarrow, kWide, Bias::yes), down(set.scope("down"), kWide, kNarrow, Bias::yes),
-      action(set.scope("action"), kNarrow, kAction, Bias::yes);
-  GraphRunner floats(set.list(), ""), rounded(set.list(), kBf16Kernels);
+  Parameters params(DType::f32, DType::f32);
+  GraphRunner floats(params.set.list(), ""), rounded(params.set.list(), kBf16Kernels);
   CHECK(floats.device().precision() == "f32");
   CHECK(rounded.device().precision() == "bf16");
   CHECK(rounded.device().linear_kernels().find(rounded.device().kernels() + " (2 f32)") != std::string::npos);

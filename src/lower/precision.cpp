@@ -1,0 +1,24 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/precision.h"
+
+#include <algorithm>
+
+namespace vla {
+
+Isa isa_for(const ParamList& list, Isa isa, Rounding rounding) {
+  const auto& params = list.params();
+  const auto rounds = [&](const Param& param) {
+    const DType type = resident_dtype(param, rounding);
+    return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8);
+  };
+  return std::any_of(params.begin(), params.end(), rounds) ? isa : without_rounding(isa);
+}
+
+std::int64_t min_rounded_keys(const ParamList& list) {
+  const auto& params = list.params();
+  const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
+  return std::any_of(params.begin(), params.end(), is_ternary) ? 512 : 128;
+}
+
+}  // namespace vla
