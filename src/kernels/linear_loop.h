@@ -99,7 +99,7 @@ class LinearLoop {
         Stripe stripe = Stripes::of_panel(job_, panel);
         stripe.row = row, stripe.n_row = n_row, stripe.k = k, stripe.depth = depth;
         stripe.gates = scratch_->gates + (whole_depth() ? 0 : panel - begin) * (kBlockRows + kRows) * kColumns;
-        multiply(stripe);
+        multiply(stripe, Stripes::behind(job_, begin, end, panel, k, depth));
       }
     }
   }
@@ -119,31 +119,31 @@ class LinearLoop {
     }
   }
 
-  /// y of the stripe (+)= the block of x times the panel. Whatever follows the product is done while a tile of sums
-  /// lies in the first cache.
-  void multiply(const Stripe& s) {
+  /// y of the stripe (+)= the block of x times the panel; `next` will be read after it. Whatever follows the product is
+  /// done while a tile of sums lies in the first cache.
+  void multiply(const Stripe& s, const std::byte* next) {
     const LinearJob::Part& part = job_.part[s.part];
     if (job_.gated)
       sum(
-          job_.part[0], s, s.gates, s.k > 0, [](auto, auto) {}, [](auto, auto) {});
+          job_.part[0], s, s.gates, s.k > 0, Stripes::panel_of(job_, part, s.column, s.k), [](auto, auto) {},
+          [](auto, auto) {});
     sum(
-        part, s, scratch_->sums, false, [&](std::int64_t r, std::int64_t n_row) { Stripes::fetch(job_, s, r, n_row); },
+        part, s, scratch_->sums, false, next,
+        [&](std::int64_t r, std::int64_t n_row) { Stripes::fetch(job_, s, r, n_row); },
         [&](std::int64_t r, std::int64_t n_row) { Stripes::finish(job_, s, scratch_->sums + r * kColumns, r, n_row); });
   }
 
   /// sums [kColumns] x n_row (+)= the block of x times a panel. `before` and `after` are called around the last step of
   /// each tile with its first row and their number.
   template <class Before, class After>
-  VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, float* sums, bool add, const Before& before,
-                      const After& after) {
+  VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, float* sums, bool add, const std::byte* next_panel,
+                      const Before& before, const After& after) {
     const std::int64_t depth = round_up(s.depth, kPanelDepth), step = even_block(depth, Tile::kStep, kPanelDepth);
     const std::int64_t n_tile = ceil_div(s.n_row, kRows);
-    const std::byte* panel = part.weight +
-                             s.column / kColumns * Layout::size(part.type, round_up(job_.d_in, kPanelDepth)) +
-                             Layout::size(part.type, s.k);
+    const std::byte* panel = Stripes::panel_of(job_, part, s.column, s.k);
     for (std::int64_t k = 0; k < depth; k += step) {
       const std::int64_t d = min(step, depth - k), size = Layout::size(part.type, d);
-      const std::byte* next = panel + size;  // prefetched meanwhile
+      const std::byte* next = k + d < depth ? panel + size : next_panel;  // prefetched meanwhile
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         if (k + d == depth) before(r, n_row);

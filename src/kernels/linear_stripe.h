@@ -3,7 +3,7 @@
 #pragma once
 
 #include "kernels/gelu_erf.h"
-#include "kernels/linear_job.h"
+#include "kernels/linear_panels.h"
 #include "kernels/numbers.h"
 #include "kernels/rounded.h"
 #include "kernels/sizes.h"
@@ -39,6 +39,25 @@ struct LinearStripes {
     for (; panel >= ceil_div(job.part[part].d_out, kColumns); ++part) panel -= ceil_div(job.part[part].d_out, kColumns);
     const std::int64_t column = panel * kColumns;
     return {part, column, min(kColumns, job.part[part].d_out - column), 0, 0, 0, 0, nullptr};
+  }
+
+  /// A part's panel at a column, from depth k on.
+  static const std::byte* panel_of(const LinearJob& job, const LinearJob::Part& part, std::int64_t column,
+                                   std::int64_t k) {
+    using Layout = Panels<kColumns>;
+    return part.weight + column / kColumns * Layout::size(part.type, round_up(job.d_in, kPanelDepth)) +
+           Layout::size(part.type, k);
+  }
+
+  /// What is read behind panel `panel` at depths from k to k + depth by an item that takes panels begin to end, block
+  /// of the depth by block; behind its last block what an item beside it begins with.
+  static const std::byte* behind(const LinearJob& job, std::int64_t begin, std::int64_t end, std::int64_t panel,
+                                 std::int64_t k, std::int64_t depth) {
+    const bool ends_block = panel + 1 == end, goes_on = ends_block && k + depth < job.d_in;
+    const std::int64_t next = goes_on ? begin : panel + 1;
+    if (next == n_panel(job)) return job.part[0].weight;
+    const Stripe s = of_panel(job, next);
+    return panel_of(job, job.part[job.gated ? 0 : s.part], s.column, goes_on ? k + depth : ends_block ? 0 : k);
   }
 
   /// Where tile t of `n_row` rows begins: tiles are of nearly equal height, or whole but for the last.

@@ -105,7 +105,8 @@ class TileLoop {
       if (job_.x_type != DType::bf16) take_rows();
       n_finish_ = ceil_div(kSquare * kSquare, depth_ * (job_.gated ? 2 : 1));
       for (std::int64_t panel = begin; panel < end; ++panel)
-        multiply(panel, (whole_depth() ? panel % 2 : panel - begin) * block_rows_ * kSquare);
+        multiply(panel, (whole_depth() ? panel % 2 : panel - begin) * block_rows_ * kSquare,
+                 Stripes::behind(job_, begin, end, panel, k_, depth_));
     }
     finish_summed();
   }
@@ -129,24 +130,24 @@ class TileLoop {
     return reinterpret_cast<const X*>(job_.x) + place_in_tiles(row_ + r, k_ + k, job_.d_in);
   }
 
-  /// One panel, and its gate's, with sums at a place of the scratch. The stripe's depth is all of it, since no partial
-  /// sum goes to y.
-  void multiply(std::int64_t panel, std::int64_t place) {
+  /// One panel, and its gate's, with sums at a place of the scratch; `next` will be read after them. The stripe's depth
+  /// is all of it, since no partial sum goes to y.
+  void multiply(std::int64_t panel, std::int64_t place, const std::byte* next) {
     Stripe s = Stripes::of_panel(job_, panel);
     s.row = row_, s.n_row = n_row_, s.depth = job_.d_in, s.gates = scratch_->gates + place;
-    if (job_.gated) sum(job_.part[0], s, s.gates, false);
-    sum(job_.part[s.part], s, scratch_->sums + place, k_ + depth_ == job_.d_in);
+    const LinearJob::Part& part = job_.part[s.part];
+    if (job_.gated) sum(job_.part[0], s, s.gates, Stripes::panel_of(job_, part, s.column, k_), false);
+    sum(part, s, scratch_->sums + place, next, k_ + depth_ == job_.d_in);
   }
 
   /// sums (+)= the block of x times a panel. `finish`: these were the last, y is made of them.
-  void sum(const LinearJob::Part& part, const Stripe& s, float* sums, bool finish) {
+  void sum(const LinearJob::Part& part, const Stripe& s, float* sums, const std::byte* next_panel, bool finish) {
     const std::int64_t depth = round_up(depth_, kSquare), step = even_block(depth, kStep, kSquare);
     const std::int64_t n_tile = ceil_div(n_row_, kSquare);
-    const std::byte* panel = part.weight + s.column / kSquare * Layout::size(part.type, round_up(job_.d_in, kSquare)) +
-                             Layout::size(part.type, k_);
+    const std::byte* panel = Stripes::panel_of(job_, part, s.column, k_);
     for (std::int64_t k = 0; k < depth; k += step) {
       const std::int64_t d = min(step, depth - k), size = Layout::size(part.type, d);
-      const std::byte* next = panel + size;
+      const std::byte* next = k + d < depth ? panel + size : next_panel;
       const bool is_last = finish && k + d == depth;
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = t * kSquare, n_row = min(kSquare, n_row_ - r);
