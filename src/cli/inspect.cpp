@@ -248,10 +248,12 @@ Command add_inspect(CLI::App& app) {
   add_text(*command, "--manifest", options->manifest, "ARCH",
            "Print the keys and parameters that an architecture declares, as JSON");
   command
-      ->add_option("--graph", options->graph,
-                   "Print the program of the prefix or of a step for the largest observation, a line an operation: the "
-                   "phase in which it runs (those of one phase run side by side), kernel, work, what was fused, and "
-                   "shapes with their layout (@slot: outlives a run, @kept: made once per observation)")
+      ->add_option(
+          "--graph", options->graph,
+          "Print the program of the prefix or of a step for the largest observation, a line an operation: the "
+          "phase in which it runs (those of one phase run side by side), kernel, work, what was fused, and "
+          "shapes with their layout (@slot: outlives a run, @kept: made once per observation, @thread: a block of "
+          "rows at a time, in memory of the thread that takes it through both products)")
       ->check(CLI::IsMember({"prefix", "step"}));
   add_text(*command, "--kernels", options->kernels, "NAME", "As for vla run: what the program is made of");
   add_text(*command, "--device", options->device, "NAME", "As for vla run: whose memory and program are shown");

@@ -40,6 +40,12 @@ class Worker {
     return {reinterpret_cast<T*>(memory_), kept};
   }
 
+  /// Scratch memory from there on. No item of a job before finds its own again.
+  std::byte* scratch_from(std::size_t offset) {
+    owner_ = {};
+    return memory_ + offset;
+  }
+
   const int index;
 
  private:

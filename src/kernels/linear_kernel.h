@@ -40,6 +40,9 @@ struct LinearKernel {
   /// to this depth, as partial sums of deeper ones lie in y.
   RoundedLayout rounded = RoundedLayout::none;
   std::int64_t max_rounded_depth = 0;
+  /// Numbers of x that the second cache keeps beside what passes through it, where x is read as the product before left
+  /// it; 0 where it is copied first.
+  std::int64_t kept_x = 0;
   /// What computes products of at most `max_few` rows in its place, from the same packed matrix; null where it does so
   /// itself.
   const LinearKernel* few = nullptr;

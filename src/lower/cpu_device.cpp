@@ -70,6 +70,7 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   start(l);
   fuse(l);
   choose_layouts(l);
+  choose_blocks(l);
   schedule(l);
   place(l);
   if (l.arena_size > arena_.size()) {

@@ -36,6 +36,47 @@ struct LinearTask : Task {
   void run(std::int64_t item, Worker& worker) const override { kernel->run(job, item, worker); }
 };
 
+/// An item is a block of rows that goes through two products of tiles. What lies between them begins at `inner` of a
+/// thread's scratch memory, behind that of the kernels.
+struct BlockedTask : Task {
+  const kernels::LinearKernel* kernel[2];
+  kernels::LinearJob job[2];
+  std::size_t inner;
+
+  void run(std::int64_t item, Worker& worker) const override {
+    const std::int64_t n_square = kernels::ceil_div(job[0].n_row, kernels::kSquare);
+    const std::int64_t first = n_square * item / n_item * kernels::kSquare;
+    const std::int64_t n = kernels::min(n_square * (item + 1) / n_item * kernels::kSquare, job[0].n_row) - first;
+    kernels::LinearJob up = rows_of(job[0], first, n), down = rows_of(job[1], first, n);
+    up.part[up.n_part - 1].y = worker.scratch_from(inner), down.x = worker.scratch_from(inner);
+    run_alone(*kernel[0], up, worker);
+    run_alone(*kernel[1], down, worker);
+  }
+
+ private:
+  /// The job for n rows from `first` on, a multiple of kSquare, since bf16 lies in tiles.
+  static kernels::LinearJob rows_of(kernels::LinearJob job, std::int64_t first, std::int64_t n) {
+    const auto offset = [&](DType type, std::int64_t d, std::int64_t stride) {
+      return type == DType::bf16 ? 2 * kernels::place_in_tiles(first, 0, d)
+                                 : first * stride * static_cast<std::int64_t>(dtype_size(type));
+    };
+    job.n_row = n;
+    job.x += offset(job.x_type, job.d_in, job.x_stride);
+    for (kernels::LinearJob::Part& part : std::span(job.part, static_cast<std::size_t>(job.n_part))) {
+      part.y += offset(part.y_type, part.d_out, part.d_out);
+      if (part.residual != nullptr) part.residual += first * part.d_out;
+    }
+    return job;
+  }
+
+  /// All of a job, which takes over nothing from one that lay at the same address.
+  static void run_alone(const kernels::LinearKernel& kernel, kernels::LinearJob& job, Worker& worker) {
+    worker.scratch<std::byte>();
+    const std::int64_t n = kernel.cut(job, 1);
+    for (std::int64_t i = 0; i < n; ++i) kernel.run(job, i, worker);
+  }
+};
+
 /// An item is some rows of x, or of its norm.
 struct QuantizeTask : Task {
   kernels::LinearJob::Norm norm;
@@ -192,6 +233,8 @@ kernels::HeadRows head_rows(const Lowering& l, ValueId id) {
 
 double flop_of_op(const FusedOp& op) {
   double flop = 0;
+  if (const auto* blocked = std::get_if<BlockedOp>(&op.op))
+    for (const FusedOp& product : blocked->products) flop += flop_of_op(product);
   if (const auto* linear = std::get_if<LinearOp>(&op.op))
     for (const Node* node : linear->linears) flop += flop_of(*node);
   if (const auto* attention = std::get_if<AttentionOp>(&op.op)) flop = flop_of(*attention->node);
@@ -210,10 +253,9 @@ kernels::LinearJob::Norm norm_of(const Lowering& l, const Reader& op) {
           operand(l, op.norm_bias), norm.eps};
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp& linear) {
-  auto task = std::make_unique<LinearTask>();
-  task->kernel = &kernel_of(l, linear);
-  kernels::LinearJob& job = task->job;
+kernels::LinearJob job_of(const Lowering& l, const FusedOp& op) {
+  const auto& linear = std::get<LinearOp>(op.op);
+  kernels::LinearJob job = {};
   const Value& x = l.value(linear.x);
   job.x = address(l, linear.x), job.x_type = x.type, job.x_stride = row_stride(x);
   job.d_in = x.shape[0], job.n_row = count(x.shape) / x.shape[0];
@@ -236,7 +278,35 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
   }
   kernels::LinearJob::Part& last = job.part[job.n_part - 1];
   last.factor = operand(l, linear.factor), last.residual = operand(l, linear.residual);
-  task->n_item = task->kernel->cut(job, threads_for(l, op));
+  return job;
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp& linear) {
+  auto task = std::make_unique<LinearTask>();
+  task->kernel = &kernel_of(l, linear), task->job = job_of(l, op);
+  task->n_item = task->kernel->cut(task->job, threads_for(l, op));
+  return task;
+}
+
+/// Scratch memory of a thread: the kernels', and behind it the numbers between the products of a block.
+struct BlockedScratch {
+  std::size_t kernels, inner;
+};
+BlockedScratch scratch_sizes(const Lowering& l, const BlockedOp& blocked) {
+  const Value& inner = l.value(blocked.products[0].writes[0]);
+  const std::int64_t d = inner.shape[0], n_square = kernels::ceil_div(count(inner.shape) / d, kernels::kSquare);
+  const std::int64_t n_row = kernels::ceil_div(n_square, blocked.n_block) * kernels::kSquare;
+  return {aligned(std::max(scratch_of(l, blocked.products[0]), scratch_of(l, blocked.products[1]))),
+          2 * static_cast<std::size_t>(kernels::rounded_count(inner.rounded, n_row, d))};
+}
+
+std::unique_ptr<Task> make(const Lowering& l, const FusedOp&, const BlockedOp& blocked) {
+  auto task = std::make_unique<BlockedTask>();
+  for (std::size_t i = 0; i < 2; ++i) {
+    task->kernel[i] = &kernel_of(l, std::get<LinearOp>(blocked.products[i].op));
+    task->job[i] = job_of(l, blocked.products[i]);
+  }
+  task->inner = scratch_sizes(l, blocked).kernels, task->n_item = blocked.n_block;
   return task;
 }
 
@@ -363,13 +433,17 @@ std::unique_ptr<Task> emit(const Lowering& l, const FusedOp& op) {
 
 std::size_t scratch_of(const Lowering& l, const FusedOp& op) {
   if (const auto* linear = std::get_if<LinearOp>(&op.op)) return kernel_of(l, *linear).scratch_size;
+  if (const auto* blocked = std::get_if<BlockedOp>(&op.op)) {
+    const BlockedScratch size = scratch_sizes(l, *blocked);
+    return size.kernels + size.inner;
+  }
   if (const auto* quantize = std::get_if<QuantizeOp>(&op.op))
     return quantize->norm != nullptr ? static_cast<std::size_t>(l.value(quantize->x).shape[0]) * sizeof(float) : 0;
   return 0;
 }
 
 KindClock::Kind kind_of(const FusedOp& op) {
-  if (std::holds_alternative<LinearOp>(op.op)) return KindClock::products;
+  if (std::holds_alternative<LinearOp>(op.op) || std::holds_alternative<BlockedOp>(op.op)) return KindClock::products;
   if (std::holds_alternative<PackOp>(op.op) || std::holds_alternative<AttentionOp>(op.op)) return KindClock::attention;
   const auto* row = std::get_if<RowOp>(&op.op);
   const bool is_norm = row != nullptr && row->node->as<op::Norm>() != nullptr;
@@ -378,6 +452,10 @@ KindClock::Kind kind_of(const FusedOp& op) {
 
 Work work_of(const Lowering& l, const FusedOp& op) {
   Work work;
+  if (const auto* blocked = std::get_if<BlockedOp>(&op.op)) {
+    for (const FusedOp& product : blocked->products) work += work_of(l, product);
+    return work;
+  }
   work.flop = flop_of_op(op);
   const auto* lookup = std::get_if<LookupOp>(&op.op);
   for (const ValueId id : op.reads) {

@@ -76,6 +76,7 @@ class Layouts {
     require_rows(op.norm_bias);
   }
   void require_layouts(QuantizeOp&) {}  // is made here
+  void require_layouts(BlockedOp&) {}   // is made later
 
   /// The product reads x, or its norm, as codes, which are made once, just before the first operation that reads them.
   void quantize(LinearOp& op, const kernels::LinearKernel& kernel) {

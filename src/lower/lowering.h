@@ -11,7 +11,7 @@
 #include "lower/cpu_weights.h"
 
 /// How a graph becomes a program for the CPU: a short list of passes over the structures below, each in a file of its
-/// name (fuse, layout, schedule, place, emit).
+/// name (fuse, layout, blocks, schedule, place, emit).
 namespace vla::lower {
 
 /// An index into Lowering::values. Values of nodes come first, by Node::id.
@@ -20,7 +20,7 @@ constexpr ValueId kNone = -1;
 
 /// Where numbers lie: of a node's result, or of packed keys and values.
 struct Value {
-  enum class Home { arena, kept, slot, constant, parameter };
+  enum class Home { arena, kept, slot, constant, parameter, thread };
 
   const Node* node = nullptr;  // none for packed keys and values, and for codes
   DType type = DType::f32;
@@ -98,9 +98,17 @@ struct PatchesOp {
   ValueId images;
 };
 
+struct FusedOp;
+/// Two products, of which the second alone reads what the first makes, as in an MLP. A thread takes a block of rows
+/// through both, so that the numbers between them stay in its cache: memory of the thread is their home.
+struct BlockedOp {
+  std::vector<FusedOp> products;
+  std::int64_t n_block;
+};
+
 /// One operation of the program: nodes that were fused.
 struct FusedOp {
-  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
+  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, BlockedOp> op;
   std::vector<ValueId> reads, writes;
   int order = 0;           // the id of the node whose result it gives
   bool invariant = false;  // the same from run to run
@@ -148,6 +156,8 @@ void fuse(Lowering& l);
 /// Chooses the dtype of values between products, makes codes of what ternary ones read, and copies what its reader
 /// needs contiguous.
 void choose_layouts(Lowering& l);
+/// Joins two products to one operation on blocks of rows where that saves more ways through the caches than it costs.
+void choose_blocks(Lowering& l);
 /// Puts operations that do not depend on each other into one phase, and what stays the same into Program::prepare.
 void schedule(Lowering& l);
 /// Gives every value its place: in its slot, in the memory that programs share, or in memory of the program.

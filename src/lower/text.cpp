@@ -56,13 +56,15 @@ struct Describe {
     return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), "copy", op.ids};
   }
   Words operator()(const PatchesOp& op) const { return {"patches", "copy", op.images}; }
+  Words operator()(const BlockedOp&) const { return {}; }  // its products are described
 };
 
 std::string layout(const Lowering& l, ValueId id) {
   const Value& value = l.value(id);
-  const char* home = l.base(id).home == Value::Home::slot   ? "@slot"
-                     : l.base(id).home == Value::Home::kept ? "@kept"
-                                                            : "";
+  const char* home = l.base(id).home == Value::Home::slot     ? "@slot"
+                     : l.base(id).home == Value::Home::kept   ? "@kept"
+                     : l.base(id).home == Value::Home::thread ? "@thread"
+                                                              : "";
   if (value.node == nullptr && value.size > 0 && value.stride == Shape{1, 1, 1, 1})
     return fmt::format("panels{}", home);
   return fmt::format("{}{}{}{}", dtype_name(value.type),
@@ -72,6 +74,14 @@ std::string layout(const Lowering& l, ValueId id) {
 }  // namespace
 
 std::string text_of(const Lowering& l, const FusedOp& op) {
+  if (const auto* blocked = std::get_if<BlockedOp>(&op.op)) {
+    std::vector<std::string> lines;
+    for (FusedOp product : blocked->products) {
+      product.phase = op.phase;
+      lines.push_back(fmt::format("{}, {} blocks of rows", text_of(l, product), blocked->n_block));
+    }
+    return fmt::format("{}", fmt::join(lines, "\n"));
+  }
   const auto words = std::visit(Describe{l, op}, op.op);
   std::vector<std::string> results;
   for (const ValueId id : op.writes) results.push_back(layout(l, id));

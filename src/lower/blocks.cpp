@@ -1,0 +1,66 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+#include <map>
+
+#include "kernels/sizes.h"
+#include "lower/lowering.h"
+
+namespace vla::lower {
+namespace {
+
+/// Each block reads all weights: of fewer rows they would not come as fast as they are multiplied.
+constexpr std::int64_t kMinBlockRows = 128;
+
+/// How many blocks of rows keep `x` in the second cache from the product that makes it to the one that reads it; 0
+/// where it stays there without blocks, or would not with blocks that pay.
+std::int64_t n_block_of(const Lowering& l, const Value& x, const kernels::LinearKernel& reader) {
+  if (x.rounded != kernels::RoundedLayout::tiles) return 0;
+  const std::int64_t d = kernels::round_up(x.shape[0], kernels::kSquare), n_row = count(x.shape) / x.shape[0];
+  const std::int64_t max_rows = reader.kept_x / d / kernels::kSquare * kernels::kSquare;
+  if (max_rows < kMinBlockRows || n_row * d <= 2 * reader.kept_x) return 0;
+  const std::int64_t n_block = kernels::round_up(kernels::ceil_div(n_row, max_rows), l.n_thread);
+  return n_row / n_block >= kMinBlockRows ? n_block : 0;
+}
+
+/// The operations that read each base.
+std::map<ValueId, std::vector<FusedOp*>> readers_of(Lowering& l) {
+  std::map<ValueId, std::vector<FusedOp*>> readers;
+  for (FusedOp& op : l.ops)
+    for (const ValueId id : op.reads) readers[l.value(id).base].push_back(&op);
+  return readers;
+}
+
+/// `up` becomes part of `down`, which alone reads what it makes, and is left without results.
+void join(Lowering& l, FusedOp& up, FusedOp& down, std::int64_t n_block) {
+  const ValueId inner = up.writes[0];
+  l.value(inner).home = Value::Home::thread;
+  FusedOp both;
+  both.reads = up.reads, both.writes = down.writes, both.order = down.order;
+  std::copy_if(down.reads.begin(), down.reads.end(), std::back_inserter(both.reads),
+               [&](ValueId id) { return id != inner; });
+  BlockedOp blocked = {{}, n_block};
+  blocked.products.push_back(std::move(up));
+  blocked.products.push_back(std::move(down));
+  both.op = std::move(blocked);
+  down = std::move(both);
+}
+
+}  // namespace
+
+void choose_blocks(Lowering& l) {
+  const auto readers = readers_of(l);
+  for (FusedOp& up : l.ops) {
+    if (!std::holds_alternative<LinearOp>(up.op) || up.writes.size() != 1) continue;
+    const ValueId inner = up.writes[0];
+    const auto found = readers.find(inner);
+    if (found == readers.end() || found->second.size() != 1) continue;
+    FusedOp& down = *found->second[0];
+    const auto* reader = std::get_if<LinearOp>(&down.op);
+    if (reader == nullptr || reader->x != inner || l.value(inner).home != Value::Home::arena) continue;
+    if (const std::int64_t n_block = n_block_of(l, l.value(inner), kernel_of(l, *reader))) join(l, up, down, n_block);
+  }
+  std::erase_if(l.ops, [](const FusedOp& op) { return op.writes.empty(); });
+}
+
+}  // namespace vla::lower
