@@ -41,10 +41,13 @@ class TileLoop {
   static constexpr std::int64_t kSplitDepth = 1024, kSplitRows = 256, kMinGroup = 4, kMaxGroup = 24;
   static constexpr std::int64_t kMinSplitItems = 8;
   static constexpr std::int64_t kMaxSums = kMaxGroup * kSplitRows * kSquare;
+  // So many bytes of weights come from memory for each block of rows, unless threads multiply the same panels at the
+  // same time: blocks may then be larger, and all threads share them evenly.
+  static constexpr std::int64_t kFarWeights = 16 << 20, kFarX = 640 << 10, kFarRows = 320;
 
   struct Scratch {
     std::int64_t row, depth;  // which rows of x the copy holds, and from which depth on
-    alignas(64) X x[kMaxX];
+    alignas(64) X x[kFarX];
     alignas(64) float normed[kMaxDepth];
     alignas(64) float sums[kMaxSums];  // of a panel and the one before, or of a group
     alignas(64) float gates[kMaxSums];
@@ -60,11 +63,12 @@ class TileLoop {
 
  private:
   static std::int64_t cut(LinearJob& job, int n_thread) {
+    job.block_rows = block_rows(job, n_thread);
     const TileLoop loop(job);
     const bool whole = loop.whole_depth();
     const std::int64_t n_item = n_thread == 1 ? 1 : n_thread * (whole ? kMinItems : kMinSplitItems);
     job.n_group = min(ceil_div(n_item, loop.n_block_), ceil_div(loop.n_panel_, whole ? 1 : kMinGroup));
-    const std::int64_t room = whole ? 1 : ceil_div(loop.n_panel_, kMaxGroup);
+    const std::int64_t room = whole ? 1 : ceil_div(loop.n_panel_, kMaxSums / (job.block_rows * kSquare));
     if (job.n_group < room) job.n_group = room;
     return loop.n_block_ * job.n_group;
   }
@@ -80,20 +84,28 @@ class TileLoop {
 
   explicit TileLoop(const LinearJob& job)
       : job_(job),
-        block_depth_(job.d_in <= max_depth(job.n_row) ? job.d_in : even_block(job.d_in, kSplitDepth, kSquare)),
-        block_rows_(even_block(job.n_row, whole_depth() ? max_rows(job.d_in) : kSplitRows, kSquare)),
+        block_depth_(has_whole_depth(job) ? job.d_in : even_block(job.d_in, kSplitDepth, kSquare)),
+        block_rows_(job.block_rows),
         n_block_(ceil_div(job.n_row, block_rows_)),
         n_panel_(Stripes::n_panel(job)) {}
 
   /// Few rows leave room for a greater depth.
-  static std::int64_t max_depth(std::int64_t n_row) {
-    const std::int64_t depth = kMaxX / round_up(n_row, kSquare) / kSquare * kSquare;
-    return depth > kMaxDepth ? depth : kMaxDepth;
-  }
-  static std::int64_t max_rows(std::int64_t depth) {
-    return min(kMaxRows, kMaxX / round_up(depth, kSquare) / kSquare * kSquare);
+  static bool has_whole_depth(const LinearJob& job) {
+    return job.d_in <= kMaxDepth || job.d_in <= kMaxX / round_up(job.n_row, kSquare) / kSquare * kSquare;
   }
   bool whole_depth() const { return block_depth_ >= job_.d_in; }
+
+  static std::int64_t block_rows(const LinearJob& job, int n_thread) {
+    const auto n_block = [&](std::int64_t max_x, std::int64_t max_split_rows) {
+      const std::int64_t max_rows = min(kMaxRows, max_x / round_up(job.d_in, kSquare) / kSquare * kSquare);
+      return ceil_div(job.n_row, has_whole_depth(job) ? max_rows : max_split_rows);
+    };
+    std::int64_t n = n_block(kMaxX, kSplitRows), size = 0;
+    for (int i = 0; i < job.n_part; ++i) size += Layout::size(job.part[i].type, job.d_in) * job.part[i].d_out / kSquare;
+    if (n > 1 && size >= kFarWeights)
+      for (n = n_block(kFarX, kFarRows); n % n_thread != 0 && n_thread % n != 0;) ++n;
+    return n == 0 ? kSquare : round_up(ceil_div(job.n_row, n), kSquare);
+  }
 
   /// Some panels by a block of rows.
   void item(std::int64_t i) {

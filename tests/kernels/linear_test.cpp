@@ -337,6 +337,26 @@ TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds 
   }
 }
 
+TEST_CASE("tiles: threads share blocks of rows evenly where weights come from memory for each block") {
+  const auto n_block = [](std::int64_t n_row, std::int64_t d_in, std::int64_t d_out, int n_thread) {
+    LinearJob job = {};
+    job.n_row = n_row, job.d_in = d_in, job.n_part = 1;
+    job.part[0].type = DType::bf16, job.part[0].d_out = d_out;
+    const std::int64_t n_item = row("emulated_amx").cut(job, n_thread), n = ceil_div(n_row, job.block_rows);
+    CHECK(n_item == n * job.n_group);
+    return n;
+  };
+  for (const auto& [d_in, d_out] : {std::pair{2048, 16384}, std::pair{16384, 2048}}) {
+    CHECK(n_block(560, d_in, d_out, 2) == 2);
+    CHECK(n_block(816, d_in, d_out, 1) == 3);
+    CHECK(n_block(816, d_in, d_out, 2) == 4);
+    CHECK(n_block(816, d_in, d_out, 3) == 3);
+    CHECK(n_block(816, d_in, d_out, 8) == 4);
+    CHECK(n_block(200, d_in, d_out, 2) == 1);
+  }
+  CHECK(n_block(560, 2048, 2048, 2) == 3);  // a cache keeps these weights
+}
+
 TEST_CASE("x is rounded to the nearest bf16, ties to even, as PyTorch rounds it") {
   CHECK(from_bf16(to_bf16(1.0f)) == 1.0f);
   CHECK(from_bf16(to_bf16(1.0f + 0x1p-8f)) == 1.0f);                                // a tie: 1 is even
