@@ -40,7 +40,7 @@ class Worker {
     return {reinterpret_cast<T*>(memory_), kept};
   }
 
-  /// Scratch memory from there on. No item of a job before finds its own again.
+  /// Scratch memory behind the first `offset` bytes. Whatever items left in the memory is given up.
   std::byte* scratch_from(std::size_t offset) {
     owner_ = {};
     return memory_ + offset;

@@ -10,7 +10,8 @@ namespace {
 /// 32 rows by 32 columns: four tiles of sums, two of x and two of the panel.
 struct AmxInt8Tile : AmxRounding {
   using Session = AmxSession;
-  static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kBlockRows = 288, kStep = 768;
+  static constexpr int kRows = kMaxTernaryRows, kColumns = 32, kStep = 768;
+  static constexpr int kBlockRows = 288;  // pi0's 560 rows are two blocks, and two threads read its weights together
   static constexpr std::int64_t kBlockKiB = 640;
   static constexpr bool kEven = false, kBeside = true, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::tiles;

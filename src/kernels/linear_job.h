@@ -54,7 +54,7 @@ struct LinearJob {
   /// f32, or bf16 where the kernel rounds what it multiplies, laid out as LinearKernel::rounded says, or i8: rows as
   /// LinearKernel::quantize makes them, x_stride bytes apart.
   DType x_type;
-  // Made by LinearKernel::cut: groups of panels, and rows of a block of x where the threads matter for them.
+  // Made by LinearKernel::cut: groups of panels and, for tiles, rows of a block of x.
   std::int64_t n_group, block_rows;
 };
 

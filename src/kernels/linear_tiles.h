@@ -57,8 +57,10 @@ class TileLoop {
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa),
                                        const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
-    return {name,      Layout::packed_size,  Layout::pack, supports, cut, run,    sizeof(Scratch),
-            kMaxDepth, RoundedLayout::tiles, kAnyDepth,    kMaxX,    few, max_few};
+    LinearKernel row = {name,      Layout::packed_size,  Layout::pack, supports, cut,    run, sizeof(Scratch),
+                        kMaxDepth, RoundedLayout::tiles, kAnyDepth,    few,      max_few};
+    row.kept_x = kMaxX;
+    return row;
   }
 
  private:

@@ -48,9 +48,11 @@ struct BlockedTask : Task {
     const std::int64_t first = n_square * item / n_item * kernels::kSquare;
     const std::int64_t n = kernels::min(n_square * (item + 1) / n_item * kernels::kSquare, job[0].n_row) - first;
     kernels::LinearJob up = rows_of(job[0], first, n), down = rows_of(job[1], first, n);
-    up.part[up.n_part - 1].y = worker.scratch_from(inner), down.x = worker.scratch_from(inner);
-    run_alone(*kernel[0], up, worker);
-    run_alone(*kernel[1], down, worker);
+    // Each product starts anew: jobs of other blocks lay at the same addresses.
+    up.part[up.n_part - 1].y = worker.scratch_from(inner);
+    run_all(*kernel[0], up, worker);
+    down.x = worker.scratch_from(inner);
+    run_all(*kernel[1], down, worker);
   }
 
  private:
@@ -69,9 +71,7 @@ struct BlockedTask : Task {
     return job;
   }
 
-  /// All of a job, which takes over nothing from one that lay at the same address.
-  static void run_alone(const kernels::LinearKernel& kernel, kernels::LinearJob& job, Worker& worker) {
-    worker.scratch<std::byte>();
+  static void run_all(const kernels::LinearKernel& kernel, kernels::LinearJob& job, Worker& worker) {
     const std::int64_t n = kernel.cut(job, 1);
     for (std::int64_t i = 0; i < n; ++i) kernel.run(job, i, worker);
   }

@@ -156,7 +156,7 @@ void fuse(Lowering& l);
 /// Chooses the dtype of values between products, makes codes of what ternary ones read, and copies what its reader
 /// needs contiguous.
 void choose_layouts(Lowering& l);
-/// Joins two products to one operation on blocks of rows where that saves more ways through the caches than it costs.
+/// Joins two products to one operation on blocks of rows where what lies between them would not stay in a cache.
 void choose_blocks(Lowering& l);
 /// Puts operations that do not depend on each other into one phase, and what stays the same into Program::prepare.
 void schedule(Lowering& l);
