@@ -6,7 +6,7 @@ An editable install compiles nothing: it finds the library in the build of the s
 
     VLA_BUILD_DIR   build folder to use or to make, below the source tree unless absolute (default: build/cpu where it was configured,
                     else build/wheel)
-    CMAKE_ARGS      for the first configuration of it, e.g. -DVLA_NATIVE=OFF for a wheel that goes to other machines
+    CMAKE_ARGS      for the first configuration of it, e.g. -DVLA_NATIVE=ON for a ggml of this machine alone
 """
 
 import os

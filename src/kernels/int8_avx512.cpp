@@ -25,6 +25,14 @@ struct VnniTile {
  private:
   static constexpr int kStrips = kColumns / Int8Panels::kColumns;
 
+  static VLA_INLINE void add_products(__m512i& sum, __m512i numbers, __m512i codes) {
+#ifdef VLA_EMULATED_INSTRUCTIONS  // in plain C++, for tests
+    sum = _mm512_dpbusd_epi32(sum, numbers, codes);
+#else  // of the intrinsic compilers copy every sum
+    asm("vpdpbusd %2, %1, %0" : "+v"(sum) : "v"(numbers), "v"(codes));
+#endif
+  }
+
   template <int kCount, class Strips>
   static void tile(const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                    std::int32_t* sums, bool add) {
@@ -46,8 +54,7 @@ struct VnniTile {
           std::memcpy(&four, x + r * x_stride, sizeof(four));
           const __m512i codes = _mm512_set1_epi32(four);
 #pragma GCC unroll 4
-          for (int j = 0; j < kStrips; ++j)  // of the intrinsic compilers copy every sum
-            asm("vpdpbusd %2, %1, %0" : "+v"(sum[r][j]) : "v"(numbers[j]), "v"(codes));
+          for (int j = 0; j < kStrips; ++j) add_products(sum[r][j], numbers[j], codes);
         }
       }
 #pragma GCC unroll 6

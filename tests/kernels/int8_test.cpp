@@ -390,10 +390,12 @@ bool lacks(const std::string& name) {
 #define VLA_TERNARY_TEST(sentence, check)                                                           \
   VLA_LOOKUP_TEST(sentence, check)                                                                  \
   VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check(*row(ternary_kernels(), name)); }) \
+  VLA_EMULATED_TEST("avx512_int8", sentence, check(kEmulatedTernaryAvx512))                         \
   VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx))
-#define VLA_INT8_TEST(sentence, check)                                                 \
-  VLA_LOOKUP_TEST(sentence, check)                                                     \
-  VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check_both(name, check); }) \
+#define VLA_INT8_TEST(sentence, check)                                                                  \
+  VLA_LOOKUP_TEST(sentence, check)                                                                      \
+  VLA_INT8_TEST_OF(sentence, check, [](const char* name) { check_both(name, check); })                  \
+  VLA_EMULATED_TEST("avx512_int8", sentence, check(kEmulatedTernaryAvx512); check(kEmulatedInt8Avx512)) \
   VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx); check(kEmulatedInt8Amx))
 
 VLA_TERNARY_TEST("codes, sums and products are those of BitVLA's quantizers, bit for bit", check_golden)

@@ -8,8 +8,10 @@
 /// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2.
 #include <immintrin.h>
 
+#include <array>
 #include <bit>
 #include <cmath>
+#include <cstdint>
 #include <cstdlib>
 #include <cstring>
 
@@ -78,6 +80,14 @@ inline __m512 min(unsigned, __m512 a, __m512 b) {
 inline __m512 reciprocal(unsigned, __m512 x) {
   return std::bit_cast<__m512>(std::bit_cast<Words>(1.0f / x) & static_cast<int>(0xfffffe00U));
 }
+/// sum += the products of four bytes, those of `a` without sign, those of `b` with one.
+inline __m512i dot_bytes(__m512i sum, __m512i a, __m512i b) {
+  auto y = std::bit_cast<Words>(sum);
+  const auto first = std::bit_cast<std::array<std::uint8_t, 64>>(a);
+  const auto second = std::bit_cast<std::array<std::int8_t, 64>>(b);
+  for (std::size_t i = 0; i < 64; ++i) y[i / 4] += first[i] * second[i];
+  return std::bit_cast<__m512i>(y);
+}
 inline __m512i shift_left(unsigned, __m512i x, int n) { return std::bit_cast<__m512i>(std::bit_cast<Words>(x) << n); }
 inline __m256 half(unsigned, __m512 x, int i) {
   __m256 y;
@@ -94,6 +104,9 @@ inline __m512 widen(unsigned, __m256i x) {
 #define _mm512_load_ps vla::test::avx512::load
 #define _mm512_loadu_ps vla::test::avx512::load
 #define _mm512_maskz_loadu_ps vla::test::avx512::load_some
+#define _mm512_storeu_si512 vla::test::avx512::store_words
+#define _mm512_setzero_si512() vla::test::avx512::set_word(0)
+#define _mm512_dpbusd_epi32 vla::test::avx512::dot_bytes
 #define _mm512_loadu_si512 vla::test::avx512::load_words
 #define _mm512_storeu_ps vla::test::avx512::store
 #define _mm512_mask_storeu_ps vla::test::avx512::store_some
@@ -125,4 +138,6 @@ inline __m512 widen(unsigned, __m256i x) {
 #ifndef VLA_EMULATED_MACHINE
 #define kLinearAvx512 kEmulatedLinearAvx512
 #define kAvx512Kernels kEmulatedAvx512Kernels
+#define kTernaryAvx512 kEmulatedTernaryAvx512
+#define kInt8Avx512 kEmulatedInt8Avx512
 #endif
