@@ -289,8 +289,21 @@ Status Engine::encode(const Observation& observation, const Noise& noise, const 
   VLA_TRY(to.x, start(noise));
   if (leftover) {
     VLA_TRY(to.steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(to.x)));
+    VLA_CHECK(check_leftover(*leftover, to.inputs));
   }
   clock.lap(to.timing, "tokenize");
+  return {};
+}
+
+/// Rows far from the training data pull the whole chunk there: most often they are in world units.
+Status Engine::check_leftover(const Leftover& leftover, Inputs& inputs) const {
+  const std::optional<std::string> far = processor_.far_action(leftover.rows);
+  if (!far) return {};
+  if (processor_.refuses_beyond())
+    return Error{Code::bad_observation, "leftover", fmt::format("at most {} when normalized", kStateBound), *far,
+                 "send rows of ActionChunk::normalized, not actions in world units"};
+  inputs.is_beyond = true;
+  inputs.notes.push_back(fmt::format("leftover{}; more than {} is far from what the policy gives", *far, kStateBound));
   return {};
 }
 
@@ -326,6 +339,8 @@ Result<ActionChunk> Engine::run(Prepared& prepared) {
   chunk.notes = inputs.notes;
   for (const auto* taps : {&injected_input_, &injected_})
     for (const Tap& tap : *taps) chunk.notes.push_back(tap.path + " was injected, not computed");
+  if (const std::optional<std::string> far = processor_.far_action(chunk.normalized))
+    chunk.notes.push_back(fmt::format("actions{}; more than {} is far from the training data", *far, kStateBound));
   chunk.is_beyond = inputs.is_beyond;
   record_chunk(chunk);
   return chunk;

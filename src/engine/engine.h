@@ -135,6 +135,7 @@ class Engine {
   Status make_graphs();
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 Prepared& to) const;
+  Status check_leftover(const Leftover& leftover, Inputs& inputs) const;
   Result<ActionChunk> run(Prepared& prepared);
   Status make_conditions();
   Status run_once(const Graph& graph);

@@ -243,6 +243,21 @@ Result<std::vector<float>> Processor::decode(std::span<const float> chunk, int h
   return actions;
 }
 
+std::optional<std::string> Processor::far_action(std::span<const float> rows) const {
+  const std::size_t width = action_names_.size();
+  std::size_t far = rows.size(), n_far = 0;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    const auto has_statistics = [&](const auto& op) { return op->unnormalizes(i % width); };
+    if (std::abs(static_cast<double>(rows[i])) <= kStateBound ||
+        std::none_of(recipe_.action.begin(), recipe_.action.end(), has_statistics))
+      continue;
+    if (n_far++ == 0 || std::abs(rows[i]) > std::abs(rows[far])) far = i;
+  }
+  if (n_far == 0) return {};
+  return fmt::format("[{}][\"{}\"] is {:.3g} when normalized{}", far / width, action_names_[far % width], rows[far],
+                     n_far > 1 ? fmt::format(", and {} more are far", n_far - 1) : "");
+}
+
 bool Processor::reads(const std::string& tensor) const {
   const auto read_by = [&](const auto& op) { return op->reads(tensor); };
   return std::any_of(recipe_.state.begin(), recipe_.state.end(), read_by) ||

@@ -41,7 +41,7 @@ struct Inputs {
   std::vector<std::string> notes;      // warnings, e.g. that the instruction was truncated
 };
 
-/// The default bound of a normalized state value, beyond which an answer has a note: ten standard deviations, or five
+/// The bound of a normalized action, and the default one of a normalized state value, beyond which an answer has a note: ten standard deviations, or five
 /// times the range of the training data. Degrees in place of radians exceed it.
 inline constexpr double kStateBound = 10.0;
 
@@ -80,6 +80,12 @@ class Processor {
   /// finite, naming its row and column.
   Result<std::vector<float>> decode(std::span<const float> chunk, int horizon, int d_action,
                                     std::span<const float> raw_state) const;
+
+  /// Which value of normalized actions (n, action_names().size()) is farthest from the training data, where one is
+  /// beyond kStateBound: for a note or a refusal. Columns that have no statistics are not looked at.
+  std::optional<std::string> far_action(std::span<const float> rows) const;
+  /// Whether a state or a leftover beyond its bound is refused.
+  bool refuses_beyond() const { return refuses_beyond_; }
 
   /// Whether a step of the recipe reads this tensor; any other statistics in a bundle are a mistake.
   bool reads(const std::string& tensor) const;

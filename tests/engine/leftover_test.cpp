@@ -136,3 +136,31 @@ TEST_CASE("policies that cannot go on from rows say so") {
     CHECK(chunk.error().code == Code::unsupported);
   }
 }
+
+TEST_CASE("rows in world units are noted, and refused where a state would be") {
+  const LeftoverCase c = leftover_cases().front();
+  const auto engine = load_engine(c.golden.bundle());
+  Leftover far = c.leftover;
+  const auto says_far = [](const ActionChunk& chunk, const char* what) {
+    return std::any_of(chunk.notes.begin(), chunk.notes.end(),
+                       [&](const std::string& note) { return note.starts_with(what); });
+  };
+  const auto near = act(*engine, c, c.leftover);
+  REQUIRE(near.ok());
+  CHECK_FALSE(near->is_beyond);
+  CHECK_FALSE(says_far(*near, "leftover["));
+  far.rows.back() = -100;
+  const auto noted = act(*engine, c, far);
+  REQUIRE(noted.ok());
+  CHECK(noted->is_beyond);
+  CHECK(says_far(*noted, "leftover["));
+  for (float& x : far.rows) x = 100;
+  const auto pulled = act(*engine, c, far);
+  REQUIRE(pulled.ok());
+  CHECK(says_far(*pulled, "actions["));
+  engine->refuse_beyond();
+  const auto refused = act(*engine, c, far);
+  REQUIRE_FALSE(refused.ok());
+  CHECK(refused.error().code == Code::bad_observation);
+  CHECK(refused.error().where == "leftover");
+}

@@ -229,6 +229,9 @@ class UnnormalizeOp final : public ActionOp {
       row[i] = normalizer_->map(static_cast<float>(row[i]), i, place.index);
     }
   }
+  bool unnormalizes(std::size_t column) const override {
+    return std::find(columns_.begin(), columns_.end(), static_cast<int>(column)) != columns_.end();
+  }
   bool reads(const std::string& tensor) const override { return fields.reads(tensor); }
 
  private:

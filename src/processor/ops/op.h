@@ -121,6 +121,8 @@ class ActionOp {
   virtual Status bind(ActionLayout& layout, const std::string& where) = 0;
   /// One row, in place. Its numbers are float32, but for those of an op that says otherwise; the last are rounded.
   virtual void apply(std::vector<double>& row, const RowPlace& place) const = 0;
+  /// Whether `apply` takes this column from the network's units by statistics.
+  virtual bool unnormalizes(std::size_t /*column*/) const { return false; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 
