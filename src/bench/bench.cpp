@@ -20,6 +20,12 @@ Result<RandomBundle> make_random(const Request& request, const Watcher& watcher)
   return RandomBundle::make(request.arch, entry.published(), sizes);
 }
 
+/// Before the machine is measured, which takes seconds. Errors: those of Bundle::open.
+Status check_bundle(const std::string& path) {
+  const Result<Bundle> found = Bundle::open(path);
+  return found ? Status() : Status(found.error());
+}
+
 Conditions conditions_of(const Engine& engine, const Workload& workload, int n_step) {
   const auto text = [&](const char* key) { return *engine.bundle().keys().string(key); };  // every bundle has them
   return {text("vla.arch"),           text("vla.dtype"), text("vla.source.name"), workload.n_view(),
@@ -44,6 +50,7 @@ Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const st
 
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher) {
+  if (!request.bundle.empty()) VLA_CHECK(check_bundle(request.bundle));
   VLA_TRY(const std::unique_ptr<Device> device, open_device(request.n_thread, request.kernels, request.device));
   std::optional<RandomBundle> random;
   if (request.bundle.empty()) {

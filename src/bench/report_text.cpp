@@ -77,6 +77,14 @@ std::vector<std::string> around(const Report& report) {
   return lines;
 }
 
+/// What most readers came for.
+std::string headline(const Report& report) {
+  const StageRow* total = report.find("total");
+  if (total == nullptr || total->p50 <= 0) return "";
+  return fmt::format("{:.{}f} ms an act (median, pixels to actions): {:.3g} chunks a second", total->p50,
+                     total->p50 < 100 ? 1 : 0, 1e3 / total->p50);
+}
+
 }  // namespace
 
 std::string to_text(const Report& report) {
@@ -92,7 +100,7 @@ std::string to_text(const Report& report) {
       text += i == 0 ? fmt::format("{:<{}}", row[i], width) : fmt::format("  {:>{}}", row[i], width);
       if (i + 1 == row.size()) text += "\n";
     }
-  return text;
+  return text + "\n" + headline(report) + "\n";
 }
 
 std::string to_markdown(const Report& report) {

@@ -17,6 +17,7 @@
 #include <system_error>
 
 #include "cli/commands.h"
+#include "cli/help.h"
 #include "cli/say.h"
 
 namespace {
@@ -48,7 +49,9 @@ int fail_usage(const CLI::App& app, const CLI::ParseError& parse_error) {
   std::string what =
       unknown.empty() ? parse_error.what() : fmt::format("{} does not know {}", command, fmt::join(unknown, " "));
   std::replace(what.begin(), what.end(), '\n', ' ');
-  return fail({vla::Code::usage, "arguments", "", what, "see " + command + " --help"});
+  const CLI::App& asked = chosen.empty() ? app : *chosen.front();
+  const std::string meant = unknown.empty() ? "" : vla::cli::suggestion(asked, unknown.front());
+  return fail({vla::Code::usage, "arguments", "", what, meant + "see " + command + " --help"});
 }
 
 /// A script must not take an answer for whole that a full disk or a closed pipe cut off.
@@ -84,8 +87,11 @@ int run(int argc, char** argv) {
   choose("replay", vla::cli::add_replay(app));
 #endif
 
+  vla::cli::format_help(app);
+  std::vector<std::string> given = vla::cli::arguments(argc, argv);
+  std::reverse(given.begin(), given.end());  // as CLI11 takes them
   try {
-    app.parse(argc, argv);
+    app.parse(std::move(given));
   } catch (const CLI::ParseError& parse_error) {
     if (parse_error.get_exit_code() != 0) return fail_usage(app, parse_error);
     app.exit(parse_error);  // help or version was asked for

@@ -47,7 +47,7 @@ class Answer:
         """Whether this is one typed error: its exit code, one line on stderr that has `parts`, nothing on stdout."""
         assert self.code == EXIT[code], (self.code, self.err)
         assert self.out == ""
-        call = r"arguments: [^\n]+; see vla( \w+)? --help"  # of a call that cannot be read
+        call = r"arguments: [^\n]+; (did you mean \S+ )?see vla( \w+)? --help"  # of a call that cannot be read
         assert re.fullmatch(rf"error: {code}: ({call}|[^\n]+: expected [^\n]+, found [^\n]+)\n", self.err), self.err
         for part in parts:
             assert part in self.err, (part, self.err)

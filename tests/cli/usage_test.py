@@ -70,8 +70,8 @@ def test_run_without_an_image_a_state_or_a_text_is_a_usage_error_that_names_it(v
 @pytest.mark.parametrize(
     "arguments, unknown",
     [
-        (["runn"], "vla does not know runn; see vla --help"),
-        (["run", "policy.gguf", "--images", "top=top.png"], "vla run does not know --images top=top.png; see vla run --help"),
+        (["runn"], "vla does not know runn; did you mean run? see vla --help"),
+        (["run", "policy.gguf", "--images", "top=top.png"], "vla run does not know --images top=top.png; did you mean --image? see vla run --help"),
         (["serve", "policy.gguf", "--port", "5555"], "vla serve does not know --port 5555; see vla serve --help"),
     ],
     ids=str,
@@ -116,3 +116,28 @@ def test_output_that_cannot_be_written_is_an_io_error(vla, golden):
     with open("/dev/full", "wb") as full:
         answer = vla(*golden.arguments(), stdout=full)
     answer.refused("io", "standard output")
+
+
+COMMANDS = ["run", "inspect", "compare", "bench", "serve", "keygen", "replay"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_terminal_and_says_ranges_in_words(vla, command):
+    answer = vla(command, "--help")
+    assert answer.code == 0
+    assert vla("help", command).out == answer.out
+    assert max(map(len, answer.out.splitlines())) <= 130  # examples stay in one line
+    assert ":INT in [" not in answer.out and "TEXT:" not in answer.out
+
+
+@pytest.mark.parametrize(
+    "arguments, meant",
+    [(["brench"], "bench"), (["run", "policy.gguf", "--txt", "go"], "--text"), (["serve", "--thread", "2"], "--threads")],
+)
+def test_a_misspelled_word_is_answered_with_the_one_that_was_meant(vla, arguments, meant):
+    answer = vla(*arguments)
+    assert answer.code == 2 and f"did you mean {meant}?" in answer.err
+
+
+def test_a_word_like_no_other_is_answered_without_a_guess(vla):
+    assert "did you mean" not in vla("inspect", "policy.gguf", "--frobnicate").err
