@@ -19,13 +19,6 @@ std::vector<std::int64_t> dims(const Shape& shape) {
 
 std::string shape_text(const Shape& shape) { return fmt::format("[{}]", fmt::join(dims(shape), ", ")); }
 
-const char* op_name(const Op& op) {
-  constexpr const char* kNames[] = {"input", "constant",  "parameter", "linear",  "embedding",     "gather", "norm",
-                                    "rope",  "attention", "activate",  "add",     "multiply",      "scale",  "concat",
-                                    "slice", "repeat",    "reshape",   "patches", "pixel_shuffle", "write"};
-  return kNames[op.index()];
-}
-
 Graph::Graph(Slots& slots, TapFilter filter, Injector injector)
     : slots_(slots), filter_(std::move(filter)), injector_(std::move(injector)) {
   static std::atomic<std::uint64_t> n_graph = 0;

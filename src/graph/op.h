@@ -12,18 +12,23 @@
 
 /// What a graph is made of: plain structs that say what is computed and nothing about how. Operands are tensors, in the
 /// order of the comment; shapes follow ggml, fastest first. Graph::add checks them when an operation is recorded.
+/// Every pass has a function for each of them and none for the rest, so that one that it does not know fails to
+/// compile.
 namespace vla::op {
 
 /// Leaf: what a slot holds when the graph runs.
 struct Input {
+  static constexpr const char* kName = "input";
   const Slot* slot;
 };
 /// Leaf: numbers that depend on shapes and configuration alone (masks, rotary tables, ids).
 struct Constant {
+  static constexpr const char* kName = "constant";
   std::variant<std::vector<float>, std::vector<std::int32_t>> values;
 };
 /// Leaf: a declared vector as a tensor of its own.
 struct Parameter {
+  static constexpr const char* kName = "parameter";
   const Param* param;
 };
 
@@ -34,69 +39,92 @@ struct Parameter {
 /// of codes) * (scale / s). Every operation is rounded to float32 by itself; the sums are exact.
 /// Source: BitVLA modeling_bitnet.py BitLinear, WeightQuant, ActQuant.
 struct Linear {
+  static constexpr const char* kName = "linear";
   const Param* weight;
   const Param* bias;
   const Param* scale = nullptr;
 };
 /// ids [n] i32 -> rows of a declared table [d, n].
 struct Embedding {
+  static constexpr const char* kName = "embedding";
   const Param* table;
 };
 /// table [d, n_row], ids [n] i32 -> [d, n].
-struct Gather {};
+struct Gather {
+  static constexpr const char* kName = "gather";
+};
 
 enum class NormKind { layer, rms };
 /// x, then weight and bias [d] where there are any. layer: (x - mean) / sqrt(variance + eps) * weight + bias over the
 /// first dimension; rms: x / sqrt(mean(x^2) + eps) * weight + bias.
 struct Norm {
+  static constexpr const char* kName = "norm";
   NormKind kind;
   float eps;
 };
 /// x [d_head, n_head, n, n_batch], table [d_head, n]: per token d_head/2 cosines, then sines. The pairs
 /// (x_i, x_{i + d_head/2}) turn by the token's angles, in every head and batch alike.
-struct Rope {};
+struct Rope {
+  static constexpr const char* kName = "rope";
+};
 /// q [d_head, n_head, n_query, n_batch], mask [n_key, n_query] if `has_mask`, then segments of keys and values in turn,
 /// each [d_head, n_head_kv, n_key_i, n_batch], which stand one after the other -> [d_head * n_head, n_query, n_batch].
 /// softmax(q k / sqrt(d_head) + mask) v in float32. Every query must see a key.
 struct Attention {
+  static constexpr const char* kName = "attention";
   bool has_mask;
 };
 /// x -> the same shape.
 struct Activate {
+  static constexpr const char* kName = "activate";
   Activation activation;
 };
 /// a, b -> the shape of a. Where b has 1 in a dimension it counts for all of a's.
-struct Add {};
-struct Multiply {};
+struct Add {
+  static constexpr const char* kName = "add";
+};
+struct Multiply {
+  static constexpr const char* kName = "multiply";
+};
 /// x * factor.
 struct Scale {
+  static constexpr const char* kName = "scale";
   float factor;
 };
 /// Parts that differ in dimension `dim` only, one after the other.
 struct Concat {
+  static constexpr const char* kName = "concat";
   int dim;
 };
 /// Indices first to first + count - 1 of dimension `dim`; `count` is in the result's shape.
 struct Slice {
+  static constexpr const char* kName = "slice";
   int dim;
   std::int64_t first;
 };
 /// x with 1 in a dimension -> as often as the result's shape says.
-struct Repeat {};
+struct Repeat {
+  static constexpr const char* kName = "repeat";
+};
 /// The same numbers in the same order.
-struct Reshape {};
+struct Reshape {
+  static constexpr const char* kName = "reshape";
+};
 /// images [width, height, 3, n_view] -> pixels of non-overlapping patches, row by row: [3 * size^2, n_patch, n_view],
 /// of a patch channel, row, column.
 struct Patches {
+  static constexpr const char* kName = "patches";
   int size;
 };
 /// x [d, n, n_view], patches in rows of `n_column` -> squares of factor x factor patches as one token, of a square its
 /// rows one after the other: [d * factor^2, n / factor^2, n_view].
 struct PixelShuffle {
+  static constexpr const char* kName = "pixel_shuffle";
   int n_column, factor;
 };
 /// Stores x in a slot of its shape.
 struct Write {
+  static constexpr const char* kName = "write";
   Slot* slot;
 };
 
@@ -109,6 +137,8 @@ using Op = std::variant<op::Input, op::Constant, op::Parameter, op::Linear, op::
                         op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Write>;
 
 /// The operation's word, for messages and printed graphs.
-const char* op_name(const Op& op);
+inline const char* op_name(const Op& op) {
+  return std::visit([](const auto& known) { return known.kName; }, op);
+}
 
 }  // namespace vla

@@ -231,15 +231,30 @@ kernels::HeadRows head_rows(const Lowering& l, ValueId id) {
   return {base.data, x.offset, x.stride[1], x.stride[2], x.stride[3], x.rounded, base.shape[0]};
 }
 
-double flop_of_op(const FusedOp& op) {
-  double flop = 0;
-  if (const auto* blocked = std::get_if<BlockedOp>(&op.op))
-    for (const FusedOp& product : blocked->products) flop += flop_of_op(product);
-  if (const auto* linear = std::get_if<LinearOp>(&op.op))
-    for (const Node* node : linear->linears) flop += flop_of(*node);
-  if (const auto* attention = std::get_if<AttentionOp>(&op.op)) flop = flop_of(*attention->node);
-  return flop;
-}
+double flop_of_op(const FusedOp& op);
+struct FlopOf {
+  double operator()(const BlockedOp& op) const { return sum(op.products, flop_of_op); }
+  double operator()(const LinearOp& op) const {
+    return sum(op.linears, [](const Node* node) { return flop_of(*node); });
+  }
+  double operator()(const AttentionOp& op) const { return flop_of(*op.node); }
+  // Counted are products alone.
+  double operator()(const QuantizeOp&) const { return 0; }
+  double operator()(const PackOp&) const { return 0; }
+  double operator()(const RowOp&) const { return 0; }
+  double operator()(const CopyOp&) const { return 0; }
+  double operator()(const LookupOp&) const { return 0; }
+  double operator()(const PatchesOp&) const { return 0; }
+
+ private:
+  template <class Of, class Flop>
+  static double sum(const Of& all, const Flop& flop) {
+    double result = 0;
+    for (const auto& one : all) result += flop(one);
+    return result;
+  }
+};
+double flop_of_op(const FusedOp& op) { return std::visit(FlopOf{}, op.op); }
 
 /// Threads that share an operation.
 int threads_for(const Lowering& l, const FusedOp& op) { return flop_of_op(op) < kMinSharedFlop ? 1 : l.n_thread; }
@@ -350,28 +365,42 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const Attention
   return task;
 }
 
+/// The kernel of a row operation, and how it takes its second operand.
+struct SetRowKernel {
+  const Lowering& l;
+  const RowOp& row;
+  RowTask& task;
+
+  void operator()(const op::Norm& norm) const {
+    task.kernel = norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm, task.s = norm.eps;
+  }
+  void operator()(const op::Rope&) const { task.kernel = cpu(l).rotate_half, task.w_stride = {1, 0, task.shape[0], 0}; }
+  void operator()(const op::Activate& op) const { task.kernel = cpu(l).activation(op.activation); }
+  void operator()(const op::Scale& op) const { task.kernel = cpu(l).scale, task.s = op.factor; }
+  void operator()(const op::Add&) const {
+    broadcast();
+    task.kernel = cpu(l).add;
+  }
+  void operator()(const op::Multiply&) const {
+    broadcast();
+    task.kernel = task.w_is_scalar ? cpu(l).scale : cpu(l).multiply;
+  }
+
+ private:
+  void broadcast() const {
+    const Value& w = l.value(row.w);
+    for (std::size_t i = 1; i < 4; ++i) task.w_stride[i] = w.shape[i] == 1 ? 0 : w.stride[i];
+    task.w_is_scalar = w.shape[0] == 1 && task.shape[0] != 1;
+  }
+};
+
 std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const RowOp& row) {
   auto task = std::make_unique<RowTask>();
   const Node& node = *row.node;
   task->x = floats(l, row.x), task->x_stride = l.value(row.x).stride;
   task->w = operand(l, row.w), task->b = operand(l, row.b);
   task->y = floats(l, op.writes[0]), task->shape = node.shape;
-  if (const auto* norm = node.as<op::Norm>()) {
-    task->kernel = norm->kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm;
-    task->s = norm->eps;
-  } else if (node.as<op::Rope>() != nullptr) {
-    task->kernel = cpu(l).rotate_half;
-    task->w_stride = {1, 0, node.shape[0], 0};
-  } else if (const auto* activate = node.as<op::Activate>()) {
-    task->kernel = cpu(l).activation(activate->activation);
-  } else if (const auto* scale = node.as<op::Scale>()) {
-    task->kernel = cpu(l).scale, task->s = scale->factor;
-  } else {
-    const Value& w = l.value(row.w);
-    for (std::size_t i = 1; i < 4; ++i) task->w_stride[i] = w.shape[i] == 1 ? 0 : w.stride[i];
-    task->w_is_scalar = w.shape[0] == 1 && node.shape[0] != 1;
-    task->kernel = node.as<op::Add>() != nullptr ? cpu(l).add : task->w_is_scalar ? cpu(l).scale : cpu(l).multiply;
-  }
+  std::visit(SetRowKernel{l, row, *task}, row.what);
   task->item_rows = item_rows(l, count(node.shape) / node.shape[0], node.shape[0], task->n_item);
   return task;
 }
@@ -431,24 +460,48 @@ std::unique_ptr<Task> emit(const Lowering& l, const FusedOp& op) {
   return std::visit([&](const auto& what) { return make(l, op, what); }, op.op);
 }
 
-std::size_t scratch_of(const Lowering& l, const FusedOp& op) {
-  if (const auto* linear = std::get_if<LinearOp>(&op.op)) return kernel_of(l, *linear).scratch_size;
-  if (const auto* blocked = std::get_if<BlockedOp>(&op.op)) {
-    const BlockedScratch size = scratch_sizes(l, *blocked);
+namespace {
+
+struct ScratchOf {
+  const Lowering& l;
+
+  std::size_t operator()(const LinearOp& op) const { return kernel_of(l, op).scratch_size; }
+  std::size_t operator()(const BlockedOp& op) const {
+    const BlockedScratch size = scratch_sizes(l, op);
     return size.kernels + size.inner;
   }
-  if (const auto* quantize = std::get_if<QuantizeOp>(&op.op))
-    return quantize->norm != nullptr ? static_cast<std::size_t>(l.value(quantize->x).shape[0]) * sizeof(float) : 0;
-  return 0;
-}
+  std::size_t operator()(const QuantizeOp& op) const {
+    return op.norm != nullptr ? static_cast<std::size_t>(l.value(op.x).shape[0]) * sizeof(float) : 0;
+  }
+  std::size_t operator()(const PackOp&) const { return 0; }
+  std::size_t operator()(const AttentionOp&) const { return 0; }
+  std::size_t operator()(const RowOp&) const { return 0; }
+  std::size_t operator()(const CopyOp&) const { return 0; }
+  std::size_t operator()(const LookupOp&) const { return 0; }
+  std::size_t operator()(const PatchesOp&) const { return 0; }
+};
 
-KindClock::Kind kind_of(const FusedOp& op) {
-  if (std::holds_alternative<LinearOp>(op.op) || std::holds_alternative<BlockedOp>(op.op)) return KindClock::products;
-  if (std::holds_alternative<PackOp>(op.op) || std::holds_alternative<AttentionOp>(op.op)) return KindClock::attention;
-  const auto* row = std::get_if<RowOp>(&op.op);
-  const bool is_norm = row != nullptr && row->node->as<op::Norm>() != nullptr;
-  return is_norm || std::holds_alternative<QuantizeOp>(op.op) ? KindClock::norms : KindClock::others;
-}
+struct KindOf {
+  using Kind = KindClock::Kind;
+
+  Kind operator()(const LinearOp&) const { return KindClock::products; }
+  Kind operator()(const BlockedOp&) const { return KindClock::products; }
+  Kind operator()(const PackOp&) const { return KindClock::attention; }
+  Kind operator()(const AttentionOp&) const { return KindClock::attention; }
+  Kind operator()(const QuantizeOp&) const { return KindClock::norms; }
+  Kind operator()(const RowOp& op) const {
+    return std::holds_alternative<op::Norm>(op.what) ? KindClock::norms : KindClock::others;
+  }
+  Kind operator()(const CopyOp&) const { return KindClock::others; }
+  Kind operator()(const LookupOp&) const { return KindClock::others; }
+  Kind operator()(const PatchesOp&) const { return KindClock::others; }
+};
+
+}  // namespace
+
+std::size_t scratch_of(const Lowering& l, const FusedOp& op) { return std::visit(ScratchOf{l}, op.op); }
+
+KindClock::Kind kind_of(const FusedOp& op) { return std::visit(KindOf{}, op.op); }
 
 Work work_of(const Lowering& l, const FusedOp& op) {
   Work work;

@@ -1,6 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include <algorithm>
+#include <iterator>
 #include <map>
 #include <tuple>
 
@@ -37,46 +38,65 @@ class Fuser {
   }
 
   void visit(const Node& node) {
-    if (node.as<op::Linear>() != nullptr)
-      visit_linear(node);
-    else if (node.as<op::Attention>() != nullptr)
-      visit_attention(node);
-    else if (node.as<op::Concat>() != nullptr)
-      add(concat(node), node);
-    else if (node.as<op::PixelShuffle>() != nullptr)
-      add(pixel_shuffle(node), node);
-    else if (node.as<op::Embedding>() != nullptr || node.as<op::Gather>() != nullptr)
-      add(LookupOp{&node, operand(node, node.in.size() - 1), node.in.size() > 1 ? operand(node, 0) : kNone}, node);
-    else if (node.as<op::Patches>() != nullptr)
-      add(PatchesOp{&node, operand(node, 0)}, node);
-    else if (is_view_op(node)) {
-      if (l.value(node.id).base == node.id) add(copy(node), node);
-    } else if (!node.in.empty() && node.as<op::Write>() == nullptr)
-      add(RowOp{&node, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
+    std::visit([&](const auto& op) { visit(node, op); }, node.op);
+  }
+
+  // Leaves are values; what a slot gets is the result of another operation (layout.cpp).
+  void visit(const Node&, const op::Input&) {}
+  void visit(const Node&, const op::Constant&) {}
+  void visit(const Node&, const op::Parameter&) {}
+  void visit(const Node&, const op::Write&) {}
+
+  void visit(const Node& node, const op::Linear&) { visit_linear(node); }
+  void visit(const Node& node, const op::Attention&) { visit_attention(node); }
+  void visit(const Node& node, const op::Concat& op) { add(concat(node, op), node); }
+  void visit(const Node& node, const op::PixelShuffle& op) { add(pixel_shuffle(node, op), node); }
+  void visit(const Node& node, const op::Embedding&) { add(LookupOp{&node, operand(node, 0)}, node); }
+  void visit(const Node& node, const op::Gather&) { add(LookupOp{&node, operand(node, 1), operand(node, 0)}, node); }
+  void visit(const Node& node, const op::Patches&) { add(PatchesOp{&node, operand(node, 0)}, node); }
+
+  void visit(const Node& node, const op::Norm& op) { add_rows(node, op); }
+  void visit(const Node& node, const op::Rope& op) { add_rows(node, op); }
+  void visit(const Node& node, const op::Activate& op) { add_rows(node, op); }
+  void visit(const Node& node, const op::Add& op) { add_rows(node, op); }
+  void visit(const Node& node, const op::Multiply& op) { add_rows(node, op); }
+  void visit(const Node& node, const op::Scale& op) { add_rows(node, op); }
+  void add_rows(const Node& node, decltype(RowOp::what) what) {
+    add(RowOp{&node, what, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
+  }
+
+  // Copies where a view would do but must not be one.
+  void visit(const Node& node, const op::Slice& op) {
+    const ValueId x = operand(node, 0);
+    copy(node, [&](CopyOp::Part& part) {
+      part.from_offset = op.first * l.value(x).stride[static_cast<std::size_t>(op.dim)];
+    });
+  }
+  void visit(const Node& node, const op::Repeat&) {
+    const Shape& from = node.in[0].shape();
+    copy(node, [&](CopyOp::Part& part) {
+      for (std::size_t i = 0; i < 4; ++i)
+        if (from[i] == 1) part.from_stride[i] = 0;
+    });
+  }
+  void visit(const Node& node, const op::Reshape&) {
+    const Shape& from = node.in[0].shape();
+    copy(node, [&](CopyOp::Part& part) { part.shape = from, part.to_stride = contiguous_strides(from); });
+  }
+  template <class Change>
+  void copy(const Node& node, const Change& change) {
+    if (l.value(node.id).base != node.id) return;  // a view
+    const ValueId x = operand(node, 0);
+    CopyOp::Part part = {x, node.shape, l.value(x).stride, contiguous_strides(node.shape), 0};
+    change(part);
+    add(CopyOp{{part}}, node);
   }
 
   static ValueId operand(const Node& node, std::size_t i) { return i < node.in.size() ? node.in[i].node()->id : kNone; }
 
-  static bool is_view_op(const Node& node) {
-    return node.as<op::Slice>() != nullptr || node.as<op::Repeat>() != nullptr || node.as<op::Reshape>() != nullptr;
-  }
-
-  /// What would be a view, but must not be one.
-  CopyOp copy(const Node& node) const {
-    const ValueId x = node.in[0].node()->id;
-    const Value& from = l.value(x);
-    CopyOp::Part part = {x, node.shape, from.stride, contiguous_strides(node.shape), 0};
-    if (node.as<op::Reshape>() != nullptr) part.shape = from.shape, part.to_stride = contiguous_strides(from.shape);
-    if (const auto* slice = node.as<op::Slice>())
-      part.from_offset = slice->first * from.stride[static_cast<std::size_t>(slice->dim)];
-    for (std::size_t i = 0; node.as<op::Repeat>() != nullptr && i < 4; ++i)
-      if (from.shape[i] == 1) part.from_stride[i] = 0;
-    return {{part}};
-  }
-
-  CopyOp concat(const Node& node) const {
+  CopyOp concat(const Node& node, const op::Concat& concat) const {
     CopyOp op;
-    const auto dim = static_cast<std::size_t>(node.as<op::Concat>()->dim);
+    const auto dim = static_cast<std::size_t>(concat.dim);
     const Shape to = contiguous_strides(node.shape);
     std::int64_t offset = 0;
     for (Tensor part : node.in) {
@@ -89,8 +109,8 @@ class Fuser {
 
   /// Patch (factor R + r, factor C + c) becomes part (r, c) of token (R, C): one copy for each
   /// part.
-  CopyOp pixel_shuffle(const Node& node) const {
-    const auto [n_column, factor] = *node.as<op::PixelShuffle>();
+  CopyOp pixel_shuffle(const Node& node, const op::PixelShuffle& shuffle) const {
+    const auto [n_column, factor] = shuffle;
     const Value& x = l.value(node.in[0].node()->id);
     const std::int64_t d = x.shape[0], row = x.stride[1], n_row = x.shape[1] / n_column;
     CopyOp op;
@@ -276,30 +296,29 @@ class Fuser {
   }
 
   static void note_operands(FusedOp& op) {
-    const auto read = [&](std::initializer_list<ValueId> ids) {
-      for (const ValueId id : ids)
-        if (id != kNone) op.reads.push_back(id);
-    };
-    const auto read_prepared = [&](const Prepared& rows) { read({rows.x, rows.weight, rows.table}); };
-    if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
-      read({linear->x, linear->factor, linear->residual, linear->norm_weight, linear->norm_bias});
-    } else if (const auto* pack = std::get_if<PackOp>(&op.op)) {
-      read_prepared(pack->k);
-      read({pack->v});
-    } else if (const auto* attention = std::get_if<AttentionOp>(&op.op)) {
-      op.reads = attention->packed;
-      read_prepared(attention->q);
-      read({attention->mask});
-    } else if (const auto* copy = std::get_if<CopyOp>(&op.op)) {
-      for (const CopyOp::Part& part : copy->parts) read({part.from});
-    } else if (const auto* row = std::get_if<RowOp>(&op.op)) {
-      read({row->x, row->w, row->b});
-    } else if (const auto* lookup = std::get_if<LookupOp>(&op.op)) {
-      read({lookup->table, lookup->ids});
-    } else {
-      read({std::get<PatchesOp>(op.op).images});
-    }
+    const std::vector<ValueId> all = std::visit([](const auto& what) { return operands(what); }, op.op);
+    std::copy_if(all.begin(), all.end(), std::back_inserter(op.reads), [](ValueId id) { return id != kNone; });
   }
+  static std::vector<ValueId> operands(const LinearOp& op) {
+    return {op.x, op.factor, op.residual, op.norm_weight, op.norm_bias};
+  }
+  static std::vector<ValueId> operands(const PackOp& op) { return {op.k.x, op.k.weight, op.k.table, op.v}; }
+  static std::vector<ValueId> operands(const AttentionOp& op) {
+    std::vector<ValueId> all = op.packed;
+    all.insert(all.end(), {op.q.x, op.q.weight, op.q.table, op.mask});
+    return all;
+  }
+  static std::vector<ValueId> operands(const CopyOp& op) {
+    std::vector<ValueId> all;
+    for (const CopyOp::Part& part : op.parts) all.push_back(part.from);
+    return all;
+  }
+  static std::vector<ValueId> operands(const RowOp& op) { return {op.x, op.w, op.b}; }
+  static std::vector<ValueId> operands(const LookupOp& op) { return {op.table, op.ids}; }
+  static std::vector<ValueId> operands(const PatchesOp& op) { return {op.images}; }
+  // Made by passes behind this one, which note what they read.
+  static std::vector<ValueId> operands(const QuantizeOp&) { return {}; }
+  static std::vector<ValueId> operands(const BlockedOp&) { return {}; }
 
   Lowering& l;
   std::map<std::tuple<ValueId, ValueId, Isa>, ValueId> packs_;

@@ -116,8 +116,8 @@ class Layouts {
   void require_layouts(RowOp& op) {
     require_rows(op.x);
     const std::int64_t d = op.node->shape[0];
-    if (op.node->as<op::Add>() != nullptr && l.value(op.w).shape[0] != d) op.w = copied(op.w, d);
-    if (op.node->as<op::Rope>() != nullptr) require_contiguous(op.w);
+    if (std::holds_alternative<op::Add>(op.what) && l.value(op.w).shape[0] != d) op.w = copied(op.w, d);
+    if (std::holds_alternative<op::Rope>(op.what)) require_contiguous(op.w);
     require_rows(op.w);
     require_rows(op.b);
   }

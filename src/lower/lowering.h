@@ -74,9 +74,10 @@ struct AttentionOp {
   std::vector<ValueId> packed;
   std::vector<std::int64_t> n_key;
 };
-/// One row at a time: norm, rope, activation, add, multiply, scale.
+/// One row at a time.
 struct RowOp {
   const Node* node;
+  std::variant<op::Norm, op::Rope, op::Activate, op::Add, op::Multiply, op::Scale> what;
   ValueId x, w = kNone, b = kNone;
 };
 /// Parts of the result from numbers that lie elsewhere: concat, pixel_shuffle, and views that must be contiguous.

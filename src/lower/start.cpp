@@ -73,36 +73,63 @@ Value view(const Node& node, const Value& of, const Shape& stride, std::int64_t 
   return value;
 }
 
-/// A view where the operation computes nothing, else a value of its own.
-Value value_of(const Lowering& l, const Node& node) {
-  Value value = own(node);
-  if (const auto* input = node.as<op::Input>()) {
-    value.home = Value::Home::slot, value.data = static_cast<std::byte*>(input->slot->place);
-  } else if (const auto* write = node.as<op::Write>()) {
-    value.home = Value::Home::slot, value.data = static_cast<std::byte*>(write->slot->place);
-  } else if (node.as<op::Constant>() != nullptr) {
+/// A view where the operation computes nothing, else a value of its own: one function for each operation.
+struct MakeValue {
+  const Lowering& l;
+  const Node& node;
+
+  Value operator()(const op::Input& op) const { return in_slot(*op.slot); }
+  Value operator()(const op::Write& op) const { return in_slot(*op.slot); }
+  Value operator()(const op::Constant&) const {
+    Value value = own(node);
     value.home = Value::Home::constant;
-  } else if (const auto* parameter = node.as<op::Parameter>()) {
-    value.home = Value::Home::parameter;
-    value.data = const_cast<std::byte*>(l.weights.data(parameter->param));
+    return value;
   }
-  if (node.in.empty()) return value;
-  const Value& x = l.value(node.in[0].node()->id);
-  // What a slot holds may be overwritten later in the run: record a copy.
-  if (node.tapped && l.base(x.base).home == Value::Home::slot) return value;
-  if (const auto* slice = node.as<op::Slice>()) {
-    return view(node, x, x.stride, slice->first * x.stride[static_cast<std::size_t>(slice->dim)]);
+  Value operator()(const op::Parameter& op) const {
+    Value value = own(node);
+    value.home = Value::Home::parameter, value.data = const_cast<std::byte*>(l.weights.data(op.param));
+    return value;
   }
-  if (node.as<op::Repeat>() != nullptr) {
-    Shape stride = x.stride;
+
+  Value operator()(const op::Slice& op) const {
+    return must_copy() ? own(node)
+                       : view(node, x(), x().stride, op.first * x().stride[static_cast<std::size_t>(op.dim)]);
+  }
+  Value operator()(const op::Repeat&) const {
+    Shape stride = x().stride;
     for (std::size_t i = 0; i < 4; ++i)
-      if (x.shape[i] == 1) stride[i] = 0;
-    return view(node, x, stride, 0);
+      if (x().shape[i] == 1) stride[i] = 0;
+    return must_copy() ? own(node) : view(node, x(), stride, 0);
   }
-  if (node.as<op::Reshape>() != nullptr)
-    if (const auto stride = reshape_strides(x, node.shape)) return view(node, x, *stride, 0);
-  return value;
-}
+  Value operator()(const op::Reshape&) const {
+    const auto stride = reshape_strides(x(), node.shape);
+    return must_copy() || !stride ? own(node) : view(node, x(), *stride, 0);
+  }
+
+  Value operator()(const op::Linear&) const { return own(node); }
+  Value operator()(const op::Embedding&) const { return own(node); }
+  Value operator()(const op::Gather&) const { return own(node); }
+  Value operator()(const op::Norm&) const { return own(node); }
+  Value operator()(const op::Rope&) const { return own(node); }
+  Value operator()(const op::Attention&) const { return own(node); }
+  Value operator()(const op::Activate&) const { return own(node); }
+  Value operator()(const op::Add&) const { return own(node); }
+  Value operator()(const op::Multiply&) const { return own(node); }
+  Value operator()(const op::Scale&) const { return own(node); }
+  Value operator()(const op::Concat&) const { return own(node); }
+  Value operator()(const op::Patches&) const { return own(node); }
+  Value operator()(const op::PixelShuffle&) const { return own(node); }
+
+ private:
+  const Value& x() const { return l.value(node.in[0].node()->id); }
+  /// What a slot holds may be overwritten later in the run, so that a tap records a copy.
+  bool must_copy() const { return node.tapped && l.base(x().base).home == Value::Home::slot; }
+  Value in_slot(const Slot& slot) const {
+    Value value = own(node);
+    value.home = Value::Home::slot, value.data = static_cast<std::byte*>(slot.place);
+    return value;
+  }
+};
 
 }  // namespace
 
@@ -115,7 +142,7 @@ void start(Lowering& l) {
     if (!l.needed[static_cast<std::size_t>(node->id)]) continue;
     for (Tensor in : node->in) l.readers[static_cast<std::size_t>(in.node()->id)].push_back(&*node);
   }
-  for (const Node& node : nodes) l.values.push_back(value_of(l, node));
+  for (const Node& node : nodes) l.values.push_back(std::visit(MakeValue{l, node}, node.op));
 }
 
 }  // namespace vla::lower

@@ -252,3 +252,31 @@ TEST_CASE("attention with more segments or wider heads than its kernels have roo
     CHECK(error_of(8, 7).find("segments") != std::string::npos);
   }
 }
+
+TEST_CASE("one graph has every operation there is, and gives the same on all kernels") {
+  std::vector<bool> recorded(std::variant_size_v<Op>);
+  check_like_ggml([&](GraphRunner& r, const LowerParams& p) {
+    Graph& g = r.graph;
+    const Tensor ids = g.add(op::Constant{std::vector<std::int32_t>{2, 0, 1}}, {}, {3, 1, 1, 1});
+    const Tensor rows = g.add(op::Gather{}, {g.add(op::Embedding{p.table()}, {ids}), ids});
+    const Tensor patches = g.add(op::Patches{2}, {input(r, {4, 4, 3, 1})});
+    const Tensor squares = g.add(op::PixelShuffle{2, 2}, {patches});
+    const Tensor x = add(g, norm(g, op::NormKind::rms, {rows, p.parameter(g, 35)}), p.linear(g, rows, 35));
+    const Tensor heads =
+        g.add(op::Rope{}, {reshape(g, slice_features(g, x, 0, 34), {34, 1, 3, 1}), input(r, {34, 3, 1, 1})});
+    const Tensor mixed = g.add(op::Attention{false}, {heads, heads, heads});
+    const Tensor gated = multiply(g, activate(g, mixed, Activation::silu), scale(g, mixed, 0.5f));
+    const Tensor one = g.add(op::Repeat{}, {reshape(g, slice_features(g, gated, 0, 1), {1, 3, 1, 1})}, {2, 3, 1, 1});
+    const Tensor all = concat(g, {gated, one}, 0);
+    const Slot* kept = r.slot(std::vector<float>(36 * 3), {36, 3, 1, 1});
+    g.add(op::Write{const_cast<Slot*>(kept)}, {all});
+    const Tensor result =
+        concat(g, {reshape(g, all, {108, 1, 1, 1}), reshape(g, squares, {48, 1, 1, 1}), constant(g, {1, 2}, {2})}, 0);
+    for (const Node& node : g.nodes()) recorded[node.op.index()] = true;
+    return result;
+  });
+  for (std::size_t i = 0; i < recorded.size(); ++i) {
+    CAPTURE(i);  // of Op, in graph/op.h
+    CHECK(recorded[i]);
+  }
+}
