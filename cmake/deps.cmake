@@ -47,6 +47,14 @@ if(VLA_GGML_DIR)
 endif()
 set(BUILD_SHARED_LIBS OFF)
 set(GGML_NATIVE ${VLA_NATIVE} CACHE BOOL "" FORCE)
+# Of a build for any machine: written here, since ggml's own defaults stay as they were when a folder was configured first.
+set(vla_ggml_avx2 ON)
+if(VLA_NATIVE OR NOT CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
+  set(vla_ggml_avx2 OFF)
+endif()
+foreach(instructions SSE42 AVX AVX2 BMI2 FMA F16C)
+  set(GGML_${instructions} ${vla_ggml_avx2} CACHE BOOL "" FORCE)
+endforeach()
 set(GGML_OPENMP OFF CACHE BOOL "" FORCE)
 set(GGML_LLAMAFILE ON CACHE BOOL "" FORCE)    # blocked float32 products
 set(GGML_CPU_REPACK OFF CACHE BOOL "" FORCE)  # quantized formats that no bundle uses

@@ -76,7 +76,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   std::vector<int> steps = request.steps;
   if (steps.empty()) steps.push_back(engine->solver().n_step);
   report.conditions = conditions_of(*engine, workload, steps.back());
-  report.precision = engine->precision(), report.arithmetic = engine->arithmetic();
+  report.precision = precision_name(engine->precision()), report.arithmetic = engine->arithmetic();
   VLA_CHECK(accept(report.conditions));
   VLA_TRY(const std::vector<Series> all, run_all(*engine, workload, steps, request, watcher));
   report.predicted = engine->memory();

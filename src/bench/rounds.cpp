@@ -46,10 +46,10 @@ double Round::total() const {
 }
 
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher) {
-  const Isa isa = *choose_isa(engine.kernels());
-  const kernels::PeakProbe& probe = kernels::peak_probe_of(isa);
+  const Features use = engine.device().features();
+  const kernels::PeakProbe& probe = kernels::peak_probe_of(use);
   const kernels::PeakProbe* int8 =
-      engine.precision() == "int8" ? kernels::int8_probe_of(isa, engine.has_ternary()) : nullptr;
+      engine.has_int8_products() ? kernels::int8_probe_of(use, engine.has_ternary()) : nullptr;
   const auto measure_peaks = [&](Round& round) {  // half of what is before and after
     const int n_thread = engine.device().n_thread();
     round.peak += kernels::measure_peak(probe, n_thread, kProbeSeconds) / 2;

@@ -174,7 +174,7 @@ void print_json(const Engine& engine) {
     root["modules"][path] = {{"parameters", size.n_param}, {"stored_bytes", size.stored}};
   root["device"] = engine.device().name();
   root["linear_kernels"] = engine.linear_kernels();
-  root["precision"] = engine.precision();
+  root["precision"] = precision_name(engine.precision());
   root["real_time_chunking"] = kind_name(engine.real_time_chunking().kind);
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {

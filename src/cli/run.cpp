@@ -156,7 +156,7 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   root["bundle"] = identity_json(engine.bundle());
   root["kernels"] = engine.kernels();
   root["device"] = engine.device().name();
-  root["precision"] = engine.precision();
+  root["precision"] = precision_name(engine.precision());
   root["notes"] = chunk.notes;
   if (options.seed && options.noise.empty()) root["seed"] = *options.seed;
   say(stdout, "{}\n", text_of(root));

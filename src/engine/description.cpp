@@ -59,7 +59,7 @@ Description describe(const Engine& engine) {
                                   {"source.revision", &out.revision},
                                   {"source.converter", &out.converter}})
     *text = *keys.string(fmt::format("vla.{}", key));
-  out.precision = engine.precision();
+  out.precision = precision_name(engine.precision());
   out.kernels = engine.kernels();
   out.device = engine.device().name();
   out.memory = engine.memory();

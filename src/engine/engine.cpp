@@ -31,7 +31,7 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
     robot->device_ = device;
     robot->tap_pattern_ = options.tap_pattern;
     robot->dry_ = options.dry;
-    robot->asked_kernels_ = options.kernels;
+    robot->chose_kernels_ = !options.kernels.empty();
     robot->all_plans_ = all_plans;
     VLA_CHECK(robot->take_injected(options.inject));
     VLA_CHECK(robot->load_policy(params));
@@ -356,21 +356,21 @@ bool Engine::has_ternary() const {
   return std::any_of(params_->params().begin(), params_->params().end(), is_ternary);
 }
 
-std::string Engine::precision() const { return has_ternary() ? "int8" : device_->precision(); }
+Precision Engine::precision() const { return has_ternary() ? Precision::int8 : device_->precision(); }
 
 std::string Engine::arithmetic() const {
-  const std::string floats = device_->precision();
-  if (floats == "int8") return "int8 products, as asked for: less exact than PyTorch's bf16";
-  if (precision() == "int8") return "ternary products of int8, others " + floats;
+  const Precision floats = device_->precision();
+  if (floats == Precision::int8) return "int8 products, as asked for: less exact than PyTorch's bf16";
+  if (has_int8_products()) return fmt::format("ternary products of int8, others {}", precision_name(floats));
   const auto n_rounded = std::ranges::count_if(params_->params(), [](const Param& param) {
     return param.type() != DType::bf16 && resident_dtype(param, Rounding::bf16) == DType::bf16;
   });
-  if (floats == "bf16") {
-    const bool rounds = n_rounded > 0 && asked_kernels_ == kBf16Kernels;
+  if (floats == Precision::bf16) {
+    const bool rounds = n_rounded > 0 && device_->rounding() == Rounding::bf16;
     const std::string rounded = rounds ? fmt::format(" ({} matrices rounded to it, as asked for)", n_rounded) : "";
     return fmt::format("bf16 products{}, sums in float32; --kernels float32 avoids them", rounded);
   }
-  const bool could = n_rounded > 0 && asked_kernels_.empty() && device_->has_bf16();
+  const bool could = n_rounded > 0 && !chose_kernels_ && device_->has_bf16();
   return could ? fmt::format("float32; --kernels bf16 is faster and rounds {} matrices", n_rounded) : "float32";
 }
 

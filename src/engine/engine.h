@@ -122,7 +122,8 @@ class Engine {
   std::string kernels() const { return device_->kernels(); }
   /// Of the large products: "int8" where activations are int8, and weights ternary or quantized because somebody asked
   /// for it, "bf16" where activations are rounded to it (sums are float32), else "f32".
-  std::string precision() const;
+  Precision precision() const;
+  bool has_int8_products() const { return precision() == Precision::int8; }
   /// The same as text for display.
   std::string arithmetic() const;
   /// Whether some weights are ternary.
@@ -164,7 +165,7 @@ class Engine {
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
   bool dry_ = false;
-  std::string asked_kernels_;
+  bool chose_kernels_ = false;         // somebody did
   std::shared_ptr<ParamList> params_;  // of all robots
   std::unique_ptr<Policy> policy_;
   std::unique_ptr<Slots> tables_;

@@ -118,7 +118,7 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
         ggml_new_tensor(weight_context_.get(), type, static_cast<int>(param.shape.size()), param.shape.data()));
     ggml_set_name(weights_.back(), param.name.c_str());
   }
-  if (n_bf16 > 0) precision_ = "bf16";
+  if (n_bf16 > 0) precision_ = Precision::bf16;
   for (const auto& [n, type] : {std::pair{n_f32, "f32"}, {n_f16, "f16"}, {n_bf16, "bf16"}})
     if (n > 0) linear_text_ += fmt::format("{}{} {}", linear_text_.empty() ? "ggml (" : " + ", n, type);
   if (!linear_text_.empty()) linear_text_ += ")";

@@ -38,7 +38,8 @@ class GgmlDevice final : public Device {
   int n_thread() const override { return n_thread_; }
   bool is_host() const override { return held_->pool != nullptr; }
   std::string kernels() const override { return "ggml"; }
-  std::string precision() const override { return precision_; }
+  Precision precision() const override { return precision_; }
+  Rounding rounding() const override { return rounding_; }
   bool has_bf16() const override { return !is_host(); }
   const std::string& linear_kernels() const override { return linear_text_; }
   std::size_t weights_size() const override { return weights_size_; }
@@ -96,7 +97,7 @@ class GgmlDevice final : public Device {
   int n_thread_ = 0;
   bool keeps_f16_ = false;  // its products of f16 weights are as exact as those of float32
   Rounding rounding_ = Rounding::none;
-  std::string precision_ = "f32";
+  Precision precision_ = Precision::f32;
   ggml_context_ptr weight_context_;
   std::shared_ptr<void> weight_memory_;
   std::size_t weights_size_ = 0;

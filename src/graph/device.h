@@ -9,10 +9,27 @@
 #include <utility>
 #include <vector>
 
+#include "base/cpu.h"
 #include "graph/graph.h"
+#include "graph/rounding.h"
 #include "graph/work.h"
 
 namespace vla {
+
+/// What operands of large products are rounded to; sums are float32, or whole numbers of int8.
+enum class Precision { f32, bf16, int8 };
+
+constexpr const char* precision_name(Precision precision) {
+  switch (precision) {
+    case Precision::bf16:
+      return "bf16";
+    case Precision::int8:
+      return "int8";
+    case Precision::f32:
+      break;
+  }
+  return "f32";
+}
 
 /// A graph made ready for a device: memory is there, and it can be run as often as wanted.
 class Program {
@@ -80,8 +97,12 @@ class Device {
   virtual bool is_host() const { return true; }
   /// As `--kernels` names them.
   virtual std::string kernels() const = 0;
-  /// Of the large products: "bf16" where activations are rounded to it (sums are float32), else "f32".
-  virtual std::string precision() const = 0;
+  /// Of the processor, where its kernels use some.
+  virtual Features features() const { return {}; }
+  /// Of the large products.
+  virtual Precision precision() const = 0;
+  /// Of large matrices, when they are loaded.
+  virtual Rounding rounding() const = 0;
   /// Whether it has faster products of bf16, for whoever asks for them (graph/rounding.h).
   virtual bool has_bf16() const = 0;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.

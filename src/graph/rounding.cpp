@@ -6,10 +6,6 @@
 
 namespace vla {
 
-Rounding rounding_of(const std::string& kernels) {
-  return kernels == kInt8Kernels ? Rounding::int8 : kernels == kBf16Kernels ? Rounding::bf16 : Rounding::none;
-}
-
 DType resident_dtype(const Param& param, Rounding rounding) {
   constexpr std::int64_t kMinRounded = 144;
   const bool keeps = rounding == Rounding::none || param.storage != Storage::matrix ||

@@ -2,8 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <string>
-
 #include "bundle/params.h"
 
 /// Matrices in other numbers than those of the bundle, because somebody asked for it.
@@ -11,10 +9,6 @@ namespace vla {
 
 /// What large matrices of floats are rounded to when they are loaded.
 enum class Rounding { none, bf16, int8 };
-
-/// The names of `--kernels` that ask for it: the best of the machine, with such products in place of others.
-constexpr const char *kBf16Kernels = "bf16", *kInt8Kernels = "int8";
-Rounding rounding_of(const std::string& kernels);
 
 /// The dtype of a parameter in memory. Matrices from or to fewer than 144 numbers keep theirs: they take no time worth
 /// an error, and padded states and actions of robots have up to 132 numbers (GR00T N1.7).

@@ -40,24 +40,15 @@ CpuKernels avx512_with(const AttentionKernel& attention) {
 
 }  // namespace
 
-const CpuKernels* cpu_kernels(Isa isa) {
+const CpuKernels* cpu_kernels(Features use) {
   static const CpuKernels avx512_bf16 = avx512_with(kAttentionAvx512Bf16), amx = avx512_with(kAttentionAmx);
-  switch (isa) {
-    case Isa::avx2:
-      return &kAvx2Kernels;
-    case Isa::avx512:
-      return &kAvx512Kernels;
-    case Isa::avx512_bf16:
-      return &avx512_bf16;
-    case Isa::amx:
-      return &amx;
-    case Isa::ggml:
-      break;
-  }
-  return nullptr;
+  if (use.has(Feature::amx_bf16)) return &amx;
+  if (use.has(Feature::avx512_bf16)) return &avx512_bf16;
+  if (use.has(Feature::avx512)) return &kAvx512Kernels;
+  return use.has(Feature::avx2) ? &kAvx2Kernels : nullptr;
 }
 #else
-const CpuKernels* cpu_kernels(Isa) { return nullptr; }
+const CpuKernels* cpu_kernels(Features) { return nullptr; }
 #endif
 
 const CpuKernels& portable_kernels() {

@@ -4,7 +4,7 @@
 
 #include "base/activation.h"
 #include "kernels/attention_kernel.h"
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 
 namespace vla::kernels {
 
@@ -22,9 +22,9 @@ struct CpuKernels {
   RowKernel activation(Activation activation) const;
 };
 
-/// The kernels of `isa`, which the machine must have; null where plain ggml operations are to be used. Those that round
-/// to bf16 (isa.h) do so in attention too, with sums in float32, as PyTorch does with a bf16 model.
-const CpuKernels* cpu_kernels(Isa isa);
+/// The kernels for what they may use; null where plain ggml operations are to be used. Those that round to bf16
+/// (kernel_set.h) do so in attention too, with sums in float32, as PyTorch does with a bf16 model.
+const CpuKernels* cpu_kernels(Features use);
 
 /// The same templates without any instruction set: slow, and there to test them at another width.
 const CpuKernels& portable_kernels();

@@ -103,7 +103,7 @@ struct AmxInt8Tile : AmxRounding {
   }
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::amx && has_amx_int8(); }
+bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::amx_int8); }
 
 }  // namespace
 

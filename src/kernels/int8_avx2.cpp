@@ -92,10 +92,10 @@ struct Avx2Tile {
   }
 };
 
-bool supports_vnni(const MatrixDesc& desc, Isa isa) {
-  return desc.type == DType::i8 && isa >= Isa::avx2 && has_avx_vnni();
+bool supports_vnni(const MatrixDesc& desc, Features use) {
+  return desc.type == DType::i8 && use.has(Feature::avx_vnni);
 }
-bool supports(const MatrixDesc& desc, Isa isa) { return desc.type == DType::i8 && isa >= Isa::avx2; }
+bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::avx2); }
 
 }  // namespace
 

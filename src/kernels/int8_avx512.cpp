@@ -64,9 +64,7 @@ struct VnniTile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) {
-  return desc.type == DType::i8 && isa >= Isa::avx512 && has_avx512_vnni();
-}
+bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::avx512_vnni); }
 
 }  // namespace
 

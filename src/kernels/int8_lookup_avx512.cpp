@@ -320,8 +320,8 @@ class LookupLoop {
   std::int64_t row_ = 0, n_row_ = 0;
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) {
-  return desc.is_ternary && isa >= Isa::avx512 && permutes_beside_vnni();
+bool supports(const MatrixDesc& desc, Features use) {
+  return desc.is_ternary && use.has(Feature::permutes_beside_vnni);
 }
 
 constexpr std::int64_t kFewRows = 32;  // for which tables do not pay

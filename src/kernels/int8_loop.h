@@ -114,7 +114,7 @@ class Int8Loop {
 
  public:
   /// The row of the table that this tile makes. Whoever quantizes x computes its norm, of any width.
-  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa)) {
+  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use)) {
     LinearKernel row = {name, Weights::packed_size, Weights::pack, supports,      cut,
                         run,  sizeof(Scratch),      kAnyDepth,     Tile::kLayout, kAnyDepth};
     row.quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); };

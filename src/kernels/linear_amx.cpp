@@ -70,7 +70,7 @@ struct AmxTile : AmxRounding {
 /// Few rows are bound by reading weights: x stays as it is there.
 constexpr std::int64_t kMaxFew = 16;
 
-bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::amx && desc.type == DType::bf16; }
+bool supports(const MatrixDesc& desc, Features use) { return use.has(Feature::amx_bf16) && desc.type == DType::bf16; }
 
 }  // namespace
 

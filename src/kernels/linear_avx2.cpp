@@ -90,7 +90,7 @@ struct Avx2Tile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx2 && is_float(desc.type); }
+bool supports(const MatrixDesc& desc, Features use) { return use.has(Feature::avx2) && is_float(desc.type); }
 
 }  // namespace
 

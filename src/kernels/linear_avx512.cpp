@@ -61,7 +61,7 @@ struct Avx512Tile {
   };
 };
 
-bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx512 && is_float(desc.type); }
+bool supports(const MatrixDesc& desc, Features use) { return use.has(Feature::avx512) && is_float(desc.type); }
 
 }  // namespace
 

@@ -53,7 +53,9 @@ struct Avx512Bf16Tile {
 /// Few rows are bound by reading weights: x stays as it is there.
 constexpr std::int64_t kMaxFew = 16;
 
-bool supports(const MatrixDesc& desc, Isa isa) { return isa >= Isa::avx512_bf16 && desc.type == DType::bf16; }
+bool supports(const MatrixDesc& desc, Features use) {
+  return use.has(Feature::avx512_bf16) && desc.type == DType::bf16;
+}
 
 }  // namespace
 

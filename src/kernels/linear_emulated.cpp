@@ -61,8 +61,8 @@ struct EmulatedAmxTile {
   }
 };
 
-bool any(const MatrixDesc& desc, Isa) { return is_float(desc.type); }
-bool bf16_only(const MatrixDesc& desc, Isa) { return desc.type == DType::bf16; }
+bool any(const MatrixDesc& desc, Features) { return is_float(desc.type); }
+bool bf16_only(const MatrixDesc& desc, Features) { return desc.type == DType::bf16; }
 
 constexpr LinearKernel kFloat = LinearLoop<FloatTile>::kernel("emulated", any);
 constexpr LinearKernel kPair = TileLoop<EmulatedAmxTile>::kernel("emulated_amx", bf16_only);

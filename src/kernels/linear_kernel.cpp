@@ -21,10 +21,10 @@ std::span<const LinearKernel* const> linear_kernels() {
 #endif
 }
 
-const LinearKernel* choose_linear(const MatrixDesc& desc, Isa isa) {
+const LinearKernel* choose_linear(const MatrixDesc& desc, Features use) {
   const auto kernels = desc.is_ternary ? ternary_kernels() : desc.type == DType::i8 ? int8_kernels() : linear_kernels();
   for (const LinearKernel* kernel : kernels)
-    if (kernel->supports(desc, isa)) return kernel;
+    if (kernel->supports(desc, use)) return kernel;
   return nullptr;
 }
 

@@ -5,7 +5,7 @@
 #include <span>
 
 #include "kernels/executor.h"
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "kernels/linear_job.h"
 #include "kernels/rounded.h"
 
@@ -30,7 +30,7 @@ struct LinearKernel {
   std::size_t (*packed_size)(const MatrixDesc& desc);
   /// `stored` and `packed` start at multiples of 32 and 64 bytes.
   void (*pack)(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
-  bool (*supports)(const MatrixDesc& desc, Isa isa);
+  bool (*supports)(const MatrixDesc& desc, Features use);
   /// Cuts a job into items for so many threads, and says how many there are.
   std::int64_t (*cut)(LinearJob& job, int n_thread);
   void (*run)(const LinearJob& job, std::int64_t item, Worker& worker);
@@ -57,8 +57,8 @@ struct LinearKernel {
 /// The implementations, best first.
 std::span<const LinearKernel* const> linear_kernels();
 
-/// The first row that takes a matrix on a machine, or null.
-const LinearKernel* choose_linear(const MatrixDesc& desc, Isa isa);
+/// The first row that takes a matrix with no more than these features, or null.
+const LinearKernel* choose_linear(const MatrixDesc& desc, Features use);
 
 /// The same loop with tiles in plain C++, slow and for every machine: panels and edges stay tested where the
 /// instructions are missing.

@@ -52,7 +52,7 @@ class LinearLoop {
 
  public:
   /// The row of the table that this tile makes.
-  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Isa isa),
+  static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
                                        const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
     return {name,    Layout::packed_size, Layout::pack, supports, cut, run, sizeof(Scratch), Tile::kMaxDepth,
             kLayout, Tile::kMaxDepth,     few,          max_few};

@@ -33,8 +33,8 @@ Status check_attention(const Graph& graph) {
 
 }  // namespace
 
-Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, Isa isa, Rounding rounding) {
-  std::unique_ptr<CpuDevice> device(new CpuDevice(isa, rounding));
+Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, const Arithmetic& arithmetic) {
+  std::unique_ptr<CpuDevice> device(new CpuDevice(arithmetic));
   VLA_TRY(device->executor_, kernels::Executor::shared(n_thread));
   return std::unique_ptr<Device>(std::move(device));
 }
@@ -43,8 +43,8 @@ std::string CpuDevice::name() const { return fmt::format("cpu, {} thread{}", n_t
 
 Status CpuDevice::load(const ParamList& params, bool fill) {
   min_rounded_keys_ = min_rounded_keys(params);
-  isa_ = isa_for(params, isa_, rounding_);
-  VLA_TRY(weights_, CpuWeights::load(params, {isa_, rounding_, n_thread(), fill}));
+  arithmetic_.use = features_for(params, arithmetic_.use, arithmetic_.at_load);
+  VLA_TRY(weights_, CpuWeights::load(params, {arithmetic_.use, arithmetic_.at_load, n_thread(), fill}));
   return {};
 }
 
@@ -66,7 +66,8 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
   VLA_CHECK(check_attention(graph));
-  Lowering l = {graph, options, weights_, isa_, min_rounded_keys_, n_thread(), {}, {}, {}, {}, {}, 0, 0, 0, 0};
+  Lowering l = {graph, options, weights_, arithmetic_.use, min_rounded_keys_, n_thread(), {}, {}, {}, {}, {}, 0,
+                0,     0,       0};
   start(l);
   fuse(l);
   choose_layouts(l);

@@ -4,7 +4,7 @@
 
 #include "graph/device.h"
 #include "kernels/executor.h"
-#include "kernels/isa.h"
+#include "lower/arithmetic.h"
 #include "lower/cpu_weights.h"
 #include "lower/kind_clock.h"
 
@@ -14,7 +14,7 @@ namespace vla::lower {
 class CpuDevice final : public Device {
  public:
   /// Errors: device.
-  static Result<std::unique_ptr<Device>> open(int n_thread, Isa isa, Rounding rounding);
+  static Result<std::unique_ptr<Device>> open(int n_thread, const Arithmetic& arithmetic);
 
   Status load(const ParamList& params, bool fill) override;
   Status allocate(Slots& slots) override;
@@ -24,11 +24,14 @@ class CpuDevice final : public Device {
 
   std::string name() const override;
   int n_thread() const override { return executor_->n_thread(); }
-  std::string kernels() const override { return isa_name(isa_); }
-  std::string precision() const override {
-    return rounding_ == Rounding::int8 ? "int8" : rounds_to_bf16(isa_) ? "bf16" : "f32";
+  std::string kernels() const override { return name_of(arithmetic_.use); }
+  Features features() const override { return arithmetic_.use; }
+  Precision precision() const override {
+    if (arithmetic_.at_load == Rounding::int8) return Precision::int8;
+    return rounds_to_bf16(arithmetic_.use) ? Precision::bf16 : Precision::f32;
   }
-  bool has_bf16() const override { return rounds_to_bf16(usable_isas().back()); }
+  Rounding rounding() const override { return arithmetic_.at_load; }
+  bool has_bf16() const override { return rounds_to_bf16(this_cpu()); }
   const std::string& linear_kernels() const override { return weights_.text(); }
   std::size_t weights_size() const override { return weights_.size(); }
   std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }
@@ -37,10 +40,9 @@ class CpuDevice final : public Device {
   void touch() override;
 
  private:
-  CpuDevice(Isa isa, Rounding rounding) : isa_(isa), rounding_(rounding) {}
+  explicit CpuDevice(const Arithmetic& arithmetic) : arithmetic_(arithmetic) {}
 
-  Isa isa_;
-  const Rounding rounding_;
+  Arithmetic arithmetic_;
   std::int64_t min_rounded_keys_ = 0;
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<KindClock> clock_ = std::make_shared<KindClock>();

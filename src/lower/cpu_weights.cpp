@@ -126,7 +126,7 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
     if (param.is_matrix()) {
       place.type = resident_dtype(param, options.rounding);
       const kernels::MatrixDesc desc = desc_of(param, place.type);
-      place.kernel = kernels::choose_linear(desc, options.isa);
+      place.kernel = kernels::choose_linear(desc, options.use);
       ++counts[place.kernel->name][param.storage == Storage::ternary ? "ternary" : dtype_name(param.type())];
       size += aligned(place.kernel->packed_size(desc));
       if (has_scales(param, place.type)) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));

@@ -22,7 +22,7 @@ using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 class CpuWeights {
  public:
   struct Options {
-    Isa isa;
+    Features use;
     Rounding rounding;
     int n_thread;
     bool fill = true;  // else memory is reserved and never touched

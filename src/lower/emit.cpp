@@ -28,7 +28,7 @@ float* floats(const Lowering& l, ValueId id) { return reinterpret_cast<float*>(a
 /// Null for an operand that there is not.
 const float* operand(const Lowering& l, ValueId id) { return id != kNone ? floats(l, id) : nullptr; }
 
-const kernels::CpuKernels& cpu(const Lowering& l) { return *kernels::cpu_kernels(l.isa); }
+const kernels::CpuKernels& cpu(const Lowering& l) { return *kernels::cpu_kernels(l.use); }
 
 struct LinearTask : Task {
   const kernels::LinearKernel* kernel;
@@ -338,7 +338,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const QuantizeO
 
 std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PackOp& pack) {
   auto task = std::make_unique<PackTask>();
-  task->kernel = &kernels::cpu_kernels(pack.isa)->attention;
+  task->kernel = &kernels::cpu_kernels(pack.use)->attention;
   task->job = pack_sizes(l, pack);
   task->job.k = head_rows(l, pack.k.x), task->job.v = head_rows(l, pack.v), task->job.prep = prep_of(l, pack.k);
   task->job.packed = address(l, op.writes[0]);
@@ -350,7 +350,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const Attention
   auto task = std::make_unique<AttentionTask>();
   kernels::AttentionJob& job = task->job;
   const Value& q = l.value(attention.q.x);
-  task->kernel = &kernels::cpu_kernels(attention.isa)->attention;
+  task->kernel = &kernels::cpu_kernels(attention.use)->attention;
   job.d_head = q.shape[0], job.n_head = q.shape[1], job.n_query = q.shape[2], job.n_batch = q.shape[3];
   job.n_head_kv = attention.node->in.back().dim(1);
   job.scale = 1.0f / std::sqrt(static_cast<float>(job.d_head));

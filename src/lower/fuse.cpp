@@ -217,13 +217,13 @@ class Fuser {
       if (node != nullptr) l.fused[at(node)] = true;
   }
 
-  ValueId pack(Tensor k, Tensor v, const Node& attention, Isa isa) {
-    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id, isa}, kNone);
+  ValueId pack(Tensor k, Tensor v, const Node& attention, Features use) {
+    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id, use}, kNone);
     if (!is_new) return known->second;
     const ValueId id = static_cast<ValueId>(l.values.size());
     Value& value = l.values.emplace_back();
     value.base = id, value.shape = k.shape();
-    PackOp op = {prepared(k), v.node()->id, isa};
+    PackOp op = {prepared(k), v.node()->id, use};
     drop(op.k);
     add(std::move(op), attention);
     l.ops.back().writes = {id};
@@ -246,12 +246,12 @@ class Fuser {
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
     const bool rounds = n_key >= l.min_rounded_keys && !comes_from_floats(node.in[0]);
-    const Isa isa = rounds ? l.isa : without_rounding(l.isa);
-    AttentionOp op = {&node, prepared(node.in[0]), isa};
+    const Features use = rounds ? l.use : without_rounding(l.use);
+    AttentionOp op = {&node, prepared(node.in[0]), use};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;
     for (std::size_t i = first; i < node.in.size(); i += 2) {
-      op.packed.push_back(pack(node.in[i], node.in[i + 1], node, isa));
+      op.packed.push_back(pack(node.in[i], node.in[i + 1], node, use));
       op.n_key.push_back(node.in[i].dim(2));
     }
     add(std::move(op), node);
@@ -321,7 +321,7 @@ class Fuser {
   static std::vector<ValueId> operands(const BlockedOp&) { return {}; }
 
   Lowering& l;
-  std::map<std::tuple<ValueId, ValueId, Isa>, ValueId> packs_;
+  std::map<std::tuple<ValueId, ValueId, Features>, ValueId> packs_;
 };
 
 }  // namespace

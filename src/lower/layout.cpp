@@ -107,7 +107,7 @@ class Layouts {
   void require_layouts(PackOp& op) {
     require_rows(op.k);
     require_rows(op.v);
-    l.value(op_->writes[0]).size = kernels::cpu_kernels(op.isa)->attention.packed_size(pack_sizes(l, op));
+    l.value(op_->writes[0]).size = kernels::cpu_kernels(op.use)->attention.packed_size(pack_sizes(l, op));
   }
   void require_layouts(AttentionOp& op) {
     require_rows(op.q);
@@ -170,10 +170,10 @@ class Layouts {
   }
   void round_result(const FusedOp& op, const AttentionOp& attention) {
     if (l.value(op.writes[0]).shape[0] % kernels::kSquare == 0)
-      round_result(op.writes[0], attention_layout(attention.isa));
+      round_result(op.writes[0], attention_layout(attention.use));
   }
 
-  static kernels::RoundedLayout attention_layout(Isa isa) { return kernels::cpu_kernels(isa)->attention.rounded; }
+  static kernels::RoundedLayout attention_layout(Features use) { return kernels::cpu_kernels(use)->attention.rounded; }
 
   /// What only products and attention read is stored as they would round it.
   void round_result(ValueId id, kernels::RoundedLayout layout) {
@@ -193,13 +193,13 @@ class Layouts {
     if (const auto* linear = std::get_if<LinearOp>(&op.op))
       return id == linear->x && id == l.value(id).base && linear->norm == nullptr && id != linear->residual &&
              id != linear->factor && kernel_of(l, *linear).rounded == layout;
-    const auto takes_heads = [&](const Prepared& rows, Isa isa) {
+    const auto takes_heads = [&](const Prepared& rows, Features use) {
       const bool is_plain = id != rows.x || (rows.norm == nullptr && rows.rope == nullptr);
-      return is_plain && id != rows.table && attention_layout(isa) == layout && lies_in_rows(id);
+      return is_plain && id != rows.table && attention_layout(use) == layout && lies_in_rows(id);
     };
-    if (const auto* pack = std::get_if<PackOp>(&op.op)) return takes_heads(pack->k, pack->isa);
+    if (const auto* pack = std::get_if<PackOp>(&op.op)) return takes_heads(pack->k, pack->use);
     if (const auto* attention = std::get_if<AttentionOp>(&op.op))
-      return id != attention->mask && takes_heads(attention->q, attention->isa);
+      return id != attention->mask && takes_heads(attention->q, attention->use);
     return false;
   }
 

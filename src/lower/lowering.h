@@ -64,12 +64,12 @@ struct QuantizeOp {
 struct PackOp {
   Prepared k;
   ValueId v;
-  Isa isa;
+  Features use;
 };
 struct AttentionOp {
   const Node* node;
   Prepared q;
-  Isa isa;
+  Features use;
   ValueId mask = kNone;
   std::vector<ValueId> packed;
   std::vector<std::int64_t> n_key;
@@ -120,7 +120,7 @@ struct Lowering {
   const Graph& graph;
   const LowerOptions& options;
   const CpuWeights& weights;
-  Isa isa;
+  Features use;
   std::int64_t min_rounded_keys;
   int n_thread;
 

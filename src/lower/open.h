@@ -8,7 +8,7 @@
 namespace vla {
 
 /// What `--device` names (DeviceName::parse); empty text is the CPU. On the CPU `n_thread` threads run, 0 for every
-/// core that the process may use, with the kernels of choose_isa: our own, or ggml's operations as the reference of all
+/// core that the process may use, with the kernels of Arithmetic: our own, or ggml's operations as the reference of all
 /// others; `bf16` and `int8` round large matrices when they are loaded, which no other name does. Other devices have
 /// the kernels of ggml alone, in float32, or with `bf16` in such products. A device that is absent is refused, and
 /// nothing takes its place. Errors: device, usage.

@@ -6,13 +6,13 @@
 
 namespace vla {
 
-Isa isa_for(const ParamList& list, Isa isa, Rounding rounding) {
+Features features_for(const ParamList& list, Features use, Rounding rounding) {
   const auto& params = list.params();
   const auto rounds = [&](const Param& param) {
     const DType type = resident_dtype(param, rounding);
     return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8);
   };
-  return std::any_of(params.begin(), params.end(), rounds) ? isa : without_rounding(isa);
+  return std::any_of(params.begin(), params.end(), rounds) ? use : without_rounding(use);
 }
 
 std::int64_t min_rounded_keys(const ParamList& list) {

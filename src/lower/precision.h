@@ -3,16 +3,16 @@
 #pragma once
 
 #include "graph/rounding.h"
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 
 namespace vla {
 
-/// The kernels that compute with these parameters on a machine for `isa`. Tiles of bf16 round whatever they multiply.
-/// A bundle asks for that by storing matrices as bf16: those are multiplied so, and attention of queries that they make
-/// rounds too. Matrices of another dtype, and attention of their queries, are float32, as they are in PyTorch: pi0's
-/// tower beside its language model. Without any of bf16 everything is. What is rounded counts as it is in memory, and
-/// int8 as bf16.
-Isa isa_for(const ParamList& list, Isa isa, Rounding rounding = Rounding::none);
+/// What kernels may use to compute with these parameters, of what they could use. Tiles of bf16 round whatever they
+/// multiply. A bundle asks for that by storing matrices as bf16: those are multiplied so, and attention of queries that
+/// they make rounds too. Matrices of another dtype, and attention of their queries, are float32, as they are in
+/// PyTorch: pi0's tower beside its language model. Without any of bf16 everything is. What is rounded counts as it is
+/// in memory, and int8 as bf16.
+Features features_for(const ParamList& list, Features use, Rounding rounding = Rounding::none);
 
 /// Attention over fewer keys rounds nothing on any machine: it takes little time, and each output mixes so few values
 /// that their errors hardly cancel. Between ternary products they must cancel better: a number that is rounded before

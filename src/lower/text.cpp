@@ -39,15 +39,15 @@ struct Describe {
     return {fmt::format("{}quantize", op.norm != nullptr ? "norm, " : ""), op.kernel->name, op.x};
   }
   Words operator()(const PackOp& op) const {
-    return {prepared(op.k) + "pack keys and values", isa_name(op.isa), op.k.x};
+    return {prepared(op.k) + "pack keys and values", name_of(op.use), op.k.x};
   }
   Words operator()(const AttentionOp& op) const {
     return {fmt::format("{}attention {} over {} keys{}", prepared(op.q), path_of(*op.node), fmt::join(op.n_key, " + "),
                         op.mask != kNone ? ", mask" : ""),
-            isa_name(op.isa), op.q.x};
+            name_of(op.use), op.q.x};
   }
   Words operator()(const RowOp& op) const {
-    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), isa_name(l.isa), op.x};
+    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), name_of(l.use), op.x};
   }
   Words operator()(const CopyOp& op) const {
     return {fmt::format("copy {} part{}", op.parts.size(), op.parts.size() == 1 ? "" : "s"), "copy", op.parts[0].from};

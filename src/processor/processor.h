@@ -41,8 +41,8 @@ struct Inputs {
   std::vector<std::string> notes;      // warnings, e.g. that the instruction was truncated
 };
 
-/// The bound of a normalized action, and the default one of a normalized state value, beyond which an answer has a note: ten standard deviations, or five
-/// times the range of the training data. Degrees in place of radians exceed it.
+/// The bound of a normalized action, and the default one of a normalized state value, beyond which an answer has a
+/// note: ten standard deviations, or five times the range of the training data. Degrees in place of radians exceed it.
 inline constexpr double kStateBound = 10.0;
 
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.

@@ -8,7 +8,7 @@
 #include <cmath>
 #include <regex>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "support/golden_case.h"
 
 using namespace vla;
@@ -85,24 +85,26 @@ void check_chunk(const std::string& kernels) {
           &bf16 = find_tap(expected, "chunk.bf16").values;
     CHECK(rms_difference(ours, reference) <= rms_difference(bf16, reference));
     CHECK(max_difference(ours, reference) <= max_difference(bf16, reference));
-    if (engine->device().precision() == "f32")
+    if (engine->device().precision() == Precision::f32)
       CHECK(compare_taps({find_tap(expected, "chunk")}, {find_tap(chunk->taps, "chunk")}).front().within(kTolerance));
   }
 }
 
-bool lacks(Isa isa) { return std::find(usable_isas().begin(), usable_isas().end(), isa) == usable_isas().end(); }
+bool lacks(const KernelSet& set) {
+  return std::find(usable_kernels().begin(), usable_kernels().end(), set) == usable_kernels().end();
+}
 
 }  // namespace
 
 #ifndef VLA_EMULATED_MACHINE  // these kernels are the same in the other programs
 #define VLA_EVERY_TAP " kernels: every tap of every golden case, from pixels to actions, matches the reference"
 TEST_CASE("ggml" VLA_EVERY_TAP) { check_taps("ggml", false); }
-TEST_CASE("avx2" VLA_EVERY_TAP* doctest::skip(lacks(Isa::avx2))) { check_taps("avx2", false); }
-TEST_CASE("avx512" VLA_EVERY_TAP* doctest::skip(lacks(Isa::avx512))) { check_taps("avx512", false); }
+TEST_CASE("avx2" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::avx2))) { check_taps("avx2", false); }
+TEST_CASE("avx512" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::avx512))) { check_taps("avx512", false); }
 
 #define VLA_BOUNDARIES " kernels: blocks whose operations are fused match the reference where they end"
-TEST_CASE("avx2" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx2))) { check_taps("avx2", true); }
-TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx512))) { check_taps("avx512", true); }
+TEST_CASE("avx2" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::avx2))) { check_taps("avx2", true); }
+TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::avx512))) { check_taps("avx512", true); }
 #endif
 
 // Kernels of bf16 round activations as PyTorch's bf16 does: its error is what is allowed. PyTorch keeps the
@@ -110,12 +112,12 @@ TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(Isa::avx512))) { check_ta
 #define VLA_CHUNK \
   " kernels: with the same bf16 weights the chunk is nearer to the float32 reference than PyTorch's bf16 is"
 TEST_CASE("default" VLA_CHUNK) { check_chunk(""); }
-TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(Isa::amx))) { check_chunk("amx"); }
+TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(kernel_set::amx))) { check_chunk("amx"); }
 #ifndef VLA_EMULATED_MACHINE
 TEST_CASE("ggml" VLA_CHUNK) { check_chunk("ggml"); }
-TEST_CASE("avx2" VLA_CHUNK* doctest::skip(lacks(Isa::avx2))) { check_chunk("avx2"); }
-TEST_CASE("avx512" VLA_CHUNK* doctest::skip(lacks(Isa::avx512))) { check_chunk("avx512"); }
-TEST_CASE("avx512_bf16" VLA_CHUNK* doctest::skip(lacks(Isa::avx512_bf16))) { check_chunk("avx512_bf16"); }
+TEST_CASE("avx2" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx2))) { check_chunk("avx2"); }
+TEST_CASE("avx512" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx512))) { check_chunk("avx512"); }
+TEST_CASE("avx512_bf16" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx512_bf16))) { check_chunk("avx512_bf16"); }
 #endif
 
 TEST_CASE("taps do not change the answer, and without a pattern nothing is recorded") {

@@ -13,7 +13,7 @@
 
 #include "ggml/ggml_device.h"
 #include "kernels/executor.h"
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "support/golden_case.h"
 
 using namespace vla;
@@ -95,7 +95,7 @@ int posix_memalign(void** memory, size_t alignment, size_t size) {
 }
 
 TEST_CASE("a second request takes no memory and touches no new page while its graphs run" *
-          doctest::skip(!kCounts || usable_isas().size() == 1)) {
+          doctest::skip(!kCounts || usable_kernels().size() == 1)) {
   for (const std::string& path : golden_paths()) {
     CAPTURE(path);
     const GoldenCase golden = GoldenCase::read(path);

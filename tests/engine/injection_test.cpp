@@ -8,7 +8,7 @@
 #include <algorithm>
 #include <regex>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "support/golden_case.h"
 
 using namespace vla;
@@ -91,14 +91,16 @@ void check_parts(const std::string& kernels) {
   CHECK(n_part >= 20 * n_case);
 }
 
-bool lacks(Isa isa) { return std::find(usable_isas().begin(), usable_isas().end(), isa) == usable_isas().end(); }
+bool lacks(const KernelSet& set) {
+  return std::find(usable_kernels().begin(), usable_kernels().end(), set) == usable_kernels().end();
+}
 
 }  // namespace
 
 #define VLA_PARTS " kernels: with the reference's own inputs every part of BitVLA gives the reference's output"
 TEST_CASE("ggml" VLA_PARTS) { check_parts("ggml"); }
-TEST_CASE("avx2" VLA_PARTS* doctest::skip(lacks(Isa::avx2))) { check_parts("avx2"); }
-TEST_CASE("avx512" VLA_PARTS* doctest::skip(lacks(Isa::avx512))) { check_parts("avx512"); }
+TEST_CASE("avx2" VLA_PARTS* doctest::skip(lacks(kernel_set::avx2))) { check_parts("avx2"); }
+TEST_CASE("avx512" VLA_PARTS* doctest::skip(lacks(kernel_set::avx512))) { check_parts("avx512"); }
 
 TEST_CASE("a chunk follows from injected values, in every family, on all kernels") {
   for (const std::string& path : golden_paths()) {

@@ -20,13 +20,13 @@ const std::string kBundle = golden_path("smolvla/two_views/bundle.gguf");
 /// The shipped policy has matrices that are worth rounding.
 const std::string kShipped = VLA_SOURCE_DIR "/models/metaworld-tiny.gguf";
 
-/// The kernels for a bundle on a machine for `isa`.
-Isa isa_of(const std::string& path, Isa isa) {
+/// The kernels for a bundle on a machine that has all that a set uses.
+KernelSet set_of(const std::string& path, const KernelSet& set) {
   const auto bundle = Bundle::open(path);
   REQUIRE(bundle.ok());
   ParamList list(bundle->keys(), &*bundle);
   const auto policy = find_policy("smolvla")->make(list);
-  return isa_for(list, isa);
+  return kernel_set_of(features_for(list, set.uses));
 }
 
 /// A bundle whose matrices are bf16, with the same numbers of one tensor, or of all, in float32.
@@ -46,15 +46,16 @@ std::string widened(const std::string& name, const std::string& path = kBundle) 
 }  // namespace
 
 TEST_CASE("a bundle of bf16 matrices is computed in bf16 where the machine has instructions for it") {
-  CHECK(isa_of(kBundle, Isa::amx) == Isa::amx);
-  for (Isa isa : {Isa::avx512_bf16, Isa::avx512, Isa::avx2, Isa::ggml}) CHECK(isa_of(kBundle, isa) == isa);
+  CHECK(set_of(kBundle, kernel_set::amx) == kernel_set::amx);
+  for (const KernelSet& set : {kernel_set::avx512_bf16, kernel_set::avx512, kernel_set::avx2, kernel_set::ggml})
+    CHECK(set_of(kBundle, set) == set);
 }
 
 TEST_CASE("a bundle without matrices of bf16 is computed in float32, whatever its tables are") {
-  for (const Isa isa : {Isa::amx, Isa::avx512_bf16}) {
-    CHECK(isa_of(widened("all"), isa) == Isa::avx512);
-    CHECK(isa_of(widened("lm.blk.0.attn_q.weight"), isa) == isa);
-    CHECK(isa_of(widened("lm.token_embd.weight"), isa) == isa);
+  for (const KernelSet& set : {kernel_set::amx, kernel_set::avx512_bf16}) {
+    CHECK(set_of(widened("all"), set) == kernel_set::avx512);
+    CHECK(set_of(widened("lm.blk.0.attn_q.weight"), set) == set);
+    CHECK(set_of(widened("lm.token_embd.weight"), set) == set);
   }
 }
 
@@ -63,22 +64,23 @@ TEST_CASE("attention between ternary products rounds from more keys on; their su
   REQUIRE(bundle.ok());
   ParamList list(bundle->keys(), &*bundle);
   const auto policy = find_policy("bitvla")->make(list);
-  for (Isa isa : {Isa::amx, Isa::avx512_bf16}) CHECK(isa_for(list, isa) == isa);
+  for (const KernelSet& set : {kernel_set::amx, kernel_set::avx512_bf16})
+    CHECK(kernel_set_of(features_for(list, set.uses)) == set);
   CHECK(min_rounded_keys(list) == 512);
   const Keys none;
   CHECK(min_rounded_keys(ParamList(none, nullptr)) == 128);
 }
 
 TEST_CASE("an engine tells the kernels and the precision of its bundle, not those of the machine") {
-  CHECK(load_engine(kBundle)->precision() == (rounds_to_bf16(usable_isas().back()) ? "bf16" : "f32"));
-  CHECK(load_engine(kBundle, "", "float32")->precision() == "f32");
+  CHECK(load_engine(kBundle)->precision() == (rounds_to_bf16(this_cpu()) ? Precision::bf16 : Precision::f32));
+  CHECK(load_engine(kBundle, "", "float32")->precision() == Precision::f32);
   CHECK(load_engine(kBundle, "", "float32")->arithmetic() == "float32");
   CHECK(load_engine(kBundle)->arithmetic().find("int8") == std::string::npos);
 }
 
 TEST_CASE(
     "bf16 that is asked for by name rounds large matrices, tells it, and is refused where there is nothing to round" *
-    doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+    doctest::skip(!rounds_to_bf16(usable_kernels().back()))) {
   EngineOptions options;
   options.kernels = "bf16";
   const auto refused = Engine::load(widened("all"), options);
@@ -87,7 +89,7 @@ TEST_CASE(
   CHECK(refused.error().message().find("kernels bf16: expected matrices of bf16") != std::string::npos);
   CHECK(load_engine(kBundle, "", "bf16")->arithmetic() == load_engine(kBundle)->arithmetic());
   const auto rounded = load_engine(widened("all", kShipped), "", "bf16");
-  CHECK(rounded->precision() == "bf16");
+  CHECK(rounded->precision() == Precision::bf16);
   CHECK(rounded->arithmetic().find("63 matrices rounded to it, as asked for") != std::string::npos);
   CHECK(load_engine(widened("all", kShipped))->arithmetic() ==
         "float32; --kernels bf16 is faster and rounds 63 matrices");
@@ -95,18 +97,18 @@ TEST_CASE(
 }
 
 TEST_CASE("a matrix of another dtype is multiplied in float32, and the others in bf16 as before" *
-          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+          doctest::skip(!rounds_to_bf16(usable_kernels().back()))) {
   const auto engine = load_engine(widened("lm.blk.0.attn_q.weight")), all = load_engine(kBundle);
-  CHECK(engine->precision() == "bf16");
+  CHECK(engine->precision() == Precision::bf16);
   CHECK(engine->kernels() == all->kernels());
   CHECK(engine->linear_kernels().find("avx512 (1 f32)") != std::string::npos);
   CHECK(engine->linear_kernels().find(all->kernels() + " (") != std::string::npos);
 }
 
 TEST_CASE("an engine tells that matrices were quantized, as somebody asked" *
-          doctest::skip(usable_isas().back() == Isa::ggml)) {
-  const auto engine = load_engine(kShipped, "", kInt8Kernels);
-  CHECK(engine->precision() == "int8");
+          doctest::skip(usable_kernels().back() == kernel_set::ggml)) {
+  const auto engine = load_engine(kShipped, "", "int8");
+  CHECK(engine->precision() == Precision::int8);
   CHECK(engine->arithmetic().find("as asked") != std::string::npos);
   CHECK(!engine->has_ternary());
 }

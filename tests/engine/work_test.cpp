@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Operations of SmolVLA's published size, counted by hand from its configuration.
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "support/weightless.h"
 
 using namespace vla;
@@ -45,9 +45,9 @@ Expected count_by_hand(double n_view, double n_text) {
 }  // namespace
 
 TEST_CASE("the published SmolVLA counts the operations of its configuration, under every choice of kernels") {
-  for (Isa isa : usable_isas()) {
-    CAPTURE(isa_name(isa));
-    const WeightlessSmolVla smolvla(10, isa_name(isa));
+  for (const KernelSet& set : usable_kernels()) {
+    CAPTURE(name_of(set));
+    const WeightlessSmolVla smolvla(10, name_of(set));
     Plans plans(smolvla.context());
     for (const auto& [n_view, n_text] : {std::pair(2, 48), std::pair(1, 5)}) {
       const auto plan = plans.for_shape({512, 512, n_view, n_text, 32});

@@ -4,7 +4,7 @@
 // Work is counted from shapes alone, so that no graph here is run.
 #include "graph/work.h"
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "support/graph_runner.h"
 #include "support/param_set.h"
 
@@ -19,8 +19,8 @@ std::vector<ParamSet::Piece> matrix(DType type) { return {{"w", {64, 5}, test::r
 
 std::vector<std::string> own_kernels() {
   std::vector<std::string> names;
-  for (Isa isa : usable_isas())
-    if (isa != Isa::ggml) names.push_back(isa_name(isa));
+  for (const KernelSet& set : usable_kernels())
+    if (!(set == kernel_set::ggml)) names.push_back(name_of(set));
   return names;
 }
 
@@ -69,11 +69,11 @@ TEST_CASE("looking up rows moves those rows and not the table, and a view moves 
 }
 
 TEST_CASE("a program splits its work and its times at the graph's stages, and leaves out what stays the same") {
-  for (Isa isa : usable_isas()) {
-    CAPTURE(isa_name(isa));
+  for (const KernelSet& set : usable_kernels()) {
+    CAPTURE(name_of(set));
     ParamSet params(matrix(DType::f32));
     const Param* w = params.scope().matrix("w", 64, 5);
-    GraphRunner runner(params.list(), isa_name(isa));
+    GraphRunner runner(params.list(), name_of(set));
     Graph& g = runner.graph;
     const Slot *x = runner.slot(test::ramp(64 * 3, 1), {64, 3, 1, 1}),
                *same = runner.slot(test::ramp(64, 1), {64, 1, 1, 1});
@@ -85,7 +85,7 @@ TEST_CASE("a program splits its work and its times at the graph's stages, and le
     Program& program = runner.lower({{x}});
     const std::vector<Work> work = program.work();
     REQUIRE(work.size() == 2);
-    CHECK(work[0].flop == 2.0 * 64 * 5 * (isa == Isa::ggml ? 4 : 3));
+    CHECK(work[0].flop == 2.0 * 64 * 5 * (set == kernel_set::ggml ? 4 : 3));
     CHECK(work[1].flop == 2.0 * 64 * 5 * 3);
     REQUIRE(program.stages().size() == 1);
     CHECK(program.stages()[0].name == "first");

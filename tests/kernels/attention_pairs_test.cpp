@@ -124,15 +124,15 @@ void check_pair_operands(const AttentionKernel& kernel) {
 }  // namespace
 
 /// A test of kernels that round to bf16: the portable instance, the emulated ones, and the machine's.
-#define VLA_PAIR_TEST(sentence, check)                                                     \
-  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); }       \
-  VLA_EMULATED_TEST("avx512_bf16", sentence, check(kernels::kEmulatedAttentionAvx512Bf16)) \
-  TEST_CASE("avx512_bf16: " sentence* doctest::skip(test::lacks(Isa::avx512_bf16))) {      \
-    check(kernels::cpu_kernels(Isa::avx512_bf16)->attention);                              \
-  }                                                                                        \
-  VLA_EMULATED_TEST("amx", sentence, check(kernels::kEmulatedAttentionAmx))                \
-  TEST_CASE("amx: " sentence* doctest::skip(test::lacks(Isa::amx))) {                      \
-    check(kernels::cpu_kernels(Isa::amx)->attention);                                      \
+#define VLA_PAIR_TEST(sentence, check)                                                       \
+  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); }         \
+  VLA_EMULATED_TEST("avx512_bf16", sentence, check(kernels::kEmulatedAttentionAvx512Bf16))   \
+  TEST_CASE("avx512_bf16: " sentence* doctest::skip(test::lacks(kernel_set::avx512_bf16))) { \
+    check(kernels::cpu_kernels(kernel_set::avx512_bf16.uses)->attention);                    \
+  }                                                                                          \
+  VLA_EMULATED_TEST("amx", sentence, check(kernels::kEmulatedAttentionAmx))                  \
+  TEST_CASE("amx: " sentence* doctest::skip(test::lacks(kernel_set::amx))) {                 \
+    check(kernels::cpu_kernels(kernel_set::amx.uses)->attention);                            \
   }
 
 TEST_CASE("a weight for bf16 errs by 2^-18 of itself at most") {

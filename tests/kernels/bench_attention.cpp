@@ -93,8 +93,8 @@ void measure(const AttentionKernel& kernel, const std::string& name, const Shape
 
 int main(int argc, char** argv) {
   const double seconds = argc > 1 ? std::atof(argv[1]) : 0.2;
-  for (Isa isa : usable_isas())
-    if (const CpuKernels* kernels = cpu_kernels(isa);
-        kernels != nullptr && (argc < 3 || isa_name(isa) == std::string(argv[2])))
-      for (const Shape& shape : kShapes) measure(kernels->attention, isa_name(isa), shape, seconds);
+  for (const KernelSet& set : usable_kernels())
+    if (const CpuKernels* kernels = cpu_kernels(this_cpu().both(set.uses));
+        kernels != nullptr && (argc < 3 || name_of(set) == std::string(argv[2])))
+      for (const Shape& shape : kShapes) measure(kernels->attention, name_of(set), shape, seconds);
 }

@@ -182,12 +182,12 @@ int main(int argc, char** argv) {
   const auto wants = [&](const LinearKernel& kernel) { return argc < 4 || kernel.name == std::string(argv[3]); };
   for (const LinearKernel* kernel : linear_kernels()) {
     if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
-    for (Isa isa : usable_isas())
-      if (isa_name(isa) == kernel->name && wants(*kernel))
+    for (const KernelSet& set : usable_kernels())
+      if (name_of(set) == kernel->name && wants(*kernel))
         for (const Shape& shape : kShapes)
           for (const bool rounded : {false, true}) {
             if (rounded && kernel->y_layout(shape.d_in) == RoundedLayout::none) continue;
-            measure(**executor, *kernel, peak_probe_of(isa), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row,
+            measure(**executor, *kernel, peak_probe_of(set.uses), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row,
                     n_round, rounded, nullptr);
           }
   }
@@ -198,6 +198,6 @@ int main(int argc, char** argv) {
       if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
       for (const Shape& shape : kInt8Shapes)
         measure(**executor, *kernel, *probe, {DType::i8, shape.d_in, shape.d_out, ternary}, shape.n_row, n_round, false,
-                choose_linear({DType::bf16, 64, 64}, probe->isa));
+                choose_linear({DType::bf16, 64, 64}, this_cpu()));
     }
 }

@@ -372,7 +372,7 @@ void check_both(const std::string& name, void (*check)(const LinearKernel& kerne
 /// For doctest's skip decorator: this machine lacks the instructions of a row.
 bool lacks(const std::string& name) {
   const LinearKernel* kernel = row(ternary_kernels(), name);
-  return kernel == nullptr || !kernel->supports(ternary_desc(64, 64), usable_isas().back());
+  return kernel == nullptr || !kernel->supports(ternary_desc(64, 64), this_cpu());
 }
 
 }  // namespace

@@ -190,7 +190,8 @@ class Trial {
 };
 
 void check(const LinearKernel& kernel, const Case& c) {
-  if (!kernel.supports({c.type, c.shape.d_in, c.shape.d_out}, Isa::amx)) return;  // amx machines have every instruction
+  if (!kernel.supports({c.type, c.shape.d_in, c.shape.d_out}, kernel_set::amx.uses))
+    return;  // amx machines have every instruction
   CAPTURE(c.shape.n_row);
   CAPTURE(c.shape.d_in);
   CAPTURE(c.shape.d_out);
@@ -293,18 +294,18 @@ const LinearKernel& row(const std::string& name) {
 
 }  // namespace
 
-#define VLA_LINEAR_TEST(sentence, check)                                                                 \
-  TEST_CASE("emulated: " sentence) { check(row("emulated")); }                                           \
-  TEST_CASE("emulated_amx: " sentence) { check(row("emulated_amx")); }                                   \
-  TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(Isa::avx2))) { check(row("avx2")); }       \
-  VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                    \
-  VLA_EMULATED_TEST("avx512_bf16", sentence, check(kEmulatedLinearAvx512Bf16))                           \
-  VLA_EMULATED_TEST("amx", sentence, check(kEmulatedLinearAmx))                                          \
-  TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(Isa::avx512))) { check(row("avx512")); } \
-  TEST_CASE("avx512_bf16: " sentence* doctest::skip(vla::test::lacks(Isa::avx512_bf16))) {               \
-    check(row("avx512_bf16"));                                                                           \
-  }                                                                                                      \
-  TEST_CASE("amx: " sentence* doctest::skip(vla::test::lacks(Isa::amx))) { check(row("amx")); }
+#define VLA_LINEAR_TEST(sentence, check)                                                                        \
+  TEST_CASE("emulated: " sentence) { check(row("emulated")); }                                                  \
+  TEST_CASE("emulated_amx: " sentence) { check(row("emulated_amx")); }                                          \
+  TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx2))) { check(row("avx2")); }       \
+  VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                           \
+  VLA_EMULATED_TEST("avx512_bf16", sentence, check(kEmulatedLinearAvx512Bf16))                                  \
+  VLA_EMULATED_TEST("amx", sentence, check(kEmulatedLinearAmx))                                                 \
+  TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx512))) { check(row("avx512")); } \
+  TEST_CASE("avx512_bf16: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx512_bf16))) {               \
+    check(row("avx512_bf16"));                                                                                  \
+  }                                                                                                             \
+  TEST_CASE("amx: " sentence* doctest::skip(vla::test::lacks(kernel_set::amx))) { check(row("amx")); }
 
 VLA_LINEAR_TEST("products of any shape and storage type are within float32's rounding", check_shapes_and_types)
 VLA_LINEAR_TEST("bias, activation, factor and residual follow the product", check_epilogues)
@@ -315,10 +316,11 @@ VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_r
 VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
 
 TEST_CASE("every machine takes the first row that it can run, and ggml where there is none") {
-  for (Isa isa : {Isa::ggml, Isa::avx2, Isa::avx512, Isa::avx512_bf16, Isa::amx})
+  for (const KernelSet& set :
+       {kernel_set::ggml, kernel_set::avx2, kernel_set::avx512, kernel_set::avx512_bf16, kernel_set::amx})
     for (DType type : {DType::bf16, DType::f16, DType::f32}) {
-      const LinearKernel* chosen = choose_linear({type, 768, 3072}, isa);
-      const std::string expected = isa_name(type == DType::bf16 ? isa : without_rounding(isa));
+      const LinearKernel* chosen = choose_linear({type, 768, 3072}, set.uses);
+      const std::string expected = name_of(type == DType::bf16 ? set.uses : without_rounding(set.uses));
       CHECK((chosen == nullptr ? "ggml" : chosen->name) == expected);
     }
 }

@@ -22,10 +22,10 @@ TEST_CASE("every probe of this machine returns a rate that a processor can have,
 }
 
 TEST_CASE("the peak of a choice of kernels is in floating point, and in float32 for ggml") {
-  for (Isa isa : usable_isas()) {
-    const PeakProbe& probe = peak_probe_of(isa);
+  for (const KernelSet& set : usable_kernels()) {
+    const PeakProbe& probe = peak_probe_of(set.uses);
     CHECK(probe.number != Number::int8);
-    CHECK((isa == Isa::ggml ? probe.number == Number::f32 : probe.isa == isa));
+    CHECK((set == kernel_set::ggml ? probe.number == Number::f32 : set.uses.has_all(probe.needs)));
   }
 }
 

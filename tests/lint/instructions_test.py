@@ -21,7 +21,7 @@ BETTER = re.compile(r"%(zmm|tmm|k[1-7]\b|[xy]mm(1[6-9]|2\d|3[01])\b)")
 WIDE = re.compile(r"%ymm")
 # Looks at the processor itself, at run time, before it calls the function that is compiled so.
 ASKS = {"resample_torch.cpp.o"}
-# All assembler: the pretended machine is of no maker for which it is chosen (tests/support/amx_processor.h).
+# All assembler: the pretended machine is of no maker for which it is chosen (tests/support/amx_processor.cpp).
 NOT_EMULATED = {"int8_lookup_avx512"}
 
 pytestmark = pytest.mark.skipif(

@@ -71,7 +71,7 @@ int n_kept(const std::string& text, const std::string& blocks) {
 
 }  // namespace
 
-TEST_CASE("amx: a block of rows goes through both products of an MLP" * doctest::skip(lacks(Isa::amx))) {
+TEST_CASE("amx: a block of rows goes through both products of an MLP" * doctest::skip(lacks(kernel_set::amx))) {
   const Mlp mlp(kInner);
   for (const bool gated : {false, true}) {
     const Lowered whole = run(mlp, gated, kRows, 9);  // too few rows for so many threads
@@ -86,7 +86,7 @@ TEST_CASE("amx: a block of rows goes through both products of an MLP" * doctest:
   }
 }
 
-TEST_CASE("amx: rows stay whole where blocks do not pay" * doctest::skip(lacks(Isa::amx))) {
+TEST_CASE("amx: rows stay whole where blocks do not pay" * doctest::skip(lacks(kernel_set::amx))) {
   const auto blocks = [](int inner, int n_row, int n_thread) {
     return run(Mlp(inner), false, n_row, n_thread).text.find("blocks") != std::string::npos;
   };

@@ -16,7 +16,7 @@ namespace {
 /// Lines of the program's text without columns of numbers.
 std::vector<std::string> operations(const Build& build, const std::string& taps = "") {
   const LowerParams params;
-  GraphRunner runner(params.list(), isa_name(lowered_isas().back()),
+  GraphRunner runner(params.list(), name_of(lowered_kernels().back()),
                      [&](const std::string& path) { return path == "result" || path == taps; });
   runner.graph.name("result", build(runner, params));
   const std::string text = runner.lower().text();
@@ -45,7 +45,7 @@ Tensor block(GraphRunner& r, const LowerParams& p) {
 
 }  // namespace
 
-#define VLA_FUSE_TEST(sentence) TEST_CASE(sentence* doctest::skip(lowered_isas().empty()))
+#define VLA_FUSE_TEST(sentence) TEST_CASE(sentence* doctest::skip(lowered_kernels().empty()))
 
 VLA_FUSE_TEST("activation, factor and residual are part of the product before them") {
   const auto lines = operations([](GraphRunner& r, const LowerParams& p) {
@@ -105,7 +105,7 @@ VLA_FUSE_TEST("what nobody reads is not computed") {
 }
 
 TEST_CASE("attention over few keys rounds nothing, and shares no packed keys with one that does" *
-          doctest::skip(lacks(Isa::avx512_bf16))) {
+          doctest::skip(lacks(kernel_set::avx512_bf16))) {
   const LowerParams params(DType::bf16);
   GraphRunner runner(params.list(), "avx512_bf16");
   Graph& g = runner.graph;

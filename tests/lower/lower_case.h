@@ -5,7 +5,7 @@
 #include <cmath>
 #include <string>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/attention.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
@@ -14,10 +14,10 @@
 namespace vla::test {
 
 /// The instruction sets of this machine that graphs are lowered for; ggml is what they are compared with.
-inline std::vector<Isa> lowered_isas() {
-  std::vector<Isa> isas = usable_isas();
-  std::erase(isas, Isa::ggml);
-  return isas;
+inline std::vector<KernelSet> lowered_kernels() {
+  std::vector<KernelSet> sets = usable_kernels();
+  std::erase(sets, kernel_set::ggml);
+  return sets;
 }
 
 /// The same numbers but for rounding: `tolerance` of the largest.
@@ -121,9 +121,9 @@ inline std::vector<float> result_of(const std::string& kernels, const LowerParam
 inline void check_like_ggml(const Build& build, double tolerance = 2e-6) {
   const LowerParams params;
   const std::vector<float> expected = result_of("ggml", params, build);
-  for (const Isa isa : lowered_isas()) {
-    CAPTURE(isa_name(isa));
-    check_close(result_of(isa_name(isa), params, build), expected, tolerance);
+  for (const KernelSet& set : lowered_kernels()) {
+    CAPTURE(name_of(set));
+    check_close(result_of(name_of(set), params, build), expected, tolerance);
   }
 }
 

@@ -123,7 +123,7 @@ TEST_CASE("rows of tables by ids, of which some are cut off") {
       return r.graph.add(op::Embedding{p.table()}, {some(r.graph)});
     };
     const auto expected = result_of("ggml", params, build);
-    for (const Isa isa : lowered_isas()) CHECK(result_of(isa_name(isa), params, build) == expected);
+    for (const KernelSet& set : lowered_kernels()) CHECK(result_of(name_of(set), params, build) == expected);
   }
   for (const auto operand : kOperands)
     check_like_ggml([&](GraphRunner& r, const LowerParams&) {
@@ -238,9 +238,9 @@ TEST_CASE("heads that several attentions read, and rotations that others read to
 }
 
 TEST_CASE("attention with more segments or wider heads than its kernels have room for is refused") {
-  for (const Isa isa : lowered_isas()) {
+  for (const KernelSet& set : lowered_kernels()) {
     const auto error_of = [&](int d_head, int n_segment) {
-      GraphRunner r(ParamList(Keys(), nullptr), isa_name(isa));
+      GraphRunner r(ParamList(Keys(), nullptr), name_of(set));
       const Tensor q = input(r, {d_head, 1, 2, 1});
       const std::vector<KeyValue> segments(static_cast<std::size_t>(n_segment), {q, q});
       r.graph.name("result", attention(r.graph, q, segments, {}));

@@ -143,18 +143,18 @@ TEST_CASE("random graphs give what ggml gives, with every value kept or only the
   for (unsigned seed = 1; seed <= 200; ++seed)
     for (const bool taps : {false, true}) {
       const auto expected = outcome("ggml", params, seed, taps, false);
-      for (const Isa isa : lowered_isas())
+      for (const KernelSet& set : lowered_kernels())
         for (const bool hoist : {false, true}) {
           CAPTURE(seed);
           CAPTURE(taps);
           CAPTURE(hoist);
-          CAPTURE(isa_name(isa));
-          check_close(outcome(isa_name(isa), params, seed, taps, hoist), expected, 1e-4);
+          CAPTURE(name_of(set));
+          check_close(outcome(name_of(set), params, seed, taps, hoist), expected, 1e-4);
         }
     }
 }
 
-#define VLA_SLOT_TEST(sentence) TEST_CASE(sentence* doctest::skip(lowered_isas().empty()))
+#define VLA_SLOT_TEST(sentence) TEST_CASE(sentence* doctest::skip(lowered_kernels().empty()))
 
 namespace {
 
@@ -169,9 +169,9 @@ void check_overwritten(const std::function<Tensor(Graph&, const LowerParams&, Te
     for (int i = 0; i < 3; ++i) r.run();
     return r.get(x);
   };
-  for (const Isa isa : lowered_isas()) {
-    CAPTURE(isa_name(isa));
-    check_close(leave(isa_name(isa)), leave("ggml"), 1e-5);
+  for (const KernelSet& set : lowered_kernels()) {
+    CAPTURE(name_of(set));
+    check_close(leave(name_of(set)), leave("ggml"), 1e-5);
   }
 }
 
@@ -221,12 +221,12 @@ VLA_SLOT_TEST("what is read behind a write in the same graph is what was written
     r.run();
     return r.tap("result");
   };
-  for (const Isa isa : lowered_isas()) check_close(run(isa_name(isa)), run("ggml"), 1e-5);
+  for (const KernelSet& set : lowered_kernels()) check_close(run(name_of(set)), run("ggml"), 1e-5);
 }
 
 VLA_SLOT_TEST("programs of one device share working memory, whichever is lowered first") {
   const LowerParams params;
-  const auto device = open_device(2, isa_name(lowered_isas().back()));
+  const auto device = open_device(2, name_of(lowered_kernels().back()));
   REQUIRE(device.ok());
   REQUIRE((*device)->load(params.list(), true).ok());
   Slots slots;

@@ -3,7 +3,7 @@
 //
 // Matrices of floats that are rounded when they are loaded, because somebody asked for it.
 #include "graph/rounding.h"
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/linear.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
@@ -55,7 +55,7 @@ std::vector<float> mlp(const std::string& kernels, DType type, DType small) {
 
 std::vector<float> mlp(const std::string& kernels, DType type) { return mlp(kernels, type, type); }
 
-bool lacks_kernels() { return usable_isas().back() == Isa::ggml; }
+bool lacks_kernels() { return usable_kernels().back() == kernel_set::ggml; }
 
 }  // namespace
 
@@ -65,7 +65,7 @@ VLA_QUANTIZED_TEST(
     "large products are near those of float32, whatever the weights are stored as, and small ones the same") {
   for (const DType type : {DType::bf16, DType::f16, DType::f32}) {
     CAPTURE(dtype_name(type));
-    const std::vector<float> expected = mlp("float32", type), same = mlp("", type), got = mlp(kInt8Kernels, type);
+    const std::vector<float> expected = mlp("float32", type), same = mlp("", type), got = mlp("int8", type);
     constexpr std::size_t kRow = kNarrow + kAction;
     double error = 0, size = 0;
     for (std::size_t i = 0; i < got.size(); ++i) {
@@ -83,8 +83,8 @@ VLA_QUANTIZED_TEST(
 
 VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number") {
   Parameters params(DType::bf16, DType::bf16);
-  GraphRunner floats(params.set.list(), ""), quantized(params.set.list(), kInt8Kernels);
-  CHECK(quantized.device().precision() == "int8");
+  GraphRunner floats(params.set.list(), ""), quantized(params.set.list(), "int8");
+  CHECK(quantized.device().precision() == Precision::int8);
   CHECK(quantized.device().kernels() == floats.device().kernels());
   CHECK(quantized.device().linear_kernels().find("_int8 (2 bf16)") != std::string::npos);
   CHECK(quantized.device().weights_size() < 0.7 * static_cast<double>(floats.device().weights_size()));
@@ -94,9 +94,9 @@ VLA_QUANTIZED_TEST("a policy with nothing to round is refused, before any memory
   struct {
     std::string kernels, verb;
     DType small;
-  } const cases[] = {{kInt8Kernels, "quantizing", DType::bf16}, {kBf16Kernels, "rounding", DType::f32}};
+  } const cases[] = {{"int8", "quantizing", DType::bf16}, {"bf16", "rounding", DType::f32}};
   for (const auto& [kernels, verb, small] : cases) {
-    if (kernels == kBf16Kernels && !rounds_to_bf16(usable_isas().back())) continue;
+    if (std::string(kernels) == "bf16" && !rounds_to_bf16(usable_kernels().back())) continue;
     ParamSet set({piece("action.weight", {kNarrow, kAction}, small), piece("action.bias", {kAction}, DType::f32)});
     const Linear action(set.scope("action"), kNarrow, kAction, Bias::yes);
     const auto device = open_device(1, kernels);
@@ -111,22 +111,22 @@ VLA_QUANTIZED_TEST("a policy with nothing to round is refused, before any memory
 }
 
 TEST_CASE("large matrices rounded to bf16 are those of a bundle that stores them so, and small ones stay" *
-          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+          doctest::skip(!rounds_to_bf16(usable_kernels().back()))) {
   for (const DType type : {DType::f32, DType::f16}) {
     CAPTURE(dtype_name(type));
-    CHECK(mlp(kBf16Kernels, type) == mlp("", DType::bf16, type));
-    CHECK(mlp("", type) != mlp(kBf16Kernels, type));
+    CHECK(mlp("bf16", type) == mlp("", DType::bf16, type));
+    CHECK(mlp("", type) != mlp("bf16", type));
   }
   Parameters params(DType::f32, DType::f32);
-  GraphRunner floats(params.set.list(), ""), rounded(params.set.list(), kBf16Kernels);
-  CHECK(floats.device().precision() == "f32");
-  CHECK(rounded.device().precision() == "bf16");
+  GraphRunner floats(params.set.list(), ""), rounded(params.set.list(), "bf16");
+  CHECK(floats.device().precision() == Precision::f32);
+  CHECK(rounded.device().precision() == Precision::bf16);
   CHECK(rounded.device().linear_kernels().find(rounded.device().kernels() + " (2 f32)") != std::string::npos);
   CHECK(rounded.device().weights_size() < 0.6 * static_cast<double>(floats.device().weights_size()));
 }
 
 TEST_CASE("other devices take no int8") {
-  const auto device = open_device(1, kInt8Kernels, "vulkan");
+  const auto device = open_device(1, "int8", "vulkan");
   REQUIRE(!device.ok());
   CHECK(device.error().code == Code::usage);
 }

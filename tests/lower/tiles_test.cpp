@@ -44,15 +44,16 @@ void check_operands(const std::string& kernels, const std::string& rounded, cons
 
 }  // namespace
 
-TEST_CASE("amx: queries, keys and values lie in tiles behind the product" * doctest::skip(lacks(Isa::amx))) {
+TEST_CASE("amx: queries, keys and values lie in tiles behind the product" * doctest::skip(lacks(kernel_set::amx))) {
   check_operands("amx", "bf16 tiles [24, 130, 2]", "bf16 tiles [12, 1, 130, 2]");
 }
-TEST_CASE("avx512_bf16: queries, keys and values are rounded by the product" * doctest::skip(lacks(Isa::avx512_bf16))) {
+TEST_CASE("avx512_bf16: queries, keys and values are rounded by the product" *
+          doctest::skip(lacks(kernel_set::avx512_bf16))) {
   check_operands("avx512_bf16", "bf16[24, 130, 2]", "bf16[12, 1, 130, 2]");
 }
 
 TEST_CASE("attention is computed in float32 where a matrix of float32 made its queries" *
-          doctest::skip(!rounds_to_bf16(usable_isas().back()))) {
+          doctest::skip(!rounds_to_bf16(usable_kernels().back()))) {
   constexpr int kWidth = 64;
   const auto piece = [&](const char* name, DType type) {
     return ParamSet::Piece{std::string(name) + ".weight", {kWidth, kWidth}, ramp(kWidth * kWidth, 0.1f), type};
@@ -68,7 +69,7 @@ TEST_CASE("attention is computed in float32 where a matrix of float32 made its q
   };
   const Tensor from_wide = attend_from(wide), from_narrow = attend_from(narrow);
   g.name("result", concat(g, {from_wide, from_narrow}, 0));
-  const std::string text = r.lower().text(), best = isa_name(usable_isas().back());
+  const std::string text = r.lower().text(), best = name_of(usable_kernels().back());
   const auto kernel_of = [&](Tensor attended) {
     const std::size_t at = text.find(fmt::format("attention %{} ", attended.node()->id));
     REQUIRE(at != std::string::npos);
@@ -79,7 +80,7 @@ TEST_CASE("attention is computed in float32 where a matrix of float32 made its q
   CHECK(kernel_of(from_narrow) == best);
 }
 
-TEST_CASE("amx: int8 products leave queries, keys and values in tiles too" * doctest::skip(lacks(Isa::amx))) {
+TEST_CASE("amx: int8 products leave queries, keys and values in tiles too" * doctest::skip(lacks(kernel_set::amx))) {
   constexpr int kWidth = 160;
   std::vector<ParamSet::Piece> pieces;
   for (const char* name : {"q", "k", "v"})
@@ -88,8 +89,7 @@ TEST_CASE("amx: int8 products leave queries, keys and values in tiles too" * doc
   const auto linear = [&](const char* name) { return Linear(set.scope(name), kWidth, kWidth, Bias::no); };
   const Linear q = linear("q"), k = linear("k"), v = linear("v");
   const auto run = [&](const char* tapped) {
-    GraphRunner r(set.list(), kInt8Kernels,
-                  [=](const std::string& path) { return path == "result" || path == tapped; });
+    GraphRunner r(set.list(), "int8", [=](const std::string& path) { return path == "result" || path == tapped; });
     Graph& g = r.graph;
     const Tensor x = input(r, {kWidth, 130, 1, 1}), keys = k(g, x);
     g.name("keys", keys);
@@ -107,7 +107,7 @@ TEST_CASE("amx: int8 products leave queries, keys and values in tiles too" * doc
 }
 
 TEST_CASE("amx: what products alone read stays in tiles between them, the last of uneven size" *
-          doctest::skip(lacks(Isa::amx))) {
+          doctest::skip(lacks(kernel_set::amx))) {
   const LowerParams params(DType::bf16);
   const auto run = [&](const char* kernels, int n_row) {
     GraphRunner runner(params.list(), kernels);

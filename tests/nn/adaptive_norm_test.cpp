@@ -8,7 +8,7 @@
 
 #include <cmath>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/mlp.h"
 #include "nn/norm.h"
 #include "support/graph_runner.h"
@@ -127,12 +127,12 @@ TEST_CASE("an adaptive LayerNorm takes scale and shift in the order of its kind"
 
 TEST_CASE("a norm without weights has mean 0 and a variance just below 1") {
   const auto x = ramp(kWidth * kToken, 3);
-  for (Isa isa : usable_isas()) {
+  for (const KernelSet& set : usable_kernels()) {
     const auto got = test::run_graph(
         [&](Graph& g) {
           return layer_norm(g, test::constant(g, x, {kWidth, kToken}), kEps);
         },
-        isa_name(isa));
+        name_of(set));
     for (int token = 0; token < kToken; ++token) {
       double mean = 0, square = 0;
       for (int i = 0; i < kWidth; ++i) mean += at(got, token * kWidth + i) / double{kWidth};

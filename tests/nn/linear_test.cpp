@@ -8,7 +8,7 @@
 
 #include <cmath>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/norm.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
@@ -66,15 +66,15 @@ void check_like_ggml(const std::function<Tensor(Graph&, const Layers&, Tensor)>&
   for (DType type : {DType::bf16, DType::f16, DType::f32})
     for (int n_row : {kFew, kMany}) {
       const std::vector<float> expected = run("ggml", type, n_row, "", build);
-      for (Isa isa : usable_isas())
+      for (const KernelSet& set : usable_kernels())
         for (const char* tap : {"", "a", "c"}) {
-          CAPTURE(isa_name(isa));
+          CAPTURE(name_of(set));
           CAPTURE(dtype_name(type));
           CAPTURE(n_row);
           CAPTURE(tap);
-          const std::vector<float> got = run(isa_name(isa), type, n_row, tap, build);
+          const std::vector<float> got = run(name_of(set), type, n_row, tap, build);
           // Some round x to bf16: 2^-9 of each product, or 2^-17 for few rows.
-          const bool rounds = type == DType::bf16 && rounds_to_bf16(isa);
+          const bool rounds = type == DType::bf16 && rounds_to_bf16(set);
           const double tolerance = !rounds ? 1e-5 : n_row == kMany ? 0.1 : 4e-4;
           double largest = 0;
           REQUIRE(got.size() == expected.size());

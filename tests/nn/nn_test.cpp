@@ -7,7 +7,7 @@
 #include <cmath>
 #include <functional>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/attention.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
@@ -75,13 +75,13 @@ TEST_CASE("gelu agrees with its definition over the whole range of float32") {
 TEST_CASE("gelu of erf and relu agree with their definitions on every choice of kernels") {
   std::vector<float> x = ramp(4099, 12);
   for (float edge : {0.0f, -0.0f, 1e-30f, -1e-30f, 100.0f, -100.0f, 1e30f, -1e30f, NAN}) x.push_back(edge);
-  for (Isa isa : usable_isas()) {
+  for (const KernelSet& set : usable_kernels()) {
     const auto run = [&](Activation activation) {
       return run_graph(
           [&](Graph& g) {
             return activate(g, test::constant(g, x, {static_cast<std::int64_t>(x.size())}), activation);
           },
-          isa_name(isa));
+          name_of(set));
     };
     const auto gelu = run(Activation::gelu_erf), relu = run(Activation::relu);
     CHECK(std::isnan(gelu.back()));
@@ -89,7 +89,7 @@ TEST_CASE("gelu of erf and relu agree with their definitions on every choice of 
     for (std::size_t i = 0; i + 1 < x.size(); ++i) {
       const double expected = x[i] / 2.0 * std::erfc(-x[i] * M_SQRT1_2);
       // ggml adds one to erf: 2^-24 of half of x, where x is above -6.
-      const double lost = isa == Isa::ggml ? 4e-7 : 0;
+      const double lost = set == kernel_set::ggml ? 4e-7 : 0;
       CHECK(std::abs(gelu[i] - expected) <= 0x1p-22 * std::abs(expected) + lost + 0x1p-148);
       CHECK(relu[i] == std::max(x[i], 0.0f));
     }
@@ -149,7 +149,7 @@ TEST_CASE("a slice holds the tokens of its range, and whatever takes tokens take
   const auto tokens = [&](Graph& g, float value, int n_view) {
     return test::constant(g, std::vector<float>(static_cast<std::size_t>(kWidth * n_view), value), {kWidth, 1, n_view});
   };
-  for (Isa isa : usable_isas())
+  for (const KernelSet& set : usable_kernels())
     for (int n_view : {1, kView}) {
       std::vector<float> same, between, factored, positive;
       for (int view = 0; view < n_view; ++view) {
@@ -162,7 +162,7 @@ TEST_CASE("a slice holds the tokens of its range, and whatever takes tokens take
             positive.push_back(std::max(at(view, token, i), 0.0f));
           }
       }
-      const auto run = [&](const Use& use) { return use_slice(n_view, use, isa_name(isa)); };
+      const auto run = [&](const Use& use) { return use_slice(n_view, use, name_of(set)); };
       CHECK(run([](Graph& g, Tensor s) { return scale(g, s, 1); }) == same);
       CHECK(run([](Graph& g, Tensor s) { return flatten_views(g, s); }) == same);
       CHECK(run([&](Graph& g, Tensor s) { return concat_tokens(g, {tokens(g, 2, n_view), s}); }) == between);

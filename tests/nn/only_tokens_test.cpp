@@ -6,7 +6,7 @@
 
 #include <cmath>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/attention.h"
 #include "nn/linear.h"
 #include "nn/norm.h"
@@ -71,10 +71,10 @@ struct Outcome {
 };
 
 /// Some tokens behind two layers; `tap` is recorded too.
-Outcome run(Choose choose, Isa isa, const std::string& tap = "") {
+Outcome run(Choose choose, const KernelSet& kernels, const std::string& tap = "") {
   test::ParamSet set(make_pieces());
   const Layer layer(set.scope());
-  test::GraphRunner runner(set.list(), isa_name(isa),
+  test::GraphRunner runner(set.list(), name_of(kernels),
                            [&](const std::string& path) { return path == "result" || path == tap; });
   Graph& g = runner.graph;
   const auto input = [&](const Shape& shape, float range) {
@@ -95,9 +95,9 @@ Outcome run(Choose choose, Isa isa, const std::string& tap = "") {
 }  // namespace
 
 TEST_CASE("tokens that are computed alone are those of all, from less work") {
-  for (const Isa isa : usable_isas()) {
-    CAPTURE(isa_name(isa));
-    const Outcome all = run(slice_tokens, isa), some = run(only_tokens, isa);
+  for (const KernelSet& set : usable_kernels()) {
+    CAPTURE(name_of(set));
+    const Outcome all = run(slice_tokens, set), some = run(only_tokens, set);
     REQUIRE(some.values.size() == kModel * kCount);
     REQUIRE(all.values.size() == some.values.size());
     for (std::size_t i = 0; i < some.values.size(); ++i) CHECK(std::abs(some.values[i] - all.values[i]) <= 1e-5);
@@ -108,10 +108,10 @@ TEST_CASE("tokens that are computed alone are those of all, from less work") {
 }
 
 TEST_CASE("what is tapped is computed whole, once") {
-  const Isa isa = usable_isas().back();
+  const KernelSet set = usable_kernels().back();
   for (const char* tap : {"first", "second"}) {
     CAPTURE(tap);
-    const Outcome all = run(slice_tokens, isa, tap), some = run(only_tokens, isa, tap);
+    const Outcome all = run(slice_tokens, set, tap), some = run(only_tokens, set, tap);
     CHECK((some.flop < all.flop) == (std::string(tap) == "first"));
     CHECK(some.flop <= all.flop);
   }

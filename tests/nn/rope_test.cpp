@@ -6,7 +6,7 @@
 
 #include <cmath>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "support/graph_runner.h"
 
 using namespace vla;
@@ -20,12 +20,12 @@ template <class MakeTable, class Angle>
 void check_turned(int d_head, int n_token, const MakeTable& make_table, const Angle& angle) {
   constexpr int kHeads = 2, kBatches = 2;
   const std::vector<float> x = ramp(static_cast<std::size_t>(d_head * kHeads * n_token * kBatches), 1);
-  for (Isa isa : usable_isas()) {
+  for (const KernelSet& set : usable_kernels()) {
     const auto y = run_graph(
         [&](Graph& g) {
           return apply_rope(g, test::constant(g, x, {d_head, kHeads, n_token, kBatches}), make_table(g));
         },
-        isa_name(isa));
+        name_of(set));
     REQUIRE(y.size() == x.size());
     for (int row = 0; row < kHeads * n_token * kBatches; ++row)
       for (int i = 0; i < d_head / 2; ++i) {

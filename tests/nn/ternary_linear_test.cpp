@@ -6,7 +6,7 @@
 
 #include <cmath>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 #include "nn/norm.h"
 #include "nn/tokens.h"
 #include "support/graph_runner.h"
@@ -83,12 +83,12 @@ std::size_t n_line(const std::string& text, const std::string& word) {
 
 TEST_CASE("a ternary product is the same to the bit on every choice of kernels, in float32 whole numbers too") {
   for (const int n_row : {1, 29, 70})
-    for (const Isa isa : usable_isas()) {
+    for (const KernelSet& set : usable_kernels()) {
       const Build build = [](Graph& g, const Layers& l, Tensor x) {
         return add(g, l.c(g, scale(g, l.a(g, x), 0.5f)), x);
       };
-      CAPTURE(isa_name(isa));
-      CHECK(run(isa_name(isa), n_row, build).values == run("ggml", n_row, build).values);
+      CAPTURE(name_of(set));
+      CHECK(run(name_of(set), n_row, build).values == run("ggml", n_row, build).values);
     }
 }
 
@@ -98,15 +98,15 @@ TEST_CASE("what follows a ternary product, and the norm before it, is fused and 
     const Tensor mid = multiply(g, activate(g, l.a(g, h), Activation::relu_squared), l.b(g, h));
     return add(g, x, l.c(g, mid));
   };
-  for (const Isa isa : usable_isas()) {
+  for (const KernelSet& set : usable_kernels()) {
     // A number that is rounded otherwise may become the next code: a 127th of the row's largest.
-    const std::vector<float> expected = run("ggml", 70, build).values, got = run(isa_name(isa), 70, build).values;
+    const std::vector<float> expected = run("ggml", 70, build).values, got = run(name_of(set), 70, build).values;
     double error = 0, size = 0;
     for (std::size_t i = 0; i < got.size(); ++i)
       error += std::pow(double{got[i]} - expected[i], 2), size += std::pow(double{expected[i]}, 2);
     CHECK(std::sqrt(error / size) < 2e-3);
-    if (isa == Isa::ggml) continue;
-    const std::string text = run(isa_name(isa), 70, build).text;
+    if (set == kernel_set::ggml) continue;
+    const std::string text = run(name_of(set), 70, build).text;
     CAPTURE(text);
     CHECK(n_line(text, "\n") == 4);  // quantize, gate and up, quantize, down
     CHECK(n_line(text, "norm, quantize") == 1);
@@ -115,9 +115,9 @@ TEST_CASE("what follows a ternary product, and the norm before it, is fused and 
 }
 
 TEST_CASE("products of one x read the same codes") {
-  for (const Isa isa : usable_isas()) {
-    if (isa == Isa::ggml) continue;
-    const Outcome outcome = run(isa_name(isa), 40, [](Graph& g, const Layers& l, Tensor x) {
+  for (const KernelSet& set : usable_kernels()) {
+    if (set == kernel_set::ggml) continue;
+    const Outcome outcome = run(name_of(set), 40, [](Graph& g, const Layers& l, Tensor x) {
       const Tensor h = l.norm(g, x);
       return add(g, scale(g, l.a(g, h), 2), activate(g, l.b(g, h), Activation::silu));
     });
@@ -129,11 +129,11 @@ TEST_CASE("products of one x read the same codes") {
 
 TEST_CASE("a tapped norm is an operation of its own, which quantizing reads") {
   const Build build = [](Graph& g, const Layers& l, Tensor x) { return l.a(g, l.norm(g, x)); };
-  for (const Isa isa : usable_isas()) {
-    const Outcome got = run(isa_name(isa), 40, build, "norm");
+  for (const KernelSet& set : usable_kernels()) {
+    const Outcome got = run(name_of(set), 40, build, "norm");
     const std::vector<float> expected = run("ggml", 40, build, "norm").values;
     for (std::size_t i = 0; i < expected.size(); ++i) CHECK(std::abs(got.values[i] - expected[i]) < 1e-6f);
-    if (isa != Isa::ggml) CHECK(n_line(got.text, "norm, quantize") == 0);
+    if (!(set == kernel_set::ggml)) CHECK(n_line(got.text, "norm, quantize") == 0);
   }
 }
 

@@ -10,7 +10,9 @@
 namespace vla::test {
 
 /// For doctest's skip decorator: a test of instructions that this machine lacks is counted as skipped under its name.
-inline bool lacks(Isa isa) { return std::find(usable_isas().begin(), usable_isas().end(), isa) == usable_isas().end(); }
+inline bool lacks(const KernelSet& set) {
+  return std::find(usable_kernels().begin(), usable_kernels().end(), set) == usable_kernels().end();
+}
 
 }  // namespace vla::test
 
@@ -25,18 +27,18 @@ extern const LinearKernel kEmulatedTernaryAvx512, kEmulatedInt8Avx512, kEmulated
 }  // namespace vla::kernels
 
 #define VLA_EMULATED_TEST(isa, sentence, ...) \
-  TEST_CASE(isa " (emulated): " sentence* doctest::skip(vla::test::lacks(vla::Isa::avx2))) { __VA_ARGS__; }
+  TEST_CASE(isa " (emulated): " sentence* doctest::skip(vla::test::lacks(vla::kernel_set::avx2))) { __VA_ARGS__; }
 #else
 #define VLA_EMULATED_TEST(isa, sentence, ...)
 #endif
 
 /// The same test for every instruction set, and for the portable instance of the same templates.
-#define VLA_KERNEL_TEST(sentence, check)                                              \
-  TEST_CASE("portable: " sentence) { check(vla::kernels::portable_kernels()); }       \
-  TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(vla::Isa::avx2))) {     \
-    check(*vla::kernels::cpu_kernels(vla::Isa::avx2));                                \
-  }                                                                                   \
-  VLA_EMULATED_TEST("avx512", sentence, check(vla::kernels::kEmulatedAvx512Kernels))  \
-  TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(vla::Isa::avx512))) { \
-    check(*vla::kernels::cpu_kernels(vla::Isa::avx512));                              \
+#define VLA_KERNEL_TEST(sentence, check)                                                     \
+  TEST_CASE("portable: " sentence) { check(vla::kernels::portable_kernels()); }              \
+  TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(vla::kernel_set::avx2))) {     \
+    check(*vla::kernels::cpu_kernels(vla::kernel_set::avx2.uses));                           \
+  }                                                                                          \
+  VLA_EMULATED_TEST("avx512", sentence, check(vla::kernels::kEmulatedAvx512Kernels))         \
+  TEST_CASE("avx512: " sentence* doctest::skip(vla::test::lacks(vla::kernel_set::avx512))) { \
+    check(*vla::kernels::cpu_kernels(vla::kernel_set::avx512.uses));                         \
   }

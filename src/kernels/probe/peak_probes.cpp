@@ -140,29 +140,21 @@ constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell th
 #endif
 
 std::vector<PeakProbe> detect() {
-  std::vector<PeakProbe> found = {{"baseline f32", Isa::ggml, Number::f32, 8 * 4 * 2, multiply_add_any}};
+  std::vector<PeakProbe> found = {{"baseline f32", {}, Number::f32, 8 * 4 * 2, multiply_add_any}};
 #if defined(__x86_64__)
-  const std::vector<Isa>& usable = usable_isas();
-  const auto has = [&](Isa isa) { return std::find(usable.begin(), usable.end(), isa) != usable.end(); };
-  if (has(Isa::avx2)) {
-    found.push_back({"avx2 f32", Isa::avx2, Number::f32, 12 * 8 * 2, multiply_add_avx2});
-    found.push_back({"avx2 int8", Isa::avx2, Number::int8, 12 * 32 * 2, multiply_add_bytes});
-    if (has_avx_vnni()) found.push_back({"avxvnni int8", Isa::avx2, Number::int8, 12 * 32 * 2, multiply_add_avxvnni});
-  }
-  if (has(Isa::avx512)) {
-    found.push_back({"avx512 f32", Isa::avx512, Number::f32, 28 * 16 * 2, multiply_add_avx512});
-    if (has_avx512_vnni()) found.push_back({"avx512 int8", Isa::avx512, Number::int8, 28 * 64 * 2, multiply_add_vnni});
-    if (permutes_beside_vnni())
-      found.push_back({"avx512 lookup", Isa::avx512, Number::ternary, 8 * (2 * 64 + 96) * 2, multiply_add_lookup});
-  }
-  if (has(Isa::avx512_bf16))
-    found.push_back({"avx512 bf16", Isa::avx512_bf16, Number::bf16, 28 * 32 * 2, multiply_add_pairs});
-  if (has(Isa::amx)) {
-    constexpr double kTileProduct = 16 * 16 * 32 * 2;  // of bf16; a tile holds twice as many int8
-    found.push_back({"amx bf16", Isa::amx, Number::bf16, 6 * kTileProduct, multiply_add_amx_bf16});
-    if (has_amx_int8())
-      found.push_back({"amx int8", Isa::amx, Number::int8, 2 * 6 * kTileProduct, multiply_add_amx_int8});
-  }
+  constexpr double kTileProduct = 16 * 16 * 32 * 2;  // of bf16; a tile holds twice as many int8
+  const PeakProbe all[] = {
+      {"avx2 f32", {Feature::avx2}, Number::f32, 12 * 8 * 2, multiply_add_avx2},
+      {"avx2 int8", {Feature::avx2}, Number::int8, 12 * 32 * 2, multiply_add_bytes},
+      {"avxvnni int8", {Feature::avx_vnni}, Number::int8, 12 * 32 * 2, multiply_add_avxvnni},
+      {"avx512 f32", {Feature::avx512}, Number::f32, 28 * 16 * 2, multiply_add_avx512},
+      {"avx512 int8", {Feature::avx512_vnni}, Number::int8, 28 * 64 * 2, multiply_add_vnni},
+      {"avx512 lookup", {Feature::permutes_beside_vnni}, Number::ternary, 8 * (2 * 64 + 96) * 2, multiply_add_lookup},
+      {"avx512 bf16", {Feature::avx512_bf16}, Number::bf16, 28 * 32 * 2, multiply_add_pairs},
+      {"amx bf16", {Feature::amx_bf16}, Number::bf16, 6 * kTileProduct, multiply_add_amx_bf16},
+      {"amx int8", {Feature::amx_int8}, Number::int8, 2 * 6 * kTileProduct, multiply_add_amx_int8}};
+  for (const PeakProbe& probe : all)
+    if (this_cpu().has_all(probe.needs)) found.push_back(probe);
 #endif
   return found;
 }
@@ -174,17 +166,18 @@ const std::vector<PeakProbe>& peak_probes() {
   return probes;
 }
 
-const PeakProbe& peak_probe_of(Isa isa) {
+const PeakProbe& peak_probe_of(Features use) {
   const PeakProbe* best = &peak_probes().front();
   for (const PeakProbe& probe : peak_probes())
-    if (isa == Isa::ggml ? probe.number == Number::f32 : probe.isa == isa && probe.number < Number::int8) best = &probe;
+    if (use.empty() ? probe.number == Number::f32 : use.has_all(probe.needs) && probe.number < Number::int8)
+      best = &probe;
   return *best;
 }
 
-const PeakProbe* int8_probe_of(Isa isa, bool ternary) {
+const PeakProbe* int8_probe_of(Features use, bool ternary) {
   const PeakProbe* best = nullptr;
   for (const PeakProbe& probe : peak_probes())
-    if ((probe.number == Number::int8 || (ternary && probe.number == Number::ternary)) && probe.isa <= isa)
+    if ((probe.number == Number::int8 || (ternary && probe.number == Number::ternary)) && use.has_all(probe.needs))
       best = &probe;
   return best;
 }

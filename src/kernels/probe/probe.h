@@ -5,7 +5,7 @@
 #include <string>
 #include <vector>
 
-#include "kernels/isa.h"
+#include "kernels/kernel_set.h"
 
 namespace vla::kernels {
 
@@ -13,8 +13,8 @@ enum class Number { f32, bf16, int8, ternary };
 
 /// A loop of multiply-adds on registers alone: as fast as the machine can multiply with these instructions.
 struct PeakProbe {
-  std::string name;     // "avx2 f32"
-  Isa isa;              // of the kernels that multiply with these instructions
+  std::string name;  // "avx2 f32"
+  Features needs;
   Number number;        // what is multiplied; sums are f32, or int32 for int8 and ternary
   double op_per_round;  // two for each multiply-add
   void (*run)(long n_round);
@@ -24,11 +24,11 @@ struct PeakProbe {
 const std::vector<PeakProbe>& peak_probes();
 
 /// The loop in whose rate the speed of these kernels is measured: that of the kernels' own products, and the fastest in
-/// float32 for `ggml`, which is compiled for this machine as a whole.
-const PeakProbe& peak_probe_of(Isa isa);
+/// float32 where they use no features, which is ggml.
+const PeakProbe& peak_probe_of(Features use);
 /// The same of their products of int8 codes, by weights that are ternary or int8; null where these are made without
 /// such instructions.
-const PeakProbe* int8_probe_of(Isa isa, bool ternary);
+const PeakProbe* int8_probe_of(Features use, bool ternary);
 
 /// Operations per second of `n_thread` threads that run the loop side by side, in wall time. The best of many short
 /// bursts within about `seconds`: what the machine can do now, not what other programs leave of it.

@@ -1,0 +1,56 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <compare>
+#include <cstdint>
+#include <initializer_list>
+
+namespace vla {
+
+/// Something that a processor can do and another cannot.
+enum class Feature {
+  avx2,    // with FMA and F16C
+  avx512,  // F, BW, DQ, VL
+  avx512_bf16,
+  avx512_vnni,
+  avx_vnni,
+  amx_bf16,  // and the operating system permits tiles
+  amx_int8,
+  permutes_beside_vnni,  // in the same cycle, as AMD's processors do; Intel's do one or the other
+};
+
+/// A set of them: what a processor has, or what kernels may use of it.
+class Features {
+ public:
+  constexpr Features() = default;
+  constexpr Features(std::initializer_list<Feature> all) {
+    for (const Feature one : all) bits_ |= bit(one);
+  }
+
+  constexpr bool has(Feature one) const { return (bits_ & bit(one)) != 0; }
+  constexpr bool has_all(Features all) const { return (bits_ & all.bits_) == all.bits_; }
+  constexpr bool empty() const { return bits_ == 0; }
+  constexpr Features with(Feature one) const { return Features(bits_ | bit(one)); }
+  constexpr Features both(Features other) const { return Features(bits_ & other.bits_); }
+  constexpr Features without(Features other) const { return Features(bits_ & ~other.bits_); }
+  constexpr auto operator<=>(const Features&) const = default;
+
+ private:
+  explicit constexpr Features(std::uint32_t bits) : bits_(bits) {}
+  static constexpr std::uint32_t bit(Feature one) { return std::uint32_t{1} << static_cast<unsigned>(one); }
+
+  std::uint32_t bits_ = 0;
+};
+
+/// What the processor under this process has, in a source of its own: a test program that emulates a better machine
+/// links another.
+Features detect_features();
+
+/// The same, asked once.
+inline const Features& this_cpu() {
+  static const Features features = detect_features();
+  return features;
+}
+
+}  // namespace vla

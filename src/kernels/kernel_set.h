@@ -1,0 +1,59 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "base/cpu.h"
+
+namespace vla {
+
+/// Kernels under a name that `--kernels` takes: the features without which they do not run, and all that they use where
+/// they are there.
+struct KernelSet {
+  const char* name;
+  Features needs, uses;
+
+  bool operator==(const KernelSet& other) const { return needs == other.needs; }
+};
+
+namespace kernel_set {
+
+inline constexpr KernelSet ggml = {"ggml", {}, {}};  // none of our own: the reference of every other
+inline constexpr KernelSet avx2 = {"avx2", {Feature::avx2}, {Feature::avx2, Feature::avx_vnni}};
+inline constexpr KernelSet avx512 = {
+    "avx512",
+    {Feature::avx2, Feature::avx512},
+    {Feature::avx2, Feature::avx_vnni, Feature::avx512, Feature::avx512_vnni, Feature::permutes_beside_vnni}};
+inline constexpr KernelSet avx512_bf16 = {
+    "avx512_bf16", {Feature::avx2, Feature::avx512, Feature::avx512_bf16}, avx512.uses.with(Feature::avx512_bf16)};
+inline constexpr KernelSet amx = {"amx",
+                                  {Feature::avx2, Feature::avx512, Feature::avx512_bf16, Feature::amx_bf16},
+                                  avx512_bf16.uses.with(Feature::amx_bf16).with(Feature::amx_int8)};
+
+/// The best last.
+inline constexpr KernelSet all[] = {ggml, avx2, avx512, avx512_bf16, amx};
+
+}  // namespace kernel_set
+
+/// Those that a processor can run, `ggml` first and the best last.
+std::vector<KernelSet> kernel_sets(Features machine);
+/// Those of this one.
+const std::vector<KernelSet>& usable_kernels();
+
+/// The best whose needs are among these features.
+const KernelSet& kernel_set_of(Features use);
+inline std::string name_of(const KernelSet& set) { return set.name; }
+inline std::string name_of(Features use) { return kernel_set_of(use).name; }
+
+/// Whether kernels round what they multiply to bf16 where they may use these features.
+constexpr bool rounds_to_bf16(Features use) { return use.has(Feature::avx512_bf16); }
+constexpr bool rounds_to_bf16(const KernelSet& set) { return rounds_to_bf16(set.uses); }
+
+/// What takes their place where nothing may be rounded to bf16.
+constexpr Features without_rounding(Features use) {
+  return rounds_to_bf16(use) ? use.both(kernel_set::avx512.uses) : use;
+}
+
+}  // namespace vla

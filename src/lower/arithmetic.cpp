@@ -1,0 +1,55 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/arithmetic.h"
+
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <algorithm>
+
+namespace vla {
+namespace {
+
+constexpr const char *kFloat32 = "float32", *kBf16 = "bf16", *kInt8 = "int8";
+
+/// The kernels of a set, as far as the machine has what they use. Errors: device.
+Result<Arithmetic> with(const KernelSet& set, Features machine) {
+  if (machine.has_all(set.needs))
+    return Arithmetic{set == kernel_set::ggml ? Arithmetic::Backend::ggml : Arithmetic::Backend::own,
+                      machine.both(set.uses)};
+  std::vector<std::string> names;
+  for (const KernelSet& usable : kernel_sets(machine)) names.push_back(usable.name);
+  return Error{Code::device, "kernels", fmt::format("what this machine can run: {}", fmt::join(names, ", ")), set.name,
+               "leave the choice to the program"};
+}
+
+/// The best of the machine, with large matrices in these numbers. Errors: device.
+Result<Arithmetic> rounding(Rounding at_load, const char* name, const char* expected, bool has, Arithmetic best) {
+  if (!has) return Error{Code::device, "kernels", expected, name, "leave the choice to the program"};
+  best.at_load = at_load;
+  return best;
+}
+
+}  // namespace
+
+Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machine) {
+  VLA_TRY(const Arithmetic best, with(kernel_set_of(machine), machine));
+  if (kernels.empty()) return best;
+  if (kernels == kFloat32) return with(kernel_set_of(without_rounding(machine)), machine);
+  if (kernels == kBf16)
+    return rounding(Rounding::bf16, kBf16, "a machine with AVX-512 BF16 or AMX", rounds_to_bf16(machine), best);
+  if (kernels == kInt8)
+    return rounding(Rounding::int8, kInt8, "a machine with AVX2", best.backend == Backend::own, best);
+  for (const KernelSet& set : kernel_set::all)
+    if (kernels == set.name) return with(set, machine);
+  return Error{Code::usage, "kernels", "ggml, avx2, avx512, avx512_bf16, amx, float32, bf16 or int8", kernels};
+}
+
+Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& device) {
+  if (kernels == kBf16) return Arithmetic{Backend::ggml, {}, Rounding::bf16};
+  if (kernels.empty() || kernels == kFloat32 || kernels == kernel_set::ggml.name) return Arithmetic{Backend::ggml, {}};
+  return Error{Code::usage, "kernels", fmt::format("none, float32, bf16 or ggml with device {}", device), kernels,
+               "other kernels are the CPU's"};
+}
+
+}  // namespace vla
