@@ -89,6 +89,19 @@ def test_n1_5_takes_the_row_and_the_statistics_that_its_data_config_names(conver
     assert found["text"][1]["text"].endswith("{instruction}<|im_end|>\n<|im_start|>assistant\n")
 
 
+@pytest.mark.parametrize("horizon", [3, 6, 9])
+def test_the_network_of_n1_5_has_as_many_rows_as_the_data_config_whatever_its_head_says(converter, horizon):
+    bundle = converter.bundle(Changed(N1_5, DATA, lambda c: c.update(horizon=horizon)), **N1_5.options)
+    assert bundle.keys["policy.horizon"] == horizon
+    assert {"op": "rows", "count": horizon} in recipe(bundle)["action"]
+
+
+def test_a_data_config_of_n1_5_with_more_rows_than_the_head_has_positions_is_refused(converter):
+    changed = Changed(N1_5, DATA, lambda c: c.update(horizon=11))
+    error = converter.refusal(changed, **N1_5.options)
+    assert "--variant: horizon: expected at most max_seq_len 10, the rows of the head's position table, found 11" in error.message()
+
+
 def test_keys_of_n1_5_have_modes_of_their_own(converter):
     modes = {"x": "mean_std", "y": "q99", "z": "sin_cos", "roll": "binary", "pitch": None}
     bundle = converter.bundle(Changed(N1_5, DATA, lambda c: c["state"].update(modes)), **N1_5.options)
@@ -192,6 +205,7 @@ def test_data_configs_of_n1_5_with_rotations_are_those_of_the_authors(converter,
         robot["statistics"][part] = {key: {"min": [-1.0] * width, "max": [1.0] * width} for key, (_, width) in have.items()}
         robot["modalities"][part] = {key: {"rotation_type": kind, "absolute": True, "continuous": True} for key, (kind, _) in have.items()}
     monkeypatch.setattr(n1_5, "EMBODIMENTS", {"new_embodiment": 1})
+    monkeypatch.setitem(CONFIGS, name, config._replace(horizon=4))  # this head has no positions for 16 rows
     bundle = converter.bundle(Changed(case, META, lambda c: c.update(new_embodiment=robot)), **{**case.options, "embodiment": "new_embodiment", "variant": name})
     turned = [key for key in config.rotations if key.startswith("state.")]
     ops = [op for op in recipe(bundle)["state"] if op["op"] == "rotation"]

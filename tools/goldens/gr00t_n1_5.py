@@ -35,6 +35,10 @@ class Checkpoint(gr00t.Checkpoint):
     N_VOCAB = N_VOCAB
     n_future: int = 3
 
+    @property
+    def policy(self):
+        return super().policy | {"chunk_size": self.robot.rows}
+
     def backbone_shapes(self):
         v, d_model = self.vision, self.text["hidden_size"]
         n_position = (v["image_size"] // v["patch_size"]) ** 2
@@ -107,11 +111,11 @@ def arm(*parts, **more):
 
 
 CASES = {
-    # Two cameras of 4:3, cropped and squashed; five of six rows; numbers beyond their ranges, which nothing clips.
+    # Two cameras of 4:3, cropped and squashed; a row less than the head's config says; numbers beyond their ranges, which nothing clips.
     "gr00t_n1_5/libero": arm(81, {"image": (30, 40, "png"), "wrist_image": (30, 40, "png")}, "Open the middle drawer, please.", Checkpoint(
         "my_arm", INDEX, Robot(("image", "wrist_image"), POSE | {"gripper": 2}, POSE | {"gripper": 1}, 5),
         vision(24, 3, 3, 40, 28), text(40, 5, 6, 2, 12, 56), head(3, (6, 4, 9), (2, 5, 8), 20, 14, 11, 6), camera(40, 30)), state=(0.5, -2.25, 0.1, 4.0, 0.03125, -3.5, 0.2, 0.3)),
-    # Percentiles of states, means of actions; one camera that is enlarged; the whole horizon; eight steps.
+    # Percentiles of states, means of actions; one camera that is enlarged; as many rows as the head's config says; eight steps.
     "gr00t_n1_5/percentiles": arm(82, {"front": (24, 24, "png")}, "push the plate slowly", Checkpoint(
         "my_arm", INDEX, Robot(("front",), {"pose": 4, "gripper": 1}, {"gripper": 1, "pose": 4}, 6),
         vision(20, 2, 2, 36, 42), text(36, 4, 4, 1, 16, 48), head(4, (5, 3, 8), (1, 3, 12), 18, 9, 7, 6, num_inference_timesteps=8),
@@ -126,10 +130,10 @@ CASES = {
     "gr00t_n1_5/faint": arm(84, {"camera": (32, 32, "png")}, "Go on", Checkpoint(
         "my_arm", INDEX, Robot(("camera",), {"x": 1, "hand": 3}, {"x": 1, "hand": 2}, 3),
         vision(16, 2, 2, 24, 28), text(24, 4, 3, 1, 8, 32), head(3, (4, 2, 10), (1, 3, 8), 14, 6, 5, 4), camera(32, 32), faint=True)),
-    # Every mode in which a key may be normalized, in one robot; numbers beyond their ranges.
+    # Every mode in which a key may be normalized, in one robot; numbers beyond their ranges; two rows more than the head's config says.
     "gr00t_n1_5/modes": arm(85, {"camera": (32, 32, "png")}, "wipe the table", Checkpoint(
         "my_arm", INDEX, Robot(("camera",), {"arm": 3, "hand": 2, "pose": 3, "grip": 2, "base": 1, "lift": 1},
-                               {"base": 1, "grip": 2, "hand": 2, "pose": 2, "arm": 2}, 3),
+                               {"base": 1, "grip": 2, "hand": 2, "pose": 2, "arm": 2}, 6),
         vision(16, 2, 2, 24, 28), text(24, 4, 3, 1, 8, 32), head(3, (4, 2, 10), (1, 3, 8), 14, 16, 11, 4),
         camera(32, 32, {"arm": "sin_cos", "hand": "mean_std", "pose": "q99", "grip": "binary", "lift": "min_max"},
                {"grip": "binary", "hand": "mean_std", "pose": "q99", "arm": "min_max"})),
@@ -173,7 +177,9 @@ def network(checkpoint, eagle):
     tower = SiglipVisionConfig(**tower, vision_use_head=False, attn_implementation="eager")
     whole, inner = nn.Module(), nn.Module()
     cross = {k: v for k, v in h["diffusion_model_cfg"].items() if k != "cross_attention_dim"}
-    settings = h | {"use_alternate_vl_dit": False, "max_action_dim": h["action_dim"], "state_history_length": 1, "diffusion_model_cfg": cross}
+    # As the authors' Gr00tPolicy._load_model: as many rows as the data config has, whatever the head's own config says.
+    horizon = json.loads((checkpoint / "data_config.json").read_text())["horizon"]
+    settings = h | {"action_horizon": horizon, "use_alternate_vl_dit": False, "max_action_dim": h["action_dim"], "state_history_length": 1, "diffusion_model_cfg": cross}
     whole.backbone, whole.action_head = nn.Module(), GR00TN17ActionHead(GR00TN17Config(**settings))
     whole.action_head.future_tokens = nn.Embedding(h["num_target_vision_tokens"], h["input_embedding_dim"])
     whole.backbone.eagle_model = inner
@@ -255,9 +261,9 @@ class Reference:
         return np.concatenate(out, -1).astype(np.float32)
 
     @property
-    def part(self):
-        """Rows and columns of a chunk that the robot gets."""
-        return slice(self.robot["horizon"]), slice(sum(len(self.statistics["action"][key]["min"]) for key in self.robot["action"]))
+    def columns(self):
+        """Those of a chunk that the robot gets."""
+        return slice(sum(len(self.statistics["action"][key]["min"]) for key in self.robot["action"]))
 
     def features(self, ids, images):
         inner = self.model.backbone.eagle_model
@@ -273,6 +279,7 @@ class Reference:
             context = head.vl_self_attention(head.vlln(self.features(batch["ids"], batch["images"])))
             state = head.state_encoder(batch["state"].to(self.dtype), index)
             x, n_step = noise.to(self.dtype), head.num_inference_timesteps
+            assert x.shape[1] == head.action_horizon, "noise of another horizon than the network's"
             for k in range(n_step):
                 time = torch.tensor([int(k / n_step * head.num_timestep_buckets)])
                 action = head.action_encoder(x, time, index) + head.position_embedding.weight[: x.shape[1]]
@@ -314,6 +321,5 @@ class Recorder(HeadTaps):
         self.n_front = 1 + self.reference.model.action_head.future_tokens.num_embeddings
         chunk = self.reference.predict_action_chunk(batch, noise)[0]
         self.put(f"step.{self.step}.x", chunk)
-        rows, columns = self.reference.part
-        self.put("chunk", chunk[rows, columns])
+        self.put("chunk", chunk[:, self.reference.columns])
         return self.taps

@@ -153,7 +153,8 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
             ", ".join(EMBODIMENTS), s.n_embodiment
         )
         problems.add("--embodiment " + options.embodiment, expected, str(s.embodiment), code=Code.USAGE)
-    robot = _robot(config, metadata, min(config.horizon, s.horizon), problems)
+    _read_horizon(config, s, problems)
+    robot = _robot(config, metadata, s.horizon, problems)
     images = _images(config, metadata, s, problems)
     problems.raise_any()
     parts = Parts(EAGLE_2_5, folder, robot, images, formalize=False)
@@ -163,6 +164,15 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
 def embodiments(checkpoint: Checkpoint) -> List[str]:
     """Tags of the robots that the checkpoint describes."""
     return list(read_json(checkpoint.path(METADATA)))
+
+
+def _read_horizon(config: DataConfig, s: Sizes, problems: Problems) -> None:
+    """The data config's, whatever the head's own config says: the authors' Gr00tPolicy._load_model rebuilds the head with as many
+    rows as the data config has delta_indices, and every row of a chunk attends to all others."""
+    s.horizon = config.horizon
+    if s.horizon > s.n_position:
+        expected = "at most max_seq_len {}, the rows of the head's position table".format(s.n_position)
+        problems.add("--variant: horizon", expected, str(s.horizon))
 
 
 def network_keys(s: Sizes, n_future: int) -> List[Key]:
