@@ -4,11 +4,12 @@
 
 import json
 import os
+import shutil
 
 import pytest
 
 from tiny import write_json, write_safetensors
-from vla_cpp.convert import Code
+from vla_cpp.convert import Code, ConvertError, Options, convert_checkpoint
 
 BAD, IO = Code.BAD_BUNDLE, Code.IO
 
@@ -100,11 +101,42 @@ def test_the_folder_above_a_trainers_policy_is_told_where_the_policy_is(converte
     assert "give " + str(converter.folder / "pretrained_model") in error.message() and error.code == IO
 
 
-def test_an_adapter_without_weights_is_told_to_be_merged(converter, tiny):
+def test_a_lora_adapter_is_refused_with_what_to_merge_it_into(converter):
+    converter.folder.mkdir()
+    (converter.folder / "adapter_config.json").write_text(json.dumps({"base_model_name_or_path": "lerobot/smolvla_base"}))
+    (converter.folder / "adapter_model.safetensors").write_bytes(b"")
+    error = converter.refusal()
+    assert "found a LoRA adapter (adapter_config.json); merge it into lerobot/smolvla_base" in error.message()
+    assert error.code == Code.UNSUPPORTED
+
+
+@pytest.mark.parametrize(
+    "root, runs, given",
+    [
+        ("outputs/train/arm", ["checkpoints/000100", "checkpoints/last"], "checkpoints/last"),
+        ("outputs/train/arm", ["checkpoints/000100", "checkpoints/000200"], "checkpoints/000200"),
+        ("outputs/train/arm/checkpoints", ["000100", "last"], "last"),
+        ("outputs/train", ["2026-01-02/10-00-00_smolvla/checkpoints/last"], "2026-01-02/10-00-00_smolvla/checkpoints/last"),
+        ("outputs/train", ["arm/checkpoints/last"], "arm/checkpoints/last"),
+    ],
+)
+def test_a_folder_of_lerobots_training_is_refused_with_the_policy_in_it(tmp_path, root, runs, given):
+    for run in runs:
+        policy = tmp_path / root / run / "pretrained_model"
+        policy.mkdir(parents=True)
+        (policy / "config.json").write_text("{}")
+    with pytest.raises(ConvertError) as info:
+        convert_checkpoint(str(tmp_path / root), str(tmp_path / "out.gguf"), Options())
+    assert info.value.code == IO
+    assert info.value.message().endswith("found a folder of LeRobot's training; give {}".format(tmp_path / root / given / "pretrained_model"))
+
+
+def test_a_smolvla_without_its_backbones_files_is_refused_with_the_pinned_repository(converter, tiny):
+    tiny.config["vlm_model_name"] = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
     converter.save(tiny)
-    (converter.folder / "model.safetensors").rename(converter.folder / "adapter_model.safetensors")
-    write_json(str(converter.folder / "adapter_config.json"), {})
-    assert "merge the adapter into the policy" in converter.refusal().message()
+    shutil.rmtree(converter.folder / "vlm")
+    hint = "run vla-convert again with --backbone hub:HuggingFaceTB/SmolVLM2-500M-Video-Instruct@7b375e1b73b11138ff12fe22c8f2822d8fe03467"
+    assert converter.refusal().message().endswith(hint)
 
 
 def test_a_declared_tokenizer_folder_that_is_missing_is_refused(converter, tiny):

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from vla_cpp.convert import read_bundle
-from vla_cpp.convert.cli import main
+from vla_cpp.convert.cli import main, report
+from vla_cpp.convert.conversion import Summary
 
 PACKAGE = os.path.join(os.path.dirname(__file__), "..", "..", "python")
 
@@ -57,6 +58,28 @@ def test_a_refusal_goes_to_stderr_in_the_form_of_the_runtime(converter, tiny, ca
 def test_each_class_of_refusal_has_its_exit_code(converter, tiny, capsys, code, change):
     change(tiny)
     assert main([converter.save(tiny), "-o", converter.out]) == code
+
+
+HOSTILE = "x\x1b]0;owned\x07\x1b[2J\nwrote out.gguf: smolvla\u202e"
+
+
+def test_names_of_tensors_and_types_reach_the_terminal_escaped(converter, tiny, capsys):
+    tiny.tensors[HOSTILE] = np.zeros(1, np.float32)
+    assert main([converter.save(tiny), "-o", converter.out]) == 3
+    shown = [capsys.readouterr().err]
+    tiny.tensors.pop(HOSTILE)
+    tiny.config["type"] = HOSTILE
+    assert main([converter.save(tiny), "-o", converter.out]) == 6
+    shown.append(capsys.readouterr().err)
+    for text in shown:
+        assert "\\x1b]0;owned\\x07" in text and "\\nwrote out.gguf" in text
+        assert all(line.isprintable() for line in text.splitlines()) and len(text.splitlines()) == 1
+
+
+def test_the_summary_is_escaped_too():
+    summary = Summary("out\x1b[2J.gguf", "smolvla", "f32")
+    summary.dropped["never read"], summary.notes = ["\x1b[31mname"], [HOSTILE]
+    assert all(line.isprintable() for line in report(summary).split("\n")) and len(report(summary).split("\n")) == 3
 
 
 def test_a_checkpoint_that_is_not_there_is_an_io_error(tmp_path, capsys):

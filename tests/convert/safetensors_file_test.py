@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 
 from vla_cpp.convert import Code, ConvertError
 from vla_cpp.convert.errors import Problems
-from vla_cpp.convert.safetensors_file import MAX_HEADER, read_safetensors
+from vla_cpp.convert.safetensors_file import MAX_HEADER, MAX_TENSORS, read_safetensors
 
 GOOD = {
     "a": {"dtype": "F32", "shape": [2, 3], "data_offsets": [0, 24]},
@@ -28,6 +28,14 @@ def write(path, header, data=32, length=None):
 
 def changed(**fields):
     return {**GOOD, "b": {**GOOD["b"], **fields}}
+
+
+def test_more_tensors_than_any_policy_has_are_refused_before_they_are_made(tmp_path):
+    header = {"t{}".format(i): {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for i in range(300_000)}
+    path, before = write(tmp_path / "f", header, data=0), time.process_time()
+    with pytest.raises(ConvertError, match="expected at most {} tensors, found 300000".format(MAX_TENSORS)):
+        read_safetensors(path)
+    assert time.process_time() - before < 1
 
 
 def test_a_file_of_the_formats_own_library_is_read_back(tmp_path):

@@ -4,6 +4,7 @@
 
 import re
 import struct
+import time
 import zipfile
 
 import numpy as np
@@ -14,6 +15,7 @@ from goldens.files import Call, Name, Persistent, Raw, bfloat16_bits, pickled, s
 from vla_cpp.convert import ConvertError
 from vla_cpp.convert.errors import Code
 from vla_cpp.convert.pickle_values import MAX_BYTES, MAX_STEPS
+from vla_cpp.convert.safetensors_file import MAX_TENSORS
 from vla_cpp.convert.torch_file import read_torch
 
 GOOD = {"x": np.arange(6, dtype="<f4").reshape(2, 3), "y": bfloat16_bits([1.5, -2.0]), "z": np.ones(3, "<f2")}
@@ -155,6 +157,22 @@ def test_nesting_without_end_is_refused_and_does_not_exhaust_the_stack(tmp_path)
     assert "found list" in refusal(of_pickle(tmp_path, b"]" * 300_000 + b"a" * 299_999 + b"."))
     deep_key = b"}" + b")" + b"\x85" * 300_000 + b"K\x01s."
     assert "found dict" in refusal(of_pickle(tmp_path, deep_key))
+
+
+def test_keys_that_hash_alike_take_no_quadratic_time(tmp_path):
+    keys = b"".join(b"\x8a\x0a" + ((2**61 - 1) * i).to_bytes(10, "little") + b"N" for i in range(1, 40_001))
+    before = time.process_time()
+    assert "found dict" in refusal(of_pickle(tmp_path, b"\x80\x02}(" + keys + b"u."))
+    pairs = b"".join(b"\x8a\x0a" + ((2**61 - 1) * i).to_bytes(10, "little") + b"N\x86" for i in range(1, 40_001))
+    ordered = files.emit(Name("collections OrderedDict")) + b"](" + pairs + b"e\x85R."
+    assert "found dict" in refusal(of_pickle(tmp_path, b"\x80\x02" + ordered))
+    assert time.process_time() - before < 5
+
+
+def test_more_tensors_than_any_policy_has_are_refused_before_they_are_looked_at(tmp_path):
+    names = b"".join(files.emit("t{}".format(i)) + b"N" for i in range(MAX_TENSORS + 1))
+    data = b"\x80\x02}" + files.emit("module") + b"}(" + names + b"us."
+    assert "expected at most {} tensors, found {}".format(MAX_TENSORS, MAX_TENSORS + 1) in refusal(of_pickle(tmp_path, data))
 
 
 def test_a_compressed_entry_is_refused(tmp_path):

@@ -6,7 +6,6 @@ whose layout it is: LeRobot's, openpi's, or that of an architecture's authors.""
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass, field
 from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
 
@@ -14,13 +13,16 @@ import numpy as np
 
 from .dtypes import STATISTICS, to_f32
 from .errors import Code, Problems, refuse
-from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_NAME, HUB_PATTERNS, hub_folder, plain_name, read_json
+from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_name, read_json
+from .instead import check_is_policy, instead_of
 from .safetensors_file import Entry, read_safetensors
 
 LEROBOT, OPENPI = "lerobot", "openpi"  # layouts; that of an architecture's authors is called as the architecture
 WEIGHTS = "model.safetensors"
 INDEX = WEIGHTS + ".index.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+# Commits of the backbones that policies name: where config and tokenizer are to be fetched from if they are not in the checkpoint.
+BACKBONES = {"HuggingFaceTB/SmolVLM2-500M-Video-Instruct": "7b375e1b73b11138ff12fe22c8f2822d8fe03467"}
 # Where releases without processor files kept statistics: "<group>.buffer_<feature, dots as underscores>.<statistic>".
 OLD_GROUPS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.", "unnormalize_targets.")
 MAX_STATISTIC = 1 << 24  # bytes; a statistic has one number per joint, or per pixel channel
@@ -75,11 +77,7 @@ def _weight_files(folder: str, problems: Problems) -> List[str]:
             folder, "either {} or {}".format(WEIGHTS, INDEX), "both", "remove the one that is not the policy's"
         )
     if not single and not index:
-        hint = (
-            "merge the adapter into the policy and save it again"
-            if os.path.exists(os.path.join(folder, "adapter_config.json"))
-            else "give the folder that holds config.json and " + WEIGHTS
-        )
+        hint = "give the folder that holds config.json and " + WEIGHTS
         raise refuse(folder, WEIGHTS, "no such file", hint, Code.IO)
     return [WEIGHTS] if single else _shards(folder, problems)
 
@@ -135,12 +133,10 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout]) -> Checkpoint:
     """A folder, or a repository as hub_folder() reads it. `authors`: layouts by architecture. Errors: io, bad_bundle."""
     hub = hub_folder(source, HUB_PATTERNS)
     if hub is None and not os.path.isdir(source):
-        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", _instead(source), Code.IO)
+        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", instead_of(source), Code.IO)
     folder, revision = (hub.folder, hub.commit) if hub else (source, "")
     name = hub.repo if hub else os.path.basename(os.path.abspath(folder))
-    inner = os.path.join(folder, "pretrained_model")
-    if not os.path.exists(os.path.join(folder, "config.json")) and os.path.isdir(inner):
-        raise refuse(os.path.join(folder, "config.json"), "a policy", "none", "give " + inner, Code.IO)
+    check_is_policy(folder)
     # openpi's training writes no config.json, its converter from JAX one without a type.
     has_assets = os.path.isdir(os.path.join(folder, "assets"))
     has_config = os.path.exists(os.path.join(folder, "config.json"))
@@ -153,15 +149,6 @@ def open_checkpoint(source: str, authors: Mapping[str, Layout]) -> Checkpoint:
     old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
     weights = {key: entry for key, entry in tensors.items() if key not in old}
     return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder), layout)
-
-
-def _instead(source: str) -> str:
-    """What a source that is no folder was probably meant to be."""
-    if source.endswith(".gguf"):
-        return "a bundle is converted already: vla run takes it"
-    if os.path.isfile(source):
-        return "give the folder that holds the file"
-    return "hub:{}@main fetches it from the hub".format(source) if re.fullmatch(HUB_NAME, source) else ""
 
 
 def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:
@@ -206,7 +193,9 @@ def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_mod
         "backbone {}, which config.json: {} names".format(str(named)[:100], key),
         "--backbone DIR, or vlm/ inside the checkpoint",
         "neither",
-        "--backbone {} fetches it from the hub".format(HUB_FORM),
+        "run vla-convert again with --backbone hub:{}@{}".format(named, BACKBONES[named])
+        if isinstance(named, str) and named in BACKBONES
+        else "--backbone {} fetches it from the hub".format(HUB_FORM),
         Code.IO,
     )
 

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import fields
 
 from .. import __version__
+from ..printable import printable
 from .archs import Options, names
 from .conversion import STORED, Summary, convert_checkpoint
 from .errors import Code, ConvertError
@@ -169,10 +170,10 @@ def _progress(quiet: bool):
         TimeRemainingColumn,
     )
 
-    columns = (TextColumn("{task.description:<32.32}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description:<32.32}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("reading", total=None)
-        yield lambda what, done, total: bar.update(task, description=what, completed=done, total=total)
+        yield lambda what, done, total: bar.update(task, description=printable(what), completed=done, total=total)
 
 
 def report(summary: Summary) -> str:
@@ -198,7 +199,7 @@ def report(summary: Summary) -> str:
                 tensors[0] if len(tensors) == 1 else "{} tensors such as {}".format(len(tensors), tensors[0]), reason
             )
         )
-    return "\n".join(lines + ["  note      " + note for note in summary.notes])
+    return "\n".join(printable(line) for line in lines + ["  note      " + note for note in summary.notes])
 
 
 def main(argv=None) -> int:
@@ -218,7 +219,7 @@ def main(argv=None) -> int:
     except Exception as error:  # noqa: BLE001 - the user gets one line and an exit code for bugs too
         print(
             "error: vla-convert: {}: {}; this is a fault of the converter, please report it".format(
-                type(error).__name__, error
+                type(error).__name__, printable(str(error))
             ),
             file=sys.stderr,
         )

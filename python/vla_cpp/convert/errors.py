@@ -7,6 +7,7 @@ from __future__ import annotations
 import enum
 from typing import List, NamedTuple
 
+from ..printable import printable
 
 MAX_LINES = 50  # of a report: who has more problems than these gave the wrong checkpoint
 
@@ -31,8 +32,9 @@ class Problem(NamedTuple):
     code: Code = Code.BAD_BUNDLE
 
     def message(self) -> str:
+        """One line, whatever a file's names and values hold."""
         text = "{}: expected {}, found {}".format(self.where, self.expected, self.found)
-        return text + ("; " + self.hint if self.hint else "")
+        return printable(text) + ("; " + printable(self.hint) if self.hint else "")
 
 
 class ConvertError(Exception):
@@ -50,7 +52,7 @@ class ConvertError(Exception):
     def message(self) -> str:
         if len(self.problems) == 1:
             return self.problems[0].message()
-        lines = ["{}: {} problems".format(self.subject or "checkpoint", len(self.problems))]
+        lines = [printable("{}: {} problems".format(self.subject or "checkpoint", len(self.problems)))]
         lines += ["  " + problem.message() for problem in self.problems[:MAX_LINES]]
         if len(self.problems) > MAX_LINES:
             lines.append("  and {} more".format(len(self.problems) - MAX_LINES))

@@ -36,6 +36,7 @@ OTHERS = set(
 )
 KNOWN = OTHERS.union(ARGUMENTS, CONSTANTS, EMPTY, TUPLES, PUTS, GETS)
 KEYS = (str, int, float, bytes, type(None))  # of dictionaries that are kept; entries with other keys are dropped
+MAX_KEY = 1 << 60  # whole numbers from 2^61 - 1 on share the hashes of smaller ones, and a dictionary of them takes quadratic time
 
 
 class Global(NamedTuple):
@@ -54,6 +55,10 @@ class Inert:
 def describe(value) -> str:
     """A value in a refusal: never its content, which may be nested without end."""
     return value.name.replace(" ", ".")[:100] if isinstance(value, (Global, Inert)) else type(value).__name__
+
+
+def _is_key(value) -> bool:
+    return isinstance(value, KEYS) and not (isinstance(value, int) and abs(value) >= MAX_KEY)
 
 
 Calls = Dict[str, Callable[[tuple], object]]  # "module name" -> what a call of it with these arguments makes
@@ -155,7 +160,7 @@ class _Machine:
         if len(items) % 2:
             raise ValueError("a key without a value")
         if isinstance(self.top(), dict):
-            self.top().update((k, v) for k, v in zip(items[::2], items[1::2]) if isinstance(k, KEYS))
+            self.top().update((k, v) for k, v in zip(items[::2], items[1::2]) if _is_key(k))
         elif not isinstance(self.top(), Inert):
             raise ValueError("items for what is no dictionary")
 
@@ -200,4 +205,4 @@ def ordered_dict(arguments: tuple) -> dict:
     pairs = arguments[0] if isinstance(arguments[0], list) else [()]
     if len(arguments) != 1 or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in pairs):
         raise ValueError("an OrderedDict of something else than pairs")
-    return {key: value for key, value in pairs if isinstance(key, KEYS)}
+    return {key: value for key, value in pairs if _is_key(key)}

@@ -22,6 +22,7 @@ from .files import open_file
 # The limit that the format's own library sets; a header of a large checkpoint takes less than a megabyte.
 MAX_HEADER = 100_000_000
 CHUNK_BYTES = 8 << 20
+MAX_TENSORS = 50_000  # of a file; the largest policies have some thousand
 
 
 class Entry(NamedTuple):
@@ -71,6 +72,12 @@ def _unique(pairs):
     return dict(pairs)
 
 
+def check_count(where: str, n_tensor: int) -> None:
+    """Before anything is made for each of them. Errors: bad_bundle."""
+    if n_tensor > MAX_TENSORS:
+        raise refuse(where, "at most {} tensors".format(MAX_TENSORS), str(n_tensor))
+
+
 def _is_count(value) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
 
@@ -88,6 +95,7 @@ def _read_header(path: str) -> Tuple[dict, int, int]:
                 hint,
             )
         text = file.read(length)
+    check_count(path, text.count(b'"data_offsets"'))
     try:
         header = json.loads(text.decode("utf-8"), object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:

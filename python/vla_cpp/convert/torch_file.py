@@ -17,7 +17,7 @@ from .dtypes import SIZES
 from .errors import Code, refuse
 from .files import open_file
 from .pickle_values import MAX_BYTES, Global, describe, ordered_dict, read_pickle
-from .safetensors_file import Entry
+from .safetensors_file import Entry, check_count
 
 STORAGES = {
     "BoolStorage": "BOOL",
@@ -186,6 +186,7 @@ def read_torch(path: str, member: str) -> Dict[str, Entry]:
     if not isinstance(state, dict) or not state:
         expected = "a dictionary with the tensors" + (" under " + member if member else "")
         raise refuse(where, expected, describe(content if state is None else state))
+    check_count(where, len(state))
     names = [name for name in state if not isinstance(name, str)]
     if names:
         raise refuse(where + ": " + member, "names of tensors", type(names[0]).__name__)
