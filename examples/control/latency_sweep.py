@@ -106,7 +106,7 @@ def simulate(latency_ms, interval, mode, blend, seed):
     policy = ToyPolicy(world, latency_ms, seed)
     fade = {"fade_steps": max(1, interval // 2)} if blend == "linear" else {}
     loop = ChunkLoop(
-        policy, rate_hz=RATE_HZ, replan_every=interval, mode=mode, blend=blend, on_late="hold",
+        policy, rate_hz=RATE_HZ, replan_every=interval, mode=mode, blend=blend, on_late="hold", on_note="raise",
         clock=lambda: world.now, sleep=world.sleep, **fade,
     )  # fmt: skip
 

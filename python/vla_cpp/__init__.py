@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _ERRORS = (
     "VlaError InternalError UsageError BadBundle BadObservation BadAction Unsupported OutOfMemory DeviceError IoError "
-    "Superseded Late Busy TooLarge BadRequest Incompatible ShuttingDown Timeout Disconnected"
+    "Superseded Late Busy TooLarge BadRequest Incompatible ShuttingDown Timeout Disconnected Noted"
 ).split()
 _HOMES = {
     "Client": "client",

@@ -14,6 +14,7 @@ import zmq
 from google.protobuf.message import DecodeError
 
 from . import __version__, wire
+from .answer import Asked, check_same_policy
 from .chunk import Chunk
 from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
@@ -139,7 +140,8 @@ class Client(Handle):
         def write(request: Any) -> bytes:
             return wire.act_bytes(request, spec, limits, seed=seed, noise=noise, deadline_ms=deadline_ms, **observation)
 
-        return self._ask("chunk", timeout, write)
+        capture_time_ns = observation.get("capture_time_ns")
+        return self._ask("chunk", timeout, write, Asked(self.address, spec, seed, noise is not None, capture_time_ns))
 
     def health(self, timeout: Optional[float] = None) -> Health:
         """Answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""
@@ -161,13 +163,13 @@ class Client(Handle):
 
     # --- requests and answers ------------------------------------------------------------------------------------------------
 
-    def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes]) -> Pending:
-        """Sends a request that `write` completes. kind: the field of the Response that answers it."""
+    def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes], asked: Optional[Asked] = None) -> Pending:
+        """Sends a request that `write` completes. kind: the field of the Response that answers it; asked: what a chunk must go with."""
         with self._lock:
             connection = self._connect()
             request = self._new_request()
             data = write(request)
-            pending = Pending(self, request.request_id, kind, timeout)
+            pending = Pending(self, request.request_id, kind, timeout, asked)
             connection.send(data)
             self._pending[pending._id] = pending
             return pending
@@ -237,6 +239,8 @@ class Client(Handle):
             raise Incompatible(self.address, f"answers of protocol version {wire.PROTOCOL_VERSION}", found)
         if kind in ("description", "chunk"):
             self._check_bundle(getattr(response, kind).bundle)
+        if kind == "description" and self._spec is not None:
+            check_same_policy(self.address, self._spec, wire.spec_of(response.description))
         pending = self._pending.pop(response.request_id, None)
         if pending is None:  # to a greeting, or to a request that nobody waits for
             return
@@ -254,7 +258,8 @@ class Client(Handle):
             return Health(**{f.name: getattr(response.health, f.name) for f in response.health.DESCRIPTOR.fields})
         if kind == "description":
             return response.description
-        return wire.chunk_of(response.chunk)
+        chunk = wire.chunk_of(response.chunk)
+        return pending._asked.check(chunk) if pending._asked else chunk
 
     def _check_bundle(self, bundle: Any) -> None:
         known = self._spec.bundle if self._spec else bundle

@@ -142,11 +142,17 @@ class Disconnected(VlaError):
     code = "disconnected"
 
 
+class Noted(VlaError):
+    """Loop: a chunk came with a note, and on_note is "raise"."""
+
+    code = "noted"
+
+
 _CLASSES = {
     c.code: c
     for c in (
         InternalError, UsageError, BadBundle, BadObservation, BadAction, Unsupported, OutOfMemory, DeviceError, IoError,
-        Superseded, Late, Busy, TooLarge, BadRequest, Incompatible, ShuttingDown, Timeout, Disconnected,
+        Superseded, Late, Busy, TooLarge, BadRequest, Incompatible, ShuttingDown, Timeout, Disconnected, Noted,
     )
 }  # fmt: skip
 

@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Optional
 
+from .answer import Asked
 from .errors import VlaError
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ class Health:
 class Pending:
     """An answer that is under way."""
 
-    def __init__(self, client: Client, request_id: int, kind: str, timeout: float) -> None:
-        self._client, self._id, self._kind = client, request_id, kind
+    def __init__(self, client: Client, request_id: int, kind: str, timeout: float, asked: Optional[Asked] = None) -> None:
+        self._client, self._id, self._kind, self._asked = client, request_id, kind, asked
         self._timeout, self._until = timeout, time.monotonic() + timeout
         self._answer: Any = None
         self._error: Optional[VlaError] = None

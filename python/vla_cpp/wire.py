@@ -18,6 +18,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from .chunk import Chunk
 from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
 from .observation import Image, Leftover, State, image_arg, leftover_of, named, noise_of, place, states_of
+from .printable import printable
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 PROTOCOL_VERSION = 1
@@ -190,7 +191,7 @@ def spec_of(description: Any) -> Spec:
 
 def bundle_of(bundle: Any) -> BundleInfo:
     source = bundle.source_name + (f"@{bundle.source_revision}" if bundle.source_revision else "")
-    return BundleInfo(bundle.name, bundle.arch, bundle.checksum, source)
+    return BundleInfo(*map(printable, (bundle.name, bundle.arch, bundle.checksum, source)))
 
 
 def chunk_of(message: Any) -> Chunk:
@@ -208,10 +209,10 @@ def chunk_of(message: Any) -> Chunk:
         names=tuple(message.names),
         rate_hz=message.rate_hz,
         bundle=bundle_of(message.bundle),
-        timing={stage.name: stage.ms for stage in message.stages},
+        timing={printable(stage.name): stage.ms for stage in message.stages},
         queue_ms=message.queue_ms,
         seed=message.seed if message.HasField("seed") else None,
-        notes=tuple(message.notes),
+        notes=tuple(map(printable, message.notes)),
         capture_time_ns=message.capture_time_ns or None,
         normalized=normalized.reshape(message.horizon, message.d_action) if normalized.size else None,
     )
@@ -220,4 +221,4 @@ def chunk_of(message: Any) -> Chunk:
 def exception_of(error: Any) -> VlaError:
     known = _CODES.get(error.code)
     code = known.name.lower() if known else f"code_{error.code}"
-    return error_of(code, error.where, error.expected, error.found, error.hint)
+    return error_of(code, *map(printable, (error.where, error.expected, error.found, error.hint)))

@@ -144,7 +144,7 @@ def test_the_example_says_what_is_wrong(where, case):
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_a_control_loop_runs_on_it(policy, case, mode):
     observation = dict(images=frames(case), state=case.state, text=case.text)
-    with ChunkLoop(policy, rate_hz=50, replan_every=3, mode=mode, blend="ensemble", on_late="hold") as loop:
+    with ChunkLoop(policy, rate_hz=50, replan_every=3, mode=mode, blend="ensemble", on_late="hold", on_note="raise") as loop:
         loop.begin(observation)
         actions = []
         for _ in range(30):

@@ -4,6 +4,7 @@
 
 import os
 import pickle
+import re
 import socket
 import threading
 import time
@@ -16,6 +17,7 @@ from faulty_server import chunk, response
 import vla_cpp
 from vla_cpp import wire
 from vla_cpp.client import _health
+from vla_cpp.control import ChunkLoop
 
 FRAME = np.zeros((64, 64, 3), np.uint8)
 OBSERVATION = {"images": {"top": FRAME}, "state": [0.0, 0.0], "text": "go"}
@@ -172,6 +174,75 @@ def test_other_weights_behind_the_same_address_are_refused(faulty, client):
     faulty.on_act = lambda request: [response(request, chunk=other)]
     with pytest.raises(vla_cpp.Incompatible, match="xxh3:2"):
         client.act(**OBSERVATION)
+
+
+FALSE = {
+    "shape of the answer: expected (4, 2), found (2, 4)": lambda c: (setattr(c, "horizon", 2), setattr(c, "d_action", 4)),
+    "column names of the answer: expected ('a', 'b'), found ('b', 'a')": lambda c: c.names.reverse(),
+    "column names of the answer: expected ('a', 'b'), found ('a',)": lambda c: c.names.pop(),
+    "seed of the answer: expected 7, found 8": lambda c: setattr(c, "seed", 8),
+    "capture time of the answer: expected 5, found 6": lambda c: setattr(c, "capture_time_ns", 6),
+    "normalized rows of the answer: expected none, found (4, 2)": lambda c: c.normalized.extend([0.0] * 8),
+}
+
+
+@pytest.mark.parametrize("message", FALSE)
+def test_a_chunk_that_does_not_go_with_the_request_and_the_description_is_refused(faulty, client, message):
+    told = chunk(1)
+    FALSE[message](told)
+    faulty.on_act = lambda request: [response(request, chunk=told)]
+    with pytest.raises(vla_cpp.Incompatible, match=re.escape(message)):
+        client.act(**OBSERVATION, seed=7, capture_time_ns=5)
+    faulty.on_act = lambda request: [response(request, chunk=chunk(3))]
+    assert client.act(**OBSERVATION)[0, 0] == 3
+
+
+def test_actions_that_no_robot_is_commanded_come_with_a_note_for_each_column(faulty, client):
+    told = chunk(0.5)
+    told.actions[3] = -1e30
+    faulty.on_act = lambda request: [response(request, chunk=told)]
+    assert client.act(**OBSERVATION).notes == ('action "b": 1e+30, beyond 1e+06, which no unit of a robot explains',)
+
+
+def test_what_a_server_says_is_shown_without_what_a_terminal_obeys(faulty, client):
+    hostile = "\x1b]0;owned\x07\x1b[2J\nerror: forged"
+    told = chunk(1)
+    told.notes.append(hostile)
+    faulty.on_act = lambda request: [response(request, chunk=told)]
+    assert client.act(**OBSERVATION).notes[0].isprintable()
+    refused = error_message("BUSY", where=hostile, expected=hostile, found=hostile, hint=hostile)
+    faulty.on_act = lambda request: [response(request, error=refused)]
+    with pytest.raises(vla_cpp.Busy) as caught:
+        client.act(**OBSERVATION)
+    assert str(caught.value).isprintable() and "forged" in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d.actions[0].MergeFrom(wire.MESSAGES["Dimension"](name="c")),
+        lambda d: setattr(d, "horizon", 8),
+        lambda d: setattr(d, "noise_kind", "uniform"),
+        lambda d: setattr(d.bundle, "checksum", "xxh3:2"),
+    ],
+)
+def test_a_server_that_comes_back_with_another_policy_is_an_error_of_a_loop(faulty, client, change, mode):
+    with ChunkLoop(client, rate_hz=20, replan_every=1, mode=mode, blend="replace", on_late="hold", on_note="raise") as loop:
+        loop.begin(OBSERVATION)
+        change(faulty.description)
+        client._drop(vla_cpp.Disconnected(faulty.address, "", "the server was started anew"))
+        with pytest.raises(vla_cpp.Incompatible):
+            for _ in range(40):
+                loop.step(OBSERVATION)
+                loop.pace()
+
+
+def test_a_server_that_comes_back_on_another_device_is_the_same_policy(faulty, client):
+    client.act(**OBSERVATION)
+    faulty.description.runtime.device, faulty.description.bundle.name = "cuda:0", "moved.gguf"
+    client._drop(vla_cpp.Disconnected(faulty.address, "", "the server was started anew"))
+    assert client.act(**OBSERVATION, seed=3)[0, 0] == 3
 
 
 def test_an_error_that_names_no_request_ends_those_under_way(faulty, client):

@@ -25,7 +25,7 @@ def description():
 
 def chunk(value, **fields):
     """A chunk whose actions are all `value`."""
-    message = wire.MESSAGES["ActionChunk"](horizon=HORIZON, d_action=D_ACTION, actions=[value] * (HORIZON * D_ACTION))
+    message = wire.MESSAGES["ActionChunk"](horizon=HORIZON, d_action=D_ACTION, actions=[value] * (HORIZON * D_ACTION), names=["a", "b"])
     message.bundle.name, message.bundle.checksum = "double.gguf", "xxh3:1"
     for name, field in fields.items():
         setattr(message, name, field)
@@ -33,6 +33,12 @@ def chunk(value, **fields):
 
 
 def response(request, **kind):
+    """An answer to the request. A chunk tells its seed and its capture time, unless it has others."""
+    told = kind.get("chunk")
+    if told is not None and request.act.HasField("seed") and not told.HasField("seed"):
+        told.seed = request.act.seed
+    if told is not None and not told.capture_time_ns:
+        told.capture_time_ns = request.act.capture_time_ns
     return wire.Response(protocol_version=1, request_id=request.request_id, **kind)
 
 
@@ -47,6 +53,7 @@ class FaultyServer:
         self.acts = []
         self.peers = set()
         self.on_act = lambda request: [response(request, chunk=chunk(request.act.seed))]
+        self.description = description()
         self.on_hello = lambda request: [
             response(request, hello=wire.MESSAGES["HelloReply"](min_version=1, max_version=1))
         ]
@@ -70,7 +77,7 @@ class FaultyServer:
         if kind == "hello":
             return self.on_hello(request)
         if kind == "describe":
-            return [response(request, description=description())]
+            return [response(request, description=self.description)]
         if kind == "health":
             return [response(request, health=wire.MESSAGES["HealthReply"](ready=True))]
         self.acts.append(request)

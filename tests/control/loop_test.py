@@ -5,6 +5,7 @@
 import dataclasses
 import threading
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ SPEC = Spec(
     views=(), min_views=0, states=(), action_names=("x",), action_units=("",), horizon=HORIZON, d_action=1, d_noise=1, noise_rows=HORIZON,
     noise="normal", rate_hz=10.0, bundle=BundleInfo("b", "a", "c", "s"), precision="", kernels="", device="",
 )  # fmt: skip
-ARGUMENTS = dict(rate_hz=10, replan_every=4, mode="async", blend="replace", on_late="hold")
+ARGUMENTS = dict(rate_hz=10, replan_every=4, mode="async", blend="replace", on_late="hold", on_note="raise")
 
 
 class Clock:
@@ -217,6 +218,35 @@ def test_a_function_that_answers_nonsense_is_refused(clock):
         run(starved(clock, on_late=lambda last, tick: [np.nan]), 1)
 
 
+class Noting(Remote):
+    """One whose chunks come with two notes."""
+
+    def submit(self, *, state):
+        answer = super().submit(state=state)
+        answer.outcome = dataclasses.replace(answer.outcome, notes=("the state is far out", "the text was cut"))
+        return answer
+
+
+@pytest.mark.parametrize("on_note, warned", [("ignore", []), ("warn", ["the state is far out", "the text was cut"])])
+def test_notes_are_counted_and_warned_of_where_that_is_asked_for(clock, on_note, warned):
+    loop = loop_of(Noting(clock), clock, mode="sync", on_note=on_note)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert values(run(loop, 2)) == [0, 1]
+    assert [str(w.message) for w in caught] == warned and loop.stats["notes"] == 2
+    loop.reset()
+    assert loop.stats["notes"] == 0
+
+
+def test_a_chunk_with_notes_is_never_commanded_where_they_are_to_be_raised(clock):
+    loop = loop_of(Noting(clock), clock, mode="sync", on_note="raise")
+    for _ in range(2):
+        with pytest.raises(vla_cpp.Noted, match="the state is far out; the text was cut"):
+            loop.step({"state": 0.0})
+        clock.now += 0.1
+    assert loop.stats["chunks"] == 0 and loop.stats["noted"] == 2 and loop.stats["notes"] == 4
+
+
 def test_reset_begins_anew_and_what_was_under_way_is_not_used(clock):
     loop = loop_of(Remote(clock, latency=0.25), clock)
     loop.step({"state": 100.0})
@@ -263,6 +293,7 @@ def test_a_policy_in_process_computes_in_a_thread_on_frames_that_stay_as_they_we
         (dict(blend="linear", fade_steps=-1), "fade_steps"),
         (dict(blend="ensemble", decay=-1), "decay"),
         (dict(on_late="wait"), "on_late"),
+        (dict(on_note="log"), "on_note"),
         (dict(max_age=-1), "max_age"),
         (dict(max_age=float("nan")), "max_age"),
         (dict(max_jump=0), "max_jump"),
@@ -274,7 +305,7 @@ def test_arguments_that_make_no_sense_are_refused_by_name(clock, changed, where)
     assert caught.value.where == where
 
 
-@pytest.mark.parametrize("missing", ["rate_hz", "replan_every", "mode", "blend", "on_late"])
+@pytest.mark.parametrize("missing", ["rate_hz", "replan_every", "mode", "blend", "on_late", "on_note"])
 def test_what_changes_the_motion_has_no_default(clock, missing):
     arguments = {k: v for k, v in ARGUMENTS.items() if k != missing}
     with pytest.raises(TypeError, match=missing):

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Callable, Dict, Mapping, Optional, Union
+from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
 
 import numpy as np
 
-from ..errors import Busy, Disconnected, Late, ShuttingDown, Superseded, Timeout, Unsupported, UsageError, VlaError
+from ..errors import Busy, Disconnected, Late, Noted, ShuttingDown, Superseded, Timeout, Unsupported, UsageError, VlaError
 from ..observation import Leftover
 from .blend import Blend, CrossFade, Ensemble
 from .schedule import Action, ChunkSchedule, OnLate, late_rule
@@ -41,7 +42,8 @@ class RealTimeChunking:
 class ChunkLoop:
     """Turns observations into one action per control period, with a policy that answers in chunks.
 
-        loop = ChunkLoop(policy, rate_hz=20, replan_every=8, mode="async", blend="ensemble", on_late="hold")
+        loop = ChunkLoop(policy, rate_hz=20, replan_every=8, mode="async", blend="ensemble", on_late="hold",
+                         on_note="warn")
         while running:
             action = loop.step(lambda: dict(images=cameras(), state=joints(), text="open the drawer"))
             if action.values is not None:
@@ -60,6 +62,8 @@ class ChunkLoop:
     on_late       what to command when no chunk has a row: "hold" repeats the last command, which is right for positions and WRONG
                   for velocities and differences; "zero" commands zeros; "stop" raises Late; a function (last command or None, tick)
                   returns the values, or None to command nothing. When a chunk comes, commands go on with its row for this step
+    on_note       what to do with a chunk that comes with notes, such as a state far from what the policy was trained with: "ignore"
+                  them, "warn" of each (Python's warnings), or "raise" Noted instead of commanding the chunk. `stats` counts them
     max_age       seconds between an observation and the last command that may come of it. By default the time that the rows of a
                   chunk take in "async" mode; in "sync" mode, where the robot stands still meanwhile, any
     max_jump      largest change of each value from one command to the next, beyond which it is cut: a number, or one per value
@@ -79,6 +83,7 @@ class ChunkLoop:
         mode: str,
         blend: Union[str, Blend],
         on_late: Union[str, OnLate],
+        on_note: str,
         fade_steps: Optional[int] = None,
         decay: float = ACT_DECAY,
         rtc: Optional[RealTimeChunking] = None,
@@ -92,6 +97,8 @@ class ChunkLoop:
             raise UsageError("mode", '"sync", "async" or "rtc"', repr(mode))
         if (mode == "rtc") != isinstance(rtc, RealTimeChunking):
             raise UsageError("rtc", 'a RealTimeChunking with the mode "rtc", and only there', repr(rtc))
+        if on_note not in ("ignore", "warn", "raise"):
+            raise UsageError("on_note", '"ignore", "warn" or "raise"', repr(on_note))
         if not 0 < rate_hz < math.inf:
             raise UsageError("rate_hz", "periods per second, above 0", str(rate_hz))
         spec = policy.spec
@@ -111,7 +118,7 @@ class ChunkLoop:
             max_age=_age_in_ticks(max_age, rate_hz, None if mode == "sync" else spec.horizon),
             max_jump=max_jump,
         )
-        self.rate_hz, self.mode, self.rtc = rate_hz, mode, rtc
+        self.rate_hz, self.mode, self.rtc, self.on_note = rate_hz, mode, rtc, on_note
         self._policy, self._clock, self._sleep = policy, clock, sleep
         # A client answers without waiting by itself; any other policy computes in a thread of its own.
         self._worker = None if hasattr(policy, "submit") else ThreadPoolExecutor(1, "vla-act")
@@ -121,7 +128,7 @@ class ChunkLoop:
     def _forget(self) -> None:
         self._start: Optional[float] = None
         self._tick = -1
-        self._missed = 0
+        self._missed = self._notes = 0
         self._errors: Dict[str, int] = {}
         self.last_error: Optional[VlaError] = None
 
@@ -162,8 +169,9 @@ class ChunkLoop:
     @property
     def stats(self) -> Dict[str, Any]:
         """Counts since the start: actions, held, chunks, stale (dropped for their age), failed (in all, and by the error's code),
-        limited, missed (periods without a call of `step`); and the delay in steps."""
-        return {**self.schedule.counts, **self._errors, "missed": self._missed, "delay": self.schedule.delay}
+        limited, missed (periods without a call of `step`), notes; and the delay in steps."""
+        own = {"missed": self._missed, "notes": self._notes, "delay": self.schedule.delay}
+        return {**self.schedule.counts, **self._errors, **own}
 
     def reset(self) -> None:
         """Begins a new episode. What is still under way is not used."""
@@ -227,7 +235,15 @@ class ChunkLoop:
             raise
         else:
             self.last_error = None
+            self._hear(chunk.notes)
             self.schedule.receive(chunk, tick)
+
+    def _hear(self, notes: Sequence[str]) -> None:
+        self._notes += len(notes)
+        if notes and self.on_note == "raise":
+            self._fail(Noted("chunk", "no notes", "; ".join(notes)))
+        for note in notes if self.on_note == "warn" else ():
+            warnings.warn(note, stacklevel=4)
 
     def _fail(self, error: VlaError) -> None:
         self.schedule.fail()

@@ -79,7 +79,7 @@ def run_delayed(guard: Guard, policy: EvalPolicy, job: Job, replan_every: int, m
     clock = Clock()
     delayed = Delayed(policy, clock, latency, lambda: noise_of(job.seed, len(out.engine_ms), *policy.noise_shape), out)
     loop = ChunkLoop(
-        delayed, rate_hz=declaration.rate_hz, replan_every=replan_every, mode=mode, blend="replace", on_late="zero",
+        delayed, rate_hz=declaration.rate_hz, replan_every=replan_every, mode=mode, blend="replace", on_late="zero", on_note="ignore",
         rtc=rtc_of(delayed.spec, replan_every) if mode == "rtc" else None, allow_other_rate=True, clock=clock, sleep=clock.sleep,
     )  # fmt: skip
 
