@@ -9,6 +9,7 @@ from typing import Dict, Optional, Tuple
 
 import numpy as np
 
+from .printable import printable
 from .spec import BundleInfo
 
 
@@ -44,6 +45,14 @@ class Chunk:
                 raise ValueError(f"a chunk is {self.actions.dtype}; as {np.dtype(dtype)} it must be copied")
             return self.actions.astype(dtype)
         return self.actions.copy() if copy else self.actions
+
+    def __repr__(self) -> str:
+        rate = f" at {self.rate_hz:g} Hz" if self.rate_hz else ""
+        start = "" if self.seed is None else f", seed {self.seed}"
+        lines = [f"{len(self.actions)} actions{rate} of {self.bundle.name}, in {sum(self.timing.values()):.1f} ms{start}"]
+        for name, column in zip(self.names, self.actions.T):
+            lines.append(f"  {name}  {column[0]:.4g} first, {column.min():.4g} to {column.max():.4g}")
+        return "\n".join(map(printable, lines + ["  note  " + note for note in self.notes]))
 
     def __len__(self) -> int:
         return len(self.actions)

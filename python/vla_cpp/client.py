@@ -98,8 +98,8 @@ class Client(Handle):
     ) -> Chunk:
         """One observation in, one action chunk out.
 
-        images           frames by view: uint8 (height, width, 3) RGB of any size, the bytes of a JPEG or PNG file, or None for a
-                         camera that the robot does not have
+        images           frames by view: uint8 (height, width, 3) RGB of any size, a Pillow image, the bytes of a JPEG or PNG file, or
+                         None for a camera that the robot does not have
         state            world units: vectors by name, or one vector where the policy has one state
         text             the instruction, as a person says it
         seed, noise      where the solver starts: a number, or float32 (noise_rows, d_noise); with neither a seed is drawn, and the

@@ -12,7 +12,7 @@ import numpy as np
 from .errors import BadObservation, Unsupported, UsageError
 from .spec import Spec, StateSpec, ViewSpec
 
-Image = Union[np.ndarray, bytes, bytearray, memoryview, None]
+Image = Union[np.ndarray, bytes, bytearray, memoryview, "PIL.Image.Image", None]  # noqa: F821 (Pillow is not needed)
 State = Union[Mapping[str, object], Sequence[float], np.ndarray, float]
 
 MAX_SEED = 2**64 - 1
@@ -73,14 +73,43 @@ def image_arg(where: str, image: Image) -> Tuple[str, Union[np.ndarray, bytes, N
         if data.startswith(b"\x89PNG\r\n\x1a\n"):
             return "png", data
         raise BadObservation(where, "the bytes of a JPEG or PNG file", f"{len(data)} bytes that start otherwise")
+    if is_pillow(image):
+        if image.mode != "RGB":
+            raise BadObservation(where, "a picture of mode RGB", f"mode {image.mode}", 'image.convert("RGB")')
+        image = np.asarray(image)
     if not isinstance(image, np.ndarray):
-        hint = "numpy.asarray(image) of a picture, open(path, 'rb').read() of a file"
-        raise BadObservation(where, "a uint8 array, the bytes of a JPEG or PNG file, or None", type(image).__name__, hint)
+        raise BadObservation(where, "a uint8 array, a Pillow image, the bytes of a JPEG or PNG file, or None", type(image).__name__, _of_tensor(image))
     if image.dtype != np.uint8:
-        raise BadObservation(where, "uint8 pixels", str(image.dtype), "give 0 to 255, not 0 to 1")
+        raise BadObservation(where, "uint8 pixels", f"{image.dtype} of shape {image.shape}", _of_floats(image))
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise BadObservation(where, "shape (height, width, 3)", str(image.shape), "rows first, channels last: RGB")
+        hint = "image.transpose(1, 2, 0) puts the channels last" if _channels_first(image) else "rows first, channels last: RGB"
+        raise BadObservation(where, "shape (height, width, 3)", str(image.shape), hint)
     return "rgb", np.ascontiguousarray(image)
+
+
+def is_pillow(image: object) -> bool:
+    """Without importing Pillow, which need not be there."""
+    return hasattr(image, "getbands") and hasattr(image, "mode")
+
+
+def _channels_first(image: Any) -> bool:
+    return len(image.shape) == 3 and image.shape[0] == 3 and image.shape[2] != 3
+
+
+def _of_tensor(image: object) -> str:
+    if not hasattr(image, "numpy") or not hasattr(image, "shape"):
+        return "numpy.asarray(image) of a picture, open(path, 'rb').read() of a file"
+    if "float" not in str(getattr(image, "dtype", "")):
+        return "image.permute(1, 2, 0).numpy()" if _channels_first(image) else "image.numpy()"
+    turn = ".permute(1, 2, 0)" if _channels_first(image) else ""
+    return f"for values in [0, 1], as LeRobot has them: (255 * image).round().byte(){turn}.numpy()"
+
+
+def _of_floats(image: np.ndarray) -> str:
+    if image.dtype.kind != "f":
+        return "give 0 to 255, not 0 to 1"
+    turn = ".transpose(1, 2, 0)" if _channels_first(image) else ""
+    return f"for values in [0, 1], as LeRobot has them: (255 * image).round().astype(numpy.uint8){turn}"
 
 
 def states_of(state: State, specs: Sequence[StateSpec]) -> Dict[str, np.ndarray]:

@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Mapping, Tuple
+from typing import Mapping, Sequence, Tuple
+
+from .printable import printable
 
 
 @dataclass(frozen=True)
@@ -83,3 +85,28 @@ class Spec:
     real_time_chunking: str = ""
     embodiment: str = ""
     robots: Mapping[str, Spec] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        robot = f", robot {self.embodiment}" if self.embodiment else ""
+        lines = [f"{self.bundle.name} ({self.bundle.arch}{robot}), {self.precision} on {self.device}"]
+        lines += [f"  image   {_view_text(view)}" for view in self.views]
+        lines += [f"  state   {s.name}, {s.width} values{_named(s.names, s.units)}" for s in self.states]
+        if self.horizon:
+            rate = f" at {self.rate_hz:g} Hz" if self.rate_hz else ""
+            lines.append(f"  action  {self.horizon} rows{rate} of {self.d_action} values{_named(self.action_names, self.action_units)}")
+            lines.append(f"  noise   {self.noise}, {self.noise_rows} x {self.d_noise}")
+        if self.real_time_chunking:
+            lines.append(f"  real-time chunking: {self.real_time_chunking}")
+        lines += ["  robot   " + tag for tag in self.robots]
+        return "\n".join(map(printable, lines))
+
+
+def _view_text(view: ViewSpec) -> str:
+    return f"{view.name}, seen as {view.width} x {view.height}" + (", optional" if view.optional else "")
+
+
+def _named(names: Sequence[str], units: Sequence[str]) -> str:
+    """": x [m], y [m]" of what has names; units only where the bundle says them."""
+    units = units or [""] * len(names)
+    texts = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units) if name]
+    return ": " + ", ".join(texts) if texts else ""

@@ -3,6 +3,7 @@
 """What a caller gives is brought into one form, or refused by name."""
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from vla_cpp import BadObservation, StateSpec, UsageError, ViewSpec
@@ -55,6 +56,40 @@ def test_another_image_is_refused_by_the_view(image, found):
 def test_a_state_is_float32_by_name(state):
     ((name, values),) = states_of(state, JOINTS).items()
     assert name == "observation.state" and values.dtype == np.float32 and values.tolist() == [1, 2]
+
+
+def test_a_pillow_image_is_a_frame_as_it_is():
+    picture = PIL.Image.effect_noise((6, 4), 50).convert("RGB")
+    kind, rows = image_arg("top", picture)
+    assert kind == "rgb" and rows.shape == (4, 6, 3) and (rows == np.asarray(picture)).all()
+    with pytest.raises(BadObservation, match=r'a picture of mode RGB, found mode RGBA; image.convert\("RGB"\)'):
+        image_arg("top", picture.convert("RGBA"))
+
+
+class Tensor:
+    """As torch's, as far as a message looks."""
+
+    def __init__(self, array):
+        self.shape, self.dtype, self._array = array.shape, "torch." + str(array.dtype), array
+
+    def numpy(self):
+        return self._array
+
+
+@pytest.mark.parametrize(
+    "image, hint",
+    [
+        (np.zeros((3, 4, 6), np.float32), "(255 * image).round().astype(numpy.uint8).transpose(1, 2, 0)"),
+        (np.zeros((4, 6, 3), np.float64), "(255 * image).round().astype(numpy.uint8)"),
+        (np.zeros((3, 4, 6), np.uint8), "image.transpose(1, 2, 0) puts the channels last"),
+        (Tensor(np.zeros((3, 4, 6), np.float32)), "(255 * image).round().byte().permute(1, 2, 0).numpy()"),
+        (Tensor(np.zeros((3, 4, 6), np.uint8)), "image.permute(1, 2, 0).numpy()"),
+    ],
+)
+def test_frames_as_lerobot_has_them_are_refused_with_how_to_convert_them(image, hint):
+    with pytest.raises(BadObservation) as caught:
+        image_arg("top", image)
+    assert caught.value.hint.endswith(hint)
 
 
 def test_one_number_is_a_state_of_one():

@@ -14,7 +14,7 @@ from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Union
 import numpy as np
 
 from ..errors import Busy, Disconnected, Late, Noted, ShuttingDown, Superseded, Timeout, Unsupported, UsageError, VlaError
-from ..observation import Leftover
+from ..observation import Leftover, is_pillow
 from .blend import Blend, CrossFade, Ensemble
 from .schedule import Action, ChunkSchedule, OnLate, late_rule
 
@@ -257,7 +257,7 @@ def _snapshot(value: Any) -> Any:
     """Arrays are copied: a camera may write its next frame while another thread still reads this one."""
     if isinstance(value, Mapping):
         return {key: _snapshot(part) for key, part in value.items()}
-    return value.copy() if isinstance(value, np.ndarray) else value
+    return value.copy() if isinstance(value, np.ndarray) or is_pillow(value) else value
 
 
 def _blend_of(blend: Union[str, Blend], fade_steps: Optional[int], decay: float) -> Blend:
