@@ -70,6 +70,15 @@ def test_each_moment_of_the_state_is_a_token_of_n1_6(converter):
     assert bundle.tensors["state_in.weight"].shape == (14, 6)
 
 
+def test_a_robot_of_n1_6_with_more_steps_than_the_head_has_rows_is_refused(converter):
+    def change(content):
+        for robot in content["processor_kwargs"]["modality_configs"].values():
+            robot["action"]["delta_indices"] = list(range(100))
+
+    error = converter.refusal(Changed(N1_6, "processor_config.json", change), **N1_6.options)
+    assert "action: delta_indices: expected at most action_horizon" in error.message() and "found 100 steps" in error.message()
+
+
 def test_n1_5_takes_the_row_and_the_statistics_that_its_data_config_names(converter):
     bundle = converter.bundle(Changed(N1_5), dtype="f32", **N1_5.options)
     shape = (3, 14, 20)

@@ -41,6 +41,7 @@ RELEASE = Release(
         "behavior_r1_pro": 24,
     },
     state_rows=True,
+    cuts_rows=False,
 )
 plan = partial(make_plan, RELEASE)
 embodiments = partial(described, RELEASE)

@@ -103,6 +103,7 @@ class Release(NamedTuple):
     ignored: Collection[str]
     embodiments: Dict[str, int]  # indices of tags that embodiment_id.json does not have
     state_rows: bool = False  # each moment of the state is a token of its own; else all of them are one
+    cuts_rows: bool = True  # a robot with more steps than the head has rows gets what there is; else its reference refuses it
 
 
 def make_plan(release: Release, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
@@ -114,6 +115,8 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     s.embodiment = embodiment_index(checkpoint, options.embodiment, release.embodiments, s.n_embodiment, problems)
     statistics = read_json(processor_file(checkpoint, STATISTICS))
     robot = read_robot(options.embodiment, robot_config, statistics, processor, s.horizon, problems)
+    if not release.cuts_rows:
+        _check_horizon(robot_config, s, options, problems)
     problems.raise_any()
     s.max_views = len(robot.cameras)
     if release.state_rows:
@@ -128,6 +131,13 @@ def make_plan(release: Release, checkpoint: Checkpoint, options: Options, proble
     s.image_width, s.image_height = images.width, images.height
     parts = Parts(backbone, folder, robot, images, processor.get("formalize_language"))
     return assemble(parts, network_keys(release, s), weights(release, s), checkpoint, options, s, problems)
+
+
+def _check_horizon(robot: dict, s: Sizes, options: Options, problems: Problems) -> None:
+    steps = member(robot, "action", dict, PROCESSOR).get("delta_indices")
+    if isinstance(steps, list) and len(steps) > s.horizon:
+        where = "{}: {}.action: delta_indices".format(PROCESSOR, options.embodiment)
+        problems.add(where, "at most action_horizon {} of config.json".format(s.horizon), "{} steps".format(len(steps)))
 
 
 def described(release: Release, checkpoint: Checkpoint) -> List[str]:
