@@ -23,6 +23,7 @@
 #include <list>
 #include <map>
 
+#include "serve/eviction.h"
 #include "serve/listener.h"
 
 namespace vla::serve {
@@ -120,6 +121,7 @@ struct Shared {
   Hub::Handler* handler = nullptr;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections;  // oldest first
   std::size_t n_held = 0;                                            // bytes of requests that are not whole
+  Standings standings() const;
   void make_room();
   void bound_receipt();
 };
@@ -131,6 +133,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
       : shared_(shared),
         socket_(std::move(socket)),
         client_(std::move(client)),
+        group_(group_of(client_.peer)),
         session_(shared.limits.message, shared.keys) {}
 
   void start() {
@@ -168,10 +171,10 @@ class Connection : public std::enable_shared_from_this<Connection> {
     if (session_.is_open() && out_.empty() && (slow_ > 1 || silent_ > kPingAfter)) send(session_.ping());
   }
 
-  const std::string& peer() const { return client_.peer; }
-  std::size_t n_held() const { return n_held_; }
-  Clock::time_point began() const { return began_; }  // the request that is being received
-  Clock::time_point served() const { return served_; }
+  Standing standing() const {
+    const bool has_key = session_.is_open() && !session_.client_key().empty();
+    return {client_.connection, has_key ? session_.client_key() : group_, session_.is_open(), served_, began_, n_held_};
+  }
   bool has_answers() const { return !out_.empty(); }
 
  private:
@@ -246,6 +249,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   Shared& shared_;
   Socket socket_;
   Client client_;
+  const std::string group_;  // of its address
   Session session_;
   std::deque<std::string> out_;  // the first one is on its way
   Clock::time_point began_ = Clock::now(), served_ = {};
@@ -254,38 +258,26 @@ class Connection : public std::enable_shared_from_this<Connection> {
   bool is_paused_ = false, is_closed_ = false;
 };
 
-/// Which peer has the most, counted by `amount`.
-template <class Amount>
-std::string heaviest(const std::map<std::uint64_t, std::shared_ptr<Connection>>& connections, Amount amount) {
-  std::map<std::string, std::size_t> sums;
-  for (const auto& [id, connection] : connections) sums[connection->peer()] += amount(*connection);
-  const auto most = std::max_element(sums.begin(), sums.end(), [](auto& a, auto& b) { return a.second < b.second; });
-  return most == sums.end() ? "" : most->first;
+Standings Shared::standings() const {
+  Standings all;
+  all.reserve(connections.size());
+  for (const auto& [id, connection] : connections) all.push_back(connection->standing());
+  return all;
 }
 
-/// Of the peer with the most connections the one goes that was served longest ago, or never.
 void Shared::make_room() {
-  while (connections.size() > limits.connections) {
-    const std::string peer = heaviest(connections, [](const Connection&) { return std::size_t{1}; });
-    std::shared_ptr<Connection> idle;
-    for (const auto& [id, connection] : connections)
-      if (connection->peer() == peer && (!idle || connection->served() < idle->served())) idle = connection;
-    idle->drop("connections", fmt::format("more than {}, and this one was served longest ago", limits.connections));
-  }
+  while (const auto chosen = to_evict(standings(), limits.connections, Clock::now()))
+    connections.at(*chosen)->drop(
+        "connections", fmt::format("more than {}, or {} in their handshake, and this one gives way", limits.connections,
+                                   max_handshakes(limits.connections)));
 }
 
-/// Of the peer with the most bytes in receipt the request goes that began first.
 void Shared::bound_receipt() {
   while (n_held > limits.receipt) {
-    const std::string peer = heaviest(connections, [](const Connection& c) { return c.n_held(); });
-    std::shared_ptr<Connection> slowest;
-    for (const auto& [id, connection] : connections)
-      if (connection->peer() == peer && connection->n_held() > 0 &&
-          (!slowest || connection->began() < slowest->began()))
-        slowest = connection;
-    if (!slowest) return;
-    slowest->drop("receipt",
-                  fmt::format("requests in receipt took more than {} bytes, and this one began first", limits.receipt));
+    const auto chosen = to_interrupt(standings(), limits.connections, limits.message, limits.receipt, Clock::now());
+    if (!chosen) return;
+    connections.at(*chosen)->drop(
+        "receipt", fmt::format("requests in receipt took more than {} bytes, and this one gives way", limits.receipt));
   }
 }
 
