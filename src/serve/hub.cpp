@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 #include <ifaddrs.h>
+#include <malloc.h>
 #include <net/if.h>
 #include <unistd.h>
 
@@ -34,8 +35,9 @@ using asio::ip::tcp;
 using Local = asio::local::stream_protocol;
 using boost::system::error_code;
 
-constexpr std::size_t kMaxAnswers = 64;  // that one connection may leave unread
-constexpr int kTurn = 4;                 // messages of a connection before the others get their turn
+constexpr std::size_t kMaxAnswers = 64;        // that one connection may leave unread
+constexpr std::size_t kMaxUnread = 128 << 10;  // bytes of them before it is not read from; twice that are kept
+constexpr int kTurn = 4;                       // messages of a connection before the others get their turn
 constexpr auto kSweep = std::chrono::seconds(1);
 constexpr int kHandshakePatience = 10, kSilencePatience = 15, kPingAfter = 5;  // in sweeps
 
@@ -121,6 +123,7 @@ struct Shared {
   Hub::Handler* handler = nullptr;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections;  // oldest first
   std::size_t n_held = 0;                                            // bytes of requests that are not whole
+  bool has_freed = false;  // since the last sweep: answers of connections that closed
   Standings standings() const;
   void make_room();
   void bound_receipt();
@@ -142,7 +145,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   }
   void answer(std::string_view response, bool delimiter) {
     guard([&] {
-      if (out_.size() < kMaxAnswers) send(session_.pack(response, delimiter));
+      if (out_.size() < kMaxAnswers && n_unread_ < 2 * kMaxUnread) send(session_.pack(response, delimiter));
     });
   }
   void drop(const char* why, const std::string& detail) {
@@ -157,6 +160,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
     socket_.shutdown(Socket::shutdown_both, ignored);
     socket_.close(ignored);
     hold(0);
+    if (out_.size() > 1) out_.erase(out_.begin() + 1, out_.end());  // the first one belongs to the write until it ends
+    shared_.has_freed = shared_.has_freed || n_unread_ > 0;
     shared_.connections.erase(client_.connection);
   }
 
@@ -204,7 +209,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   void handle() {
     guard([this] {
       for (int i = 0; i < kTurn; ++i) {
-        is_paused_ = out_.size() >= kMaxAnswers;
+        is_paused_ = out_.size() >= kMaxAnswers || n_unread_ >= kMaxUnread;
         if (is_paused_) return;
         Result<std::optional<Message>> message = session_.next();
         if (std::string control = session_.take_output(); !control.empty()) send(std::move(control));
@@ -232,16 +237,18 @@ class Connection : public std::enable_shared_from_this<Connection> {
   }
 
   void send(std::string bytes) {
+    n_unread_ += bytes.size();
     out_.push_back(std::move(bytes));
     if (out_.size() == 1) write();
   }
   void write() {
     asio::async_write(socket_, asio::buffer(out_.front()), [self = shared_from_this()](error_code error, std::size_t) {
       if (error) return self->close();
+      self->n_unread_ -= self->out_.front().size();
       self->out_.pop_front();
       self->guard([&] {
         if (!self->out_.empty()) self->write();
-        if (self->is_paused_ && self->out_.size() < kMaxAnswers / 2) self->handle();
+        if (self->is_paused_ && self->out_.size() < kMaxAnswers / 2 && self->n_unread_ < kMaxUnread) self->handle();
       });
     });
   }
@@ -254,7 +261,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   std::deque<std::string> out_;  // the first one is on its way
   Clock::time_point began_ = Clock::now(), served_ = {};
   int age_ = 0, silent_ = 0, slow_ = 0;  // sweeps: since it came, since a byte, since a request began
-  std::size_t n_held_ = 0;
+  std::size_t n_held_ = 0, n_unread_ = 0;
   bool is_paused_ = false, is_closed_ = false;
 };
 
@@ -371,6 +378,7 @@ class Hub::Sockets : public Shared {
       is_sweeping_ = false;
       const auto all = connections;
       for (const auto& [id, connection] : all) connection->sweep();
+      if (std::exchange(has_freed, false)) ::malloc_trim(0);  // else the process keeps what a flood took
     });
     is_sweeping_ = true;
   }

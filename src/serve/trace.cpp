@@ -62,15 +62,15 @@ std::string slices_of_act(const Answered& answered, std::int64_t from, std::int6
 
 }  // namespace
 
-Result<std::unique_ptr<Trace>> Trace::open(const std::string& path) {
+Result<std::unique_ptr<Trace>> Trace::open(const std::string& path, std::size_t max_bytes) {
   VLA_TRY(const int fd, open_to_write(path, false));
-  std::unique_ptr<Trace> trace(new Trace(fd));
+  std::unique_ptr<Trace> trace(new Trace(fd, max_bytes));
   if (const int failure = trace->writer_.failure(); failure != 0)
     return Error{Code::io, path, "a thread to write it", std::strerror(failure)};
   return trace;
 }
 
-Trace::Trace(int fd) : writer_(fd, Writer::Owns::yes, kMaxWaiting) {
+Trace::Trace(int fd, std::size_t max_bytes) : max_bytes_(max_bytes), writer_(fd, Writer::Owns::yes, kMaxWaiting) {
   writer_.put("[\n" + name_of_thread(kIo, "requests") + ",\n" + name_of_thread(kEngine, "engine") + ",\n" +
               name_of_thread(kHost, "host, beside a device") + ",\n");
 }
@@ -80,7 +80,7 @@ Trace::~Trace() {
   writer_.set_tail(
       fmt::format(R"({{"ph":"M","pid":1,"name":"process_name","args":{{"name":"vla serve","dropped":{}}}}})"
                   "\n]\n",
-                  writer_.n_dropped()));
+                  n_dropped()));
 }
 
 std::int64_t Trace::ns(Clock::time_point time) const {
@@ -104,7 +104,12 @@ void Trace::answered(const Answered& answered) {
       events += on_request(id, "send", finished, sent, "");
       events += slices_of_act(answered, started, finished, fmt::format(R"("request":{})", id));
     }
-    writer_.put(std::move(events));
+    n_byte_ += events.size();
+    if (n_byte_ <= max_bytes_) {
+      writer_.put(std::move(events));
+    } else {
+      ++n_beyond_;
+    }
   } catch (const std::exception&) {  // no memory for an event: the server goes on without it
   }
 }

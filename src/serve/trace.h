@@ -15,20 +15,24 @@ namespace vla::serve {
 /// process has not closed it.
 class Trace final : public Observer {
  public:
-  /// Replaces the file. Errors: io.
-  static Result<std::unique_ptr<Trace>> open(const std::string& path);
+  static constexpr std::size_t kMaxBytes = std::size_t{1} << 30;
+  /// Replaces the file. What comes after `max_bytes` is dropped and counted. Errors: io.
+  static Result<std::unique_ptr<Trace>> open(const std::string& path, std::size_t max_bytes = kMaxBytes);
   ~Trace() override;
 
   void answered(const Answered& answered) override;
-  /// Requests that the disk was too slow for.
-  std::uint64_t n_dropped() const { return writer_.n_dropped(); }
+  /// Requests that the disk was too slow for, or that came after the last byte.
+  std::uint64_t n_dropped() const { return writer_.n_dropped() + n_beyond_; }
 
  private:
-  explicit Trace(int fd);
+  Trace(int fd, std::size_t max_bytes);
   std::int64_t ns(Clock::time_point time) const;
 
   const Clock::time_point start_ = Clock::now();
-  std::uint64_t n_request_ = 0;  // of the I/O thread
+  const std::size_t max_bytes_;
+  std::uint64_t n_request_ = 0;  // of the I/O thread, as the bytes are
+  std::size_t n_byte_ = 0;
+  std::atomic<std::uint64_t> n_beyond_ = 0;
   Writer writer_;
 };
 

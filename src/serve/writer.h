@@ -16,7 +16,7 @@
 namespace vla::serve {
 
 /// Opens a file to be written from its start, which must not exist yet where `fresh`. Only its owner may read it, since
-/// it holds what a robot sees and does. Errors: io.
+/// it holds what a robot sees and does. A symbolic link is refused: another user may have put it there. Errors: io.
 Result<int> open_to_write(const std::string& path, bool fresh);
 
 /// Writes to a file or a pipe from a thread of its own, so that the caller never waits for a disk

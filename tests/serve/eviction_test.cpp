@@ -6,6 +6,7 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include "serve/hub.h"
 #include "serve/support.h"
 
 using namespace vla;
@@ -18,7 +19,19 @@ constexpr std::size_t kMiB = 1 << 20;
 const Clock::time_point kNow = Clock::time_point(std::chrono::hours(1));
 Clock::time_point ago(int ms) { return kNow - std::chrono::milliseconds(ms); }
 
-/// A connection to a server from an address of this machine that sends nothing.
+/// Answers every message with a megabyte.
+struct Generous : Hub::Handler {
+  Hub& hub;
+  int n_received = 0;
+  explicit Generous(Hub& its_hub) : hub(its_hub) {}
+  void received(Client& client, Message) override {
+    ++n_received;
+    hub.send(client.connection, std::string(kMiB, 'a'), false);
+  }
+  void dropped(const Client&, const std::string&, const std::string&) override {}
+};
+
+/// A connection to a server from an address of this machine that sends what it is told to, and does not read.
 class Silent {
  public:
   Silent(std::uint32_t from, const std::string& server) : fd_(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0)) {
@@ -31,6 +44,9 @@ class Silent {
     REQUIRE(::connect(fd_, reinterpret_cast<const sockaddr*>(&its), sizeof(its)) == 0);
   }
   ~Silent() { ::close(fd_); }
+  void send(const std::string& bytes) {
+    REQUIRE(::send(fd_, bytes.data(), bytes.size(), MSG_NOSIGNAL) == static_cast<ssize_t>(bytes.size()));
+  }
   Silent(const Silent&) = delete;
   Silent& operator=(const Silent&) = delete;
 
@@ -102,4 +118,24 @@ TEST_CASE("a robot that is served stays connected while 300 addresses of its mac
   Peer late(running.address());
   late.send(health);
   CHECK(late.receive(3000).has_value());
+}
+
+TEST_CASE("a peer that reads no answers is not read from once they take 128 KiB, however few they are") {
+  Hub hub({kMiB, 8, 4 * kMiB}, nullptr);
+  Generous handler(hub);
+  const auto address = hub.bind("tcp://127.0.0.1:0");
+  REQUIRE(address);
+  Silent peer(INADDR_LOOPBACK, *address);
+  std::string bytes("\xff\0\0\0\0\0\0\0\1\x7f\3\1NULL", 16);
+  bytes.resize(64);
+  bytes += std::string(
+      "\4\x1c\5READY\xbSocket-Type\0\0\0\6"
+      "DEALER",
+      30);
+  for (int i = 0; i < 60; ++i) bytes += std::string("\0\1a", 3);
+  peer.send(bytes);
+  for (const auto end = Clock::now() + std::chrono::milliseconds(500); Clock::now() < end;)
+    hub.wait(handler, STDERR_FILENO, end);
+  CHECK(handler.n_received > 0);
+  CHECK(handler.n_received < 20);  // what the system's own buffers take, and one more
 }

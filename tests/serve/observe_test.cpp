@@ -260,6 +260,23 @@ TEST_CASE("two hundred clients that drip their request keep no probe waiting") {
   for (const int fd : dripping) ::close(fd);
 }
 
+TEST_CASE("a trace ends at its limit, is valid JSON then too, and is not written through a symbolic link") {
+  Folder folder;
+  {
+    auto trace = Trace::open(folder / "out.json", 2000);
+    REQUIRE(trace);
+    Received request;
+    for (int i = 0; i < 100; ++i) (*trace)->answered(Answered{request, nullptr, {}, {}, {}, {}, {}, {}, false});
+    CHECK((*trace)->n_dropped() > 80);
+  }
+  CHECK(nlohmann::json::accept(content(folder / "out.json")));
+  CHECK(std::filesystem::file_size(folder / "out.json") < 3000);
+  std::filesystem::create_symlink("out.json", folder.path / "link.json");
+  const auto linked = Trace::open(folder / "link.json");
+  REQUIRE_FALSE(linked);
+  CHECK(linked.error().found == "a symbolic link");
+}
+
 TEST_CASE("a trace is valid JSON, and its stages end before their act does") {
   Folder folder;
   Sample sample;
