@@ -140,7 +140,8 @@ Command add_serve(CLI::App& app) {
   serve::ServerOptions& server = options->server;
   CLI::App* command = app.add_subcommand("serve", "Keep a policy loaded and answer clients over the network");
   command->footer(
-      "Clients: docs/serving.md; the protocol: docs/protocol.md. SIGTERM or Ctrl-C answers what waits, then ends.\n"
+      "Clients: docs/serving.md; the protocol: docs/protocol.md. SIGTERM or Ctrl-C finishes the act that runs, then "
+      "ends.\n"
       "  vla serve policy.gguf\n"
       "  vla serve policy.gguf --bind tcp://0.0.0.0:5555 --curve-secret server.secret --curve-clients clients.public");
   add_bundle(*command, options->bundle, true);

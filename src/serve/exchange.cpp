@@ -70,6 +70,12 @@ std::optional<Job> Exchange::take_late(Clock::time_point now) {
   return jobs_.take_late(now);
 }
 
+std::optional<Job> Exchange::take_waiting() {
+  const std::lock_guard lock(mutex_);
+  work_.notify_all();
+  return jobs_.pop();
+}
+
 std::optional<Clock::time_point> Exchange::first_deadline() const {
   const std::lock_guard lock(mutex_);
   return jobs_.first_deadline();

@@ -55,6 +55,7 @@ class Exchange {
   Jobs::Pushed push(Job job);
   std::optional<Answer> take_answer();
   std::optional<Job> take_late(Clock::time_point now);  // whose deadline passed while it waited
+  std::optional<Job> take_waiting();                    // any job that waits
   std::optional<Clock::time_point> first_deadline() const;
   void close();          // no further jobs come
   bool drained() const;  // nothing waits, is computed, or is still to be answered

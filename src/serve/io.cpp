@@ -30,6 +30,8 @@ Job job_of(const Client& client, Message message) {
   return job;
 }
 
+Error shutting_down() { return {Code::shutting_down, "act", "", "the server drains before it stops"}; }
+
 }  // namespace
 
 void Vitals::begin() noexcept {
@@ -61,6 +63,7 @@ void Io::run() {
     if (vitals_.stopping) {
       vitals_.ready = false;
       exchange_.close();
+      if (!vitals_.device_lost) refuse_waiting();
       if (exchange_.drained()) return hub_.flush(*this, Clock::now() + kLinger);
     }
   }
@@ -133,10 +136,7 @@ Result<v1::Response> Io::answer_now(Client& client, const Job& job) const {
 
 /// An act that waits has its answer still to come, so nothing may throw once it is in line.
 void Io::queue(Job job) {
-  if (vitals_.stopping)
-    return refuse(std::move(job), [] {
-      return Error{Code::shutting_down, "act", "", "the server drains before it stops"};
-    });
+  if (vitals_.stopping) return refuse(std::move(job), shutting_down);
   if (const auto deadline = job.envelope.deadline_ms) {
     if (*deadline == 0 || *deadline > kMaxDeadlineMs)
       return refuse(std::move(job), [&] {
@@ -215,6 +215,11 @@ void Io::deliver(Answer answer) {
   }
   answered.sent = Clock::now();
   for (Observer* observer : observers_) observer->answered(answered);
+}
+
+/// An act in line could take as long as all before it: a server that stops finishes only what it has begun.
+void Io::refuse_waiting() {
+  while (std::optional<Job> job = exchange_.take_waiting()) refuse(std::move(*job), shutting_down);
 }
 
 void Io::deliver_waiting() {

@@ -14,6 +14,7 @@ namespace vla::serve {
 /// What both threads and every observer may read.
 struct Vitals {
   std::atomic<bool> ready = false, stopping = false;
+  std::atomic<bool> device_lost = false;  // acts that wait get the device's error
   std::atomic<std::uint64_t> n_chunk = 0, n_error = 0;
   std::atomic<Clock::rep> ready_since = 0;
 
@@ -29,7 +30,7 @@ class Io final : public Hub::Handler {
   Io(Hub& hub, Exchange& exchange, Vitals& vitals, const v1::Description& description,
      std::span<Observer* const> observers);
 
-  /// Until the server is stopped and all waiting requests are answered.
+  /// Until the server is stopped, what is computed is answered, and what waits is refused.
   void run();
 
   void received(Client& client, Message message) override;
@@ -44,6 +45,7 @@ class Io final : public Hub::Handler {
   void settle(Answer answer) noexcept;
   void deliver(Answer answer);
   void deliver_waiting();
+  void refuse_waiting();
   void answer_without_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;
 
   Hub& hub_;

@@ -170,7 +170,9 @@ void Server::compute(Engine& engine, Act& act) {
   act.answer.finished = Clock::now();
   act.request = {};
   exchange_.put(std::move(act.answer));
-  if (!engine.device().failure()) stop();  // no act after this one can succeed
+  if (engine.device().failure()) return;
+  vitals_.device_lost = true;  // no act after this one can succeed
+  stop();
 }
 
 Status Server::prepare(const Engine& engine, Act& act) const {
