@@ -13,6 +13,7 @@ namespace vla::serve {
 namespace {
 
 constexpr std::size_t kMaxWaiting = 1 << 20;
+constexpr double kBurst = 200, kPerSecond = 50;  // lines about clients
 
 std::string now() {
   const auto time = std::chrono::system_clock::now();
@@ -59,9 +60,29 @@ double ms(Clock::duration time) { return std::chrono::duration<double, std::mill
 }  // namespace
 
 Log::Log(int fd, LogFormat format, Level min_level)
-    : format_(format), min_level_(min_level), writer_(fd, Writer::Owns::no, kMaxWaiting) {}
+    : format_(format), min_level_(min_level), writer_(fd, Writer::Owns::no, kMaxWaiting), allowance_(kBurst) {}
+
+/// Whoever is refused can ask again at once: its lines must not fill the disk.
+bool Log::may_tell() {
+  if (min_level_ == Level::debug) return true;
+  const Clock::time_point at = Clock::now();
+  allowance_ = std::min(kBurst, allowance_ + std::chrono::duration<double>(at - told_at_).count() * kPerSecond);
+  told_at_ = at;
+  if (allowance_ < 1) {
+    ++n_left_out_;
+    return false;
+  }
+  allowance_ -= 1;
+  try {
+    if (n_left_out_ > 0) event(Level::warn, "log_limited", {{"lines", n_left_out_}});
+    n_left_out_ = 0;
+  } catch (const std::exception&) {  // no memory: the next line tells it
+  }
+  return true;
+}
 
 Log::~Log() {
+  if (n_left_out_ > 0) event(Level::warn, "log_limited", {{"lines", n_left_out_}});
   if (writer_.n_dropped() > n_told_)
     writer_.set_tail(line(Level::warn, "log_dropped", {{"lines", writer_.n_dropped() - n_told_}}));
 }
@@ -90,7 +111,7 @@ void Log::event(Level level, const char* name, const Fields& fields) noexcept {
 
 void Log::answered(const Answered& answered) {
   const Level level = level_of(answered.error);
-  if (level < min_level_) return;
+  if (level < min_level_ || !may_tell()) return;
   const Received& request = answered.request;
   try {
     Fields fields = {{"client", request.client},
@@ -118,7 +139,7 @@ void Log::answered(const Answered& answered) {
 /// A peer without a key or without ZMTP is a warning; a peer that fell silent is normal.
 void Log::dropped(const Dropped& connection) {
   const Level level = connection.why == "silent" ? Level::info : Level::warn;
-  if (level < min_level_) return;
+  if (level < min_level_ || !may_tell()) return;
   try {
     event(level, "dropped",
           {{"client", connection.client},

@@ -35,17 +35,23 @@ class Log final : public Observer {
   /// From any thread.
   void event(Level level, const char* name, const Fields& fields) noexcept;
   /// A request: at level debug where it was answered as requested, info where the queue refused it, warn
-  /// where the request was wrong, error where the server failed.
+  /// where the request was wrong, error where the server failed. At levels above debug, clients and peers cause at
+  /// most 200 lines at once and 50 a second; a line `log_limited` counts the others.
   void answered(const Answered& answered) override;
   void dropped(const Dropped& connection) override;
 
  private:
+  bool may_tell();
   std::string line(Level level, const char* name, const Fields& fields) const;
 
   LogFormat format_;
   Level min_level_;
   Writer writer_;
   std::atomic<std::uint64_t> n_told_ = 0;  // of the lines that were dropped
+  // Of the I/O thread: lines about clients that may be written now, and those that were left out.
+  double allowance_;
+  std::uint64_t n_left_out_ = 0;
+  Clock::time_point told_at_ = Clock::now();
 };
 
 }  // namespace vla::serve

@@ -260,6 +260,22 @@ TEST_CASE("two hundred clients that drip their request keep no probe waiting") {
   for (const int fd : dripping) ::close(fd);
 }
 
+TEST_CASE("peers that are refused again and again cause a few hundred lines of the log, and a count of the others") {
+  Folder folder;
+  const auto fd = open_to_write(folder / "log", false);
+  REQUIRE(fd);
+  {
+    Log log(*fd, LogFormat::json, Level::info);
+    for (int i = 0; i < 2000; ++i) log.dropped({"1", "10.0.0.7", "", "handshake", "other bytes"});
+  }
+  ::close(*fd);
+  const std::string lines = content(folder / "log");
+  const auto n = std::count(lines.begin(), lines.end(), '\n');
+  CHECK(n >= 200);
+  CHECK(n < 600);
+  CHECK(lines.find("log_limited") != std::string::npos);
+}
+
 TEST_CASE("a trace ends at its limit, is valid JSON then too, and is not written through a symbolic link") {
   Folder folder;
   {
