@@ -32,7 +32,8 @@ struct Answer {
   std::optional<Error> error;
   Clock::time_point started, finished;
   Timing stages;
-  bool is_beyond = false;  // the state is beyond the bundle's bound
+  bool is_beyond = false;          // the state is beyond the bundle's bound
+  std::vector<std::string> notes;  // of the chunk
 };
 
 /// Where the I/O thread and those that compute meet: jobs one way, answers the other. None holds the lock for longer

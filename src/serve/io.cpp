@@ -206,7 +206,8 @@ void Io::deliver(Answer answer) {
                     std::move(answer.stages),
                     job.request(),
                     std::as_bytes(std::span(answer.response)),
-                    answer.is_beyond};
+                    answer.is_beyond,
+                    answer.notes};
   hub_.send(job.connection, answer.response, job.delimiter);
   if (answer.error) {
     ++vitals_.n_error;

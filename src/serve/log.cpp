@@ -13,6 +13,8 @@ namespace vla::serve {
 namespace {
 
 constexpr std::size_t kMaxWaiting = 1 << 20;
+constexpr auto kNoteAgain = std::chrono::minutes(1);
+constexpr std::size_t kMaxNoted = 1024;
 constexpr double kBurst = 200, kPerSecond = 50;  // lines about clients
 
 std::string now() {
@@ -109,7 +111,34 @@ void Log::event(Level level, const char* name, const Fields& fields) noexcept {
   }
 }
 
+/// Notes of a kind begin alike: the values that differ from act to act stand behind a colon or a bracket.
+bool Log::is_news(const std::string& client, const std::string& note) {
+  const Clock::time_point at = Clock::now();
+  if (noted_.size() >= kMaxNoted) noted_.clear();
+  const auto [told, is_new] = noted_.try_emplace(client + '\n' + note.substr(0, note.find_first_of(":[")), at);
+  if (!is_new && at - told->second < kNoteAgain) return false;
+  told->second = at;
+  return true;
+}
+
+void Log::tell_notes(const Answered& answered) {
+  const Received& request = answered.request;
+  try {
+    for (const std::string& note : answered.notes) {
+      if (!is_news(request.client, note) || !may_tell()) continue;
+      event(Level::warn, "note",
+            {{"client", request.client},
+             {"peer", request.peer},
+             {"name", request.name},
+             {"request_id", request.request_id},
+             {"note", note}});
+    }
+  } catch (const std::exception&) {  // as above
+  }
+}
+
 void Log::answered(const Answered& answered) {
+  if (min_level_ <= Level::warn) tell_notes(answered);
   const Level level = level_of(answered.error);
   if (level < min_level_ || !may_tell()) return;
   const Received& request = answered.request;

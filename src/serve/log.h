@@ -35,13 +35,16 @@ class Log final : public Observer {
   /// From any thread.
   void event(Level level, const char* name, const Fields& fields) noexcept;
   /// A request: at level debug where it was answered as requested, info where the queue refused it, warn
-  /// where the request was wrong, error where the server failed. At levels above debug, clients and peers cause at
+  /// where the request was wrong, error where the server failed. A chunk's notes are warnings, each told once a minute
+  /// for a client and what it is about. At levels above debug, clients and peers cause at
   /// most 200 lines at once and 50 a second; a line `log_limited` counts the others.
   void answered(const Answered& answered) override;
   void dropped(const Dropped& connection) override;
 
  private:
   bool may_tell();
+  void tell_notes(const Answered& answered);
+  bool is_news(const std::string& client, const std::string& note);
   std::string line(Level level, const char* name, const Fields& fields) const;
 
   LogFormat format_;
@@ -51,6 +54,7 @@ class Log final : public Observer {
   // Of the I/O thread: lines about clients that may be written now, and those that were left out.
   double allowance_;
   std::uint64_t n_left_out_ = 0;
+  std::map<std::string, Clock::time_point> noted_;  // by client and the beginning of the note, when it was told
   Clock::time_point told_at_ = Clock::now();
 };
 

@@ -50,6 +50,7 @@ struct Answered {
   Timing stages;                        // of the engine, "decode" first; empty where it never saw the request
   std::span<const std::byte> in, out;   // the serialized Request and Response, valid during the call only
   bool is_beyond = false;               // answered though the state is beyond the bundle's bound
+  std::span<const std::string> notes;   // of the chunk: warnings, valid during the call only
   const char* code() const { return error == nullptr ? "ok" : code_name(error->code); }
 };
 

@@ -195,7 +195,7 @@ Status Server::respond(Engine& engine, Act& act) const {
   VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
-  answer.is_beyond = chunk.is_beyond;
+  answer.is_beyond = chunk.is_beyond, answer.notes = chunk.notes;
   v1::Response response = response_to(answer.job.request_id);
   const std::string& embodiment = act.prepared.robot->bundle().embodiment();
   *response.mutable_chunk() = encode_chunk(act.request, std::move(chunk), description_of(description_, embodiment));

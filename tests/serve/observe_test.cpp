@@ -276,6 +276,31 @@ TEST_CASE("peers that are refused again and again cause a few hundred lines of t
   CHECK(lines.find("log_limited") != std::string::npos);
 }
 
+TEST_CASE("notes of chunks are warnings at the default level, once a minute for a client and what they are about") {
+  Folder folder;
+  const auto fd = open_to_write(folder / "log", false);
+  REQUIRE(fd);
+  {
+    Log log(*fd, LogFormat::json, Level::warn);
+    for (int i = 0; i < 100; ++i) {
+      const std::vector<std::string> notes = {"DEGRADED: gripper passes unnormalized",
+                                              "state[0] (\"x\"): " + std::to_string(1000 + i) + ", which is far"};
+      for (const char* client : {"1", "2"}) {
+        Received request;
+        request.client = client;
+        Answered answered{request, nullptr, {}, {}, {}, {}, {}, {}, true};
+        answered.notes = notes;
+        log.answered(answered);
+      }
+    }
+  }
+  ::close(*fd);
+  const std::string lines = content(folder / "log");
+  CHECK(std::count(lines.begin(), lines.end(), '\n') == 4);
+  CHECK(lines.find(R"("event":"note")") != std::string::npos);
+  CHECK(lines.find("DEGRADED") != std::string::npos);
+}
+
 TEST_CASE("a trace ends at its limit, is valid JSON then too, and is not written through a symbolic link") {
   Folder folder;
   {
