@@ -91,7 +91,7 @@ def _count(a: argparse.Namespace, policies: Any, driver: Any, task: str, sentenc
     low, high = (100 * x for x in row["all"]["wilson95"])
     t = data["latency"]["round_trip_ms"]
     what = f"solved the scene's task in {row['all']['solved']} of {row['all']['episodes']} layouts (95 % interval {low:.0f} to {high:.0f} %)"
-    console.print(f"{what}; a look takes {t['p50']:.0f} ms, p95 {t['p95']:.0f}", highlight=False, soft_wrap=True)
+    console.print(f"{what}; from frame to chunk, server included, {t['p50']:.0f} ms, p95 {t['p95']:.0f}", highlight=False, soft_wrap=True)
 
 
 class _Teller(Watcher):
