@@ -175,9 +175,10 @@ TEST_CASE("a full queue answers busy to a further client, and those that wait ar
   options.max_queue = 1;
   Held held(options);
   auto& [brake, running, a] = held;
-  Peer b(running.address()), c(running.address());
+  Peer b(running.address());
   b.send(act_request(golden(), 2));
   await_queue(b);
+  Peer c(running.address());  // connects later: an older connection of the same address would take the place
   CHECK(code_of(c.ask(act_request(golden(), 3))) == "BUSY");
   brake.let_go(2);
   CHECK(a.answer().has_chunk());
