@@ -12,8 +12,9 @@ namespace vla {
 /// Keys' cubic with a = -0.5, with weights of 22 binary digits, or of as many as 16 bits hold.
 enum class ByteFilter { pillow_bilinear, pillow_bicubic, torch_bicubic };
 
-/// An RGB image of interleaved bytes at another size, equal to the bit to Pillow's or to torchvision's resize of an
-/// 8-bit tensor (transforms.v2, torch 2.13). Rows are rounded to bytes before columns are summed. All sizes must be at
+/// An RGB image of interleaved bytes at another size, equal to the bit to Pillow 13.0's or to torchvision's resize of
+/// an 8-bit tensor (transforms.v2, torch 2.13). Rows are rounded to bytes before columns are summed, or the other way
+/// round where Pillow does so: if the image loses more than twice as many rows as columns. All sizes must be at
 /// least 1. Sources: Pillow src/libImaging/Resample.c; torch aten/src/ATen/native/cpu/UpSampleKernelAVXAntialias.h.
 std::vector<std::uint8_t> resample_8bit(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                         int to_height, ByteFilter filter = ByteFilter::pillow_bilinear);

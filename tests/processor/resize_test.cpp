@@ -67,6 +67,43 @@ TEST_CASE("an image of the size keeps its bytes under both filters") {
   CHECK(resample_torch(rgb, 5, 4, 5, 4) == rgb);
 }
 
+TEST_CASE("each combination of growing and shrinking has the bytes of Pillow 13.0") {
+  struct Case {
+    int width, height, to_width, to_height;
+    ByteFilter filter;
+    std::vector<std::uint8_t> expected;
+  };
+  // Of 6 x 9, four rows lost are no more than twice the two columns lost, seven are.
+  const Case cases[] = {
+      {3, 9, 4, 2, ByteFilter::pillow_bicubic, {25, 54,  83,  30, 59,  88,  38, 67,  96,  43,  72,  101,
+                                                78, 107, 136, 86, 115, 144, 98, 127, 156, 106, 135, 164}},
+      {6, 9, 4, 2, ByteFilter::pillow_bicubic, {28, 57,  86,  40,  69,  98,  55,  84,  113, 66,  95,  124,
+                                                83, 112, 141, 101, 130, 159, 111, 140, 169, 120, 149, 178}},
+      {6, 9, 4, 5, ByteFilter::pillow_bicubic, {8,   37,  66,  18,  47,  76,  30,  59,  88,  41,  70,  99,
+                                                31,  60,  89,  43,  72,  101, 58,  87,  116, 71,  100, 129,
+                                                55,  84,  113, 71,  100, 129, 88,  117, 146, 94,  123, 152,
+                                                80,  109, 138, 97,  126, 155, 106, 135, 164, 117, 146, 175,
+                                                102, 131, 160, 122, 151, 180, 131, 160, 189, 139, 168, 197}},
+      {6, 2, 3, 3, ByteFilter::pillow_bicubic, {3,  32, 61, 17, 46, 75, 30, 59, 88, 11, 40, 69, 26, 55,
+                                                84, 40, 69, 98, 18, 47, 76, 34, 63, 92, 50, 79, 108}},
+      {3, 2, 4, 3, ByteFilter::pillow_bicubic, {0,  28, 57, 3,  32, 61, 9,  38, 67, 13, 42, 71,
+                                                7,  36, 65, 11, 40, 69, 18, 47, 76, 22, 51, 80,
+                                                14, 43, 72, 18, 47, 76, 26, 55, 84, 30, 59, 88}},
+      {3, 9, 4, 2, ByteFilter::pillow_bilinear, {28, 57,  86,  34, 63,  92,  41, 70,  99,  47,  76,  105,
+                                                 76, 105, 134, 84, 113, 142, 93, 122, 151, 101, 130, 159}},
+      {6, 5, 4, 3, ByteFilter::pillow_bilinear, {9,  38, 67,  18, 47, 76,  30, 59,  88,  40, 69,  98,
+                                                 29, 58, 87,  42, 71, 100, 55, 84,  113, 68, 97,  126,
+                                                 50, 79, 108, 66, 95, 124, 80, 109, 138, 89, 118, 147}},
+  };
+  for (const Case& c : cases) {
+    CAPTURE(c.to_width);
+    CAPTURE(c.to_height);
+    const Frame frame = frame_of(c.width, c.height);
+    const auto& rgb = std::get<std::vector<std::uint8_t>>(frame.rgb);
+    CHECK(resample_8bit(rgb, c.width, c.height, c.to_width, c.to_height, c.filter) == c.expected);
+  }
+}
+
 TEST_CASE("standardize equals torch on every byte in each arithmetic") {
   const std::string file = read_text(data_path("standardize.npy"));
   const auto expected = parse_npy(bytes_of(file), "standardize.npy");
