@@ -30,8 +30,9 @@ struct ImageLimits {
 /// The pixels are those of Pillow after `exif_transpose` and `convert("RGB")`, as LeRobot's data sets are decoded: grey
 /// is replicated, palettes are expanded, transparency is dropped without blending, EXIF or XMP orientation is applied,
 /// colour profiles and gamma are ignored. Refused: 16-bit PNG and CMYK JPEG (Pillow's conversions of them lose or
-/// invert values), anything truncated or corrupt, also where Pillow or libjpeg would go on with a warning, and float
-/// values outside [0, 1]. `where` names the image in errors. Errors: bad_observation.
+/// invert values), JPEG in arithmetic code or of too many scans for its size, anything truncated or corrupt, also where
+/// Pillow or libjpeg would go on with a warning, and float values outside [0, 1]. `where` names the image in errors.
+/// Errors: bad_observation.
 Result<Frame> decode_image(std::span<const std::byte> file, const std::string& where, const ImageLimits& limits = {});
 
 /// What `decode_image` guarantees, for frames that come from elsewhere: a size within the limits, as many numbers as

@@ -1,5 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
+#include <fmt/format.h>
+
+#include <algorithm>
 #include <csetjmp>
 #include <cstdio>  // jpeglib.h needs FILE
 #include <cstring>
@@ -13,14 +16,15 @@
 namespace vla::codecs {
 namespace {
 
-constexpr int kMaxScans = 200;  // of a progressive file; more is an attack on the decoder's time
+/// Every scan passes over all pixels, and a scan may take no more than a few bytes of the file: what bounds the time is
+/// the product. It leaves ten scans, which is what progressive files have, to an image of 26 million pixels.
+constexpr std::int64_t kMaxScans = 200, kMaxScanPixels = std::int64_t{1} << 28;
 
 /// libjpeg reports errors through a function that must not return; it jumps, which destroys nothing. So everything that
 /// owns memory lives here, outside the functions that a jump leaves, and those (`guarded_*`) hold only plain values.
 struct JpegReader {
   jpeg_decompress_struct jpeg{};
   jpeg_error_mgr errors{};
-  jpeg_progress_mgr progress{};
   std::jmp_buf jump{};
   char message[JMSG_LENGTH_MAX] = {};
   std::vector<std::uint8_t> pixels;
@@ -42,13 +46,6 @@ void on_message(j_common_ptr jpeg, int level) {
   if (level < 0) fail(jpeg);
 }
 
-void on_progress(j_common_ptr jpeg) {
-  auto* reader = static_cast<JpegReader*>(jpeg->client_data);
-  if (reader->jpeg.input_scan_number <= kMaxScans) return;
-  std::strncpy(reader->message, "too many scans", sizeof reader->message - 1);
-  std::longjmp(reader->jump, 1);
-}
-
 bool guarded_header(JpegReader& reader, Bytes file) {
   reader.jpeg.err = jpeg_std_error(&reader.errors);
   reader.errors.error_exit = fail;
@@ -56,11 +53,47 @@ bool guarded_header(JpegReader& reader, Bytes file) {
   reader.jpeg.client_data = &reader;
   if (setjmp(reader.jump) != 0) return false;
   jpeg_create_decompress(&reader.jpeg);
-  reader.progress.progress_monitor = on_progress;
-  reader.jpeg.progress = &reader.progress;
   jpeg_mem_src(&reader.jpeg, reinterpret_cast<const unsigned char*>(file.data()), file.size());
   jpeg_save_markers(&reader.jpeg, JPEG_APP0 + 1, 0xFFFF);
   jpeg_read_header(&reader.jpeg, TRUE);
+  return true;
+}
+
+/// How many scans the file has, by its markers.
+std::int64_t count_scans(Bytes file) {
+  constexpr unsigned kEnd = 0xD9, kScan = 0xDA;
+  const auto byte = [&](std::size_t at) { return std::to_integer<unsigned>(file[at]); };
+  std::int64_t n_scan = 0;
+  for (std::size_t at = 2; at + 1 < file.size();) {
+    const unsigned marker = byte(at + 1);
+    if (byte(at) != 0xFF || marker == 0xFF) {
+      ++at;
+      continue;
+    }
+    if (marker == kEnd) break;
+    n_scan += marker == kScan ? 1 : 0;
+    const bool is_bare = marker <= 1 || (marker >= 0xD0 && marker <= 0xD8);  // a byte of a scan, a restart or a start
+    at += 2;
+    if (!is_bare && at + 1 < file.size()) at += std::max<std::size_t>(byte(at) << 8 | byte(at + 1), 2);
+  }
+  return n_scan;
+}
+
+Status check_scans(Bytes file, std::int64_t width, std::int64_t height, const std::string& where) {
+  const std::int64_t n_scan = count_scans(file);
+  const std::int64_t most = std::clamp<std::int64_t>(kMaxScanPixels / (width * height), 1, kMaxScans);
+  if (n_scan <= most) return {};
+  return refused(where, fmt::format("at most {} scans in a JPEG of {} x {}", most, width, height),
+                 fmt::format("{} scans", n_scan), "save it as a baseline JPEG");
+}
+
+/// libjpeg makes up grey for what no scan brings, without a word.
+bool is_whole(const jpeg_decompress_struct& jpeg) {
+  for (int c = 0; c < jpeg.num_components; ++c) {
+    if (jpeg.comp_info[c].quant_table == nullptr) return false;  // of a component that no scan has
+    const int* const missing_bits = jpeg.coef_bits != nullptr ? jpeg.coef_bits[c] : nullptr;
+    if (missing_bits != nullptr && std::count(missing_bits, missing_bits + DCTSIZE2, 0) != DCTSIZE2) return false;
+  }
   return true;
 }
 
@@ -68,6 +101,10 @@ bool guarded_pixels(JpegReader& reader) {
   if (setjmp(reader.jump) != 0) return false;
   reader.jpeg.out_color_space = JCS_RGB;
   jpeg_start_decompress(&reader.jpeg);
+  if (!is_whole(reader.jpeg)) {
+    std::strncpy(reader.message, "one without all of its scans", sizeof reader.message - 1);
+    return false;
+  }
   const std::size_t row_size = static_cast<std::size_t>(reader.jpeg.output_width) * 3;
   while (reader.jpeg.output_scanline < reader.jpeg.output_height) {
     JSAMPROW row = reader.pixels.data() + reader.jpeg.output_scanline * row_size;
@@ -116,6 +153,9 @@ Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimit
   if (reader.jpeg.num_components != 1 && reader.jpeg.num_components != 3)
     return refused(where, "a grey or RGB JPEG",
                    reader.jpeg.num_components == 4 ? "a CMYK one" : "another number of channels", "convert it to RGB");
+  // Of an arithmetic code missing data cannot be told from zeros, and no camera writes it.
+  if (reader.jpeg.arith_code) return refused(where, "a JPEG in Huffman code", "arithmetic code", "save it anew");
+  VLA_CHECK(check_scans(file, width, height, where));
   Image image{static_cast<int>(width), static_cast<int>(height), {}, {}, {}};
   read_metadata(reader, image);  // now, because finishing frees the markers
   reader.pixels.resize(static_cast<std::size_t>(width * height) * 3);

@@ -99,6 +99,29 @@ std::string jpeg_of_scans(int n_bit) {
   return file;
 }
 
+std::string jpeg_segment(int marker, const std::string& content) {
+  const std::string size = big_endian(content.size() + 2).substr(2);
+  return std::string("\xFF") + static_cast<char>(marker) + size + content;
+}
+
+/// Everything of a JPEG up to its first scan. Both of its codes have one word, a zero bit, for a block without
+/// anything.
+std::string jpeg_start(int kind, std::size_t width, std::size_t height, int n_component) {
+  const std::string lengths = '\1' + std::string(15, '\0'), zero(1, '\0');
+  std::string frame =
+      '\x8' + big_endian(height).substr(2) + big_endian(width).substr(2) + static_cast<char>(n_component);
+  for (int i = 1; i <= n_component; ++i) frame += static_cast<char>(i) + std::string("\x11\0", 2);
+  return "\xFF\xD8" + jpeg_segment(0xDB, zero + std::string(64, '\1')) + jpeg_segment(kind, frame) +
+         jpeg_segment(0xC4, zero + lengths + zero) + jpeg_segment(0xC4, '\x10' + lengths + zero);
+}
+
+/// The header of a scan of one component: coefficients `first` to `last` without their lowest `bits`.
+std::string jpeg_scan(int component, int first, int last, int bits) {
+  std::string content = {1, static_cast<char>(component), 0};
+  for (const int number : {first, last, bits}) content += static_cast<char>(number);
+  return jpeg_segment(0xDA, content);
+}
+
 /// The most memory that this process has had, in bytes.
 std::size_t peak_memory() {
   rusage usage = {};
@@ -219,13 +242,49 @@ TEST_CASE("truncated and damaged images are refused") {
   CHECK(contains(refusal_of("bad_exif.jpg"), "EXIF"));
 }
 
-TEST_CASE("a JPEG of more than 200 scans is refused when it has come so far") {
+TEST_CASE("a JPEG of more than 200 scans is refused") {
   const std::string many = jpeg_of_scans(3), most = jpeg_of_scans(2);  // 253 and 190
   const auto frame = decode_image(bytes_of(most), "top");
   REQUIRE_MESSAGE(frame.ok(), frame.error().message());
   const auto refused = decode_image(bytes_of(many), "top");
   REQUIRE_FALSE(refused.ok());
-  CHECK(contains(refused.error().message(), "too many scans"));
+  CHECK(contains(refused.error().message(), "expected at most 200 scans in a JPEG of 8 x 8, found 253 scans"));
+}
+
+TEST_CASE("scans times pixels are bounded before a JPEG is decoded") {
+  const std::string scan = jpeg_scan(1, 1, 63, 0);
+  const std::string file = jpeg_start(0xC2, 4096, 4096, 1) + jpeg_scan(1, 0, 0, 0) + repeated(scan, 16) + "\xFF\xD9";
+  const auto refused = decode_image(bytes_of(file), "top");
+  CHECK(contains(refusal(refused, Code::bad_observation),
+                 "top: expected at most 16 scans in a JPEG of 4096 x 4096, found 17 scans"));
+}
+
+TEST_CASE("a JPEG in arithmetic code is refused") {
+  for (const int kind : {0xC9, 0xCA}) {
+    const bool progressive = kind == 0xCA;
+    const std::string file = jpeg_start(kind, 8, 8, 1) + jpeg_scan(1, 0, progressive ? 0 : 63, 0) + "\xFF\xD9";
+    CHECK(contains(refusal(decode_image(bytes_of(file), "top"), Code::bad_observation),
+                   "top: expected a JPEG in Huffman code, found arithmetic code"));
+  }
+}
+
+TEST_CASE("a JPEG without all of its scans is damaged") {
+  const std::string end = "\xFF\xD9", zeros(1, '\0');
+  const std::string colour = jpeg_start(0xC0, 8, 8, 3), grey = jpeg_start(0xC2, 8, 8, 1);
+  const auto sequential = [&](int component) { return jpeg_scan(component, 0, 63, 0) + zeros; };
+  const auto first = [&](int bits) { return jpeg_scan(1, 0, 0, bits) + zeros; };
+  const auto rest = [&](int bits) { return jpeg_scan(1, 1, 63, bits) + zeros; };
+  for (const std::string& whole : {colour + sequential(1) + sequential(2) + sequential(3), grey + first(0) + rest(0)}) {
+    const std::string file = whole + end;
+    const auto frame = decode_image(bytes_of(file), "top");
+    REQUIRE_MESSAGE(frame.ok(), frame.error().message());
+  }
+  for (const std::string& part : {colour + sequential(1) + sequential(2), grey + first(0), grey + first(0) + rest(1),
+                                  grey + first(1) + rest(0)}) {
+    const std::string file = part + end;
+    CHECK(contains(refusal(decode_image(bytes_of(file), "top"), Code::bad_observation),
+                   "top: expected a whole JPEG image, found one without all of its scans"));
+  }
 }
 
 TEST_CASE("an image that is cut anywhere is refused") {
