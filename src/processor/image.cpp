@@ -5,6 +5,8 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
+
 #include "base/npy.h"
 #include "processor/image_codecs.h"
 
@@ -15,12 +17,18 @@ Error refused(const std::string& where, std::string expected, std::string found,
   return {Code::bad_observation, where, std::move(expected), std::move(found), std::move(hint)};
 }
 
+constexpr std::int64_t kMaxSide = 1 << 15;
+
 Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits) {
   const std::string found = fmt::format("{} x {}", width, height);
   if (width < 1 || height < 1) return refused(where, "an image with at least one pixel", found);
   // Divided, because the product of two hostile numbers may not fit.
   if (width > limits.max_pixels / height)
     return Error{limits.over, where, fmt::format("at most {} pixels", limits.max_pixels), found,
+                 "scale the image down"};
+  // A row costs time of its own, however short it is, and padding makes a square of a line.
+  if (std::max(width, height) > kMaxSide)
+    return Error{limits.over, where, fmt::format("sides of at most {} pixels", kMaxSide), found,
                  "scale the image down"};
   return {};
 }

@@ -282,6 +282,26 @@ TEST_CASE("bicubic resizes of bytes are those of Pillow and of torchvision, whos
   CHECK(resample_8bit(colours(), 6, 4, 3, 5, ByteFilter::torch_bicubic) == expected);
 }
 
+TEST_CASE("a sliver of an image is refused before it is padded or scaled") {
+  Json recipe = Json::parse(kRecipe);
+  const auto apply = [&](int width, int height) {
+    const auto parsed = parse_recipe(recipe.dump());
+    REQUIRE(parsed.ok());
+    std::vector<float> out(12);
+    const Frame frame{width, height, std::vector<std::uint8_t>(static_cast<std::size_t>(width) * height * 3)};
+    return parsed->fit->apply(frame, out, "view");
+  };
+  CHECK(contains(refusal(apply(1, 8000), Code::bad_observation),
+                 "view: expected an image that padding and scaling make no larger than 1048576 pixels, found 1 x 8000, "
+                 "which becomes 8000 x 8000"));
+  refusal(apply(2048, 511), Code::bad_observation);
+  CHECK(apply(2048, 512).ok());
+  CHECK(apply(1, 1024).ok());
+  recipe["image"].erase(0);
+  recipe["image"][0]["size"] = 256;
+  CHECK(contains(refusal(apply(1, 8000), Code::bad_observation), "which becomes 256 x 2048000"));
+}
+
 TEST_CASE("a frame of another camera than the policy was trained with is refused, and a crop takes the middle") {
   const Json crop = {{"op", "center_crop"}, {"width", 3}, {"height", 1}};
   Json recipe = Json::parse(kRecipe);

@@ -185,12 +185,12 @@ TEST_CASE("a damaged text is passed over") {
 }
 
 TEST_CASE("a PNG of many short rows takes no memory beside its pixels") {
-  constexpr std::size_t kHeight = 4 << 20;
-  const std::string file = grey_png(1, kHeight, kHeight);
+  constexpr std::size_t kWidth = 128, kHeight = 1 << 15;
+  const std::string file = grey_png(kWidth, kHeight, kHeight);
   const std::size_t before = peak_memory();
   const auto frame = decode_image(bytes_of(file), "top");
   REQUIRE_MESSAGE(frame.ok(), frame.error().message());
-  CHECK(peak_memory() - before < 2 * 3 * kHeight);
+  CHECK(peak_memory() - before < 2 * 3 * kWidth * kHeight);
 }
 
 TEST_CASE("a PNG that announces 64 million pixels and brings one row takes memory for one row") {
@@ -300,6 +300,17 @@ TEST_CASE("an image that is cut anywhere is refused") {
 TEST_CASE("a 20000 x 20000 image is refused by its header") {
   CHECK(contains(refusal_of("bad_huge.png"), "at most 64000000 pixels, found 20000 x 20000"));
   CHECK(contains(refusal_of("bad_huge.jpg"), "at most 64000000 pixels, found 20000 x 20000"));
+}
+
+TEST_CASE("an image with a side of more than 32768 pixels is refused by its header") {
+  for (const auto& [width, height] : {std::pair{std::size_t{1}, std::size_t{1} << 24}, {32769, 1}}) {
+    const std::string file = grey_png(width, height, 1);
+    CHECK(contains(refusal(decode_image(bytes_of(file), "top"), Code::bad_observation),
+                   "top: expected sides of at most 32768 pixels, found "));
+  }
+  const std::string longest = grey_png(32768, 1, 1);
+  CHECK(decode_image(bytes_of(longest), "top").ok());
+  refusal(check_frame({1, 32769, std::vector<std::uint8_t>(3 * 32769)}, "f"), Code::bad_observation);
 }
 
 TEST_CASE("the pixel limit is inclusive and holds for every format") {

@@ -85,6 +85,15 @@ Image centred(const Image& from, int width, int height) {
   return to;
 }
 
+/// Ops that make of a frame an image whose size the recipe does not state.
+bool follows_frame(const ByteOp& op) {
+  return std::holds_alternative<SquarePad>(op) || std::holds_alternative<SmallestSide>(op);
+}
+
+/// What such ops may make of a frame: four times its pixels, which leaves room for sides of 4 to 1, so that an act
+/// costs no more than the pixels that were admitted; of a small frame more.
+double most_pixels_grown(const Frame& frame) { return std::max(4.0 * frame.width * frame.height, 1024.0 * 1024.0); }
+
 Image applied(const ByteOp& op, const Image& from, int width, int height) {
   if (std::holds_alternative<SmallestSide>(op))
     return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
@@ -112,13 +121,21 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
                    "this policy takes the images of the cameras that it was trained with"};
   }
   // All sizes come before any image, so that none is made which nothing needs or no memory holds.
+  const double most_grown = most_pixels_grown(frame);
   std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
   bool fits = true;
   for (const ByteOp& op : pipeline.ops) {
     if (const auto* crop = std::get_if<CenterCrop>(&op))
       fits &= crop->width <= sizes.back().width && crop->height <= sizes.back().height;
     sizes.push_back(std::visit([&](const auto& o) { return size_after(o, sizes.back()); }, op));
-    fits &= sizes.back().width * sizes.back().height <= static_cast<double>(ImageLimits().max_pixels);
+    const double n_pixel = sizes.back().width * sizes.back().height;
+    if (follows_frame(op) && n_pixel > most_grown)
+      return Error{Code::bad_observation, where,
+                   fmt::format("an image that padding and scaling make no larger than {} pixels", most_grown),
+                   fmt::format("{} x {}, which becomes {} x {}", frame.width, frame.height, sizes.back().width,
+                               sizes.back().height),
+                   "send whole camera images, whose sides are more alike"};
+    fits &= n_pixel <= static_cast<double>(ImageLimits().max_pixels);
   }
   if (!fits || sizes.back() != Size{static_cast<double>(pipeline.width), static_cast<double>(pipeline.height)})
     return Error{Code::bad_observation, where,
