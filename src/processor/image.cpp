@@ -17,7 +17,7 @@ Error refused(const std::string& where, std::string expected, std::string found,
   return {Code::bad_observation, where, std::move(expected), std::move(found), std::move(hint)};
 }
 
-constexpr std::int64_t kMaxSide = 1 << 15;
+constexpr std::int64_t kMaxSide = 1 << 14;
 
 Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits) {
   const std::string found = fmt::format("{} x {}", width, height);
