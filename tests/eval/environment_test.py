@@ -91,6 +91,19 @@ def test_libero_names_its_suites_and_says_what_is_missing(monkeypatch, tmp_path)
         make("libero", "libero_goal/0")
 
 
+def test_libero_refuses_another_mujoco_and_says_why(monkeypatch, tmp_path):
+    from vla_cpp.eval.environments import libero
+
+    (tmp_path / "config.yaml").write_text("")
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    for found in ("3.3.0", "3.4.0", "3.8.1"):
+        monkeypatch.setattr(libero.metadata, "version", lambda _, found=found: found)
+        with pytest.raises(MissingSimulator, match=f"mujoco: expected 3.3.2, found {found}; .*boxes collide differently"):
+            make("libero", "libero_goal/0")
+    monkeypatch.setattr(libero.metadata, "version", lambda _: "3.3.2")
+    libero.check_mujoco()
+
+
 def test_libero_turns_a_quaternion_into_a_rotation_vector():
     from vla_cpp.eval.environments.libero import rotation_vector
 

@@ -12,6 +12,7 @@ Source: LeRobot envs/libero.py, openpi examples/libero/main.py.
 from __future__ import annotations
 
 import os
+from importlib import metadata
 from pathlib import Path
 from typing import List
 
@@ -23,6 +24,7 @@ from . import MissingSimulator
 SUITES = {"libero_spatial": (10, 280), "libero_object": (10, 280), "libero_goal": (10, 300), "libero_10": (10, 520)}
 SIZE = 256  # pixels, both ways
 SETTLE = 10  # steps in which objects fall into place before an episode begins
+MUJOCO = "3.3.2"
 VIEWS = {"image": "agentview_image", "image2": "robot0_eye_in_hand_image"}
 
 
@@ -31,6 +33,19 @@ def rotation_vector(quaternion: np.ndarray) -> np.ndarray:
     w = float(np.clip(quaternion[3], -1.0, 1.0))
     sine = float(np.sqrt(1.0 - w * w))
     return np.zeros(3) if np.isclose(sine, 0.0) else quaternion[:3] * (2.0 * np.arccos(w) / sine)
+
+
+def check_mujoco() -> None:
+    """Errors: MissingSimulator where MuJoCo is another version, because success rates would then not compare with published ones."""
+    try:
+        found = metadata.version("mujoco")
+    except metadata.PackageNotFoundError:
+        found = "none"
+    if found != MUJOCO:
+        raise MissingSimulator(
+            f"LIBERO: mujoco: expected {MUJOCO}, found {found}; from 3.4.0 on boxes collide differently, which changes success rates "
+            f"without an error: pip install mujoco=={MUJOCO}"
+        )
 
 
 class Libero(Environment):
@@ -66,6 +81,7 @@ class Libero(Environment):
                 f"LIBERO is not set up: {folder / 'config.yaml'} is missing. Run `pip install hf-libero`, then `python -c 'import libero.libero'` "
                 "once, and answer its question"
             )
+        check_mujoco()
         try:
             from libero.libero import benchmark
             from libero.libero.envs import OffScreenRenderEnv
