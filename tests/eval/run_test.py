@@ -213,3 +213,17 @@ def test_a_package_that_is_missing_is_named_with_what_installs_it():
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     result = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
     assert result.returncode == 9 and result.stderr == "vla-eval: the module rich is missing; at the root of vla.cpp: pip install './python[eval]'\n"
+
+
+def test_random_actions_are_as_wide_as_the_environment_says():
+    import argparse
+
+    import numpy as np
+    from vla_cpp.eval import run
+    from vla_cpp.eval.policies import make_policy
+
+    driver = run.Policies(argparse.Namespace()).named("random")
+    run.size_random([driver, None], 7)
+    policy = make_policy(driver.description)
+    noise = np.zeros(policy.noise_shape, np.float32)
+    assert policy.act(None, "", noise).actions.shape == (16, 7)

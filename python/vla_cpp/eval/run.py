@@ -72,7 +72,7 @@ class Policies(contextlib.ExitStack):
     def named(self, text: str) -> Driver:
         """bundle FILE, tcp://ADDRESS, torch:DIR, or random."""
         if text == "random":
-            return Driver({"kind": "random", "horizon": 16, "d_action": 4}, "random actions", "random")
+            return Driver({"kind": "random", "horizon": 16}, "random actions", "random")
         if text.startswith("torch:"):
             return self.torch(text[len("torch:") :])
         return self.served(text) if "://" in text else self.bundle(text)
@@ -106,6 +106,7 @@ def run(
     """Runs the jobs that are not on disk yet and returns the summary of all. Errors: RunFailed, JournalMismatch."""
     options = options_of(find(name), a.spec)
     declaration = declaration_of(name, jobs[0].task, options)
+    size_random([a, b], declaration["d_action"])
     replan_every = replan_every or declaration["replan_every"]
     head = {
         "environment": name, "a": a.label, "a_identity": a.identity, "b": b.label if b else "", "b_identity": b.identity if b else "",
@@ -124,6 +125,13 @@ def run(
     # In the order of the jobs, not in that in which workers finished them: a table must not depend on who was faster.
     finished = {row.key: row for row in journal.outcomes}
     return report.summary([finished[job.key] for job in jobs], head)
+
+
+def size_random(drivers: List[Optional[Driver]], d_action: int) -> None:
+    """Random actions have no policy that says how wide they are: the environment does."""
+    for driver in drivers:
+        if driver and driver.description["kind"] == "random":
+            driver.description["d_action"] = d_action
 
 
 def declaration_of(name: str, task: str, options: Dict[str, Any]) -> Dict[str, Any]:
