@@ -34,3 +34,13 @@ def test_latency_is_told_where_something_was_inferred_and_only_there():
 def test_looks_are_counted_from_one_and_only_episodes_that_got_so_far_count():
     table = report.differences([outcome(difference=[1.0, 4.0]), outcome(difference=[3.0], seed=2)])
     assert [(row["look"], row["chunks"], row["max"]) for row in table] == [(1, 2, 3.0), (2, 1, 4.0)]
+
+
+def test_smoothness_is_a_table_of_both_policies_where_it_was_measured():
+    rows = [outcome(), outcome(driver="b")]
+    rows[0].smoothness, rows[1].smoothness = {"jerk": 0.25}, {"jerk": 0.5, "gripper_flips": 2.0}
+    data = report.summary(rows, {**HEAD, "b": "B"})
+    assert data["smoothness"] == {"jerk": 0.25} and data["smoothness_b"]["gripper_flips"] == 2
+    text = report.markdown(data)
+    assert "| executed actions | jerk | gripper flips |" in text and "| A | 0.25 |  |" in text and "| B | 0.5 | 2 |" in text
+    assert "executed actions" not in report.markdown(report.summary([outcome()], HEAD))

@@ -91,12 +91,17 @@ def run_delayed(guard: Guard, policy: EvalPolicy, job: Job, replan_every: int, m
             out.solved, out.steps = guard.step(action), out.steps + 1
 
     loop.begin(observe)
+    chunk = None  # that the last action came from
     while out.steps < declaration.limit and not out.solved:
         missed = loop.stats["missed"]
         action = loop.step(observe)
         for _ in range(loop.stats["missed"] - missed):  # the robot stood while `step` waited
             execute(np.zeros(declaration.d_action, np.float32))
+        if action.chunk is not None and action.chunk is not chunk:
+            chunk = action.chunk
+            guard.begin_chunk()
         execute(action.values)
         loop.pace()
-    out.clipped, out.facts = guard.clipped, {**facts_of(guard), "held": float(loop.stats["held"])}
+    out.clipped, out.smoothness = guard.clipped, guard.smoothness()
+    out.facts = {**facts_of(guard), "held": float(loop.stats["held"])}
     return out

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Dict, List, Mapping, Tuple
+from typing import Any, Dict, List, Mapping, Optional, Tuple
 
 import numpy as np
+
+from .smoothness import smoothness
 
 
 class EnvironmentFault(Exception):
@@ -26,6 +28,7 @@ class Declaration:
     limit        steps after which an episode has failed
     replan_every steps executed of a chunk before the next look, unless the caller says otherwise
     conventions  text for people: turned images, frames of reference, units
+    gripper      the column of an action that commands the gripper, if one does
     """
 
     views: Mapping[str, Tuple[int, int]]
@@ -37,6 +40,7 @@ class Declaration:
     limit: int
     replan_every: int
     conventions: str
+    gripper: Optional[int] = None
 
 
 @dataclass
@@ -90,11 +94,20 @@ class Guard:
     def __init__(self, environment: Environment) -> None:
         self.inner, self.declaration = environment, environment.declaration
         self.label = f"environment {environment.name}, task {environment.task}"
-        self.clipped = self.executed = 0
+        self.clipped, self.executed, self.borders = 0, [], []
 
     def reset(self, seed: int) -> None:
         self.inner.reset(seed)
-        self.clipped = self.executed = 0
+        self.clipped, self.executed, self.borders = 0, [], []
+
+    def begin_chunk(self) -> None:
+        """The next action is the first of another chunk."""
+        self.borders.append(len(self.executed))
+
+    def smoothness(self) -> Dict[str, float]:
+        """Of the actions since `reset`."""
+        actions = np.reshape(self.executed, (len(self.executed), self.declaration.d_action))
+        return smoothness(actions, self.borders, self.declaration.gripper)
 
     def instruction(self) -> str:
         text = self.inner.instruction()
@@ -118,7 +131,7 @@ class Guard:
     def step(self, action: np.ndarray) -> bool:
         low, high = self.declaration.low, self.declaration.high
         within = np.clip(action, low, high).astype(np.float32)
-        self.executed += 1
+        self.executed.append(within)
         self.clipped += bool((within != action).any())
         solved = self.inner.step(within)
         if not isinstance(solved, (bool, np.bool_)):

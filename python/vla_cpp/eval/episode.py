@@ -70,6 +70,7 @@ class Outcome:
     difference: List[float] = field(default_factory=list)  # largest of each chunk to the shadow's, in action units
     bundle: str = ""
     facts: Dict[str, float] = field(default_factory=dict)
+    smoothness: Dict[str, float] = field(default_factory=dict)  # of the executed actions
 
     @property
     def key(self) -> str:
@@ -102,13 +103,14 @@ def run_episode(
             other = shadow.act(look.observation, text, noise).actions
             out.difference.append(float(np.abs(other - look.answer.actions).max()))
         watcher.on_look(look)
+        guard.begin_chunk()
         for action in look.answer.actions[:replan_every]:
             watcher.on_step(out.steps)
             out.solved, out.steps = guard.step(action), out.steps + 1
             look.executed += 1
             if out.solved or out.steps == guard.declaration.limit:
                 break
-    out.clipped = guard.clipped
+    out.clipped, out.smoothness = guard.clipped, guard.smoothness()
     out.facts = facts_of(guard)
     return out
 

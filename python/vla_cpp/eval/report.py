@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import Any, Dict, List, Sequence
 
 from .episode import Outcome
+from .smoothness import mean_of
 from .statistics import paired, quantile, wilson
 
 
@@ -84,6 +85,10 @@ def summary(rows: Sequence[Outcome], head: Dict[str, Any]) -> Dict[str, Any]:
         out.update({key + suffix: by_task(part) for key, part in (("success", own), ("swapped", swapped)) if part})
     out["latency"] = latency(of["a"], head["rate_hz"])
     out["clipped_share"] = sum(row.clipped for row in of["a"]) / max(1, sum(row.steps for row in of["a"]))
+    for driver, suffix in (("a", ""), ("b", "_b")):
+        measured = [row.smoothness for row in of[driver] if row.smoothness]
+        if measured:
+            out["smoothness" + suffix] = mean_of(measured)
     if of["b"]:
         out["paired"] = pairs(rows)
     if any(row.difference for row in rows):
@@ -107,6 +112,8 @@ def markdown(data: Dict[str, Any]) -> str:
         lines += _paired_text(data["paired"], head)
     if "differences" in data:
         lines += ["Largest difference of two chunks from the same observation and noise, by look:", "", *_difference_table(data), ""]
+    if "smoothness" in data:
+        lines += [*_smoothness_table(data, head), ""]
     lines += [*_latency_text(data["latency"], head), ""]
     return "\n".join(lines)
 
@@ -132,6 +139,16 @@ def _paired_text(table: Dict[str, Any], head: Dict[str, Any]) -> List[str]:
         who = "A" if row["a"] else "B"
         lines.append(f"- only {who} solved {row['task']}, seed {row['seed']} (A {row['a_steps']} steps, B {row['b_steps']})")
     return lines + ([""] if table["discordant"] else [])
+
+
+def _smoothness_table(data: Dict[str, Any], head: Dict[str, Any]) -> List[str]:
+    """Means over episodes, in action units and steps."""
+    names = dict.fromkeys([*data["smoothness"], *data.get("smoothness_b", {})])
+    lines = [f"| executed actions | {' | '.join(name.replace('_', ' ') for name in names)} |", "|---|" + "---:|" * len(names)]
+    for key, policy in (("smoothness", head["a"]), ("smoothness_b", head["b"])):
+        if key in data:
+            lines.append(f"| {policy} | " + " | ".join(f"{data[key][n]:.3g}" if n in data[key] else "" for n in names) + " |")
+    return lines
 
 
 def _difference_table(data: Dict[str, Any]) -> List[str]:

@@ -69,6 +69,7 @@ class Libero(Environment):
             limit=SUITES[suite][1],
             replan_every=8,
             conventions="both frames are turned by 180 degrees; state: position (m), rotation vector (rad), two gripper joints",
+            gripper=6,
         )
 
     @staticmethod

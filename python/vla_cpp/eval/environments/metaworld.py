@@ -73,6 +73,7 @@ class MetaWorld(Environment):
         replan_every=8,
         conventions="corner4 hangs upside down: frames are turned by 180 degrees. Goal marks are hidden. State: hand x, y, z in "
         "metres, gripper opening. Action: dx, dy, dz in hundredths of a metre per step, gripper effort.",
+        gripper=3,
     )
 
     def __init__(self, task: str) -> None:
