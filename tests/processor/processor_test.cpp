@@ -171,7 +171,10 @@ TEST_CASE("states that are missing, unknown, of another width or not finite are 
 
 TEST_CASE("a state that overflows when normalized is refused") {
   EditableBundle bundle = sample();
-  bundle.tensor("stats.observation.state.mean").data = std::string("\xff\xff\x7f\xff\0\0\0\0", 8);  // -max of float32
+  bundle.tensor("stats.observation.state.std").data = std::string(8, '\0');
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["state"][0]["eps"] = 1e-30;
+  bundle.set("processor.recipe", recipe.dump());
   Observation bad = observation();
   bad.states["state"] = {3e38f, 0.0f};
   CHECK(contains(refusal(make(bundle).encode(bad), Code::bad_observation), "state[0]"));
@@ -302,8 +305,21 @@ TEST_CASE("statistics that are missing, not finite or of another length are refu
   bundle = sample();
   bundle.tensor("stats.action.std").data = std::string("\0\0\xc0\x7f\0\0\0\0", 8);
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "finite numbers"));
+  for (const auto& [name, value] : {std::pair("std", -1.0f), std::pair("std", 1e38f), std::pair("mean", -1e38f)}) {
+    bundle = sample();
+    std::memcpy(bundle.tensor(std::string("stats.action.") + name).data.data(), &value, sizeof(value));
+    CHECK(contains(refusal(create(bundle), Code::bad_bundle), std::string("stats.action.") + name + "[0]: expected"));
+  }
   CHECK(contains(refused_recipe("/action/0/size", 1), "stats.action.mean: expected 1 numbers"));
   CHECK(contains(refused_recipe("/state/0/kind", "quantiles"), "stats.observation.state.q01"));
+}
+
+TEST_CASE("a column that is unnormalized twice is refused") {
+  EditableBundle bundle = sample();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["action"].push_back(recipe["action"][1]);
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.action[2]"));
 }
 
 TEST_CASE("a spread of zero without eps is refused where it would divide") {

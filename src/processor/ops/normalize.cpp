@@ -8,6 +8,7 @@
 #include <cmath>
 #include <numeric>
 #include <optional>
+#include <tuple>
 #include <utility>
 
 #include "processor/ops/columns.h"
@@ -74,6 +75,24 @@ Normalizer::Normalizer(const NormRule& rule, Direction direction, double eps, st
                           : spread_of<double>(rule, divides, low_[i], high[i], eps));
 }
 
+namespace {
+
+/// Statistics that no data have: nothing that a robot measures is so large, and no deviation is negative.
+Status check_statistics(const NormRule& rule, std::span<const double> low, std::span<const double> high,
+                        const std::string& stats) {
+  const bool is_deviation = rule.spread == NormRule::Spread::value;
+  for (const auto& [name, values, is_spread] :
+       {std::tuple(rule.low, low, false), std::tuple(rule.high, high, is_deviation)})
+    for (std::size_t i = 0; i < values.size(); ++i)
+      if (values[i] < (is_spread ? 0.0 : kPlain.low) || values[i] > kPlain.high)
+        return Error{Code::bad_bundle, fmt::format("{}.{}[{}]", stats, name, i),
+                     fmt::format("{} to {}", is_spread ? 0.0 : kPlain.low, kPlain.high), fmt::format("{}", values[i]),
+                     "convert the checkpoint again, with the statistics of its training data"};
+  return {};
+}
+
+}  // namespace
+
 Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormRule& rule, const std::string& stats, double eps,
                                       Direction direction, int width, const std::string& where, int n_row) {
   const auto n_column = static_cast<std::size_t>(width);
@@ -86,6 +105,7 @@ Result<Normalizer> Normalizer::create(const Bundle& bundle, const NormRule& rule
   if (low.size() != high.size())
     return Error{Code::bad_bundle, fmt::format("{}.{}", stats, rule.high), fmt::format("{} numbers", low.size()),
                  std::to_string(high.size())};
+  VLA_CHECK(check_statistics(rule, low, high, stats));
   Normalizer normalizer(rule, direction, eps, std::move(low), high);
   normalizer.row_step_ = high.size() > n_column ? n_column : 0;
   if (direction == Direction::unnormalize) return normalizer;
@@ -218,6 +238,9 @@ class UnnormalizeOp final : public ActionOp {
     const auto width = static_cast<std::size_t>(layout.width);
     columns_ = chosen_columns(fields.columns, width);
     VLA_CHECK(check_columns(columns_, width, where));
+    for (const int column : columns_)
+      if (!layout.unnormalized.insert(column).second)
+        return misfit(where, "columns that no op before it unnormalizes", fmt::format("column {} again", column));
     VLA_TRY(normalizer_,
             Normalizer::create(layout.bundle, *fields.rule, fields.stats, fields.eps,
                                Normalizer::Direction::unnormalize, layout.width, where, std::max(1, layout.n_row)));

@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <set>
 #include <span>
 #include <string>
 #include <vector>
@@ -103,9 +104,10 @@ class StateOp {
 struct ActionLayout {
   const Bundle& bundle;
   std::size_t n_state;
-  int width;              // columns
-  int n_row = 0;          // rows, 0: all
-  bool relative = false;  // to the state
+  int width;                        // columns
+  int n_row = 0;                    // rows, 0: all
+  bool relative = false;            // to the state
+  std::set<int> unnormalized = {};  // columns
 };
 
 /// What a row of a chunk belongs to.
