@@ -16,14 +16,13 @@ namespace vla::serve {
 
 /// The acts that wait for the engine: at most one for each client, the newest.
 ///
-/// Peers take turns: a peer is one key or one address, a client one connection of it. Of the turns of a peer every
-/// second one is for its oldest connection that waits, so that what opens many connections beside a robot's does not
-/// delay it, and the others are in the order in which its clients began to wait. A newer act of a client takes the
-/// place of its older one. Where the queue is full, the peer that has most in it gives way to one that has less, and
-/// within a peer a newer connection to an older one.
+/// Peers take turns, and the clients of a peer take turns at its turns, in the order in which they began to wait: a
+/// peer is one key or one address, a client one connection of it. A newer act of a client takes the place of its older
+/// one. So neither a client that sends faster than others nor a peer that opens many connections gets more turns. Where
+/// the queue is full, the peer that has most in it gives way to one that has less.
 ///
-/// `Job` has `client` and `peer` (std::string), `connection` (a number that rises with each one that comes), `deadline`
-/// (std::optional<Clock::time_point>) and `size` (bytes). The queue knows no clock and takes no lock.
+/// `Job` has `client` and `peer` (std::string), `deadline` (std::optional<Clock::time_point>) and `size` (bytes). The
+/// queue knows no clock and takes no lock.
 template <class Job>
 class Queue {
  public:
@@ -46,12 +45,11 @@ class Queue {
     const auto older = find([&](const Job& j) { return j.client == job.client; });
     const std::size_t n_new = older == line_.end() ? 1 : 0, freed = older == line_.end() ? 0 : older->size;
     while (line_.size() + n_new > limits_.jobs || bytes_ - freed + job.size > limits_.bytes) {
-      auto last = line_.size() + n_new > limits_.jobs
-                      ? last_of_others(
-                            job.peer, [](const Job&) { return 1; }, n_new)
-                      : last_of_others(
-                            job.peer, [](const Job& j) { return j.size; }, job.size - std::min(freed, job.size));
-      if (last == line_.end()) last = newer_of_same(job);
+      const auto last = line_.size() + n_new > limits_.jobs
+                            ? last_of_others(
+                                  job.peer, [](const Job&) { return 1; }, n_new)
+                            : last_of_others(
+                                  job.peer, [](const Job& j) { return j.size; }, job.size - std::min(freed, job.size));
       if (last == line_.end()) {
         result.refused.push_back(std::move(job));
         return result;
@@ -82,25 +80,15 @@ class Queue {
     return first;
   }
 
-  /// Of the peer whose turn it is, its oldest client or the one that waits longest.
+  /// The client that waits longest, of the peer whose turn it is.
   std::optional<Job> pop() {
     if (line_.empty()) return std::nullopt;
     turns_.splice(turns_.end(), turns_, turns_.begin());
-    Turn& turn = turns_.back();
-    turn.for_oldest = !turn.for_oldest;
-    Place chosen = find([&](const Job& job) { return job.peer == turn.peer; });
-    if (turn.for_oldest)
-      for (auto at = chosen; at != line_.end(); ++at)
-        if (at->peer == turn.peer && at->connection < chosen->connection) chosen = at;
-    return take(chosen);
+    return take(find([&](const Job& job) { return job.peer == turns_.back(); }));
   }
 
  private:
   using Place = typename std::list<Job>::iterator;
-  struct Turn {
-    std::string peer;
-    bool for_oldest = false;  // its last turn was
-  };
 
   template <class Wanted>
   Place find(Wanted wanted) {
@@ -109,8 +97,8 @@ class Queue {
 
   /// Takes all memory before it changes anything: where there is none, the queue stays as it was.
   void wait(Job job) {
-    const bool has_turn = std::any_of(turns_.begin(), turns_.end(), [&](const Turn& t) { return t.peer == job.peer; });
-    std::list<Turn> turn(has_turn ? 0 : 1, Turn{job.peer});
+    const bool has_turn = std::find(turns_.begin(), turns_.end(), job.peer) != turns_.end();
+    std::list<std::string> turn(has_turn ? 0 : 1, job.peer);
     std::list<Job> last;
     last.push_back(std::move(job));
     bytes_ += last.back().size;
@@ -131,28 +119,17 @@ class Queue {
     return std::prev(last.base());
   }
 
-  /// The job of the newest connection of the same peer, where that came after this job's.
-  Place newer_of_same(const Job& job) {
-    Place newest = line_.end();
-    for (auto at = line_.begin(); at != line_.end(); ++at)
-      if (at->peer == job.peer && at->connection > job.connection &&
-          (newest == line_.end() || at->connection > newest->connection))
-        newest = at;
-    return newest;
-  }
-
   Job take(Place at) {
     Job job = std::move(*at);
     bytes_ -= job.size;
     line_.erase(at);
-    if (find([&](const Job& other) { return other.peer == job.peer; }) == line_.end())
-      turns_.remove_if([&](const Turn& turn) { return turn.peer == job.peer; });
+    if (find([&](const Job& other) { return other.peer == job.peer; }) == line_.end()) turns_.remove(job.peer);
     return job;
   }
 
   Limits limits_;
-  std::list<Job> line_;    // of at most as many clients as fit: a search by name costs nothing beside one act
-  std::list<Turn> turns_;  // the peers that have a job in line, the next one first
+  std::list<Job> line_;           // of at most as many clients as fit: a search by name costs nothing beside one act
+  std::list<std::string> turns_;  // the peers that have a job in line, the next one first
   std::size_t bytes_ = 0;
 };
 

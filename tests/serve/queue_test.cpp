@@ -18,7 +18,6 @@ struct Item {
   std::size_t size = 1;
   std::optional<Clock::time_point> deadline = {};
   std::string peer = {};
-  std::uint64_t connection = 0;
 };
 
 Clock::time_point at(int ms) { return Clock::time_point(std::chrono::milliseconds(ms)); }
@@ -79,23 +78,6 @@ TEST_CASE("a peer of seventy connections gets as many turns as a peer of one") {
     std::set<std::string> served = {queue.pop()->peer, queue.pop()->peer};
     CHECK(served == std::set<std::string>{"many", "one"});
   }
-}
-
-TEST_CASE("seventy connections of a robot's own address delay it by one act, and are all served") {
-  Queue<Item> queue({64, 100});
-  for (int i = 0; i < 64; ++i) queue.push({"many" + std::to_string(i), i, 1, {}, "here", 100 + std::uint64_t(i)});
-  const auto pushed = queue.push({"robot", 1000, 1, {}, "here", 1});
-  REQUIRE(pushed.refused.size() == 1);
-  CHECK(pushed.refused[0].number == 63);
-  int n_served = 0;
-  for (int turn = 0; turn < 63 * 2; ++turn) {
-    const std::string first = queue.pop()->client, second = queue.pop()->client;
-    CHECK((first == "robot" || second == "robot"));
-    ++n_served;
-    if (queue.empty()) break;
-    queue.push({"robot", 2000 + turn, 1, {}, "here", 1});
-  }
-  CHECK(n_served == 63);
 }
 
 TEST_CASE("where the queue is full, the last act of the peer that has most gives way to a peer that has less") {
