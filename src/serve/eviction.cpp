@@ -48,7 +48,6 @@ std::string group_of(const std::string& peer) {
   if (not_an_address) return peer;
   if (address.is_v6() && address.to_v6().is_v4_mapped())
     return group_of(ip::make_address_v4(ip::v4_mapped, address.to_v6()).to_string());
-  if (address.is_loopback()) return "loopback";
   if (address.is_v4()) return peer;
   ip::address_v6::bytes_type bytes = address.to_v6().to_bytes();
   std::fill(bytes.begin() + 8, bytes.end(), std::uint8_t{0});

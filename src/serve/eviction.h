@@ -24,8 +24,8 @@ struct Standing {
 /// Oldest connection first.
 using Standings = std::vector<Standing>;
 
-/// What counts as one peer: 127.0.0.0/8 and ::1 are this machine, an IPv6 address counts by its first 64 bits. Other
-/// text, such as a key, is its own group.
+/// What counts as one peer: an IPv6 address by its first 64 bits. Other text, such as an IPv4 address or a key, is its
+/// own group, also of this machine: a program there must not share its robot's.
 std::string group_of(const std::string& peer);
 
 /// How many connections may be in their handshake at once.
