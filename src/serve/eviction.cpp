@@ -61,18 +61,17 @@ std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t ma
   const auto n_unfinished = static_cast<std::size_t>(std::count_if(standings.begin(), standings.end(), unfinished));
   const bool is_full = standings.size() > max_connections;
   if (!is_full && n_unfinished <= max_handshakes(max_connections)) return std::nullopt;
-  const auto sums = sums_by_group(standings, [](const Standing&) { return std::size_t{1}; });
-  const auto rank = [&](const Standing& s) {
-    return std::tuple(-static_cast<std::ptrdiff_t>(sums.at(s.group)), s.served);
+  // Of the connections that could give way alone: a robot's second one must not lose its place because of the first.
+  const auto largest_of = [&](auto is_candidate) {
+    const auto sums = sums_by_group(standings, [&](const Standing& s) { return std::size_t{is_candidate(s)}; });
+    return first_of(standings, is_candidate, [&](const Standing& s) {
+      return std::tuple(-static_cast<std::ptrdiff_t>(sums.at(s.group)), s.served);
+    });
   };
-  if (!is_full || n_unfinished > std::max<std::size_t>(1, max_connections / 8))
-    return first_of(standings, unfinished, rank);
+  if (!is_full || n_unfinished > std::max<std::size_t>(1, max_connections / 8)) return largest_of(unfinished);
   const std::set<std::uint64_t> safe = kept(standings, max_connections, now);
-  const auto found = first_of(
-      standings, [&](const Standing& s) { return s.is_open && !safe.contains(s.connection); }, rank);
-  return found ? found
-               : first_of(
-                     standings, [](const Standing&) { return true; }, rank);
+  const auto found = largest_of([&](const Standing& s) { return s.is_open && !safe.contains(s.connection); });
+  return found ? found : largest_of([](const Standing&) { return true; });
 }
 
 std::optional<std::uint64_t> to_interrupt(const Standings& standings, std::size_t max_connections,

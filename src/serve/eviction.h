@@ -33,7 +33,7 @@ std::size_t max_handshakes(std::size_t max_connections);
 
 /// The connection that gives way to new ones; none where there is room. Half of the places are kept for the oldest
 /// connections that were served within a minute. Handshakes give way before open connections, except for an eighth of
-/// the places; then the group with most connections, and in it the connection that was served longest ago.
+/// the places; then the group that has most of those that could, and in it the one that was served longest ago.
 std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t max_connections, Clock::time_point now);
 
 /// The connection whose half-received request gives way where all of them take more than `max_bytes`; none otherwise.
