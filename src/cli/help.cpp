@@ -6,9 +6,10 @@
 #include <fmt/ranges.h>
 
 #include <algorithm>
-#include <numeric>
 #include <regex>
 #include <sstream>
+
+#include "base/edit_distance.h"
 
 namespace vla::cli {
 namespace {
@@ -67,21 +68,6 @@ class HelpFormatter final : public CLI::Formatter {
   }
 };
 
-/// Letters to insert, delete or change (Levenshtein).
-std::size_t distance(const std::string& a, const std::string& b) {
-  std::vector<std::size_t> row(b.size() + 1);
-  std::iota(row.begin(), row.end(), std::size_t{0});
-  for (std::size_t i = 0; i < a.size(); ++i) {
-    std::size_t diagonal = row[0]++;
-    for (std::size_t j = 0; j < b.size(); ++j) {
-      const std::size_t changed = diagonal + (a[i] == b[j] ? 0 : 1);
-      diagonal = row[j + 1];
-      row[j + 1] = std::min({row[j] + 1, row[j + 1] + 1, changed});
-    }
-  }
-  return row.back();
-}
-
 std::vector<std::string> known_words(const CLI::App& app) {
   std::vector<std::string> words;
   for (const CLI::Option* option : app.get_options())
@@ -113,7 +99,7 @@ std::string suggestion(const CLI::App& app, const std::string& unknown) {
   std::string best;
   std::size_t least = std::max<std::size_t>(2, given.size() / 4) + 1;
   for (const std::string& word : known_words(app))
-    if (const std::size_t d = distance(given, word); d < least) least = d, best = word;
+    if (const std::size_t d = edit_distance(given, word); d < least) least = d, best = word;
   return best.empty() ? "" : fmt::format("did you mean {}? ", best);
 }
 

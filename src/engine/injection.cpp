@@ -6,31 +6,17 @@
 #include <fmt/ranges.h>
 
 #include <algorithm>
-#include <numeric>
+
+#include "base/edit_distance.h"
 
 namespace vla {
 namespace {
-
-/// Letters to be added, removed or changed to make one of the other (Levenshtein).
-std::size_t distance(const std::string& a, const std::string& b) {
-  std::vector<std::size_t> row(b.size() + 1);
-  std::iota(row.begin(), row.end(), std::size_t{0});
-  for (std::size_t i = 0; i < a.size(); ++i) {
-    std::size_t diagonal = row[0]++;
-    for (std::size_t j = 0; j < b.size(); ++j) {
-      const std::size_t changed = diagonal + (a[i] == b[j] ? 0 : 1);
-      diagonal = row[j + 1];
-      row[j + 1] = std::min({changed, row[j] + 1, diagonal + 1});
-    }
-  }
-  return row.back();
-}
 
 /// The names that are most like this one.
 std::vector<std::string> nearest(const std::string& name, const std::set<std::string>& names) {
   constexpr std::size_t kShown = 3;
   std::vector<std::pair<std::size_t, std::string>> all;
-  for (const std::string& other : names) all.emplace_back(distance(name, other), other);
+  for (const std::string& other : names) all.emplace_back(edit_distance(name, other), other);
   std::sort(all.begin(), all.end());
   std::vector<std::string> first;
   for (std::size_t i = 0; i < std::min(kShown, all.size()); ++i) first.push_back(all[i].second);
