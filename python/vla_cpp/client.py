@@ -158,7 +158,7 @@ class Client(Handle):
                 self._context = None
 
     def __del__(self) -> None:
-        if getattr(self, "_context", None) is not None:
+        if getattr(self, "_context", None) is not None and os is not None:  # modules are gone when the interpreter ends
             self.close()
 
     # --- requests and answers ------------------------------------------------------------------------------------------------

@@ -114,7 +114,7 @@ class Policy(Handle):
             self._handle = ctypes.c_void_p()
 
     def __del__(self) -> None:
-        if getattr(self, "_library", None) is not None:
+        if getattr(self, "_library", None) is not None and os is not None:  # modules are gone when the interpreter ends
             self.close()
 
     def _check_usable(self) -> None:
