@@ -57,16 +57,28 @@ class Environment:
     name          of the adapter, e.g. "metaworld"
     task          which of its tasks this is
     declaration   see above
+    one_at_a_time whether a task is so large or slow to make that a process holds one only, and does all of its episodes first
     """
 
     name = ""
     task = ""
+    one_at_a_time = False
     declaration: Declaration
 
     @classmethod
     def tasks(cls) -> List[str]:
         """The tasks that `make` takes."""
         raise NotImplementedError
+
+    @classmethod
+    def suites(cls) -> Dict[str, List[str]]:
+        """The tasks by suite, where there are so many that a run names its suites; then a task is `suite/...`."""
+        return {}
+
+    @classmethod
+    def declare(cls, task: str, **options: Any) -> Declaration:
+        """The declaration of a task, without starting a simulator where the class knows it."""
+        return getattr(cls, "declaration", None) or cls(task, **options).declaration  # type: ignore[call-arg]
 
     def instruction(self) -> str:
         """The sentence that asks for the task."""

@@ -22,9 +22,16 @@ def find(name: str) -> Type[Environment]:
     return getattr(importlib.import_module(f".{name}", __name__), _HOMES[name])
 
 
+def no_task(name: str, task: str) -> str:
+    """What to say of a task that a simulator does not have."""
+    kind = find(name)
+    there = [f"{suite}/0 to {len(tasks) - 1}" for suite, tasks in kind.suites().items()] or kind.tasks()
+    return f"{name} has no task '{task}'; there are: {', '.join(there)}"
+
+
 def make(name: str, task: str, **options: Any) -> Environment:
     """A task of a simulator. Errors: MissingSimulator, ValueError for an unknown task."""
     kind = find(name)
     if task not in kind.tasks():
-        raise ValueError(f"{name} has no task '{task}'; there are: {', '.join(kind.tasks())}")
+        raise ValueError(no_task(name, task))
     return kind(task, **options)
