@@ -6,9 +6,9 @@ from vla_cpp.eval.episode import Outcome
 HEAD = {"environment": "null", "a": "A", "b": "", "rate_hz": 80.0, "replan_every": 8}
 
 
-def outcome(solved=True, swapped=False, engine_ms=2.0, seed=1, driver="a", difference=()):
+def outcome(solved=True, swapped=False, engine_ms=2.0, seed=1, driver="a", difference=(), task="drift"):
     return Outcome(
-        task="drift", seed=seed, driver=driver, sentence="go", swapped=swapped, solved=solved, steps=8, clipped=0, replan_every=8,
+        task=task, seed=seed, driver=driver, sentence="go", swapped=swapped, solved=solved, steps=8, clipped=0, replan_every=8,
         round_trip_ms=[engine_ms + 1], engine_ms=[engine_ms], difference=list(difference),
     )  # fmt: skip
 
@@ -44,3 +44,17 @@ def test_smoothness_is_a_table_of_both_policies_where_it_was_measured():
     text = report.markdown(data)
     assert "| executed actions | jerk | gripper flips |" in text and "| A | 0.25 |  |" in text and "| B | 0.5 | 2 |" in text
     assert "executed actions" not in report.markdown(report.summary([outcome()], HEAD))
+
+
+def test_suites_are_counted_after_their_tasks():
+    rows = [outcome(task="b/1", solved=False), outcome(task="a/0"), outcome(task="b/0"), outcome(task="b/1", seed=2)]
+    table = report.by_task(rows)
+    counts = {name: (row["solved"], row["episodes"]) for name, row in table.items()}
+    assert list(counts.items()) == [("b/1", (1, 2)), ("b/0", (1, 1)), ("b", (2, 3)), ("a/0", (1, 1)), ("a", (1, 1)), ("all", (3, 4))]
+    assert list(report.by_task([outcome()])) == ["drift", "all"]
+
+
+def test_a_paired_run_has_the_table_of_both():
+    rows = [outcome(driver="a"), outcome(driver="b", solved=False)]
+    text = report.markdown(report.summary(rows, {**HEAD, "b": "B"}))
+    assert "| drift | 1/1 |" in text and "| drift | 0/1 |" in text

@@ -4,13 +4,17 @@
 
 import json
 import os
+import queue
 import signal
 import subprocess
 import sys
 import time
 
 import pytest
-from vla_cpp.eval.cli import main
+from vla_cpp.eval import runner
+from vla_cpp.eval.cli import _jobs, build_parser, main
+from vla_cpp.eval.environments.null import Null
+from vla_cpp.eval.episode import Job
 from vla_cpp.eval.serving import Server
 
 
@@ -184,11 +188,36 @@ def test_the_replan_study_has_a_row_for_each_interval(bundle, binary, tmp_path, 
     assert [row["latency"]["replans"] for row in data["intervals"]] == [2 * 10, 2 * 3]  # 40 steps an episode
 
 
+def test_suites_become_episodes_task_by_task():
+    arguments = build_parser().parse_args(["libero", "--random", "--suite", "object,libero_goal_swap", "--episodes", "2", "--seed", "7"])
+    jobs = [(job.task, job.seed) for job in _jobs("libero", arguments)]
+    assert jobs[:3] == [("libero_object/0", 7), ("libero_object/0", 8), ("libero_object/1", 7)]
+    assert jobs[-1] == ("libero_goal_swap/9", 8) and len(jobs) == 40
+
+
+def test_a_large_task_is_closed_before_the_next_is_made(monkeypatch, tmp_path):
+    closed = []
+    monkeypatch.setattr(Null, "one_at_a_time", True)
+    monkeypatch.setattr(Null, "close", lambda self: closed.append(self.task))
+    description = {"a": {"kind": "random", "horizon": 8, "d_action": 4}}
+    jobs, results = queue.Queue(), queue.Queue()
+    for job in (Job("still", 1), Job("still", 2), Job("drift", 1), None):
+        jobs.put(job)
+    monkeypatch.setattr(runner, "die_with_parent", lambda: None)
+    monkeypatch.setattr(runner.os, "_exit", lambda code: None)
+    results.close = results.join_thread = lambda: None
+    runner._work(runner.Plan("null", {}, description, None, 8), jobs, results)
+    assert [results.get_nowait()[0] for _ in range(4)] == ["done"] * 3 + ["end"] and closed == ["still"]
+
+
 @pytest.mark.parametrize(
     "more, told",
     [
-        (["--task", "fly"], "no task 'fly' in null; there are: drift, still"),
+        (["--task", "fly"], "null has no task 'fly'; there are: drift, still"),
         (["--episodes", "0"], "take 1 or more"),
+        (["libero", "--suite", "object,moon"], "--suite: libero has no 'moon'; there are: spatial, object, goal, 10, spatial_lan"),
+        (["libero"], "libero has 290 tasks: give --suite or --task"),
+        (["libero", "--task", "libero_goal/10"], "libero has no task 'libero_goal/10'; there are: libero_spatial/0 to 9"),
         (["--against", "random"], "go together"),
         (["--swap"], "has an opposite"),
         (["--server", "", "--bundle", "", "--random", "--embodiment", "left"], "--embodiment goes with --bundle or --server"),
@@ -197,8 +226,9 @@ def test_the_replan_study_has_a_row_for_each_interval(bundle, binary, tmp_path, 
     ],
 )
 def test_a_wrong_call_says_what_is_wrong(call, more, told, capsys):
+    arguments = [*more, "--random"] if more[0] == "libero" else call("wrong", *more)
     with pytest.raises(SystemExit) as ended:
-        main(call("wrong", *more))
+        main(arguments)
     assert ended.value.code == 2 and told in capsys.readouterr().err
 
 

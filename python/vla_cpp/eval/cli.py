@@ -12,7 +12,7 @@ from typing import Any, Dict, List, Optional
 
 from ..errors import BadObservation
 from .environment import EnvironmentFault
-from .environments import NAMES, MissingSimulator, find
+from .environments import NAMES, MissingSimulator, find, no_task
 from .episode import Job
 from .journal import JournalMismatch
 from .runner import RunFailed
@@ -50,9 +50,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("vla-eval", description=__doc__, epilog=EPILOG, formatter_class=formatter)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in NAMES:
-        text = {"metaworld": "four MetaWorld tasks", "libero": "the four LIBERO suites, where its assets are", "null": "no simulator: tries the harness"}[name]
+        text = {"metaworld": "four MetaWorld tasks", "libero": "LIBERO and LIBERO-PRO, by suite", "null": "no simulator: tries the harness"}[name]
         command = commands.add_parser(name, help=text, description=(find(name).__doc__ or text), formatter_class=formatter)
         _common(command)
+        if find(name).suites():
+            command.add_argument("--suite", metavar="NAMES", help=f"every task of these suites, with commas, e.g. object,spatial; there are: {', '.join(map(_short, find(name).suites()))}")
         command.add_argument("--replan-every", type=int, default=0, metavar="S", help="steps executed of a chunk (default: the environment's)")
         command.add_argument("--mode", choices=("sync", "async", "rtc"), default="sync", help="how chunks follow each other: the robot waits for each; it goes on with the one before meanwhile; the same, and the policy goes on from its rows (default sync)")
         command.add_argument("--latency-ms", type=float, default=0.0, metavar="MS", help="let this time of the simulator pass between an observation and its chunk (default 0)")
@@ -86,12 +88,31 @@ def _usage(text: str) -> int:
 
 def _jobs(name: str, a: argparse.Namespace) -> List[Job]:
     kind = find(name)
-    tasks = a.task or kind.tasks()
+    tasks = (a.task or []) + _of_suites(name, kind.suites(), getattr(a, "suite", None) or "")
+    if not tasks and kind.suites():
+        raise SystemExit(_usage(f"{name} has {len(kind.tasks())} tasks: give --suite or --task"))
+    tasks = tasks or kind.tasks()
     unknown = [task for task in tasks if task not in kind.tasks()]
     if unknown or a.episodes < 1 or a.workers < 1:
-        what = f"no task '{unknown[0]}' in {name}; there are: {', '.join(kind.tasks())}" if unknown else "--episodes and --workers take 1 or more"
+        what = no_task(name, unknown[0]) if unknown else "--episodes and --workers take 1 or more"
         raise SystemExit(_usage(what))
+    if kind.one_at_a_time:
+        return [Job(task, a.seed + e) for task in tasks for e in range(a.episodes)]
     return [Job(task, a.seed + e) for e in range(a.episodes) for task in tasks]
+
+
+def _short(suite: str) -> str:
+    """`object` for `libero_object`: a suite without the simulator's name before it."""
+    return suite.partition("_")[2]
+
+
+def _of_suites(name: str, suites: Dict[str, List[str]], given: str) -> List[str]:
+    named = {**suites, **{_short(suite): tasks for suite, tasks in suites.items()}}
+    wanted = [part.strip() for part in given.split(",") if part.strip()]
+    for suite in wanted:
+        if suite not in named:
+            raise SystemExit(_usage(f"--suite: {name} has no '{suite}'; there are: {', '.join(map(_short, suites))}"))
+    return [task for suite in wanted for task in named[suite]]
 
 
 def _swapped(name: str, jobs: List[Job]) -> List[Job]:

@@ -48,8 +48,10 @@ def plain_log(axes: Any, values: Sequence[float]) -> None:
 
 
 def success_bars(tables: Dict[str, Dict[str, Dict[str, Any]]], title: str, path: Path) -> None:
-    """Success by task with its 95 % intervals, one group of bars per policy."""
-    names = list(next(iter(tables.values())))
+    """Success by task, or by suite where there are suites, with 95 % intervals; one group of bars per policy."""
+    table = next(iter(tables.values()))
+    suites = {name.rpartition("/")[0] for name in table} - {""}
+    names = [name for name in table if not suites or name in suites or name == "all"]
     figure, axes = _figure(1.6 + 1.5 * len(names), 3.9)
     width = 0.8 / len(tables)
     for i, (label, table) in enumerate(tables.items()):

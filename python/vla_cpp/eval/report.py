@@ -20,10 +20,19 @@ def success(rows: Sequence[Outcome]) -> Dict[str, Any]:
 
 
 def by_task(rows: Sequence[Outcome]) -> Dict[str, Dict[str, Any]]:
-    """`success` of each task in the order of its first episode, and of `all`."""
-    tasks = list(dict.fromkeys(row.task for row in rows))
-    table = {task: success([row for row in rows if row.task == task]) for task in tasks}
+    """`success` of each task in the order of its first episode, of each suite after its tasks, and of `all`."""
+    table: Dict[str, Dict[str, Any]] = {}
+    for suite in dict.fromkeys(suite_of(row.task) for row in rows):
+        own = [row for row in rows if suite_of(row.task) == suite]
+        table.update({task: success([row for row in own if row.task == task]) for task in dict.fromkeys(row.task for row in own)})
+        if suite:
+            table[suite] = success(own)
     return {**table, "all": success(rows)}
+
+
+def suite_of(task: str) -> str:
+    """`libero_goal` of `libero_goal/3`; empty for a task that is in no suite."""
+    return task.rpartition("/")[0]
 
 
 def latency(rows: Sequence[Outcome], rate_hz: float) -> Dict[str, Any]:
@@ -105,6 +114,8 @@ def markdown(data: Dict[str, Any]) -> str:
     lines = [f"# {head['environment']}: {head['a']}", ""]
     if "success" in data:
         lines += [*_success_table(data["success"], "task"), ""]
+    if "success_b" in data:
+        lines += ["B on the same episodes:", "", *_success_table(data["success_b"], "task"), ""]
     if "swapped" in data:
         lines += ["With the opposite task's sentence (solving the scene's own task is then a fault):", ""]
         lines += [*_success_table(data["swapped"], "scene"), ""]

@@ -105,12 +105,13 @@ def run(
 ) -> Dict[str, Any]:
     """Runs the jobs that are not on disk yet and returns the summary of all. Errors: RunFailed, JournalMismatch."""
     options = options_of(find(name), a.spec)
-    declaration = declaration_of(name, jobs[0].task, options)
-    size_random([a, b], declaration["d_action"])
-    replan_every = replan_every or declaration["replan_every"]
+    declaration = find(name).declare(jobs[0].task, **options)
+    size_random([a, b], declaration.d_action)
+    replan_every = replan_every or declaration.replan_every
     head = {
         "environment": name, "a": a.label, "a_identity": a.identity, "b": b.label if b else "", "b_identity": b.identity if b else "",
-        "replan_every": replan_every, **{key: declaration[key] for key in ("limit", "rate_hz", "conventions")},
+        "replan_every": replan_every, "limit": "by suite" if find(name).suites() else declaration.limit,
+        "rate_hz": declaration.rate_hz, "conventions": declaration.conventions,
     }  # fmt: skip
     drivers = {"a": a.description, **({"b": b.description} if b else {})}
     plan = Plan(name, options, drivers, "b" if b else None, replan_every, mode, latency_ms / 1e3)
@@ -132,13 +133,6 @@ def size_random(drivers: List[Optional[Driver]], d_action: int) -> None:
     for driver in drivers:
         if driver and driver.description["kind"] == "random":
             driver.description["d_action"] = d_action
-
-
-def declaration_of(name: str, task: str, options: Dict[str, Any]) -> Dict[str, Any]:
-    """The declaration, without starting a simulator in this process where the class already has it."""
-    kind = find(name)
-    declaration = getattr(kind, "declaration", None) or make(name, task, **options).declaration
-    return {key: getattr(declaration, key) for key in declaration.__dataclass_fields__}
 
 
 @contextlib.contextmanager
@@ -172,6 +166,8 @@ def film_episodes(name: str, driver: Driver, rows: List[Outcome], folder: Path, 
     environments: Dict[str, Environment] = {}
     for row in rows:
         if row.task not in environments:
+            if environments and find(name).one_at_a_time:
+                environments.popitem()[1].close()
             environments[row.task] = make(name, row.task, **options_of(find(name), driver.spec))
         environment = environments[row.task]
         view = next(iter(environment.declaration.views))

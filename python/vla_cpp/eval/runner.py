@@ -56,7 +56,7 @@ def _work(plan: Plan, jobs: Any, results: Any) -> None:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    from .environments import MissingSimulator, make
+    from .environments import MissingSimulator, find, make
     from .policies import make_policy
 
     job: Optional[Job] = None
@@ -68,6 +68,8 @@ def _work(plan: Plan, jobs: Any, results: Any) -> None:
             if job is None:
                 break
             if job.task not in guards:
+                if guards and find(plan.environment).one_at_a_time:
+                    guards.popitem()[1].inner.close()
                 guards[job.task] = Guard(make(plan.environment, job.task, **plan.options))
             results.put(("done", _run(plan, guards[job.task], policies, job)))
         results.put(("end", None))
