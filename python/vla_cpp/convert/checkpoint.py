@@ -15,6 +15,7 @@ from .dtypes import STATISTICS, to_f32
 from .errors import Code, Problems, refuse
 from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_name, read_json
 from .instead import check_is_policy, instead_of
+from .options import Option
 from .safetensors_file import Entry, read_safetensors
 
 LEROBOT, OPENPI = "lerobot", "openpi"  # layouts; that of an architecture's authors is called as the architecture
@@ -102,10 +103,11 @@ class Layout(NamedTuple):
     """How a checkpoint is saved, and how it is recognized."""
 
     name: str  # whose it is, as in "a checkpoint of ..."
-    options: Tuple[str, ...]  # of archs.Options: what such a checkpoint leaves open, of what others state or do not have
+    options: Tuple[Option, ...]  # what such a checkpoint leaves open, of what others state or do not have
     model_types: Tuple[str, ...] = ()  # what config.json states as model_type
     files: Tuple[str, ...] = ()  # any of them tells it, where config.json does not
     read: Callable[[str, Problems], Tensors] = read_stored  # tensors of the folder, and those that share the memory of one
+    about: str = ""  # a paragraph of `vla-convert --help`
 
 
 def clean(name: str) -> str:

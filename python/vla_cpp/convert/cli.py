@@ -7,18 +7,20 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import contextmanager
-from dataclasses import fields
+from typing import Dict, List
 
 from .. import __version__
 from ..printable import printable
-from .archs import Options, names
-from .conversion import STORED, Summary, convert_checkpoint
+from .archs import LAYOUTS, Options, authors, declared, names
+from .conversion import Summary, convert_checkpoint
 from .errors import Code, ConvertError
 from .files import missing_extra
+from .options import COMMON
 
 DESCRIPTION = """\
-Converts a Vision-Language-Action policy, as LeRobot, openpi or the authors of Evo-1, GR00T or BitVLA save it, into one self-contained GGUF
-bundle for the vla runtime: weights, tokenizer, image recipe, statistics, feature names. Architectures: {archs}.
+Converts a checkpoint of a Vision-Language-Action policy into one self-contained GGUF bundle for the vla runtime: weights, tokenizer,
+image recipe, statistics, feature names. Architectures: {archs}.
+Checkpoints are those of {layouts}.
 It refuses what it does not fully understand, and lists all problems at once."""
 
 EPILOG = """\
@@ -29,9 +31,7 @@ keeps the type of each, which is exact too: matrices of bf16 are then computed i
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
 two agree for grids whose side is a power of two. 'shifted' reproduces transformers 4.55 to 4.57.
 
-A checkpoint of Evo-1's authors needs --variant, --views, --max-views and --masked-rows: r1 is their code before 9 April 2026, r2 the
-code since (steps, time index, pixel rounding and state padding differ); --masked-rows is zero_attention if the policy ran with
-flash-attn, which the authors ask for. docs/converting.md tells how to find out.
+{layouts}
 
 Exit codes: 0 done, 1 a fault of the converter, 2 usage, 3 damaged or contradictory checkpoint, 6 not supported, 9 files that cannot
 be read or written."""
@@ -45,8 +45,10 @@ class _Parser(argparse.ArgumentParser):
 def build_parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="vla-convert",
-        description=DESCRIPTION.format(archs=", ".join(names())),
-        epilog=EPILOG,
+        description=DESCRIPTION.format(
+            archs=", ".join(names()), layouts=", ".join(layout.name for layout in (*LAYOUTS.values(), *authors().values()))
+        ),
+        epilog=EPILOG.format(layouts="\n\n".join(layout.about for layout in authors().values() if layout.about)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -54,105 +56,23 @@ def build_parser() -> argparse.ArgumentParser:
         "checkpoint", metavar="CHECKPOINT", help="folder with config.json and weights, or hub:OWNER/NAME@REVISION"
     )
     add("-o", "--out", metavar="OUT.gguf", required=True, help="the bundle to write; appears only when it is complete")
-    add(
-        "--backbone",
-        metavar="DIR",
-        default="",
-        help="folder with the backbone's config.json and tokenizer.json, where they live elsewhere, or hub:OWNER/NAME@REVISION",
-    )
-    add(
-        "--dtype",
-        choices=("f32", "bf16", "f16", STORED),
-        default="",
-        help="storage of matrices and tables; vectors and statistics are always f32",
-    )
-    add(
-        "--dataset-info",
-        metavar="INFO.json",
-        default="",
-        help="meta/info.json of the LeRobot data set: names of state and action numbers, control rate",
-    )
-    add(
-        "--identity-stats",
-        metavar="FEATURE",
-        action="append",
-        default=[],
-        help="let FEATURE (observation.state or action) pass unnormalized when its statistics are missing",
-    )
-    add(
-        "--state-bound",
-        metavar="N",
-        type=float,
-        help="report a normalized state value beyond N in every answer, or refuse it with --strict-state; the runtime's default is 10",
-    )
-    add(
-        "--position-precision",
-        choices=("float32", "bfloat16", "shifted"),
-        default="",
-        help="rule for the rows of the vision position table; see below",
-    )
-    add(
-        "--variant",
-        metavar="NAME",
-        default="",
-        help="openpi: the training configuration, e.g. pi05_droid; Evo-1's authors: the revision of their code, r1 or r2; GR00T N1.5: the"
-        " data config, by name or as a JSON file",
-    )
-    _add_evo1(parser)
-    _add_gr00t(parser)
+    for option in COMMON:
+        add(option.flag, help=option.help, **option.arguments())
+    some = parser.add_argument_group("options of some checkpoints", "what these do not state; of others they are refused").add_argument
+    for option, helps in declared():
+        some(option.flag, help=_merged(helps), **option.arguments())
     add("--force", action="store_true", help="overwrite OUT.gguf")
     add("--quiet", action="store_true", help="no progress bar and no summary")
     add("--version", action="version", version="vla-convert " + __version__)
     return parser
 
 
-def _add_evo1(parser: argparse.ArgumentParser) -> None:
-    about = "what their folder (config.json, norm_stats.json, *.pt) does not state; see below"
-    add = parser.add_argument_group("checkpoints of Evo-1's authors", about).add_argument
-    add("--stats", metavar="ARM/DATASET", default="", help="the entry of norm_stats.json to normalize with, where there are several")
-    add(
-        "--views",
-        metavar="A,B,...",
-        type=lambda text: text.split(","),
-        default=(),
-        help="names of the cameras, in the order of the prompt's view slots",
-    )
-    add("--max-views", metavar="N", type=int, default=0, help="view slots of the prompt; the authors' server has 3")
-    add(
-        "--masked-rows",
-        choices=("zero_attention", "causal_attention"),
-        default="",
-        help="what attention wrote into masked rows, which the action head reads: zeros with flash-attn",
-    )
-
-
-def _add_gr00t(parser: argparse.ArgumentParser) -> None:
-    about = "a checkpoint holds several robots; --variant, --camera-size, --gripper-sign and --dataset-info take TAG=VALUE,... where these differ"
-    add = parser.add_argument_group("checkpoints of GR00T", about).add_argument
-    add(
-        "--embodiment",
-        metavar="TAG",
-        default="",
-        help="tag of the robot in processor_config.json; required. A,B,... puts several into one bundle, all every one that has"
-        " statistics",
-    )
-    add(
-        "--camera-size",
-        metavar="WxH",
-        default="",
-        help="camera resolution, for a pipeline that keeps the aspect ratio; square by default",
-    )
-    add(
-        "--gripper-sign",
-        metavar="KEY",
-        default="",
-        help="map the action KEY to -1 above 0.5 and to 1 elsewhere, as LIBERO's simulator expects its gripper",
-    )
-    add(
-        "--letterbox",
-        action="store_true",
-        help="pad images to squares even if the checkpoint does not say so, as the authors' servers have done since March 2026",
-    )
+def _merged(helps: Dict[str, str]) -> str:
+    """"openpi: ...; GR00T N1.6, GR00T N1.7: ..." of the help of each layout."""
+    layouts: Dict[str, List[str]] = {}
+    for layout, text in helps.items():
+        layouts.setdefault(text, []).append(layout)
+    return "; ".join("{}: {}".format(", ".join(names), text) for text, names in layouts.items())
 
 
 @contextmanager
@@ -204,7 +124,7 @@ def report(summary: Summary) -> str:
 
 def main(argv=None) -> int:
     args = build_parser().parse_args(argv)
-    options = Options(**{field.name: getattr(args, field.name) for field in fields(Options)})
+    options = Options(**{name: getattr(args, name) for name in vars(Options())})
     try:
         with _progress(args.quiet) as progress:
             summary = convert_checkpoint(args.checkpoint, args.out, options, args.force, progress)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Callable, Dict, Iterator, List, Tuple
 
 import numpy as np
@@ -19,10 +19,10 @@ from .checkpoint import Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
 from .embodiments import plan_robots
 from .errors import Code, Problems, refuse
+from .options import STORED
 from .safetensors_file import Entry
 from .ternary import quantize
 
-STORED = "stored"  # --dtype: every matrix as it is stored
 Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
 
 
@@ -48,7 +48,7 @@ def convert_checkpoint(
     _check_out(out, force)
     _check_state_bound(options)
     checkpoint = open_checkpoint(source, archs.authors())
-    options = replace(options, backbone=given_backbone(checkpoint, options.backbone))
+    options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)

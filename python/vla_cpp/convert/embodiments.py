@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Dict, List, Sequence
 
 import numpy as np
@@ -38,7 +37,7 @@ def _tags(module: Any, checkpoint: Checkpoint, options: Options) -> List[str]:
 def options_of(tag: str, tags: Sequence[str], options: Options) -> Options:
     """What one of the robots is converted with. Errors: usage."""
     own = {name: _value_of(tag, tags, name, getattr(options, name)) for name in OWN_OPTIONS}
-    return replace(options, embodiment=tag, **own)
+    return options.replaced(embodiment=tag, **own)
 
 
 def _value_of(tag: str, tags: Sequence[str], name: str, given: str) -> str:

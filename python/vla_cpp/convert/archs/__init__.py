@@ -1,20 +1,23 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """One package or module per architecture, named as in the checkpoint's `type`. Each has `plan(checkpoint, options, problems) -> Plan`,
-`embodiments(checkpoint)`, their tags, where a checkpoint holds several robots, and `LAYOUT` where its authors do not save it as LeRobot does."""
+`embodiments(checkpoint)`, their tags, where a checkpoint holds several robots, and `LAYOUT` where its authors do not save it as LeRobot does, with the options that
+such a checkpoint leaves open."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
 from dataclasses import dataclass, field
-from typing import Dict, List, NamedTuple, Optional, Sequence, Tuple
+from types import SimpleNamespace
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
 from ..bundle import Key
 from ..checkpoint import LEROBOT, OPENPI, Layout
 from ..errors import Code, Problems, refuse
+from ..options import COMMON, IDENTITY_STATS, POSITION_PRECISION, Option, variant
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
@@ -45,25 +48,17 @@ class Dropped(NamedTuple):
     reason: str
 
 
-@dataclass
-class Options:
-    """What a person chose beyond the checkpoint. Empty means: as the checkpoint says."""
+class Options(SimpleNamespace):
+    """What a person chose beyond the checkpoint, by the names of options: those of every checkpoint, and those that layouts declare."""
 
-    backbone: str = ""
-    dtype: str = ""
-    dataset_info: str = ""
-    identity_stats: Sequence[str] = ()
-    state_bound: Optional[float] = None  # of a normalized number of the state; the runtime's own where it is not said
-    position_precision: str = ""
-    variant: str = ""  # openpi's name of a training configuration, or the revision of Evo-1's code: checkpoints do not state them
-    stats: str = ""  # Evo-1: which entry of norm_stats.json, ARM/DATASET; BitVLA: which of dataset_statistics.json
-    views: Sequence[str] = ()  # Evo-1, BitVLA: names of the cameras in the order of the prompt's slots
-    max_views: int = 0  # Evo-1: places for views in the prompt
-    embodiment: str = ""  # GR00T: the robot, by its tag in the checkpoint; several with commas, or `all`
-    camera_size: str = ""  # GR00T: WIDTHxHEIGHT of images whose aspect the pipeline keeps; they are square without it
-    gripper_sign: str = ""  # GR00T: the key of a gripper's actions, which become -1 where it opens and 1 where it closes
-    letterbox: bool = False  # GR00T: images are padded to squares, as the authors' later servers do
-    masked_rows: str = ""  # Evo-1: what the reference's attention leaves in rows that are masked
+    def __init__(self, **chosen: Any) -> None:
+        values = {option.name: option.default for option in (*COMMON, *(option for option, _ in declared()))}
+        if unknown := sorted(set(chosen) - set(values)):
+            raise TypeError("no option {}; there are {}".format(", ".join(unknown), ", ".join(values)))
+        super().__init__(**{**values, **chosen})
+
+    def replaced(self, **chosen: Any) -> Options:
+        return Options(**{**vars(self), **chosen})
 
 
 @dataclass
@@ -102,8 +97,8 @@ def load(name):
 
 
 LAYOUTS = {
-    LEROBOT: Layout("LeRobot", ("identity_stats", "position_precision")),
-    OPENPI: Layout("openpi", ("variant",)),
+    LEROBOT: Layout("LeRobot", (IDENTITY_STATS, POSITION_PRECISION)),
+    OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),)),
 }
 
 
@@ -112,17 +107,26 @@ def authors() -> Dict[str, Layout]:
     return {name: _module(name).LAYOUT for name in names() if hasattr(_module(name), "LAYOUT")}
 
 
+def declared() -> List[Tuple[Option, Dict[str, str]]]:
+    """Every option that a layout declares, with the help of each layout by its name."""
+    found: Dict[str, Tuple[Option, Dict[str, str]]] = {}
+    for layout in (*LAYOUTS.values(), *authors().values()):
+        for option in layout.options:
+            found.setdefault(option.name, (option, {}))[1][layout.name] = option.help
+    return list(found.values())
+
+
 def check_options(layout: str, config: dict, options: Options) -> None:
     """Refuses options that a layout does not leave open. Errors: usage."""
-    problems, layouts = Problems("arguments"), {**LAYOUTS, **authors()}
-    for name in dict.fromkeys(option for each in layouts.values() for option in each.options):
-        if getattr(options, name) and name not in layouts[layout].options:
-            *most, last = [each.name for each in layouts.values() if name in each.options]
+    problems, own = Problems("arguments"), {**LAYOUTS, **authors()}[layout].name
+    for option, layouts in declared():
+        if getattr(options, option.name) and own not in layouts:
+            *most, last = layouts
             wanted = "a checkpoint of " + ", ".join(most) + (" or " if most else "") + last
-            found = "one of " + layouts[layout].name
+            found = "one of " + own
             if layout == LEROBOT:
                 found = "config.json of type {}, which states everything itself".format(config.get("type"))
-            problems.add("--" + name.replace("_", "-"), wanted, found, "leave the option out", Code.USAGE)
+            problems.add(option.flag, wanted, found, "leave the option out", Code.USAGE)
     problems.raise_any()
 
 

@@ -20,6 +20,7 @@ from ..checkpoint import Checkpoint, Layout, find_backbone
 from ..errors import Code, Problems, refuse
 from ..files import member, read_json
 from ..networks import MAX_LAYERS
+from ..options import variant
 from ..section import Fixed, Section
 from . import TABLE, Options, Plan, Weight
 from .gr00t import head
@@ -29,7 +30,7 @@ from .gr00t.plan import Parts, assemble, network_keys_of
 from .gr00t.robot import BINARY, ROBOT_OPTIONS, SIN_COS, Group, Robot, choose
 from .gr00t.sizes import Sizes
 
-LAYOUT = Layout("GR00T N1.5", (*ROBOT_OPTIONS, "variant"), model_types=("gr00t_n1_5",))
+LAYOUT = Layout("GR00T N1.5", (*ROBOT_OPTIONS, variant("the data config, by name or as a JSON file")), model_types=("gr00t_n1_5",))
 POLICY, METADATA = "config.json", os.path.join("experiment_cfg", "metadata.json")
 TOP_FIXED: Fixed = {"model_type": (None, "gr00t_n1_5")}
 TOP_IGNORED = set(

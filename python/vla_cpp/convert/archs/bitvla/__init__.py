@@ -26,6 +26,7 @@ from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
 from ...errors import Problems, refuse
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json, read_text
+from ...options import stats, views
 from ...section import Fixed, Section
 from ...torch_file import read_torch
 from ...tokenizer import TokenizerPlan, read_tokenizer
@@ -129,7 +130,15 @@ def _read_tensors(folder: str, problems: Problems) -> Tensors:
     return tensors, aliases
 
 
-LAYOUT = Layout("BitVLA's authors", ("stats", "views"), model_types=("bitvla", "openvla"), read=_read_tensors)
+LAYOUT = Layout(
+    "BitVLA's authors",
+    (
+        stats("the entry of dataset_statistics.json to normalize with, where there are several"),
+        views("names of the cameras, in the order of the prompt's view slots"),
+    ),
+    model_types=("bitvla", "openvla"),
+    read=_read_tensors,
+)
 
 
 def _read_robot(checkpoint: Checkpoint, s: Sizes, problems: Problems) -> None:

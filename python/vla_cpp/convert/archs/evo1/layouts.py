@@ -31,6 +31,7 @@ from ...files import member, read_json
 from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim
 from ...networks import MAX_LAYERS
 from ...normalization import Normalization
+from ...options import Option, stats, variant, views
 from ...section import Section
 from ...torch_file import read_torch
 from .. import Options
@@ -88,7 +89,24 @@ def _read_tensors(folder: str, _problems: Problems) -> Tensors:
 
 
 LAYOUT = Layout(
-    "Evo-1's authors", ("variant", "stats", "views", "max_views", "masked_rows"), files=(*TORCH_FILES, NORM_STATS), read=_read_tensors
+    "Evo-1's authors",
+    (
+        variant("the revision of their code, r1 or r2"),
+        stats("ARM/DATASET, the entry of norm_stats.json to normalize with, where there are several"),
+        views("names of the cameras, in the order of the prompt's view slots"),
+        Option("--max-views", "view slots of the prompt; the authors' server has 3", "N", 0, read=int),
+        Option(
+            "--masked-rows",
+            "what attention wrote into masked rows, which the action head reads: zeros with flash-attn",
+            choices=("zero_attention", "causal_attention"),
+        ),
+    ),
+    files=(*TORCH_FILES, NORM_STATS),
+    read=_read_tensors,
+    about="""\
+A checkpoint of Evo-1's authors needs --variant, --views, --max-views and --masked-rows: r1 is their code before 9 April 2026, r2 the
+code since (steps, time index, pixel rounding and state padding differ); --masked-rows is zero_attention if the policy ran with
+flash-attn, which the authors ask for. docs/converting.md tells how to find out.""",
 )
 
 WIDTH = 24  # of states and actions on their way to the network: a literal of the server

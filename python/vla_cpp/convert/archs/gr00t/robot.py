@@ -15,13 +15,32 @@ import numpy as np
 from ...checkpoint import Checkpoint
 from ...errors import Code, Problems, refuse
 from ...files import member, read_json
+from ...options import Option
 from ...section import Section
 
 PROCESSOR, STATISTICS, EMBODIMENTS = "processor_config.json", "statistics.json", "embodiment_id.json"
 DOCS = "docs/converting.md, GR00T"
 MODALITY = {"delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"}
 MAX_WIDTH = 1 << 16
-ROBOT_OPTIONS = ("embodiment", "camera_size", "letterbox", "gripper_sign")  # what every release leaves open
+ROBOT_OPTIONS = (  # what every release leaves open
+    Option(
+        "--embodiment",
+        "tag of the robot in processor_config.json; required. A,B,... puts several into one bundle, all every one that has statistics;"
+        " --variant, --camera-size, --gripper-sign and --dataset-info then take TAG=VALUE,... where these differ",
+        "TAG",
+    ),
+    Option("--camera-size", "camera resolution, for a pipeline that keeps the aspect ratio; square by default", "WxH"),
+    Option(
+        "--letterbox",
+        "pad images to squares even if the checkpoint does not say so, as the authors' servers have done since March 2026",
+        default=False,
+    ),
+    Option(
+        "--gripper-sign",
+        "map the action KEY to -1 above 0.5 and to 1 elsewhere, as LIBERO's simulator expects its gripper",
+        "KEY",
+    ),
+)
 
 
 # How the numbers of a key are normalized: a kind of the recipe's ops normalize and unnormalize, one of these, or "" for as they are.

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a person may say beyond a checkpoint. A layout declares the options that its checkpoints leave open; `vla-convert` collects them."""
+
+from __future__ import annotations
+
+from typing import Any, Callable, NamedTuple, Tuple
+
+
+class Option(NamedTuple):
+    """Not given means: as the checkpoint says. Layouts may share one, each with its own help."""
+
+    flag: str  # --max-views; the attribute of archs.Options is max_views
+    help: str
+    metavar: str = ""
+    default: Any = ""  # False: a flag; a tuple: may be given several times
+    choices: Tuple[str, ...] = ()
+    read: Callable[[str], Any] = str
+
+    @property
+    def name(self) -> str:
+        return self.flag[2:].replace("-", "_")
+
+    def arguments(self) -> dict:
+        """As argparse takes it."""
+        if self.default is False:
+            return {"action": "store_true"}
+        if self.choices:
+            return {"choices": self.choices, "default": self.default}
+        if self.default == () and self.read is str:
+            return {"metavar": self.metavar, "action": "append", "default": []}
+        return {"metavar": self.metavar, "type": self.read, "default": self.default}
+
+
+STORED = "stored"  # --dtype: every matrix as it is stored
+COMMON = (
+    Option(
+        "--backbone",
+        "folder with the backbone's config.json and tokenizer.json, where they live elsewhere, or hub:OWNER/NAME@REVISION",
+        "DIR",
+    ),
+    Option(
+        "--dtype",
+        "storage of matrices and tables; vectors and statistics are always f32",
+        choices=("f32", "bf16", "f16", STORED),
+    ),
+    Option("--dataset-info", "meta/info.json of the LeRobot data set: names of state and action numbers, control rate", "INFO.json"),
+    Option(
+        "--state-bound",
+        "report a normalized state value beyond N in every answer, or refuse it with --strict-state; the runtime's default is 10",
+        "N",
+        None,
+        read=float,
+    ),
+)
+IDENTITY_STATS = Option(
+    "--identity-stats",
+    "let FEATURE (observation.state or action) pass unnormalized when its statistics are missing",
+    "FEATURE",
+    (),
+)
+POSITION_PRECISION = Option(
+    "--position-precision",
+    "rule for the rows of the vision position table; see below",
+    choices=("float32", "bfloat16", "shifted"),
+)
+
+
+def variant(what: str) -> Option:
+    return Option("--variant", what, "NAME")
+
+
+def stats(what: str) -> Option:
+    return Option("--stats", what, "NAME")
+
+
+def views(what: str) -> Option:
+    """Names, with commas between them."""
+    return Option("--views", what, "A,B,...", (), read=lambda text: text.split(","))
