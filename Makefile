@@ -18,7 +18,7 @@ help:
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 525 MB of NVIDIA's compiler and libraries)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
-	@echo "make tsan      build executor and server and run their tests under the thread sanitizer"
+	@echo "make tsan      run the tests of executor, engine and server under the thread sanitizer"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
 	@echo "make clean     remove what was built"
@@ -96,7 +96,7 @@ asan: packages $(STAMP)
 	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
 	cmake --build --preset asan
 
-# The server's threads: acts of many clients at once, and whatever else tests/serve does. A few minutes of building.
+# Threads: those of kernels, of who prepares while another acts, and of tests/serve. A few minutes of building.
 tsan: packages
 	@test -f build/tsan/build.ninja || cmake --preset tsan $(CMAKE_ARGS)
 	cmake --build --preset tsan

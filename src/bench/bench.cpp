@@ -27,7 +27,9 @@ Status check_bundle(const std::string& path) {
 }
 
 Conditions conditions_of(const Engine& engine, const Workload& workload, int n_step) {
-  const auto text = [&](const char* key) { return *engine.bundle().keys().string(key); };  // every bundle has them
+  const auto text = [&](const char* key) {
+    return *engine.robot().bundle().keys().string(key);
+  };  // every bundle has them
   return {text("vla.arch"),           text("vla.dtype"), text("vla.source.name"), workload.n_view(),
           workload.width(),           workload.height(), workload.n_text(),       n_step,
           engine.device().n_thread(), engine.kernels(),  engine.device().name()};
@@ -38,7 +40,7 @@ Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const st
                                     const Request& request, const Watcher& watcher) {
   std::vector<Series> all;
   for (int n_step : steps) {
-    if (n_step != engine.solver().n_step) VLA_CHECK(engine.set_steps(n_step));
+    if (n_step != engine.robot().solver().n_step) VLA_CHECK(engine.set_steps(n_step));
     watcher.tell(fmt::format("{} solver steps", n_step));
     VLA_TRY(Series series, run_series(engine, workload, request.n_warmup, request.n_round, watcher));
     all.push_back(std::move(series));
@@ -72,9 +74,9 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   clock.lap(load, "load");
   report.load = load.front().second;
 
-  VLA_TRY(Workload workload, Workload::make(engine->processor(), request.sizes));
+  VLA_TRY(Workload workload, Workload::make(engine->robot().processor(), request.sizes));
   std::vector<int> steps = request.steps;
-  if (steps.empty()) steps.push_back(engine->solver().n_step);
+  if (steps.empty()) steps.push_back(engine->robot().solver().n_step);
   report.conditions = conditions_of(*engine, workload, steps.back());
   report.precision = precision_name(engine->precision()), report.arithmetic = engine->arithmetic();
   VLA_CHECK(accept(report.conditions));

@@ -55,7 +55,7 @@ Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int 
     round.peak += kernels::measure_peak(probe, n_thread, kProbeSeconds) / 2;
     if (int8 != nullptr) round.int8_peak += kernels::measure_peak(*int8, n_thread, kProbeSeconds) / 2;
   };
-  Series series{engine.solver().n_step, probe.name, int8 != nullptr ? int8->name : "", {}, {}, {}};
+  Series series{engine.robot().solver().n_step, probe.name, int8 != nullptr ? int8->name : "", {}, {}, {}};
   for (int i = 0; i < n_warmup; ++i) {
     VLA_CHECK(watcher.before_round());
     engine.device().count_times(true);

@@ -70,34 +70,24 @@ std::vector<std::int64_t> Param::stored_shape() const {
   return stored;
 }
 
-void ParamList::go_on(const Bundle& bundle) {
-  keys_ = &bundle.keys();
-  bundle_ = &bundle;
-  names_.clear();
-  for (const Param& param : params_)
-    if (param.source != nullptr) by_source_.emplace(param.source->data.data(), &param);
-}
-
-/// The parameter of a robot before this one that is the same tensor of the file, or null.
-const Param* ParamList::shared(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const {
+/// The parameter that is the same tensor of the file, or null.
+const Param* ParamList::find(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const {
   const TensorInfo* tensor = bundle_ != nullptr ? bundle_->find(name) : nullptr;
-  const auto found = tensor != nullptr ? by_source_.find(tensor->data.data()) : by_source_.end();
-  if (found == by_source_.end()) return nullptr;
+  if (tensor == nullptr) return nullptr;
+  const auto found = declared_->by_source.find(tensor->data.data());
+  if (found == declared_->by_source.end()) return nullptr;
   const Param& param = *found->second;
   return param.name == name && param.storage == storage && param.shape == shape ? &param : nullptr;
 }
 
 const Param& ParamList::declare(std::string name, Storage storage, std::vector<std::int64_t> shape) {
-  if (const Param* param = shared(name, storage, shape)) {
-    names_.insert(std::move(name));
-    return *param;
-  }
-  Param& param = params_.emplace_back();
-  param.id = static_cast<int>(params_.size()) - 1;
+  names_.insert(name);
+  if (const Param* param = find(name, storage, shape)) return *param;
+  Param& param = declared_->params.emplace_back();
+  param.id = static_cast<int>(declared_->params.size()) - 1;
   param.name = std::move(name);
   param.storage = storage;
   param.shape = std::move(shape);
-  names_.insert(param.name);
   if (bundle_ != nullptr) look_up(param);
   return param;
 }
@@ -119,6 +109,7 @@ void ParamList::look_up(Param& param) {
     if (*wrong) return problem(fmt::format("wrong code      {:<40} expected 0, 1 or 2, file has 3", param.name));
   }
   param.source = tensor;
+  declared_->by_source.emplace(tensor->data.data(), &param);
 }
 
 void ParamList::problem(const Error& error) {

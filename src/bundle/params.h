@@ -6,6 +6,7 @@
 #include <functional>
 #include <initializer_list>
 #include <map>
+#include <memory>
 #include <set>
 #include <string>
 #include <vector>
@@ -45,15 +46,18 @@ struct Param {
 /// record, and `report` gives all problems in one error, so that a wrong bundle is understood at the first try.
 class ParamList {
  public:
-  /// `bundle` may be null: then the list is a manifest of what the keys ask for, and tensors are not looked up.
-  ParamList(const Keys& keys, const Bundle* bundle) : keys_(&keys), bundle_(bundle) {}
-
-  /// From now on parameters are those of another robot of the same file. What it shares with robots before it is not
-  /// declared again: `declare` gives the parameter that there is. Call `report` first. `bundle` must outlive this.
-  void go_on(const Bundle& bundle);
+  /// `bundle` may be null: then the list is a manifest of what the keys ask for, and tensors are not looked up. Both
+  /// must outlive this.
+  ParamList(const Keys& keys, const Bundle* bundle)
+      : keys_(&keys), bundle_(bundle), declared_(std::make_shared<Declared>()) {}
+  /// The list of another robot of the same file. The parameters of all such lists are one: what another robot has
+  /// declared is not declared again.
+  ParamList(const Bundle& bundle, const ParamList& other)
+      : keys_(&bundle.keys()), bundle_(&bundle), declared_(other.declared_) {}
 
   const Keys& keys() const { return *keys_; }
-  const std::deque<Param>& params() const { return params_; }
+  /// Of all robots.
+  const std::deque<Param>& params() const { return declared_->params; }
   const Bundle* bundle() const { return bundle_; }
 
   const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape);
@@ -65,15 +69,17 @@ class ParamList {
   Status report(const std::string& policy, const std::function<bool(const std::string&)>& is_used) const;
 
  private:
+  struct Declared {
+    std::deque<Param> params;  // a deque: modules keep pointers to their parameters
+    std::map<const std::byte*, const Param*> by_source;
+  };
   void look_up(Param& param);
-
-  const Param* shared(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const;
+  const Param* find(const std::string& name, Storage storage, const std::vector<std::int64_t>& shape) const;
 
   const Keys* keys_;
   const Bundle* bundle_;
-  std::deque<Param> params_;                            // a deque: modules keep pointers to their parameters
-  std::map<const std::byte*, const Param*> by_source_;  // of robots before the one that is declared now
-  std::set<std::string> names_;
+  std::shared_ptr<Declared> declared_;
+  std::set<std::string> names_;  // of this robot
   std::vector<std::string> problems_;
 };
 

@@ -89,7 +89,7 @@ Status read_states(const vla_observation& given, const FeatureNames& features, O
 }
 
 /// Without a default: a chunk from noise that was not chosen could not be reproduced.
-Result<Noise> read_noise(const vla_observation& given, const Engine& engine) {
+Result<Noise> read_noise(const vla_observation& given, const Robot& robot) {
   if (given.has_seed > 1) return usage("observation.has_seed", "0 or 1", std::to_string(given.has_seed));
   const bool has_noise = given.noise != nullptr;
   if (has_noise == (given.has_seed == 1))
@@ -98,8 +98,8 @@ Result<Noise> read_noise(const vla_observation& given, const Engine& engine) {
     if (given.n_noise != 0) return usage("observation.noise", fmt::format("{} numbers", given.n_noise), "NULL");
     return Noise(given.seed);
   }
-  const auto horizon = static_cast<std::size_t>(engine.solver_horizon()),
-             width = static_cast<std::size_t>(engine.d_action_padded());
+  const auto horizon = static_cast<std::size_t>(robot.solver_horizon()),
+             width = static_cast<std::size_t>(robot.d_action_padded());
   if (given.n_noise != horizon * width)
     return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon, width),
                  fmt::format("{} numbers", given.n_noise)};
@@ -131,7 +131,7 @@ Result<Request> read_observation(const vla_observation* given, const Engine& eng
   if (known.embodiment != nullptr) {
     VLA_TRY(request.observation.embodiment, read_name(known.embodiment, "observation.embodiment"));
   }
-  VLA_TRY(const Engine* robot, engine.robot(request.observation.embodiment));
+  VLA_TRY(const Robot* robot, engine.robot(request.observation.embodiment));
   VLA_TRY(request.noise, read_noise(known, *robot));
   VLA_TRY(request.leftover, read_leftover(known));
   if (known.text_size > Tokenizer::kMaxText)

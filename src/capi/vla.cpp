@@ -13,14 +13,15 @@
 #include "engine/engine.h"
 
 struct vla_policy {
-  explicit vla_policy(std::unique_ptr<vla::Engine> loaded)
-      : engine(std::move(loaded)), description(describe_robots(*engine)) {}
+  vla_policy(std::unique_ptr<vla::Engine> loaded, bool rejects_out_of_range)
+      : engine(std::move(loaded)), strict_state(rejects_out_of_range), description(describe_robots(*engine)) {}
   static std::vector<vla::Description> describe_robots(const vla::Engine& engine) {
     std::vector<vla::Description> robots;
-    for (const vla::Engine* robot : engine.robots()) robots.push_back(vla::describe(*robot));
+    for (const vla::Robot* robot : engine.robots()) robots.push_back(vla::describe(engine, *robot));
     return robots;
   }
   std::unique_ptr<vla::Engine> engine;
+  bool strict_state;
   vla::capi::Description description;
   std::mutex mutex;  // the engine answers one observation at a time
 };
@@ -73,8 +74,7 @@ Status open(const char* path, const vla_options* options, vla_policy** out) {
   VLA_TRY(const std::string file, read_name(path, "path"));
   VLA_TRY(const Options known, read_options(options));
   VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(file, known.engine));
-  if (known.strict_state) engine->refuse_beyond();
-  *out = new vla_policy(std::move(engine));
+  *out = new vla_policy(std::move(engine), known.strict_state);
   return {};
 }
 
@@ -86,7 +86,8 @@ Status act(vla_policy* policy, const vla_observation* observation, vla_chunk** o
   auto chunk = std::make_unique<vla_chunk>();
   StageClock clock;
   Timing before, queue;
-  VLA_TRY(const Request request, read_observation(observation, *policy->engine));
+  VLA_TRY(Request request, read_observation(observation, *policy->engine));
+  request.observation.reject_out_of_range = policy->strict_state;
   clock.lap(before, "decode");
   const std::lock_guard<std::mutex> turn(policy->mutex);
   clock.lap(queue, "queue");

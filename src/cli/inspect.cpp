@@ -99,19 +99,19 @@ void print_numbers(const std::vector<Description::Number>& numbers, const StatsC
   }
 }
 
-void print_features(const Description& d, const Engine& engine) {
-  const Recipe& recipe = engine.processor().recipe();
+void print_features(const Description& d, const Robot& robot) {
+  const Recipe& recipe = robot.processor().recipe();
   say(stdout, "views        any size, {} to {} x {}; at least {} of {} must be present\n", recipe.fit->described(),
       recipe.width, recipe.height, d.min_views, d.views.size());
   for (const auto& view : d.views)
     say(stdout, "    {}{}\n", view.name, view.alias.empty() ? "" : fmt::format("  (also {})", view.alias));
   for (const auto& state : d.states) {
     say(stdout, "state        {}, {} numbers\n", state.name, state.numbers.size());
-    print_numbers(state.numbers, read_stats(engine.bundle(), state.name));
+    print_numbers(state.numbers, read_stats(robot.bundle(), state.name));
   }
   say(stdout, "action       {} rows of {} numbers{}\n", d.horizon, d.actions.size(),
       d.rate_hz > 0 ? fmt::format(", {:g} rows a second", d.rate_hz) : ", control rate unstated");
-  print_numbers(d.actions, read_stats(engine.bundle(), "action"));
+  print_numbers(d.actions, read_stats(robot.bundle(), "action"));
   say(stdout, "instruction  at most {} tokens\n", d.max_text_tokens);
 }
 
@@ -127,25 +127,26 @@ void print_modules(const Engine& engine) {
 }
 
 void print_human(const Engine& engine) {
-  const Description d = describe(engine);
+  const Robot& robot = engine.robot();
+  const Description d = describe(engine, robot);
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
   say(stdout, "bundle       {}\n", d.path);
-  say(stdout, "policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(engine.bundle().file_size()));
+  say(stdout, "policy       {}, stored as {}, {}\n", d.arch, d.dtype, size(robot.bundle().file_size()));
   if (!d.embodiment.empty())
     say(stdout, "embodiment   {}, one of {}\n", d.embodiment,
-        fmt::format("{}", fmt::join(engine.bundle().embodiments(), ", ")));
-  for (const std::string& feature : engine.processor().degraded())
+        fmt::format("{}", fmt::join(robot.bundle().embodiments(), ", ")));
+  for (const std::string& feature : robot.processor().degraded())
     say(stdout, "DEGRADED     {} passes unnormalized, as --identity-stats allowed when converting\n", feature);
   say(stdout, "source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
       d.converter);
-  if (const auto backbone = engine.bundle().keys().string("vla.source.backbone"))
+  if (const auto backbone = robot.bundle().keys().string("vla.source.backbone"))
     say(stdout, "backbone     {}\n", *backbone);
   say(stdout, "checksum     {}\n", d.checksum);
-  print_features(d, engine);
+  print_features(d, robot);
   say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);
   say(stdout, "leftover     {}\n",
       d.real_time_chunking.empty() ? "refused: no real-time chunking" : d.real_time_chunking);
-  const Json recipe = Json::parse(*engine.bundle().keys().string("processor.recipe"), nullptr, false);
+  const Json recipe = Json::parse(*robot.bundle().keys().string("processor.recipe"), nullptr, false);
   for (const auto& [list, ops] : recipe.items()) {
     say(stdout, "recipe       {}\n", list);
     for (const Json& op : ops) say(stdout, "    {}\n", text_of(op));
@@ -158,36 +159,37 @@ void print_human(const Engine& engine) {
 }
 
 void print_json(const Engine& engine) {
+  const Bundle& bundle = engine.robot().bundle();
   Json root;
-  root["bundle"] = identity_json(engine.bundle());
-  if (!engine.bundle().embodiment().empty()) root["embodiments"] = engine.bundle().embodiments();
+  root["bundle"] = identity_json(bundle);
+  if (!bundle.embodiment().empty()) root["embodiments"] = bundle.embodiments();
   root["keys"] = Json::object();
-  for (const auto& [key, value] : engine.bundle().keys().all())
+  for (const auto& [key, value] : bundle.keys().all())
     if (!key.starts_with("tokenizer."))  // tens of thousands of tokens serve no reader
       std::visit([&, &name = key](const auto& v) { root["keys"][name] = v; }, value);
   root["stats"] = Json::object();
-  for (const TensorInfo& tensor : engine.bundle().tensors())
+  for (const TensorInfo& tensor : bundle.tensors())
     if (tensor.name.starts_with("stats."))
-      if (auto values = engine.bundle().stats(tensor.name)) root["stats"][tensor.name] = *values;
+      if (auto values = bundle.stats(tensor.name)) root["stats"][tensor.name] = *values;
   root["modules"] = Json::object();
   for (const auto& [path, size] : module_sizes(engine.params()))
     root["modules"][path] = {{"parameters", size.n_param}, {"stored_bytes", size.stored}};
   root["device"] = engine.device().name();
   root["linear_kernels"] = engine.linear_kernels();
   root["precision"] = precision_name(engine.precision());
-  root["real_time_chunking"] = kind_name(engine.real_time_chunking().kind);
+  root["real_time_chunking"] = kind_name(engine.robot().real_time_chunking().kind);
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
   auto exact = nlohmann::ordered_json::parse(text_of(root));  // its numbers are double
-  for (const TensorInfo& tensor : engine.bundle().tensors())
+  for (const TensorInfo& tensor : bundle.tensors())
     if (tensor.name.starts_with("stats.") && tensor.type == DType::f64)
-      exact["stats"][tensor.name] = *engine.bundle().stats(tensor.name);
+      exact["stats"][tensor.name] = *bundle.stats(tensor.name);
   say_lines(stdout, exact.dump(2, ' ', true, Json::error_handler_t::replace) + "\n");
 }
 
 Status print_devices() {
-  const DeviceList list = Engine::devices();
+  const DeviceList list = list_devices();
   say(stdout, "{:<9}  {:>10}  {:>10}  {:<9}  {}\n", "device", "memory", "free", "products", "description");
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
   for (const DeviceInfo& device : list.devices)
@@ -198,7 +200,7 @@ Status print_devices() {
 }
 
 Status print_devices_json() {
-  const DeviceList list = Engine::devices();
+  const DeviceList list = list_devices();
   Json root = {{"devices", Json::array()}, {"absent", Json::object()}};
   for (const DeviceInfo& device : list.devices)
     root["devices"].push_back({{"name", device.name},

@@ -95,11 +95,11 @@ Result<NpyArray> read_rows(const std::string& file, const std::string& where) {
 }
 
 /// Noise that is transposed would have the right count, so its shape must be the one that the solver starts from.
-Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
+Result<Noise> read_noise(const RunOptions& options, const Robot& robot) {
   if (options.noise.empty()) return Noise(*options.seed);
   VLA_TRY(NpyArray array, read_rows(options.noise, "noise"));
-  const std::vector<std::size_t> shape = {static_cast<std::size_t>(engine.solver_horizon()),
-                                          static_cast<std::size_t>(engine.d_action_padded())};
+  const std::vector<std::size_t> shape = {static_cast<std::size_t>(robot.solver_horizon()),
+                                          static_cast<std::size_t>(robot.d_action_padded())};
   if (array.shape != shape)
     return Error{Code::bad_observation, "noise", fmt::format("shape ({})", fmt::join(shape, ", ")),
                  fmt::format("({})", fmt::join(array.shape, ", "))};
@@ -107,10 +107,10 @@ Result<Noise> read_noise(const RunOptions& options, const Engine& engine) {
 }
 
 /// The last rows of a chunk that `--normalized-out` wrote.
-Result<std::optional<Leftover>> read_leftover(const RunOptions& options, const Engine& engine) {
+Result<std::optional<Leftover>> read_leftover(const RunOptions& options, const Robot& robot) {
   if (options.leftover.empty()) return std::optional<Leftover>();
   VLA_TRY(NpyArray array, read_rows(options.leftover, "leftover"));
-  const std::size_t width = engine.processor().action_names().size();
+  const std::size_t width = robot.processor().action_names().size();
   if (array.shape.size() != 2 || array.shape[1] != width)
     return Error{Code::bad_observation, "leftover", fmt::format("rows of {} numbers", width),
                  fmt::format("shape ({})", fmt::join(array.shape, ", "))};
@@ -118,8 +118,8 @@ Result<std::optional<Leftover>> read_leftover(const RunOptions& options, const E
                                           options.schedule, options.max_guidance});
 }
 
-void print_table(const ActionChunk& chunk, const Engine& engine) {
-  const std::vector<std::string>& names = engine.processor().action_names();
+void print_table(const ActionChunk& chunk, const Robot& robot) {
+  const std::vector<std::string>& names = robot.processor().action_names();
   std::size_t width = 9;
   for (const std::string& name : names) width = std::max(width, name.size());
   say(stdout, "{:>4}", "step");
@@ -151,9 +151,9 @@ void print_json(const ActionChunk& chunk, const Engine& engine, const RunOptions
   for (const auto& [stage, ms] : chunk.timing) timing[stage] = static_cast<float>(ms);
   Json root;
   root["actions"] = std::move(actions);
-  root["action_names"] = engine.processor().action_names();
+  root["action_names"] = engine.robot().processor().action_names();
   root["timing_ms"] = std::move(timing);
-  root["bundle"] = identity_json(engine.bundle());
+  root["bundle"] = identity_json(engine.robot().bundle());
   root["kernels"] = engine.kernels();
   root["device"] = engine.device().name();
   root["precision"] = precision_name(engine.precision());
@@ -195,15 +195,16 @@ Status run(RunOptions& options) {
                                                                               .tap_pattern = options.tap,
                                                                               .inject = std::move(inject),
                                                                               .embodiment = options.embodiment}));
-  if (options.strict_state) engine->refuse_beyond();
+  const Robot& robot = engine->robot();
   clock.lap(before, "load");
   Observation observation;
   observation.text = options.text;
-  for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image, engine->processor().views()));
-  for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, engine->processor()));
+  observation.reject_out_of_range = options.strict_state;
+  for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image, robot.processor().views()));
+  for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, robot.processor()));
   clock.lap(before, "decode");
-  VLA_TRY(const Noise noise, read_noise(options, *engine));
-  VLA_TRY(const std::optional<Leftover> leftover, read_leftover(options, *engine));
+  VLA_TRY(const Noise noise, read_noise(options, robot));
+  VLA_TRY(const std::optional<Leftover> leftover, read_leftover(options, robot));
   VLA_TRY(ActionChunk chunk, engine->act(observation, noise, leftover));
   chunk.timing.insert(chunk.timing.begin(), before.begin(), before.end());
 
@@ -221,7 +222,7 @@ Status run(RunOptions& options) {
     print_json(chunk, *engine, options);
     return {};
   }
-  print_table(chunk, *engine);
+  print_table(chunk, robot);
   print_timing(chunk.timing, *engine);
   return {};
 }

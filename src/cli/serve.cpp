@@ -27,7 +27,7 @@ namespace {
 struct ServeOptions {
   std::string bundle, kernels, device, embodiment;
   int n_thread = 0;
-  bool strict_state = false, restarts = false;
+  bool restarts = false;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
   WatchOptions watch;
@@ -67,7 +67,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
     for (const std::string& text : some)
       if (!text.empty() && std::find(all.begin(), all.end(), text) == all.end()) all.push_back(text);
   };
-  for (const Engine* robot : engine.robots()) {
+  for (const Robot* robot : engine.robots()) {
     add_new(features, robot->processor().views().names());
     add_new(features, robot->processor().states().names());
     add_new(degraded, robot->processor().degraded());
@@ -123,7 +123,6 @@ Status serve(ServeOptions& options, bool& ready) {
                                                                               .all_robots = true}));
   watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
-  if (options.strict_state) engine->refuse_beyond();  // not before, as warming up takes any numbers
   stop_on_signals(*server);
   watch->ready(warm_up_ms);
   print_ready(*server, *engine, warm_up_ms, watch->metrics_address());
@@ -175,7 +174,7 @@ Command add_serve(CLI::App& app) {
                    "Largest number of connections; the longest idle one is closed for a new one")
       ->check(CLI::Range(1, 65536))
       ->capture_default_str();
-  command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
+  command->add_flag("--strict-state", server.strict_state, kStrictStateHelp);
   command->add_flag("--insecure", server.insecure, "Allow addresses that other machines reach, without keys");
   command->add_option("--curve-secret", server.curve_secret, "The server's secret key, a file from vla keygen")
       ->check(CLI::ExistingFile);

@@ -16,10 +16,10 @@ std::vector<Description::Number> numbers(const std::vector<std::string>& names, 
 
 }  // namespace
 
-/// Processor::create and Engine::load have checked every key that is read here.
-Description describe(const Engine& engine) {
-  const Keys& keys = engine.bundle().keys();
-  const Processor& processor = engine.processor();
+/// Processor::create and Robot::open have checked every key that is read here.
+Description describe(const Engine& engine, const Robot& robot) {
+  const Keys& keys = robot.bundle().keys();
+  const Processor& processor = robot.processor();
   const auto texts = [&](const char* key) { return *keys.strings(key); };
   Description out;
 
@@ -39,19 +39,19 @@ Description describe(const Engine& engine) {
   }
   out.max_text_tokens = recipe.max_tokens;
 
-  out.horizon = engine.horizon();
+  out.horizon = robot.horizon();
   out.actions = numbers(processor.action_names(), texts("action.units"), 0, processor.action_names().size());
   out.rate_hz = *keys.number("action.rate_hz", kRateHz);
-  out.solver_horizon = engine.solver_horizon();
-  out.d_action_padded = engine.d_action_padded();
+  out.solver_horizon = robot.solver_horizon();
+  out.d_action_padded = robot.d_action_padded();
   out.solver = *keys.string("solver.kind");
-  out.noise = engine.solver().noise;
-  out.n_step = engine.solver().n_step;
-  out.t_start = engine.solver().times.front().value;
-  out.real_time_chunking = kind_name(engine.real_time_chunking().kind);
+  out.noise = robot.solver().noise;
+  out.n_step = robot.solver().n_step;
+  out.t_start = robot.solver().times.front().value;
+  out.real_time_chunking = kind_name(robot.real_time_chunking().kind);
 
-  out.embodiment = engine.bundle().embodiment();
-  out.path = engine.bundle().path();
+  out.embodiment = robot.bundle().embodiment();
+  out.path = robot.bundle().path();
   for (const auto& [key, text] : {std::pair{"arch", &out.arch},
                                   {"dtype", &out.dtype},
                                   {"checksum", &out.checksum},

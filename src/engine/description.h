@@ -44,6 +44,7 @@ struct Description {
   MemoryUse memory;
 };
 
-Description describe(const Engine& engine);
+/// `robot` is one of the engine.
+Description describe(const Engine& engine, const Robot& robot);
 
 }  // namespace vla

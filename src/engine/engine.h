@@ -8,13 +8,9 @@
 #include <utility>
 #include <vector>
 
-#include "engine/leftover.h"
-#include "engine/noise.h"
-#include "engine/plan.h"
-#include "engine/timing.h"
+#include "engine/robot.h"
 #include "graph/rounding.h"
 #include "lower/open.h"
-#include "processor/processor.h"
 
 namespace vla {
 
@@ -30,29 +26,6 @@ struct EngineOptions {
   bool all_robots = false;      // without a tag: every robot of a bundle of several
 };
 
-/// The answer to one observation.
-struct ActionChunk {
-  int horizon = 0;  // rows
-  int d_action = 0;
-  std::vector<float> actions;      // (horizon, d_action) in the robot's own units
-  std::vector<float> normalized;   // before unnormalization: what a Leftover takes
-  std::vector<std::string> notes;  // warnings about this answer
-  bool is_beyond = false;          // one of them: the state is beyond the bundle's bound
-  Timing timing;
-  std::vector<Tap> taps;
-};
-
-class Engine;
-
-/// What the host makes of one observation before the device is needed. Vectors keep their memory when filled again.
-struct Prepared {
-  const Engine* robot = nullptr;  // that the observation names
-  Inputs inputs;
-  std::vector<float> x;  // what the solver starts from
-  std::optional<Steering> steering;
-  Timing timing;
-};
-
 /// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
 /// they run.
 struct MemoryUse {
@@ -60,60 +33,48 @@ struct MemoryUse {
   std::size_t total() const { return weights + plan + working; }
 };
 
-/// A loaded bundle, ready to act. It owns the loop that every architecture runs: prefix, cache, solver steps,
-/// unnormalize. One thread at a time may call it, and another one `prepare`.
-///
-/// Where it has several robots, this is the first of them and keeps the others: they share weights and working memory.
+/// A loaded bundle, ready to act: the device with the parameters, the bundle's robots, and their plans. It owns the
+/// loop that every architecture runs: prefix, cache, solver steps, unnormalize. One thread at a time may call it, and
+/// others its const functions meanwhile.
 class Engine {
  public:
-  /// Opens, checks and loads a bundle, and builds the largest plan. Errors: io, bad_bundle, unsupported, out_of_memory,
-  /// device.
+  /// Opens, checks and loads a bundle, and builds the largest plans. Errors: io, bad_bundle, unsupported,
+  /// out_of_memory, device.
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
-  /// What `device` of the options may name on this machine.
-  static DeviceList devices() { return list_devices(); }
-
-  /// Of all robots: from now on a state beyond the bundle's bound is refused, as Processor::refuse_beyond.
-  void refuse_beyond();
-  /// This robot and the others.
-  std::vector<const Engine*> robots() const;
+  /// In the bundle's order; at least one.
+  std::vector<const Robot*> robots() const;
+  /// The first one, which is the only one without EngineOptions::all_robots.
+  const Robot& robot() const { return *robots_.front(); }
   /// The robot that answers to this tag; an empty one where there is one robot. Errors: bad_observation, with the tags
   /// that there are.
-  Result<const Engine*> robot(const std::string& tag) const;
+  Result<const Robot*> robot(const std::string& tag) const;
+
   /// Computes the chunk of the robot that the observation names. `leftover`: rows of the previous chunk that are not
   /// executed yet, which the new chunk continues. Errors: bad_observation, bad_action (a number that is not finite came
   /// out), unsupported, device, out_of_memory.
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
-  /// The two halves of it: the host's, and the device's with unnormalization. One thread may prepare an observation
-  /// while another one acts on the one before. Errors: of the first bad_observation, unsupported and out_of_memory.
+  /// The two halves of it: the host's, and the device's with unnormalization. Any thread may prepare an observation
+  /// while another one acts. Errors: of the first bad_observation, unsupported and out_of_memory.
   Status prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                 Prepared& to) const noexcept;
-  Result<ActionChunk> act(Prepared& prepared) noexcept;
+                 EncodedObservation& to) const noexcept;
+  Result<ActionChunk> act(EncodedObservation& prepared) noexcept;
 
-  /// Solves in another number of steps than the bundle asks for, to measure what a step costs. Errors: bad_bundle,
-  /// out_of_memory, device.
+  /// Solves for the first robot in another number of steps than the bundle asks for, to measure what a step costs; no
+  /// other thread may prepare meanwhile. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step);
-  /// The program of the prefix or of a step for the largest observation, one line an operation: phase, kernel, MFLOP,
-  /// MB, what is computed, and how its operand and results lie in memory. Errors: out_of_memory.
+  /// The program of the prefix or of a step for the first robot's largest observation, one line an operation: phase,
+  /// kernel, MFLOP, MB, what is computed, and how its operand and results lie in memory. Errors: out_of_memory.
   enum class Part { prefix, step };
   Result<std::string> program_text(Part part);
   /// What the network computed for the last observation; empty before the first, and where its plan is gone.
   StageWork work() const;
 
-  const Bundle& bundle() const { return bundle_; }
-  const Processor& processor() const { return processor_; }
   const Device& device() const { return *device_; }
   Device& device() { return *device_; }
-  const Solver& solver() const { return solver_; }
-  const ParamList& params() const { return *params_; }
-  /// What `act` does with a leftover: nothing where actions are relative to a state, which the rows would have lost.
-  RealTimeChunking real_time_chunking() const;
-  /// Rows of a chunk.
-  int horizon() const { return processor_.n_row(horizon_); }
-  /// Rows and columns of the solver's start: those of a chunk, or more.
-  int solver_horizon() const { return horizon_; }
-  int d_action_padded() const { return d_action_; }
+  /// Of all robots.
+  const ParamList& params() const { return robot().params(); }
   MemoryUse memory() const;
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return device_->linear_kernels(); }
@@ -130,52 +91,26 @@ class Engine {
   bool has_ternary() const;
 
  private:
-  Engine(Bundle bundle, Processor processor) : bundle_(std::move(bundle)), processor_(std::move(processor)) {}
-  static Result<std::vector<std::unique_ptr<Engine>>> open_robots(Bundle file, const EngineOptions& options);
-  Status load_policy(std::shared_ptr<ParamList>& params);
-  Status make_graphs();
-  Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
-                Prepared& to) const;
-  Status check_leftover(const Leftover& leftover, Inputs& inputs) const;
-  Result<ActionChunk> run(Prepared& prepared);
-  Status make_conditions();
-  Status run_once(const Graph& graph);
-  Status make_constants();
-  Status make_plans();
+  explicit Engine(const EngineOptions& options)
+      : tap_pattern_(options.tap_pattern), dry_(options.dry), chose_kernels_(!options.kernels.empty()) {}
+  Status open_robots(Bundle file, const EngineOptions& options);
   Status take_injected(const std::vector<Tap>& given);
+  Status make_plans();
   Status inject_inputs(Inputs& inputs) const;
-  InputShape largest_shape() const;
-  ChunkShape chunk_shape() const;
-  std::uint32_t placed(std::uint32_t views) const;
-  Result<std::vector<float>> start(const Noise& noise) const;
+  Result<ActionChunk> run(EncodedObservation& observation);
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
               const std::vector<T>& values) const;
-  void record_inputs(std::vector<Tap>& taps, const Inputs& inputs) const;
-  std::vector<float> normalized(const std::vector<float>& x) const;
-  void record_chunk(ActionChunk& chunk) const;
 
-  Bundle bundle_;
-  Processor processor_;
-  std::vector<std::unique_ptr<Engine>> others_;  // of the first robot
-  std::shared_ptr<Device> device_;
-  Solver solver_;
-  int horizon_ = 0, d_action_ = 0, d_state_ = 0;
   std::string tap_pattern_;
+  bool dry_, chose_kernels_;         // somebody chose them
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads
-  bool dry_ = false;
-  bool chose_kernels_ = false;         // somebody did
-  std::shared_ptr<ParamList> params_;  // of all robots
-  std::unique_ptr<Policy> policy_;
-  std::unique_ptr<Slots> tables_;
-  const Slot* conditions_ = nullptr;  // in tables_
-  std::unique_ptr<Slots> constant_slots_;
-  Cache constants_;       // in constant_slots_
-  Plans::All all_plans_;  // of all robots
-  std::unique_ptr<Plans> plans_;
-  std::optional<InputShape> last_shape_;
-  Prepared prepared_;  // of the last observation that came to `act` as a whole
+  std::unique_ptr<Device> device_;   // goes after what it made
+  std::vector<std::unique_ptr<Robot>> robots_;
+  std::optional<Plans> plans_;
+  std::optional<std::pair<const Robot*, InputShape>> last_;
+  EncodedObservation prepared_;  // of the last observation that came to `act` as a whole
 };
 
 }  // namespace vla

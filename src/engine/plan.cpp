@@ -42,19 +42,19 @@ Tensor after(Graph& g, Tensor k, int n_step) {
 
 }  // namespace
 
-Plan::Plan(const PlanContext& context, const InputShape& shape)
+Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& context)
     : tap_pattern_(context.tap_pattern),
       device_(context.device),
       images_(slots_.add_f32({shape.width, shape.height, 3, shape.n_view})),
       tokens_(slots_.add_i32({shape.n_text, 1, 1, 1})),
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
-      x_(slots_.add_f32({context.d_action, context.horizon, 1, 1})),
+      x_(slots_.add_f32({network.d_action, network.horizon, 1, 1})),
       k_(slots_.add_i32({1, 1, 1, 1})),
       target_(shape.steered ? slots_.add_f32(x_->shape) : nullptr),
-      keep_(shape.steered ? slots_.add_f32({context.horizon, context.solver.n_step, 1, 1}) : nullptr),
-      pull_(shape.steered ? slots_.add_f32({context.horizon, context.solver.n_step, 1, 1}) : nullptr),
+      keep_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
+      pull_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
       views_(shape.views),
-      cache_(context.constants),
+      cache_(network.constants),
       injection_(context.injected, slots_) {}
 
 /// v' = keep * v + pull * (x - target), row by row.
@@ -66,23 +66,23 @@ Tensor Plan::steered(Graph& g, Tensor x, Tensor k, Tensor velocity) const {
   return add(g, multiply(g, velocity, of_rows(keep_)), multiply(g, off, of_rows(pull_)));
 }
 
-Status Plan::lower(const PlanContext& context) {
+Status Plan::lower(const Network& network, bool dry) {
   Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
-  Graph step(slots_, step_filter(tap_pattern_, context.solver.n_step), injection_.of_step(context.solver.n_step));
-  context.policy.prefix(
+  Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_step));
+  network.policy.prefix(
       prefix,
       {prefix.input(images_), prefix.input(tokens_), state_ != nullptr ? prefix.input(state_) : Tensor(), views_},
       cache_);
   const Tensor x = step.input(x_), k = step.input(k_);
-  const Tensor condition = context.conditions != nullptr ? column(step, step.input(context.conditions), k) : Tensor();
-  Tensor answer = context.policy.velocity(step, x, condition, cache_);
+  const Tensor condition = network.conditions != nullptr ? column(step, step.input(network.conditions), k) : Tensor();
+  Tensor answer = network.policy.velocity(step, x, condition, cache_);
   LowerOptions changing = {{x_, k_}};
   if (target_ != nullptr) {
     answer = steered(step, x, k, answer);
     changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
   }
-  step.write(step.name("x", context.solver.next(step, x, answer)), x_);
-  if (condition || target_ != nullptr) step.write(after(step, k, context.solver.n_step), k_);
+  step.write(step.name("x", network.solver.next(step, x, answer)), x_);
+  if (condition || target_ != nullptr) step.write(after(step, k, network.solver.n_step), k_);
 
   VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
@@ -91,13 +91,13 @@ Status Plan::lower(const PlanContext& context) {
   for (const Slot* slot : injection_.slots()) varying.varying.push_back(slot), changing.varying.push_back(slot);
   VLA_TRY(prefix_, device_.lower(prefix, varying));
   VLA_TRY(step_, device_.lower(step, changing));
-  return context.dry ? Status() : prefix_->prepare();
+  return dry ? Status() : prefix_->prepare();
 }
 
-Result<std::unique_ptr<Plan>> Plan::build(const PlanContext& context, const InputShape& shape) {
-  VLA_CHECK(context.policy.check(shape));
-  std::unique_ptr<Plan> plan(new Plan(context, shape));
-  VLA_CHECK(plan->lower(context));
+Result<std::unique_ptr<Plan>> Plan::build(const Network& network, const InputShape& shape, const PlanContext& context) {
+  VLA_CHECK(network.policy.check(shape));
+  std::unique_ptr<Plan> plan(new Plan(network, shape, context));
+  VLA_CHECK(plan->lower(network, context.dry));
   return plan;
 }
 
@@ -150,28 +150,22 @@ void Plan::collect_step_taps(int k, std::vector<Tap>& taps) const {
   }
 }
 
-Plans::Plans(PlanContext context, All all) : context_(std::move(context)), all_(std::move(all)) {
-  all_->push_back(this);
-}
-
-const Plan* Plans::find(const InputShape& shape) const {
-  const auto found = plans_.find(shape);
+const Plan* Plans::find(const Network& network, const InputShape& shape) const {
+  const auto found = plans_.find({&network.policy, shape});
   return found != plans_.end() ? found->second.get() : nullptr;
 }
 
-Result<Plan*> Plans::for_shape(const InputShape& shape) {
-  if (const auto found = plans_.find(shape); found != plans_.end()) return found->second.get();
-  std::size_t bytes = 0;
-  for (const Plans* robot : *all_) bytes += robot->size();
-  if (bytes > kMaxPlanBytes)
-    for (Plans* robot : *all_) robot->plans_.clear();
-  VLA_TRY(std::unique_ptr<Plan> plan, Plan::build(context_, shape));
-  return (plans_[shape] = std::move(plan)).get();
+Result<Plan*> Plans::for_shape(const Network& network, const InputShape& shape) {
+  const std::pair key(&network.policy, shape);
+  if (const auto found = plans_.find(key); found != plans_.end()) return found->second.get();
+  if (size() > kMaxPlanBytes) clear();
+  VLA_TRY(std::unique_ptr<Plan> plan, Plan::build(network, shape, context_));
+  return (plans_[key] = std::move(plan)).get();
 }
 
 std::size_t Plans::size() const {
   std::size_t bytes = 0;
-  for (const auto& [shape, plan] : plans_) bytes += plan->size();
+  for (const auto& [key, plan] : plans_) bytes += plan->size();
   return bytes;
 }
 

@@ -17,14 +17,18 @@ namespace vla {
 /// Work by stage, under the names that Timing has.
 using StageWork = std::vector<std::pair<std::string, Work>>;
 
-/// What every plan is built from and shares.
-struct PlanContext {
+/// A robot's network, as its plans are built from it.
+struct Network {
   const Policy& policy;
-  Device& device;
   const Solver& solver;
   const Slot* conditions;  // [d, n_step]: what depends on the time alone, one column per solver step; or null
   const Cache& constants;  // what depends on the weights alone
   int d_action, horizon;
+};
+
+/// What all plans of an engine share.
+struct PlanContext {
+  Device& device;
   std::string tap_pattern;
   bool dry;                               // nothing is computed
   const std::vector<Tap>* injected = {};  // null: nothing
@@ -35,7 +39,8 @@ struct PlanContext {
 class Plan {
  public:
   /// Errors: out_of_memory, internal, bad_observation (values to be injected that have no place).
-  static Result<std::unique_ptr<Plan>> build(const PlanContext& context, const InputShape& shape);
+  static Result<std::unique_ptr<Plan>> build(const Network& network, const InputShape& shape,
+                                             const PlanContext& context);
 
   void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
   /// Where the first step starts.
@@ -64,8 +69,8 @@ class Plan {
   std::size_t size() const { return slots_.size() + prefix_->size() + step_->size(); }
 
  private:
-  Plan(const PlanContext& context, const InputShape& shape);
-  Status lower(const PlanContext& context);
+  Plan(const Network& network, const InputShape& shape, const PlanContext& context);
+  Status lower(const Network& network, bool dry);
   Tensor steered(Graph& step, Tensor x, Tensor k, Tensor velocity) const;
 
   std::string tap_pattern_;
@@ -80,26 +85,23 @@ class Plan {
   std::unique_ptr<Program> prefix_, step_;
 };
 
-/// A robot's cached plans, within the memory limit that all robots of an engine share.
+/// The cached plans of all robots of an engine, within one memory limit.
 class Plans {
  public:
-  using All = std::shared_ptr<std::vector<Plans*>>;
-  explicit Plans(PlanContext context, All all = std::make_shared<std::vector<Plans*>>());
-  ~Plans() { std::erase(*all_, this); }
-  Plans(const Plans&) = delete;
-  Plans& operator=(const Plans&) = delete;
+  explicit Plans(PlanContext context) : context_(std::move(context)) {}
 
-  /// Where there is no such plan yet and memory is short, all other plans go, also those of other robots.
-  Result<Plan*> for_shape(const InputShape& shape);
+  /// Where there is no such plan yet and memory is short, all others go. `network` must outlive its plans. Errors:
+  /// those of Plan::build.
+  Result<Plan*> for_shape(const Network& network, const InputShape& shape);
   /// Null where there is none.
-  const Plan* find(const InputShape& shape) const;
+  const Plan* find(const Network& network, const InputShape& shape) const;
+  void clear() { plans_.clear(); }
   /// Bytes of all plans.
   std::size_t size() const;
 
  private:
   PlanContext context_;
-  All all_;  // these plans and the other robots'
-  std::map<InputShape, std::unique_ptr<Plan>> plans_;
+  std::map<std::pair<const Policy*, InputShape>, std::unique_ptr<Plan>> plans_;
 };
 
 }  // namespace vla

@@ -92,7 +92,7 @@ class Evo1 final : public Policy {
     return check_prefix(1, n_token_, 1);
   }
 
-  bool places_views() const override { return in_place_; }
+  bool depends_on_which_views() const override { return in_place_; }
 
   Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
     // The reference takes a row of its table by the time in double.

@@ -56,7 +56,7 @@ class Policy {
   }
 
   /// Whether it matters which views are present, and not their number alone.
-  virtual bool places_views() const { return false; }
+  virtual bool depends_on_which_views() const { return false; }
 
   virtual RealTimeChunking real_time_chunking() const { return {}; }
 

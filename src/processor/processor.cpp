@@ -177,7 +177,7 @@ std::string Processor::state_place(std::size_t i) const {
 }
 
 /// Adds a note, or refuses, where normalized state values are far outside the training range.
-Status Processor::check_bound(const StateOp& op, Inputs& inputs) const {
+Status Processor::check_bound(const StateOp& op, bool reject, Inputs& inputs) const {
   std::vector<std::size_t> beyond;
   for (std::size_t i = 0; i < inputs.state.size(); ++i)
     if (op.normalizes(i) && std::abs(static_cast<double>(inputs.state[i])) > state_bound_) beyond.push_back(i);
@@ -185,10 +185,10 @@ Status Processor::check_bound(const StateOp& op, Inputs& inputs) const {
   const std::size_t i = beyond.front(), n_other = beyond.size() - 1;
   const std::string found = fmt::format("{}, which is {:.3g} when normalized{}", inputs.raw_state[i], inputs.state[i],
                                         n_other > 0 ? fmt::format(", and {} more such numbers", n_other) : "");
-  if (refuses_beyond_)
+  if (reject)
     return bad_observation(state_place(i), fmt::format("at most {} when normalized", state_bound_), found,
                            "are its units those of the training data?");
-  inputs.is_beyond = true;
+  inputs.out_of_range = true;
   inputs.notes.push_back(
       fmt::format("{}: {}; more than {} is far from what the policy has seen", state_place(i), found, state_bound_));
   return {};
@@ -197,7 +197,7 @@ Status Processor::check_bound(const StateOp& op, Inputs& inputs) const {
 Status Processor::encode_state(const Observation& observation, Inputs& inputs) const {
   using Stage = StateOp::Stage;
   inputs.notes.clear();
-  inputs.is_beyond = false;
+  inputs.out_of_range = false;
   for (const std::string& feature : degraded_)
     inputs.notes.push_back("DEGRADED: " + feature +
                            " passes unnormalized, as --identity-stats allowed when converting");
@@ -209,7 +209,7 @@ Status Processor::encode_state(const Observation& observation, Inputs& inputs) c
       raw = false;
     }
     op->apply(inputs.state);
-    VLA_CHECK(check_bound(*op, inputs));
+    VLA_CHECK(check_bound(*op, observation.reject_out_of_range, inputs));
   }
   if (raw) inputs.raw_state = inputs.state;
   if (const std::size_t bad = first_bad(inputs.state); bad < inputs.state.size())

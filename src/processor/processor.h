@@ -25,6 +25,7 @@ struct Observation {
   std::map<std::string, std::vector<float>> states;   // world units
   std::string text;                                   // the instruction, UTF-8
   std::string embodiment = {};                        // the robot's tag; empty where the policy is for one
+  bool reject_out_of_range = false;  // refuse a state or leftover beyond its bound, instead of a note in the answer
 };
 
 /// The host side of one observation, as the network reads it. Vectors keep their memory when filled again.
@@ -37,7 +38,7 @@ struct Inputs {
   std::vector<float> state;            // normalized, padded; empty where the network sees none
   std::vector<int> discretized_state;  // where the prompt has a place for it
   std::vector<float> raw_state;        // before its normalization, which actions may be relative to
-  bool is_beyond = false;              // the state has a number beyond the bundle's bound, as a note says
+  bool out_of_range = false;           // the state has a number beyond the bundle's bound, as a note says
   std::vector<std::string> notes;      // warnings, e.g. that the instruction was truncated
 };
 
@@ -53,9 +54,6 @@ class Processor {
   /// rows, and checks that they fit each other. The bundle may be closed afterwards. Errors: bad_bundle.
   /// `tokenizer`: shared with a processor of the same `tokenizer.*` and `lm.n_vocab`; null makes one.
   static Result<Processor> create(const Bundle& bundle, std::shared_ptr<const Tokenizer> tokenizer = nullptr);
-
-  /// From now on a state beyond its bound is refused instead of answered with a note.
-  void refuse_beyond() { refuses_beyond_ = true; }
 
   /// All three parts below. Errors: bad_observation.
   Result<Inputs> encode(const Observation& observation) const;
@@ -84,8 +82,6 @@ class Processor {
   /// Which value of normalized actions (n, action_names().size()) is farthest from the training data, where one is
   /// beyond kStateBound: for a note or a refusal. Columns that have no statistics are not looked at.
   std::optional<std::string> far_action(std::span<const float> rows) const;
-  /// Whether a state or a leftover beyond its bound is refused.
-  bool refuses_beyond() const { return refuses_beyond_; }
 
   /// Whether a step of the recipe reads this tensor; any other statistics in a bundle are a mistake.
   bool reads(const std::string& tensor) const;
@@ -120,7 +116,7 @@ class Processor {
   void cut_tokens(std::vector<std::int32_t>& tokens) const;
   Status read_degraded(const Keys& keys);
   std::string state_place(std::size_t i) const;
-  Status check_bound(const StateOp& op, Inputs& inputs) const;
+  Status check_bound(const StateOp& op, bool reject, Inputs& inputs) const;
   Status gather_states(const Observation& observation, std::vector<float>& state) const;
 
   FeatureNames views_, states_;
@@ -129,7 +125,6 @@ class Processor {
   std::vector<int> state_dims_;
   std::vector<std::string> state_names_, action_names_, degraded_;
   double state_bound_ = kStateBound;
-  bool refuses_beyond_ = false;
   Recipe recipe_;
   std::shared_ptr<const Tokenizer> tokenizer_;
   /// Where the text has places for views: the tokens of every prompt up to the last place, or from the first place on,

@@ -79,9 +79,9 @@ void write_robot(const Description& d, v1::Description& out) {
 
 v1::Description describe(const Engine& engine, const v1::Limits& limits) {
   v1::Description out;
-  const std::vector<const Engine*> robots = engine.robots();
-  for (const Engine* robot : robots) {
-    const Description d = vla::describe(*robot);
+  const std::vector<const Robot*> robots = engine.robots();
+  for (const Robot* robot : robots) {
+    const Description d = vla::describe(engine, *robot);
     v1::Description& own = robots.size() > 1 ? *out.add_embodiments() : out;
     write_common(d, limits, own);
     write_robot(d, own);

@@ -24,14 +24,14 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   limits.set_max_pixels(static_cast<std::uint64_t>(options.max_pixels));
   limits.set_max_text_bytes(static_cast<std::uint32_t>(options.max_text));
   std::size_t most = 0;
-  for (const Engine* robot : engine.robots()) most = std::max(most, robot->processor().views().names().size());
+  for (const Robot* robot : engine.robots()) most = std::max(most, robot->processor().views().names().size());
   limits.set_max_views(static_cast<std::uint32_t>(most));
   limits.set_max_queue(static_cast<std::uint32_t>(options.max_queue));
   return limits;
 }
 
 /// An observation of a robot with every view and the longest text.
-Observation largest_observation(const Engine& robot) {
+Observation largest_observation(const Robot& robot) {
   const Processor& processor = robot.processor();
   const Recipe& recipe = processor.recipe();
   const int width = recipe.width, height = recipe.height;
@@ -50,8 +50,8 @@ Observation largest_observation(const Engine& robot) {
 
 Result<double> warm_up(Engine& engine) {
   const auto start = Clock::now();
-  for (const Engine* robot : engine.robots()) {
-    Prepared prepared;  // its memory is not kept: every act that is served brings its own
+  for (const Robot* robot : engine.robots()) {
+    EncodedObservation prepared;  // its memory is not kept: every act that is served brings its own
     const Status sound = engine.prepare(largest_observation(*robot), Noise(std::uint64_t{0}), {}, prepared);
     const auto chunk = sound ? engine.act(prepared) : Result<ActionChunk>(sound.error());
     if (!chunk && chunk.error().code != Code::bad_observation && chunk.error().code != Code::bad_action)
@@ -178,11 +178,12 @@ void Server::compute(Engine& engine, Act& act) {
 Status Server::prepare(const Engine& engine, Act& act) const {
   const std::span<const std::byte> body = act.answer.job.body();
   VLA_TRY(const std::string embodiment, named_embodiment(body));
-  VLA_TRY(const Engine* robot, engine.robot(embodiment));
+  VLA_TRY(const Robot* robot, engine.robot(embodiment));
   const v1::Description& description = description_of(description_, robot->bundle().embodiment());
   const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
                          robot->solver_horizon(), robot->d_action_padded(), description.actions_size()};
   VLA_TRY(act.request, decode_act(body, limits, robot->processor().views(), robot->processor().states()));
+  act.request.observation.reject_out_of_range = options_.strict_state;
   act.clock.lap(act.answer.stages, "decode");
   VLA_CHECK(engine.prepare(act.request.observation, act.request.noise, act.request.leftover, act.prepared));
   act.clock = {};  // the wait for the device begins
@@ -195,7 +196,7 @@ Status Server::respond(Engine& engine, Act& act) const {
   VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
-  answer.is_beyond = chunk.is_beyond, answer.notes = chunk.notes;
+  answer.is_beyond = chunk.out_of_range, answer.notes = chunk.notes;
   v1::Response response = response_to(answer.job.request_id);
   const std::string& embodiment = act.prepared.robot->bundle().embodiment();
   *response.mutable_chunk() = encode_chunk(act.request, std::move(chunk), description_of(description_, embodiment));

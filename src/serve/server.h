@@ -24,6 +24,7 @@ struct ServerOptions {
   std::size_t max_text = 4096;              // bytes
   std::size_t max_queue = 64;               // acts
   std::size_t max_connections = 256;
+  bool strict_state = false;  // refuse states beyond the bundle's bound
 };
 
 /// Computes one act of a synthetic observation with every view and the longest text, so that the first client does not
@@ -63,7 +64,7 @@ class Server {
   struct Act {
     Answer answer;
     ActRequest request;
-    Prepared prepared;
+    EncodedObservation prepared;
     StageClock clock;
   };
   /// False when no act comes any more.

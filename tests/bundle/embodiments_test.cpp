@@ -166,16 +166,17 @@ TEST_CASE("a parameter that robots share is declared once, and one of their own 
   ParamList list(arm->keys(), &*arm);
   const Param* shared = Scope(list, "lm").matrix("weight", 4, 2);
   const Param* own = Scope(list, "state_in").matrix("weight", 3, 4);
-  CHECK(list.report("test", [](const std::string&) { return false; }).ok());
-  list.go_on(*humanoid);
-  CHECK(Scope(list, "policy").dim("max_views") == 2);
   CHECK(Scope(list, "lm").matrix("weight", 4, 2) == shared);
-  const Param* other = Scope(list, "state_in").matrix("weight", 5, 4);
+  CHECK(list.report("test", [](const std::string&) { return false; }).ok());
+  ParamList next(*humanoid, list);
+  CHECK(Scope(next, "policy").dim("max_views") == 2);
+  CHECK(Scope(next, "lm").matrix("weight", 4, 2) == shared);
+  const Param* other = Scope(next, "state_in").matrix("weight", 5, 4);
   CHECK(other != own);
   CHECK(other->source->data.front() == std::byte{3});
   CHECK(own->source->data.front() == std::byte{2});
   CHECK(list.params().size() == 3);
-  CHECK(list.report("test", [](const std::string& tensor) { return tensor == "stats.x"; }).ok());
+  CHECK(next.report("test", [](const std::string& tensor) { return tensor == "stats.x"; }).ok());
 }
 
 TEST_CASE("a tensor of a further robot that no module declares is refused, and so is a shape that does not fit") {
@@ -186,10 +187,10 @@ TEST_CASE("a tensor of a further robot that no module declares is refused, and s
   ParamList list(arm->keys(), &*arm);
   Scope(list, "lm").matrix("weight", 4, 2);
   Scope(list, "state_in").matrix("weight", 3, 4);
-  list.go_on(*humanoid);
-  Scope(list, "lm").matrix("weight", 2, 4);
-  Scope(list, "state_in").matrix("weight", 5, 4);
-  const Status report = list.report("test", [](const std::string&) { return false; });
+  ParamList next(*humanoid, list);
+  Scope(next, "lm").matrix("weight", 2, 4);
+  Scope(next, "state_in").matrix("weight", 5, 4);
+  const Status report = next.report("test", [](const std::string&) { return false; });
   REQUIRE_FALSE(report.ok());
   CHECK(contains(report.error().message(), "unused tensor   stats.x"));
   CHECK(contains(report.error().message(), "wrong shape     lm.weight"));

@@ -12,7 +12,7 @@ using namespace vla::test;
 
 TEST_CASE("a description states features, chunk and solver of a bundle that pads its actions") {
   const auto engine = load_engine(golden_path("smolvla/absent_view/bundle.gguf"));
-  const Description d = describe(*engine);
+  const Description d = describe(*engine, engine->robot());
   CHECK(d.arch == "smolvla");
   REQUIRE(d.views.size() == 4);
   CHECK(d.views[2].name == "observation.images.base");
@@ -29,7 +29,7 @@ TEST_CASE("a description states features, chunk and solver of a bundle that pads
 
 TEST_CASE("a robot that gets the first rows and columns only: the chunk is smaller than the solver's start") {
   const auto engine = load_engine(golden_path("gr00t_n1_7/libero/bundle.gguf"));
-  const Description d = describe(*engine);
+  const Description d = describe(*engine, engine->robot());
   CHECK(d.horizon == 5);
   CHECK(d.solver_horizon == 8);
   CHECK(d.actions.size() == 7);

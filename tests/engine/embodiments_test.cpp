@@ -87,9 +87,9 @@ TEST_CASE("robots whose tokenizers are described alike have one, and its descrip
     bundle.set("embodiment.arm.tokenizer.added", Value(added));
     bundle.set("embodiment.dog.tokenizer.added", Value(added + (alike ? "" : " ")));
     const auto engine = load(bundle, "both.gguf", {.dry = true, .all_robots = true});
-    const std::vector<const Engine*> robots = engine->robots();
+    const std::vector<const Robot*> robots = engine->robots();
     CHECK((robots[0]->processor().tokenizer() == robots[1]->processor().tokenizer()) == alike);
-    for (const Engine* robot : robots) CHECK_FALSE(robot->bundle().keys().has("tokenizer.tokens"));
+    for (const Robot* robot : robots) CHECK_FALSE(robot->bundle().keys().has("tokenizer.tokens"));
   }
 }
 

@@ -48,9 +48,9 @@ TEST_CASE("the published SmolVLA counts the operations of its configuration, und
   for (const KernelSet& set : usable_kernels()) {
     CAPTURE(name_of(set));
     const WeightlessSmolVla smolvla(10, name_of(set));
-    Plans plans(smolvla.context());
+    Plans plans = smolvla.plans();
     for (const auto& [n_view, n_text] : {std::pair(2, 48), std::pair(1, 5)}) {
-      const auto plan = plans.for_shape({512, 512, n_view, n_text, 32});
+      const auto plan = plans.for_shape(smolvla.network(), {512, 512, n_view, n_text, 32});
       REQUIRE(plan.ok());
       const StageWork work = (*plan)->work(10);
       const Expected expected = count_by_hand(n_view, n_text);

@@ -28,7 +28,7 @@ inline Observation plain_observation(const Processor& processor, int width = 24,
 
 /// One act of one robot. Aborts when it is refused for a reason that no bundle can be, or answers with numbers that are
 /// not finite. Returns whether it answered.
-inline bool check_robot(Engine& engine, const Engine& robot) {
+inline bool check_robot(Engine& engine, const Robot& robot) {
   const auto act = [&](auto... size) {
     Observation observation = plain_observation(robot.processor(), size...);
     observation.embodiment = robot.bundle().embodiment();
@@ -63,7 +63,7 @@ inline bool check_act(const std::string& bytes) {
     return false;
   }
   bool answered = true;
-  for (const Engine* robot : (*engine)->robots()) answered &= check_robot(**engine, *robot);
+  for (const Robot* robot : (*engine)->robots()) answered &= check_robot(**engine, *robot);
   return answered;
 }
 

@@ -390,25 +390,26 @@ TEST_CASE("of very many names a message lists the first fifty") {
 TEST_CASE("a state far beyond what the policy has seen is told by name, or refused where that is asked for") {
   Observation seen = observation();
   seen.states["state"] = {1.5f, 1e30f};
-  Processor processor = make();
+  const Processor processor = make();
   const auto inputs = processor.encode(seen);
   REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
-  CHECK(inputs->is_beyond);
+  CHECK(inputs->out_of_range);
   REQUIRE(inputs->notes.size() == 1);
   CHECK(contains(inputs->notes[0],
                  "observation.state[1] (\"y\"): 1e+30, which is 5e+29 when normalized; more than 10 is far"));
   seen.states["state"] = {-20.0f, 1e30f};
   CHECK(contains(processor.encode(seen)->notes.at(0),
                  "observation.state[0] (\"x\"): -20, which is -21 when normalized, and 1 more"));
-  processor.refuse_beyond();
+  seen.reject_out_of_range = true;
   CHECK(contains(refusal(processor.encode(seen), Code::bad_observation),
                  "observation.state[0] (\"x\"): expected at most 10 when normalized"));
   seen.states["state"] = {10.9f, -17.9f};  // 9.9 and -9.95 of 0.5 + 0.5 and 1.5 + 0.5
   CHECK(processor.encode(seen)->notes.empty());
-  CHECK_FALSE(processor.encode(seen)->is_beyond);
+  CHECK_FALSE(processor.encode(seen)->out_of_range);
+  seen.reject_out_of_range = false;
   EditableBundle bundle = sample();
   bundle.set("observation.state_bound", 5.0);
-  CHECK(make(bundle).encode(seen)->is_beyond);
+  CHECK(make(bundle).encode(seen)->out_of_range);
 }
 
 TEST_CASE("a feature that passes unnormalized by permission is told with every answer") {

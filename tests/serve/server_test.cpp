@@ -21,8 +21,8 @@ TEST_CASE("an act through the server gives the bytes that the engine gives, from
   for (const Noise& noise : {Noise(golden().noise), Noise(std::uint64_t{99})}) {
     if (const auto* values = std::get_if<std::vector<float>>(&noise)) {
       v1::Noise& sent = *request.mutable_act()->mutable_noise();
-      sent.set_horizon(static_cast<std::uint32_t>(engine->solver_horizon()));
-      sent.set_d_action(static_cast<std::uint32_t>(engine->d_action_padded()));
+      sent.set_horizon(static_cast<std::uint32_t>(engine->robot().solver_horizon()));
+      sent.set_d_action(static_cast<std::uint32_t>(engine->robot().d_action_padded()));
       sent.mutable_values()->Add(values->begin(), values->end());
     } else {
       request.mutable_act()->set_seed(std::get<std::uint64_t>(noise));
@@ -125,8 +125,8 @@ TEST_CASE("noise that is not finite is refused by the engine's own rule") {
   Peer peer(running.address());
   v1::Request request = act_request(golden(), 5);
   v1::Noise& noise = *request.mutable_act()->mutable_noise();
-  noise.set_horizon(static_cast<std::uint32_t>(running.engine->solver_horizon()));
-  noise.set_d_action(static_cast<std::uint32_t>(running.engine->d_action_padded()));
+  noise.set_horizon(static_cast<std::uint32_t>(running.engine->robot().solver_horizon()));
+  noise.set_d_action(static_cast<std::uint32_t>(running.engine->robot().d_action_padded()));
   noise.mutable_values()->Add(golden().noise.begin(), golden().noise.end());
   noise.set_values(2, HUGE_VALF);
   CHECK(code_of(peer.ask(request)) == "BAD_OBSERVATION");

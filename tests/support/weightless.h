@@ -23,12 +23,14 @@ struct WeightlessSmolVla {
     REQUIRE(device->allocate(tables).ok());
   }
 
-  PlanContext context() const { return {*policy, *device, solver, conditions, constants, 32, 50, "", true}; }
+  Network network() const { return {*policy, solver, conditions, constants, 32, 50}; }
+  Network other_robot() const { return {*other, solver, conditions, constants, 32, 50}; }
+  Plans plans() const { return Plans({*device, "", true}); }
 
   PolicyEntry entry = *find_policy("smolvla");
   Keys keys = entry.published();
   ParamList list{keys, nullptr};
-  std::unique_ptr<Policy> policy = entry.make(list);
+  std::unique_ptr<Policy> policy = entry.make(list), other = entry.make(list);
   std::unique_ptr<Device> device;
   Solver solver;
   Slots tables;

@@ -1,0 +1,166 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "engine/robot.h"
+
+#include <fmt/format.h>
+
+#include <cmath>
+
+namespace vla {
+namespace {
+
+constexpr int kMaxHorizon = 4096;
+
+/// Load rate: lowers a graph that is used once, and runs it.
+Status run_once(const Graph& graph, Device& device, bool dry) {
+  VLA_CHECK(device.allocate(graph.slots()));
+  VLA_TRY(const std::unique_ptr<Program> program, device.lower(graph));
+  return dry ? Status() : program->run();
+}
+
+}  // namespace
+
+Robot::Robot(Bundle bundle, Processor processor, const Robot* other)
+    : bundle_(std::move(bundle)),
+      processor_(std::move(processor)),
+      params_(other != nullptr ? ParamList(bundle_, other->params_) : ParamList(bundle_.keys(), &bundle_)) {}
+
+Result<std::unique_ptr<Robot>> Robot::open(Bundle bundle, const Robot* other) {
+  const bool same_text = other != nullptr && bundle.keys().same("tokenizer.", other->bundle_.keys()) &&
+                         bundle.keys().same("lm.n_vocab", other->bundle_.keys());
+  VLA_TRY(Processor processor, Processor::create(bundle, same_text ? other->processor_.tokenizer() : nullptr));
+  std::unique_ptr<Robot> robot(new Robot(std::move(bundle), std::move(processor), other));
+  VLA_CHECK(robot->read_policy());
+  return robot;
+}
+
+Status Robot::read_policy() {
+  const Keys& keys = bundle_.keys();
+  VLA_TRY(const std::string arch, keys.string("vla.arch"));
+  VLA_TRY(const PolicyEntry entry, find_policy(arch));
+  policy_ = entry.make(params_);
+  VLA_CHECK(params_.report(arch, [this](const std::string& tensor) { return processor_.reads(tensor); }));
+  VLA_TRY(solver_, Solver::read(keys));
+  VLA_TRY(horizon_, keys.integer("policy.horizon", {1, kMaxHorizon}));
+  VLA_TRY(d_action_, keys.integer("policy.d_action", {1, kMaxVector}));
+  VLA_TRY(d_state_, keys.integer("policy.d_state", {0, kMaxVector}));
+  return policy_->check(largest_shape());
+}
+
+Status Robot::compute_constants(Device& device, bool dry) {
+  VLA_CHECK(make_conditions(device, dry));
+  const Recipe& recipe = processor_.recipe();
+  Graph graph(constant_slots_);
+  const auto absent_view = [&] {
+    return graph.constant(processor_.absent_view(), {recipe.width, recipe.height, 3, 1});
+  };
+  policy_->constants(graph, absent_view, constants_);
+  return graph.nodes().empty() ? Status() : run_once(graph, device, dry);
+}
+
+/// The table of everything that depends on the time alone.
+Status Robot::make_conditions(Device& device, bool dry) {
+  tables_ = Slots();
+  conditions_ = nullptr;
+  Graph graph(tables_);
+  const Tensor computed = policy_->condition(graph, solver_.times);
+  if (!computed) return {};
+  Slot* table = tables_.add_f32(computed.shape());
+  graph.write(computed, table);
+  conditions_ = table;
+  return run_once(graph, device, dry);
+}
+
+Status Robot::set_steps(int n_step, Device& device, bool dry) {
+  Keys keys = bundle_.keys();
+  keys.set("solver.steps", std::int64_t{n_step});
+  VLA_TRY(solver_, Solver::read(keys));
+  return make_conditions(device, dry);
+}
+
+InputShape Robot::largest_shape() const {
+  const Recipe& recipe = processor_.recipe();
+  const int n_view = static_cast<int>(processor_.views().names().size());
+  return {recipe.width,      recipe.height, n_view,
+          recipe.max_tokens, d_state_,      view_key(static_cast<std::uint32_t>((std::uint64_t{1} << n_view) - 1))};
+}
+
+InputShape Robot::shape_of(const EncodedObservation& observation) const {
+  const Inputs& in = observation.inputs;
+  return {in.width,
+          in.height,
+          in.n_view,
+          static_cast<int>(in.tokens.size()),
+          d_state_,
+          view_key(in.views),
+          observation.steering.has_value()};
+}
+
+/// The views of a shape: shapes that are the same for the policy must be equal.
+std::uint32_t Robot::view_key(std::uint32_t views) const { return policy_->depends_on_which_views() ? views : 0; }
+
+RealTimeChunking Robot::real_time_chunking() const {
+  return processor_.relative_actions() ? RealTimeChunking() : policy_->real_time_chunking();
+}
+
+ChunkShape Robot::chunk_shape() const {
+  return {horizon_, d_action_, horizon(), static_cast<int>(processor_.action_names().size())};
+}
+
+Status Robot::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                     EncodedObservation& to) const {
+  StageClock clock;
+  to.timing.clear(), to.steering.reset();
+  VLA_CHECK(processor_.encode_images(observation, to.inputs));
+  VLA_CHECK(processor_.encode_state(observation, to.inputs));
+  clock.lap(to.timing, "preprocess");
+  VLA_CHECK(processor_.encode_text(observation, to.inputs));
+  VLA_TRY(to.x, start(noise));
+  if (leftover) {
+    VLA_TRY(to.steering, steer(real_time_chunking(), solver_, *leftover, chunk_shape(), std::move(to.x)));
+    VLA_CHECK(check_leftover(observation, *leftover, to.inputs));
+  }
+  clock.lap(to.timing, "tokenize");
+  return {};
+}
+
+Result<std::vector<float>> Robot::start(const Noise& noise) const {
+  const std::size_t count = static_cast<std::size_t>(horizon_) * static_cast<std::size_t>(d_action_);
+  if (const auto* seed = std::get_if<std::uint64_t>(&noise)) return draw_noise(solver_.noise, *seed, count);
+  const auto& values = std::get<std::vector<float>>(noise);
+  if (values.size() != count)
+    return Error{Code::bad_observation, "noise", fmt::format("{} x {} numbers", horizon_, d_action_),
+                 fmt::format("{} numbers", values.size())};
+  for (float value : values)
+    if (!std::isfinite(value)) return Error{Code::bad_observation, "noise", "finite numbers", fmt::format("{}", value)};
+  return values;
+}
+
+/// Rows far from the training data pull the whole chunk there: most often they are in world units.
+Status Robot::check_leftover(const Observation& observation, const Leftover& leftover, Inputs& inputs) const {
+  const std::optional<std::string> far = processor_.far_action(leftover.rows);
+  if (!far) return {};
+  if (observation.reject_out_of_range)
+    return Error{Code::bad_observation, "leftover", fmt::format("at most {} when normalized", kStateBound), *far,
+                 "send rows of ActionChunk::normalized, not actions in world units"};
+  inputs.out_of_range = true;
+  inputs.notes.push_back(fmt::format("leftover{}; more than {} is far from what the policy gives", *far, kStateBound));
+  return {};
+}
+
+Result<ActionChunk> Robot::decode(const std::vector<float>& x, const Inputs& inputs) const {
+  ActionChunk chunk;
+  VLA_TRY(chunk.actions, processor_.decode(x, horizon_, d_action_, inputs.raw_state));
+  const ChunkShape shape = chunk_shape();
+  chunk.horizon = shape.n_row, chunk.d_action = shape.d_normalized;
+  for (int row = 0; row < shape.n_row; ++row)
+    chunk.normalized.insert(chunk.normalized.end(), x.begin() + row * d_action_,
+                            x.begin() + row * d_action_ + shape.d_normalized);
+  chunk.notes = inputs.notes;
+  if (const std::optional<std::string> far = processor_.far_action(chunk.normalized))
+    chunk.notes.push_back(fmt::format("actions{}; more than {} is far from the training data", *far, kStateBound));
+  chunk.out_of_range = inputs.out_of_range;
+  return chunk;
+}
+
+}  // namespace vla

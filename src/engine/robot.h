@@ -1,0 +1,103 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "engine/leftover.h"
+#include "engine/noise.h"
+#include "engine/plan.h"
+#include "engine/solver.h"
+#include "engine/taps.h"
+#include "engine/timing.h"
+#include "processor/processor.h"
+
+namespace vla {
+
+class Robot;
+
+/// What the host makes of one observation before the device is needed. Vectors keep their memory when filled again.
+struct EncodedObservation {
+  const Robot* robot = nullptr;  // that the observation names
+  Inputs inputs;
+  std::vector<float> x;  // what the solver starts from
+  std::optional<Steering> steering;
+  Timing timing;
+};
+
+/// The answer to one observation.
+struct ActionChunk {
+  int horizon = 0;  // rows
+  int d_action = 0;
+  std::vector<float> actions;      // (horizon, d_action) in the robot's own units
+  std::vector<float> normalized;   // before unnormalization: what a Leftover takes
+  std::vector<std::string> notes;  // warnings about this answer
+  bool out_of_range = false;       // one of them: the state is beyond the bundle's bound
+  Timing timing;
+  std::vector<Tap> taps;
+};
+
+/// One robot of a bundle: its keys and statistics, its processor, policy and solver, and what the policy computes of
+/// weights and times alone. Nothing of it changes once it is loaded, so that any thread may encode observations.
+class Robot {
+ public:
+  /// `bundle` is of one robot. `other`: a robot of the same file before this one, which shares parameters and tokenizer
+  /// with it, or null. Errors: bad_bundle, unsupported.
+  static Result<std::unique_ptr<Robot>> open(Bundle bundle, const Robot* other);
+  /// Load rate: what every plan starts from. The device has the parameters; `dry`: nothing is computed. Errors:
+  /// bad_bundle, unsupported, out_of_memory, device.
+  Status compute_constants(Device& device, bool dry);
+  /// Removes keys that the robots after this one were compared with.
+  void forget_tokenizer() { bundle_.forget("tokenizer."); }
+  /// Solves in another number of steps; plans of this robot must be gone. Errors: bad_bundle, out_of_memory, device.
+  Status set_steps(int n_step, Device& device, bool dry);
+
+  /// Fills all of `to` but its robot. Errors: bad_observation, unsupported.
+  Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                EncodedObservation& to) const;
+  /// What the network answered, (solver_horizon, d_action_padded), as the robot's rows and columns, with notes. Errors:
+  /// bad_action.
+  Result<ActionChunk> decode(const std::vector<float>& x, const Inputs& inputs) const;
+
+  const Bundle& bundle() const { return bundle_; }
+  const Processor& processor() const { return processor_; }
+  const Solver& solver() const { return solver_; }
+  const ParamList& params() const { return params_; }
+  Network network() const { return {*policy_, solver_, conditions_, constants_, d_action_, horizon_}; }
+  InputShape largest_shape() const;
+  InputShape shape_of(const EncodedObservation& observation) const;
+  /// What an act does with a leftover: nothing where actions are relative to a state, which the rows would have lost.
+  RealTimeChunking real_time_chunking() const;
+  /// Rows of a chunk.
+  int horizon() const { return processor_.n_row(horizon_); }
+  /// Rows and columns of the solver's start: those of a chunk, or more.
+  int solver_horizon() const { return horizon_; }
+  int d_action_padded() const { return d_action_; }
+  /// Bytes of what was computed at load.
+  std::size_t constants_size() const { return tables_.size() + constant_slots_.size(); }
+
+ private:
+  Robot(Bundle bundle, Processor processor, const Robot* other);
+  Status read_policy();
+  Status make_conditions(Device& device, bool dry);
+  Status check_leftover(const Observation& observation, const Leftover& leftover, Inputs& inputs) const;
+  ChunkShape chunk_shape() const;
+  std::uint32_t view_key(std::uint32_t views) const;
+  Result<std::vector<float>> start(const Noise& noise) const;
+  std::vector<float> normalized(const std::vector<float>& x) const;
+
+  Bundle bundle_;
+  Processor processor_;
+  ParamList params_;
+  std::unique_ptr<Policy> policy_;
+  Solver solver_;
+  int horizon_ = 0, d_action_ = 0, d_state_ = 0;
+  Slots tables_, constant_slots_;
+  const Slot* conditions_ = nullptr;  // in tables_
+  Cache constants_;                   // in constant_slots_
+};
+
+}  // namespace vla
