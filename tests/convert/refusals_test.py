@@ -308,3 +308,16 @@ def test_names_of_a_data_set_with_other_widths_are_refused(converter, tiny, tmp_
     write_json(str(tmp_path / "info.json"), {"fps": 10, "features": {"observation.state": {"names": ["a", "b"]}}})
     message = converter.refusal(tiny, dataset_info=str(tmp_path / "info.json")).message()
     assert "features.observation.state.names: expected {} different names".format(STATE_DIM) in message
+
+
+@pytest.mark.parametrize(
+    "info, place",
+    [
+        ({"anything": 1}, "features: expected observation.state and action, found none"),
+        ({"features": {"observation.images.top": {}}}, "features: expected observation.state and action, found observation.images.top"),
+        ({"features": {"action": {"shape": [14]}}}, "features.action.shape: expected [2], found [14]"),
+    ],
+)
+def test_a_file_that_is_no_info_of_this_robot_is_refused(converter, tiny, tmp_path, info, place):
+    write_json(str(tmp_path / "info.json"), info)
+    assert place in converter.refusal(tiny, dataset_info=str(tmp_path / "info.json")).message()

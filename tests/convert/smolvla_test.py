@@ -9,6 +9,8 @@ import pytest
 
 from tiny import ACTION_DIM, D_VISION, EXPERT, N_LAYER, STATE_DIM, VLM, Tiny, write_json, write_safetensors
 
+from vla_cpp.convert import Code
+
 PAIRS = {  # the bundle's name -> the checkpoint's, one per rule of the mapping
     "vision.position.weight": VLM + "vision_model.embeddings.position_embedding.weight",
     "vision.blk.0.attn_norm.bias": VLM + "vision_model.encoder.layers.0.layer_norm1.bias",
@@ -321,3 +323,49 @@ def test_the_tokenizer_that_the_processor_saved_wins_over_the_backbones(converte
     tiny.tokenizer["added_tokens"][1]["content"] = "<own>"
     write_json(folder + "/tokenizer/tokenizer.json", tiny.tokenizer)
     assert "<own>" in converter.bundle(backbone=folder + "/vlm").keys["tokenizer.tokens"]
+
+
+def test_units_are_taken_by_number_by_feature_or_for_all(converter, tiny):
+    for wrong in ("furlong", "elbow=rad", "action=m,action=rad"):
+        error = converter.refusal(tiny, units=wrong)
+        assert "--units" in error.message() and error.code == Code.USAGE
+    assert converter.bundle(tiny, units="rad").keys["observation.state_units"] == ["rad"] * STATE_DIM
+    keys = converter.bundle(tiny, units="observation.state=m,action.1=%").keys
+    assert keys["observation.state_units"] == ["m"] * STATE_DIM and keys["action.units"] == ["", "%"]
+
+
+@pytest.mark.parametrize(
+    "unit, reach, note",
+    [
+        ("rad", 90, "are these degrees?"),
+        ("deg", 3, "are these radians?"),
+        ("", 90, "state the unit with --units"),
+        ("deg", 90, ""),
+        ("", 3, ""),
+    ],
+)
+def test_units_that_the_statistics_do_not_bear_out_are_noted(converter, tiny, unit, reach, note):
+    tiny.old_layout()
+    for group in ("normalize_inputs.buffer_observation_state", "normalize_targets.buffer_action", "unnormalize_outputs.buffer_action"):
+        tiny.tensors[group + ".mean"] = np.full_like(tiny.tensors[group + ".mean"], reach)
+    converter.bundle(tiny, units=unit)
+    notes = [line for line in converter.summary.notes if line.startswith("UNITS: ")]
+    assert bool(notes) == bool(note) and all(note in line for line in notes)
+
+
+def test_statistics_of_several_data_sets_are_chosen_by_name(converter, tiny):
+    tiny.old_layout()
+    for name in [name for name in tiny.tensors if ".buffer_" in name]:
+        values = tiny.tensors.pop(name)
+        for i, robot in enumerate(("so100-blue", "so100")):
+            tiny.tensors[name.replace(".buffer_", ".{}_buffer_".format(robot))] = values + np.float32(i)
+    message = converter.refusal(tiny).message()
+    assert message.count("--stats: expected whose statistics to normalize with: so100, so100-blue, found nothing") == 1
+    assert "--stats" in converter.refusal(tiny, stats="aloha").message()
+    blue, plain = (converter.bundle(tiny, stats=name).tensors["stats.action.mean"] for name in ("so100-blue", "so100"))
+    assert np.allclose(plain, blue + 1)
+
+
+def test_statistics_of_one_robot_leave_nothing_to_choose(converter, tiny):
+    assert "--stats" in converter.refusal(tiny, stats="so100").message()
+    assert "--stats" in converter.refusal(tiny.old_layout(), stats="so100").message()

@@ -46,6 +46,7 @@ class Checkpoint:
     processors: Optional[Tuple[dict, dict]]  # pre and post, None in the older layout
     layout: str = LEROBOT
     notes: List[str] = field(default_factory=list)
+    robot: str = ""  # whose statistics to use, where there are those of several
     backbone: str = ""  # the repository and commit that --backbone fetched
     degraded: List[str] = field(default_factory=list)  # features that pass unnormalized because --identity-stats allows it
 

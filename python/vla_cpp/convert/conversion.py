@@ -22,6 +22,7 @@ from .errors import Code, Problems, refuse
 from .options import STORED
 from .safetensors_file import Entry
 from .ternary import quantize
+from .units import add_units
 
 Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
 
@@ -52,7 +53,9 @@ def convert_checkpoint(
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
+    checkpoint.robot = options.stats
     plan = plan_robots(archs.load(arch), checkpoint, options, problems)
+    add_units(plan, options.units, checkpoint.notes, problems)
     if options.state_bound is not None:
         plan.keys.append(Key("observation.state_bound", "f32", options.state_bound))
     dropped = _match(checkpoint, plan, problems)

@@ -28,6 +28,8 @@ def states_of(dims: Dict[str, int]) -> List[Key]:
 def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problems: Problems) -> List[Key]:
     """Without a data set the names are generated and the rate is 0, which the runtime reads as unstated."""
     info = read_json(info_path) if info_path else {}
+    if info_path:
+        _check_info(info, info_path, dims, problems)
     names = {feature: _names(info, info_path, feature, dim, notes, problems) for feature, dim in dims.items()}
     if not info_path:
         notes.append(
@@ -44,6 +46,19 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
         Key("action.units", "string[]", [""] * dims[ACTION]),
         Key("action.rate_hz", "f32", float(rate)),
     ]
+
+
+def _check_info(info: dict, path: str, dims: Dict[str, int], problems: Problems) -> None:
+    """Whether it is a data set's meta/info.json, and of this robot."""
+    features = member(info, "features", dict, path)
+    if not any(feature in features for feature in dims):
+        hint = "give meta/info.json of the data set that the policy was trained on"
+        problems.add(path + ": features", " and ".join(dims), ", ".join(map(str, features))[:120] or "none", hint)
+    for feature, dim in dims.items():
+        shape = features[feature].get("shape") if isinstance(features.get(feature), dict) else None
+        if shape is not None and shape != [dim]:
+            place = "{}: features.{}.shape".format(path, feature)
+            problems.add(place, str([dim]), str(shape)[:120], "the data set is not the policy's")
 
 
 def _names(info: dict, path: str, feature: str, dim: int, notes: List[str], problems: Problems) -> List[str]:

@@ -13,7 +13,7 @@ from typing import Dict, List, NamedTuple, Sequence, Tuple
 import numpy as np
 
 from .checkpoint import Checkpoint, read_statistic
-from .errors import Problems
+from .errors import Code, Problems
 from .safetensors_file import read_safetensors
 
 # Normalization mode -> the recipe's kind and the statistics that its formula reads.
@@ -125,15 +125,28 @@ def from_file(path: str, feature: str) -> Found:
 
 
 def from_weights(checkpoint: Checkpoint, feature: str, problems: Problems) -> Found:
-    """Statistics as the older layout has them among the weights; groups that hold the same statistic must agree."""
+    """Statistics as the older layout has them among the weights; groups that hold the same statistic must agree. Policies that were
+    trained on several data sets have "<data set>_buffer_..." for each: LeRobot took the first of them."""
     marker = "buffer_" + feature.replace(".", "_") + "."
-    values: Dict[str, np.ndarray] = {}
+    robots: Dict[str, Dict[str, np.ndarray]] = {}
     for name, entry in sorted(checkpoint.old_statistics.items()):
         _, _, rest = name.partition(".")
-        if not rest.startswith(marker):
+        robot, found, statistic = rest.partition(marker)
+        if not found or (robot and not robot.endswith("_")):
             continue
-        statistic, value = rest[len(marker) :], read_statistic(entry)
+        values, value = robots.setdefault(robot[:-1], {}), read_statistic(entry)
         before = values.setdefault(statistic, value)
         if not np.array_equal(before, value, equal_nan=True):
             problems.add("tensor " + name, "the numbers that another group has", "others")
-    return Found(values, sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics}))
+    features = sorted({name.rsplit(".", 1)[0] for name in checkpoint.old_statistics})
+    return Found(robots.get(_robot(checkpoint, sorted(robots), problems), {}), features)
+
+
+def _robot(checkpoint: Checkpoint, robots: List[str], problems: Problems) -> str:
+    if checkpoint.robot in robots or len(robots) < 2 and not checkpoint.robot:
+        return checkpoint.robot if checkpoint.robot in robots else "".join(robots)
+    names = ", ".join(name for name in robots if name) or "none, since the statistics are those of one robot"
+    expected = "whose statistics to normalize with: " + names
+    if ("--stats", expected) not in [(problem.where, problem.expected) for problem in problems.list]:  # not again for actions
+        problems.add("--stats", expected, checkpoint.robot or "nothing", code=Code.USAGE)
+    return ""

@@ -46,6 +46,12 @@ COMMON = (
     ),
     Option("--dataset-info", "meta/info.json of the LeRobot data set: names of state and action numbers, control rate", "INFO.json"),
     Option(
+        "--units",
+        "of all numbers of state and action, or of those named (a number, or observation.state or action for all of its numbers): rad, deg, m, ...;"
+        " clients are told, and statistics that do not go with them are noted",
+        "UNIT | NAME=UNIT,...",
+    ),
+    Option(
         "--state-bound",
         "report a normalized state value beyond N in every answer, or refuse it with --strict-state; the runtime's default is 10",
         "N",

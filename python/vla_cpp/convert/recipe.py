@@ -270,6 +270,9 @@ def read_processors(
             problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
     if checkpoint.processors is None:
         return _from_weights(checkpoint, reader)
+    if checkpoint.robot:
+        found = "processor files, which have those of one robot"
+        problems.add("--stats", "a checkpoint with statistics of several robots", found, "leave the option out", Code.USAGE)
     required = {PRE: ["normalizer_processor"], POST: ["unnormalizer_processor"]}
     if min_widths is None:
         required[PRE].insert(0, "tokenizer_processor")

@@ -17,7 +17,7 @@ import numpy as np
 from ..bundle import Key
 from ..checkpoint import LEROBOT, OPENPI, Layout
 from ..errors import Code, Problems, refuse
-from ..options import COMMON, IDENTITY_STATS, POSITION_PRECISION, Option, variant
+from ..options import COMMON, IDENTITY_STATS, POSITION_PRECISION, Option, stats, variant
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
@@ -97,7 +97,7 @@ def load(name):
 
 
 LAYOUTS = {
-    LEROBOT: Layout("LeRobot", (IDENTITY_STATS, POSITION_PRECISION)),
+    LEROBOT: Layout("LeRobot", (IDENTITY_STATS, POSITION_PRECISION, stats("whose, where the weights have those of several data sets"))),
     OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),)),
 }
 
