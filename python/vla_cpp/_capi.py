@@ -11,6 +11,7 @@ from ctypes import POINTER, c_char_p, c_double, c_float, c_int32, c_size_t, c_ui
 from pathlib import Path
 
 from .errors import IoError, Unsupported
+from .installed import PACKAGE, source_tree
 
 ABI_VERSION = 1
 IMAGE_ABSENT, IMAGE_RGB8, IMAGE_FILE = 1, 2, 3
@@ -164,13 +165,12 @@ _FUNCTIONS = {
 
 
 def _candidates() -> list:
-    """Where the library may lie: as told, in this package (a wheel carries it), in the build of this source tree."""
+    """Where the library may lie: as told, in this package (a wheel carries it), in the build of the source tree."""
     told = os.environ.get("VLA_LIBRARY")
     if told:
         return [Path(told)]
-    package = Path(__file__).resolve().parent
-    name = f"libvla.so.{ABI_VERSION}"
-    return [package / "lib" / name, package.parents[1] / "build" / "cpu" / "lib" / name]
+    name, root = f"libvla.so.{ABI_VERSION}", source_tree()
+    return [PACKAGE / "lib" / name, *([root / "build" / "cpu" / "lib" / name] if root else [])]
 
 
 @functools.lru_cache(maxsize=None)
@@ -179,7 +179,8 @@ def load() -> ctypes.CDLL:
     candidates = _candidates()
     path = next((p for p in candidates if p.is_file()), None)
     if path is None:
-        hint = "pip install ./python builds it, or name it in the environment variable VLA_LIBRARY"
+        how = "pip install ./python builds it" if source_tree() else "install the wheel again, which carries it"
+        hint = how + ", or name it in the environment variable VLA_LIBRARY"
         raise IoError("libvla.so", " or ".join(map(str, candidates)), "no such file", hint)
     try:
         library = ctypes.CDLL(str(path))

@@ -10,6 +10,7 @@ import re
 import stat
 from typing import BinaryIO, NamedTuple, Optional
 
+from ..installed import extra_hint
 from .errors import Code, ConvertError, refuse
 
 MAX_JSON = 256 << 20  # the tokenizers of the largest vocabularies take some 20 MB
@@ -141,8 +142,5 @@ def _download(source: str, repo: str, revision: str, patterns) -> str:
         )
 
 
-EXTRA = "at the root of vla.cpp: pip install './python[convert]'"
-
-
 def missing_extra(package: str) -> ConvertError:
-    return refuse("vla-convert", "the package " + package, "none", EXTRA, Code.USAGE)
+    return refuse("vla-convert", "the package " + package, "none", extra_hint("convert"), Code.USAGE)

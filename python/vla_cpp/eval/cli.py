@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Dict, List, Optional
 
 from ..errors import BadObservation
+from ..installed import extra_hint
 from .environment import EnvironmentFault
 from .environments import NAMES, MissingSimulator, find, no_task
 from .episode import Job
@@ -220,7 +221,7 @@ def main(argv: Optional[List[str]] = None) -> int:
         data = replan(a) if a.command == "replan" else evaluate(a.command, a)
     except ModuleNotFoundError as error:
         package = str(error.name).partition(".")[0]
-        print(f"vla-eval: the module {package} is missing; at the root of vla.cpp: pip install './python[eval]'", file=sys.stderr)
+        print(f"vla-eval: the module {package} is missing; {extra_hint('eval')}", file=sys.stderr)
         return 9
     except (RunFailed, JournalMismatch, EnvironmentFault, MissingSimulator, ServerFailed) as error:
         print(f"vla-eval: {error}", file=sys.stderr)

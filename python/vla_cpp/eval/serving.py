@@ -15,6 +15,8 @@ import tempfile
 from pathlib import Path
 from typing import IO, List, Optional
 
+from ..installed import source_tree
+
 ADDRESS = re.compile(r"\b(?:tcp|ipc)://\S+")
 
 
@@ -35,7 +37,8 @@ def find_vla(named: str) -> str:
     name = named or os.environ.get("VLA_BINARY", "vla")
     found = shutil.which(name)
     if found is None:
-        raise ServerFailed(f"cannot find the program '{name}': build it (make build) and name it with --vla build/cpu/bin/vla")
+        how = "build it (make build) and name it with --vla build/cpu/bin/vla" if source_tree() else "name it with --vla FILE"
+        raise ServerFailed(f"cannot find the program '{name}': {how}")
     return found
 
 
