@@ -20,16 +20,18 @@ FAR_ACTION = 1e6
 
 @dataclass(frozen=True)
 class Asked:
-    """What an answer must go with. spec: of the robot; seed, capture_time_ns: as sent, None where they were not."""
+    """What an answer must go with. spec: of the robot; seed, capture_time_ns: as sent, None where they were not; notes: of the
+    observation, which the answer gets."""
 
     address: str
     spec: Spec
     seed: Optional[int]
     has_noise: bool
     capture_time_ns: Optional[int]
+    notes: Tuple[str, ...] = ()
 
     def check(self, chunk: Chunk) -> Chunk:
-        """The chunk, with a note where its actions are far out. Errors: Incompatible, BadAction."""
+        """The chunk, with notes: of the observation, and where its actions are far out. Errors: Incompatible, BadAction."""
         for what, expected, found in self._facts(chunk):
             if expected != found:
                 hint = "what listens there? a new Client reads what its policy gives"
@@ -37,7 +39,7 @@ class Asked:
         for part in (chunk.actions, chunk.normalized):
             if part is not None and not np.isfinite(part).all():
                 raise BadAction("answer", "finite actions", "one that is not")
-        notes = _far(chunk.actions, chunk.names)
+        notes = (*self.notes, *_far(chunk.actions, chunk.names))
         return replace(chunk, notes=(*chunk.notes, *notes)) if notes else chunk
 
     def _facts(self, chunk: Chunk) -> Tuple[Tuple[str, Any, Any], ...]:

@@ -18,6 +18,7 @@ from .answer import Asked, check_same_policy
 from .chunk import Chunk
 from .connection import Connection, curve_keys
 from .errors import Disconnected, Incompatible, Timeout, UsageError, VlaError
+from .frozen import CameraWatch
 from .handle import Handle, wrong_process
 from .observation import Image, Leftover, State, check_start, robot_of
 from .pending import Health, Pending
@@ -65,6 +66,7 @@ class Client(Handle):
         self._last_id = random.SystemRandom().getrandbits(62)
         self._spec: Optional[Spec] = None
         self._limits: Any = None
+        self._cameras = CameraWatch()
         try:
             self._connect()
         except VlaError:
@@ -141,7 +143,8 @@ class Client(Handle):
             return wire.act_bytes(request, spec, limits, seed=seed, noise=noise, deadline_ms=deadline_ms, **observation)
 
         capture_time_ns = observation.get("capture_time_ns")
-        return self._ask("chunk", timeout, write, Asked(self.address, spec, seed, noise is not None, capture_time_ns))
+        notes = self._cameras.notes(spec, observation.get("images", {}), observation.get("state"))
+        return self._ask("chunk", timeout, write, Asked(self.address, spec, seed, noise is not None, capture_time_ns, notes))
 
     def health(self, timeout: Optional[float] = None) -> Health:
         """Answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""

@@ -15,6 +15,7 @@ import numpy as np
 from . import _capi
 from .chunk import Chunk
 from .errors import BadObservation, UsageError, VlaError, error_of
+from .frozen import CameraWatch
 from .handle import Handle, wrong_process
 from .observation import Image, Leftover, State, check_start, image_arg, leftover_of, named, noise_of, place, robot_of, states_of
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
@@ -55,6 +56,7 @@ class Policy(Handle):
         self._handle = ctypes.c_void_p()
         self._lock = threading.Lock()
         self._pid = os.getpid()
+        self._cameras = CameraWatch()
         self._library = _capi.load()
         if not isinstance(threads, int) or not 0 <= threads <= 512:
             raise UsageError("threads", "a whole number from 0 to 512", repr(threads))
@@ -95,13 +97,14 @@ class Policy(Handle):
             seed = random.SystemRandom().getrandbits(32)
         spec = robot_of(self._spec, embodiment)
         call = _Call(spec, images, state, text, seed, noise, leftover)
+        notes = self._cameras.notes(spec, images, state)
         with self._lock:
             self._check_usable()
             answer = ctypes.c_void_p()
             if self._library.vla_act(self._handle, call.observation, ctypes.byref(answer)):
                 raise self._last_error(self._handle)
         try:
-            return self._chunk_of(answer, spec, seed, capture_time_ns)
+            return self._chunk_of(answer, spec, seed, capture_time_ns, notes)
         finally:
             self._library.vla_chunk_close(answer)
 
@@ -127,7 +130,7 @@ class Policy(Handle):
         error = self._library.vla_last_error(handle).contents
         return error_of(*(_text(getattr(error, part)) for part in ("code_name", "where", "expected", "found", "hint")))
 
-    def _chunk_of(self, answer: ctypes.c_void_p, spec: Spec, seed: Optional[int], capture_time_ns: Optional[int]) -> Chunk:
+    def _chunk_of(self, answer: ctypes.c_void_p, spec: Spec, seed: Optional[int], capture_time_ns: Optional[int], notes: Tuple[str, ...]) -> Chunk:
         lib = self._library
         actions, normalized = (
             np.ctypeslib.as_array(numbers(answer), (spec.horizon, spec.d_action)).copy()
@@ -141,7 +144,7 @@ class Policy(Handle):
             bundle=spec.bundle,
             timing={_text(lib.vla_chunk_stage_name(answer, i)): lib.vla_chunk_stage_ms(answer, i) for i in stages},
             seed=None if seed is None else int(seed),
-            notes=tuple(_text(lib.vla_chunk_note(answer, i)) for i in range(lib.vla_chunk_n_note(answer))),
+            notes=(*(_text(lib.vla_chunk_note(answer, i)) for i in range(lib.vla_chunk_n_note(answer))), *notes),
             capture_time_ns=capture_time_ns,
             normalized=normalized if spec.real_time_chunking else None,
         )

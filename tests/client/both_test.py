@@ -28,6 +28,19 @@ def test_the_chunk_is_that_of_vla_run(policy, case, tmp_path):
     assert np.asarray(chunk).tobytes() == ran(case, tmp_path, "--seed", "5").tobytes()
 
 
+def test_a_camera_that_stopped_is_noticed_while_the_state_moves(policy, case):
+    pictures, state = frames(case), np.array(case.state, np.float32)
+
+    def notes(moved, images):
+        return [n for n in policy.act(images=images, state=state + moved, text=case.text, seed=1).notes if "camera still run" in n]
+
+    assert not any(notes(0.0, pictures) for _ in range(8)), "a robot that rests"
+    assert not any(notes(0.01 * i, {v: p if p is None else p + np.uint8(i) for v, p in pictures.items()}) for i in range(8))
+    found = [notes(0.01 * i, pictures) for i in range(8)]
+    assert found[:4] == [[]] * 4 and all(len(n) == len([p for p in pictures.values() if p is not None]) for n in found[4:])
+    assert "view camera1: the same picture in 5 acts" in found[4][0]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_server_library_and_program_give_the_same_bytes(name, tmp_path):
     case = Golden(name)
