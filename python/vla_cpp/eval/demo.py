@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""vla-eval demo: one sentence, a robot in a simulator, and a film of what it did."""
+"""vla-eval demo: sentences, a robot in a simulator, and a film of what it did."""
 
 from __future__ import annotations
 
@@ -10,21 +10,25 @@ from pathlib import Path
 from typing import Any, List
 
 from .environments import MissingSimulator, make
-from .environments.metaworld import SENTENCES
+from .environments.metaworld import RATE_HZ, SENTENCES
 from .episode import Job, Look, Outcome, Watcher, run_episode
 from .environment import Guard
+
+
+SHOWN = ("faucet-open", "drawer-close", "faucet-close")
 
 
 def add_command(commands: Any) -> None:
     parser = commands.add_parser(
         "demo", help="say a sentence, watch the robot, get a film", formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Serves a bundle, tells it a sentence in a MetaWorld scene that it has never seen, shows every look while it runs,\n"
-        "writes a film and a contact sheet, then counts a few more layouts.",
+        description="Serves a bundle, tells it a sentence in each of a few MetaWorld scenes that it has never seen, shows every look while it\n"
+        "runs, writes a film and a contact sheet, then counts a few more layouts of the first scene.",
     )  # fmt: skip
     parser.add_argument("--bundle", default="models/metaworld-tiny.gguf", metavar="FILE")
     parser.add_argument("--embodiment", metavar="TAG", help="the robot, where the bundle is for several")
-    parser.add_argument("--text", default="open the faucet", help="the sentence (default: open the faucet)")
+    parser.add_argument("--text", help=f"one sentence (default, a scene for each: {', '.join(SENTENCES[task] for task in SHOWN)})")
     parser.add_argument("--task", choices=list(SENTENCES), help="the scene (default: the one that the sentence belongs to)")
+    parser.add_argument("--gif", action="store_true", help="write the film as GIF too")
     parser.add_argument("--seed", type=int, default=910000, help="of the layout that is filmed (default 910000)")
     parser.add_argument("--episodes", type=int, default=8, help="further layouts to count (default 8)")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
@@ -38,38 +42,47 @@ def play(a: argparse.Namespace) -> int:
     from rich.console import Console
 
     from . import run as runs
-    from .film import Recorder, contact_sheet, film
-    from .policies import make_policy
+    from .film import contact_sheet, film
 
     console = Console()
     task = a.task or next((task for task, sentence in SENTENCES.items() if sentence == a.text), None)
-    if task is None:
+    if a.text and task is None:
         told = ", ".join(f'"{sentence}"' for sentence in SENTENCES.values())
         print(f"vla-eval demo: the policy knows {told}; for another sentence name the scene with --task", file=sys.stderr)
         return 2
     a.out.mkdir(parents=True, exist_ok=True)
+    tasks = [task] if task else list(SHOWN)
     with runs.Policies(a) as policies:
         driver = policies.bundle(a.bundle)
         spec = driver.spec
         console.print(f"[bold]{spec.bundle.name}[/] ({spec.bundle.arch}) serves on {spec.device}, kernels: {spec.kernels}", highlight=False)
-        console.print(f"MetaWorld [bold]{task}[/], layout {a.seed}. The robot hears: [bold yellow]“{a.text}”[/]", highlight=False)
-        environment = _scene(task)
-        policy = make_policy(driver.description)
-        recorder = Recorder("corner4", environment.frame)  # type: ignore[attr-defined]
-        told = _Teller(console, recorder.watcher(), spec.action_names)
-        sentence = "" if a.text == environment.instruction() else a.text
-        outcome = run_episode(Guard(environment), policy, Job(task, a.seed, "a", sentence), environment.declaration.replan_every, watcher=told)
-        recorder.finish(outcome.steps)
-        policy.close()
-        console.print(_verdict(outcome), highlight=False)
-        title = f"MetaWorld {task}, seed {a.seed}"
-        stem = a.out / f"{task}-{a.seed}"
-        path = film(recorder, outcome, spec.action_names, title, stem, environment.declaration.rate_hz)
-        contact_sheet(recorder, outcome, spec.action_names, title, stem.with_suffix(".png"))
+        scenes = [_play_scene(task, a, driver, console) for task in tasks]
+        stem = a.out / f"{'-'.join(tasks)}-{a.seed}"
+        path = film(scenes, stem, RATE_HZ, a.gif)
+        contact_sheet(scenes[0], stem.with_suffix(".png"))
         console.print(f"film: {path}\ncontact sheet: {stem.with_suffix('.png')}", highlight=False, soft_wrap=True)
         if a.episodes:
-            _count(a, policies, driver, task, sentence, console)
+            _count(a, policies, driver, tasks[0], scenes[0].outcome.sentence if scenes[0].outcome.swapped else "", console)
     return 0
+
+
+def _play_scene(task: str, a: argparse.Namespace, driver: Any, console: Any) -> Any:
+    """The scene with what was recorded of it."""
+    from .film import Recorder, Scene
+    from .policies import make_policy
+
+    environment = _scene(task)
+    sentence = a.text or environment.instruction()
+    console.print(f"MetaWorld [bold]{task}[/], layout {a.seed}. The robot hears: [bold yellow]“{sentence}”[/]", highlight=False)
+    policy = make_policy(driver.description)
+    recorder = Recorder(environment.picture)
+    told = _Teller(console, recorder.watcher(), driver.spec.action_names)
+    other = "" if sentence == environment.instruction() else sentence
+    outcome = run_episode(Guard(environment), policy, Job(task, a.seed, "a", other), environment.declaration.replan_every, watcher=told)
+    recorder.finish(outcome.steps)
+    policy.close()
+    console.print(_verdict(outcome), highlight=False)
+    return Scene(recorder, outcome, driver.spec.action_names, f"MetaWorld {task}, seed {a.seed}")
 
 
 def _scene(task: str) -> Any:

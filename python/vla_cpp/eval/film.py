@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, List, Optional, Sequence, Tuple
+from typing import Any, Callable, List, Optional, Sequence, Tuple
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -18,6 +18,7 @@ BLUE, PALE, GOOD, BAD = (19, 98, 196), (186, 209, 239), (20, 130, 70), (200, 40,
 CURVES = [(19, 98, 196), (224, 123, 31), (20, 130, 70), (150, 60, 160), (200, 40, 40), (90, 90, 90), (0, 150, 160), (160, 120, 0)]
 WIDTH, HEIGHT, PICTURE = 960, 480, 400
 EVERY = 2  # steps between two frames of a film
+HOLD = 0.7  # seconds that the end of a scene stays
 
 
 @dataclass
@@ -31,10 +32,9 @@ class Shot:
 
 @dataclass
 class Recorder:
-    """Collects an episode for a film. `view` names the camera; `grab` returns its frame now."""
+    """Collects an episode for a film. `grab` returns a picture of it now."""
 
-    view: str
-    grab: Any
+    grab: Callable[[], np.ndarray]
     shots: List[Shot] = field(default_factory=list)
     looks: List[Look] = field(default_factory=list)
 
@@ -43,14 +43,26 @@ class Recorder:
 
     def _on_step(self, step: int) -> None:
         look = self.looks[-1]
-        if step == look.step:
-            self.shots.append(Shot(step, look.observation.frames[self.view], look))
-        elif (step - look.step) % EVERY == 0:
+        if (step - look.step) % EVERY == 0:
             self.shots.append(Shot(step, self.grab(), look))
 
     def finish(self, steps: int) -> None:
-        """The last frame: how it ended."""
+        """How it ended."""
         self.shots.append(Shot(steps, self.grab(), self.looks[-1]))
+
+
+@dataclass
+class Scene:
+    """An episode with what was recorded of it."""
+
+    recorder: Recorder
+    outcome: Outcome
+    names: Sequence[str]
+    title: str
+
+    def page(self, shot: Shot, times: bool = True) -> Image.Image:
+        end = shot is self.recorder.shots[-1]
+        return draw_frame(shot, self.recorder.looks, self.outcome, self.names, self.title, end, times)
 
 
 def _font(size: int) -> Any:
@@ -93,8 +105,8 @@ def _latencies(draw: ImageDraw.ImageDraw, box: Tuple[int, int, int, int], looks:
         draw.text((left + wide / 2, y1 - high - 2), f"{look.answer.engine_ms:.0f}", font=_font(10), fill=INK, anchor="mb")
 
 
-def draw_frame(shot: Shot, looks: Sequence[Look], outcome: Outcome, names: Sequence[str], title: str, end: bool) -> Image.Image:
-    """One image of the film, 960 x 480."""
+def draw_frame(shot: Shot, looks: Sequence[Look], outcome: Outcome, names: Sequence[str], title: str, end: bool, times: bool) -> Image.Image:
+    """One image of the film, 960 x 480. `times`: with those of the looks, which are this machine's."""
     page = Image.new("RGB", (WIDTH, HEIGHT), PAPER)
     draw = ImageDraw.Draw(page)
     page.paste(Image.fromarray(shot.frame).resize((PICTURE, PICTURE), Image.BICUBIC), (24, 56))
@@ -107,20 +119,22 @@ def draw_frame(shot: Shot, looks: Sequence[Look], outcome: Outcome, names: Seque
         draw.text((WIDTH - 24, 56), told, font=_font(15), fill=GOOD if outcome.solved else BAD, anchor="ra")
     draw.text((right, 84), "the chunk that is being executed; grey: replaced by the next look", font=_font(12), fill=FAINT)
     _curves(draw, (right, 106, WIDTH - 24, 306), shot.look, shot.step, names, outcome.replan_every)
+    if not times:
+        return page
     draw.text((right, 340), "inference per look, ms", font=_font(12), fill=FAINT)
     most = max(look.answer.engine_ms for look in looks)
     _latencies(draw, (right, 356, WIDTH - 24, 444), looks, shot.step, most, len(looks))
     return page
 
 
-def film(recorder: Recorder, outcome: Outcome, names: Sequence[str], title: str, path: Path, rate_hz: float) -> Path:
+def film(scenes: Sequence[Scene], path: Path, rate_hz: float, gif: bool = False) -> Path:
     """Writes PATH.mp4 where a video encoder is installed (imageio-ffmpeg), else PATH.gif, at half the robot's speed; returns
-    which."""
-    pages = [
-        draw_frame(shot, recorder.looks, outcome, names, title, shot is recorder.shots[-1]) for shot in recorder.shots
-    ]
+    which. `gif`: PATH.gif too, of a third of the pictures and without times, for pages that play no video."""
     fps = max(5.0, rate_hz / EVERY / 2)
-    pages += [pages[-1]] * int(1.5 * fps)
+    shots = [(scene, shot) for scene in scenes for shot in scene.recorder.shots + scene.recorder.shots[-1:] * int(HOLD * fps)]
+    if gif:
+        _gif([scene.page(shot, times=False) for scene, shot in shots[::3]], path.with_suffix(".gif"), fps / 3)
+    pages = [scene.page(shot) for scene, shot in shots]
     return _mp4(pages, path.with_suffix(".mp4"), fps) or _gif(pages, path.with_suffix(".gif"), fps)
 
 
@@ -138,21 +152,28 @@ def _mp4(pages: List[Image.Image], path: Path, fps: float) -> Optional[Path]:
 
 
 def _gif(pages: List[Image.Image], path: Path, fps: float) -> Path:
-    small = [page.resize((WIDTH * 2 // 3, HEIGHT * 2 // 3), Image.LANCZOS).convert("P", palette=Image.ADAPTIVE, colors=96) for page in pages]
-    small[0].save(str(path), save_all=True, append_images=small[1:], duration=int(1000 / fps), loop=0, optimize=True)
+    """All pictures share a palette, with the colours of curves in it, so that what stands still costs nothing."""
+    small = [page.resize((WIDTH * 2 // 3, HEIGHT * 2 // 3), Image.LANCZOS) for page in pages]
+    sample = Image.new("RGB", (small[0].width, 6 * small[0].height))
+    for i in range(5):
+        sample.paste(small[i * (len(small) - 1) // 4], (0, i * small[0].height))
+    for i, colour in enumerate(CURVES):
+        sample.paste(colour, (40 * i, 5 * small[0].height, 40 * i + 40, sample.height))
+    palette = sample.quantize(96)
+    drawn = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in small]
+    drawn[0].save(str(path), save_all=True, append_images=drawn[1:], duration=int(1000 / fps), loop=0, optimize=True)
     return path
 
 
-def contact_sheet(recorder: Recorder, outcome: Outcome, names: Sequence[str], title: str, path: Path, columns: int = 3) -> None:
+def contact_sheet(scene: Scene, path: Path, columns: int = 3) -> None:
     """The looks of an episode on one page, as PNG: at most nine, evenly spread, and the end."""
-    shots = [shot for shot in recorder.shots[:-1] if shot.step == shot.look.step]
+    shots = [shot for shot in scene.recorder.shots[:-1] if shot.step == shot.look.step]
     if len(shots) > 8:
         shots = [shots[round(i * (len(shots) - 1) / 7)] for i in range(8)]
-    shots.append(recorder.shots[-1])
+    shots.append(scene.recorder.shots[-1])
     rows = -(-len(shots) // columns)
     wide, high = 2 * WIDTH // 3, 2 * HEIGHT // 3
     page = Image.new("RGB", (columns * wide, rows * high), PAPER)
     for i, shot in enumerate(shots):
-        image = draw_frame(shot, recorder.looks, outcome, names, title, shot is recorder.shots[-1])
-        page.paste(image.resize((wide, high), Image.LANCZOS), ((i % columns) * wide, (i // columns) * high))
+        page.paste(scene.page(shot).resize((wide, high), Image.LANCZOS), ((i % columns) * wide, (i // columns) * high))
     page.save(str(path), optimize=True)

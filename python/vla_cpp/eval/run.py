@@ -159,7 +159,7 @@ def progress(title: str, total: int, before: List[Outcome], quiet: bool) -> Iter
 
 def film_episodes(name: str, driver: Driver, rows: List[Outcome], folder: Path, names: List[str]) -> List[Path]:
     """Runs these episodes again, which are the same again, and films them. Returns the files."""
-    from .film import Recorder, contact_sheet, film
+    from .film import Recorder, Scene, contact_sheet, film
 
     paths: List[Path] = []
     policy = make_policy(driver.description)
@@ -171,14 +171,15 @@ def film_episodes(name: str, driver: Driver, rows: List[Outcome], folder: Path, 
             environments[row.task] = make(name, row.task, **options_of(find(name), driver.spec))
         environment = environments[row.task]
         view = next(iter(environment.declaration.views))
-        recorder = Recorder(view, lambda: environment.observe().frames[view])
+        recorder = Recorder(lambda: environment.observe().frames[view])
         job = Job(row.task, row.seed, "a", row.sentence if row.swapped else "")
         outcome = run_episode(Guard(environment), policy, job, row.replan_every, watcher=recorder.watcher())
         recorder.finish(outcome.steps)
         stem = folder / f"{row.task.replace('/', '-')}-{row.seed}{'-swapped' if row.swapped else ''}"
         title = f"{name} {row.task}, seed {row.seed}, {driver.label}"
-        paths.append(film(recorder, outcome, names, title, stem, environment.declaration.rate_hz))
-        contact_sheet(recorder, outcome, names, title, stem.with_suffix(".png"))
+        scene = Scene(recorder, outcome, names, title)
+        paths.append(film([scene], stem, environment.declaration.rate_hz))
+        contact_sheet(scene, stem.with_suffix(".png"))
     policy.close()
     return paths
 

@@ -20,6 +20,7 @@ from ..environment import Declaration, Environment, Observation
 from . import MissingSimulator
 
 SIZE = 128  # pixels, both ways
+PICTURE = 400  # of what people look at
 LIMIT = 150  # steps; the scripted experts need at most 93 for these tasks
 CAMERA = "corner4"
 RATE_HZ = 80.0
@@ -94,6 +95,7 @@ class MetaWorld(Environment):
             mujoco.Renderer.close = lambda renderer: None  # the destructor of the one that failed would print a traceback
             raise MissingSimulator(f"MuJoCo cannot draw with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}") from error
         _renderers.append(self._renderer)
+        self._painter: Any = None
         self._options = mujoco.MjvOption()
         self._options.sitegroup[:] = 0  # coloured goal marks would betray the task
 
@@ -117,10 +119,22 @@ class MetaWorld(Environment):
 
     def frame(self) -> np.ndarray:
         """(128, 128, 3) uint8 RGB, upright."""
-        self._renderer.update_scene(self._env.data, camera=CAMERA, scene_option=self._options)
-        flags = self._renderer.scene.flags
+        return self._drawn(self._renderer)
+
+    def picture(self) -> np.ndarray:
+        """The same for a film: (400, 400, 3)."""
+        if self._painter is None:
+            area = self._env.model.vis.global_
+            area.offwidth = area.offheight = PICTURE
+            self._painter = self._mujoco.Renderer(self._env.model, PICTURE, PICTURE)
+            _renderers.append(self._painter)
+        return self._drawn(self._painter)
+
+    def _drawn(self, renderer: Any) -> np.ndarray:
+        renderer.update_scene(self._env.data, camera=CAMERA, scene_option=self._options)
+        flags = renderer.scene.flags
         flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = flags[self._mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-        return np.ascontiguousarray(self._renderer.render()[::-1, ::-1])
+        return np.ascontiguousarray(renderer.render()[::-1, ::-1])
 
     def step(self, action: np.ndarray) -> bool:
         self._obs, _, _, _, info = self._env.step(np.clip(action, -1, 1).astype(np.float32))
