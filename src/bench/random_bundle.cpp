@@ -198,12 +198,12 @@ std::uint16_t to_16_bits(float value, DType type) {
 /// The bytes of `count` numbers, evenly drawn from -0.04 to 0.04: rows of any length keep the size of what they
 /// multiply.
 std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
-  std::string bytes(count * dtype_size(type), '\0');
+  const std::size_t size = dtype_size(type, 1);
+  std::string bytes(count * size, '\0');
   for (std::size_t i = 0; i < count; ++i) {
     const float value = 0.08f * static_cast<float>(next_random(seed) >> 40) / 16777216.0f - 0.04f;
     const std::uint16_t half = type == DType::f32 ? 0 : to_16_bits(value, type);
-    std::memcpy(bytes.data() + i * dtype_size(type), type == DType::f32 ? static_cast<const void*>(&value) : &half,
-                dtype_size(type));
+    std::memcpy(bytes.data() + i * size, type == DType::f32 ? static_cast<const void*>(&value) : &half, size);
   }
   return bytes;
 }
@@ -233,7 +233,7 @@ class Values {
   /// Calls `use` with the bytes of `param`, in pieces.
   template <class Use>
   void each_piece(const Param& param, std::size_t size, Use use) const {
-    const std::string& source = param.storage == Storage::ternary  ? codes_
+    const std::string& source = !is_float(param.encoding.type)     ? codes_
                                 : param.storage != Storage::vector ? pool_
                                 : param.name.ends_with("bias")     ? zeros_
                                                                    : ones_;
@@ -287,9 +287,10 @@ bool write_bundle(int file, const Keys& keys, const ParamList& list, const Rando
   std::vector<TensorInfo> tensors;
   std::vector<std::byte> nothing;
   for (const Param& param : list.params()) {
-    const DType type = param.storage == Storage::matrix || param.storage == Storage::table ? sizes.dtype : param.type();
-    const std::size_t size = static_cast<std::size_t>(param.stored_count()) * dtype_size(type);
-    tensors.push_back({param.name, type, param.stored_shape(), {nothing.data(), size}});
+    const bool is_any_float = param.storage != Storage::vector && is_float(param.encoding.type);
+    TensorInfo tensor = {param.name, is_any_float ? sizes.dtype : param.stored_type(), param.stored_shape(), {}};
+    tensor.data = {nothing.data(), dtype_size(tensor.type, tensor.count())};
+    tensors.push_back(std::move(tensor));
   }
   Output out(file);
   const std::string head = write_gguf_head(keys, tensors);

@@ -136,13 +136,13 @@ Result<std::vector<std::string>> read_embodiments(const GgufContent& content, co
 }  // namespace
 
 const char* dtype_name(DType type) {
-  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32", "i8", "f64"};
+  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32", "i8", "f64", "ternary"};
   return kNames[static_cast<int>(type)];
 }
 
-std::size_t dtype_size(DType type) {
-  constexpr std::size_t kSizes[] = {4, 2, 2, 4, 1, 8};
-  return kSizes[static_cast<int>(type)];
+int dtype_bits(DType type) {
+  constexpr int kBits[] = {32, 16, 16, 32, 8, 64, 2};
+  return kBits[static_cast<int>(type)];
 }
 
 std::int64_t TensorInfo::count() const {

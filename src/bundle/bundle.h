@@ -12,14 +12,10 @@
 
 #include "base/result.h"
 #include "bundle/content.h"
+#include "bundle/encoding.h"
 #include "bundle/keys.h"
 
 namespace vla {
-
-enum class DType { f32, f16, bf16, i32, i8, f64 };
-
-const char* dtype_name(DType type);
-std::size_t dtype_size(DType type);
 
 /// A tensor as stored in the file. `shape` follows ggml: fastest dimension first. `data` of an opened bundle is read by
 /// Bundle::read.

@@ -242,7 +242,7 @@ Result<PlacedTensor> read_tensor(Cursor& cursor, std::uint64_t file_size, const 
   }
   VLA_TRY(tensor.info.type, read_dtype(cursor, what));
   VLA_TRY(tensor.offset, cursor.scalar<std::uint64_t>(what));
-  tensor.size = count * dtype_size(tensor.info.type);
+  tensor.size = dtype_size(tensor.info.type, static_cast<std::int64_t>(count));
   return tensor;
 }
 

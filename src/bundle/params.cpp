@@ -14,23 +14,15 @@ constexpr std::size_t kMaxLines = 50;  // problems in a report; more mean the wr
 
 std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::format("[{}]", fmt::join(shape, ", ")); }
 
-/// The dtypes that a storage allows, for people.
-const char* dtypes_of(Storage storage) {
-  switch (storage) {
-    case Storage::vector:
-      return "f32";
-    case Storage::ternary:
-      return "i8";
-    case Storage::matrix:
-    case Storage::table:
-      break;
-  }
-  return "f32, bf16 or f16";
+/// The dtypes that the bundle's tensor may have, for people.
+const char* dtypes_of(const Param& param) {
+  if (!is_float(param.encoding.type)) return dtype_name(param.stored_type());
+  return param.storage == Storage::vector ? "f32" : "f32, bf16 or f16";
 }
 
-bool allows(Storage storage, DType type) {
-  if (storage == Storage::ternary) return type == DType::i8;
-  return type == DType::f32 || (storage != Storage::vector && (type == DType::bf16 || type == DType::f16));
+bool allows(const Param& param, DType type) {
+  if (!is_float(param.encoding.type)) return type == param.stored_type();
+  return param.storage == Storage::vector ? type == DType::f32 : is_float(type);
 }
 
 /// Whether one of the four codes of a byte is 3, which stands for no number.
@@ -53,9 +45,9 @@ Result<bool> has_wrong_code(const Bundle& bundle, std::span<const std::byte> cod
 
 }  // namespace
 
-const char* storage_name(Storage storage) {
-  constexpr const char* kNames[] = {"matrix", "table", "vector", "ternary"};
-  return kNames[static_cast<int>(storage)];
+const char* Param::storage_text() const {
+  constexpr const char* kNames[] = {"matrix", "table", "vector"};
+  return is_float(encoding.type) ? kNames[static_cast<int>(storage)] : dtype_name(encoding.type);
 }
 
 std::int64_t Param::count() const {
@@ -66,7 +58,7 @@ std::int64_t Param::count() const {
 
 std::vector<std::int64_t> Param::stored_shape() const {
   std::vector<std::int64_t> stored = shape;
-  if (storage == Storage::ternary) stored[0] = (stored[0] + 3) / 4;
+  if (is_packed()) stored[0] = static_cast<std::int64_t>(dtype_size(encoding.type, stored[0]));
   return stored;
 }
 
@@ -77,18 +69,26 @@ const Param* ParamList::find(const std::string& name, Storage storage, const std
   const auto found = declared_->by_source.find(tensor->data.data());
   if (found == declared_->by_source.end()) return nullptr;
   const Param& param = *found->second;
-  return param.name == name && param.storage == storage && param.shape == shape ? &param : nullptr;
+  if (param.name != name || param.storage != storage || param.shape != shape) return nullptr;
+  const Param* scales = param.scales;
+  return scales == nullptr || find(scales->name, scales->storage, scales->shape) == scales ? &param : nullptr;
 }
 
-const Param& ParamList::declare(std::string name, Storage storage, std::vector<std::int64_t> shape) {
+const Param& ParamList::declare(std::string name, Storage storage, std::vector<std::int64_t> shape, Encoding encoding) {
   names_.insert(name);
-  if (const Param* param = find(name, storage, shape)) return *param;
+  if (const Param* param = find(name, storage, shape)) {
+    if (param->scales != nullptr) names_.insert(param->scales->name);
+    return *param;
+  }
   Param& param = declared_->params.emplace_back();
   param.id = static_cast<int>(declared_->params.size()) - 1;
   param.name = std::move(name);
   param.storage = storage;
   param.shape = std::move(shape);
+  param.encoding = encoding;
   if (bundle_ != nullptr) look_up(param);
+  if (const std::int64_t n = param.encoding.n_scale(param.count()); n > 0)
+    param.scales = &declare(param.name.substr(0, param.name.rfind('.') + 1) + "scale", Storage::vector, {n});
   return param;
 }
 
@@ -96,14 +96,15 @@ void ParamList::look_up(Param& param) {
   const TensorInfo* tensor = bundle_->find(param.name);
   if (tensor == nullptr)
     return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.stored_shape()),
-                               storage_name(param.storage)));
+                               param.storage_text()));
   if (tensor->shape != param.stored_shape())
     return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name,
                                shape_text(param.stored_shape()), shape_text(tensor->shape)));
-  if (!allows(param.storage, tensor->type))
-    return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name, dtypes_of(param.storage),
+  if (!allows(param, tensor->type))
+    return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name, dtypes_of(param),
                                dtype_name(tensor->type)));
-  if (param.storage == Storage::ternary) {
+  if (is_float(param.encoding.type)) param.encoding.type = tensor->type;
+  if (param.encoding.type == DType::ternary) {
     const Result<bool> wrong = has_wrong_code(*bundle_, tensor->data);
     if (!wrong) return problem(wrong.error());
     if (*wrong) return problem(fmt::format("wrong code      {:<40} expected 0, 1 or 2, file has 3", param.name));
@@ -187,7 +188,8 @@ const Param* Scope::ternary(const std::string& name, int d_in, int d_out) const 
         fmt::format("wrong size      {:<40} expected rows of whole bytes, four numbers each, "
                     "there are {}",
                     (*this / name).path(), d_in));
-  return &list_->declare((*this / name).path(), Storage::ternary, {d_in, d_out});
+  const Encoding one_scale = {DType::ternary, std::int64_t{d_in} * d_out};
+  return &list_->declare((*this / name).path(), Storage::matrix, {d_in, d_out}, one_scale);
 }
 
 const Param* Scope::table(const std::string& name, int d_model, int n_row) const {

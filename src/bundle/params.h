@@ -15,12 +15,8 @@
 
 namespace vla {
 
-/// How a parameter may be stored: a matrix or a table in any float dtype of the bundle, a vector in f32 only. A ternary
-/// matrix is stored as bytes (i8), rows of d_in / 4: element 4 i + j of a row is the code in bits 2 j and 2 j + 1 of
-/// byte i, and codes 0, 1 and 2 stand for -1, 0 and 1.
-enum class Storage { matrix, table, vector, ternary };
-
-const char* storage_name(Storage storage);
+/// What a parameter is for: a matrix or a table may be in any float dtype of the bundle, a vector in f32 only.
+enum class Storage { matrix, table, vector };
 
 /// One declared weight. `shape` follows ggml, fastest first: a matrix is [d_in, d_out].
 struct Param {
@@ -28,18 +24,17 @@ struct Param {
   std::string name;
   Storage storage = Storage::matrix;
   std::vector<std::int64_t> shape;
+  Encoding encoding;                   // as stored; without a bundle float32 stands for any float
   const TensorInfo* source = nullptr;  // set where the bundle has a tensor that fits
+  const Param* scales = nullptr;       // a vector, where the encoding has some
 
   std::int64_t count() const;
-  bool is_matrix() const { return storage == Storage::matrix || storage == Storage::ternary; }
-  /// As stored; float32 where no bundle gives the numbers of a float.
-  DType type() const {
-    if (storage == Storage::ternary) return DType::i8;
-    return source != nullptr ? source->type : DType::f32;
-  }
-  /// Of the bundle's tensor.
+  /// Of the bundle's tensor, in which elements of less than a byte are bytes.
   std::vector<std::int64_t> stored_shape() const;
-  std::int64_t stored_count() const { return storage == Storage::ternary ? (shape[0] + 3) / 4 * shape[1] : count(); }
+  DType stored_type() const { return is_packed() ? DType::i8 : encoding.type; }
+  bool is_packed() const { return dtype_bits(encoding.type) < 8; }
+  /// What `vla inspect` calls it: the storage, or the dtype of codes.
+  const char* storage_text() const;
 };
 
 /// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they
@@ -60,7 +55,8 @@ class ParamList {
   const std::deque<Param>& params() const { return declared_->params; }
   const Bundle* bundle() const { return bundle_; }
 
-  const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape);
+  /// Where `encoding` has scales, they are declared too, as the vector `scale` beside it.
+  const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape, Encoding encoding = {});
   void problem(std::string line) { problems_.push_back(std::move(line)); }
   void problem(const Error& error);
 
@@ -111,7 +107,7 @@ class Scope {
   void require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const;
 
   const Param* matrix(const std::string& name, int d_in, int d_out) const;
-  /// d_in must be a multiple of 4.
+  /// Of -1, 0 and 1, with one scale. d_in must be a multiple of 4.
   const Param* ternary(const std::string& name, int d_in, int d_out) const;
   const Param* table(const std::string& name, int d_model, int n_row) const;
   const Param* vector(const std::string& name, int size) const;

@@ -61,7 +61,7 @@ Status print_manifest(const std::string& arch) {
     Json row;
     row["name"] = param.name;
     row["shape"] = shape_json(param);
-    row["storage"] = storage_name(param.storage);
+    row["storage"] = param.storage_text();
     root["parameters"].push_back(std::move(row));
   }
   say_lines(stdout, text_of(root, 2) + "\n");

@@ -178,7 +178,7 @@ StageWork Engine::work() const {
 }
 
 bool Engine::has_ternary() const {
-  const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
+  const auto is_ternary = [](const Param& param) { return param.encoding.type == DType::ternary; };
   return std::any_of(params().params().begin(), params().params().end(), is_ternary);
 }
 
@@ -188,9 +188,8 @@ std::string Engine::arithmetic() const {
   const Precision floats = device_->precision();
   if (floats == Precision::int8) return "int8 products, as asked for: less exact than PyTorch's bf16";
   if (has_int8_products()) return fmt::format("ternary products of int8, others {}", precision_name(floats));
-  const auto n_rounded = std::ranges::count_if(params().params(), [](const Param& param) {
-    return param.type() != DType::bf16 && resident_dtype(param, Rounding::bf16) == DType::bf16;
-  });
+  const auto n_rounded = std::ranges::count_if(
+      params().params(), [](const Param& param) { return param.encoding != resident_encoding(param, Rounding::bf16); });
   if (floats == Precision::bf16) {
     const bool rounds = n_rounded > 0 && device_->rounding() == Rounding::bf16;
     const std::string rounded = rounds ? fmt::format(" ({} matrices rounded to it, as asked for)", n_rounded) : "";

@@ -24,6 +24,7 @@ ggml_type type_of(DType type) {
     case DType::i32:
       return GGML_TYPE_I32;
     case DType::i8:
+    case DType::ternary:  // its bytes
       return GGML_TYPE_I8;
     case DType::f64:  // of statistics alone, which no graph reads
     case DType::f32:
@@ -33,10 +34,10 @@ ggml_type type_of(DType type) {
 }
 
 void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
-  const DType type = param.type();
+  const DType type = param.encoding.type;
   if (type_of(type) == tensor->type) return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
   std::vector<float> values(static_cast<std::size_t>(param.count()));
-  if (param.storage == Storage::ternary)
+  if (type == DType::ternary)
     for (std::size_t i = 0; i < values.size(); ++i)
       values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
   else if (type == DType::f32)
@@ -101,9 +102,9 @@ GgmlDevice::~GgmlDevice() {
 /// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened unless that was
 /// asked for. Rows of a table are widened exactly when they are looked up.
 ggml_type GgmlDevice::resident_type(const Param& param) const {
-  const ggml_type type = type_of(resident_dtype(param, rounding_));
+  const ggml_type type = type_of(resident_encoding(param, rounding_).type);
   const bool kept = type == GGML_TYPE_F16 ? keeps_f16_ : type == GGML_TYPE_BF16 && rounding_ == Rounding::bf16;
-  return param.storage == Storage::table || (param.is_matrix() && kept) ? type : GGML_TYPE_F32;
+  return param.storage == Storage::table || (param.storage == Storage::matrix && kept) ? type : GGML_TYPE_F32;
 }
 
 Status GgmlDevice::load(const ParamList& params, bool fill) {
@@ -113,7 +114,7 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
   int n_f32 = 0, n_f16 = 0, n_bf16 = 0;
   for (const Param& param : params.params()) {
     const ggml_type type = resident_type(param);
-    if (param.is_matrix()) ++(type == GGML_TYPE_F16 ? n_f16 : type == GGML_TYPE_BF16 ? n_bf16 : n_f32);
+    if (param.storage == Storage::matrix) ++(type == GGML_TYPE_F16 ? n_f16 : type == GGML_TYPE_BF16 ? n_bf16 : n_f32);
     weights_.push_back(
         ggml_new_tensor(weight_context_.get(), type, static_cast<int>(param.shape.size()), param.shape.data()));
     ggml_set_name(weights_.back(), param.name.c_str());

@@ -43,12 +43,12 @@ class Translator {
     return ggml_new_tensor(constants_, op.values.index() == 1 ? GGML_TYPE_I32 : GGML_TYPE_F32, 4, node_->shape.data());
   }
   ggml_tensor* translate(const op::Linear& op) {
-    ggml_tensor* y =
-        op.scale != nullptr ? ternary_product(op) : ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
+    ggml_tensor* y = op.rule == op::Rule::int8_rows ? int8_product(op)
+                                                    : ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
     return op.bias != nullptr ? ggml_add(c, y, device_.weight(op.bias)) : y;
   }
   /// Codes are whole numbers in float32, and so small that their sums are exact.
-  ggml_tensor* ternary_product(const op::Linear& op) {
+  ggml_tensor* int8_product(const op::Linear& op) {
     constexpr float kRound = 0x1.8p23f;  // adding it rounds to a whole number, ties to even
     constexpr float kSmallest = 1e-5f;
     ggml_tensor* x = contiguous(in(0));
@@ -58,7 +58,7 @@ class Translator {
     ggml_tensor* ones = ggml_scale_bias(c, largest, 0.0f, 1.0f);
     ggml_tensor* s = ggml_scale(c, ggml_div(c, ones, largest), 127.0f);
     ggml_tensor* codes = ggml_scale_bias(c, ggml_scale_bias(c, ggml_mul(c, x, s), 1.0f, kRound), 1.0f, -kRound);
-    ggml_tensor* step = ggml_div(c, ggml_mul(c, ones, device_.weight(op.scale)), s);
+    ggml_tensor* step = ggml_div(c, ggml_mul(c, ones, device_.weight(op.weight->scales)), s);
     return ggml_mul(c, ggml_mul_mat(c, device_.weight(op.weight), codes), step);
   }
   ggml_tensor* translate(const op::Embedding& op) { return ggml_get_rows(c, device_.weight(op.table), in(0)); }

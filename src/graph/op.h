@@ -32,17 +32,20 @@ struct Parameter {
   const Param* param;
 };
 
-/// x [d_in, n, ...] -> W x + b [d_out, n, ...]; bias may be null.
+/// How a product is defined.
 ///
-/// With `scale` [1] the weight is ternary, -scale, 0 or scale, and x becomes int8 first: of each row a = max |x|, at
-/// least 1e-5, s = (1 / a) * 127, and q = x * s rounded to the nearest, ties to even. Then W x is float(sum of products
-/// of codes) * (scale / s). Every operation is rounded to float32 by itself; the sums are exact.
+/// floats: sums of products of floats, which a device rounds as its precision says.
+/// int8_rows: the weight is ternary, and x becomes int8 first: of each row a = max |x|, at least 1e-5,
+/// s = (1 / a) * 127, and q = x * s rounded to the nearest, ties to even. Then W x is float(sum of products of codes) *
+/// (scale of W / s). Every operation is rounded to float32 by itself; the sums are exact.
 /// Source: BitVLA modeling_bitnet.py BitLinear, WeightQuant, ActQuant.
+enum class Rule { floats, int8_rows };
+/// x [d_in, n, ...] -> W x + b [d_out, n, ...]; bias may be null.
 struct Linear {
   static constexpr const char* kName = "linear";
   const Param* weight;
   const Param* bias;
-  const Param* scale = nullptr;
+  Rule rule = Rule::floats;
 };
 /// ids [n] i32 -> rows of a declared table [d, n].
 struct Embedding {

@@ -10,11 +10,12 @@ namespace vla {
 /// What large matrices of floats are rounded to when they are loaded.
 enum class Rounding { none, bf16, int8 };
 
-/// The dtype of a parameter in memory. Matrices from or to fewer than 144 numbers keep theirs: they take no time worth
-/// an error, and padded states and actions of robots have up to 132 numbers (GR00T N1.7).
-DType resident_dtype(const Param& param, Rounding rounding);
+/// The encoding of a parameter in memory; int8 has a scale for each row of a matrix. Matrices from or to fewer than 144
+/// elements keep theirs: they take no time worth an error, and padded states and actions of robots have up to 132
+/// elements (GR00T N1.7).
+Encoding resident_encoding(const Param& param, Rounding rounding);
 
-/// Errors: unsupported where no matrix would have the dtype that was asked for.
+/// Errors: unsupported where no matrix would have the encoding that was asked for.
 Status check_rounding(const ParamList& list, Rounding rounding);
 
 }  // namespace vla

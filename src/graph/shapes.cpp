@@ -39,7 +39,7 @@ struct Rules {
   }
   ShapeCheck operator()(const op::Linear& op) const {
     if (!has(1) || !floats() || of(0)[0] != op.weight->shape[0]) return {false};
-    if ((op.weight->storage == Storage::ternary) != (op.scale != nullptr)) return {false};
+    if ((op.weight->encoding.type == DType::ternary) != (op.rule == op::Rule::int8_rows)) return {false};
     return {op.bias == nullptr || op.bias->shape[0] == op.weight->shape[1],
             {op.weight->shape[1], of(0)[1], of(0)[2], of(0)[3]}};
   }

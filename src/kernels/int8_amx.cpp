@@ -103,7 +103,7 @@ struct AmxInt8Tile : AmxRounding {
   }
 };
 
-bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::amx_int8); }
+bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::amx_int8); }
 
 }  // namespace
 

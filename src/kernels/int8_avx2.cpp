@@ -92,10 +92,8 @@ struct Avx2Tile {
   }
 };
 
-bool supports_vnni(const MatrixDesc& desc, Features use) {
-  return desc.type == DType::i8 && use.has(Feature::avx_vnni);
-}
-bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::avx2); }
+bool supports_vnni(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::avx_vnni); }
+bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::avx2); }
 
 }  // namespace
 

@@ -64,7 +64,7 @@ struct VnniTile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::avx512_vnni); }
+bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::avx512_vnni); }
 
 }  // namespace
 

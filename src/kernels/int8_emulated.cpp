@@ -37,7 +37,7 @@ struct PlainTile {
   typedef std::uint64_t Eight __attribute__((vector_size(8)));
 };
 
-bool supports(const MatrixDesc& desc, Features) { return desc.type == DType::i8; }
+bool supports(const MatrixDesc& desc, Features) { return !is_float(desc.type); }
 
 }  // namespace
 

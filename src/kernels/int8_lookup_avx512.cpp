@@ -321,7 +321,7 @@ class LookupLoop {
 };
 
 bool supports(const MatrixDesc& desc, Features use) {
-  return desc.is_ternary && use.has(Feature::permutes_beside_vnni);
+  return desc.type == DType::ternary && use.has(Feature::permutes_beside_vnni);
 }
 
 constexpr std::int64_t kFewRows = 32;  // for which tables do not pay

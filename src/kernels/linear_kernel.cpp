@@ -22,7 +22,9 @@ std::span<const LinearKernel* const> linear_kernels() {
 }
 
 const LinearKernel* choose_linear(const MatrixDesc& desc, Features use) {
-  const auto kernels = desc.is_ternary ? ternary_kernels() : desc.type == DType::i8 ? int8_kernels() : linear_kernels();
+  const auto kernels = desc.type == DType::ternary ? ternary_kernels()
+                       : desc.type == DType::i8    ? int8_kernels()
+                                                   : linear_kernels();
   for (const LinearKernel* kernel : kernels)
     if (kernel->supports(desc, use)) return kernel;
   return nullptr;

@@ -11,14 +11,11 @@
 
 namespace vla::kernels {
 
-/// A weight matrix as the bundle has it: d_out rows of d_in numbers, one row after the other. A ternary one is of i8
-/// with four numbers a byte (Storage::ternary).
+/// A weight matrix: d_out rows of d_in elements, one row after the other. Scales of codes are no part of it.
 struct MatrixDesc {
   DType type;
   std::int64_t d_in, d_out;
-  bool is_ternary = false;
 };
-constexpr MatrixDesc ternary_desc(std::int64_t d_in, std::int64_t d_out) { return {DType::i8, d_in, d_out, true}; }
 
 /// No limit of a depth.
 constexpr std::int64_t kAnyDepth = std::int64_t{1} << 62;

@@ -22,10 +22,6 @@ VLA_INLINE float from_f16(std::uint16_t x) {
 
 /// Bytes of a stored number.
 constexpr VLA_INLINE std::int64_t number_size(DType type) { return type == DType::f32 ? 4 : 2; }
-/// Whether a product in float32 can read the numbers.
-constexpr VLA_INLINE bool is_float(DType type) {
-  return type == DType::f32 || type == DType::bf16 || type == DType::f16;
-}
 
 /// Number i of a stored matrix.
 VLA_INLINE float stored_number(DType type, const std::byte* stored, std::int64_t i) {

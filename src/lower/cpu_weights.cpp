@@ -11,25 +11,20 @@
 #include <map>
 
 #include "kernels/executor.h"
-#include "kernels/quantize_weights.h"
 #include "kernels/sizes.h"
+#include "lower/recode.h"
 
 namespace vla::lower {
 namespace {
 
 /// The matrix as it is multiplied.
-kernels::MatrixDesc desc_of(const Param& param, DType type) {
-  return {type, param.shape[0], param.shape[1], param.storage == Storage::ternary};
+kernels::MatrixDesc desc_of(const Param& param, const Encoding& encoding) {
+  return {encoding.type, param.shape[0], param.shape[1]};
 }
 
-/// Ternary matrices have one scale, which is a parameter.
-bool has_scales(const Param& param, DType type) { return type == DType::i8 && param.storage == Storage::matrix; }
-
-void round_to_bf16(DType type, const std::byte* stored, std::int64_t n, std::byte* to) {
-  for (std::int64_t i = 0; i < n; ++i) {
-    const std::uint16_t rounded = to_bf16(kernels::stored_number(type, stored, i));
-    std::memcpy(to + static_cast<std::int64_t>(sizeof(rounded)) * i, &rounded, sizeof(rounded));
-  }
+/// Scales that the bundle does not have.
+std::int64_t n_made_scale(const Param& param, const Encoding& encoding) {
+  return param.scales == nullptr ? encoding.n_scale(param.count()) : 0;
 }
 
 /// Rows of a matrix in a part that is read and packed at a time: whole panels of every kernel.
@@ -45,58 +40,58 @@ struct PackTask : kernels::Task {
     std::span<const std::byte> from;
     const kernels::LinearKernel* kernel;  // null: a copy
     std::byte* to;
-    DType stored = DType::f32;
-    float* scales = nullptr;  // of int8
-    bool is_rounded() const { return kernel != nullptr && desc.type != stored; }
+    Recode recode = {};
+    float* scales = nullptr;  // where they are made
   };
   const Bundle* bundle;
   std::vector<Part> parts;
-  mutable std::vector<Room> rooms, rounded;  // of each worker
+  mutable std::vector<Room> rooms, recoded;  // of each worker
   mutable std::atomic<bool> has_failed = false;
 
-  void add(const Param& param, DType type, const kernels::LinearKernel* kernel, std::byte* to, float* scales) {
+  void add(const Param& param, std::byte* to) {
+    parts.push_back({.desc = {}, .from = param.source->data, .kernel = nullptr, .to = to});
+  }
+  void add(const Param& param, const Encoding& encoding, const kernels::LinearKernel* kernel, std::byte* to,
+           float* scales) {
     const std::span<const std::byte> all = param.source->data;
-    if (kernel == nullptr) return parts.push_back({{}, all, nullptr, to});
-    kernels::MatrixDesc desc = desc_of(param, type);
+    kernels::MatrixDesc desc = desc_of(param, encoding);
     const std::int64_t n_row = desc.d_out, row = static_cast<std::int64_t>(all.size()) / n_row;
     const std::int64_t step = kernels::round_up(kPartSize / row + 1, kPartRows);
     for (std::int64_t first = 0; first < n_row; first += step) {
       desc.d_out = first;
       std::byte* const place = to + kernel->packed_size(desc);
       desc.d_out = std::min(step, n_row - first);
-      parts.push_back({desc,
-                       all.subspan(static_cast<std::size_t>(first * row), static_cast<std::size_t>(desc.d_out * row)),
-                       kernel, place, param.type(), scales != nullptr ? scales + first : nullptr});
+      parts.push_back(
+          {.desc = desc,
+           .from = all.subspan(static_cast<std::size_t>(first * row), static_cast<std::size_t>(desc.d_out * row)),
+           .kernel = kernel,
+           .to = place,
+           .recode = {param.encoding.type, encoding},
+           .scales = scales != nullptr ? scales + encoding.n_scale(first * desc.d_in) : nullptr});
     }
   }
 
   void run(std::int64_t item, kernels::Worker& worker) const override {
     const Part& part = parts[static_cast<std::size_t>(item)];
-    const auto& [desc, from, kernel, to, stored, scales] = part;
     const auto i = static_cast<std::size_t>(worker.index);
-    const std::byte* read = bundle->content()->read(from, rooms[i]);
-    if (read == nullptr) {
+    const std::byte* read = bundle->content()->read(part.from, rooms[i]);
+    if (read == nullptr)
       has_failed = true;
-    } else if (part.is_rounded()) {
-      std::byte* const numbers = rounded[i].take(rounded_size(desc) + row_size(desc));
-      auto* const row = reinterpret_cast<float*>(numbers + rounded_size(desc));
-      if (scales != nullptr)
-        kernels::quantize_weights(stored, read, desc.d_in, desc.d_out, numbers, scales, row);
-      else
-        round_to_bf16(stored, read, desc.d_in * desc.d_out, numbers);
-      kernel->pack(desc, numbers, to);
-    } else if (kernel != nullptr) {
-      kernel->pack(desc, read, to);
-    } else {
-      std::memcpy(to, read, from.size());
-    }
+    else if (part.kernel == nullptr)
+      std::memcpy(part.to, read, part.from.size());
+    else
+      part.kernel->pack(part.desc, part.recode(read, part.desc.d_in * part.desc.d_out, recoded[i], part.scales),
+                        part.to);
   }
 
-  static std::size_t rounded_size(const kernels::MatrixDesc& desc) {
-    return aligned(static_cast<std::size_t>(desc.d_in * desc.d_out) * dtype_size(desc.type));
-  }
-  static std::size_t row_size(const kernels::MatrixDesc& desc) {
-    return static_cast<std::size_t>(desc.d_in) * sizeof(float);
+  /// Takes the memory that workers need, since they must not run out of it.
+  void reserve(int n_thread) {
+    rooms.resize(static_cast<std::size_t>(n_thread)), recoded.resize(rooms.size());
+    for (const Part& part : parts)
+      for (std::size_t i = 0; i < rooms.size(); ++i) {
+        rooms[i].take(Content::room_for(part.from.size()));
+        if (part.recode.changes()) recoded[i].take(part.recode.room_for(part.desc.d_in * part.desc.d_out));
+      }
   }
 };
 
@@ -123,13 +118,13 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
   for (const Param& param : list.params()) {
     Place place;
     offsets.push_back(size);
-    if (param.is_matrix()) {
-      place.type = resident_dtype(param, options.rounding);
-      const kernels::MatrixDesc desc = desc_of(param, place.type);
+    if (param.storage == Storage::matrix) {
+      place.encoding = resident_encoding(param, options.rounding);
+      const kernels::MatrixDesc desc = desc_of(param, place.encoding);
       place.kernel = kernels::choose_linear(desc, options.use);
-      ++counts[place.kernel->name][param.storage == Storage::ternary ? "ternary" : dtype_name(param.type())];
+      ++counts[place.kernel->name][dtype_name(param.encoding.type)];
       size += aligned(place.kernel->packed_size(desc));
-      if (has_scales(param, place.type)) size += aligned(static_cast<std::size_t>(desc.d_out) * sizeof(float));
+      size += aligned(static_cast<std::size_t>(n_made_scale(param, place.encoding)) * sizeof(float));
     } else if (param.storage == Storage::vector) {
       size += aligned(static_cast<std::size_t>(param.count()) * sizeof(float));
     } else if (param.source != nullptr) {
@@ -147,20 +142,18 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
     if (param.storage == Storage::table) continue;
     Place& place = weights.places_[static_cast<std::size_t>(param.id)];
     place.data = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
-    if (has_scales(param, place.type))
+    if (n_made_scale(param, place.encoding) > 0)
       place.scales =
-          reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc_of(param, place.type))));
-    if (options.fill) task.add(param, place.type, place.kernel, place.data, place.scales);
+          reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc_of(param, place.encoding))));
+    if (!options.fill) continue;
+    if (place.kernel != nullptr)
+      task.add(param, place.encoding, place.kernel, place.data, place.scales);
+    else
+      task.add(param, place.data);
   }
   if (task.parts.empty()) return weights;
   VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(options.n_thread));
-  task.rooms.resize(static_cast<std::size_t>(executor->n_thread()));
-  task.rounded.resize(task.rooms.size());
-  for (const PackTask::Part& part : task.parts)  // a worker must not run out of memory
-    for (std::size_t i = 0; i < task.rooms.size(); ++i) {
-      task.rooms[i].take(Content::room_for(part.from.size()));
-      if (part.is_rounded()) task.rounded[i].take(PackTask::rounded_size(part.desc) + PackTask::row_size(part.desc));
-    }
+  task.reserve(executor->n_thread());
   task.n_item = static_cast<std::int64_t>(task.parts.size());
   const kernels::Phase phase = {{&task}, nullptr};
   executor->run({&phase, 1});

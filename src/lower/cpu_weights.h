@@ -17,8 +17,8 @@ namespace vla::lower {
 /// The tables of a policy's bundle.
 using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 
-/// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in panels, in the bundle's dtype or
-/// rounded; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
+/// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in panels, encoded as in the bundle
+/// or rounded; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
 class CpuWeights {
  public:
   struct Options {
@@ -31,15 +31,16 @@ class CpuWeights {
   /// was opened, unsupported where nothing is worth rounding (graph/rounding.h).
   static Result<CpuWeights> load(const ParamList& list, const Options& options);
 
-  const std::byte* data(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].data; }
-  /// Of each column of the product, where the matrix was quantized when it was loaded; else null.
-  const float* scales(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].scales; }
-  /// Of its numbers in memory.
-  DType type(const Param* param) const { return places_[static_cast<std::size_t>(param->id)].type; }
-  /// What multiplies by a matrix.
-  const kernels::LinearKernel* kernel(const Param* param) const {
-    return places_[static_cast<std::size_t>(param->id)].kernel;
+  const std::byte* data(const Param* param) const { return place(param).data; }
+  const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
+  /// How it lies in memory.
+  const Encoding& encoding(const Param* param) const { return place(param).encoding; }
+  /// What `encoding` has of them; null where it has none.
+  const float* scales(const Param* matrix) const {
+    return matrix->scales != nullptr ? floats(matrix->scales) : place(matrix).scales;
   }
+  /// What multiplies by a matrix.
+  const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
   /// All tables that have their source.
   const std::shared_ptr<const Tables>& tables() const { return tables_; }
   /// Of one of them; null where it has no source.
@@ -55,10 +56,11 @@ class CpuWeights {
  private:
   struct Place {
     std::byte* data = nullptr;
-    DType type = DType::f32;
+    Encoding encoding;
     const kernels::LinearKernel* kernel = nullptr;
-    float* scales = nullptr;
+    float* scales = nullptr;  // made when the matrix was rounded
   };
+  const Place& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
 
   Memory memory_;
   std::shared_ptr<const Tables> tables_;

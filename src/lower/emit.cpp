@@ -22,7 +22,7 @@ constexpr std::int64_t kItemNumbers = 16384;
 
 std::byte* address(const Lowering& l, ValueId id) {
   const Value& value = l.value(id);
-  return l.base(id).data + value.offset * static_cast<std::int64_t>(dtype_size(value.type));
+  return l.base(id).data + dtype_size(value.type, value.offset);
 }
 float* floats(const Lowering& l, ValueId id) { return reinterpret_cast<float*>(address(l, id)); }
 /// Null for an operand that there is not.
@@ -60,7 +60,7 @@ struct BlockedTask : Task {
   static kernels::LinearJob rows_of(kernels::LinearJob job, std::int64_t first, std::int64_t n) {
     const auto offset = [&](DType type, std::int64_t d, std::int64_t stride) {
       return type == DType::bf16 ? 2 * kernels::place_in_tiles(first, 0, d)
-                                 : first * stride * static_cast<std::int64_t>(dtype_size(type));
+                                 : static_cast<std::int64_t>(dtype_size(type, first * stride));
     };
     job.n_row = n;
     job.x += offset(job.x_type, job.d_in, job.x_stride);
@@ -279,13 +279,10 @@ kernels::LinearJob job_of(const Lowering& l, const FusedOp& op) {
   for (const Node* node : linear.linears) {
     const auto& product = *node->as<op::Linear>();
     kernels::LinearJob::Part& part = job.part[job.n_part++];
-    part.type = l.weights.type(product.weight);
+    part.type = l.weights.encoding(product.weight).type;
     part.weight = l.weights.data(product.weight);
-    const auto vector = [&](const Param* param) {
-      return param != nullptr ? reinterpret_cast<const float*>(l.weights.data(param)) : nullptr;
-    };
-    part.bias = vector(product.bias);
-    part.scale = product.scale != nullptr ? vector(product.scale) : l.weights.scales(product.weight);
+    part.bias = product.bias != nullptr ? l.weights.floats(product.bias) : nullptr;
+    part.scale = l.weights.scales(product.weight);
     part.d_out = product.weight->shape[1];
     // Of gate and up the one result is up's.
     const std::size_t i = linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1);
@@ -425,7 +422,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LookupOp&
   float* const y = floats(l, op.writes[0]);
   if (const auto* embedding = node.as<op::Embedding>()) {
     auto task = std::make_unique<EmbeddingTask>();
-    task->table = l.weights.rows(embedding->table), task->type = embedding->table->type();
+    task->table = l.weights.rows(embedding->table), task->type = embedding->table->encoding.type;
     task->ids = ids, task->y = y, task->d = node.shape[0], task->n = node.shape[1], task->n_item = 1;
     return task;
   }
@@ -445,9 +442,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PatchesOp
   return task;
 }
 
-std::size_t bytes_of(const Value& value) {
-  return static_cast<std::size_t>(count(value.shape)) * dtype_size(value.type);
-}
+std::size_t bytes_of(const Value& value) { return dtype_size(value.type, count(value.shape)); }
 
 }  // namespace
 
@@ -523,8 +518,7 @@ Work work_of(const Lowering& l, const FusedOp& op) {
   if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
     for (const Node* node : linear->linears) {
       const auto& product = *node->as<op::Linear>();
-      work.weights += static_cast<double>(product.weight->stored_count()) *
-                      static_cast<double>(dtype_size(l.weights.type(product.weight)));
+      work.weights += static_cast<double>(dtype_size(l.weights.encoding(product.weight).type, product.weight->count()));
       if (product.bias != nullptr) work.weights += 4.0 * static_cast<double>(product.bias->shape[0]);
     }
     work.bytes += work.weights;

@@ -236,7 +236,7 @@ class Fuser {
     while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();
     const auto* product = node->as<op::Linear>();
     if (product == nullptr) return false;
-    const DType type = l.weights.type(product->weight);
+    const DType type = l.weights.encoding(product->weight).type;
     return type == DType::f32 || type == DType::f16;
   }
 

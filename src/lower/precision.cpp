@@ -9,7 +9,7 @@ namespace vla {
 Features features_for(const ParamList& list, Features use, Rounding rounding) {
   const auto& params = list.params();
   const auto rounds = [&](const Param& param) {
-    const DType type = resident_dtype(param, rounding);
+    const DType type = resident_encoding(param, rounding).type;
     return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8);
   };
   return std::any_of(params.begin(), params.end(), rounds) ? use : without_rounding(use);
@@ -17,7 +17,7 @@ Features features_for(const ParamList& list, Features use, Rounding rounding) {
 
 std::int64_t min_rounded_keys(const ParamList& list) {
   const auto& params = list.params();
-  const auto is_ternary = [](const Param& param) { return param.storage == Storage::ternary; };
+  const auto is_ternary = [](const Param& param) { return param.encoding.type == DType::ternary; };
   return std::any_of(params.begin(), params.end(), is_ternary) ? 512 : 128;
 }
 

@@ -63,7 +63,7 @@ Value own(const Node& node) {
   Value value;
   value.node = &node, value.base = node.id, value.type = node.type, value.shape = node.shape;
   value.stride = contiguous_strides(node.shape);
-  value.size = static_cast<std::size_t>(count(node.shape)) * dtype_size(node.type);
+  value.size = dtype_size(node.type, count(node.shape));
   return value;
 }
 

@@ -49,8 +49,8 @@ Tensor head_rows(Graph& g, Tensor x, int n_head, const std::optional<RmsNorm>& n
 
 KeyValueProjection::KeyValueProjection(const Scope& s, int d_context, const Heads& heads)
     : n_head_(heads.n_head_kv),
-      k_(s / "attn_k", d_context, heads.d_key(), heads.bias, heads.weights),
-      v_(s / "attn_v", d_context, heads.d_key(), heads.bias, heads.weights),
+      k_(s / "attn_k", d_context, heads.d_key(), heads.bias, heads.rule),
+      v_(s / "attn_v", d_context, heads.d_key(), heads.bias, heads.rule),
       norm_(head_norm(s / "attn_k_norm", heads)) {}
 
 KeyValue KeyValueProjection::operator()(Graph& g, Tensor key_context, Tensor value_context, Tensor rotary) const {
@@ -59,10 +59,10 @@ KeyValue KeyValueProjection::operator()(Graph& g, Tensor key_context, Tensor val
 
 Attention::Attention(const Scope& s, int d_model, int d_context, const Heads& heads)
     : heads_(heads),
-      q_(s / "attn_q", d_model, heads.d_query(), heads.bias, heads.weights),
+      q_(s / "attn_q", d_model, heads.d_query(), heads.bias, heads.rule),
       norm_(head_norm(s / "attn_q_norm", heads)),
       kv_(s, d_context, heads),
-      out_(s / "attn_out", heads.d_query(), d_model, heads.out_bias, heads.weights) {
+      out_(s / "attn_out", heads.d_query(), d_model, heads.out_bias, heads.rule) {
   if (heads.sub_norm_eps) sub_norm_.emplace(s / "attn_sub_norm", heads.d_query(), *heads.sub_norm_eps);
 }
 

@@ -20,7 +20,7 @@ struct Heads {
   Bias bias = Bias::no;                // of queries, keys and values
   Bias out_bias = Bias::no;            // of the output product
   std::optional<float> norm_eps = {};  // queries and keys pass an RMS norm over the head
-  Weights weights = Weights::floats;
+  Rule rule = Rule::floats;
   std::optional<float> sub_norm_eps = {};  // what all heads give passes an RMS norm before the output product
   float rope_base = 0;                     // 0: nothing turns by position alone
   RotaryAngle rope_angle = RotaryAngle::product;
@@ -30,8 +30,8 @@ struct Heads {
   /// Reads n_head, n_head_kv, d_head and rope_base of `s`, and checks that they go together.
   static Heads read(const Scope& s, RotaryAngle angle);
   /// Heads that share the model's width evenly, with biases everywhere.
-  static Heads even(int d_model, int n_head, Weights weights = Weights::floats) {
-    return {n_head, n_head, d_model / n_head, Bias::yes, Bias::yes, {}, weights};
+  static Heads even(int d_model, int n_head, Rule rule = Rule::floats) {
+    return {n_head, n_head, d_model / n_head, Bias::yes, Bias::yes, {}, rule};
   }
   /// The rotary table of `count` tokens from position `first` on.
   Tensor rotary(Graph& g, int first, int count) const;

@@ -9,9 +9,9 @@ namespace vla {
 EncoderBlock::EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family)
     : Module(s),
       attn_norm_(s / "attn_norm", d_model, eps),
-      attention_(s, d_model, d_model, Heads::even(d_model, n_head, family.weights)),
+      attention_(s, d_model, d_model, Heads::even(d_model, n_head, family.rule)),
       ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(s, d_model, d_ff, family.activation, family.weights) {
+      mlp_(s, d_model, d_ff, family.activation, family.rule) {
   if (!family.scaled) return;
   attn_scale_ = (s / "attn_scale").vector("weight", d_model);
   ffn_scale_ = (s / "ffn_scale").vector("weight", d_model);

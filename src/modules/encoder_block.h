@@ -11,11 +11,11 @@ namespace vla {
 struct EncoderFamily {
   Activation activation;  // of the MLP
   bool scaled;            // attention and MLP are multiplied feature by feature before they are added (LayerScale)
-  Weights weights = Weights::floats;
+  Rule rule = Rule::floats;
 };
 constexpr EncoderFamily kPlainEncoder = {Activation::gelu_tanh, false};
 constexpr EncoderFamily kInternEncoder = {Activation::gelu_erf, true};
-constexpr EncoderFamily kTernaryEncoder = {Activation::gelu_tanh, false, Weights::ternary};
+constexpr EncoderFamily kTernaryEncoder = {Activation::gelu_tanh, false, Rule::int8_rows};
 
 /// One pre-norm encoder layer: attention in which all tokens of a view see each other, then a GELU MLP.
 /// Sources: transformers modeling_siglip.py SiglipEncoderLayer, modeling_qwen3_vl.py Qwen3VLVisionBlock; InternVL

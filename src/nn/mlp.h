@@ -14,9 +14,9 @@ namespace vla {
 /// Sources: transformers SiglipMLP (gelu_tanh), InternVLVisionMLP (gelu_erf).
 class Mlp {
  public:
-  Mlp(const Scope& s, int d_model, int d_ff, Activation activation, Weights weights = Weights::floats)
-      : up_(s / "ffn_up", d_model, d_ff, Bias::yes, weights),
-        down_(s / "ffn_down", d_ff, d_model, Bias::yes, weights),
+  Mlp(const Scope& s, int d_model, int d_ff, Activation activation, Rule rule = Rule::floats)
+      : up_(s / "ffn_up", d_model, d_ff, Bias::yes, rule),
+        down_(s / "ffn_down", d_ff, d_model, Bias::yes, rule),
         activation_(activation) {}
   Tensor operator()(Graph& g, Tensor x) const { return down_(g, activate(g, up_(g, x), activation_)); }
 
@@ -30,11 +30,11 @@ class Mlp {
 /// Sources: transformers LlamaMLP (silu), GemmaMLP (gelu_tanh); BitVLA modeling_bitnet.py BitNetMLP (relu_squared).
 class GatedMlp {
  public:
-  GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation, Weights weights = Weights::floats,
+  GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation, Rule rule = Rule::floats,
            std::optional<float> sub_norm_eps = {})
-      : gate_(s / "ffn_gate", d_model, d_ff, Bias::no, weights),
-        up_(s / "ffn_up", d_model, d_ff, Bias::no, weights),
-        down_(s / "ffn_down", d_ff, d_model, Bias::no, weights),
+      : gate_(s / "ffn_gate", d_model, d_ff, Bias::no, rule),
+        up_(s / "ffn_up", d_model, d_ff, Bias::no, rule),
+        down_(s / "ffn_down", d_ff, d_model, Bias::no, rule),
         activation_(activation) {
     if (sub_norm_eps) sub_norm_.emplace(s / "ffn_sub_norm", d_ff, *sub_norm_eps);
   }

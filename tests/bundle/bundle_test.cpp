@@ -174,14 +174,17 @@ TEST_CASE("a ternary matrix is bytes of four codes, none of which is 3") {
   const auto report = [](DType type, const std::vector<std::int64_t>& shape, const std::string& data) {
     EditableBundle bundle = small_bundle();
     bundle.tensors.push_back({"a.weight", type, shape, data});
+    bundle.tensors.push_back({"a.scale", DType::f32, {1}, std::string(4, '\1')});
     const std::string bytes = bundle.bytes();
     const auto parsed = parse(bytes);
     REQUIRE_MESSAGE(parsed.ok(), (parsed ? "" : parsed.error().message()));
     ParamList list(parsed->keys(), &*parsed);
     const Param* weight = (Scope(list, "") / "a").ternary("weight", 12, 2);
-    CHECK(weight->type() == DType::i8);
+    CHECK(weight->encoding == Encoding{DType::ternary, 24});
     CHECK(weight->shape == std::vector<std::int64_t>{12, 2});
-    const Status status = list.report("bitvla", [](const std::string& name) { return name != "a.weight"; });
+    REQUIRE(weight->scales != nullptr);
+    CHECK(weight->scales->source == parsed->find("a.scale"));
+    const Status status = list.report("bitvla", [](const std::string& name) { return name[0] != 'a'; });
     return status.ok() ? "" : status.error().message();
   };
   CHECK(report(DType::i8, {3, 2}, std::string("\x00", 1) + "\x55\xAA\x24\x18\x62").empty());
@@ -190,6 +193,14 @@ TEST_CASE("a ternary matrix is bytes of four codes, none of which is 3") {
   CHECK(contains(report(DType::i8, {12, 2}, std::string(24, '\x55')), "wrong shape     a.weight"));
   CHECK(contains(report(DType::f32, {3, 2}, std::string(24, '\x55')), "wrong dtype     a.weight"));
   CHECK(contains(report(DType::f32, {3, 2}, std::string(24, '\x55')), "expected i8, file has f32"));
+}
+
+TEST_CASE("sizes count bits, and elements of less than a byte fill whole ones") {
+  CHECK(dtype_size(DType::ternary, 5) == 2);
+  CHECK(dtype_size(DType::bf16, 3) == 6);
+  CHECK(dtype_size(DType::f64, 1) == 8);
+  CHECK(Encoding{DType::i8, 64}.n_scale(640) == 10);
+  CHECK(Encoding{DType::bf16}.n_scale(640) == 0);
 }
 
 TEST_CASE("bytes are no matrix, table or vector of floats") {

@@ -179,6 +179,28 @@ TEST_CASE("a parameter that robots share is declared once, and one of their own 
   CHECK(next.report("test", [](const std::string& tensor) { return tensor == "stats.x"; }).ok());
 }
 
+TEST_CASE("codes are shared together with their scale, or not at all") {
+  EditableBundle bundle = two_robots();
+  for (const char* name : {"a", "b"})
+    bundle.tensors.push_back({name + std::string(".weight"), DType::i8, {1, 2}, "UU"});
+  bundle.tensors.push_back({"a.scale", DType::f32, {1}, std::string(4, '\1')});
+  for (const std::string& tag : kTags)
+    bundle.tensors.push_back({"embodiment." + tag + ".b.scale", DType::f32, {1}, std::string(4, tag[0])});
+  const std::string bytes = bundle.bytes();
+  auto arm = parse(bytes), humanoid = parse(bytes);
+  REQUIRE(arm->choose("arm").ok());
+  REQUIRE(humanoid->choose("humanoid").ok());
+  ParamList list(arm->keys(), &*arm);
+  const Param *a = Scope(list, "a").ternary("weight", 4, 2), *b = Scope(list, "b").ternary("weight", 4, 2);
+  ParamList next(*humanoid, list);
+  CHECK(Scope(next, "a").ternary("weight", 4, 2) == a);
+  const Param* own = Scope(next, "b").ternary("weight", 4, 2);
+  CHECK(own != b);
+  CHECK(own->scales->source->data.front() == std::byte{'h'});
+  CHECK(b->scales->source->data.front() == std::byte{'a'});
+  CHECK(next.report("test", [](const std::string& name) { return name[0] != 'a' && name[0] != 'b'; }).ok());
+}
+
 TEST_CASE("a tensor of a further robot that no module declares is refused, and so is a shape that does not fit") {
   const std::string bytes = two_robots().bytes();
   auto arm = parse(bytes), humanoid = parse(bytes);

@@ -45,7 +45,7 @@ inline void check_tensors(const Bundle& bundle, std::span<const std::byte> bytes
   for (const TensorInfo& tensor : bundle.tensors()) {
     const bool is_inside =
         tensor.data.data() >= bytes.data() && tensor.data.data() + tensor.data.size() <= bytes.data() + bytes.size();
-    const auto size = static_cast<std::size_t>(tensor.count()) * dtype_size(tensor.type);
+    const std::size_t size = dtype_size(tensor.type, tensor.count());
     if (!is_inside || tensor.data.size() != size) std::abort();
   }
 }

@@ -11,7 +11,9 @@ using namespace vla;
 
 namespace {
 
-Param param(Storage storage, std::vector<std::int64_t> shape) { return {0, "p", storage, std::move(shape), nullptr}; }
+Param param(Storage storage, std::vector<std::int64_t> shape) {
+  return {.name = "p", .storage = storage, .shape = std::move(shape)};
+}
 
 struct Fixture {
   Slots slots;
@@ -45,6 +47,11 @@ TEST_CASE_FIXTURE(Fixture, "products take x of their depth, and look-ups take id
   refuses(op::Linear{&weight, &wrong}, {f32({4, 3, 1, 1})});
   refuses(op::Linear{&weight, &bias}, {i32({4, 1, 1, 1})});
   refuses(op::Linear{&weight, &bias}, {Tensor()});
+  Param ternary = weight;
+  ternary.encoding = {DType::ternary, 28};
+  accepts(op::Linear{&ternary, &bias, op::Rule::int8_rows}, {f32({4, 3, 1, 1})}, {7, 3, 1, 1});
+  refuses(op::Linear{&ternary, &bias, op::Rule::floats}, {f32({4, 3, 1, 1})});
+  refuses(op::Linear{&weight, &bias, op::Rule::int8_rows}, {f32({4, 3, 1, 1})});
   accepts(op::Embedding{&table}, {i32({3, 1, 1, 1})}, {4, 3, 1, 1});
   refuses(op::Embedding{&weight}, {i32({3, 1, 1, 1})});
   refuses(op::Embedding{&table}, {f32({3, 1, 1, 1})});

@@ -29,7 +29,7 @@ std::vector<std::string> own_kernels() {
 TEST_CASE("a product counts two operations for each multiply-add, and attention two products with every key") {
   Slots slots;
   Graph g(slots);
-  const Param weight = {0, "w", Storage::matrix, {8, 5}, nullptr};
+  const Param weight = {.name = "w", .shape = {8, 5}};
   const Tensor x = g.input(slots.add_f32({8, 3, 2, 1}));
   CHECK(flop_of(*g.add(op::Linear{&weight, nullptr}, {x}).node()) == 2.0 * 8 * 5 * 3 * 2);
   const Tensor q = g.input(slots.add_f32({4, 6, 3, 2})), k = g.input(slots.add_f32({4, 2, 7, 2})),

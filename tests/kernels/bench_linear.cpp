@@ -92,7 +92,7 @@ struct Trial {
         s{n_row, d.d_in, d.d_out},
         x(static_cast<std::size_t>(quantized_size(round_up(s.n_row, kSquare), s.d_in)) * 4),
         y(static_cast<std::size_t>(round_up(s.n_row, kSquare) * round_up(s.d_out, kSquare)) * 4),
-        stored(static_cast<std::size_t>(s.d_in * s.d_out) * dtype_size(d.type) / (d.is_ternary ? 4 : 1)),
+        stored(dtype_size(d.type, s.d_in * s.d_out)),
         packed(kernel.packed_size(desc)),
         scale(static_cast<std::size_t>(s.d_out), 1.0f) {
     LinearJob job = {};
@@ -152,9 +152,8 @@ void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& pr
   const double best = *std::max_element(rates.begin(), rates.end()),
                peak = *std::max_element(peaks.begin(), peaks.end());
   fmt::print("{:12} {:7} {:5} x {:5} x {:5}  {:8.1f} G/s  {:5.1f} % of {:8.1f}  median {:5.1f} %  reads {:6.1f} GB/s",
-             kernel.name, desc.is_ternary ? "ternary" : dtype_name(desc.type), s.n_row, s.d_in, s.d_out, best * 1e-9,
-             100 * best / peak, peak * 1e-9, 100 * median(shares),
-             best / flop * static_cast<double>(trial.stored.n) * 1e-9);
+             kernel.name, dtype_name(desc.type), s.n_row, s.d_in, s.d_out, best * 1e-9, 100 * best / peak, peak * 1e-9,
+             100 * median(shares), best / flop * static_cast<double>(trial.stored.n) * 1e-9);
   fmt::print("  packed at {:.1f} GB/s", static_cast<double>(trial.stored.n) / trial.pack_seconds * 1e-9);
   if (rounded) fmt::print("  rounded, GELU");
   if (versus != nullptr) fmt::print("  {:.2f} x {}", median(factors), versus->name);
@@ -197,7 +196,7 @@ int main(int argc, char** argv) {
       if (probe == nullptr || !wants(*kernel)) continue;
       if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
       for (const Shape& shape : kInt8Shapes)
-        measure(**executor, *kernel, *probe, {DType::i8, shape.d_in, shape.d_out, ternary}, shape.n_row, n_round, false,
-                choose_linear({DType::bf16, 64, 64}, this_cpu()));
+        measure(**executor, *kernel, *probe, {ternary ? DType::ternary : DType::i8, shape.d_in, shape.d_out},
+                shape.n_row, n_round, false, choose_linear({DType::bf16, 64, 64}, this_cpu()));
     }
 }

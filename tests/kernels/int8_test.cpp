@@ -70,7 +70,7 @@ Codes codes_of(const float* x, std::int64_t n) {
 enum class Weights { ternary, int8 };
 
 MatrixDesc desc_of(Weights weights, std::int64_t d_in, std::int64_t d_out) {
-  return {DType::i8, d_in, d_out, weights == Weights::ternary};
+  return {weights == Weights::ternary ? DType::ternary : DType::i8, d_in, d_out};
 }
 
 /// Whose packed matrix all kernels read.
@@ -280,7 +280,7 @@ void check_golden(const LinearKernel& kernel) {
             golden.codes[static_cast<std::size_t>(r * Golden::kIn + k)]);
   }
   const std::vector<std::byte> stored = test::store_ternary(golden.weight);
-  const test::Pages packed = test::packed(kernel, ternary_desc(Golden::kIn, Golden::kOut), stored.data());
+  const test::Pages packed = test::packed(kernel, {DType::ternary, Golden::kIn, Golden::kOut}, stored.data());
   const auto product = [&](std::int64_t row, std::int64_t n_row, const float* scale, const float* bias) {
     std::vector<float> y(static_cast<std::size_t>(n_row * Golden::kOut));
     LinearJob job = {};
@@ -372,7 +372,7 @@ void check_both(const std::string& name, void (*check)(const LinearKernel& kerne
 /// For doctest's skip decorator: this machine lacks the instructions of a row.
 bool lacks(const std::string& name) {
   const LinearKernel* kernel = row(ternary_kernels(), name);
-  return kernel == nullptr || !kernel->supports(ternary_desc(64, 64), this_cpu());
+  return kernel == nullptr || !kernel->supports({DType::ternary, 64, 64}, this_cpu());
 }
 
 }  // namespace

@@ -27,7 +27,7 @@ std::vector<float> ternary(std::size_t count) {
 }
 
 void add_layer(std::vector<test::ParamSet::Piece>& pieces, const std::string& name, int d_in, int d_out, float scale) {
-  pieces.push_back({name + ".weight", {d_in, d_out}, ternary(static_cast<std::size_t>(d_in * d_out)), DType::i8});
+  pieces.push_back({name + ".weight", {d_in, d_out}, ternary(static_cast<std::size_t>(d_in * d_out)), DType::ternary});
   pieces.push_back({name + ".scale", {1}, {scale}});
   pieces.push_back({name + ".bias", {d_out}, ramp(static_cast<std::size_t>(d_out), 1.0f)});
 }
@@ -45,9 +45,9 @@ struct Layers {
   Linear a, b, c;
   RmsNorm norm;
   explicit Layers(const Scope& s)
-      : a(s / "a", kModel, kFf, Bias::yes, Weights::ternary),
-        b(s / "b", kModel, kFf, Bias::yes, Weights::ternary),
-        c(s / "c", kFf, kModel, Bias::yes, Weights::ternary),
+      : a(s / "a", kModel, kFf, Bias::yes, Rule::int8_rows),
+        b(s / "b", kModel, kFf, Bias::yes, Rule::int8_rows),
+        c(s / "c", kFf, kModel, Bias::yes, Rule::int8_rows),
         norm(s / "norm", kModel, 1e-5f) {}
 };
 
@@ -139,7 +139,7 @@ TEST_CASE("a tapped norm is an operation of its own, which quantizing reads") {
 
 TEST_CASE("a ternary product whose rows are no whole bytes is refused") {
   ParamList list(Keys(), nullptr);
-  const Linear layer(Scope(list, "odd"), 35, 8, Bias::no, Weights::ternary);
+  const Linear layer(Scope(list, "odd"), 35, 8, Bias::no, Rule::int8_rows);
   const Status fits = list.report("test", {});
   REQUIRE_FALSE(fits.ok());
   CHECK(fits.error().message().find("odd.weight") != std::string::npos);

@@ -30,9 +30,12 @@ class ParamSet {
     bundle.set("vla.bundle_version", Value(std::int64_t{1}));
     for (Piece piece : pieces) {
       const auto stored = store_as(piece.type, piece.values);
-      if (piece.type == DType::i8) piece.shape[0] /= 4;
-      bundle.tensors.push_back(
-          {piece.name, piece.type, piece.shape, {reinterpret_cast<const char*>(stored.data()), stored.size()}});
+      const bool is_ternary = piece.type == DType::ternary;
+      if (is_ternary) piece.shape[0] /= 4;
+      bundle.tensors.push_back({piece.name,
+                                is_ternary ? DType::i8 : piece.type,
+                                piece.shape,
+                                {reinterpret_cast<const char*>(stored.data()), stored.size()}});
     }
     bytes_ = bundle.bytes();
     auto parsed = Bundle::parse(std::as_bytes(std::span(bytes_)), "test");

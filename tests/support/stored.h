@@ -26,9 +26,9 @@ inline std::vector<std::byte> store_int8(const std::vector<float>& values) {
   return out;
 }
 
-/// Values in a storage type, and what the type made of them. i8 is ternary.
+/// Values in a storage type, and what the type made of them.
 inline std::vector<std::byte> store_as(DType type, std::vector<float>& values) {
-  if (type == DType::i8) return store_ternary(values);
+  if (type == DType::ternary) return store_ternary(values);
   std::vector<std::byte> out(values.size() * (type == DType::f32 ? 4 : 2));
   for (std::size_t i = 0; i < values.size(); ++i) {
     if (type == DType::f32) {

@@ -12,7 +12,7 @@ namespace {
 Heads heads_of(const Scope& s, QwenFamily family) {
   Heads heads = Heads::read(s, RotaryAngle::product);
   heads.bias = family.bias;
-  heads.weights = family.weights;
+  heads.rule = family.rule;
   if (family.head_norms) heads.norm_eps = s.number("norm_eps", kNormEps);
   if (family.sub_norms) heads.sub_norm_eps = s.number("norm_eps", kNormEps);
   return heads;
@@ -25,7 +25,7 @@ QwenBlock::QwenBlock(const Scope& s, int d_model, int d_ff, const Heads& heads, 
       attn_norm_(s / "attn_norm", d_model, eps),
       attention_(s, d_model, d_model, heads),
       ffn_norm_(s / "ffn_norm", d_model, eps),
-      mlp_(s, d_model, d_ff, activation, heads.weights, heads.sub_norm_eps) {}
+      mlp_(s, d_model, d_ff, activation, heads.rule, heads.sub_norm_eps) {}
 
 Tensor QwenBlock::forward(Graph& g, Tensor x, Tensor rotary, Tensor mask, Tensor added) const {
   x = add(g, x, attention_.among(g, attn_norm_(g, x), rotary, mask));

@@ -17,14 +17,14 @@ struct QwenFamily {
   bool head_norms;                           // queries and keys are normalized head by head
   bool final_norm;                           // features are read behind it, else they are what the last layer gives
   Activation activation = Activation::silu;  // of the gated MLP
-  Weights weights = Weights::floats;
+  Rule rule = Rule::floats;
   bool sub_norms = false;  // both output products have an RMS norm in front
 };
 constexpr QwenFamily kQwen2 = {Bias::yes, false, true};
 constexpr QwenFamily kQwen3 = {Bias::no, true, true};
 constexpr QwenFamily kQwen3Inner = {Bias::no, true, false};
 /// BitNet b1.58. Source: BitVLA modeling_bitnet.py BitNetModel.
-constexpr QwenFamily kBitNet = {Bias::no, false, true, Activation::relu_squared, Weights::ternary, true};
+constexpr QwenFamily kBitNet = {Bias::no, false, true, Activation::relu_squared, Rule::int8_rows, true};
 
 /// One layer: attention, then a gated MLP.
 /// Sources: transformers modeling_qwen2.py Qwen2DecoderLayer, modeling_qwen3.py Qwen3DecoderLayer.

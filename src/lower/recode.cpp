@@ -1,0 +1,35 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/recode.h"
+
+#include <cassert>
+#include <cstring>
+
+#include "kernels/quantize_weights.h"
+
+namespace vla::lower {
+namespace {
+
+void round_to_bf16(DType type, const std::byte* stored, std::int64_t n, std::byte* to) {
+  for (std::int64_t i = 0; i < n; ++i) {
+    const std::uint16_t rounded = to_bf16(kernels::stored_number(type, stored, i));
+    std::memcpy(to + static_cast<std::int64_t>(sizeof(rounded)) * i, &rounded, sizeof(rounded));
+  }
+}
+
+}  // namespace
+
+const std::byte* Recode::operator()(const std::byte* from, std::int64_t count, Room& room, float* scales) const {
+  if (!changes()) return from;
+  assert(is_float(stored) && (wanted.type == DType::bf16 || wanted.type == DType::i8));
+  std::byte* const to = room.take(room_for(count));
+  if (wanted.type == DType::bf16) {
+    round_to_bf16(stored, from, count, to);
+  } else {
+    auto* const group = reinterpret_cast<float*>(to + aligned(dtype_size(wanted.type, count)));
+    kernels::quantize_weights(stored, from, wanted.group, count / wanted.group, to, scales, group);
+  }
+  return to;
+}
+
+}  // namespace vla::lower

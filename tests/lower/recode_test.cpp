@@ -1,0 +1,63 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/recode.h"
+
+#include <doctest/doctest.h>
+
+#include "support/stored.h"
+
+using namespace vla;
+using lower::Recode;
+
+namespace {
+
+struct Recoded {
+  std::vector<std::byte> bytes;
+  std::vector<float> scales;
+};
+
+Recoded recoded(std::vector<float> values, DType stored, Encoding wanted) {
+  const std::vector<std::byte> from = test::store_as(stored, values);
+  const auto count = static_cast<std::int64_t>(values.size());
+  Recoded result = {{}, std::vector<float>(static_cast<std::size_t>(wanted.n_scale(count)))};
+  Room room;
+  const std::byte* to = Recode{stored, wanted}(from.data(), count, room, result.scales.data());
+  result.bytes.assign(to, to + dtype_size(wanted.type, count));
+  return result;
+}
+
+std::vector<int> codes(const Recoded& recoded) {
+  std::vector<int> codes;
+  for (const std::byte code : recoded.bytes) codes.push_back(static_cast<signed char>(code));
+  return codes;
+}
+
+}  // namespace
+
+TEST_CASE("int8 codes have a scale for every group: for each row, or several in a row") {
+  const std::vector<float> rows = {0, 1, -2, 0.5f, 254, 127, -5, 1};  // 4 to a row
+  for (const DType stored : {DType::f32, DType::bf16, DType::f16}) {
+    const Recoded by_row = recoded(rows, stored, {DType::i8, 4}), by_half = recoded(rows, stored, {DType::i8, 2});
+    CHECK(codes(by_row) == std::vector<int>{0, 64, -127, 32, 127, 64, -2, 0});
+    CHECK(by_row.scales == std::vector<float>{2.0f / 127, 2});
+    CHECK(codes(by_half) == std::vector<int>{0, 127, -127, 32, 127, 64, -127, 25});
+    CHECK(by_half.scales == std::vector<float>{1.0f / 127, 2.0f / 127, 2, 5.0f / 127});
+  }
+}
+
+TEST_CASE("what is stored as it is wanted stays where it is, codes too") {
+  const std::vector<std::byte> stored(8, std::byte{0x15});
+  Room room;
+  for (const Encoding same : {Encoding{DType::f32}, Encoding{DType::bf16}, Encoding{DType::ternary, 8}}) {
+    const Recode recode = {same.type, same};
+    CHECK_FALSE(recode.changes());
+    CHECK(recode(stored.data(), 2, room, nullptr) == stored.data());
+  }
+}
+
+TEST_CASE("bf16 is the nearest one, ties to even") {
+  std::vector<float> expected = {1, -1 - 0x1p-7f, 0x1p-130f, 3.0e38f};
+  const Recoded rounded = recoded({1 + 0x1p-8f, -1 - 0x1.8p-8f, 0x1p-130f, 3.0e38f}, DType::f32, {DType::bf16});
+  CHECK(rounded.bytes == test::store_as(DType::bf16, expected));
+  CHECK(rounded.scales.empty());
+}
