@@ -6,7 +6,6 @@
 #include <tuple>
 
 #include "lower/lowering.h"
-#include "lower/precision.h"
 
 namespace vla::lower {
 namespace {
@@ -17,23 +16,24 @@ class Fuser {
  public:
   explicit Fuser(Lowering& lowering) : l(lowering) {}
 
-  void run() {
+  std::vector<FusedOp> run() {
     for (const Node& node : l.graph.nodes())
       if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
     join_products();
     fuse_norms();
     // A norm that its readers compute is no operation.
-    std::erase_if(l.ops, [&](const FusedOp& op) {
+    std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
       return row != nullptr && l.fused[at(row->node)];
     });
-    for (FusedOp& op : l.ops) note_operands(op);
-    std::stable_sort(l.ops.begin(), l.ops.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
+    for (FusedOp& op : ops_) note_operands(op);
+    std::stable_sort(ops_.begin(), ops_.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
+    return std::move(ops_);
   }
 
  private:
   void add(decltype(FusedOp::op) op, const Node& result) {
-    FusedOp& added = l.ops.emplace_back();
+    FusedOp& added = ops_.emplace_back();
     added.op = std::move(op), added.writes = {result.id}, added.order = result.id;
   }
 
@@ -41,7 +41,7 @@ class Fuser {
     std::visit([&](const auto& op) { visit(node, op); }, node.op);
   }
 
-  // Leaves are values; what a slot gets is the result of another operation (layout.cpp).
+  // Leaves are values; what a slot gets is the result of another operation (store.cpp).
   void visit(const Node&, const op::Input&) {}
   void visit(const Node&, const op::Constant&) {}
   void visit(const Node&, const op::Parameter&) {}
@@ -136,9 +136,8 @@ class Fuser {
     return l.fused[at(reader)] ? nullptr : reader;
   }
 
-  const kernels::LinearKernel* kernel(const Node& linear) const {
-    return l.weights.kernel(linear.as<op::Linear>()->weight);
-  }
+  static const Param& weight(const Node& linear) { return *linear.as<op::Linear>()->weight; }
+  const void* multiplier(const Node& linear) const { return l.target.multiplier(weight(linear)); }
 
   void visit_linear(const Node& linear) {
     LinearOp op;
@@ -186,7 +185,7 @@ class Fuser {
       if (gate->as<op::Linear>() == nullptr || only_reader(*gate) != activate) return nullptr;
     }
     if (up->as<op::Linear>() == nullptr || only_reader(*up) != product || up->in[0] != gate->in[0] ||
-        kernel(*up) != kernel(*gate) || up->shape != gate->shape)
+        multiplier(*up) != multiplier(*gate) || up->shape != gate->shape)
       return nullptr;
     op.linears = {gate, up}, op.gated = true, op.activation = activate->as<op::Activate>()->activation;
     take(gate), take(up), take(activate);
@@ -217,16 +216,16 @@ class Fuser {
       if (node != nullptr) l.fused[at(node)] = true;
   }
 
-  ValueId pack(Tensor k, Tensor v, const Node& attention, Features use) {
-    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id, use}, kNone);
+  ValueId pack(Tensor k, Tensor v, const Node& attention, bool rounds) {
+    const auto [known, is_new] = packs_.try_emplace({k.node()->id, v.node()->id, rounds}, kNone);
     if (!is_new) return known->second;
     const ValueId id = static_cast<ValueId>(l.values.size());
     Value& value = l.values.emplace_back();
     value.base = id, value.shape = k.shape();
-    PackOp op = {prepared(k), v.node()->id, use};
+    PackOp op = {prepared(k), v.node()->id, rounds};
     drop(op.k);
     add(std::move(op), attention);
-    l.ops.back().writes = {id};
+    ops_.back().writes = {id};
     return known->second = id;
   }
 
@@ -234,9 +233,8 @@ class Fuser {
   bool comes_from_floats(Tensor x) const {
     const Node* node = x.node();
     while (node->as<op::Linear>() == nullptr && !node->in.empty()) node = node->in[0].node();
-    const auto* product = node->as<op::Linear>();
-    if (product == nullptr) return false;
-    const DType type = l.weights.encoding(product->weight).type;
+    if (node->as<op::Linear>() == nullptr) return false;
+    const DType type = l.target.encoding(weight(*node)).type;
     return type == DType::f32 || type == DType::f16;
   }
 
@@ -245,13 +243,12 @@ class Fuser {
     const std::size_t first = has_mask ? 2 : 1;
     std::int64_t n_key = 0;
     for (std::size_t i = first; i < node.in.size(); i += 2) n_key += node.in[i].dim(2);
-    const bool rounds = n_key >= l.min_rounded_keys && !comes_from_floats(node.in[0]);
-    const Features use = rounds ? l.use : without_rounding(l.use);
-    AttentionOp op = {&node, prepared(node.in[0]), use};
+    const bool rounds = n_key >= l.target.min_rounded_keys() && !comes_from_floats(node.in[0]);
+    AttentionOp op = {&node, prepared(node.in[0]), rounds};
     drop(op.q);
     if (has_mask) op.mask = node.in[1].node()->id;
     for (std::size_t i = first; i < node.in.size(); i += 2) {
-      op.packed.push_back(pack(node.in[i], node.in[i + 1], node, use));
+      op.packed.push_back(pack(node.in[i], node.in[i + 1], node, rounds));
       op.n_key.push_back(node.in[i].dim(2));
     }
     add(std::move(op), node);
@@ -259,14 +256,14 @@ class Fuser {
 
   /// Products of one x that nothing follows share the reading of it.
   void join_products() {
-    std::map<std::pair<ValueId, const kernels::LinearKernel*>, FusedOp*> open;
-    for (FusedOp& op : l.ops) {
+    std::map<std::pair<ValueId, const void*>, FusedOp*> open;
+    for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);
       if (linear == nullptr || linear->gated || linear->activation != Activation::none || linear->factor != kNone ||
           linear->residual != kNone)
         continue;
-      FusedOp*& first = open[{linear->x, kernel(*linear->linears[0])}];
-      if (first == nullptr || first->writes.size() == kernels::LinearJob::kMaxPart) {
+      FusedOp*& first = open[{linear->x, multiplier(*linear->linears[0])}];
+      if (first == nullptr || first->writes.size() == l.target.max_products()) {
         first = &op;
         continue;
       }
@@ -274,18 +271,18 @@ class Fuser {
       first->writes.push_back(op.writes[0]);
       op.writes.clear();
     }
-    std::erase_if(l.ops, [](const FusedOp& op) { return op.writes.empty(); });
+    std::erase_if(ops_, [](const FusedOp& op) { return op.writes.empty(); });
   }
 
   /// A norm that products alone read is computed by them, row by row as they copy x.
   void fuse_norms() {
-    for (FusedOp& op : l.ops) {
+    for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);
       if (linear == nullptr) continue;
       const Node* norm = l.node(linear->x);
       if (norm == nullptr || norm->as<op::Norm>() == nullptr || norm->tapped) continue;
       const bool takes = std::all_of(l.readers[at(norm)].begin(), l.readers[at(norm)].end(), [&](const Node* reader) {
-        return reader->as<op::Linear>() != nullptr && norm->shape[0] <= kernel(*reader)->max_norm;
+        return reader->as<op::Linear>() != nullptr && norm->shape[0] <= l.target.max_norm(weight(*reader));
       });
       const Value& x = l.value(norm->in[0].node()->id);
       if (!takes || row_stride(x) < 0) continue;
@@ -316,16 +313,14 @@ class Fuser {
   static std::vector<ValueId> operands(const RowOp& op) { return {op.x, op.w, op.b}; }
   static std::vector<ValueId> operands(const LookupOp& op) { return {op.table, op.ids}; }
   static std::vector<ValueId> operands(const PatchesOp& op) { return {op.images}; }
-  // Made by passes behind this one, which note what they read.
-  static std::vector<ValueId> operands(const QuantizeOp&) { return {}; }
-  static std::vector<ValueId> operands(const BlockedOp&) { return {}; }
 
   Lowering& l;
-  std::map<std::tuple<ValueId, ValueId, Features>, ValueId> packs_;
+  std::vector<FusedOp> ops_;
+  std::map<std::tuple<ValueId, ValueId, bool>, ValueId> packs_;
 };
 
 }  // namespace
 
-void fuse(Lowering& l) { Fuser(l).run(); }
+std::vector<FusedOp> fuse(Lowering& l) { return Fuser(l).run(); }
 
 }  // namespace vla::lower

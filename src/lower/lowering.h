@@ -2,49 +2,58 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <array>
 #include <string>
 #include <variant>
 #include <vector>
 
 #include "graph/device.h"
-#include "lower/cpu_weights.h"
+#include "lower/target.h"
 
-/// How a graph becomes a program for the CPU: a short list of passes over the structures below, each in a file of its
-/// name (fuse, layout, blocks, schedule, place, emit).
+/// How a graph becomes a program for a machine. What is here and in the files
+/// beside it holds for every machine: it asks a Target what that can do, and
+/// knows neither kernels nor addresses. A target's own passes come between
+/// `store` and `schedule`; those of the CPU are in lower/cpu.
 namespace vla::lower {
 
 /// An index into Lowering::values. Values of nodes come first, by Node::id.
 using ValueId = int;
 constexpr ValueId kNone = -1;
 
-/// Where numbers lie: of a node's result, or of packed keys and values.
+/// Where elements lie: of a node's result, or of what a target makes on the
+/// way.
 struct Value {
+  /// Memory that programs share, or of the program, or of a slot, ... thread:
+  /// of whoever computes it, for its readers in the same operation.
   enum class Home { arena, kept, slot, constant, parameter, thread };
 
-  const Node* node = nullptr;  // none for packed keys and values, and for codes
+  const Node* node = nullptr;  // none for packed keys and values, and for what targets add
   DType type = DType::f32;
   Shape shape = {1, 1, 1, 1};
-  Shape stride = {1, 1, 1, 1};  // numbers from one index to the next
-  ValueId base = kNone;         // whose memory this is: its own, or that of the value it is a view of
-  std::int64_t offset = 0;      // numbers from the beginning of the base
-  /// How bf16 lies that a product or attention has stored: strides are then those of rows that follow each other.
-  kernels::RoundedLayout rounded = kernels::RoundedLayout::none;
+  Shape stride = {1, 1, 1, 1};  // elements from one index to the next
+  ValueId base = kNone;         // whose memory this is: its own, or that of the value
+                                // it is a view of
+  std::int64_t offset = 0;      // elements from the beginning of the base
+  /// The target's own layout, in which strides are those of rows that follow
+  /// each other. 0: strides say all.
+  int layout = 0;
 
   // Of a base alone.
   Home home = Home::arena;
-  std::size_t size = 0;       // bytes
-  std::byte* data = nullptr;  // known when memory is placed
+  std::size_t size = 0, begin = 0;  // bytes, and those before it in the arena or
+                                    // among what is kept
+  const Slot* slot = nullptr;
 };
 
-/// What is done to rows of queries or keys on the way: nodes that were fused, or null.
+/// What is done to rows of queries or keys on the way: nodes that were fused,
+/// or null.
 struct Prepared {
   ValueId x;
   const Node *norm = nullptr, *rope = nullptr;
   ValueId weight = kNone, table = kNone;
 };
 
-/// activation(W x + b) * factor + residual, or up to three products of the same x, or gate and up of a gated MLP.
+/// activation(W x + b) * factor + residual, or up to three products of the same
+/// x, or gate and up of a gated MLP.
 struct LinearOp {
   std::vector<const Node*> linears;
   ValueId x;
@@ -54,22 +63,16 @@ struct LinearOp {
   bool gated = false;
   ValueId factor = kNone, residual = kNone;
 };
-/// Rows of x as int8 codes with their scales, for products that take them (kernels/quantized.h).
-struct QuantizeOp {
-  ValueId x;
-  const Node* norm = nullptr;  // x is what this node normalizes
-  ValueId norm_weight = kNone, norm_bias = kNone;
-  const kernels::LinearKernel* kernel;
-};
+/// Keys and values as attention reads them: once for all attention over them.
 struct PackOp {
   Prepared k;
   ValueId v;
-  Features use;
+  bool rounds;
 };
 struct AttentionOp {
   const Node* node;
   Prepared q;
-  Features use;
+  bool rounds;  // to what the device rounds products to; else it is float32
   ValueId mask = kNone;
   std::vector<ValueId> packed;
   std::vector<std::int64_t> n_key;
@@ -80,7 +83,8 @@ struct RowOp {
   std::variant<op::Norm, op::Rope, op::Activate, op::Add, op::Multiply, op::Scale> what;
   ValueId x, w = kNone, b = kNone;
 };
-/// Parts of the result from numbers that lie elsewhere: concat, pixel_shuffle, and views that must be contiguous.
+/// Parts of the result from elements that lie elsewhere: concat, pixel_shuffle,
+/// and views that must be contiguous.
 struct CopyOp {
   struct Part {
     ValueId from;
@@ -99,37 +103,28 @@ struct PatchesOp {
   ValueId images;
 };
 
-struct FusedOp;
-/// Two products, of which the second alone reads what the first makes, as in an MLP. A thread takes a block of rows
-/// through both, so that the numbers between them stay in its cache: memory of the thread is their home.
-struct BlockedOp {
-  std::vector<FusedOp> products;
-  std::int64_t n_block;
-};
-
-/// One operation of the program: nodes that were fused.
-struct FusedOp {
-  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, BlockedOp> op;
+/// What the passes behind fusion know of an operation.
+struct Step {
   std::vector<ValueId> reads, writes;
   int order = 0;           // the id of the node whose result it gives
   bool invariant = false;  // the same from run to run
   int phase = 0;
 };
+/// One operation of the program: nodes that were fused.
+struct FusedOp : Step {
+  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
+};
 
 struct Lowering {
   const Graph& graph;
   const LowerOptions& options;
-  const CpuWeights& weights;
-  Features use;
-  std::int64_t min_rounded_keys;
-  int n_thread;
+  const Target& target;
 
-  std::vector<Value> values;
-  std::vector<FusedOp> ops;
-  std::vector<std::vector<const Node*>> readers;  // of each node that is needed
-  std::vector<bool> needed;                       // Graph::needed
-  std::vector<bool> fused;                        // nodes that are part of an operation of another
-  int n_prepare = 0, n_phase = 0;                 // phases of Program::prepare, and of both
+  std::vector<Value> values = {};
+  std::vector<std::vector<const Node*>> readers = {};  // of each node that is needed
+  std::vector<bool> needed = {};                       // Graph::needed
+  std::vector<bool> fused = {};                        // nodes that are part of an operation of another
+  int n_prepare = 0, n_phase = 0;                      // phases of Program::prepare, and of both
   std::size_t arena_size = 0, kept_size = 0;
 
   const Node* node(ValueId id) const { return values[static_cast<std::size_t>(id)].node; }
@@ -140,28 +135,28 @@ struct Lowering {
 };
 
 /// Which stage an operation belongs to, by when its node was recorded.
-std::size_t stage_of(const Lowering& l, const FusedOp& op);
-/// What multiplies: all matrices of an operation have the same.
-const kernels::LinearKernel& kernel_of(const Lowering& l, const LinearOp& op);
-/// Strides of numbers that lie one after the other.
+std::size_t stage_of(const Lowering& l, const Step& step);
+/// Strides of elements that lie one after the other.
 Shape contiguous_strides(const Shape& shape);
 bool is_contiguous(const Value& value);
 /// Whether all rows lie at the same distance: then that, else -1.
 std::int64_t row_stride(const Value& value);
 
-/// Finds what is needed, and makes a value of every node: memory of its own, or a view.
+/// Finds what is needed, and makes a value of every node: memory of its own, or
+/// a view.
 void start(Lowering& l);
-/// Makes operations of nodes: norm into product; bias, activation, gate, factor and residual behind it; products of one
-/// x; gate and up; norm and rope into attention. A tapped node is computed for itself.
-void fuse(Lowering& l);
-/// Chooses the dtype of values between products, makes codes of what ternary ones read, and copies what its reader
-/// needs contiguous.
-void choose_layouts(Lowering& l);
-/// Joins two products to one operation on blocks of rows where what lies between them would not stay in a cache.
-void choose_blocks(Lowering& l);
-/// Puts operations that do not depend on each other into one phase, and what stays the same into Program::prepare.
-void schedule(Lowering& l);
-/// Gives every value its place: in its slot, in the memory that programs share, or in memory of the program.
-void place(Lowering& l);
+/// Makes operations of nodes: norm into product; bias, activation, gate, factor
+/// and residual behind it; products of one x; gate and up; norm and rope into
+/// attention. A tapped node is computed for itself.
+std::vector<FusedOp> fuse(Lowering& l);
+/// Has results that slots get written there at once, or copied.
+void store(Lowering& l, std::vector<FusedOp>& ops);
+
+/// Puts steps that do not depend on each other into one phase, and what stays
+/// the same into Program::prepare.
+void schedule(Lowering& l, std::vector<Step*> steps);
+/// Gives values their places in the memory that programs share, or among what
+/// Program::prepare leaves: Value::begin.
+void place(Lowering& l, const std::vector<Step*>& steps);
 
 }  // namespace vla::lower

@@ -7,7 +7,7 @@
 #include <unistd.h>
 
 #include "ggml/ggml_device.h"
-#include "lower/cpu_device.h"
+#include "lower/cpu/cpu_device.h"
 
 namespace vla {
 namespace {

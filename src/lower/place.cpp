@@ -14,13 +14,13 @@ struct Life {
   bool overlaps(const Life& other) const { return first <= other.last && other.first <= last; }
 };
 
-std::vector<Life> find_lives(const Lowering& l) {
+std::vector<Life> find_lives(const Lowering& l, const std::vector<Step*>& steps) {
   std::vector<Life> lives(l.values.size());
   const auto at = [&](ValueId id) -> Life& { return lives[static_cast<std::size_t>(l.value(id).base)]; };
-  for (const FusedOp& op : l.ops)
-    for (const ValueId id : op.writes) at(id) = {op.phase, op.phase};
-  for (const FusedOp& op : l.ops)
-    for (const ValueId id : op.reads) at(id).last = std::max(at(id).last, op.phase);
+  for (const Step* step : steps)
+    for (const ValueId id : step->writes) at(id) = {step->phase, step->phase};
+  for (const Step* step : steps)
+    for (const ValueId id : step->reads) at(id).last = std::max(at(id).last, step->phase);
   for (const Node& node : l.graph.nodes())
     if (node.tapped) at(node.id).last = l.n_phase;
   return lives;
@@ -29,8 +29,9 @@ std::vector<Life> find_lives(const Lowering& l) {
 }  // namespace
 
 /// Values one after the other, largest first, each at the lowest place that no other value takes while it lives.
-void place(Lowering& l) {
-  const std::vector<Life> lives = find_lives(l);
+void place(Lowering& l, const std::vector<Step*>& steps) {
+  const std::vector<Life> lives = find_lives(l, steps);
+  const std::size_t alignment = l.target.alignment();
   std::vector<std::size_t> order(l.values.size());
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::stable_sort(order.begin(), order.end(),
@@ -44,17 +45,17 @@ void place(Lowering& l) {
     Value& value = l.values[i];
     const Life& life = lives[i];
     if (value.home != Value::Home::arena || value.base != static_cast<ValueId>(i) || life.last < 0) continue;
-    const std::size_t size = aligned(value.size);
+    const std::size_t size = (value.size + alignment - 1) / alignment * alignment;
     if (life.first < l.n_prepare && life.last >= l.n_prepare) {  // made by prepare, for every run
       value.home = Value::Home::kept;
-      value.offset = static_cast<std::int64_t>(l.kept_size);
+      value.begin = l.kept_size;
       l.kept_size += size;
       continue;
     }
     std::size_t begin = 0;
     for (const Taken& other : taken)
       if (other.life.overlaps(life) && other.begin < begin + size && other.end > begin) begin = other.end;
-    value.offset = static_cast<std::int64_t>(begin);
+    value.begin = begin;
     const Taken now = {life, begin, begin + size};
     taken.insert(std::upper_bound(taken.begin(), taken.end(), begin,
                                   [](std::size_t b, const Taken& other) { return b < other.begin; }),

@@ -85,9 +85,9 @@ struct MakeValue {
     value.home = Value::Home::constant;
     return value;
   }
-  Value operator()(const op::Parameter& op) const {
+  Value operator()(const op::Parameter&) const {
     Value value = own(node);
-    value.home = Value::Home::parameter, value.data = const_cast<std::byte*>(l.weights.data(op.param));
+    value.home = Value::Home::parameter;
     return value;
   }
 
@@ -126,7 +126,7 @@ struct MakeValue {
   bool must_copy() const { return node.tapped && l.base(x().base).home == Value::Home::slot; }
   Value in_slot(const Slot& slot) const {
     Value value = own(node);
-    value.home = Value::Home::slot, value.data = static_cast<std::byte*>(slot.place);
+    value.home = Value::Home::slot, value.slot = &slot;
     return value;
   }
 };

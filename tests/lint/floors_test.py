@@ -48,6 +48,8 @@ LIBRARIES = [
     (re.compile(r"png\.h"), {"processor", "bench"}),
     (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|prometheus/.*|boost/.*|sodium\.h"), {"serve"}),
 ]
+# Files of lower beside the folder of a machine hold for every machine, but for those that choose one.
+EVERY_MACHINE = re.compile(r"lower/(?!open|arithmetic)\w+\.(h|cpp)")
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 
 
@@ -74,6 +76,8 @@ def problems(src):
             reason = library_problem(room, header)
             if other in ROOMS and other != room and other not in ROOMS[room]:
                 reason = f"{room} may include {', '.join(sorted(ROOMS[room])) or 'only itself'}"
+            elif EVERY_MACHINE.fullmatch(name) and header.startswith(("kernels/", "ggml/", "lower/cpu/")):
+                reason = "holds for every machine"
             elif quoted and other not in ROOMS:
                 reason = reason or "is named by no room; write the path from src/"
             if reason:
@@ -106,6 +110,11 @@ class Floors(unittest.TestCase):
 
     def test_a_policy_that_includes_ggml_or_a_kernel_is_refused(self):
         self.assertEqual(len(self.check({"policies/p.cpp": '#include <ggml.h>\n#include "kernels/gelu.h"\n'})), 2)
+
+    def test_a_pass_for_every_machine_that_includes_a_kernel_is_refused(self):
+        text = '#include "kernels/executor.h"\n#include "lower/cpu/emit.h"\n'
+        found = self.check({"lower/fuse.cpp": text, "lower/cpu/emit.cpp": text, "lower/open.cpp": text})
+        self.assertEqual(["lower/fuse.cpp"] * 2, [problem.split(":")[0] for problem in found])
 
     def test_a_folder_that_is_no_room_is_refused(self):
         self.assertIn("is in no room", self.check({"utils/misc.h": "\n"})[0])

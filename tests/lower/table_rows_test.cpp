@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/table_rows.h"
+#include "lower/cpu/table_rows.h"
 
 #include <doctest/doctest.h>
 

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/recode.h"
+#include "lower/cpu/recode.h"
 
 #include <cassert>
 #include <cstring>

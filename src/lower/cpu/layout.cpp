@@ -5,29 +5,25 @@
 
 #include "kernels/cpu_kernels.h"
 #include "kernels/quantized.h"
-#include "lower/emit.h"
-#include "lower/lowering.h"
+#include "lower/cpu/emit.h"
 
 namespace vla::lower {
 namespace {
 
 class Layouts {
  public:
-  explicit Layouts(Lowering& lowering) : l(lowering) {}
+  explicit Layouts(CpuLowering& lowering) : l(lowering) {}
 
-  void run() {
-    for (FusedOp& op : l.ops) {
-      op_ = &op;
+  void run(std::vector<FusedOp> ops) {
+    for (FusedOp& op : ops) {
+      step_ = &op;
       std::visit([&](auto& what) { require_layouts(what); }, op.op);
-      out_.push_back(std::move(op));
+      std::visit([&](auto& what) { l.ops.push_back({static_cast<Step&&>(op), std::move(what)}); }, op.op);
     }
-    l.ops = std::move(out_);
-    for (const Node& node : l.graph.nodes())
-      if (node.as<op::Write>() != nullptr) store(node);
-    for (const FusedOp& op : l.ops)
+    for (const CpuOp& op : l.ops)
       for (const ValueId id : op.reads) reads_[l.value(id).base].push_back({&op, id});
     for (Value& value : l.values) views_[value.base].push_back(&value);
-    for (FusedOp& op : l.ops) {
+    for (const CpuOp& op : l.ops) {
       if (const auto* linear = std::get_if<LinearOp>(&op.op)) round_result(op, *linear);
       if (const auto* attention = std::get_if<AttentionOp>(&op.op)) round_result(op, *attention);
     }
@@ -41,13 +37,13 @@ class Layouts {
     Value& to = l.values.emplace_back(Value(l.value(id)));
     to.shape[0] = d;
     to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.home = Value::Home::arena;
-    to.data = nullptr, to.size = static_cast<std::size_t>(count(to.shape)) * 4;
+    to.slot = nullptr, to.size = static_cast<std::size_t>(count(to.shape)) * 4;
     Shape from_stride = l.value(id).stride;
     if (l.value(id).shape[0] != d) from_stride[0] = 0;
-    FusedOp& op = out_.emplace_back();
+    CpuOp& op = l.ops.emplace_back();
     op.op = CopyOp{{{id, to.shape, from_stride, to.stride, 0}}};
-    op.reads = {id}, op.writes = {copy}, op.order = op_->order;
-    std::replace(op_->reads.begin(), op_->reads.end(), id, copy);
+    op.reads = {id}, op.writes = {copy}, op.order = step_->order;
+    std::replace(step_->reads.begin(), step_->reads.end(), id, copy);
     return copy;
   }
 
@@ -75,9 +71,6 @@ class Layouts {
     require_rows(op.norm_weight);
     require_rows(op.norm_bias);
   }
-  void require_layouts(QuantizeOp&) {}  // is made here
-  void require_layouts(BlockedOp&) {}   // is made later
-
   /// The product reads x, or its norm, as codes, which are made once, just before the first operation that reads them.
   void quantize(LinearOp& op, const kernels::LinearKernel& kernel) {
     const auto [known, is_new] = codes_.try_emplace({op.x, op.norm}, static_cast<ValueId>(l.values.size()));
@@ -92,22 +85,22 @@ class Layouts {
       require(made.x, row_stride(l.value(made.x)) >= 0);
       require_rows(made.norm_weight);
       require_rows(made.norm_bias);
-      FusedOp& fused = out_.emplace_back();
-      fused.reads = {made.x};
+      CpuOp& quantized = l.ops.emplace_back();
+      quantized.reads = {made.x};
       for (const ValueId id : {made.norm_weight, made.norm_bias})
-        if (id != kNone) fused.reads.push_back(id);
-      fused.op = made, fused.writes = {known->second}, fused.order = op_->order;
+        if (id != kNone) quantized.reads.push_back(id);
+      quantized.op = made, quantized.writes = {known->second}, quantized.order = step_->order;
     }
     op.x = known->second;
     op.norm = nullptr, op.norm_weight = op.norm_bias = kNone;
-    op_->reads = {op.x};
+    step_->reads = {op.x};
     for (const ValueId id : {op.factor, op.residual})
-      if (id != kNone) op_->reads.push_back(id);
+      if (id != kNone) step_->reads.push_back(id);
   }
   void require_layouts(PackOp& op) {
     require_rows(op.k);
     require_rows(op.v);
-    l.value(op_->writes[0]).size = kernels::cpu_kernels(op.use)->attention.packed_size(pack_sizes(l, op));
+    l.value(step_->writes[0]).size = attention(op.rounds).packed_size(pack_sizes(l, op));
   }
   void require_layouts(AttentionOp& op) {
     require_rows(op.q);
@@ -128,52 +121,18 @@ class Layouts {
   }
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
 
-  /// A value goes to its slot at once where its operation may write there, else by a copy.
-  void store(const Node& write) {
-    const ValueId from = write.in[0].node()->id;
-    Value& value = l.value(from);
-    Value& base = l.base(from);
-    const bool is_whole = is_contiguous(value) && value.offset == 0 && count(value.shape) == count(base.shape);
-    if (is_whole && base.home == Value::Home::arena && may_write(write, value.base)) {
-      base.home = Value::Home::slot, base.data = l.value(write.id).data;
-      return;
-    }
-    FusedOp& op = l.ops.emplace_back();
-    op.op = CopyOp{{{from, value.shape, value.stride, contiguous_strides(value.shape), 0}}};
-    op.reads = {from}, op.writes = {write.id}, op.order = write.id;
-  }
-
-  /// Nobody may need what the slot held once it is overwritten. An operation row by row may read it itself, every
-  /// number before it writes that.
-  bool may_write(const Node& write, ValueId result) const {
-    const std::byte* slot = l.value(write.id).data;
-    const auto writer = std::find_if(l.ops.begin(), l.ops.end(), [&](const FusedOp& op) {
-      return std::find(op.writes.begin(), op.writes.end(), result) != op.writes.end();
-    });
-    if (writer == l.ops.end()) return false;
-    for (const FusedOp& op : l.ops)
-      for (const ValueId id : op.reads) {
-        if (l.base(id).home != Value::Home::slot || l.base(id).data != slot) continue;
-        if (op.order > writer->order) return false;
-        if (op.order < writer->order) continue;
-        const Value& value = l.value(id);
-        const bool in_place = std::holds_alternative<RowOp>(op.op) && value.shape == l.value(result).shape &&
-                              value.offset == 0 && is_contiguous(value);
-        if (!in_place) return false;
-      }
-    return true;
-  }
-
-  void round_result(const FusedOp& op, const LinearOp& linear) {
+  void round_result(const CpuOp& op, const LinearOp& linear) {
     if (linear.residual != kNone || linear.factor != kNone) return;
     for (const ValueId id : op.writes) round_result(id, kernel_of(l, linear).y_layout(linear.linears[0]->in[0].dim(0)));
   }
-  void round_result(const FusedOp& op, const AttentionOp& attention) {
+  void round_result(const CpuOp& op, const AttentionOp& node) {
     if (l.value(op.writes[0]).shape[0] % kernels::kSquare == 0)
-      round_result(op.writes[0], attention_layout(attention.use));
+      round_result(op.writes[0], attention(node.rounds).rounded);
   }
 
-  static kernels::RoundedLayout attention_layout(Features use) { return kernels::cpu_kernels(use)->attention.rounded; }
+  const kernels::AttentionKernel& attention(bool rounds) const {
+    return kernels::cpu_kernels(l.features(rounds))->attention;
+  }
 
   /// What only products and attention read is stored as they would round it.
   void round_result(ValueId id, kernels::RoundedLayout layout) {
@@ -183,23 +142,23 @@ class Layouts {
       if (view->node != nullptr && view->node->tapped) return;
     for (const auto& [op, read] : reads_[id])
       if (!takes(*op, read, layout)) return;
-    for (Value* view : views_[id]) view->type = DType::bf16, view->rounded = layout;
+    for (Value* view : views_[id]) view->type = DType::bf16, view->layout = static_cast<int>(layout);
     y.size = static_cast<std::size_t>(kernels::rounded_count(layout, count(y.shape) / y.shape[0], y.shape[0])) * 2;
   }
 
   /// Whether an operation may find a value that it reads, or view of one, rounded: as the product of a whole value, or
   /// as rows of heads to which attention does nothing first.
-  bool takes(const FusedOp& op, ValueId id, kernels::RoundedLayout layout) const {
+  bool takes(const CpuOp& op, ValueId id, kernels::RoundedLayout layout) const {
     if (const auto* linear = std::get_if<LinearOp>(&op.op))
       return id == linear->x && id == l.value(id).base && linear->norm == nullptr && id != linear->residual &&
              id != linear->factor && kernel_of(l, *linear).rounded == layout;
-    const auto takes_heads = [&](const Prepared& rows, Features use) {
+    const auto takes_heads = [&](const Prepared& rows, bool rounds) {
       const bool is_plain = id != rows.x || (rows.norm == nullptr && rows.rope == nullptr);
-      return is_plain && id != rows.table && attention_layout(use) == layout && lies_in_rows(id);
+      return is_plain && id != rows.table && attention(rounds).rounded == layout && lies_in_rows(id);
     };
-    if (const auto* pack = std::get_if<PackOp>(&op.op)) return takes_heads(pack->k, pack->use);
-    if (const auto* attention = std::get_if<AttentionOp>(&op.op))
-      return id != attention->mask && takes_heads(attention->q, attention->use);
+    if (const auto* pack = std::get_if<PackOp>(&op.op)) return takes_heads(pack->k, pack->rounds);
+    if (const auto* node = std::get_if<AttentionOp>(&op.op))
+      return id != node->mask && takes_heads(node->q, node->rounds);
     return false;
   }
 
@@ -211,22 +170,21 @@ class Layouts {
            x.offset % d + (x.shape[1] - 1) * x.stride[1] + x.shape[0] <= d;
   }
 
-  Lowering& l;
-  FusedOp* op_ = nullptr;
-  std::vector<FusedOp> out_;
+  CpuLowering& l;
+  Step* step_ = nullptr;                                      // of the operation at hand
   std::map<std::pair<ValueId, const Node*>, ValueId> codes_;  // of x, or of its norm
   // Of each base: who reads it or a view of it, and itself with its views.
-  std::map<ValueId, std::vector<std::pair<const FusedOp*, ValueId>>> reads_;
+  std::map<ValueId, std::vector<std::pair<const CpuOp*, ValueId>>> reads_;
   std::map<ValueId, std::vector<Value*>> views_;
 };
 
 }  // namespace
 
-const kernels::LinearKernel& kernel_of(const Lowering& l, const LinearOp& op) {
+const kernels::LinearKernel& kernel_of(const CpuLowering& l, const LinearOp& op) {
   const Shape& x = op.linears[0]->in[0].node()->shape;
   return l.weights.kernel(op.linears[0]->as<op::Linear>()->weight)->for_rows(count(x) / x[0]);
 }
 
-void choose_layouts(Lowering& l) { Layouts(l).run(); }
+void choose_layouts(CpuLowering& l, std::vector<FusedOp> ops) { Layouts(l).run(std::move(ops)); }
 
 }  // namespace vla::lower

@@ -1,19 +1,46 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu_device.h"
+#include "lower/cpu/cpu_device.h"
 
 #include <fmt/format.h>
 
 #include <algorithm>
 #include <cstring>
+#include <limits>
 
 #include "kernels/attention_kernel.h"
 #include "kernels/pages.h"
-#include "lower/cpu_program.h"
-#include "lower/precision.h"
+#include "lower/cpu/cpu_program.h"
+#include "lower/cpu/precision.h"
 
 namespace vla::lower {
 namespace {
+
+/// More keys than attention can have: none of it rounds.
+constexpr std::int64_t kNoKeys = std::numeric_limits<std::int64_t>::max();
+
+class CpuTarget final : public Target {
+ public:
+  CpuTarget(const CpuWeights& weights, std::int64_t min_rounded_keys)
+      : weights_(weights), min_rounded_keys_(min_rounded_keys) {}
+
+  const void* multiplier(const Param& matrix) const override { return weights_.kernel(&matrix); }
+  std::size_t max_products() const override { return kernels::LinearJob::kMaxPart; }
+  std::int64_t max_norm(const Param& matrix) const override { return weights_.kernel(&matrix)->max_norm; }
+  const Encoding& encoding(const Param& matrix) const override { return weights_.encoding(&matrix); }
+  std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
+  std::size_t alignment() const override { return kAlignment; }
+
+ private:
+  const CpuWeights& weights_;
+  std::int64_t min_rounded_keys_;
+};
+
+std::vector<Step*> steps(CpuLowering& l) {
+  std::vector<Step*> steps;
+  for (CpuOp& op : l.ops) steps.push_back(&op);
+  return steps;
+}
 
 /// Kernels of attention have room for so much.
 Status check_attention(const Graph& graph) {
@@ -66,14 +93,18 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
   VLA_CHECK(check_attention(graph));
-  Lowering l = {graph, options, weights_, arithmetic_.use, min_rounded_keys_, n_thread(), {}, {}, {}, {}, {}, 0,
-                0,     0,       0};
+  const CpuTarget target(weights_, rounds_to_bf16(arithmetic_.use) ? min_rounded_keys_ : kNoKeys);
+  CpuLowering l = {{.graph = graph, .options = options, .target = target}, weights_, arithmetic_.use, n_thread()};
   start(l);
-  fuse(l);
-  choose_layouts(l);
+  std::vector<FusedOp> ops = fuse(l);
+  store(l, ops);
+  choose_layouts(l, std::move(ops));
   choose_blocks(l);
-  schedule(l);
-  place(l);
+  schedule(l, steps(l));
+  place(l, steps(l));
+  std::stable_sort(l.ops.begin(), l.ops.end(), [](const CpuOp& a, const CpuOp& b) {
+    return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
+  });
   if (l.arena_size > arena_.size()) {
     // Programs made before keep the memory that they were given.
     VLA_TRY(arena_, Memory::allocate(l.arena_size, "working memory"));

@@ -10,12 +10,24 @@
 #include "bundle/params.h"
 #include "graph/rounding.h"
 #include "kernels/linear_kernel.h"
-#include "lower/table_rows.h"
+#include "lower/cpu/table_rows.h"
 
 namespace vla::lower {
 
 /// The tables of a policy's bundle.
 using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
+
+/// Where parameters are, by their ids. Programs look matrices up when a run begins: until then one may move.
+struct WeightTable {
+  struct Entry {
+    std::byte* data = nullptr;
+    float* scales = nullptr;  // of the codes of a matrix
+  };
+  std::vector<Entry> entries;
+  std::uint64_t version = 1;  // another one after every change
+
+  const Entry& at(const Param* param) const { return entries[static_cast<std::size_t>(param->id)]; }
+};
 
 /// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in panels, encoded as in the bundle
 /// or rounded; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
@@ -31,16 +43,14 @@ class CpuWeights {
   /// was opened, unsupported where nothing is worth rounding (graph/rounding.h).
   static Result<CpuWeights> load(const ParamList& list, const Options& options);
 
-  const std::byte* data(const Param* param) const { return place(param).data; }
+  const std::byte* data(const Param* param) const { return table_->at(param).data; }
   const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
   /// How it lies in memory.
   const Encoding& encoding(const Param* param) const { return place(param).encoding; }
-  /// What `encoding` has of them; null where it has none.
-  const float* scales(const Param* matrix) const {
-    return matrix->scales != nullptr ? floats(matrix->scales) : place(matrix).scales;
-  }
   /// What multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
+  /// Where everything is; programs keep it.
+  const std::shared_ptr<WeightTable>& table() const { return table_; }
   /// All tables that have their source.
   const std::shared_ptr<const Tables>& tables() const { return tables_; }
   /// Of one of them; null where it has no source.
@@ -55,14 +65,13 @@ class CpuWeights {
 
  private:
   struct Place {
-    std::byte* data = nullptr;
     Encoding encoding;
     const kernels::LinearKernel* kernel = nullptr;
-    float* scales = nullptr;  // made when the matrix was rounded
   };
   const Place& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
 
   Memory memory_;
+  std::shared_ptr<WeightTable> table_;
   std::shared_ptr<const Tables> tables_;
   std::size_t table_size_ = 0;
   std::vector<Place> places_;

@@ -3,7 +3,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
-#include "lower/emit.h"
+#include "lower/cpu/emit.h"
 
 namespace vla::lower {
 namespace {
@@ -12,8 +12,8 @@ std::string path_of(const Node& node) { return node.path.empty() ? fmt::format("
 
 /// The parts of a fused operation in the order in which they are computed.
 struct Describe {
-  const Lowering& l;
-  const FusedOp& fused;
+  const CpuLowering& l;
+  const CpuOp& fused;
 
   /// `what [shape] -> [shape] kernel`.
   struct Words {
@@ -39,12 +39,12 @@ struct Describe {
     return {fmt::format("{}quantize", op.norm != nullptr ? "norm, " : ""), op.kernel->name, op.x};
   }
   Words operator()(const PackOp& op) const {
-    return {prepared(op.k) + "pack keys and values", name_of(op.use), op.k.x};
+    return {prepared(op.k) + "pack keys and values", name_of(l.features(op.rounds)), op.k.x};
   }
   Words operator()(const AttentionOp& op) const {
     return {fmt::format("{}attention {} over {} keys{}", prepared(op.q), path_of(*op.node), fmt::join(op.n_key, " + "),
                         op.mask != kNone ? ", mask" : ""),
-            name_of(op.use), op.q.x};
+            name_of(l.features(op.rounds)), op.q.x};
   }
   Words operator()(const RowOp& op) const {
     return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), name_of(l.use), op.x};
@@ -59,7 +59,7 @@ struct Describe {
   Words operator()(const BlockedOp&) const { return {}; }  // its products are described
 };
 
-std::string layout(const Lowering& l, ValueId id) {
+std::string layout(const CpuLowering& l, ValueId id) {
   const Value& value = l.value(id);
   const char* home = l.base(id).home == Value::Home::slot     ? "@slot"
                      : l.base(id).home == Value::Home::kept   ? "@kept"
@@ -68,15 +68,15 @@ std::string layout(const Lowering& l, ValueId id) {
   if (value.node == nullptr && value.size > 0 && value.stride == Shape{1, 1, 1, 1})
     return fmt::format("panels{}", home);
   return fmt::format("{}{}{}{}", dtype_name(value.type),
-                     value.rounded == kernels::RoundedLayout::tiles ? " tiles " : "", shape_text(value.shape), home);
+                     rounded(value) == kernels::RoundedLayout::tiles ? " tiles " : "", shape_text(value.shape), home);
 }
 
 }  // namespace
 
-std::string text_of(const Lowering& l, const FusedOp& op) {
+std::string text_of(const CpuLowering& l, const CpuOp& op) {
   if (const auto* blocked = std::get_if<BlockedOp>(&op.op)) {
     std::vector<std::string> lines;
-    for (FusedOp product : blocked->products) {
+    for (CpuOp product : blocked->products) {
       product.phase = op.phase;
       lines.push_back(fmt::format("{}, {} blocks of rows", text_of(l, product), blocked->n_block));
     }

@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "bundle/params.h"
-#include "lower/memory.h"
+#include "lower/cpu/memory.h"
 
 namespace vla::lower {
 

@@ -4,9 +4,7 @@
 
 #include <deque>
 
-#include "kernels/executor.h"
-#include "lower/kind_clock.h"
-#include "lower/lowering.h"
+#include "lower/cpu/emit.h"
 
 namespace vla::lower {
 
@@ -14,7 +12,7 @@ namespace vla::lower {
 class CpuProgram final : public Program {
  public:
   /// The last pass: addresses and tasks. Errors: out_of_memory.
-  static Result<std::unique_ptr<Program>> make(Lowering& l, const Memory& arena,
+  static Result<std::unique_ptr<Program>> make(CpuLowering& l, const Memory& arena,
                                                std::shared_ptr<kernels::Executor> executor,
                                                std::shared_ptr<KindClock> clock);
 
@@ -33,14 +31,18 @@ class CpuProgram final : public Program {
     Shape shape, stride;
   };
   Status run(std::span<const kernels::Phase> phases);
-  Status give_addresses(Lowering& l);
-  Status make_tasks(const Lowering& l);
-  void make_taps(const Lowering& l);
+  void bind();
+  Status give_addresses(CpuLowering& l);
+  Status make_tasks(const CpuLowering& l);
+  void make_taps(const CpuLowering& l);
 
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<KindClock> clock_;
   std::shared_ptr<const Tables> tables_;
   Memory arena_, own_;  // own: constants, and what prepare leaves
+  std::shared_ptr<const WeightTable> weights_;
+  MatrixUses uses_;
+  std::uint64_t bound_ = 0;  // the version of the table that tasks know
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;
   std::size_t n_prepare_ = 0, host_size_ = 0;

@@ -1,61 +1,69 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu_program.h"
+#include "lower/cpu/cpu_program.h"
 
 #include <fmt/format.h>
 
 #include <algorithm>
 #include <cstring>
 
-#include "lower/emit.h"
+#include "lower/cpu/emit.h"
 
 namespace vla::lower {
 
-Result<std::unique_ptr<Program>> CpuProgram::make(Lowering& l, const Memory& arena,
+Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& arena,
                                                   std::shared_ptr<kernels::Executor> executor,
                                                   std::shared_ptr<KindClock> clock) {
   std::unique_ptr<CpuProgram> program(new CpuProgram);
   program->executor_ = std::move(executor), program->clock_ = std::move(clock);
-  program->arena_ = arena, program->tables_ = l.weights.tables();
+  program->arena_ = arena, program->tables_ = l.weights.tables(), program->weights_ = l.weights.table();
   VLA_CHECK(program->give_addresses(l));
   VLA_CHECK(program->make_tasks(l));
   program->make_taps(l);
   return std::unique_ptr<Program>(std::move(program));
 }
 
-Status CpuProgram::give_addresses(Lowering& l) {
+Status CpuProgram::give_addresses(CpuLowering& l) {
   std::size_t size = aligned(l.kept_size);
   for (const Value& value : l.values)
     if (value.home == Value::Home::constant) size += aligned(value.size);
   VLA_TRY(own_, Memory::allocate(size, "constants"));
   std::byte* next = own_.data() + aligned(l.kept_size);
-  for (std::size_t i = 0; i < l.values.size(); ++i) {
-    Value& value = l.values[i];
-    if (value.base != static_cast<ValueId>(i)) continue;
-    if (value.home == Value::Home::constant) {
-      const auto& values = value.node->as<op::Constant>()->values;
-      value.data = next, next += aligned(value.size);
-      std::visit([&](const auto& numbers) { std::memcpy(value.data, numbers.data(), value.size); }, values);
-    } else if (value.home == Value::Home::kept) {
-      value.data = own_.data() + value.offset, value.offset = 0;
-    } else if (value.home == Value::Home::arena) {
-      value.data = arena_.data() + value.offset, value.offset = 0;
+  const auto address = [&](const Value& value) -> std::byte* {
+    switch (value.home) {
+      case Value::Home::arena:
+        return arena_.data() + value.begin;
+      case Value::Home::kept:
+        return own_.data() + value.begin;
+      case Value::Home::slot:
+        return static_cast<std::byte*>(value.slot->place);
+      case Value::Home::parameter:
+        return const_cast<std::byte*>(l.weights.data(value.node->as<op::Parameter>()->param));
+      case Value::Home::constant:
+        std::visit([&](const auto& elements) { std::memcpy(next, elements.data(), value.size); },
+                   value.node->as<op::Constant>()->values);
+        return std::exchange(next, next + aligned(value.size));
+      case Value::Home::thread:
+        break;
     }
-  }
+    return nullptr;  // a thread's own
+  };
+  for (std::size_t i = 0; i < l.values.size(); ++i)
+    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(l.values[i]) : nullptr);
   return {};
 }
 
-Status CpuProgram::make_tasks(const Lowering& l) {
+Status CpuProgram::make_tasks(const CpuLowering& l) {
   std::size_t scratch = 0;
-  for (const FusedOp& op : l.ops) scratch = std::max(scratch, scratch_of(l, op));
+  for (const CpuOp& op : l.ops) scratch = std::max(scratch, scratch_of(l, op));
   VLA_CHECK(executor_->reserve(scratch));
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
   phases_.resize(static_cast<std::size_t>(l.n_phase));
   const auto& stages = l.graph.stages();
   work_.resize(stages.size() + 1);
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
-  for (const FusedOp& op : l.ops) {
-    tasks_.push_back(std::make_unique<TimedTask>(emit(l, op), kind_of(op), clock_));
+  for (const CpuOp& op : l.ops) {
+    tasks_.push_back(std::make_unique<TimedTask>(emit(l, op, uses_), kind_of(op), clock_));
     const auto phase = static_cast<std::size_t>(op.phase);
     phases_[phase].tasks.push_back(tasks_.back().get());
     text_ += text_of(l, op) + "\n";
@@ -71,11 +79,11 @@ Status CpuProgram::make_tasks(const Lowering& l) {
   return {};
 }
 
-void CpuProgram::make_taps(const Lowering& l) {
+void CpuProgram::make_taps(const CpuLowering& l) {
   for (const Node& node : l.graph.nodes()) {
     if (!node.tapped) continue;
     const Value& value = l.value(node.id);
-    const auto* data = reinterpret_cast<const float*>(l.base(node.id).data) + value.offset;
+    const auto* data = reinterpret_cast<const float*>(l.address(value.base)) + value.offset;
     taps_.push_back({node.path, node.shape});
     tap_places_.push_back({data, value.shape, value.stride});
   }
@@ -84,7 +92,17 @@ void CpuProgram::make_taps(const Lowering& l) {
 Status CpuProgram::prepare() { return run(std::span(phases_).first(n_prepare_)); }
 Status CpuProgram::run() { return run(std::span(phases_).subspan(n_prepare_)); }
 
+/// Matrices are where the table has them.
+void CpuProgram::bind() {
+  for (const auto& [part, matrix] : uses_) {
+    const auto& [data, scales] = weights_->entries[static_cast<std::size_t>(matrix)];
+    part->weight = data, part->scale = scales;
+  }
+  bound_ = weights_->version;
+}
+
 Status CpuProgram::run(std::span<const kernels::Phase> phases) {
+  if (bound_ != weights_->version) bind();
   executor_->run(phases);
   for (const auto& [param, rows] : *tables_) VLA_CHECK(rows->status());
   return {};

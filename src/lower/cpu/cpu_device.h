@@ -5,8 +5,8 @@
 #include "graph/device.h"
 #include "kernels/executor.h"
 #include "lower/arithmetic.h"
-#include "lower/cpu_weights.h"
-#include "lower/kind_clock.h"
+#include "lower/cpu/cpu_weights.h"
+#include "lower/cpu/kind_clock.h"
 
 namespace vla::lower {
 
@@ -33,6 +33,7 @@ class CpuDevice final : public Device {
   Rounding rounding() const override { return arithmetic_.at_load; }
   bool has_bf16() const override { return rounds_to_bf16(this_cpu()); }
   const std::string& linear_kernels() const override { return weights_.text(); }
+  const CpuWeights& weights() const { return weights_; }
   std::size_t weights_size() const override { return weights_.size(); }
   std::size_t working_size() const override { return arena_.size() + executor_->scratch_size(); }
   void count_times(bool on) override;

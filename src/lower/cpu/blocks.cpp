@@ -4,7 +4,7 @@
 #include <map>
 
 #include "kernels/sizes.h"
-#include "lower/lowering.h"
+#include "lower/cpu/cpu_lowering.h"
 
 namespace vla::lower {
 namespace {
@@ -14,8 +14,8 @@ constexpr std::int64_t kMinBlockRows = 128;
 
 /// How many blocks of rows keep `x` in the second cache from the product that makes it to the one that reads it; 0
 /// where it stays there without blocks, or would not with blocks that pay.
-std::int64_t n_block_of(const Lowering& l, const Value& x, const kernels::LinearKernel& reader) {
-  if (x.rounded != kernels::RoundedLayout::tiles) return 0;
+std::int64_t n_block_of(const CpuLowering& l, const Value& x, const kernels::LinearKernel& reader) {
+  if (rounded(x) != kernels::RoundedLayout::tiles) return 0;
   const std::int64_t d = kernels::round_up(x.shape[0], kernels::kSquare), n_row = count(x.shape) / x.shape[0];
   const std::int64_t max_rows = reader.kept_x / d / kernels::kSquare * kernels::kSquare;
   if (max_rows < kMinBlockRows || n_row * d <= 2 * reader.kept_x) return 0;
@@ -24,18 +24,18 @@ std::int64_t n_block_of(const Lowering& l, const Value& x, const kernels::Linear
 }
 
 /// The operations that read each base.
-std::map<ValueId, std::vector<FusedOp*>> readers_of(Lowering& l) {
-  std::map<ValueId, std::vector<FusedOp*>> readers;
-  for (FusedOp& op : l.ops)
+std::map<ValueId, std::vector<CpuOp*>> readers_of(CpuLowering& l) {
+  std::map<ValueId, std::vector<CpuOp*>> readers;
+  for (CpuOp& op : l.ops)
     for (const ValueId id : op.reads) readers[l.value(id).base].push_back(&op);
   return readers;
 }
 
 /// `up` becomes part of `down`, which alone reads what it makes, and is left without results.
-void join(Lowering& l, FusedOp& up, FusedOp& down, std::int64_t n_block) {
+void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block) {
   const ValueId inner = up.writes[0];
   l.value(inner).home = Value::Home::thread;
-  FusedOp both;
+  CpuOp both;
   both.reads = up.reads, both.writes = down.writes, both.order = down.order;
   std::copy_if(down.reads.begin(), down.reads.end(), std::back_inserter(both.reads),
                [&](ValueId id) { return id != inner; });
@@ -48,19 +48,19 @@ void join(Lowering& l, FusedOp& up, FusedOp& down, std::int64_t n_block) {
 
 }  // namespace
 
-void choose_blocks(Lowering& l) {
+void choose_blocks(CpuLowering& l) {
   const auto readers = readers_of(l);
-  for (FusedOp& up : l.ops) {
+  for (CpuOp& up : l.ops) {
     if (!std::holds_alternative<LinearOp>(up.op) || up.writes.size() != 1) continue;
     const ValueId inner = up.writes[0];
     const auto found = readers.find(inner);
     if (found == readers.end() || found->second.size() != 1) continue;
-    FusedOp& down = *found->second[0];
+    CpuOp& down = *found->second[0];
     const auto* reader = std::get_if<LinearOp>(&down.op);
     if (reader == nullptr || reader->x != inner || l.value(inner).home != Value::Home::arena) continue;
     if (const std::int64_t n_block = n_block_of(l, l.value(inner), kernel_of(l, *reader))) join(l, up, down, n_block);
   }
-  std::erase_if(l.ops, [](const FusedOp& op) { return op.writes.empty(); });
+  std::erase_if(l.ops, [](const CpuOp& op) { return op.writes.empty(); });
 }
 
 }  // namespace vla::lower

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/emit.h"
+#include "lower/cpu/emit.h"
 
 #include <cmath>
 #include <cstring>
@@ -20,15 +20,18 @@ constexpr double kMinSharedFlop = 2e6;
 /// Numbers of an item of what is not a product.
 constexpr std::int64_t kItemNumbers = 16384;
 
-std::byte* address(const Lowering& l, ValueId id) {
+std::byte* address(const CpuLowering& l, ValueId id) {
   const Value& value = l.value(id);
-  return l.base(id).data + dtype_size(value.type, value.offset);
+  return l.address(value.base) + dtype_size(value.type, value.offset);
 }
-float* floats(const Lowering& l, ValueId id) { return reinterpret_cast<float*>(address(l, id)); }
+float* floats(const CpuLowering& l, ValueId id) { return reinterpret_cast<float*>(address(l, id)); }
 /// Null for an operand that there is not.
-const float* operand(const Lowering& l, ValueId id) { return id != kNone ? floats(l, id) : nullptr; }
+const float* operand(const CpuLowering& l, ValueId id) { return id != kNone ? floats(l, id) : nullptr; }
 
-const kernels::CpuKernels& cpu(const Lowering& l) { return *kernels::cpu_kernels(l.use); }
+const kernels::CpuKernels& cpu(const CpuLowering& l) { return *kernels::cpu_kernels(l.use); }
+const kernels::AttentionKernel* attention_kernel(const CpuLowering& l, bool rounds) {
+  return &kernels::cpu_kernels(l.features(rounds))->attention;
+}
 
 struct LinearTask : Task {
   const kernels::LinearKernel* kernel;
@@ -207,14 +210,14 @@ struct PatchesTask : Task {
 };
 
 /// Cuts rows of d numbers into items for the threads, and says how many rows an item has.
-std::int64_t item_rows(const Lowering& l, std::int64_t n_row, std::int64_t d, std::int64_t& n_item) {
+std::int64_t item_rows(const CpuLowering& l, std::int64_t n_row, std::int64_t d, std::int64_t& n_item) {
   const std::int64_t wanted = l.n_thread == 1 ? 1 : std::min<std::int64_t>(n_row * d / kItemNumbers, 8 * l.n_thread);
   const std::int64_t rows = kernels::ceil_div(n_row, std::max<std::int64_t>(1, wanted));
   n_item = kernels::ceil_div(n_row, rows);
   return rows;
 }
 
-kernels::RowPrep prep_of(const Lowering& l, const Prepared& rows) {
+kernels::RowPrep prep_of(const CpuLowering& l, const Prepared& rows) {
   kernels::RowPrep prep;
   if (rows.norm != nullptr) {
     const auto& norm = *rows.norm->as<op::Norm>();
@@ -226,12 +229,12 @@ kernels::RowPrep prep_of(const Lowering& l, const Prepared& rows) {
 }
 
 /// x [d_head, n_head, n_token, n_batch].
-kernels::HeadRows head_rows(const Lowering& l, ValueId id) {
+kernels::HeadRows head_rows(const CpuLowering& l, ValueId id) {
   const Value &x = l.value(id), &base = l.base(id);
-  return {base.data, x.offset, x.stride[1], x.stride[2], x.stride[3], x.rounded, base.shape[0]};
+  return {l.address(x.base), x.offset, x.stride[1], x.stride[2], x.stride[3], rounded(x), base.shape[0]};
 }
 
-double flop_of_op(const FusedOp& op);
+double flop_of_op(const CpuOp& op);
 struct FlopOf {
   double operator()(const BlockedOp& op) const { return sum(op.products, flop_of_op); }
   double operator()(const LinearOp& op) const {
@@ -254,21 +257,22 @@ struct FlopOf {
     return result;
   }
 };
-double flop_of_op(const FusedOp& op) { return std::visit(FlopOf{}, op.op); }
+double flop_of_op(const CpuOp& op) { return std::visit(FlopOf{}, op.op); }
 
 /// Threads that share an operation.
-int threads_for(const Lowering& l, const FusedOp& op) { return flop_of_op(op) < kMinSharedFlop ? 1 : l.n_thread; }
+int threads_for(const CpuLowering& l, const CpuOp& op) { return flop_of_op(op) < kMinSharedFlop ? 1 : l.n_thread; }
 
 /// What LinearOp and QuantizeOp do to the rows that they read.
 template <class Reader>
-kernels::LinearJob::Norm norm_of(const Lowering& l, const Reader& op) {
+kernels::LinearJob::Norm norm_of(const CpuLowering& l, const Reader& op) {
   if (op.norm == nullptr) return {};
   const auto& norm = *op.norm->template as<op::Norm>();
   return {norm.kind == op::NormKind::rms ? cpu(l).rms_norm : cpu(l).layer_norm, operand(l, op.norm_weight),
           operand(l, op.norm_bias), norm.eps};
 }
 
-kernels::LinearJob job_of(const Lowering& l, const FusedOp& op) {
+/// All but the addresses of matrices.
+kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op) {
   const auto& linear = std::get<LinearOp>(op.op);
   kernels::LinearJob job = {};
   const Value& x = l.value(linear.x);
@@ -280,9 +284,7 @@ kernels::LinearJob job_of(const Lowering& l, const FusedOp& op) {
     const auto& product = *node->as<op::Linear>();
     kernels::LinearJob::Part& part = job.part[job.n_part++];
     part.type = l.weights.encoding(product.weight).type;
-    part.weight = l.weights.data(product.weight);
     part.bias = product.bias != nullptr ? l.weights.floats(product.bias) : nullptr;
-    part.scale = l.weights.scales(product.weight);
     part.d_out = product.weight->shape[1];
     // Of gate and up the one result is up's.
     const std::size_t i = linear.gated ? 0 : static_cast<std::size_t>(job.n_part - 1);
@@ -293,10 +295,16 @@ kernels::LinearJob job_of(const Lowering& l, const FusedOp& op) {
   return job;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp& linear) {
+void note_uses(const LinearOp& linear, kernels::LinearJob& job, MatrixUses& uses) {
+  for (std::size_t i = 0; i < linear.linears.size(); ++i)
+    uses.push_back({&job.part[i], linear.linears[i]->as<op::Linear>()->weight->id});
+}
+
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const LinearOp& linear, MatrixUses& uses) {
   auto task = std::make_unique<LinearTask>();
   task->kernel = &kernel_of(l, linear), task->job = job_of(l, op);
   task->n_item = task->kernel->cut(task->job, threads_for(l, op));
+  note_uses(linear, task->job, uses);
   return task;
 }
 
@@ -304,25 +312,26 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LinearOp&
 struct BlockedScratch {
   std::size_t kernels, inner;
 };
-BlockedScratch scratch_sizes(const Lowering& l, const BlockedOp& blocked) {
+BlockedScratch scratch_sizes(const CpuLowering& l, const BlockedOp& blocked) {
   const Value& inner = l.value(blocked.products[0].writes[0]);
   const std::int64_t d = inner.shape[0], n_square = kernels::ceil_div(count(inner.shape) / d, kernels::kSquare);
   const std::int64_t n_row = kernels::ceil_div(n_square, blocked.n_block) * kernels::kSquare;
   return {aligned(std::max(scratch_of(l, blocked.products[0]), scratch_of(l, blocked.products[1]))),
-          2 * static_cast<std::size_t>(kernels::rounded_count(inner.rounded, n_row, d))};
+          2 * static_cast<std::size_t>(kernels::rounded_count(rounded(inner), n_row, d))};
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp&, const BlockedOp& blocked) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp&, const BlockedOp& blocked, MatrixUses& uses) {
   auto task = std::make_unique<BlockedTask>();
   for (std::size_t i = 0; i < 2; ++i) {
-    task->kernel[i] = &kernel_of(l, std::get<LinearOp>(blocked.products[i].op));
-    task->job[i] = job_of(l, blocked.products[i]);
+    const auto& linear = std::get<LinearOp>(blocked.products[i].op);
+    task->kernel[i] = &kernel_of(l, linear), task->job[i] = job_of(l, blocked.products[i]);
+    note_uses(linear, task->job[i], uses);
   }
   task->inner = scratch_sizes(l, blocked).kernels, task->n_item = blocked.n_block;
   return task;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const QuantizeOp& quantize) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const QuantizeOp& quantize, MatrixUses&) {
   auto task = std::make_unique<QuantizeTask>();
   const Value &x = l.value(quantize.x), &codes = l.value(op.writes[0]);
   task->norm = norm_of(l, quantize), task->quantize = quantize.kernel->quantize;
@@ -333,9 +342,9 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const QuantizeO
   return task;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PackOp& pack) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const PackOp& pack, MatrixUses&) {
   auto task = std::make_unique<PackTask>();
-  task->kernel = &kernels::cpu_kernels(pack.use)->attention;
+  task->kernel = attention_kernel(l, pack.rounds);
   task->job = pack_sizes(l, pack);
   task->job.k = head_rows(l, pack.k.x), task->job.v = head_rows(l, pack.v), task->job.prep = prep_of(l, pack.k);
   task->job.packed = address(l, op.writes[0]);
@@ -343,11 +352,11 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PackOp& p
   return task;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const AttentionOp& attention) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const AttentionOp& attention, MatrixUses&) {
   auto task = std::make_unique<AttentionTask>();
   kernels::AttentionJob& job = task->job;
   const Value& q = l.value(attention.q.x);
-  task->kernel = &kernels::cpu_kernels(attention.use)->attention;
+  task->kernel = attention_kernel(l, attention.rounds);
   job.d_head = q.shape[0], job.n_head = q.shape[1], job.n_query = q.shape[2], job.n_batch = q.shape[3];
   job.n_head_kv = attention.node->in.back().dim(1);
   job.scale = 1.0f / std::sqrt(static_cast<float>(job.d_head));
@@ -357,14 +366,14 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const Attention
     job.segment[job.n_segment++] = {address(l, attention.packed[i]), attention.n_key[i], job.n_key};
     job.n_key += attention.n_key[i];
   }
-  job.out = address(l, op.writes[0]), job.out_layout = l.value(op.writes[0]).rounded;
+  job.out = address(l, op.writes[0]), job.out_layout = rounded(l.value(op.writes[0]));
   task->n_item = task->kernel->cut(job, threads_for(l, op));
   return task;
 }
 
 /// The kernel of a row operation, and how it takes its second operand.
 struct SetRowKernel {
-  const Lowering& l;
+  const CpuLowering& l;
   const RowOp& row;
   RowTask& task;
 
@@ -391,7 +400,7 @@ struct SetRowKernel {
   }
 };
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const RowOp& row) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const RowOp& row, MatrixUses&) {
   auto task = std::make_unique<RowTask>();
   const Node& node = *row.node;
   task->x = floats(l, row.x), task->x_stride = l.value(row.x).stride;
@@ -402,7 +411,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const RowOp& ro
   return task;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const CopyOp& copy) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const CopyOp& copy, MatrixUses&) {
   auto task = std::make_unique<CopyTask>();
   task->n_item = 0;
   for (const CopyOp::Part& part : copy.parts) {
@@ -416,7 +425,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const CopyOp& c
   return task;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LookupOp& lookup) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const LookupOp& lookup, MatrixUses&) {
   const Node& node = *lookup.node;
   const auto* ids = reinterpret_cast<const std::int32_t*>(address(l, lookup.ids));
   float* const y = floats(l, op.writes[0]);
@@ -433,7 +442,7 @@ std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const LookupOp&
   return task;
 }
 
-std::unique_ptr<Task> make(const Lowering& l, const FusedOp& op, const PatchesOp& patches) {
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const PatchesOp& patches, MatrixUses&) {
   auto task = std::make_unique<PatchesTask>();
   const Node& node = *patches.node;
   task->images = floats(l, patches.images), task->y = floats(l, op.writes[0]);
@@ -446,19 +455,19 @@ std::size_t bytes_of(const Value& value) { return dtype_size(value.type, count(v
 
 }  // namespace
 
-kernels::PackJob pack_sizes(const Lowering& l, const PackOp& op) {
+kernels::PackJob pack_sizes(const CpuLowering& l, const PackOp& op) {
   const Value& k = l.value(op.k.x);
   return {k.shape[0], k.shape[1], k.shape[2], k.shape[3], {}, {}, {}, nullptr};
 }
 
-std::unique_ptr<Task> emit(const Lowering& l, const FusedOp& op) {
-  return std::visit([&](const auto& what) { return make(l, op, what); }, op.op);
+std::unique_ptr<Task> emit(const CpuLowering& l, const CpuOp& op, MatrixUses& uses) {
+  return std::visit([&](const auto& what) { return make(l, op, what, uses); }, op.op);
 }
 
 namespace {
 
 struct ScratchOf {
-  const Lowering& l;
+  const CpuLowering& l;
 
   std::size_t operator()(const LinearOp& op) const { return kernel_of(l, op).scratch_size; }
   std::size_t operator()(const BlockedOp& op) const {
@@ -494,14 +503,14 @@ struct KindOf {
 
 }  // namespace
 
-std::size_t scratch_of(const Lowering& l, const FusedOp& op) { return std::visit(ScratchOf{l}, op.op); }
+std::size_t scratch_of(const CpuLowering& l, const CpuOp& op) { return std::visit(ScratchOf{l}, op.op); }
 
-KindClock::Kind kind_of(const FusedOp& op) { return std::visit(KindOf{}, op.op); }
+KindClock::Kind kind_of(const CpuOp& op) { return std::visit(KindOf{}, op.op); }
 
-Work work_of(const Lowering& l, const FusedOp& op) {
+Work work_of(const CpuLowering& l, const CpuOp& op) {
   Work work;
   if (const auto* blocked = std::get_if<BlockedOp>(&op.op)) {
-    for (const FusedOp& product : blocked->products) work += work_of(l, product);
+    for (const CpuOp& product : blocked->products) work += work_of(l, product);
     return work;
   }
   work.flop = flop_of_op(op);

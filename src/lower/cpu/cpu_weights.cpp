@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu_weights.h"
+#include "lower/cpu/cpu_weights.h"
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
@@ -12,7 +12,7 @@
 
 #include "kernels/executor.h"
 #include "kernels/sizes.h"
-#include "lower/recode.h"
+#include "lower/cpu/recode.h"
 
 namespace vla::lower {
 namespace {
@@ -138,18 +138,22 @@ Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& option
   weights.text_ = describe(counts);
   PackTask task;
   task.bundle = list.bundle();
+  weights.table_ = std::make_shared<WeightTable>();
+  auto& entries = weights.table_->entries;
+  for (const std::size_t offset : offsets) entries.push_back({weights.memory_.data() + offset});
   for (const Param& param : list.params()) {
     if (param.storage == Storage::table) continue;
-    Place& place = weights.places_[static_cast<std::size_t>(param.id)];
-    place.data = weights.memory_.data() + offsets[static_cast<std::size_t>(param.id)];
-    if (n_made_scale(param, place.encoding) > 0)
-      place.scales =
-          reinterpret_cast<float*>(place.data + aligned(place.kernel->packed_size(desc_of(param, place.encoding))));
+    const auto& [encoding, kernel] = weights.place(&param);
+    auto& [data, scales] = entries[static_cast<std::size_t>(param.id)];
+    const bool makes_scales = n_made_scale(param, encoding) > 0;
+    if (makes_scales) scales = reinterpret_cast<float*>(data + aligned(kernel->packed_size(desc_of(param, encoding))));
+    if (param.scales != nullptr)
+      scales = reinterpret_cast<float*>(entries[static_cast<std::size_t>(param.scales->id)].data);
     if (!options.fill) continue;
-    if (place.kernel != nullptr)
-      task.add(param, place.encoding, place.kernel, place.data, place.scales);
+    if (kernel != nullptr)
+      task.add(param, encoding, kernel, data, makes_scales ? scales : nullptr);
     else
-      task.add(param, place.data);
+      task.add(param, data);
   }
   if (task.parts.empty()) return weights;
   VLA_TRY(const std::shared_ptr<kernels::Executor> executor, kernels::Executor::shared(options.n_thread));

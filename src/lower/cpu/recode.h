@@ -4,7 +4,7 @@
 
 #include "bundle/content.h"
 #include "bundle/encoding.h"
-#include "lower/memory.h"
+#include "lower/cpu/memory.h"
 
 namespace vla::lower {
 

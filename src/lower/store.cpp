@@ -1,0 +1,53 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
+
+#include "lower/lowering.h"
+
+namespace vla::lower {
+namespace {
+
+/// Nobody may need what the slot held once it is overwritten. An operation row by row may read it itself, every
+/// element before it writes that.
+bool may_write(const Lowering& l, const std::vector<FusedOp>& ops, const Node& write, ValueId result) {
+  const Slot* slot = l.value(write.id).slot;
+  const auto writer = std::find_if(ops.begin(), ops.end(), [&](const FusedOp& op) {
+    return std::find(op.writes.begin(), op.writes.end(), result) != op.writes.end();
+  });
+  if (writer == ops.end()) return false;
+  for (const FusedOp& op : ops)
+    for (const ValueId id : op.reads) {
+      if (l.base(id).home != Value::Home::slot || l.base(id).slot != slot) continue;
+      if (op.order > writer->order) return false;
+      if (op.order < writer->order) continue;
+      const Value& value = l.value(id);
+      const bool in_place = std::holds_alternative<RowOp>(op.op) && value.shape == l.value(result).shape &&
+                            value.offset == 0 && is_contiguous(value);
+      if (!in_place) return false;
+    }
+  return true;
+}
+
+/// A value goes to its slot at once where its operation may write there, else by a copy.
+void store(Lowering& l, std::vector<FusedOp>& ops, const Node& write) {
+  const ValueId from = write.in[0].node()->id;
+  Value& value = l.value(from);
+  Value& base = l.base(from);
+  const bool is_whole = is_contiguous(value) && value.offset == 0 && count(value.shape) == count(base.shape);
+  if (is_whole && base.home == Value::Home::arena && may_write(l, ops, write, value.base)) {
+    base.home = Value::Home::slot, base.slot = l.value(write.id).slot;
+    return;
+  }
+  FusedOp& op = ops.emplace_back();
+  op.op = CopyOp{{{from, value.shape, value.stride, contiguous_strides(value.shape), 0}}};
+  op.reads = {from}, op.writes = {write.id}, op.order = write.id;
+}
+
+}  // namespace
+
+void store(Lowering& l, std::vector<FusedOp>& ops) {
+  for (const Node& node : l.graph.nodes())
+    if (node.as<op::Write>() != nullptr) store(l, ops, node);
+}
+
+}  // namespace vla::lower

@@ -1,0 +1,34 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "bundle/params.h"
+
+namespace vla::lower {
+
+/// What a machine can do at a time. Passes that hold for every machine ask it;
+/// parameters must be loaded.
+class Target {
+ public:
+  virtual ~Target() = default;
+
+  /// What multiplies by a matrix, told apart by its address: products of one x
+  /// may be one operation, and so may gate and up, where it is the same.
+  virtual const void* multiplier(const Param& matrix) const = 0;
+  /// How many products of one x may be one operation.
+  virtual std::size_t max_products() const = 0;
+  /// The widest row whose norm a product computes as it reads x; 0: it computes
+  /// none.
+  virtual std::int64_t max_norm(const Param& matrix) const = 0;
+  /// How a matrix lies in memory.
+  virtual const Encoding& encoding(const Param& matrix) const = 0;
+  /// Attention over fewer keys is float32.
+  virtual std::int64_t min_rounded_keys() const = 0;
+  /// Every value starts at a multiple of so many bytes.
+  virtual std::size_t alignment() const = 0;
+};
+
+}  // namespace vla::lower
