@@ -5,23 +5,19 @@
 
     python3 tests/lint/registry_test.py
 """
-import re
+import sys
 import tempfile
 import unittest
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def registered(root):
-    text = (root / "src/policies/registry.inc").read_text()
-    return re.findall(r"^\s*POLICY\(\s*(\w+)\s*\)", text, re.M)
+sys.path.append(str(ROOT / "scripts"))
+from model_tables import registered, written  # noqa: E402
 
 
 def problems(root):
     """`name: what is missing`, over the five touches of an architecture."""
-    found, models = [], root / "docs/models.md"
-    rows = models.read_text(encoding="utf-8") if models.is_file() else ""
+    found = []
     for name in registered(root):
         mapping = f"python/vla_cpp/convert/archs/{name}"
         for paths in ((f"src/policies/{name}.cpp",), (f"{mapping}/__init__.py", f"{mapping}.py")):
@@ -29,16 +25,20 @@ def problems(root):
                 found.append(f"{name}: missing {paths[0]}")
         if not list((root / "tests/golden" / name).glob("*/expected.gguf")):
             found.append(f"{name}: missing a case with expected.gguf under tests/golden/{name}/")
-        if not re.search(rf"^\|\s*`{name}`\s*\|", rows, re.M):
-            found.append(f"{name}: missing a row that starts with `{name}` in docs/models.md")
+        if not (root / f"docs/models/{name}.json").is_file():
+            found.append(f"{name}: missing docs/models/{name}.json")
     return found
 
 
 class Registry(unittest.TestCase):
-    def test_every_registered_policy_has_source_mapping_fixture_and_row(self):
+    def test_every_registered_policy_has_source_mapping_fixture_and_document(self):
         self.assertTrue(registered(ROOT), "src/policies/registry.inc registers nothing")
         found = problems(ROOT)
         self.assertFalse(found, "\n" + "\n".join(found))
+
+    def test_the_tables_of_the_documents_are_those_of_the_registry(self):
+        for document, text in written(ROOT).items():
+            self.assertEqual((ROOT / document).read_text(encoding="utf-8"), text, f"{document}: run scripts/model_tables.py")
 
     def test_a_policy_of_one_line_lacks_four_things(self):
         with tempfile.TemporaryDirectory() as folder:
