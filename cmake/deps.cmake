@@ -40,11 +40,6 @@ set(vla_ggml_tree ${VLA_GGML_DIR})
 if(NOT vla_ggml_tree)
   vla_fetch_ggml(vla_ggml_tree)
 endif()
-# What a library that carries a ggml of its own must have been built from (src/ggml/backend_library.h).
-set(VLA_BACKEND_BUILD "vla ${PROJECT_VERSION}, ggml of ${VLA_GGML_ARCHIVE}")
-if(VLA_GGML_DIR)
-  set(VLA_BACKEND_BUILD "vla ${PROJECT_VERSION}, ggml in ${VLA_GGML_DIR}")
-endif()
 set(BUILD_SHARED_LIBS OFF)
 set(GGML_NATIVE ${VLA_NATIVE} CACHE BOOL "" FORCE)
 # Of a build for any machine: written here, since ggml's own defaults stay as they were when a folder was configured first.

@@ -4,7 +4,7 @@
 
 #include <fmt/format.h>
 
-#include "lower/open.h"
+#include "devices/devices.h"
 #include "policies/policy.h"
 
 namespace vla::bench {

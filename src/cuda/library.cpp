@@ -8,7 +8,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "ggml/backend_library.h"
+#include "ggml/ggml_library.h"
 
 namespace {
 
@@ -25,18 +25,18 @@ ggml_backend_reg_t open() {
                            ")");
 }
 
-const char* driver(ggml_backend_dev_t) {
-  thread_local std::string text;
+std::string driver(ggml_backend_dev_t) {
   int newest = 0, runtime = 0;
   cudaDriverGetVersion(&newest);
   cudaRuntimeGetVersion(&runtime);
-  text = "driver for CUDA " + version_text(newest) + ", runtime " + version_text(runtime);
-  return text.c_str();
+  return "driver for CUDA " + version_text(newest) + ", runtime " + version_text(runtime);
 }
+
+constexpr vla::GgmlBackend kCuda = {"cuda", open, driver};
 
 }  // namespace
 
-const vla::BackendLibrary* vla_backend_library() {
-  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback, driver};
+const vla::DeviceLibrary* vla_device_library() {
+  static const vla::DeviceLibrary library = vla::library_of<kCuda>();
   return &library;
 }

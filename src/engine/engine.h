@@ -8,9 +8,9 @@
 #include <utility>
 #include <vector>
 
+#include "devices/devices.h"
 #include "engine/robot.h"
 #include "graph/rounding.h"
-#include "lower/open.h"
 
 namespace vla {
 

@@ -11,6 +11,7 @@
 
 #include "base/bf16.h"
 #include "ggml/ggml_program.h"
+#include "ggml/reference.h"
 
 namespace vla {
 namespace {
@@ -58,7 +59,7 @@ void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
 void GgmlDevice::FreePool::operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
 
 Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
-  set_guard(ggml_log_set, ggml_set_abort_callback);
+  set_guard();
   auto device = std::make_unique<GgmlDevice>();
   Held& held = *device->held_;
   device->n_thread_ = n_thread;
@@ -74,17 +75,18 @@ Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
   return std::unique_ptr<Device>(std::move(device));
 }
 
-Result<std::unique_ptr<Device>> GgmlDevice::open(const DeviceName& name, Rounding rounding) {
-  set_guard(ggml_log_set, ggml_set_abort_callback);
-  VLA_TRY(ggml_backend_dev_t found, find_device(name));
+Result<std::unique_ptr<Device>> open_reference(int n_thread) { return GgmlDevice::cpu(n_thread); }
+
+Result<std::unique_ptr<Device>> GgmlDevice::open(ggml_backend_dev_t of, const std::string& name, bool keeps_f16,
+                                                 Rounding rounding) {
   auto device = std::make_unique<GgmlDevice>();
   device->n_thread_ = 1;  // the one that calls
-  device->text_ = fmt::format("{}, {}", name.text(), ggml_backend_dev_description(found));
-  device->keeps_f16_ = name.kind == "vulkan", device->rounding_ = rounding;
+  device->text_ = fmt::format("{}, {}", name, ggml_backend_dev_description(of));
+  device->keeps_f16_ = keeps_f16, device->rounding_ = rounding;
   Held& held = *device->held_;
-  VLA_CHECK(device->guarded([&] { held.backend.reset(ggml_backend_dev_init(found, nullptr)); }));
-  if (!held.backend) return Error{Code::device, name.text(), "a device that starts", "its driver refused it"};
-  held.memory.emplace(name.text(), ggml_backend_dev_buffer_type(found), found);
+  VLA_CHECK(device->guarded([&] { held.backend.reset(ggml_backend_dev_init(of, nullptr)); }));
+  if (!held.backend) return Error{Code::device, name, "a device that starts", "its driver refused it"};
+  held.memory.emplace(name, ggml_backend_dev_buffer_type(of), of);
   return std::unique_ptr<Device>(std::move(device));
 }
 

@@ -8,7 +8,6 @@
 #include <memory>
 #include <optional>
 
-#include "ggml/backends.h"
 #include "ggml/ggml_memory.h"
 #include "ggml/guard.h"
 #include "graph/device.h"
@@ -23,8 +22,9 @@ class GgmlDevice final : public Device {
   /// Errors: device.
   static Result<std::unique_ptr<Device>> cpu(int n_thread);
   /// A device of another kind, with Rounding::none or bf16: then what matrices of bf16 multiply is rounded to it too.
-  /// Errors: device.
-  static Result<std::unique_ptr<Device>> open(const DeviceName& name, Rounding rounding);
+  /// `keeps_f16`: its products of f16 weights are as exact as those of float32. Errors: device.
+  static Result<std::unique_ptr<Device>> open(ggml_backend_dev_t of, const std::string& name, bool keeps_f16,
+                                              Rounding rounding);
   ~GgmlDevice() override;
 
   Status load(const ParamList& params, bool fill) override;
@@ -95,7 +95,7 @@ class GgmlDevice final : public Device {
   std::unique_ptr<Held> held_ = std::make_unique<Held>();
   std::string text_;
   int n_thread_ = 0;
-  bool keeps_f16_ = false;  // its products of f16 weights are as exact as those of float32
+  bool keeps_f16_ = false;
   Rounding rounding_ = Rounding::none;
   Precision precision_ = Precision::f32;
   ggml_context_ptr weight_context_;

@@ -42,10 +42,9 @@ std::string joined(const std::string& lines) {
 
 }  // namespace
 
-void set_guard(void (*set_log)(ggml_log_callback, void*),
-               ggml_abort_callback_t (*set_abort)(ggml_abort_callback_t)) noexcept {
-  set_log(on_log, nullptr);
-  set_abort(on_abort);
+void set_guard() noexcept {
+  ggml_log_set(on_log, nullptr);
+  ggml_set_abort_callback(on_abort);
 }
 
 bool ggml_aborted() noexcept { return aborted; }

@@ -12,10 +12,9 @@
 
 namespace vla {
 
-/// Set in every copy of ggml: an abort becomes an exception where `guarded` catches it. What ggml logged as an error
-/// before is part of its text, since that is where CUDA's reason stands.
-void set_guard(void (*set_log)(ggml_log_callback, void*),
-               ggml_abort_callback_t (*set_abort)(ggml_abort_callback_t)) noexcept;
+/// From now on an abort of ggml becomes an exception where `guarded` catches it. What ggml logged as an error before is
+/// part of its text, since that is where CUDA's reason stands.
+void set_guard() noexcept;
 
 /// An abort was made an exception. It left ggml's functions where they stood, maybe with locks of all devices held.
 bool ggml_aborted() noexcept;

@@ -71,6 +71,13 @@ struct LowerOptions {
   std::vector<const Slot*> varying;
 };
 
+/// A device that is there.
+struct DeviceInfo {
+  std::string name, description;
+  std::size_t memory = 0, free = 0;  // bytes
+  std::string precision;             // of products: "f32, bf16"
+};
+
 /// Something that graphs run on: it keeps parameters, slots and working memory, and lowers graphs for itself.
 class Device {
  public:

@@ -7,6 +7,8 @@
 #include <algorithm>
 #include <array>
 
+#include "processor/json_fields.h"
+
 // The table of ops: one function of each file in ops/.
 #define OPS(file)   \
   namespace vla {   \

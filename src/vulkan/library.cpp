@@ -9,18 +9,17 @@
 #include <string>
 #include <vector>
 
-#include "ggml/backend_library.h"
+#include "ggml/ggml_library.h"
 
 namespace {
 
 /// ggml keeps its own instance to itself.
-const char* driver(ggml_backend_dev_t device) {
-  thread_local std::string text;
-  text = "driver unknown";
+std::string driver(ggml_backend_dev_t device) {
+  std::string text = "driver unknown";
   const VkApplicationInfo application = {.sType = VK_STRUCTURE_TYPE_APPLICATION_INFO, .apiVersion = VK_API_VERSION_1_2};
   const VkInstanceCreateInfo info = {.sType = VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO, .pApplicationInfo = &application};
   VkInstance instance = nullptr;
-  if (vkCreateInstance(&info, nullptr, &instance) != VK_SUCCESS) return text.c_str();
+  if (vkCreateInstance(&info, nullptr, &instance) != VK_SUCCESS) return text;
   std::uint32_t n = 0;
   vkEnumeratePhysicalDevices(instance, &n, nullptr);
   std::vector<VkPhysicalDevice> all(n);
@@ -36,13 +35,14 @@ const char* driver(ggml_backend_dev_t device) {
            std::to_string(VK_API_VERSION_PATCH(api));
   }
   vkDestroyInstance(instance, nullptr);
-  return text.c_str();
+  return text;
 }
+
+constexpr vla::GgmlBackend kVulkan = {"vulkan", ggml_backend_vk_reg, driver, true};
 
 }  // namespace
 
-const vla::BackendLibrary* vla_backend_library() {
-  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, ggml_backend_vk_reg, ggml_log_set,
-                                              ggml_set_abort_callback, driver};
+const vla::DeviceLibrary* vla_device_library() {
+  static const vla::DeviceLibrary library = vla::library_of<kVulkan>();
   return &library;
 }

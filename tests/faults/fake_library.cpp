@@ -16,7 +16,7 @@
 #include <cstring>
 #include <thread>
 
-#include "ggml/backend_library.h"
+#include "ggml/ggml_library.h"
 
 namespace {
 
@@ -121,10 +121,11 @@ ggml_backend_reg_t open() {
   return &registry;
 }
 
+constexpr vla::GgmlBackend kFake = {"cuda", open, [](ggml_backend_dev_t) { return std::string("driver fake 1.0"); }};
+
 }  // namespace
 
-const vla::BackendLibrary* vla_backend_library() {
-  static const vla::BackendLibrary library = {VLA_BACKEND_BUILD, open, ggml_log_set, ggml_set_abort_callback,
-                                              [](ggml_backend_dev_t) { return "driver fake 1.0"; }};
+const vla::DeviceLibrary* vla_device_library() {
+  static const vla::DeviceLibrary library = vla::library_of<kFake>();
   return &library;
 }

@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What may be recorded, and what a graph says of what does not fit.
+#include "devices/devices.h"
 #include "graph/cache.h"
-#include "lower/open.h"
 
 #include <doctest/doctest.h>
 

@@ -30,7 +30,7 @@ void fail_as_ggml_does(const std::shared_ptr<int>&) {
 }  // namespace
 
 TEST_CASE("ggml's abort in a guarded call is a device error with what was logged, and what the call held is freed") {
-  set_guard(ggml_log_set, ggml_set_abort_callback);
+  set_guard();
   const auto held = std::make_shared<int>();
   const Status status = guarded("cuda:0", [&] { fail_as_ggml_does(std::shared_ptr<int>(held)); });
   REQUIRE_FALSE(status.ok());
@@ -52,7 +52,7 @@ TEST_CASE("exceptions of a driver are errors; one that says there is no memory i
 }
 
 TEST_CASE("ggml's abort outside of a guarded call ends the process") {
-  set_guard(ggml_log_set, ggml_set_abort_callback);
+  set_guard();
   static_cast<void>(guarded("cpu", [] {}));
   const pid_t child = fork();
   REQUIRE(child >= 0);

@@ -7,7 +7,7 @@
 
 #include <limits>
 
-#include "ggml/backends.h"
+#include "devices/devices.h"
 
 using namespace vla;
 

@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-#include "lower/open.h"
+#include "devices/devices.h"
 
 namespace vla::test {
 

@@ -4,8 +4,8 @@
 
 #include <doctest/doctest.h>
 
+#include "devices/devices.h"
 #include "engine/plan.h"
-#include "lower/open.h"
 
 namespace vla::test {
 

@@ -8,6 +8,7 @@
 #include <cmath>
 #include <numeric>
 
+#include "processor/json_fields.h"
 #include "processor/ops/planes.h"
 #include "processor/recipe.h"
 

@@ -11,6 +11,7 @@
 #include <tuple>
 #include <utility>
 
+#include "processor/json_fields.h"
 #include "processor/ops/columns.h"
 #include "processor/recipe.h"
 

@@ -10,13 +10,14 @@
 #include "base/result.h"
 #include "bundle/bundle.h"
 #include "processor/image.h"
-#include "processor/json_fields.h"
 #include "processor/names.h"
 
 /// The kinds of ops of a recipe. An op is read from its fields, checked against the bundle once, and applied to every
 /// observation or chunk. Each file of this folder holds an op, or a few that are closely related, and names them
 /// in a function `<file>_ops()`; the build puts these functions into one table (src/CMakeLists.txt).
 namespace vla {
+
+class JsonFields;
 
 struct Recipe;
 
@@ -138,7 +139,6 @@ inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op 
 /// Numbers of pixels, states and actions: far beyond any of them, and far from the end of float32.
 inline constexpr Range kPlain = {-1e9, 1e9};
 
-inline Error misplaced(const JsonFields& fields, const char* expected) { return fields.wrong("op", expected); }
 inline Error misfit(std::string where, std::string expected, std::string found) {
   return {Code::bad_bundle, std::move(where), std::move(expected), std::move(found), "convert the checkpoint again"};
 }

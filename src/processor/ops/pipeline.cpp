@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "processor/byte_pixels.h"
+#include "processor/json_fields.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"
 

@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "base/bf16.h"
+#include "processor/json_fields.h"
 #include "processor/recipe.h"
 
 namespace vla {

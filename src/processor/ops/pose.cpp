@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "processor/json_fields.h"
 #include "processor/ops/matrix.h"
 #include "processor/recipe.h"
 

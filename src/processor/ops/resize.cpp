@@ -3,6 +3,7 @@
 #include "processor/ops/resize.h"
 
 #include "processor/byte_pixels.h"
+#include "processor/json_fields.h"
 #include "processor/ops/pipeline.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"

@@ -12,6 +12,7 @@
 #include <array>
 #include <cmath>
 
+#include "processor/json_fields.h"
 #include "processor/ops/matrix.h"
 #include "processor/recipe.h"
 

@@ -6,6 +6,7 @@
 
 #include <utility>
 
+#include "processor/json_fields.h"
 #include "processor/ops/columns.h"
 #include "processor/recipe.h"
 

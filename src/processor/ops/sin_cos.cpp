@@ -8,6 +8,7 @@
 #include <cmath>
 #include <iterator>
 
+#include "processor/json_fields.h"
 #include "processor/ops/columns.h"
 #include "processor/recipe.h"
 

@@ -5,6 +5,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include "processor/json_fields.h"
 #include "processor/python_text.h"
 #include "processor/recipe.h"
 #include "processor/tokenizer.h"

@@ -2,10 +2,27 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "ggml/backends.h"
 #include "graph/device.h"
 
 namespace vla {
+
+/// A device as `--device` names it: `vulkan:1`.
+struct DeviceName {
+  std::string kind;
+  int index = 0;
+  std::string text() const { return kind == "cpu" ? kind : kind + ":" + std::to_string(index); }
+
+  /// "cpu", "vulkan" or "cuda", the last two also with a number; empty text is the CPU. Errors: usage.
+  static Result<DeviceName> parse(const std::string& text);
+};
+
+/// What build and machine have: devices, and for each kind that has none the reason.
+struct DeviceList {
+  std::vector<DeviceInfo> devices;                          // the CPU first
+  std::vector<std::pair<std::string, std::string>> absent;  // kind, reason
+};
+
+DeviceList list_devices();
 
 /// What `--device` names (DeviceName::parse); empty text is the CPU. On the CPU `n_thread` threads run, 0 for every
 /// core that the process may use, with the kernels of Arithmetic: our own, or ggml's operations as the reference of all
@@ -13,8 +30,5 @@ namespace vla {
 /// the kernels of ggml alone, in float32, or with `bf16` in such products. A device that is absent is refused, and
 /// nothing takes its place. Errors: device, usage.
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device = "");
-
-/// The CPU first.
-DeviceList list_devices();
 
 }  // namespace vla

@@ -1,0 +1,94 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "devices/devices.h"
+
+#include <fmt/format.h>
+#include <sched.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <charconv>
+
+#include "devices/libraries.h"
+#include "ggml/reference.h"
+#include "lower/cpu/cpu_device.h"
+
+namespace vla {
+namespace {
+
+constexpr const char* kKinds[] = {"vulkan", "cuda"};
+constexpr int kMaxThreads = 512;
+
+int usable_cores() {
+  cpu_set_t set;
+  return sched_getaffinity(0, sizeof(set), &set) == 0 ? CPU_COUNT(&set) : 1;
+}
+
+DeviceInfo cpu() {
+  const auto pages = [](int which) {
+    return static_cast<std::size_t>(sysconf(which)) * static_cast<std::size_t>(sysconf(_SC_PAGESIZE));
+  };
+  return {"cpu", fmt::format("{} threads, {}", usable_cores(), name_of(this_cpu())), pages(_SC_PHYS_PAGES),
+          pages(_SC_AVPHYS_PAGES), rounds_to_bf16(this_cpu()) ? "f32, bf16" : "f32"};
+}
+
+Result<std::vector<DeviceInfo>> list(const std::string& kind) {
+  VLA_TRY(const DeviceLibrary* library, device_library(kind));
+  return library->list();
+}
+
+Result<std::unique_ptr<Device>> open_cpu(int n_thread, const std::string& kernels) {
+  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_cpu(kernels, this_cpu()));
+  if (n_thread <= 0) n_thread = usable_cores();
+  if (n_thread > kMaxThreads)
+    return Error{Code::device, "threads", fmt::format("at most {}", kMaxThreads), std::to_string(n_thread)};
+  if (arithmetic.backend == Arithmetic::Backend::ggml) return open_reference(n_thread);
+  return lower::CpuDevice::open(n_thread, arithmetic);
+}
+
+/// What is there instead.
+Error absent(const DeviceName& name, const std::string& reason) {
+  std::string here;
+  for (const DeviceInfo& device : list_devices().devices)
+    here += device.name == "cpu" ? device.name : fmt::format(", {} ({})", device.name, device.description);
+  return {Code::device, name.text(), "one of " + here, reason,
+          "vla inspect --devices lists them; docs/gpu.md says what each needs"};
+}
+
+}  // namespace
+
+Result<DeviceName> DeviceName::parse(const std::string& text) {
+  if (text.empty() || text == "cpu") return DeviceName{"cpu"};
+  const std::size_t colon = std::min(text.find(':'), text.size());
+  DeviceName name = {text.substr(0, colon)};
+  const bool known = std::find(std::begin(kKinds), std::end(kKinds), name.kind) != std::end(kKinds);
+  const char *at = text.data() + std::min(colon + 1, text.size()), *end = text.data() + text.size();
+  const auto [next, error] = std::from_chars(at, end, name.index);
+  const bool counts = colon == text.size() || (error == std::errc() && next == end && name.index >= 0);
+  if (known && counts) return name;
+  return Error{Code::usage, "device", "cpu, vulkan, vulkan:N, cuda or cuda:N", text};
+}
+
+DeviceList list_devices() {
+  DeviceList all = {{cpu()}, {}};
+  for (const char* kind : kKinds) {
+    const Result<std::vector<DeviceInfo>> found = list(kind);
+    if (found)
+      all.devices.insert(all.devices.end(), found->begin(), found->end());
+    else
+      all.absent.emplace_back(kind, found.error().found);
+  }
+  return all;
+}
+
+Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device) {
+  VLA_TRY(const DeviceName name, DeviceName::parse(device));
+  if (name.kind == "cpu") return open_cpu(n_thread, kernels);
+  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.text()));
+  const Result<std::vector<DeviceInfo>> found = list(name.kind);
+  if (!found) return absent(name, found.error().found);
+  if (static_cast<std::size_t>(name.index) >= found->size()) return absent(name, "none with this number");
+  return (*device_library(name.kind))->open(name.index, arithmetic.at_load);
+}
+
+}  // namespace vla
