@@ -85,11 +85,11 @@ VLA_API const vla_error* vla_last_error(const vla_policy* policy);
 typedef struct vla_options {
   size_t struct_size;
   int32_t n_thread;     /* CPU threads, at most 512; 0: every core that the process may use */
-  const char* kernels;  /* "ggml", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to
-                           bf16, or "bf16": the best that does, with large matrices rounded to it, or "int8": the best,
-                           with large matrices quantized, faster and less exact. NULL: on the CPU the best for the
-                           bundle's dtype, which rounds to bf16 if the bundle and the machine have it. Other devices
-                           take "float32", as NULL does, and "bf16" */
+  const char* kernels;  /* "ggml", "portable", "neon", "avx2", "avx512", "avx512_bf16", "amx", or "float32":
+                           the best that does not round to bf16, or "bf16": the best that does, with large matrices
+                           rounded to it, or "int8": the best, with large matrices quantized, faster and less exact.
+                           NULL: on the CPU the best for the bundle's dtype, which rounds to bf16 if the bundle and the
+                           machine have it. Other devices take "float32", as NULL does, and "bf16" */
   int32_t strict_state; /* 1: an observation whose state is far beyond what the policy has seen is refused with
                            VLA_BAD_OBSERVATION; 0: it is answered with a note */
   const char* device;   /* "cpu", "vulkan", "vulkan:1", "cuda", ...; NULL: "cpu". There is no fallback: an absent device
@@ -150,7 +150,7 @@ struct vla_description {
   const char* converter; /* the program that made the bundle, and its version */
   const char* dtype;     /* how matrices are stored: "f32", "bf16" or "f16" */
   const char* precision; /* of the large products: "f32", "bf16" with sums in float32, or "int8" */
-  const char* kernels;   /* what computes them: "ggml", "avx2", ... */
+  const char* kernels;   /* what computes them: "ggml", "portable", "neon", "avx2", ... */
   const char* device;    /* "cpu, 8 threads", "vulkan:0, " and the name that its driver gives it */
   uint64_t memory_weights, memory_plan, memory_working; /* bytes */
 

@@ -6,6 +6,8 @@
 #include <cpuid.h>
 #include <sys/syscall.h>
 #include <unistd.h>
+#elif defined(__aarch64__)
+#include <sys/auxv.h>
 #endif
 
 namespace vla {
@@ -33,9 +35,10 @@ bool is_set(unsigned bits, int i) { return (bits >> i & 1U) != 0; }
 /// Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, CPUID leaves 1 and 7.
 Features detect_features() {
   __builtin_cpu_init();  // which knows whether the operating system saves vector registers
+  Features found = {Feature::baseline};
   const Registers leaf1(1, 0), leaf7(7, 0), more(7, 1);
-  if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !is_set(leaf1.c, 29)) return {};  // F16C
-  Features found;
+  if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma") || !is_set(leaf1.c, 29))  // F16C
+    return found;
   const auto add = [&found](bool has, Feature feature) {
     if (has) found = found.with(feature);
   };
@@ -55,9 +58,21 @@ Features detect_features() {
   return found;
 }
 
+#elif defined(__aarch64__)
+
+/// Source: Linux, Documentation/arch/arm64/elf_hwcaps.rst.
+Features detect_features() {
+  constexpr unsigned long kAsimd = 1UL << 1, kAsimdDp = 1UL << 20;
+  const unsigned long has = getauxval(AT_HWCAP);
+  Features found = {Feature::baseline};
+  if ((has & kAsimd) != 0) found = found.with(Feature::neon);
+  if ((has & kAsimdDp) != 0) found = found.with(Feature::dotprod);
+  return found;
+}
+
 #else
 
-Features detect_features() { return {}; }
+Features detect_features() { return {Feature::baseline}; }
 
 #endif
 

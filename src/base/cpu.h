@@ -10,14 +10,17 @@ namespace vla {
 
 /// Something that a processor can do and another cannot.
 enum class Feature {
-  avx2,    // with FMA and F16C
-  avx512,  // F, BW, DQ, VL
+  baseline,  // what the whole program is compiled for: every processor that runs it
+  avx2,      // with FMA and F16C
+  avx512,    // F, BW, DQ, VL
   avx512_bf16,
   avx512_vnni,
   avx_vnni,
   amx_bf16,  // and the operating system permits tiles
   amx_int8,
   permutes_beside_vnni,  // in the same cycle, as AMD's processors do; Intel's do one or the other
+  neon,
+  dotprod,  // SDOT
 };
 
 /// A set of them: what a processor has, or what kernels may use of it.

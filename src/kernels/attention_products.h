@@ -16,7 +16,7 @@ constexpr int row_stride(int n) { return n + 32; }
 constexpr int kHeadStride = row_stride(kMaxHead);
 
 /// Float32: kRowsOfTile rows times two vectors, one operand broadcast. `V` is a type of vec.h.
-template <class V, int kRowsOfTile>
+template <class V, int kRowsOfTile, int kVectorsOfPanel = 2>
 struct FloatProducts {
   using Vector = V;
   using Float = typename V::Float;
@@ -24,7 +24,8 @@ struct FloatProducts {
   struct Session {};
   static constexpr int kTile = kRowsOfTile, kRows = 24, kPart = kRows;  // rows of a tile, of a block, of a pass
   static constexpr int kKeys = 128;                                     // of a chunk
-  static constexpr int kPanel = 2 * V::width, kMinPanel = V::width, kDepth = 1;  // columns; unit of the depth
+  static constexpr int kVectors = kVectorsOfPanel, kPanel = kVectors * V::width;
+  static constexpr int kMinPanel = V::width, kDepth = 1;  // columns; unit of the depth
   static constexpr bool kBeside = false;
   static constexpr RoundedLayout kRounded = RoundedLayout::none;
 

@@ -26,9 +26,4 @@ struct CpuKernels {
 /// (kernel_set.h) do so in attention too, with sums in float32, as PyTorch does with a bf16 model.
 const CpuKernels* cpu_kernels(Features use);
 
-/// The same templates without any instruction set: slow, and there to test them at another width.
-const CpuKernels& portable_kernels();
-/// Attention with numbers rounded to bf16, as AMX multiplies them, in plain C++: for tests on machines without AMX.
-const AttentionKernel& emulated_amx_attention();
-
 }  // namespace vla::kernels

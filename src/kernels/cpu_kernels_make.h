@@ -9,16 +9,16 @@
 namespace vla::kernels {
 
 /// The kernels of one instruction set, all from the same templates. Only a file that is compiled for V's instructions
-/// may include this. `kTile`: rows of a register tile that is two vectors wide.
-template <class V, int kTile>
+/// may include this. `Products`: of attention, a type of attention_products.h.
+template <class Products>
 class CpuKernelsMaker {
+  using V = typename Products::Vector;
   using Float = typename V::Float;
 
  public:
   static constexpr CpuKernels make() {
-    return {map<Silu>,        map<GeluTanh>, map<GeluErf>, map<Relu>,
-            map<ReluSquared>, layer_norm,    rms_norm,     rotate_half,
-            map<Plus>,        map<Times>,    scaled,       AttentionTile<FloatProducts<V, kTile>>::kernel()};
+    return {map<Silu>, map<GeluTanh>, map<GeluErf>, map<Relu>,  map<ReluSquared>, layer_norm,
+            rms_norm,  rotate_half,   map<Plus>,    map<Times>, scaled,           AttentionTile<Products>::kernel()};
   }
 
  private:
@@ -63,12 +63,14 @@ class CpuKernelsMaker {
   /// The sum of (x - mean)^2, or of x where `mean` is null. Two chains of sums, so that one need not wait for the
   /// other.
   static VLA_INLINE float sum(const float* x, const float* mean, std::int64_t n) {
-    const auto term = [&](Float value) { return mean == nullptr ? value : (value - *mean) * (value - *mean); };
+    const auto add = [&](Float& sum, Float value) VLA_LAMBDA {
+      sum = mean == nullptr ? sum + value : V::fma(value - *mean, value - *mean, sum);
+    };
     Float even = {}, odd = {};
     std::int64_t i = 0;
     for (; i + 2 * V::width <= n; i += 2 * V::width) {
-      even += term(V::load(x + i));
-      odd += term(V::load(x + i + V::width));
+      add(even, V::load(x + i));
+      add(odd, V::load(x + i + V::width));
     }
     float total = V::sum(even + odd);
     for (; i < n; ++i) total += mean == nullptr ? x[i] : (x[i] - *mean) * (x[i] - *mean);
@@ -103,8 +105,8 @@ class CpuKernelsMaker {
       const std::int64_t left = half - i;
       const Float a = load<V>(x + i, left), b = load<V>(x + half + i, left);
       const Float c = load<V>(w + i, left), s = load<V>(w + half + i, left);
-      store<V>(y + i, a * c - b * s, left);
-      store<V>(y + half + i, b * c + a * s, left);
+      store<V>(y + i, V::fma(a, c, -(b * s)), left);
+      store<V>(y + half + i, V::fma(b, c, a * s), left);
     }
   }
 };

@@ -87,8 +87,8 @@ VLA_INLINE typename V::Float gelu_erf_for_bf16(typename V::Float x) {
   p = V::fma(p, t, V::set(0x1.d086aap-3f));
   p = V::fma(p, t, V::set(0x1.6ab44ep-2f));
   p = V::fma(p, t, V::set(0x1.7a5e16p-2f));
-  const Float tail = y * t * p * exp2_for_bf16<V>(y * y * -0.72134752f);
-  return V::fma(V::set(0.5f), size, 0.5f * x) - tail;
+  const Float power = exp2_for_bf16<V>(y * y * -0.72134752f);
+  return V::fma(-(y * t * p), power, V::fma(V::set(0.5f), size, 0.5f * x));
 }
 
 }  // namespace vla::kernels

@@ -9,17 +9,24 @@
 ///
 /// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply a line of 64
 /// bytes at a time, four consecutive numbers of every column, as instructions that sum products of four bytes take
-/// them: one operand has no sign, so that numbers are stored with an offset, which comes off the sums again. Zeros fill
-/// strips up to four, and the depth up to 64, where x has zeros.
+/// them. Numbers may be stored with an offset, which comes off the sums again. Zeros fill strips up to four, and the
+/// depth up to 64, where x has zeros.
 namespace vla::kernels {
 
 struct Int8Panels {
   static constexpr std::int64_t kColumns = 16, kGroup = 16, kLine = 64;
 };
 
-/// Lines as they are multiplied; -128 to 127 plus 128.
+/// Lines as they are multiplied: -128 to 127, and 128 more where instructions take weights without a sign, as those of
+/// x86-64 do.
 struct BytePanels : Int8Panels {
+#if defined(__x86_64__)
+  using Number = std::uint8_t;
   static constexpr int kOffset = 128;
+#else
+  using Number = std::int8_t;
+  static constexpr int kOffset = 0;
+#endif
   /// A scale for each column.
   static constexpr bool kManyScales = true;
 

@@ -21,6 +21,8 @@ struct KernelSet {
 namespace kernel_set {
 
 inline constexpr KernelSet ggml = {"ggml", {}, {}};  // none of our own: the reference of every other
+inline constexpr KernelSet portable = {"portable", {Feature::baseline}, {Feature::baseline}};
+inline constexpr KernelSet neon = {"neon", {Feature::neon}, {Feature::neon, Feature::dotprod}};
 inline constexpr KernelSet avx2 = {"avx2", {Feature::avx2}, {Feature::avx2, Feature::avx_vnni}};
 inline constexpr KernelSet avx512 = {
     "avx512",
@@ -33,7 +35,7 @@ inline constexpr KernelSet amx = {"amx",
                                   avx512_bf16.uses.with(Feature::amx_bf16).with(Feature::amx_int8)};
 
 /// The best last.
-inline constexpr KernelSet all[] = {ggml, avx2, avx512, avx512_bf16, amx};
+inline constexpr KernelSet all[] = {ggml, portable, neon, avx2, avx512, avx512_bf16, amx};
 
 }  // namespace kernel_set
 

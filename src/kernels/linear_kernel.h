@@ -57,8 +57,4 @@ std::span<const LinearKernel* const> linear_kernels();
 /// The first row that takes a matrix with no more than these features, or null.
 const LinearKernel* choose_linear(const MatrixDesc& desc, Features use);
 
-/// The same loop with tiles in plain C++, slow and for every machine: panels and edges stay tested where the
-/// instructions are missing.
-std::span<const LinearKernel* const> emulated_linear_kernels();
-
 }  // namespace vla::kernels

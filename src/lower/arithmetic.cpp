@@ -23,9 +23,8 @@ Result<Arithmetic> with(const KernelSet& set, Features machine) {
                "leave the choice to the program"};
 }
 
-/// The best of the machine, with large matrices in these numbers. Errors: device.
-Result<Arithmetic> rounding(Rounding at_load, const char* name, const char* expected, bool has, Arithmetic best) {
-  if (!has) return Error{Code::device, "kernels", expected, name, "leave the choice to the program"};
+/// The best of the machine, with large matrices in these numbers.
+Arithmetic rounding(Rounding at_load, Arithmetic best) {
   best.at_load = at_load;
   return best;
 }
@@ -36,13 +35,15 @@ Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machi
   VLA_TRY(const Arithmetic best, with(kernel_set_of(machine), machine));
   if (kernels.empty()) return best;
   if (kernels == kFloat32) return with(kernel_set_of(without_rounding(machine)), machine);
-  if (kernels == kBf16)
-    return rounding(Rounding::bf16, kBf16, "a machine with AVX-512 BF16 or AMX", rounds_to_bf16(machine), best);
-  if (kernels == kInt8)
-    return rounding(Rounding::int8, kInt8, "a machine with AVX2", best.backend == Backend::own, best);
+  if (kernels == kBf16 && !rounds_to_bf16(machine))
+    return Error{Code::device, "kernels", "a machine with AVX-512 BF16 or AMX", kernels,
+                 "leave the choice to the program"};
+  if (kernels == kBf16) return rounding(Rounding::bf16, best);
+  if (kernels == kInt8) return rounding(Rounding::int8, best);
   for (const KernelSet& set : kernel_set::all)
     if (kernels == set.name) return with(set, machine);
-  return Error{Code::usage, "kernels", "ggml, avx2, avx512, avx512_bf16, amx, float32, bf16 or int8", kernels};
+  return Error{Code::usage, "kernels", "ggml, portable, neon, avx2, avx512, avx512_bf16, amx, float32, bf16 or int8",
+               kernels};
 }
 
 Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& device) {

@@ -99,10 +99,12 @@ bool lacks(const KernelSet& set) {
 #ifndef VLA_EMULATED_MACHINE  // these kernels are the same in the other programs
 #define VLA_EVERY_TAP " kernels: every tap of every golden case, from pixels to actions, matches the reference"
 TEST_CASE("ggml" VLA_EVERY_TAP) { check_taps("ggml", false); }
+TEST_CASE("portable" VLA_EVERY_TAP) { check_taps("portable", false); }
 TEST_CASE("avx2" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::avx2))) { check_taps("avx2", false); }
 TEST_CASE("avx512" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::avx512))) { check_taps("avx512", false); }
 
 #define VLA_BOUNDARIES " kernels: blocks whose operations are fused match the reference where they end"
+TEST_CASE("portable" VLA_BOUNDARIES) { check_taps("portable", true); }
 TEST_CASE("avx2" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::avx2))) { check_taps("avx2", true); }
 TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::avx512))) { check_taps("avx512", true); }
 #endif
@@ -115,6 +117,7 @@ TEST_CASE("default" VLA_CHUNK) { check_chunk(""); }
 TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(kernel_set::amx))) { check_chunk("amx"); }
 #ifndef VLA_EMULATED_MACHINE
 TEST_CASE("ggml" VLA_CHUNK) { check_chunk("ggml"); }
+TEST_CASE("portable" VLA_CHUNK) { check_chunk("portable"); }
 TEST_CASE("avx2" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx2))) { check_chunk("avx2"); }
 TEST_CASE("avx512" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx512))) { check_chunk("avx512"); }
 TEST_CASE("avx512_bf16" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx512_bf16))) { check_chunk("avx512_bf16"); }

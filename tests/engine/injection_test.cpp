@@ -99,6 +99,7 @@ bool lacks(const KernelSet& set) {
 
 #define VLA_PARTS " kernels: with the reference's own inputs every part of BitVLA gives the reference's output"
 TEST_CASE("ggml" VLA_PARTS) { check_parts("ggml"); }
+TEST_CASE("portable" VLA_PARTS) { check_parts("portable"); }
 TEST_CASE("avx2" VLA_PARTS* doctest::skip(lacks(kernel_set::avx2))) { check_parts("avx2"); }
 TEST_CASE("avx512" VLA_PARTS* doctest::skip(lacks(kernel_set::avx512))) { check_parts("avx512"); }
 

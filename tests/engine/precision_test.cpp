@@ -105,8 +105,7 @@ TEST_CASE("a matrix of another dtype is multiplied in float32, and the others in
   CHECK(engine->linear_kernels().find(all->kernels() + " (") != std::string::npos);
 }
 
-TEST_CASE("an engine tells that matrices were quantized, as somebody asked" *
-          doctest::skip(usable_kernels().back() == kernel_set::ggml)) {
+TEST_CASE("an engine tells that matrices were quantized, as somebody asked") {
   const auto engine = load_engine(kShipped, "", "int8");
   CHECK(engine->precision() == Precision::int8);
   CHECK(engine->arithmetic().find("as asked") != std::string::npos);

@@ -5,6 +5,7 @@
 #include "kernels/attention_products.h"
 
 #include "base/bf16.h"
+#include "kernels/portable/vec_portable.h"
 #include "support/attention_case.h"
 #include "support/kernel_rows.h"
 
@@ -123,9 +124,8 @@ void check_pair_operands(const AttentionKernel& kernel) {
 
 }  // namespace
 
-/// A test of kernels that round to bf16: the portable instance, the emulated ones, and the machine's.
+/// A test of kernels that round to bf16: the emulated ones, and the machine's.
 #define VLA_PAIR_TEST(sentence, check)                                                       \
-  TEST_CASE("portable amx: " sentence) { check(kernels::emulated_amx_attention()); }         \
   VLA_EMULATED_TEST("avx512_bf16", sentence, check(kernels::kEmulatedAttentionAvx512Bf16))   \
   TEST_CASE("avx512_bf16: " sentence* doctest::skip(test::lacks(kernel_set::avx512_bf16))) { \
     check(kernels::cpu_kernels(kernel_set::avx512_bf16.uses)->attention);                    \

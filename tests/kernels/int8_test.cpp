@@ -378,7 +378,8 @@ bool lacks(const std::string& name) {
 }  // namespace
 
 #define VLA_INT8_TEST_OF(sentence, check, check_named)                                                        \
-  TEST_CASE("plain_int8: " sentence) { check_named("plain_int8"); }                                           \
+  TEST_CASE("portable_int8: " sentence) { check_named("portable_int8"); }                                     \
+  TEST_CASE("dotprod_int8: " sentence* doctest::skip(lacks("dotprod_int8"))) { check_named("dotprod_int8"); } \
   TEST_CASE("avx2_int8: " sentence* doctest::skip(lacks("avx2_int8"))) { check_named("avx2_int8"); }          \
   TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check_named("avxvnni_int8"); } \
   TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check_named("avx512_int8"); }    \

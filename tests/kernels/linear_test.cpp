@@ -190,8 +190,9 @@ class Trial {
 };
 
 void check(const LinearKernel& kernel, const Case& c) {
-  if (!kernel.supports({c.type, c.shape.d_in, c.shape.d_out}, kernel_set::amx.uses))
-    return;  // amx machines have every instruction
+  // A machine with every instruction of both families.
+  constexpr Features all = kernel_set::amx.uses.with(Feature::baseline).with(Feature::neon);
+  if (!kernel.supports({c.type, c.shape.d_in, c.shape.d_out}, all)) return;
   CAPTURE(c.shape.n_row);
   CAPTURE(c.shape.d_in);
   CAPTURE(c.shape.d_out);
@@ -284,19 +285,38 @@ void check_rounded(const LinearKernel& kernel) {
   for (Activation activation : kActivations) check_rounded_after(activation, kernel);
 }
 
+[[maybe_unused]] void check_blocks(const LinearKernel& tiles) {
+  const auto n_block = [&](std::int64_t n_row, std::int64_t d_in, std::int64_t d_out, int n_thread) {
+    LinearJob job = {};
+    job.n_row = n_row, job.d_in = d_in, job.n_part = 1;
+    job.part[0].type = DType::bf16, job.part[0].d_out = d_out;
+    const std::int64_t n_item = tiles.cut(job, n_thread), n = ceil_div(n_row, job.block_rows);
+    CHECK(n_item == n * job.n_group);
+    return n;
+  };
+  for (const auto& [d_in, d_out] : {std::pair{2048, 16384}, std::pair{16384, 2048}}) {
+    CHECK(n_block(560, d_in, d_out, 2) == 2);
+    CHECK(n_block(816, d_in, d_out, 1) == 3);
+    CHECK(n_block(816, d_in, d_out, 2) == 4);
+    CHECK(n_block(816, d_in, d_out, 3) == 3);
+    CHECK(n_block(816, d_in, d_out, 8) == 4);
+    CHECK(n_block(200, d_in, d_out, 2) == 1);
+  }
+  CHECK(n_block(560, 2048, 2048, 2) == 3);  // a cache keeps these weights
+}
+
 const LinearKernel& row(const std::string& name) {
-  for (const auto& rows : {linear_kernels(), emulated_linear_kernels()})
-    for (const LinearKernel* kernel : rows)
-      if (kernel->name == name) return *kernel;
+  for (const LinearKernel* kernel : linear_kernels())
+    if (kernel->name == name) return *kernel;
   FAIL("no row " << name);
-  return *emulated_linear_kernels().front();
+  return *linear_kernels().back();
 }
 
 }  // namespace
 
 #define VLA_LINEAR_TEST(sentence, check)                                                                        \
-  TEST_CASE("emulated: " sentence) { check(row("emulated")); }                                                  \
-  TEST_CASE("emulated_amx: " sentence) { check(row("emulated_amx")); }                                          \
+  TEST_CASE("portable: " sentence) { check(row("portable")); }                                                  \
+  TEST_CASE("neon: " sentence* doctest::skip(vla::test::lacks(kernel_set::neon))) { check(row("neon")); }       \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx2))) { check(row("avx2")); }       \
   VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                           \
   VLA_EMULATED_TEST("avx512_bf16", sentence, check(kEmulatedLinearAvx512Bf16))                                  \
@@ -315,9 +335,8 @@ VLA_LINEAR_TEST("any number of threads computes every number once", check_thread
 VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_rounded)
 VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
 
-TEST_CASE("every machine takes the first row that it can run, and ggml where there is none") {
-  for (const KernelSet& set :
-       {kernel_set::ggml, kernel_set::avx2, kernel_set::avx512, kernel_set::avx512_bf16, kernel_set::amx})
+TEST_CASE("every machine takes the first row that it can run, and ggml asks for none") {
+  for (const KernelSet& set : usable_kernels())
     for (DType type : {DType::bf16, DType::f16, DType::f32}) {
       const LinearKernel* chosen = choose_linear({type, 768, 3072}, set.uses);
       const std::string expected = name_of(type == DType::bf16 ? set.uses : without_rounding(set.uses));
@@ -339,25 +358,8 @@ TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds 
   }
 }
 
-TEST_CASE("tiles: threads share blocks of rows evenly where weights come from memory for each block") {
-  const auto n_block = [](std::int64_t n_row, std::int64_t d_in, std::int64_t d_out, int n_thread) {
-    LinearJob job = {};
-    job.n_row = n_row, job.d_in = d_in, job.n_part = 1;
-    job.part[0].type = DType::bf16, job.part[0].d_out = d_out;
-    const std::int64_t n_item = row("emulated_amx").cut(job, n_thread), n = ceil_div(n_row, job.block_rows);
-    CHECK(n_item == n * job.n_group);
-    return n;
-  };
-  for (const auto& [d_in, d_out] : {std::pair{2048, 16384}, std::pair{16384, 2048}}) {
-    CHECK(n_block(560, d_in, d_out, 2) == 2);
-    CHECK(n_block(816, d_in, d_out, 1) == 3);
-    CHECK(n_block(816, d_in, d_out, 2) == 4);
-    CHECK(n_block(816, d_in, d_out, 3) == 3);
-    CHECK(n_block(816, d_in, d_out, 8) == 4);
-    CHECK(n_block(200, d_in, d_out, 2) == 1);
-  }
-  CHECK(n_block(560, 2048, 2048, 2) == 3);  // a cache keeps these weights
-}
+VLA_EMULATED_TEST("amx", "threads share blocks of rows evenly where weights come from memory for each block",
+                  check_blocks(kEmulatedLinearAmx))
 
 TEST_CASE("x is rounded to the nearest bf16, ties to even, as PyTorch rounds it") {
   CHECK(from_bf16(to_bf16(1.0f)) == 1.0f);

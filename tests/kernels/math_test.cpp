@@ -8,6 +8,7 @@
 #include <limits>
 #include <vector>
 
+#include "kernels/portable/vec_portable.h"
 #include "support/kernel_rows.h"
 
 using namespace vla;

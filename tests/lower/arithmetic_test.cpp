@@ -12,13 +12,14 @@ using Backend = Arithmetic::Backend;
 
 /// Processors that differ in what they have, from nothing to everything.
 const Features kMachines[] = {
-    {},
-    {Feature::avx2},
-    {Feature::avx2, Feature::avx_vnni},
-    {Feature::avx2, Feature::avx512},
-    kernel_set::avx512.uses,
-    kernel_set::avx512_bf16.uses,
-    kernel_set::amx.uses,
+    {Feature::baseline},
+    {Feature::baseline, Feature::neon},
+    {Feature::baseline, Feature::avx2},
+    {Feature::baseline, Feature::avx2, Feature::avx_vnni},
+    {Feature::baseline, Feature::avx2, Feature::avx512},
+    kernel_set::avx512.uses.with(Feature::baseline),
+    kernel_set::avx512_bf16.uses.with(Feature::baseline),
+    kernel_set::amx.uses.with(Feature::baseline),
 };
 
 }  // namespace
@@ -52,8 +53,7 @@ TEST_CASE("no name takes the best, float32 the best that does not round, and bf1
     const auto bf16 = Arithmetic::on_cpu("bf16", machine), int8 = Arithmetic::on_cpu("int8", machine);
     REQUIRE(bf16.ok() == rounds_to_bf16(best));
     if (bf16) CHECK((bf16->at_load == Rounding::bf16 && kernel_set_of(bf16->use) == best));
-    REQUIRE(int8.ok() == !(best == kernel_set::ggml));
-    if (int8) CHECK((int8->at_load == Rounding::int8 && kernel_set_of(int8->use) == best));
+    CHECK((int8->at_load == Rounding::int8 && kernel_set_of(int8->use) == best));
   }
 }
 
@@ -69,6 +69,7 @@ TEST_CASE("an unknown name is refused with the names that there are, on every de
 
 TEST_CASE("features that other features imply are never there without them") {
   CHECK(kernel_sets(this_cpu()).front() == kernel_set::ggml);
+  CHECK(this_cpu().has(Feature::baseline));
   CHECK(this_cpu().has(Feature::avx512) >= this_cpu().has(Feature::avx512_vnni));
   CHECK(this_cpu().has(Feature::amx_bf16) >= this_cpu().has(Feature::amx_int8));
 }

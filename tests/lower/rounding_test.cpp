@@ -55,14 +55,9 @@ std::vector<float> mlp(const std::string& kernels, DType type, DType small) {
 
 std::vector<float> mlp(const std::string& kernels, DType type) { return mlp(kernels, type, type); }
 
-bool lacks_kernels() { return usable_kernels().back() == kernel_set::ggml; }
-
 }  // namespace
 
-#define VLA_QUANTIZED_TEST(sentence) TEST_CASE(sentence* doctest::skip(lacks_kernels()))
-
-VLA_QUANTIZED_TEST(
-    "large products are near those of float32, whatever the weights are stored as, and small ones the same") {
+TEST_CASE("large products are near those of float32, whatever the weights are stored as, and small ones the same") {
   for (const DType type : {DType::bf16, DType::f16, DType::f32}) {
     CAPTURE(dtype_name(type));
     const std::vector<float> expected = mlp("float32", type), same = mlp("", type), got = mlp("int8", type);
@@ -81,7 +76,7 @@ VLA_QUANTIZED_TEST(
   }
 }
 
-VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number") {
+TEST_CASE("what was quantized is told, and takes a byte for each number") {
   Parameters params(DType::bf16, DType::bf16);
   GraphRunner floats(params.set.list(), ""), quantized(params.set.list(), "int8");
   CHECK(quantized.device().precision() == Precision::int8);
@@ -90,7 +85,7 @@ VLA_QUANTIZED_TEST("what was quantized is told, and takes a byte for each number
   CHECK(quantized.device().weights_size() < 0.7 * static_cast<double>(floats.device().weights_size()));
 }
 
-VLA_QUANTIZED_TEST("a policy with nothing to round is refused, before any memory is taken") {
+TEST_CASE("a policy with nothing to round is refused, before any memory is taken") {
   struct {
     std::string kernels, verb;
     DType small;

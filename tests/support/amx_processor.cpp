@@ -9,8 +9,8 @@
 namespace vla {
 
 Features detect_features() {
-  if (!__builtin_cpu_supports("avx2")) return {};
-  return kernel_set::amx.uses.without({Feature::avx_vnni, Feature::permutes_beside_vnni});
+  if (!__builtin_cpu_supports("avx2")) return {Feature::baseline};
+  return kernel_set::amx.uses.with(Feature::baseline).without({Feature::avx_vnni, Feature::permutes_beside_vnni});
 }
 
 }  // namespace vla

@@ -1,8 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
 #include "kernels/linear_loop.h"
 #include "kernels/tile_heights.h"
+#include "kernels/x86/vec_avx2.h"
 
 namespace vla::kernels {
 namespace {
@@ -98,4 +98,3 @@ extern const LinearKernel kLinearAvx2;
 const LinearKernel kLinearAvx2 = LinearLoop<Avx2Tile>::kernel("avx2", supports);
 
 }  // namespace vla::kernels
-#endif

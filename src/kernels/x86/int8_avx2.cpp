@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
 #include "kernels/int8_loop.h"
+#include "kernels/x86/vec_avx2.h"
 
 namespace vla::kernels {
 namespace {
@@ -105,4 +105,3 @@ const LinearKernel kInt8AvxVnni = Int8Loop<Avx2Tile<FourProducts>, BytePanels>::
 const LinearKernel kInt8Avx2 = Int8Loop<Avx2Tile<SignedProducts>, BytePanels>::kernel("avx2_int8", supports);
 
 }  // namespace vla::kernels
-#endif

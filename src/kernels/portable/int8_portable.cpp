@@ -1,12 +1,13 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/int8_loop.h"
+#include "kernels/portable/vec_portable.h"
 
 namespace vla::kernels {
 namespace {
 
-/// A tile in plain C++, slow and for every machine.
-struct PlainTile {
+/// Any machine's compiler makes something of it.
+struct PortableTile {
   using V = Portable;
   static constexpr int kRows = 5, kColumns = 32, kBlockRows = 25, kStep = 128;
   static constexpr std::int64_t kBlockKiB = 640;
@@ -32,7 +33,7 @@ struct PlainTile {
   static VLA_INLINE int number(const Strips& panel, std::int64_t k, int n) {
     const int place = n % 16 * 4 + static_cast<int>(k % 4);
     const auto eight = panel.template load<Eight>(k / 16 * 16, static_cast<int>(k % 16 / 4), n / 16, place / 8 * 8);
-    return static_cast<int>(eight[0] >> place % 8 * 8 & 255);
+    return static_cast<BytePanels::Number>(eight[0] >> place % 8 * 8 & 255);
   }
   typedef std::uint64_t Eight __attribute__((vector_size(8)));
 };
@@ -41,8 +42,8 @@ bool supports(const MatrixDesc& desc, Features) { return !is_float(desc.type); }
 
 }  // namespace
 
-extern const LinearKernel kTernaryPlain, kInt8Plain;
-const LinearKernel kTernaryPlain = Int8Loop<PlainTile, TernaryPanels>::kernel("plain_int8", supports);
-const LinearKernel kInt8Plain = Int8Loop<PlainTile, BytePanels>::kernel("plain_int8", supports);
+extern const LinearKernel kTernaryPortable, kInt8Portable;
+const LinearKernel kTernaryPortable = Int8Loop<PortableTile, TernaryPanels>::kernel("portable_int8", supports);
+const LinearKernel kInt8Portable = Int8Loop<PortableTile, BytePanels>::kernel("portable_int8", supports);
 
 }  // namespace vla::kernels

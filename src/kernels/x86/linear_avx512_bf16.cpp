@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
-#include "kernels/linear_avx512_tile.h"
 #include "kernels/linear_loop.h"
-#include "kernels/rounding_avx512.h"
+#include "kernels/x86/linear_avx512_tile.h"
+#include "kernels/x86/rounding_avx512.h"
 
 namespace vla::kernels {
 namespace {
@@ -64,4 +63,3 @@ const LinearKernel kLinearAvx512Bf16 =
     LinearLoop<Avx512Bf16Tile>::kernel("avx512_bf16", supports, &kLinearAvx512, kMaxFew);
 
 }  // namespace vla::kernels
-#endif

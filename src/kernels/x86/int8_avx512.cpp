@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
 #include "kernels/int8_loop.h"
+#include "kernels/x86/vec_avx512.h"
 
 namespace vla::kernels {
 namespace {
@@ -73,4 +73,3 @@ const LinearKernel kTernaryAvx512 = Int8Loop<VnniTile<2560>, TernaryPanels>::ker
 const LinearKernel kInt8Avx512 = Int8Loop<VnniTile<512>, BytePanels>::kernel("avx512_int8", supports);
 
 }  // namespace vla::kernels
-#endif

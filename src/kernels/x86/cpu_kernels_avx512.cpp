@@ -1,12 +1,11 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
 #include "kernels/cpu_kernels_make.h"
+#include "kernels/x86/vec_avx512.h"
 
 namespace vla::kernels {
 
-extern const CpuKernels kAvx2Kernels;
-const CpuKernels kAvx2Kernels = CpuKernelsMaker<Avx2, 6>::make();
+extern const CpuKernels kAvx512Kernels;
+const CpuKernels kAvx512Kernels = CpuKernelsMaker<FloatProducts<Avx512, 12>>::make();
 
 }  // namespace vla::kernels
-#endif

@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
-#include "kernels/amx_tiles.h"
 #include "kernels/attention_tile.h"
+#include "kernels/x86/amx_tiles.h"
 
 namespace vla::kernels {
 namespace {
@@ -59,4 +58,3 @@ extern const AttentionKernel kAttentionAmx;
 const AttentionKernel kAttentionAmx = Attention::kernel();
 
 }  // namespace vla::kernels
-#endif

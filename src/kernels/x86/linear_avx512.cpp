@@ -1,7 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
-#include "kernels/linear_avx512_tile.h"
+#include "kernels/x86/linear_avx512_tile.h"
 
 namespace vla::kernels {
 namespace {
@@ -69,4 +68,3 @@ extern const LinearKernel kLinearAvx512;
 const LinearKernel kLinearAvx512 = LinearLoop<Avx512Tile>::kernel("avx512", supports);
 
 }  // namespace vla::kernels
-#endif

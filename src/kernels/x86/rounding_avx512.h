@@ -6,7 +6,7 @@
 
 #include <cstdint>
 
-#include "kernels/vec.h"
+#include "kernels/x86/vec_avx512.h"
 
 /// Rounding to bf16 by the instructions of AVX-512 BF16: to the nearest, ties to even, as PyTorch rounds; a NaN stays
 /// one. What bf16 holds only as a subnormal number becomes zero, as it does in their products. Only files that are

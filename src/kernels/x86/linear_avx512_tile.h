@@ -4,6 +4,7 @@
 
 #include "kernels/linear_loop.h"
 #include "kernels/tile_heights.h"
+#include "kernels/x86/vec_avx512.h"
 
 /// The inner loop of products on AVX-512: rows by 2 vectors of sums.
 namespace vla::kernels {

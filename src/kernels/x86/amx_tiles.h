@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include "kernels/rounding_avx512.h"
+#include "kernels/x86/rounding_avx512.h"
 
 /// What every product on AMX's tiles needs. Only files that are compiled for AMX may include this.
 namespace vla::kernels {

@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
-#include "kernels/amx_tiles.h"
 #include "kernels/int8_loop.h"
+#include "kernels/x86/amx_tiles.h"
 
 namespace vla::kernels {
 namespace {
@@ -112,4 +111,3 @@ const LinearKernel kTernaryAmx = Int8Loop<AmxInt8Tile, TernaryPanels>::kernel("a
 const LinearKernel kInt8Amx = Int8Loop<AmxInt8Tile, BytePanels>::kernel("amx_int8", supports);
 
 }  // namespace vla::kernels
-#endif

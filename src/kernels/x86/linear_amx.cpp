@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
-#include "kernels/amx_tiles.h"
 #include "kernels/linear_tiles.h"
+#include "kernels/x86/amx_tiles.h"
 
 namespace vla::kernels {
 namespace {
@@ -78,4 +77,3 @@ extern const LinearKernel kLinearAvx512, kLinearAmx;
 const LinearKernel kLinearAmx = TileLoop<AmxTile>::kernel("amx", supports, &kLinearAvx512, kMaxFew);
 
 }  // namespace vla::kernels
-#endif

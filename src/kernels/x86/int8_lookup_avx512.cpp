@@ -7,8 +7,8 @@
 // With three numbers of each of 32 columns as indices vpermw finds 32 sums in it, which vpaddw adds: 96 multiply-adds
 // by two instructions, where VNNI makes 64 by one. Cores of AMD permute and add beside multiplying, so that both ways
 // run side by side: of seven numbers of a column, four are multiplied and three looked up. The sums are the same.
-#if defined(__x86_64__)
 #include "kernels/int8_loop.h"
+#include "kernels/x86/vec_avx512.h"
 
 namespace vla::kernels {
 
@@ -344,4 +344,3 @@ const LinearKernel kTernaryLookup = {
 };
 
 }  // namespace vla::kernels
-#endif

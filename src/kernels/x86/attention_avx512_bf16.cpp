@@ -1,8 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#if defined(__x86_64__)
 #include "kernels/attention_tile.h"
-#include "kernels/rounding_avx512.h"
+#include "kernels/x86/rounding_avx512.h"
 
 namespace vla::kernels {
 namespace {
@@ -23,4 +22,3 @@ extern const AttentionKernel kAttentionAvx512Bf16;
 const AttentionKernel kAttentionAvx512Bf16 = Attention::kernel();
 
 }  // namespace vla::kernels
-#endif
