@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test build vulkan cuda wheel packages asan tsan fuzz format clean
+.PHONY: help demo libero test test-arm64 build vulkan cuda wheel packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -14,6 +14,7 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), and one of its tasks drawn as proof"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
+	@echo "make test-arm64  build for 64-bit ARM, and run the tests of that under an emulator"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 525 MB of NVIDIA's compiler and libraries)"
@@ -109,6 +110,14 @@ tsan: packages
 test: build vulkan asan
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
 	$(VENV)/bin/python scripts/test.py
+
+# Downloads 90 MB of Debian's libraries for ARM into .cache.
+test-arm64: build
+	@scripts/packages.sh arm64
+	@scripts/sysroot.sh .cache/sysroot-arm64
+	@test -f build/arm64/build.ninja || cmake --preset arm64 $(CMAKE_ARGS)
+	cmake --build --preset arm64
+	$(VENV)/bin/python scripts/test.py --preset arm64
 
 SECONDS ?= 600
 fuzz: $(STAMP)

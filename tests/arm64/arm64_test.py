@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The program for 64-bit ARM under an emulator, beside that of this machine, which must be x86-64.
+
+The emulator is a hundred times slower than a machine and shows nothing of time or of the order in which cores see memory.
+"""
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT / "tests/cli")]
+
+from golden_cases import NAMES, Golden  # noqa: E402
+
+HERE, ARM, EMULATOR = os.environ["VLA_BINARY_HERE"], os.environ["VLA_BINARY"], shlex.split(os.environ["VLA_EMULATOR"])
+# A processor of robots' boards, and one with everything that the emulator knows.
+PROCESSORS = ["cortex-a76", "max"]
+SHORT = ["smolvla/two_views", "bitvla/two_views", "pi0/two_views"]
+
+
+def run(*command, cpu="max"):
+    answer = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "QEMU_CPU": cpu})
+    assert answer.returncode == 0, answer.stderr
+    return answer.stdout
+
+
+def taps(path, name, *options, emulated=True, cpu="max"):
+    """The file of all taps that a golden case leaves at a path."""
+    program = [*EMULATOR, ARM] if emulated else [HERE]
+    run(*program, *Golden(name).arguments(options=["--tap", "*", "--taps-out", path, *options]), cpu=cpu)
+    return path
+
+
+@pytest.mark.parametrize("cpu", PROCESSORS)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_tap_of_every_golden_case_matches_the_reference(name, cpu, tmp_path):
+    made = taps(tmp_path / "taps.gguf", name, "--kernels", "neon", cpu=cpu)
+    run(HERE, "compare", Golden(name).expected, made, "--tolerance", "1e-5")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_portable_kernels_give_the_bytes_of_another_machine(name, tmp_path):
+    """Pixels, tokens, positions and everything that is computed from them."""
+    options = ["--kernels", "portable"]
+    here = taps(tmp_path / "here.gguf", name, *options, emulated=False).read_bytes()
+    assert taps(tmp_path / "arm.gguf", name, *options).read_bytes() == here
+
+
+def test_noise_pixels_and_codes_of_weights_are_those_of_another_machine():
+    tool = Path(ARM).with_name("bytes_tool")
+    assert run(*EMULATOR, tool) == run(Path(HERE).with_name("bytes_tool"))
