@@ -26,6 +26,8 @@ constexpr std::uint64_t kCountBits = 24, kCountMask = (std::uint64_t{1} << kCoun
 void pause() {
 #if defined(__x86_64__)
   __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  asm volatile("yield");
 #endif
 }
 

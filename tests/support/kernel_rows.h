@@ -35,6 +35,9 @@ extern const LinearKernel kEmulatedTernaryAvx512, kEmulatedInt8Avx512, kEmulated
 /// The same test for the portable kernels and for every instruction set.
 #define VLA_KERNEL_TEST(sentence, check)                                                                  \
   TEST_CASE("portable: " sentence) { check(*vla::kernels::cpu_kernels(vla::kernel_set::portable.uses)); } \
+  TEST_CASE("neon: " sentence* doctest::skip(vla::test::lacks(vla::kernel_set::neon))) {                  \
+    check(*vla::kernels::cpu_kernels(vla::kernel_set::neon.uses));                                        \
+  }                                                                                                       \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(vla::kernel_set::avx2))) {                  \
     check(*vla::kernels::cpu_kernels(vla::kernel_set::avx2.uses));                                        \
   }                                                                                                       \
