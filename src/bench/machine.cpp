@@ -2,8 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bench/machine.h"
 
+#include <fmt/format.h>
+
+#include <algorithm>
 #include <ctime>
 #include <fstream>
+#include <utility>
 
 #include "kernels/probe/probe.h"
 
@@ -20,6 +24,24 @@ std::string proc_line(const char* file, const std::string& key) {
     return text == std::string::npos ? "" : line.substr(text);
   }
   return "";
+}
+
+/// Source: Linux, arch/arm64/include/asm/cputype.h.
+constexpr std::pair<unsigned, const char*> kArmParts[] = {
+    {0xd03, "Cortex-A53"},   {0xd05, "Cortex-A55"},    {0xd07, "Cortex-A57"},  {0xd08, "Cortex-A72"},
+    {0xd09, "Cortex-A73"},   {0xd0a, "Cortex-A75"},    {0xd0b, "Cortex-A76"},  {0xd0c, "Neoverse-N1"},
+    {0xd0d, "Cortex-A77"},   {0xd0e, "Cortex-A76AE"},  {0xd40, "Neoverse-V1"}, {0xd41, "Cortex-A78"},
+    {0xd42, "Cortex-A78AE"}, {0xd44, "Cortex-X1"},     {0xd46, "Cortex-A510"}, {0xd47, "Cortex-A710"},
+    {0xd48, "Cortex-X2"},    {0xd49, "Neoverse-N2"},   {0xd4b, "Cortex-A78C"}, {0xd4d, "Cortex-A715"},
+    {0xd4e, "Cortex-X3"},    {0xd4f, "Neoverse-V2"},   {0xd80, "Cortex-A520"}, {0xd81, "Cortex-A720"},
+    {0xd82, "Cortex-X4"},    {0xd83, "Neoverse-V3AE"}, {0xd84, "Neoverse-V3"}, {0xd85, "Cortex-X925"},
+    {0xd87, "Cortex-A725"}};
+
+std::string arm_core(unsigned implementer, unsigned part) {
+  if (implementer == 0x41)
+    for (const auto& [number, name] : kArmParts)
+      if (number == part) return name;
+  return fmt::format("core {:#x}:{:#x}", implementer, part);
 }
 
 std::size_t status_bytes(const std::string& key) {
@@ -46,8 +68,28 @@ Roofs measure_roofs(int n_thread) {
 }
 
 std::string cpu_name() {
-  const std::string name = proc_line("/proc/cpuinfo", "model name");
+  std::ifstream cpuinfo("/proc/cpuinfo");
+  std::string name = proc_line("/proc/cpuinfo", "model name");
+  if (name.empty()) name = arm_cores(cpuinfo);
   return name.empty() ? "unnamed CPU" : name;
+}
+
+std::string arm_cores(std::istream& cpuinfo) {
+  std::vector<std::pair<std::string, int>> all;
+  unsigned implementer = 0;
+  for (std::string line; std::getline(cpuinfo, line);) {
+    const auto number = [&] {
+      return static_cast<unsigned>(std::strtoul(line.c_str() + line.find(':') + 1, nullptr, 16));
+    };
+    if (line.starts_with("CPU implementer")) implementer = number();
+    if (!line.starts_with("CPU part")) continue;
+    const std::string name = arm_core(implementer, number());
+    const auto known = std::find_if(all.begin(), all.end(), [&](const auto& core) { return core.first == name; });
+    known == all.end() ? void(all.emplace_back(name, 1)) : void(++known->second);
+  }
+  std::string text;
+  for (const auto& [name, count] : all) text += fmt::format("{}{} {}", text.empty() ? "" : ", ", count, name);
+  return text;
 }
 
 double cpu_seconds() {

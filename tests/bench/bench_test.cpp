@@ -5,6 +5,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <sstream>
 
 #include "bench/roofline.h"
 #include "bench/versus.h"
@@ -112,6 +113,16 @@ TEST_CASE("products of int8 codes refer to a peak of their own") {
   CHECK(report.find("prefix")->share_of_peak_p50 == doctest::Approx(0.2));
   CHECK(report.find("steps")->floor == doctest::Approx(5));
   CHECK(to_json(report).find("\"int8_peak_gops\":6000.0") != std::string::npos);
+}
+
+TEST_CASE("cores of ARM64 are named by their numbers, and counted") {
+  const std::string little = "processor : 0\nCPU implementer\t: 0x41\nCPU part\t: 0xd05\n",
+                    big = "processor : 1\nCPU implementer\t: 0x41\nCPU part\t: 0xd0b\n",
+                    other = "CPU implementer\t: 0x61\nCPU part\t: 0xd0b\n";
+  std::istringstream rk3588(little + little + big + little + big), unknown(other), x86("model name : AMD EPYC\n");
+  CHECK(arm_cores(rk3588) == "3 Cortex-A55, 2 Cortex-A76");
+  CHECK(arm_cores(unknown) == "1 core 0x61:0xd0b");
+  CHECK(arm_cores(x86).empty());
 }
 
 TEST_CASE("rounds that had less of the machine than most are named") {
