@@ -13,7 +13,7 @@ install(TARGETS vla RUNTIME DESTINATION ${CMAKE_INSTALL_BINDIR})
 install(TARGETS vla_shared EXPORT vlaTargets
         LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT library NAMELINK_COMPONENT development)
 install(FILES include/vla/vla.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)
-install(FILES src/serve/vla.proto DESTINATION ${CMAKE_INSTALL_DATADIR}/vla)
+install(FILES src/wire/vla.proto DESTINATION ${CMAKE_INSTALL_DATADIR}/vla)
 install(FILES LICENSE LICENSES-third-party.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
 
 set(package_dir ${CMAKE_INSTALL_LIBDIR}/cmake/vla)

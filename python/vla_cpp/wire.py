@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of `vla serve`, to and from Python. docs/protocol.md and src/serve/vla.proto say what they mean.
+"""The messages of `vla serve`, to and from Python. docs/protocol.md and src/wire/vla.proto say what they mean.
 
 The schema comes as a serialized descriptor (`vla.desc`), from which protobuf makes classes when this module is imported. Code that
 protoc generates would tie the package to the releases of protobuf that accept that code; a descriptor is read by all of them.

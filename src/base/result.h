@@ -9,7 +9,7 @@
 
 namespace vla {
 
-/// One class per exit code and per code on the wire (src/serve/vla.proto), which are the same number; `code_name` gives
+/// One class per exit code and per code on the wire (src/wire/vla.proto), which are the same number; `code_name` gives
 /// the spelling that users see. The last seven are answers of a server.
 enum class Code {
   internal,

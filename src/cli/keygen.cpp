@@ -4,7 +4,7 @@
 
 #include "cli/commands.h"
 #include "cli/say.h"
-#include "serve/curve.h"
+#include "zmtp/curve.h"
 
 namespace vla::cli {
 
@@ -19,7 +19,7 @@ Command add_keygen(CLI::App& app) {
       ->type_name("")
       ->required();
   return [prefix]() -> Status {
-    VLA_CHECK(serve::write_key_pair(*prefix));
+    VLA_CHECK(zmtp::write_key_pair(*prefix));
     say(stdout, "{0}.secret\n{0}.public\n", *prefix);
     return {};
   };

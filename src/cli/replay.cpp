@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "serve/replay.h"
+#include "observe/replay.h"
 
 #include <fmt/format.h>
 

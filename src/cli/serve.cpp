@@ -18,7 +18,7 @@
 #include "cli/commands.h"
 #include "cli/say.h"
 #include "cli/watch.h"
-#include "serve/codec.h"
+#include "serve/native/codec.h"
 #include "serve/server.h"
 
 namespace vla::cli {

@@ -8,7 +8,7 @@
 #include <iterator>
 
 #include "cli/commands.h"
-#include "serve/codec.h"
+#include "serve/native/codec.h"
 
 namespace vla::cli {
 namespace {

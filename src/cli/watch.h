@@ -9,12 +9,12 @@
 #include <vector>
 
 #include "engine/engine.h"
-#include "serve/log.h"
-#include "serve/metrics.h"
-#include "serve/monitor.h"
-#include "serve/recording.h"
+#include "observe/log.h"
+#include "observe/metrics.h"
+#include "observe/monitor.h"
+#include "observe/recording.h"
+#include "observe/trace.h"
 #include "serve/server.h"
-#include "serve/trace.h"
 
 namespace vla::cli {
 

@@ -6,29 +6,15 @@
 #include <mutex>
 #include <optional>
 
-#include "serve/bytes.h"
-#include "serve/envelope.h"
-#include "serve/observer.h"
+#include "serve/front.h"
 #include "serve/queue.h"
 
 namespace vla::serve {
 
-/// A request on its way through the server, with what is needed to answer it.
-struct Job : Received {
-  std::uint64_t connection = 0;
-  bool delimiter = false;  // the client put an empty frame before the request, as REQ sockets do
-  Bytes bytes;             // the serialized Request
-  Envelope envelope;
-  std::optional<Clock::time_point> deadline;
-
-  std::span<const std::byte> request() const { return bytes.span(); }
-  std::span<const std::byte> body() const { return envelope.body(request()); }
-};
-
 /// A job with its answer.
 struct Answer {
   Job job;
-  std::string response;  // the serialized Response; empty where there is an error
+  std::string response;  // its bytes; empty where there is an error
   std::optional<Error> error;
   Clock::time_point started, finished;
   Timing stages;

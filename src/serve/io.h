@@ -3,11 +3,13 @@
 #pragma once
 
 #include <atomic>
+#include <exception>
+#include <memory>
 #include <span>
+#include <vector>
 
+#include "net/loop.h"
 #include "serve/exchange.h"
-#include "serve/hub.h"
-#include "serve/vla.pb.h"
 
 namespace vla::serve {
 
@@ -22,36 +24,53 @@ struct Vitals {
   Health health(const Exchange& exchange) const;
 };
 
-/// The I/O thread: receives requests, answers at once what needs no engine, puts acts in line, and sends what comes
-/// back. It never computes, so that no client waits for it while another one's act runs.
-class Io final : public Hub::Handler {
+/// The I/O thread, on which the front ends receive requests, answer at once what needs no engine, and put acts in line;
+/// it sends what comes back. It never computes, so that no client waits for it while another one's act runs.
+class Io {
  public:
+  using Fronts = std::vector<std::unique_ptr<Front>>;
   /// Everything outlives the thread.
-  Io(Hub& hub, Exchange& exchange, Vitals& vitals, const v1::Description& description,
-     std::span<Observer* const> observers);
+  Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, Vitals& vitals, std::span<Observer* const> observers);
 
   /// Until the server is stopped, what is computed is answered, and what waits is refused.
   void run();
 
-  void received(Client& client, Message message) override;
-  void dropped(const Client& client, const std::string& why, const std::string& detail) override;
+  /// For the front ends. A request that came; then one of the next three, which answers it exactly once. The job is
+  /// lost where they throw for lack of memory.
+  void received(const Received& request);
+  /// Puts an act in line, whose `deadline_ms` is checked.
+  void submit(Job job);
+  void answer(Job job, std::string response);
+  /// Makes the error only where the memory for it may be lacking.
+  template <class MakeError>
+  void refuse(Job job, MakeError error) noexcept {
+    Answer answer;
+    answer.started = answer.finished = job.at;
+    answer.job = std::move(job);
+    try {
+      answer.error = error();
+    } catch (const std::exception&) {
+      return settle_without_memory(answer);
+    }
+    settle(answer);
+  }
+  void dropped(const Dropped& connection);
+  void count_error() noexcept { ++vitals_.n_error; }  // of a request that was refused without a job
+  Health health() const { return vitals_.health(exchange_); }
 
  private:
-  void handle(Client& client, Job job, const Status& sound);
-  Result<v1::Response> answer_now(Client& client, const Job& job) const;
-  void queue(Job job);
-  template <class MakeError>
-  void refuse(Job job, MakeError error) noexcept;
-  void settle(Answer answer) noexcept;
-  void deliver(Answer answer);
+  void settle(Answer& answer) noexcept;
+  void settle_without_memory(Answer& answer) noexcept;
+  void deliver(Answer& answer);
   void deliver_waiting();
   void refuse_waiting();
-  void answer_without_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;
+  void wait(std::optional<Clock::time_point> until);
+  bool has_answers() const;
 
-  Hub& hub_;
+  net::Loop& loop_;
+  const Fronts& fronts_;
   Exchange& exchange_;
   Vitals& vitals_;
-  const v1::Description& description_;
   std::span<Observer* const> observers_;
 };
 

@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-#include "serve/observer.h"
+#include "observe/observer.h"
 
 namespace vla::serve {
 

@@ -7,16 +7,16 @@
 #include <new>
 #include <stdexcept>
 
+#include "base/out_of_memory.h"
 #include "base/thread.h"
-#include "serve/endpoint.h"
-#include "serve/fields.h"
+#include "serve/native/codec.h"
+#include "serve/native/front.h"
 #include "serve/relay.h"
 
 namespace vla::serve {
 namespace {
 
-constexpr std::size_t kQueueMessages = 8;    // acts that wait may hold so many times the largest message
-constexpr std::size_t kReceiptMessages = 4;  // and requests that are being received so many times
+constexpr std::size_t kQueueMessages = 8;  // acts that wait may hold so many times the largest message
 
 v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   v1::Limits limits;
@@ -64,44 +64,21 @@ Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
   return {options.max_queue, kQueueMessages * options.max_message};
 }
 
-Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) {
+Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) try {
   std::unique_ptr<Server> server(new Server(options));
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
-  VLA_CHECK(server->guard());
-  const Hub::Limits limits{options.max_message, options.max_connections, kReceiptMessages * options.max_message};
-  try {
-    server->hub_ = std::make_unique<Hub>(limits, server->keys_ ? &*server->keys_ : nullptr);
-  } catch (const std::runtime_error& no_descriptor) {  // of Asio
-    return Error{Code::io, "sockets", "what they need of the system", no_descriptor.what()};
-  }
-  VLA_CHECK(server->bind());
+  VLA_TRY(auto native, NativeFront::open(server->loop_, options));
+  server->fronts_.push_back(std::move(native));
   return server;
+} catch (const std::runtime_error& no_descriptor) {  // of Asio
+  return Error{Code::io, "sockets", "what they need of the system", no_descriptor.what()};
 }
 
-/// Who can reach the server can move the robot: clients on other machines need a key, unless the user allows all with
-/// --insecure.
-Status Server::guard() {
-  const bool has_keys = !options_.curve_secret.empty();
-  if (has_keys != !options_.curve_clients.empty())
-    return Error{Code::usage, "--curve-secret", "--curve-secret and --curve-clients together", "one of them"};
-  for (const std::string& endpoint : options_.bind) {
-    VLA_TRY(const Reach reach, reach_of(endpoint));
-    if (reach == Reach::remote && !has_keys && !options_.insecure)
-      return Error{Code::usage, "--bind", "keys for an address that other machines can reach", endpoint + " without",
-                   "vla keygen makes keys for --curve-secret and --curve-clients; --insecure lets everybody in"};
-  }
-  if (!has_keys) return {};
-  VLA_TRY(keys_, read_keys(options_.curve_secret, options_.curve_clients));
-  return {};
-}
-
-Status Server::bind() {
-  for (const std::string& endpoint : options_.bind) {
-    VLA_CHECK(check_free(endpoint));
-    VLA_TRY(std::string bound, hub_->bind(endpoint));
-    addresses_.push_back(std::move(bound));
-  }
-  return {};
+std::vector<std::string> Server::addresses() const {
+  std::vector<std::string> all;
+  for (const auto& front : fronts_)
+    for (std::string& address : front->addresses()) all.push_back(std::move(address));
+  return all;
 }
 
 void Server::stop() noexcept {
@@ -115,10 +92,11 @@ v1::Description Server::describe(const Engine& engine) const {
 
 /// Programs run on the thread that calls this.
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
-  description_ = describe(engine);
+  const v1::Description description = describe(engine);
+  for (const auto& front : fronts_) VLA_CHECK(front->serve(engine, description));
   observers_ = observers;
   vitals_.begin();
-  Io io(*hub_, exchange_, vitals_, description_, observers);
+  Io io(loop_, fronts_, exchange_, vitals_, observers);
   Relay<Act> relay;
   std::thread preparing;
   if (!engine.device().is_host()) {
@@ -137,7 +115,7 @@ Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   }
   if (!talking) return talking.error();
   talking->join();
-  hub_.reset();
+  fronts_.clear();
   return engine.device().failure();
 }
 
@@ -176,13 +154,7 @@ void Server::compute(Engine& engine, Act& act) {
 }
 
 Status Server::prepare(const Engine& engine, Act& act) const {
-  const std::span<const std::byte> body = act.answer.job.body();
-  VLA_TRY(const std::string embodiment, named_embodiment(body));
-  VLA_TRY(const Robot* robot, engine.robot(embodiment));
-  const v1::Description& description = description_of(description_, robot->bundle().embodiment());
-  const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
-                         robot->solver_horizon(), robot->d_action_padded(), description.actions_size()};
-  VLA_TRY(act.request, decode_act(body, limits, robot->processor().views(), robot->processor().states()));
+  VLA_TRY(act.request, act.answer.job.call->decode());
   act.request.observation.reject_out_of_range = options_.strict_state;
   act.clock.lap(act.answer.stages, "decode");
   VLA_CHECK(engine.prepare(act.request.observation, act.request.noise, act.request.leftover, act.prepared));
@@ -190,19 +162,16 @@ Status Server::prepare(const Engine& engine, Act& act) const {
   return {};
 }
 
-Status Server::respond(Engine& engine, Act& act) const {
+Status Server::respond(Engine& engine, Act& act) {
   Answer& answer = act.answer;
   if (!engine.device().is_host()) act.clock.lap(act.prepared.timing, "wait");
   VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
   answer.is_beyond = chunk.out_of_range, answer.notes = chunk.notes;
-  v1::Response response = response_to(answer.job.request_id);
-  const std::string& embodiment = act.prepared.robot->bundle().embodiment();
-  *response.mutable_chunk() = encode_chunk(act.request, std::move(chunk), description_of(description_, embodiment));
-  response.mutable_chunk()->set_queue_ms(
-      std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count());
-  answer.response = response.SerializeAsString();
+  act.request.observation.embodiment = act.prepared.robot->bundle().embodiment();
+  const double queue_ms = std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count();
+  answer.response = answer.job.call->encode({act.request, std::move(chunk), queue_ms});
   return {};
 }
 

@@ -8,31 +8,17 @@
 #include <vector>
 
 #include "engine/engine.h"
-#include "serve/codec.h"
-#include "serve/curve.h"
 #include "serve/io.h"
-#include "serve/observer.h"
+#include "serve/options.h"
 
 namespace vla::serve {
-
-struct ServerOptions {
-  std::vector<std::string> bind = {"tcp://127.0.0.1:5555"};
-  bool insecure = false;                    // an address that others can reach may be bound without keys
-  std::string curve_secret, curve_clients;  // files; both or neither
-  std::size_t max_message = 32 << 20;       // bytes
-  std::int64_t max_pixels = 1 << 24;        // of the images of an act
-  std::size_t max_text = 4096;              // bytes
-  std::size_t max_queue = 64;               // acts
-  std::size_t max_connections = 256;
-  bool strict_state = false;  // refuse states beyond the bundle's bound
-};
 
 /// Computes one act of a synthetic observation with every view and the longest text, so that the first client does not
 /// pay for what happens once. A policy may refuse such an observation; what fails otherwise would fail every act.
 /// Milliseconds. Errors: device, out_of_memory, internal.
 Result<double> warm_up(Engine& engine);
 
-/// One resident policy behind a socket that speaks like a ZeroMQ ROUTER. It keeps nothing between requests.
+/// One resident policy behind the sockets of its front ends. It keeps nothing between requests.
 class Server {
  public:
   /// Binds the addresses. Requests that come before `run` wait. Errors: usage (an address or a key that is none; an
@@ -40,7 +26,7 @@ class Server {
   static Result<std::unique_ptr<Server>> open(const ServerOptions& options);
 
   /// What was bound, ports filled in.
-  const std::vector<std::string>& addresses() const { return addresses_; }
+  std::vector<std::string> addresses() const;
 
   /// Serves on this thread, which computes, and a second one, which talks, until `stop` or the loss of the
   /// device; then answers what waits and returns. Where the policy is on a device of its own, a third thread prepares
@@ -57,8 +43,6 @@ class Server {
  private:
   explicit Server(const ServerOptions& options) : options_(options), exchange_(limits_of(options)) {}
   static Exchange::Jobs::Limits limits_of(const ServerOptions& options);
-  Status guard();
-  Status bind();
 
   /// An act on its way to its answer.
   struct Act {
@@ -71,7 +55,7 @@ class Server {
   bool prepare_next(const Engine& engine, Act& act);
   void compute(Engine& engine, Act& act);
   Status prepare(const Engine& engine, Act& act) const;
-  Status respond(Engine& engine, Act& act) const;
+  static Status respond(Engine& engine, Act& act);
   template <class Work>
   static void attempt(Act& act, const Work& work) noexcept;
 
@@ -79,10 +63,8 @@ class Server {
   std::span<Observer* const> observers_;
   Vitals vitals_;
   Exchange exchange_;
-  v1::Description description_;
-  std::optional<CurveKeys> keys_;
-  std::unique_ptr<Hub> hub_;
-  std::vector<std::string> addresses_;
+  net::Loop loop_;
+  Io::Fronts fronts_;
 };
 
 }  // namespace vla::serve

@@ -13,7 +13,7 @@ from google.protobuf import descriptor_pb2
 
 from vla_cpp import wire
 
-SCHEMA = Path(__file__).resolve().parents[2] / "src/serve/vla.proto"
+SCHEMA = Path(__file__).resolve().parents[2] / "src/wire/vla.proto"
 SPEC, LIMITS = wire.spec_of(description()), wire.MESSAGES["Limits"]()
 
 
@@ -26,7 +26,7 @@ def parsed(**changed):
 
 
 def test_the_descriptor_of_the_package_is_that_of_the_schema(tmp_path):
-    """To write it anew: protoc -I src/serve --descriptor_set_out=python/vla_cpp/vla.desc vla.proto"""
+    """To write it anew: protoc -I src/wire --descriptor_set_out=python/vla_cpp/vla.desc vla.proto"""
     if not shutil.which("protoc"):
         pytest.skip("protoc is not installed")
     out = tmp_path / "vla.desc"

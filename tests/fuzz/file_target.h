@@ -9,8 +9,8 @@
 
 #include "engine/taps.h"
 #include "fuzz/budget.h"
-#include "serve/curve.h"
-#include "serve/recording.h"
+#include "observe/recording.h"
+#include "zmtp/curve.h"
 
 namespace vla::fuzz {
 
@@ -32,7 +32,7 @@ inline bool check_file(FileKind kind, std::string_view bytes, const std::string&
     return false;
   };
   if (kind == FileKind::keys) {
-    const auto keys = serve::read_public_keys(file);
+    const auto keys = zmtp::read_public_keys(file);
     return keys ? true : refuse(keys.error());
   }
   if (kind == FileKind::taps) {

@@ -6,8 +6,8 @@
 #include <span>
 
 #include "processor/image.h"
-#include "serve/codec.h"
-#include "serve/envelope.h"
+#include "serve/native/codec.h"
+#include "wire/envelope.h"
 
 namespace vla::fuzz {
 
@@ -28,9 +28,9 @@ inline RequestFate check_request(std::span<const std::byte> bytes) {
       std::abort();
     if (serve::encode_error(error).SerializeAsString().empty()) std::abort();
   };
-  serve::Envelope envelope;
+  wire::Envelope envelope;
   RequestFate fate;
-  const Status read = serve::read_envelope(bytes, envelope);
+  const Status read = wire::read_envelope(bytes, envelope);
   fate.kind = envelope.kind;
   if (!read) return refuse(read.error()), fate;
   if (envelope.kind == serve::Kind::hello) {

@@ -10,7 +10,7 @@
 #include <string>
 
 #include "fuzz/budget.h"
-#include "serve/session.h"
+#include "zmtp/session.h"
 
 namespace vla::fuzz {
 
@@ -23,8 +23,8 @@ class CurveClient {
     pair_of(2, public_, secret_);
     pair_of(3, transient_public_, transient_secret_);
   }
-  serve::CurveKeys server_keys() const {
-    serve::CurveKeys keys;
+  zmtp::CurveKeys server_keys() const {
+    zmtp::CurveKeys keys;
     std::copy_n(server_secret_, 32, keys.secret.begin());
     std::copy_n(server_public_, 32, keys.own_public.begin());
     keys.clients.emplace(reinterpret_cast<const char*>(public_), 32);
@@ -102,8 +102,8 @@ inline int check_session(std::string_view input) {
   const std::size_t step = 1 + static_cast<unsigned char>(input[0]) / 2;
   input.remove_prefix(1);
   CurveClient client;
-  const serve::CurveKeys keys = client.server_keys();
-  serve::Session session(kMaxMessage, has_keys ? &keys : nullptr);
+  const zmtp::CurveKeys keys = client.server_keys();
+  zmtp::Session session(kMaxMessage, has_keys ? &keys : nullptr);
   session.take_output();
   int n_message = 0;
 

@@ -30,9 +30,13 @@ ROOMS = {
     "policies": GRAPH | {"nn", "modules"},
     "engine": GRAPH | NETWORK | {"devices", "processor"},
     "bench": GRAPH | NETWORK | {"kernels", "devices", "processor", "engine"},
-    "serve": {"engine", "policies", "processor", "bundle", "base"},
+    "net": {"base"},
+    "zmtp": {"base", "net"},
+    "wire": {"base"},
+    "observe": {"base", "engine", "net", "wire"},
+    "serve": {"engine", "processor", "bundle", "base", "net", "zmtp", "wire", "observe"},
     "capi": {"engine", "policies", "processor", "bundle", "base"},
-    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "bench"},  # doors that the program opens
+    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "observe", "zmtp", "wire", "bench"},  # doors that the program opens
 }
 # Libraries that belong to some rooms: no other sees their headers, not through any number of ours either. The engine's taps are a
 # GGUF file of tensors.
@@ -42,12 +46,15 @@ LIBRARIES = [
     (re.compile(r"vulkan/.*"), {"vulkan"}),
     (re.compile(r"cuda_runtime_api\.h|cublas_v2\.h"), {"cuda"}),
     (re.compile(r"CLI/.*"), {"cli"}),
-    (re.compile(r"nlohmann/.*"), {"processor", "cli", "serve", "bench"}),
+    (re.compile(r"nlohmann/.*"), {"processor", "cli", "observe", "serve", "bench"}),
     (re.compile(r"jpeglib\.h"), {"processor"}),
     (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
-    (re.compile(r"zmq\.h(pp)?|google/protobuf/.*|boost/.*|sodium\.h"), {"serve"}),
-    (re.compile(r"prometheus/.*"), {"serve", "cli"}),  # cli keeps the metrics
+    (re.compile(r"google/protobuf/.*"), {"wire", "serve"}),
+    (re.compile(r"prometheus/.*"), {"observe"}),
+    (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp"}),  # of a client; keys in Z85
+    (re.compile(r"boost/.*"), {"net", "zmtp", "observe", "serve"}),
+    (re.compile(r"sodium\.h"), {"zmtp"}),
 ]
 # Files of lower beside the folder of a machine hold for every machine, but for the one that chooses.
 EVERY_MACHINE = re.compile(r"lower/(?!arithmetic)\w+\.(h|cpp)")

@@ -5,8 +5,8 @@
 #include <cstdio>
 #include <set>
 
-#include "serve/curve.h"
 #include "serve/support.h"
+#include "zmtp/curve.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -44,7 +44,7 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   for (const char* who : {".server", ".friend", ".stranger"}) {
     std::remove((prefix + who + ".secret").c_str());
     std::remove((prefix + who + ".public").c_str());
-    REQUIRE(serve::write_key_pair(prefix + who).ok());
+    REQUIRE(zmtp::write_key_pair(prefix + who).ok());
   }
   options.curve_secret = prefix + ".server.secret";
   CHECK(serve::Server::open(options).error().where == "--curve-secret");
@@ -56,10 +56,9 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   Running running(options, {&names});
   const auto connect = [&](const std::string& who) {
     auto peer = std::make_unique<Peer>("inproc://nowhere");
-    const std::string secret = *serve::read_secret_key(prefix + who + ".secret");
-    peer->socket.set(zmq::sockopt::curve_serverkey,
-                     *serve::public_key_of(*serve::read_secret_key(options.curve_secret)));
-    peer->socket.set(zmq::sockopt::curve_publickey, *serve::public_key_of(secret));
+    const std::string secret = *zmtp::read_secret_key(prefix + who + ".secret");
+    peer->socket.set(zmq::sockopt::curve_serverkey, *zmtp::public_key_of(*zmtp::read_secret_key(options.curve_secret)));
+    peer->socket.set(zmq::sockopt::curve_publickey, *zmtp::public_key_of(secret));
     peer->socket.set(zmq::sockopt::curve_secretkey, secret);
     peer->socket.disconnect("inproc://nowhere");
     peer->socket.connect(running.address());
@@ -77,6 +76,6 @@ TEST_CASE("with keys, a listed client is served and every other one is not") {
   CHECK_FALSE(open_text.receive(1).has_value());
   running.server->stop();
   CHECK(running.join().ok());
-  const std::string friends_key = *serve::public_key_of(*serve::read_secret_key(prefix + ".friend.secret"));
+  const std::string friends_key = *zmtp::public_key_of(*zmtp::read_secret_key(prefix + ".friend.secret"));
   CHECK(names.peers == std::set<std::string>{friends_key});
 }

@@ -1,17 +1,18 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "serve/codec.h"
+#include "serve/native/codec.h"
 
 #include <doctest/doctest.h>
 #include <fmt/format.h>
 
 #include <cctype>
 
-#include "serve/envelope.h"
 #include "support/editable_bundle.h"
+#include "wire/envelope.h"
 
 using namespace vla;
 using namespace vla::serve;
+using namespace vla::wire;
 
 namespace {
 

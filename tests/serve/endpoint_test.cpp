@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "serve/endpoint.h"
+#include "net/endpoint.h"
 
 #include <doctest/doctest.h>
 #include <sys/stat.h>
@@ -8,11 +8,12 @@
 #include <cstdio>
 #include <fstream>
 
-#include "serve/curve.h"
 #include "support/editable_bundle.h"
+#include "zmtp/curve.h"
 
 using namespace vla;
-using namespace vla::serve;
+using namespace vla::net;
+using namespace vla::zmtp;
 
 TEST_CASE("loopback addresses and ipc paths are local") {
   for (const char* endpoint : {"tcp://127.0.0.1:5555", "tcp://127.9.9.9:0", "tcp://127.0.0.1:*", "tcp://[::1]:5555",

@@ -1,16 +1,17 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "serve/eviction.h"
+#include "net/eviction.h"
 
 #include <arpa/inet.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
-#include "serve/hub.h"
 #include "serve/support.h"
+#include "zmtp/hub.h"
 
 using namespace vla;
-using namespace vla::serve;
+using namespace vla::net;
+using vla::zmtp::Hub;
 using namespace vla::test;
 
 namespace {
@@ -24,11 +25,11 @@ struct Generous : Hub::Handler {
   Hub& hub;
   int n_received = 0;
   explicit Generous(Hub& its_hub) : hub(its_hub) {}
-  void received(Client& client, Message) override {
+  void received(zmtp::Client& client, zmtp::Message) override {
     ++n_received;
     hub.send(client.connection, std::string(kMiB, 'a'), false);
   }
-  void dropped(const Client&, const std::string&, const std::string&) override {}
+  void dropped(const zmtp::Client&, const std::string&, const std::string&) override {}
 };
 
 /// A connection to a server from an address of this machine that sends what it is told to, and does not read.
@@ -120,7 +121,8 @@ TEST_CASE("a robot that is served stays connected while 300 addresses of its mac
 }
 
 TEST_CASE("a peer that reads no answers is not read from once they take 128 KiB, however few they are") {
-  Hub hub({kMiB, 8, 4 * kMiB}, nullptr);
+  Loop loop;
+  Hub hub(loop, {kMiB, 8, 4 * kMiB}, nullptr);
   Generous handler(hub);
   const auto address = hub.bind("tcp://127.0.0.1:0");
   REQUIRE(address);
@@ -134,7 +136,7 @@ TEST_CASE("a peer that reads no answers is not read from once they take 128 KiB,
   for (int i = 0; i < 60; ++i) bytes += std::string("\0\1a", 3);
   peer.send(bytes);
   for (const auto end = Clock::now() + std::chrono::milliseconds(500); Clock::now() < end;)
-    hub.wait(handler, STDERR_FILENO, end);
+    loop.wait([&] { hub.begin(handler); }, STDERR_FILENO, end);
   CHECK(handler.n_received > 0);
   CHECK(handler.n_received < 20);  // what the system's own buffers take, and one more
 }

@@ -19,11 +19,10 @@
 
 #include <jpeglib.h>
 
-#include "serve/observer.h"
-#include "serve/vla.pb.h"
+#include "observe/observer.h"
+#include "wire/vla.pb.h"
 
 using namespace vla;
-using serve::Clock;
 
 namespace {
 

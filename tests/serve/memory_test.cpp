@@ -19,11 +19,11 @@
 #include <limits>
 #include <optional>
 
-#include "serve/log.h"
-#include "serve/metrics.h"
-#include "serve/recording.h"
+#include "observe/log.h"
+#include "observe/metrics.h"
+#include "observe/recording.h"
+#include "observe/trace.h"
 #include "serve/support.h"
-#include "serve/trace.h"
 
 #if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
 constexpr bool kCanFail = false;

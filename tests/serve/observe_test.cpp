@@ -12,13 +12,13 @@
 #include <nlohmann/json.hpp>
 #include <sstream>
 
-#include "serve/codec.h"
-#include "serve/log.h"
-#include "serve/metrics.h"
-#include "serve/monitor.h"
-#include "serve/replay.h"
+#include "observe/log.h"
+#include "observe/metrics.h"
+#include "observe/monitor.h"
+#include "observe/replay.h"
+#include "observe/trace.h"
+#include "serve/native/codec.h"
 #include "serve/support.h"
-#include "serve/trace.h"
 
 using namespace vla;
 using namespace vla::test;

@@ -9,6 +9,7 @@
 #include <set>
 
 using namespace vla::serve;
+using vla::Clock;
 
 namespace {
 

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // ZMTP byte by byte, without a socket.
-#include "serve/session.h"
+#include "zmtp/session.h"
 
 #include <doctest/doctest.h>
 
@@ -11,7 +11,7 @@
 #include <random>
 
 using namespace vla;
-using namespace vla::serve;
+using namespace vla::zmtp;
 
 namespace {
 

@@ -1,0 +1,52 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <boost/asio/io_context.hpp>
+#include <boost/asio/steady_timer.hpp>
+#include <chrono>
+#include <functional>
+
+namespace vla::net {
+
+/// Takes connections at one address, one after the other. Where the system has no descriptor left it tries again after
+/// a moment.
+template <class Protocol>
+class Listener {
+ public:
+  using Socket = typename Protocol::socket;
+  /// Binds at once. Errors: boost::system::system_error.
+  Listener(boost::asio::io_context& context, const typename Protocol::endpoint& endpoint)
+      : acceptor_(context, endpoint), retry_(context) {}
+
+  typename Protocol::endpoint endpoint() const { return acceptor_.local_endpoint(); }
+
+  /// Calls `taken` with each connection from now on. To be called again where something was thrown on the way.
+  void listen(std::function<void(Socket)> taken) {
+    if (!taken_) taken_ = std::move(taken);
+    if (!is_waiting_) accept();
+  }
+
+ private:
+  void accept() {
+    acceptor_.async_accept([this](boost::system::error_code error, Socket socket) {
+      is_waiting_ = false;
+      if (error) return accept_later();
+      taken_(std::move(socket));
+      accept();
+    });
+    is_waiting_ = true;
+  }
+  void accept_later() {
+    retry_.expires_after(std::chrono::milliseconds(100));
+    retry_.async_wait([this](boost::system::error_code) { accept(); });
+    is_waiting_ = true;
+  }
+
+  typename Protocol::acceptor acceptor_;
+  boost::asio::steady_timer retry_;
+  std::function<void(Socket)> taken_;
+  bool is_waiting_ = false;
+};
+
+}  // namespace vla::net

@@ -1,0 +1,124 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "observe/metrics.h"
+
+#include <prometheus/gauge.h>
+#include <prometheus/text_serializer.h>
+#include <unistd.h>
+
+#include <fstream>
+#include <new>
+
+namespace vla::serve {
+namespace {
+
+const prometheus::Histogram::BucketBoundaries kSeconds = {1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 0.01, 0.025,
+                                                          0.05, 0.1,    0.25, 0.5,  1,      2.5,  5,    10};
+
+double seconds(Clock::duration time) { return std::chrono::duration<double>(time).count(); }
+
+/// Second number of /proc/self/statm, in pages; 0 where there is none.
+double resident_bytes() {
+  std::ifstream file("/proc/self/statm");
+  double size = 0, resident = 0;
+  file >> size >> resident;
+  return resident * static_cast<double>(::sysconf(_SC_PAGESIZE));
+}
+
+prometheus::MetricFamily gauge(const char* name, const char* help, double value) {
+  prometheus::MetricFamily family{name, help, prometheus::MetricType::Gauge, {}};
+  family.metric.emplace_back().gauge.value = value;
+  return family;
+}
+
+prometheus::Counter& counter(prometheus::Registry& registry, const char* name, const char* help) {
+  return prometheus::BuildCounter().Name(name).Help(help).Register(registry).Add({});
+}
+
+}  // namespace
+
+Metrics::Metrics()
+    : requests_(prometheus::BuildCounter()
+                    .Name("vla_requests_total")
+                    .Help("Requests answered, by kind and code")
+                    .Register(*registry_)),
+      stages_(prometheus::BuildHistogram()
+                  .Name("vla_stage_seconds")
+                  .Help("Wall time of acts that reached the engine, by stage")
+                  .Register(*registry_)),
+      dropped_(prometheus::BuildCounter()
+                   .Name("vla_dropped_connections_total")
+                   .Help("Connections that the server ended, by reason")
+                   .Register(*registry_)),
+      received_bytes_(counter(*registry_, "vla_received_bytes_total", "Bytes of requests")),
+      sent_bytes_(counter(*registry_, "vla_sent_bytes_total", "Bytes of answers")),
+      clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")),
+      refused_(counter(*registry_, "vla_refused_clients_total", "Handshakes of clients whose key is not listed")),
+      beyond_(counter(*registry_, "vla_state_beyond_total", "Acts answered though their state is beyond its bound")) {
+  info("vla_build_info", "Version of the server", {{"version", VLA_VERSION}});
+}
+
+void Metrics::info(const char* name, const char* help, const prometheus::Labels& labels) {
+  prometheus::BuildGauge().Name(name).Help(help).Register(*registry_).Add(labels).Set(1);
+}
+
+void Metrics::describe(const v1::Description& description, const MemoryUse& memory) {
+  const v1::Bundle& bundle = description.bundle();
+  info("vla_bundle_info", "The bundle that answers",
+       {{"name", bundle.name()}, {"arch", bundle.arch()}, {"checksum", bundle.checksum()}, {"dtype", bundle.dtype()}});
+  const v1::Runtime& runtime = description.runtime();
+  info("vla_runtime_info", "What computes",
+       {{"device", runtime.device()}, {"precision", runtime.precision()}, {"kernels", runtime.kernels()}});
+  auto& family = prometheus::BuildGauge()
+                     .Name("vla_engine_memory_bytes")
+                     .Help("Memory of the engine, by what it holds")
+                     .Register(*registry_);
+  family.Add({{"part", "weights"}}).Set(static_cast<double>(memory.weights));
+  family.Add({{"part", "plan"}}).Set(static_cast<double>(memory.plan));
+  family.Add({{"part", "working"}}).Set(static_cast<double>(memory.working));
+}
+
+std::string Metrics::text(const Health& health) const {
+  std::vector<prometheus::MetricFamily> families = registry_->Collect();
+  families.push_back(gauge("vla_ready", "1 while acts are taken", health.ready ? 1 : 0));
+  families.push_back(gauge("vla_queue_depth", "Acts that wait", static_cast<double>(health.n_waiting)));
+  families.push_back(gauge("vla_computing", "1 while the engine computes", health.computing ? 1 : 0));
+  families.push_back(gauge("vla_uptime_seconds", "Time since the server became ready", health.uptime_s));
+  families.push_back(gauge("process_resident_memory_bytes", "Resident memory of the process", resident_bytes()));
+  return prometheus::TextSerializer().Serialize(families);
+}
+
+void Metrics::received(const Received& request) {
+  received_bytes_.Increment(static_cast<double>(request.size));
+  if (request.is_first) clients_.Increment();
+}
+
+/// `why` is one of a few words of the server's own.
+void Metrics::dropped(const Dropped& connection) try {
+  if (connection.why == "key") refused_.Increment();
+  dropped_.Add({{"why", connection.why}}).Increment();
+} catch (const std::bad_alloc&) {  // uncounted: the server goes on
+}
+
+void Metrics::answered(const Answered& answered) try {
+  sent_bytes_.Increment(static_cast<double>(answered.out.size()));
+  const Received& request = answered.request;
+  const int code = answered.error == nullptr ? 0 : exit_code(answered.error->code);
+  prometheus::Counter*& count = request_[{request.kind, code}];
+  if (count == nullptr) count = &requests_.Add({{"kind", kind_name(request.kind)}, {"code", answered.code()}});
+  if (answered.is_beyond) beyond_.Increment();
+  count->Increment();
+  if (answered.stages.empty()) return;
+  observe("queue", seconds(answered.started - request.at));
+  for (const auto& [stage, ms] : answered.stages) observe(stage, ms / 1e3);
+  observe("total", seconds(answered.sent - request.at));
+} catch (const std::bad_alloc&) {  // as above
+}
+
+void Metrics::observe(const std::string& stage, double seconds) {
+  prometheus::Histogram*& histogram = stage_[stage];
+  if (histogram == nullptr) histogram = &stages_.Add({{"stage", stage}}, kSeconds);
+  histogram->Observe(seconds);
+}
+
+}  // namespace vla::serve

@@ -1,0 +1,47 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <prometheus/counter.h>
+#include <prometheus/histogram.h>
+#include <prometheus/registry.h>
+
+#include <map>
+#include <string>
+
+#include "engine/engine.h"
+#include "observe/observer.h"
+#include "wire/vla.pb.h"
+
+namespace vla::serve {
+
+/// Counts and times requests for Prometheus. docs/serving.md lists the metrics. Labels take their values from the
+/// server, never from a client, so that their number is bounded.
+class Metrics final : public Observer {
+ public:
+  Metrics();
+
+  /// What answers, once it is known.
+  void describe(const v1::Description& description, const MemoryUse& memory);
+  /// Text of the exposition format 0.0.4, from any thread. Resident memory is read now.
+  std::string text(const Health& health) const;
+
+  void received(const Received& request) override;
+  void dropped(const Dropped& connection) override;
+  void answered(const Answered& answered) override;
+
+ private:
+  void info(const char* name, const char* help, const prometheus::Labels& labels);
+  void observe(const std::string& stage, double seconds);
+
+  std::shared_ptr<prometheus::Registry> registry_ = std::make_shared<prometheus::Registry>();
+  prometheus::Family<prometheus::Counter>& requests_;
+  prometheus::Family<prometheus::Histogram>& stages_;
+  prometheus::Family<prometheus::Counter>& dropped_;
+  prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_, &beyond_;
+  // Of the I/O thread:
+  std::map<std::string, prometheus::Histogram*> stage_;
+  std::map<std::pair<Kind, int>, prometheus::Counter*> request_;
+};
+
+}  // namespace vla::serve

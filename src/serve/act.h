@@ -1,0 +1,33 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <optional>
+
+#include "engine/engine.h"
+
+namespace vla::serve {
+
+/// The bounds of an act. All are compared before memory is taken that the sizes ask for.
+struct ActLimits {
+  std::int64_t max_pixels = 0;  // of all images
+  std::size_t max_text = 0;     // bytes
+  std::size_t max_views = 0;
+  int horizon = 0, d_noise = 0;  // of the noise that the policy takes
+  int d_action = 0;              // of a chunk
+};
+
+/// An act, ready for the engine.
+struct ActRequest {
+  Observation observation;
+  Noise noise;
+  std::optional<std::uint64_t> seed;  // that the noise is drawn from: the client's or a fresh one
+  std::optional<Leftover> leftover;
+  std::int64_t capture_time_ns = 0;
+};
+
+/// The seed of an act whose client gave none.
+std::uint64_t fresh_seed();
+
+}  // namespace vla::serve

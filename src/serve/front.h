@@ -1,0 +1,66 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "observe/observer.h"
+#include "serve/act.h"
+#include "wire/vla.pb.h"
+
+namespace vla::serve {
+
+class Io;
+
+/// The answer of the engine to an act.
+struct Reply {
+  const ActRequest& request;
+  ActionChunk chunk;  // `timing` has the server's own stages in it
+  double queue_ms;    // that the act waited
+};
+
+/// One request of a client, in the protocol of its front end: how it is decoded and answered. One thread at a time.
+class Call {
+ public:
+  virtual ~Call() = default;
+  /// The act that it is, with its images decoded. On the thread that prepares. Errors: bad_request, too_large,
+  /// bad_observation.
+  virtual Result<ActRequest> decode() = 0;
+  /// The chunk's bytes. On the thread that computes.
+  virtual std::string encode(Reply reply) = 0;
+  /// The refusal's bytes. On the I/O thread, as what follows.
+  virtual std::string encode(const Error& error) = 0;
+  /// Hands an answer to the socket. A client that is gone, or that does not read, does not get it.
+  virtual void send(const std::string& answer) = 0;
+  /// Frees what it holds, and tells the client that there is no memory for its answer, if there is any for that.
+  virtual void send_out_of_memory() noexcept = 0;
+  /// The request as a serialized v1::Request; empty in other protocols.
+  virtual std::span<const std::byte> native() const { return {}; }
+};
+
+/// A request on its way through the server.
+struct Job : Received {
+  std::unique_ptr<Call> call;
+  std::optional<std::uint64_t> deadline_ms;  // from its receipt: when its turn has to have come
+  std::optional<Clock::time_point> deadline;
+};
+
+/// A protocol: the sockets that it listens at, what it answers itself, and the calls that it hands to `Io::submit`. It
+/// knows no architecture; what a policy takes is in the description.
+class Front {
+ public:
+  virtual ~Front() = default;
+  /// What was bound, ports filled in.
+  virtual std::vector<std::string> addresses() const = 0;
+  /// The policy that answers, before `begin`. Errors: usage where the protocol cannot carry what the policy takes.
+  virtual Status serve(const Engine& engine, const v1::Description& description) = 0;
+  /// Takes connections from now on; called before every turn of the loop.
+  virtual void begin(Io& io) = 0;
+  /// Whether an answer has not left yet.
+  virtual bool has_answers() const = 0;
+};
+
+}  // namespace vla::serve

@@ -1,0 +1,247 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Requests, from bytes to what the engine takes.
+#include <fmt/format.h>
+
+#include <array>
+#include <string_view>
+
+#include "processor/image_codecs.h"
+#include "processor/unicode.h"
+#include "serve/native/codec.h"
+#include "wire/fields.h"
+
+namespace vla::serve {
+namespace {
+
+using wire::Fields;
+using wire::not_a_request;
+
+constexpr std::size_t kMaxName = 256;  // bytes; errors quote the name
+
+Error bad_observation(std::string where, std::string expected, std::string found) {
+  return {Code::bad_observation, std::move(where), std::move(expected), std::move(found)};
+}
+
+Error too_large(std::string where, std::string expected, std::string found) {
+  return {Code::too_large, std::move(where), std::move(expected), std::move(found),
+          "Description.limits has all limits"};
+}
+
+std::span<const std::byte> bytes_of(const std::string& text) { return std::as_bytes(std::span(text)); }
+
+std::string_view text_of(std::span<const std::byte> bytes) {
+  return {reinterpret_cast<const char*>(bytes.data()), bytes.size()};
+}
+
+/// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, f floats
+/// (packed or not), d double, and a digit for a message, the index of its own row.
+constexpr std::array<const char*, 8> kFields = {
+    "15t3vvv7t",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover, embodiment
+    "t2bb4",      // 1 View: name, rgb, jpeg, png, absent
+    "uub",        // 2 RawRgb: width, height, rows
+    "uuf",        // 3 Noise: horizon, d_action, values
+    "",           // 4 Absent
+    "tf",         // 5 State: name, values
+    "uutt",       // 6 Hello: min_version, max_version, client_name, client_version
+    "uufutd",     // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
+};
+
+/// Whether a field that was read is encoded as its type says.
+bool fits(const Fields& field, char type) {
+  if (type == 'v') return field.type == 'v';
+  if (type == 'u') return field.type == 'v' && field.varint <= ~std::uint32_t{0};  // Protobuf would cut it off
+  if (type == 'd') return field.type == 'd';
+  return field.type == 'b' || (type == 'f' && field.type == 'f');
+}
+
+/// Whether a message holds known fields only, each in its own encoding. Protobuf would skip any other, and what it
+/// skipped might have changed the answer: a seed in a wrong encoding would become a fresh one.
+Status check_fields(std::span<const std::byte> bytes, std::size_t row, const char* where) {
+  const std::string_view types = kFields[row];
+  for (Fields field(bytes, where);;) {
+    VLA_TRY(const bool more, field.next());
+    if (!more) return {};
+    const auto index = static_cast<std::size_t>(field.number) - 1;
+    if (index >= types.size() || !fits(field, types[index])) return field.unknown();
+    const char type = types[index];
+    if (type == 't' && unicode::valid_prefix(text_of(field.value)) < field.value.size())
+      return not_a_request(where, "text in UTF-8", fmt::format("field {} with other bytes", field.number));
+    if (type >= '0' && type <= '9') VLA_CHECK(check_fields(field.value, static_cast<std::size_t>(type - '0'), where));
+  }
+}
+
+template <class Message>
+Result<Message> parse(std::span<const std::byte> bytes, std::size_t row, const char* where) {
+  VLA_CHECK(check_fields(bytes, row, where));
+  Message message;
+  if (!message.ParseFromArray(bytes.data(), static_cast<int>(bytes.size())))
+    return not_a_request(where, "a serialized message", "bytes that do not parse as one");
+  return message;
+}
+
+Status check_name(const std::string& name, const char* where) {
+  if (name.size() <= kMaxName) return {};
+  return too_large(where, fmt::format("names of at most {} bytes", kMaxName), fmt::format("{} bytes", name.size()));
+}
+
+ImageLimits image_limits(const ActLimits& limits) { return {limits.max_pixels, Code::too_large}; }
+
+Result<Frame> decode_raw(const v1::RawRgb& raw, const std::string& where, const ActLimits& limits) {
+  const std::int64_t width = raw.width(), height = raw.height();
+  VLA_CHECK(codecs::check_size(width, height, where, image_limits(limits)));
+  const std::string& rows = raw.rows();
+  if (rows.size() != static_cast<std::size_t>(width * height * 3))
+    return bad_observation(where, fmt::format("{} bytes for {} x {} RGB", width * height * 3, width, height),
+                           fmt::format("{} bytes", rows.size()));
+  return Frame{static_cast<int>(width), static_cast<int>(height), std::vector<std::uint8_t>(rows.begin(), rows.end())};
+}
+
+Result<Frame> decode_file(const std::string& file, bool is_format, const char* format, const std::string& where,
+                          const ActLimits& limits) {
+  if (!is_format) return bad_observation(where, format, "bytes that do not begin as one");
+  return decode_image(bytes_of(file), where, image_limits(limits));
+}
+
+Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string& where, const ActLimits& limits) {
+  std::optional<Frame> frame;
+  switch (view.image_case()) {
+    case v1::View::kRgb: {
+      VLA_TRY(frame, decode_raw(view.rgb(), where, limits));
+      break;
+    }
+    case v1::View::kJpeg: {
+      VLA_TRY(frame, decode_file(view.jpeg(), codecs::is_jpeg(bytes_of(view.jpeg())), "a JPEG file", where, limits));
+      break;
+    }
+    case v1::View::kPng: {
+      VLA_TRY(frame, decode_file(view.png(), codecs::is_png(bytes_of(view.png())), "a PNG file", where, limits));
+      break;
+    }
+    case v1::View::kAbsent:
+      break;
+    case v1::View::IMAGE_NOT_SET:
+      return bad_observation(where, "one of rgb, jpeg, png, absent", "none of them");
+  }
+  return frame;
+}
+
+Status decode_views(const v1::Act& act, const ActLimits& limits, const FeatureNames& features,
+                    Observation& observation) {
+  ActLimits left = limits;  // an act costs what its images cost together
+  if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
+    return too_large("views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
+  for (const v1::View& view : act.views()) {
+    VLA_CHECK(check_name(view.name(), "views"));
+    const std::string where = features.place(view.name());
+    if (observation.views.contains(view.name())) return bad_observation(where, "each view once", "a second one");
+    VLA_TRY(std::optional<Frame> frame, decode_view(view, where, left));
+    if (frame) left.max_pixels -= std::int64_t{frame->width} * frame->height;
+    observation.views.emplace(view.name(), std::move(frame));
+  }
+  return {};
+}
+
+Status decode_states(const v1::Act& act, const FeatureNames& features, Observation& observation) {
+  for (const v1::State& state : act.states()) {
+    VLA_CHECK(check_name(state.name(), "states"));
+    std::vector<float> values(state.values().begin(), state.values().end());
+    if (!observation.states.emplace(state.name(), std::move(values)).second)
+      return bad_observation(features.place(state.name()), "each state once", "a second one");
+  }
+  return {};
+}
+
+Status decode_start(const v1::Act& act, const ActLimits& limits, ActRequest& request) {
+  if (!act.has_noise()) {
+    request.seed = act.has_seed() ? act.seed() : fresh_seed();
+    request.noise = *request.seed;
+    return {};
+  }
+  const v1::Noise& noise = act.noise();
+  const auto horizon = static_cast<std::uint32_t>(limits.horizon), d_noise = static_cast<std::uint32_t>(limits.d_noise);
+  if (noise.horizon() != horizon || noise.d_action() != d_noise)
+    return bad_observation("noise", fmt::format("{} rows of {}", horizon, d_noise),
+                           fmt::format("{} rows of {}", noise.horizon(), noise.d_action()));
+  request.noise = std::vector<float>(noise.values().begin(), noise.values().end());  // the engine checks its numbers
+  return {};
+}
+
+/// The engine checks its numbers; what it cannot see is whether rows and columns changed places.
+Status decode_leftover(const v1::Act& act, const ActLimits& limits, ActRequest& request) {
+  if (!act.has_leftover()) return {};
+  const v1::Leftover& given = act.leftover();
+  const auto d_action = static_cast<std::uint32_t>(limits.d_action),
+             horizon = static_cast<std::uint32_t>(limits.horizon);
+  if (given.d_action() != d_action || given.n_row() > horizon || given.delay() > horizon ||
+      static_cast<std::uint64_t>(given.values_size()) != std::uint64_t{given.n_row()} * d_action)
+    return bad_observation("leftover", fmt::format("at most {} rows of {}", horizon, d_action),
+                           fmt::format("{} rows of {}, {} numbers, a delay of {}", given.n_row(), given.d_action(),
+                                       given.values_size(), given.delay()));
+  VLA_CHECK(check_name(given.schedule(), "leftover.schedule"));
+  request.leftover = {
+      {given.values().begin(), given.values().end()}, static_cast<int>(given.delay()), given.schedule(), {}};
+  if (given.has_max_guidance()) request.leftover->max_guidance = given.max_guidance();
+  return {};
+}
+
+}  // namespace
+
+Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits& limits, const FeatureNames& views,
+                              const FeatureNames& states) {
+  VLA_TRY(v1::Act act, parse<v1::Act>(bytes, 0, "act"));
+  if (act.text().size() > limits.max_text)
+    return too_large("instruction", fmt::format("at most {} bytes", limits.max_text),
+                     fmt::format("{} bytes", act.text().size()));
+  ActRequest request;
+  request.observation.text = std::move(*act.mutable_text());
+  request.observation.embodiment = std::move(*act.mutable_embodiment());
+  request.capture_time_ns = act.capture_time_ns();
+  VLA_CHECK(decode_views(act, limits, views, request.observation));
+  VLA_CHECK(decode_states(act, states, request.observation));
+  VLA_CHECK(decode_start(act, limits, request));
+  VLA_CHECK(decode_leftover(act, limits, request));
+  return request;
+}
+
+Result<std::string> named_embodiment(std::span<const std::byte> act) {
+  std::string tag;
+  for (Fields field(act, "act");;) {
+    VLA_TRY(const bool more, field.next());
+    if (!more) return tag;
+    if (field.number != v1::Act::kEmbodimentFieldNumber || field.type != 'b') continue;
+    tag = text_of(field.value);
+    VLA_CHECK(check_name(tag, "embodiment"));
+  }
+}
+
+Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::string* client) {
+  constexpr std::size_t kMaxHello = 4096, kMaxName = 64;
+  if (bytes.size() > kMaxHello)
+    return too_large("hello", fmt::format("at most {} bytes", kMaxHello), fmt::format("{} bytes", bytes.size()));
+  VLA_TRY(const v1::Hello hello, parse<v1::Hello>(bytes, 6, "hello"));
+  if (hello.min_version() < 1 || hello.max_version() < hello.min_version())
+    return Error{Code::bad_request, "hello", "versions with 1 <= min_version <= max_version",
+                 fmt::format("{} to {}", hello.min_version(), hello.max_version())};
+  if (hello.max_version() < wire::kMinVersion || hello.min_version() > wire::kMaxVersion)
+    return wire::incompatible(hello.min_version(), hello.max_version());
+  if (client != nullptr)
+    *client = (hello.client_name() + (hello.client_version().empty() ? "" : " ") + hello.client_version())
+                  .substr(0, kMaxName);
+  v1::HelloReply reply;
+  reply.set_min_version(wire::kMinVersion);
+  reply.set_max_version(wire::kMaxVersion);
+  reply.set_server_name("vla");
+  reply.set_server_version(VLA_VERSION);
+  reply.add_features("leftover");
+  reply.add_features("embodiment");
+  return reply;
+}
+
+Status check_empty(std::span<const std::byte> body) {
+  if (body.empty()) return {};
+  return Error{Code::bad_request, "request", "an empty Describe or Health", fmt::format("{} bytes", body.size())};
+}
+
+}  // namespace vla::serve

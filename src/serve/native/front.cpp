@@ -1,0 +1,183 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/native/front.h"
+
+#include <new>
+
+#include "base/out_of_memory.h"
+#include "net/endpoint.h"
+#include "serve/io.h"
+#include "serve/native/codec.h"
+#include "zmtp/curve.h"
+
+namespace vla::serve {
+namespace {
+
+/// Who can reach the server can move the robot: clients on other machines need a key, unless the user allows all with
+/// --insecure.
+Result<std::optional<zmtp::CurveKeys>> guard(const ServerOptions& options) {
+  const bool has_keys = !options.curve_secret.empty();
+  if (has_keys != !options.curve_clients.empty())
+    return Error{Code::usage, "--curve-secret", "--curve-secret and --curve-clients together", "one of them"};
+  for (const std::string& endpoint : options.bind) {
+    VLA_TRY(const net::Reach reach, net::reach_of(endpoint));
+    if (reach == net::Reach::remote && !has_keys && !options.insecure)
+      return Error{Code::usage, "--bind", "keys for an address that other machines can reach", endpoint + " without",
+                   "vla keygen makes keys for --curve-secret and --curve-clients; --insecure lets everybody in"};
+  }
+  std::optional<zmtp::CurveKeys> keys;
+  if (!has_keys) return keys;
+  VLA_TRY(keys, zmtp::read_keys(options.curve_secret, options.curve_clients));
+  return keys;
+}
+
+}  // namespace
+
+class NativeFront::Request final : public Call {
+ public:
+  Request(NativeFront& front, std::uint64_t connection, zmtp::Message message, const wire::Envelope& envelope)
+      : front_(front),
+        connection_(connection),
+        delimiter_(message.delimiter),
+        bytes_(std::move(message.bytes)),
+        envelope_(envelope) {}
+
+  Result<ActRequest> decode() override { return front_.decode(envelope_.body(bytes_.span())); }
+  std::string encode(Reply reply) override {
+    v1::Response response = response_to(envelope_.request_id);
+    const v1::Description& description = description_of(front_.description_, reply.request.observation.embodiment);
+    *response.mutable_chunk() = encode_chunk(std::move(reply), description);
+    return response.SerializeAsString();
+  }
+  std::string encode(const Error& error) override { return refusal(envelope_.request_id, error); }
+  void send(const std::string& answer) override { front_.hub_.send(connection_, answer, delimiter_); }
+  void send_out_of_memory() noexcept override {
+    bytes_ = {};
+    front_.send_out_of_memory(connection_, envelope_.request_id, delimiter_);
+  }
+  std::span<const std::byte> native() const override { return bytes_.span(); }
+
+ private:
+  NativeFront& front_;
+  const std::uint64_t connection_;
+  const bool delimiter_;  // the client put an empty frame before the request, as REQ sockets do
+  net::Bytes bytes_;      // the serialized Request
+  const wire::Envelope envelope_;
+};
+
+Result<std::unique_ptr<NativeFront>> NativeFront::open(net::Loop& loop, const ServerOptions& options) {
+  VLA_TRY(auto keys, guard(options));
+  std::unique_ptr<NativeFront> front(new NativeFront(loop, options, std::move(keys)));
+  VLA_CHECK(front->bind());
+  return front;
+}
+
+NativeFront::NativeFront(net::Loop& loop, const ServerOptions& options, std::optional<zmtp::CurveKeys> keys)
+    : options_(options),
+      keys_(std::move(keys)),
+      hub_(loop, {options.max_message, options.max_connections, kReceiptMessages * options.max_message},
+           keys_ ? &*keys_ : nullptr) {}
+
+Status NativeFront::bind() {
+  for (const std::string& endpoint : options_.bind) {
+    VLA_CHECK(net::check_free(endpoint));
+    VLA_TRY(std::string bound, hub_.bind(endpoint));
+    addresses_.push_back(std::move(bound));
+  }
+  return {};
+}
+
+Status NativeFront::serve(const Engine& engine, const v1::Description& description) {
+  engine_ = &engine;
+  description_ = description;
+  return {};
+}
+
+void NativeFront::begin(Io& io) {
+  io_ = &io;
+  hub_.begin(*this);
+}
+
+void NativeFront::dropped(const zmtp::Client& client, const std::string& why, const std::string& detail) {
+  io_->dropped({std::to_string(client.connection), client.peer, client.name, why, detail});
+}
+
+void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
+  const std::uint64_t connection = client.connection;
+  const bool delimiter = message.delimiter;
+  std::uint64_t request_id = 0;
+  try {
+    Status sound = message.refused ? Status(*message.refused) : Status();
+    wire::Envelope envelope;  // first: a refusal for lack of memory has the request's number
+    const Status read = wire::read_envelope(message.bytes.span(), envelope);
+    request_id = envelope.request_id;
+    if (sound) sound = read;
+    Job job;
+    job.client = std::to_string(connection);
+    job.peer = client.peer;
+    job.name = client.name;
+    job.is_first = client.n_request == 0;
+    job.request_id = request_id;
+    job.kind = envelope.kind;
+    job.size = message.size;
+    job.at = Clock::now();
+    job.deadline_ms = envelope.deadline_ms;
+    job.call = std::make_unique<Request>(*this, connection, std::move(message), envelope);
+    ++client.n_request;
+    io_->received(job);
+    handle(client, std::move(job), envelope, sound);
+  } catch (const std::bad_alloc&) {
+    send_out_of_memory(connection, request_id, delimiter);
+    io_->count_error();
+  }
+}
+
+/// What was answered otherwise has been freed by now.
+void NativeFront::send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept try {
+  hub_.send(connection, refusal(request_id, out_of_memory("request")), delimiter);
+} catch (const std::exception&) {  // not even for that: the client's patience ends it
+}
+
+void NativeFront::handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& sound) {
+  if (!sound) return io_->refuse(std::move(job), [&] { return sound.error(); });
+  if (job.kind == Kind::act) return io_->submit(std::move(job));
+  auto response = answer_now(client, job, envelope);
+  job.name = client.name;  // a hello tells it
+  if (!response) return io_->refuse(std::move(job), [&] { return response.error(); });
+  io_->answer(std::move(job), response->SerializeAsString());
+}
+
+Result<v1::Response> NativeFront::answer_now(zmtp::Client& client, const Job& job,
+                                             const wire::Envelope& envelope) const {
+  const std::span<const std::byte> body = envelope.body(job.call->native());
+  v1::Response response = response_to(job.request_id);
+  if (job.kind == Kind::hello) {
+    VLA_TRY(*response.mutable_hello(), answer_hello(body, &client.name));
+    return response;
+  }
+  VLA_CHECK(check_empty(body));
+  if (job.kind == Kind::describe) {
+    *response.mutable_description() = description_;
+    return response;
+  }
+  const Health now = io_->health();
+  v1::HealthReply& reply = *response.mutable_health();
+  reply.set_ready(now.ready);
+  reply.set_queue_depth(static_cast<std::uint32_t>(now.n_waiting));
+  reply.set_computing(now.computing);
+  reply.set_uptime_s(now.uptime_s);
+  reply.set_chunks_served(now.n_chunk);
+  reply.set_errors_served(now.n_error);
+  return response;
+}
+
+Result<ActRequest> NativeFront::decode(std::span<const std::byte> act) const {
+  VLA_TRY(const std::string embodiment, named_embodiment(act));
+  VLA_TRY(const Robot* robot, engine_->robot(embodiment));
+  const v1::Description& description = description_of(description_, robot->bundle().embodiment());
+  const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
+                         robot->solver_horizon(), robot->d_action_padded(), description.actions_size()};
+  return decode_act(act, limits, robot->processor().views(), robot->processor().states());
+}
+
+}  // namespace vla::serve

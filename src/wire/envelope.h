@@ -1,0 +1,46 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+#include <span>
+
+#include "base/result.h"
+
+namespace vla::wire {
+
+enum class Kind { unknown, hello, describe, act, health };
+
+constexpr const char* kind_name(Kind kind) {
+  constexpr const char* kNames[] = {"unknown", "hello", "describe", "act", "health"};
+  return kNames[static_cast<int>(kind)];
+}
+
+/// The protocol versions that this build speaks.
+constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
+
+/// What the I/O thread knows of a request: enough to queue, answer or refuse it, without looking at an image.
+struct Envelope {
+  std::uint32_t version = 0;
+  std::uint64_t request_id = 0;
+  Kind kind = Kind::unknown;
+  std::size_t body_at = 0, body_size = 0;    // place of the serialized Hello, Describe, Act or Health in the request
+  std::optional<std::uint64_t> deadline_ms;  // of an act
+
+  /// Not kept as a span: a message that ZeroMQ stores inside its own object moves with it.
+  std::span<const std::byte> body(std::span<const std::byte> request) const {
+    return request.subspan(body_at, body_size);
+  }
+};
+
+/// Walks over the fields of a serialized Request, and of an Act in it, without copying one. After an error `envelope`
+/// holds what was read before it, so that the refusal can carry the request's number. Errors: bad_request,
+/// incompatible.
+Status read_envelope(std::span<const std::byte> request, Envelope& envelope);
+
+/// The refusal of a peer that speaks versions `min` to `max` only.
+Error incompatible(std::uint32_t min, std::uint32_t max);
+
+}  // namespace vla::wire

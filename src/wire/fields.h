@@ -1,0 +1,49 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <google/protobuf/io/coded_stream.h>
+
+#include <cstddef>
+#include <cstdint>
+#include <span>
+#include <string>
+
+#include "base/result.h"
+
+namespace vla::wire {
+
+/// What a client that follows the schema never gets.
+Error not_a_request(std::string where, std::string expected, std::string found);
+
+/// Walks over the fields of one serialized message, without copying or allocating. A field takes two bytes on the wire
+/// and a hundred when it is parsed into an object, so their number is bounded here, before anything is parsed.
+class Fields {
+ public:
+  static constexpr int kMax = 1 << 14;  // the numbers of a state or of noise that are not packed are fields
+
+  Fields(std::span<const std::byte> bytes, const char* where);
+
+  /// The field that was read last: its number; its encoding, `v` varint, `b` bytes, `f` four bytes, `d` eight; and its
+  /// value where it is a varint or bytes.
+  int number = 0;
+  char type = '?';
+  std::uint64_t varint = 0;
+  std::span<const std::byte> value;
+
+  /// False at the end of the bytes. Errors: bad_request.
+  Result<bool> next();
+  /// The refusal of the field that was read last.
+  Error unknown() const;
+
+ private:
+  bool read_value(std::uint32_t wire_type);
+  bool read_bytes();
+
+  std::span<const std::byte> bytes_;
+  google::protobuf::io::CodedInputStream input_;
+  const char* where_;
+  int count_ = 0;
+};
+
+}  // namespace vla::wire
