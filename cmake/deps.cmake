@@ -107,4 +107,5 @@ if(VLA_BUILD_SERVER)
   find_path(VLA_PROMETHEUS_DIR prometheus/registry.h REQUIRED)
   find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
   find_path(VLA_BOOST_DIR boost/beast/http.hpp REQUIRED)  # Asio and Beast, headers only
+  find_path(VLA_MSGPACK_DIR msgpack.hpp REQUIRED)         # headers only
 endif()

@@ -11,6 +11,11 @@ set -euo pipefail
 packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
           libcli11-dev nlohmann-json3-dev libfmt-dev libpng-dev libjpeg-dev libxxhash-dev libutf8proc-dev doctest-dev
           libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev protobuf-compiler prometheus-cpp-dev libboost-dev)
+if apt-cache show libmsgpack-cxx-dev >/dev/null 2>&1 || ! apt-cache show libmsgpack-dev >/dev/null 2>&1; then
+  packages+=(libmsgpack-cxx-dev)
+else
+  packages+=(libmsgpack-dev)  # its name before Ubuntu 22.10
+fi
 if [ "${1:-}" = demo ]; then
   if apt-cache show libegl1 >/dev/null 2>&1 && ! apt-cache show libosmesa6 >/dev/null 2>&1; then
     packages+=(libegl1 libgl1-mesa-dri)  # newer releases have no OSMesa any more

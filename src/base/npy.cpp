@@ -3,7 +3,9 @@
 #include "base/npy.h"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
 
+#include <array>
 #include <charconv>
 #include <cstring>
 #include <string_view>
@@ -55,10 +57,9 @@ bool is_npy(std::span<const std::byte> bytes) {
   return bytes.size() >= kMagic.size() && std::memcmp(bytes.data(), kMagic.data(), kMagic.size()) == 0;
 }
 
-Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& where) {
+Result<NpyHeader> read_npy_header(std::span<const std::byte> bytes, const std::string& where) {
   const auto bad = [&](const std::string& found) {
-    return Error{Code::bad_observation, where, "a .npy array of uint8 or float32 in C order", found,
-                 "save it with numpy.save"};
+    return Error{Code::bad_observation, where, "a .npy array", found, "save it with numpy.save"};
   };
   if (!is_npy(bytes) || bytes.size() < 12) return bad("other or too few bytes");
   const int version = static_cast<int>(bytes[6]);
@@ -68,18 +69,34 @@ Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& 
   const std::size_t start = version == 1 ? 10 : 12;
   if (length > bytes.size() - start) return bad("a truncated header");
   const std::string_view header(reinterpret_cast<const char*>(bytes.data()) + start, length);
-  const std::span<const std::byte> data = bytes.subspan(start + length);
+  NpyHeader out;
+  std::string_view descr = after(header, "'descr'");
+  if (!descr.starts_with('\'')) return bad("a dtype that is not plain");
+  descr.remove_prefix(1);
+  out.descr = descr.substr(0, descr.find('\''));
+  const std::string_view order = after(header, "'fortran_order'");
+  out.is_fortran_order = order.starts_with("True");
+  if (!out.is_fortran_order && !order.starts_with("False")) return bad("a damaged order");
+  if (!parse_shape(after(header, "'shape'"), out.shape, out.count)) return bad("a damaged shape");
+  out.data_at = start + length;
+  return out;
+}
 
-  const std::string_view descr = after(header, "'descr'");
-  const bool is_float = descr.starts_with("'<f4'"), is_byte = descr.starts_with("'|u1'");
-  if (!is_float && !is_byte) return bad(fmt::format("dtype {}", descr.substr(0, descr.find(','))));
-  if (!after(header, "'fortran_order'").starts_with("False")) return bad("Fortran order");
-  NpyArray array;
-  std::size_t count = 0;
-  if (!parse_shape(after(header, "'shape'"), array.shape, count)) return bad("a damaged shape");
-  const std::size_t element = is_float ? 4 : 1;
+Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& where) {
+  const auto bad = [&](const std::string& found) {
+    return Error{Code::bad_observation, where, "a .npy array of uint8 or float32 in C order", found,
+                 "save it with numpy.save"};
+  };
+  VLA_TRY(NpyHeader header, read_npy_header(bytes, where));
+  const bool is_float = header.descr == "<f4";
+  if (!is_float && header.descr != "|u1") return bad("dtype '" + header.descr.substr(0, 40) + "'");
+  if (header.is_fortran_order) return bad("Fortran order");
+  const std::span<const std::byte> data = bytes.subspan(header.data_at);
+  const std::size_t count = header.count, element = is_float ? 4 : 1;
   if (count > data.size() / element || data.size() != count * element)
     return bad(fmt::format("{} bytes of data for {} elements", data.size(), count));
+  NpyArray array;
+  array.shape = std::move(header.shape);
   if (is_float)
     array.values = copy_values<float>(data, count);
   else
@@ -87,13 +104,19 @@ Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& 
   return array;
 }
 
-Status write_npy(const std::string& path, std::span<const float> values, std::size_t rows, std::size_t columns) {
-  std::string header = fmt::format("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {}), }}", rows, columns);
-  header.append(63 - (kMagic.size() + 4 + header.size()) % 64, ' ');  // the data starts at a multiple of 64
+std::string npy_header(std::span<const std::size_t> shape) {
+  std::string header = fmt::format("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}{}), }}",
+                                   fmt::join(shape, ", "), shape.size() == 1 ? "," : "");
+  header.append(63 - (kMagic.size() + 4 + header.size()) % 64, ' ');
   header += '\n';
   const auto length = static_cast<std::uint16_t>(header.size());
   std::string bytes = std::string(kMagic).append("\x01\0", 2);
   bytes.append(reinterpret_cast<const char*>(&length), 2).append(header);
+  return bytes;
+}
+
+Status write_npy(const std::string& path, std::span<const float> values, std::size_t rows, std::size_t columns) {
+  std::string bytes = npy_header(std::array{rows, columns});
   bytes.append(reinterpret_cast<const char*>(values.data()), values.size_bytes());
   return write_file(path, bytes);
 }

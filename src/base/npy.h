@@ -18,11 +18,24 @@ struct NpyArray {
   std::variant<std::vector<std::uint8_t>, std::vector<float>> values;
 };
 
+/// What a .npy file says of its data.
+struct NpyHeader {
+  std::string descr;  // NumPy's type string, such as `<f4`
+  bool is_fortran_order = false;
+  std::vector<std::size_t> shape;
+  std::size_t count = 0;    // elements
+  std::size_t data_at = 0;  // where they begin in the file
+};
+
 /// Whether bytes begin like a .npy file.
 bool is_npy(std::span<const std::byte> bytes);
-/// Parses a .npy file, versions 1 to 3. Errors: bad_observation with `where`.
+/// Reads the header of a file of versions 1 to 3. Errors: bad_observation with `where`.
 /// Source: numpy/lib/format.py.
+Result<NpyHeader> read_npy_header(std::span<const std::byte> bytes, const std::string& where);
+/// Parses a .npy file, versions 1 to 3. Errors: bad_observation with `where`.
 Result<NpyArray> parse_npy(std::span<const std::byte> bytes, const std::string& where);
+/// The bytes before the data of a float32 array in C order; the data then start at a multiple of 64.
+std::string npy_header(std::span<const std::size_t> shape);
 /// Writes float32 values (rows, columns). Errors: io.
 Status write_npy(const std::string& path, std::span<const float> values, std::size_t rows, std::size_t columns);
 

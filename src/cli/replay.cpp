@@ -73,6 +73,7 @@ Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOpt
                                                                               .device = options.device,
                                                                               .embodiment = options.embodiment,
                                                                               .all_robots = true}));
+  VLA_CHECK(server->load(*engine));
   options.replay.address = server->addresses().front();
   std::optional<Result<serve::ReplayReport>> result;
   VLA_TRY(std::thread client, start_thread("replay", [&]() noexcept {

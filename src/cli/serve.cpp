@@ -18,6 +18,7 @@
 #include "cli/commands.h"
 #include "cli/say.h"
 #include "cli/watch.h"
+#include "serve/names.h"
 #include "serve/native/codec.h"
 #include "serve/server.h"
 
@@ -79,6 +80,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
     line += fmt::format(" {}={}", name, quoted(value));
   };
   add("address", fmt::format("{}", fmt::join(server.addresses(), ",")));
+  if (const auto names = server.told(); !names.empty()) add("names", fmt::format("{}", fmt::join(names, "; ")));
   add("bundle", description.bundle().name());
   add("arch", description.bundle().arch());
   if (!tags.empty()) add("embodiments", fmt::format("{}", fmt::join(tags, ",")));
@@ -121,6 +123,7 @@ Status serve(ServeOptions& options, bool& ready) {
                                                                               .device = options.device,
                                                                               .embodiment = options.embodiment,
                                                                               .all_robots = true}));
+  VLA_CHECK(server->load(*engine));
   watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
@@ -130,6 +133,25 @@ Status serve(ServeOptions& options, bool& ready) {
   const Status status = server->run(*engine, watch->observers());
   watch->ended(status);
   return status;
+}
+
+/// What lets clients of other servers in as they are.
+void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
+  add_text(command, "--openpi", server.openpi, "ADDRESS:PORT",
+           "Answer openpi's clients too: WebSocket (docs/drop_in.md)");
+  add_text(command, "--gr00t", server.gr00t, "ADDRESS:PORT", "Answer the clients of GR00T's policy server too");
+  add_text(command, "--preset", server.preset, "NAME",
+           "With --openpi, the keys of a published robot: " + serve::presets());
+  command
+      .add_option(
+          "--map", server.map,
+          "A client's key for a view or state of the policy, KEY=FEATURE[,bgr][,degrees][,flipped]; several times")
+      ->type_name("LINE")
+      ->allow_extra_args(false);
+  command
+      .add_option("--api-token", server.api_token, "A file with the secret that clients of --openpi and --gr00t send")
+      ->check(CLI::ExistingFile);
+  command.add_flag("--gr00t-kill", server.gr00t_kill, "Let clients of --gr00t stop the server");
 }
 
 }  // namespace
@@ -150,6 +172,7 @@ Command add_serve(CLI::App& app) {
       ->type_name("ENDPOINT")
       ->allow_extra_args(false)
       ->capture_default_str();
+  add_other_protocols(*command, server);
   command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();

@@ -149,8 +149,8 @@ void Log::answered(const Answered& answered) {
                      {"request_id", request.request_id},
                      {"kind", kind_name(request.kind)},
                      {"code", answered.code()},
-                     {"bytes_in", answered.in.size()},
-                     {"bytes_out", answered.out.size()},
+                     {"bytes_in", answered.request.size},
+                     {"bytes_out", answered.n_sent},
                      {"queue_ms", ms(answered.started - request.at)},
                      {"engine_ms", ms(answered.finished - answered.started)},
                      {"total_ms", ms(answered.sent - request.at)}};

@@ -101,7 +101,7 @@ void Metrics::dropped(const Dropped& connection) try {
 }
 
 void Metrics::answered(const Answered& answered) try {
-  sent_bytes_.Increment(static_cast<double>(answered.out.size()));
+  sent_bytes_.Increment(static_cast<double>(answered.n_sent));
   const Received& request = answered.request;
   const int code = answered.error == nullptr ? 0 : exit_code(answered.error->code);
   prometheus::Counter*& count = request_[{request.kind, code}];

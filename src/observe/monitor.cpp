@@ -13,13 +13,12 @@
 #include <boost/beast/http/read.hpp>
 #include <boost/beast/http/string_body.hpp>
 #include <boost/beast/http/write.hpp>
-#include <charconv>
 #include <exception>
 #include <list>
 
 #include "base/thread.h"
-#include "net/endpoint.h"
 #include "net/listener.h"
+#include "net/tcp.h"
 
 namespace vla::serve {
 namespace {
@@ -93,25 +92,6 @@ class Connection : public std::enable_shared_from_this<Connection> {
   Response response_;
 };
 
-/// Names are not resolved: the address is bound as given.
-Result<tcp::endpoint> endpoint_of(const std::string& address, bool insecure) {
-  const auto reach = net::reach_of("tcp://" + address);
-  const std::size_t colon = address.rfind(':');
-  std::string host = address.substr(0, colon);
-  if (host == "*") host = "0.0.0.0";
-  if (host.starts_with('[') && host.ends_with(']')) host = host.substr(1, host.size() - 2);
-  error_code not_an_address;
-  const auto ip = boost::asio::ip::make_address(host, not_an_address);
-  if (!reach || address.ends_with(":*") || not_an_address)
-    return Error{Code::usage, "--metrics", "ADDRESS:PORT", "'" + address + "'", "for example 127.0.0.1:9090"};
-  if (*reach == net::Reach::remote && !insecure)
-    return Error{Code::usage, "--metrics", "an address of this machine's own, such as 127.0.0.1:9090",
-                 address + ", which other machines can reach", "--insecure lets everybody in"};
-  unsigned short port = 0;
-  std::from_chars(address.data() + colon + 1, address.data() + address.size(), port);
-  return tcp::endpoint(ip, port);
-}
-
 }  // namespace
 
 class Monitor::Http {
@@ -123,7 +103,7 @@ class Monitor::Http {
   }
 
   Status start(const std::string& address, bool insecure) {
-    VLA_TRY(const tcp::endpoint endpoint, endpoint_of(address, insecure));
+    VLA_TRY(const tcp::endpoint endpoint, net::tcp_endpoint_of(address, "--metrics", insecure));
     try {
       listener_.emplace(context_, endpoint);
       address_ = fmt::format("{}:{}", address.substr(0, address.rfind(':')), listener_->endpoint().port());

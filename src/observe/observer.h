@@ -43,9 +43,12 @@ struct Answered {
   Clock::time_point started, finished;  // of the engine; both `request.at` where the engine never saw the request
   Clock::time_point sent;               // handed to the socket
   Timing stages;                        // of the engine, "decode" first; empty where it never saw the request
-  std::span<const std::byte> in, out;   // the serialized Request and Response, valid during the call only
-  bool is_beyond = false;               // answered though the state is beyond the bundle's bound
-  std::span<const std::string> notes;   // of the chunk: warnings, valid during the call only
+  std::size_t n_sent = 0;               // bytes of the answer
+  /// The serialized v1::Request and v1::Response, valid during the call only: those that went over the wire, or what an
+  /// act of another protocol would have been. Empty where it was refused in that protocol.
+  std::span<const std::byte> in, out;
+  bool is_beyond = false;              // answered though the state is beyond the bundle's bound
+  std::span<const std::string> notes;  // of the chunk: warnings, valid during the call only
   const char* code() const { return error == nullptr ? "ok" : code_name(error->code); }
 };
 
@@ -58,6 +61,8 @@ class Observer {
   virtual void dropped(const Dropped&) {}    // on the I/O thread
   virtual void started(const Received&) {}   // when an act leaves the queue, on the thread that prepares it
   virtual void answered(const Answered&) {}  // on the I/O thread
+  /// Whether `in` and `out` are wanted of acts of other protocols too, for which they are made.
+  virtual bool records() const { return false; }
 };
 
 /// What the server is doing, from any thread.

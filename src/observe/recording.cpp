@@ -93,7 +93,7 @@ void Recorder::describe(const v1::Description& description) {
 }
 
 void Recorder::answered(const Answered& answered) {
-  if (!stopped_) add(answered.in, answered.out);
+  if (!stopped_ && !answered.out.empty()) add(answered.in, answered.out);
 }
 
 void Recorder::add(std::span<const std::byte> in, std::span<const std::byte> out) {

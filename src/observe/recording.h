@@ -30,6 +30,7 @@ class Recorder final : public Observer {
   /// Who answers; before the first request.
   void describe(const v1::Description& description);
   void answered(const Answered& answered) override;
+  bool records() const override { return true; }
 
   /// Called once, when it stops before the server does: at the limit, or when the disk fails or is too slow. From then
   /// on nothing is recorded, so that a recording has no holes.

@@ -93,10 +93,10 @@ void Trace::answered(const Answered& answered) {
   const std::uint64_t id = ++n_request_;
   const std::int64_t sent = ns(answered.sent);
   try {
-    std::string events = on_request(
-        id, kind_name(request.kind), ns(request.at), sent,
-        fmt::format(R"("client":"{}","request_id":"{}","code":"{}","bytes_in":{},"bytes_out":{})", request.client,
-                    request.request_id, answered.code(), answered.in.size(), answered.out.size()));
+    std::string events =
+        on_request(id, kind_name(request.kind), ns(request.at), sent,
+                   fmt::format(R"("client":"{}","request_id":"{}","code":"{}","bytes_in":{},"bytes_out":{})",
+                               request.client, request.request_id, answered.code(), request.size, answered.n_sent));
     if (!answered.stages.empty()) {
       const std::int64_t started = ns(answered.started), finished = ns(answered.finished);
       events += on_request(id, "queue", ns(request.at), started, "");

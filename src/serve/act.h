@@ -6,6 +6,7 @@
 #include <optional>
 
 #include "engine/engine.h"
+#include "serve/options.h"
 
 namespace vla::serve {
 
@@ -26,6 +27,12 @@ struct ActRequest {
   std::optional<Leftover> leftover;
   std::int64_t capture_time_ns = 0;
 };
+
+/// The robot of an engine that has one. Errors: usage for a bundle of several, which `option`'s clients cannot name.
+Result<const Robot*> only_robot(const Engine& engine, const char* option);
+
+/// The bounds for one robot's acts.
+ActLimits act_limits(const ServerOptions& options, const Robot& robot);
 
 /// The seed of an act whose client gave none.
 std::uint64_t fresh_seed();

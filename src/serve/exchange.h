@@ -20,6 +20,7 @@ struct Answer {
   Timing stages;
   bool is_beyond = false;          // the state is beyond the bundle's bound
   std::vector<std::string> notes;  // of the chunk
+  Record record;                   // of an act of another protocol, where one is kept
 };
 
 /// Where the I/O thread and those that compute meet: jobs one way, answers the other. None holds the lock for longer

@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "net/bytes.h"
 #include "observe/observer.h"
 #include "serve/act.h"
 #include "wire/vla.pb.h"
@@ -20,6 +21,11 @@ struct Reply {
   const ActRequest& request;
   ActionChunk chunk;  // `timing` has the server's own stages in it
   double queue_ms;    // that the act waited
+};
+
+/// An act and its answer as serialized v1::Request and v1::Response.
+struct Record {
+  std::string request, response;
 };
 
 /// One request of a client, in the protocol of its front end: how it is decoded and answered. One thread at a time.
@@ -37,8 +43,8 @@ class Call {
   virtual void send(const std::string& answer) = 0;
   /// Frees what it holds, and tells the client that there is no memory for its answer, if there is any for that.
   virtual void send_out_of_memory() noexcept = 0;
-  /// The request as a serialized v1::Request; empty in other protocols.
-  virtual std::span<const std::byte> native() const { return {}; }
+  /// The request where it is a serialized v1::Request; null in other protocols.
+  virtual const net::Bytes* native() const { return nullptr; }
 };
 
 /// A request on its way through the server.
@@ -57,6 +63,8 @@ class Front {
   virtual std::vector<std::string> addresses() const = 0;
   /// The policy that answers, before `begin`. Errors: usage where the protocol cannot carry what the policy takes.
   virtual Status serve(const Engine& engine, const v1::Description& description) = 0;
+  /// The names that its clients give, and their conventions, for people; empty where they are the policy's own.
+  virtual std::string told() const { return {}; }
   /// Takes connections from now on; called before every turn of the loop.
   virtual void begin(Io& io) = 0;
   /// Whether an answer has not left yet.

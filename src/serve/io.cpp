@@ -64,6 +64,11 @@ bool Io::has_answers() const {
   return std::any_of(fronts_.begin(), fronts_.end(), [](const auto& front) { return front->has_answers(); });
 }
 
+void Io::stop() noexcept {
+  vitals_.stopping = true;
+  exchange_.wake();
+}
+
 void Io::dropped(const Dropped& connection) {
   for (Observer* observer : observers_) observer->dropped(connection);
 }
@@ -128,14 +133,16 @@ void Io::settle_without_memory(Answer& answer) noexcept {
 /// peer. What can fail comes before it is sent, so that no request gets two answers.
 void Io::deliver(Answer& answer) {
   const Job& job = answer.job;
+  const net::Bytes* const native = job.call->native();
   Answered answered{job,
                     answer.error ? &*answer.error : nullptr,
                     answer.started,
                     answer.finished,
                     {},
                     std::move(answer.stages),
-                    job.call->native(),
-                    std::as_bytes(std::span(answer.response)),
+                    answer.response.size(),
+                    native != nullptr ? native->span() : std::as_bytes(std::span(answer.record.request)),
+                    std::as_bytes(std::span(native != nullptr ? answer.response : answer.record.response)),
                     answer.is_beyond,
                     answer.notes};
   job.call->send(answer.response);

@@ -56,6 +56,7 @@ class Io {
   }
   void dropped(const Dropped& connection);
   void count_error() noexcept { ++vitals_.n_error; }  // of a request that was refused without a job
+  void stop() noexcept;                               // as Server::stop
   Health health() const { return vitals_.health(exchange_); }
 
  private:

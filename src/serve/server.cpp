@@ -9,8 +9,10 @@
 
 #include "base/out_of_memory.h"
 #include "base/thread.h"
+#include "serve/gr00t/front.h"
 #include "serve/native/codec.h"
 #include "serve/native/front.h"
+#include "serve/openpi/front.h"
 #include "serve/relay.h"
 
 namespace vla::serve {
@@ -69,6 +71,14 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) try {
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
   VLA_TRY(auto native, NativeFront::open(server->loop_, options));
   server->fronts_.push_back(std::move(native));
+  if (!options.openpi.empty()) {
+    VLA_TRY(auto front, openpi::Front::open(server->loop_, options));
+    server->fronts_.push_back(std::move(front));
+  }
+  if (!options.gr00t.empty()) {
+    VLA_TRY(auto front, gr00t::Front::open(server->loop_, options));
+    server->fronts_.push_back(std::move(front));
+  }
   return server;
 } catch (const std::runtime_error& no_descriptor) {  // of Asio
   return Error{Code::io, "sockets", "what they need of the system", no_descriptor.what()};
@@ -90,11 +100,23 @@ v1::Description Server::describe(const Engine& engine) const {
   return serve::describe(engine, limits_told(options_, engine));
 }
 
+Status Server::load(const Engine& engine) {
+  description_ = describe(engine);
+  for (const auto& front : fronts_) VLA_CHECK(front->serve(engine, description_));
+  return {};
+}
+
+std::vector<std::string> Server::told() const {
+  std::vector<std::string> all;
+  for (const auto& front : fronts_)
+    if (std::string told = front->told(); !told.empty()) all.push_back(std::move(told));
+  return all;
+}
+
 /// Programs run on the thread that calls this.
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
-  const v1::Description description = describe(engine);
-  for (const auto& front : fronts_) VLA_CHECK(front->serve(engine, description));
   observers_ = observers;
+  records_ = std::any_of(observers.begin(), observers.end(), [](const Observer* o) { return o->records(); });
   vitals_.begin();
   Io io(loop_, fronts_, exchange_, vitals_, observers);
   Relay<Act> relay;
@@ -162,7 +184,7 @@ Status Server::prepare(const Engine& engine, Act& act) const {
   return {};
 }
 
-Status Server::respond(Engine& engine, Act& act) {
+Status Server::respond(Engine& engine, Act& act) const {
   Answer& answer = act.answer;
   if (!engine.device().is_host()) act.clock.lap(act.prepared.timing, "wait");
   VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
@@ -171,7 +193,11 @@ Status Server::respond(Engine& engine, Act& act) {
   answer.is_beyond = chunk.out_of_range, answer.notes = chunk.notes;
   act.request.observation.embodiment = act.prepared.robot->bundle().embodiment();
   const double queue_ms = std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count();
-  answer.response = answer.job.call->encode({act.request, std::move(chunk), queue_ms});
+  Reply reply{act.request, std::move(chunk), queue_ms};
+  if (records_ && answer.job.call->native() == nullptr)
+    answer.record =
+        record_of(answer.job.request_id, reply, description_of(description_, act.request.observation.embodiment));
+  answer.response = answer.job.call->encode(std::move(reply));
   return {};
 }
 

@@ -28,9 +28,15 @@ class Server {
   /// What was bound, ports filled in.
   std::vector<std::string> addresses() const;
 
+  /// The policy that clients get. Errors: usage where a front end cannot carry what it takes.
+  Status load(const Engine& engine);
+  /// What front ends say of their names, for people; after `load`.
+  std::vector<std::string> told() const;
+
   /// Serves on this thread, which computes, and a second one, which talks, until `stop` or the loss of the
   /// device; then answers what waits and returns. Where the policy is on a device of its own, a third thread prepares
-  /// the next act meanwhile. Observers outlive the call. Once for each server. Errors: device, out_of_memory.
+  /// the next act meanwhile. Observers outlive the call. Once for each server, after `load`. Errors: device,
+  /// out_of_memory.
   Status run(Engine& engine, std::span<Observer* const> observers = {});
   /// What `describe` is answered with once this engine is served.
   v1::Description describe(const Engine& engine) const;
@@ -55,12 +61,14 @@ class Server {
   bool prepare_next(const Engine& engine, Act& act);
   void compute(Engine& engine, Act& act);
   Status prepare(const Engine& engine, Act& act) const;
-  static Status respond(Engine& engine, Act& act);
+  Status respond(Engine& engine, Act& act) const;
   template <class Work>
   static void attempt(Act& act, const Work& work) noexcept;
 
   ServerOptions options_;
   std::span<Observer* const> observers_;
+  bool records_ = false;  // one of them does
+  v1::Description description_;
   Vitals vitals_;
   Exchange exchange_;
   net::Loop loop_;

@@ -54,6 +54,7 @@ LIBRARIES = [
     (re.compile(r"prometheus/.*"), {"observe"}),
     (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp"}),  # of a client; keys in Z85
     (re.compile(r"boost/.*"), {"net", "zmtp", "observe", "serve"}),
+    (re.compile(r"msgpack\.hpp"), {"serve"}),
     (re.compile(r"sodium\.h"), {"zmtp"}),
 ]
 # Files of lower beside the folder of a machine hold for every machine, but for the one that chooses.

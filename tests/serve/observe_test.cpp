@@ -77,6 +77,7 @@ struct Sample {
             at + milliseconds(9),
             at + milliseconds(10),
             stages,
+            out.size(),
             std::as_bytes(std::span(in)),
             std::as_bytes(std::span(out))};
   }
@@ -288,7 +289,7 @@ TEST_CASE("notes of chunks are warnings at the default level, once a minute for 
       for (const char* client : {"1", "2"}) {
         Received request;
         request.client = client;
-        Answered answered{request, nullptr, {}, {}, {}, {}, {}, {}, true};
+        Answered answered{request, nullptr, {}, {}, {}, {}, 0, {}, {}, true};
         answered.notes = notes;
         log.answered(answered);
       }
@@ -307,7 +308,7 @@ TEST_CASE("a trace ends at its limit, is valid JSON then too, and is not written
     auto trace = Trace::open(folder / "out.json", 2000);
     REQUIRE(trace);
     Received request;
-    for (int i = 0; i < 100; ++i) (*trace)->answered(Answered{request, nullptr, {}, {}, {}, {}, {}, {}, false});
+    for (int i = 0; i < 100; ++i) (*trace)->answered(Answered{request, nullptr, {}, {}, {}, {}, 0, {}, {}, false});
     CHECK((*trace)->n_dropped() > 80);
   }
   CHECK(nlohmann::json::accept(content(folder / "out.json")));

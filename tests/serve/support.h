@@ -146,6 +146,8 @@ class Running {
     auto opened = serve::Server::open(options);
     REQUIRE_MESSAGE(opened.ok(), (opened ? "" : opened.error().message()));
     server = std::move(*opened);
+    const Status loaded = server->load(*engine);
+    REQUIRE_MESSAGE(loaded.ok(), (loaded ? "" : loaded.error().message()));
     thread_ = std::thread([this] { status_ = server->run(*engine, observers_); });
   }
   ~Running() {

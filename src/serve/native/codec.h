@@ -33,6 +33,9 @@ const v1::Description& description_of(const v1::Description& all, const std::str
 /// An answer of the engine -> its message; `names` and so on come from `description`.
 v1::ActionChunk encode_chunk(Reply reply, const v1::Description& description);
 
+/// What an act of another protocol and its answer would have been in this one.
+Record record_of(std::uint64_t request_id, const Reply& reply, const v1::Description& description);
+
 v1::Error encode_error(const Error& error);
 /// The serialized response that refuses a request of this number.
 std::string refusal(std::uint64_t request_id, const Error& error);

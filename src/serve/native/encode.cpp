@@ -133,6 +133,37 @@ v1::Error encode_error(const Error& error) {
   return out;
 }
 
+Record record_of(std::uint64_t request_id, const Reply& reply, const v1::Description& description) {
+  const ActRequest& given = reply.request;
+  v1::Request request;
+  request.set_protocol_version(wire::kMaxVersion);
+  request.set_request_id(request_id);
+  v1::Act& act = *request.mutable_act();
+  for (const auto& [name, frame] : given.observation.views) {
+    v1::View& view = *act.add_views();
+    view.set_name(name);
+    const auto* rows = frame ? std::get_if<std::vector<std::uint8_t>>(&frame->rgb) : nullptr;
+    if (rows == nullptr) {
+      view.mutable_absent();
+      continue;
+    }
+    view.mutable_rgb()->set_width(u32(frame->width));
+    view.mutable_rgb()->set_height(u32(frame->height));
+    view.mutable_rgb()->set_rows(rows->data(), rows->size());
+  }
+  for (const auto& [name, values] : given.observation.states) {
+    v1::State& state = *act.add_states();
+    state.set_name(name);
+    state.mutable_values()->Add(values.begin(), values.end());
+  }
+  act.set_text(given.observation.text);
+  if (given.seed) act.set_seed(*given.seed);
+  act.set_embodiment(given.observation.embodiment);
+  v1::Response response = response_to(request_id);
+  *response.mutable_chunk() = encode_chunk(reply, description);
+  return {request.SerializeAsString(), response.SerializeAsString()};
+}
+
 std::string refusal(std::uint64_t request_id, const Error& error) {
   v1::Response response = response_to(request_id);
   *response.mutable_error() = encode_error(error);

@@ -55,7 +55,7 @@ class NativeFront::Request final : public Call {
     bytes_ = {};
     front_.send_out_of_memory(connection_, envelope_.request_id, delimiter_);
   }
-  std::span<const std::byte> native() const override { return bytes_.span(); }
+  const net::Bytes* native() const override { return &bytes_; }
 
  private:
   NativeFront& front_;
@@ -149,7 +149,7 @@ void NativeFront::handle(zmtp::Client& client, Job job, const wire::Envelope& en
 
 Result<v1::Response> NativeFront::answer_now(zmtp::Client& client, const Job& job,
                                              const wire::Envelope& envelope) const {
-  const std::span<const std::byte> body = envelope.body(job.call->native());
+  const std::span<const std::byte> body = envelope.body(job.call->native()->span());
   v1::Response response = response_to(job.request_id);
   if (job.kind == Kind::hello) {
     VLA_TRY(*response.mutable_hello(), answer_hello(body, &client.name));
@@ -174,9 +174,8 @@ Result<v1::Response> NativeFront::answer_now(zmtp::Client& client, const Job& jo
 Result<ActRequest> NativeFront::decode(std::span<const std::byte> act) const {
   VLA_TRY(const std::string embodiment, named_embodiment(act));
   VLA_TRY(const Robot* robot, engine_->robot(embodiment));
-  const v1::Description& description = description_of(description_, robot->bundle().embodiment());
-  const ActLimits limits{options_.max_pixels,     options_.max_text,        description_.limits().max_views(),
-                         robot->solver_horizon(), robot->d_action_padded(), description.actions_size()};
+  ActLimits limits = act_limits(options_, *robot);
+  limits.max_views = description_.limits().max_views();  // of all robots, as the description tells
   return decode_act(act, limits, robot->processor().views(), robot->processor().states());
 }
 

@@ -1,0 +1,354 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/openpi/sockets.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <boost/asio/dispatch.hpp>
+#include <boost/asio/ip/tcp.hpp>
+#include <boost/beast/core/flat_buffer.hpp>
+#include <boost/beast/http/empty_body.hpp>
+#include <boost/beast/http/parser.hpp>
+#include <boost/beast/http/read.hpp>
+#include <boost/beast/http/string_body.hpp>
+#include <boost/beast/http/write.hpp>
+#include <boost/beast/websocket/rfc6455.hpp>
+#include <boost/beast/websocket/stream.hpp>
+#include <deque>
+#include <exception>
+#include <map>
+#include <optional>
+
+#include "net/eviction.h"
+#include "net/listener.h"
+#include "net/sweeper.h"
+#include "net/tcp.h"
+#include "serve/token.h"
+
+namespace vla::serve::openpi {
+namespace {
+
+namespace asio = boost::asio;
+namespace beast = boost::beast;
+namespace http = boost::beast::http;
+namespace websocket = boost::beast::websocket;
+using asio::ip::tcp;
+using boost::system::error_code;
+
+constexpr std::size_t kMaxHeader = 8192;
+constexpr std::size_t kPiece = 256 << 10;  // bytes that are read at once
+// In seconds of this process: for the handshake, for a sign of life, before a ping asks for one, for the close.
+constexpr int kHandshakePatience = 10, kSilencePatience = 60, kPingAfter = 20, kClosePatience = 5;
+
+using Request = http::request<http::empty_body>;
+using Response = http::response<http::string_body>;
+
+Response plain(const Request& request, http::status status, std::string body) {
+  Response response(status, request.version());
+  response.set(http::field::content_type, "text/plain; charset=utf-8");
+  response.keep_alive(false);
+  response.body() = std::move(body);
+  response.prepare_payload();
+  return response;
+}
+
+class Connection;
+
+/// What the connections share.
+struct Shared {
+  asio::io_context& context;
+  Sockets::Limits limits;
+  std::string api_key;
+  Sockets::Handler* handler = nullptr;
+  std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
+  std::size_t n_held = 0;  // bytes of requests that are not whole, or that wait
+  net::Standings standings() const;
+  void make_room();
+  void bound_receipt();
+};
+
+class Connection : public std::enable_shared_from_this<Connection> {
+ public:
+  Connection(Shared& shared, tcp::socket socket, Peer peer)
+      : shared_(shared), peer_(std::move(peer)), group_(net::group_of(peer_.address)), stream_(std::move(socket)) {
+    parser_.header_limit(kMaxHeader);
+    stream_.read_message_max(shared.limits.message);
+    stream_.auto_fragment(false);
+    stream_.control_callback([this](websocket::frame_type, beast::string_view) { silent_ = 0; });
+  }
+
+  void start() {
+    guard([this] {
+      http::async_read_header(stream_.next_layer(), buffer_, parser_,
+                              [self = shared_from_this()](error_code error, std::size_t) {
+                                if (error) return self->close();
+                                self->guard([&] { self->answer_http(); });
+                              });
+    });
+  }
+  void send(std::string message, bool is_text) {
+    guard([&] {
+      is_failed_ = is_failed_ || is_text;
+      out_.push_back({std::move(message), is_text});
+      if (out_.size() == 1) write();
+    });
+  }
+  void drop(const char* why, const std::string& detail) {
+    if (is_closed_) return;
+    const auto self = shared_from_this();
+    close();
+    shared_.handler->dropped(peer_, why, detail);
+  }
+  void close() {
+    if (std::exchange(is_closed_, true)) return;
+    error_code ignored;
+    stream_.next_layer().shutdown(tcp::socket::shutdown_both, ignored);
+    stream_.next_layer().close(ignored);
+    hold(0);
+    shared_.connections.erase(peer_.connection);
+  }
+  void sweep() {
+    guard([this] {
+      ++age_, ++silent_;
+      if (!is_open_ && age_ > kHandshakePatience) return drop("handshake", "none within 10 s");
+      if (silent_ > (is_ending_ ? kClosePatience : kSilencePatience)) return drop("silent", "no sign of life");
+      if (is_open_ && !is_ending_ && silent_ % kPingAfter == 0 && !is_pinging_) ping();
+    });
+  }
+  net::Standing standing() const { return {peer_.connection, group_, is_open_, served_, began_, n_held_}; }
+  bool has_answers() const { return !out_.empty(); }
+
+ private:
+  struct Out {
+    std::string bytes;
+    bool is_text;
+  };
+
+  /// No memory on the way costs this connection only.
+  template <class Step>
+  void guard(Step step) {
+    try {
+      if (!is_closed_) step();
+    } catch (const std::exception& exception) {
+      drop("memory", exception.what());
+    }
+  }
+
+  void answer_http() {
+    const Request& request = parser_.get();
+    if (request.target() == "/healthz" && !websocket::is_upgrade(request))
+      return answer_http(plain(request, http::status::ok, "OK\n"));
+    if (!websocket::is_upgrade(request))
+      return answer_http(plain(request, http::status::upgrade_required, "a WebSocket is here, and /healthz\n"));
+    // A page in the browser of this machine may connect to it too, and says so.
+    if (request.count(http::field::origin) != 0)
+      return answer_http(plain(request, http::status::forbidden, "not for web pages\n"));
+    const auto given = request[http::field::authorization];
+    if (!shared_.api_key.empty() && !is_same_secret({given.data(), given.size()}, "Api-Key " + shared_.api_key))
+      return answer_http(plain(request, http::status::unauthorized, "another Api-Key is needed\n"));
+    stream_.async_accept(request, [self = shared_from_this()](error_code error) {
+      if (error) return self->close();
+      self->guard([&] { self->open(); });
+    });
+  }
+  void answer_http(Response response) {
+    response_ = std::move(response);
+    http::async_write(stream_.next_layer(), response_, [self = shared_from_this()](error_code, std::size_t) {
+      error_code ignored;
+      self->stream_.next_layer().shutdown(tcp::socket::shutdown_send, ignored);
+      self->close();
+    });
+  }
+
+  void open() {
+    is_open_ = true;
+    buffer_.clear();
+    stream_.binary(true);
+    send(shared_.handler->greeting(), false);
+    read();
+  }
+
+  /// Reads also while a request is in work, so that pings are answered.
+  void read() {
+    stream_.async_read_some(buffer_, kPiece, [self = shared_from_this()](error_code error, std::size_t) {
+      if (error == websocket::error::message_too_big)
+        return self->drop("size", fmt::format("more than {} bytes", self->shared_.limits.message));
+      if (error) return self->close();
+      self->guard([&] { self->handle(); });
+    });
+  }
+  void handle() {
+    silent_ = 0;
+    if (n_held_ == 0) began_ = Clock::now();
+    hold(buffer_.size());
+    shared_.bound_receipt();
+    if (is_closed_) return;
+    if (!stream_.is_message_done()) return read();
+    is_waiting_ = true;
+    next();
+  }
+  /// The message that came whole, where none is in work.
+  void next() {
+    if (!is_waiting_ || is_busy_ || is_failed_) return;
+    is_waiting_ = false;
+    is_busy_ = true;
+    served_ = Clock::now();
+    const auto data = buffer_.data();
+    std::string message(static_cast<const char*>(data.data()), data.size());
+    buffer_.consume(buffer_.size());
+    hold(0);
+    shared_.handler->received(peer_, std::move(message), stream_.got_text());
+    if (!is_closed_) read();
+  }
+
+  void write() {
+    stream_.text(out_.front().is_text);
+    stream_.async_write(asio::buffer(out_.front().bytes), [self = shared_from_this()](error_code error, std::size_t) {
+      if (error) return self->close();
+      const bool was_text = self->out_.front().is_text;
+      self->out_.pop_front();
+      self->guard([&] {
+        if (was_text) return self->end();
+        if (std::exchange(self->is_greeted_, true)) self->answered();
+        if (!self->out_.empty()) self->write();
+        self->next();
+      });
+    });
+  }
+  void answered() {
+    is_busy_ = false;
+    peer_.total_ms = std::chrono::duration<double, std::milli>(Clock::now() - served_).count();
+  }
+  /// Code and reason of the reference.
+  void end() {
+    is_ending_ = true;
+    silent_ = 0;
+    stream_.async_close(
+        {websocket::close_code::internal_error, "Internal server error. Traceback included in previous frame."},
+        [self = shared_from_this()](error_code) { self->close(); });
+  }
+  void ping() {
+    is_pinging_ = true;
+    stream_.async_ping({}, [self = shared_from_this()](error_code error) {
+      self->is_pinging_ = false;
+      if (error) self->close();
+    });
+  }
+
+  void hold(std::size_t n) {
+    shared_.n_held += n - n_held_;
+    n_held_ = n;
+  }
+
+  Shared& shared_;
+  Peer peer_;
+  const std::string group_;  // of its address
+  websocket::stream<tcp::socket> stream_;
+  beast::flat_buffer buffer_;  // the header, then the message that is being received or that waits
+  http::request_parser<http::empty_body> parser_;
+  Response response_;
+  std::deque<Out> out_;  // the first one is on its way
+  Clock::time_point began_ = Clock::now(), served_ = {};
+  int age_ = 0, silent_ = 0;  // sweeps: since it came, since a sign of life
+  std::size_t n_held_ = 0;
+  bool is_open_ = false, is_greeted_ = false, is_busy_ = false, is_waiting_ = false;
+  bool is_failed_ = false, is_ending_ = false, is_closed_ = false, is_pinging_ = false;
+};
+
+net::Standings Shared::standings() const {
+  net::Standings all;
+  all.reserve(connections.size());
+  for (const auto& [id, connection] : connections) all.push_back(connection->standing());
+  return all;
+}
+
+void Shared::make_room() {
+  while (const auto chosen = net::to_evict(standings(), limits.connections, Clock::now()))
+    connections.at(*chosen)->drop("connections",
+                                  fmt::format("more than {}, and this one gives way", limits.connections));
+}
+
+void Shared::bound_receipt() {
+  while (n_held > limits.receipt) {
+    const auto chosen =
+        net::to_interrupt(standings(), limits.connections, limits.message, limits.receipt, Clock::now());
+    if (!chosen) return;
+    connections.at(*chosen)->drop(
+        "receipt", fmt::format("requests in receipt took more than {} bytes, and this one gives way", limits.receipt));
+  }
+}
+
+}  // namespace
+
+class Sockets::All : public Shared {
+ public:
+  All(net::Loop& loop, const Limits& its_limits, std::string its_key)
+      : Shared{loop.context(), its_limits, std::move(its_key)} {}
+  ~All() {
+    while (!connections.empty()) connections.begin()->second->close();
+  }
+
+  Result<std::string> bind(const std::string& address, const char* option, bool insecure) {
+    VLA_TRY(const tcp::endpoint endpoint, net::tcp_endpoint_of(address, option, insecure));
+    try {
+      listener_.emplace(context, endpoint);
+      return fmt::format("{}:{}", address.substr(0, address.rfind(':')), listener_->endpoint().port());
+    } catch (const boost::system::system_error& error) {
+      return Error{Code::io, address, "a free address of this machine", error.code().message(),
+                   fmt::format("choose another with {}; port 0 takes a free one", option)};
+    }
+  }
+
+  void begin(Handler& its_handler) {
+    handler = &its_handler;
+    listener_->listen([this](tcp::socket socket) { add(std::move(socket)); });
+    sweeper_.begin([this] {
+      const auto all = connections;
+      for (const auto& [id, connection] : all) connection->sweep();
+    });
+  }
+
+ private:
+  void add(tcp::socket socket) {
+    error_code gone;
+    socket.set_option(tcp::no_delay(true), gone);
+    const auto endpoint = socket.remote_endpoint(gone);
+    Peer peer{++n_connection_, gone ? "" : endpoint.address().to_string()};
+    const auto connection = std::make_shared<Connection>(*this, std::move(socket), std::move(peer));
+    connections.emplace(n_connection_, connection);
+    connection->start();
+    make_room();
+  }
+
+  std::optional<net::Listener<tcp>> listener_;
+  net::Sweeper sweeper_{context};
+  std::uint64_t n_connection_ = 0;
+};
+
+Sockets::Sockets(net::Loop& loop, const Limits& limits, std::string api_key)
+    : all_(std::make_unique<All>(loop, limits, std::move(api_key))) {}
+Sockets::~Sockets() = default;
+Result<std::string> Sockets::bind(const std::string& address, const char* option, bool insecure) {
+  return all_->bind(address, option, insecure);
+}
+void Sockets::begin(Handler& handler) { all_->begin(handler); }
+void Sockets::send(std::uint64_t connection, std::string message) {
+  const auto found = all_->connections.find(connection);
+  if (found != all_->connections.end()) std::shared_ptr(found->second)->send(std::move(message), false);
+}
+void Sockets::fail(std::uint64_t connection, std::string text) {
+  const auto found = all_->connections.find(connection);
+  if (found != all_->connections.end()) std::shared_ptr(found->second)->send(std::move(text), true);
+}
+void Sockets::drop(std::uint64_t connection) noexcept try {
+  const auto found = all_->connections.find(connection);
+  if (found != all_->connections.end()) std::shared_ptr(found->second)->drop("memory", "none for its request");
+} catch (const std::exception&) {  // it was told as far as it could be
+}
+bool Sockets::has_answers() const {
+  return std::any_of(all_->connections.begin(), all_->connections.end(),
+                     [](const auto& connection) { return connection.second->has_answers(); });
+}
+
+}  // namespace vla::serve::openpi
