@@ -214,5 +214,21 @@ class Libero(Environment):
         self._obs, _, done, _ = self._env.step(action.tolist())
         return bool(done)
 
+    def sensors(self) -> Mapping[str, np.ndarray]:
+        """robosuite's whole observation, among it what no policy gets: the place of every object in metres."""
+        return self._obs
+
+    def objects(self) -> List[str]:
+        """The names of what the task is about: what to move, then where to."""
+        return list(self._env.obj_of_interest)
+
+    def corners(self, name: str) -> np.ndarray:
+        """(n, 3) in metres: corners of the boxes that an object collides with."""
+        sim, signs = self._env.sim, np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        body = sim.model.body_name2id(f"{name}_main")
+        geoms = [g for g in range(sim.model.ngeom) if sim.model.geom_bodyid[g] == body and sim.model.geom_contype[g]]
+        boxes = [signs * sim.model.geom_size[g] @ sim.data.geom_xmat[g].reshape(3, 3).T + sim.data.geom_xpos[g] for g in geoms]
+        return np.concatenate(boxes)
+
     def close(self) -> None:
         self._env.close()
