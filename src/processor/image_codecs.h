@@ -42,3 +42,7 @@ Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& x
 void turn_upright(Image& image, int orientation);
 
 }  // namespace vla::codecs
+/// Pixels (height, width, 3) after a JPEG of this quality and 4:2:0, decoded by the fast integer DCT, as TensorFlow's
+/// encode_jpeg and decode_jpeg leave them. Throws std::bad_alloc.
+std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int width, int height, int quality);
+

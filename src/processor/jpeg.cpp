@@ -5,7 +5,9 @@
 #include <algorithm>
 #include <csetjmp>
 #include <cstdio>  // jpeglib.h needs FILE
+#include <cstdlib>
 #include <cstring>
+#include <new>
 
 #include <jpeglib.h>
 
@@ -147,6 +149,65 @@ bool is_jpeg(Bytes file) {
 Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits) {
   JpegReader reader;
   if (!guarded_header(reader, file)) return corrupt(reader, where);
+namespace {
+
+/// The file that an encoder writes. libjpeg frees and takes its memory itself.
+struct JpegWriter {
+  jpeg_compress_struct jpeg{};
+  jpeg_error_mgr errors{};
+  std::jmp_buf jump{};
+  unsigned char* file = nullptr;
+  unsigned long size = 0;
+
+  JpegWriter() = default;
+  JpegWriter(const JpegWriter&) = delete;
+  JpegWriter& operator=(const JpegWriter&) = delete;
+  ~JpegWriter() {
+    jpeg_destroy_compress(&jpeg);
+    std::free(file);
+  }
+};
+
+[[noreturn]] void fail_to_write(j_common_ptr jpeg) {
+  std::longjmp(static_cast<JpegWriter*>(jpeg->client_data)->jump, 1);
+}
+
+bool guarded_encode(JpegWriter& writer, const std::uint8_t* rgb, int width, int height, int quality) {
+  writer.jpeg.err = jpeg_std_error(&writer.errors);
+  writer.errors.error_exit = fail_to_write;
+  writer.jpeg.client_data = &writer;
+  if (setjmp(writer.jump) != 0) return false;
+  jpeg_create_compress(&writer.jpeg);
+  jpeg_mem_dest(&writer.jpeg, &writer.file, &writer.size);
+  writer.jpeg.image_width = static_cast<JDIMENSION>(width);
+  writer.jpeg.image_height = static_cast<JDIMENSION>(height);
+  writer.jpeg.input_components = 3;
+  writer.jpeg.in_color_space = JCS_RGB;
+  jpeg_set_defaults(&writer.jpeg);
+  jpeg_set_quality(&writer.jpeg, quality, TRUE);
+  jpeg_start_compress(&writer.jpeg, TRUE);
+  while (writer.jpeg.next_scanline < writer.jpeg.image_height) {
+    const std::size_t row = std::size_t{writer.jpeg.next_scanline} * static_cast<std::size_t>(width) * 3;
+    auto* scanline = const_cast<JSAMPROW>(rgb + row);  // which libjpeg reads only
+    jpeg_write_scanlines(&writer.jpeg, &scanline, 1);
+  }
+  jpeg_finish_compress(&writer.jpeg);
+  return true;
+}
+
+}  // namespace
+
+std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int width, int height, int quality) {
+  JpegWriter writer;
+  if (!guarded_encode(writer, rgb.data(), width, height, quality)) throw std::bad_alloc();  // nothing else can fail
+  JpegReader reader;
+  reader.pixels.resize(rgb.size());
+  if (!guarded_header(reader, std::as_bytes(std::span(writer.file, writer.size)))) throw std::bad_alloc();
+  reader.jpeg.dct_method = JDCT_IFAST;
+  if (!guarded_pixels(reader)) throw std::bad_alloc();
+  return std::move(reader.pixels);
+}
+
   const auto width = static_cast<std::int64_t>(reader.jpeg.image_width);
   const auto height = static_cast<std::int64_t>(reader.jpeg.image_height);
   VLA_CHECK(check_size(width, height, where, limits));

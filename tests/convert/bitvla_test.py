@@ -89,6 +89,9 @@ def test_statistics_stay_doubles_and_the_gripper_is_not_stretched(converter):
             assert bundle.dtypes[name] == "f64"
             assert bundle.tensors[name].tolist() == expected[key][quantile]
     recipe = json.loads(bundle.keys["processor.recipe"])
+    assert recipe["image"][0] == {"op": "jpeg", "quality": 95}
+    plain = json.loads(converter.bundle(plain_images=True).keys["processor.recipe"])
+    assert plain["image"] == recipe["image"][1:]
     assert recipe["action"][0]["columns"] == [0, 1, 2, 3, 4, 5]
     assert [op["op"] for op in recipe["action"]] == ["unnormalize", "affine", "sign"]
 

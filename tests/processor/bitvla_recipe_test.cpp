@@ -5,9 +5,12 @@
 #include <cstring>
 
 #include "base/npy.h"
+#include "processor/byte_pixels.h"
+#include "processor/image_codecs.h"
 #include "processor/images.h"
 #include "processor/ops/columns.h"
 #include "processor/ops/normalize.h"
+#include "processor/ops/pipeline.h"
 #include "processor/resample.h"
 #include "processor/sample.h"
 
@@ -87,6 +90,25 @@ TEST_CASE("Lanczos and corner-aligned crops have the bytes of TensorFlow, up, do
   }
   CHECK(rest.empty());
   CHECK(compared == 16);
+}
+
+TEST_CASE("a JPEG on the way has the pixels of TensorFlow's encoder and decoder") {
+  for (const auto& [width, height] : {std::pair{40, 24}, {37, 21}}) {
+    const std::string name = "jpeg_" + std::to_string(width) + "x" + std::to_string(height) + ".npy";
+    const std::string file = read_text(data_path(name));
+    const auto expected = parse_npy(bytes_of(file), name);
+    REQUIRE(expected.ok());
+    const Frame frame = frame_of(width, height);
+    const auto found = codecs::through_jpeg(std::get<std::vector<std::uint8_t>>(frame.rgb), width, height, 95);
+    CHECK(found == std::get<std::vector<std::uint8_t>>(expected->values));
+    // As an op it works on images of any size.
+    const Pipeline pipeline{width, height, {JpegRoundTrip{95}}};
+    std::vector<float> planes(found.size()), wanted(found.size());
+    REQUIRE(run_pipeline(frame, pipeline, planes, "view").ok());
+    spread_bytes(found, wanted);
+    CHECK(planes == wanted);
+  }
+  CHECK(contains(refused("/image/0", Json{{"op", "jpeg"}, {"quality", 0}}), "processor.recipe.image[0].quality"));
 }
 
 TEST_CASE("views that follow each other without text are places of their own, and text around them moves none") {

@@ -127,8 +127,9 @@ class Checkpoint:
 
 
 def case(seed, cameras, text, checkpoint, **options):
+    """The reference is called behind its client, which is where images go through a JPEG."""
     frames = {camera: (side, side, "png") for camera in cameras for side in [checkpoint.vision["image_size"]]}
-    return Case(seed, frames, text, checkpoint, options=options)
+    return Case(seed, frames, text, checkpoint, options={"plain_images": True, **options})
 
 
 def sizes(d, d_ff, n_layer, n_head, **others):

@@ -8,6 +8,7 @@
 #include <cmath>
 
 #include "processor/byte_pixels.h"
+#include "processor/image_codecs.h"
 #include "processor/json_fields.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"
@@ -39,6 +40,8 @@ Size size_after(const SmallestSide& op, const Size& from) {
 Size size_after(const CropFraction& op, const Size& from) {
   return {std::max(1.0, std::floor(from.width * op.fraction)), std::max(1.0, std::floor(from.height * op.fraction))};
 }
+
+Size size_after(const JpegRoundTrip&, const Size& from) { return from; }
 
 /// Of the ops that state a size.
 template <class Op>
@@ -96,6 +99,8 @@ bool follows_frame(const ByteOp& op) {
 double most_pixels_grown(const Frame& frame) { return std::max(4.0 * frame.width * frame.height, 1024.0 * 1024.0); }
 
 Image applied(const ByteOp& op, const Image& from, int width, int height) {
+  if (const auto* jpeg = std::get_if<JpegRoundTrip>(&op))
+    return {width, height, codecs::through_jpeg(from.rgb, width, height, jpeg->quality)};
   if (std::holds_alternative<SmallestSide>(op))
     return {width, height, resample_opencv_area(from.rgb, from.width, from.height, width, height)};
   if (const auto* resize = std::get_if<ByteResize>(&op)) return {width, height, resized(from, *resize)};
@@ -188,6 +193,12 @@ Status parse_crop_fraction(JsonFields& fields, Recipe& recipe) {
 
 Status parse_crop_and_resize(JsonFields& fields, Recipe& recipe) {
   CropAndResize op;
+Status parse_jpeg(JsonFields& fields, Recipe& recipe) {
+  JpegRoundTrip op;
+  VLA_TRY(op.quality, fields.integer("quality", 1, 100));
+  return add(fields, recipe, op);
+}
+
   VLA_TRY(op.area, fields.wide_number("area", {1e-6, 1}));
   VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
   VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));
@@ -225,7 +236,8 @@ Status parse_byte_resize(JsonFields& fields, Recipe& recipe) {
 }
 
 Ops pipeline_ops() {
-  return {{"image", "square_pad", parse_square_pad},
+  return {{"image", "jpeg", parse_jpeg},
+          {"image", "square_pad", parse_square_pad},
           {"image", "smallest_side", parse_smallest_side},
           {"image", "crop_fraction", parse_crop_fraction},
           {"image", "crop_and_resize", parse_crop_and_resize},

@@ -60,8 +60,13 @@ struct CropAndResize {
   int height = 0;
 };
 
-using ByteOp =
-    std::variant<SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop, Lanczos3, CropAndResize>;
+/// `codecs::through_jpeg`.
+struct JpegRoundTrip {
+  int quality = 0;
+};
+
+using ByteOp = std::variant<JpegRoundTrip, SquarePad, SmallestSide, CropFraction, ByteResize, CameraSize, CenterCrop,
+                            Lanczos3, CropAndResize>;
 
 /// Ops on 8-bit images in order, and the size that the last one must leave.
 struct Pipeline {

@@ -26,7 +26,7 @@ from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
 from ...errors import Problems, refuse
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json, read_text
-from ...options import stats, views
+from ...options import Option, stats, views
 from ...section import Fixed, Section
 from ...torch_file import read_torch
 from ...tokenizer import TokenizerPlan, read_tokenizer
@@ -38,7 +38,7 @@ STATISTICS, PROCESSOR, IMAGES = "dataset_statistics.json", "processor_config.jso
 SIDECARS = ("action_head", "proprio_projector")
 HORIZONS = {(8, 7): 8}  # of LIBERO, by numbers of states and actions
 GRIPPER = 6  # from 0, closed, to 1, open; LIBERO's simulator opens it by -1
-CROP, EPS = 0.9, 1e-8
+CROP, EPS, JPEG_QUALITY = 0.9, 1e-8, 95
 VIEWS, ALIASES = ("image", "image2"), ("full_image", "wrist_image")  # LeRobot's names of LIBERO's cameras, and the reference's
 BOS, STOP, END, IMAGE, STATE = "<|begin_of_text|>", "<|end_of_text|>", "<|eot_id|>", "<|image_pad|>", "<proprio_pad>"
 QUESTION = "What action should the robot take to {instruction}?"
@@ -73,7 +73,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     text, prompt_keys = _prompt(checkpoint, tokenizer, s, problems)
     normal = {"kind": "openpi_quantiles", "eps": EPS}  # the same formula, on statistics in float64
     document = {
-        "image": image_ops(s.vision.image_size),
+        "image": image_ops(s.vision.image_size, options.plain_images),
         "text": text,
         "state": [
             {"op": "normalize", "stats": "stats." + recipe.STATE, **normal},
@@ -97,11 +97,13 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     return Plan(keys, weights(s), dropped(s), statistics)
 
 
-def image_ops(side: int) -> List[dict]:
-    """From the camera's image, turned by 180 degrees as LIBERO's clients do. The reference passes it through a JPEG first."""
+def image_ops(side: int, plain: bool) -> List[dict]:
+    """From the camera's image, turned by 180 degrees as LIBERO's clients do. The reference passes it through a JPEG first
+    (openvla_utils.py, resize_image_for_policy), as the data were that it was trained on; `plain`: not that."""
     size = {"width": side, "height": side}
     half = [0.5] * 3
     return [
+        *([] if plain else [{"op": "jpeg", "quality": JPEG_QUALITY}]),
         {"op": "lanczos3", **size},
         {"op": "crop_and_resize", "area": CROP, **size},
         {"op": "size", **size},
@@ -135,6 +137,7 @@ LAYOUT = Layout(
     (
         stats("the entry of dataset_statistics.json to normalize with, where there are several"),
         views("names of the cameras, in the order of the prompt's view slots"),
+        Option("--plain-images", "images do not go through a JPEG of quality 95, as they do in the authors' evaluation", default=False),
     ),
     model_types=("bitvla", "openvla"),
     read=_read_tensors,
