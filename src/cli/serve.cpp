@@ -183,7 +183,9 @@ Command add_serve(CLI::App& app) {
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();
-  command->add_option("--max-pixels", server.max_pixels, "Largest number of pixels of all images of an act together")
+  command
+      ->add_option("--max-pixels", server.max_pixels,
+                   "What the images of an act may cost together, in pixels: docs/security.md")
       ->check(CLI::Range(1, 1 << 28))
       ->capture_default_str();
   command->add_option("--max-text", server.max_text, "Longest instruction, in bytes")

@@ -102,22 +102,24 @@ void turn_upright(Image& image, int orientation) {
   const bool exchanged = orientation >= 5;
   const bool mirror_x = orientation == 2 || orientation == 3 || orientation == 7 || orientation == 8;
   const bool mirror_y = orientation == 3 || orientation == 4 || orientation == 6 || orientation == 7;
-  const int width = exchanged ? image.height : image.width;
-  const int height = exchanged ? image.width : image.height;
+  const std::ptrdiff_t source_width = image.width, source_height = image.height;
+  const std::ptrdiff_t width = exchanged ? source_height : source_width,
+                       height = exchanged ? source_width : source_height;
+  const std::ptrdiff_t first = (mirror_y ? (source_height - 1) * source_width : 0) + (mirror_x ? source_width - 1 : 0);
+  const std::ptrdiff_t along_x = mirror_x ? -1 : 1, along_y = mirror_y ? -source_width : source_width;
+  const std::ptrdiff_t step_x = exchanged ? along_y : along_x, step_y = exchanged ? along_x : along_y;
   std::vector<std::uint8_t> turned(image.rgb.size());
-  std::uint8_t* out = turned.data();
-  for (int y = 0; y < height; ++y) {
-    for (int x = 0; x < width; ++x, out += 3) {
-      const int along_x = exchanged ? y : x;
-      const int along_y = exchanged ? x : y;
-      const int source_x = mirror_x ? image.width - 1 - along_x : along_x;
-      const int source_y = mirror_y ? image.height - 1 - along_y : along_y;
-      const auto pixel = static_cast<std::size_t>(source_y) * static_cast<std::size_t>(image.width) +
-                         static_cast<std::size_t>(source_x);
-      std::copy_n(image.rgb.data() + pixel * 3, 3, out);
+  // Columns become rows in strips that stay in the cache.
+  constexpr std::ptrdiff_t kStrip = 64;
+  for (std::ptrdiff_t left = 0; left < width; left += kStrip)
+    for (std::ptrdiff_t y = 0; y < height; ++y) {
+      const std::uint8_t* in = image.rgb.data() + 3 * (first + y * step_y + left * step_x);
+      std::uint8_t* out = turned.data() + 3 * (y * width + left);
+      for (std::ptrdiff_t x = left; x < std::min(left + kStrip, width); ++x, out += 3, in += 3 * step_x)
+        out[0] = in[0], out[1] = in[1], out[2] = in[2];
     }
-  }
-  image = {width, height, std::move(turned), std::move(image.exif), std::move(image.xmp)};
+  image = {static_cast<int>(width), static_cast<int>(height), std::move(turned), std::move(image.exif),
+           std::move(image.xmp)};
 }
 
 }  // namespace vla::codecs

@@ -33,6 +33,23 @@ Status check_size(std::int64_t width, std::int64_t height, const std::string& wh
   return {};
 }
 
+Result<ImageHeader> read_header(Bytes file, const std::string& where, const ImageLimits& limits) {
+  if (is_png(file)) return png_header(file, where, limits);
+  if (is_jpeg(file)) return jpeg_header(file, where, limits);
+  return refused(where, "a PNG or JPEG image", "a file of another kind");
+}
+
+std::optional<std::string> suspicious(const Frame& frame) {
+  constexpr std::uint8_t kOne = 1;
+  const auto is_flat = [](const auto& rgb) { return std::equal(rgb.begin() + 3, rgb.end(), rgb.begin()); };
+  if (frame.width * frame.height > 1 && std::visit(is_flat, frame.rgb))
+    return "all pixels are alike: is the camera on?";
+  const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
+  if (bytes != nullptr && std::all_of(bytes->begin(), bytes->end(), [](std::uint8_t byte) { return byte <= kOne; }))
+    return "all bytes are 0 or 1: were pixels in [0, 1] made whole numbers? multiply them by 255 first";
+  return {};
+}
+
 }  // namespace codecs
 
 namespace {

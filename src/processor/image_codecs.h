@@ -4,6 +4,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
@@ -28,10 +29,28 @@ struct Image {
 Error refused(const std::string& where, std::string expected, std::string found, std::string hint = {});
 Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits);
 
+/// What a PNG or JPEG file says of itself before it is decoded.
+struct ImageHeader {
+  int width = 0, height = 0;  // as they are stored, before the image is turned upright
+  std::int64_t work = 0;      // of decoding, counted in pixels of about 10 ns
+};
+
+/// Reads no more than the header and the places of scans. Errors: those of `decode_image` that a header shows.
+Result<ImageHeader> read_header(Bytes file, const std::string& where, const ImageLimits& limits);
+
+/// Why no camera gives such a frame, if none does: all of its pixels are alike, or its bytes are 0 and 1.
+std::optional<std::string> suspicious(const Frame& frame);
+
 bool is_png(Bytes file);
 bool is_jpeg(Bytes file);
+Result<ImageHeader> png_header(Bytes file, const std::string& where, const ImageLimits& limits);
+Result<ImageHeader> jpeg_header(Bytes file, const std::string& where, const ImageLimits& limits);
 Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits& limits);
 Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits);
+
+/// Pixels (height, width, 3) after a JPEG of this quality and 4:2:0, decoded by the fast integer DCT, as TensorFlow's
+/// encode_jpeg and decode_jpeg leave them. Throws std::bad_alloc.
+std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int width, int height, int quality);
 
 /// The EXIF orientation, 1 to 8, or failing that the XMP one; 1 when neither says. Errors: bad_observation for EXIF
 /// data that does not start as a TIFF structure. Source: Pillow Image.getexif, TiffImagePlugin
@@ -42,7 +61,3 @@ Result<int> orientation(std::span<const std::uint8_t> exif, const std::string& x
 void turn_upright(Image& image, int orientation);
 
 }  // namespace vla::codecs
-/// Pixels (height, width, 3) after a JPEG of this quality and 4:2:0, decoded by the fast integer DCT, as TensorFlow's
-/// encode_jpeg and decode_jpeg leave them. Throws std::bad_alloc.
-std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int width, int height, int quality);
-

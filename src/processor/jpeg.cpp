@@ -61,32 +61,40 @@ bool guarded_header(JpegReader& reader, Bytes file) {
   return true;
 }
 
-/// How many scans the file has, by its markers.
-std::int64_t count_scans(Bytes file) {
+/// What the markers of a file say.
+struct Markers {
+  std::int64_t width = 0, height = 0, n_scan = 0;
+};
+
+Markers read_markers(Bytes file) {
   constexpr unsigned kEnd = 0xD9, kScan = 0xDA;
   const auto byte = [&](std::size_t at) { return std::to_integer<unsigned>(file[at]); };
-  std::int64_t n_scan = 0;
+  Markers found;
   for (std::size_t at = 2; at + 1 < file.size();) {
     const unsigned marker = byte(at + 1);
     if (byte(at) != 0xFF || marker == 0xFF) {
-      ++at;
+      const void* next = std::memchr(file.data() + at + 1, 0xFF, file.size() - at - 1);
+      if (next == nullptr) break;
+      at = static_cast<std::size_t>(static_cast<const std::byte*>(next) - file.data());
       continue;
     }
     if (marker == kEnd) break;
-    n_scan += marker == kScan ? 1 : 0;
+    found.n_scan += marker == kScan ? 1 : 0;
+    const bool is_frame = marker >= 0xC0 && marker <= 0xCF && marker != 0xC4 && marker != 0xC8 && marker != 0xCC;
+    if (is_frame && found.height == 0 && at + 8 < file.size())
+      found.height = byte(at + 5) << 8 | byte(at + 6), found.width = byte(at + 7) << 8 | byte(at + 8);
     const bool is_bare = marker <= 1 || (marker >= 0xD0 && marker <= 0xD8);  // a byte of a scan, a restart or a start
     at += 2;
     if (!is_bare && at + 1 < file.size()) at += std::max<std::size_t>(byte(at) << 8 | byte(at + 1), 2);
   }
-  return n_scan;
+  return found;
 }
 
-Status check_scans(Bytes file, std::int64_t width, std::int64_t height, const std::string& where) {
-  const std::int64_t n_scan = count_scans(file);
-  const std::int64_t most = std::clamp<std::int64_t>(kMaxScanPixels / (width * height), 1, kMaxScans);
-  if (n_scan <= most) return {};
-  return refused(where, fmt::format("at most {} scans in a JPEG of {} x {}", most, width, height),
-                 fmt::format("{} scans", n_scan), "save it as a baseline JPEG");
+Status check_scans(const Markers& found, const std::string& where) {
+  const std::int64_t most = std::clamp<std::int64_t>(kMaxScanPixels / (found.width * found.height), 1, kMaxScans);
+  if (found.n_scan <= most) return {};
+  return refused(where, fmt::format("at most {} scans in a JPEG of {} x {}", most, found.width, found.height),
+                 fmt::format("{} scans", found.n_scan), "save it as a baseline JPEG");
 }
 
 /// libjpeg makes up grey for what no scan brings, without a word.
@@ -141,14 +149,6 @@ Error corrupt(const JpegReader& reader, const std::string& where) {
 
 }  // namespace
 
-bool is_jpeg(Bytes file) {
-  constexpr std::uint8_t kStart[] = {0xFF, 0xD8, 0xFF};
-  return file.size() >= sizeof kStart && std::memcmp(file.data(), kStart, sizeof kStart) == 0;
-}
-
-Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits) {
-  JpegReader reader;
-  if (!guarded_header(reader, file)) return corrupt(reader, where);
 namespace {
 
 /// The file that an encoder writes. libjpeg frees and takes its memory itself.
@@ -208,6 +208,23 @@ std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int
   return std::move(reader.pixels);
 }
 
+bool is_jpeg(Bytes file) {
+  constexpr std::uint8_t kStart[] = {0xFF, 0xD8, 0xFF};
+  return file.size() >= sizeof kStart && std::memcmp(file.data(), kStart, sizeof kStart) == 0;
+}
+
+/// A scan passes over all pixels and costs a quarter of the first; a byte of code costs as much as a pixel.
+Result<ImageHeader> jpeg_header(Bytes file, const std::string& where, const ImageLimits& limits) {
+  const Markers found = read_markers(file);
+  VLA_CHECK(check_size(found.width, found.height, where, limits));
+  VLA_CHECK(check_scans(found, where));
+  return ImageHeader{static_cast<int>(found.width), static_cast<int>(found.height),
+                     found.width * found.height * (3 + found.n_scan) / 4 + static_cast<std::int64_t>(file.size())};
+}
+
+Result<Image> decode_jpeg(Bytes file, const std::string& where, const ImageLimits& limits) {
+  JpegReader reader;
+  if (!guarded_header(reader, file)) return corrupt(reader, where);
   const auto width = static_cast<std::int64_t>(reader.jpeg.image_width);
   const auto height = static_cast<std::int64_t>(reader.jpeg.image_height);
   VLA_CHECK(check_size(width, height, where, limits));
@@ -216,7 +233,9 @@ std::vector<std::uint8_t> through_jpeg(const std::vector<std::uint8_t>& rgb, int
                    reader.jpeg.num_components == 4 ? "a CMYK one" : "another number of channels", "convert it to RGB");
   // Of an arithmetic code missing data cannot be told from zeros, and no camera writes it.
   if (reader.jpeg.arith_code) return refused(where, "a JPEG in Huffman code", "arithmetic code", "save it anew");
-  VLA_CHECK(check_scans(file, width, height, where));
+  const Markers found = read_markers(file);
+  if (found.width != width || found.height != height) return refused(where, "a whole JPEG image", "one of two sizes");
+  VLA_CHECK(check_scans(found, where));
   Image image{static_cast<int>(width), static_cast<int>(height), {}, {}, {}};
   read_metadata(reader, image);  // now, because finishing frees the markers
   reader.pixels.resize(static_cast<std::size_t>(width * height) * 3);

@@ -199,22 +199,23 @@ void drop_exif_name(std::vector<std::uint8_t>& exif) {
     exif.erase(exif.begin(), exif.begin() + sizeof kName);
 }
 
+std::uint32_t number_at(Bytes file, std::size_t at) {
+  std::uint32_t value = 0;
+  for (std::size_t i = 0; i < 4; ++i) value = value << 8 | std::to_integer<std::uint32_t>(file[at + i]);
+  return value;
+}
+
 /// Walks the chunks up to the end before libpng does: it would take memory for the length that a chunk states, up to
 /// 2 GiB, before it reads, and would go on without an orientation whose chunk is damaged. `exif` is the last eXIf
 /// chunk.
 const char* damage(Bytes file, Bytes& exif, Texts& texts) {
   constexpr std::size_t kAround = 12;  // length, type and checksum
-  const auto number = [&](std::size_t at) {
-    std::uint32_t value = 0;
-    for (std::size_t i = 0; i < 4; ++i) value = value << 8 | std::to_integer<std::uint32_t>(file[at + i]);
-    return value;
-  };
   for (std::size_t at = kSignature.size(); file.size() - at >= kAround;) {
-    const std::size_t length = number(at);
+    const std::size_t length = number_at(file, at);
     if (length > file.size() - at - kAround) break;
     const Bytes content = file.subspan(at + 4, length + 4);  // the type belongs to the checksum
     const auto checksum = crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
-    if (checksum != number(at + 8 + length)) return "a chunk with another checksum";
+    if (checksum != number_at(file, at + 8 + length)) return "a chunk with another checksum";
     const std::string_view text(reinterpret_cast<const char*>(content.data()), content.size());
     if (text.starts_with("IEND")) return nullptr;
     if (text.starts_with("eXIf")) exif = content.subspan(4);
@@ -236,6 +237,15 @@ Error corrupt(const PngReader& reader, const std::string& where) {
 
 bool is_png(Bytes file) {
   return file.size() >= kSignature.size() && std::memcmp(file.data(), kSignature.data(), kSignature.size()) == 0;
+}
+
+Result<ImageHeader> png_header(Bytes file, const std::string& where, const ImageLimits& limits) {
+  constexpr std::size_t kWidth = 16, kEnd = 33;  // of the IHDR chunk, which is the first
+  constexpr std::int64_t kWork = 3;              // rows of Paeth's filter
+  if (file.size() < kEnd) return refused(where, "a whole PNG image", "a truncated one");
+  const std::int64_t width = number_at(file, kWidth), height = number_at(file, kWidth + 4);
+  VLA_CHECK(check_size(width, height, where, limits));
+  return ImageHeader{static_cast<int>(width), static_cast<int>(height), kWork * width * height};
 }
 
 Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {

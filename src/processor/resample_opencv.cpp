@@ -109,7 +109,9 @@ std::vector<std::uint8_t> pooled(std::span<const std::uint8_t> rgb, int width, i
     std::fill(sums.begin(), sums.end(), 0);
     for (std::size_t k = 0; k < n_row; ++k) {
       const std::uint8_t* row = rgb.data() + (y * n_row + k) * in_row;
-      for (std::size_t i = 0; i < in_row; ++i) sums[i / (3 * n_column) * 3 + i % 3] += row[i];
+      for (int* sum = sums.data(); sum != sums.data() + out_row; sum += 3)
+        for (std::size_t i = 0; i < n_column; ++i, row += 3)
+          for (std::size_t c = 0; c < 3; ++c) sum[c] += row[c];
     }
     for (const int sum : sums)
       out.push_back(static_cast<std::uint8_t>(std::nearbyint(static_cast<float>(sum) * share)));

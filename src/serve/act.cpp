@@ -2,7 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/act.h"
 
+#include <fmt/format.h>
+
 #include <random>
+
+#include "processor/ops/pipeline.h"
 
 namespace vla::serve {
 
@@ -16,8 +20,23 @@ Result<const Robot*> only_robot(const Engine& engine, const char* option) {
 
 ActLimits act_limits(const ServerOptions& options, const Robot& robot) {
   const Processor& processor = robot.processor();
-  return {options.max_pixels,     options.max_text,        processor.views().names().size(),
-          robot.solver_horizon(), robot.d_action_padded(), static_cast<int>(processor.action_names().size())};
+  return {options.max_pixels,
+          options.max_text,
+          processor.views().names().size(),
+          robot.solver_horizon(),
+          robot.d_action_padded(),
+          static_cast<int>(processor.action_names().size()),
+          processor.recipe().fit.get()};
+}
+
+Status spend(ActLimits& left, int width, int height, std::int64_t work, const std::string& where) {
+  if (left.fit != nullptr) work += fit_work(*left.fit, width, height);
+  if (work > left.max_pixels)
+    return Error{Code::too_large, where, fmt::format("an image that costs at most {} pixels", left.max_pixels),
+                 fmt::format("{} x {}, which costs {}", width, height, work),
+                 };
+  left.max_pixels -= work;
+  return {};
 }
 
 std::uint64_t fresh_seed() {

@@ -4,6 +4,7 @@
 
 #include <cstdint>
 #include <optional>
+#include <string>
 
 #include "engine/engine.h"
 #include "serve/options.h"
@@ -12,11 +13,12 @@ namespace vla::serve {
 
 /// The bounds of an act. All are compared before memory is taken that the sizes ask for.
 struct ActLimits {
-  std::int64_t max_pixels = 0;  // of all images
+  std::int64_t max_pixels = 0;  // of all images, and what decoding and fitting them costs
   std::size_t max_text = 0;     // bytes
   std::size_t max_views = 0;
   int horizon = 0, d_noise = 0;  // of the noise that the policy takes
   int d_action = 0;              // of a chunk
+  const Fit* fit = nullptr;      // that images go through
 };
 
 /// An act, ready for the engine.
@@ -33,6 +35,9 @@ Result<const Robot*> only_robot(const Engine& engine, const char* option);
 
 /// The bounds for one robot's acts.
 ActLimits act_limits(const ServerOptions& options, const Robot& robot);
+/// An act costs what its images cost together: `work` of decoding this one, in pixels, and what fitting it takes. Errors:
+/// too_large.
+Status spend(ActLimits& left, int width, int height, std::int64_t work, const std::string& where);
 
 /// The seed of an act whose client gave none.
 std::uint64_t fresh_seed();

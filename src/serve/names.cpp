@@ -325,13 +325,14 @@ Result<Observation> observe(const Value& message, const Names& names, const ActL
     return Error{Code::bad_observation, "observation", "a map with the keys " + all_keys(names), "another type"};
   VLA_CHECK(check_keys(message, names));
   Observation observation;
-  ImageLimits left{limits.max_pixels, Code::too_large};  // an act costs what its images cost together
+  ActLimits left = limits;
   for (const Names::Entry& entry : names.views) {
     const Value* value = at(message, entry.key);
     if (value == nullptr) continue;  // the engine says which views must be there
     VLA_TRY(const msgpack::Array array, msgpack::array_of(*value, entry.key));
-    VLA_TRY(Frame frame, msgpack::frame_of(array, entry.key, left, entry.convention.is_bgr));
-    left.max_pixels -= std::int64_t{frame.width} * frame.height;
+    const ImageLimits pixels{left.max_pixels, Code::too_large};
+    VLA_TRY(Frame frame, msgpack::frame_of(array, entry.key, pixels, entry.convention.is_bgr));
+    VLA_CHECK(spend(left, frame.width, frame.height, std::int64_t{frame.width} * frame.height, entry.key));
     observation.views.emplace(entry.feature, std::move(frame));
   }
   for (const Names::Entry& entry : names.states) {

@@ -23,14 +23,26 @@ def _number(number, value):
     return _varint(number << 3) + _varint(value)
 
 
-def act(request_id, golden, seed=None, deadline_ms=None, text=None):
-    """The act that a golden case is, its images as PNG."""
+def rgb(width, height):
+    """A black frame without encoding."""
+    return _number(1, width) + _number(2, height) + _bytes(3, bytes(3 * width * height))
+
+
+def act(request_id, golden, seed=None, deadline_ms=None, text=None, image=None, n_image=1):
+    """The act that a golden case is, its images as PNG. `image` is (tag of its field, file) of another for the first
+    `n_image` views."""
+    files = [(b"\x22", file.read_bytes()) if file else (b"\x2a", b"") for file in golden.images.values()]
+    files[:n_image] = files[:n_image] if image is None else [image] * n_image
     views = b"".join(
-        _bytes(1, _bytes(1, name.encode()) + (_bytes(4, file.read_bytes()) if file else _bytes(5, b"")))
-        for name, file in golden.images.items()
+        _bytes(1, _bytes(1, name.encode()) + tag + _varint(len(file)) + file)
+        for name, (tag, file) in zip(golden.images, files, strict=True)
     )
-    state = _bytes(2, _bytes(1, b"state") + _bytes(2, struct.pack(f"<{len(golden.state)}f", *golden.state)))
-    body = views + state + _bytes(3, (golden.text if text is None else text).encode())
+    features = golden.state if isinstance(golden.state, dict) else {"state": golden.state}
+    states = b"".join(
+        _bytes(2, _bytes(1, name.encode()) + _bytes(2, struct.pack(f"<{len(state)}f", *state)))
+        for name, state in features.items()
+    )
+    body = views + states + _bytes(3, (golden.text if text is None else text).encode())
     body += b"" if seed is None else _number(5, seed)
     body += b"" if deadline_ms is None else _number(7, deadline_ms)
     return _number(1, 1) + _number(2, request_id) + _bytes(5, body)

@@ -107,6 +107,7 @@ TEST_CASE("a JPEG on the way has the pixels of TensorFlow's encoder and decoder"
     REQUIRE(run_pipeline(frame, pipeline, planes, "view").ok());
     spread_bytes(found, wanted);
     CHECK(planes == wanted);
+    CHECK(pipeline_work(pipeline, width, height) == 2 * width * height);
   }
   CHECK(contains(refused("/image/0", Json{{"op", "jpeg"}, {"quality", 0}}), "processor.recipe.image[0].quality"));
 }

@@ -61,6 +61,13 @@ TEST_CASE("a mean over parts of pixels has the bytes of OpenCV") {
   CHECK(resample_opencv_area(row, 3, 1, 1, 1) == std::vector<std::uint8_t>{115, 3, 1});
 }
 
+TEST_CASE("ops on images of any size cost half of the pixels that they read") {
+  const Pipeline pipeline{4, 4, {SquarePad{}, SmallestSide{8}, CropFraction{0.5}}};
+  CHECK(pipeline_work(pipeline, 20, 10) == (20 * 10 + 20 * 20 + 8 * 8) / 2);
+  CHECK(pipeline_work({4, 4, {SmallestSide{4096}, SmallestSide{4096}}}, 1, 16384) > std::int64_t{1} << 35);
+  CHECK(fit_work(*make(groot()).recipe().fit, 20, 10) == (20 * 10 + 20 * 20 + 4 * 4) / 2);
+}
+
 TEST_CASE("text is lower-cased and cleaned as Python does it") {
   CHECK(python::lower("\u0130\u039f\u0394\u039f\u03a3 \u03a3 \u03a3A") ==
         "i\u0307\u03bf\u03b4\u03bf\u03c2 \u03c3 \u03c3a");

@@ -11,6 +11,7 @@
 
 #include <jpeglib.h>
 
+#include "processor/image_codecs.h"
 #include "processor/support.h"
 
 using namespace vla;
@@ -257,6 +258,24 @@ TEST_CASE("scans times pixels are bounded before a JPEG is decoded") {
   const auto refused = decode_image(bytes_of(file), "top");
   CHECK(contains(refusal(refused, Code::bad_observation),
                  "top: expected at most 16 scans in a JPEG of 4096 x 4096, found 17 scans"));
+}
+
+TEST_CASE("what decoding costs is known from the header") {
+  const std::string black = grey_png(100, 30, 1);
+  const auto png = codecs::read_header(bytes_of(black), "top", {});
+  REQUIRE_MESSAGE(png.ok(), png.error().message());
+  CHECK(png->width == 100);
+  CHECK(png->height == 30);
+  CHECK(png->work == 3 * 100 * 30);
+  const std::string scan = jpeg_scan(1, 1, 63, 0);
+  const std::string file = jpeg_start(0xC2, 64, 48, 1) + jpeg_scan(1, 0, 0, 0) + repeated(scan, 8) + "\xFF\xD9";
+  const auto jpeg = codecs::read_header(bytes_of(file), "top", {});
+  REQUIRE_MESSAGE(jpeg.ok(), jpeg.error().message());
+  CHECK(jpeg->width == 64);
+  CHECK(jpeg->height == 48);
+  CHECK(jpeg->work == 64 * 48 * 3 + static_cast<std::int64_t>(file.size()));
+  for (const std::string& cut : {black.substr(0, 20), file.substr(0, 12), std::string("GIF89a")})
+    refusal(codecs::read_header(bytes_of(cut), "top", {}), Code::bad_observation);
 }
 
 TEST_CASE("a JPEG in arithmetic code is refused") {

@@ -151,6 +151,14 @@ TEST_CASE("what is over a limit is told apart from what is wrong") {
   check_refused(act, Code::too_large, "view \"jpeg\"");
 }
 
+TEST_CASE("images are counted together before any is decoded") {
+  v1::Act act = full_act();
+  act.mutable_views(0)->mutable_rgb()->set_width(99);
+  act.mutable_views(0)->mutable_rgb()->set_height(100);  // its rows are not there, which nobody looks at
+  act.mutable_views(1)->set_png(test::read_text(test::source_path("tests/processor/data/images/rgb.png")));
+  check_refused(act, Code::too_large, "view \"jpeg\"");
+}
+
 TEST_CASE("a name that would make an error long is refused without being told back") {
   v1::Act act = full_act();
   act.mutable_views(0)->set_name(std::string(257, 'n'));

@@ -157,6 +157,23 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   return {};
 }
 
+std::int64_t fit_work(const Fit& fit, int width, int height) {
+  const auto* const pipeline = dynamic_cast<const OneFit<Pipeline>*>(&fit);
+  return pipeline != nullptr ? pipeline_work(pipeline->op, width, height) : 0;
+}
+
+std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height) {
+  constexpr double kMost = 1e15;  // in place of what a sliver of an image would become
+  constexpr double kJpeg = 4.0;   // both ways
+  Size size = {static_cast<double>(width), static_cast<double>(height)};
+  double n_read = 0.0;
+  for (const ByteOp& op : pipeline.ops) {
+    n_read += size.width * size.height * (std::holds_alternative<JpegRoundTrip>(op) ? kJpeg : 1.0);
+    size = std::visit([&](const auto& o) { return size_after(o, size); }, op);
+  }
+  return static_cast<std::int64_t>(std::min(n_read / 2, kMost));
+}
+
 namespace {
 
 constexpr std::size_t kMaxByteOps = 16;
@@ -176,6 +193,12 @@ Status add(const JsonFields& fields, Recipe& recipe, ByteOp op) {
   return {};
 }
 
+Status parse_jpeg(JsonFields& fields, Recipe& recipe) {
+  JpegRoundTrip op;
+  VLA_TRY(op.quality, fields.integer("quality", 1, 100));
+  return add(fields, recipe, op);
+}
+
 Status parse_square_pad(JsonFields& fields, Recipe& recipe) { return add(fields, recipe, SquarePad{}); }
 
 Status parse_smallest_side(JsonFields& fields, Recipe& recipe) {
@@ -193,12 +216,6 @@ Status parse_crop_fraction(JsonFields& fields, Recipe& recipe) {
 
 Status parse_crop_and_resize(JsonFields& fields, Recipe& recipe) {
   CropAndResize op;
-Status parse_jpeg(JsonFields& fields, Recipe& recipe) {
-  JpegRoundTrip op;
-  VLA_TRY(op.quality, fields.integer("quality", 1, 100));
-  return add(fields, recipe, op);
-}
-
   VLA_TRY(op.area, fields.wide_number("area", {1e-6, 1}));
   VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
   VLA_TRY(op.height, fields.integer("height", 1, kMaxImageSide));

@@ -81,6 +81,12 @@ struct Pipeline {
 /// Errors: bad_observation.
 Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
 
+/// What a fit costs with a frame of this size, counted in pixels of about 10 ns; 0 where it depends on the size it
+/// makes.
+std::int64_t fit_work(const Fit& fit, int width, int height);
+/// Half a pixel for each that an op reads.
+std::int64_t pipeline_work(const Pipeline& pipeline, int width, int height);
+
 /// The op "resize" among others.
 Status parse_byte_resize(JsonFields& fields, Recipe& recipe);
 

@@ -127,17 +127,34 @@ Result<std::optional<Frame>> decode_view(const v1::View& view, const std::string
   return frame;
 }
 
+Result<codecs::ImageHeader> read_header(const v1::View& view, const std::string& where, const ActLimits& limits) {
+  if (view.has_jpeg() || view.has_png())
+    return codecs::read_header(bytes_of(view.has_jpeg() ? view.jpeg() : view.png()), where, image_limits(limits));
+  const std::int64_t width = view.rgb().width(), height = view.rgb().height();
+  VLA_CHECK(codecs::check_size(width, height, where, image_limits(limits)));
+  return codecs::ImageHeader{static_cast<int>(width), static_cast<int>(height), width * height};
+}
+
+/// An act costs what its images cost together. `left` is what this one leaves to the next.
+Status check_cost(const v1::View& view, const std::string& where, ActLimits& left) {
+  if (view.has_absent() || view.image_case() == v1::View::IMAGE_NOT_SET) return {};
+  VLA_TRY(const codecs::ImageHeader header, read_header(view, where, left));
+  return spend(left, header.width, header.height, header.work, where);
+}
+
 Status decode_views(const v1::Act& act, const ActLimits& limits, const FeatureNames& features,
                     Observation& observation) {
-  ActLimits left = limits;  // an act costs what its images cost together
   if (static_cast<std::size_t>(act.views_size()) > limits.max_views)
     return too_large("views", fmt::format("at most {} views", limits.max_views), std::to_string(act.views_size()));
-  for (const v1::View& view : act.views()) {
+  ActLimits left = limits;
+  for (const v1::View& view : act.views()) {  // all of them before any image is decoded
     VLA_CHECK(check_name(view.name(), "views"));
+    VLA_CHECK(check_cost(view, features.place(view.name()), left));
+  }
+  for (const v1::View& view : act.views()) {
     const std::string where = features.place(view.name());
     if (observation.views.contains(view.name())) return bad_observation(where, "each view once", "a second one");
-    VLA_TRY(std::optional<Frame> frame, decode_view(view, where, left));
-    if (frame) left.max_pixels -= std::int64_t{frame->width} * frame->height;
+    VLA_TRY(std::optional<Frame> frame, decode_view(view, where, limits));
     observation.views.emplace(view.name(), std::move(frame));
   }
   return {};
