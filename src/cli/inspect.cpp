@@ -9,6 +9,7 @@
 #include "cli/json.h"
 #include "cli/say.h"
 #include "engine/description.h"
+#include "processor/constant_actions.h"
 
 namespace vla::cli {
 namespace {
@@ -137,6 +138,8 @@ void print_human(const Engine& engine) {
         fmt::format("{}", fmt::join(robot.bundle().embodiments(), ", ")));
   for (const std::string& feature : robot.processor().degraded())
     say(stdout, "DEGRADED     {} passes unnormalized, as --identity-stats allowed when converting\n", feature);
+  for (const std::string& action : constant_actions(robot.processor(), robot.solver_horizon(), robot.d_action_padded()))
+    say(stdout, "CONSTANT     {} has no spread in its statistics: it is the same whatever the network says\n", action);
   say(stdout, "source       {}{}, converted by {}\n", d.source, d.revision.empty() ? "" : " at " + d.revision,
       d.converter);
   if (const auto backbone = robot.bundle().keys().string("vla.source.backbone"))

@@ -18,6 +18,7 @@
 #include "cli/commands.h"
 #include "cli/say.h"
 #include "cli/watch.h"
+#include "processor/constant_actions.h"
 #include "serve/names.h"
 #include "serve/native/codec.h"
 #include "serve/server.h"
@@ -63,7 +64,7 @@ std::string quoted(const std::string& value) {
 
 /// One line that programs can split as a shell would.
 void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const std::string& metrics) {
-  std::vector<std::string> features, tags, degraded;  // of all robots
+  std::vector<std::string> features, tags, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
       if (!text.empty() && std::find(all.begin(), all.end(), text) == all.end()) all.push_back(text);
@@ -72,6 +73,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
     add_new(features, robot->processor().views().names());
     add_new(features, robot->processor().states().names());
     add_new(degraded, robot->processor().degraded());
+    add_new(constant, constant_actions(robot->processor(), robot->solver_horizon(), robot->d_action_padded()));
     add_new(tags, {robot->bundle().embodiment()});
   }
   const v1::Description description = serve::describe(engine, {});
@@ -91,6 +93,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("features", fmt::format("{}", fmt::join(features, ",")));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
   if (!metrics.empty()) add("metrics", metrics);
+  if (!constant.empty()) add("CONSTANT", fmt::format("{}", fmt::join(constant, ",")));
   if (!degraded.empty()) add("DEGRADED", fmt::format("{}", fmt::join(degraded, ",")));
   say(stdout, "{}\n", line);
   std::fflush(stdout);

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "processor/image_codecs.h"
 #include "processor/ops/text.h"
 #include "processor/unicode.h"
 
@@ -25,6 +26,21 @@ std::size_t first_bad(std::span<const float> values) {
 
 std::size_t view_size(const Recipe& recipe) {
   return std::size_t{3} * static_cast<std::size_t>(recipe.width) * static_cast<std::size_t>(recipe.height);
+}
+
+bool is_latin(std::uint32_t code_point) {
+  constexpr std::uint32_t kEndOfLatin = 0x370, kMoreLatin = 0x1E00, kEndOfMore = 0x1F00;
+  return code_point < kEndOfLatin || (code_point >= kMoreLatin && code_point < kEndOfMore);
+}
+
+/// Whether valid UTF-8 has a letter of another script than the Latin one.
+bool has_foreign_letter(std::string_view text) {
+  while (!text.empty()) {
+    const unicode::Char c = unicode::first(text);
+    if (!is_latin(c.code_point) && (unicode::classes(c.code_point) & unicode::kLetter) != 0) return true;
+    text.remove_prefix(c.size);
+  }
+  return false;
 }
 
 /// Arranges what was given by name in the bundle's order; a null pointer where nothing was.
@@ -68,6 +84,7 @@ Result<std::vector<Processor::PresentView>> Processor::present_views(const Obser
 }
 
 Status Processor::encode_images(const Observation& observation, Inputs& inputs) const {
+  inputs.notes.clear();  // of the observation before: images come first
   VLA_TRY(const std::vector<PresentView> present, present_views(observation));
   inputs.n_view = static_cast<int>(present.size());
   inputs.views = 0;
@@ -79,6 +96,7 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
     const auto& [index, name, frame] = present[i];
     inputs.views |= 1U << index;
     VLA_CHECK(check_frame(*frame, *name));
+    if (const auto note = codecs::suspicious(*frame)) inputs.notes.push_back(fmt::format("{}: {}", *name, *note));
     VLA_CHECK(encode_view(*frame, *name, {inputs.pixels.data() + i * size, size}));
   }
   return {};
@@ -117,6 +135,8 @@ Status Processor::encode_text(const Observation& observation, Inputs& inputs) co
   if (recipe_.drops_punctuation && prompt == *fill_prompt({}, inputs.discretized_state))
     return bad_observation("instruction", "a letter, digit or white space",
                            "nothing but punctuation, which is dropped");
+  if (has_foreign_letter(observation.text))
+    inputs.notes.push_back("instruction: letters of another script than the Latin one, in which policies are trained");
   VLA_TRY(inputs.tokens, tokenizer_->encode(prompt, kMaxPrompt));
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
   if (inputs.tokens.size() > limit) {
@@ -196,7 +216,6 @@ Status Processor::check_bound(const StateOp& op, bool reject, Inputs& inputs) co
 
 Status Processor::encode_state(const Observation& observation, Inputs& inputs) const {
   using Stage = StateOp::Stage;
-  inputs.notes.clear();
   inputs.out_of_range = false;
   for (const std::string& feature : degraded_)
     inputs.notes.push_back("DEGRADED: " + feature +

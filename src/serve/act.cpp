@@ -34,7 +34,7 @@ Status spend(ActLimits& left, int width, int height, std::int64_t work, const st
   if (work > left.max_pixels)
     return Error{Code::too_large, where, fmt::format("an image that costs at most {} pixels", left.max_pixels),
                  fmt::format("{} x {}, which costs {}", width, height, work),
-                 };
+                 "Description.limits has all limits"};
   left.max_pixels -= work;
   return {};
 }

@@ -41,6 +41,15 @@ def test_a_camera_that_stopped_is_noticed_while_the_state_moves(policy, case):
     assert "view camera1: the same picture in 5 acts" in found[4][0]
 
 
+@pytest.mark.parametrize("value, note", [(0, "all pixels are alike"), (200, "all pixels are alike"), (None, "0 or 1")])
+def test_a_picture_that_no_camera_takes_is_noticed(policy, case, value, note):
+    pictures = frames(case)
+    picture = pictures["camera1"]
+    pictures["camera1"] = picture // 128 if value is None else np.full_like(picture, value)
+    (found,) = policy.act(images=pictures, state=case.state, text=case.text, seed=1).notes
+    assert found.startswith("observation.images.camera1: ") and note in found
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_server_library_and_program_give_the_same_bytes(name, tmp_path):
     case = Golden(name)

@@ -123,7 +123,7 @@ TEST_CASE("the views that are present are told by their place in the bundle's or
 TEST_CASE("an absent view is a black frame under the whole recipe") {
   const Processor processor = make(evo1());
   Observation seen = observation();
-  seen.views = {{"side", grey(0)}};
+  seen.views = {{"side", Frame{4, 2, std::vector<std::uint8_t>(24)}}};
   CHECK(processor.absent_view() == processor.encode(seen)->pixels);
   CHECK(processor.absent_view().front() == -1.0f);
   CHECK(processor.absent_view().back() == 0.0f);

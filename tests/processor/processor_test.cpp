@@ -6,6 +6,7 @@
 #include <cstring>
 #include <limits>
 
+#include "processor/constant_actions.h"
 #include "processor/sample.h"
 
 using namespace vla;
@@ -69,19 +70,54 @@ TEST_CASE("inputs that are filled again keep their memory and drop what they hel
   Inputs inputs;
   Observation seen = observation();
   seen.text = "pick up the red cube and place it in the bowl";
-  REQUIRE(processor.encode_text(seen, inputs).ok());
-  CHECK(inputs.notes.size() == 1);
   REQUIRE(processor.encode_images(seen, inputs).ok());
   REQUIRE(processor.encode_state(seen, inputs).ok());
+  REQUIRE(processor.encode_text(seen, inputs).ok());
+  CHECK(inputs.notes.size() == 1);
   const float* pixels = inputs.pixels.data();
   const float* state = inputs.state.data();
-  REQUIRE(processor.encode_text(observation(), inputs).ok());
   REQUIRE(processor.encode_images(observation(), inputs).ok());
   REQUIRE(processor.encode_state(observation(), inputs).ok());
+  REQUIRE(processor.encode_text(observation(), inputs).ok());
   CHECK(inputs.pixels.data() == pixels);
   CHECK(inputs.state.data() == state);
   CHECK(inputs.state.size() == 4);
   CHECK(inputs.notes.empty());
+}
+
+TEST_CASE("an image that no camera gives has a note") {
+  const auto note_on = [](std::vector<std::uint8_t> rgb) {
+    Observation seen = observation();
+    seen.views["top"] = Frame{2, 1, std::move(rgb)};
+    const auto notes = make().encode(seen)->notes;
+    return notes.empty() ? std::string() : notes.front();
+  };
+  CHECK(contains(note_on({9, 8, 7, 9, 8, 7}), "observation.images.top: all pixels are alike"));
+  CHECK(contains(note_on({1, 0, 1, 0, 0, 1}), "observation.images.top: all bytes are 0 or 1"));
+  CHECK(note_on({1, 0, 1, 0, 0, 2}).empty());
+  CHECK(note_on({9, 8, 7, 9, 8, 6}).empty());
+  Observation seen = observation();
+  seen.views["top"] = Frame{2, 1, std::vector<float>(6, 0.5f)};
+  CHECK(contains(make().encode(seen)->notes.at(0), "all pixels are alike"));
+}
+
+TEST_CASE("an instruction in another script has a note") {
+  const auto notes_on = [](const char* text) {
+    Observation seen = observation();
+    seen.text = text;
+    return make().encode(seen)->notes;
+  };
+  CHECK(notes_on("\u00e8 \u2192").empty());
+  for (const char* text : {"\u53d6", "\u0431", "a \u03b2"})
+    CHECK(contains(notes_on(text).at(0), "instruction: letters of another script"));
+}
+
+TEST_CASE("actions whose statistics have no spread are known when a bundle is loaded") {
+  CHECK(constant_actions(make(), 3, 4) == std::vector<std::string>{"gripper"});
+  EditableBundle bundle = sample();
+  bundle.erase("stats.action.std");
+  add_stats(bundle, "stats.action.std", {2.0f, 0.001f});
+  CHECK(constant_actions(make(bundle), 3, 4).empty());
 }
 
 TEST_CASE("views that are unknown, doubled, missing or too few are refused with the bundle's names") {

@@ -68,7 +68,12 @@ inline Processor make(const EditableBundle& bundle = sample()) {
   return std::move(*processor);
 }
 
-inline Frame grey(std::uint8_t value) { return {4, 2, std::vector<std::uint8_t>(24, value)}; }
+/// All of one grey but for one number, since an image of one colour gets a note.
+inline Frame grey(std::uint8_t value) {
+  std::vector<std::uint8_t> rgb(24, value);
+  rgb[13] ^= 0x80;
+  return {4, 2, std::move(rgb)};
+}
 
 inline Observation observation() {
   return {{{"top", grey(0)}, {"wrist", grey(255)}, {"side", std::nullopt}}, {{"state", {1.5f, 6.0f}}}, "pick up"};
