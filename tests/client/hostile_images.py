@@ -65,26 +65,25 @@ def files():
     ImageFile.MAXBLOCK = 1 << 26  # or Pillow refuses to write noise
     noise, side = np.random.default_rng(0), 4096
     black = np.zeros((side, side, 3), np.uint8)
-    random = noise.integers(0, 256, (side, side, 3), dtype=np.uint8)
-    line = random[:4].reshape(1, 4 * side, 3)
+    random = noise.integers(0, 256, (2600, 2600, 3), dtype=np.uint8)
+    line = random.reshape(1, -1, 3)[:, : 4 * side]
     made = {
-        "black.png": _encoded(black, "PNG"),
-        "black.jpg": _encoded(black[:4000], "JPEG"),
-        "turned.jpg": _encoded(black[:4000], "JPEG", exif=_turned()),
+        "black.png": _encoded(black[:2000, :1800], "PNG"),
+        "black.jpg": _encoded(black[:2700], "JPEG"),
+        "turned.jpg": _encoded(black[:1750], "JPEG", exif=_turned()),
+        "large.png": _png(2 * side, 1, noise).replace(struct.pack(">II", 2 * side, 1), struct.pack(">II", 2 * side, side)),
         "arithmetic.jpg": b"\xff\xd8\xff\xc9" + struct.pack(">HBHHB", 11, 8, side, side, 1) + b"\1\x11\0\xff\xd9",
         "lying.png": _png(8, 8, noise).replace(struct.pack(">II", 8, 8), struct.pack(">II", 60_000, 60_000)),
         "row.jpg": _encoded(line, "JPEG"),
         "column.jpg": _encoded(line.reshape(-1, 1, 3), "JPEG"),
         "column.png": _encoded(line.reshape(-1, 1, 3), "PNG"),
     }
-    for size in (1024, 2048, 2364, 3072):
+    for size in (1900, 2600):  # the first is about as large as each may be, the second is refused
         made[f"noise_{size}.png"] = _png(size, size, noise)
-        made[f"sparse_{size}.png"] = _png(size, size, noise, most=6)
-        made[f"interlaced_{size}.png"] = _png(size, size, noise, ADAM7)
-        for quality in (50, 75, 100):
-            for progressive in (False, True):
-                name = f"noise_{size}_{quality}{'_progressive' if progressive else ''}.jpg"
-                made[name] = _encoded(random[:size, :size], "JPEG", quality=quality, subsampling=0, progressive=progressive)
+        made[f"interlaced_{size}.png"] = _png(size, size, noise, ADAM7, most=6)
+        for quality, progressive in ((75, False), (75, True), (100, False)):
+            name = f"noise_{size}_{quality}{'_progressive' if progressive else ''}.jpg"
+            made[name] = _encoded(random[:size, :size], "JPEG", quality=quality, subsampling=0, progressive=progressive)
     for size, n in ((256, 198), (600, 190), (1024, 60), (1300, 36), (2048, 12), (3600, 2), (4096, 14)):
         made[f"scans_{size}_{n}.jpg"] = _scans(size, size, n)
     return {name: file for name, file in made.items() if len(file) < MOST_MESSAGE}
