@@ -15,23 +15,24 @@
 namespace vla {
 namespace {
 
-/// False with errno where the system does not take all of them.
-bool write_all(int fd, std::span<const std::byte> bytes) {
-  while (!bytes.empty()) {
-    const ssize_t n = ::write(fd, bytes.data(), bytes.size());
-    if (n < 0 && errno != EINTR) return false;
-    if (n > 0) bytes = bytes.subspan(static_cast<std::size_t>(n));
-  }
-  return true;
-}
-
 Error cannot_write(const std::string& path, int number) {
   return {Code::io, path, "a file that can be written", std::strerror(number)};
 }
 
-Status write_in_place(const std::string& path, std::span<const std::byte> bytes) {
+Status write_new(const std::string& path, const WriteTo& write, unsigned mode) {
+  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode);
+  if (fd < 0) return cannot_write(path, errno);
+  bool written = write(fd) && ::fsync(fd) == 0;
+  int number = errno;
+  if (::close(fd) != 0 && written) written = false, number = errno;
+  if (written) return {};
+  ::unlink(path.c_str());
+  return cannot_write(path, number);
+}
+
+Status write_in_place(const std::string& path, const WriteTo& write) {
   const int fd = ::open(path.c_str(), O_WRONLY | O_CLOEXEC);
-  const bool written = fd >= 0 && write_all(fd, bytes);
+  const bool written = fd >= 0 && write(fd);
   const int number = errno;
   if (fd >= 0 && ::close(fd) != 0 && written) return cannot_write(path, errno);
   return written ? Status() : cannot_write(path, number);
@@ -53,25 +54,31 @@ Result<std::vector<std::byte>> read_file(const std::string& path, std::size_t li
   return bytes;
 }
 
+bool write_all(int file, std::span<const std::byte> bytes) {
+  while (!bytes.empty()) {
+    const ssize_t n = ::write(file, bytes.data(), bytes.size());
+    if (n < 0 && errno != EINTR) return false;
+    if (n > 0) bytes = bytes.subspan(static_cast<std::size_t>(n));
+  }
+  return true;
+}
+
 Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode) {
-  const int fd = ::open(path.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_CLOEXEC, mode);
-  if (fd < 0) return cannot_write(path, errno);
-  bool written = write_all(fd, bytes) && ::fsync(fd) == 0;
-  int number = errno;
-  if (::close(fd) != 0 && written) written = false, number = errno;
-  if (written) return {};
-  ::unlink(path.c_str());
-  return cannot_write(path, number);
+  return write_new(path, [bytes](int file) { return write_all(file, bytes); }, mode);
 }
 
 Status write_file(const std::string& path, std::span<const std::byte> bytes) {
+  return write_file(path, [bytes](int file) { return write_all(file, bytes); });
+}
+
+Status write_file(const std::string& path, const WriteTo& write) {
   std::error_code ignored;
   const auto there = std::filesystem::status(path, ignored);
-  if (std::filesystem::exists(there) && !std::filesystem::is_regular_file(there)) return write_in_place(path, bytes);
+  if (std::filesystem::exists(there) && !std::filesystem::is_regular_file(there)) return write_in_place(path, write);
   const bool is_link = std::filesystem::is_symlink(std::filesystem::symlink_status(path, ignored));
   const std::string target = is_link ? std::filesystem::weakly_canonical(path, ignored).string() : path;
   const std::string part = fmt::format("{}.{:08x}.part", target, std::random_device()());
-  if (const Status written = write_new_file(part, bytes, 0666); !written)
+  if (const Status written = write_new(part, write, 0666); !written)
     return Error{Code::io, path, written.error().expected, written.error().found};
   if (::rename(part.c_str(), target.c_str()) == 0) return {};
   const int number = errno;

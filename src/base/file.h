@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstddef>
+#include <functional>
 #include <span>
 #include <string>
 #include <vector>
@@ -19,6 +20,11 @@ Status write_new_file(const std::string& path, std::span<const std::byte> bytes,
 /// Writes a file whole or not at all: the bytes go into a new file beside it, which takes its name when all of them are
 /// on the disk. What is no regular file, such as a pipe, is written to as it is. Errors: io.
 Status write_file(const std::string& path, std::span<const std::byte> bytes);
+/// The same of bytes that `write` writes to an open file; it returns false, with errno set, where it could not.
+using WriteTo = std::function<bool(int file)>;
+Status write_file(const std::string& path, const WriteTo& write);
+/// All of them, or false with errno set.
+bool write_all(int file, std::span<const std::byte> bytes);
 inline Status write_file(const std::string& path, const std::string& text) {
   return write_file(path, std::as_bytes(std::span(text)));
 }

@@ -5,7 +5,6 @@
 #include <fmt/format.h>
 #include <sys/mman.h>
 #include <unistd.h>
-#include <xxhash.h>
 
 #include <algorithm>
 #include <cstring>
@@ -19,7 +18,6 @@ namespace vla::bench {
 namespace {
 
 constexpr int kRobot = 7;  // joints of the robot that the features describe
-constexpr std::string_view kNoDigits = "xxh3:0000000000000000";
 
 std::vector<std::string> numbered(const std::string& name, int count) {
   std::vector<std::string> names;
@@ -140,7 +138,7 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
       {"general.architecture", "vla"},
       {"vla.arch", arch},
       {"vla.bundle_version", std::int64_t{1}},
-      {"vla.checksum", std::string(kNoDigits)},
+      {"vla.checksum", std::string(kNoChecksum)},
       {"vla.dtype", dtype_name(sizes.dtype)},
       {"vla.source.name", fmt::format("random weights, seed {}", sizes.seed)},
       {"vla.source.revision", ""},
@@ -254,35 +252,6 @@ class Values {
   std::string pool_, codes_, ones_, zeros_;
 };
 
-/// A growing file in memory with its checksum.
-class Output {
- public:
-  explicit Output(int file) : file_(file), state_(XXH3_createState(), XXH3_freeState) {
-    XXH3_64bits_reset(state_.get());
-  }
-
-  void put(std::string_view bytes) {
-    XXH3_64bits_update(state_.get(), bytes.data(), bytes.size());
-    for (size_ += bytes.size(); !bytes.empty() && !failed_;) {
-      const ssize_t n = ::write(file_, bytes.data(), bytes.size());
-      failed_ = n <= 0;
-      if (!failed_) bytes.remove_prefix(static_cast<std::size_t>(n));
-    }
-  }
-  void pad() { put(std::string((kGgufAlignment - size_ % kGgufAlignment) % kGgufAlignment, '\0')); }
-  /// Writes the checksum of everything over the zeros at `place`. False if anything could not be written.
-  bool seal(std::size_t place) {
-    const std::string digits = fmt::format("{:016x}", XXH3_64bits_digest(state_.get()));
-    return !failed_ && ::pwrite(file_, digits.data(), digits.size(), static_cast<off_t>(place)) == 16;
-  }
-
- private:
-  int file_;
-  std::size_t size_ = 0;
-  bool failed_ = false;
-  std::unique_ptr<XXH3_state_t, decltype(&XXH3_freeState)> state_;
-};
-
 bool write_bundle(int file, const Keys& keys, const ParamList& list, const RandomSizes& sizes) {
   std::vector<TensorInfo> tensors;
   std::vector<std::byte> nothing;
@@ -292,15 +261,14 @@ bool write_bundle(int file, const Keys& keys, const ParamList& list, const Rando
     tensor.data = {nothing.data(), dtype_size(tensor.type, tensor.count())};
     tensors.push_back(std::move(tensor));
   }
-  Output out(file);
-  const std::string head = write_gguf_head(keys, tensors);
-  out.put(head);
+  BundleFile out(file, keys, tensors);
   const Values values(list, sizes);
   for (std::size_t i = 0; i < tensors.size(); ++i) {
-    values.each_piece(list.params()[i], tensors[i].data.size(), [&](std::string_view piece) { out.put(piece); });
-    out.pad();
+    values.each_piece(list.params()[i], tensors[i].data.size(),
+                      [&](std::string_view piece) { out.put(std::as_bytes(std::span(piece))); });
+    out.end_tensor();
   }
-  return out.seal(head.find(kNoDigits) + kNoDigits.find('0'));
+  return out.seal();
 }
 
 }  // namespace

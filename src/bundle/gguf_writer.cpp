@@ -2,6 +2,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "bundle/gguf_writer.h"
 
+#include <fmt/format.h>
+#include <unistd.h>
+#include <xxhash.h>
+
+#include <cerrno>
+
+#include "base/file.h"
+
 namespace vla {
 namespace {
 
@@ -73,6 +81,34 @@ std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors) {
     pad(out);
   }
   return out;
+}
+
+BundleFile::BundleFile(int file, const Keys& keys, std::span<const TensorInfo> tensors)
+    : file_(file), state_(XXH3_createState(), [](XXH3_state_s* state) { return static_cast<int>(XXH3_freeState(state)); }) {
+  XXH3_64bits_reset(state_.get());
+  const std::string head = write_gguf_head(keys, tensors);
+  digits_ = head.find(kNoChecksum) + kNoChecksum.find('0');
+  put(std::as_bytes(std::span(head)));
+}
+
+BundleFile::~BundleFile() = default;
+
+void BundleFile::put(std::span<const std::byte> bytes) {
+  XXH3_64bits_update(state_.get(), bytes.data(), bytes.size());
+  size_ += bytes.size();
+  if (!failed_ && !write_all(file_, bytes)) failed_ = true, errno_ = errno;
+}
+
+void BundleFile::end_tensor() {
+  constexpr std::byte kZeros[kGgufAlignment] = {};
+  put(std::span(kZeros).first((kGgufAlignment - size_ % kGgufAlignment) % kGgufAlignment));
+}
+
+bool BundleFile::seal() {
+  const std::string digits = fmt::format("{:016x}", XXH3_64bits_digest(state_.get()));
+  if (failed_) return errno = errno_, false;
+  return ::pwrite(file_, digits.data(), digits.size(), static_cast<off_t>(digits_)) ==
+         static_cast<ssize_t>(digits.size());
 }
 
 }  // namespace vla

@@ -17,28 +17,35 @@ std::string shape_text(const std::vector<std::int64_t>& shape) { return fmt::for
 /// The dtypes that the bundle's tensor may have, for people.
 const char* dtypes_of(const Param& param) {
   if (!is_float(param.encoding.type)) return dtype_name(param.stored_type());
-  return param.storage == Storage::vector ? "f32" : "f32, bf16 or f16";
+  return param.storage == Storage::vector  ? "f32"
+         : param.storage == Storage::table ? "f32, bf16 or f16"
+                                           : "f32, bf16, f16 or i8";
 }
 
 bool allows(const Param& param, DType type) {
   if (!is_float(param.encoding.type)) return type == param.stored_type();
-  return param.storage == Storage::vector ? type == DType::f32 : is_float(type);
+  if (param.storage == Storage::vector) return type == DType::f32;
+  return is_float(type) || (param.storage == Storage::matrix && type == DType::i8);
 }
 
-/// Whether one of the four codes of a byte is 3, which stands for no number.
-bool has_wrong_code(std::span<const std::byte> codes) {
+/// Whether a byte is no code: one of four ternary codes is 3, or an int8 code is -128.
+bool has_wrong_code(DType type, std::span<const std::byte> codes) {
   std::byte wrong = {};
-  for (const std::byte four : codes) wrong |= four & four >> 1 & std::byte{0x55};
+  if (type == DType::ternary) {
+    for (const std::byte four : codes) wrong |= four & four >> 1 & std::byte{0x55};
+  } else {
+    for (const std::byte code : codes) wrong |= static_cast<std::byte>(code == std::byte{0x80});
+  }
   return wrong != std::byte{};
 }
 
 /// The same of a tensor, read part by part.
-Result<bool> has_wrong_code(const Bundle& bundle, std::span<const std::byte> codes) {
+Result<bool> has_wrong_code(const Bundle& bundle, DType type, std::span<const std::byte> codes) {
   constexpr std::size_t kPart = std::size_t{1} << 20;
   Room room;
   for (std::size_t i = 0; i < codes.size(); i += kPart) {
     VLA_TRY(const auto part, bundle.read(codes.subspan(i, std::min(kPart, codes.size() - i)), room));
-    if (has_wrong_code(part)) return true;
+    if (has_wrong_code(type, part)) return true;
   }
   return false;
 }
@@ -48,6 +55,12 @@ Result<bool> has_wrong_code(const Bundle& bundle, std::span<const std::byte> cod
 const char* Param::storage_text() const {
   constexpr const char* kNames[] = {"matrix", "table", "vector"};
   return is_float(encoding.type) ? kNames[static_cast<int>(storage)] : dtype_name(encoding.type);
+}
+
+/// A module of the network has one ternary matrix, and BitLinear's scale has its name; other matrices may lie side by side.
+std::string Param::scales_name() const {
+  if (encoding.type != DType::ternary) return name + "_scale";
+  return name.substr(0, name.rfind('.') + 1) + "scale";
 }
 
 std::int64_t Param::count() const {
@@ -88,7 +101,7 @@ const Param& ParamList::declare(std::string name, Storage storage, std::vector<s
   param.encoding = encoding;
   if (bundle_ != nullptr) look_up(param);
   if (const std::int64_t n = param.encoding.n_scale(param.count()); n > 0)
-    param.scales = &declare(param.name.substr(0, param.name.rfind('.') + 1) + "scale", Storage::vector, {n});
+    param.scales = &declare(param.scales_name(), Storage::vector, {n});
   return param;
 }
 
@@ -103,11 +116,15 @@ void ParamList::look_up(Param& param) {
   if (!allows(param, tensor->type))
     return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name, dtypes_of(param),
                                dtype_name(tensor->type)));
-  if (is_float(param.encoding.type)) param.encoding.type = tensor->type;
-  if (param.encoding.type == DType::ternary) {
-    const Result<bool> wrong = has_wrong_code(*bundle_, tensor->data);
+  if (is_float(param.encoding.type))
+    param.encoding = {tensor->type, tensor->type == DType::i8 ? param.shape[0] : 0};  // int8: a scale for each row
+  if (!is_float(param.encoding.type)) {
+    const bool is_ternary = param.encoding.type == DType::ternary;
+    const Result<bool> wrong = has_wrong_code(*bundle_, param.encoding.type, tensor->data);
     if (!wrong) return problem(wrong.error());
-    if (*wrong) return problem(fmt::format("wrong code      {:<40} expected 0, 1 or 2, file has 3", param.name));
+    if (*wrong)
+      return problem(fmt::format("wrong code      {:<40} expected {}", param.name,
+                                 is_ternary ? "0, 1 or 2, file has 3" : "-127 to 127, file has -128"));
   }
   param.source = tensor;
   declared_->by_source.emplace(tensor->data.data(), &param);

@@ -15,7 +15,8 @@
 
 namespace vla {
 
-/// What a parameter is for: a matrix or a table may be in any float dtype of the bundle, a vector in f32 only.
+/// What a parameter is for: a matrix or a table may be in any float dtype of the bundle, a vector in f32 only. A matrix of
+/// floats may also be quantized: int8 codes, -127 to 127, with a scale for each row.
 enum class Storage { matrix, table, vector };
 
 /// One declared weight. `shape` follows ggml, fastest first: a matrix is [d_in, d_out].
@@ -35,6 +36,8 @@ struct Param {
   bool is_packed() const { return dtype_bits(encoding.type) < 8; }
   /// What `vla inspect` calls it: the storage, or the dtype of codes.
   const char* storage_text() const;
+  /// Of its scales, where the encoding has some.
+  std::string scales_name() const;
 };
 
 /// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they

@@ -81,6 +81,7 @@ int run(int argc, char** argv) {
   choose("inspect", vla::cli::add_inspect(app));
   choose("compare", vla::cli::add_compare(app));
   choose("bench", vla::cli::add_bench(app));
+  choose("quantize", vla::cli::add_quantize(app));
 #ifdef VLA_SERVER
   choose("serve", vla::cli::add_serve(app));
   choose("keygen", vla::cli::add_keygen(app));

@@ -34,13 +34,18 @@ ggml_type type_of(DType type) {
   return GGML_TYPE_F32;
 }
 
-void upload(ggml_tensor* tensor, const Param& param, const std::byte* data) {
+/// scales: what the encoding has of them.
+void upload(ggml_tensor* tensor, const Param& param, const std::byte* data, const float* scales) {
   const DType type = param.encoding.type;
-  if (type_of(type) == tensor->type) return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
+  if (is_float(type) && type_of(type) == tensor->type)
+    return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
   std::vector<float> values(static_cast<std::size_t>(param.count()));
   if (type == DType::ternary)
     for (std::size_t i = 0; i < values.size(); ++i)
       values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
+  else if (type == DType::i8)
+    for (std::size_t i = 0; i < values.size(); ++i)
+      values[i] = static_cast<float>(std::to_integer<signed char>(data[i])) * scales[i / static_cast<std::size_t>(param.encoding.group)];
   else if (type == DType::f32)
     std::memcpy(values.data(), data, param.source->data.size());
   else if (type == DType::bf16)
@@ -127,11 +132,16 @@ Status GgmlDevice::load(const ParamList& params, bool fill) {
   if (!linear_text_.empty()) linear_text_ += ")";
   if (weights_.empty()) return {};
   VLA_TRY(weights_size_, memory().place(weight_context_.get(), "weights", &weight_memory_));
-  Room room;
+  Room room, scales_room;
   for (const Param& param : params.params()) {
     if (!fill) break;
     VLA_TRY(const auto data, params.bundle()->read(param.source->data, room));
-    VLA_CHECK(guarded([&] { upload(weight(&param), param, data.data()); }));
+    std::span<const std::byte> scales;
+    if (param.scales != nullptr) {
+      VLA_TRY(scales, params.bundle()->read(param.scales->source->data, scales_room));
+    }
+    const auto* const values = reinterpret_cast<const float*>(scales.data());
+    VLA_CHECK(guarded([&] { upload(weight(&param), param, data.data(), values); }));
   }
   return {};
 }

@@ -8,6 +8,8 @@ namespace vla {
 
 Encoding resident_encoding(const Param& param, Rounding rounding) {
   constexpr std::int64_t kMinRounded = 144;
+  if (rounding == Rounding::float32)
+    return param.encoding.type == DType::i8 ? Encoding{DType::f32} : param.encoding;
   const bool keeps = rounding == Rounding::none || param.storage != Storage::matrix || !is_float(param.encoding.type) ||
                      std::min(param.shape[0], param.shape[1]) < kMinRounded;
   if (keeps) return param.encoding;
@@ -15,7 +17,7 @@ Encoding resident_encoding(const Param& param, Rounding rounding) {
 }
 
 Status check_rounding(const ParamList& list, Rounding rounding) {
-  if (rounding == Rounding::none) return {};
+  if (rounding == Rounding::none || rounding == Rounding::float32) return {};
   const bool to_int8 = rounding == Rounding::int8;
   const DType wanted = to_int8 ? DType::i8 : DType::bf16;
   for (const Param& param : list.params())

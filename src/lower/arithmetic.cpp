@@ -34,7 +34,10 @@ Arithmetic rounding(Rounding at_load, Arithmetic best) {
 Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machine) {
   VLA_TRY(const Arithmetic best, with(kernel_set_of(machine), machine));
   if (kernels.empty()) return best;
-  if (kernels == kFloat32) return with(kernel_set_of(without_rounding(machine)), machine);
+  if (kernels == kFloat32) {
+    VLA_TRY(const Arithmetic exact, with(kernel_set_of(without_rounding(machine)), machine));
+    return rounding(Rounding::float32, exact);
+  }
   if (kernels == kBf16 && !rounds_to_bf16(machine))
     return Error{Code::device, "kernels", "a machine with AVX-512 BF16 or AMX", kernels,
                  "leave the choice to the program"};

@@ -29,6 +29,7 @@ ROOMS = {
     "modules": GRAPH | {"nn"},
     "policies": GRAPH | {"nn", "modules"},
     "engine": GRAPH | NETWORK | {"devices", "processor"},
+    "quantize": GRAPH | NETWORK | {"kernels", "lower"},
     "bench": GRAPH | NETWORK | {"kernels", "devices", "processor", "engine"},
     "net": {"base"},
     "zmtp": {"base", "net"},
@@ -36,7 +37,7 @@ ROOMS = {
     "observe": {"base", "engine", "net", "wire"},
     "serve": {"engine", "processor", "bundle", "base", "net", "zmtp", "wire", "observe"},
     "capi": {"engine", "policies", "processor", "bundle", "base"},
-    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "observe", "zmtp", "wire", "bench"},  # doors that the program opens
+    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "observe", "zmtp", "wire", "bench", "quantize"},  # doors that the program opens
 }
 # Libraries that belong to some rooms: no other sees their headers, not through any number of ours either. The engine's taps are a
 # GGUF file of tensors.

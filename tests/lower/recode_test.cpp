@@ -21,7 +21,7 @@ Recoded recoded(std::vector<float> values, DType stored, Encoding wanted) {
   const auto count = static_cast<std::int64_t>(values.size());
   Recoded result = {{}, std::vector<float>(static_cast<std::size_t>(wanted.n_scale(count)))};
   Room room;
-  const std::byte* to = Recode{stored, wanted}(from.data(), count, room, result.scales.data());
+  const std::byte* to = Recode{{stored}, wanted}(from.data(), nullptr, count, room, result.scales.data());
   result.bytes.assign(to, to + dtype_size(wanted.type, count));
   return result;
 }
@@ -49,9 +49,9 @@ TEST_CASE("what is stored as it is wanted stays where it is, codes too") {
   const std::vector<std::byte> stored(8, std::byte{0x15});
   Room room;
   for (const Encoding same : {Encoding{DType::f32}, Encoding{DType::bf16}, Encoding{DType::ternary, 8}}) {
-    const Recode recode = {same.type, same};
+    const Recode recode = {same, same};
     CHECK_FALSE(recode.changes());
-    CHECK(recode(stored.data(), 2, room, nullptr) == stored.data());
+    CHECK(recode(stored.data(), nullptr, 2, room, nullptr) == stored.data());
   }
 }
 
@@ -60,4 +60,13 @@ TEST_CASE("bf16 is the nearest one, ties to even") {
   const Recoded rounded = recoded({1 + 0x1p-8f, -1 - 0x1.8p-8f, 0x1p-130f, 3.0e38f}, DType::f32, {DType::bf16});
   CHECK(rounded.bytes == test::store_as(DType::bf16, expected));
   CHECK(rounded.scales.empty());
+}
+
+TEST_CASE("codes become float32 by the scale of their group") {
+  const std::vector<std::byte> codes = {std::byte{127}, std::byte{0x81}, std::byte{3}, std::byte{0}};
+  const std::vector<float> scales = {0.1f, 2};
+  Room room;
+  const std::byte* to = Recode{{DType::i8, 2}, {DType::f32}}(codes.data(), scales.data(), 4, room, nullptr);
+  const auto* values = reinterpret_cast<const float*>(to);
+  CHECK(std::vector<float>(values, values + 4) == std::vector<float>{127 * 0.1f, -127 * 0.1f, 6, 0});
 }

@@ -27,7 +27,7 @@ class CpuDevice final : public Device {
   std::string kernels() const override { return name_of(arithmetic_.use); }
   Features features() const override { return arithmetic_.use; }
   Precision precision() const override {
-    if (arithmetic_.at_load == Rounding::int8) return Precision::int8;
+    if (weights_.has_int8()) return Precision::int8;
     return rounds_to_bf16(arithmetic_.use) ? Precision::bf16 : Precision::f32;
   }
   Rounding rounding() const override { return arithmetic_.at_load; }

@@ -41,11 +41,12 @@ struct PackTask : kernels::Task {
     const kernels::LinearKernel* kernel;  // null: a copy
     std::byte* to;
     Recode recode = {};
-    float* scales = nullptr;  // where they are made
+    float* scales = nullptr;                      // where they are made
+    std::span<const std::byte> from_scales = {};  // of codes that become floats
   };
   const Bundle* bundle;
   std::vector<Part> parts;
-  mutable std::vector<Room> rooms, recoded;  // of each worker
+  mutable std::vector<Room> rooms, scale_rooms, recoded;  // of each worker
   mutable std::atomic<bool> has_failed = false;
 
   void add(const Param& param, std::byte* to) {
@@ -66,30 +67,43 @@ struct PackTask : kernels::Task {
            .from = all.subspan(static_cast<std::size_t>(first * row), static_cast<std::size_t>(desc.d_out * row)),
            .kernel = kernel,
            .to = place,
-           .recode = {param.encoding.type, encoding},
-           .scales = scales != nullptr ? scales + encoding.n_scale(first * desc.d_in) : nullptr});
+           .recode = {param.encoding, encoding},
+           .scales = scales != nullptr ? scales + encoding.n_scale(first * desc.d_in) : nullptr,
+           .from_scales = from_scales(param, encoding, first * desc.d_in, desc.d_out * desc.d_in)});
     }
+  }
+
+  /// Those of elements from `first` on, where float32 needs them.
+  static std::span<const std::byte> from_scales(const Param& param, const Encoding& wanted, std::int64_t first,
+                                                std::int64_t count) {
+    if (wanted.type == param.encoding.type || param.scales == nullptr) return {};
+    const auto size = [&](std::int64_t n) { return static_cast<std::size_t>(param.encoding.n_scale(n)) * sizeof(float); };
+    return param.scales->source->data.subspan(size(first), size(count));
   }
 
   void run(std::int64_t item, kernels::Worker& worker) const override {
     const Part& part = parts[static_cast<std::size_t>(item)];
     const auto i = static_cast<std::size_t>(worker.index);
     const std::byte* read = bundle->content()->read(part.from, rooms[i]);
-    if (read == nullptr)
+    const std::byte* scales = bundle->content()->read(part.from_scales, scale_rooms[i]);
+    if (read == nullptr || (scales == nullptr && !part.from_scales.empty())) {
       has_failed = true;
-    else if (part.kernel == nullptr)
+    } else if (part.kernel == nullptr) {
       std::memcpy(part.to, read, part.from.size());
-    else
-      part.kernel->pack(part.desc, part.recode(read, part.desc.d_in * part.desc.d_out, recoded[i], part.scales),
-                        part.to);
+    } else {
+      const std::int64_t count = part.desc.d_in * part.desc.d_out;
+      const auto* const from_scales = reinterpret_cast<const float*>(scales);
+      part.kernel->pack(part.desc, part.recode(read, from_scales, count, recoded[i], part.scales), part.to);
+    }
   }
 
   /// Takes the memory that workers need, since they must not run out of it.
   void reserve(int n_thread) {
-    rooms.resize(static_cast<std::size_t>(n_thread)), recoded.resize(rooms.size());
+    rooms.resize(static_cast<std::size_t>(n_thread)), recoded.resize(rooms.size()), scale_rooms.resize(rooms.size());
     for (const Part& part : parts)
       for (std::size_t i = 0; i < rooms.size(); ++i) {
         rooms[i].take(Content::room_for(part.from.size()));
+        scale_rooms[i].take(Content::room_for(part.from_scales.size()));
         if (part.recode.changes()) recoded[i].take(part.recode.room_for(part.desc.d_in * part.desc.d_out));
       }
   }
@@ -106,6 +120,10 @@ std::string describe(const std::map<std::string, std::map<std::string, int>>& co
 }
 
 }  // namespace
+
+bool CpuWeights::has_int8() const {
+  return std::ranges::any_of(places_, [](const Place& place) { return place.encoding.type == DType::i8; });
+}
 
 Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& options) {
   VLA_CHECK(check_rounding(list, options.rounding));

@@ -58,6 +58,8 @@ class CpuWeights {
     const auto found = tables_->find(table);
     return found != tables_->end() ? found->second.get() : nullptr;
   }
+  /// Whether matrices of floats are int8 codes, as they are stored or rounded.
+  bool has_int8() const;
   /// Bytes in memory; of tables those of the rows that may be kept.
   std::size_t size() const { return memory_.size() + table_size_; }
   /// Which kernel multiplies how many matrices, for display: `avx2 (98 bf16)`.

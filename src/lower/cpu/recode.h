@@ -11,17 +11,17 @@ namespace vla::lower {
 /// Elements of a matrix from the bundle's encoding to that in memory. What encodings there are between the two is known
 /// here alone.
 struct Recode {
-  DType stored;
-  Encoding wanted;
+  Encoding stored, wanted;
 
-  bool changes() const { return wanted.type != stored; }
+  bool changes() const { return wanted.type != stored.type; }
   /// Bytes that `operator()` takes of its room.
   std::size_t room_for(std::int64_t count) const {
     return aligned(dtype_size(wanted.type, count)) + static_cast<std::size_t>(wanted.group) * sizeof(float);
   }
   /// `count` elements, whole groups of them, as they are wanted: in `room`, or `from` itself where nothing changes.
-  /// Where the encoding gets scales, they go to `scales`.
-  const std::byte* operator()(const std::byte* from, std::int64_t count, Room& room, float* scales) const;
+  /// from_scales: those of codes that become floats; scales: room for those that codes get.
+  const std::byte* operator()(const std::byte* from, const float* from_scales, std::int64_t count, Room& room,
+                              float* scales) const;
 };
 
 }  // namespace vla::lower

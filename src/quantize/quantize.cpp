@@ -1,0 +1,213 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "quantize/quantize.h"
+
+#include <algorithm>
+#include <cmath>
+#include <map>
+#include <optional>
+#include <set>
+
+#include "base/file.h"
+#include "bundle/gguf_writer.h"
+#include "graph/rounding.h"
+#include "kernels/numbers.h"
+#include "lower/cpu/recode.h"
+#include "policies/policy.h"
+
+namespace vla {
+namespace {
+
+constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a time
+
+/// Tensors of the file by the address of their bytes, which the robots of a bundle share.
+struct Matrices {
+  std::map<const std::byte*, Encoding> wanted;
+  std::set<const std::byte*> read_otherwise;
+
+  void add(const ParamList& list) {
+    for (const Param& param : list.params()) {
+      const Encoding encoding = resident_encoding(param, Rounding::int8);
+      const std::byte* const place = param.source->data.data();
+      if (encoding == param.encoding)
+        read_otherwise.insert(place);
+      else
+        wanted.emplace(place, encoding);
+    }
+  }
+  std::optional<Encoding> find(const TensorInfo& tensor) const {
+    const auto found = wanted.find(tensor.data.data());
+    if (found == wanted.end() || read_otherwise.contains(tensor.data.data())) return std::nullopt;
+    return found->second;
+  }
+};
+
+/// What the policy of every robot reads as a large matrix. Errors: bad_bundle, unsupported.
+Result<Matrices> find_matrices(const Bundle& bundle) {
+  Matrices matrices;
+  std::vector<std::string> tags = bundle.embodiments();
+  if (tags.empty()) tags.emplace_back();
+  for (const std::string& tag : tags) {
+    Bundle robot = bundle;
+    VLA_CHECK(robot.choose(tag));
+    VLA_TRY(const std::string arch, robot.keys().string("vla.arch"));
+    VLA_TRY(const PolicyEntry entry, find_policy(arch));
+    ParamList list(robot.keys(), &robot);
+    const std::unique_ptr<Policy> policy = entry.make(list);
+    VLA_CHECK(list.report(arch, [](const std::string&) { return true; }));
+    matrices.add(list);
+  }
+  return matrices;
+}
+
+/// The squares of what a matrix is, and of what its codes miss.
+struct Squares {
+  double value = 0, missed = 0;
+
+  void add(DType type, const std::byte* stored, const std::byte* codes, const float* scales, std::int64_t d_in,
+           std::int64_t n_row) {
+    for (std::int64_t i = 0; i < n_row * d_in; ++i) {
+      const float value_i = kernels::stored_number(type, stored, i);
+      const float code = static_cast<float>(std::to_integer<signed char>(codes[i])) * scales[i / d_in];
+      value += double{value_i} * value_i;
+      missed += double{value_i - code} * (value_i - code);
+    }
+  }
+};
+
+/// Writes the tensors, one after the other.
+class Writer {
+ public:
+  Writer(const Bundle& bundle, BundleFile& out, const std::function<void(QuantizeProgress)>& report)
+      : bundle_(bundle), out_(out), report_(report) {}
+
+  Status copy(const TensorInfo& tensor) {
+    constexpr std::size_t kPart = std::size_t{1} << 22;
+    for (std::size_t at = 0; at < tensor.data.size(); at += kPart) {
+      VLA_TRY(const auto part, read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at))));
+      out_.put(part);
+    }
+    out_.end_tensor();
+    return {};
+  }
+
+  /// Codes, then scales: two tensors.
+  Result<Squares> quantize(const TensorInfo& tensor, const Encoding& wanted) {
+    const std::int64_t d_in = tensor.shape[0], d_out = tensor.shape[1];
+    const std::size_t row = tensor.data.size() / static_cast<std::size_t>(d_out);
+    std::vector<float> scales(static_cast<std::size_t>(d_out));
+    Squares squares;
+    for (std::int64_t first = 0; first < d_out; first += kPartRows) {
+      const std::int64_t n = std::min(kPartRows, d_out - first);
+      VLA_TRY(const auto part,
+              read(tensor.data.subspan(static_cast<std::size_t>(first) * row, static_cast<std::size_t>(n) * row)));
+      float* const to = scales.data() + first;
+      const std::byte* codes = lower::Recode{{tensor.type}, wanted}(part.data(), nullptr, n * d_in, codes_, to);
+      squares.add(tensor.type, part.data(), codes, to, d_in, n);
+      out_.put({codes, static_cast<std::size_t>(n * d_in)});
+    }
+    out_.end_tensor();
+    out_.put(std::as_bytes(std::span(scales)));
+    out_.end_tensor();
+    return squares;
+  }
+
+ private:
+  Result<std::span<const std::byte>> read(std::span<const std::byte> part) {
+    VLA_TRY(const auto bytes, bundle_.read(part, room_));
+    report_({done_ += static_cast<std::int64_t>(part.size()), static_cast<std::int64_t>(bundle_.file_size())});
+    return bytes;
+  }
+
+  const Bundle& bundle_;
+  BundleFile& out_;
+  const std::function<void(QuantizeProgress)>& report_;
+  Room room_, codes_;
+  std::int64_t done_ = 0;
+};
+
+/// The tensors of the quantized file; of their data only the sizes count.
+std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& matrices) {
+  std::vector<TensorInfo> tensors;
+  for (const TensorInfo& tensor : bundle.tensors()) {
+    tensors.push_back(tensor);
+    if (!matrices.find(tensor)) continue;
+    TensorInfo& codes = tensors.back();
+    codes.type = DType::i8;
+    codes.data = tensor.data.first(dtype_size(DType::i8, tensor.count()));
+    const std::int64_t d_out = tensor.shape[1];
+    // No bundle has a matrix with rows of fewer bytes than a scale.
+    tensors.push_back({tensor.name + "_scale", DType::f32, {d_out}, tensor.data.first(dtype_size(DType::f32, d_out))});
+  }
+  return tensors;
+}
+
+Keys quantized_keys(const Bundle& bundle) {
+  Keys keys = bundle.keys();
+  keys.set("vla.checksum", std::string(kNoChecksum));
+  keys.set("vla.dtype", std::string("int8"));
+  return keys;
+}
+
+/// A row of the report for every module, in the order of the file.
+class Report {
+ public:
+  QuantizedModule& of(const TensorInfo& tensor) {
+    std::string path = tensor.name.substr(0, tensor.name.find('.'));
+    const auto found = std::ranges::find(rows_, path, &QuantizedModule::path);
+    if (found != rows_.end()) return *found;
+    squares_.emplace_back();
+    return rows_.emplace_back(QuantizedModule{.path = std::move(path)});
+  }
+  void add(QuantizedModule& row, const Squares& more) {
+    Squares& squares = squares_[static_cast<std::size_t>(&row - rows_.data())];
+    squares.value += more.value, squares.missed += more.missed;
+    ++row.n_matrix;
+    row.error = squares.value > 0 ? std::sqrt(squares.missed / squares.value) : 0;
+  }
+  std::vector<QuantizedModule> take() { return std::move(rows_); }
+
+ private:
+  std::vector<QuantizedModule> rows_;
+  std::vector<Squares> squares_;
+};
+
+Status write_tensors(const Bundle& bundle, const Matrices& matrices, Writer& writer, Report& report) {
+  for (const TensorInfo& tensor : bundle.tensors()) {
+    QuantizedModule& row = report.of(tensor);
+    row.before += static_cast<std::int64_t>(tensor.data.size());
+    if (const std::optional<Encoding> wanted = matrices.find(tensor)) {
+      VLA_TRY(const Squares squares, writer.quantize(tensor, *wanted));
+      report.add(row, squares);
+      row.after += tensor.count() + tensor.shape[1] * static_cast<std::int64_t>(sizeof(float));
+    } else {
+      VLA_CHECK(writer.copy(tensor));
+      row.after += static_cast<std::int64_t>(tensor.data.size());
+    }
+  }
+  return {};
+}
+
+}  // namespace
+
+Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to,
+                                              const std::function<void(QuantizeProgress)>& progress) {
+  VLA_TRY(const Bundle bundle, Bundle::open(from));
+  VLA_TRY(const Matrices matrices, find_matrices(bundle));
+  const std::vector<TensorInfo> tensors = quantized_tensors(bundle, matrices);
+  if (tensors.size() == bundle.tensors().size())
+    return Error{Code::unsupported, from, "large matrices of floats", "none: it is quantized already, or too small"};
+  Report report;
+  Status made;
+  const Status written = write_file(to, [&](int file) {
+    BundleFile out(file, quantized_keys(bundle), tensors);
+    Writer writer(bundle, out, progress);
+    made = write_tensors(bundle, matrices, writer, report);
+    return made && out.seal();
+  });
+  VLA_CHECK(made);
+  VLA_CHECK(written);
+  return report.take();
+}
+
+}  // namespace vla

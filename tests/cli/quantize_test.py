@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""`vla quantize`: a bundle of int8 codes gives the actions that --kernels int8 makes of the floats, and float32 those of its codes."""
+
+import gguf
+import numpy as np
+import pytest
+
+from golden_cases import ROOT, data_offset, sealed
+from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle
+
+SHIPPED = ROOT / "models/metaworld-tiny.gguf"
+MATRIX = "vision.blk.0.attn_q.weight"
+FEW_ROWS = 144  # matrices from or to fewer elements stay as they are
+
+
+@pytest.fixture(scope="module")
+def quantized(vla, tmp_path_factory):
+    path = tmp_path_factory.mktemp("quantized") / "int8.gguf"
+    answer = vla("quantize", SHIPPED, "-o", path)
+    assert answer.code == 0, answer.err
+    assert "matrices" in answer.out and "all" in answer.out
+    return path
+
+
+@pytest.fixture(scope="module")
+def actions(vla):
+    frame = ROOT / "examples/metaworld/episodes"
+    image = sorted(frame.rglob("*.png"))[0]
+
+    def run(bundle, *options):
+        answer = vla("run", bundle, "--image", f"corner4={image}", "--state", "0,0.4,0.2,1", "--text", "open the faucet",
+                     "--seed", "3", "--threads", "2", "--json", *options)
+        return np.array(answer.json()["actions"]), answer.json()
+
+    return run
+
+
+def widened(codes, scales):
+    return codes.astype(np.float32) * scales[:, None]
+
+
+def test_large_matrices_become_codes_and_the_rest_stays(quantized):
+    before, after = read_bundle(str(SHIPPED)), read_bundle(str(quantized))
+    for name, values in before.tensors.items():
+        large = before.dtypes[name] == "bf16" and values.ndim == 2 and min(values.shape) >= FEW_ROWS and "embed.tokens" not in name
+        if after.dtypes[name] != "i8":
+            assert np.array_equal(after.tensors[name], values), name
+            continue
+        assert large, name
+        scales = after.tensors[name + "_scale"]
+        assert np.abs(widened(after.tensors[name], scales) - values).max(axis=1) == pytest.approx(0, abs=scales.max())
+        assert np.array_equal(np.abs(after.tensors[name]).max(axis=1), np.full(len(scales), 127))
+    assert list(after.dtypes.values()).count("i8") == 64
+    assert quantized.stat().st_size < 0.6 * SHIPPED.stat().st_size
+
+
+def test_it_gives_the_actions_of_kernels_int8_to_the_bit(actions, quantized):
+    asked, _ = actions(SHIPPED, "--kernels", "int8")
+    stored, answer = actions(quantized)
+    assert np.array_equal(stored, asked)
+    assert answer["precision"] == "int8"
+    assert not np.array_equal(stored, actions(SHIPPED, "--kernels", "float32")[0])
+
+
+@pytest.mark.parametrize("kernels", ["float32", "ggml"])
+def test_float32_of_its_codes_is_asked_for_by_name(actions, quantized, tmp_path, kernels):
+    content = read_bundle(str(quantized))
+    kinds = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
+    keys = []
+    for name, field in gguf.GGUFReader(quantized).fields.items():
+        if not name.startswith("GGUF.") and name != "vla.checksum":
+            kind = kinds[int(field.types[-1])] + ("[]" if field.types[0] == 9 else "")
+            value = "f32" if name == "vla.dtype" else field.contents()
+            keys.append(Key(name, kind, value))
+    wide = {}
+    for name, values in content.tensors.items():
+        if content.dtypes[name] == "i8":
+            wide[name] = widened(values, content.tensors[name + "_scale"])
+        elif not name.endswith("_scale"):
+            wide[name] = values
+    tensors = [TensorInfo(name, values.shape, "f64" if content.dtypes[name] == "f64" else "f32") for name, values in wide.items()]
+    with BundleWriter(str(tmp_path / "wide.gguf"), keys, tensors) as out:
+        for name, values in wide.items():
+            out.write(name, values)
+    assert np.array_equal(actions(quantized, "--kernels", kernels)[0], actions(tmp_path / "wide.gguf", "--kernels", kernels)[0])
+
+
+def test_a_quantized_bundle_is_not_quantized_again(vla, quantized, tmp_path):
+    vla("quantize", quantized, "-o", tmp_path / "again.gguf").refused("unsupported", "quantized already")
+    assert not (tmp_path / "again.gguf").exists()
+
+
+def test_a_file_that_exists_is_kept(vla, quantized):
+    before = quantized.read_bytes()
+    vla("quantize", SHIPPED, "-o", quantized).refused("usage", "--force")
+    assert quantized.read_bytes() == before
+    assert vla("quantize", SHIPPED, "-o", quantized, "--force", "--quiet").code == 0
+    assert quantized.read_bytes() == before
+
+
+def test_a_code_that_no_number_has_is_refused(vla, quantized, tmp_path):
+    data = bytearray(quantized.read_bytes())
+    data[data_offset(quantized, MATRIX) + 17] = 0x80
+    (tmp_path / "code.gguf").write_bytes(sealed(data))
+    answer = vla("inspect", tmp_path / "code.gguf")
+    assert answer.code == 3 and f"wrong code      {MATRIX}" in answer.err and "-127 to 127, file has -128" in answer.err
+
+
+def test_codes_without_their_scales_are_refused(vla, quantized, tmp_path):
+    data = quantized.read_bytes().replace(MATRIX.encode() + b"_scale", MATRIX.encode() + b"_scalf", 1)
+    (tmp_path / "lost.gguf").write_bytes(sealed(data))
+    answer = vla("inspect", tmp_path / "lost.gguf")
+    assert answer.code == 3 and "missing tensor" in answer.err and MATRIX + "_scale" in answer.err
