@@ -64,7 +64,8 @@ bool write_all(int file, std::span<const std::byte> bytes) {
 }
 
 Status write_new_file(const std::string& path, std::span<const std::byte> bytes, unsigned mode) {
-  return write_new(path, [bytes](int file) { return write_all(file, bytes); }, mode);
+  return write_new(
+      path, [bytes](int file) { return write_all(file, bytes); }, mode);
 }
 
 Status write_file(const std::string& path, std::span<const std::byte> bytes) {

@@ -84,7 +84,8 @@ std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors) {
 }
 
 BundleFile::BundleFile(int file, const Keys& keys, std::span<const TensorInfo> tensors)
-    : file_(file), state_(XXH3_createState(), [](XXH3_state_s* state) { return static_cast<int>(XXH3_freeState(state)); }) {
+    : file_(file),
+      state_(XXH3_createState(), [](XXH3_state_s* state) { return static_cast<int>(XXH3_freeState(state)); }) {
   XXH3_64bits_reset(state_.get());
   const std::string head = write_gguf_head(keys, tensors);
   digits_ = head.find(kNoChecksum) + kNoChecksum.find('0');

@@ -25,7 +25,8 @@ std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors);
 /// What `vla.checksum` is before the bytes are known.
 inline constexpr std::string_view kNoChecksum = "xxh3:0000000000000000";
 
-/// A bundle that grows in an open file, with its checksum: first the head, then the bytes of one tensor after the other.
+/// A bundle that grows in an open file, with its checksum: first the head, then the bytes of one tensor after the
+/// other.
 class BundleFile {
  public:
   /// `vla.checksum` of the keys must be kNoChecksum. Of the tensors' data only the sizes are used.

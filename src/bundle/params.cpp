@@ -57,7 +57,8 @@ const char* Param::storage_text() const {
   return is_float(encoding.type) ? kNames[static_cast<int>(storage)] : dtype_name(encoding.type);
 }
 
-/// A module of the network has one ternary matrix, and BitLinear's scale has its name; other matrices may lie side by side.
+/// A module of the network has one ternary matrix, and BitLinear's scale has its name; other matrices may lie side by
+/// side.
 std::string Param::scales_name() const {
   if (encoding.type != DType::ternary) return name + "_scale";
   return name.substr(0, name.rfind('.') + 1) + "scale";

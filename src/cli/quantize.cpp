@@ -33,7 +33,8 @@ void print(const std::vector<QuantizedModule>& rows) {
     width = std::max(width, row.path.size());
     all.n_matrix += row.n_matrix, all.before += row.before, all.after += row.after;
   }
-  say(stdout, "{:<{}}  {:>8}  {:>10}  {:>10}  {:>8}\n", "module", width, "matrices", "before, MB", "after, MB", "error");
+  say(stdout, "{:<{}}  {:>8}  {:>10}  {:>10}  {:>8}\n", "module", width, "matrices", "before, MB", "after, MB",
+      "error");
   for (const QuantizedModule& row : rows) print_row(row, width);
   say(stdout, "{:<{}}  {:>8}  {:>10}  {:>10}\n", all.path, width, all.n_matrix, megabytes(all.before),
       megabytes(all.after));
@@ -66,9 +67,11 @@ Status run(const QuantizeOptions& options) {
 
 Command add_quantize(CLI::App& app) {
   auto options = std::make_shared<QuantizeOptions>();
-  CLI::App* command = app.add_subcommand("quantize", "Write a bundle with its large matrices in int8: half the size of bf16");
+  CLI::App* command =
+      app.add_subcommand("quantize", "Write a bundle with its large matrices in int8: half the size of bf16");
   command->footer(
-      "The codes are those that --kernels int8 makes at every load, so the actions are the same; the file is smaller and\n"
+      "The codes are those that --kernels int8 makes at every load, so the actions are the same; the file is smaller "
+      "and\n"
       "ready sooner. How far actions move from float32 is for you to judge, on your own observations:\n"
       "  vla quantize policy.gguf -o policy.int8.gguf\n"
       "  vla run policy.gguf ... --kernels float32 --tap '*' --taps-out expected.gguf\n"

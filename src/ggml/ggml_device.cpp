@@ -45,7 +45,8 @@ void upload(ggml_tensor* tensor, const Param& param, const std::byte* data, cons
       values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
   else if (type == DType::i8)
     for (std::size_t i = 0; i < values.size(); ++i)
-      values[i] = static_cast<float>(std::to_integer<signed char>(data[i])) * scales[i / static_cast<std::size_t>(param.encoding.group)];
+      values[i] = static_cast<float>(std::to_integer<signed char>(data[i])) *
+                  scales[i / static_cast<std::size_t>(param.encoding.group)];
   else if (type == DType::f32)
     std::memcpy(values.data(), data, param.source->data.size());
   else if (type == DType::bf16)

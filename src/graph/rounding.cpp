@@ -8,8 +8,7 @@ namespace vla {
 
 Encoding resident_encoding(const Param& param, Rounding rounding) {
   constexpr std::int64_t kMinRounded = 144;
-  if (rounding == Rounding::float32)
-    return param.encoding.type == DType::i8 ? Encoding{DType::f32} : param.encoding;
+  if (rounding == Rounding::float32) return param.encoding.type == DType::i8 ? Encoding{DType::f32} : param.encoding;
   const bool keeps = rounding == Rounding::none || param.storage != Storage::matrix || !is_float(param.encoding.type) ||
                      std::min(param.shape[0], param.shape[1]) < kMinRounded;
   if (keeps) return param.encoding;

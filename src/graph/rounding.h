@@ -7,8 +7,8 @@
 /// Matrices in other numbers than those of the bundle, because somebody asked for it.
 namespace vla {
 
-/// What matrices become when they are loaded: large ones of floats are rounded to bf16 or int8, or quantized ones become
-/// float32 again.
+/// What matrices become when they are loaded: large ones of floats are rounded to bf16 or int8, or quantized ones
+/// become float32 again.
 enum class Rounding { none, bf16, int8, float32 };
 
 /// The encoding of a parameter in memory; int8 has a scale for each row of a matrix. Matrices from or to fewer than 144

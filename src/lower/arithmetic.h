@@ -16,9 +16,9 @@ struct Arithmetic {
   Features use;  // of our own kernels
   Rounding at_load = Rounding::none;
 
-  /// On a processor: a KernelSet by name, "float32" for the best that rounds nothing, "bf16" for the best that rounds to
-  /// bf16, large matrices too, "int8" for the best with large matrices quantized, or nothing for the best.
-  /// Errors: usage for an unknown name, device for one that the processor cannot run.
+  /// On a processor: a KernelSet by name, "float32" for the best that rounds nothing, "bf16" for the best that rounds
+  /// to bf16, large matrices too, "int8" for the best with large matrices quantized, or nothing for the best. Errors:
+  /// usage for an unknown name, device for one that the processor cannot run.
   static Result<Arithmetic> on_cpu(const std::string& kernels, Features machine);
   /// On another device: "float32", "ggml" or nothing, or "bf16". Errors: usage.
   static Result<Arithmetic> on_device(const std::string& kernels, const std::string& device);

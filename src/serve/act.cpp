@@ -20,12 +20,8 @@ Result<const Robot*> only_robot(const Engine& engine, const char* option) {
 
 ActLimits act_limits(const ServerOptions& options, const Robot& robot) {
   const Processor& processor = robot.processor();
-  return {options.max_pixels,
-          options.max_text,
-          processor.views().names().size(),
-          robot.solver_horizon(),
-          robot.d_action_padded(),
-          static_cast<int>(processor.action_names().size()),
+  return {options.max_pixels,          options.max_text,        processor.views().names().size(),
+          robot.solver_horizon(),      robot.d_action_padded(), static_cast<int>(processor.action_names().size()),
           processor.recipe().fit.get()};
 }
 
@@ -33,8 +29,7 @@ Status spend(ActLimits& left, int width, int height, std::int64_t work, const st
   if (left.fit != nullptr) work += fit_work(*left.fit, width, height);
   if (work > left.max_pixels)
     return Error{Code::too_large, where, fmt::format("an image that costs at most {} pixels", left.max_pixels),
-                 fmt::format("{} x {}, which costs {}", width, height, work),
-                 "Description.limits has all limits"};
+                 fmt::format("{} x {}, which costs {}", width, height, work), "Description.limits has all limits"};
   left.max_pixels -= work;
   return {};
 }

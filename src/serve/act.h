@@ -35,8 +35,8 @@ Result<const Robot*> only_robot(const Engine& engine, const char* option);
 
 /// The bounds for one robot's acts.
 ActLimits act_limits(const ServerOptions& options, const Robot& robot);
-/// An act costs what its images cost together: `work` of decoding this one, in pixels, and what fitting it takes. Errors:
-/// too_large.
+/// An act costs what its images cost together: `work` of decoding this one, in pixels, and what fitting it takes.
+/// Errors: too_large.
 Status spend(ActLimits& left, int width, int height, std::int64_t work, const std::string& where);
 
 /// The seed of an act whose client gave none.

@@ -185,9 +185,9 @@ TEST_CASE("a random bundle of every dtype passes every check of a bundle and ans
     const auto engine = Engine::load(random->path(), {.n_thread = 1});
     REQUIRE_MESSAGE(engine.ok(), engine.error().message());
     const Engine& loaded = **engine;
-    CHECK(loaded.processor().views().names().size() == 3);
-    CHECK(loaded.solver().n_step == 2);
-    auto workload = Workload::make(loaded.processor(), {2, 40, 30, 17});
+    CHECK(loaded.robot().processor().views().names().size() == 3);
+    CHECK(loaded.robot().solver().n_step == 2);
+    auto workload = Workload::make(loaded.robot().processor(), {2, 40, 30, 17});
     REQUIRE(workload.ok());
     REQUIRE(workload->decode().ok());
     CHECK(std::get<0>(workload->observation().views.at("observation.images.view1")->rgb).size() == 40 * 30 * 3);

@@ -52,7 +52,7 @@ LIBRARIES = [
     (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
     (re.compile(r"google/protobuf/.*"), {"wire", "serve"}),
-    (re.compile(r"prometheus/.*"), {"observe"}),
+    (re.compile(r"prometheus/.*"), {"observe", "cli"}),  # cli keeps the metrics
     (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp"}),  # of a client; keys in Z85
     (re.compile(r"boost/.*"), {"net", "zmtp", "observe", "serve"}),
     (re.compile(r"msgpack\.hpp"), {"serve"}),

@@ -68,7 +68,7 @@ def test_the_linker_cannot_choose_code_of_a_better_machine_for_all():
 def test_every_kernel_that_the_pretended_machine_can_choose_is_emulated():
     better = {path.name for path in objects("src/CMakeFiles/vla_kernels.dir/kernels/x86")}
     better = {name[: -len(".cpp.o")] for name in better if re.search(r"_(avx512|avx512_bf16|amx)\.cpp\.o$", name)}
-    emulated = {path.name[: -len(".cpp.o")] for path in objects("tests/CMakeFiles/test_amx_machine.dir")}
+    emulated = {path.name[: -len(".cpp.o")] for path in objects("tests/CMakeFiles/vla_emulated.dir")}
     assert better - emulated == NOT_EMULATED
-    for path in objects("tests/CMakeFiles/test_amx_machine.dir"):
+    for path in objects("tests/CMakeFiles/vla_emulated.dir"):
         assert not BETTER.search(run("objdump", "-d", "--no-show-raw-insn", path)), path.name

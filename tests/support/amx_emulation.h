@@ -108,9 +108,3 @@ inline void multiply_bytes(int c, int a, int b) {
 #define _tile_dpbsud vla::test::amx::multiply_bytes
 
 #define AmxSession EmulatedAmxSession
-#ifndef VLA_EMULATED_MACHINE
-#define kLinearAmx kEmulatedLinearAmx
-#define kTernaryAmx kEmulatedTernaryAmx
-#define kInt8Amx kEmulatedInt8Amx
-#define kAttentionAmx kEmulatedAttentionAmx
-#endif

@@ -51,8 +51,3 @@ inline __m512 add_pairs(__m512 sum, __m512bh a, __m512bh b) {
 #define _mm512_cvtne2ps_pbh vla::test::bf16::round_pairs
 #define _mm512_cvtneps_pbh vla::test::bf16::round_half_as_many
 #define _mm512_dpbf16_ps vla::test::bf16::add_pairs
-
-#ifndef VLA_EMULATED_MACHINE
-#define kLinearAvx512Bf16 kEmulatedLinearAvx512Bf16
-#define kAttentionAvx512Bf16 kEmulatedAttentionAvx512Bf16
-#endif

@@ -127,7 +127,7 @@ inline __m512 widen(unsigned, __m256i x) {
 #define _mm512_maskz_extractf32x8_ps vla::test::avx512::half
 #define _mm512_maskz_cvtph_ps vla::test::avx512::widen
 
-// What the sources ask the compiler for, and names of their own, so that the program holds the real kernels too.
+// What the sources ask the compiler for.
 #if !defined(__AVX512F__)
 #define __AVX512F__ 1
 #define __AVX512DQ__ 1
@@ -135,9 +135,5 @@ inline __m512 widen(unsigned, __m256i x) {
 #define VLA_EMULATED_INSTRUCTIONS
 #define asm(...) static_cast<void>(0)  // a hint that names a register of 64 bytes
 #define Avx512 EmulatedAvx512
-#ifndef VLA_EMULATED_MACHINE
-#define kLinearAvx512 kEmulatedLinearAvx512
-#define kAvx512Kernels kEmulatedAvx512Kernels
-#define kTernaryAvx512 kEmulatedTernaryAvx512
-#define kInt8Avx512 kEmulatedInt8Avx512
-#endif
+
+#include "support/emulated_names.h"

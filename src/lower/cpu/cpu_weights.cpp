@@ -77,7 +77,9 @@ struct PackTask : kernels::Task {
   static std::span<const std::byte> from_scales(const Param& param, const Encoding& wanted, std::int64_t first,
                                                 std::int64_t count) {
     if (wanted.type == param.encoding.type || param.scales == nullptr) return {};
-    const auto size = [&](std::int64_t n) { return static_cast<std::size_t>(param.encoding.n_scale(n)) * sizeof(float); };
+    const auto size = [&](std::int64_t n) {
+      return static_cast<std::size_t>(param.encoding.n_scale(n)) * sizeof(float);
+    };
     return param.scales->source->data.subspan(size(first), size(count));
   }
 
