@@ -123,7 +123,7 @@ def test_an_option_may_differ_by_robot(converter, tmp_path):
     tiny = TinyGr00t()
     tiny.kwargs["letter_box_transform"] = False
     info = tmp_path / "info.json"
-    info.write_text(json.dumps({"fps": 20, "features": {}}))
+    info.write_text(json.dumps({"fps": 20, "features": {"observation.state": {}}}))
     own = {
         "gripper_sign": {TAG: "gripper", OTHER: ""},
         "camera_size": {TAG: "640x480", OTHER: "1280x720"},
