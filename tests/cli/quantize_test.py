@@ -49,9 +49,10 @@ def test_large_matrices_become_codes_and_the_rest_stays(quantized):
             continue
         assert large, name
         scales = after.tensors[name + "_scale"]
-        assert np.abs(widened(after.tensors[name], scales) - values).max(axis=1) == pytest.approx(0, abs=scales.max())
+        floats = (values.astype(np.uint32) << 16).view(np.float32)  # of bf16
+        assert (np.abs(widened(after.tensors[name], scales) - floats) <= 0.5001 * scales[:, None]).all()
         assert np.array_equal(np.abs(after.tensors[name]).max(axis=1), np.full(len(scales), 127))
-    assert list(after.dtypes.values()).count("i8") == 64
+    assert list(after.dtypes.values()).count("i8") == 63
     assert quantized.stat().st_size < 0.6 * SHIPPED.stat().st_size
 
 
@@ -79,7 +80,8 @@ def test_float32_of_its_codes_is_asked_for_by_name(actions, quantized, tmp_path,
             wide[name] = widened(values, content.tensors[name + "_scale"])
         elif not name.endswith("_scale"):
             wide[name] = values
-    tensors = [TensorInfo(name, values.shape, "f64" if content.dtypes[name] == "f64" else "f32") for name, values in wide.items()]
+    dtypes = {name: "f32" if content.dtypes[name] == "i8" else content.dtypes[name] for name in wide}
+    tensors = [TensorInfo(name, values.shape, dtypes[name]) for name, values in wide.items()]
     with BundleWriter(str(tmp_path / "wide.gguf"), keys, tensors) as out:
         for name, values in wide.items():
             out.write(name, values)

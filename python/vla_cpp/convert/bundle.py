@@ -9,6 +9,7 @@ that nobody's file or link is written through.
 
 from __future__ import annotations
 
+import mmap
 import os
 import struct
 import tempfile
@@ -186,11 +187,10 @@ def file_digest(file: BinaryIO, digits: int = -1) -> str:
 
 
 def _check_digest(path: str) -> None:
-    with open(path, "rb") as file:
-        head = file.read(4096)
-        # Behind the key stand the type (4 bytes), the length (8) and "xxh3:".
-        digits = head.find(CHECKSUM_KEY.encode()) + len(CHECKSUM_KEY) + 4 + 8 + len("xxh3:")
-        stated, found = head[digits : digits + 16].decode("latin1"), file_digest(file, digits)
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        # Behind the key, wherever it is, stand the type (4 bytes), the length (8) and "xxh3:".
+        digits = data.find(CHECKSUM_KEY.encode()) + len(CHECKSUM_KEY) + 4 + 8 + len("xxh3:")
+        stated, found = data[digits : digits + 16].decode("latin1"), file_digest(file, digits)
     if found != stated:
         raise refuse(
             path,
