@@ -16,8 +16,8 @@ from server_process import SECONDS, VLA
 
 
 @contextlib.contextmanager
-def serving(case, *options):
-    """A running `vla serve`: its ready line, and the address of a protocol by what it begins with."""
+def serving(case, *options, stops=False):
+    """A running `vla serve`: its ready line, and the address of a protocol by what it begins with. `stops`: a client ends it."""
     command = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "1", *map(str, options)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     line = process.stdout.readline()
@@ -26,7 +26,8 @@ def serving(case, *options):
         addresses = re.search(r"address=(\S+)", line)[1].split(",")
         yield line, lambda scheme: next(a for a in addresses if a.startswith(scheme))
     finally:
-        process.send_signal(signal.SIGTERM)
+        if not stops:
+            process.send_signal(signal.SIGTERM)
         assert process.wait(SECONDS) == 0
         process.stdout.close(), process.stderr.close()
 
@@ -85,9 +86,9 @@ class WebSocket:
 
     def send(self, payload, opcode=2):
         size = len(payload)
-        head = bytes([0x80 | opcode]) + (
-            bytes([0x80 | size]) if size < 126 else struct.pack(">BQ", 0x80 | 127, size)
-        )
+        length = struct.pack(">BH", 126, size) if 126 <= size < 65536 else struct.pack(">BQ", 127, size)
+        length = bytes([size]) if size < 126 else length
+        head = bytes([0x80 | opcode, 0x80 | length[0]]) + length[1:]
         self.socket.sendall(head + bytes(4) + payload)  # a mask of zeros
 
     def receive(self):

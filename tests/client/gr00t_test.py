@@ -105,6 +105,14 @@ def test_the_first_release_sends_the_observation_itself_and_gets_its_actions_wit
     assert len(json.loads(config["action"]["as_json"])["delta_indices"]) == next(iter(answer.values())).shape[0]
 
 
+def test_a_modality_can_be_asked_for_before_anything_else(robot):
+    for flags in ((), ("--gr00t-n1-5",)):
+        with serving(robot, "--gr00t", "127.0.0.1:0", *flags) as (_, address):
+            video = Client(address("gr00t+"), npy_array).ask("get_modality_config")["video"]
+            assert video["__ModalityConfig_class__"] is True
+            assert isinstance(video["as_json"], str) == bool(flags) and ("__ModalityConfig__" in video) != bool(flags)
+
+
 def test_what_has_no_arrays_is_answered_in_the_words_of_the_reference(served):
     client = Client(served[1], npy_array)
     assert client.ask("ping") == {"status": "ok", "message": "Server is running"}
@@ -150,7 +158,7 @@ def test_a_token_is_asked_of_everybody_and_kill_only_works_where_it_was_asked_fo
     token.write_text("s3cret\n")
     token.chmod(0o600)
     options = ("--gr00t", "127.0.0.1:0", "--api-token", token, "--gr00t-kill")
-    with serving(case, *options) as (_, address):
+    with serving(case, *options, stops=True) as (_, address):
         client = Client(address("gr00t+"), numpy_array)
         assert client.ask("ping") == {"error": "Unauthorized: Invalid API token"}
         assert client.ask("kill", api_token="s3cre") == {"error": "Unauthorized: Invalid API token"}

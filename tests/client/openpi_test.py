@@ -5,6 +5,7 @@
 import json
 import socket
 import statistics
+import subprocess
 import threading
 import time
 import urllib.error
@@ -16,7 +17,7 @@ import pytest
 pytest.importorskip("msgpack")
 
 from drop_in import WebSocket, numpy_array, openpi_array, pack, serving, unpack  # noqa: E402
-from server_process import SECONDS, frames, ran  # noqa: E402
+from server_process import SECONDS, VLA, frames, ran  # noqa: E402
 
 import vla_cpp  # noqa: E402
 
@@ -198,12 +199,8 @@ def test_a_key_that_the_server_asks_for_is_asked_of_everybody(case, options, tmp
 
 def test_names_are_checked_at_the_start_and_told_in_the_ready_line(case, served, options):
     assert "names='" in served[0] and "(rgb)" in served[0] and "(radians)" in served[0]
-    import subprocess
-
-    from server_process import VLA
-
-    def refusal(*arguments):
-        command = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--openpi", "127.0.0.1:0", *arguments]
+    def refusal(*arguments, address="127.0.0.1:0"):
+        command = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--openpi", address, *arguments]
         ended = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=60)
         assert ended.returncode == 2 and not ended.stdout
         return ended.stderr
@@ -212,7 +209,7 @@ def test_names_are_checked_at_the_start_and_told_in_the_ready_line(case, served,
         assert view in refusal()
     assert "observation/state" in refusal(*options[2:])
     assert "libero, droid, aloha" in refusal("--preset", "humanoid")
-    assert "insecure" in refusal(*options, "--openpi", "0.0.0.0:0")
+    assert "insecure" in refusal(*options, address="0.0.0.0:0")
 
 
 def test_what_an_openpi_client_asked_can_be_replayed(case, options, tmp_path):
@@ -220,11 +217,7 @@ def test_what_an_openpi_client_asked_can_be_replayed(case, options, tmp_path):
         with WebSocket(address("ws://")) as client:
             client.receive()
             client.ask(pack(observation(case), openpi_array))
-    import subprocess
-
-    from server_process import VLA
-
-    replayed = subprocess.run([VLA, "replay", tmp_path / "kept", case.bundle], capture_output=True, text=True)
+    replayed = subprocess.run([VLA, "replay", tmp_path / "kept", "--bundle", case.bundle], capture_output=True, text=True)
     assert replayed.returncode == 0 and "1 " in replayed.stdout, replayed.stdout + replayed.stderr
 
 

@@ -174,8 +174,8 @@ std::string encode_modalities(const Dialect& dialect, const Names& names, const 
   msgpack::Writer out;
   out.map(modalities.size());
   for (Modality& modality : modalities) {
-    out.text(modality.name).map(2);
-    out.text(dialect.framing == Framing::numpy ? "__ModalityConfig__" : "__ModalityConfig_class__").boolean(true);
+    out.text(modality.name).map(dialect.is_n1_5 ? 2 : 3).text("__ModalityConfig_class__").boolean(true);
+    if (!dialect.is_n1_5) out.text("__ModalityConfig__").boolean(true);  // N1.7's mark, beside N1.6's
     out.text("as_json");
     std::vector<int> steps;
     for (int i = 0; i < modality.n_step; ++i) steps.push_back(i);

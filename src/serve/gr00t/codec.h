@@ -31,7 +31,8 @@ Result<Observed> read_observation(const msgpack::Value* data);
 /// The answer to an act. Columns of actions with names such as `arm.0`, `arm.1` are one array, `arm`.
 std::string encode_reply(Reply reply, const Dialect& dialect, const Names& names, const v1::Description& description);
 
-/// The answer to get_modality_config.
+/// The answer to get_modality_config. Clients ask before they have sent an array, so that N1.6 and N1.7, which know it
+/// by other marks, get both.
 std::string encode_modalities(const Dialect& dialect, const Names& names, const v1::Description& description);
 
 std::string encode_error(const Error& error);

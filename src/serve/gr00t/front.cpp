@@ -97,6 +97,7 @@ Status Front::serve(const Engine& engine, const v1::Description& description) {
   embodiment_ = robot->bundle().embodiment();
   limits_ = act_limits(options_, *robot);
   description_ = description;
+  if (options_.gr00t_n1_5) last_ = {msgpack::Framing::npy, true, true, false};
   return {};
 }
 

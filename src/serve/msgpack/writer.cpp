@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/msgpack/writer.h"
 
+#include <cstring>
 #include <msgpack.hpp>
 
 #include "base/npy.h"
@@ -23,7 +24,14 @@ Writer& Writer::text(std::string_view v) {
 Writer& Writer::bytes(std::string_view v) {
   return Packer(*this).pack_bin(u32(v.size())).pack_bin_body(v.data(), u32(v.size())), *this;
 }
-Writer& Writer::real(double v) { return Packer(*this).pack_double(v), *this; }
+/// Not the library's, which writes whole numbers as integers.
+Writer& Writer::real(double v) {
+  std::uint64_t bits;
+  std::memcpy(&bits, &v, sizeof bits);
+  out_ += '\xcb';
+  for (int shift = 56; shift >= 0; shift -= 8) out_ += static_cast<char>(bits >> shift);
+  return *this;
+}
 Writer& Writer::integer(std::int64_t v) { return Packer(*this).pack_int64(v), *this; }
 Writer& Writer::boolean(bool v) { return v ? Packer(*this).pack_true() : Packer(*this).pack_false(), *this; }
 Writer& Writer::nil() { return Packer(*this).pack_nil(), *this; }
