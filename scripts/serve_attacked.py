@@ -7,7 +7,7 @@ scripts/serve_attacked.py                 the shipped policy, 20 seconds quiet a
 scripts/serve_attacked.py --attack half_sent --attack flood
 scripts/serve_attacked.py --real-time    on a machine that does other work beside it
 
-The attackers come from 127.0.0.2 and run at the lowest priority, since they are to attack the server and not the cores that it
+The attackers come from 127.0.0.2 (`own_address` from the robot's 127.0.0.1, `many_addresses` from 256 others) and run at the lowest priority, since they are to attack the server and not the cores that it
 shares with them here. Fails where an answer is lost or wrong, or a row misses its bar. docs/security.md says what is promised.
 """
 
@@ -35,12 +35,13 @@ import zmq
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tests/client")]
 import hostile  # noqa: E402
+import hostile_images  # noqa: E402
 
 import vla_cpp  # noqa: E402
 from vla_cpp import wire  # noqa: E402
 
 ATTACKER = "127.0.0.2"
-MAX_MESSAGE_MIB = 32
+MAX_MESSAGE_MIB, MAX_PIXELS = 32, 1 << 20
 HEALTH_MS, LATE_MS, ACT_RATIO = 20, 20, 2  # the bars
 PERIOD = 0.03  # seconds between the acts of a robot that behaves
 
@@ -135,29 +136,71 @@ def drip_http(target):
 
 
 def hostile_png(target):
-    """70 connections of one peer that ask for acts all the time: an image with 200 compressed texts that would be 8 MB each, and one
-    with fewer rows than it announces."""
+    """Acts with an image with 200 compressed texts that would be 8 MB each, and with one with fewer rows than it announces."""
+    ask_for_ever(target, [act_of(spec_of(target), png=image) for image in (png(8, 8, texts=200), png(4000, 4000, rows=1))])
+
+
+def heavy_images(target):
+    """Acts with the images that cost most of those that the limit on pixels admits."""
+    spec, black = spec_of(target), np.zeros((1024, 1024, 3), np.uint8)
+    images = [act_of(spec, jpeg=hostile_images._scans(1024, 1024, 15)), act_of(spec, png=hostile_images._encoded(black, "PNG"))]
+    ask_for_ever(target, images)
+
+
+def own_address(target):
+    """Acts that are in order, from a program of the robot's own machine."""
+    spec = spec_of(target)
+    ask_for_ever(target, [act_of(spec, rgb=np.zeros((v.height, v.width, 3), np.uint8)) for v in spec.views[:1]], source="127.0.0.1")
+
+
+def many_addresses(target):
+    """256 connections from as many addresses, whose handshakes are done, and that say nothing more."""
+
+    def one(source):
+        with hostile.connect(target.address, hostile.HANDSHAKE, source=source) as raw:
+            while raw.recv(1 << 16):
+                pass
+
+    again_and_again(*[lambda n=n: one(f"127.0.{1 + n // 128}.{1 + n % 128}") for n in range(256)])
+
+
+def spec_of(target):
     with vla_cpp.Client(target.address, timeout=20) as client:
-        view = client.spec.views[0].name
-    acts = []
-    for image in (png(8, 8, texts=200), png(4000, 4000, rows=1)):
-        message = wire.Request(protocol_version=1, request_id=1)
-        message.act.views.add(name=view, png=image)
-        acts.append(message.SerializeToString())
+        return client.spec
+
+
+def act_of(spec, **image):
+    """The bytes of an act that has this image in each of its views."""
+    message = wire.Request(protocol_version=1, request_id=7)
+    for v in spec.views:
+        view = message.act.views.add(name=v.name, **{k: data for k, data in image.items() if k != "rgb"})
+        if "rgb" in image:
+            view.rgb.height, view.rgb.width, view.rgb.rows = *image["rgb"].shape[:2], image["rgb"].tobytes()
+    for s in spec.states:
+        message.act.states.add(name=s.name).values.extend([0.1] * s.width)
+    message.act.text = "go"
+    return message.SerializeToString()
+
+
+def ask_for_ever(target, acts, n_connection=70, source=ATTACKER):
+    """Connections of one peer that ask again as soon as they are answered."""
     poller = zmq.Poller()
-    for n in range(70):
+    for n in range(n_connection):
         s = zmq.Context.instance().socket(zmq.DEALER)
         s.linger = 0
-        s.connect(target.address.replace("tcp://", f"tcp://{ATTACKER}:0;"))
-        s.send(acts[n % 2])
+        s.connect(target.address.replace("tcp://", f"tcp://{source}:0;"))
+        s.send(acts[n % len(acts)])
         poller.register(s, zmq.POLLIN)
     for n in itertools.count():
         for s, _ in poller.poll():
             s.recv()
-            s.send(acts[n % 2])
+            s.send(acts[n % len(acts)])
 
 
-ATTACKS = {f.__name__: f for f in (half_sent, flood, connections, drip, drip_http, hostile_png)}
+ATTACKS = {
+    f.__name__: f
+    for f in (half_sent, flood, connections, drip, drip_http, hostile_png, heavy_images, own_address, many_addresses)
+}
 
 
 def request(kind):
@@ -184,7 +227,7 @@ class Target:
 
     def __init__(self, options):
         command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", "--metrics", "127.0.0.1:0"]
-        command += ["--threads", str(options.threads), "--max-message", str(MAX_MESSAGE_MIB)]
+        command += ["--threads", str(options.threads), "--max-message", str(MAX_MESSAGE_MIB), "--max-pixels", str(MAX_PIXELS)]
         self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         line = self.process.stdout.readline()
         self.address = re.search(r"address='?(tcp://[^\s']+)", line)[1]
@@ -284,17 +327,8 @@ def late_after(address, spec, observation, n=8, deadline_ms=2):
 
 def slow_upload(target, seconds, outcome):
     """A robot on a bad line: its act takes that long to come, and is answered."""
-    with vla_cpp.Client(target.address, timeout=20) as client:
-        spec = client.spec
-    message = wire.Request(protocol_version=1, request_id=7)
-    for view in spec.views:
-        pixels = np.zeros((view.height, view.width, 3), np.uint8)
-        rgb = message.act.views.add(name=view.name).rgb
-        rgb.width, rgb.height, rgb.rows = view.width, view.height, pixels.tobytes()
-    for s in spec.states:
-        message.act.states.add(name=s.name).values.extend([0.1] * s.width)
-    message.act.text = "go"
-    data = message.SerializeToString()
+    spec = spec_of(target)
+    data = act_of(spec, rgb=np.zeros((spec.views[0].height, spec.views[0].width, 3), np.uint8))
     try:
         with hostile.connect(target.address, hostile.HANDSHAKE, source="127.0.0.4") as raw:
             data = hostile.long_frame(len(data), data)

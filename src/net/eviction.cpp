@@ -3,6 +3,7 @@
 #include "net/eviction.h"
 
 #include <algorithm>
+#include <bit>
 #include <boost/asio/ip/address.hpp>
 #include <map>
 #include <set>
@@ -54,6 +55,11 @@ std::string group_of(const std::string& peer) {
   return ip::address_v6(bytes, address.to_v6().scope_id()).to_string() + "/64";
 }
 
+Share share_of(const std::string& peer, Clock::time_point since, Clock::time_point now) {
+  const auto seconds = std::chrono::duration_cast<std::chrono::seconds>(now - since).count();
+  return {group_of(peer), static_cast<int>(std::bit_width(static_cast<std::uint64_t>(std::max(seconds, 0L))))};
+}
+
 std::size_t max_handshakes(std::size_t max_connections) { return std::max<std::size_t>(1, max_connections / 4); }
 
 std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t max_connections, Clock::time_point now) {
@@ -65,7 +71,8 @@ std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t ma
   const auto largest_of = [&](auto is_candidate) {
     const auto sums = sums_by_group(standings, [&](const Standing& s) { return std::size_t{is_candidate(s)}; });
     return first_of(standings, is_candidate, [&](const Standing& s) {
-      return std::tuple(-static_cast<std::ptrdiff_t>(sums.at(s.group)), s.served);
+      const std::size_t sum = std::max(sums.at(s.group), max_connections / 16);
+      return std::tuple(-static_cast<std::ptrdiff_t>(sum), s.n_held > 0, s.served);
     });
   };
   if (!is_full || n_unfinished > std::max<std::size_t>(1, max_connections / 8)) return largest_of(unfinished);

@@ -28,12 +28,20 @@ using Standings = std::vector<Standing>;
 /// own group, also of this machine: a program there must not share its robot's.
 std::string group_of(const std::string& peer);
 
+/// What decides in a queue whose turn it is.
+struct Share {
+  std::string group;  // `group_of` the peer
+  int seniority = 0;  // of its connection: 0 in its first second, and one more whenever its time doubles
+};
+Share share_of(const std::string& peer, Clock::time_point since, Clock::time_point now);
+
 /// How many connections may be in their handshake at once.
 std::size_t max_handshakes(std::size_t max_connections);
 
 /// The connection that gives way to new ones; none where there is room. Half of the places are kept for the oldest
 /// connections that were served within a minute. Handshakes give way before open connections, except for an eighth of
-/// the places; then the group that has most of those that could, and in it the one that was served longest ago.
+/// the places; then the group that has most of those that could, where all that have a sixteenth of the places or less
+/// are alike, and in it those that are not sending a request, the one that was served longest ago before others.
 std::optional<std::uint64_t> to_evict(const Standings& standings, std::size_t max_connections, Clock::time_point now);
 
 /// The connection whose half-received request gives way where all of them take more than `max_bytes`; none otherwise.

@@ -31,10 +31,10 @@ std::optional<Job> Exchange::next() {
     const bool has_late = deadline && *deadline <= Clock::now();
     if (has_late) {
       wake();  // the I/O thread takes it out and comes back
-    } else if (!jobs_.empty()) {
+    } else if (!jobs_.empty() && !(jobs_.is_crowded() && n_taken_ > 0)) {
       ++n_taken_;
       return jobs_.pop();
-    } else if (closed_) {
+    } else if (closed_ && jobs_.empty()) {
       return std::nullopt;
     }
     work_.wait(lock);
@@ -47,6 +47,7 @@ void Exchange::put(Answer answer) noexcept {
     work_.wait(lock, [this] { return !answer_; });
     answer_ = std::move(answer);
     --n_taken_;
+    work_.notify_all();
   }
   wake();
 }

@@ -35,7 +35,8 @@ class Exchange {
   Exchange& operator=(const Exchange&) = delete;
 
   /// For one thread that takes jobs and one that answers them, or both in one; nothing here takes memory. `next` sleeps
-  /// until there is a job that is not late, and returns none when the exchange is closed and empty.
+  /// until there is a job that is not late, and returns none when the exchange is closed and empty. In a crowd it gives
+  /// out one job at a time: one that is prepared ahead could not be overtaken by who comes from outside of the crowd.
   std::optional<Job> next();
   void put(Answer answer) noexcept;
 

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "net/bytes.h"
+#include "net/eviction.h"
 #include "observe/observer.h"
 #include "serve/act.h"
 #include "wire/vla.pb.h"
@@ -50,6 +51,7 @@ class Call {
 /// A request on its way through the server.
 struct Job : Received {
   std::unique_ptr<Call> call;
+  net::Share share;                          // whose turn it is
   std::optional<std::uint64_t> deadline_ms;  // from its receipt: when its turn has to have come
   std::optional<Clock::time_point> deadline;
 };

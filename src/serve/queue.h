@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-#include "observe/observer.h"
+#include "base/clock.h"
 
 namespace vla::serve {
 
@@ -19,20 +19,26 @@ namespace vla::serve {
 /// Peers take turns, and the clients of a peer take turns at its turns, in the order in which they began to wait: a
 /// peer is one key or one address, a client one connection of it. A newer act of a client takes the place of its older
 /// one. So neither a client that sends faster than others nor a peer that opens many connections gets more turns. Where
-/// the queue is full, the peer that has most in it gives way to one that has less.
+/// more than `kCrowd` clients of one peer wait, as where a program floods the server from the robot's own machine,
+/// those of about the same seniority take turns first: many connections that came together get as many turns as one
+/// that came long before them, or after. Where the queue is full, the peer that has most in it gives way to one that
+/// has less, and then within the peer the seniority that has most.
 ///
-/// `Job` has `client` and `peer` (std::string), `deadline` (std::optional<Clock::time_point>) and `size` (bytes). The
-/// queue knows no clock and takes no lock.
+/// `Job` has `client` (std::string), `share` (net::Share), `deadline` (std::optional<Clock::time_point>) and `size`
+/// (bytes). The queue knows no clock and takes no lock.
 template <class Job>
 class Queue {
  public:
   struct Limits {
     std::size_t jobs, bytes;
   };
+  static constexpr std::size_t kCrowd = 8;
   explicit Queue(Limits limits) : limits_(limits) {}
 
   std::size_t size() const { return line_.size(); }
   bool empty() const { return line_.empty(); }
+  /// Whether more than `kCrowd` clients of the peer wait whose turn is next.
+  bool is_crowded() const { return !turns_.empty() && n_of(turns_.front().group) > kCrowd; }
 
   /// Puts a job in line. Those that do not wait afterwards come back: `superseded` the older job of the same client,
   /// `refused` the given one or the last ones of a peer that has more in line.
@@ -46,10 +52,10 @@ class Queue {
     const std::size_t n_new = older == line_.end() ? 1 : 0, freed = older == line_.end() ? 0 : older->size;
     while (line_.size() + n_new > limits_.jobs || bytes_ - freed + job.size > limits_.bytes) {
       const auto last = line_.size() + n_new > limits_.jobs
-                            ? last_of_others(
-                                  job.peer, [](const Job&) { return 1; }, n_new)
-                            : last_of_others(
-                                  job.peer, [](const Job& j) { return j.size; }, job.size - std::min(freed, job.size));
+                            ? to_give_way(
+                                  job, [](const Job&) { return std::size_t{1}; }, n_new)
+                            : to_give_way(
+                                  job, [](const Job& j) { return j.size; }, job.size - std::min(freed, job.size));
       if (last == line_.end()) {
         result.refused.push_back(std::move(job));
         return result;
@@ -83,12 +89,19 @@ class Queue {
   /// The client that waits longest, of the peer whose turn it is.
   std::optional<Job> pop() {
     if (line_.empty()) return std::nullopt;
+    const bool is_crowd = is_crowded();
     turns_.splice(turns_.end(), turns_, turns_.begin());
-    return take(find([&](const Job& job) { return job.peer == turns_.back(); }));
+    Turn& turn = turns_.back();
+    if (is_crowd) return take(next_seniority(turn));
+    return take(find([&](const Job& job) { return job.share.group == turn.group; }));
   }
 
  private:
   using Place = typename std::list<Job>::iterator;
+  struct Turn {
+    std::string group;
+    int seniority = -1;  // that had its last turn, in a crowd
+  };
 
   template <class Wanted>
   Place find(Wanted wanted) {
@@ -97,8 +110,8 @@ class Queue {
 
   /// Takes all memory before it changes anything: where there is none, the queue stays as it was.
   void wait(Job job) {
-    const bool has_turn = std::find(turns_.begin(), turns_.end(), job.peer) != turns_.end();
-    std::list<std::string> turn(has_turn ? 0 : 1, job.peer);
+    std::list<Turn> turn;
+    if (n_of(job.share.group) == 0) turn.push_back({job.share.group});
     std::list<Job> last;
     last.push_back(std::move(job));
     bytes_ += last.back().size;
@@ -106,16 +119,48 @@ class Queue {
     line_.splice(line_.end(), last);
   }
 
-  /// The last job of the peer whose jobs amount to most, where that is more than `peer` would have with `added`.
+  std::size_t n_of(const std::string& group) const {
+    return static_cast<std::size_t>(
+        std::count_if(line_.begin(), line_.end(), [&](const Job& job) { return job.share.group == group; }));
+  }
+
+  /// Of a crowd of the group, the first of those whose seniority comes next after the one that had the last turn.
+  Place next_seniority(Turn& turn) {
+    const auto distance = [&](const Job& job) {
+      return job.share.group == turn.group ? static_cast<unsigned>(job.share.seniority - turn.seniority - 1) % 256
+                                           : 256;
+    };
+    const auto next = std::min_element(line_.begin(), line_.end(),
+                                       [&](const Job& a, const Job& b) { return distance(a) < distance(b); });
+    turn.seniority = next->share.seniority;
+    return next;
+  }
+
+  /// The job that gives way to the given one, which adds an amount to what its peer has; none where that would be
+  /// unfair.
   template <class Amount>
-  Place last_of_others(const std::string& peer, Amount amount, std::size_t added) {
-    std::map<std::string, std::size_t> sums;
-    for (const Job& job : line_) sums[job.peer] += static_cast<std::size_t>(amount(job));
-    const std::size_t own = sums[peer] + added;
+  Place to_give_way(const Job& job, Amount amount, std::size_t added) {
+    const auto group = [](const Job& j) { return j.share.group; };
+    const auto seniority = [](const Job& j) { return j.share.seniority; };
+    const auto place = last_of_most(
+        job, group, [](const Job&) { return true; }, amount, added);
+    if (place != line_.end()) return place;
+    return last_of_most(
+        job, seniority, [&](const Job& j) { return j.share.group == job.share.group; }, amount, added);
+  }
+
+  /// Of jobs that share a key, the last one of those that amount to most, where that is more than those with the given
+  /// one's key would have.
+  template <class Key, class Among, class Amount>
+  Place last_of_most(const Job& job, Key key, Among among, Amount amount, std::size_t added) {
+    std::map<decltype(key(job)), std::size_t> sums;
+    for (const Job& j : line_)
+      if (among(j)) sums[key(j)] += amount(j);
+    const std::size_t own = sums[key(job)] + added;
     const auto most = std::max_element(sums.begin(), sums.end(), [](auto& a, auto& b) { return a.second < b.second; });
-    if (most->first == peer || most->second <= own) return line_.end();
+    if (most->first == key(job) || most->second <= own) return line_.end();
     const auto last =
-        std::find_if(line_.rbegin(), line_.rend(), [&](const Job& job) { return job.peer == most->first; });
+        std::find_if(line_.rbegin(), line_.rend(), [&](const Job& j) { return among(j) && key(j) == most->first; });
     return std::prev(last.base());
   }
 
@@ -123,13 +168,13 @@ class Queue {
     Job job = std::move(*at);
     bytes_ -= job.size;
     line_.erase(at);
-    if (find([&](const Job& other) { return other.peer == job.peer; }) == line_.end()) turns_.remove(job.peer);
+    if (n_of(job.share.group) == 0) turns_.remove_if([&](const Turn& turn) { return turn.group == job.share.group; });
     return job;
   }
 
   Limits limits_;
-  std::list<Job> line_;           // of at most as many clients as fit: a search by name costs nothing beside one act
-  std::list<std::string> turns_;  // the peers that have a job in line, the next one first
+  std::list<Job> line_;    // of at most as many clients as fit: a search by name costs nothing beside one act
+  std::list<Turn> turns_;  // of the peers that have a job in line, the next one first
   std::size_t bytes_ = 0;
 };
 

@@ -18,6 +18,7 @@ struct Client {
   std::string peer;             // with keys, the client's public key; else its address, or `ipc` and its user
   std::string name;             // as it calls itself in a hello
   std::uint64_t n_request = 0;  // that came so far
+  Clock::time_point since = Clock::now();
 };
 
 /// The sockets of a ZeroMQ ROUTER: what listens, and the connections that came. All of it runs inside the loop's

@@ -84,6 +84,20 @@ TEST_CASE("handshakes are bounded on their own, and the oldest of the largest gr
   CHECK_FALSE(to_evict(all, 16, kNow));
 }
 
+TEST_CASE(
+    "eight connections of one robot do not give way to silent ones from many addresses, nor does a request on its "
+    "way") {
+  Standings all;
+  for (std::uint64_t i = 0; i < 8; ++i) all.push_back({i, "robot", true, {}, {}, i == 0 ? 100U : 0U});
+  for (std::uint64_t i = 8; i < 257; ++i) all.push_back({i, std::to_string(i), true});
+  for (std::uint64_t i = 1; i < 8; ++i) all[i].served = ago(90'000);  // too long ago for a kept place
+  CHECK(to_evict(all, 256, kNow) == 8);
+  for (std::uint64_t i = 8; i < 26; ++i) all[i].group = "attacker";
+  all[25].n_held = 1000;
+  all[8].served = all[9].served = ago(80'000);
+  CHECK(to_evict(all, 256, kNow) == 10);
+}
+
 TEST_CASE("where all are served, a new connection is let in and one that came late gives way") {
   Standings all;
   for (std::uint64_t i = 1; i <= 8; ++i) all.push_back({i, "peer " + std::to_string(i), true, ago(100)});

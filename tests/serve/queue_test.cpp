@@ -8,6 +8,8 @@
 #include <random>
 #include <set>
 
+#include "net/eviction.h"
+
 using namespace vla::serve;
 using vla::Clock;
 
@@ -18,7 +20,7 @@ struct Item {
   int number = 0;
   std::size_t size = 1;
   std::optional<Clock::time_point> deadline = {};
-  std::string peer = {};
+  vla::net::Share share = {};
 };
 
 Clock::time_point at(int ms) { return Clock::time_point(std::chrono::milliseconds(ms)); }
@@ -73,33 +75,63 @@ TEST_CASE("an act is late from its deadline on, not before") {
 
 TEST_CASE("a peer of seventy connections gets as many turns as a peer of one") {
   Queue<Item> queue(kRoom);
-  for (int i = 0; i < 70; ++i) queue.push({"many" + std::to_string(i), i, 1, {}, "many"});
+  for (int i = 0; i < 70; ++i) queue.push({"many" + std::to_string(i), i, 1, {}, {"many"}});
   for (int turn = 0; turn < 5; ++turn) {
-    queue.push({"one", 100 + turn, 1, {}, "one"});
-    std::set<std::string> served = {queue.pop()->peer, queue.pop()->peer};
+    queue.push({"one", 100 + turn, 1, {}, {"one"}});
+    std::set<std::string> served = {queue.pop()->share.group, queue.pop()->share.group};
     CHECK(served == std::set<std::string>{"many", "one"});
   }
 }
 
+TEST_CASE("in a crowd of one peer, a connection of another age gets every second turn") {
+  for (const int age : {0, 9}) {
+    Queue<Item> queue(kRoom);
+    for (int i = 0; i < 70; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", 5}});
+    int n_robot = 0;
+    for (int turn = 0; turn < 20; ++turn) {
+      queue.push({"robot", 100, 1, {}, {"here", age}});
+      n_robot += queue.pop()->client == "robot";
+    }
+    CHECK(n_robot == 10);
+  }
+}
+
+TEST_CASE("a few clients of one peer take turns, whatever their age") {
+  Queue<Item> queue(kRoom);
+  for (int i = 0; i < 8; ++i) queue.push({std::to_string(i), i, 1, {}, {"here", i}});
+  for (int turn = 0; turn < 24; ++turn) {
+    const auto item = queue.pop();
+    CHECK(item->number == turn % 8);
+    queue.push(*item);
+  }
+}
+
+TEST_CASE("where the queue is full of one peer's acts, the age that has most gives way to one that has less") {
+  Queue<Item> queue({3, 100});
+  for (int i = 0; i < 3; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", 2}});
+  CHECK(queue.push({"robot", 3, 1, {}, {"here", 6}}).refused.at(0).number == 2);
+  CHECK(queue.push({"flood3", 4, 1, {}, {"here", 2}}).refused.at(0).number == 4);
+}
+
 TEST_CASE("where the queue is full, the last act of the peer that has most gives way to a peer that has less") {
   Queue<Item> queue({3, 100});
-  for (int i = 0; i < 3; ++i) queue.push({"a" + std::to_string(i), i, 1, {}, "a"});
-  CHECK(queue.push({"a3", 3, 1, {}, "a"}).refused.at(0).number == 3);
-  CHECK(queue.push({"b0", 4, 1, {}, "b"}).refused.at(0).number == 2);
-  CHECK(queue.push({"b1", 5, 1, {}, "b"}).refused.at(0).number == 5);  // it would have as many
-  CHECK(queue.push({"c0", 6, 1, {}, "c"}).refused.at(0).number == 1);
-  CHECK(queue.push({"d0", 7, 1, {}, "d"}).refused.at(0).number == 7);  // all have the same
+  for (int i = 0; i < 3; ++i) queue.push({"a" + std::to_string(i), i, 1, {}, {"a"}});
+  CHECK(queue.push({"a3", 3, 1, {}, {"a"}}).refused.at(0).number == 3);
+  CHECK(queue.push({"b0", 4, 1, {}, {"b"}}).refused.at(0).number == 2);
+  CHECK(queue.push({"b1", 5, 1, {}, {"b"}}).refused.at(0).number == 5);  // it would have as many
+  CHECK(queue.push({"c0", 6, 1, {}, {"c"}}).refused.at(0).number == 1);
+  CHECK(queue.push({"d0", 7, 1, {}, {"d"}}).refused.at(0).number == 7);  // all have the same
   CHECK(queue.size() == 3);
 }
 
 TEST_CASE("bytes too are taken from the peer that has most of them") {
   Queue<Item> queue({10, 10});
-  queue.push({"a0", 0, 5, {}, "a"});
-  queue.push({"a1", 1, 4, {}, "a"});
-  const auto pushed = queue.push({"b0", 2, 4, {}, "b"});
+  queue.push({"a0", 0, 5, {}, {"a"}});
+  queue.push({"a1", 1, 4, {}, {"a"}});
+  const auto pushed = queue.push({"b0", 2, 4, {}, {"b"}});
   REQUIRE(pushed.refused.size() == 1);
   CHECK(pushed.refused[0].number == 1);
-  CHECK(queue.push({"b1", 3, 6, {}, "b"}).refused.at(0).number == 3);
+  CHECK(queue.push({"b1", 3, 6, {}, {"b"}}).refused.at(0).number == 3);
   CHECK(queue.size() == 2);
 }
 

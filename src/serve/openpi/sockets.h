@@ -18,6 +18,7 @@ struct Peer {
   std::string address;
   std::uint64_t n_request = 0;          // that came so far
   std::optional<double> total_ms = {};  // from the receipt of the last request to its answer's departure
+  Clock::time_point since = Clock::now();
 };
 
 /// WebSocket connections at one address, and HTTP's `/healthz`. All of it runs inside the loop's `wait`, and no peer is
