@@ -4,13 +4,13 @@
 #
 # sysroot.sh FOLDER: lays Debian's arm64 libraries in a folder, without root and without a change to this machine's packages. apt keeps
 # lists and state of its own there, and packages are unpacked, not installed. (As a second architecture of the machine they would
-# replace some of its own.) A folder that is complete stays as it is.
+# replace some of its own.) A folder with all of these packages stays as it is.
 set -euo pipefail
 folder=$(mkdir -p "$1" && cd "$1" && pwd)
-[ -e "$folder/.complete" ] && exit 0
 state=$folder/.apt
 packages=(libfmt-dev libpng-dev libjpeg62-turbo-dev libxxhash-dev libutf8proc-dev nlohmann-json3-dev libcli11-dev doctest-dev
-          libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev prometheus-cpp-dev libboost-dev libc6-dev libstdc++-12-dev)
+          libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev prometheus-cpp-dev libmsgpack-cxx-dev libboost-dev libc6-dev libstdc++-12-dev)
+[ "$(cat "$folder/.complete" 2>/dev/null)" = "${packages[*]}" ] && exit 0
 rm -rf "$state" && mkdir -p "$state"/{lists/partial,cache/archives/partial,state}
 : > "$state/status"  # nothing is installed: all that is needed is downloaded
 cat > "$state/apt.conf" <<CONF
@@ -33,4 +33,4 @@ find "$folder/usr/lib" "$folder/lib" -type l -lname '/*' 2>/dev/null | while rea
   ln -sfn "$(realpath -m --relative-to="$(dirname "$link")" "$folder$(readlink "$link")")" "$link"
 done
 rm -rf "$state"
-touch "$folder/.complete"
+echo "${packages[*]}" > "$folder/.complete"
