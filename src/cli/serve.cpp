@@ -90,6 +90,7 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("precision", description.runtime().precision());
   add("kernels", description.runtime().kernels());
   add("memory_mb", fmt::format("{:.1f}", static_cast<double>(engine.memory().total()) / 1e6));
+  add("connections", std::to_string(server.max_connections()));
   add("features", fmt::format("{}", fmt::join(features, ",")));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
   if (!metrics.empty()) add("metrics", metrics);

@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "serve/server.h"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <exception>
 #include <new>
@@ -9,6 +11,7 @@
 
 #include "base/out_of_memory.h"
 #include "base/thread.h"
+#include "net/descriptors.h"
 #include "serve/gr00t/front.h"
 #include "serve/native/codec.h"
 #include "serve/native/front.h"
@@ -19,6 +22,21 @@ namespace vla::serve {
 namespace {
 
 constexpr std::size_t kQueueMessages = 8;  // acts that wait may hold so many times the largest message
+/// Kept from connections for whoever watches the server, log, recording, and the sockets that listen.
+constexpr std::size_t kKeptDescriptors = 16;
+
+/// The options with as few connections as there are descriptors for: what watches a server has to reach one that has
+/// all of its connections.
+Result<ServerOptions> within_descriptors(ServerOptions options) {
+  const std::size_t n_front = std::size_t{1} + !options.openpi.empty() + !options.gr00t.empty();
+  const std::size_t spare = net::spare_descriptors();
+  if (spare < kKeptDescriptors + n_front)
+    return Error{Code::io, "ulimit -n",
+                 fmt::format("{} file descriptors that can be opened", kKeptDescriptors + n_front),
+                 std::to_string(spare), "raise the limit for this process"};
+  options.max_connections = std::min(options.max_connections, (spare - kKeptDescriptors) / n_front);
+  return options;
+}
 
 v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   v1::Limits limits;
@@ -66,7 +84,8 @@ Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
   return {options.max_queue, kQueueMessages * options.max_message};
 }
 
-Result<std::unique_ptr<Server>> Server::open(const ServerOptions& options) try {
+Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked) try {
+  VLA_TRY(const ServerOptions options, within_descriptors(asked));
   std::unique_ptr<Server> server(new Server(options));
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
   VLA_TRY(auto native, NativeFront::open(server->loop_, options));

@@ -22,11 +22,13 @@ Result<double> warm_up(Engine& engine);
 class Server {
  public:
   /// Binds the addresses. Requests that come before `run` wait. Errors: usage (an address or a key that is none; an
-  /// address that others can reach, without keys), io (in use, not of this machine).
+  /// address that others can reach, without keys), io (in use, not of this machine; no file descriptors).
   static Result<std::unique_ptr<Server>> open(const ServerOptions& options);
 
   /// What was bound, ports filled in.
   std::vector<std::string> addresses() const;
+  /// Of each protocol: fewer than asked for where the system gives this process few file descriptors.
+  std::size_t max_connections() const { return options_.max_connections; }
 
   /// The policy that clients get. Errors: usage where a front end cannot carry what it takes.
   Status load(const Engine& engine);

@@ -54,7 +54,7 @@ def serve(vla):
 def test_the_ready_line_says_where_and_what_and_the_address_is_open(serve, golden):
     ready = serve(golden.bundle, "--bind", "tcp://127.0.0.1:0").ready
     assert set(ready) == {
-        "address", "bundle", "arch", "device", "precision", "kernels", "memory_mb", "features", "warm_up_ms",
+        "address", "bundle", "arch", "device", "precision", "kernels", "memory_mb", "connections", "features", "warm_up_ms",
     }  # fmt: skip
     host, port = re.fullmatch(r"tcp://(127\.0\.0\.1):(\d+)", ready["address"]).groups()
     socket.create_connection((host, int(port)), timeout=5).close()

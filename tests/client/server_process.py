@@ -4,6 +4,7 @@
 
 import os
 import re
+import shlex
 import signal
 import statistics
 import subprocess
@@ -21,13 +22,16 @@ SECONDS = 20  # for what takes milliseconds on a machine with nothing else to do
 
 
 class Server:
-    def __init__(self, case, *options, address="tcp://127.0.0.1:0"):
+    """`told` are the fields of its ready line; `before` is called in its process before the program."""
+
+    def __init__(self, case, *options, address="tcp://127.0.0.1:0", before=None):
         assert VLA.is_file(), f"{VLA} is not built: run `make build`, or set VLA_BINARY"
         command = [VLA, "serve", case.bundle, "--bind", address, "--threads", "1", *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, preexec_fn=before)
         line = self.process.stdout.readline()
         assert line.startswith("ready "), line
-        self.address = re.search(r"address=(tcp://127\.0\.0\.1:\d+)", line)[1]
+        self.told = dict(field.split("=", 1) for field in shlex.split(line)[1:])
+        self.address = re.match(r"tcp://127\.0\.0\.1:\d+", self.told["address"])[0]
 
     def stop(self, how=signal.SIGTERM):
         self.process.send_signal(how)

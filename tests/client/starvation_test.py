@@ -4,15 +4,17 @@
 that behaves is served meanwhile."""
 
 import contextlib
+import resource
 import socket
 import threading
 import time
+import urllib.request
 from urllib.parse import urlsplit
 
 import hostile
 import pytest
 from faults_test import n_files, request, resident_mib
-from server_process import SECONDS, Server
+from server_process import SECONDS, Robot, Server
 
 import vla_cpp
 
@@ -90,6 +92,21 @@ def test_three_hundred_connections_keep_nobody_out_and_take_no_more_than_the_lim
         assert late.health().ready
     for peer in peers:
         peer.close()
+
+
+def test_with_few_file_descriptors_fewer_connections_are_taken_and_health_is_told_over_http(case):
+    server = Server(case, "--metrics", "127.0.0.1:0", before=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40)))
+    try:
+        assert 1 <= int(server.told["connections"]) <= 24
+        robot = Robot(server.address, case)
+        peers = [hostile.connect(server.address, hostile.HANDSHAKE) for _ in range(60)]
+        robot.acts(5)
+        for _ in range(10):
+            with urllib.request.urlopen(f"http://{server.told['metrics']}/healthz", timeout=SECONDS) as page:
+                assert page.status == 200
+        [peer.close() for peer in peers]
+    finally:
+        assert server.stop() == 0
 
 
 def test_a_slow_request_is_answered_while_those_who_fall_silent_lose_their_connection(server):
