@@ -79,8 +79,9 @@ Status check_identity(const Keys& keys) {
   for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
     if (const auto text = keys.string(key); !text) return text.error();
   VLA_TRY(const std::string dtype, keys.string("vla.dtype"));
-  if (dtype == "f32" || dtype == "bf16" || dtype == "f16" || dtype == "int8") return {};
-  return Error{Code::bad_bundle, "vla.dtype", "f32, bf16, f16 or int8", dtype};
+  if (dtype == "f32" || dtype == "bf16" || dtype == "f16" || dtype == "int8" || dtype == "int4")
+    return {};
+  return Error{Code::bad_bundle, "vla.dtype", "f32, bf16, f16, int8 or int4", dtype};
 }
 
 Status check_tags(const std::vector<std::string>& tags, const std::string& where) {
@@ -134,16 +135,6 @@ Result<std::vector<std::string>> read_embodiments(const GgufContent& content, co
 }
 
 }  // namespace
-
-const char* dtype_name(DType type) {
-  constexpr const char* kNames[] = {"f32", "f16", "bf16", "i32", "i8", "f64", "ternary"};
-  return kNames[static_cast<int>(type)];
-}
-
-int dtype_bits(DType type) {
-  constexpr int kBits[] = {32, 16, 16, 32, 8, 64, 2};
-  return kBits[static_cast<int>(type)];
-}
 
 std::int64_t TensorInfo::count() const {
   std::int64_t product = 1;

@@ -2,21 +2,40 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
 #include <cstddef>
 #include <cstdint>
 
 namespace vla {
 
 /// What an element is stored as. Rows of ternary ones are whole bytes: element 4 i + j of a row is the code in bits 2 j
-/// and 2 j + 1 of byte i, and codes 0, 1 and 2 stand for -1, 0 and 1. A bundle's tensors are of the other dtypes: there
-/// the bytes of a ternary matrix are i8.
-enum class DType { f32, f16, bf16, i32, i8, f64, ternary };
+/// and 2 j + 1 of byte i, and codes 0, 1 and 2 stand for -1, 0 and 1. Rows of int4 ones are blocks (Int4Block). A
+/// bundle's tensors are of the other dtypes: there the bytes of a ternary or int4 matrix are i8.
+enum class DType { f32, f16, bf16, i32, i8, f64, ternary, int4 };
+
+/// 64 elements of a row of an int4 matrix: a step from 0 to 17, then codes from 1 to 15, those of elements 2 i and
+/// 2 i + 1 in the lower and the higher bits of byte i. (code - 8) * step is a whole number of at most 119, which counts
+/// as an int8 code: so sums of products are whole numbers as well. The largest step is the one whose product with the
+/// largest code fits into a byte without sign.
+struct Int4Block {
+  static constexpr std::int64_t kElements = 64;
+  static constexpr int kMaxStep = 17, kZero = 8, kMost = 7;
+
+  std::uint8_t step;
+  std::array<std::uint8_t, kElements / 2> codes;
+
+  int operator[](std::int64_t i) const {
+    return ((codes[static_cast<std::size_t>(i / 2)] >> i % 2 * 4 & 15) - kZero) * step;
+  }
+};
+static_assert(sizeof(Int4Block) == 33 && alignof(Int4Block) == 1);
 
 const char* dtype_name(DType type);
 int dtype_bits(DType type);
 
-/// Bytes of n elements one behind the other.
+/// Bytes of n elements one behind the other; of int4 ones, whole blocks of them.
 inline std::size_t dtype_size(DType type, std::int64_t n) {
+  if (type == DType::int4) return static_cast<std::size_t>(n / Int4Block::kElements) * sizeof(Int4Block);
   return static_cast<std::size_t>(n * dtype_bits(type) + 7) / 8;
 }
 
@@ -33,5 +52,8 @@ struct Encoding {
   std::int64_t n_scale(std::int64_t count) const { return group > 0 ? count / group : 0; }
   bool operator==(const Encoding&) const = default;
 };
+
+/// The values of n int8 or int4 codes, whole groups of them: code * scale.
+void widen_codes(const Encoding& encoding, const std::byte* codes, const float* scales, std::int64_t n, float* to);
 
 }  // namespace vla

@@ -22,17 +22,23 @@ const char* dtypes_of(const Param& param) {
                                            : "f32, bf16, f16 or i8";
 }
 
+/// Whether it may be so where the policy declares floats.
 bool allows(const Param& param, DType type) {
-  if (!is_float(param.encoding.type)) return type == param.stored_type();
   if (param.storage == Storage::vector) return type == DType::f32;
   return is_float(type) || (param.storage == Storage::matrix && type == DType::i8);
 }
 
-/// Whether a byte is no code: one of four ternary codes is 3, or an int8 code is -128.
+/// Whether a byte is no code: one of four ternary codes is 3, an int8 code is -128, or an int4 one 0.
 bool has_wrong_code(DType type, std::span<const std::byte> codes) {
   std::byte wrong = {};
   if (type == DType::ternary) {
     for (const std::byte four : codes) wrong |= four & four >> 1 & std::byte{0x55};
+  } else if (type == DType::int4) {
+    const std::span blocks(reinterpret_cast<const Int4Block*>(codes.data()), codes.size() / sizeof(Int4Block));
+    return std::ranges::any_of(blocks, [](const Int4Block& block) {
+      return block.step > Int4Block::kMaxStep ||
+             std::ranges::any_of(block.codes, [](int two) { return (two & 15) == 0 || two >> 4 == 0; });
+    });
   } else {
     for (const std::byte code : codes) wrong |= static_cast<std::byte>(code == std::byte{0x80});
   }
@@ -41,13 +47,27 @@ bool has_wrong_code(DType type, std::span<const std::byte> codes) {
 
 /// The same of a tensor, read part by part.
 Result<bool> has_wrong_code(const Bundle& bundle, DType type, std::span<const std::byte> codes) {
-  constexpr std::size_t kPart = std::size_t{1} << 20;
+  constexpr std::size_t kPart = sizeof(Int4Block) << 15;
   Room room;
   for (std::size_t i = 0; i < codes.size(); i += kPart) {
     VLA_TRY(const auto part, bundle.read(codes.subspan(i, std::min(kPart, codes.size() - i)), room));
     if (has_wrong_code(type, part)) return true;
   }
   return false;
+}
+
+const char* codes_text(DType type) {
+  return type == DType::ternary ? "0, 1 or 2, file has 3"
+         : type == DType::int4  ? "steps of 0 to 17 and codes of 1 to 15, file has others"
+                                : "-127 to 127, file has -128";
+}
+
+/// How the bundle's tensor of a matrix that may be floats is encoded; codes have a scale for each row.
+Encoding encoding_of(const TensorInfo& tensor, const std::vector<std::int64_t>& shape) {
+  if (tensor.type != DType::i8) return {tensor.type};
+  const bool is_int4 = shape[0] % Int4Block::kElements == 0 && !tensor.shape.empty() &&
+                       tensor.shape[0] == static_cast<std::int64_t>(dtype_size(DType::int4, shape[0]));
+  return {is_int4 ? DType::int4 : DType::i8, shape[0]};
 }
 
 }  // namespace
@@ -111,21 +131,18 @@ void ParamList::look_up(Param& param) {
   if (tensor == nullptr)
     return problem(fmt::format("missing tensor  {:<40} expected {} {}", param.name, shape_text(param.stored_shape()),
                                param.storage_text()));
+  if (is_float(param.encoding.type) && allows(param, tensor->type)) param.encoding = encoding_of(*tensor, param.shape);
   if (tensor->shape != param.stored_shape())
     return problem(fmt::format("wrong shape     {:<40} expected {}, file has {}", param.name,
                                shape_text(param.stored_shape()), shape_text(tensor->shape)));
-  if (!allows(param, tensor->type))
+  if (tensor->type != param.stored_type())
     return problem(fmt::format("wrong dtype     {:<40} expected {}, file has {}", param.name, dtypes_of(param),
                                dtype_name(tensor->type)));
-  if (is_float(param.encoding.type))
-    param.encoding = {tensor->type, tensor->type == DType::i8 ? param.shape[0] : 0};  // int8: a scale for each row
   if (!is_float(param.encoding.type)) {
-    const bool is_ternary = param.encoding.type == DType::ternary;
     const Result<bool> wrong = has_wrong_code(*bundle_, param.encoding.type, tensor->data);
     if (!wrong) return problem(wrong.error());
     if (*wrong)
-      return problem(fmt::format("wrong code      {:<40} expected {}", param.name,
-                                 is_ternary ? "0, 1 or 2, file has 3" : "-127 to 127, file has -128"));
+      return problem(fmt::format("wrong code      {:<40} expected {}", param.name, codes_text(param.encoding.type)));
   }
   param.source = tensor;
   declared_->by_source.emplace(tensor->data.data(), &param);

@@ -16,7 +16,7 @@
 namespace vla {
 
 /// What a parameter is for: a matrix or a table may be in any float dtype of the bundle, a vector in f32 only. A matrix
-/// of floats may also be quantized: int8 codes, -127 to 127, with a scale for each row.
+/// of floats may also be quantized: int8 codes, -127 to 127, or blocks of int4 ones, with a scale for each row.
 enum class Storage { matrix, table, vector };
 
 /// One declared weight. `shape` follows ggml, fastest first: a matrix is [d_in, d_out].

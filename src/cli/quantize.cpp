@@ -14,7 +14,7 @@ namespace vla::cli {
 namespace {
 
 struct QuantizeOptions {
-  std::string from, to;
+  std::string from, to, dtype = "int8";
   bool force = false, quiet = false;
 };
 
@@ -53,11 +53,12 @@ Status run(const QuantizeOptions& options) {
   std::error_code ignored;
   if (std::filesystem::exists(options.to, ignored) && !options.force)
     return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
+  const Rounding codes = options.dtype == "int4" ? Rounding::int4 : Rounding::int8;
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
   const auto progress = [shows](QuantizeProgress at) {
     if (shows) print_progress(at);
   };
-  VLA_TRY(const std::vector<QuantizedModule> rows, quantize(options.from, options.to, progress));
+  VLA_TRY(const std::vector<QuantizedModule> rows, quantize(options.from, options.to, codes, progress));
   if (shows) say(stderr, "\r{:<16}\r", "");
   if (!options.quiet) print(rows);
   return {};
@@ -67,12 +68,12 @@ Status run(const QuantizeOptions& options) {
 
 Command add_quantize(CLI::App& app) {
   auto options = std::make_shared<QuantizeOptions>();
-  CLI::App* command =
-      app.add_subcommand("quantize", "Write a bundle with its large matrices in int8: half the size of bf16");
+  CLI::App* command = app.add_subcommand(
+      "quantize", "Write a bundle with its large matrices in int8 or int4: a half or a quarter of bf16");
   command->footer(
-      "The codes are those that --kernels int8 makes at every load, so the actions are the same; the file is smaller "
-      "and\n"
-      "ready sooner. How far actions move from float32 is for you to judge, on your own observations:\n"
+      "The codes are those that --kernels int8 or int4 makes at every load, so the actions are the same; the file is\n"
+      "smaller and ready sooner. int4 has codes of four bits and a step for each 64 of a row, and moves actions more.\n"
+      "How far actions move from float32 is for you to judge, on your own observations:\n"
       "  vla quantize policy.gguf -o policy.int8.gguf\n"
       "  vla run policy.gguf ... --kernels float32 --tap '*' --taps-out expected.gguf\n"
       "  vla run policy.int8.gguf ... --tap '*' --taps-out got.gguf\n"
@@ -80,6 +81,8 @@ Command add_quantize(CLI::App& app) {
       "error: root mean square of what quantization moved, of that of the matrices.");
   add_bundle(*command, options->from, true);
   add_text(*command, "-o,--output", options->to, "FILE", "The quantized bundle")->required();
+  command->add_option("--dtype", options->dtype, "Codes of the large matrices (int8, int4; default int8)")
+      ->check(CLI::IsMember({"int8", "int4"}));
   command->add_flag("--force", options->force, "Write over a file that exists");
   command->add_flag("--quiet", options->quiet, "Print nothing");
   return [options] { return run(*options); };

@@ -187,7 +187,7 @@ Precision Engine::precision() const { return has_ternary() ? Precision::int8 : d
 std::string Engine::arithmetic() const {
   const Precision floats = device_->precision();
   if (floats == Precision::int8)
-    return device_->rounding() == Rounding::int8
+    return device_->rounding() == Rounding::int8 || device_->rounding() == Rounding::int4
                ? "int8 products, as asked for: less exact than PyTorch's bf16"
                : "int8 products, as the bundle is quantized; --kernels float32 makes float32 of its codes";
   if (has_int8_products()) return fmt::format("ternary products of int8, others {}", precision_name(floats));

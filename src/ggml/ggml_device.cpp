@@ -26,6 +26,7 @@ ggml_type type_of(DType type) {
       return GGML_TYPE_I32;
     case DType::i8:
     case DType::ternary:  // its bytes
+    case DType::int4:
       return GGML_TYPE_I8;
     case DType::f64:  // of statistics alone, which no graph reads
     case DType::f32:
@@ -43,10 +44,8 @@ void upload(ggml_tensor* tensor, const Param& param, const std::byte* data, cons
   if (type == DType::ternary)
     for (std::size_t i = 0; i < values.size(); ++i)
       values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
-  else if (type == DType::i8)
-    for (std::size_t i = 0; i < values.size(); ++i)
-      values[i] = static_cast<float>(std::to_integer<signed char>(data[i])) *
-                  scales[i / static_cast<std::size_t>(param.encoding.group)];
+  else if (type == DType::i8 || type == DType::int4)
+    widen_codes(param.encoding, data, scales, param.count(), values.data());
   else if (type == DType::f32)
     std::memcpy(values.data(), data, param.source->data.size());
   else if (type == DType::bf16)

@@ -8,21 +8,28 @@ namespace vla {
 
 Encoding resident_encoding(const Param& param, Rounding rounding) {
   constexpr std::int64_t kMinRounded = 144;
-  if (rounding == Rounding::float32) return param.encoding.type == DType::i8 ? Encoding{DType::f32} : param.encoding;
-  const bool keeps = rounding == Rounding::none || param.storage != Storage::matrix || !is_float(param.encoding.type) ||
+  const DType stored = param.encoding.type;
+  if (rounding == Rounding::float32)
+    return stored == DType::i8 || stored == DType::int4 ? Encoding{DType::f32} : param.encoding;
+  const bool keeps = rounding == Rounding::none || param.storage != Storage::matrix || !is_float(stored) ||
                      std::min(param.shape[0], param.shape[1]) < kMinRounded;
   if (keeps) return param.encoding;
-  return rounding == Rounding::int8 ? Encoding{DType::i8, param.shape[0]} : Encoding{DType::bf16};
+  if (rounding == Rounding::bf16) return Encoding{DType::bf16};
+  const bool has_blocks = rounding == Rounding::int4 && param.shape[0] % Int4Block::kElements == 0;
+  return {has_blocks ? DType::int4 : DType::i8, param.shape[0]};
 }
 
 Status check_rounding(const ParamList& list, Rounding rounding) {
   if (rounding == Rounding::none || rounding == Rounding::float32) return {};
-  const bool to_int8 = rounding == Rounding::int8;
-  const DType wanted = to_int8 ? DType::i8 : DType::bf16;
+  const bool to_bf16 = rounding == Rounding::bf16;
+  const auto is_wanted = [&](DType type) { return to_bf16 ? type == DType::bf16 : !is_float(type); };
   for (const Param& param : list.params())
-    if (param.storage == Storage::matrix && resident_encoding(param, rounding).type == wanted) return {};
-  return Error{Code::unsupported, to_int8 ? "kernels int8" : "kernels bf16",
-               to_int8 ? "matrices of floats that are worth quantizing" : "matrices of bf16, or others worth rounding",
+    if (param.storage == Storage::matrix && param.encoding.type != DType::ternary &&
+        is_wanted(resident_encoding(param, rounding).type))
+      return {};
+  const char* name = to_bf16 ? "bf16" : rounding == Rounding::int8 ? "int8" : "int4";
+  return Error{Code::unsupported, std::string("kernels ") + name,
+               to_bf16 ? "matrices of bf16, or others worth rounding" : "matrices of floats that are worth quantizing",
                "none", "leave --kernels out"};
 }
 

@@ -7,11 +7,12 @@
 /// Matrices in other numbers than those of the bundle, because somebody asked for it.
 namespace vla {
 
-/// What matrices become when they are loaded: large ones of floats are rounded to bf16 or int8, or quantized ones
+/// What matrices become when they are loaded: large ones of floats are rounded to bf16, int8 or int4, or quantized ones
 /// become float32 again.
-enum class Rounding { none, bf16, int8, float32 };
+enum class Rounding { none, bf16, int8, int4, float32 };
 
-/// The encoding of a parameter in memory; int8 has a scale for each row of a matrix. Matrices from or to fewer than 144
+/// The encoding of a parameter in memory; int8 and int4 have a scale for each row of a matrix. Rows that are no whole
+/// blocks of int4 become int8. Matrices from or to fewer than 144
 /// elements keep theirs: they take no time worth an error, and padded states and actions of robots have up to 132
 /// elements (GR00T N1.7).
 Encoding resident_encoding(const Param& param, Rounding rounding);

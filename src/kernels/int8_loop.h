@@ -6,64 +6,13 @@
 #include "kernels/linear_stripe.h"
 #include "kernels/tile_heights.h"
 
-/// The loop around a tile of products of int8 codes of x and weights that are ternary or int8: what an item is, what
-/// lies in which cache.
+/// The loop around a tile of products of int8 codes of x and weights that are ternary, int4 or int8: what an item is,
+/// what lies in which cache.
 ///
 /// A panel's columns are taken a step of the depth at a time, which stays in a cache while all rows of a block of x
-/// pass by. Two bits for a number are expanded to bytes once for them; of few rows the tile unpacks them itself. Sums
+/// pass by. Two or four bits for a number are expanded to bytes once for them; of few rows the tile unpacks them. Sums
 /// are whole numbers, so that they are the same in every order.
 namespace vla::kernels {
-
-/// Where a tile reads the numbers of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a byte
-/// on of the line that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they are expanded
-/// (TernaryPanels::expand). fetch(k, s, i) asks for the line that is loaded kAhead groups of four numbers later: a long
-/// step lies in the second cache.
-template <int kStrips>
-struct ExpandedStrips {
-  static constexpr std::int64_t kAhead = 8;
-  const std::byte* lines;
-
-  template <class Vector>
-  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
-    Vector numbers;
-    std::memcpy(&numbers, line(k + 4 * s, i) + byte, sizeof(numbers));
-    return numbers;
-  }
-  VLA_INLINE void fetch(std::int64_t k, int s, int i) const { __builtin_prefetch(line(k + 4 * (s + kAhead), i)); }
-  VLA_INLINE const std::byte* line(std::int64_t k, int i) const {
-    return lines + k * kStrips * 16 + i * TernaryPanels::kLine;
-  }
-};
-/// The same with numbers of two bits, and the bytes from one strip to the next.
-template <int kStrips>
-struct PackedStrips {
-  const std::byte* strips;
-  std::int64_t strip;
-
-  template <class Vector>
-  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
-    typedef std::uint64_t Words __attribute__((vector_size(sizeof(Vector))));
-    Words words;
-    std::memcpy(&words, strips + i * strip + k * 4 + byte, sizeof(words));
-    return std::bit_cast<Vector>((words >> 2 * s) & 0x0303030303030303U);
-  }
-  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
-};
-
-/// The same of numbers that lie as they are multiplied.
-template <int kStrips>
-struct ByteStrips {
-  const std::byte* strips;
-  std::int64_t strip;
-
-  template <class Vector>
-  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
-    Vector numbers;
-    std::memcpy(&numbers, strips + i * strip + (k + 4 * s) * 16 + byte, sizeof(numbers));
-    return numbers;
-  }
-  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
-};
 
 /// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the
 /// row).
@@ -87,8 +36,8 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
 /// (sums are of the weights themselves, without their offset), kLayout (of a y that is rounded, as LinearStripes says),
 /// and
 ///   multiply(n_row, x, x_stride, strips, depth, sums, add, between)
-///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and PackedStrips for TernaryPanels, of
-///     ByteStrips for BytePanels. It may read and write rows up to kRows.
+///     sums [kColumns] x n_row <= kRows, += where `add`; of ExpandedStrips and of the panels' own Strips. It may read
+///     and write rows up to kRows.
 /// Where products have a unit of their own (kBeside), multiply calls between() for every 64 of the depth before it
 /// writes sums: some rows of the tile before are finished there.
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
@@ -101,12 +50,12 @@ class Int8Loop {
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
   static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks numbers for
   static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
-  static constexpr bool kTernary = std::is_same_v<Weights, TernaryPanels>;
+  static constexpr bool kPacked = !std::is_same_v<Weights, BytePanels>;
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
   static_assert(kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
 
   struct Scratch {
-    alignas(64) std::byte panel[kTernary ? Tile::kStep * kColumns : 1];
+    alignas(64) std::byte panel[kPacked ? Tile::kStep * kColumns : 1];
     alignas(64) std::int32_t sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kColumns];
     alignas(64) float scaled[kRows * kColumns];
@@ -180,29 +129,30 @@ class Int8Loop {
 
   /// Sums of a panel's columns.
   VLA_INLINE void sum(const LinearJob::Part& part, const Stripe& s, bool gate) {
-    const std::int64_t strip = Weights::strip_size(job_.d_in), n_tile = ceil_div(s.n_row, kRows);
-    const std::int64_t depth = quantized_depth(job_.d_in), step = even_block(depth, Tile::kStep, kQuantizedUnit);
-    const std::byte* strips = part.weight + s.column / Int8Panels::kColumns * strip;
-    for (std::int64_t k = 0; k < depth; k += step, strips += Weights::strip_size(step)) {
+    const std::int64_t n_tile = ceil_div(s.n_row, kRows), depth = quantized_depth(job_.d_in);
+    const std::int64_t step = even_block(depth, Tile::kStep, kQuantizedUnit);
+    const std::byte* strips = part.weight + s.column / Int8Panels::kColumns * Weights::strip_size(job_.d_in);
+    for (std::int64_t k = 0; k < depth; k += step) {
+      const typename Weights::template Strips<kStrips> numbers(strips, job_.d_in, k);
       const std::int64_t d = min(step, depth - k);
-      const bool expands = kTernary && job_.n_row > kFewRows;
-      if constexpr (kTernary)
-        if (expands) TernaryPanels::expand<kStrips>(strips, strip, d, scratch_->panel);
+      bool expands = false;
+      if constexpr (kPacked) {
+        expands = job_.n_row > kFewRows;
+        if (expands) expand<typename V::Int, kStrips>(numbers, 0, d, scratch_->panel);
+      }
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         std::int32_t* sums = scratch_->sums + r * kColumns;
         if (k + d == depth && !gate) Stripes::fetch(job_, s, r, n_row);
         const std::int64_t n_finish = ceil_div(kRows * 64, d);
-        const auto multiply = [&](const auto& numbers) VLA_LAMBDA {
-          Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, numbers, d, sums, k > 0,
+        const auto multiply = [&](const auto& from) VLA_LAMBDA {
+          Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, from, d, sums, k > 0,
                          [&]() VLA_LAMBDA { summed_.finish(n_finish); });
         };
-        if constexpr (!kTernary)
-          multiply(ByteStrips<kStrips>{strips, strip});
-        else if (expands)
+        if (!expands)
+          multiply(numbers);
+        else if constexpr (kPacked)
           multiply(ExpandedStrips<kStrips>{scratch_->panel});
-        else
-          multiply(PackedStrips<kStrips>{strips, strip});
         if (k + d < depth) continue;
         summed_ = {this, &part, s, gate, r, n_row, 0, Finish(job_, s, scratch_->scaled, r, n_row)};
         if constexpr (!Tile::kBeside) summed_.finish();

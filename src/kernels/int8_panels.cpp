@@ -33,6 +33,32 @@ void BytePanels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte
   }
 }
 
+std::size_t Int4Panels::packed_size(const MatrixDesc& desc) { return size_of<Int4Panels>(desc); }
+
+void Int4Panels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
+  const auto* block = reinterpret_cast<const Int4Block*>(stored);
+  std::memset(packed, 0, packed_size(desc));
+  for (std::int64_t n = 0; n < desc.d_out; ++n) {
+    std::byte* const strip = packed + n / kColumns * strip_size(desc.d_in);
+    std::byte* lines = strip + n % kColumns * 4;
+    std::byte* step = strip + lines_size(desc.d_in) + n % kColumns;
+    for (std::int64_t k = 0; k < desc.d_in; k += Int4Block::kElements, ++block, step += kColumns) {
+      *step = std::byte{block->step};
+      for (std::int64_t i = 0; i < Int4Block::kElements; i += 8, lines += kLine) {
+        // Bytes of two neighbours each become bytes of two that are four apart.
+        std::uint32_t two;
+        std::memcpy(&two, block->codes.data() + i / 2, sizeof(two));
+        const std::uint32_t low = two & 0x0f0f0f0f, high = two >> 4 & 0x0f0f0f0f;
+        const auto spread = [](std::uint32_t even, std::uint32_t odd) {
+          return (even & 0xff) | (odd & 0xff) << 8 | (even & 0xff00) << 8 | (odd & 0xff00) << 16;
+        };
+        const std::uint32_t line = spread(low, high) | spread(low >> 16, high >> 16) << 4;
+        std::memcpy(lines, &line, sizeof(line));
+      }
+    }
+  }
+}
+
 std::size_t TernaryPanels::packed_size(const MatrixDesc& desc) { return size_of<TernaryPanels>(desc); }
 
 void TernaryPanels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {

@@ -2,16 +2,24 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <bit>
+#include <cstring>
+
 #include "kernels/linear_kernel.h"
 #include "kernels/quantized.h"
 
-/// How a ternary matrix, or one of int8, lies in memory for the kernels, from load on.
+/// How a ternary matrix, or one of int4 or int8, lies in memory for the kernels, from load on.
 ///
 /// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply a line of 64
 /// bytes at a time, four consecutive numbers of every column, as instructions that sum products of four bytes take
 /// them. Numbers may be stored with an offset, which comes off the sums again. Zeros fill strips up to four, and the
 /// depth up to 64, where x has zeros.
 namespace vla::kernels {
+
+template <class Element, std::size_t kBytes>
+struct VectorOf {
+  typedef Element Type __attribute__((vector_size(kBytes)));
+};
 
 struct Int8Panels {
   static constexpr std::int64_t kColumns = 16, kGroup = 16, kLine = 64;
@@ -32,9 +40,33 @@ struct BytePanels : Int8Panels {
 
   static constexpr VLA_INLINE std::int64_t strip_size(std::int64_t d_in) { return quantized_depth(d_in) * kColumns; }
 
+  template <int kStrips>
+  struct Strips;
+
   // A LinearKernel's functions.
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
+};
+
+/// Where a tile reads the numbers of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a byte
+/// on of the line that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they lie as they are
+/// multiplied.
+template <int kStrips>
+struct BytePanels::Strips {
+  const std::byte* strips;
+  std::int64_t strip;  // bytes from one to the next
+
+  /// From element k of a depth on.
+  Strips(const std::byte* all, std::int64_t d_in, std::int64_t k)
+      : strips(all + strip_size(k)), strip(strip_size(d_in)) {}
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    Vector numbers;
+    std::memcpy(&numbers, strips + i * strip + (k + 4 * s) * 16 + byte, sizeof(numbers));
+    return numbers;
+  }
+  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
 /// Two bits for a number, -1 to 1 plus 1: byte 4 n + i of a line has numbers i, 4 + i, 8 + i and 12 + i of column n,
@@ -52,22 +84,116 @@ struct TernaryPanels : Int8Panels {
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 
-  /// A byte for each number of `n_strip` strips over a depth: lines of 64 bytes with four numbers of 16 columns, of one
-  /// strip after the other, then the next four numbers.
   template <int kStrips>
-  static VLA_INLINE void expand(const std::byte* strips, std::int64_t strip, std::int64_t depth, std::byte* to) {
-    constexpr std::uint64_t kMask = 0x0303030303030303;
-    for (std::int64_t k = 0; k < depth; k += kGroup, strips += kLine, to += 4 * kStrips * kLine)
-      for (int i = 0; i < kStrips; ++i) {
-        std::uint64_t codes[8];
-        std::memcpy(codes, strips + i * strip, sizeof(codes));
-        for (int s = 0; s < 4; ++s) {
-          std::uint64_t line[8];
-          for (int word = 0; word < 8; ++word) line[word] = codes[word] >> 2 * s & kMask;
-          std::memcpy(to + (s * kStrips + i) * kLine, line, sizeof(line));
-        }
-      }
+  struct Strips;
+};
+
+template <int kStrips>
+struct TernaryPanels::Strips {
+  const std::byte* strips;
+  std::int64_t strip;
+
+  Strips(const std::byte* all, std::int64_t d_in, std::int64_t k)
+      : strips(all + strip_size(k)), strip(strip_size(d_in)) {}
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    typedef std::uint64_t Words __attribute__((vector_size(sizeof(Vector))));
+    Words words;
+    std::memcpy(&words, strips + i * strip + k * 4 + byte, sizeof(words));
+    return std::bit_cast<Vector>((words >> 2 * s) & 0x0303030303030303U);
+  }
+  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
+};
+
+/// Codes of four bits and a step for each 64 of a column (Int4Block), which give the numbers of BytePanels: byte 4 n +
+/// i of a line has codes i and 4 + i of column n. Behind the lines of a strip are its steps, 16 for each 64 of the
+/// depth.
+struct Int4Panels : Int8Panels {
+  static constexpr int kOffset = BytePanels::kOffset;
+  static constexpr bool kManyScales = true;
+
+  static constexpr VLA_INLINE std::int64_t lines_size(std::int64_t d_in) {
+    return quantized_depth(d_in) / 2 * kColumns;
+  }
+  static constexpr VLA_INLINE std::int64_t strip_size(std::int64_t d_in) {
+    return lines_size(d_in) + quantized_depth(d_in) / Int4Block::kElements * kColumns;
+  }
+
+  // A LinearKernel's functions.
+  static std::size_t packed_size(const MatrixDesc& desc);
+  static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
+
+  template <int kStrips>
+  struct Strips;
+};
+
+template <int kStrips>
+struct Int4Panels::Strips {
+  const std::byte *lines, *steps;
+  std::int64_t strip;
+
+  Strips(const std::byte* all, std::int64_t d_in, std::int64_t k)
+      : lines(all + lines_size(k)),
+        steps(all + lines_size(d_in) + k / Int4Block::kElements * kColumns),
+        strip(strip_size(d_in)) {}
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    using Columns = typename VectorOf<std::uint8_t, sizeof(Vector) / 4>::Type;
+    using Fours = typename VectorOf<std::uint32_t, sizeof(Vector)>::Type;
+    using Pairs = typename VectorOf<std::uint16_t, sizeof(Vector)>::Type;
+    using Bytes = typename VectorOf<std::uint8_t, sizeof(Vector)>::Type;
+    Columns columns;
+    std::memcpy(&columns, steps + i * strip + k / Int4Block::kElements * kColumns + byte / 4, sizeof(columns));
+    Fours step = __builtin_convertvector(columns, Fours);
+    step |= step << 16;
+    const Fours zeros = step << 3 | step << 11;  // kZero * step, in each byte
+    Pairs codes;
+    std::memcpy(&codes, lines + i * strip + k * 8 + s / 2 * kLine + byte, sizeof(codes));
+    codes = (codes >> s % 2 * 4) & 0x0f0f;
+    codes *= std::bit_cast<Pairs>(step);  // no byte carries into the next: 15 * kMaxStep is 255
+    return std::bit_cast<Vector>(std::bit_cast<Bytes>(codes) - std::bit_cast<Bytes>(zeros) +
+                                 static_cast<std::uint8_t>(kOffset));
+  }
+  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
+};
+static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kZero == 8);
+
+/// Numbers of a panel that were expanded to bytes: lines of 64 with four numbers of 16 columns, of one strip after the
+/// other, then the next four numbers. fetch(k, s, i) asks for the line that is loaded kAhead groups of four numbers
+/// later: a long step lies in the L2 cache.
+template <int kStrips>
+struct ExpandedStrips {
+  static constexpr std::int64_t kAhead = 8;
+  const std::byte* lines;
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    Vector numbers;
+    std::memcpy(&numbers, line(k + 4 * s, i) + byte, sizeof(numbers));
+    return numbers;
+  }
+  VLA_INLINE void fetch(std::int64_t k, int s, int i) const { __builtin_prefetch(line(k + 4 * (s + kAhead), i)); }
+  VLA_INLINE const std::byte* line(std::int64_t k, int i) const {
+    return lines + k * kStrips * 16 + i * Int8Panels::kLine;
   }
 };
+
+/// Writes the lines that ExpandedStrips reads, of `depth` elements from k on; Vector as wide as the machine's.
+template <class Vector, int kStrips, class Strips>
+VLA_INLINE void expand(const Strips& strips, std::int64_t k, std::int64_t depth, std::byte* to) {
+  for (const std::int64_t end = k + depth; k < end; k += Int8Panels::kGroup)
+#pragma GCC unroll 4
+    for (int i = 0; i < kStrips; ++i)
+#pragma GCC unroll 8
+      for (int byte = 0; byte < Int8Panels::kLine; byte += static_cast<int>(sizeof(Vector)))
+#pragma GCC unroll 4
+        for (int s = 0; s < 4; ++s) {
+          const auto numbers = strips.template load<Vector>(k, s, i, byte);
+          std::memcpy(to + ((k - end + depth) / 4 + s) * kStrips * Int8Panels::kLine + i * Int8Panels::kLine + byte,
+                      &numbers, sizeof(numbers));
+        }
+}
 
 }  // namespace vla::kernels

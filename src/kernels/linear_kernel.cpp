@@ -7,7 +7,8 @@
 
 namespace vla::kernels {
 
-extern const LinearKernel kLinearPortable, kTernaryPortable, kInt8Portable;  // each in the file of its name
+extern const LinearKernel kLinearPortable, kTernaryPortable, kInt4Portable,
+    kInt8Portable;  // each in the file of its name
 
 namespace {
 
@@ -29,6 +30,11 @@ std::span<const LinearKernel* const> ternary_kernels() {
   return all;
 }
 
+std::span<const LinearKernel* const> int4_kernels() {
+  static const auto all = with(machine::int4_kernels(), kInt4Portable);
+  return all;
+}
+
 std::span<const LinearKernel* const> int8_kernels() {
   static const auto all = with(machine::int8_kernels(), kInt8Portable);
   return all;
@@ -36,6 +42,7 @@ std::span<const LinearKernel* const> int8_kernels() {
 
 const LinearKernel* choose_linear(const MatrixDesc& desc, Features use) {
   const auto kernels = desc.type == DType::ternary ? ternary_kernels()
+                       : desc.type == DType::int4  ? int4_kernels()
                        : desc.type == DType::i8    ? int8_kernels()
                                                    : linear_kernels();
   for (const LinearKernel* kernel : kernels)

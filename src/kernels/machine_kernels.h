@@ -12,9 +12,10 @@ namespace vla::kernels::machine {
 
 using LinearKernels = std::span<const LinearKernel* const>;
 
-/// Products of floats, of ternary weights and of int8 ones, best first.
+/// Products of floats, of ternary weights, of int4 and of int8 ones, best first.
 LinearKernels linear_kernels();
 LinearKernels ternary_kernels();
+LinearKernels int4_kernels();
 LinearKernels int8_kernels();
 
 /// Null where none runs with these features.

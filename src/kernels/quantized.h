@@ -8,8 +8,8 @@
 #include "kernels/sizes.h"
 #include "kernels/vec.h"
 
-/// Rows of x as int8 codes, as products of ternary and int8 matrices read them: d_in codes, zeros up to a multiple of
-/// 64, and 64 bytes that begin with the row's scale.
+/// Rows of x as int8 codes, as products of ternary, int4 and int8 matrices read them: d_in codes, zeros up to a
+/// multiple of 64, and 64 bytes that begin with the row's scale.
 namespace vla::kernels {
 
 constexpr std::int64_t kQuantizedUnit = 64;

@@ -10,7 +10,7 @@
 namespace vla {
 namespace {
 
-constexpr const char *kFloat32 = "float32", *kBf16 = "bf16", *kInt8 = "int8";
+constexpr const char *kFloat32 = "float32", *kBf16 = "bf16", *kInt8 = "int8", *kInt4 = "int4";
 
 /// The kernels of a set, as far as the machine has what they use. Errors: device.
 Result<Arithmetic> with(const KernelSet& set, Features machine) {
@@ -43,10 +43,11 @@ Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machi
                  "leave the choice to the program"};
   if (kernels == kBf16) return rounding(Rounding::bf16, best);
   if (kernels == kInt8) return rounding(Rounding::int8, best);
+  if (kernels == kInt4) return rounding(Rounding::int4, best);
   for (const KernelSet& set : kernel_set::all)
     if (kernels == set.name) return with(set, machine);
-  return Error{Code::usage, "kernels", "ggml, portable, neon, avx2, avx512, avx512_bf16, amx, float32, bf16 or int8",
-               kernels};
+  return Error{Code::usage, "kernels",
+               "ggml, portable, neon, avx2, avx512, avx512_bf16, amx, float32, bf16, int8 or int4", kernels};
 }
 
 Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& device) {

@@ -25,9 +25,9 @@ struct Matrices {
   std::map<const std::byte*, Encoding> wanted;
   std::set<const std::byte*> read_otherwise;
 
-  void add(const ParamList& list) {
+  void add(const ParamList& list, Rounding codes) {
     for (const Param& param : list.params()) {
-      const Encoding encoding = resident_encoding(param, Rounding::int8);
+      const Encoding encoding = resident_encoding(param, codes);
       const std::byte* const place = param.source->data.data();
       if (encoding == param.encoding)
         read_otherwise.insert(place);
@@ -43,7 +43,7 @@ struct Matrices {
 };
 
 /// What the policy of every robot reads as a large matrix. Errors: bad_bundle, unsupported.
-Result<Matrices> find_matrices(const Bundle& bundle) {
+Result<Matrices> find_matrices(const Bundle& bundle, Rounding codes) {
   Matrices matrices;
   std::vector<std::string> tags = bundle.embodiments();
   if (tags.empty()) tags.emplace_back();
@@ -55,7 +55,7 @@ Result<Matrices> find_matrices(const Bundle& bundle) {
     ParamList list(robot.keys(), &robot);
     const std::unique_ptr<Policy> policy = entry.make(list);
     VLA_CHECK(list.report(arch, [](const std::string&) { return true; }));
-    matrices.add(list);
+    matrices.add(list, codes);
   }
   return matrices;
 }
@@ -64,13 +64,11 @@ Result<Matrices> find_matrices(const Bundle& bundle) {
 struct Squares {
   double value = 0, missed = 0;
 
-  void add(DType type, const std::byte* stored, const std::byte* codes, const float* scales, std::int64_t d_in,
-           std::int64_t n_row) {
-    for (std::int64_t i = 0; i < n_row * d_in; ++i) {
-      const float value_i = kernels::stored_number(type, stored, i);
-      const float code = static_cast<float>(std::to_integer<signed char>(codes[i])) * scales[i / d_in];
+  void add(DType type, const std::byte* stored, std::span<const float> widened) {
+    for (std::size_t i = 0; i < widened.size(); ++i) {
+      const float value_i = kernels::stored_number(type, stored, static_cast<std::int64_t>(i));
       value += double{value_i} * value_i;
-      missed += double{value_i - code} * (value_i - code);
+      missed += double{value_i - widened[i]} * (value_i - widened[i]);
     }
   }
 };
@@ -96,6 +94,7 @@ class Writer {
     const std::int64_t d_in = tensor.shape[0], d_out = tensor.shape[1];
     const std::size_t row = tensor.data.size() / static_cast<std::size_t>(d_out);
     std::vector<float> scales(static_cast<std::size_t>(d_out));
+    std::vector<float> widened(static_cast<std::size_t>(kPartRows * d_in));
     Squares squares;
     for (std::int64_t first = 0; first < d_out; first += kPartRows) {
       const std::int64_t n = std::min(kPartRows, d_out - first);
@@ -103,8 +102,9 @@ class Writer {
               read(tensor.data.subspan(static_cast<std::size_t>(first) * row, static_cast<std::size_t>(n) * row)));
       float* const to = scales.data() + first;
       const std::byte* codes = lower::Recode{{tensor.type}, wanted}(part.data(), nullptr, n * d_in, codes_, to);
-      squares.add(tensor.type, part.data(), codes, to, d_in, n);
-      out_.put({codes, static_cast<std::size_t>(n * d_in)});
+      widen_codes(wanted, codes, to, n * d_in, widened.data());
+      squares.add(tensor.type, part.data(), std::span(widened).first(static_cast<std::size_t>(n * d_in)));
+      out_.put({codes, dtype_size(wanted.type, n * d_in)});
     }
     out_.end_tensor();
     out_.put(std::as_bytes(std::span(scales)));
@@ -131,10 +131,12 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
   std::vector<TensorInfo> tensors;
   for (const TensorInfo& tensor : bundle.tensors()) {
     tensors.push_back(tensor);
-    if (!matrices.find(tensor)) continue;
+    const std::optional<Encoding> wanted = matrices.find(tensor);
+    if (!wanted) continue;
     TensorInfo& codes = tensors.back();
     codes.type = DType::i8;
-    codes.data = tensor.data.first(dtype_size(DType::i8, tensor.count()));
+    codes.data = tensor.data.first(dtype_size(wanted->type, tensor.count()));
+    codes.shape[0] = static_cast<std::int64_t>(dtype_size(wanted->type, codes.shape[0]));
     const std::int64_t d_out = tensor.shape[1];
     // No bundle has a matrix with rows of fewer bytes than a scale.
     tensors.push_back({tensor.name + "_scale", DType::f32, {d_out}, tensor.data.first(dtype_size(DType::f32, d_out))});
@@ -142,10 +144,10 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
   return tensors;
 }
 
-Keys quantized_keys(const Bundle& bundle) {
+Keys quantized_keys(const Bundle& bundle, Rounding codes) {
   Keys keys = bundle.keys();
   keys.set("vla.checksum", std::string(kNoChecksum));
-  keys.set("vla.dtype", std::string("int8"));
+  keys.set("vla.dtype", std::string(codes == Rounding::int4 ? "int4" : "int8"));
   return keys;
 }
 
@@ -179,7 +181,8 @@ Status write_tensors(const Bundle& bundle, const Matrices& matrices, Writer& wri
     if (const std::optional<Encoding> wanted = matrices.find(tensor)) {
       VLA_TRY(const Squares squares, writer.quantize(tensor, *wanted));
       report.add(row, squares);
-      row.after += tensor.count() + tensor.shape[1] * static_cast<std::int64_t>(sizeof(float));
+      const std::size_t n_scale = static_cast<std::size_t>(tensor.shape[1]);
+      row.after += static_cast<std::int64_t>(dtype_size(wanted->type, tensor.count()) + n_scale * sizeof(float));
     } else {
       VLA_CHECK(writer.copy(tensor));
       row.after += static_cast<std::int64_t>(tensor.data.size());
@@ -190,17 +193,17 @@ Status write_tensors(const Bundle& bundle, const Matrices& matrices, Writer& wri
 
 }  // namespace
 
-Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to,
+Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, Rounding codes,
                                               const std::function<void(QuantizeProgress)>& progress) {
   VLA_TRY(const Bundle bundle, Bundle::open(from));
-  VLA_TRY(const Matrices matrices, find_matrices(bundle));
+  VLA_TRY(const Matrices matrices, find_matrices(bundle, codes));
   const std::vector<TensorInfo> tensors = quantized_tensors(bundle, matrices);
   if (tensors.size() == bundle.tensors().size())
     return Error{Code::unsupported, from, "large matrices of floats", "none: it is quantized already, or too small"};
   Report report;
   Status made;
   const Status written = write_file(to, [&](int file) {
-    BundleFile out(file, quantized_keys(bundle), tensors);
+    BundleFile out(file, quantized_keys(bundle, codes), tensors);
     Writer writer(bundle, out, progress);
     made = write_tensors(bundle, matrices, writer, report);
     return made && out.seal();

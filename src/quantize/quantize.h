@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "base/result.h"
+#include "graph/rounding.h"
 
 namespace vla {
 
@@ -23,11 +24,11 @@ struct QuantizeProgress {
   std::int64_t done, all;  // bytes
 };
 
-/// Writes a bundle whose large matrices are int8 codes with a scale for each row: the codes that `--kernels int8` makes
-/// at every load, so that the chunk is the same to the bit. Norms, biases, tables, and matrices from or to fewer than
-/// 144 elements stay as they are (graph/rounding.h), and so does a tensor that something else reads too. Errors: those
-/// of Bundle::open and of the policy's manifest; unsupported where no matrix is worth it; io.
-Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to,
+/// Writes a bundle whose large matrices are int8 or int4 codes with a scale for each row: those that `--kernels int8`
+/// or `int4` makes at every load, so that the chunk is the same to the bit. Norms, biases, tables, and matrices from or
+/// to fewer than 144 elements stay as they are (graph/rounding.h), and so does a tensor that something else reads too.
+/// Errors: those of Bundle::open and of the policy's manifest; unsupported where no matrix is worth it; io.
+Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, Rounding codes,
                                               const std::function<void(QuantizeProgress)>& report);
 
 }  // namespace vla

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""`vla quantize`: a bundle of int8 codes gives the actions that --kernels int8 makes of the floats, and float32 those of its codes."""
+"""`vla quantize`: a bundle of codes gives the actions that --kernels int8 or int4 makes of the floats, and float32 those of its codes."""
 
 import gguf
 import numpy as np
@@ -15,12 +15,18 @@ FEW_ROWS = 144  # matrices from or to fewer elements stay as they are
 
 
 @pytest.fixture(scope="module")
-def quantized(vla, tmp_path_factory):
-    path = tmp_path_factory.mktemp("quantized") / "int8.gguf"
-    answer = vla("quantize", SHIPPED, "-o", path)
-    assert answer.code == 0, answer.err
-    assert "matrices" in answer.out and "all" in answer.out
-    return path
+def bundles(vla, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("quantized")
+    for dtype in ("int8", "int4"):
+        answer = vla("quantize", SHIPPED, "-o", folder / f"{dtype}.gguf", "--dtype", dtype)
+        assert answer.code == 0, answer.err
+        assert "matrices" in answer.out and "all" in answer.out
+    return folder
+
+
+@pytest.fixture
+def quantized(bundles):
+    return bundles / "int8.gguf"
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +46,19 @@ def widened(codes, scales):
     return codes.astype(np.float32) * scales[:, None]
 
 
+def whole_numbers(blocks):
+    """Those of int4 blocks: 33 bytes for 64 elements, a step and then two codes a byte."""
+    rows, width = blocks.shape
+    blocks = blocks.view(np.uint8).reshape(rows, width // 33, 33)
+    codes = np.stack([blocks[:, :, 1:] & 15, blocks[:, :, 1:] >> 4], axis=-1).astype(np.int32) - 8
+    return (codes.reshape(rows, width // 33, 64) * blocks[:, :, :1]).reshape(rows, -1)
+
+
+def codes_of(content, name, width):
+    codes = content.tensors[name]
+    return codes if codes.shape[1] == width else whole_numbers(codes)
+
+
 def test_large_matrices_become_codes_and_the_rest_stays(quantized):
     before, after = read_bundle(str(SHIPPED)), read_bundle(str(quantized))
     for name, values in before.tensors.items():
@@ -56,16 +75,36 @@ def test_large_matrices_become_codes_and_the_rest_stays(quantized):
     assert quantized.stat().st_size < 0.6 * SHIPPED.stat().st_size
 
 
-def test_it_gives_the_actions_of_kernels_int8_to_the_bit(actions, quantized):
-    asked, _ = actions(SHIPPED, "--kernels", "int8")
-    stored, answer = actions(quantized)
+def test_of_int4_every_block_is_nearer_than_sevenths_of_its_largest_and_rows_of_no_whole_blocks_are_int8(bundles):
+    before, after = read_bundle(str(SHIPPED)), read_bundle(str(bundles / "int4.gguf"))
+    blocks = [name for name, dtype in after.dtypes.items() if dtype == "i8" and after.tensors[name].shape != before.tensors[name].shape]
+    others = [name for name, dtype in after.dtypes.items() if dtype == "i8" and name not in blocks]
+    assert len(blocks) > 40 and all(before.tensors[name].shape[1] % 64 for name in others)
+    missed, simple = 0, 0
+    for name in blocks:
+        floats = (before.tensors[name].astype(np.uint32) << 16).view(np.float32)
+        numbers = whole_numbers(after.tensors[name])
+        assert numbers.shape == floats.shape and np.abs(numbers).max() <= 119
+        missed += np.square(floats - widened(numbers, after.tensors[name + "_scale"])).sum()
+        unit = np.abs(floats.reshape(len(floats), -1, 64)).max(-1, keepdims=True) / 7
+        simple += np.square(floats - (np.rint(floats.reshape(len(floats), -1, 64) / unit) * unit).reshape(floats.shape)).sum()
+    assert missed < simple
+    assert (bundles / "int4.gguf").stat().st_size < 0.4 * SHIPPED.stat().st_size
+
+
+@pytest.mark.parametrize("dtype", ["int8", "int4"])
+def test_it_gives_the_actions_of_kernels_of_its_dtype_to_the_bit(actions, bundles, dtype):
+    asked, _ = actions(SHIPPED, "--kernels", dtype)
+    stored, answer = actions(bundles / f"{dtype}.gguf")
     assert np.array_equal(stored, asked)
     assert answer["precision"] == "int8"
     assert not np.array_equal(stored, actions(SHIPPED, "--kernels", "float32")[0])
 
 
+@pytest.mark.parametrize("dtype", ["int8", "int4"])
 @pytest.mark.parametrize("kernels", ["float32", "ggml"])
-def test_float32_of_its_codes_is_asked_for_by_name(actions, quantized, tmp_path, kernels):
+def test_float32_of_its_codes_is_asked_for_by_name(actions, bundles, tmp_path, kernels, dtype):
+    quantized, floats = bundles / f"{dtype}.gguf", read_bundle(str(SHIPPED))
     content = read_bundle(str(quantized))
     kinds = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
     keys = []
@@ -77,7 +116,7 @@ def test_float32_of_its_codes_is_asked_for_by_name(actions, quantized, tmp_path,
     wide = {}
     for name, values in content.tensors.items():
         if content.dtypes[name] == "i8":
-            wide[name] = widened(values, content.tensors[name + "_scale"])
+            wide[name] = widened(codes_of(content, name, floats.tensors[name].shape[1]), content.tensors[name + "_scale"])
         elif not name.endswith("_scale"):
             wide[name] = values
     dtypes = {name: "f32" if content.dtypes[name] == "i8" else content.dtypes[name] for name in wide}
@@ -107,6 +146,15 @@ def test_a_code_that_no_number_has_is_refused(vla, quantized, tmp_path):
     (tmp_path / "code.gguf").write_bytes(sealed(data))
     answer = vla("inspect", tmp_path / "code.gguf")
     assert answer.code == 3 and f"wrong code      {MATRIX}" in answer.err and "-127 to 127, file has -128" in answer.err
+
+
+@pytest.mark.parametrize("place, byte", [(0, 18), (1, 0x08), (32, 0x80)])
+def test_a_block_of_int4_that_no_number_has_is_refused(vla, bundles, tmp_path, place, byte):
+    data = bytearray((bundles / "int4.gguf").read_bytes())
+    data[data_offset(bundles / "int4.gguf", MATRIX) + 33 * 5 + place] = byte
+    (tmp_path / "block.gguf").write_bytes(sealed(data))
+    answer = vla("inspect", tmp_path / "block.gguf")
+    assert answer.code == 3 and f"wrong code      {MATRIX}" in answer.err and "steps of 0 to 17" in answer.err
 
 
 def test_codes_without_their_scales_are_refused(vla, quantized, tmp_path):

@@ -4,6 +4,8 @@
 
 #include <doctest/doctest.h>
 
+#include <cmath>
+#include <random>
 #include <vector>
 
 #include "support/stored.h"
@@ -47,4 +49,71 @@ TEST_CASE("rows of zeros, of tiny weights and of weights that are not finite") {
   CHECK(q.scales[1] == 0);
   CHECK(std::isnan(q.scales[2]));
   CHECK(std::isnan(q.scales[3]));
+}
+
+namespace {
+
+struct Int4 {
+  std::vector<Int4Block> blocks;
+  float scale = 0;
+  float value(std::size_t k) const {
+    return static_cast<float>(blocks[k / 64][static_cast<std::int64_t>(k % 64)]) * scale;
+  }
+};
+
+Int4 int4_of(const std::vector<float>& row) {
+  Int4 result = {std::vector<Int4Block>(row.size() / 64)};
+  std::vector<float> room(row.size());
+  quantize_weights(DType::f32, reinterpret_cast<const std::byte*>(row.data()), static_cast<std::int64_t>(row.size()), 1,
+                   result.blocks.data(), &result.scale, room.data());
+  return result;
+}
+
+double missed(const std::vector<float>& row, const auto& value) {
+  double sum = 0;
+  for (std::size_t k = 0; k < row.size(); ++k) sum += std::pow(double{row[k]} - value(k), 2);
+  return sum;
+}
+
+}  // namespace
+
+TEST_CASE("int4: whole multiples of a block's step are exact, whatever the steps of a row") {
+  std::vector<float> row(128);
+  for (std::size_t k = 0; k < row.size(); ++k)
+    row[k] = 0.25f * static_cast<float>((static_cast<int>(k % 15) - 7) * (k < 64 ? 17 : 3));
+  const Int4 q = int4_of(row);
+  CHECK(q.scale == 0.25f);
+  CHECK(q.blocks[0].step == 17);
+  CHECK(q.blocks[1].step == 3);
+  for (std::size_t k = 0; k < row.size(); ++k) CHECK(q.value(k) == row[k]);
+}
+
+TEST_CASE("int4: of normal numbers it misses less than the nearest multiples of a seventh of each block's largest") {
+  std::mt19937 random(5);
+  std::normal_distribution<float> normal;
+  std::vector<float> row(1024);
+  for (std::size_t k = 0; k < row.size(); ++k) row[k] = normal(random) * (k / 64 % 3 == 1 ? 0.2f : 1.0f);
+  const Int4 q = int4_of(row);
+  const auto simple = [&](std::size_t k) {
+    float most = 0;
+    for (std::size_t i = k / 64 * 64; i < k / 64 * 64 + 64; ++i) most = std::max(most, std::abs(row[i]));
+    return std::nearbyint(row[k] / (most / 7)) * (most / 7);
+  };
+  CHECK(missed(row, [&](std::size_t k) { return q.value(k); }) < missed(row, simple));
+  for (const Int4Block& block : q.blocks) {
+    CHECK(block.step <= Int4Block::kMaxStep);
+    for (const int two : block.codes) CHECK(((two & 15) != 0 && two >> 4 != 0));
+  }
+}
+
+TEST_CASE("int4: rows of zeros, of tiny weights and of weights that are not finite") {
+  std::vector<float> row(64);
+  CHECK(int4_of(row).scale == 0);
+  row[3] = 1e-38f;
+  CHECK(int4_of(row).scale == 0);
+  for (const float bad : {std::numeric_limits<float>::infinity(), std::numeric_limits<float>::quiet_NaN()}) {
+    row[3] = bad;
+    CHECK(std::isnan(int4_of(row).scale));
+    CHECK(int4_of(row).blocks[0][3] == 0);
+  }
 }

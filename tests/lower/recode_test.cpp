@@ -70,3 +70,17 @@ TEST_CASE("codes become float32 by the scale of their group") {
   const auto* values = reinterpret_cast<const float*>(to);
   CHECK(std::vector<float>(values, values + 4) == std::vector<float>{127 * 0.1f, -127 * 0.1f, 6, 0});
 }
+
+TEST_CASE("int4 codes become float32 by their step and the scale of their row") {
+  std::vector<int> codes(128);
+  codes[0] = -7, codes[1] = 5, codes[64] = 2;
+  const std::vector<std::byte> stored = test::store_int4(codes, {17, 3});
+  const float scale = 0.1f;
+  Room room;
+  const std::byte* to = Recode{{DType::int4, 128}, {DType::f32}}(stored.data(), &scale, 128, room, nullptr);
+  const auto* values = reinterpret_cast<const float*>(to);
+  CHECK(values[0] == -119 * 0.1f);
+  CHECK(values[1] == 85 * 0.1f);
+  CHECK(values[64] == 6 * 0.1f);
+  CHECK(values[2] == 0);
+}

@@ -23,7 +23,8 @@ namespace vla::kernels {
 extern const CpuKernels kEmulatedAvx512Kernels;
 extern const AttentionKernel kEmulatedAttentionAvx512Bf16, kEmulatedAttentionAmx;
 extern const LinearKernel kEmulatedLinearAvx512, kEmulatedLinearAvx512Bf16, kEmulatedLinearAmx;
-extern const LinearKernel kEmulatedTernaryAvx512, kEmulatedInt8Avx512, kEmulatedTernaryAmx, kEmulatedInt8Amx;
+extern const LinearKernel kEmulatedTernaryAvx512, kEmulatedInt4Avx512, kEmulatedInt8Avx512;
+extern const LinearKernel kEmulatedTernaryAmx, kEmulatedInt4Amx, kEmulatedInt8Amx;
 }  // namespace vla::kernels
 
 #define VLA_EMULATED_TEST(isa, sentence, ...) \

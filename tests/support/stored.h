@@ -5,6 +5,7 @@
 #include <bit>
 #include <cmath>
 #include <cstring>
+#include <span>
 #include <vector>
 
 #include "kernels/numbers.h"
@@ -24,6 +25,18 @@ inline std::vector<std::byte> store_int8(const std::vector<float>& values) {
   std::vector<std::byte> out;
   for (const float value : values) out.push_back(static_cast<std::byte>(static_cast<signed char>(value)));
   return out;
+}
+
+/// Codes from -7 to 7 and a step for each 64 of them as blocks of int4.
+inline std::vector<std::byte> store_int4(const std::vector<int>& codes, const std::vector<int>& steps) {
+  std::vector<Int4Block> blocks(steps.size());
+  for (std::size_t i = 0; i < codes.size(); ++i) {
+    Int4Block& block = blocks[i / Int4Block::kElements];
+    block.step = static_cast<std::uint8_t>(steps[i / Int4Block::kElements]);
+    block.codes[i % Int4Block::kElements / 2] |= static_cast<std::uint8_t>((codes[i] + 8) << i % 2 * 4);
+  }
+  const auto bytes = std::as_bytes(std::span(blocks));
+  return {bytes.begin(), bytes.end()};
 }
 
 /// Values in a storage type, and what the type made of them.

@@ -70,12 +70,13 @@ struct DotTile {
   }
 };
 
-bool supports(const MatrixDesc& desc, Features use) { return desc.type == DType::i8 && use.has(Feature::dotprod); }
+bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::dotprod); }
 
 }  // namespace
 
-extern const LinearKernel kTernaryDotprod, kInt8Dotprod;
+extern const LinearKernel kTernaryDotprod, kInt4Dotprod, kInt8Dotprod;
 const LinearKernel kTernaryDotprod = Int8Loop<DotTile, TernaryPanels>::kernel("dotprod_int8", supports);
+const LinearKernel kInt4Dotprod = Int8Loop<DotTile, Int4Panels>::kernel("dotprod_int8", supports);
 const LinearKernel kInt8Dotprod = Int8Loop<DotTile, BytePanels>::kernel("dotprod_int8", supports);
 
 }  // namespace vla::kernels

@@ -5,7 +5,7 @@
 namespace vla::kernels {
 
 // Each in the file of its name.
-extern const LinearKernel kLinearNeon, kTernaryDotprod, kInt8Dotprod;
+extern const LinearKernel kLinearNeon, kTernaryDotprod, kInt4Dotprod, kInt8Dotprod;
 extern const CpuKernels kNeonKernels;
 
 namespace machine {
@@ -17,6 +17,11 @@ LinearKernels linear_kernels() {
 
 LinearKernels ternary_kernels() {
   static constexpr const LinearKernel* kAll[] = {&kTernaryDotprod};
+  return kAll;
+}
+
+LinearKernels int4_kernels() {
+  static constexpr const LinearKernel* kAll[] = {&kInt4Dotprod};
   return kAll;
 }
 

@@ -6,6 +6,7 @@ namespace vla::kernels::machine {
 
 LinearKernels linear_kernels() { return {}; }
 LinearKernels ternary_kernels() { return {}; }
+LinearKernels int4_kernels() { return {}; }
 LinearKernels int8_kernels() { return {}; }
 const CpuKernels* cpu_kernels(Features) { return nullptr; }
 std::span<const PeakProbe> peak_probes() { return {}; }

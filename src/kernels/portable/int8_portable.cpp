@@ -42,8 +42,9 @@ bool supports(const MatrixDesc& desc, Features) { return !is_float(desc.type); }
 
 }  // namespace
 
-extern const LinearKernel kTernaryPortable, kInt8Portable;
+extern const LinearKernel kTernaryPortable, kInt4Portable, kInt8Portable;
 const LinearKernel kTernaryPortable = Int8Loop<PortableTile, TernaryPanels>::kernel("portable_int8", supports);
+const LinearKernel kInt4Portable = Int8Loop<PortableTile, Int4Panels>::kernel("portable_int8", supports);
 const LinearKernel kInt8Portable = Int8Loop<PortableTile, BytePanels>::kernel("portable_int8", supports);
 
 }  // namespace vla::kernels

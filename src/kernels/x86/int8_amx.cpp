@@ -29,13 +29,14 @@ struct AmxInt8Tile : AmxRounding {
     close(n_row, sums);
   }
 
-  template <class Between>
-  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const PackedStrips<2>& strips,
-                       std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
+  /// Of codes of less than a byte.
+  template <class Strips, class Between>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                       std::int32_t* sums, bool add, const Between& between) {
     alignas(64) std::byte lines[kDepth * kColumns];
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
-      TernaryPanels::expand<2>(strips.strips + k * 4, strips.strip, kDepth, lines);
+      expand<V::Int, 2>(strips, k, kDepth, lines);
       before_tile_loads();
       add_products(n_row, x + k, x_stride, lines, kLineOfPair, Int8Panels::kLine);
       between();
@@ -44,7 +45,7 @@ struct AmxInt8Tile : AmxRounding {
   }
 
   template <class Between>
-  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ByteStrips<2>& strips,
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const BytePanels::Strips<2>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     AwakeVectors vectors;
     open(n_row, sums, add);
@@ -106,8 +107,9 @@ bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type
 
 }  // namespace
 
-extern const LinearKernel kTernaryAmx, kInt8Amx;
+extern const LinearKernel kTernaryAmx, kInt4Amx, kInt8Amx;
 const LinearKernel kTernaryAmx = Int8Loop<AmxInt8Tile, TernaryPanels>::kernel("amx_int8", supports);
+const LinearKernel kInt4Amx = Int8Loop<AmxInt8Tile, Int4Panels>::kernel("amx_int8", supports);
 const LinearKernel kInt8Amx = Int8Loop<AmxInt8Tile, BytePanels>::kernel("amx_int8", supports);
 
 }  // namespace vla::kernels

@@ -30,8 +30,9 @@ struct TwoProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
 };
 
-/// Of int8 weights: a pair of bytes up to 255 by codes would not fit into 16 bits. So the weight gives its sign to the
-/// code, which is never -128, and is at most 128 itself; pairs are then summed to 32 bits at once.
+/// Of int8 weights, and of int4 ones, which expand to such: a pair of bytes up to 255 by codes would not fit into 16
+/// bits. So the weight gives its sign to the code, which is never -128, and is at most 128 itself; pairs are then
+/// summed to 32 bits at once.
 struct SignedProducts {
   static constexpr int kRows = 4, kStep = 512;
   static constexpr bool kSigned = true;
@@ -97,10 +98,12 @@ bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type
 
 }  // namespace
 
-extern const LinearKernel kTernaryAvxVnni, kTernaryAvx2, kInt8AvxVnni, kInt8Avx2;
+extern const LinearKernel kTernaryAvxVnni, kTernaryAvx2, kInt4AvxVnni, kInt4Avx2, kInt8AvxVnni, kInt8Avx2;
 const LinearKernel kTernaryAvxVnni =
     Int8Loop<Avx2Tile<FourProducts>, TernaryPanels>::kernel("avxvnni_int8", supports_vnni);
 const LinearKernel kTernaryAvx2 = Int8Loop<Avx2Tile<TwoProducts>, TernaryPanels>::kernel("avx2_int8", supports);
+const LinearKernel kInt4AvxVnni = Int8Loop<Avx2Tile<FourProducts>, Int4Panels>::kernel("avxvnni_int8", supports_vnni);
+const LinearKernel kInt4Avx2 = Int8Loop<Avx2Tile<SignedProducts>, Int4Panels>::kernel("avx2_int8", supports);
 const LinearKernel kInt8AvxVnni = Int8Loop<Avx2Tile<FourProducts>, BytePanels>::kernel("avxvnni_int8", supports_vnni);
 const LinearKernel kInt8Avx2 = Int8Loop<Avx2Tile<SignedProducts>, BytePanels>::kernel("avx2_int8", supports);
 

@@ -68,8 +68,9 @@ bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type
 
 }  // namespace
 
-extern const LinearKernel kTernaryAvx512, kInt8Avx512;
+extern const LinearKernel kTernaryAvx512, kInt4Avx512, kInt8Avx512;
 const LinearKernel kTernaryAvx512 = Int8Loop<VnniTile<2560>, TernaryPanels>::kernel("avx512_int8", supports);
+const LinearKernel kInt4Avx512 = Int8Loop<VnniTile<512>, Int4Panels>::kernel("avx512_int8", supports);
 const LinearKernel kInt8Avx512 = Int8Loop<VnniTile<512>, BytePanels>::kernel("avx512_int8", supports);
 
 }  // namespace vla::kernels

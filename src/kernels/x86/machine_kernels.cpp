@@ -7,6 +7,7 @@ namespace vla::kernels {
 // Each in the file of its name.
 extern const LinearKernel kLinearAmx, kLinearAvx512Bf16, kLinearAvx512, kLinearAvx2;
 extern const LinearKernel kTernaryAmx, kTernaryLookup, kTernaryAvx512, kTernaryAvxVnni, kTernaryAvx2;
+extern const LinearKernel kInt4Amx, kInt4Avx512, kInt4AvxVnni, kInt4Avx2;
 extern const LinearKernel kInt8Amx, kInt8Avx512, kInt8AvxVnni, kInt8Avx2;
 extern const CpuKernels kAvx2Kernels, kAvx512Kernels;
 extern const AttentionKernel kAttentionAvx512Bf16, kAttentionAmx;
@@ -30,6 +31,11 @@ LinearKernels linear_kernels() {
 LinearKernels ternary_kernels() {
   static constexpr const LinearKernel* kAll[] = {&kTernaryAmx, &kTernaryLookup, &kTernaryAvx512, &kTernaryAvxVnni,
                                                  &kTernaryAvx2};
+  return kAll;
+}
+
+LinearKernels int4_kernels() {
+  static constexpr const LinearKernel* kAll[] = {&kInt4Amx, &kInt4Avx512, &kInt4AvxVnni, &kInt4Avx2};
   return kAll;
 }
 

@@ -124,7 +124,9 @@ std::string describe(const std::map<std::string, std::map<std::string, int>>& co
 }  // namespace
 
 bool CpuWeights::has_int8() const {
-  return std::ranges::any_of(places_, [](const Place& place) { return place.encoding.type == DType::i8; });
+  return std::ranges::any_of(places_, [](const Place& place) {
+    return place.encoding.type == DType::i8 || place.encoding.type == DType::int4;
+  });
 }
 
 Result<CpuWeights> CpuWeights::load(const ParamList& list, const Options& options) {

@@ -10,7 +10,7 @@ Features features_for(const ParamList& list, Features use, Rounding rounding) {
   const auto& params = list.params();
   const auto rounds = [&](const Param& param) {
     const DType type = resident_encoding(param, rounding).type;
-    return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8);
+    return param.storage == Storage::matrix && (type == DType::bf16 || type == DType::i8 || type == DType::int4);
   };
   return std::any_of(params.begin(), params.end(), rounds) ? use : without_rounding(use);
 }

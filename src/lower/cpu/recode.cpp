@@ -17,27 +17,25 @@ void round_to_bf16(DType type, const std::byte* stored, std::int64_t n, std::byt
   }
 }
 
-void widen(const std::byte* codes, std::int64_t n, std::int64_t group, const float* scales, std::byte* to) {
-  for (std::int64_t i = 0; i < n; ++i) {
-    const float value = static_cast<float>(std::to_integer<std::int8_t>(codes[i])) * scales[i / group];
-    std::memcpy(to + static_cast<std::int64_t>(sizeof(value)) * i, &value, sizeof(value));
-  }
-}
-
 }  // namespace
 
 const std::byte* Recode::operator()(const std::byte* from, const float* from_scales, std::int64_t count, Room& room,
                                     float* scales) const {
   if (!changes()) return from;
   std::byte* const to = room.take(room_for(count));
-  if (stored.type == DType::i8 && wanted.type == DType::f32) {
-    widen(from, count, stored.group, from_scales, to);
+  if (!is_float(stored.type)) {
+    assert(stored.group > 0 && wanted.type == DType::f32);
+    widen_codes(stored, from, from_scales, count, reinterpret_cast<float*>(to));
   } else if (wanted.type == DType::bf16) {
     round_to_bf16(stored.type, from, count, to);
   } else {
-    assert(is_float(stored.type) && wanted.type == DType::i8);
-    auto* const group = reinterpret_cast<float*>(to + aligned(dtype_size(wanted.type, count)));
-    kernels::quantize_weights(stored.type, from, wanted.group, count / wanted.group, to, scales, group);
+    assert(wanted.type == DType::i8 || wanted.type == DType::int4);
+    auto* const row = reinterpret_cast<float*>(to + aligned(dtype_size(wanted.type, count)));
+    const std::int64_t d_in = wanted.group, d_out = count / d_in;
+    if (wanted.type == DType::i8)
+      kernels::quantize_weights(stored.type, from, d_in, d_out, to, scales, row);
+    else
+      kernels::quantize_weights(stored.type, from, d_in, d_out, reinterpret_cast<Int4Block*>(to), scales, row);
   }
   return to;
 }
