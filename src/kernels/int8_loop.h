@@ -152,7 +152,7 @@ class Int8Loop {
         if (!expands)
           multiply(numbers);
         else if constexpr (kPacked)
-          multiply(ExpandedStrips<kStrips>{scratch_->panel});
+          multiply(ExpandedStrips<kStrips, std::remove_const_t<decltype(numbers)>>{scratch_->panel, numbers});
         if (k + d < depth) continue;
         summed_ = {this, &part, s, gate, r, n_row, 0, Finish(job_, s, scratch_->scaled, r, n_row)};
         if constexpr (!Tile::kBeside) summed_.finish();

@@ -128,8 +128,14 @@ struct Int4Panels : Int8Panels {
   struct Strips;
 };
 
+/// The same for a tile that multiplies codes, and sums of a block by its step: load gives codes, 1 to 15.
+struct Int4Codes : Int4Panels {
+  template <int kStrips>
+  struct Strips;
+};
+
 template <int kStrips>
-struct Int4Panels::Strips {
+struct Int4Codes::Strips {
   const std::byte *lines, *steps;
   std::int64_t strip;
 
@@ -140,33 +146,49 @@ struct Int4Panels::Strips {
 
   template <class Vector>
   VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
-    using Columns = typename VectorOf<std::uint8_t, sizeof(Vector) / 4>::Type;
-    using Fours = typename VectorOf<std::uint32_t, sizeof(Vector)>::Type;
     using Pairs = typename VectorOf<std::uint16_t, sizeof(Vector)>::Type;
-    using Bytes = typename VectorOf<std::uint8_t, sizeof(Vector)>::Type;
-    Columns columns;
-    std::memcpy(&columns, steps + i * strip + k / Int4Block::kElements * kColumns + byte / 4, sizeof(columns));
-    Fours step = __builtin_convertvector(columns, Fours);
-    step |= step << 16;
-    const Fours zeros = step << 3 | step << 11;  // kZero * step, in each byte
     Pairs codes;
     std::memcpy(&codes, lines + i * strip + k * 8 + s / 2 * kLine + byte, sizeof(codes));
-    codes = (codes >> s % 2 * 4) & 0x0f0f;
-    codes *= std::bit_cast<Pairs>(step);  // no byte carries into the next: 15 * kMaxStep is 255
-    return std::bit_cast<Vector>(std::bit_cast<Bytes>(codes) - std::bit_cast<Bytes>(zeros) +
-                                 static_cast<std::uint8_t>(kOffset));
+    return std::bit_cast<Vector>((codes >> s % 2 * 4) & 0x0f0f);
+  }
+  /// The step of each column, twice, in 16 bits.
+  template <class Vector>
+  VLA_INLINE Vector step(std::int64_t k, int i, int byte) const {
+    using Columns = typename VectorOf<std::uint8_t, sizeof(Vector) / 4>::Type;
+    using Fours = typename VectorOf<std::uint32_t, sizeof(Vector)>::Type;
+    Columns columns;
+    std::memcpy(&columns, steps + i * strip + k / Int4Block::kElements * kColumns + byte / 4, sizeof(columns));
+    const Fours step = __builtin_convertvector(columns, Fours);
+    return std::bit_cast<Vector>(step | step << 16);
   }
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
+};
+
+template <int kStrips>
+struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
+  using Packed = Int4Codes::Strips<kStrips>;
+  using Packed::Packed;
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    using Pairs = typename VectorOf<std::uint16_t, sizeof(Vector)>::Type;
+    using Bytes = typename VectorOf<std::uint8_t, sizeof(Vector)>::Type;
+    const auto step = Packed::template step<Pairs>(k, i, byte);
+    const auto zeros = std::bit_cast<Bytes>(step << 3 | step << 11);  // kZero * step, in each byte
+    const auto numbers = Packed::template load<Pairs>(k, s, i, byte) * step;  // no byte carries: 15 * kMaxStep is 255
+    return std::bit_cast<Vector>(std::bit_cast<Bytes>(numbers) - (zeros - static_cast<std::uint8_t>(kOffset)));
+  }
 };
 static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kZero == 8);
 
 /// Numbers of a panel that were expanded to bytes: lines of 64 with four numbers of 16 columns, of one strip after the
 /// other, then the next four numbers. fetch(k, s, i) asks for the line that is loaded kAhead groups of four numbers
 /// later: a long step lies in the L2 cache.
-template <int kStrips>
+template <int kStrips, class Packed>
 struct ExpandedStrips {
   static constexpr std::int64_t kAhead = 8;
   const std::byte* lines;
+  const Packed& packed;
 
   template <class Vector>
   VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
@@ -177,6 +199,10 @@ struct ExpandedStrips {
   VLA_INLINE void fetch(std::int64_t k, int s, int i) const { __builtin_prefetch(line(k + 4 * (s + kAhead), i)); }
   VLA_INLINE const std::byte* line(std::int64_t k, int i) const {
     return lines + k * kStrips * 16 + i * Int8Panels::kLine;
+  }
+  template <class Vector>
+  VLA_INLINE Vector step(std::int64_t k, int i, int byte) const {
+    return packed.template step<Vector>(k, i, byte);
   }
 };
 

@@ -2,8 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How fast each row of the matrix product is on this machine, as a share of the multiply-add peak that is measured
-// beside it; of products of ternary and int8 weights also how much faster than the float32 kernel that takes turns with
-// them. Not a test: what it prints depends on what else the machine does.
+// beside it; of products of ternary, int4 and int8 weights also how much faster than the float32 kernel that takes
+// turns with them. Not a test: what it prints depends on what else the machine does.
 //
 //   bench_linear [threads] [rounds] [kernel]
 #include <fmt/format.h>
@@ -175,7 +175,7 @@ const PeakProbe* probe_of(const LinearKernel& kernel) {
 int main(int argc, char** argv) {
   const int n_thread = argc > 1 ? std::atoi(argv[1]) : 1, n_round = argc > 2 ? std::atoi(argv[2]) : 7;
   if (n_thread < 1 || n_round < 1) return fmt::print("usage: bench_linear [threads] [rounds] [kernel]\n"), 1;
-  fmt::print("{} thread(s), best and median of {} rounds, bf16, ternary or int8 weights\n", n_thread, n_round);
+  fmt::print("{} thread(s), best and median of {} rounds, bf16, ternary, int4 or int8 weights\n", n_thread, n_round);
   const auto executor = Executor::shared(n_thread);
   if (!executor) return fmt::print("{}\n", executor.error().message()), 1;
   const auto wants = [&](const LinearKernel& kernel) { return argc < 4 || kernel.name == std::string(argv[3]); };
@@ -190,13 +190,15 @@ int main(int argc, char** argv) {
                     n_round, rounded, nullptr);
           }
   }
-  for (const bool ternary : {true, false})
-    for (const LinearKernel* kernel : ternary ? ternary_kernels() : int8_kernels()) {
+  const std::pair<DType, std::span<const LinearKernel* const>> int8[] = {
+      {DType::ternary, ternary_kernels()}, {DType::int4, int4_kernels()}, {DType::i8, int8_kernels()}};
+  for (const auto& [weights, kernels] : int8)
+    for (const LinearKernel* kernel : kernels) {
       const PeakProbe* probe = probe_of(*kernel);
       if (probe == nullptr || !wants(*kernel)) continue;
       if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
       for (const Shape& shape : kInt8Shapes)
-        measure(**executor, *kernel, *probe, {ternary ? DType::ternary : DType::i8, shape.d_in, shape.d_out},
-                shape.n_row, n_round, false, choose_linear({DType::bf16, 64, 64}, this_cpu()));
+        measure(**executor, *kernel, *probe, {weights, shape.d_in, shape.d_out}, shape.n_row, n_round, false,
+                choose_linear({DType::bf16, 64, 64}, this_cpu()));
     }
 }

@@ -15,8 +15,8 @@ struct AmxInt8Tile : AmxRounding {
   static constexpr bool kEven = false, kBeside = true, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::tiles;
 
-  template <class Between>
-  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2>& strips,
+  template <class Packed, class Between>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2, Packed>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     // Rows that x does not have are multiplied too; nobody looks at their sums.
     AwakeVectors vectors;

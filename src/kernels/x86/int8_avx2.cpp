@@ -30,7 +30,7 @@ struct TwoProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
 };
 
-/// Of int8 weights, and of int4 ones, which expand to such: a pair of bytes up to 255 by codes would not fit into 16
+/// Of int8 weights: a pair of bytes up to 255 by codes would not fit into 16
 /// bits. So the weight gives its sign to the code, which is never -128, and is at most 128 itself; pairs are then
 /// summed to 32 bits at once.
 struct SignedProducts {
@@ -93,6 +93,71 @@ struct Avx2Tile {
   }
 };
 
+/// Of int4 weights: two products of codes summed to 16 bits, which hold a block less eight times what x sums to in it:
+/// 32 * 7 * 127. Its step multiplies that.
+struct Int4Tile {
+  using V = Avx2;
+  static constexpr int kRows = 6, kColumns = 16, kBlockRows = 216, kStep = 1024, kBlock = Int4Block::kElements;
+  static constexpr std::int64_t kBlockKiB = 640;
+  static constexpr bool kEven = true, kBeside = false, kSigned = true;
+  static constexpr RoundedLayout kLayout = RoundedLayout::none;
+  static_assert(kBlock / 2 * Int4Block::kMost * 127 <= 32767);
+  struct Session {};
+
+  template <class Strips, class Between>
+  static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
+                       std::int32_t* sums, bool add, const Between&) {
+    with_height<kRows>(n_row, [&]<int n>() {
+      for (std::int64_t k = 0; k < depth; k += kBlock) block<n>(x + k, x_stride, strips, k, sums, add || k > 0);
+    });
+  }
+
+ private:
+  template <int kCount, class Strips>
+  static VLA_INLINE void block(const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t first,
+                               std::int32_t* sums, bool add) {
+    __m256i sum[kCount][2];
+#pragma GCC unroll 6
+    for (int r = 0; r < kCount; ++r) sum[r][0] = sum[r][1] = minus_zeros(x + r * x_stride);
+    for (std::int64_t k = first; k < first + kBlock; k += Int8Panels::kGroup)
+#pragma GCC unroll 4
+      for (int s = 0; s < 4; ++s, x += 4) {
+        const __m256i left = strips.template load<__m256i>(k, s, 0, 0);
+        const __m256i right = strips.template load<__m256i>(k, s, 0, 32);
+#pragma GCC unroll 6
+        for (int r = 0; r < kCount; ++r) {
+          std::int32_t four;
+          std::memcpy(&four, x + r * x_stride, sizeof(four));
+          const __m256i codes = _mm256_set1_epi32(four);
+          TwoProducts::add(sum[r][0], left, codes);
+          TwoProducts::add(sum[r][1], right, codes);
+        }
+      }
+#pragma GCC unroll 2
+    for (int i = 0; i < 2; ++i) {
+      const __m256i step = strips.template step<__m256i>(first, 0, 32 * i);
+#pragma GCC unroll 6
+      for (int r = 0; r < kCount; ++r) {
+        auto* place = reinterpret_cast<__m256i*>(sums + r * kColumns + 8 * i);
+        const __m256i total = _mm256_madd_epi16(sum[r][i], step);
+        _mm256_storeu_si256(place, add ? _mm256_add_epi32(total, _mm256_loadu_si256(place)) : total);
+      }
+    }
+  }
+
+  /// What codes that stand for zero add to the two sums of a column, with the other sign.
+  static VLA_INLINE __m256i minus_zeros(const std::byte* x) {
+    const __m256i zero = _mm256_set1_epi8(Int4Block::kZero);
+    const auto* halves = reinterpret_cast<const __m256i*>(x);
+    const __m256i eight = _mm256_add_epi16(_mm256_maddubs_epi16(zero, _mm256_loadu_si256(halves)),
+                                           _mm256_maddubs_epi16(zero, _mm256_loadu_si256(halves + 1)));
+    __m128i four = _mm_add_epi16(_mm256_castsi256_si128(eight), _mm256_extracti128_si256(eight, 1));
+    four = _mm_add_epi16(four, _mm_shuffle_epi32(four, 0b01001110));
+    four = _mm_add_epi16(four, _mm_shuffle_epi32(four, 0b10110001));
+    return _mm256_sub_epi16(_mm256_setzero_si256(), _mm256_broadcastd_epi32(four));
+  }
+};
+
 bool supports_vnni(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::avx_vnni); }
 bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type) && use.has(Feature::avx2); }
 
@@ -103,7 +168,7 @@ const LinearKernel kTernaryAvxVnni =
     Int8Loop<Avx2Tile<FourProducts>, TernaryPanels>::kernel("avxvnni_int8", supports_vnni);
 const LinearKernel kTernaryAvx2 = Int8Loop<Avx2Tile<TwoProducts>, TernaryPanels>::kernel("avx2_int8", supports);
 const LinearKernel kInt4AvxVnni = Int8Loop<Avx2Tile<FourProducts>, Int4Panels>::kernel("avxvnni_int8", supports_vnni);
-const LinearKernel kInt4Avx2 = Int8Loop<Avx2Tile<SignedProducts>, Int4Panels>::kernel("avx2_int8", supports);
+const LinearKernel kInt4Avx2 = Int8Loop<Int4Tile, Int4Codes>::kernel("avx2_int8", supports);
 const LinearKernel kInt8AvxVnni = Int8Loop<Avx2Tile<FourProducts>, BytePanels>::kernel("avxvnni_int8", supports_vnni);
 const LinearKernel kInt8Avx2 = Int8Loop<Avx2Tile<SignedProducts>, BytePanels>::kernel("avx2_int8", supports);
 
