@@ -39,7 +39,8 @@ class GatedMlp {
     if (sub_norm_eps) sub_norm_.emplace(s / "ffn_sub_norm", d_ff, *sub_norm_eps);
   }
   Tensor operator()(Graph& g, Tensor x) const {
-    const Tensor h = multiply(g, activate(g, gate_(g, x), activation_), up_(g, x));
+    const Tensor up = up_(g, x);  // on its own: compilers differ in which argument they evaluate first
+    const Tensor h = multiply(g, activate(g, gate_(g, x), activation_), up);
     return down_(g, sub_norm_ ? (*sub_norm_)(g, h) : h);
   }
 
