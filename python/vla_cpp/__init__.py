@@ -3,6 +3,7 @@
 """Python side of vla.cpp.
 
     Client   a policy at `vla serve`                Policy   the same in this process
+    OpenpiClient   one at a server of openpi's protocol
     control  running chunks on a robot              convert  checkpoints into bundles (the extra `convert`)
 
 Names are imported when they are first used, so that each part needs only its own packages.
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from .client import Client as Client
     from .errors import *  # noqa: F403
     from .observation import Leftover as Leftover
+    from .openpi import OpenpiClient as OpenpiClient
     from .policy import Policy as Policy
     from .spec import BundleInfo as BundleInfo
     from .spec import Spec as Spec
@@ -36,6 +38,7 @@ _HOMES = {
     "Policy": "policy",
     "Chunk": "chunk",
     "Leftover": "observation",
+    "OpenpiClient": "openpi",
     **dict.fromkeys(("BundleInfo", "Spec", "StateSpec", "ViewSpec"), "spec"),
     **dict.fromkeys(_ERRORS, "errors"),
 }

@@ -10,12 +10,13 @@ import sys
 from pathlib import Path
 from typing import Any, Dict, List, Optional
 
-from ..errors import BadObservation
+from ..errors import BadObservation, UsageError, VlaError
 from ..installed import extra_hint
 from .environment import EnvironmentFault
 from .environments import NAMES, MissingSimulator, find, no_task
 from .episode import Job
 from .journal import JournalMismatch
+from .policies import OPENPI
 from .runner import RunFailed
 from .serving import ServerFailed
 
@@ -30,9 +31,10 @@ Exit codes: 0 done, 2 usage, 9 the run ended early (its episodes so far are kept
 def _common(parser: argparse.ArgumentParser) -> None:
     who = parser.add_argument_group("the policy, one of")
     who.add_argument("--bundle", metavar="FILE", help="serve this bundle for the run")
-    who.add_argument("--server", metavar="ADDRESS", help="use a running `vla serve`, e.g. tcp://127.0.0.1:5555")
+    who.add_argument("--server", metavar="ADDRESS", help="use a running `vla serve`, e.g. tcp://127.0.0.1:5555, or with --map a server of openpi's protocol, e.g. openpi://127.0.0.1:8000")
     who.add_argument("--torch", metavar="DIR", help="a LeRobot checkpoint, in PyTorch float32")
     who.add_argument("--embodiment", metavar="TAG", help="the robot, where the bundle is for several")
+    who.add_argument("--map", action="append", metavar="KEY=NAME", help="of openpi's protocol: a key that the server takes, and the view, state or `text` that it stands for; several times")
     who.add_argument("--random", action="store_true", help="uniform actions: the floor that a policy must leave")
     parser.add_argument("--episodes", type=int, default=20, help="of each task (default 20)")
     parser.add_argument("--task", action="append", metavar="NAME", help="only this task; may be given again (default: all)")
@@ -77,8 +79,11 @@ def _driver(policies: Any, a: argparse.Namespace) -> Any:
     given = [x for x in (a.bundle, a.server, a.torch and f"torch:{a.torch}", "random" if a.random else None) if x]
     if len(given) != 1:
         raise SystemExit(_usage("give one of --bundle, --server, --torch and --random"))
-    if a.embodiment is not None and not (a.bundle or a.server):
-        raise SystemExit(_usage("--embodiment goes with --bundle or --server"))
+    is_openpi = given[0].startswith(OPENPI)
+    if a.embodiment is not None and (is_openpi or not (a.bundle or a.server)):
+        raise SystemExit(_usage("--embodiment goes with --bundle or --server, not with openpi's protocol"))
+    if bool(a.map) != any((text or "").startswith(OPENPI) for text in (given[0], getattr(a, "against", None))):
+        raise SystemExit(_usage("--map KEY=NAME goes with a server of openpi's protocol, which needs it"))
     return policies.named(given[0])
 
 
@@ -133,8 +138,8 @@ def evaluate(name: str, a: argparse.Namespace) -> Dict[str, Any]:
     if not 0 <= a.latency_ms < 1e5:
         raise SystemExit(_usage(f"--latency-ms: expected 0 or more, found {a.latency_ms:g}"))
     delayed = a.mode != "sync" or a.latency_ms > 0
-    if delayed and (a.against or a.film != "none" or a.torch or a.random):
-        raise SystemExit(_usage("--mode and --latency-ms go with --bundle or --server, and not with --against and --film"))
+    if delayed and (a.against or a.film != "none" or not (a.bundle or a.server) or (a.server or "").startswith(OPENPI)):
+        raise SystemExit(_usage("--mode and --latency-ms go with --bundle or --server of vla's own protocol, and not with --against and --film"))
     jobs = _jobs(name, a)
     if a.swap:
         jobs = _swapped(name, jobs)
@@ -223,13 +228,13 @@ def main(argv: Optional[List[str]] = None) -> int:
         package = str(error.name).partition(".")[0]
         print(f"vla-eval: the module {package} is missing; {extra_hint('eval')}", file=sys.stderr)
         return 9
-    except (RunFailed, JournalMismatch, EnvironmentFault, MissingSimulator, ServerFailed) as error:
+    except (BadObservation, UsageError) as error:
+        return _usage(str(error))
+    except (RunFailed, JournalMismatch, EnvironmentFault, MissingSimulator, ServerFailed, VlaError, ImportError) as error:
         print(f"vla-eval: {error}", file=sys.stderr)
         if isinstance(error, RunFailed):
             print("vla-eval: episodes that ended are kept; the same command runs the missing ones", file=sys.stderr)
         return 9
-    except BadObservation as error:
-        return _usage(str(error))
     except KeyboardInterrupt:
         print("vla-eval: stopped; the same command goes on", file=sys.stderr)
         return 130

@@ -5,11 +5,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Dict, Optional, Tuple
+from typing import Any, Dict, Optional, Sequence, Tuple
 
 import numpy as np
 
 from .environment import Observation
+
+OPENPI = ("openpi://", "ws://", "wss://")  # how the address of a server of that protocol begins
 
 
 @dataclass
@@ -60,6 +62,31 @@ class ServedPolicy(EvalPolicy):
         self._client.close()
 
 
+class OpenpiPolicy(EvalPolicy):
+    """Any server of openpi's protocol. names: the lines of OpenpiClient, for the views and states of the environment.
+
+    The protocol has no place for noise: `vla serve` takes a seed, made from the episode's noise; another server draws its own.
+    """
+
+    noise_shape = (1, 2)
+
+    def __init__(self, address: str, timeout: float, names: Sequence[str]) -> None:
+        from ..openpi import OpenpiClient
+
+        self._client = OpenpiClient(address, names, timeout=timeout)
+        self.identity = self._client.identity
+        noise = "" if self._client.takes_seeds else ", whose noise no seed fixes"
+        self.label = f"{self._client.name} over openpi's protocol{noise}"
+
+    def act(self, observation: Observation, text: str, noise: np.ndarray) -> Answer:
+        seed = int(noise.view(np.uint64)[0, 0]) >> 1 if self._client.takes_seeds else None
+        chunk = self._client.act(images=observation.frames, state=observation.state, text=text, seed=seed)
+        return Answer(np.asarray(chunk), sum(chunk.timing.values()), dict(chunk.timing))
+
+    def close(self) -> None:
+        self._client.close()
+
+
 class TorchPolicy(EvalPolicy):
     """A LeRobot checkpoint in PyTorch, float32, on one thread: the reference."""
 
@@ -102,6 +129,8 @@ def make_policy(description: Dict[str, Any]) -> EvalPolicy:
     kind = description["kind"]
     if kind == "served":
         return ServedPolicy(description["address"], description["timeout"], description["embodiment"])
+    if kind == "openpi":
+        return OpenpiPolicy(description["address"], description["timeout"], description["names"])
     if kind == "torch":
         return TorchPolicy(description["checkpoint"])
     return RandomPolicy(description["horizon"], description["d_action"])

@@ -16,7 +16,7 @@ from .environment import Environment, Guard
 from .environments import find, make
 from .episode import Job, Outcome, run_episode
 from .journal import Journal
-from .policies import ServedPolicy, make_policy
+from .policies import OPENPI, OpenpiPolicy, ServedPolicy, make_policy
 from .runner import Plan, RunFailed, run_jobs
 from .serving import Server
 
@@ -30,7 +30,7 @@ class Driver:
     description: Dict[str, Any]
     label: str
     identity: str
-    spec: Any = None  # of a served one
+    spec: Any = None  # of `vla serve`
 
 
 def no_fault() -> Optional[str]:
@@ -63,6 +63,14 @@ class Policies(contextlib.ExitStack):
         label = f"{spec.bundle.name}{f' for {robot}' if robot else ''}, computed in {precision} with {spec.kernels} kernels"
         return Driver(description, label, spec.bundle.checksum, spec)
 
+    def openpi(self, address: str) -> Driver:
+        """A server of openpi's protocol. It does not say what its policy takes, so there is no spec."""
+        description = {"kind": "openpi", "address": address, "timeout": TIMEOUT, "names": self._arguments.map or []}
+        policy = make_policy(description)
+        assert isinstance(policy, OpenpiPolicy)
+        policy.close()
+        return Driver(description, policy.label, policy.identity)
+
     def torch(self, checkpoint: str) -> Driver:
         from . import lerobot_reference
 
@@ -70,11 +78,13 @@ class Policies(contextlib.ExitStack):
         return Driver({"kind": "torch", "checkpoint": str(Path(checkpoint).resolve())}, "PyTorch float32", identity)
 
     def named(self, text: str) -> Driver:
-        """bundle FILE, tcp://ADDRESS, torch:DIR, or random."""
+        """bundle FILE, tcp://ADDRESS, openpi://ADDRESS, torch:DIR, or random."""
         if text == "random":
             return Driver({"kind": "random", "horizon": 16}, "random actions", "random")
         if text.startswith("torch:"):
             return self.torch(text[len("torch:") :])
+        if text.startswith(OPENPI):
+            return self.openpi(text)
         return self.served(text) if "://" in text else self.bundle(text)
 
     def fault(self) -> Optional[str]:

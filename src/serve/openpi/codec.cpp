@@ -13,7 +13,7 @@ namespace vla::serve::openpi {
 
 std::string encode_metadata(const v1::Description& description, const Names& names) {
   msgpack::Writer out;
-  out.map(8);
+  out.map(9);
   out.text("action_horizon").integer(description.horizon());
   out.text("action_dim").integer(description.actions_size());
   out.text("action_names").list(static_cast<std::size_t>(description.actions_size()));
@@ -21,6 +21,7 @@ std::string encode_metadata(const v1::Description& description, const Names& nam
   out.text("control_hz").real(description.rate_hz());
   out.text("names").text(names.told());
   out.text("bundle").text(description.bundle().name());
+  out.text("checksum").text(description.bundle().checksum());
   out.text("precision").text(description.runtime().precision());
   out.text("server").text("vla.cpp " + description.runtime().server_version());
   return out.take();
