@@ -155,6 +155,7 @@ void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
   command
       .add_option("--api-token", server.api_token, "A file with the secret that clients of --openpi and --gr00t send")
       ->check(CLI::ExistingFile);
+  command.add_flag("--vllm-omni", server.vllm_omni, "The clients of --openpi speak the dialect of vLLM-Omni");
   command.add_flag("--gr00t-n1-5", server.gr00t_n1_5,
                    "Describe the policy as clients of GR00T N1.5 read it, also before their first act");
   command.add_flag("--gr00t-kill", server.gr00t_kill, "Let clients of --gr00t stop the server");

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("websockets")
 
 from drop_in import openpi_array, pack, serving, unpack  # noqa: E402
-from server_process import ROOT, SECONDS, VLA, frames, ran  # noqa: E402
+from server_process import ROOT, SECONDS, frames, ran  # noqa: E402
 from websockets.sync.server import serve  # noqa: E402
 
 import vla_cpp  # noqa: E402
@@ -46,7 +46,7 @@ def answering(answer, metadata=None):
             reply = answer(unpack(message))
             connection.send(reply)
             if isinstance(reply, str):
-                return connection.close(1011, "Internal server error. Traceback included in previous frame.")
+                connection.close(1011, "Internal server error. Traceback included in previous frame.")
 
     with serve(handle, "127.0.0.1", 0, compression=None) as server:
         thread = threading.Thread(target=server.serve_forever)

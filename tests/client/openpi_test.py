@@ -197,6 +197,30 @@ def test_a_key_that_the_server_asks_for_is_asked_of_everybody(case, options, tmp
             assert client.status == 101 and client.receive()[0] == 2
 
 
+def test_the_dialect_of_vllm_omni_keeps_the_connection_and_answers_with_the_actions_alone(case, options, tmp_path):
+    """As its clients put it (vllm_omni/entrypoints/openpi/connection.py): errors and resets are binary maps."""
+    expected = ran(case, tmp_path, "--seed", "7")
+    extra = {"endpoint": "infer", "session_id": "episode 1", "seed": 7, "sampling_params": {}}
+    asked = pack({**observation(case), **extra}, openpi_array)
+    with serving(case, "--openpi", "127.0.0.1:0", "--vllm-omni", *options) as (_, address):
+        with WebSocket(address("ws://"), path="/v1/realtime/robot/openpi") as client:
+            metadata = unpack(client.receive()[1])
+            assert (metadata["action_horizon"], metadata["action_dim"]) == expected.shape
+            for _ in range(2):
+                assert client.ask(asked).tobytes() == expected.tobytes()
+                assert client.ask(pack({"endpoint": "reset"}, openpi_array)) == {"status": "reset successful"}
+            for wrong, words in [
+                ({"endpoint": "train"}, "infer or reset"),
+                ({"sampling_params": {"num_inference_steps": 4}}, "sampling_params"),
+                ({"seed": "7"}, "seed"),
+                ({"prompt": 5}, "prompt"),
+            ]:
+                answer = client.ask(pack({**observation(case), **wrong}, openpi_array))
+                assert answer["type"] == "error" and words in answer["message"], answer
+            assert client.ask(b"\xc1")["type"] == "error"
+            assert client.ask(asked).tobytes() == expected.tobytes()
+
+
 def test_names_are_checked_at_the_start_and_told_in_the_ready_line(case, served, options):
     assert "names='" in served[0] and "(rgb)" in served[0] and "(radians)" in served[0]
     def refusal(*arguments, address="127.0.0.1:0"):

@@ -29,6 +29,8 @@ inline void check_refusal(const Error& error) {
   if (error.message().size() > 8192) std::abort();
   if (error.code != Code::bad_request && error.code != Code::too_large && error.code != Code::bad_observation)
     std::abort();
+  const std::string omni = serve::openpi::encode_omni_error(error);
+  if (!msgpack::read(std::as_bytes(std::span(omni)))) std::abort();
   if (serve::openpi::encode_error(error).empty() || serve::gr00t::encode_error(error).empty()) std::abort();
 }
 
@@ -62,6 +64,8 @@ inline bool check_openpi(std::span<const std::byte> bytes) {
       "");
   const auto message = msgpack::read(bytes);
   if (!message) return check_refusal(message.error()), false;
+  msgpack::Value omni = *message;
+  if (const auto keys = serve::openpi::take_omni_keys(omni); !keys) check_refusal(keys.error());
   const auto act = serve::openpi::decode_act(*message, names, kMessageLimits, "");
   if (!act) return check_refusal(act.error()), false;
   return check_act(act->observation, kMessageLimits,

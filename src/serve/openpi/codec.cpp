@@ -11,6 +11,8 @@
 
 namespace vla::serve::openpi {
 
+using msgpack::Value;
+
 std::string encode_metadata(const v1::Description& description, const Names& names) {
   msgpack::Writer out;
   out.map(9);
@@ -25,6 +27,31 @@ std::string encode_metadata(const v1::Description& description, const Names& nam
   out.text("precision").text(description.runtime().precision());
   out.text("server").text("vla.cpp " + description.runtime().server_version());
   return out.take();
+}
+
+Result<OmniKeys> take_omni_keys(Value& message) {
+  OmniKeys keys;
+  std::vector<Value> kept;
+  for (std::size_t i = 0; i + 1 < message.items.size() && message.is_map(); i += 2) {
+    const std::string_view key = message.items[i].data;
+    Value& value = message.items[i + 1];
+    if (key == "endpoint") {
+      keys.is_reset = value.is_text() && value.data == "reset";
+      if (!keys.is_reset && !(value.is_text() && value.data == "infer"))
+        return Error{Code::bad_observation, "endpoint", "infer or reset", printable(value.data.substr(0, 100))};
+    } else if (key == "seed" && value.type == Value::Type::integer && value.integer >= 0) {
+      keys.seed = static_cast<std::uint64_t>(value.integer);
+    } else if (key == "seed" && value.type != Value::Type::nil) {
+      return Error{Code::bad_observation, "seed", "an integer from 0 up", "another value"};
+    } else if (key == "sampling_params" && value.type != Value::Type::nil && !value.items.empty()) {
+      return Error{Code::bad_observation, "sampling_params", "none: the bundle has the solver's steps", "some"};
+    } else if (key != "session_id" && key != "seed" && key != "sampling_params") {
+      kept.push_back(std::move(message.items[i]));
+      kept.push_back(std::move(value));
+    }
+  }
+  if (message.is_map()) message.items = std::move(kept);
+  return keys;
 }
 
 Result<ActRequest> decode_act(const msgpack::Value& message, const Names& names, const ActLimits& limits,
@@ -62,6 +89,27 @@ std::string encode_reply(Reply reply, const Names& names, std::optional<double> 
   if (prev_total_ms) out.text("prev_total_ms").real(*prev_total_ms);
   out.text("queue_ms").real(reply.queue_ms);
   for (const auto& [name, ms] : chunk.timing) out.text(name + "_ms").real(ms);
+  return out.take();
+}
+
+std::string encode_omni_reply(Reply reply, const Names& names) {
+  ActionChunk& chunk = reply.chunk;
+  const std::array shape{static_cast<std::size_t>(chunk.horizon), static_cast<std::size_t>(chunk.d_action)};
+  names.to_client(chunk.actions, shape[1]);
+  msgpack::Writer out;
+  out.array(msgpack::Framing::openpi, shape, chunk.actions);
+  return out.take();
+}
+
+std::string encode_omni_reset() {
+  msgpack::Writer out;
+  out.map(1).text("status").text("reset successful");
+  return out.take();
+}
+
+std::string encode_omni_error(const Error& error) {
+  msgpack::Writer out;
+  out.map(2).text("type").text("error").text("message").text(encode_error(error));
   return out.take();
 }
 

@@ -17,15 +17,25 @@ class Front::Request final : public Call {
     if (is_text) return Error{Code::bad_request, "request", "a binary message", "a text message"};
     VLA_TRY(message_, msgpack::read(std::as_bytes(std::span(bytes_))));
     VLA_TRY(extension_, extension_of(message_.find(kExtension), kExtension));
+    if (front_.options_.vllm_omni) {
+      VLA_TRY(omni_, take_omni_keys(message_));
+    }
     return {};
   }
+  bool is_reset() const { return omni_.is_reset; }
   const Extension& extension() const { return extension_; }
 
   Result<ActRequest> decode() override {
-    return decode_act(message_, front_.names_, front_.limits_, front_.embodiment_);
+    VLA_TRY(ActRequest request, decode_act(message_, front_.names_, front_.limits_, front_.embodiment_));
+    if (omni_.seed) request.noise = *(request.seed = omni_.seed);
+    return request;
   }
-  std::string encode(Reply reply) override { return encode_reply(std::move(reply), front_.names_, previous_ms_); }
+  std::string encode(Reply reply) override {
+    if (front_.options_.vllm_omni) return encode_omni_reply(std::move(reply), front_.names_);
+    return encode_reply(std::move(reply), front_.names_, previous_ms_);
+  }
   std::string encode(const Error& error) override {
+    if (front_.options_.vllm_omni) return encode_omni_error(error);
     is_refused_ = true;
     return encode_error(error);
   }
@@ -42,6 +52,7 @@ class Front::Request final : public Call {
   const std::string bytes_;
   msgpack::Value message_;  // over the bytes
   Extension extension_;
+  OmniKeys omni_;
   bool is_refused_ = false;
 };
 
@@ -84,13 +95,15 @@ void Front::received(Peer& peer, std::string message, bool is_text) {
   job.at = Clock::now();
   job.share = net::share_of(peer.address, peer.since, job.at);
   job.request_id = ++peer.n_request;
-  job.kind = Kind::act;
   auto request = std::make_unique<Request>(*this, peer, std::move(message));
   const Status sound = request->read(is_text);
+  const bool is_reset = request->is_reset();
+  job.kind = is_reset ? Kind::unknown : Kind::act;
   job.deadline_ms = request->extension().deadline_ms;
   job.call = std::move(request);
   io_->received(job);
   if (!sound) return io_->refuse(std::move(job), [&] { return sound.error(); });
+  if (is_reset) return io_->answer(std::move(job), encode_omni_reset());
   io_->submit(std::move(job));
 }
 
