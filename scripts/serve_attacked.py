@@ -36,6 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tests/client")]
 import hostile  # noqa: E402
 import hostile_images  # noqa: E402
+from drop_in import WebSocket, numpy_array, openpi_array, pack, unpack  # noqa: E402
 
 import vla_cpp  # noqa: E402
 from vla_cpp import wire  # noqa: E402
@@ -44,6 +45,8 @@ ATTACKER = "127.0.0.2"
 MAX_MESSAGE_MIB, MAX_PIXELS = 32, 1 << 20
 HEALTH_MS, LATE_MS, ACT_RATIO = 20, 20, 2  # the bars
 PERIOD = 0.03  # seconds between the acts of a robot that behaves
+HALF_SENT = hostile.HANDSHAKE + hostile.long_frame(30_000_000)
+OTHER_PERIOD = 0.15  # of those that speak openpi's and GR00T's protocols
 
 
 # --- attacks: each runs in a process of its own until that is ended --------------------------------------------------
@@ -66,11 +69,11 @@ def connect(target, data=b""):
     return hostile.connect(target.address, data, source=ATTACKER)
 
 
-def half_sent(target):
+def half_sent(target, begin=HALF_SENT):
     """40 requests of 30 MB, of which 20 MB come, as fast as a network of 1 Gbit brings them."""
 
     def one():
-        with connect(target, hostile.HANDSHAKE + hostile.long_frame(30_000_000)) as raw:
+        with connect(target, begin) as raw:
             for _ in range(20):
                 raw.sendall(bytes(1_000_000))
                 time.sleep(0.3)
@@ -98,13 +101,7 @@ def flood(target):
 
 def connections(target):
     """200 connections that say nothing, or half a greeting."""
-
-    def one(data):
-        with connect(target, data) as raw:
-            while raw.recv(1 << 16):
-                pass
-
-    again_and_again(*[lambda: one(b"")] * 100, *[lambda: one(hostile.GREETING[:40])] * 100)
+    again_and_again(*[lambda: silent(target, b"")] * 100, *[lambda: silent(target, hostile.GREETING[:40])] * 100)
 
 
 def drip(target):
@@ -119,6 +116,57 @@ def drip(target):
                     time.sleep(0.005)
 
     again_and_again(*[one] * 20)
+
+
+def silent(target, data):
+    """A connection that has sent that much, and waits for its end."""
+    with connect(target, data) as raw:
+        while raw.recv(1 << 16):
+            pass
+
+
+def send(target, begin, steps, pause=0.0):
+    """A connection that sends one step after the other, and reads nothing."""
+    with connect(target, begin) as raw:
+        for step in steps:
+            raw.sendall(step)
+            time.sleep(pause)
+
+
+def gr00t(target):
+    """What the attacks on the native protocol do, at that of GR00T, and msgpack that is deep, wide or long."""
+    target = argparse.Namespace(address=target.gr00t)
+    ping = b"\x81\xa8endpoint\xa4ping"
+    wide = b"\x81\xa4data" + b"\xdf\x00\x0f\xff\xff" * 1000
+    bodies = [hostile.long_frame(len(b), b, flags=2) for b in (b"\x91" * 100_000, b"\xdd" + b"\xff" * 4, wide, bytes(1_000_000))]
+    threading.Thread(target=half_sent, args=(target,), daemon=True).start()
+    again_and_again(
+        *[lambda: silent(target, hostile.GREETING[:40])] * 60,
+        lambda: send(target, hostile.HANDSHAKE, [b"\x01\x00" * 1_000_000]),
+        lambda: send(target, hostile.HANDSHAKE, itertools.repeat(bytes([0, len(ping)]) + ping)),
+        lambda: send(target, hostile.HANDSHAKE, itertools.cycle(bodies), pause=0.05),
+    )
+
+
+def openpi(target):
+    """The same at that of openpi: handshakes in drops, fragments, pings and acts without end, peers that read nothing."""
+    head, frame = hostile.UPGRADE, hostile.websocket_frame
+    with vla_cpp.Client(target.address, timeout=20) as client:
+        act = frame(0x82, pack(openpi_act(client.spec, 2), openpi_array))
+    target = argparse.Namespace(address=target.openpi)
+    begin = head + frame(0x82, bytes(30_000_000))[:14]
+    threading.Thread(target=half_sent, args=(target, begin), daemon=True).start()
+    again_and_again(
+        *[lambda: silent(target, b"")] * 50,
+        *[lambda: silent(target, head[:60])] * 50,
+        *[lambda: silent(target, head)] * 50,
+        *[lambda: send(target, b"", (head[i : i + 1] for i in range(len(head))), pause=0.01)] * 10,
+        lambda: send(target, head + frame(0x02, b""), itertools.repeat(frame(0x00, b"") * 1000)),
+        lambda: send(target, head, itertools.repeat(frame(0x89, b"?" * 100) * 100)),
+        lambda: send(target, head, itertools.repeat(act, 20), pause=0.05),
+        lambda: send(target, head, [frame(0x82, b"\x91" * 100_000)]),
+        lambda: send(target, head, [frame(0x82, bytes(1_000_000))]),
+    )
 
 
 def drip_http(target):
@@ -199,14 +247,40 @@ def ask_for_ever(target, acts, n_connection=70, source=ATTACKER):
 
 ATTACKS = {
     f.__name__: f
-    for f in (half_sent, flood, connections, drip, drip_http, hostile_png, heavy_images, own_address, many_addresses)
-}
+    for f in (
+        half_sent, flood, connections, drip, gr00t, openpi, drip_http, hostile_png, heavy_images, own_address, many_addresses,
+    )
+}  # fmt: skip
 
 
 def request(kind):
     message = wire.Request(protocol_version=1, request_id=1)
     getattr(message, kind).SetInParent()
     return message.SerializeToString()
+
+
+def scene(spec, seed):
+    """Frames by view and vectors by state."""
+    rng = np.random.default_rng(seed)
+    images = {v.name: rng.integers(0, 255, (v.height, v.width, 3), np.uint8) for v in spec.views}
+    return images, {s.name: np.full(s.width, 0.1, np.float32) for s in spec.states}
+
+
+def openpi_act(spec, seed):
+    """An observation of openpi's protocol, with the names that Target gives it."""
+    images, states = scene(spec, seed)
+    parts = {f"view{i}": frame for i, frame in enumerate(images.values())}
+    parts.update((f"state{i}", values) for i, values in enumerate(states.values()))
+    return {**parts, "prompt": "open the drawer", "vla": {"seed": 1}}
+
+
+def gr00t_act(spec, seed):
+    images, states = scene(spec, seed)
+    short = lambda name: name.rsplit(".", 1)[-1]  # noqa: E731
+    parts = {f"video.{short(name)}": frame[None, None] for name, frame in images.items()}
+    parts.update((f"state.{short(name)}", values[None, None]) for name, values in states.items())
+    parts["annotation.human.task_description"] = ["open the drawer"]
+    return {"endpoint": "get_action", "data": {"observation": parts, "options": {"seed": 1}}}
 
 
 def png(width, height, rows=None, texts=0):
@@ -226,11 +300,19 @@ class Target:
     """A server of its own, or where it is."""
 
     def __init__(self, options):
+        inspected = subprocess.run([options.vla, "inspect", options.bundle, "--json"], check=True, capture_output=True)
+        keys = json.loads(inspected.stdout)["keys"]
         command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", "--metrics", "127.0.0.1:0"]
+        command += ["--openpi", "127.0.0.1:0", "--gr00t", "127.0.0.1:0"]
+        for kind in ("view", "state"):
+            for i, name in enumerate(keys[f"observation.{kind}s"]):
+                command += ["--map", f"{kind}{i}={name}"]
         command += ["--threads", str(options.threads), "--max-message", str(MAX_MESSAGE_MIB), "--max-pixels", str(MAX_PIXELS)]
         self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         line = self.process.stdout.readline()
-        self.address = re.search(r"address='?(tcp://[^\s']+)", line)[1]
+        addresses = re.search(r"address='?([^\s']+)", line)[1].split(",")
+        self.address, openpi, gr00t = addresses
+        self.openpi, self.gr00t = openpi.replace("ws://", "tcp://"), gr00t.removeprefix("gr00t+")
         self.metrics = "http://" + re.search(r"metrics='?([^\s']+)", line)[1]
 
     def memory_mib(self, what="VmRSS"):
@@ -239,28 +321,31 @@ class Target:
 
 
 class Behaved:
-    """A robot that asks for an act in each of its periods, and a probe of health, over ZeroMQ and HTTP."""
+    """Robots that ask for an act in each of their periods, one in each protocol, and a probe of health, over ZeroMQ and HTTP."""
 
     def __init__(self, target):
         self._target = target
         self._robot, self._probe = (vla_cpp.Client(target.address, timeout=20) for _ in range(2))
         spec = self._robot.spec
-        rng = np.random.default_rng(1)
-        self._observation = {
-            "images": {v.name: rng.integers(0, 255, (v.height, v.width, 3), np.uint8) for v in spec.views},
-            "state": {s.name: np.full(s.width, 0.1, np.float32) for s in spec.states},
-            "text": "open the drawer",
-        }
+        images, states = scene(spec, 1)
+        self._observation = {"images": images, "state": states, "text": "open the drawer"}
         self._expected = self._robot.act(**self._observation, seed=1).actions.tobytes()
+        self._openpi = WebSocket(target.openpi.removeprefix("tcp://"))
+        self._openpi.receive()
+        self._gr00t = zmq.Context.instance().socket(zmq.REQ)
+        self._gr00t.linger, self._gr00t.rcvtimeo = 0, 20_000
+        self._gr00t.connect(target.gr00t)
+        self._messages = pack(openpi_act(spec, 1), openpi_array), pack(gr00t_act(spec, 1), numpy_array)
 
     def watch(self, seconds):
         """Milliseconds of acts, of health, of /healthz, and then how long after its deadline LATE came."""
         self._until = time.monotonic() + seconds
-        times = {"act": [], "health": [], "healthz": [], "late": []}
+        times = {"act": [], "openpi": [], "gr00t": [], "health": [], "healthz": [], "late": []}
         threads = [
             threading.Thread(target=self._repeat, args=(times[name], what, period))
             for name, what, period in (
-                ("act", self._act, PERIOD), ("health", self._probe.health, 0.02), ("healthz", self._healthz, 0.02)
+                ("act", self._act, PERIOD), ("openpi", self._act_openpi, OTHER_PERIOD), ("gr00t", self._act_gr00t, OTHER_PERIOD),
+                ("health", self._probe.health, 0.02), ("healthz", self._healthz, 0.02)
             )
         ]  # fmt: skip
         self._failed = []
@@ -286,6 +371,15 @@ class Behaved:
     def _act(self):
         chunk = self._robot.act(**self._observation, seed=1)
         assert chunk.actions.tobytes() == self._expected, "the actions of another observation"
+
+    def _act_openpi(self):
+        actions = self._openpi.ask(self._messages[0])["actions"]
+        assert actions.tobytes() == self._expected, "the actions of another observation"
+
+    def _act_gr00t(self):
+        self._gr00t.send(self._messages[1])
+        answer = unpack(self._gr00t.recv())
+        assert isinstance(answer, list) and len(answer) == 2, answer
 
     def _healthz(self):
         with urllib.request.urlopen(self._target.metrics + "/healthz", timeout=20) as page:
@@ -369,7 +463,7 @@ def measure(options):
         quiet = behaved.watch(options.seconds)
         before = target.memory_mib()
         for name in options.attack or ATTACKS:
-            command = [sys.executable, __file__, "--as", name, target.address, target.metrics]
+            command = [sys.executable, __file__, "--as", name, target.address, target.metrics, target.openpi, target.gr00t]
             attackers.append(subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=last_of_all))
         [attacker.stdout.readline() for attacker in attackers]
         time.sleep(1)
@@ -390,13 +484,14 @@ def measure(options):
 
 def rows_of(options, quiet, attacked, rest):
     """(what, measured when quiet, under attack, bar, whether it holds)"""
-    act, loose = {q: p(quiet["act"], q) for q in (50, 95)}, options.loose
-    memory = 12 * MAX_MESSAGE_MIB + 15 * 16 + 10  # docs/security.md
+    loose = options.loose
+    memory = 24 * MAX_MESSAGE_MIB + 15 * 16 + 10  # docs/security.md
     rows = []
-    for q in (50, 95):
-        ratio = p(attacked["act"], q) / act[q]
-        rows.append((f"act p{q}, ms", f"{act[q]:.1f}", f"{p(attacked['act'], q):.1f} ({ratio:.2f}x)",
-                     f"{ACT_RATIO * loose:g}x", ratio <= ACT_RATIO * loose))  # fmt: skip
+    for name, q in itertools.product(("act", "openpi", "gr00t"), (50, 95)):
+        before, after = p(quiet[name], q), p(attacked[name], q)
+        what = name if name == "act" else f"act by {name}"
+        rows.append((f"{what} p{q}, ms", f"{before:.1f}", f"{after:.1f} ({after / before:.2f}x)",
+                     f"{ACT_RATIO * loose:g}x", after <= ACT_RATIO * loose * before))  # fmt: skip
     for name, bar in (("health", HEALTH_MS), ("healthz", HEALTH_MS), ("late", LATE_MS)):
         worst = p(attacked[name], 95)
         what = "LATE after its deadline" if name == "late" else name
@@ -423,16 +518,16 @@ def parse():
         "--real-time", action="store_true", help="server and robot have their cores before all other work of the machine; takes root"
     )
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--as", dest="role", nargs=3, help=argparse.SUPPRESS)  # attack, address, metrics
+    parser.add_argument("--as", dest="role", nargs=5, help=argparse.SUPPRESS)  # attack, then Target's addresses
     return parser.parse_args()
 
 
 def main():
     options = parse()
     if options.role:
-        attack, address, metrics = options.role
+        attack, *addresses = options.role
         print("attacking", flush=True)
-        return ATTACKS[attack](argparse.Namespace(address=address, metrics=metrics))
+        return ATTACKS[attack](argparse.Namespace(**dict(zip(("address", "metrics", "openpi", "gr00t"), addresses))))
     quiet, attacked, rest = measure(options)
     rows = rows_of(options, quiet, attacked, rest)
     if options.json:

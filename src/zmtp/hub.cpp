@@ -20,9 +20,7 @@
 #include <deque>
 #include <exception>
 #include <list>
-#include <map>
 
-#include "net/eviction.h"
 #include "net/listener.h"
 #include "net/sweeper.h"
 
@@ -34,7 +32,6 @@ using asio::ip::tcp;
 using Local = asio::local::stream_protocol;
 using boost::system::error_code;
 using net::Standing;
-using net::Standings;
 
 constexpr std::size_t kMaxAnswers = 64;        // that one connection may leave unread
 constexpr std::size_t kMaxUnread = 128 << 10;  // bytes of them before it is not read from; twice that are kept
@@ -116,17 +113,11 @@ void set_options(Local::socket&) {}
 class Connection;
 
 /// What the connections of a hub share.
-struct Shared {
+struct Shared : net::Connections<Connection> {
   asio::io_context& context;
-  Hub::Limits limits;
   const CurveKeys* keys;
   Hub::Handler* handler = nullptr;
-  std::map<std::uint64_t, std::shared_ptr<Connection>> connections;  // oldest first
-  std::size_t n_held = 0;                                            // bytes of requests that are not whole
   bool has_freed = false;  // since the last sweep: answers of connections that closed
-  Standings standings() const;
-  void make_room();
-  void bound_receipt();
 };
 
 class Connection : public std::enable_shared_from_this<Connection> {
@@ -265,39 +256,15 @@ class Connection : public std::enable_shared_from_this<Connection> {
   bool is_paused_ = false, is_closed_ = false;
 };
 
-Standings Shared::standings() const {
-  Standings all;
-  all.reserve(connections.size());
-  for (const auto& [id, connection] : connections) all.push_back(connection->standing());
-  return all;
-}
-
-void Shared::make_room() {
-  while (const auto chosen = net::to_evict(standings(), limits.connections, Clock::now()))
-    connections.at(*chosen)->drop(
-        "connections", fmt::format("more than {}, or {} in their handshake, and this one gives way", limits.connections,
-                                   net::max_handshakes(limits.connections)));
-}
-
-void Shared::bound_receipt() {
-  while (n_held > limits.receipt) {
-    const auto chosen =
-        net::to_interrupt(standings(), limits.connections, limits.message, limits.receipt, Clock::now());
-    if (!chosen) return;
-    connections.at(*chosen)->drop(
-        "receipt", fmt::format("requests in receipt took more than {} bytes, and this one gives way", limits.receipt));
-  }
-}
-
 }  // namespace
 
 class Hub::Sockets : public Shared {
  public:
   Sockets(net::Loop& loop, const Limits& its_limits, const CurveKeys* its_keys)
-      : Shared{loop.context(), its_limits, its_keys} {}
+      : Shared{{its_limits}, loop.context(), its_keys} {}
   ~Sockets() {
     for (const std::string& path : paths_) ::unlink(path.c_str());
-    while (!connections.empty()) connections.begin()->second->close();
+    close_all();
   }
 
   Result<std::string> bind(const std::string& endpoint) {
@@ -330,12 +297,7 @@ class Hub::Sockets : public Shared {
   }
 
   void send(std::uint64_t connection, std::string_view response, bool delimiter) {
-    const auto found = connections.find(connection);
-    if (found != connections.end()) found->second->answer(response, delimiter);
-  }
-
-  bool has_answers() const {
-    return std::any_of(connections.begin(), connections.end(), [](const auto& c) { return c.second->has_answers(); });
+    if (const auto found = find(connection)) found->answer(response, delimiter);
   }
 
  private:
@@ -350,8 +312,7 @@ class Hub::Sockets : public Shared {
   }
 
   void sweep() {
-    const auto all = connections;
-    for (const auto& [id, connection] : all) connection->sweep();
+    sweep_all();
     if (std::exchange(has_freed, false)) ::malloc_trim(0);  // else the process keeps what a flood took
   }
 

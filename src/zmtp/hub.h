@@ -7,6 +7,7 @@
 #include <string>
 #include <string_view>
 
+#include "net/connections.h"
 #include "net/loop.h"
 #include "zmtp/session.h"
 
@@ -25,11 +26,7 @@ struct Client {
 /// `wait`, and no peer is waited for. A peer that asks faster than it reads is not read from meanwhile.
 class Hub {
  public:
-  struct Limits {
-    std::size_t message = 0;      // bytes of a request
-    std::size_t connections = 0;  // at once
-    std::size_t receipt = 0;      // bytes of all requests that are not whole yet
-  };
+  using Limits = net::ConnectionLimits;
   class Handler {
    public:
     virtual ~Handler() = default;

@@ -7,11 +7,11 @@ import io
 import re
 import signal
 import socket
-import struct
 import subprocess
 
 import msgpack
 import numpy as np
+from hostile import UPGRADE, websocket_frame
 from server_process import SECONDS, VLA
 
 
@@ -77,19 +77,14 @@ class WebSocket:
         host, port = re.fullmatch(r"(?:ws://)?([\d.]+):(\d+)", address).groups()
         self.socket = socket.create_connection((host, int(port)), SECONDS)
         self.file = self.socket.makefile("rb")
-        lines = [f"GET {path} HTTP/1.1", f"Host: {host}:{port}", "Upgrade: websocket", "Connection: Upgrade"]
-        lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13", *headers, "", ""]
-        self.socket.sendall("\r\n".join(lines).encode())
+        head = UPGRADE.replace(b" / ", f" {path} ".encode())
+        self.socket.sendall(head[:-2] + "".join(f"{line}\r\n" for line in headers).encode() + b"\r\n")
         self.status = int(self.file.readline().split()[1])
         while self.file.readline().strip():
             pass
 
     def send(self, payload, opcode=2):
-        size = len(payload)
-        length = struct.pack(">BH", 126, size) if 126 <= size < 65536 else struct.pack(">BQ", 127, size)
-        length = bytes([size]) if size < 126 else length
-        head = bytes([0x80 | opcode, 0x80 | length[0]]) + length[1:]
-        self.socket.sendall(head + bytes(4) + payload)  # a mask of zeros
+        self.socket.sendall(websocket_frame(0x80 | opcode, payload))
 
     def receive(self):
         """Opcode and payload of the next frame; None at the end."""
@@ -104,6 +99,9 @@ class WebSocket:
     def ask(self, payload):
         self.send(payload)
         opcode, answer = self.receive()
+        while opcode == 9:
+            self.send(answer, opcode=10)
+            opcode, answer = self.receive()
         assert opcode == 2, answer
         return unpack(answer)
 

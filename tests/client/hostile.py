@@ -11,6 +11,17 @@ SIGNATURE = b"\xff" + bytes(8) + b"\x7f"
 GREETING = SIGNATURE + b"\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 READY = b"\x05READY" + b"\x0bSocket-Type" + struct.pack(">I", 6) + b"DEALER"
 HANDSHAKE = GREETING + b"\x04" + bytes([len(READY)]) + READY
+UPGRADE = (
+    b"GET / HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
+def websocket_frame(first, payload, is_masked=True):
+    """A client's frame of WebSocket, by a mask of zeros; `first`: final bit and opcode."""
+    n = len(payload)
+    size = bytes([n]) if n < 126 else b"\x7e" + struct.pack(">H", n) if n < 65536 else b"\x7f" + struct.pack(">Q", n)
+    return bytes([first, 0x80 * is_masked | size[0]]) + size[1:] + bytes(4) * is_masked + payload
 
 
 def long_frame(size, payload=b"", flags=2):

@@ -10,8 +10,9 @@ import pytest
 pytest.importorskip("msgpack")
 
 from drop_in import openpi_array, pack, serving, unpack  # noqa: E402
+from hostile import UPGRADE, websocket_frame  # noqa: E402
 from openpi_test import keys_of, observation, options  # noqa: E402, F401
-from record_openpi_server import AFTER_GREETING, REQUESTS, UPGRADE, after_greeting, frame, request, split  # noqa: E402
+from record_openpi_server import AFTER_GREETING, REQUESTS, after_greeting, request, split  # noqa: E402
 
 RECORDED = json.loads((Path(__file__).parent / "data/openpi_server.json").read_text())
 
@@ -43,9 +44,9 @@ def test_any_path_is_upgraded_in_the_same_way(port):
 
 def test_metadata_and_answers_are_packed_to_the_byte_as_the_reference_packs_them(case, port):
     reference = [RECORDED["greeting"], *RECORDED["answers"]]
-    greeting = split(request(port, UPGRADE.format(path="/"))[1])
+    greeting = split(request(port, UPGRADE)[1])
     message = pack(observation(case, 7), openpi_array)
-    answers = after_greeting(port, frame(0x82, message), frame(0x82, message))
+    answers = after_greeting(port, websocket_frame(0x82, message), websocket_frame(0x82, message))
     for data in [*map(bytes.fromhex, reference), greeting[0][1], *(payload for _, payload in answers)]:
         assert pack(unpack(data), openpi_array) == data
     assert [first for first, _ in (*greeting, *answers)] == [0x82] * 3
@@ -78,7 +79,7 @@ def test_a_message_in_pieces_with_a_ping_between_is_one_message(case, port):
     message = pack(observation(case, 7), openpi_array)
     at = len(message) // 2
     pieces = [(0x02, message[:at]), (0x89, b"?"), (0x80, message[at:]), (0x82, message)]
-    came = after_greeting(port, *(frame(*piece) for piece in pieces))
+    came = after_greeting(port, *(websocket_frame(*piece) for piece in pieces))
     assert came[0] == (0x8A, b"?")
     chunks = [unpack(payload)["actions"].tobytes() for first, payload in came[1:]]
     assert len(chunks) == 2 and chunks[0] == chunks[1]

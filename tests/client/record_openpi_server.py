@@ -13,37 +13,28 @@ import threading
 import time
 from pathlib import Path
 
-MASK = bytes(4)
-UPGRADE = (
-    "GET {path} HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-)
-
-
-def frame(first, payload, is_masked=True):
-    """One frame; `first`: final bit and opcode."""
-    n = len(payload)
-    size = bytes([n]) if n < 126 else b"\x7e" + n.to_bytes(2, "big") if n < 65536 else b"\x7f" + n.to_bytes(8, "big")
-    return bytes([first, 0x80 * is_masked | size[0]]) + size[1:] + MASK * is_masked + payload
-
+from hostile import UPGRADE, websocket_frame
 
 # What a client sends after the greeting, by name; each on a connection of its own. The policy's answer to {} is an exception.
 AFTER_GREETING = {
-    "an observation without keys": frame(0x82, b"\x80"),
-    "no msgpack": frame(0x82, b"\xc1"),
-    "a text message": frame(0x81, b"hello"),
-    "an empty message": frame(0x82, b""),
-    "a ping": frame(0x89, b"here?"),
-    "a close": frame(0x88, b"\x03\xe8"),
-    "a close with a reason": frame(0x88, b"\x03\xe8bye"),
-    "a close without a code": frame(0x88, b""),
-    "a reserved opcode": frame(0x83, b""),
-    "a reserved bit": frame(0xC2, b"\x80"),
-    "a frame without a mask": frame(0x82, b"\x80", is_masked=False),
-    "a continuation of nothing": frame(0x80, b"\x80"),
-    "text that is not UTF-8": frame(0x81, b"\xff"),
+    "an observation without keys": websocket_frame(0x82, b"\x80"),
+    "no msgpack": websocket_frame(0x82, b"\xc1"),
+    "a text message": websocket_frame(0x81, b"hello"),
+    "an empty message": websocket_frame(0x82, b""),
+    "a ping": websocket_frame(0x89, b"here?"),
+    "a close": websocket_frame(0x88, b"\x03\xe8"),
+    "a close with a reason": websocket_frame(0x88, b"\x03\xe8bye"),
+    "a close without a code": websocket_frame(0x88, b""),
+    "a reserved opcode": websocket_frame(0x83, b""),
+    "a reserved bit": websocket_frame(0xC2, b"\x80"),
+    "a frame without a mask": websocket_frame(0x82, b"\x80", is_masked=False),
+    "a continuation of nothing": websocket_frame(0x80, b"\x80"),
+    "text that is not UTF-8": websocket_frame(0x81, b"\xff"),
 }
-REQUESTS = {"health": "GET /healthz HTTP/1.1\r\nHost: robot\r\n\r\n", "another path": UPGRADE.format(path="/v1/any")}
+REQUESTS = {
+    "health": b"GET /healthz HTTP/1.1\r\nHost: robot\r\n\r\n",
+    "another path": UPGRADE.replace(b" / ", b" /v1/any "),
+}
 
 
 def all_of(raw, seconds=2.0):
@@ -74,7 +65,7 @@ def split(data):
 def request(port, text):
     """Head and body of the answer to an HTTP request, and what follows an upgrade."""
     with socket.create_connection(("127.0.0.1", port), 20) as raw:
-        raw.sendall(text.encode())
+        raw.sendall(text)
         head, _, rest = all_of(raw, 0.5).partition(b"\r\n\r\n")
     return head.decode().split("\r\n"), rest
 
@@ -82,7 +73,7 @@ def request(port, text):
 def after_greeting(port, *messages):
     """The frames that come after the greeting."""
     with socket.create_connection(("127.0.0.1", port), 20) as raw:
-        raw.sendall(UPGRADE.format(path="/").encode())
+        raw.sendall(UPGRADE)
         time.sleep(0.2)
         [raw.sendall(message) for message in messages]
         return split(all_of(raw, 0.5).partition(b"\r\n\r\n")[2])[1:]
@@ -109,8 +100,8 @@ def main(path):
     for name, text in REQUESTS.items():
         head, rest = request(port, text)
         told["requests"][name] = {"head": head, "rest": rest.hex() if name == "health" else ""}
-    told["greeting"] = split(request(port, UPGRADE.format(path="/"))[1])[0][1].hex()
-    good = frame(0x82, b"\x81\xa5state\x01")
+    told["greeting"] = split(request(port, UPGRADE)[1])[0][1].hex()
+    good = websocket_frame(0x82, b"\x81\xa5state\x01")
     told["answers"] = [payload.hex() for _, payload in after_greeting(port, good, good)]
     for name, message in AFTER_GREETING.items():
         frames = after_greeting(port, message)

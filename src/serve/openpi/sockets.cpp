@@ -4,7 +4,6 @@
 
 #include <fmt/format.h>
 
-#include <algorithm>
 #include <boost/asio/dispatch.hpp>
 #include <boost/asio/ip/tcp.hpp>
 #include <boost/beast/core/flat_buffer.hpp>
@@ -17,10 +16,8 @@
 #include <boost/beast/websocket/stream.hpp>
 #include <deque>
 #include <exception>
-#include <map>
 #include <optional>
 
-#include "net/eviction.h"
 #include "net/listener.h"
 #include "net/sweeper.h"
 #include "net/tcp.h"
@@ -56,16 +53,10 @@ Response plain(const Request& request, http::status status, std::string body) {
 class Connection;
 
 /// What the connections share.
-struct Shared {
+struct Shared : net::Connections<Connection> {
   asio::io_context& context;
-  Sockets::Limits limits;
   std::string api_key;
   Sockets::Handler* handler = nullptr;
-  std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
-  std::size_t n_held = 0;  // bytes of requests that are not whole, or that wait
-  net::Standings standings() const;
-  void make_room();
-  void bound_receipt();
 };
 
 class Connection : public std::enable_shared_from_this<Connection> {
@@ -197,6 +188,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     const auto data = buffer_.data();
     std::string message(static_cast<const char*>(data.data()), data.size());
     buffer_.consume(buffer_.size());
+    if (buffer_.capacity() > 2 * kPiece) buffer_.shrink_to_fit();  // of a large message
     hold(0);
     shared_.handler->received(peer_, std::move(message), stream_.got_text());
     if (!is_closed_) read();
@@ -256,38 +248,13 @@ class Connection : public std::enable_shared_from_this<Connection> {
   bool is_failed_ = false, is_ending_ = false, is_closed_ = false, is_pinging_ = false;
 };
 
-net::Standings Shared::standings() const {
-  net::Standings all;
-  all.reserve(connections.size());
-  for (const auto& [id, connection] : connections) all.push_back(connection->standing());
-  return all;
-}
-
-void Shared::make_room() {
-  while (const auto chosen = net::to_evict(standings(), limits.connections, Clock::now()))
-    connections.at(*chosen)->drop("connections",
-                                  fmt::format("more than {}, and this one gives way", limits.connections));
-}
-
-void Shared::bound_receipt() {
-  while (n_held > limits.receipt) {
-    const auto chosen =
-        net::to_interrupt(standings(), limits.connections, limits.message, limits.receipt, Clock::now());
-    if (!chosen) return;
-    connections.at(*chosen)->drop(
-        "receipt", fmt::format("requests in receipt took more than {} bytes, and this one gives way", limits.receipt));
-  }
-}
-
 }  // namespace
 
 class Sockets::All : public Shared {
  public:
   All(net::Loop& loop, const Limits& its_limits, std::string its_key)
-      : Shared{loop.context(), its_limits, std::move(its_key)} {}
-  ~All() {
-    while (!connections.empty()) connections.begin()->second->close();
-  }
+      : Shared{{its_limits}, loop.context(), std::move(its_key)} {}
+  ~All() { close_all(); }
 
   Result<std::string> bind(const std::string& address, const char* option, bool insecure) {
     VLA_TRY(const tcp::endpoint endpoint, net::tcp_endpoint_of(address, option, insecure));
@@ -303,10 +270,7 @@ class Sockets::All : public Shared {
   void begin(Handler& its_handler) {
     handler = &its_handler;
     listener_->listen([this](tcp::socket socket) { add(std::move(socket)); });
-    sweeper_.begin([this] {
-      const auto all = connections;
-      for (const auto& [id, connection] : all) connection->sweep();
-    });
+    sweeper_.begin([this] { sweep_all(); });
   }
 
  private:
@@ -334,21 +298,15 @@ Result<std::string> Sockets::bind(const std::string& address, const char* option
 }
 void Sockets::begin(Handler& handler) { all_->begin(handler); }
 void Sockets::send(std::uint64_t connection, std::string message) {
-  const auto found = all_->connections.find(connection);
-  if (found != all_->connections.end()) std::shared_ptr(found->second)->send(std::move(message), false);
+  if (const auto found = all_->find(connection)) found->send(std::move(message), false);
 }
 void Sockets::fail(std::uint64_t connection, std::string text) {
-  const auto found = all_->connections.find(connection);
-  if (found != all_->connections.end()) std::shared_ptr(found->second)->send(std::move(text), true);
+  if (const auto found = all_->find(connection)) found->send(std::move(text), true);
 }
 void Sockets::drop(std::uint64_t connection) noexcept try {
-  const auto found = all_->connections.find(connection);
-  if (found != all_->connections.end()) std::shared_ptr(found->second)->drop("memory", "none for its request");
+  if (const auto found = all_->find(connection)) found->drop("memory", "none for its request");
 } catch (const std::exception&) {  // it was told as far as it could be
 }
-bool Sockets::has_answers() const {
-  return std::any_of(all_->connections.begin(), all_->connections.end(),
-                     [](const auto& connection) { return connection.second->has_answers(); });
-}
+bool Sockets::has_answers() const { return all_->has_answers(); }
 
 }  // namespace vla::serve::openpi

@@ -8,6 +8,7 @@
 #include <string>
 
 #include "base/result.h"
+#include "net/connections.h"
 #include "net/loop.h"
 
 namespace vla::serve::openpi {
@@ -26,11 +27,7 @@ struct Peer {
 /// are answered at all times.
 class Sockets {
  public:
-  struct Limits {
-    std::size_t message = 0;      // bytes of a request
-    std::size_t connections = 0;  // at once
-    std::size_t receipt = 0;      // bytes of all requests that are not whole yet
-  };
+  using Limits = net::ConnectionLimits;
   class Handler {
    public:
     virtual ~Handler() = default;
