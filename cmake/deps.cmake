@@ -108,4 +108,15 @@ if(VLA_BUILD_SERVER)
   find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
   find_path(VLA_BOOST_DIR boost/beast/http.hpp REQUIRED)  # Asio and Beast, headers only
   find_path(VLA_MSGPACK_DIR msgpack.hpp REQUIRED)         # headers only
+  # LeRobot's protocol, where libgrpc++-dev is installed.
+  find_path(VLA_GRPC_DIR grpcpp/grpcpp.h)
+  set(VLA_GRPC_LIBRARIES)
+  foreach(library grpc++ grpc gpr absl_synchronization)
+    find_library(VLA_LIBRARY_${library} ${library})
+    list(APPEND VLA_GRPC_LIBRARIES ${VLA_LIBRARY_${library}})
+  endforeach()
+  if(NOT VLA_LEROBOT OR NOT VLA_GRPC_DIR OR "${VLA_GRPC_LIBRARIES}" MATCHES NOTFOUND)
+    set(VLA_GRPC_LIBRARIES)
+    message(STATUS "vla serve --lerobot is not built: it needs VLA_LEROBOT=ON and libgrpc++-dev")
+  endif()
 endif()

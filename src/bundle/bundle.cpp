@@ -79,8 +79,7 @@ Status check_identity(const Keys& keys) {
   for (const char* key : {"vla.arch", "vla.source.name", "vla.source.revision", "vla.source.converter"})
     if (const auto text = keys.string(key); !text) return text.error();
   VLA_TRY(const std::string dtype, keys.string("vla.dtype"));
-  if (dtype == "f32" || dtype == "bf16" || dtype == "f16" || dtype == "int8" || dtype == "int4")
-    return {};
+  if (dtype == "f32" || dtype == "bf16" || dtype == "f16" || dtype == "int8" || dtype == "int4") return {};
   return Error{Code::bad_bundle, "vla.dtype", "f32, bf16, f16, int8 or int4", dtype};
 }
 

@@ -144,6 +144,8 @@ void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
   add_text(command, "--openpi", server.openpi, "ADDRESS:PORT",
            "Answer openpi's clients too: WebSocket (docs/drop_in.md)");
   add_text(command, "--gr00t", server.gr00t, "ADDRESS:PORT", "Answer the clients of GR00T's policy server too");
+  add_text(command, "--lerobot", server.lerobot, "ADDRESS:PORT",
+           "Answer the robot_client of LeRobot too; in builds with libgrpc++");
   add_text(command, "--preset", server.preset, "NAME",
            "With --openpi, the keys of a published robot: " + serve::presets());
   command

@@ -174,7 +174,7 @@ struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
     using Pairs = typename VectorOf<std::uint16_t, sizeof(Vector)>::Type;
     using Bytes = typename VectorOf<std::uint8_t, sizeof(Vector)>::Type;
     const auto step = Packed::template step<Pairs>(k, i, byte);
-    const auto zeros = std::bit_cast<Bytes>(step << 3 | step << 11);  // kZero * step, in each byte
+    const auto zeros = std::bit_cast<Bytes>(step << 3 | step << 11);          // kZero * step, in each byte
     const auto numbers = Packed::template load<Pairs>(k, s, i, byte) * step;  // no byte carries: 15 * kMaxStep is 255
     return std::bit_cast<Vector>(std::bit_cast<Bytes>(numbers) - (zeros - static_cast<std::uint8_t>(kOffset)));
   }

@@ -20,13 +20,13 @@ struct ServerOptions {
   bool strict_state = false;                // refuse states beyond the bundle's bound
 
   // Of the protocols that other clients speak (docs/drop_in.md); an empty address: not served.
-  std::string openpi, gr00t;     // ADDRESS:PORT
-  std::string preset;            // of openpi's clients
-  std::vector<std::string> map;  // lines for both; those of GR00T begin with a modality and a dot
-  bool vllm_omni = false;        // openpi's clients speak the dialect of vLLM-Omni
-  std::string api_token;         // a file
-  bool gr00t_n1_5 = false;       // the client is of that release, also before its first act
-  bool gr00t_kill = false;       // clients may stop the server
+  std::string openpi, gr00t, lerobot;  // ADDRESS:PORT
+  std::string preset;                  // of openpi's clients
+  std::vector<std::string> map;        // lines for both; those of GR00T begin with a modality and a dot
+  bool vllm_omni = false;              // openpi's clients speak the dialect of vLLM-Omni
+  std::string api_token;               // a file
+  bool gr00t_n1_5 = false;             // the client is of that release, also before its first act
+  bool gr00t_kill = false;             // clients may stop the server
 };
 
 constexpr std::size_t kReceiptMessages = 4;  // requests that are being received hold so many times the largest message

@@ -13,6 +13,9 @@
 #include "base/thread.h"
 #include "net/descriptors.h"
 #include "serve/gr00t/front.h"
+#ifdef VLA_LEROBOT
+#include "serve/lerobot/front.h"
+#endif
 #include "serve/native/codec.h"
 #include "serve/native/front.h"
 #include "serve/openpi/front.h"
@@ -97,6 +100,15 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked) try {
   if (!options.gr00t.empty()) {
     VLA_TRY(auto front, gr00t::Front::open(server->loop_, options));
     server->fronts_.push_back(std::move(front));
+  }
+  if (!options.lerobot.empty()) {
+#ifdef VLA_LEROBOT
+    VLA_TRY(auto front, lerobot::Front::open(server->loop_, options));
+    server->fronts_.push_back(std::move(front));
+#else
+    return Error{Code::unsupported, "--lerobot", "a build with libgrpc++", "one without",
+                 "install libgrpc++-dev, configure and build again"};
+#endif
   }
   return server;
 } catch (const std::runtime_error& no_descriptor) {  // of Asio

@@ -34,16 +34,21 @@ inline void check_refusal(const Error& error) {
   if (serve::openpi::encode_error(error).empty() || serve::gr00t::encode_error(error).empty()) std::abort();
 }
 
-/// What is accepted must keep every limit, and be answered with a message that can be read.
-inline bool check_act(const Observation& observation, const serve::ActLimits& limits, const std::string& answer) {
+/// What is accepted must keep every limit.
+inline bool check_observation(const Observation& observation, const serve::ActLimits& limits) {
   std::int64_t pixels = 0;
   for (const auto& [name, frame] : observation.views) {
     if (frame && !check_frame(*frame, name, {limits.max_pixels})) std::abort();
     if (frame) pixels += std::int64_t{frame->width} * frame->height;
   }
   if (pixels > limits.max_pixels || observation.text.size() > limits.max_text) std::abort();
-  if (!msgpack::read(std::as_bytes(std::span(answer)))) std::abort();
   return true;
+}
+
+/// And be answered with a message that can be read.
+inline bool check_act(const Observation& observation, const serve::ActLimits& limits, const std::string& answer) {
+  if (!msgpack::read(std::as_bytes(std::span(answer)))) std::abort();
+  return check_observation(observation, limits);
 }
 
 inline ActionChunk small_chunk() {

@@ -1,0 +1,69 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <deque>
+#include <map>
+
+#include "base/clock.h"
+#include "net/sweeper.h"
+#include "serve/front.h"
+#include "serve/lerobot/codec.h"
+#include "serve/lerobot/rpcs.h"
+#include "serve/options.h"
+
+namespace vla::serve::lerobot {
+
+/// The protocol of LeRobot's asynchronous inference: gRPC with pickles, which are read without executing anything
+/// (docs/drop_in.md). Only in builds with libgrpc++.
+class Front final : public serve::Front, Rpcs::Handler {
+ public:
+  /// Binds `options.lerobot`. Errors: usage, io.
+  static Result<std::unique_ptr<serve::Front>> open(net::Loop& loop, const ServerOptions& options);
+
+  std::vector<std::string> addresses() const override { return {"grpc://" + address_}; }
+  Status serve(const Engine& engine, const v1::Description& description) override;
+  std::string told() const override { return "lerobot=" + names_.told(); }
+  void begin(Io& io) override;
+  bool has_answers() const override { return rpcs_.has_answers(); }
+
+ private:
+  class Request;
+  /// A robot: one connection.
+  struct Client {
+    std::uint64_t number = 0;
+    std::shared_ptr<const Setup> setup;
+    Filter filter;
+    std::shared_ptr<const Observed> observed;  // the newest that is to be computed
+    struct Asking {
+      std::uint64_t rpc;
+      Clock::time_point since;
+    };
+    std::deque<Asking> asking;  // for actions
+    std::uint64_t n_request = 0;
+    Clock::time_point used = {};
+  };
+
+  Front(net::Loop& loop, const ServerOptions& options);
+  void called(Rpc rpc) override;
+  void cancelled(std::uint64_t rpc) override;
+  Result<std::string> answer_now(Rpc& rpc, Client& client);
+  Client& client_of(const std::string& peer);
+  void make_room();
+  void submit_next(const std::string& peer, Client& client);
+  void sweep();
+
+  const ServerOptions options_;
+  Rpcs rpcs_;
+  net::Sweeper sweeper_;
+  std::string address_, embodiment_;
+  v1::Description description_;
+  Names names_;
+  ActLimits limits_;
+  double period_ = 0;  // seconds between rows of a chunk
+  std::map<std::string, Client> clients_;
+  std::uint64_t n_client_ = 0;
+  Io* io_ = nullptr;
+};
+
+}  // namespace vla::serve::lerobot

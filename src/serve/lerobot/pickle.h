@@ -1,0 +1,69 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <deque>
+#include <span>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "base/result.h"
+#include "serve/msgpack/array.h"
+
+namespace vla::pickle {
+
+/// A value of a pickle. Text, bytes and elements of arrays stay in the message, which outlives the value.
+struct Value {
+  enum class Type { none, boolean, integer, real, text, bytes, list, map, array, object, name, dtype };
+
+  Type type = Type::none;
+  std::int64_t integer = 0;  // of a boolean too
+  double real = 0;           // also where it is an integer or a boolean
+  std::string_view data;     // of text and bytes
+  std::string name;          // of a class or function, and of an object's class: `module.name`
+  std::vector<const Value*>
+      items;             // of a list or tuple; of a map keys and values by turns; an object's map of attributes
+  msgpack::Array array;  // of an array; of a dtype all but the shape and the elements
+  bool is_whole = true;  // an array and a dtype come in two steps
+
+  bool is_number() const { return type == Type::boolean || type == Type::integer || type == Type::real; }
+  /// The value at a key that is text; null where there is none or this has no keys.
+  const Value* find(std::string_view key) const;
+};
+
+constexpr std::size_t kMaxSteps = 1 << 16;  // opcodes of a message
+constexpr std::size_t kMaxMarks = 64;       // containers that are open at once
+
+/// A message that Python's pickle wrote, protocol 2 to 5. Nothing of it is executed: names of classes and functions are
+/// compared with the few that LeRobot's clients and NumPy's arrays use, and stand for data. Errors: bad_request for any
+/// other name, with the name, for opcodes that could do anything but make data, and beyond the bounds.
+class Pickle {
+ public:
+  static Result<Pickle> read(std::span<const std::byte> message);
+  const Value& root() const { return *root_; }
+
+ private:
+  friend class Reader;
+  std::deque<Value> values_;
+  const Value* root_ = nullptr;
+};
+
+/// Writes values of protocol 4 one after the other, as a stack machine reads them.
+class Writer {
+ public:
+  Writer() : out_("\x80\x04") {}
+  Writer& op(char opcode) { return out_ += opcode, *this; }
+  Writer& text(std::string_view value);
+  Writer& integer(std::int64_t value);
+  Writer& real(double value);
+  /// A class or function.
+  Writer& name(std::string_view module, std::string_view name);
+  /// The end, and the bytes.
+  std::string take() { return op('.'), std::move(out_); }
+
+ private:
+  std::string out_;
+};
+
+}  // namespace vla::pickle

@@ -1,0 +1,269 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "serve/lerobot/rpcs.h"
+
+#include <fmt/format.h>
+#include <grpcpp/generic/async_generic_service.h>
+#include <grpcpp/grpcpp.h>
+#include <grpcpp/resource_quota.h>
+
+#include <atomic>
+#include <boost/asio/post.hpp>
+#include <map>
+#include <mutex>
+
+#include "base/clock.h"
+#include "base/printable.h"
+#include "net/sweeper.h"
+#include "net/tcp.h"
+#include "serve/lerobot/async_inference.pb.h"
+
+namespace vla::serve::lerobot {
+namespace {
+
+constexpr int kMaxPiece = 4 << 20;  // of LeRobot's channels
+constexpr int kMaxStreams = 16;     // of a connection
+constexpr int kHandshakeMs = 10'000, kKeepaliveMs = 20'000;
+constexpr auto kReceiptPatience = std::chrono::seconds(60);
+
+grpc::StatusCode status_of(Code code) {
+  switch (code) {
+    case Code::bad_request:
+    case Code::bad_observation:
+    case Code::too_large:
+      return grpc::StatusCode::INVALID_ARGUMENT;
+    case Code::incompatible:
+      return grpc::StatusCode::FAILED_PRECONDITION;
+    case Code::unsupported:
+      return grpc::StatusCode::UNIMPLEMENTED;
+    case Code::busy:
+    case Code::out_of_memory:
+      return grpc::StatusCode::RESOURCE_EXHAUSTED;
+    case Code::late:
+    case Code::superseded:
+      return grpc::StatusCode::ABORTED;
+    case Code::shutting_down:
+      return grpc::StatusCode::UNAVAILABLE;
+    default:
+      return grpc::StatusCode::INTERNAL;
+  }
+}
+
+grpc::Status status_of(const Error& error) {
+  return {status_of(error.code), fmt::format("{}: {}", code_name(error.code), printable(error.message()))};
+}
+
+}  // namespace
+
+/// What all calls share. gRPC's threads and the loop's use it.
+class Rpcs::All : public grpc::CallbackGenericService {
+ public:
+  class Call;
+  All(net::Loop& loop, const Limits& limits) : limits_(limits), context_(loop.context()), sweeper_(loop.context()) {}
+  ~All() override {
+    std::map<std::uint64_t, Call*> left;
+    {
+      const std::lock_guard lock(mutex_);
+      is_closed_ = true;
+      left.swap(live_);
+      n_leaving_ += left.size();
+    }
+    for (const auto& [id, call] : left) end(*call, shutting_down());
+    if (server_) server_->Shutdown(std::chrono::system_clock::now() + std::chrono::seconds(1));
+  }
+
+  Result<std::string> bind(const std::string& address, const char* option, bool insecure) {
+    VLA_TRY(const auto endpoint, net::tcp_endpoint_of(address, option, insecure));
+    const std::string host = endpoint.address().to_string();
+    const std::string where =
+        fmt::format("{}:{}", endpoint.address().is_v6() ? "[" + host + "]" : host, endpoint.port());
+    grpc::ResourceQuota quota;
+    quota.Resize(limits_.receipt + (16u << 20));
+    grpc::ServerBuilder builder;
+    int port = 0;
+    builder.AddListeningPort(where, grpc::InsecureServerCredentials(), &port);
+    builder.RegisterCallbackGenericService(this);
+    builder.SetResourceQuota(quota);
+    builder.SetMaxReceiveMessageSize(kMaxPiece + 1024);
+    builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);
+    builder.AddChannelArgument(GRPC_ARG_MAX_CONCURRENT_STREAMS, kMaxStreams);
+    builder.AddChannelArgument(GRPC_ARG_SERVER_HANDSHAKE_TIMEOUT_MS, kHandshakeMs);
+    // Frames of cameras come at once, not by turns of 64 kB.
+    builder.AddChannelArgument(GRPC_ARG_HTTP2_STREAM_LOOKAHEAD_BYTES, kMaxPiece);
+    builder.AddChannelArgument(GRPC_ARG_HTTP2_MAX_FRAME_SIZE, kMaxPiece);
+    builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_TIME_MS, kKeepaliveMs);
+    builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveMs);
+    builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_PERMIT_WITHOUT_CALLS, 1);
+    server_ = builder.BuildAndStart();
+    if (!server_ || port == 0)
+      return Error{Code::io, address, "a free address of this machine", "one that cannot be bound",
+                   fmt::format("choose another with {}; port 0 takes a free one", option)};
+    return fmt::format("{}:{}", address.substr(0, address.rfind(':')), port);
+  }
+
+  void begin(Rpcs::Handler& handler) {
+    handler_ = &handler;
+    sweeper_.begin([this] { sweep(); });
+  }
+  bool has_answers() const { return n_leaving_ > 0; }
+
+  grpc::ServerGenericBidiReactor* CreateReactor(grpc::GenericCallbackServerContext* context) override;
+  /// Takes a call out, which then has to be ended. Null where that was done.
+  Call* take(std::uint64_t id) {
+    const std::lock_guard lock(mutex_);
+    const auto found = live_.find(id);
+    if (found == live_.end()) return nullptr;
+    Call* const call = found->second;
+    live_.erase(found);
+    ++n_leaving_;
+    return call;
+  }
+  static void end(Call& call, const Error& error);
+  void hand_over(Rpc rpc) {
+    boost::asio::post(context_, [this, rpc = std::move(rpc)]() mutable { handler_->called(std::move(rpc)); });
+  }
+  void cancelled(std::uint64_t id) {
+    boost::asio::post(context_, [this, id] { handler_->cancelled(id); });
+  }
+
+  const Limits limits_;
+  std::atomic<std::size_t> n_held_ = 0, n_leaving_ = 0;  // bytes in receipt; calls that end
+
+ private:
+  static Error shutting_down() { return {Code::shutting_down, "call", "", "the server stops"}; }
+  void sweep();
+
+  boost::asio::io_context& context_;
+  net::Sweeper sweeper_;
+  Rpcs::Handler* handler_ = nullptr;
+  std::mutex mutex_;
+  std::map<std::uint64_t, Call*> live_;
+  std::uint64_t n_call_ = 0;
+  bool is_closed_ = false;
+  std::unique_ptr<grpc::Server> server_;
+};
+
+/// One call. gRPC does not destroy it before it was ended.
+class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
+ public:
+  Call(All& all, std::uint64_t id, const grpc::GenericCallbackServerContext& context) : all_(all), id_(id) {
+    rpc_.id = id;
+    rpc_.peer = context.peer();
+    rpc_.method = context.method().substr(context.method().rfind('/') + 1);
+  }
+  void start() { StartRead(&in_); }
+  void answer(const std::string& message) {
+    const grpc::Slice slice(message);
+    out_ = grpc::ByteBuffer(&slice, 1);
+    StartWriteAndFinish(&out_, {}, grpc::Status::OK);
+  }
+  void refuse(const Error& error) { Finish(status_of(error)); }
+  bool is_stuck(Clock::time_point now) const { return !is_whole_ && now - began_ > kReceiptPatience; }
+
+ private:
+  void OnReadDone(bool ok) override {
+    try {
+      if (!ok) return is_whole_ ? void() : fail({Code::bad_request, "call", "a whole message", "one that is cut off"});
+      if (Status sound = take_piece(); !sound) return fail(sound.error());
+      if (!is_whole_) return StartRead(&in_);
+      all_.n_held_ -= std::exchange(n_held_, 0);
+      all_.hand_over(std::move(rpc_));
+    } catch (const std::exception&) {
+      fail({Code::out_of_memory, "call", "", "no memory for it"});
+    }
+  }
+  void OnCancel() override { all_.cancelled(id_); }
+  void OnDone() override {
+    all_.n_held_ -= n_held_;
+    --all_.n_leaving_;
+    delete this;
+  }
+
+  Status take_piece() {
+    grpc::Slice slice;
+    if (!in_.DumpToSingleSlice(&slice).ok()) return Error{Code::out_of_memory, "call", "", "no memory for it"};
+    if (rpc_.method != "SendObservations") {
+      rpc_.message.assign(reinterpret_cast<const char*>(slice.begin()), slice.size());
+      is_whole_ = true;
+      return {};
+    }
+    transport::Observation piece;
+    if (!piece.ParseFromArray(slice.begin(), static_cast<int>(slice.size())))
+      return Error{Code::bad_request, "Observation", "LeRobot's message", "other bytes"};
+    if (piece.transfer_state() == transport::TRANSFER_BEGIN) rpc_.message.clear();
+    if (piece.transfer_state() == transport::TRANSFER_UNKNOWN)
+      return Error{Code::bad_request, "transfer_state", "begin, middle or end", "unknown"};
+    if (rpc_.message.size() + piece.data().size() > all_.limits_.message)
+      return Error{Code::too_large, "Observation", fmt::format("at most {} bytes", all_.limits_.message), "more"};
+    n_held_ += piece.data().size();
+    if ((all_.n_held_ += piece.data().size()) > all_.limits_.receipt)
+      return Error{Code::busy, "Observation", fmt::format("at most {} bytes in receipt", all_.limits_.receipt), "more"};
+    rpc_.message += piece.data();
+    is_whole_ = piece.transfer_state() == transport::TRANSFER_END;
+    return {};
+  }
+  void fail(const Error& error) {
+    if (all_.take(id_) != nullptr) refuse(error);
+  }
+
+  All& all_;
+  Rpc rpc_;
+  const std::uint64_t id_;
+  const Clock::time_point began_ = Clock::now();
+  grpc::ByteBuffer in_, out_;
+  std::size_t n_held_ = 0;
+  std::atomic<bool> is_whole_ = false;
+};
+
+grpc::ServerGenericBidiReactor* Rpcs::All::CreateReactor(grpc::GenericCallbackServerContext* context) {
+  std::optional<Error> refused;
+  Call* call = nullptr;
+  {
+    const std::lock_guard lock(mutex_);
+    call = new Call(*this, ++n_call_, *context);
+    if (is_closed_) refused = shutting_down();
+    if (live_.size() >= limits_.connections)
+      refused = Error{Code::busy, "calls", fmt::format("at most {} at once", limits_.connections), "more"};
+    if (refused) {
+      ++n_leaving_;
+    } else {
+      live_.emplace(n_call_, call);
+    }
+  }
+  if (refused) {
+    call->refuse(*refused);
+  } else {
+    call->start();
+  }
+  return call;
+}
+
+void Rpcs::All::end(Call& call, const Error& error) { call.refuse(error); }
+
+void Rpcs::All::sweep() {
+  std::vector<std::uint64_t> stuck;
+  {
+    const std::lock_guard lock(mutex_);
+    for (const auto& [id, call] : live_)
+      if (call->is_stuck(Clock::now())) stuck.push_back(id);
+  }
+  for (const std::uint64_t id : stuck)
+    if (Call* const call = take(id)) end(*call, {Code::late, "call", "a whole message within 60 s", "a part"});
+}
+
+Rpcs::Rpcs(net::Loop& loop, const Limits& limits) : all_(std::make_unique<All>(loop, limits)) {}
+Rpcs::~Rpcs() = default;
+Result<std::string> Rpcs::bind(const std::string& address, const char* option, bool insecure) {
+  return all_->bind(address, option, insecure);
+}
+void Rpcs::begin(Handler& handler) { all_->begin(handler); }
+void Rpcs::answer(std::uint64_t id, const std::string& message) {
+  if (All::Call* const call = all_->take(id)) call->answer(message);
+}
+void Rpcs::refuse(std::uint64_t id, const Error& error) noexcept try {
+  if (All::Call* const call = all_->take(id)) call->refuse(error);
+} catch (const std::exception&) {  // no memory for the words: the client's own deadline ends it
+}
+bool Rpcs::has_answers() const { return all_->has_answers(); }
+
+}  // namespace vla::serve::lerobot
