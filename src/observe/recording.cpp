@@ -14,8 +14,8 @@
 namespace vla::serve {
 namespace {
 
-constexpr std::string_view kMagic = "VLAREC1\n";
-constexpr std::size_t kHead = 24, kSealed = 16;  // bytes of a record before its request; of them under the checksum
+constexpr std::string_view kMagic = "VLAREC2\n";
+constexpr std::size_t kHead = 40, kSealed = 32;  // bytes of a record before its request; of them under the checksum
 constexpr std::size_t kMaxWaiting = 128 << 20;
 
 using Head = std::array<char, kHead>;
@@ -38,12 +38,15 @@ std::uint64_t seal(const Head& head, std::string_view in, std::string_view out) 
   return XXH3_64bits_withSeed(out.data(), out.size(), XXH3_64bits_withSeed(in.data(), in.size(), of_head));
 }
 
-std::string record_of(const char* mark, std::uint32_t index, std::string_view in, std::string_view out) {
+std::string record_of(const char* mark, std::uint32_t index, std::uint64_t client, std::uint64_t at_ns,
+                      std::string_view in, std::string_view out) {
   Head head;
   std::memcpy(head.data(), mark, 4);
   put(head, 4, index);
   put(head, 8, static_cast<std::uint32_t>(in.size()));
   put(head, 12, static_cast<std::uint32_t>(out.size()));
+  put(head, 16, client);
+  put(head, 24, at_ns);
   put(head, kSealed, seal(head, in, out));
   std::string record;
   record.reserve(kHead + in.size() + out.size());
@@ -72,6 +75,7 @@ Result<std::unique_ptr<Recorder>> Recorder::open(const std::string& folder, std:
 Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
     : path_(std::move(path)),
       max_bytes_(max_bytes),
+      epoch_(std::chrono::system_clock::now().time_since_epoch() - Clock::now().time_since_epoch()),
       bytes_(kMagic.size() + kHead),
       writer_(fd, Writer::Owns::yes, kMaxWaiting) {
   writer_.put(std::string(kMagic));
@@ -80,7 +84,7 @@ Recorder::Recorder(std::string path, int fd, std::uint64_t max_bytes)
 /// A server that never got to serve leaves no file in the way of the next one.
 Recorder::~Recorder() {
   if (n_record_ > 0) {
-    writer_.set_tail(record_of("VEND", n_record_, "", ""));
+    writer_.set_tail(record_of("VEND", n_record_, 0, 0, "", ""));
   } else {
     std::error_code ignored;
     std::filesystem::remove(path_, ignored);
@@ -89,18 +93,21 @@ Recorder::~Recorder() {
 
 void Recorder::describe(const v1::Description& description) {
   const std::string bytes = description.SerializeAsString();
-  add(std::as_bytes(std::span(bytes)), {});
+  add({}, std::as_bytes(std::span(bytes)), {});
 }
 
 void Recorder::answered(const Answered& answered) {
-  if (!stopped_ && !answered.out.empty()) add(answered.in, answered.out);
+  if (stopped_ || answered.out.empty()) return;
+  const std::string& client = answered.request.client;
+  const auto at = epoch_ + answered.request.at.time_since_epoch();
+  add({XXH3_64bits(client.data(), client.size()), static_cast<std::uint64_t>(at.count())}, answered.in, answered.out);
 }
 
-void Recorder::add(std::span<const std::byte> in, std::span<const std::byte> out) {
+void Recorder::add(const Came& came, std::span<const std::byte> in, std::span<const std::byte> out) {
   const std::uint64_t size = kHead + in.size() + out.size();
   if (bytes_ + size > max_bytes_) return stop("it reached its limit");
   try {
-    if (!writer_.put(record_of("VREC", n_record_, text(in), text(out))))
+    if (!writer_.put(record_of("VREC", n_record_, came.client, came.at_ns, text(in), text(out))))
       return stop(writer_.failure() != 0 ? std::strerror(writer_.failure()) : "the disk is too slow");
   } catch (const std::exception&) {
     return stop("no memory");
@@ -135,7 +142,7 @@ Result<Recording> Recording::open(const std::string& folder) {
   std::array<char, kMagic.size()> magic = {};
   recording.file_.read(magic.data(), magic.size());
   if (std::string_view(magic.data(), magic.size()) != kMagic)
-    return recording.damaged("VLAREC1, the mark of a recording", "other bytes");
+    return recording.damaged("VLAREC2, the mark of a recording", "other bytes");
   recording.at_ = kMagic.size();
   VLA_TRY(const auto first, recording.next());
   if (!first || !recording.description_.ParseFromString(first->request))

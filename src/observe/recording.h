@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <chrono>
 #include <fstream>
 #include <functional>
 #include <memory>
@@ -14,10 +15,11 @@
 namespace vla::serve {
 
 /// Requests and their answers as they went over the wire, in one file of a folder, in the order of the answers.
-/// The file: 8 bytes `VLAREC1\n`, then records. A record is a mark of 4 bytes (`VREC`, or `VEND` for the last one),
-/// three little-endian u32 (its index from 0, bytes of the request, bytes of the answer), a u64 (XXH3-64, chained over
-/// these 16 bytes, the request and the answer), the Request and the Response. Record 0 has the server's Description as
-/// its request and no answer.
+/// The file: 8 bytes `VLAREC2\n`, then records. A record is a mark of 4 bytes (`VREC`, or `VEND` for the last one),
+/// three little-endian u32 (its index from 0, bytes of the request, bytes of the answer), three u64 (a number that
+/// tells connections apart; when the request came, in nanoseconds since 1970; XXH3-64, chained over these 32 bytes, the
+/// request and the answer), the Request and the Response. Record 0 has the server's Description as its request and no
+/// answer. Times are the system's when the file was opened, counted on by a clock that nobody sets.
 constexpr const char* kRecordingFile = "requests.vlarec";
 
 /// Records what a server answers, up to a size.
@@ -38,11 +40,15 @@ class Recorder final : public Observer {
 
  private:
   Recorder(std::string path, int fd, std::uint64_t max_bytes);
-  void add(std::span<const std::byte> in, std::span<const std::byte> out);
+  struct Came {
+    std::uint64_t client = 0, at_ns = 0;
+  };
+  void add(const Came& came, std::span<const std::byte> in, std::span<const std::byte> out);
   void stop(const char* why);
 
   const std::string path_;
   const std::uint64_t max_bytes_;
+  const std::chrono::nanoseconds epoch_;  // of the steady clock, since 1970
   std::uint64_t bytes_ = 0;
   std::uint32_t n_record_ = 0;
   bool stopped_ = false;

@@ -379,17 +379,17 @@ def with_record(recording, index, change, of_request=False):
     at = 8
     for _ in range(index):
         n_in, n_out = struct.unpack_from("<II", data, at + 8)
-        at += 24 + n_in + n_out
+        at += 40 + n_in + n_out
     n_in, n_out = struct.unpack_from("<II", data, at + 8)
-    start, middle, end = at + 24, at + 24 + n_in, at + 24 + n_in + n_out
+    start, middle, end = at + 40, at + 40 + n_in, at + 40 + n_in + n_out
     part = slice(start, middle) if of_request else slice(middle, end)
     changed = change(bytes(data[part]))
     assert len(changed) == part.stop - part.start
     data[part] = changed
     seal = 0
-    for sealed in (slice(at, at + 16), slice(start, middle), slice(middle, end)):
+    for sealed in (slice(at, at + 32), slice(start, middle), slice(middle, end)):
         seal = xxhash.xxh3_64_intdigest(bytes(data[sealed]), seal)
-    struct.pack_into("<Q", data, at + 16, seal)
+    struct.pack_into("<Q", data, at + 32, seal)
     path.write_bytes(data)
 
 
@@ -412,7 +412,7 @@ def test_a_recording_under_limits_that_no_server_has_is_refused(vla, golden, rec
     assert answer.code == 11 and "limits that vla serve takes, found 1 bytes, 16777216 pixels" in answer.err
 
 
-@pytest.mark.parametrize("place", [0, 3, 20, 40, 5000, -1, -20])
+@pytest.mark.parametrize("place", [0, 3, 20, 40, 50, 5000, -1, -20])
 def test_a_damaged_recording_is_refused_with_its_place(vla, golden, recording, place):
     path = recording / "requests.vlarec"
     data = bytearray(path.read_bytes())
@@ -425,11 +425,11 @@ def test_a_damaged_recording_is_refused_with_its_place(vla, golden, recording, p
 def test_a_recording_that_was_cut_is_refused_and_its_whole_part_can_be_replayed(vla, golden, recording):
     path = recording / "requests.vlarec"
     data = path.read_bytes()
-    path.write_bytes(data[:-30])
+    path.write_bytes(data[:-46])
     answer = vla("replay", recording, "--bundle", golden.bundle, "--threads", 2)
     assert answer.code == 11 and "the end of the file" in answer.err and "--first 6" in answer.err
     assert vla("replay", recording, "--bundle", golden.bundle, "--threads", 2, "--first", 6).code == 0
-    path.write_bytes(data[:-24])
+    path.write_bytes(data[:-40])
     answer = vla("replay", recording, "--bundle", golden.bundle, "--threads", 2)
     assert answer.code == 0 and "the recording has no end" in answer.out
 
