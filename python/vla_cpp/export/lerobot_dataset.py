@@ -1,0 +1,85 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""A LeRobot data set, written by LeRobot itself: a frame for each chunk, with the chunk's first row as its action."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Dict, Iterable, Iterator, List, Optional
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from ..errors import BadRequest, UsageError, VlaError
+from ..recording import RecordedAct
+from .common import column_names, pixels
+
+MAX_OFF = 0.25  # of a frame's time that the median distance of the acts may differ from it
+
+
+def write_lerobot(folder: Path, acts: Iterable[RecordedAct], fps: int, gap_s: float) -> Dict[str, int]:
+    """Frames and episodes that were written. Errors: UsageError (nothing to write, another rate than the recorded one), BadRequest
+    (a frame with other views or sizes than the first)."""
+    starts = _starts(acts, fps, gap_s)
+    data: Optional[LeRobotDataset] = None
+    try:
+        for act, is_start in zip(_answered(acts), starts):
+            frame = _frame(act)
+            if data is None:
+                features = _features(act, frame)
+                data = LeRobotDataset.create(folder.name, fps, features, root=folder, use_videos=False)
+            elif is_start:
+                data.save_episode()
+            _check(act, frame, features)
+            data.add_frame({**frame, "task": act.text})
+        data.save_episode()
+    finally:
+        if data is not None:
+            data.finalize()
+    return {"frames": len(starts), "episodes": sum(starts)}
+
+
+def _answered(acts: Iterable[RecordedAct]) -> Iterator[RecordedAct]:
+    return (act for act in acts if not isinstance(act.answer, VlaError))
+
+
+def _starts(acts: Iterable[RecordedAct], fps: int, gap_s: float) -> List[bool]:
+    """Whether an episode starts with each act: where the instruction is another, or the robot had paused. Gone through first, since
+    LeRobot counts time in frames: a data set of a wrong rate teaches a wrong speed."""
+    seen = [(act.text, act.record.received_ns / 1e9) for act in _answered(acts)]
+    if not seen:
+        raise UsageError("--lerobot", "acts that were answered with a chunk")
+    starts, intervals = [True], []
+    for (text, at), (next_text, next_at) in zip(seen, seen[1:]):
+        starts.append(text != next_text or next_at - at > gap_s)
+        if not starts[-1]:
+            intervals.append(next_at - at)
+    frames = float(np.median(intervals)) * fps if intervals else 1.0
+    if abs(frames - 1) > MAX_OFF:
+        hint = "a frame is written for each act: record with a chunk asked for at every step"
+        raise UsageError("--fps", f"the rate of the acts, {fps / frames:.3g} a second (median)", str(fps), hint)
+    return starts
+
+
+def _frame(act: RecordedAct) -> Dict[str, Any]:
+    images = {name: pixels(image) for name, image in act.images.items()}
+    return {**images, **act.states, "action": act.answer.actions[0], "action_chunk": act.answer.actions}
+
+
+def _features(act: RecordedAct, frame: Dict[str, Any]) -> Dict[str, Any]:
+    names = {state.name: column_names(state.names, state.width) for state in act.spec.states}
+    names["action"] = column_names(act.answer.names, act.answer.actions.shape[1])
+    found = {}
+    for name, value in frame.items():
+        if name in act.images:
+            found[name] = {"dtype": "image", "shape": value.shape, "names": ["height", "width", "channels"]}
+        else:
+            found[name] = {"dtype": "float32", "shape": value.shape, "names": names.get(name)}
+    return found
+
+
+def _check(act: RecordedAct, frame: Dict[str, Any], features: Dict[str, Any]) -> None:
+    shapes = {name: tuple(value.shape) for name, value in frame.items()}
+    expected = {name: tuple(feature["shape"]) for name, feature in features.items()}
+    if shapes != expected:
+        raise BadRequest(f"record {act.record.index}", f"features as in the first frame: {expected}", str(shapes))
