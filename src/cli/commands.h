@@ -54,6 +54,7 @@ Command add_compare(CLI::App& app);
 Command add_serve(CLI::App& app);
 Command add_keygen(CLI::App& app);
 Command add_bench(CLI::App& app);
+Command add_doctor(CLI::App& app);
 Command add_quantize(CLI::App& app);
 Command add_replay(CLI::App& app);
 

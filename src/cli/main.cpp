@@ -80,6 +80,7 @@ int run(int argc, char** argv) {
   choose("run", vla::cli::add_run(app));
   choose("inspect", vla::cli::add_inspect(app));
   choose("compare", vla::cli::add_compare(app));
+  choose("doctor", vla::cli::add_doctor(app));
   choose("bench", vla::cli::add_bench(app));
   choose("quantize", vla::cli::add_quantize(app));
 #ifdef VLA_SERVER

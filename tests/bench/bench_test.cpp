@@ -7,6 +7,7 @@
 #include <cmath>
 #include <sstream>
 
+#include "bench/doctor.h"
 #include "bench/roofline.h"
 #include "bench/versus.h"
 #include "policies/policy.h"
@@ -213,4 +214,40 @@ TEST_CASE("an instruction has exactly the tokens that were asked for") {
   }
   CHECK(Workload::make(*processor, {1, 0, 0, 4000}).error().code == Code::usage);
   CHECK(Workload::make(*processor, {5, 0, 0, 7}).error().where == "--views");
+}
+
+TEST_CASE("memory that a process could take is what the system and its group leave") {
+  const std::string meminfo = "MemTotal:  8000 kB\nMemAvailable:    2000 kB\n";
+  CHECK(free_memory(meminfo, "", "") == 2'048'000);
+  CHECK(free_memory(meminfo, "max\n", "12\n") == 2'048'000);
+  CHECK(free_memory(meminfo, "1000000\n", "400000\n") == 600'000);
+  CHECK(free_memory(meminfo, "1000000\n", "1400000\n") == 0);
+  CHECK(free_memory("", "", "") == 0);
+}
+
+TEST_CASE("a stage is predicted from its arithmetic, for kernels whose share of the peak is known") {
+  Report report = report_of(10);
+  const Work work = {.flop = 4e9, .bytes = 1e9};
+  CHECK(predict(work, report.before, report) == doctest::Approx(4e9 / (0.78 * 2e12)));
+  Work codes = work;
+  codes.int8 = 1e9;
+  CHECK(predict(codes, report.before, report) == 0);
+  report.conditions.kernels = "amx";
+  CHECK(predict(work, report.before, report) == 0);
+  report.conditions.kernels = "avx2", report.conditions.device = "cuda:0";
+  CHECK(predict(work, report.before, report) == 0);
+}
+
+TEST_CASE("a rate is held while a chunk lasts until the next one is there") {
+  Checkup checkup;
+  checkup.horizon = 16, checkup.rate_hz = 80, checkup.total = 190;
+  CHECK(checkup.replan_rows() == 16);
+  CHECK(checkup.holds_rate());
+  checkup.total = 201;
+  CHECK_FALSE(checkup.holds_rate());
+  checkup.one_thread = 100;  // the fewer threads where they are faster
+  CHECK(checkup.replan_rows() == 8);
+  CHECK(checkup.holds_rate());
+  checkup.rate_hz = 0, checkup.one_thread = 0;
+  CHECK(checkup.holds_rate());
 }

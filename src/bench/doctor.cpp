@@ -1,0 +1,121 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "bench/doctor.h"
+
+#include <fmt/format.h>
+
+#include <cmath>
+#include <fstream>
+#include <sstream>
+
+#include "devices/devices.h"
+#include "engine/description.h"
+#include "kernels/kernel_set.h"
+
+namespace vla::bench {
+namespace {
+
+constexpr double kFewMs = 250;  // an act that is so short may be faster on one thread
+
+/// What float networks of every architecture reach of the peak (docs/performance.md). With other kernels they differ
+/// too much from one network to the next.
+struct KnownShare {
+  const char* kernels;
+  double share;
+};
+constexpr KnownShare kShares[] = {{"avx2", 0.78}};
+
+std::string content(const char* path) {
+  std::ifstream in(path);
+  std::ostringstream text;
+  text << in.rdbuf();
+  return text.str();
+}
+
+std::string first_line(const char* path) {
+  const std::string text = content(path);
+  return text.substr(0, text.find('\n'));
+}
+
+double median_cores(const Report& report) {
+  std::vector<double> cores;
+  for (const Round& round : report.rounds) cores.push_back(round.cores);
+  return quantile(cores, 0.5);
+}
+
+void add_stages(Checkup& checkup) {
+  const Report& report = checkup.report;
+  for (const StageRow& row : report.stages)
+    if (row.work.flop > 0 && row.name != "total")
+      checkup.stages.push_back({row.name, 1e3 * predict(row.work, report.before, report), row.p50});
+  checkup.total = report.find("total")->p50;
+  checkup.host = checkup.total - report.find("network")->p50;
+}
+
+}  // namespace
+
+std::size_t free_memory(const std::string& meminfo, const std::string& limit, const std::string& used) {
+  const std::string key = "MemAvailable:";
+  const std::size_t at = meminfo.find(key);
+  const auto number = [](const char* text) { return static_cast<std::size_t>(std::strtoull(text, nullptr, 10)); };
+  const std::size_t system = at == std::string::npos ? 0 : 1024 * number(meminfo.c_str() + at + key.size());
+  if (limit.empty() || used.empty() || limit.starts_with("max")) return system;
+  const std::size_t most = number(limit.c_str()), now = number(used.c_str());
+  return std::min(system, most - std::min(most, now));
+}
+
+Result<Machine> examine_machine() {
+  VLA_TRY(const std::unique_ptr<Device> device, open_device(0, ""));
+  Machine machine;
+  machine.cpu = cpu_name();
+  machine.n_core = device->n_thread();
+  for (const KernelSet& set : usable_kernels()) machine.kernels.push_back(name_of(set));
+  machine.load = std::strtod(first_line("/proc/loadavg").c_str(), nullptr);
+  machine.governor = first_line("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor");
+  machine.free_memory = free_memory(content("/proc/meminfo"), content("/sys/fs/cgroup/memory.max"),
+                                    content("/sys/fs/cgroup/memory.current"));
+  machine.roofs = measure_roofs(machine.n_core);
+  return machine;
+}
+
+int Checkup::replan_rows() const { return std::max(1, static_cast<int>(std::ceil(1e-3 * best() * rate_hz))); }
+
+double predict(const Work& work, const Roofs& roofs, const Report& report) {
+  if (!report.conditions.on_cpu() || work.int8 > 0) return 0;
+  for (const auto& [kernels, share] : kShares)
+    if (report.conditions.kernels == kernels) return work.flop / (share * roofs.peak(report.peak_name));
+  return 0;
+}
+
+Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher) {
+  Checkup checkup;
+  {  // sizes alone
+    VLA_TRY(const std::unique_ptr<Engine> dry, Engine::load(request.bundle, {.n_thread = request.n_thread,
+                                                                             .kernels = request.kernels,
+                                                                             .device = request.device,
+                                                                             .dry = true,
+                                                                             .embodiment = request.embodiment}));
+    checkup.predicted_memory = dry->memory().total();
+    checkup.horizon = describe(*dry, dry->robot()).horizon;
+    checkup.rate_hz = describe(*dry, dry->robot()).rate_hz;
+  }
+  const bool on_cpu = request.device.empty() || request.device == "cpu";
+  if (on_cpu && free_memory > 0 && checkup.predicted_memory > free_memory)
+    return Error{Code::out_of_memory, request.bundle,
+                 fmt::format("{:.1f} GB of free memory", 1e-9 * static_cast<double>(checkup.predicted_memory)),
+                 fmt::format("{:.1f} GB", 1e-9 * static_cast<double>(free_memory)),
+                 "vla quantize makes a smaller bundle"};
+  const auto accept = [](const Conditions&) { return Status(); };
+  VLA_TRY(checkup.report, measure(request, accept, watcher));
+  checkup.cores = median_cores(checkup.report);
+  add_stages(checkup);
+  if (on_cpu && checkup.total < kFewMs && checkup.report.conditions.n_thread > 1) {
+    Request one = request;
+    one.n_thread = 1;
+    VLA_TRY(const Report report, measure(one, accept, watcher));
+    checkup.one_thread = report.find("total")->p50;
+  }
+  return checkup;
+}
+
+}  // namespace vla::bench

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""vla doctor: what a person and a script learn of machine, build and policy, and what its exit code says."""
+
+import json
+import os
+import struct
+
+import pytest
+from conftest import ROOT
+from golden_cases import sealed
+
+DEMO = ROOT / "models/metaworld-tiny.gguf"
+
+
+@pytest.fixture(scope="module")
+def report(vla):
+    return vla("doctor", DEMO, "--json").json()
+
+
+def test_the_machine_and_the_build_are_told_without_a_bundle(vla):
+    answer = vla("doctor")
+    assert answer.code == 0
+    for word in ("machine", "cores", "peaks", "GB/s", "memory", "governor", "load", "build", "device"):
+        assert word in answer.out, word
+
+
+def test_json_has_machine_build_and_policy(report):
+    machine, policy = report["machine"], report["policy"]
+    assert machine["cores"] == len(os.sched_getaffinity(0)) and machine["bandwidth_gbytes_per_s"] > 0
+    assert machine["free_memory_bytes"] > 1e8 and machine["load"] >= 0
+    assert machine["devices"][0]["name"] == "cpu" and machine["kernels"][-1] in machine["devices"][0]["description"]
+    assert policy["arch"] == "smolvla" and policy["horizon"] == 16 and policy["memory_bytes"] > 1e6
+    assert list(policy["stages"]) == ["vision", "prefix", "steps", "network"]
+    network = policy["stages"]["network"]["measured_ms"]
+    assert policy["act_ms"] == pytest.approx(network + policy["host_ms"], rel=1e-3)
+
+
+def test_prediction_and_measurement_agree(vla):
+    policy = vla("doctor", DEMO, "--threads", 1, "--json").json()["policy"]
+    if policy["kernels"] != "avx2":
+        assert policy["stages"]["network"]["predicted_ms"] is None
+        pytest.skip(f"no prediction for {policy['kernels']}")
+    network = policy["stages"]["network"]
+    seconds_of_core = network["measured_ms"] * min(1, policy["cores"])  # others may run
+    assert seconds_of_core == pytest.approx(network["predicted_ms"], rel=0.4)
+
+
+def test_an_act_of_a_few_milliseconds_is_measured_on_one_thread_too(vla, report):
+    policy = report["policy"]
+    assert ("one_thread_act_ms" in policy) == (policy["threads"] > 1 and policy["act_ms"] < 250)
+    answer = vla("doctor", DEMO, "--threads", 1)
+    assert answer.code == 0 and "predicted ms  measured ms" in answer.out and "replan every" in answer.out
+    assert answer.out.count("\n") <= 40
+
+
+def test_what_is_refused_is_told_after_the_machine(vla, tmp_path):
+    (tmp_path / "bad.gguf").write_bytes(b"GGUF")
+    answer = vla("doctor", tmp_path / "bad.gguf")
+    assert answer.code == 3 and "machine" in answer.out and "error: bad_bundle" in answer.err
+    answer = vla("doctor", tmp_path / "bad.gguf", "--json")
+    assert answer.code == 3 and json.loads(answer.out)["refused"]["code"] == "bad_bundle"
+    assert vla("doctor", DEMO, "--device", "cuda:77").code == 8
+
+
+def test_a_chunk_that_ends_before_the_next_is_there_has_its_exit_code(vla, tmp_path):
+    data = bytearray(DEMO.read_bytes())
+    at = data.index(b"action.rate_hz") + len("action.rate_hz")
+    kind, rate = struct.unpack_from("<If", data, at)
+    assert (kind, rate) == (6, 80)  # float32
+    struct.pack_into("<f", data, at + 4, 1e5)
+    (tmp_path / "fast.gguf").write_bytes(sealed(bytes(data)))
+    answer = vla("doctor", tmp_path / "fast.gguf", "--threads", 1)
+    assert answer.code == 16 and "the rate is not held" in answer.out and "error: late" in answer.err
