@@ -50,9 +50,8 @@ cuda: build
 
 # A wheel for any x86-64 machine with a system as old as this one's: pip installs it in seconds.
 wheel: packages $(STAMP)
-	@test -f build/wheel/CMakeCache.txt || cmake -S . -B build/wheel -G Ninja -DCMAKE_BUILD_TYPE=Release -DVLA_BUILD_TESTS=OFF \
-	  -DVLA_BUILD_SERVER=OFF $(CMAKE_ARGS)
-	cmake --build build/wheel --target vla_shared
+	@test -f build/wheel/CMakeCache.txt || cmake -S . -B build/wheel -G Ninja -DCMAKE_BUILD_TYPE=Release -DVLA_BUILD_TESTS=OFF $(CMAKE_ARGS)
+	cmake --build build/wheel --target vla_shared vla
 	VLA_BUILD_DIR=build/wheel $(VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps -w out ./python
 
 # The simulator has an environment of its own. RECORDED=1: recorded camera frames instead, where MuJoCo cannot draw.

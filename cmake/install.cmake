@@ -7,9 +7,11 @@ include(CMakePackageConfigHelpers)
 
 # Libraries that lie beside libvla.so go before the system's, also for what they need themselves: a Python wheel carries them.
 set_target_properties(vla_shared PROPERTIES INSTALL_RPATH "$ORIGIN")
+set_target_properties(vla PROPERTIES INSTALL_RPATH "$ORIGIN/../${CMAKE_INSTALL_LIBDIR}")
 target_link_options(vla_shared PRIVATE -Wl,--disable-new-dtags)
+target_link_options(vla PRIVATE -Wl,--disable-new-dtags)
 
-install(TARGETS vla RUNTIME DESTINATION ${CMAKE_INSTALL_BINDIR})
+install(TARGETS vla RUNTIME DESTINATION ${CMAKE_INSTALL_BINDIR} COMPONENT program)
 install(TARGETS vla_shared EXPORT vlaTargets
         LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT library NAMELINK_COMPONENT development)
 install(FILES include/vla/vla.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A wheel carries libvla.so and the libraries that a system may lack, so that no compiler is needed where it is installed.
+"""A wheel carries libvla.so, the program `vla` and the libraries that a system may lack, so that no compiler is needed where it is
+installed.
 
 An editable install compiles nothing: it finds the library in the build of the source tree. Environment of a real one:
 
@@ -24,7 +25,7 @@ from setuptools.command.build_py import build_py
 ROOT = Path(__file__).resolve().parent.parent
 LIBRARY = "libvla.so.1"
 # Part of every system with Python and NumPy; a second copy would conflict.
-SYSTEM = re.compile(r"linux-vdso|ld-linux|lib(c|m|dl|rt|pthread|stdc\+\+|gcc_s)\.so")
+SYSTEM = re.compile(r"linux-vdso|ld-linux|lib(c|m|dl|rt|pthread|resolv|stdc\+\+|gcc_s)\.so")
 
 
 def run(*command):
@@ -32,9 +33,9 @@ def run(*command):
     subprocess.run([str(word) for word in command], check=True)
 
 
-def compile_library(build):
+def compile_runtime(build):
     """pip hides the output of a build that takes minutes, so progress goes to the terminal itself, if there is one."""
-    command = ["cmake", "--build", str(build), "--target", "vla_shared", "--parallel", str(os.cpu_count() or 1)]
+    command = ["cmake", "--build", str(build), "--target", "vla_shared", "vla", "--parallel", str(os.cpu_count() or 1)]
     print("+", shlex.join(command), flush=True)
     try:
         terminal = open("/dev/tty", "w")
@@ -64,8 +65,8 @@ def copy_licence(path, folder):
         shutil.copy(text, folder / f"LICENSE-{owner}")
 
 
-def build_library(folder):
-    """Builds libvla.so and installs it into `folder`, with what it needs beside it."""
+def build_runtime(package):
+    """Builds libvla.so and vla, and installs them into lib/ and bin/ of the package, with what they need beside the library."""
     if not (ROOT / "CMakeLists.txt").is_file():
         raise SystemExit(f"{ROOT}: expected the source tree of vla.cpp around the folder python/, found none")
     configured = ROOT / "build/cpu"
@@ -73,35 +74,50 @@ def build_library(folder):
     build = ROOT / (os.environ.get("VLA_BUILD_DIR") or default)
     if not (build / "CMakeCache.txt").is_file():
         arguments = shlex.split(os.environ.get("CMAKE_ARGS", ""))
-        run("cmake", "-S", ROOT, "-B", build, "-DCMAKE_BUILD_TYPE=Release", "-DVLA_BUILD_TESTS=OFF",
-            "-DVLA_BUILD_SERVER=OFF", *arguments)
-    compile_library(build)
-    run("cmake", "--install", build, "--component", "library", "--prefix", build / "wheel_prefix")
-    folder.mkdir(parents=True, exist_ok=True)
-    library = next((build / "wheel_prefix").rglob(LIBRARY))
-    shutil.copy(library, folder)
-    listing = subprocess.run(["ldd", str(library)], check=True, capture_output=True, text=True).stdout
-    for name, path in re.findall(r"^\s*(\S+) => (\S+)", listing, re.M):
+        run("cmake", "-S", ROOT, "-B", build, "-DCMAKE_BUILD_TYPE=Release", "-DVLA_BUILD_TESTS=OFF", *arguments)
+    compile_runtime(build)
+    prefix = build / "wheel_prefix"
+    for component in ("library", "program"):
+        run("cmake", "--install", build, "--component", component, "--prefix", prefix, "--strip")
+    for folder in ("lib", "bin"):
+        shutil.rmtree(package / folder, ignore_errors=True)  # of an earlier build
+        (package / folder).mkdir(parents=True)
+    library, program = next(prefix.rglob(LIBRARY)), prefix / "bin/vla"
+    shutil.copy(library, package / "lib")
+    shutil.copy(program, package / "bin")
+    listing = subprocess.run(["ldd", str(program), str(library)], check=True, capture_output=True, text=True)
+    for name, path in re.findall(r"^\s*(\S+) => (\S+)", listing.stdout, re.M):
         if not SYSTEM.match(name):
-            shutil.copy(path, folder / name)
-            copy_licence(path, folder)
+            shutil.copy(path, package / "lib" / name)
+            copy_licence(path, package / "lib")
     for notice in ("LICENSE", "LICENSES-third-party.md"):
-        shutil.copy(ROOT / notice, folder)
+        shutil.copy(ROOT / notice, package / "lib")
 
 
-class BuildWithLibrary(build_py):
+class BuildWithRuntime(build_py):
     def run(self):
         super().run()
         if not self.editable_mode:
-            build_library(Path(self.build_lib) / "vla_cpp" / "lib")
+            build_runtime(Path(self.build_lib) / "vla_cpp")
+
+
+def needed_libc(package):
+    """The oldest glibc 2.N of a system that has what the carried files need of its C and C++ libraries, as auditwheel tells it."""
+    files = [*package.glob("lib/*.so*"), package / "bin/vla"]
+    needs = subprocess.run(["readelf", "--version-info", "--wide", *map(str, files)], check=True, capture_output=True, text=True).stdout
+    c, cpp = (max(map(int, re.findall(rf"\b{name}(\d+)\b", needs))) for name in (r"GLIBC_2\.", r"GLIBCXX_3\.4\."))
+    if cpp > 30:  # newer than the table: as new as here
+        return int(platform.libc_ver()[1].split(".")[1])
+    return max(c, 35 if cpp == 30 else 34 if cpp == 29 else 0)
 
 
 class PlatformWheel(bdist_wheel):
     def get_tag(self):
-        """Any Python, since ctypes loads the library; systems whose C library is as new as this one's."""
-        libc, version = platform.libc_ver()
-        system = f"manylinux_{version.replace('.', '_')}_{platform.machine()}"
-        return "py3", "none", system if libc == "glibc" else super().get_tag()[2]
+        """Any Python, since ctypes loads the library."""
+        package = Path(self.get_finalized_command("build_py").build_lib) / "vla_cpp"
+        if platform.libc_ver()[0] != "glibc" or not (package / "bin").is_dir():  # an editable install carries nothing
+            return "py3", "none", super().get_tag()[2]
+        return "py3", "none", f"manylinux_2_{needed_libc(package)}_{platform.machine()}"
 
 
 class PlatformDistribution(Distribution):
@@ -109,4 +125,4 @@ class PlatformDistribution(Distribution):
         return True
 
 
-setup(cmdclass={"build_py": BuildWithLibrary, "bdist_wheel": PlatformWheel}, distclass=PlatformDistribution)
+setup(cmdclass={"build_py": BuildWithRuntime, "bdist_wheel": PlatformWheel}, distclass=PlatformDistribution)

@@ -60,6 +60,7 @@ def test_the_wheel_is_for_any_python_3_of_this_platform_and_carries_the_library_
     assert re.fullmatch(r"vla_cpp-[\d.]+-py3-none-(many)?linux\w*\.whl", wheel.name)
     names = zipfile.ZipFile(wheel).namelist()
     carried = {name.split("/")[-1] for name in names if name.startswith("vla_cpp/lib/")}
+    assert "vla_cpp/bin/vla" in names
     assert {"libvla.so.1", "LICENSE", "LICENSES-third-party.md"} <= carried
     assert "vla_cpp/py.typed" in names
     libraries = {name for name in carried if ".so" in name} - {"libvla.so.1"}
@@ -79,9 +80,20 @@ def test_in_an_environment_with_numpy_alone_and_no_programs_act_gives_the_bytes_
     assert np.load(tmp_path / "got.npy").tobytes() == chunk_of_run(golden, seed=4).tobytes()
     assert not {"torch", "zmq", "google.protobuf", "gguf"} & set(told["modules"])
     ours = Path(told["package"]).parent / "lib"
-    carried = {path.name for path in ours.iterdir() if ".so" in path.name}
-    loaded = {Path(path).name for path in told["loaded"] if Path(path).parent == ours}
-    assert carried - loaded <= {"libz.so.1"}  # Python has loaded one of that name before
+    loaded = {Path(path) for path in told["loaded"] if (ours / Path(path).name).is_file()}
+    assert {path.name for path in loaded if path.parent != ours} <= {"libz.so.1"}  # Python has loaded one of that name before
+    assert {"libvla.so.1", "libfmt.so.9"} <= {path.name for path in loaded} or shutil.which("dpkg-query") is None
+
+
+def test_the_program_runs_on_the_libraries_beside_it(bare, tmp_path):
+    packages = next(bare.parents[1].glob("lib/python*/site-packages"))
+    version = run(bare, "-m", "vla_cpp.program", "--version", env={"PATH": str(tmp_path)}, cwd=tmp_path)
+    assert re.fullmatch(r"\d+\.\d+\.\d+\n", version)
+    found = dict(re.findall(r"^\s*(\S+) => (\S+)", run("ldd", packages / "vla_cpp/bin/vla"), re.M))
+    ours = packages / "vla_cpp/lib"
+    assert "libzmq.so.5" in found and all(Path(found[p.name]).resolve() == p for p in ours.iterdir() if p.name in found)
+    told = json.loads(run(bare, "-m", "vla_cpp.program", "doctor", "--json", env={"PATH": str(tmp_path)}, cwd=tmp_path))
+    assert told["build"]["server"] and told["machine"]["cores"] > 0
 
 
 def test_an_editable_install_compiles_nothing(tmp_path):
