@@ -41,8 +41,17 @@ inline CLI::Option* add_text(CLI::App& command, const char* name, std::string& v
   return command.add_option(name, value, help)->type_name(type)->check(CLI::Validator(given, ""));
 }
 
+/// Where vla-pull has put what a name `hub:OWNER/NAME@REVISION` stands for; every other text is a file's name. What
+/// comes back is the problem, or empty.
+std::string find_pulled(std::string& bundle);
+
 inline void add_bundle(CLI::App& command, std::string& bundle, bool required) {
-  command.add_option("BUNDLE", bundle, "The policy, a .gguf file from vla-convert")->type_name("")->required(required);
+  command
+      .add_option("BUNDLE", bundle,
+                  "The policy, a .gguf file from vla-convert, or the hub:OWNER/NAME@REVISION of vla-pull")
+      ->type_name("")
+      ->required(required)
+      ->transform(CLI::Validator([](std::string& text) { return find_pulled(text); }, ""));
 }
 
 /// Adds one subcommand. What it returns is run after parsing; its Status becomes the exit code (base/result.h).
@@ -56,6 +65,7 @@ Command add_keygen(CLI::App& app);
 Command add_bench(CLI::App& app);
 Command add_doctor(CLI::App& app);
 Command add_quantize(CLI::App& app);
+Command add_manual(CLI::App& app);
 Command add_replay(CLI::App& app);
 
 }  // namespace vla::cli

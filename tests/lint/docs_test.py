@@ -21,6 +21,7 @@ MADE = ("build/", ".venv/")  # written by the build: named, but not in the tree
 PROGRAMS = {  # program -> files in whose text its flags are written
     "vla": ("src/cli/*.cpp",),
     "vla-convert": ("python/vla_cpp/**/*.py",),
+    "vla-pull": ("python/vla_cpp/pull.py",),
     "vla-export": ("python/vla_cpp/export/*.py",),
 }
 ANY_OF_OURS = ("src/cli/*.cpp", "python/**/*.py", "scripts/*", "tools/**/*.py", "examples/**/*.py", "tests/lint/*.py")
