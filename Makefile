@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test test-arm64 build vulkan cuda wheel packages asan tsan fuzz format clean
+.PHONY: help demo libero test test-arm64 build vulkan cuda wheel deb packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -19,6 +19,7 @@ help:
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 525 MB of NVIDIA's compiler and libraries)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
+	@echo "make deb       out/vla_*.deb for this system: the program, its manual, and the server as a unit of systemd"
 	@echo "make tsan      run the tests of executor, engine and server under the thread sanitizer"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
@@ -53,6 +54,15 @@ wheel: packages $(STAMP)
 	@test -f build/wheel/CMakeCache.txt || cmake -S . -B build/wheel -G Ninja -DCMAKE_BUILD_TYPE=Release -DVLA_BUILD_TESTS=OFF $(CMAKE_ARGS)
 	cmake --build build/wheel --target vla_shared vla
 	VLA_BUILD_DIR=build/wheel $(VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps -w out ./python
+	$(PYTHON) scripts/sbom.py build/wheel out
+
+deb: packages
+	@test -f build/deb/CMakeCache.txt || cmake -S . -B build/deb -G Ninja -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX=/usr \
+	  -DVLA_BUILD_TESTS=OFF -DVLA_DEB=ON $(CMAKE_ARGS)
+	cmake --build build/deb --target vla vla_shared
+	cpack --config build/deb/CPackConfig.cmake -B out
+	@rm -rf out/_CPack_Packages
+	$(PYTHON) scripts/sbom.py build/deb out
 
 # The simulator has an environment of its own. RECORDED=1: recorded camera frames instead, where MuJoCo cannot draw.
 SIM       := .venv-sim

@@ -16,6 +16,10 @@ install(TARGETS vla_shared EXPORT vlaTargets
         LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT library NAMELINK_COMPONENT development)
 install(FILES include/vla/vla.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)
 install(FILES src/wire/vla.proto DESTINATION ${CMAKE_INSTALL_DATADIR}/vla)
+if(NOT CMAKE_CROSSCOMPILING)
+  install(FILES ${CMAKE_BINARY_DIR}/vla.1 DESTINATION ${CMAKE_INSTALL_MANDIR}/man1)
+  install(FILES ${CMAKE_BINARY_DIR}/vla.bash DESTINATION ${CMAKE_INSTALL_DATADIR}/bash-completion/completions RENAME vla)
+endif()
 install(FILES LICENSE LICENSES-third-party.md DESTINATION ${CMAKE_INSTALL_DOCDIR})
 
 set(package_dir ${CMAKE_INSTALL_LIBDIR}/cmake/vla)

@@ -48,23 +48,11 @@ class HelpFormatter final : public CLI::Formatter {
 
  private:
   std::string make_option_opts(const CLI::Option* option) const override {
-    if (!option->get_option_text().empty()) return " " + option->get_option_text();
-    if (option->get_type_size() == 0 || option->get_positional()) return "";
-    const bool many = option->get_expected_max() == CLI::detail::expected_max_vector_size;
-    return " " + Accepted(option->get_type_name()).kind + (many ? " ..." : "");
+    const std::string value = option_value(*option);
+    return value.empty() || option->get_positional() ? "" : " " + value;
   }
-
   std::string make_option_desc(const CLI::Option* option) const override {
-    std::vector<std::string> facts;
-    const std::string range = Accepted(option->get_type_name()).range, given = option->get_default_str();
-    if (option->get_required()) facts.push_back("required");
-    if (!range.empty()) facts.push_back(range);
-    if (option->get_type_size() != 0 && !given.empty())
-      facts.push_back("default " + std::regex_replace(given, std::regex(R"(^\[(.*)\]$)"), "$1"));
-    for (const CLI::Option* other : option->get_excludes()) facts.push_back("not with " + other->get_name());
-    for (const CLI::Option* other : option->get_needs()) facts.push_back("only with " + other->get_name());
-    const std::string text = option->get_description();
-    return wrap(facts.empty() ? text : fmt::format("{} ({})", text, fmt::join(facts, "; ")), kWidth - kNames);
+    return wrap(option_text(*option), kWidth - kNames);
   }
 };
 
@@ -78,6 +66,33 @@ std::vector<std::string> known_words(const CLI::App& app) {
 }
 
 }  // namespace
+
+std::string option_value(const CLI::Option& option) {
+  if (!option.get_option_text().empty()) return option.get_option_text();
+  if (option.get_type_size() == 0) return "";
+  const bool many = option.get_expected_max() == CLI::detail::expected_max_vector_size;
+  return Accepted(option.get_type_name()).kind + (many ? " ..." : "");
+}
+
+std::string option_text(const CLI::Option& option) {
+  std::vector<std::string> facts;
+  const std::string range = Accepted(option.get_type_name()).range, given = option.get_default_str();
+  if (option.get_required()) facts.push_back("required");
+  if (!range.empty()) facts.push_back(range);
+  if (option.get_type_size() != 0 && !given.empty())
+    facts.push_back("default " + std::regex_replace(given, std::regex(R"(^\[(.*)\]$)"), "$1"));
+  for (const CLI::Option* other : option.get_excludes()) facts.push_back("not with " + other->get_name());
+  for (const CLI::Option* other : option.get_needs()) facts.push_back("only with " + other->get_name());
+  const std::string text = option.get_description();
+  return facts.empty() ? text : fmt::format("{} ({})", text, fmt::join(facts, "; "));
+}
+
+std::vector<std::string> option_choices(const CLI::Option& option) {
+  std::istringstream kind(option.get_type_size() == 0 ? "" : Accepted(option.get_type_name()).kind);
+  std::vector<std::string> choices;
+  for (std::string word; std::getline(kind, word, '|');) choices.push_back(word);
+  return choices.size() > 1 ? choices : std::vector<std::string>();
+}
 
 void format_help(CLI::App& app) {
   const auto formatter = std::make_shared<HelpFormatter>();

@@ -83,6 +83,7 @@ int run(int argc, char** argv) {
   choose("doctor", vla::cli::add_doctor(app));
   choose("bench", vla::cli::add_bench(app));
   choose("quantize", vla::cli::add_quantize(app));
+  choose("manual", vla::cli::add_manual(app));
 #ifdef VLA_SERVER
   choose("serve", vla::cli::add_serve(app));
   choose("keygen", vla::cli::add_keygen(app));

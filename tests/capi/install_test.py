@@ -44,6 +44,7 @@ def test_an_installation_has_these_files_and_no_others(prefix, build):
         "bin/vla", "include/vla/vla.h", "lib/libvla.so", "lib/libvla.so.1", "lib/pkgconfig/vla.pc",
         *(f"lib/cmake/vla/{f}.cmake" for f in ("vlaConfig", "vlaConfigVersion", "vlaTargets", "vlaTargets-release")),
         "share/doc/vla/LICENSE", "share/doc/vla/LICENSES-third-party.md", "share/vla/vla.proto",
+        "share/man/man1/vla.1", "share/bash-completion/completions/vla",
         *(f"lib/{library.name}" for library in build.glob("lib/libvla-*.so")),  # where the build has other devices
     }  # fmt: skip
     assert (
