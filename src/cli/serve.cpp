@@ -63,7 +63,7 @@ std::string quoted(const std::string& value) {
 }
 
 /// One line that programs can split as a shell would.
-void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const std::string& metrics) {
+void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const Watch& watch) {
   std::vector<std::string> features, tags, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
@@ -93,7 +93,8 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("connections", std::to_string(server.max_connections()));
   add("features", fmt::format("{}", fmt::join(features, ",")));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
-  if (!metrics.empty()) add("metrics", metrics);
+  if (const std::string metrics = watch.metrics_address(); !metrics.empty()) add("metrics", metrics);
+  if (const std::string page = watch.page_url(); !page.empty()) add("page", page);
   if (!constant.empty()) add("CONSTANT", fmt::format("{}", fmt::join(constant, ",")));
   if (!degraded.empty()) add("DEGRADED", fmt::format("{}", fmt::join(degraded, ",")));
   say(stdout, "{}\n", line);
@@ -132,7 +133,7 @@ Status serve(ServeOptions& options, bool& ready) {
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
   watch->ready(warm_up_ms);
-  print_ready(*server, *engine, warm_up_ms, watch->metrics_address());
+  print_ready(*server, *engine, warm_up_ms, *watch);
   ready = true;
   const Status status = server->run(*engine, watch->observers());
   watch->ended(status);

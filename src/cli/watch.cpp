@@ -2,13 +2,16 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "cli/watch.h"
 
+#include <fmt/format.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <iterator>
+#include <random>
 
 #include "cli/commands.h"
 #include "serve/native/codec.h"
+#include "serve/token.h"
 
 namespace vla::cli {
 namespace {
@@ -22,11 +25,39 @@ Level level_of(const WatchOptions& options) {
   return static_cast<Level>(found - std::begin(serve::kLevelNames));
 }
 
+/// 128 bits of the system's, as hexadecimal digits.
+std::string drawn_token() {
+  std::random_device device;
+  std::string token;
+  for (int i = 0; i < 4; ++i) token += fmt::format("{:08x}", device());
+  return token;
+}
+
+/// Where the states of a robot were in training: their extremes or, where the bundle has none, three deviations around
+/// the mean. Keys are `tag/state`.
+void add_ranges(const Robot& robot, std::map<std::string, serve::Page::Range>& ranges) {
+  for (const std::string& state : robot.processor().states().names()) {
+    const auto stats = [&](const char* name) { return robot.bundle().stats(fmt::format("stats.{}.{}", state, name)); };
+    serve::Page::Range range;
+    for (const auto& [low, high] : {std::pair{"min", "max"}, std::pair{"q01", "q99"}})
+      if (const auto a = stats(low), b = stats(high); range.low.empty() && a && b) range = {*a, *b};
+    if (const auto mean = stats("mean"), deviation = stats("std"); range.low.empty() && mean && deviation) {
+      range = {*mean, *mean};
+      for (std::size_t i = 0; i < mean->size(); ++i)
+        range.low[i] -= 3 * (*deviation)[i], range.high[i] += 3 * (*deviation)[i];
+    }
+    if (!range.low.empty()) ranges[robot.bundle().embodiment() + "/" + state] = std::move(range);
+  }
+}
+
 }  // namespace
 
 void add_watch_options(CLI::App& command, WatchOptions& options) {
   add_text(command, "--metrics", options.metrics, "ADDRESS:PORT",
            "HTTP: /metrics (Prometheus), /healthz, /readyz; port 0 takes a free one");
+  add_text(command, "--page", options.page, "ADDRESS:PORT",
+           "A page for a browser that shows frames, actions and times as they come; the ready line has its address, "
+           "which ends with a token");
   command.add_option("--log", options.log, "Format of the log on standard error: text or json")
       ->check(CLI::IsMember({"text", "json"}));
   command.add_option("--log-level", options.level, "debug (every request), info (default with --log), warn, error")
@@ -64,6 +95,10 @@ Status Watch::open(const WatchOptions& options, bool insecure) {
             serve::Monitor::open(options.metrics, insecure,
                                  {[this] { return metrics_->text(server_.health()); }, [this] { return obstacle(); }}));
   }
+  if (!options.page.empty()) {
+    VLA_TRY(page_, serve::Page::open(options.page, insecure,
+                                     {drawn_token(), serve::is_same_secret, [this] { return server_.health(); }}));
+  }
   if (!options.record.empty()) {  // last: it makes a file that must not be there
     VLA_TRY(recorder_, serve::Recorder::open(options.record, options.record_limit_mb * 1'000'000));
     recorder_->on_stop([this](const std::string& why, std::uint64_t n) {
@@ -88,6 +123,11 @@ void Watch::loaded(const Engine& engine) {
   const v1::Description description = server_.describe(engine);
   if (metrics_) metrics_->describe(description, engine.memory());
   if (recorder_) recorder_->describe(description);
+  if (page_) {
+    std::map<std::string, serve::Page::Range> ranges;
+    for (const Robot* robot : engine.robots()) add_ranges(*robot, ranges);
+    page_->describe(description, ranges);
+  }
   const v1::Bundle& bundle = description.bundle();
   log_.event(Level::info, "loaded",
              {{"bundle", bundle.name()},
@@ -115,7 +155,7 @@ void Watch::ended(const Status& status) {
 std::vector<serve::Observer*> Watch::observers() {
   std::vector<serve::Observer*> all;
   for (serve::Observer* observer :
-       std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recorder_.get()})
+       std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recorder_.get(), page_.get()})
     if (observer != nullptr) all.push_back(observer);
   return all;
 }

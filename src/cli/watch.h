@@ -12,6 +12,7 @@
 #include "observe/log.h"
 #include "observe/metrics.h"
 #include "observe/monitor.h"
+#include "observe/page.h"
 #include "observe/recording.h"
 #include "observe/trace.h"
 #include "serve/server.h"
@@ -19,7 +20,7 @@
 namespace vla::cli {
 
 struct WatchOptions {
-  std::string metrics, log, level, trace, record;
+  std::string metrics, page, log, level, trace, record;
   std::uint64_t record_limit_mb = 1024;
 };
 
@@ -41,6 +42,8 @@ class Watch {
   std::vector<serve::Observer*> observers();
   /// Where HTTP listens; empty where it does not.
   std::string metrics_address() const { return monitor_ ? monitor_->address() : std::string(); }
+  /// Of the page, with its token; empty where there is none.
+  std::string page_url() const { return page_ ? page_->url() : std::string(); }
 
  private:
   Watch(const WatchOptions& options, const serve::Server& server);
@@ -53,6 +56,7 @@ class Watch {
   std::unique_ptr<serve::Metrics> metrics_;
   std::unique_ptr<serve::Trace> trace_;
   std::unique_ptr<serve::Recorder> recorder_;
+  std::unique_ptr<serve::Page> page_;
   std::unique_ptr<serve::Monitor> monitor_;  // last: asks the others
 };
 

@@ -1,0 +1,60 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <deque>
+#include <map>
+#include <mutex>
+#include <vector>
+
+#include "observe/http.h"
+#include "observe/observer.h"
+#include "wire/vla.pb.h"
+
+namespace vla::serve {
+
+/// A live page for people: `/` is the page, which asks `/policy` once, `/acts?after=N` for what was answered since, and
+/// `/image?act=N&view=I` for frames. Every request needs `token=`, which is drawn anew for each server and is no other
+/// secret, since browsers keep addresses. The last
+/// acts are kept, up to a size; a viewer that falls behind misses some, and holds nothing up.
+class Page final : public Observer {
+ public:
+  struct Range {
+    std::vector<double> low, high;  // one for each number of a state, in world units
+  };
+  struct Sources {
+    std::string token;
+    std::function<bool(std::string_view given, std::string_view token)> is_same;
+    std::function<Health()> health;
+  };
+  /// As Http::open.
+  static Result<std::unique_ptr<Page>> open(const std::string& address, bool insecure, Sources sources);
+
+  /// The policy and where its states were in training, by name; before the first request.
+  void describe(const v1::Description& description, const std::map<std::string, Range>& ranges);
+  void answered(const Answered& answered) override;
+  bool records() const override { return true; }
+
+  const std::string& address() const { return http_->address(); }
+  /// For a browser.
+  std::string url() const;
+
+  /// An answered act. What is derived from the bytes is made when the first viewer asks, on the thread of Http.
+  struct Act;
+
+ private:
+  explicit Page(Sources sources) : sources_(std::move(sources)) {}
+  HttpReply reply(const std::string& path, const std::string& query);
+  HttpReply acts_after(std::uint64_t id);
+  HttpReply image(std::uint64_t id, std::size_t view);
+
+  const Sources sources_;
+  std::mutex mutex_;
+  std::deque<std::shared_ptr<Act>> acts_;  // ids count up without gaps
+  std::uint64_t n_act_ = 0;
+  std::size_t bytes_ = 0;
+  std::string policy_ = "{}";
+  std::unique_ptr<Http> http_;  // last: its thread asks the others
+};
+
+}  // namespace vla::serve

@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""vla serve --page: what it gives to whom, and what a browser shows of it."""
+
+import json
+import re
+import shlex
+import shutil
+import socket
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.request
+from urllib.parse import parse_qs, urlencode, urlsplit
+
+import numpy as np
+import pytest
+from server_process import SECONDS, VLA, frames
+
+import vla_cpp
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+class Watched:
+    """A server with a page, a robot, and what the page gives."""
+
+    def __init__(self, case, *options):
+        command = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "1", "--page", "127.0.0.1:0", *options]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        ready = dict(word.partition("=")[::2] for word in shlex.split(self.process.stdout.readline())[1:])
+        self.url = ready["page"]
+        self.token = parse_qs(urlsplit(self.url).query)["token"][0]
+        self.robot = vla_cpp.Client(ready["address"], timeout=SECONDS)
+        self.case = case
+        self.sent = {name: frame if i else frame[:40, :60] for i, (name, frame) in enumerate(frames(case).items())}
+        self.files = {name: file.read_bytes() for name, file in list(case.images.items())[1:]}
+
+    def act(self, text="open the drawer", state=None, **options):
+        """The first view as pixels, the others as files."""
+        images = {**self.sent, **self.files}
+        return self.robot.act(images=images, state=self.case.state if state is None else state, text=text, seed=1, **options)
+
+    def get(self, path, token=None, **query):
+        """Status, type and body."""
+        parts = urlsplit(self.url)
+        query = urlencode({"token": self.token if token is None else token, **query})
+        try:
+            with urllib.request.urlopen(f"http://{parts.netloc}/{path}?{query}", timeout=SECONDS) as reply:
+                return reply.status, reply.headers["Content-Type"], reply.read()
+        except urllib.error.HTTPError as error:
+            return error.code, error.headers["Content-Type"], error.read()
+
+    def acts(self, after=0):
+        return json.loads(self.get("acts", after=after)[2])
+
+    def stop(self):
+        self.robot.close()
+        self.process.terminate()
+        self.process.communicate(timeout=SECONDS)
+        return self.process.returncode
+
+
+@pytest.fixture(scope="module")
+def watched(case):
+    watched = Watched(case)
+    yield watched
+    assert watched.stop() == 0
+
+
+def test_nothing_is_given_without_the_token(watched):
+    watched.act()
+    assert re.fullmatch("[0-9a-f]{32}", watched.token)
+    for token in ("", watched.token[:-1], watched.token[:-1] + "x", watched.token + "0"):
+        for path in ("", "policy", "acts", "image", "nothing"):
+            status, _, body = watched.get(path, token=token, act=1, view=0)
+            assert status == 403 and b"token" in body and len(body) < 200
+    assert watched.get("nothing")[0] == 404
+
+
+def test_the_page_loads_nothing_from_elsewhere(watched):
+    status, kind, body = watched.get("")
+    assert status == 200 and kind.startswith("text/html")
+    assert not re.search(rb"https?://|src=|@import|<link", body)
+
+
+def test_an_act_is_told_with_its_frames(watched):
+    last = watched.acts()["last"]
+    chunk = watched.act(deadline_ms=5000)
+    told = watched.acts(after=last)
+    (act,) = told["acts"]
+    assert told["last"] == act["id"] == last + 1 and told["ready"] and told["chunks"] >= 1
+    assert (act["text"], act["code"], act["deadline_ms"]) == ("open the drawer", "ok", 5000)
+    assert act["name"].startswith("vla-cpp-python") and abs(act["at_ms"] / 1000 - time.time()) < 60
+    assert np.array_equal(np.float32(act["chunk"]["actions"]).reshape(chunk.actions.shape), chunk.actions)
+    assert dict(act["chunk"]["stages"]) == pytest.approx(chunk.timing)
+    assert act["total_ms"] >= sum(chunk.timing.values()) * 0.99
+    assert np.array_equal(np.float32(next(iter(act["states"].values()))), np.float32(watched.case.state))
+    for i, view in enumerate(act["views"]):
+        status, kind, body = watched.get("image", act=act["id"], view=i)
+        assert status == 200
+        if view["kind"] == "rgb":
+            head, _, rows = body.partition(b"\n")
+            sent = watched.sent[view["name"]]
+            assert head == f"P6 {sent.shape[1]} {sent.shape[0]} 255".encode() and rows == sent.tobytes()
+        else:
+            assert (kind, body) == ("image/png", watched.files[view["name"]])
+    assert watched.get("image", act=act["id"], view=9)[0] == watched.get("image", act=10**18, view=0)[0] == 404
+
+
+def test_the_policy_is_told_with_the_range_of_its_states(watched):
+    policy = json.loads(watched.get("policy")[2])
+    (robot,) = policy["robots"]
+    (state,) = robot["states"]
+    assert policy["arch"] == "smolvla" and robot["horizon"] == 5 and len(robot["actions"]) == 7
+    assert len(state["low"]) == len(state["high"]) == len(state["dimensions"]) == 6
+    assert all(low <= high for low, high in zip(state["low"], state["high"]))
+
+
+def test_a_refusal_is_told(watched):
+    last = watched.acts()["last"]
+    with pytest.raises(vla_cpp.BadObservation):
+        watched.act(text="")
+    (act,) = watched.acts(after=last)["acts"]
+    assert act["code"] == "bad_observation" and act["error"]["where"] == "instruction" and "chunk" not in act
+
+
+def test_old_acts_go_and_a_viewer_that_was_away_gets_the_newest(case):
+    watched = Watched(case)
+    size = 3 * 2048 * 2048
+    watched.sent = {next(iter(watched.sent)): np.zeros((2048, 2048, 3), np.uint8)}
+    n = (96 << 20) // size + 3
+    for _ in range(n):
+        watched.act()
+    told = watched.acts()
+    assert told["last"] == n and 1 < told["first"] <= n and [a["id"] for a in told["acts"]] == list(range(told["first"], n + 1))
+    assert watched.get("image", act=1, view=0)[0] == 404
+    assert watched.stop() == 0
+
+
+def test_a_viewer_that_does_not_read_holds_nothing_up(watched):
+    parts = urlsplit(watched.url)
+    held = [socket.create_connection((parts.hostname, parts.port)) for _ in range(80)]
+    for connection in held[:40]:
+        connection.sendall(f"GET /?token={watched.token} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+    begun = time.monotonic()
+    watched.act()
+    assert watched.acts()["acts"] and time.monotonic() - begun < 10
+    for connection in held:
+        connection.close()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("no chromium")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+def wait_for(page, expression):
+    """Asks from outside: the page's policy forbids what waits inside."""
+    until = time.monotonic() + 2 * SECONDS
+    while not page.evaluate(expression):
+        assert time.monotonic() < until, expression
+        time.sleep(0.02)
+
+
+def test_a_browser_shows_what_happens_and_can_step_back(watched, browser):
+    faults = []
+    page = browser.new_page(viewport={"width": 390, "height": 844}, color_scheme="dark")  # a phone
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    page.goto(watched.url)
+    stop = threading.Event()
+
+    def robot():
+        count = 0
+        while not stop.wait(0.05):
+            count += 1
+            watched.act(text=f"instruction {count}", state=np.asarray(watched.case.state) + (1e3 if count > 40 else 0))
+
+    thread = threading.Thread(target=robot)
+    thread.start()
+    try:
+        wait_for(page, "parseInt(document.getElementById('text').textContent.split(' ')[1]) >= 30")
+        assert page.locator("#frames canvas").count() == 2 and page.locator("#curves canvas").count() == 7
+        assert "smolvla" in page.inner_text("#policy") and "receipt to answer" in page.inner_text("#times")
+        pixels = "[...document.querySelectorAll('#frames canvas')].find(c => c.width === 60 && c.height === 40).getContext('2d').getImageData(0, 0, 60, 40).data"
+        shown = np.array(page.evaluate(f"Array.from({pixels})"), np.uint8).reshape(40, 60, 4)
+        assert np.array_equal(shown[..., :3], next(iter(watched.sent.values())))
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "wider than a phone"
+        page.click("#pause")
+        paused = page.inner_text("#text")
+        wait_for(page, "document.querySelectorAll('#events .note').length > 0")
+        assert page.inner_text("#text") == paused
+        page.click("#before")
+        assert page.inner_text("#text") == f"instruction {int(paused.split()[1]) - 1}"
+        page.click("#pause")
+        wait_for(page, "document.querySelectorAll('#state .far').length > 0")
+    finally:
+        stop.set()
+        thread.join()
+    assert not faults
+    page.close()
