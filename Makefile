@@ -136,7 +136,7 @@ fuzz: $(STAMP)
 	scripts/fuzz.sh $(SECONDS)
 
 format:
-	clang-format -i $$(git ls-files '*.h' '*.c' '*.cpp')
+	clang-format -i $$(git ls-files '*.h' '*.c' '*.cpp' '*.cu')
 
 clean:
 	rm -rf build $(VENV) $(SIM) $(LIBERO)

@@ -73,7 +73,7 @@ class Format(unittest.TestCase):
         if reason:
             print(f"SKIP test_cpp_sources_are_as_clang_format_writes_them: {reason}")
             self.skipTest(reason)
-        files = [str(f) for f in tracked("src", "tests", "include", "examples") if f.suffix in (".h", ".c", ".cpp")]
+        files = [str(f) for f in tracked("src", "tests", "include", "examples") if f.suffix in (".h", ".c", ".cpp", ".cu")]
         result = subprocess.run([program, "--dry-run", "-Werror", "--style=file", *files], capture_output=True, text=True)
         wrong = sorted({line.split(":")[0].removeprefix(f"{ROOT}/") for line in result.stderr.splitlines() if ": error:" in line})
         self.assertEqual(result.returncode, 0, "\nnot as clang-format writes them (run: make format):\n" + "\n".join(wrong))

@@ -1,0 +1,37 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace vla::cuda {
+
+struct Grid {
+  unsigned x = 1, y = 1, z = 1;
+};
+
+/// A kernel by name and how it is launched. Its one parameter is the job of the header that made this.
+struct Launch {
+  const char* kernel;
+  Grid grid;
+  unsigned n_thread;
+  unsigned shared = 0;  // bytes of shared memory whose size the launch tells
+};
+
+/// Of functions that kernels and their launches share.
+#ifdef __CUDACC__
+#define VLA_HOST_DEVICE __host__ __device__
+#else
+#define VLA_HOST_DEVICE
+#endif
+
+/// Shared memory of a block on the devices that have least: sm_86, sm_89 and sm_120.
+constexpr unsigned kMaxShared = 99 << 10;
+/// Blocks of a grid in y and z.
+constexpr unsigned kMaxGridYZ = 65535;
+
+constexpr unsigned blocks(std::int64_t n, std::int64_t size) { return static_cast<unsigned>((n + size - 1) / size); }
+constexpr std::int64_t round_up(std::int64_t n, std::int64_t unit) { return (n + unit - 1) / unit * unit; }
+
+}  // namespace vla::cuda

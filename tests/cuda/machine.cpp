@@ -1,0 +1,57 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/machine.h"
+
+#include <cstdlib>
+#include <fstream>
+#include <iterator>
+#include <sstream>
+
+#include "cuda/emulation.h"
+#include "cuda/fault.h"
+#include "cuda/ptx.h"
+
+namespace vla::test::cuda {
+namespace {
+
+const std::vector<PtxModule>& modules() {
+  static const std::vector<PtxModule> all = [] {
+    std::vector<PtxModule> loaded;
+    const char* files = std::getenv("VLA_CUDA_PTX");
+    std::istringstream names(files == nullptr ? "" : files);
+    for (std::string name; std::getline(names, name, ':');) {
+      std::ifstream in(name);
+      if (!in) throw Fault("cannot read " + name);
+      loaded.emplace_back(std::string(std::istreambuf_iterator<char>(in), {}));
+    }
+    return loaded;
+  }();
+  return all;
+}
+
+}  // namespace
+
+bool runs_ptx() { return !modules().empty(); }
+
+void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size) {
+  const std::string name = how.kernel;
+  const auto refuse = [&](const std::string& why) { throw Fault(name + ": " + why); };
+  const vla::cuda::Grid& grid = how.grid;
+  if (grid.x == 0 || grid.y == 0 || grid.z == 0) refuse("a grid without blocks");
+  if (grid.y > vla::cuda::kMaxGridYZ || grid.z > vla::cuda::kMaxGridYZ)
+    refuse("more blocks in y or z than a grid may have");
+  if (how.shared > vla::cuda::kMaxShared) refuse("more shared memory than every device has");
+  device_memory().begin_launch();
+  const Extent extent = {grid.x, grid.y, grid.z};
+  for (const PtxModule& module : modules())
+    if (const PtxKernel* kernel = module.find(name)) {
+      if (kernel->param_size != job_size) refuse("a job of another size");
+      return run_ptx(*kernel, extent, how.n_thread, how.shared, job);
+    }
+  const Entry* entry = find_entry(how.kernel);
+  if (entry == nullptr || runs_ptx()) refuse("no kernel of this name");
+  if (entry->job_size != job_size) refuse("a job of another size");
+  run_entry(*entry, extent, how.n_thread, how.shared, job);
+}
+
+}  // namespace vla::test::cuda

@@ -1,0 +1,55 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstring>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "cuda/device_memory.h"
+#include "cuda/kernels/launch.h"
+#include "cuda/shared_memory.h"
+
+/// A device that is not there: it runs kernels as the host's compiler made them, or the PTX that nvcc made of them.
+namespace vla::test::cuda {
+
+/// Throws Fault where the kernel does what none may, and where a device would refuse the launch.
+void launch(const vla::cuda::Launch& launch, const void* job, std::size_t job_size);
+template <class Job>
+void launch(const vla::cuda::Launch& how, const Job& job) {
+  launch(how, &job, sizeof(job));
+}
+
+/// Whether kernels run as PTX: where VLA_CUDA_PTX names files, FILE:FILE.
+bool runs_ptx();
+
+/// Values in device memory.
+template <class T>
+class Device {
+ public:
+  explicit Device(std::size_t n) : n_(n), data_(static_cast<T*>(device_memory().allocate(n * sizeof(T)))) {}
+  explicit Device(const std::vector<T>& values) : Device(values.size()) {
+    std::memcpy(data_, values.data(), n_ * sizeof(T));
+  }
+  Device(const Device&) = delete;
+  ~Device() { device_memory().release(data_); }
+  T* get() const { return data_; }
+  std::vector<T> host() const { return {data_, data_ + n_}; }
+
+ private:
+  std::size_t n_;
+  T* data_;
+};
+
+/// Runs `test` in each schedule of threads and copies.
+template <class Test>
+void in_every_schedule(Test test) {
+  for (const Schedule& one : {Schedule{0, true}, Schedule{0, false}, Schedule{1, true}, Schedule{7, false}}) {
+    schedule = one;
+    test();
+  }
+  schedule = {};
+}
+
+}  // namespace vla::test::cuda

@@ -1,0 +1,184 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/machine.h"
+
+#include <doctest/doctest.h>
+
+#include <functional>
+
+#include "cuda/fault.h"
+#include "cuda/fragments.h"
+#include "cuda/machine_kernels.h"
+#include "cuda/ptx.h"
+
+using namespace vla;
+using namespace vla::test::cuda;
+
+namespace {
+
+std::string fault_of(const std::function<void()>& act) {
+  try {
+    act();
+  } catch (const Fault& fault) {
+    return fault.what();
+  }
+  return "";
+}
+bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+
+/// A kernel `k` whose one parameter is an address of 32 words, %rd1; registers r1 to r9, p1 to p3, f1 to f3 are free.
+std::string kernel_of(const std::string& body) {
+  return ".version 9.0\n.target sm_80\n.address_size 64\n.extern .shared .align 16 .b8 room[];\n"
+         ".visible .entry k(\n.param .u64 k_param_0\n)\n{\n.reg .pred %p<4>;\n.reg .b32 %r<10>;\n.reg .f32 "
+         "%f<4>;\n.reg .b64 %rd<6>;\n"
+         "ld.param.u64 %rd1, [k_param_0];\nmov.u32 %r1, %tid.x;\nmul.wide.u32 %rd2, %r1, 4;\nadd.s64 %rd3, %rd1, "
+         "%rd2;\n" +
+         body + "\nret;\n}\n";
+}
+std::vector<std::uint32_t> run_body(const std::string& body, unsigned n_thread = 32, unsigned n_block = 1) {
+  const PtxModule module(kernel_of(body));
+  const Device<std::uint32_t> y(64);
+  std::uint32_t* p = y.get();
+  device_memory().begin_launch();
+  run_ptx(*module.find("k"), {n_block, 1, 1}, n_thread, 512, &p);
+  return y.host();
+}
+std::string fault_of_body(const std::string& body, unsigned n_thread = 32, unsigned n_block = 1) {
+  return fault_of([&] { run_body(body, n_thread, n_block); });
+}
+
+}  // namespace
+
+TEST_CASE("each mistake of a kernel is a fault that says what is wrong, and threads that behave have none") {
+  if (runs_ptx()) return;  // these kernels are the host compiler's; those below are PTX
+  const Device<int> x(4), y(64);
+  const auto fault = [&](Mistake mistake) {
+    const vla::cuda::MisbehaveJob job = {mistake, x.get(), y.get()};
+    return fault_of([&] { launch({"misbehave", {}, 64, 1024}, job); });
+  };
+  in_every_schedule([&] {
+    CHECK(fault(Mistake::none).empty());
+    for (int i = 0; i < 64; ++i) REQUIRE(y.host()[static_cast<std::size_t>(i)] == 63 - i);
+    CHECK(contains(fault(Mistake::no_barrier), "race in shared memory"));
+    CHECK(contains(fault(Mistake::no_warp_barrier), "race in shared memory"));
+    CHECK(contains(fault(Mistake::write_after_read), "race in shared memory"));
+    CHECK(contains(fault(Mistake::no_wait), "has not brought"));
+    CHECK(!fault(Mistake::wait_without_barrier).empty());  // as threads come: a race, or a copy on its way
+    CHECK(contains(fault(Mistake::behind_shared), "not in shared memory"));
+    CHECK(contains(fault(Mistake::not_aligned), "not aligned"));
+    CHECK(contains(fault(Mistake::some_lanes_shuffle), "every thread waits"));
+    CHECK(contains(fault(Mistake::some_warps_wait), "every thread waits"));
+    CHECK(contains(fault(Mistake::different_instructions), "different instructions"));
+  });
+}
+
+TEST_CASE("a launch that a device would refuse is refused") {
+  const int job = 0;
+  const auto fault = [&](const vla::cuda::Launch& how) { return fault_of([&] { launch(how, &job, sizeof(job)); }); };
+  CHECK(contains(fault({"absent", {}, 32, 0}), "no kernel"));
+  CHECK(contains(fault({"misbehave", {}, 32, 0}), "job of another size"));
+  CHECK(contains(fault({"misbehave", {0, 1, 1}, 32, 0}), "without blocks"));
+  CHECK(contains(fault({"misbehave", {1, 65536, 1}, 32, 0}), "more blocks"));
+  CHECK(contains(fault({"misbehave", {}, 32, 100 << 10}), "more shared memory"));
+}
+
+TEST_CASE("PTX that is not known is refused by name when it is read") {
+  const auto refused = [](const std::string& body) { return fault_of([&] { PtxModule module(kernel_of(body)); }); };
+  CHECK(contains(refused("bfind.u32 %r2, %r1;"), "unknown instruction bfind.u32"));
+  CHECK(contains(refused("ld.local.u32 %r2, [%rd1];"), "unknown instruction ld.local.u32"));
+  CHECK(contains(refused("atom.global.add.u32 %r2, [%rd1], %r1;"), "unknown instruction atom.global.add.u32"));
+  CHECK(contains(refused("add.s32 %r2, %r1;"), "number of operands"));
+  CHECK(contains(refused("add.s32 %r2, %r1, %rd1;"), "%rd1 is no register of the operation's type"));
+  CHECK(contains(refused("add.s32 %r2, %r1, %r99;"), "unknown register %r99"));
+  CHECK(contains(refused("add.s32 %r2, %r1, %clock;"), "unknown register %clock"));
+  CHECK(contains(refused("bra $nowhere;"), "no label $nowhere"));
+  CHECK(contains(refused(".local .align 4 .b8 depot[16];"), "unknown directive .local"));
+  CHECK(contains(fault_of([] { PtxModule module(".visible .entry k(\n.param .u64 k_param_0\n)\n{\nret;\n"); }),
+                 "ends in the middle"));
+}
+
+TEST_CASE("lanes that part do each their own, and meet again") {
+  // Even lanes count to their number, odd ones store 100 + it; then all shuffle.
+  const std::vector<std::uint32_t> y = run_body(
+      "and.b32 %r2, %r1, 1;\nmov.u32 %r3, 0;\nsetp.ne.s32 %p1, %r2, 0;\n@%p1 bra $odd;\n"
+      "$loop:\nsetp.ge.s32 %p2, %r3, %r1;\n@%p2 bra $meet;\nadd.s32 %r3, %r3, 1;\nbra.uni $loop;\n"
+      "$odd:\nadd.s32 %r3, %r1, 100;\n$meet:\nshfl.sync.bfly.b32 %r4|%p3, %r3, 1, 31, -1;\nst.global.u32 [%rd3], %r4;");
+  for (std::uint32_t i = 0; i < 32; ++i) CHECK(y[i] == (i % 2 ? i - 1 : i + 101));
+  CHECK(contains(
+      fault_of_body(
+          "setp.lt.s32 %p1, %r1, 16;\n@%p1 bra $skip;\nbar.warp.sync -1;\n$skip:\n@%p1 ret;\nbar.warp.sync -1;"),
+      "lanes"));
+}
+
+TEST_CASE("PTX: accesses outside, not aligned, or of two blocks are faults with the instruction") {
+  CHECK(contains(fault_of_body("st.global.u32 [%rd3+160], %r1;"),
+                 "writes behind or before an allocation: st.global.u32"));
+  CHECK(contains(fault_of_body("ld.global.u32 %r2, [%rd1+-4];"), "reads behind or before an allocation"));
+  CHECK(contains(fault_of_body("ld.global.v2.u32 {%r2, %r3}, [%rd3];"), "not aligned"));
+  CHECK(contains(fault_of_body("st.global.u32 [%rd3], %r1;", 32, 2), "two blocks of a launch"));
+  CHECK(
+      fault_of_body(
+          "mov.u32 %r2, %ctaid.x;\nmul.wide.u32 %rd4, %r2, 128;\nadd.s64 %rd3, %rd3, %rd4;\nst.global.u32 [%rd3], %r1;",
+          32, 2)
+          .empty());
+  CHECK(contains(fault_of_body("ld.param.u64 %rd4, [k_param_0+8];"), "behind the parameter"));
+}
+
+TEST_CASE("PTX: races in shared memory, and barriers that some miss") {
+  const std::string own = "mov.u32 %r8, room;\nshl.b32 %r2, %r1, 2;\nadd.s32 %r2, %r2, %r8;\nxor.b32 %r3, %r2, ";
+  const std::string of_warp = own + "4;\nst.shared.u32 [%r2], %r1;\n",
+                    of_other = own + "128;\nst.shared.u32 [%r2], %r1;\n";
+  const std::string read = "ld.shared.u32 %r4, [%r3];";
+  CHECK(contains(fault_of_body(of_warp + read), "race in shared memory"));
+  CHECK(fault_of_body(of_warp + "bar.warp.sync -1;\n" + read).empty());
+  CHECK(contains(fault_of_body(of_other + "bar.warp.sync -1;\n" + read, 64), "race in shared memory"));
+  CHECK(fault_of_body(of_other + "bar.sync 0;\n" + read, 64).empty());
+  CHECK(contains(fault_of_body("setp.lt.s32 %p1, %r1, 32;\n@%p1 bra $end;\nbar.sync 0;\n$end:", 64),
+                 "wait at a barrier"));
+  const std::string copy =
+      "mov.u32 %r8, room;\nshl.b32 %r2, %r1, 4;\nadd.s32 %r2, %r2, %r8;\nmov.u32 %r5, 16;\n"
+      "cp.async.cg.shared.global [%r2], [%rd1], 16, %r5;\ncp.async.commit_group;\n";
+  CHECK(contains(fault_of_body(copy + "ld.shared.u32 %r4, [%r2];"), "has not brought"));
+  CHECK(contains(fault_of_body(copy + "cp.async.wait_group 1;\nld.shared.u32 %r4, [%r2];"), "has not brought"));
+  CHECK(fault_of_body(copy + "cp.async.wait_group 0;\nld.shared.u32 %r4, [%r2];").empty());
+}
+
+TEST_CASE("bank conflicts are counted as lanes that wait") {
+  const auto conflicts = [](int factor, int width) {
+    counts = {};
+    std::size_t offsets[kWarp];
+    for (int l = 0; l < kWarp; ++l) offsets[l] = static_cast<std::size_t>(l * factor);
+    SharedMemory::count_conflicts(offsets, static_cast<std::size_t>(width));
+    return counts.bank_conflicts;
+  };
+  CHECK(conflicts(4, 4) == 0);
+  CHECK(conflicts(0, 4) == 0);  // one word for all
+  CHECK(conflicts(8, 4) == 1);  // two words of every second bank
+  CHECK(conflicts(128, 4) == 31);
+  CHECK(conflicts(8, 8) == 0);    // two transactions without
+  CHECK(conflicts(16, 16) == 0);  // four of eight lanes
+  CHECK(conflicts(32, 16) == 4);  // each of which has two words in a bank
+}
+
+TEST_CASE("fragments of products are those of plain sums") {
+  Lanes a[4], b[2], sum[4], to[4];
+  const auto byte = [](const Lanes* of, int r, int l, int i) { return static_cast<std::int8_t>(of[r][l] >> 8 * i); };
+  for (int l = 0; l < kWarp; ++l) {
+    for (int r = 0; r < 4; ++r)
+      a[r][l] = static_cast<std::uint32_t>((l * 4 + r) * 2654435761U), sum[r][l] = static_cast<std::uint32_t>(r - l);
+    for (int r = 0; r < 2; ++r) b[r][l] = static_cast<std::uint32_t>((l * 2 + r) * 2246822519U);
+  }
+  mma_s8(to, a, b, sum);
+  // PTX ISA 9.0: row = l / 4 for registers 0 and 2 of a, 8 below for 1 and 3; the depth is (l % 4) * 4 + i, 16 more for
+  // 2 and 3. b: the depth (l % 4) * 4 + i, 16 more for 1; column l / 4. sum: row l / 4, 8 below for 2 and 3; column (l
+  // % 4) * 2.
+  for (int row = 0; row < 16; ++row)
+    for (int column = 0; column < 8; ++column) {
+      int expected = 0;
+      for (int k = 0; k < 32; ++k)
+        expected += byte(a, (row >= 8 ? 1 : 0) + (k >= 16 ? 2 : 0), row % 8 * 4 + k % 16 / 4, k % 4) *
+                    byte(b, k >= 16 ? 1 : 0, column * 4 + k % 16 / 4, k % 4);
+      const int lane = row % 8 * 4 + column / 2, c = (row >= 8 ? 2 : 0) + column % 2;
+      REQUIRE(static_cast<int>(to[c][lane]) == expected + static_cast<int>(sum[c][lane]));
+    }
+}

@@ -1,0 +1,88 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "cuda/device_memory.h"
+#include "cuda/emulation.h"
+#include "cuda/shared_memory.h"
+
+/// PTX as nvcc writes it, run a warp at a time: an instruction is done for all lanes of a warp before the next one is
+/// looked at. Where lanes part, those that are least far in the text go on first, until they meet again. What is not
+/// known is refused by name when the text is read. Source: PTX ISA 9.0.
+namespace vla::test::cuda {
+
+struct WarpState;
+
+/// One instruction. Operands are places in a warp's registers, which hold 32 lanes each: of 4 bytes, of 8, or one mask
+/// of 4 bytes where the register is a predicate.
+struct PtxInstruction {
+  enum Kind { kPlain, kBranch, kReturn, kBarrier, kWarp } kind = kPlain;  // kWarp: all lanes together
+  void (*run)(WarpState&, const PtxInstruction&) = nullptr;
+  std::uint32_t operand[16] = {};
+  int n_operand = 0;
+  std::uint32_t guard = 0;
+  bool has_guard = false, guard_is_not = false;
+  int target = -1;
+  // Loads, stores and copies.
+  std::int64_t offset[2] = {};
+  int width = 0, count = 1;
+  bool sign = false, wide_address = false, wide_value = false;  // registers of 8 bytes
+  mutable DeviceMemory::Allocation* hint = nullptr;             // where the last access went
+  mutable std::uint64_t hint_time = 0;
+  std::string text;
+};
+
+struct PtxKernel {
+  std::string name;
+  std::vector<PtxInstruction> code;
+  std::size_t register_bytes = 0, param_size = 0, static_shared = 0;
+  int max_thread = 1024;
+  std::vector<std::byte> constants;  // how the registers begin: constants stand first
+  struct Special {
+    std::uint32_t place;
+    int which;  // of kSpecials
+  };
+  std::vector<Special> specials;
+  struct SharedAddress {
+    std::uint32_t place;
+    bool wide;
+  };
+  std::vector<SharedAddress> dynamic_shared;  // registers that hold the address of what the launch gives
+};
+
+class PtxModule {
+ public:
+  explicit PtxModule(const std::string& text);
+  const PtxKernel* find(const std::string& name) const;
+
+ private:
+  std::map<std::string, PtxKernel> kernels_;
+};
+
+/// Runs all blocks, one after the other. Throws Fault.
+void run_ptx(const PtxKernel& kernel, Extent grid, unsigned n_thread, std::size_t shared, const void* job);
+
+// Between the two halves, ptx_parse.cpp and ptx_run.cpp.
+
+constexpr const char* kSpecials[] = {"%tid.x",    "%ctaid.x",  "%ctaid.y",  "%ctaid.z", "%ntid.x",
+                                     "%nctaid.x", "%nctaid.y", "%nctaid.z", "%laneid"};
+
+/// An operation of the table: its operands' types in order, d for 4 bytes (also of 16-bit numbers), q for 8, p for a
+/// predicate, s and g for addresses in shared and global memory.
+struct PtxOperation {
+  const char* name;
+  const char* operands;
+  void (*run)(WarpState&, const PtxInstruction&);
+  PtxInstruction::Kind kind = PtxInstruction::kPlain;
+};
+const PtxOperation* find_operation(const std::string& name);
+/// Loads (ld) and stores (st) of param, shared and global; null for others.
+void (*find_access(const std::string& operation, const std::string& space))(WarpState&, const PtxInstruction&);
+
+}  // namespace vla::test::cuda

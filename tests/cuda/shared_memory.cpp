@@ -1,0 +1,113 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/shared_memory.h"
+
+#include <algorithm>
+#include <cstring>
+
+#include "cuda/device_memory.h"
+#include "cuda/fault.h"
+
+namespace vla::test::cuda {
+
+void SharedMemory::begin(std::size_t size, int n_thread) {
+  constexpr std::size_t kAlign = 1024;
+  if (room_.size() < size + kAlign) room_.resize(size + kAlign);
+  const auto at = reinterpret_cast<std::uintptr_t>(room_.data());
+  data_ = room_.data() + (kAlign - at % kAlign) % kAlign, size_ = size;
+  std::memset(data_, kGarbage, size);
+  const auto has_copies = [](const auto& groups) { return !groups.empty(); };
+  if (std::any_of(open_.begin(), open_.end(), has_copies) ||
+      std::any_of(committed_.begin(), committed_.end(), has_copies))
+    words_.clear();  // copies of a block that ended without them
+  if (words_.size() < (size + 3) / 4) words_.resize((size + 3) / 4);
+  const auto n = static_cast<std::size_t>(n_thread);
+  warp_time_.resize(std::max(warp_time_.size(), n / kWarp));
+  open_.assign(n, {}), committed_.assign(n, {});
+  ++time_;  // whatever the block before did is over
+}
+
+void SharedMemory::check_range(std::size_t offset, std::size_t size) const {
+  if (offset % size != 0) throw Fault("address in shared memory is not aligned");
+  if (offset >= size_ || offset + size > size_) throw Fault("address is not in shared memory");
+}
+
+/// Whether an event is over for a thread: its own, or with a barrier in between.
+bool SharedMemory::ordered(const Event& event, int thread) const {
+  if (event.thread == kNobody || event.time < time_) return true;
+  if (event.time == kPending || event.thread == kMany) return false;
+  if (event.thread == thread) return true;
+  const int warp = event.thread >= kManyOfWarp ? event.thread - kManyOfWarp : event.thread / kWarp;
+  return warp == thread / kWarp && event.warp_time < warp_time_[static_cast<std::size_t>(warp)];
+}
+
+void SharedMemory::read(std::size_t offset, std::size_t size, int thread) {
+  check_range(offset, size);
+  for (std::size_t i = offset / 4; i < (offset + size + 3) / 4; ++i) {
+    Word& word = words_[i];
+    if (word.write.time == kPending && word.write.thread != kNobody)
+      throw Fault("reads what an asynchronous copy has not brought");
+    if (!ordered(word.write, thread)) throw Fault("race in shared memory: reads what another thread writes");
+    const int before = word.read.thread, warp = thread / kWarp;
+    const bool alone = before == thread || ordered(word.read, thread);
+    const bool of_warp = before >= kManyOfWarp ? before == kManyOfWarp + warp : before / kWarp == warp;
+    word.read = now(thread);
+    if (!alone) word.read.thread = of_warp ? kManyOfWarp + warp : kMany;
+  }
+}
+
+void SharedMemory::write(std::size_t offset, std::size_t size, int thread) {
+  check_range(offset, size);
+  for (std::size_t i = offset / 4; i < (offset + size + 3) / 4; ++i) {
+    Word& word = words_[i];
+    if (!ordered(word.write, thread)) throw Fault("race in shared memory: writes what another thread or a copy writes");
+    if (!ordered(word.read, thread)) throw Fault("race in shared memory: writes what another thread reads");
+    word.write = now(thread);
+  }
+}
+
+void SharedMemory::copy(std::size_t offset, const void* from, std::size_t size, int thread) {
+  if (size > 16) throw Fault("an asynchronous copy of more than 16 bytes");
+  write(offset, 16, thread);
+  ++counts.copies;
+  for (std::size_t i = offset / 4; i < offset / 4 + 4; ++i) words_[i].write.time = kPending;
+  std::memset(data_ + offset, kGarbage, 16);
+  open_[static_cast<std::size_t>(thread)].push_back({offset, from, size});
+  if (!schedule.late_copies) {
+    std::memset(data_ + offset, 0, 16);
+    std::memcpy(data_ + offset, from, size);
+  }
+}
+
+void SharedMemory::commit(int thread) {
+  auto& open = open_[static_cast<std::size_t>(thread)];
+  committed_[static_cast<std::size_t>(thread)].push_back(std::move(open));
+  open.clear();
+}
+
+void SharedMemory::wait(std::size_t n_left, int thread) {
+  auto& groups = committed_[static_cast<std::size_t>(thread)];
+  for (; groups.size() > n_left; groups.pop_front())
+    for (const Copy& copy : groups.front()) arrive(copy, thread);
+}
+
+void SharedMemory::arrive(const Copy& copy, int thread) {
+  std::memset(data_ + copy.offset, 0, 16);
+  std::memcpy(data_ + copy.offset, copy.from, copy.size);
+  for (std::size_t i = copy.offset / 4; i < copy.offset / 4 + 4; ++i) words_[i].write = now(thread);
+}
+
+void SharedMemory::count_conflicts(std::span<const std::size_t> offsets, std::size_t width) {
+  const std::size_t at_once = std::min<std::size_t>(offsets.size(), 128 / std::max<std::size_t>(width, 4));
+  for (std::size_t first = 0; first < offsets.size(); first += at_once) {
+    std::size_t words[kWarp * 4], n = 0;
+    for (std::size_t offset : offsets.subspan(first, std::min(at_once, offsets.size() - first)))
+      for (std::size_t b = 0; offset != kNone && b < width; b += 4) words[n++] = (offset + b) / 4;
+    std::sort(words, words + n);
+    int in_bank[32] = {};
+    for (std::size_t i = 0; i < n; ++i) in_bank[words[i] % 32] += i == 0 || words[i] != words[i - 1];
+    counts.bank_conflicts += std::max(0, *std::max_element(in_bank, in_bank + 32) - 1);
+  }
+}
+
+}  // namespace vla::test::cuda
