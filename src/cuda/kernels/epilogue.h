@@ -1,0 +1,23 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "base/activation.h"
+#include "cuda/kernels/launch.h"
+
+namespace vla::cuda {
+
+/// What follows the sums of a product: y = activation(sum + bias) * factor + residual; or, where there is a gate,
+/// y = activation(gate) * (sum + bias) * factor + residual. All but y may be null.
+struct Epilogue {
+  const float* bias;      // [n_column]
+  const float* factor;    // [n_column]
+  const float* gate;      // [n_column, n_row]
+  const float* residual;  // [n_column, n_row]
+  void* y;                // rows of y_stride elements, of which n_column are written
+  std::int64_t y_stride;
+  Activation activation;
+  bool is_bf16;  // y; else float32
+};
+
+}  // namespace vla::cuda

@@ -1,0 +1,181 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/linear_bf16.h"
+
+#include "cuda/kernels/finish.h"
+#include "cuda/kernels/store_sums.h"
+
+namespace vla::cuda {
+namespace {
+
+/// Stores two sums side by side: themselves where the depth is split, else y.
+VLA_DEVICE void store_pair(const LinearBf16Job& job, float first, float second, int row, int column) {
+  if (job.n_split == 1) return finish_pair(job.end, first, second, row, column, job.n_column);
+  float* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_column + column;
+  to[0] = first;
+  if (column + 1 < job.n_column) to[1] = second;
+}
+
+/// Steps of the depth that block z of a split takes.
+struct Share {
+  int first, end;
+  VLA_DEVICE explicit Share(const LinearBf16Job& job) {
+    const int n_step = (job.depth + kBf16Depth - 1) / kBf16Depth, z = static_cast<int>(blockIdx.z);
+    first = n_step * z / job.n_split, end = n_step * (z + 1) / job.n_split;
+  }
+};
+
+/// Four warps, two by two, of kTilesM x kTilesN products of 16 x 8 each, and kStages steps of the depth in shared
+/// memory.
+template <int kTilesM_, int kTilesN_>
+struct Shape {
+  static constexpr int kTilesM = kTilesM_, kTilesN = kTilesN_, kStages = 4;
+  static constexpr int kRows = 2 * kTilesM * 16, kColumns = 2 * kTilesN * 8;
+  static constexpr int kRowBytes = kBf16Depth * 2, kStage = (kRows + kColumns) * kRowBytes;
+};
+
+/// Place of 16 bytes of a row in a stage. The eight rows that a matrix is read from differ in banks.
+VLA_DEVICE int place(int row, int chunk) { return row * kBf16Depth * 2 + (chunk ^ (row >> 1 & 3)) * 16; }
+
+/// Copies a step of the depth of rows to a stage, with zeros behind the last row and behind the depth.
+template <int kRows>
+VLA_DEVICE void fetch(std::byte* to, const std::uint16_t* from, std::int64_t stride, int row0, int n_row, int step,
+                      int depth) {
+  const int chunk = thread_index() % 4, k = step * kBf16Depth + chunk * 8;
+  const int left = (depth - k) * 2, size = left < 0 ? 0 : left > 16 ? 16 : left;
+#pragma unroll
+  for (int i = 0; i < kRows; i += 32) {
+    const int row = i + thread_index() / 4;
+    const bool valid = row0 + row < n_row && size > 0;
+    dev::copy_async(to + place(row, chunk), valid ? from + (row0 + row) * stride + k : from, valid ? size : 0);
+  }
+}
+template <class S>
+VLA_DEVICE void fetch(const LinearBf16Job& job, int row0, int column0, int step, std::byte* stage) {
+  fetch<S::kRows>(stage, job.x, job.x_stride, row0, job.n_row, step, job.depth);
+  fetch<S::kColumns>(stage + S::kRows * S::kRowBytes, job.weight, job.weight_stride, column0, job.n_column, step,
+                     job.depth);
+}
+
+/// Multiplies a stage: two steps of 16 of the depth.
+template <class S>
+VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_column,
+                               float (&sum)[S::kTilesM][S::kTilesN][4]) {
+  const int lane = thread_index() % kLanes;
+  const std::byte* w = stage + S::kRows * S::kRowBytes;
+#pragma unroll
+  for (int half = 0; half < 2; ++half) {
+    unsigned a[S::kTilesM][4];
+#pragma unroll
+    for (int m = 0; m < S::kTilesM; ++m)
+      dev::load_matrices(a[m], stage + place(warp_row + m * 16 + lane % 16, half * 2 + lane / 16));
+#pragma unroll
+    for (int n = 0; n < S::kTilesN; n += 2) {
+      unsigned b[4];  // two registers for each of two times eight columns
+      dev::load_matrices(b, w + place(warp_column + n * 8 + lane / 16 * 8 + lane % 8, half * 2 + lane / 8 % 2));
+#pragma unroll
+      for (int m = 0; m < S::kTilesM; ++m) {
+        dev::multiply_bf16(sum[m][n], a[m], b[0], b[1]);
+        dev::multiply_bf16(sum[m][n + 1], a[m], b[2], b[3]);
+      }
+    }
+  }
+}
+
+template <class S>
+VLA_DEVICE void multiply(const LinearBf16Job& job) {
+  std::byte* shared = dev::shared_memory();
+  const int warp = thread_index() / kLanes;
+  const int warp_row = warp % 2 * S::kTilesM * 16, warp_column = warp / 2 * S::kTilesN * 8;
+  const int row0 = static_cast<int>(blockIdx.y) * S::kRows, column0 = static_cast<int>(blockIdx.x) * S::kColumns;
+  const Share share(job);
+
+  float sum[S::kTilesM][S::kTilesN][4] = {};
+#pragma unroll
+  for (int i = 0; i < S::kStages - 1; ++i) {
+    if (share.first + i < share.end) fetch<S>(job, row0, column0, share.first + i, shared + i * S::kStage);
+    dev::commit_copies();  // a group, even an empty one: waiting counts groups
+  }
+  for (int step = share.first; step < share.end; ++step) {
+    const int i = step - share.first;
+    dev::wait_copies<S::kStages - 2>();
+    __syncthreads();  // the stage has arrived for all threads, and all have read the one that is fetched into next
+    const int ahead = i + S::kStages - 1;
+    if (share.first + ahead < share.end)
+      fetch<S>(job, row0, column0, share.first + ahead, shared + ahead % S::kStages * S::kStage);
+    dev::commit_copies();
+    multiply_stage<S>(shared + i % S::kStages * S::kStage, warp_row, warp_column, sum);
+  }
+
+  dev::wait_copies<0>();
+  __syncthreads();  // the stages become room for sums
+  store_sums(sum, shared + warp * kSumBytes<S::kTilesN>, [&](int row, int column, float first, float second) {
+    row += row0 + warp_row, column += column0 + warp_column;
+    if (row < job.n_row && column < job.n_column) store_pair(job, first, second, row, column);
+  });
+}
+
+/// A warp has two columns and up to kBf16FewRows rows; its lanes share the depth.
+VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
+  const int lane = thread_index() % kLanes, column = (static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes) * 2;
+  const int row0 = static_cast<int>(blockIdx.y) * kBf16FewRows;
+  if (column >= job.n_column) return;  // the whole warp
+  const bool has_second = column + 1 < job.n_column;
+  const Share share(job);
+  const int end = share.end * kBf16Depth < job.depth ? share.end * kBf16Depth : job.depth;
+  float sum[kBf16FewRows][2] = {};
+  for (int k = share.first * kBf16Depth + lane * 8; k < end; k += kLanes * 8) {
+    const auto eight = [&](const std::uint16_t* from, float(&to)[8]) {
+      const uint4 words = *reinterpret_cast<const uint4*>(from + k);  // rows are padded to 8
+      const unsigned pairs[4] = {words.x, words.y, words.z, words.w};
+#pragma unroll
+      for (int i = 0; i < 8; ++i) {
+        const unsigned bits = i % 2 ? pairs[i / 2] & 0xffff0000U : pairs[i / 2] << 16;
+        to[i] = k + i < end ? dev::float_of(static_cast<int>(bits)) : 0;
+      }
+    };
+    float w[2][8];
+    eight(job.weight + column * job.weight_stride, w[0]);
+    eight(job.weight + (has_second ? column + 1 : column) * job.weight_stride, w[1]);
+#pragma unroll
+    for (int r = 0; r < kBf16FewRows; ++r) {
+      if (row0 + r >= job.n_row) break;
+      float x[8];
+      eight(job.x + (row0 + r) * job.x_stride, x);
+#pragma unroll
+      for (int i = 0; i < 8; ++i) sum[r][0] += x[i] * w[0][i], sum[r][1] += x[i] * w[1][i];
+    }
+  }
+  float first = 0, second = 0;  // of the row that this lane stores
+#pragma unroll
+  for (int r = 0; r < kBf16FewRows; ++r) {
+    const float one = sum_of_warp(sum[r][0]), two = sum_of_warp(sum[r][1]);
+    if (lane == r) first = one, second = two;
+  }
+  if (lane < kBf16FewRows && row0 + lane < job.n_row) store_pair(job, first, second, row0 + lane, column);
+}
+
+}  // namespace
+
+using Shape128 = Shape<4, 8>;
+using Shape64 = Shape<2, 4>;
+
+VLA_KERNEL(linear_bf16_128, 128, 2, LinearBf16Job) { multiply<Shape128>(job); }
+VLA_KERNEL(linear_bf16_64, 128, 4, LinearBf16Job) { multiply<Shape64>(job); }
+VLA_KERNEL(linear_bf16_few, 128, 4, LinearBf16Job) { multiply_few(job); }
+
+/// y of sums over a split depth.
+VLA_KERNEL(linear_bf16_finish, 128, 4, LinearBf16Job) {
+  const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
+  if (column >= job.n_column) return;
+  const bool has_second = column + 1 < job.n_column;
+  float first = 0, second = 0;
+  for (int z = 0; z < job.n_split; ++z) {
+    const float* from = job.partial + (static_cast<std::int64_t>(z) * job.n_row + row) * job.n_column + column;
+    first += from[0];
+    if (has_second) second += from[1];
+  }
+  finish_pair(job.end, first, second, row, column, job.n_column);
+}
+
+}  // namespace vla::cuda

@@ -1,0 +1,42 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "cuda/kernels/epilogue.h"
+#include "cuda/kernels/launch.h"
+
+/// Products of bf16 rows and a bf16 matrix with sums in float32, and the epilogue.
+namespace vla::cuda {
+
+struct LinearBf16Job {
+  const std::uint16_t* x;       // n_row rows, x_stride elements apart, a multiple of 8
+  const std::uint16_t* weight;  // n_column rows, weight_stride apart, a multiple of 8
+  std::int64_t x_stride, weight_stride;
+  int n_row, n_column, depth;  // what lies behind the depth in a row is not looked at
+  /// With more than one split, sums of a share of the depth go to partial [n_column, n_row, n_split], and
+  /// `finish_bf16_partial` adds them, in order, and makes y.
+  int n_split;
+  float* partial;
+  Epilogue end;
+};
+
+/// Rows of a block on tensor cores; few: up to kBf16FewRows in all, bound by reading the matrix once.
+enum class Bf16Shape { few, rows64, rows128 };
+constexpr int kBf16FewRows = 8;
+constexpr int kBf16Depth = 32;  // a step of the depth, the unit of a split
+
+inline Launch linear_bf16(Bf16Shape shape, const LinearBf16Job& job) {
+  const auto splits = static_cast<unsigned>(job.n_split);
+  if (shape == Bf16Shape::few)
+    return {"linear_bf16_few", {blocks(job.n_column, 8), blocks(job.n_row, kBf16FewRows), splits}, 128};
+  const unsigned size = shape == Bf16Shape::rows64 ? 64 : 128;
+  return {shape == Bf16Shape::rows64 ? "linear_bf16_64" : "linear_bf16_128",
+          {blocks(job.n_column, size), blocks(job.n_row, size), splits},
+          128,
+          4 * 2 * size * kBf16Depth * 2};
+}
+inline Launch finish_bf16_partial(const LinearBf16Job& job) {
+  return {"linear_bf16_finish", {blocks(job.n_column, 256), static_cast<unsigned>(job.n_row)}, 128};
+}
+
+}  // namespace vla::cuda

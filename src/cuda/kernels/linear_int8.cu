@@ -1,0 +1,248 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/linear_int8.h"
+
+#include "cuda/kernels/finish.h"
+#include "cuda/kernels/store_sums.h"
+
+namespace vla::cuda {
+namespace {
+
+constexpr int kDepth = Int8Tile::kDepth;
+
+/// float(sum) * (scale of the column / scale of the row). The scale of a row lies behind its codes, and the sum of
+/// them behind that.
+struct RowScale {
+  float s;
+  int sum;
+  VLA_DEVICE RowScale(const LinearInt8Job& job, int row) {
+    const std::byte* behind = job.x + row * job.x_stride + job.depth;
+    s = *reinterpret_cast<const float*>(behind), sum = *reinterpret_cast<const int*>(behind + 4);
+  }
+  VLA_DEVICE float scaled(int product, float scale) const {
+    return dev::multiply(static_cast<float>(product), dev::divide(scale, s));
+  }
+};
+
+/// Stores two sums side by side: themselves where the depth is split, else y. Of a split the first takes the offset
+/// off.
+template <CodeKind kKind>
+VLA_DEVICE void store_pair(const LinearInt8Job& job, const RowScale& of_row, int first, int second, int row,
+                           int column) {
+  const bool has_second = column + 1 < job.n_column;
+  const int offset = kKind == CodeKind::ternary && blockIdx.z == 0 ? of_row.sum : 0;
+  first -= offset, second -= offset;
+  if (job.n_split > 1) {
+    int* to = job.partial + (static_cast<std::int64_t>(blockIdx.z) * job.n_row + row) * job.n_column + column;
+    to[0] = first;
+    if (has_second) to[1] = second;
+    return;
+  }
+  finish_pair(job.end, of_row.scaled(first, job.scale[column]),
+              has_second ? of_row.scaled(second, job.scale[column + 1]) : 0, row, column, job.n_column);
+}
+
+/// Steps of the depth that block z of a split takes.
+struct Share {
+  int first, end;
+  VLA_DEVICE explicit Share(const LinearInt8Job& job) {
+    const int n_step = job.depth / kDepth, z = static_cast<int>(blockIdx.z);
+    first = n_step * z / job.n_split, end = n_step * (z + 1) / job.n_split;
+  }
+};
+
+// On tensor cores
+
+/// Four warps, two by two, of kTilesM x kTilesN products of 16 x 8 each, and kStages steps of the depth in shared
+/// memory.
+template <CodeKind kKind_, int kTilesM_, int kTilesN_>
+struct Shape {
+  static constexpr CodeKind kKind = kKind_;
+  static constexpr int kTilesM = kTilesM_, kTilesN = kTilesN_, kThreads = 128;
+  static constexpr int kStages = kKind == CodeKind::ternary ? 4 : 3;
+  static constexpr int kRows = 2 * kTilesM * 16, kColumns = 2 * kTilesN * 8;
+  static constexpr int kColumnBytes = kKind == CodeKind::ternary ? 16 : 64, kTileBytes = 32 * kColumnBytes;
+  static constexpr int kBytesX = kRows * kDepth, kBytesW = kColumns * kColumnBytes, kStage = kBytesX + kBytesW;
+};
+
+/// Place of 16 bytes of a row of x in a stage. The eight rows that a matrix is read from differ in banks.
+VLA_DEVICE int x_place(int row, int chunk) { return row * kDepth + (chunk ^ (row >> 1 & 3)) * 16; }
+
+/// Copies a step of the depth to a stage.
+template <class S>
+VLA_DEVICE void fetch(const LinearInt8Job& job, int row0, int column0, int step, std::byte* stage) {
+  const int thread = thread_index();
+#pragma unroll
+  for (int i = 0; i < S::kRows; i += S::kThreads / 4) {
+    const int row = i + thread / 4, chunk = thread % 4;
+    const bool valid = row0 + row < job.n_row;
+    const std::byte* from = job.x + (valid ? row0 + row : 0) * job.x_stride + step * kDepth + chunk * 16;
+    dev::copy_async(stage + x_place(row, chunk), from, valid ? 16 : 0);
+  }
+  const int n_tile = (job.n_column + Int8Tile::kColumns - 1) / Int8Tile::kColumns;
+#pragma unroll
+  for (int i = 0; i < S::kBytesW; i += S::kThreads * 16) {
+    const int at = i + thread * 16, tile = column0 / Int8Tile::kColumns + at / S::kTileBytes;
+    if (S::kBytesW % (S::kThreads * 16) != 0 && at >= S::kBytesW) break;
+    const bool valid = tile < n_tile;
+    const std::int64_t first =
+        (static_cast<std::int64_t>(valid ? tile : 0) * (job.depth / kDepth) + step) * S::kTileBytes;
+    dev::copy_async(stage + S::kBytesX + at, job.weight + first + at % S::kTileBytes, valid ? 16 : 0);
+  }
+}
+
+/// Multiplies a stage: two steps of 32 of the depth.
+template <class S>
+VLA_DEVICE void multiply_stage(const std::byte* stage, int warp_row, int warp_column,
+                               int (&sum)[S::kTilesM][S::kTilesN][4]) {
+  const int lane = thread_index() % kLanes;
+  const std::byte* w = stage + S::kBytesX + warp_column / 32 * S::kTileBytes + lane * 16;
+  unsigned codes[S::kTilesN][4];  // of ternary ones the first is the word of two bits, for all fragments
+#pragma unroll
+  for (int n = 0; n < S::kTilesN; n += S::kKind == CodeKind::ternary ? 4 : 1) {
+    const uint4 words = dev::read<uint4>(w + n / 4 * S::kTileBytes + n % 4 * 512);
+    if constexpr (S::kKind == CodeKind::ternary)
+      codes[n][0] = words.x, codes[n + 1][0] = words.y, codes[n + 2][0] = words.z, codes[n + 3][0] = words.w;
+    else
+      codes[n][0] = words.x, codes[n][1] = words.y, codes[n][2] = words.z, codes[n][3] = words.w;
+  }
+  const auto fragment = [&](int n, int s) {
+    return S::kKind == CodeKind::ternary ? codes[n][0] >> 2 * s & 0x03030303U : codes[n][s];
+  };
+#pragma unroll
+  for (int half = 0; half < 2; ++half) {
+    unsigned a[S::kTilesM][4];
+#pragma unroll
+    for (int m = 0; m < S::kTilesM; ++m)
+      dev::load_matrices(a[m], stage + x_place(warp_row + m * 16 + lane % 16, half * 2 + lane / 16));
+#pragma unroll
+    for (int n = 0; n < S::kTilesN; ++n) {
+      const unsigned b0 = fragment(n, half * 2), b1 = fragment(n, half * 2 + 1);
+#pragma unroll
+      for (int m = 0; m < S::kTilesM; ++m) dev::multiply_s8(sum[m][n], a[m], b0, b1);
+    }
+  }
+}
+
+template <class S>
+VLA_DEVICE void multiply(const LinearInt8Job& job) {
+  std::byte* shared = dev::shared_memory();
+  const int warp = thread_index() / kLanes;
+  const int warp_row = warp % 2 * S::kTilesM * 16, warp_column = warp / 2 * S::kTilesN * 8;
+  const int row0 = static_cast<int>(blockIdx.y) * S::kRows, column0 = static_cast<int>(blockIdx.x) * S::kColumns;
+  const Share share(job);
+
+  int sum[S::kTilesM][S::kTilesN][4] = {};
+#pragma unroll
+  for (int i = 0; i < S::kStages - 1; ++i) {
+    if (share.first + i < share.end) fetch<S>(job, row0, column0, share.first + i, shared + i * S::kStage);
+    dev::commit_copies();  // a group, even an empty one: waiting counts groups
+  }
+  int stage = 0, next = S::kStages - 1;
+  for (int step = share.first; step < share.end; ++step) {
+    dev::wait_copies<S::kStages - 2>();
+    __syncthreads();  // the stage has arrived for all threads, and all have read the one that is fetched into next
+    if (step + S::kStages - 1 < share.end)
+      fetch<S>(job, row0, column0, step + S::kStages - 1, shared + next * S::kStage);
+    dev::commit_copies();
+    multiply_stage<S>(shared + stage * S::kStage, warp_row, warp_column, sum);
+    stage = stage + 1 == S::kStages ? 0 : stage + 1;
+    next = next + 1 == S::kStages ? 0 : next + 1;
+  }
+
+  dev::wait_copies<0>();
+  __syncthreads();  // the stages become room for sums
+  store_sums(sum, shared + warp * kSumBytes<S::kTilesN>, [&](int row, int column, int first, int second) {
+    row += row0 + warp_row, column += column0 + warp_column;
+    if (row < job.n_row && column < job.n_column)
+      store_pair<S::kKind>(job, RowScale(job, row), first, second, row, column);
+  });
+}
+
+// Four bytes at a time, for few rows: bound by the matrix, which is read once
+
+constexpr int kFewRows = 4;
+
+/// A warp has a tile of columns; each lane sums a quarter of the depth for four of them.
+template <CodeKind kKind>
+VLA_DEVICE void multiply_few(const LinearInt8Job& job) {
+  constexpr int kTileBytes = kKind == CodeKind::ternary ? Int8Tile::kTernaryBytes : Int8Tile::kBytes;
+  const int lane = thread_index() % kLanes, tile = static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes;
+  const int row0 = static_cast<int>(blockIdx.y) * kFewRows;
+  if (tile * Int8Tile::kColumns >= job.n_column) return;  // the whole warp
+  const std::byte* w = job.weight + static_cast<std::int64_t>(tile) * (job.depth / kDepth) * kTileBytes + lane * 16;
+  const Share share(job);
+  int sum[kFewRows][4] = {};
+  for (int step = share.first; step < share.end; ++step) {
+    unsigned codes[4][4];
+    const auto* words = reinterpret_cast<const uint4*>(w + static_cast<std::int64_t>(step) * kTileBytes);
+    if constexpr (kKind == CodeKind::ternary) {
+      const unsigned packed[4] = {words->x, words->y, words->z, words->w};
+#pragma unroll
+      for (int i = 0; i < 16; ++i) codes[i / 4][i % 4] = packed[i / 4] >> 2 * (i % 4) & 0x03030303U;
+    } else {
+#pragma unroll
+      for (int j = 0; j < 4; ++j)
+        codes[j][0] = words[32 * j].x, codes[j][1] = words[32 * j].y, codes[j][2] = words[32 * j].z,
+        codes[j][3] = words[32 * j].w;
+    }
+#pragma unroll
+    for (int r = 0; r < kFewRows; ++r) {
+      if (row0 + r >= job.n_row) break;
+      const std::byte* x = job.x + (row0 + r) * job.x_stride + step * kDepth + lane % 4 * 4;
+#pragma unroll
+      for (int s = 0; s < 4; ++s) {
+        const unsigned four = *reinterpret_cast<const unsigned*>(x + 16 * s);
+#pragma unroll
+        for (int j = 0; j < 4; ++j) sum[r][j] = dev::dot4(four, codes[j][s], sum[r][j]);
+      }
+    }
+  }
+#pragma unroll
+  for (int r = 0; r < kFewRows; ++r) {
+    int first = 0, second = 0;  // of the four lanes that share columns each stores another pair
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      int total = sum[r][j];
+      total += dev::shuffle_xor(total, 1);
+      total += dev::shuffle_xor(total, 2);
+      const int beside = dev::shuffle_xor(total, 4);  // of the next column
+      if (lane % 4 == j) first = total, second = beside;
+    }
+    const int row = row0 + r, column = tile * Int8Tile::kColumns + lane % 4 * 8 + lane / 4;
+    if (lane % 8 < 4 && row < job.n_row && column < job.n_column)
+      store_pair<kKind>(job, RowScale(job, row), first, second, row, column);
+  }
+}
+
+}  // namespace
+
+using Ternary128 = Shape<CodeKind::ternary, 4, 8>;
+using Ternary64 = Shape<CodeKind::ternary, 2, 4>;
+using Bytes128 = Shape<CodeKind::int8, 4, 8>;
+using Bytes64 = Shape<CodeKind::int8, 2, 4>;
+
+VLA_KERNEL(linear_ternary_128, 128, 2, LinearInt8Job) { multiply<Ternary128>(job); }
+VLA_KERNEL(linear_ternary_64, 128, 4, LinearInt8Job) { multiply<Ternary64>(job); }
+VLA_KERNEL(linear_int8_128, 128, 2, LinearInt8Job) { multiply<Bytes128>(job); }
+VLA_KERNEL(linear_int8_64, 128, 4, LinearInt8Job) { multiply<Bytes64>(job); }
+VLA_KERNEL(linear_ternary_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::ternary>(job); }
+VLA_KERNEL(linear_int8_few, 128, 4, LinearInt8Job) { multiply_few<CodeKind::int8>(job); }
+
+/// y of sums over a split depth.
+VLA_KERNEL(linear_int8_finish, 128, 4, LinearInt8Job) {
+  const int row = static_cast<int>(blockIdx.y), column = (static_cast<int>(blockIdx.x) * 128 + thread_index()) * 2;
+  if (column >= job.n_column) return;
+  const bool has_second = column + 1 < job.n_column;
+  int first = 0, second = 0;
+  for (int z = 0; z < job.n_split; ++z) {
+    const int* from = job.partial + (static_cast<std::int64_t>(z) * job.n_row + row) * job.n_column + column;
+    first += from[0];
+    if (has_second) second += from[1];
+  }
+  const RowScale of_row(job, row);
+  finish_pair(job.end, of_row.scaled(first, job.scale[column]),
+              has_second ? of_row.scaled(second, job.scale[column + 1]) : 0, row, column, job.n_column);
+}
+
+}  // namespace vla::cuda

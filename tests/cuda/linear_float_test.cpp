@@ -1,0 +1,122 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <doctest/doctest.h>
+
+#include "cuda/kernels/linear_bf16.h"
+#include "cuda/kernels/linear_f32.h"
+#include "cuda/machine.h"
+#include "cuda/numbers.h"
+
+using namespace vla;
+using namespace vla::cuda;
+using namespace vla::test::cuda;
+
+namespace {
+
+struct Case {
+  int n_row, depth, n_column, n_split;
+  Activation activation = Activation::none;
+  bool has_bias = false, has_factor = false, has_gate = false, has_residual = false, is_bf16 = false;
+};
+// Fewer than a tile, and a little more; depths that end within a step and within 16 bytes; every activation and each
+// part of the epilogue.
+constexpr Case kCases[] = {
+    {1, 8, 32, 1},
+    {7, 40, 33, 1, Activation::relu, true},
+    {50, 200, 144, 1, Activation::gelu_tanh, true, false, false, true},
+    {129, 72, 130, 1, Activation::silu, true, true, true, true, true},
+    {67, 301, 70, 3, Activation::gelu_erf, true, false, false, true},
+    {16, 1000, 35, 4, Activation::relu_squared, false, true},
+};
+
+struct Operands {
+  explicit Operands(const Case& of) : c(of) {
+    Numbers numbers;
+    x = rounded_to_bf16(numbers.floats(c.n_row * c.depth));
+    weight = rounded_to_bf16(numbers.floats(c.n_column * c.depth, 1 / std::sqrt(static_cast<float>(c.depth))));
+    bias = numbers.floats(c.n_column), factor = numbers.floats(c.n_column);
+    gate = numbers.floats(c.n_row * c.n_column), residual = numbers.floats(c.n_row * c.n_column);
+  }
+
+  std::vector<double> expected() const {
+    std::vector<double> y;
+    for (int r = 0; r < c.n_row; ++r)
+      for (int n = 0; n < c.n_column; ++n) {
+        const auto column = static_cast<std::size_t>(n), at = static_cast<std::size_t>(r * c.n_column + n);
+        double sum = c.has_bias ? static_cast<double>(bias[column]) : 0;
+        for (int k = 0; k < c.depth; ++k)
+          sum += static_cast<double>(x[static_cast<std::size_t>(r * c.depth + k)]) *
+                 static_cast<double>(weight[static_cast<std::size_t>(n * c.depth + k)]);
+        sum = c.has_gate ? activated(c.activation, static_cast<double>(gate[at])) * sum : activated(c.activation, sum);
+        if (c.has_factor) sum *= static_cast<double>(factor[column]);
+        y.push_back(sum + (c.has_residual ? static_cast<double>(residual[at]) : 0));
+      }
+    return y;
+  }
+
+  Case c;
+  std::vector<float> x, weight, bias, factor, gate, residual;
+};
+
+/// Launches with the operands' epilogue; `multiply` gets it, and y's rows are two elements longer than they need be.
+template <class Multiply>
+std::vector<float> run(const Operands& of, Multiply multiply) {
+  const Case& c = of.c;
+  const Device<float> bias(of.bias), factor(of.factor), gate(of.gate), residual(of.residual);
+  const std::int64_t stride = c.n_column + 2;
+  const Device<float> y(static_cast<std::size_t>(c.n_row * stride));
+  const Device<std::uint16_t> half(static_cast<std::size_t>(c.n_row * stride));
+  multiply(Epilogue{c.has_bias ? bias.get() : nullptr, c.has_factor ? factor.get() : nullptr,
+                    c.has_gate ? gate.get() : nullptr, c.has_residual ? residual.get() : nullptr,
+                    c.is_bf16 ? static_cast<void*>(half.get()) : y.get(), stride, c.activation, c.is_bf16});
+  const std::vector<float> rows = c.is_bf16 ? widened(half.host()) : y.host();
+  std::vector<float> out;
+  for (int r = 0; r < c.n_row; ++r) {
+    const auto first = rows.begin() + r * stride;
+    out.insert(out.end(), first, first + c.n_column);
+    CHECK(std::isnan(first[c.n_column]));  // nothing is written behind a row
+  }
+  return out;
+}
+
+}  // namespace
+
+TEST_CASE("bf16 products of every shape are within 1e-6 of doubles, or a rounding of y to bf16") {
+  counts = {};
+  for (const Case& c : kCases) {
+    const Operands of(c);
+    const std::vector<double> expected = of.expected();
+    const std::int64_t stride = round_up(c.depth, 8) + 8;
+    for (Bf16Shape shape : {Bf16Shape::few, Bf16Shape::rows64, Bf16Shape::rows128}) {
+      INFO("shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
+      in_every_schedule([&] {
+        const std::vector<float> y = run(of, [&](const Epilogue& end) {
+          const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
+              weight(bf16_rows(of.weight, c.depth, stride));
+          const Device<float> partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column));
+          const LinearBf16Job job = {x.get(),    weight.get(), stride,    stride,        c.n_row,
+                                     c.n_column, c.depth,      c.n_split, partial.get(), end};
+          launch(linear_bf16(shape, job), job);
+          if (c.n_split > 1) launch(finish_bf16_partial(job), job);
+        });
+        CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : 1e-6));
+      });
+    }
+  }
+  CHECK(counts.bank_conflicts == 0);
+}
+
+TEST_CASE("float32 products are within 1e-6 of doubles") {
+  for (const Case& c : kCases) {
+    const Operands of(c);
+    INFO(c.n_row, " x ", c.depth, " x ", c.n_column);
+    in_every_schedule([&] {
+      const std::vector<float> y = run(of, [&](const Epilogue& end) {
+        const Device<float> x(of.x), weight(of.weight);
+        const LinearF32Job job = {x.get(), weight.get(), c.depth, c.n_row, c.n_column, c.depth, end};
+        launch(linear_f32(job), job);
+      });
+      CHECK(error(y, of.expected()) < (c.is_bf16 ? 4e-3 : 1e-6));
+    });
+  }
+}

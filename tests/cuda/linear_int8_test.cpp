@@ -1,0 +1,123 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/kernels/linear_int8.h"
+
+#include <doctest/doctest.h>
+
+#include <array>
+#include <random>
+
+#include "cuda/machine.h"
+
+using namespace vla;
+using namespace vla::cuda;
+using namespace vla::test::cuda;
+
+namespace {
+
+struct Case {
+  int n_row, d_in, d_out, n_split;
+  bool has_bias = false, has_residual = false;
+};
+// Fewer rows, columns and depth than a tile, and a little more; odd rows of y; more stages than there is depth.
+constexpr Case kCases[] = {{1, 48, 32, 1},          {3, 100, 80, 1, true},           {129, 144, 131, 1, true, true},
+                           {67, 430, 128, 1, true}, {130, 368, 146, 1, false, true}, {33, 700, 97, 3, true, true}};
+
+class Trial {
+ public:
+  Trial(CodeKind kind, const Case& c) : kind_(kind), c_(c) {
+    std::uniform_int_distribution<int> code(kind == CodeKind::ternary ? -1 : -127, kind == CodeKind::ternary ? 1 : 127);
+    std::uniform_int_distribution<int> any(-127, 127);
+    std::uniform_real_distribution<float> real(-2, 2);
+    const auto fill = [&](std::size_t n) {
+      std::vector<float> values(n);
+      for (float& v : values) v = real(random_);
+      return values;
+    };
+    codes_.resize(size(c.n_row, depth()));
+    row_scale_ = fill(size(c.n_row, 1)), bias_ = fill(size(c.d_out, 1)), scale_ = fill(size(c.d_out, 1));
+    residual_ = fill(size(c.n_row, c.d_out));
+    weight_.resize(size(c.d_out, c.d_in));
+    for (auto& v : weight_) v = static_cast<std::int8_t>(code(random_));
+    x_.resize(size(c.n_row, depth() + 64));
+    for (int r = 0; r < c.n_row; ++r) {
+      int sum = 0;
+      for (int k = 0; k < c.d_in; ++k) {
+        codes_[size(r, depth()) + static_cast<std::size_t>(k)] = static_cast<std::int8_t>(any(random_));
+        sum += codes_[size(r, depth()) + static_cast<std::size_t>(k)];
+      }
+      std::byte* row = &x_[size(r, depth() + 64)];
+      std::memcpy(row, &codes_[size(r, depth())], static_cast<std::size_t>(depth()));
+      std::memcpy(row + depth(), &row_scale_[static_cast<std::size_t>(r)], 4);
+      std::memcpy(row + depth() + 4, &sum, 4);
+    }
+    packed_.resize(packed_int8_size(kind, c.d_in, c.d_out));
+    pack_int8(kind, weight_.data(), c.d_in, c.d_out, packed_.data());
+  }
+
+  /// y of the kernel that `shape` names.
+  std::vector<float> run(Int8Shape shape) const {
+    const Device<std::byte> x(x_), packed(packed_);
+    const Device<float> scale(scale_), bias(bias_), residual(residual_), y(residual_.size());
+    const Device<int> partial(residual_.size() * static_cast<std::size_t>(c_.n_split));
+    LinearInt8Job job = {x.get(),  packed.get(), scale.get(), depth() + 64, c_.n_row,
+                         c_.d_out, depth(),      c_.n_split,  partial.get()};
+    job.end = {c_.has_bias ? bias.get() : nullptr,
+               nullptr,
+               nullptr,
+               c_.has_residual ? residual.get() : nullptr,
+               y.get(),
+               c_.d_out,
+               Activation::none,
+               false};
+    launch(linear_int8(kind_, shape, job), job);
+    if (c_.n_split > 1) launch(finish_int8_partial(job), job);
+    return y.host();
+  }
+
+  /// The same a rounding at a time.
+  std::vector<float> expected() const {
+    std::vector<float> y;
+    for (int r = 0; r < c_.n_row; ++r)
+      for (int n = 0; n < c_.d_out; ++n) {
+        int sum = 0;
+        for (int k = 0; k < c_.d_in; ++k)
+          sum += codes_[size(r, depth()) + static_cast<std::size_t>(k)] *
+                 weight_[size(n, c_.d_in) + static_cast<std::size_t>(k)];
+        const float step = scale_[static_cast<std::size_t>(n)] / row_scale_[static_cast<std::size_t>(r)];
+        float value = static_cast<float>(sum) * step;
+        if (c_.has_bias) value += bias_[static_cast<std::size_t>(n)];
+        if (c_.has_residual) value += residual_[size(r, c_.d_out) + static_cast<std::size_t>(n)];
+        y.push_back(value);
+      }
+    return y;
+  }
+
+ private:
+  static std::size_t size(std::int64_t rows, std::int64_t columns) { return static_cast<std::size_t>(rows * columns); }
+  int depth() const { return static_cast<int>(round_up(c_.d_in, Int8Tile::kDepth)); }
+
+  std::mt19937 random_{3};
+  CodeKind kind_;
+  Case c_;
+  std::vector<std::int8_t> codes_, weight_;
+  std::vector<std::byte> x_, packed_;
+  std::vector<float> row_scale_, scale_, bias_, residual_;
+};
+
+}  // namespace
+
+TEST_CASE("int8 products of every shape are equal to whole numbers and single roundings, bit for bit") {
+  counts = {};
+  for (CodeKind kind : {CodeKind::ternary, CodeKind::int8})
+    for (const Case& c : kCases) {
+      const Trial trial(kind, c);
+      const std::vector<float> expected = trial.expected();
+      for (Int8Shape shape : {Int8Shape::few, Int8Shape::rows64, Int8Shape::rows128}) {
+        INFO("kind ", static_cast<int>(kind), ", shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.d_in, " x ",
+             c.d_out);
+        in_every_schedule([&] { CHECK(trial.run(shape) == expected); });
+      }
+    }
+  CHECK(counts.bank_conflicts == 0);
+}
