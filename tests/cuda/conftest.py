@@ -1,0 +1,32 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels as nvcc makes them, run by the emulated machine of test_cuda. Where there is no nvcc, all of it skips."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+import cuda_kernels  # noqa: E402
+
+
+def run_tests(modules, *options):
+    """(exit code, output) of test_cuda with these files of PTX in the place of the host compiler's kernels."""
+    environment = {**os.environ, "VLA_CUDA_PTX": ":".join(str(module) for module in modules)}
+    process = subprocess.run(
+        [os.environ["VLA_TEST_CUDA"], *options], env=environment, capture_output=True, text=True, timeout=600
+    )
+    return process.returncode, process.stdout + process.stderr
+
+
+@pytest.fixture(scope="session")
+def ptx(tmp_path_factory):
+    """Every kernel as PTX."""
+    if not cuda_kernels.tool("nvcc"):
+        pytest.skip("no nvcc: `make test` downloads it")
+    return cuda_kernels.compile_all(tmp_path_factory.mktemp("ptx"))

@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Mistakes made in kernels, one at a time: the tests must see each. A kernel is compiled with the mistake to PTX, which
+also shows those in assembly, and runs in the place of the right one."""
+
+import os
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+
+import cuda_kernels
+from conftest import run_tests
+
+# File with the mistake, kernel to compile, what is there, what is there instead.
+MISTAKES = {
+    # Products of codes.
+    "no barrier before a stage is read": (
+        "linear_int8.cu",
+        "linear_int8",
+        "    __syncthreads();  // the stage has",
+        "    // the stage has",
+    ),
+    "barrier before the wait": (
+        "linear_int8.cu",
+        "linear_int8",
+        "    dev::wait_copies<S::kStages - 2>();\n    __syncthreads();",
+        "    __syncthreads();\n    dev::wait_copies<S::kStages - 2>();",
+    ),
+    "waits for a group too few": (
+        "linear_int8.cu",
+        "linear_int8",
+        "wait_copies<S::kStages - 2>",
+        "wait_copies<S::kStages - 1>",
+    ),
+    "no group where nothing is fetched": (
+        "linear_int8.cu",
+        "linear_int8",
+        "shared + next * S::kStage);\n    dev::commit_copies();",
+        "shared + next * S::kStage), dev::commit_copies();",
+    ),
+    "fetches into the stage that is read": (
+        "linear_int8.cu",
+        "linear_int8",
+        "next = S::kStages - 1;",
+        "next = S::kStages - 2;",
+    ),
+    "halves of the depth swapped": (
+        "linear_int8.cu",
+        "linear_int8",
+        "half * 2 + lane / 16)",
+        "(1 - half) * 2 + lane / 16)",
+    ),
+    "fragments of codes swapped": (
+        "linear_int8.cu",
+        "linear_int8",
+        "codes[n][0] >> 2 * s &",
+        "codes[n][0] >> 2 * (s ^ 1) &",
+    ),
+    "rows of fragments in another order": (
+        "linear_int8.cu",
+        "linear_int8",
+        "m * 16 + lane % 16,",
+        "m * 16 + (lane % 16 ^ 8),",
+    ),
+    "no swizzle, which is slow": ("linear_int8.cu", "linear_int8", "(chunk ^ (row >> 1 & 3)) * 16", "chunk * 16"),
+    "rows behind the last are copied": (
+        "linear_int8.cu",
+        "linear_int8",
+        "const bool valid = row0 + row < job.n_row;",
+        "const bool valid = true;",
+    ),
+    "columns behind the last are copied": (
+        "linear_int8.cu",
+        "linear_int8",
+        "const bool valid = tile < n_tile;",
+        "const bool valid = true;",
+    ),
+    "the offset of codes stays": (
+        "linear_int8.cu",
+        "linear_int8",
+        "first -= offset, second -= offset;",
+        "first -= offset;",
+    ),
+    "the offset comes off each split": (
+        "linear_int8.cu",
+        "linear_int8",
+        "kKind == CodeKind::ternary && blockIdx.z == 0 ?",
+        "kKind == CodeKind::ternary ?",
+    ),
+    "scales multiplied in another order": (
+        "linear_int8.cu",
+        "linear_int8",
+        "dev::multiply(static_cast<float>(product), dev::divide(scale, s))",
+        "dev::divide(dev::multiply(static_cast<float>(product), scale), s)",
+    ),
+    "a split too short": (
+        "linear_int8.cu",
+        "linear_int8",
+        "end = n_step * (z + 1) / job.n_split",
+        "end = n_step / job.n_split * (z + 1)",
+    ),
+    "some lanes shuffle": (
+        "linear_int8.cu",
+        "linear_int8",
+        "total += dev::shuffle_xor(total, 2);",
+        "if (lane < 16) total += dev::shuffle_xor(total, 2);",
+    ),
+    "no barrier before stages become room": (
+        "linear_int8.cu",
+        "linear_int8",
+        "  __syncthreads();  // the stages become",
+        "  // the stages become",
+    ),
+    "sums pass without waiting for lanes": (
+        "store_sums.h",
+        "linear_int8",
+        "    __syncwarp();\n#pragma unroll 1",
+        "#pragma unroll 1",
+    ),
+    "product and sum in one rounding": (
+        "finish.h",
+        "linear_int8",
+        "sum = dev::add(sum, e.bias[column]);",
+        "sum += e.bias[column] * 1.0000001f;",
+    ),
+    "columns behind the last are written": (
+        "finish.h",
+        "linear_int8",
+        "const bool has_second = column + 1 < n_column;",
+        "const bool has_second = true;",
+    ),
+    # Products of floats.
+    "zeros are not filled in": ("device.h", "linear_bf16", '[%0], [%1], 16, %2;"', '[%0], [%1], 16, 16;"'),
+    "registers of b swapped": (
+        "device.h",
+        "linear_bf16",
+        '"r"(b0), "r"(b1));\n}\n/// sum + the',
+        '"r"(b1), "r"(b0));\n}\n/// sum + the',
+    ),
+    "halves of a bf16 pair swapped": ("device.h", "linear_bf16", '"f"(high), "f"(low)', '"f"(low), "f"(high)'),
+    "depth ends a step too late": (
+        "linear_bf16.cu",
+        "linear_bf16",
+        "const int left = (depth - k) * 2,",
+        "const int left = 16,",
+    ),
+    "depth of few rows ends too late": ("linear_bf16.cu", "linear_bf16", "k + i < end ?", "true ?"),
+    "columns of two tiles swapped": (
+        "linear_bf16.cu",
+        "linear_bf16",
+        "lane / 16 * 8 + lane % 8, half",
+        "(1 - lane / 16) * 8 + lane % 8, half",
+    ),
+    "a split is added twice": (
+        "linear_bf16.cu",
+        "linear_bf16",
+        "for (int z = 0; z < job.n_split; ++z)",
+        "for (int z = -1; z < job.n_split; ++z)",
+    ),
+    "the gate is not activated": ("finish.h", "linear_bf16", "activate(e.activation, e.gate[at])", "e.gate[at]"),
+    "the factor comes after the residual": (
+        "finish.h",
+        "linear_bf16",
+        "return e.residual ? dev::add(sum, e.residual[at]) : sum;",
+        "return e.residual ? dev::add(sum, e.residual[at]) * (e.factor ? e.factor[column] : 1) : sum;",
+    ),
+    "no barrier before x is written again": (
+        "linear_f32.cu",
+        "linear_f32",
+        "    __syncthreads();  // all have read",
+        "    // all have read",
+    ),
+    "a row of float32 too far": (
+        "linear_f32.cu",
+        "linear_f32",
+        "row0 + row < n_row && k0 + k < depth;",
+        "row0 + row <= n_row && k0 + k < depth;",
+    ),
+    # Attention.
+    "values are not transposed": ("device.h", "attention", "x4.trans.shared", "x4.shared"),
+    "no barrier before keys are fetched again": (
+        "attention.cu",
+        "attention",
+        "    __syncthreads();  // all have read the stage",
+        "    // all have read the stage",
+    ),
+    "what was summed does not shrink": (
+        "attention.cu",
+        "attention",
+        "y[n][2 * h] *= factor, y[n][2 * h + 1] *= factor;",
+        "y[n][2 * h] *= factor;",
+    ),
+    "keys behind the last count": ("attention.cu", "attention", "if (n_valid < S::kKeys)", "if (false)"),
+    "the mask of another segment": (
+        "attention.cu",
+        "attention",
+        "first_key = tile.before + tile.first;",
+        "first_key = tile.first;",
+    ),
+    "heads of another group": (
+        "attention.cu",
+        "attention",
+        "unit.head_kv * job.group() + row % job.group()",
+        "unit.head_kv + row % job.group() * job.n_head_kv",
+    ),
+    "the sum of weights of one lane": (
+        "attention.cu",
+        "attention",
+        "    total[h] += dev::shuffle_xor(total[h], 1);\n",
+        "",
+    ),
+    "shares of the keys are not weighed": (
+        "attention.cu",
+        "attention",
+        "sum += partial[i] * weight_of(partial[job.d_head], most);",
+        "sum += partial[i];",
+    ),
+    "keys of a batch": (
+        "attention.cu",
+        "attention",
+        "unit.head_kv, tile.first + row, unit.batch",
+        "unit.head_kv, tile.first + row, 0",
+    ),
+    # Rows and elements.
+    "no barrier before partial sums are read": ("device.h", "rows", "of_warp);\n  __syncthreads();", "of_warp);"),
+    "no barrier before partial sums are written again": (
+        "rows.cu",
+        "rows",
+        "  __syncthreads();  // the room may",
+        "  // the room may",
+    ),
+    "codes rounded half away from zero": (
+        "rows.cu",
+        "rows",
+        "dev::add(dev::multiply(value(i + b), s), kRound)",
+        "dev::add(floorf(dev::multiply(value(i + b), s) + 0.5f), kRound)",
+    ),
+    "127 / a in one rounding": (
+        "rows.cu",
+        "rows",
+        "dev::multiply(dev::divide(1.0f, a < 1e-5f ? 1e-5f : a), 127.0f)",
+        "dev::divide(127.0f, a < 1e-5f ? 1e-5f : a)",
+    ),
+    "a layer norm without the mean": ("rows.cu", "rows", "if (job.norm == RowNorm::layer) mean =", "if (false) mean ="),
+    "eps outside of the root": (
+        "rows.cu",
+        "rows",
+        "sqrtf(sum_of_block(squares, room) / static_cast<float>(n) + job.eps)",
+        "(sqrtf(sum_of_block(squares, room) / static_cast<float>(n)) + 100 * job.eps)",
+    ),
+    "heads turn the other way": ("rows.cu", "rows", "low * cosine - high * sine", "low * cosine + high * sine"),
+    "the table's row of another token": (
+        "rows.cu",
+        "rows",
+        "job.table[token * job.d_head + i]",
+        "job.table[head * job.d_head + i]",
+    ),
+    "an id outside of the table": ("rows.cu", "rows", "id >= 0 && id < job.n_table;", "id < job.n_table;"),
+    "steps of another operand": ("map.cu", "map", "b += i * job.b_step[d]", "b += i * job.a_step[d]"),
+    "elements behind the last": ("map.cu", "map", "if (rest >= n) return;", ""),
+}
+TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*",
+         "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*"}  # fmt: skip
+
+
+def outcome(name, ptx, folder):
+    """What the tests say of a mistake: nothing where they do not see it."""
+    file, kernel, old, new = MISTAKES[name]
+    sources = folder / "src"
+    shutil.copytree(cuda_kernels.SOURCES / "cuda/kernels", sources / "cuda/kernels")
+    shutil.copytree(cuda_kernels.SOURCES / "base", sources / "base")
+    place = sources / "cuda/kernels" / file
+    text = place.read_text()
+    assert text.count(old) >= 1, f"{name}: {file} has no {old!r}"
+    place.write_text(text.replace(old, new))
+    module = cuda_kernels.compile_ptx(sources / f"cuda/kernels/{kernel}.cu", folder, sources, warnings=())
+    others = [one for one in ptx if one.stem != kernel]
+    code, output = run_tests([module, *others], f"--source-file={TESTS[kernel]}", "--abort-after=1")
+    shutil.rmtree(folder)
+    return output if code else ""
+
+
+def test_every_mistake_in_a_kernel_is_seen(ptx, tmp_path):
+    names = list(MISTAKES)[:: 1 if os.environ.get("VLA_ALL_MISTAKES") else 2]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        seen = dict(zip(names, pool.map(lambda name: outcome(name, ptx, tmp_path / str(names.index(name))), names)))
+    for name, output in seen.items():
+        said = [line for line in output.splitlines() if "ERROR" in line or "FATAL" in line]
+        print(f"{name}: {said[0][:200] if said else output[-200:] if output else 'NOT SEEN'}")
+    assert [name for name, output in seen.items() if not output] == []

@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""What nvcc makes of the kernels: run as PTX, and assembled for every architecture."""
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import cuda_kernels
+import pytest
+from conftest import run_tests
+
+# Tensor instructions of a step of the main loop, on every architecture. The warp has 64 x 64 sums in the shapes of 128,
+# 32 x 32 in those of 64, in products of 16 x 8; attention has 16 rows, and 64 keys or 32 of them for heads of 256.
+MAIN_LOOPS = {
+    "linear_ternary_128": ("IMMA.16832.S8.S8", 64),
+    "linear_ternary_64": ("IMMA.16832.S8.S8", 16),
+    "linear_int8_128": ("IMMA.16832.S8.S8", 64),
+    "linear_int8_64": ("IMMA.16832.S8.S8", 16),
+    "linear_bf16_128": ("HMMA.16816.F32.BF16", 64),
+    "linear_bf16_64": ("HMMA.16816.F32.BF16", 16),
+    "attention_bf16_64": ("HMMA.16816.F32.BF16", 64),
+    "attention_bf16_80": ("HMMA.16816.F32.BF16", 80),
+    "attention_bf16_128": ("HMMA.16816.F32.BF16", 128),
+    "attention_bf16_256": ("HMMA.16816.F32.BF16", 128),
+}
+TWO_BLOCKS = {name for name in MAIN_LOOPS if name.startswith("linear")} | {"attention_bf16_64"}
+
+
+def test_kernels_pass_their_tests_as_ptx(ptx):
+    code, output = run_tests(ptx)
+    assert code == 0, output
+
+
+def test_the_oldest_driver_of_jetpack_6_would_take_the_ptx(ptx, tmp_path):
+    """CUDA 12.6, whose PTX is version 8.5."""
+    for module in ptx:
+        older = tmp_path / module.name
+        older.write_text(re.sub(r"^\.version .*", ".version 8.5", module.read_text(), flags=re.M))
+        cuda_kernels.assemble(older, 80, tmp_path)
+
+
+@pytest.fixture(scope="session")
+def machine_code(ptx, tmp_path_factory):
+    """{(architecture, kernel): (resources, counts of the main loop)}."""
+    out = tmp_path_factory.mktemp("cubins")
+
+    def of(job):
+        sm, module = job
+        return [((sm, name), (used, loop)) for name, used, loop in cuda_kernels.report([module], sm, out)]
+
+    with ThreadPoolExecutor(2) as pool:
+        return dict(
+            one
+            for part in pool.map(of, [(sm, module) for sm in cuda_kernels.ARCHITECTURES for module in ptx])
+            for one in part
+        )
+
+
+def test_no_kernel_of_any_architecture_spills(machine_code):
+    for (sm, name), (used, _) in sorted(machine_code.items()):
+        print(
+            f"sm_{sm} {name}: {used['registers']} registers, {used['spills']} bytes spilled, {used['shared']} bytes of shared memory"
+        )
+    assert not [key for key, (used, _) in machine_code.items() if used["spills"]]
+
+
+def test_two_blocks_of_a_product_fit_the_registers_of_an_sm(machine_code):
+    for (sm, name), (used, _) in machine_code.items():
+        if name in TWO_BLOCKS:
+            assert 2 * 128 * -(-used["registers"] // 8) * 8 <= 65536, (sm, name)
+
+
+def test_main_loops_have_the_tensor_instructions_that_they_need(machine_code):
+    if not cuda_kernels.tool("nvdisasm"):
+        pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
+    for (sm, name), (_, loop) in machine_code.items():
+        tensor = {op: n for op, n in loop.items() if op.startswith(cuda_kernels.TENSOR)}
+        assert tensor == (dict([MAIN_LOOPS[name]]) if name in MAIN_LOOPS else {}), (sm, name)
+
+
+def test_ternary_products_leave_half_of_the_tensor_time_to_spare(machine_code):
+    """By published rates: other units need at most half of it on AGX Orin and on an RTX 3060."""
+    if not cuda_kernels.tool("nvdisasm"):
+        pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
+    for sm in (87, 86):
+        shares = cuda_kernels.shares(machine_code[sm, "linear_ternary_128"][1], sm)
+        print(sm, shares)
+        assert max(shares.values()) <= 0.5
