@@ -69,11 +69,12 @@ def run(command):
 
 
 def compile_ptx(source, out, sources=SOURCES, warnings=("-Werror", "all-warnings")):
-    """PTX for any GPU from Ampere on."""
+    """PTX for any GPU from Ampere on, and for drivers from CUDA 12.6 on (JetPack 6), whose PTX is version 8.5."""
     target = Path(out) / f"{source.stem}.ptx"
     run(
         [tool("nvcc"), "-std=c++20", "-O3", *warnings, "-arch=compute_80", f"-I{sources}", "-ptx", source, "-o", target]
     )
+    target.write_text(re.sub(r"^\.version .*", ".version 8.5", target.read_text(), flags=re.M))
     return target
 
 

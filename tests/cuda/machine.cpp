@@ -8,22 +8,29 @@
 #include <sstream>
 
 #include "cuda/emulation.h"
+#include "cuda/fake_driver.h"
 #include "cuda/fault.h"
 #include "cuda/ptx.h"
 
 namespace vla::test::cuda {
 namespace {
 
+std::vector<std::string> texts() {
+  std::vector<std::string> all;
+  const char* files = std::getenv("VLA_CUDA_PTX");
+  std::istringstream names(files == nullptr ? "" : files);
+  for (std::string name; std::getline(names, name, ':');) {
+    std::ifstream in(name);
+    if (!in) throw Fault("cannot read " + name);
+    all.emplace_back(std::istreambuf_iterator<char>(in), std::istreambuf_iterator<char>());
+  }
+  return all;
+}
+
 const std::vector<PtxModule>& modules() {
   static const std::vector<PtxModule> all = [] {
     std::vector<PtxModule> loaded;
-    const char* files = std::getenv("VLA_CUDA_PTX");
-    std::istringstream names(files == nullptr ? "" : files);
-    for (std::string name; std::getline(names, name, ':');) {
-      std::ifstream in(name);
-      if (!in) throw Fault("cannot read " + name);
-      loaded.emplace_back(std::string(std::istreambuf_iterator<char>(in), {}));
-    }
+    for (const std::string& text : texts()) loaded.emplace_back(text);
     return loaded;
   }();
   return all;
@@ -32,6 +39,7 @@ const std::vector<PtxModule>& modules() {
 }  // namespace
 
 bool runs_ptx() { return !modules().empty(); }
+std::vector<std::string> modules_of_tests() { return runs_ptx() ? texts() : std::vector<std::string>{kHostModule}; }
 
 void launch(const vla::cuda::Launch& how, const void* job, std::size_t job_size) {
   const std::string name = how.kernel;

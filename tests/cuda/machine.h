@@ -24,6 +24,9 @@ void launch(const vla::cuda::Launch& how, const Job& job) {
 /// Whether kernels run as PTX: where VLA_CUDA_PTX names files, FILE:FILE.
 bool runs_ptx();
 
+/// The files of VLA_CUDA_PTX as texts, or what the fake driver knows the host's kernels by.
+std::vector<std::string> modules_of_tests();
+
 /// Values in device memory.
 template <class T>
 class Device {

@@ -31,12 +31,9 @@ def test_kernels_pass_their_tests_as_ptx(ptx):
     assert code == 0, output
 
 
-def test_the_oldest_driver_of_jetpack_6_would_take_the_ptx(ptx, tmp_path):
-    """CUDA 12.6, whose PTX is version 8.5."""
-    for module in ptx:
-        older = tmp_path / module.name
-        older.write_text(re.sub(r"^\.version .*", ".version 8.5", module.read_text(), flags=re.M))
-        cuda_kernels.assemble(older, 80, tmp_path)
+def test_the_ptx_is_of_a_version_that_jetpack_6_takes(ptx):
+    """CUDA 12.6, whose PTX is version 8.5; what is assembled below is the same text."""
+    assert all(re.search(r"^\.version 8\.5$", module.read_text(), re.M) for module in ptx)
 
 
 @pytest.fixture(scope="session")

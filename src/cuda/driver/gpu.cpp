@@ -1,0 +1,164 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/driver/gpu.h"
+
+namespace vla::cuda {
+namespace {
+
+// Values of CUDA Driver API 13.0.
+constexpr int kOutOfMemory = 2, kNotFound = 500;
+constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kMaxDynamicShared = 8;
+constexpr unsigned kNonBlocking = 1, kNoTiming = 2, kFreeShared = 48 << 10;
+constexpr int kThreadLocal = 1;
+
+std::string version_text(int version) {
+  return std::to_string(version / 1000) + "." + std::to_string(version % 1000 / 10);
+}
+
+}  // namespace
+
+#define CALL(name, ...) check(#name, driver_.name(__VA_ARGS__))
+
+Status Gpu::check(const char* call, int result) const {
+  if (result == 0) return {};
+  const char *name = nullptr, *text = nullptr;
+  driver_.error_name(result, &name), driver_.error_text(result, &text);
+  return Error{result == kOutOfMemory ? Code::out_of_memory : Code::device, std::string("cuda ") + call, "",
+               (name ? name : "error " + std::to_string(result)) + (text ? std::string(", ") + text : "")};
+}
+
+Result<Owned> Gpu::own(const char* call, int result, Handle handle, Owned::Release release) const {
+  VLA_CHECK(check(call, result));
+  return Owned(handle, release);
+}
+
+Result<std::unique_ptr<Gpu>> Gpu::open(const Driver& driver, int device, const std::vector<std::string>& modules) {
+  std::unique_ptr<Gpu> gpu(new Gpu(driver));
+  VLA_CHECK(gpu->start(device, modules));
+  return gpu;
+}
+
+Status Gpu::start(int device, const std::vector<std::string>& modules) {
+  VLA_CHECK(CALL(init, 0));
+  int version = 0, n_device = 0, major = 0, minor = 0;
+  VLA_CHECK(CALL(driver_version, &version));
+  if (version < kMinDriver)
+    return Error{Code::device, "cuda", "a driver for CUDA " + version_text(kMinDriver) + " or newer",
+                 "one for CUDA " + version_text(version)};
+  VLA_CHECK(CALL(device_count, &n_device));
+  if (device < 0 || device >= n_device)
+    return Error{Code::device, "cuda:" + std::to_string(device), "a device below " + std::to_string(n_device),
+                 "none of this number"};
+  VLA_CHECK(CALL(device_get, &device_, device));
+  VLA_CHECK(CALL(device_attribute, &major, kCapabilityMajor, device_));
+  VLA_CHECK(CALL(device_attribute, &minor, kCapabilityMinor, device_));
+  if (major * 10 + minor < kMinCapability)
+    return Error{Code::device, "cuda:" + std::to_string(device), "compute capability 8.0 or newer (Ampere)",
+                 std::to_string(major) + "." + std::to_string(minor)};
+  Handle context = nullptr;
+  VLA_CHECK(CALL(context_retain, &context, device_));
+  has_context_ = true;
+  VLA_CHECK(CALL(context_use, context));
+  for (const std::string& text : modules) {
+    Handle module = nullptr;
+    const int result = driver_.module_load(&module, text.c_str(), 0, nullptr, nullptr);
+    VLA_TRY(Owned loaded, own("module_load", result, module, driver_.module_unload));
+    modules_.push_back(std::move(loaded));
+  }
+  return {};
+}
+
+Gpu::~Gpu() {
+  modules_.clear();
+  if (has_context_) driver_.context_release(device_);
+}
+
+Result<Buffer> Gpu::allocate(std::size_t size, const std::string& what) {
+  Address address = 0;
+  const int result = driver_.allocate(&address, size);
+  if (result == kOutOfMemory) {
+    std::size_t free = 0, total = 0;
+    VLA_CHECK(CALL(memory_info, &free, &total));
+    return Error{Code::out_of_memory, what, std::to_string(size) + " bytes of device memory",
+                 std::to_string(free) + " free"};
+  }
+  VLA_CHECK(check("allocate", result));
+  return Buffer(driver_, address, size);
+}
+
+Result<Owned> Gpu::allocate_host(std::size_t size) {
+  void* memory = nullptr;
+  const int result = driver_.host_allocate(&memory, size, 0);
+  return own("host_allocate", result, memory, driver_.host_release);
+}
+
+Result<Stream> Gpu::stream() {
+  Handle stream = nullptr, event = nullptr;
+  const int made = driver_.stream_create(&stream, kNonBlocking);
+  VLA_TRY(Owned owned, own("stream_create", made, stream, driver_.stream_destroy));
+  const int made_event = driver_.event_create(&event, kNoTiming);
+  VLA_TRY(Owned owned_event, own("event_create", made_event, event, driver_.event_destroy));
+  return Stream(*this, std::move(owned), std::move(owned_event));
+}
+
+/// The function of a kernel, which is allowed the shared memory that the launch asks for.
+Result<Handle> Gpu::kernel(const Launch& how) {
+  const auto [found, is_new] = functions_.try_emplace(how.kernel, Function{nullptr, kFreeShared});
+  Function& function = found->second;
+  for (std::size_t i = 0; i < modules_.size() && function.handle == nullptr; ++i) {
+    const int result = driver_.module_function(&function.handle, modules_[i].get(), how.kernel);
+    if (result == kNotFound) function.handle = nullptr;
+    if (result != 0 && result != kNotFound) {
+      functions_.erase(found);
+      VLA_CHECK(check("module_function", result));
+    }
+  }
+  if (function.handle == nullptr) {
+    functions_.erase(found);
+    return Error{Code::internal, how.kernel, "a kernel of a loaded module", "none"};
+  }
+  if (how.shared > function.shared) {
+    VLA_CHECK(CALL(function_attribute, function.handle, kMaxDynamicShared, static_cast<int>(how.shared)));
+    function.shared = how.shared;
+  }
+  return function.handle;
+}
+
+#undef CALL
+#define CALL(name, ...) gpu_->check(#name, gpu_->driver_.name(__VA_ARGS__))
+
+Status Stream::upload(Address to, const void* from, std::size_t size) {
+  return CALL(upload, to, from, size, stream_.get());
+}
+Status Stream::download(void* to, Address from, std::size_t size) {
+  return CALL(download, to, from, size, stream_.get());
+}
+Status Stream::wait() { return CALL(stream_wait, stream_.get()); }
+
+Status Stream::after(Stream& other) {
+  VLA_CHECK(CALL(event_record, other.event_.get(), other.stream_.get()));
+  return CALL(stream_wait_event, stream_.get(), other.event_.get(), 0);
+}
+
+Status Stream::launch_job(const Launch& how, const void* job) {
+  VLA_TRY(Handle function, gpu_->kernel(how));
+  void* parameters[] = {const_cast<void*>(job)};  // the driver copies what it points at
+  return CALL(launch, function, how.grid.x, how.grid.y, how.grid.z, how.n_thread, 1, 1, how.shared, stream_.get(),
+              parameters, nullptr);
+}
+
+Status Stream::begin_capture() { return CALL(capture_begin, stream_.get(), kThreadLocal); }
+
+Result<Owned> Stream::end_capture() {
+  Handle graph = nullptr, executable = nullptr;
+  const int ended = gpu_->driver_.capture_end(stream_.get(), &graph);
+  VLA_TRY(const Owned recorded, gpu_->own("capture_end", ended, graph, gpu_->driver_.graph_destroy));
+  const int made = gpu_->driver_.graph_instantiate(&executable, recorded.get(), 0);
+  return gpu_->own("graph_instantiate", made, executable, gpu_->driver_.executable_destroy);
+}
+
+Status Stream::launch(const Owned& graph) { return CALL(graph_launch, graph.get(), stream_.get()); }
+
+#undef CALL
+
+}  // namespace vla::cuda

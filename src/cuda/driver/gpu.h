@@ -1,0 +1,123 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "cuda/driver/driver.h"
+#include "cuda/kernels/launch.h"
+
+/// A device and what it holds. Every failure of the driver is a typed Error that names the call: out_of_memory where
+/// the driver says so, else device. Nothing is released twice, and failures while releasing are passed over.
+namespace vla::cuda {
+
+/// Something of the driver's that ends with this object.
+class Owned {
+ public:
+  using Release = int (*)(Handle);
+  Owned() = default;
+  Owned(Handle handle, Release release) : held_(handle, release) {}
+  Handle get() const { return held_.get(); }
+
+ private:
+  std::unique_ptr<void, Release> held_ = {nullptr, nullptr};
+};
+
+/// Device memory.
+class Buffer {
+ public:
+  Buffer(const Driver& driver, Address address, std::size_t size) : driver_(&driver), address_(address), size_(size) {}
+  Buffer(Buffer&& other) noexcept : driver_(other.driver_), address_(other.address_), size_(other.size_) {
+    other.address_ = 0;
+  }
+  Buffer& operator=(Buffer&&) = delete;
+  ~Buffer() {
+    if (address_ != 0) driver_->release(address_);
+  }
+  /// As kernels' jobs take it; the host must not follow it.
+  template <class T>
+  T* as(std::size_t offset = 0) const {
+    return reinterpret_cast<T*>(address_ + offset);
+  }
+  Address address() const { return address_; }
+  std::size_t size() const { return size_; }
+
+ private:
+  const Driver* driver_;
+  Address address_;
+  std::size_t size_;
+};
+
+class Gpu;
+
+/// Operations in order. Between streams only events order them.
+class Stream {
+ public:
+  /// Host memory must stay until the stream was waited for.
+  Status upload(Address to, const void* from, std::size_t size);
+  Status download(void* to, Address from, std::size_t size);
+  template <class Job>
+  Status launch(const Launch& how, const Job& job) {
+    return launch_job(how, &job);
+  }
+  /// Until all operations are done.
+  Status wait();
+  /// What comes next begins when all that is in `other` has ended.
+  Status after(Stream& other);
+
+  /// Operations, also of streams that come after this one, become a graph instead of running; those must be waited for
+  /// with after() before the end.
+  Status begin_capture();
+  /// The graph, as it is launched.
+  Result<Owned> end_capture();
+  Status launch(const Owned& graph);
+
+ private:
+  friend class Gpu;
+  Stream(Gpu& gpu, Owned stream, Owned event) : gpu_(&gpu), stream_(std::move(stream)), event_(std::move(event)) {}
+  Status launch_job(const Launch& how, const void* job);
+
+  Gpu* gpu_;
+  Owned stream_, event_;
+};
+
+class Gpu {
+ public:
+  /// Driver version and compute capability that our kernels need.
+  static constexpr int kMinDriver = 12060, kMinCapability = 80;
+
+  /// Takes the device's context for the calling thread and loads the modules, texts of PTX.
+  static Result<std::unique_ptr<Gpu>> open(const Driver& driver, int device, const std::vector<std::string>& modules);
+  Gpu(const Gpu&) = delete;
+  ~Gpu();
+
+  /// out_of_memory with both sizes where less is free.
+  Result<Buffer> allocate(std::size_t size, const std::string& what);
+  /// Memory of the host that the device reads and writes without the processor.
+  Result<Owned> allocate_host(std::size_t size);
+  Result<Stream> stream();
+
+ private:
+  friend class Stream;
+  explicit Gpu(const Driver& driver) : driver_(driver) {}
+  Status start(int device, const std::vector<std::string>& modules);
+  Result<Handle> kernel(const Launch& how);
+  Status check(const char* call, int result) const;
+  /// Checks a call that made a handle.
+  Result<Owned> own(const char* call, int result, Handle handle, Owned::Release release) const;
+
+  Driver driver_;
+  int device_ = -1;
+  bool has_context_ = false;
+  std::vector<Owned> modules_;
+  struct Function {
+    Handle handle;
+    unsigned shared;  // bytes that it is allowed
+  };
+  std::map<std::string, Function> functions_;
+};
+
+}  // namespace vla::cuda

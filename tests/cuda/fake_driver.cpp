@@ -1,0 +1,381 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cuda/fake_driver.h"
+
+#include <algorithm>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <random>
+#include <set>
+#include <vector>
+
+#include "cuda/emulation.h"
+#include "cuda/fault.h"
+#include "cuda/machine.h"
+#include "cuda/ptx.h"
+
+namespace vla::test::cuda {
+namespace {
+
+using vla::cuda::Address;
+using vla::cuda::Handle;
+
+/// Something that is done after what it depends on: places of nodes in the same list.
+struct Node {
+  std::function<void()> run;
+  std::vector<std::size_t> after;
+};
+using Nodes = std::vector<Node>;
+
+struct Module {
+  std::shared_ptr<const PtxModule> ptx;  // null: the host's
+};
+struct Function {
+  const PtxKernel* ptx = nullptr;
+  const Entry* entry = nullptr;
+  unsigned max_shared = 48 << 10;
+};
+/// The nodes that what comes next in a stream comes after.
+struct Stream {
+  std::vector<std::size_t> last;
+  bool captures = false, begins_capture = false;
+};
+struct Event {
+  std::vector<std::size_t> nodes;
+  bool captured = false;
+};
+
+struct State {
+  FakeDriver driver;
+  bool is_lost = false;
+  bool has_context = false;
+  std::map<Address, std::size_t> memory;
+  std::map<Handle, std::unique_ptr<Stream>> streams;
+  std::map<Handle, std::unique_ptr<Event>> events;
+  std::map<Handle, std::unique_ptr<Module>> modules;
+  std::map<Handle, std::unique_ptr<Function>> functions;
+  std::map<Handle, std::shared_ptr<Nodes>> graphs;
+  std::set<void*> host;
+  Nodes waiting, captured;
+  std::minstd_rand random;
+};
+State state;
+
+/// Nodes one after the other, in any order that their dependencies allow.
+void run_all(const Nodes& nodes) {
+  std::vector<std::size_t> n_before(nodes.size());
+  std::vector<std::vector<std::size_t>> next(nodes.size());
+  std::vector<std::size_t> ready;
+  for (std::size_t i = 0; i < nodes.size(); ++i) {
+    n_before[i] = nodes[i].after.size();
+    for (std::size_t before : nodes[i].after) next[before].push_back(i);
+    if (n_before[i] == 0) ready.push_back(i);
+  }
+  while (!ready.empty()) {
+    std::swap(ready.back(), ready[state.random() % ready.size()]);
+    const std::size_t i = ready.back();
+    ready.pop_back();
+    nodes[i].run();
+    for (std::size_t after : next[i])
+      if (--n_before[after] == 0) ready.push_back(after);
+  }
+}
+
+/// Runs everything that waits.
+int run_waiting() {
+  Nodes nodes;
+  nodes.swap(state.waiting);
+  for (auto& [handle, stream] : state.streams) stream->last.clear();
+  for (auto& [handle, event] : state.events)
+    if (!event->captured) event->nodes.clear();
+  try {
+    run_all(nodes);
+  } catch (const Fault& fault) {
+    state.driver.fault = fault.what();
+    state.is_lost = true, state.driver.failure = kLaunchFailed;
+    return kLaunchFailed;
+  }
+  return 0;
+}
+
+/// A module's text is read once.
+std::shared_ptr<const PtxModule> parsed(const std::string& text) {
+  static std::map<std::string, std::shared_ptr<const PtxModule>> all;
+  std::shared_ptr<const PtxModule>& module = all[text];
+  if (!module) module = std::make_shared<const PtxModule>(text);
+  return module;
+}
+
+template <class T>
+T* find(std::map<Handle, std::unique_ptr<T>>& all, Handle handle) {
+  const auto found = all.find(handle);
+  return found == all.end() ? nullptr : found->second.get();
+}
+template <class T>
+void give(std::map<Handle, std::unique_ptr<T>>& all, Handle* to, std::unique_ptr<T> object) {
+  *to = object.get();
+  all[*to] = std::move(object);
+  ++state.driver.n_handle;
+}
+template <class Map>
+int take_back(Map& all, Handle handle) {
+  if (all.erase(handle) == 0) return kInvalidHandle;
+  --state.driver.n_handle;
+  return 0;
+}
+
+/// An operation of a stream: recorded where it captures, else it waits.
+int enqueue(Handle handle, std::function<void()> run) {
+  Stream* stream = find(state.streams, handle);
+  if (stream == nullptr) return kInvalidHandle;
+  Nodes& nodes = stream->captures ? state.captured : state.waiting;
+  nodes.push_back({std::move(run), stream->last});
+  stream->last = {nodes.size() - 1};
+  return 0;
+}
+bool captures() {
+  return std::any_of(state.streams.begin(), state.streams.end(), [](const auto& one) { return one.second->captures; });
+}
+/// Whether [address, address + size) lies in one allocation.
+bool is_allocated(Address address, std::size_t size) {
+  auto found = state.memory.upper_bound(address);
+  if (found == state.memory.begin()) return false;
+  --found;
+  return address + size <= found->first + found->second;
+}
+
+/// Functions of the driver, by the names of the table.
+struct Calls {
+  static int init(unsigned) { return 0; }
+  static int error_name(int error, const char** name) {
+    *name = error == kOutOfMemory    ? "CUDA_ERROR_OUT_OF_MEMORY"
+            : error == kLaunchFailed ? "CUDA_ERROR_LAUNCH_FAILED"
+                                     : nullptr;
+    return *name ? 0 : kInvalidValue;
+  }
+  static int error_text(int, const char** text) { return *text = "as the test wants it", 0; }
+  static int driver_version(int* version) { return *version = state.driver.version, 0; }
+  static int device_count(int* count) { return *count = state.driver.n_device, 0; }
+  static int device_get(int* device, int ordinal) { return *device = ordinal, 0; }
+  static int device_attribute(int* value, int attribute, int) {
+    if (attribute != 75 && attribute != 76) return kInvalidValue;
+    *value = attribute == 75 ? state.driver.major : state.driver.minor;
+    return 0;
+  }
+  static int context_retain(Handle* context, int) { return *context = &state, ++state.driver.n_handle, 0; }
+  static int context_release(int) { return --state.driver.n_handle, 0; }
+  static int context_use(Handle context) { return state.has_context = context != nullptr, 0; }
+
+  static int memory_info(std::size_t* free, std::size_t* total) {
+    *total = state.driver.memory, *free = state.driver.memory - state.driver.used;
+    return 0;
+  }
+  static int allocate(Address* address, std::size_t size) {
+    if (captures()) return kCaptureUnsupported;
+    if (size == 0) return kInvalidValue;
+    if (size > state.driver.memory - state.driver.used) return kOutOfMemory;
+    *address = reinterpret_cast<Address>(device_memory().allocate(size));
+    state.memory[*address] = size, state.driver.used += size;
+    return 0;
+  }
+  static int release(Address address) {
+    const auto found = state.memory.find(address);
+    if (found == state.memory.end()) return kInvalidValue;
+    run_waiting();  // as the driver does: nothing that runs loses its memory
+    device_memory().release(reinterpret_cast<void*>(address));
+    state.driver.used -= found->second;
+    state.memory.erase(found);
+    return 0;
+  }
+  static int host_allocate(void** memory, std::size_t size, unsigned) {
+    *memory = std::malloc(size);
+    state.host.insert(*memory), ++state.driver.n_handle;
+    return 0;
+  }
+  static int host_release(void* memory) {
+    if (state.host.erase(memory) == 0) return kInvalidValue;
+    std::free(memory);
+    return --state.driver.n_handle, 0;
+  }
+  static int upload(Address to, const void* from, std::size_t size, Handle stream) {
+    if (!is_allocated(to, size)) return kInvalidValue;
+    return enqueue(stream, [=] { std::memcpy(reinterpret_cast<void*>(to), from, size); });
+  }
+  static int download(void* to, Address from, std::size_t size, Handle stream) {
+    if (!is_allocated(from, size)) return kInvalidValue;
+    return enqueue(stream, [=] { std::memcpy(to, reinterpret_cast<const void*>(from), size); });
+  }
+
+  static int stream_create(Handle* stream, unsigned) {
+    return give(state.streams, stream, std::make_unique<Stream>()), 0;
+  }
+  static int stream_destroy(Handle stream) { return take_back(state.streams, stream); }
+  static int stream_wait(Handle handle) {
+    Stream* stream = find(state.streams, handle);
+    if (stream == nullptr) return kInvalidHandle;
+    return captures() ? kCaptureUnsupported : run_waiting();
+  }
+  static int stream_wait_event(Handle handle, Handle of, unsigned) {
+    Stream* stream = find(state.streams, handle);
+    const Event* event = find(state.events, of);
+    if (stream == nullptr || event == nullptr) return kInvalidHandle;
+    if (event->captured && !stream->captures) stream->captures = true, stream->last.clear();
+    if (event->captured != stream->captures) return kCaptureUnsupported;
+    for (std::size_t node : event->nodes)
+      if (std::find(stream->last.begin(), stream->last.end(), node) == stream->last.end()) stream->last.push_back(node);
+    return 0;
+  }
+  static int event_create(Handle* event, unsigned) { return give(state.events, event, std::make_unique<Event>()), 0; }
+  static int event_record(Handle of, Handle handle) {
+    Event* event = find(state.events, of);
+    const Stream* stream = find(state.streams, handle);
+    if (stream == nullptr || event == nullptr) return kInvalidHandle;
+    event->nodes = stream->last, event->captured = stream->captures;
+    return 0;
+  }
+  static int event_destroy(Handle event) { return take_back(state.events, event); }
+
+  static int module_load(Handle* to, const void* image, unsigned, int*, void**) {
+    auto module = std::make_unique<Module>();
+    const std::string text = static_cast<const char*>(image);
+    try {
+      if (text != kHostModule) module->ptx = parsed(text);
+    } catch (const Fault& fault) {
+      state.driver.fault = fault.what();
+      return kInvalidPtx;
+    }
+    return give(state.modules, to, std::move(module)), 0;
+  }
+  static int module_unload(Handle module) { return take_back(state.modules, module); }
+  static int module_function(Handle* to, Handle handle, const char* name) {
+    const Module* module = find(state.modules, handle);
+    if (module == nullptr) return kInvalidHandle;
+    auto function = std::make_unique<Function>();
+    module->ptx ? void(function->ptx = module->ptx->find(name)) : void(function->entry = find_entry(name));
+    if (function->ptx == nullptr && function->entry == nullptr) return kNotFound;
+    *to = function.get();
+    state.functions[*to] = std::move(function);
+    return 0;
+  }
+  static int function_attribute(Handle handle, int attribute, int value) {
+    Function* function = find(state.functions, handle);
+    if (function == nullptr) return kInvalidHandle;
+    if (attribute != 8 || value < 0 || static_cast<unsigned>(value) > vla::cuda::kMaxShared) return kInvalidValue;
+    function->max_shared = static_cast<unsigned>(value);
+    return 0;
+  }
+  static int launch(Handle handle, unsigned x, unsigned y, unsigned z, unsigned n_thread, unsigned block_y,
+                    unsigned block_z, unsigned shared, Handle stream, void** parameters, void** extra) {
+    const Function* function = find(state.functions, handle);
+    if (function == nullptr) return kInvalidHandle;
+    const unsigned most = vla::cuda::kMaxGridYZ;
+    if (shared > function->max_shared || block_y != 1 || block_z != 1 || extra != nullptr || x == 0 || y == 0 ||
+        z == 0 || y > most || z > most)
+      return kInvalidValue;
+    const std::size_t size = function->ptx ? function->ptx->param_size : function->entry->job_size;
+    const auto* from = static_cast<const std::byte*>(parameters[0]);
+    const std::vector<std::byte> bytes(from, from + size);
+    // A job is aligned as its type is, at most as memory is.
+    return enqueue(stream, [=] {
+      const std::unique_ptr<std::byte[]> job(new std::byte[size]);
+      std::copy(bytes.begin(), bytes.end(), job.get());
+      device_memory().begin_launch();
+      const Extent grid = {x, y, z};
+      function->ptx ? run_ptx(*function->ptx, grid, n_thread, shared, job.get())
+                    : run_entry(*function->entry, grid, n_thread, shared, job.get());
+    });
+  }
+
+  static int capture_begin(Handle handle, int) {
+    Stream* stream = find(state.streams, handle);
+    if (stream == nullptr) return kInvalidHandle;
+    if (captures()) return kCaptureUnsupported;
+    state.captured.clear();
+    stream->captures = stream->begins_capture = true, stream->last.clear();
+    return 0;
+  }
+  static int capture_end(Handle handle, Handle* graph) {
+    const Stream* begun = find(state.streams, handle);
+    if (begun == nullptr || !begun->begins_capture) return kInvalidHandle;
+    // Everything must come before the end of the stream that began.
+    std::vector<bool> before(state.captured.size());
+    for (std::size_t node : begun->last) before[node] = true;
+    for (std::size_t i = state.captured.size(); i-- > 0;)
+      for (std::size_t node : state.captured[i].after)
+        if (before[i]) before[node] = true;
+    const bool joined = std::find(before.begin(), before.end(), false) == before.end();
+    for (auto& [other, stream] : state.streams) {
+      if (!stream->captures) continue;
+      stream->captures = stream->begins_capture = false;
+      stream->last.clear();
+    }
+    if (!joined) return *graph = nullptr, kCaptureUnjoined;
+    auto nodes = std::make_shared<Nodes>(std::move(state.captured));
+    state.captured.clear();
+    return keep(graph, nodes);
+  }
+  static int graph_instantiate(Handle* executable, Handle graph, std::uint64_t) {
+    const auto found = state.graphs.find(graph);
+    return found == state.graphs.end() ? kInvalidHandle : keep(executable, std::make_shared<Nodes>(*found->second));
+  }
+  static int graph_launch(Handle executable, Handle stream) {
+    const auto found = state.graphs.find(executable);
+    if (found == state.graphs.end()) return kInvalidHandle;
+    return enqueue(stream, [nodes = found->second] { run_all(*nodes); });
+  }
+  static int graph_destroy(Handle graph) { return take_back(state.graphs, graph); }
+  static int executable_destroy(Handle executable) { return take_back(state.graphs, executable); }
+
+ private:
+  static int keep(Handle* to, const std::shared_ptr<Nodes>& nodes) {
+    *to = nodes.get();
+    state.graphs[*to] = nodes, ++state.driver.n_handle;
+    return 0;
+  }
+};
+
+bool has_word(const std::string& symbol, std::initializer_list<const char*> words) {
+  return std::any_of(words.begin(), words.end(),
+                     [&](const char* word) { return symbol.find(word) != std::string::npos; });
+}
+
+/// Counts a call, and fails it where it is told to. What is given back is given back, whatever is answered.
+template <auto kCall, class... Args>
+int counted(const std::string& symbol, Args... args) {
+  ++state.driver.n_call[symbol];
+  const bool fails = ++state.driver.n_calls == state.driver.fail_at;
+  if (fails) state.driver.failed_call = symbol, state.is_lost = state.driver.is_lost_then;
+  if (fails || state.is_lost) {
+    if (has_word(symbol, {"Free", "Destroy", "Unload", "Release"})) kCall(args...);
+    return state.driver.failure;
+  }
+  if (!state.has_context && !has_word(symbol, {"cuInit", "cuDriver", "cuDevice", "cuCtx"})) return kInvalidContext;
+  return kCall(args...);
+}
+
+}  // namespace
+
+FakeDriver& fake_driver() { return state.driver; }
+
+void reset_fake_driver() {
+  state.waiting.clear();
+  while (!state.memory.empty()) {
+    device_memory().release(reinterpret_cast<void*>(state.memory.begin()->first));
+    state.memory.erase(state.memory.begin());
+  }
+  for (void* memory : state.host) std::free(memory);
+  state = {};
+}
+
+vla::cuda::Driver fake_driver_table() {
+  vla::cuda::Driver table;
+#define VLA_CUDA_CALL(name, symbol, ...) \
+  table.name = [](auto... args) { return counted<&Calls::name>(#symbol, args...); };
+  VLA_CUDA_CALLS(VLA_CUDA_CALL)
+#undef VLA_CUDA_CALL
+  table.error_name = Calls::error_name, table.error_text = Calls::error_text;  // asked about failures, so not counted
+  return table;
+}
+
+}  // namespace vla::test::cuda

@@ -1,0 +1,43 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <map>
+#include <string>
+
+#include "cuda/driver/driver.h"
+
+/// NVIDIA's driver without a device. Nothing runs before somebody waits: operations become nodes that know which ones
+/// they come after, and run in any order that this allows, so that a stream that is not waited for shows. A captured
+/// graph is such nodes, run again at each launch. Kernels run on the emulated machine; a module is PTX, or kHostModule.
+namespace vla::test::cuda {
+
+/// A module of the kernels that the host's compiler made.
+constexpr const char* kHostModule = "host";
+
+constexpr int kInvalidValue = 1, kOutOfMemory = 2, kInvalidContext = 201, kInvalidPtx = 218, kInvalidHandle = 400,
+              kNotFound = 500, kLaunchFailed = 719, kCaptureUnsupported = 900, kCaptureUnjoined = 904;
+
+/// How the driver behaves, and what was asked of it.
+struct FakeDriver {
+  int version = 13000, n_device = 1, major = 8, minor = 7;
+  std::size_t memory = std::size_t{1} << 30;
+  /// The number of the call that fails, counted from 1 since reset, and with what; 0: none. A lost device answers every
+  /// later call so too.
+  long fail_at = 0;
+  int failure = kLaunchFailed;
+  bool is_lost_then = false;
+
+  std::map<std::string, long> n_call;  // by symbol
+  long n_calls = 0;
+  std::string failed_call;  // the first that was told to fail
+  std::string fault;        // why a kernel failed
+  std::size_t used = 0;
+  long n_handle = 0;  // contexts, streams, events, modules, graphs and host memory that were not given back
+};
+FakeDriver& fake_driver();
+/// As it was at first, with nothing held.
+void reset_fake_driver();
+vla::cuda::Driver fake_driver_table();
+
+}  // namespace vla::test::cuda
