@@ -73,7 +73,8 @@ def main():
     parser.add_argument("out", type=Path)
     a = parser.parse_args()
     if shutil.which("dpkg-query") is None:
-        return print("sbom: no dpkg-query here, so no list of what is inside")
+        print("sbom: no dpkg-query here, so no list of what is inside")
+        return
     version = output(a.build / "bin/vla", "--version").strip()
     components = [ggml(), *filter(None, map(debian, HEADERS)), *loaded(a.build)]
     document = {"bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1,

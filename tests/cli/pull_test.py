@@ -55,21 +55,22 @@ class Handler(BaseHTTPRequestHandler):
         hub, path = self.server, self.path.split("?")[0]
         hub.asked.append((self.command, path, self.headers.get("Range")))
         if hub.refuses:
-            return self._send(401, b"{}", {"X-Error-Code": "GatedRepo", "X-Error-Message": "a token is needed"})
-        if re.fullmatch(r"/api/models/someone/policy(/revision/\w+)?", path):
+            self._send(401, b"{}", {"X-Error-Code": "GatedRepo", "X-Error-Message": "a token is needed"})
+        elif re.fullmatch(r"/api/models/someone/policy(/revision/\w+)?", path):
             siblings = [{"rfilename": name} for name in ("policy.gguf", "README.md")]
-            return self._send(200, json.dumps({"id": "someone/policy", "sha": COMMIT, "siblings": siblings}).encode())
-        if path.startswith("/api/models/someone/policy/tree/"):
+            self._send(200, json.dumps({"id": "someone/policy", "sha": COMMIT, "siblings": siblings}).encode())
+        elif path.startswith("/api/models/someone/policy/tree/"):
             lfs = {"oid": hub.digest, "size": len(hub.data), "pointerSize": 130}
             file = {"type": "file", "path": "policy.gguf", "size": len(hub.data), "oid": "0" * 40, "lfs": lfs}
-            return self._send(200, json.dumps([file]).encode())
-        if path == f"/someone/policy/resolve/{COMMIT}/policy.gguf":
+            self._send(200, json.dumps([file]).encode())
+        elif path == f"/someone/policy/resolve/{COMMIT}/policy.gguf":
             linked = {"X-Repo-Commit": COMMIT, "X-Linked-Etag": f'"{hub.digest}"', "X-Linked-Size": str(len(hub.data))}
             linked["Location"] = f"http://localhost:{hub.server_port}/cdn/file"  # of another host, as the hub's storage is
-            return self._send(302, b"", linked)
-        if path == "/cdn/file":
-            return self._file()
-        self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
+            self._send(302, b"", linked)
+        elif path == "/cdn/file":
+            self._file()
+        else:
+            self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
 
     def _file(self):
         data, status, headers = self.server.data, 200, {}

@@ -93,9 +93,10 @@ def _write_act(file: _File, act: RecordedAct) -> None:
     answer = act.answer
     if isinstance(answer, VlaError):
         texts = {name: getattr(answer, name) for name in ("code", "where", "expected", "found", "hint")}
-        return file.values("/error", at, texts)
-    file.values("/action", act.ready_ns, _action(answer))
-    file.values("/timing_ms", act.ready_ns, {"queue": answer.queue_ms, **answer.timing})
+        file.values("/error", at, texts)
+    else:
+        file.values("/action", act.ready_ns, _action(answer))
+        file.values("/timing_ms", act.ready_ns, {"queue": answer.queue_ms, **answer.timing})
 
 
 def _action(chunk: Chunk) -> Dict[str, Any]:

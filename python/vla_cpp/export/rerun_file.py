@@ -46,7 +46,8 @@ def _write_act(stream: rerun.RecordingStream, act: RecordedAct) -> None:
     stream.log("instruction", rerun.TextDocument(act.text))
     answer = act.answer
     if isinstance(answer, VlaError):
-        return stream.log("error", rerun.TextLog(f"{answer.code}: {answer}", level="ERROR"))
+        stream.log("error", rerun.TextLog(f"{answer.code}: {answer}", level="ERROR"))
+        return
     _set_time(stream, act.ready_ns)
     stream.log("action", rerun.Scalars(answer.actions[0]))
     stream.log("action/chunk", rerun.Tensor(answer.actions, dim_names=("row", "action")))
