@@ -15,11 +15,11 @@ sys.path.insert(0, str(ROOT / "scripts"))
 import cuda_kernels  # noqa: E402
 
 
-def run_tests(modules, *options):
-    """(exit code, output) of test_cuda with these files of PTX in the place of the host compiler's kernels."""
+def run_tests(modules, *options, program="VLA_TEST_CUDA"):
+    """(exit code, output) of a program of tests with these files of PTX in the place of the host compiler's kernels."""
     environment = {**os.environ, "VLA_CUDA_PTX": ":".join(str(module) for module in modules)}
     process = subprocess.run(
-        [os.environ["VLA_TEST_CUDA"], *options], env=environment, capture_output=True, text=True, timeout=600
+        [os.environ[program], *options], env=environment, capture_output=True, text=True, timeout=1500
     )
     return process.returncode, process.stdout + process.stderr
 

@@ -31,6 +31,11 @@ def test_kernels_pass_their_tests_as_ptx(ptx):
     assert code == 0, output
 
 
+def test_policies_match_the_reference_on_ptx(ptx):
+    code, output = run_tests(ptx, program="VLA_TEST_CUDA_POLICIES")
+    assert code == 0, output
+
+
 def test_the_ptx_is_of_a_version_that_jetpack_6_takes(ptx):
     """CUDA 12.6, whose PTX is version 8.5; what is assembled below is the same text."""
     assert all(re.search(r"^\.version 8\.5$", module.read_text(), re.M) for module in ptx)

@@ -146,6 +146,7 @@ TEST_CASE("heads are normed and turned, into rows of another order") {
                                y,
                                has_weight ? gweight.get() : nullptr,
                                has_table ? gtable.get() : nullptr,
+                               d,
                                d * n_head,
                                d * n_head * n_token,
                                n_token * padded,

@@ -22,7 +22,7 @@ ROOMS = {
     "ggml": GRAPH,
     "vulkan": GRAPH | {"ggml"},  # compiled into a library of its own, as is the next
     "cuda": GRAPH | {"ggml"},
-    "lower": GRAPH | {"kernels"},
+    "lower": GRAPH | {"kernels", "cuda"},
     "devices": GRAPH | {"kernels", "lower", "ggml"},
     "nn": GRAPH,
     "processor": {"base", "bundle"},
@@ -100,7 +100,7 @@ def problems(src):
             reason = library_problem(room, header)
             if other in ROOMS and other != room and other not in ROOMS[room]:
                 reason = f"{room} may include {', '.join(sorted(ROOMS[room])) or 'only itself'}"
-            elif EVERY_MACHINE.fullmatch(name) and header.startswith(("kernels/", "ggml/", "lower/cpu/")):
+            elif EVERY_MACHINE.fullmatch(name) and header.startswith(("kernels/", "ggml/", "cuda/", "lower/cpu/", "lower/cuda/")):
                 reason = "holds for every machine"
             elif quoted and other not in ROOMS:
                 reason = reason or "is named by no room; write the path from src/"

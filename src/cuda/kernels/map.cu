@@ -22,7 +22,8 @@ VLA_KERNEL(map_elements, 256, 4, MapJob) {
     float value = job.a[a];
     if (job.operation == MapOperation::add) value = dev::add(value, job.b[b]);
     if (job.operation == MapOperation::multiply) value = dev::multiply(value, job.b[b]);
-    value = dev::multiply(activate(job.activation, value), job.factor);
+    value = activate(job.activation, value);
+    if (job.factor != 1) value = dev::multiply(value, job.factor);  // a copy keeps any bits
     if (job.is_bf16)
       static_cast<std::uint16_t*>(job.y)[y] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
     else

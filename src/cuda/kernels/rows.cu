@@ -95,7 +95,7 @@ VLA_KERNEL(head_rows, 128, 4, HeadJob) {
   if (number >= static_cast<std::int64_t>(job.n_head) * job.n_token * job.n_batch) return;  // the whole warp
   const std::int64_t head = number % job.n_head, token = number / job.n_head % job.n_token,
                      batch = number / job.n_head / job.n_token;
-  const float* x = job.x + head * job.d_head + token * job.x_token + batch * job.x_batch;
+  const float* x = job.x + head * job.x_head + token * job.x_token + batch * job.x_batch;
   float factor = 1;
   if (job.weight) {
     float squares = 0;

@@ -33,10 +33,10 @@ inline Launch norm_rows(const NormJob& job) {
 /// d_head/2}) where there is a table.
 struct HeadJob {
   const float* x;
-  void* y;                        // float32 or bf16
-  const float* weight;            // [d_head], or null
-  const float* table;             // [d_head, n_token]: of a token cosines, then sines; or null
-  std::int64_t x_token, x_batch;  // elements from one token or batch to the next; heads are side by side
+  void* y;                                // float32 or bf16
+  const float* weight;                    // [d_head], or null
+  const float* table;                     // [d_head, n_token]: of a token cosines, then sines; or null
+  std::int64_t x_head, x_token, x_batch;  // elements from one head, token or batch to the next
   std::int64_t y_head, y_token, y_batch;
   int d_head, n_head, n_token, n_batch;
   float eps;

@@ -1,0 +1,153 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cuda/cuda_program.h"
+
+#include <algorithm>
+#include <cstring>
+
+namespace vla::lower {
+namespace {
+
+std::size_t aligned(const Lowering& l, std::size_t size) {
+  const std::size_t unit = l.target.alignment();
+  return (size + unit - 1) / unit * unit;
+}
+
+/// Words for a printed graph.
+struct KindOf {
+  const char* operator()(const LinearOp&) const { return "linear_f32"; }
+  const char* operator()(const HeadOp&) const { return "head_rows"; }
+  const char* operator()(const AttentionOp&) const { return "attention_f32"; }
+  const char* operator()(const RowOp& row) const {
+    return std::holds_alternative<op::Norm>(row.what) ? "norm_rows" : op_name(row.node->op);
+  }
+  const char* operator()(const CopyOp&) const { return "copy"; }
+  const char* operator()(const LookupOp&) const { return "lookup_rows"; }
+  const char* operator()(const PatchesOp&) const { return "patches"; }
+};
+
+/// Products alone are counted.
+double flop_of_op(const CudaOp& op) {
+  double flop = 0;
+  if (const auto* linear = std::get_if<LinearOp>(&op.op))
+    for (const Node* node : linear->linears) flop += flop_of(*node);
+  if (const auto* attention = std::get_if<AttentionOp>(&op.op)) flop = flop_of(*attention->node);
+  return flop;
+}
+
+}  // namespace
+
+Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaDevice::Shared> shared,
+                                                   std::vector<std::shared_ptr<cuda::Buffer>> memory) {
+  std::unique_ptr<CudaProgram> program(new CudaProgram);
+  program->shared_ = std::move(shared), program->memory_ = std::move(memory);
+  VLA_CHECK(program->give_addresses(l, *program->memory_.back()));
+  VLA_CHECK(program->make_calls(l));
+  program->make_taps(l);
+  return std::unique_ptr<Program>(std::move(program));
+}
+
+Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
+  const std::size_t kept = aligned(l, l.kept_size);
+  std::vector<std::byte> constants;
+  std::vector<std::size_t> begins(l.values.size(), 0);
+  for (std::size_t i = 0; i < l.values.size(); ++i) {
+    const Value& value = l.values[i];
+    if (value.home != Value::Home::constant || value.base != static_cast<ValueId>(i)) continue;
+    begins[i] = constants.size();
+    constants.resize(constants.size() + aligned(l, value.size));
+    std::visit([&](const auto& elements) { std::memcpy(&constants[begins[i]], elements.data(), value.size); },
+               value.node->as<op::Constant>()->values);
+  }
+  VLA_TRY(cuda::Buffer own, shared_->gpu->allocate(std::max<std::size_t>(kept + constants.size(), 1), "constants"));
+  own_ = std::make_unique<cuda::Buffer>(std::move(own));
+  if (!constants.empty()) {
+    VLA_CHECK(shared_->stream->upload(own_->address() + kept, constants.data(), constants.size()));
+    VLA_CHECK(shared_->stream->wait());
+  }
+  const auto address = [&](std::size_t i) -> cuda::Address {
+    const Value& value = l.values[i];
+    switch (value.home) {
+      case Value::Home::arena:
+        return arena.address() + value.begin;
+      case Value::Home::kept:
+        return own_->address() + value.begin;
+      case Value::Home::slot:
+        return reinterpret_cast<cuda::Address>(value.slot->place);
+      case Value::Home::parameter:
+        return l.param(value.node->as<op::Parameter>()->param);
+      case Value::Home::constant:
+        return own_->address() + kept + begins[i];
+      case Value::Home::thread:
+        break;
+    }
+    return 0;
+  };
+  for (std::size_t i = 0; i < l.values.size(); ++i)
+    l.data.push_back(l.values[i].base == static_cast<ValueId>(i) ? address(i) : 0);
+  return {};
+}
+
+Status CudaProgram::make_calls(const CudaLowering& l) {
+  for (const Graph::Stage& stage : l.graph.stages()) stages_.push_back({stage.name, {}});
+  work_.resize(stages_.size() + 1);
+  for (const CudaOp& op : l.ops) {
+    VLA_TRY(std::vector<Call> calls, emit(l, op));
+    std::vector<Call>& all = op.phase < l.n_prepare ? prepare_ : calls_;
+    all.insert(all.end(), calls.begin(), calls.end());
+    if (!op.invariant) work_[stage_of(l, op)].flop += flop_of_op(op);
+    text_ += std::to_string(op.phase) + " " + std::visit(KindOf{}, op.op) + "\n";
+  }
+  return {};
+}
+
+void CudaProgram::make_taps(const CudaLowering& l) {
+  for (const Node& node : l.graph.nodes()) {
+    if (!node.tapped) continue;
+    taps_.push_back({node.path, node.shape});
+    tap_places_.push_back({l.address(node.id), l.value(node.id).shape, l.value(node.id).stride});
+  }
+}
+
+Status CudaProgram::prepare() {
+  for (const Call& call : prepare_) VLA_CHECK(shared_->keep(call(*shared_->stream)));
+  return shared_->keep(shared_->stream->wait());
+}
+
+Status CudaProgram::run() {
+  VLA_CHECK(shared_->failure);
+  VLA_CHECK(shared_->keep(run_captured()));
+  for (Stage& stage : stages_) stage.done = std::chrono::steady_clock::now();  // one graph: they end together
+  return {};
+}
+
+Status CudaProgram::run_captured() {
+  if (calls_.empty()) return {};
+  if (!graph_) {
+    VLA_CHECK(shared_->stream->begin_capture());
+    for (const Call& call : calls_) VLA_CHECK(call(*shared_->stream));
+    VLA_TRY(graph_, shared_->stream->end_capture());
+  }
+  VLA_CHECK(shared_->stream->launch(*graph_));
+  return shared_->stream->wait();
+}
+
+std::vector<float> CudaProgram::tap(std::size_t i) const {
+  const auto& [data, shape, stride] = tap_places_[i];
+  std::int64_t last = 0;
+  for (std::size_t d = 0; d < 4; ++d) last += (shape[d] - 1) * stride[d];
+  std::vector<float> all(static_cast<std::size_t>(last + 1)), values;
+  if (!shared_->keep(shared_->stream->download(all.data(), data, all.size() * sizeof(float))) ||
+      !shared_->keep(shared_->stream->wait()))
+    return {};
+  values.reserve(static_cast<std::size_t>(count(shape)));
+  for (std::int64_t a = 0; a < shape[3]; ++a)
+    for (std::int64_t b = 0; b < shape[2]; ++b)
+      for (std::int64_t c = 0; c < shape[1]; ++c)
+        for (std::int64_t d = 0; d < shape[0]; ++d)
+          values.push_back(
+              all[static_cast<std::size_t>(a * stride[3] + b * stride[2] + c * stride[1] + d * stride[0])]);
+  return values;
+}
+
+}  // namespace vla::lower

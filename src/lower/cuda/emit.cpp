@@ -1,0 +1,213 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include <cmath>
+
+#include "cuda/kernels/attention.h"
+#include "cuda/kernels/linear_f32.h"
+#include "cuda/kernels/map.h"
+#include "cuda/kernels/rows.h"
+#include "lower/cuda/cuda_lowering.h"
+
+namespace vla::lower {
+namespace {
+
+using Calls = Result<std::vector<Call>>;
+
+/// more: "heads of at most".
+Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found) {
+  return {Code::unsupported, what, more + (" " + std::to_string(most)), std::to_string(found), "use --kernels ggml"};
+}
+
+template <class Job>
+Call call(const cuda::Launch& how, const Job& job) {
+  return [how, job](cuda::Stream& stream) { return stream.launch(how, job); };
+}
+int narrow(std::int64_t n) { return static_cast<int>(n); }
+std::int64_t n_row(const Shape& shape) { return count(shape) / shape[0]; }
+
+/// Element by element over a shape; b may be missing.
+cuda::MapJob map_of(const Shape& shape, const float* a, const Shape& a_step, float* y, const Shape& y_step) {
+  cuda::MapJob job = {};
+  job.a = a, job.y = y, job.factor = 1;
+  for (std::size_t i = 0; i < static_cast<std::size_t>(cuda::MapJob::kDims); ++i) {
+    job.size[i] = i < 4 ? narrow(shape[i]) : 1;
+    if (i < 4) job.a_step[i] = a_step[i], job.y_step[i] = y_step[i];
+  }
+  return job;
+}
+
+struct Emit {
+  const CudaLowering& l;
+  const CudaOp& op;
+
+  float* result() const { return l.floats(op.writes[0]); }
+
+  Calls operator()(const LinearOp& linear) const {
+    const Value& x = l.value(linear.x);
+    std::vector<Call> calls;
+    for (std::size_t i = 0; i < linear.linears.size(); ++i) {
+      const auto& product = *linear.linears[i]->as<op::Linear>();
+      if (product.rule != op::Rule::floats)
+        return Error{Code::unsupported, product.weight->name, "a matrix of floats", "a ternary one",
+                     "use --kernels ggml"};
+      const bool is_gate = linear.gated && i == 0;
+      cuda::LinearF32Job job = {};
+      job.x = l.floats(linear.x), job.x_stride = row_stride(x);
+      job.weight = reinterpret_cast<const float*>(l.param(product.weight));
+      job.n_row = narrow(n_row(x.shape)), job.n_column = narrow(product.weight->shape[1]),
+      job.depth = narrow(x.shape[0]);
+      job.end.bias = reinterpret_cast<const float*>(l.param(product.bias));
+      job.end.y = is_gate ? l.floats(op.gate) : result(), job.end.y_stride = job.n_column;
+      if (!is_gate) {
+        job.end.activation = linear.activation, job.end.gate = l.floats(op.gate);
+        job.end.factor = l.floats(linear.factor), job.end.residual = l.floats(linear.residual);
+      }
+      calls.push_back(call(cuda::linear_f32(job), job));
+    }
+    return calls;
+  }
+
+  /// Heads of a value, normed or turned, to a contiguous one.
+  Calls heads(ValueId id, const float* weight, float eps, const float* table) const {
+    const Value& x = l.value(id);
+    if (x.shape[0] > cuda::kMaxHead) return unsupported("heads", "heads of at most", cuda::kMaxHead, x.shape[0]);
+    const Shape to = contiguous_strides(x.shape);
+    const cuda::HeadJob job = {l.floats(id),
+                               result(),
+                               weight,
+                               table,
+                               x.stride[1],
+                               x.stride[2],
+                               x.stride[3],
+                               to[1],
+                               to[2],
+                               to[3],
+                               narrow(x.shape[0]),
+                               narrow(x.shape[1]),
+                               narrow(x.shape[2]),
+                               narrow(x.shape[3]),
+                               eps,
+                               false};
+    return std::vector<Call>{call(cuda::head_rows(job), job)};
+  }
+  Calls operator()(const HeadOp& head) const {
+    const auto* norm = head.rows.norm != nullptr ? head.rows.norm->as<op::Norm>() : nullptr;
+    if (norm != nullptr && norm->kind != op::NormKind::rms)
+      return Error{Code::unsupported, "heads", "an RMS norm", "a layer norm", "use --kernels ggml"};
+    return heads(head.rows.x, l.floats(head.rows.weight), norm != nullptr ? norm->eps : 0, l.floats(head.rows.table));
+  }
+
+  Calls operator()(const AttentionOp& attention) const {
+    const Value& q = l.value(attention.q.x);
+    if (q.shape[0] > cuda::kMaxHead) return unsupported("attention", "heads of at most", cuda::kMaxHead, q.shape[0]);
+    if (op.keys.size() > static_cast<std::size_t>(cuda::AttentionJob::kMaxSegment))
+      return unsupported("attention", "segments of keys: at most", cuda::AttentionJob::kMaxSegment,
+                         static_cast<std::int64_t>(op.keys.size()));
+    cuda::AttentionJob job = {};
+    const auto rows = [&](ValueId id) {
+      const Shape& stride = l.value(id).stride;
+      return cuda::HeadRows{l.floats(id), stride[1], stride[2], stride[3]};
+    };
+    job.q = rows(attention.q.x);
+    for (std::size_t i = 0; i < op.keys.size(); ++i)
+      job.segment[job.n_segment++] = {rows(op.keys[i].first), rows(op.keys[i].second), narrow(attention.n_key[i])};
+    job.mask = l.floats(attention.mask), job.y = result();
+    job.scale = 1 / std::sqrt(static_cast<float>(q.shape[0]));
+    job.d_head = narrow(q.shape[0]), job.n_head = narrow(q.shape[1]), job.n_query = narrow(q.shape[2]);
+    job.n_batch = narrow(q.shape[3]), job.n_head_kv = narrow(l.value(op.keys[0].first).shape[1]), job.n_split = 1;
+    return std::vector<Call>{call(cuda::attention_f32(job), job)};
+  }
+
+  Calls operator()(const RowOp& row) const {
+    return std::visit([&](const auto& what) { return rows(row, what); }, row.what);
+  }
+  Calls rows(const RowOp& row, const op::Norm& norm) const {
+    const Value& x = l.value(row.x);
+    if (x.shape[0] > cuda::kMaxNorm) return unsupported("norm", "rows of at most", cuda::kMaxNorm, x.shape[0]);
+    const cuda::NormJob job = {
+        l.floats(row.x),    nullptr,         nullptr,
+        l.floats(row.w),    l.floats(row.b), result(),
+        row_stride(x),      x.shape[0],      narrow(n_row(x.shape)),
+        narrow(x.shape[0]), norm.eps,        norm.kind == op::NormKind::rms ? cuda::RowNorm::rms : cuda::RowNorm::layer,
+        cuda::RowType::f32};
+    return std::vector<Call>{call(cuda::norm_rows(job), job)};
+  }
+  Calls rows(const RowOp& row, const op::Rope&) const { return heads(row.x, nullptr, 0, l.floats(row.w)); }
+  Calls rows(const RowOp& row, const op::Activate& activate) const {
+    cuda::MapJob job = map_of(row);
+    job.activation = activate.activation;
+    return std::vector<Call>{call(cuda::map_elements(job), job)};
+  }
+  Calls rows(const RowOp& row, const op::Scale& scale) const {
+    cuda::MapJob job = map_of(row);
+    job.factor = scale.factor;
+    return std::vector<Call>{call(cuda::map_elements(job), job)};
+  }
+  Calls rows(const RowOp& row, const op::Add&) const { return with_other(row, cuda::MapOperation::add); }
+  Calls rows(const RowOp& row, const op::Multiply&) const { return with_other(row, cuda::MapOperation::multiply); }
+  Calls with_other(const RowOp& row, cuda::MapOperation operation) const {
+    cuda::MapJob job = map_of(row);
+    const Value& w = l.value(row.w);
+    job.operation = operation, job.b = l.floats(row.w);
+    for (std::size_t i = 0; i < 4; ++i) job.b_step[i] = w.shape[i] == 1 ? 0 : w.stride[i];
+    return std::vector<Call>{call(cuda::map_elements(job), job)};
+  }
+  cuda::MapJob map_of(const RowOp& row) const {
+    const Shape& shape = row.node->shape;
+    return lower::map_of(shape, l.floats(row.x), l.value(row.x).stride, result(), contiguous_strides(shape));
+  }
+
+  Calls operator()(const CopyOp& copy) const {
+    std::vector<Call> calls;
+    for (const CopyOp::Part& part : copy.parts) {
+      const cuda::MapJob job = lower::map_of(part.shape, l.floats(part.from) + part.from_offset, part.from_stride,
+                                             result() + part.to_offset, part.to_stride);
+      if (job.count() > 0) calls.push_back(call(cuda::map_elements(job), job));
+    }
+    return calls;
+  }
+
+  Calls operator()(const LookupOp& lookup) const {
+    const Node& node = *lookup.node;
+    cuda::LookupJob job = {};
+    job.ids = reinterpret_cast<const std::int32_t*>(l.address(lookup.ids)), job.y = result();
+    job.n = narrow(node.shape[0]), job.n_row = narrow(node.shape[1]);
+    if (const auto* embedding = node.as<op::Embedding>()) {
+      const DType type = embedding->table->encoding.type;
+      job.table = reinterpret_cast<const void*>(l.param(embedding->table)),
+      job.n_table = narrow(embedding->table->shape[1]);
+      job.type = type == DType::f32   ? cuda::TableType::f32
+                 : type == DType::f16 ? cuda::TableType::f16
+                                      : cuda::TableType::bf16;
+    } else {
+      job.table = l.floats(lookup.table), job.n_table = narrow(l.value(lookup.table).shape[1]);
+    }
+    return std::vector<Call>{call(cuda::lookup_rows(job), job)};
+  }
+
+  Calls operator()(const PatchesOp& patches) const {
+    const Node& node = *patches.node;
+    const int size = node.as<op::Patches>()->size, width = narrow(node.in[0].dim(0)),
+              height = narrow(node.in[0].dim(1));
+    const std::int64_t columns = width / size, lines = height / size, area = std::int64_t{size} * size;
+    const std::int64_t w = width, patch = 3 * area;
+    const cuda::MapJob job = {l.floats(patches.images),
+                              nullptr,
+                              result(),
+                              {size, size, 3, narrow(columns), narrow(lines), narrow(node.in[0].dim(3))},
+                              {1, w, w * height, size, size * w, w * height * 3},
+                              {},
+                              {1, size, area, patch, patch * columns, patch * columns * lines},
+                              1,
+                              cuda::MapOperation::copy,
+                              Activation::none,
+                              false};
+    return std::vector<Call>{call(cuda::map_elements(job), job)};
+  }
+};
+
+}  // namespace
+
+Result<std::vector<Call>> emit(const CudaLowering& l, const CudaOp& op) { return std::visit(Emit{l, op}, op.op); }
+
+}  // namespace vla::lower
