@@ -82,13 +82,19 @@ void run_all(const Nodes& nodes) {
   }
 }
 
-/// Runs everything that waits.
-int run_waiting() {
+/// Takes everything that waits away from its streams.
+Nodes take_waiting() {
   Nodes nodes;
   nodes.swap(state.waiting);
-  for (auto& [handle, stream] : state.streams) stream->last.clear();
+  for (auto& [handle, stream] : state.streams)
+    if (!stream->captures) stream->last.clear();
   for (auto& [handle, event] : state.events)
     if (!event->captured) event->nodes.clear();
+  return nodes;
+}
+/// Runs it.
+int run_waiting() {
+  const Nodes nodes = take_waiting();
   try {
     run_all(nodes);
   } catch (const Fault& fault) {
@@ -195,6 +201,7 @@ struct Calls {
   }
   static int host_release(void* memory) {
     if (state.host.erase(memory) == 0) return kInvalidValue;
+    run_waiting();  // as for memory of the device
     std::free(memory);
     return --state.driver.n_handle, 0;
   }
@@ -347,6 +354,7 @@ int counted(const std::string& symbol, Args... args) {
   const bool fails = ++state.driver.n_calls == state.driver.fail_at;
   if (fails) state.driver.failed_call = symbol, state.is_lost = state.driver.is_lost_then;
   if (fails || state.is_lost) {
+    take_waiting();  // nothing runs on: whoever sees the failure gives back what operations would read
     if (has_word(symbol, {"Free", "Destroy", "Unload", "Release"})) kCall(args...);
     return state.driver.failure;
   }
