@@ -109,6 +109,7 @@ def main(folder):
         "observation_old": dumps(observation, 4, "lerobot.scripts.server.helpers"),
         "observation_p2": dumps(TimedObservation(1.0, 0, {"arm.0": 1, "arm.1": 2**40, "hand": True, "task": "go"}), 2),
         "bomb": dumps({"a": Bomb()}),
+        "half": dumps({"arm.0": np.float16(0.5)}),
     }
     for name, data in seeds.items():
         (Path(folder) / name).write_bytes(data)

@@ -66,6 +66,13 @@ TEST_CASE("a pickle that would execute is refused with the name") {
   CHECK(read.error().found.find("pathlib") != std::string::npos);
 }
 
+TEST_CASE("a number in half precision is refused, and no other number is made of it") {
+  const std::string bytes = seed("half");
+  const auto read = pickle::Pickle::read(std::as_bytes(std::span(bytes)));
+  REQUIRE(!read);
+  CHECK(read.error().expected.find("f4 or f8") != std::string::npos);
+}
+
 TEST_CASE("opcodes that do anything but make data, and what is beyond the bounds, are refused") {
   const std::string many(70000, 'N'), deep(100, '(');
   for (const std::string& bytes :

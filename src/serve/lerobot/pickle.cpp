@@ -361,7 +361,8 @@ class Reader {
     if (function.name.ends_with(".scalar") && has(0, Type::dtype) && has(1, Type::bytes)) {
       msgpack::Array array = given[0]->array;
       array.data = given[1]->data;
-      if (!fits(array) || array.is_big_endian) return bad("a number of its dtype", "other bytes");
+      const bool is_half = array.kind == 'f' && array.item == 2;
+      if (!fits(array) || array.is_big_endian || is_half) return bad("a number of its dtype, f4 or f8", "another");
       const double value = number_of(array);
       if (array.kind == 'f') return push({.type = Type::real, .real = value});
       std::int64_t bits = 0;
