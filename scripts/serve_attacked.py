@@ -213,8 +213,10 @@ def many_addresses(target):
 
 
 def spec_of(target):
-    with vla_cpp.Client(target.address, timeout=20) as client:
-        return client.spec
+    """What the policy takes; a new connection may have to give way to the attacks that began before."""
+    while True:
+        with contextlib.suppress(vla_cpp.Disconnected), vla_cpp.Client(target.address, timeout=20) as client:
+            return client.spec
 
 
 def act_of(spec, **image):
@@ -464,7 +466,7 @@ def measure(options):
         before = target.memory_mib()
         for name in options.attack or ATTACKS:
             command = [sys.executable, __file__, "--as", name, target.address, target.metrics, target.openpi, target.gr00t]
-            attackers.append(subprocess.Popen(command, stdout=subprocess.PIPE, preexec_fn=last_of_all))
+            attackers.append(subprocess.Popen(command, stdout=subprocess.PIPE))
         [attacker.stdout.readline() for attacker in attackers]
         time.sleep(1)
         uploaded = []
@@ -527,6 +529,7 @@ def main():
     if options.role:
         attack, *addresses = options.role
         print("attacking", flush=True)
+        last_of_all()  # what is imported before that is not part of the attack
         return ATTACKS[attack](argparse.Namespace(**dict(zip(("address", "metrics", "openpi", "gr00t"), addresses))))
     quiet, attacked, rest = measure(options)
     rows = rows_of(options, quiet, attacked, rest)
