@@ -3,7 +3,6 @@
 #include "net/eviction.h"
 
 #include <algorithm>
-#include <bit>
 #include <boost/asio/ip/address.hpp>
 #include <map>
 #include <set>
@@ -53,11 +52,6 @@ std::string group_of(const std::string& peer) {
   ip::address_v6::bytes_type bytes = address.to_v6().to_bytes();
   std::fill(bytes.begin() + 8, bytes.end(), std::uint8_t{0});
   return ip::address_v6(bytes, address.to_v6().scope_id()).to_string() + "/64";
-}
-
-Share share_of(const std::string& peer, Clock::time_point since, Clock::time_point now) {
-  const auto seconds = std::chrono::duration_cast<std::chrono::seconds>(now - since).count();
-  return {group_of(peer), static_cast<int>(std::bit_width(static_cast<std::uint64_t>(std::max(seconds, 0L))))};
 }
 
 std::size_t max_handshakes(std::size_t max_connections) { return std::max<std::size_t>(1, max_connections / 4); }

@@ -30,10 +30,9 @@ std::string group_of(const std::string& peer);
 
 /// What decides in a queue whose turn it is.
 struct Share {
-  std::string group;  // `group_of` the peer
-  int seniority = 0;  // of its connection: 0 in its first second, and one more whenever its time doubles
+  std::string group;             // `group_of` the peer
+  Clock::time_point since = {};  // its connection
 };
-Share share_of(const std::string& peer, Clock::time_point since, Clock::time_point now);
 
 /// How many connections may be in their handshake at once.
 std::size_t max_handshakes(std::size_t max_connections);

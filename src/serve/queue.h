@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "base/clock.h"
+#include "serve/generations.h"
 
 namespace vla::serve {
 
@@ -20,9 +21,9 @@ namespace vla::serve {
 /// peer is one key or one address, a client one connection of it. A newer act of a client takes the place of its older
 /// one. So neither a client that sends faster than others nor a peer that opens many connections gets more turns. Where
 /// more than `kCrowd` clients of one peer wait, as where a program floods the server from the robot's own machine,
-/// those of about the same seniority take turns first: many connections that came together get as many turns as one
-/// that came long before them, or after. Where the queue is full, the peer that has most in it gives way to one that
-/// has less, and then within the peer the seniority that has most.
+/// generations take turns first, which are connections that came together: many of them get as many turns as one that
+/// came long before them, or after. Where the queue is full, the peer that has most in it gives way to one that has
+/// less, and then within the peer the generation that has most.
 ///
 /// `Job` has `client` (std::string), `share` (net::Share), `deadline` (std::optional<Clock::time_point>) and `size`
 /// (bytes). The queue knows no clock and takes no lock.
@@ -92,7 +93,7 @@ class Queue {
     const bool is_crowd = is_crowded();
     turns_.splice(turns_.end(), turns_, turns_.begin());
     Turn& turn = turns_.back();
-    if (is_crowd) return take(next_seniority(turn));
+    if (is_crowd) return take(next_generation(turn));
     return take(find([&](const Job& job) { return job.share.group == turn.group; }));
   }
 
@@ -100,7 +101,7 @@ class Queue {
   using Place = typename std::list<Job>::iterator;
   struct Turn {
     std::string group;
-    int seniority = -1;  // that had its last turn, in a crowd
+    Clock::time_point last = {};  // in a crowd: when the connection came that had its last turn
   };
 
   template <class Wanted>
@@ -124,15 +125,25 @@ class Queue {
         std::count_if(line_.begin(), line_.end(), [&](const Job& job) { return job.share.group == group; }));
   }
 
-  /// Of a crowd of the group, the first of those whose seniority comes next after the one that had the last turn.
-  Place next_seniority(Turn& turn) {
+  /// Of the clients of the group that wait, and the given ones.
+  Generations generations_of(const std::string& group, std::vector<Clock::time_point> times = {}) const {
+    for (const Job& job : line_)
+      if (job.share.group == group) times.push_back(job.share.since);
+    return Generations(std::move(times));
+  }
+
+  /// Of a crowd of the group, the first of those of the next older generation after the one that had the last turn;
+  /// after the oldest comes the newest. Those that come meanwhile are newer: they delay nobody.
+  Place next_generation(Turn& turn) {
+    const Generations generations = generations_of(turn.group, {turn.last});  // it may have left the queue
     const auto distance = [&](const Job& job) {
-      return job.share.group == turn.group ? static_cast<unsigned>(job.share.seniority - turn.seniority - 1) % 256
-                                           : 256;
+      const std::size_t n = generations.size();
+      return job.share.group == turn.group ? (generations.of(turn.last) + n - generations.of(job.share.since) - 1) % n
+                                           : n;
     };
     const auto next = std::min_element(line_.begin(), line_.end(),
                                        [&](const Job& a, const Job& b) { return distance(a) < distance(b); });
-    turn.seniority = next->share.seniority;
+    turn.last = next->share.since;
     return next;
   }
 
@@ -141,12 +152,28 @@ class Queue {
   template <class Amount>
   Place to_give_way(const Job& job, Amount amount, std::size_t added) {
     const auto group = [](const Job& j) { return j.share.group; };
-    const auto seniority = [](const Job& j) { return j.share.seniority; };
+    const Generations generations = generations_of(job.share.group, {job.share.since});
+    const auto generation = [&](const Job& j) { return generations.of(j.share.since); };
     const auto place = last_of_most(
         job, group, [](const Job&) { return true; }, amount, added);
-    if (place != line_.end()) return place;
+    if (place != line_.end()) return last_of_largest_generation(place->share.group, amount);
     return last_of_most(
-        job, seniority, [&](const Job& j) { return j.share.group == job.share.group; }, amount, added);
+        job, generation, [&](const Job& j) { return j.share.group == job.share.group; }, amount, added);
+  }
+
+  /// Of a group's jobs the last one of the generation that amounts to most; of equal ones it is the newest.
+  template <class Amount>
+  Place last_of_largest_generation(const std::string& group, Amount amount) {
+    const Generations generations = generations_of(group);
+    std::map<std::size_t, std::size_t> sums;
+    for (const Job& job : line_)
+      if (job.share.group == group) sums[generations.of(job.share.since)] += amount(job);
+    const auto most =
+        std::max_element(sums.rbegin(), sums.rend(), [](auto& a, auto& b) { return a.second < b.second; });
+    const auto last = std::find_if(line_.rbegin(), line_.rend(), [&](const Job& job) {
+      return job.share.group == group && generations.of(job.share.since) == most->first;
+    });
+    return std::prev(last.base());
   }
 
   /// Of jobs that share a key, the last one of those that amount to most, where that is more than those with the given

@@ -34,12 +34,14 @@ class Watched:
         self.token = parse_qs(urlsplit(self.url).query)["token"][0]
         self.robot = vla_cpp.Client(ready["address"], timeout=SECONDS)
         self.case = case
+        self.n_act = 0
         self.sent = {name: frame if i else frame[:40, :60] for i, (name, frame) in enumerate(frames(case).items())}
         self.files = {name: file.read_bytes() for name, file in list(case.images.items())[1:]}
 
     def act(self, text="open the drawer", state=None, **options):
         """The first view as pixels, the others as files."""
         images = {**self.sent, **self.files}
+        self.n_act += 1
         return self.robot.act(images=images, state=self.case.state if state is None else state, text=text, seed=1, **options)
 
     def get(self, path, token=None, **query):
@@ -53,7 +55,10 @@ class Watched:
             return error.code, error.headers["Content-Type"], error.read()
 
     def acts(self, after=0):
-        return json.loads(self.get("acts", after=after)[2])
+        """Waits for the last act: it may be answered before the page knows."""
+        while (told := json.loads(self.get("acts", after=after)[2]))["last"] < self.n_act:
+            time.sleep(0.01)
+        return told
 
     def stop(self):
         self.robot.close()

@@ -84,21 +84,52 @@ TEST_CASE("a peer of seventy connections gets as many turns as a peer of one") {
 }
 
 TEST_CASE("in a crowd of one peer, a connection of another age gets every second turn") {
-  for (const int age : {0, 9}) {
+  for (const int since : {0, 9900}) {
     Queue<Item> queue(kRoom);
-    for (int i = 0; i < 70; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", 5}});
+    for (int i = 0; i < 70; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", at(5000 + 50 * i)}});
     int n_robot = 0;
     for (int turn = 0; turn < 20; ++turn) {
-      queue.push({"robot", 100, 1, {}, {"here", age}});
+      queue.push({"robot", 100, 1, {}, {"here", at(since)}});
       n_robot += queue.pop()->client == "robot";
     }
     CHECK(n_robot == 10);
   }
 }
 
+TEST_CASE("in a crowd whose connections come and go all the time, an old one waits for few turns") {
+  Queue<Item> queue(kRoom);
+  int now = 100'000, waited = 0, longest = 0;
+  for (int i = 0; i < 60; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", at(now += 1000)}});
+  for (int turn = 0; turn < 1000; ++turn) {
+    queue.push({"robot", 100, 1, {}, {"here", at(0)}});
+    const auto item = queue.pop();
+    longest = std::max(longest, waited);
+    waited = item->client == "robot" ? 0 : waited + 1;
+    if (waited > 0) queue.push({"flood" + std::to_string(now), 0, 1, {}, {"here", at(now += 1000)}});
+  }
+  CHECK(longest < static_cast<int>(Generations::kMax));
+}
+
+TEST_CASE("connections are cut into generations where the gaps are widest") {
+  const Generations one({at(0), at(999), at(1998)});
+  CHECK(one.size() == 1);
+  CHECK(one.of(at(1998)) == 0);
+  const Generations two({at(60'000), at(0), at(59'500)});
+  CHECK(two.size() == 2);
+  CHECK(two.of(at(0)) == 0);
+  CHECK(two.of(at(59'500)) == 1);
+  CHECK(two.of(at(60'000)) == 1);
+  std::vector<Clock::time_point> many = {at(0)};
+  for (int i = 0; i < 60; ++i) many.push_back(at(100'000 + 1000 * i));
+  const Generations most(many);
+  CHECK(most.size() == Generations::kMax);
+  CHECK(most.of(at(0)) == 0);
+  CHECK(most.of(at(100'000)) == 1);
+}
+
 TEST_CASE("a few clients of one peer take turns, whatever their age") {
   Queue<Item> queue(kRoom);
-  for (int i = 0; i < 8; ++i) queue.push({std::to_string(i), i, 1, {}, {"here", i}});
+  for (int i = 0; i < 8; ++i) queue.push({std::to_string(i), i, 1, {}, {"here", at(2000 * i)}});
   for (int turn = 0; turn < 24; ++turn) {
     const auto item = queue.pop();
     CHECK(item->number == turn % 8);
@@ -106,11 +137,20 @@ TEST_CASE("a few clients of one peer take turns, whatever their age") {
   }
 }
 
-TEST_CASE("where the queue is full of one peer's acts, the age that has most gives way to one that has less") {
+TEST_CASE("where the queue is full of one peer's acts, the generation that has most gives way to one that has less") {
   Queue<Item> queue({3, 100});
-  for (int i = 0; i < 3; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", 2}});
-  CHECK(queue.push({"robot", 3, 1, {}, {"here", 6}}).refused.at(0).number == 2);
-  CHECK(queue.push({"flood3", 4, 1, {}, {"here", 2}}).refused.at(0).number == 4);
+  for (int i = 0; i < 3; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", at(6000)}});
+  CHECK(queue.push({"robot", 3, 1, {}, {"here", at(0)}}).refused.at(0).number == 2);
+  CHECK(queue.push({"flood3", 4, 1, {}, {"here", at(6000)}}).refused.at(0).number == 4);
+}
+
+TEST_CASE("where a crowded peer gives way to another one, its largest generation does") {
+  Queue<Item> queue({4, 100});
+  for (int i = 0; i < 3; ++i) queue.push({"flood" + std::to_string(i), i, 1, {}, {"here", at(6000)}});
+  queue.push({"robot", 3, 1, {}, {"here", at(0)}});
+  CHECK(queue.push({"other0", 4, 1, {}, {"there"}}).refused.at(0).number == 2);
+  CHECK(queue.push({"other1", 5, 1, {}, {"there"}}).refused.at(0).number == 1);
+  CHECK(queue.push({"other2", 6, 1, {}, {"there"}}).refused.at(0).number == 6);
 }
 
 TEST_CASE("where the queue is full, the last act of the peer that has most gives way to a peer that has less") {

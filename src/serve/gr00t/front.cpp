@@ -118,7 +118,7 @@ void Front::received(zmtp::Client& client, zmtp::Message message) {
   job.is_first = client.n_request == 0;
   job.size = message.size;
   job.at = Clock::now();
-  job.share = net::share_of(client.peer, client.since, job.at);
+  job.share = {net::group_of(client.peer), client.since};
   job.request_id = ++client.n_request;
   const std::optional<Error> refused = message.refused;
   auto request = std::make_unique<Request>(*this, client.connection, std::move(message));

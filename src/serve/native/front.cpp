@@ -121,7 +121,7 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
     job.kind = envelope.kind;
     job.size = message.size;
     job.at = Clock::now();
-    job.share = net::share_of(client.peer, client.since, job.at);
+    job.share = {net::group_of(client.peer), client.since};
     job.deadline_ms = envelope.deadline_ms;
     job.call = std::make_unique<Request>(*this, connection, std::move(message), envelope);
     ++client.n_request;

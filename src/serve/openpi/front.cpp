@@ -93,7 +93,7 @@ void Front::received(Peer& peer, std::string message, bool is_text) {
   job.is_first = peer.n_request == 0;
   job.size = message.size();
   job.at = Clock::now();
-  job.share = net::share_of(peer.address, peer.since, job.at);
+  job.share = {net::group_of(peer.address), peer.since};
   job.request_id = ++peer.n_request;
   auto request = std::make_unique<Request>(*this, peer, std::move(message));
   const Status sound = request->read(is_text);
