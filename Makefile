@@ -122,10 +122,10 @@ test: build vulkan asan
 	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
 	$(VENV)/bin/python scripts/test.py
 
-# All mistakes that are made in kernels for CUDA and all families of policies, of which `make test` tries some.
+# All mistakes that are made in kernels for CUDA, all families of policies and all architectures; `make test` tries some.
 test-cuda: build
 	@scripts/cuda.sh .cache/nvcc nvcc
-	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
+	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 VLA_ALL_ARCHITECTURES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
 
 # Downloads 90 MB of Debian's libraries for ARM into .cache.
 test-arm64: build

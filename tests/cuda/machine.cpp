@@ -4,7 +4,6 @@
 
 #include <cstdlib>
 #include <fstream>
-#include <iterator>
 #include <sstream>
 
 #include "cuda/emulation.h"
@@ -15,15 +14,21 @@
 namespace vla::test::cuda {
 namespace {
 
-std::vector<std::string> texts() {
+std::vector<std::string> read_texts() {
   std::vector<std::string> all;
   const char* files = std::getenv("VLA_CUDA_PTX");
   std::istringstream names(files == nullptr ? "" : files);
   for (std::string name; std::getline(names, name, ':');) {
     std::ifstream in(name);
     if (!in) throw Fault("cannot read " + name);
-    all.emplace_back(std::istreambuf_iterator<char>(in), std::istreambuf_iterator<char>());
+    std::ostringstream text;
+    text << in.rdbuf();
+    all.push_back(text.str());
   }
+  return all;
+}
+const std::vector<std::string>& texts() {
+  static const std::vector<std::string> all = read_texts();
   return all;
 }
 

@@ -91,7 +91,7 @@ void select(WarpState& w, const PtxInstruction& i) {
   throw Fault("thread " + std::to_string(w.thread(lane)) + ": " + what + ": " + i.text);
 }
 template <class F>
-void guarded(const WarpState& w, const PtxInstruction& i, int lane, F access) {
+void guarded(const WarpState& w, const PtxInstruction& i, const int& lane, F access) {
   try {
     access();
   } catch (const Fault& problem) {
@@ -115,6 +115,10 @@ std::size_t in_shared(WarpState& w, const PtxInstruction& i, int lane) {
 }
 
 void load_value(WarpState& w, const PtxInstruction& i, int lane, const std::byte* from) {
+  if (i.width == 4 && !i.wide_value) {  // by far the most
+    for (int k = 0; k < i.count; ++k) std::memcpy(&w.lanes<u32>(i.operand[k + 1])[lane], from + 4 * k, 4);
+    return;
+  }
   for (int k = 0; k < i.count; ++k, from += i.width) {
     u64 value = 0;
     std::memcpy(&value, from, static_cast<std::size_t>(i.width));
@@ -125,6 +129,10 @@ void load_value(WarpState& w, const PtxInstruction& i, int lane, const std::byte
   }
 }
 void store_value(WarpState& w, const PtxInstruction& i, int lane, std::byte* to) {
+  if (i.width == 4 && !i.wide_value) {
+    for (int k = 0; k < i.count; ++k) std::memcpy(to + 4 * k, &w.lanes<u32>(i.operand[k + 1])[lane], 4);
+    return;
+  }
   for (int k = 0; k < i.count; ++k, to += i.width) {
     const u32 place = i.operand[k + 1];
     const void* from = i.wide_value ? static_cast<void*>(&w.lanes<u64>(place)[lane]) : &w.lanes<u32>(place)[lane];
@@ -151,14 +159,17 @@ template <bool kWrites>
 void access_shared(WarpState& w, const PtxInstruction& i) {
   std::size_t offsets[kWarp];
   std::fill(offsets, offsets + kWarp, SharedMemory::kNone);
-  each_lane(w.active, [&](int l) {
-    const std::size_t at = offsets[l] = in_shared(w, i, l);
-    guarded(w, i, l, [&] {
-      kWrites ? w.shared->write(at, access_size(i), w.thread(l)) : w.shared->read(at, access_size(i), w.thread(l));
+  const std::size_t size = access_size(i);
+  int lane = 0;
+  guarded(w, i, lane, [&] {
+    each_lane(w.active, [&](int l) {
+      lane = l;
+      const std::size_t at = offsets[l] = in_shared(w, i, l);
+      kWrites ? w.shared->write(at, size, w.thread(l)) : w.shared->read(at, size, w.thread(l));
+      kWrites ? store_value(w, i, l, w.shared->data() + at) : load_value(w, i, l, w.shared->data() + at);
     });
-    kWrites ? store_value(w, i, l, w.shared->data() + at) : load_value(w, i, l, w.shared->data() + at);
   });
-  SharedMemory::count_conflicts(offsets, access_size(i));
+  SharedMemory::count_conflicts(offsets, size);
 }
 void copy_async(WarpState& w, const PtxInstruction& i) {
   const u32* bytes = w.lanes<u32>(i.operand[2]);

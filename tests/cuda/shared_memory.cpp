@@ -98,15 +98,22 @@ void SharedMemory::arrive(const Copy& copy, int thread) {
 }
 
 void SharedMemory::count_conflicts(std::span<const std::size_t> offsets, std::size_t width) {
+  // The usual: one place for all lanes, or one place after the other.
+  std::size_t same = 1, in_turn = 1;
+  for (std::size_t i = 1; i < offsets.size(); ++i)
+    same += offsets[i] == offsets[0], in_turn += offsets[i] == offsets[0] + i * width;
+  if (offsets[0] != kNone && std::max(same, in_turn) == offsets.size()) return;
   const std::size_t at_once = std::min<std::size_t>(offsets.size(), 128 / std::max<std::size_t>(width, 4));
   for (std::size_t first = 0; first < offsets.size(); first += at_once) {
-    std::size_t words[kWarp * 4], n = 0;
+    std::size_t words[32][kWarp];  // of each bank, each once
+    int in_bank[32] = {}, most = 1;
     for (std::size_t offset : offsets.subspan(first, std::min(at_once, offsets.size() - first)))
-      for (std::size_t b = 0; offset != kNone && b < width; b += 4) words[n++] = (offset + b) / 4;
-    std::sort(words, words + n);
-    int in_bank[32] = {};
-    for (std::size_t i = 0; i < n; ++i) in_bank[words[i] % 32] += i == 0 || words[i] != words[i - 1];
-    counts.bank_conflicts += std::max(0, *std::max_element(in_bank, in_bank + 32) - 1);
+      for (std::size_t b = 0; offset != kNone && b < width; b += 4) {
+        const std::size_t word = (offset + b) / 4, bank = word % 32;
+        if (std::find(words[bank], words[bank] + in_bank[bank], word) != words[bank] + in_bank[bank]) continue;
+        words[bank][in_bank[bank]++] = word, most = std::max(most, in_bank[bank]);
+      }
+    counts.bank_conflicts += most - 1;
   }
 }
 
