@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test test-arm64 test-cuda build vulkan cuda wheel deb packages asan tsan fuzz format clean
+.PHONY: help demo libero test test-arm64 test-cuda test-vulkan build vulkan cuda wheel deb packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -15,6 +15,7 @@ help:
 	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), and one of its tasks drawn as proof"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make test-cuda   all tests of our kernels for CUDA, without a GPU (downloads 102 MB: NVIDIA's compiler)"
+	@echo "make test-vulkan all golden cases on --device vulkan, of which make test tries one of each family"
 	@echo "make test-arm64  build for 64-bit ARM, and run the tests of that under an emulator"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
@@ -121,6 +122,10 @@ test: build vulkan asan
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
 	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
 	$(VENV)/bin/python scripts/test.py
+
+# All golden cases, of which `make test` tries one of each family, on the first device that Vulkan has.
+test-vulkan: vulkan
+	VLA_ALL_CASES=1 ctest --preset cpu -L '^vulkan$$' --output-on-failure
 
 # All mistakes that are made in kernels for CUDA, all families of policies and all architectures; `make test` tries some.
 test-cuda: build

@@ -8,6 +8,7 @@ scripts/test.py --preset cpu    one build only
 """
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -23,7 +24,7 @@ def run_preset(preset):
     """Runs ctest of one build. Returns (counts of tests by outcome, whether ctest was content)."""
     print(f"== {preset}", flush=True)
     process = subprocess.Popen(
-        ["ctest", "--preset", preset, "-V", "--no-tests=error"],
+        ["ctest", "--preset", preset, "-V", "--no-tests=error", "-j", str(len(os.sched_getaffinity(0)))],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
