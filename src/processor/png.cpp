@@ -8,7 +8,6 @@
 #include <csetjmp>
 #include <cstdlib>
 #include <cstring>
-#include <new>
 
 #include "processor/image_codecs.h"
 
@@ -16,7 +15,6 @@ namespace vla::codecs {
 namespace {
 
 constexpr std::string_view kSignature = "\x89PNG\r\n\x1A\n";
-constexpr std::string_view kXmp = "XML:com.adobe.xmp", kExif = "Raw profile type exif";
 
 /// libpng reports errors by longjmp, which destroys nothing. So everything that owns memory lives here, outside the
 /// functions that a jump leaves, and those functions (`guarded_*`) hold only plain values.
@@ -124,73 +122,23 @@ bool expand_palette(PngReader& reader) {
   return true;
 }
 
-/// "Raw profile type exif" is how ImageMagick kept EXIF before PNG had a chunk for it: three lines, then hex digits.
-std::vector<std::uint8_t> from_raw_profile(std::string_view text) {
-  for (int line = 0; line < 3; ++line) {
-    const std::size_t end = text.find('\n');
-    if (end == std::string_view::npos) return {};
-    text.remove_prefix(end + 1);
-  }
-  std::vector<std::uint8_t> bytes;
-  int high = -1;
-  for (const char c : text) {
-    const int digit = c >= '0' && c <= '9'   ? c - '0'
-                      : c >= 'a' && c <= 'f' ? c - 'a' + 10
-                      : c >= 'A' && c <= 'F' ? c - 'A' + 10
-                                             : -1;
-    if (digit < 0) continue;
-    if (high >= 0) bytes.push_back(static_cast<std::uint8_t>(high << 4 | digit));
-    high = high >= 0 ? -1 : digit;
-  }
-  return bytes;
-}
-
-/// The two texts among a file's chunks that may say how an image is to be turned.
-struct Texts {
-  static constexpr std::size_t kMost = 1 << 20;  // bytes of both and of all their repetitions, unpacked
-  static constexpr std::size_t kEach = 1 << 12;  // what each of them counts at least
-  std::size_t left = kMost;
-  std::vector<std::uint8_t> exif;
-  std::string xmp;
+/// What a file's chunks say of how an image is to be turned.
+struct Orientation {
+  Bytes exif;            // the last eXIf chunk
+  std::string_view xmp;  // the last XMP packet, with what stands before it
 };
 
-/// Takes everything up to a zero byte from the front of `text`, and the zero byte.
-std::string_view take_word(std::string_view& text) {
-  const std::string_view word = text.substr(0, text.find('\0'));
-  text.remove_prefix(std::min(text.size(), word.size() + 1));
-  return word;
-}
-
-/// What a zlib stream holds; nothing where it is damaged or longer than `left`, from which what was unpacked is taken.
-std::string unpacked(std::string_view packed, std::size_t& left) {
-  std::string text(left, '\0');
-  uLongf size = left;
-  const int found = uncompress(reinterpret_cast<Bytef*>(text.data()), &size,
-                               reinterpret_cast<const Bytef*>(packed.data()), packed.size());
-  if (found == Z_MEM_ERROR) throw std::bad_alloc();  // not a text that is passed over: the image would not be turned
-  left -= std::min<std::size_t>(left, size);
-  text.resize(found == Z_OK ? size : 0);
-  return text;
-}
-
-/// The text of a tEXt, zTXt or iTXt chunk whose keyword was taken off: PNG specification, 11.3.4.
-std::string text_of(std::string_view type, std::string_view content, std::size_t& left) {
-  const bool packed = type == "zTXt" || (type == "iTXt" && content.starts_with('\1'));
-  if (type != "tEXt") content.remove_prefix(std::min<std::size_t>(content.size(), type == "zTXt" ? 1 : 2));
-  for (int i = 0; i < 2 && type == "iTXt"; ++i) take_word(content);  // the language, and the keyword in it
-  if (packed) return unpacked(content, left);
-  left -= std::min(left, content.size());
-  return std::string(content);
-}
-
-void read_text(std::string_view type, std::string_view content, Texts& texts) {
-  if (type != "tEXt" && type != "zTXt" && type != "iTXt") return;
-  const std::string_view keyword = take_word(content);
-  if (keyword != kXmp && keyword != kExif) return;
-  texts.left -= std::min(texts.left, Texts::kEach);
-  std::string text = text_of(type, content, texts.left);
-  if (keyword == kExif && texts.exif.empty()) texts.exif = from_raw_profile(text);
-  if (keyword == kXmp && !text.empty()) texts.xmp = std::move(text);
+/// Notes an XMP packet. Nothing is unpacked to look for one, or for the EXIF data that ImageMagick kept as hex digits
+/// before PNG had a chunk for it: returns what is refused, since the reference would turn by it.
+const char* read_text(std::string_view type, std::string_view content, Orientation& orientation) {
+  if (type != "tEXt" && type != "zTXt" && type != "iTXt") return nullptr;
+  const std::string_view keyword = content.substr(0, content.find('\0'));
+  if (keyword == "Raw profile type exif") return "EXIF data as text";
+  if (keyword != "XML:com.adobe.xmp") return nullptr;
+  content.remove_prefix(std::min(content.size(), keyword.size() + 1));
+  if (type == "zTXt" || (type == "iTXt" && content.starts_with('\1'))) return "a compressed XMP packet";
+  orientation.xmp = content;
+  return nullptr;
 }
 
 void drop_exif_name(std::vector<std::uint8_t>& exif) {
@@ -206,24 +154,25 @@ std::uint32_t number_at(Bytes file, std::size_t at) {
 }
 
 /// Walks the chunks up to the end before libpng does: it would take memory for the length that a chunk states, up to
-/// 2 GiB, before it reads, and would go on without an orientation whose chunk is damaged. `exif` is the last eXIf
-/// chunk.
-const char* damage(Bytes file, Bytes& exif, Texts& texts) {
+/// 2 GiB, before it reads, and would go on without an orientation whose chunk is damaged.
+Status walk(Bytes file, const std::string& where, Orientation& orientation) {
+  const auto damaged = [&](const char* found) { return refused(where, "a whole PNG image", found); };
   constexpr std::size_t kAround = 12;  // length, type and checksum
   for (std::size_t at = kSignature.size(); file.size() - at >= kAround;) {
     const std::size_t length = number_at(file, at);
     if (length > file.size() - at - kAround) break;
     const Bytes content = file.subspan(at + 4, length + 4);  // the type belongs to the checksum
     const auto checksum = crc32(0, reinterpret_cast<const Bytef*>(content.data()), static_cast<uInt>(content.size()));
-    if (checksum != number_at(file, at + 8 + length)) return "a chunk with another checksum";
+    if (checksum != number_at(file, at + 8 + length)) return damaged("a chunk with another checksum");
     const std::string_view text(reinterpret_cast<const char*>(content.data()), content.size());
-    if (text.starts_with("IEND")) return nullptr;
-    if (text.starts_with("eXIf")) exif = content.subspan(4);
-    read_text(text.substr(0, 4), text.substr(4), texts);
-    if (texts.left == 0) return "more than a mebibyte of texts about its orientation";
+    if (text.starts_with("IEND")) return {};
+    if (text.starts_with("eXIf")) orientation.exif = content.subspan(4);
+    if (const char* found = read_text(text.substr(0, 4), text.substr(4), orientation))
+      return refused(where, "a PNG image whose orientation, if it has one, is in an eXIf chunk", found,
+                     "save it without metadata, turned upright");
     at += length + kAround;
   }
-  return "a truncated one";
+  return damaged("a truncated one");
 }
 
 Error no_memory(const std::string& where) { return {Code::out_of_memory, where, "", "no memory for the PNG decoder"}; }
@@ -249,9 +198,8 @@ Result<ImageHeader> png_header(Bytes file, const std::string& where, const Image
 }
 
 Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits& limits) {
-  Bytes exif;
-  Texts texts;
-  if (const char* found = damage(file, exif, texts)) return refused(where, "a whole PNG image", found);
+  Orientation orientation;
+  VLA_CHECK(walk(file, where, orientation));
   PngReader reader(file);
   if (!open(reader)) return no_memory(where);
   if (!guarded_header(reader)) return corrupt(reader, where);
@@ -271,9 +219,9 @@ Result<Image> decode_png(Bytes file, const std::string& where, const ImageLimits
   if (!guarded_pixels(reader)) return corrupt(reader, where);
   if (palette && !expand_palette(reader)) return refused(where, "a whole PNG image", "a pixel beyond its palette");
 
-  Image image{static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, std::move(texts.xmp)};
-  for (const std::byte byte : exif) image.exif.push_back(std::to_integer<std::uint8_t>(byte));
-  if (exif.empty()) image.exif = std::move(texts.exif);
+  Image image{
+      static_cast<int>(width), static_cast<int>(height), std::move(reader.pixels), {}, std::string(orientation.xmp)};
+  for (const std::byte byte : orientation.exif) image.exif.push_back(std::to_integer<std::uint8_t>(byte));
   drop_exif_name(image.exif);
   return image;
 }

@@ -154,32 +154,29 @@ TEST_CASE("a thousand packed texts of 8 MB each cost a PNG nothing") {
   }
 }
 
-TEST_CASE("texts about a PNG's orientation are read up to a mebibyte in all") {
+TEST_CASE("an XMP packet turns a PNG, and what would have to be unpacked to know is refused") {
   const std::string zero(1, '\0'), upright = "<x tiff:Orientation=\"6\"/>";
-  const auto itxt = [&](const std::string& text) {
-    return chunk("iTXt" + kXmp + zero + '\1' + zero + "en" + zero + "key" + zero + packed(text));
-  };
   const auto turned = decode_data("rgb.png");
   for (const std::string& text :
-       {itxt(upright), chunk("tEXt" + kXmp + zero + upright), chunk("zTXt" + kXmp + zero + zero + packed(upright)),
-        chunk("iTXt" + kXmp + zero + zero + zero + zero + zero + upright)}) {
+       {chunk("tEXt" + kXmp + zero + upright), chunk("iTXt" + kXmp + repeated(zero, 5) + upright)}) {
     const std::string file = png_with(text);
     const auto frame = decode_image(bytes_of(file), "top");
     REQUIRE_MESSAGE(frame.ok(), frame.error().message());
     CHECK(frame->width == turned->height);
   }
-  for (const std::string& bomb : {itxt(std::string(8 << 20, 'x')), repeated(itxt(std::string(8 << 10, 'x')), 1000),
-                                  repeated(itxt(""), 1000), chunk("tEXt" + kXmp + zero + std::string(2 << 20, 'x'))}) {
-    const std::string file = png_with(bomb);
-    CHECK(contains(refusal(decode_image(bytes_of(file), "top"), Code::bad_observation), "more than a mebibyte"));
+  const std::string raw = "Raw profile type exif" + zero;
+  for (const std::string& text :
+       {chunk("zTXt" + kXmp + zero + zero + packed(upright)), chunk("tEXt" + raw), chunk("zTXt" + raw + zero),
+        chunk("iTXt" + kXmp + zero + '\1' + zero + "en" + zero + "key" + zero + packed(upright))}) {
+    const std::string file = png_with(text);
+    CHECK(contains(refusal(decode_image(bytes_of(file), "top"), Code::bad_observation), "without metadata"));
   }
 }
 
 TEST_CASE("a damaged text is passed over") {
   const std::string zero(1, '\0');
   for (const std::string& content :
-       {"zTXt" + kXmp, "zTXt" + kXmp + zero, "zTXt" + kXmp + zero + zero + "junk", "iTXt" + kXmp + zero + '\1',
-        "iTXt" + kXmp + zero + '\1' + zero + "en", std::string("tEXt"), "iTXt" + kXmp + zero}) {
+       {"tEXt" + kXmp, "iTXt" + kXmp, std::string("tEXt"), std::string("zTXt"), "iTXt" + kXmp + zero}) {
     const std::string file = png_with(chunk(content));
     CHECK(decode_image(bytes_of(file), "top").ok());
   }
@@ -217,7 +214,7 @@ TEST_CASE("every readable PNG and JPEG decodes to Pillow's pixels") {
     CHECK(pixels(*found) == pixels(*expected));
     ++compared;
   }
-  CHECK(compared == 35);
+  CHECK(compared == 34);
 }
 
 TEST_CASE("EXIF orientations 5 to 8 exchange width and height") {

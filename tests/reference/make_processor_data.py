@@ -115,8 +115,6 @@ def readable_images() -> dict:
     xmp = b'<x:xmpmeta><rdf:Description tiff:Orientation="6"/></x:xmpmeta>'
     text = PngImagePlugin.PngInfo()
     text.add_itxt("XML:com.adobe.xmp", xmp.decode())
-    raw = PngImagePlugin.PngInfo()
-    raw.add_text("Raw profile type exif", f"\nexif\n{len(exif_block(8)):8}\n{exif_block(8).hex()}\n", zip=True)
     colours = b"".join(bytes([i * 60, 255 - i * 60, i * 17]) for i in range(4))
     images = {
         "rgb.png": saved(rgb, "PNG"),
@@ -134,7 +132,6 @@ def readable_images() -> dict:
         "interlaced.png": interlaced(image(13, 9)),
         "exif.png": saved(rgb, "PNG", exif=exif_block(6)),
         "xmp.png": saved(rgb, "PNG", pnginfo=text),
-        "raw_profile.png": saved(rgb, "PNG", pnginfo=raw),
         "rgb.jpg": saved(soft, "JPEG", quality=85),
         "rgb_444.jpg": saved(soft, "JPEG", quality=90, subsampling=0),
         "rgb_422.jpg": saved(soft, "JPEG", quality=90, subsampling=1),
@@ -155,6 +152,8 @@ def readable_images() -> dict:
 def refused_images() -> dict:
     rgb, soft = Image.fromarray(image(13, 9)), Image.fromarray(smooth(21, 17))
     whole, jpeg = saved(rgb, "PNG"), saved(soft, "JPEG")
+    raw = PngImagePlugin.PngInfo()
+    raw.add_text("Raw profile type exif", f"\nexif\n{len(exif_block(8)):8}\n{exif_block(8).hex()}\n", zip=True)
     return {
         "bad_16_bit.png": png(2, 1, 16, 0, b"\0" + bytes(4)),
         "bad_16_bit_rgb.png": png(1, 1, 16, 2, b"\0" + bytes(6)),
@@ -162,6 +161,7 @@ def refused_images() -> dict:
         "bad_no_end.png": whole[:-12],
         "bad_checksum.png": whole[:60] + bytes([whole[60] ^ 1]) + whole[61:],
         "bad_palette_index.png": png(2, 1, 8, 3, b"\0\0\5", [(b"PLTE", bytes(6))]),
+        "bad_raw_profile.png": saved(rgb, "PNG", pnginfo=raw),
         "bad_few_rows.png": png(2, 4, 8, 0, b"\0\1\2"),
         "bad_huge.png": png(20000, 20000, 8, 2, b""),
         "bad_truncated.jpg": jpeg[: len(jpeg) * 2 // 3],

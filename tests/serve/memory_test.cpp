@@ -171,9 +171,8 @@ TEST_CASE("whichever allocations of a request fail, its client hears of it once,
     request.mutable_act()->mutable_views(0)->set_png(read(kGolden + "/camera1.png"));
     fail_each_allocation(server, request);
   }
-  SUBCASE("an act of a PNG whose orientation is packed") {
-    request.mutable_act()->mutable_views(0)->set_png(
-        read(VLA_SOURCE_DIR "/tests/processor/data/images/raw_profile.png"));
+  SUBCASE("an act of a PNG that is turned") {
+    request.mutable_act()->mutable_views(0)->set_png(read(VLA_SOURCE_DIR "/tests/processor/data/images/xmp.png"));
     fail_each_allocation(server, request);
   }
   SUBCASE("an act of a JPEG") {
