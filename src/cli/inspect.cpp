@@ -144,6 +144,7 @@ void print_human(const Engine& engine) {
       d.converter);
   if (const auto backbone = robot.bundle().keys().string("vla.source.backbone"))
     say(stdout, "backbone     {}\n", *backbone);
+  if (const auto chosen = robot.bundle().keys().string("vla.quantization")) say(stdout, "quantized    {}\n", *chosen);
   say(stdout, "checksum     {}\n", d.checksum);
   print_features(d, robot);
   say(stdout, "solver       {}, {} steps from {:g}, {} noise\n", d.solver, d.n_step, d.t_start, d.noise);

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "quantize/quantize.h"
+#include "quantize/search.h"
 
 #include <fmt/format.h>
 #include <unistd.h>
@@ -9,6 +9,9 @@
 
 #include "cli/commands.h"
 #include "cli/say.h"
+#ifdef VLA_SERVER
+#include "cli/calibration.h"
+#endif
 
 namespace vla::cli {
 namespace {
@@ -16,6 +19,9 @@ namespace {
 struct QuantizeOptions {
   std::string from, to, dtype = "int8";
   bool force = false, quiet = false;
+  std::string recording;  // to judge by
+  Bound bound;
+  int n_observation = 32, n_thread = 0;
 };
 
 std::string megabytes(std::int64_t bytes) { return fmt::format("{:.1f}", static_cast<double>(bytes) / 1e6); }
@@ -49,16 +55,100 @@ void print_progress(QuantizeProgress at) {
   say(stderr, "\rquantizing {:>3} %{}", percent, percent >= 100 ? "\n" : "");
 }
 
+#ifdef VLA_SERVER
+std::string percent(const Moved& moved) {
+  return fmt::format("{:.3f} % (largest {:.3f} %)", 100 * moved.rms, 100 * moved.largest);
+}
+
+const char* name_of(Rounding codes) {
+  return codes == Rounding::int4 ? "int4" : codes == Rounding::int8 ? "int8" : "as stored";
+}
+
+void print(const Found& found, std::size_t n_observation) {
+  std::size_t width = 5;
+  for (const Block& block : found.blocks) width = std::max(width, block.path.size());
+  say(stdout, "{:<{}}  {:<9}  {:>9}  {:>9}  {:>9}  {:>12}\n", "block", width, "codes", "stored MB", "int8, MB",
+      "int4, MB", "int4 moves");
+  for (const Block& block : found.blocks)
+    say(stdout, "{:<{}}  {:<9}  {:>9}  {:>9}  {:>9}  {:>10.3f} %\n", block.path, width, name_of(block.codes),
+        megabytes(block.stored), megabytes(block.int8), megabytes(block.int4), 100 * block.moved_by_int4);
+  say(stdout, "chunks of {} observations move by {} of float32's; all int8: {}; all int4: {}\n\n", n_observation,
+      percent(found.moved), percent(found.all_int8), percent(found.all_int4));
+}
+
+/// What the bundle keeps of a search.
+std::string told(const Found& found, const QuantizeOptions& options, std::size_t n_observation) {
+  const auto n = [&](Rounding codes) { return std::ranges::count(found.blocks, codes, &Block::codes); };
+  const std::string bound = options.bound.error ? fmt::format("error at most {}", *options.bound.error)
+                                                : fmt::format("{} bytes at most", *options.bound.bytes);
+  return fmt::format("{}: {} blocks in int4, {} in int8, {} as stored; chunks of {} observations move by {}", bound,
+                     n(Rounding::int4), n(Rounding::int8), n(Rounding::none), n_observation, percent(found.moved));
+}
+
+/// Codes block by block, and why.
+Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, bool shows) {
+  VLA_TRY(const std::vector<Judged> judged,
+          read_observations(options.recording, options.from, static_cast<std::size_t>(options.n_observation)));
+  const auto progress = [shows](int trial, const Moved& moved) {
+    if (shows) say(stderr, "\rtrial {:>3}: {:<40}", trial, percent(moved));
+  };
+  VLA_TRY(const Found found,
+          search(options.from, options.to + ".trial", judged, options.bound, options.n_thread, progress));
+  if (shows) say(stderr, "\r{:<60}\r", "");
+  if (!options.quiet) print(found, judged.size());
+  if (std::ranges::all_of(found.blocks, [](const Block& block) { return block.codes == Rounding::none; }))
+    return Error{Code::unsupported, options.from, "matrices that codes are good enough for", "none"};
+  return std::pair(choice_of(found.blocks), told(found, options, judged.size()));
+}
+
+void add_search(CLI::App& command, QuantizeOptions& options) {
+  CLI::Option* judge =
+      add_text(command, "--judge", options.recording, "DIR",
+               "A recording of vla serve --record: choose codes block by block by how far its actions move");
+  CLI::Option* error =
+      command
+          .add_option(
+              "--error", options.bound.error,
+              "The fewest bytes whose chunks move by at most this share of float32's, by root mean square: 0.01")
+          ->type_name("SHARE")
+          ->check(CLI::Range(1e-6, 1.0));
+  CLI::Option* size =
+      command
+          .add_option("--size", options.bound.bytes, "The least error of a file of at most so many bytes: 1.8GB, 900MB")
+          ->type_name("BYTES")
+          ->transform(CLI::AsSizeValue(true));
+  error->needs(judge)->excludes(size);
+  size->needs(judge)->excludes("--dtype");
+  error->excludes("--dtype");
+  command
+      .add_option("--observations", options.n_observation, "Of the recording, evenly spread (1 to 4096; default 32)")
+      ->needs(judge)
+      ->check(CLI::Range(1, 4096));
+  command.add_option("--threads", options.n_thread, "CPU threads; 0 takes every core")
+      ->needs(judge)
+      ->check(CLI::Range(0, 512));
+}
+#endif
+
 Status run(const QuantizeOptions& options) {
   std::error_code ignored;
   if (std::filesystem::exists(options.to, ignored) && !options.force)
     return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
-  const Rounding codes = options.dtype == "int4" ? Rounding::int4 : Rounding::int8;
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
   const auto progress = [shows](QuantizeProgress at) {
     if (shows) print_progress(at);
   };
-  VLA_TRY(const std::vector<QuantizedModule> rows, quantize(options.from, options.to, codes, progress));
+  const Rounding codes = options.dtype == "int4" ? Rounding::int4 : Rounding::int8;
+  std::pair<Choice, std::string> chosen([codes](const std::string&) { return codes; }, "");
+#ifdef VLA_SERVER
+  if (!options.recording.empty()) {
+    if (!options.bound.error && !options.bound.bytes)
+      return Error{Code::usage, "--judge", "--error or --size", "neither"};
+    VLA_TRY(chosen, choose(options, shows));
+  }
+#endif
+  VLA_TRY(const std::vector<QuantizedModule> rows,
+          quantize(options.from, options.to, chosen.first, chosen.second, progress));
   if (shows) say(stderr, "\r{:<16}\r", "");
   if (!options.quiet) print(rows);
   return {};
@@ -73,7 +163,8 @@ Command add_quantize(CLI::App& app) {
   command->footer(
       "The codes are those that --kernels int8 or int4 makes at every load, so the actions are the same; the file is\n"
       "smaller and ready sooner. int4 has codes of four bits and a step for each 64 of a row, and moves actions more.\n"
-      "How far actions move from float32 is for you to judge, on your own observations:\n"
+      "How far actions move from float32 is judged on your own observations, by the program or by you:\n"
+      "  vla quantize policy.gguf -o policy.small.gguf --judge RECORDING --error 0.01\n"
       "  vla quantize policy.gguf -o policy.int8.gguf\n"
       "  vla run policy.gguf ... --kernels float32 --tap '*' --taps-out expected.gguf\n"
       "  vla run policy.int8.gguf ... --tap '*' --taps-out got.gguf\n"
@@ -85,6 +176,9 @@ Command add_quantize(CLI::App& app) {
       ->check(CLI::IsMember({"int8", "int4"}));
   command->add_flag("--force", options->force, "Write over a file that exists");
   command->add_flag("--quiet", options->quiet, "Print nothing");
+#ifdef VLA_SERVER
+  add_search(*command, *options);
+#endif
   return [options] { return run(*options); };
 }
 

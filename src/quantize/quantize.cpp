@@ -25,9 +25,9 @@ struct Matrices {
   std::map<const std::byte*, Encoding> wanted;
   std::set<const std::byte*> read_otherwise;
 
-  void add(const ParamList& list, Rounding codes) {
+  void add(const ParamList& list, const Choice& choice) {
     for (const Param& param : list.params()) {
-      const Encoding encoding = resident_encoding(param, codes);
+      const Encoding encoding = resident_encoding(param, choice(param.source->name));
       const std::byte* const place = param.source->data.data();
       if (encoding == param.encoding)
         read_otherwise.insert(place);
@@ -43,7 +43,7 @@ struct Matrices {
 };
 
 /// What the policy of every robot reads as a large matrix. Errors: bad_bundle, unsupported.
-Result<Matrices> find_matrices(const Bundle& bundle, Rounding codes) {
+Result<Matrices> find_matrices(const Bundle& bundle, const Choice& choice) {
   Matrices matrices;
   std::vector<std::string> tags = bundle.embodiments();
   if (tags.empty()) tags.emplace_back();
@@ -55,7 +55,7 @@ Result<Matrices> find_matrices(const Bundle& bundle, Rounding codes) {
     ParamList list(robot.keys(), &robot);
     const std::unique_ptr<Policy> policy = entry.make(list);
     VLA_CHECK(list.report(arch, [](const std::string&) { return true; }));
-    matrices.add(list, codes);
+    matrices.add(list, choice);
   }
   return matrices;
 }
@@ -126,6 +126,12 @@ class Writer {
   std::int64_t done_ = 0;
 };
 
+/// Codes and scales.
+std::int64_t quantized_size(const TensorInfo& tensor, const Encoding& encoding) {
+  const std::size_t scales = static_cast<std::size_t>(tensor.shape[1]) * sizeof(float);
+  return static_cast<std::int64_t>(dtype_size(encoding.type, tensor.count()) + scales);
+}
+
 /// The tensors of the quantized file; of their data only the sizes count.
 std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& matrices) {
   std::vector<TensorInfo> tensors;
@@ -144,10 +150,13 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
   return tensors;
 }
 
-Keys quantized_keys(const Bundle& bundle, Rounding codes) {
+Keys quantized_keys(const Bundle& bundle, const Matrices& matrices, const std::string& why) {
   Keys keys = bundle.keys();
+  const bool has_int4 = std::ranges::any_of(
+      bundle.tensors(), [&](const TensorInfo& t) { return matrices.find(t).value_or(Encoding{}).type == DType::int4; });
   keys.set("vla.checksum", std::string(kNoChecksum));
-  keys.set("vla.dtype", std::string(codes == Rounding::int4 ? "int4" : "int8"));
+  keys.set("vla.dtype", std::string(has_int4 ? "int4" : "int8"));
+  if (!why.empty()) keys.set("vla.quantization", why);
   return keys;
 }
 
@@ -181,8 +190,7 @@ Status write_tensors(const Bundle& bundle, const Matrices& matrices, Writer& wri
     if (const std::optional<Encoding> wanted = matrices.find(tensor)) {
       VLA_TRY(const Squares squares, writer.quantize(tensor, *wanted));
       report.add(row, squares);
-      const std::size_t n_scale = static_cast<std::size_t>(tensor.shape[1]);
-      row.after += static_cast<std::int64_t>(dtype_size(wanted->type, tensor.count()) + n_scale * sizeof(float));
+      row.after += quantized_size(tensor, *wanted);
     } else {
       VLA_CHECK(writer.copy(tensor));
       row.after += static_cast<std::int64_t>(tensor.data.size());
@@ -191,19 +199,37 @@ Status write_tensors(const Bundle& bundle, const Matrices& matrices, Writer& wri
   return {};
 }
 
+Error nothing_to_quantize(const std::string& path) {
+  return {Code::unsupported, path, "large matrices of floats", "none: it is quantized already, or too small"};
+}
+
 }  // namespace
 
-Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, Rounding codes,
+Result<std::vector<Quantizable>> quantizable(const std::string& path) {
+  VLA_TRY(const Bundle bundle, Bundle::open(path));
+  const auto all = [](Rounding codes) { return [codes](const std::string&) { return codes; }; };
+  VLA_TRY(const Matrices int8, find_matrices(bundle, all(Rounding::int8)));
+  VLA_TRY(const Matrices int4, find_matrices(bundle, all(Rounding::int4)));
+  std::vector<Quantizable> found;
+  for (const TensorInfo& tensor : bundle.tensors())
+    if (const auto bytes = int8.find(tensor))
+      found.push_back({tensor.name, static_cast<std::int64_t>(tensor.data.size()), quantized_size(tensor, *bytes),
+                       quantized_size(tensor, *int4.find(tensor))});
+  if (found.empty()) return nothing_to_quantize(path);
+  return found;
+}
+
+Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, const Choice& choice,
+                                              const std::string& why,
                                               const std::function<void(QuantizeProgress)>& progress) {
   VLA_TRY(const Bundle bundle, Bundle::open(from));
-  VLA_TRY(const Matrices matrices, find_matrices(bundle, codes));
+  VLA_TRY(const Matrices matrices, find_matrices(bundle, choice));
   const std::vector<TensorInfo> tensors = quantized_tensors(bundle, matrices);
-  if (tensors.size() == bundle.tensors().size())
-    return Error{Code::unsupported, from, "large matrices of floats", "none: it is quantized already, or too small"};
+  if (tensors.size() == bundle.tensors().size()) return nothing_to_quantize(from);
   Report report;
   Status made;
   const Status written = write_file(to, [&](int file) {
-    BundleFile out(file, quantized_keys(bundle, codes), tensors);
+    BundleFile out(file, quantized_keys(bundle, matrices, why), tensors);
     Writer writer(bundle, out, progress);
     made = write_tensors(bundle, matrices, writer, report);
     return made && out.seal();

@@ -24,11 +24,25 @@ struct QuantizeProgress {
   std::int64_t done, all;  // bytes
 };
 
-/// Writes a bundle whose large matrices are int8 or int4 codes with a scale for each row: those that `--kernels int8`
-/// or `int4` makes at every load, so that the chunk is the same to the bit. Norms, biases, tables, and matrices from or
-/// to fewer than 144 elements stay as they are (graph/rounding.h), and so does a tensor that something else reads too.
-/// Errors: those of Bundle::open and of the policy's manifest; unsupported where no matrix is worth it; io.
-Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, Rounding codes,
+/// What the matrix of this tensor becomes: int8, int4, or none.
+using Choice = std::function<Rounding(const std::string& tensor)>;
+
+/// A large matrix of floats, and its bytes as stored, as int8 and as int4, scales included.
+struct Quantizable {
+  std::string tensor;
+  std::int64_t stored = 0, int8 = 0, int4 = 0;
+};
+/// In the order of the file. Errors: those of Bundle::open and of the policy's manifest; unsupported where there is
+/// none.
+Result<std::vector<Quantizable>> quantizable(const std::string& bundle);
+
+/// Writes a bundle whose large matrices are int8 or int4 codes with a scale for each row: where all are of one kind,
+/// those that `--kernels int8` or `int4` makes at every load, so that the chunk is the same to the bit. Norms, biases,
+/// tables, and matrices from or to fewer than 144 elements stay as they are (graph/rounding.h), and so does a tensor
+/// that something else reads too. `why`, which the bundle keeps as vla.quantization, says what chose; it may be empty.
+/// Errors: those of `quantizable`; unsupported where nothing is chosen; io.
+Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, const Choice& choice,
+                                              const std::string& why,
                                               const std::function<void(QuantizeProgress)>& report);
 
 }  // namespace vla

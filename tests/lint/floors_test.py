@@ -29,7 +29,7 @@ ROOMS = {
     "modules": GRAPH | {"nn"},
     "policies": GRAPH | {"nn", "modules"},
     "engine": GRAPH | NETWORK | {"devices", "processor"},
-    "quantize": GRAPH | NETWORK | {"kernels", "lower"},
+    "quantize": GRAPH | NETWORK | {"kernels", "lower", "devices", "processor", "engine"},
     "bench": GRAPH | NETWORK | {"kernels", "devices", "processor", "engine"},
     "net": {"base"},
     "zmtp": {"base", "net"},

@@ -1,0 +1,238 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "quantize/search.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+#include <filesystem>
+
+namespace vla {
+namespace {
+
+/// `vision.blk.3` of `vision.blk.3.attn_q.weight`; the first level of a path without a number.
+std::string block_of(const std::string& tensor) {
+  for (std::size_t end = tensor.find('.'); end != std::string::npos; end = tensor.find('.', end + 1)) {
+    const std::size_t digits = tensor.find_first_not_of("0123456789", end + 1);
+    if (digits > end + 1 && digits != std::string::npos && tensor[digits] == '.') return tensor.substr(0, digits);
+  }
+  return tensor.substr(0, tensor.find('.'));
+}
+
+std::vector<Block> blocks_of(const std::vector<Quantizable>& matrices) {
+  std::vector<Block> blocks;
+  for (const Quantizable& matrix : matrices) {
+    const std::string path = block_of(matrix.tensor);
+    auto block = std::ranges::find(blocks, path, &Block::path);
+    if (block == blocks.end()) block = blocks.insert(block, Block{.path = path});
+    block->stored += matrix.stored, block->int8 += matrix.int8, block->int4 += matrix.int4;
+  }
+  return blocks;
+}
+
+std::int64_t bytes_of(const Block& block) {
+  return block.codes == Rounding::int4 ? block.int4 : block.codes == Rounding::int8 ? block.int8 : block.stored;
+}
+
+/// Chunks of a bundle for the observations.
+Result<std::vector<std::vector<float>>> chunks_of(const std::string& bundle, const EngineOptions& options,
+                                                  std::span<const Judged> judged) {
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(bundle, options));
+  std::vector<std::vector<float>> chunks;
+  for (const Judged& one : judged) {
+    VLA_TRY(ActionChunk chunk, engine->act(one.observation, one.noise));
+    chunks.push_back(std::move(chunk.normalized));
+  }
+  return chunks;
+}
+
+Moved moved(const std::vector<std::vector<float>>& expected, const std::vector<std::vector<float>>& got) {
+  double value = 0, missed = 0, largest_value = 0, largest = 0;
+  for (std::size_t k = 0; k < expected.size(); ++k)
+    for (std::size_t i = 0; i < expected[k].size(); ++i) {
+      const double x = expected[k][i], d = got[k][i] - x;
+      value += x * x, missed += d * d;
+      largest_value = std::max(largest_value, std::abs(x)), largest = std::max(largest, std::abs(d));
+    }
+  return value > 0 ? Moved{std::sqrt(missed / value), largest / largest_value} : Moved{};
+}
+
+/// Squares, so that those of several blocks add.
+double beyond(double larger, double smaller) { return std::sqrt(std::max(0.0, larger * larger - smaller * smaller)); }
+
+class Search {
+ public:
+  using Report = std::function<void(int, const Moved&)>;
+  Search(std::string from, std::string trial, std::span<const Judged> judged, int n_thread, const Report& report)
+      : from_(std::move(from)), trial_(std::move(trial)), judged_(judged), report_(report) {
+    options_.n_thread = n_thread, options_.all_robots = true;
+  }
+
+  Status open() {
+    VLA_TRY(const std::vector<Quantizable> matrices, quantizable(from_));
+    std::error_code error;
+    n_byte_ = static_cast<std::int64_t>(std::filesystem::file_size(from_, error));
+    found_.blocks = blocks_of(matrices);
+    return {};
+  }
+
+  Status to_error(double most) {
+    VLA_CHECK(measure_int4());
+    if (found_.all_int8.rms > most) VLA_CHECK(measure_int8());
+    set_all(Rounding::int4);
+    found_.moved = found_.all_int4;
+    while (found_.moved.rms > most) {
+      // Where a choice misses more than was expected of it, less must be expected of the next one.
+      const double aim = most * std::min(1.0, expected() / found_.moved.rms);
+      do {
+        VLA_TRY(Block* const block, next([](const Block&) { return true; }));
+        if (block == nullptr)
+          return Error{Code::unsupported, "--error", fmt::format("{:.3g} or more", found_.moved.rms),
+                       fmt::format("{:.3g}", most), "that is with every matrix as it is stored"};
+        give_back(*block);
+      } while (expected() > aim);
+      VLA_TRY(found_.moved, compute());
+    }
+    return {};
+  }
+
+  Status to_size(std::int64_t most) {
+    set_all(Rounding::int8);
+    const bool may_keep = size() < most;
+    set_all(Rounding::int4);
+    if (size() > most)
+      return Error{Code::unsupported, "--size", fmt::format("{} bytes or more", size()), std::to_string(most),
+                   "that is with all large matrices in int4"};
+    VLA_CHECK(measure_int4());
+    if (may_keep) VLA_CHECK(measure_int8());
+    set_all(Rounding::int4);
+    for (;;) {
+      VLA_TRY(Block* const block, next([&](const Block& b) { return size() + added(b) <= most; }));
+      if (block == nullptr) break;
+      give_back(*block);
+    }
+    VLA_TRY(found_.moved, compute());
+    return {};
+  }
+
+  Found take() { return std::move(found_); }
+
+ private:
+  void set_all(Rounding codes) {
+    for (Block& block : found_.blocks) block.codes = codes;
+  }
+  Result<Moved> with_all(Rounding codes) {
+    set_all(codes);
+    return compute();
+  }
+  Result<Moved> with_one(Block& one, Rounding codes) {
+    set_all(Rounding::int8);
+    one.codes = codes;
+    return compute();
+  }
+  Result<Moved> compute() {
+    const bool is_stored = std::ranges::all_of(found_.blocks, [](const Block& b) { return b.codes == Rounding::none; });
+    if (!is_stored)
+      if (const auto made = quantize(from_, trial_, choice_of(found_.blocks), {}, [](QuantizeProgress) {}); !made)
+        return made.error();
+    VLA_TRY(const auto got, chunks_of(is_stored ? from_ : trial_, options_, judged_));
+    const Moved result = moved(expected_, got);
+    report_(++found_.n_trial, result);
+    return result;
+  }
+
+  /// Bytes of the file with the codes of the blocks.
+  std::int64_t size() const {
+    std::int64_t size = n_byte_;
+    for (const Block& block : found_.blocks) size += bytes_of(block) - block.stored;
+    return size;
+  }
+  double expected() const {
+    double square = found_.all_int8.rms * found_.all_int8.rms;
+    for (const Block& block : found_.blocks)
+      square += block.codes == Rounding::int4   ? block.moved_by_int4 * block.moved_by_int4
+                : block.codes == Rounding::none ? -block.moved_by_int8 * block.moved_by_int8
+                                                : 0;
+    return std::sqrt(std::max(0.0, square));
+  }
+
+  static std::int64_t added(const Block& block) {
+    return block.codes == Rounding::int4 ? block.int8 - block.int4 : block.stored - block.int8;
+  }
+  static void give_back(Block& block) { block.codes = block.codes == Rounding::int4 ? Rounding::int8 : Rounding::none; }
+
+  /// The block whose next larger codes spare the actions most for their bytes. Null where none is left.
+  Result<Block*> next(const std::function<bool(const Block&)>& fits) {
+    std::vector<Block*> candidates;
+    for (Block& block : found_.blocks)
+      if ((block.codes == Rounding::int4 || (knows_int8_ && block.codes == Rounding::int8)) && fits(block))
+        candidates.push_back(&block);
+    if (!candidates.empty())
+      return *std::ranges::max_element(candidates, {}, [](auto* block) { return worth(*block); });
+    if (knows_int8_ || std::ranges::none_of(found_.blocks, fits)) return static_cast<Block*>(nullptr);
+    const std::vector<Block> chosen = found_.blocks;
+    VLA_CHECK(measure_int8());
+    for (std::size_t i = 0; i < chosen.size(); ++i) found_.blocks[i].codes = chosen[i].codes;
+    return next(fits);
+  }
+  static double worth(const Block& block) {
+    const double moved = block.codes == Rounding::int4 ? block.moved_by_int4 : block.moved_by_int8;
+    return moved * moved / static_cast<double>(std::max<std::int64_t>(added(block), 1));
+  }
+
+  Status measure_int4() {
+    EngineOptions float32 = options_;
+    float32.kernels = "float32";
+    VLA_TRY(expected_, chunks_of(from_, float32, judged_));
+    VLA_TRY(found_.all_int8, with_all(Rounding::int8));
+    VLA_TRY(found_.all_int4, with_all(Rounding::int4));
+    for (Block& block : found_.blocks) {
+      VLA_TRY(const Moved moved, with_one(block, Rounding::int4));
+      block.moved_by_int4 = beyond(moved.rms, found_.all_int8.rms);
+    }
+    return {};
+  }
+
+  Status measure_int8() {
+    knows_int8_ = true;
+    for (Block& block : found_.blocks) {
+      VLA_TRY(const Moved moved, with_one(block, Rounding::none));
+      block.moved_by_int8 = beyond(found_.all_int8.rms, moved.rms);
+    }
+    return {};
+  }
+
+  const std::string from_, trial_;
+  const std::span<const Judged> judged_;
+  const Report& report_;
+  EngineOptions options_;
+  std::int64_t n_byte_ = 0;  // of the file as it is
+  bool knows_int8_ = false;
+  std::vector<std::vector<float>> expected_;
+  Found found_;
+};
+
+}  // namespace
+
+Choice choice_of(const std::vector<Block>& blocks) {
+  std::map<std::string, Rounding> codes;
+  for (const Block& block : blocks) codes.emplace(block.path, block.codes);
+  return [codes = std::move(codes)](const std::string& tensor) {
+    const auto found = codes.find(block_of(tensor));
+    return found == codes.end() ? Rounding::none : found->second;
+  };
+}
+
+Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
+                     const Bound& bound, int n_thread, const std::function<void(int, const Moved&)>& report) {
+  Search search(from, trial, judged, n_thread, report);
+  VLA_CHECK(search.open());
+  const Status done = bound.error ? search.to_error(*bound.error) : search.to_size(*bound.bytes);
+  std::error_code ignored;
+  std::filesystem::remove(trial, ignored);
+  VLA_CHECK(done);
+  return search.take();
+}
+
+}  // namespace vla

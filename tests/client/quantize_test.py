@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""`vla quantize --judge`: codes chosen block by block, by how far the actions of a recording move."""
+
+import re
+import subprocess
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from server_process import ROOT, SECONDS, VLA, Server
+
+import vla_cpp
+from vla_cpp.convert.bundle import read_bundle
+
+SHIPPED = SimpleNamespace(bundle=ROOT / "models/metaworld-tiny.gguf")
+SCENES = [("faucet-open", "open the faucet"), ("drawer-close", "close the drawer")]
+
+
+def scene(name, text):
+    frame = (ROOT / f"examples/metaworld/episodes/{name}/step_00.png").read_bytes()
+    return dict(images={"corner4": frame}, state=[0.0045, 0.4003, 0.1957, 1], text=text, seed=7)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recorded") / "acts"
+    server = Server(SHIPPED, "--record", folder)
+    with vla_cpp.Client(server.address, timeout=SECONDS) as robot:
+        for name, text in SCENES:
+            robot.act(**scene(name, text))
+        with pytest.raises(vla_cpp.BadObservation):
+            robot.act(**{**scene(*SCENES[0]), "text": ""})
+    assert server.stop() == 0
+    return folder
+
+
+def quantize(*arguments):
+    return subprocess.run([VLA, "quantize", SHIPPED.bundle, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+
+
+def moved(bundle):
+    """Of float32's chunks, by root mean square."""
+    chunks = []
+    for path, kernels in ((SHIPPED.bundle, "float32"), (bundle, None)):
+        with vla_cpp.Policy(path, kernels=kernels, threads=1) as policy:
+            chunks.append(np.array([policy.act(**scene(*s)).normalized for s in SCENES]))
+    return np.sqrt(np.mean((chunks[1] - chunks[0]) ** 2) / np.mean(chunks[0] ** 2))
+
+
+def test_blocks_get_the_codes_that_keep_the_error(recording, tmp_path):
+    out = tmp_path / "small.gguf"
+    answer = quantize("-o", out, "--judge", recording, "--error", 0.025, "--threads", 1)
+    assert answer.returncode == 0, answer.stderr
+    blocks = dict(re.findall(r"^(\S*blk\S*) +(int4|int8|as stored) ", answer.stdout, re.M))
+    assert {"int4", "int8"} <= set(blocks.values()) and len(blocks) == 11
+    before, content = read_bundle(str(SHIPPED.bundle)), read_bundle(str(out))
+    for name, dtype in content.dtypes.items():
+        block = ".".join(name.split(".")[:3])
+        if dtype == "i8" and block in blocks:
+            width = before.tensors[name].shape[1]
+            is_packed = content.tensors[name].shape[1] != width
+            assert is_packed == (blocks[block] == "int4" and width % 64 == 0), name
+    told = re.search(r"chunks of 2 observations move by ([\d.]+) %.*all int8: ([\d.]+) %.*all int4: ([\d.]+) %", answer.stdout)
+    error, int8, int4 = (float(number) / 100 for number in told.groups())
+    assert error <= 0.025 < int4 and int8 < int4
+    assert moved(out) == pytest.approx(error, rel=0.01)
+    assert "error at most 0.025: " in subprocess.run([VLA, "inspect", out], capture_output=True, text=True).stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["small.gguf"]
+
+
+def test_what_cannot_be_is_refused_with_what_can(recording, tmp_path):
+    out = tmp_path / "small.gguf"
+    answer = quantize("-o", out, "--judge", recording, "--size", "3MB")
+    assert answer.returncode == 6 and re.search(r"--size: expected \d+ bytes or more, found 3000000", answer.stderr), answer
+    answer = quantize("-o", out, "--judge", recording)
+    assert answer.returncode == 2 and "expected --error or --size, found neither" in answer.stderr
+    assert quantize("-o", out, "--error", 0.1).returncode == 2
+    assert quantize("-o", out, "--judge", recording, "--error", 0.1, "--size", "5MB").returncode == 2
+    assert quantize("-o", out, "--judge", tmp_path, "--error", 0.1).returncode != 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_of_another_policy_is_refused(case, tmp_path):
+    server = Server(case, "--record", tmp_path / "acts")
+    with vla_cpp.Client(server.address, timeout=SECONDS) as robot:
+        robot.act(images={v: f.read_bytes() for v, f in case.images.items()}, state=case.state, text=case.text, seed=1)
+    assert server.stop() == 0
+    answer = quantize("-o", tmp_path / "small.gguf", "--judge", tmp_path / "acts", "--error", 0.1)
+    assert "error: bad_request: " in answer.stderr and "expected acts of this policy, found " in answer.stderr, answer
