@@ -3,11 +3,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cycles of ARM64's inner loops by llvm-mca's models of processors, as a share of what their multiply-adds alone would take.
 
-    scripts/arm64_cycles.py [--build build/arm64] [--mca llvm-mca-19] [--cpus neoverse-n1,neoverse-v1]
+    scripts/arm64_cycles.py [--objects FOLDER] [--mca llvm-mca-19] [--cpus neoverse-n1,neoverse-v1]
 
-Reads the loops from the objects of a build (make test-arm64). Every load hits the first cache in a model, so that the shares are upper
-bounds. The limit is what the same model takes for as many multiply-adds on registers that do not wait for each other. Exits with 1 where
-a loop that a table names spills registers or moves vectors, or is not there.
+Reads the loops from the objects of src/kernels/arm (those of make test-arm64). Every load hits the first cache in a model, so that the
+shares are upper bounds. The limit is what the same model takes for as many multiply-adds on registers that do not wait for each other.
+Exits with 1 where a loop that the table names spills registers or moves vectors, or is not there; --mca "" asks for nothing else.
 """
 
 import argparse
@@ -21,11 +21,18 @@ LOOPS = [
     ("linear_neon", "float32, 6 rows", r"tile<6, .*Floats>", "fmla", 96),
     ("linear_neon", "bf16 widened, 6 rows", r"tile<6, .*Pairs>", "fmla", 96),
     ("linear_neon", "f16 widened, 6 rows", r"tile<6, .*Halves>", "fmla", 96),
-    ("int8_dotprod", "int8, 6 rows", r"tile<6, .*ByteStrips", "sdot", 96),
+    ("int8_dotprod", "int8, 6 rows", r"tile<6, .*BytePanels::Strips", "sdot", 96),
     ("int8_dotprod", "ternary expanded, 6 rows", r"tile<6, .*ExpandedStrips", "sdot", 96),
+    ("linear_neon_bf16", "bf16 by BFMMLA, 6 rows", r"NeonBf16Tile::multiply", "bfmmla", 24),
+    ("linear_neon_bf16", "bf16 by BFMMLA, 4 rows", r"NeonBf16Tile::multiply", "bfmmla", 16),
+    ("linear_neon_bf16", "bf16 by BFMMLA, 2 rows", r"NeonBf16Tile::multiply", "bfmmla", 8),
+    ("linear_neon_bf16", "bf16 in fours widened, 4 rows", r"QuadTile::tile<4>", "fmla", 64),
+    ("int8_i8mm", "int8, int4, ternary by SMMLA, 6 rows", r"MatrixTile::multiply", "smmla", 24),
+    ("int8_i8mm", "int8, int4, ternary by SMMLA, 4 rows", r"MatrixTile::multiply", "smmla", 16),
     ("cpu_kernels_neon", "attention, queries by keys", r"::multiply_keys", "fmla", 96),
     ("cpu_kernels_neon", "attention, weights by values", r"::mix_values", "fmla", 96),
 ]
+LATER = {"bfmmla", "smmla"}  # which Neoverse-N1 lacks
 FEATURES = "+dotprod,+bf16,+i8mm,+fullfp16"
 
 
@@ -72,25 +79,26 @@ def cycles(mca, cpu, body):
     return int(re.search(r"Total Cycles:\s+(\d+)", report)[1]) / n
 
 
-def limit(mca, cpu, add, count):
-    kind = "16b" if add == "sdot" else "4s"
-    return cycles(mca, cpu, [f"{add} v{i}.4s, v30.{kind}, v31.{kind}" for i in range(24)]) * count / 24
+def share(mca, cpu, add, count, body):
+    if cpu == "neoverse-n1" and add in LATER:
+        return "-"
+    kind = {"fmla": "4s", "bfmmla": "8h"}.get(add, "16b")
+    alone = cycles(mca, cpu, [f"{add} v{i}.4s, v30.{kind}, v31.{kind}" for i in range(24)]) * count / 24
+    return f"{100 * alone / cycles(mca, cpu, body):.0f} %"
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--build", default="build/arm64", type=Path)
+    parser.add_argument("--objects", default="build/arm64/src/CMakeFiles/vla_kernels.dir/kernels/arm", type=Path)
     parser.add_argument("--mca", default="llvm-mca-19")
     parser.add_argument("--cpus", default="neoverse-n1,neoverse-v1")
     args = parser.parse_args()
-    cpus = args.cpus.split(",")
-    folder = args.build / "src/CMakeFiles/vla_kernels.dir/kernels/arm"
-    print(
-        f"| loop | multiply-adds | instructions | spills | moves | {' | '.join(cpus)} |\n|{' --- |' * (5 + len(cpus))}"
-    )
+    cpus = args.cpus.split(",") if args.mca else []
+    heads = ["loop", "multiply-adds", "instructions", "spills", "moves", *cpus]
+    print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
     wrong = False
     for source, title, name, add, count in LOOPS:
-        body = inner_loop(folder / f"{source}.cpp.o", name, add, count)
+        body = inner_loop(args.objects / f"{source}.cpp.o", name, add, count)
         if body is None:
             print(f"| {title} | not found |")
             wrong = True
@@ -98,8 +106,8 @@ def main():
         spills = sum("[sp" in line for line in body)
         moves = sum(line.startswith("mov v") for line in body)
         wrong |= spills + moves > 0
-        shares = [f"{100 * limit(args.mca, cpu, add, count) / cycles(args.mca, cpu, body):.0f} %" for cpu in cpus]
-        print(f"| {title} | {count} | {len(body)} | {spills} | {moves} | {' | '.join(shares)} |")
+        shares = [share(args.mca, cpu, add, count, body) for cpu in cpus]
+        print(f"| {' | '.join(map(str, [title, count, len(body), spills, moves, *shares]))} |")
     return 1 if wrong else 0
 
 

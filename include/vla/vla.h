@@ -85,9 +85,10 @@ VLA_API const vla_error* vla_last_error(const vla_policy* policy);
 typedef struct vla_options {
   size_t struct_size;
   int32_t n_thread;     /* CPU threads, at most 512; 0: every core that the process may use */
-  const char* kernels;  /* "ggml", "portable", "neon", "avx2", "avx512", "avx512_bf16", "amx", or "float32":
-                           the best that does not round to bf16, or "bf16": the best that does, with large matrices
-                           rounded to it, or "int8": the best, with large matrices quantized, faster and less exact.
+  const char* kernels;  /* "ggml", "portable", "neon", "neon_bf16", "avx2", "avx512", "avx512_bf16", "amx", or
+                           "float32": the best that does not round to bf16, or "bf16": the best that does, with large
+                           matrices rounded to it, or "int8": the best, with large matrices quantized, faster and less
+                           exact.
                            NULL: on the CPU the best for the bundle's dtype, which rounds to bf16 if the bundle and the
                            machine have it. Other devices take "float32", as NULL does, and "bf16" */
   int32_t strict_state; /* 1: an observation whose state is far beyond what the policy has seen is refused with

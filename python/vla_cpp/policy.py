@@ -29,7 +29,7 @@ class Policy(Handle):
 
     path     a bundle that vla-convert made
     threads  of the CPU; 0 takes every core that the process may use
-    kernels  "ggml", "portable", "neon", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to bf16,
+    kernels  "ggml", "portable", "neon", "neon_bf16", "avx2", "avx512", "avx512_bf16", "amx", or "float32": the best that does not round to bf16,
              or "bf16": the best that does, with large matrices rounded to it, "int8" or "int4": the best, with large matrices quantized, smaller and less exact;
              None: on the CPU the best for the bundle's dtype.
              Other devices take "float32", as None does, and "bf16"

@@ -62,11 +62,15 @@ Features detect_features() {
 
 /// Source: Linux, Documentation/arch/arm64/elf_hwcaps.rst.
 Features detect_features() {
-  constexpr unsigned long kAsimd = 1UL << 1, kAsimdDp = 1UL << 20;
-  const unsigned long has = getauxval(AT_HWCAP);
+  constexpr unsigned long kAsimd = 1UL << 1, kAsimdDp = 1UL << 20, kI8mm = 1UL << 13, kBf16 = 1UL << 14;
+  const unsigned long has = getauxval(AT_HWCAP), has_too = getauxval(AT_HWCAP2);
   Features found = {Feature::baseline};
-  if ((has & kAsimd) != 0) found = found.with(Feature::neon);
-  if ((has & kAsimdDp) != 0) found = found.with(Feature::dotprod);
+  if ((has & kAsimd) == 0) return found;
+  found = found.with(Feature::neon);
+  if ((has_too & kBf16) != 0) found = found.with(Feature::neon_bf16);
+  if ((has & kAsimdDp) == 0) return found;
+  found = found.with(Feature::dotprod);
+  if ((has_too & kI8mm) != 0) found = found.with(Feature::i8mm);
   return found;
 }
 

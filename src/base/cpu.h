@@ -20,7 +20,9 @@ enum class Feature {
   amx_int8,
   permutes_beside_vnni,  // in the same cycle, as AMD's processors do; Intel's do one or the other
   neon,
-  dotprod,  // SDOT
+  dotprod,    // SDOT
+  neon_bf16,  // BFMMLA
+  i8mm,       // SMMLA
 };
 
 /// A set of them: what a processor has, or what kernels may use of it.

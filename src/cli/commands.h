@@ -11,10 +11,13 @@ namespace vla::cli {
 
 /// Of --kernels, wherever a policy is loaded.
 constexpr const char* kKernelsHelp =
-    "ggml, portable, neon, avx2, avx512, avx512_bf16, amx, or float32: the best that does not round to bf16, or bf16: "
-    "the best that does, with large matrices rounded to it, or int8: the best, with large matrices quantized, faster "
+    "ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx, or float32: the best that does not round to "
+    "bf16, "
+    "or bf16: the best that does, with large matrices rounded to it, or int8: the best, with large matrices quantized, "
+    "faster "
     "and less exact; "
-    "not given: on the CPU the best for the bundle's dtype, which multiplies bf16 (by avx512_bf16 or amx) if the "
+    "not given: on the CPU the best for the bundle's dtype, which multiplies bf16 (by neon_bf16, avx512_bf16 or amx) "
+    "if the "
     "bundle is stored as bf16. Other devices take float32 (not given) and bf16";
 
 /// Of --device, wherever a policy is loaded.

@@ -40,9 +40,13 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
 ///     and write rows up to kRows.
 /// Where products have a unit of their own (kBeside), multiply calls between() for every 64 of the depth before it
 /// writes sums: some rows of the tile before are finished there.
+/// Where an instruction takes two rows by two columns (kPairs), rows are copied in pairs and numbers of any width
+/// rearranged, both by the tile: pair(first, second, depth, to) and expand(strips, depth, to); then multiply has the
+/// latter's bytes for `strips` and no between().
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
 template <class Tile, class Weights>
 class Int8Loop {
+  static constexpr bool kPairs = requires { Tile::kPairs; };
   using V = typename Tile::V;
   using Stripes = LinearStripes<Tile, Tile::kLayout>;
   using Finish = typename Stripes::Finish;
@@ -55,7 +59,10 @@ class Int8Loop {
   static_assert(kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
 
   struct Scratch {
-    alignas(64) std::byte panel[kPacked ? Tile::kStep * kColumns : 1];
+    // In pairs: which rows of x the block holds. Items of one block follow each other, so that a worker copies it once.
+    std::int64_t row;
+    alignas(64) std::byte x[kPairs ? (Tile::kBlockKiB << 10) + (kRows + 1) * quantized_stride(kMaxPairedDepth) : 1];
+    alignas(64) std::byte panel[kPacked || kPairs ? Tile::kStep * kColumns : 1];
     alignas(64) std::int32_t sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kColumns];
     alignas(64) float scaled[kRows * kColumns];
@@ -92,8 +99,11 @@ class Int8Loop {
   static void run(const LinearJob& job, std::int64_t item, Worker& worker) {
     [[maybe_unused]] const typename Tile::Session session;
     Int8Loop loop(job);
-    loop.scratch_ = worker.scratch<Scratch>();
+    const auto [scratch, kept] = worker.scratch_of<Scratch>(&job);
+    loop.scratch_ = scratch;
     const std::int64_t row = item / job.n_group * loop.block_rows_, group = item % job.n_group;
+    if constexpr (kPairs)
+      if (!kept || scratch->row != row) loop.pair_rows(row, min(loop.block_rows_, job.n_row - row));
     for (std::int64_t panel = loop.n_panel_ * group / job.n_group; panel < loop.n_panel_ * (group + 1) / job.n_group;
          ++panel) {
       Stripe stripe = Stripes::of_panel(job, panel);
@@ -106,6 +116,14 @@ class Int8Loop {
   }
 
   const std::byte* row_of(const Stripe& s, std::int64_t r) const { return job_.x + (s.row + r) * job_.x_stride; }
+
+  void pair_rows(std::int64_t row, std::int64_t n_row) {
+    scratch_->row = row;
+    const std::byte* from = job_.x + row * job_.x_stride;
+    for (std::int64_t r = 0; r < n_row; r += 2)
+      Tile::pair(from + r * job_.x_stride, from + min(r + 1, n_row - 1) * job_.x_stride, quantized_depth(job_.d_in),
+                 scratch_->x + r * job_.x_stride);
+  }
 
   /// A tile's sums are complete, and some of its rows are finished: they become the gates, or y.
   struct Summed {
@@ -136,7 +154,9 @@ class Int8Loop {
       const typename Weights::template Strips<kStrips> numbers(strips, job_.d_in, k);
       const std::int64_t d = min(step, depth - k);
       bool expands = false;
-      if constexpr (kPacked) {
+      if constexpr (kPairs) {
+        Tile::expand(numbers, d, scratch_->panel);
+      } else if constexpr (kPacked) {
         expands = job_.n_row > kFewRows;
         if (expands) expand<typename V::Int, kStrips>(numbers, 0, d, scratch_->panel);
       }
@@ -149,7 +169,10 @@ class Int8Loop {
           Tile::multiply(static_cast<int>(n_row), row_of(s, r) + k, job_.x_stride, from, d, sums, k > 0,
                          [&]() VLA_LAMBDA { summed_.finish(n_finish); });
         };
-        if (!expands)
+        if constexpr (kPairs)
+          Tile::multiply(static_cast<int>(n_row), scratch_->x + r * job_.x_stride + 2 * k, job_.x_stride,
+                         scratch_->panel, d, sums, k > 0);
+        else if (!expands)
           multiply(numbers);
         else if constexpr (kPacked)
           multiply(ExpandedStrips<kStrips, std::remove_const_t<decltype(numbers)>>{scratch_->panel, numbers});

@@ -22,7 +22,9 @@ namespace kernel_set {
 
 inline constexpr KernelSet ggml = {"ggml", {}, {}};  // none of our own: the reference of every other
 inline constexpr KernelSet portable = {"portable", {Feature::baseline}, {Feature::baseline}};
-inline constexpr KernelSet neon = {"neon", {Feature::neon}, {Feature::neon, Feature::dotprod}};
+inline constexpr KernelSet neon = {"neon", {Feature::neon}, {Feature::neon, Feature::dotprod, Feature::i8mm}};
+inline constexpr KernelSet neon_bf16 = {
+    "neon_bf16", {Feature::neon, Feature::neon_bf16}, neon.uses.with(Feature::neon_bf16)};
 inline constexpr KernelSet avx2 = {"avx2", {Feature::avx2}, {Feature::avx2, Feature::avx_vnni}};
 inline constexpr KernelSet avx512 = {
     "avx512",
@@ -35,7 +37,7 @@ inline constexpr KernelSet amx = {"amx",
                                   avx512_bf16.uses.with(Feature::amx_bf16).with(Feature::amx_int8)};
 
 /// The best last.
-inline constexpr KernelSet all[] = {ggml, portable, neon, avx2, avx512, avx512_bf16, amx};
+inline constexpr KernelSet all[] = {ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx};
 
 }  // namespace kernel_set
 
@@ -50,12 +52,12 @@ inline std::string name_of(const KernelSet& set) { return set.name; }
 inline std::string name_of(Features use) { return kernel_set_of(use).name; }
 
 /// Whether kernels round what they multiply to bf16 where they may use these features.
-constexpr bool rounds_to_bf16(Features use) { return use.has(Feature::avx512_bf16); }
+constexpr bool rounds_to_bf16(Features use) { return use.has(Feature::avx512_bf16) || use.has(Feature::neon_bf16); }
 constexpr bool rounds_to_bf16(const KernelSet& set) { return rounds_to_bf16(set.uses); }
 
 /// What takes their place where nothing may be rounded to bf16.
 constexpr Features without_rounding(Features use) {
-  return rounds_to_bf16(use) ? use.both(kernel_set::avx512.uses) : use;
+  return use.without({Feature::avx512_bf16, Feature::amx_bf16, Feature::amx_int8, Feature::neon_bf16});
 }
 
 }  // namespace vla

@@ -23,7 +23,8 @@ struct Ahead {
 /// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
 /// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kStep (of the depth, most),
 /// kRounds (x becomes bf16), kEven (tiles of equal height), and
-///   copy(from, n, to)                 n numbers of x, zeros up to a multiple of 32
+///   place(r, k)                       where number k of row r of the block lies, if not behind k others of its row
+///   copy(from, n, to)                 n numbers of x, zeros up to a multiple of 32; where kRounds also from bf16
 ///   store_rounded(to, vector, left)   y as bf16, where kRounds
 ///   multiply(type, n_row, x, panel, depth, c, add, ahead)
 ///     c [kColumns] x n_row <= kRows, += where `add`; prefetches ahead
@@ -85,6 +86,13 @@ class LinearLoop {
         block_depth_(even_block(job.d_in, Tile::kMaxDepth, kPanelDepth)),
         n_panel_(Stripes::n_panel(job)) {}
 
+  static VLA_INLINE std::int64_t place(std::int64_t r, std::int64_t k) {
+    if constexpr (requires { Tile::place(r, k); })
+      return Tile::place(r, k);
+    else
+      return r * Tile::kXStride + k;
+  }
+
   bool whole_depth() const { return block_depth_ >= job_.d_in; }
 
   /// Some panels by a block of rows.
@@ -109,12 +117,12 @@ class LinearLoop {
     if (row == scratch_->row && k == scratch_->depth) return;
     scratch_->row = row, scratch_->depth = k;
     for (std::int64_t r = 0; r < n_row; ++r) {
-      X* to = scratch_->x + r * Tile::kXStride;
-      const std::int64_t place = (row + r) * job_.x_stride;
+      X* to = scratch_->x + place(r, 0);
+      const std::int64_t from = (row + r) * job_.x_stride;
       if (Tile::kRounds && job_.x_type == DType::bf16)
-        copy_padded(reinterpret_cast<const X*>(job_.x) + place + k, depth, to);
+        Tile::copy(reinterpret_cast<const X*>(job_.x) + from + k, depth, to);
       else
-        Tile::copy(job_.norm(reinterpret_cast<const float*>(job_.x) + place, job_.d_in, scratch_->normed) + k, depth,
+        Tile::copy(job_.norm(reinterpret_cast<const float*>(job_.x) + from, job_.d_in, scratch_->normed) + k, depth,
                    to);
     }
   }
@@ -147,8 +155,8 @@ class LinearLoop {
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
         if (k + d == depth) before(r, n_row);
-        Tile::multiply(part.type, static_cast<int>(n_row), scratch_->x + r * Tile::kXStride + k, panel, d,
-                       sums + r * kColumns, add || k > 0, {next + size * t / n_tile, size / n_tile});
+        Tile::multiply(part.type, static_cast<int>(n_row), scratch_->x + place(r, k), panel, d, sums + r * kColumns,
+                       add || k > 0, {next + size * t / n_tile, size / n_tile});
         if (k + d == depth) after(r, n_row);
       }
       panel = next;

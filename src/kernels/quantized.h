@@ -16,6 +16,9 @@ constexpr std::int64_t kQuantizedUnit = 64;
 /// A tile of a product may read so many rows, of which x has only some: behind the last there must be memory.
 constexpr int kMaxTernaryRows = 32;
 
+/// Deeper products have no kernel that copies rows.
+constexpr std::int64_t kMaxPairedDepth = 32768;
+
 /// Codes of a row with the zeros behind them.
 constexpr VLA_INLINE std::int64_t quantized_depth(std::int64_t d_in) { return round_up(d_in, kQuantizedUnit); }
 /// Bytes from one row to the next.

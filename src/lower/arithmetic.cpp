@@ -39,7 +39,7 @@ Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machi
     return rounding(Rounding::float32, exact);
   }
   if (kernels == kBf16 && !rounds_to_bf16(machine))
-    return Error{Code::device, "kernels", "a machine with AVX-512 BF16 or AMX", kernels,
+    return Error{Code::device, "kernels", "a machine with AVX-512 BF16, AMX or ARM's BF16", kernels,
                  "leave the choice to the program"};
   if (kernels == kBf16) return rounding(Rounding::bf16, best);
   if (kernels == kInt8) return rounding(Rounding::int8, best);
@@ -47,7 +47,7 @@ Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machi
   for (const KernelSet& set : kernel_set::all)
     if (kernels == set.name) return with(set, machine);
   return Error{Code::usage, "kernels",
-               "ggml, portable, neon, avx2, avx512, avx512_bf16, amx, float32, bf16, int8 or int4", kernels};
+               "ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx, float32, bf16, int8 or int4", kernels};
 }
 
 Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& device) {

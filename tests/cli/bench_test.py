@@ -35,7 +35,7 @@ def test_json_is_one_object_on_the_last_line_and_tells_the_conditions(answer, re
     conditions = report["conditions"]
     assert (conditions["policy"], conditions["weights"]) == ("smolvla", "bf16")
     assert [conditions[k] for k in ("views", "height", "width", "tokens", "steps")] == [1, 48, 64, 9, 3]
-    assert report["threads"] == 2 and report["kernels"] in ("ggml", "portable", "neon", "avx2", "avx512", "avx512_bf16", "amx") and report["cpu"]
+    assert report["threads"] == 2 and report["kernels"] in ("ggml", "portable", "neon", "neon_bf16", "avx2", "avx512", "avx512_bf16", "amx") and report["cpu"]
     assert report["load_ms"] > 0 and report["memory_bytes"]["predicted"] > 0 and report["memory_bytes"]["peak"] > 0
 
 

@@ -87,7 +87,7 @@ def test_kernels_and_precision_are_told_in_the_json_and_in_plain_words(vla, gold
     for options in ([], FLOAT32, ["--kernels", "ggml"]):
         told = vla(*golden.arguments(options=["--json", *options])).json()
         words = "bf16 products, sums in float32; --kernels float32 avoids them"
-        assert told["precision"] == ("bf16" if told["kernels"] in ("amx", "avx512_bf16") else "f32")
+        assert told["precision"] == ("bf16" if told["kernels"] in ("amx", "avx512_bf16", "neon_bf16") else "f32")
         line = f"kernels: {told['kernels']}, {words if told['precision'] == 'bf16' else 'float32'}"
         assert vla(*golden.arguments(options=options)).out.splitlines()[-1] == line
     assert told["kernels"] == "ggml"

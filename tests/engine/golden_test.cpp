@@ -100,11 +100,13 @@ bool lacks(const KernelSet& set) {
 #define VLA_EVERY_TAP " kernels: every tap of every golden case, from pixels to actions, matches the reference"
 TEST_CASE("ggml" VLA_EVERY_TAP) { check_taps("ggml", false); }
 TEST_CASE("portable" VLA_EVERY_TAP) { check_taps("portable", false); }
+TEST_CASE("neon" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::neon))) { check_taps("neon", false); }
 TEST_CASE("avx2" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::avx2))) { check_taps("avx2", false); }
 TEST_CASE("avx512" VLA_EVERY_TAP* doctest::skip(lacks(kernel_set::avx512))) { check_taps("avx512", false); }
 
 #define VLA_BOUNDARIES " kernels: blocks whose operations are fused match the reference where they end"
 TEST_CASE("portable" VLA_BOUNDARIES) { check_taps("portable", true); }
+TEST_CASE("neon" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::neon))) { check_taps("neon", true); }
 TEST_CASE("avx2" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::avx2))) { check_taps("avx2", true); }
 TEST_CASE("avx512" VLA_BOUNDARIES* doctest::skip(lacks(kernel_set::avx512))) { check_taps("avx512", true); }
 #endif
@@ -118,6 +120,8 @@ TEST_CASE("amx" VLA_CHUNK* doctest::skip(lacks(kernel_set::amx))) { check_chunk(
 #ifndef VLA_EMULATED_MACHINE
 TEST_CASE("ggml" VLA_CHUNK) { check_chunk("ggml"); }
 TEST_CASE("portable" VLA_CHUNK) { check_chunk("portable"); }
+TEST_CASE("neon" VLA_CHUNK* doctest::skip(lacks(kernel_set::neon))) { check_chunk("neon"); }
+TEST_CASE("neon_bf16" VLA_CHUNK* doctest::skip(lacks(kernel_set::neon_bf16))) { check_chunk("neon_bf16"); }
 TEST_CASE("avx2" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx2))) { check_chunk("avx2"); }
 TEST_CASE("avx512" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx512))) { check_chunk("avx512"); }
 TEST_CASE("avx512_bf16" VLA_CHUNK* doctest::skip(lacks(kernel_set::avx512_bf16))) { check_chunk("avx512_bf16"); }

@@ -47,13 +47,14 @@ std::string widened(const std::string& name, const std::string& path = kBundle) 
 
 TEST_CASE("a bundle of bf16 matrices is computed in bf16 where the machine has instructions for it") {
   CHECK(set_of(kBundle, kernel_set::amx) == kernel_set::amx);
-  for (const KernelSet& set : {kernel_set::avx512_bf16, kernel_set::avx512, kernel_set::avx2, kernel_set::ggml})
+  for (const KernelSet& set : {kernel_set::avx512_bf16, kernel_set::avx512, kernel_set::avx2, kernel_set::neon_bf16,
+                               kernel_set::neon, kernel_set::ggml})
     CHECK(set_of(kBundle, set) == set);
 }
 
 TEST_CASE("a bundle without matrices of bf16 is computed in float32, whatever its tables are") {
-  for (const KernelSet& set : {kernel_set::amx, kernel_set::avx512_bf16}) {
-    CHECK(set_of(widened("all"), set) == kernel_set::avx512);
+  for (const KernelSet& set : {kernel_set::amx, kernel_set::avx512_bf16, kernel_set::neon_bf16}) {
+    CHECK(set_of(widened("all"), set) == (set == kernel_set::neon_bf16 ? kernel_set::neon : kernel_set::avx512));
     CHECK(set_of(widened("lm.blk.0.attn_q.weight"), set) == set);
     CHECK(set_of(widened("lm.token_embd.weight"), set) == set);
   }

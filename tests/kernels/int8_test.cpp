@@ -419,6 +419,7 @@ bool lacks(const std::string& name) {
 #define VLA_INT8_TEST_OF(sentence, check, check_named)                                                        \
   TEST_CASE("portable_int8: " sentence) { check_named("portable_int8"); }                                     \
   TEST_CASE("dotprod_int8: " sentence* doctest::skip(lacks("dotprod_int8"))) { check_named("dotprod_int8"); } \
+  TEST_CASE("i8mm_int8: " sentence* doctest::skip(lacks("i8mm_int8"))) { check_named("i8mm_int8"); }          \
   TEST_CASE("avx2_int8: " sentence* doctest::skip(lacks("avx2_int8"))) { check_named("avx2_int8"); }          \
   TEST_CASE("avxvnni_int8: " sentence* doctest::skip(lacks("avxvnni_int8"))) { check_named("avxvnni_int8"); } \
   TEST_CASE("avx512_int8: " sentence* doctest::skip(lacks("avx512_int8"))) { check_named("avx512_int8"); }    \
@@ -438,6 +439,15 @@ bool lacks(const std::string& name) {
   VLA_EMULATED_TEST("avx512_int8", sentence, check(kEmulatedTernaryAvx512); check(kEmulatedInt4Avx512); \
                     check(kEmulatedInt8Avx512))                                                         \
   VLA_EMULATED_TEST("amx_int8", sentence, check(kEmulatedTernaryAmx); check(kEmulatedInt4Amx); check(kEmulatedInt8Amx))
+
+TEST_CASE("few rows go to a kernel that reads the same packed matrix and the same codes") {
+  for (const auto& kernels : {ternary_kernels(), int4_kernels(), int8_kernels()})
+    for (const LinearKernel* kernel : kernels) {
+      const LinearKernel& few = kernel->for_rows(1);
+      CHECK((few.pack == kernel->pack));
+      CHECK((few.quantize != nullptr));
+    }
+}
 
 VLA_TERNARY_TEST("codes, sums and products are those of BitVLA's quantizers, bit for bit", check_golden)
 VLA_INT8_TEST("codes and scales of rows are the reference's, bit for bit", check_codes)

@@ -64,6 +64,7 @@ struct Case {
   DType x_type = DType::f32, y_type = DType::f32;
 };
 
+bool is_mmla(const LinearKernel& kernel) { return std::strcmp(kernel.name, "neon_bf16") == 0; }
 bool rounds(const LinearKernel& kernel) { return kernel.rounded != RoundedLayout::none; }
 
 /// From the second number on.
@@ -148,7 +149,8 @@ class Trial {
     return part;
   }
 
-  /// W x + b. Every order of n float32 additions of the products is within n half-units of their absolute sum.
+  /// W x + b. Every order of n float32 additions of the products is within n half-units of their absolute sum;
+  /// BFMMLA's, which do not round to the nearest, within n units.
   Expected product(int i, std::int64_t row, std::int64_t n) const {
     const Part& part = parts_[static_cast<std::size_t>(i)];
     const std::int64_t d_in = case_.shape.d_in;
@@ -159,7 +161,7 @@ class Trial {
       const double term = double{value} * part.weight[static_cast<std::size_t>(n * d_in + k + 1)];
       sum += term, size += std::abs(term);
     }
-    return {sum, static_cast<double>(d_in + 2) * 0x1p-24 * size};
+    return {sum, static_cast<double>(d_in + 2) * (is_mmla(kernel_) ? 0x1p-23 : 0x1p-24) * size};
   }
 
   /// The activations are at most 1.13 steep and round twice; what follows rounds once each.
@@ -191,7 +193,7 @@ class Trial {
 
 void check(const LinearKernel& kernel, const Case& c) {
   // A machine with every instruction of both families.
-  constexpr Features all = kernel_set::amx.uses.with(Feature::baseline).with(Feature::neon);
+  constexpr Features all = kernel_set::amx.uses.with(Feature::baseline).with(Feature::neon).with(Feature::neon_bf16);
   if (!kernel.supports({c.type, c.shape.d_in, c.shape.d_out}, all)) return;
   CAPTURE(c.shape.n_row);
   CAPTURE(c.shape.d_in);
@@ -280,7 +282,7 @@ void check_rounded_after(Activation activation, const LinearKernel& kernel) {
 }
 
 void check_rounded(const LinearKernel& kernel) {
-  CHECK(rounds(kernel) == (std::strstr(kernel.name, "avx512_bf16") || std::strstr(kernel.name, "amx")));
+  CHECK(rounds(kernel) == (std::strstr(kernel.name, "_bf16") || std::strstr(kernel.name, "amx")));
   if (!rounds(kernel)) return;
   for (Activation activation : kActivations) check_rounded_after(activation, kernel);
 }
@@ -317,6 +319,12 @@ const LinearKernel& row(const std::string& name) {
 #define VLA_LINEAR_TEST(sentence, check)                                                                        \
   TEST_CASE("portable: " sentence) { check(row("portable")); }                                                  \
   TEST_CASE("neon: " sentence* doctest::skip(vla::test::lacks(kernel_set::neon))) { check(row("neon")); }       \
+  TEST_CASE("neon_bf16: " sentence* doctest::skip(vla::test::lacks(kernel_set::neon_bf16))) {                   \
+    check(row("neon_bf16"));                                                                                    \
+  }                                                                                                             \
+  TEST_CASE("neon_bf16, few rows: " sentence* doctest::skip(vla::test::lacks(kernel_set::neon_bf16))) {         \
+    check(*row("neon_bf16").few);                                                                               \
+  }                                                                                                             \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx2))) { check(row("avx2")); }       \
   VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                           \
   VLA_EMULATED_TEST("avx512_bf16", sentence, check(kEmulatedLinearAvx512Bf16))                                  \
@@ -334,6 +342,36 @@ VLA_LINEAR_TEST("a product may be deeper than the caches", check_depths)
 VLA_LINEAR_TEST("any number of threads computes every number once", check_threads)
 VLA_LINEAR_TEST("what is multiplied as bf16 may come and leave as bf16", check_rounded)
 VLA_LINEAR_TEST("the number of threads does not change a bit", check_bytes)
+
+namespace {
+
+/// BFMMLA's rounding: to the neighbour whose last bit is odd, where x is no float32.
+float to_odd(double x) {
+  float y = static_cast<float>(x);
+  if (y == x) return y;
+  if (std::abs(y) > std::abs(x)) y = std::nextafter(y, 0.0f);
+  return std::bit_cast<float>(std::bit_cast<std::uint32_t>(y) | 1U);
+}
+
+}  // namespace
+
+TEST_CASE("neon_bf16: pairs of products, and then sums, are rounded to odd" *
+          doctest::skip(test::lacks(kernel_set::neon_bf16))) {
+  constexpr std::int64_t kDepth = 96;
+  Numbers numbers;
+  std::vector<float> x = numbers.some(kDepth), w = numbers.some(kDepth), y = {0, test::kUntouched};
+  const std::vector<std::byte> stored = test::store_as(DType::bf16, w);
+  for (float& number : x) number = from_bf16(to_bf16(number));
+  float sum = 0;
+  for (std::size_t k = 1; k <= kDepth; k += 2)
+    sum = to_odd(double{sum} + to_odd(double{x[k]} * w[k] + double{x[k + 1]} * w[k + 1]));
+  const test::Pages packed = test::packed(row("neon_bf16"), {DType::bf16, kDepth, 1}, stored.data() + 2);
+  LinearJob job = {};
+  job.x = bytes(x), job.x_stride = job.d_in = kDepth, job.n_row = job.n_part = 1;
+  job.part[0] = {DType::bf16, packed.get(), nullptr, nullptr, nullptr, bytes(y), 1};
+  test::run_job(row("neon_bf16"), job, 1);
+  CHECK(y[1] == sum);
+}
 
 TEST_CASE("every machine takes the first row that it can run, and ggml asks for none") {
   for (const KernelSet& set : usable_kernels())

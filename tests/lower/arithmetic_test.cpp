@@ -14,6 +14,7 @@ using Backend = Arithmetic::Backend;
 const Features kMachines[] = {
     {Feature::baseline},
     {Feature::baseline, Feature::neon},
+    kernel_set::neon_bf16.uses.with(Feature::baseline),
     {Feature::baseline, Feature::avx2},
     {Feature::baseline, Feature::avx2, Feature::avx_vnni},
     {Feature::baseline, Feature::avx2, Feature::avx512},
@@ -49,7 +50,8 @@ TEST_CASE("no name takes the best, float32 the best that does not round, and bf1
     CHECK(kernel_set_of(Arithmetic::on_cpu("", machine)->use) == best);
     const auto floats = Arithmetic::on_cpu("float32", machine);
     CHECK_FALSE(rounds_to_bf16(floats->use));
-    CHECK(kernel_set_of(floats->use) == (rounds_to_bf16(best) ? kernel_set::avx512 : best));
+    const KernelSet& exact = best == kernel_set::neon_bf16 ? kernel_set::neon : kernel_set::avx512;
+    CHECK(kernel_set_of(floats->use) == (rounds_to_bf16(best) ? exact : best));
     const auto bf16 = Arithmetic::on_cpu("bf16", machine), int8 = Arithmetic::on_cpu("int8", machine);
     REQUIRE(bf16.ok() == rounds_to_bf16(best));
     if (bf16) CHECK((bf16->at_load == Rounding::bf16 && kernel_set_of(bf16->use) == best));
@@ -72,4 +74,5 @@ TEST_CASE("features that other features imply are never there without them") {
   CHECK(this_cpu().has(Feature::baseline));
   CHECK(this_cpu().has(Feature::avx512) >= this_cpu().has(Feature::avx512_vnni));
   CHECK(this_cpu().has(Feature::amx_bf16) >= this_cpu().has(Feature::amx_int8));
+  CHECK(this_cpu().has(Feature::dotprod) >= this_cpu().has(Feature::i8mm));
 }

@@ -42,7 +42,7 @@ def _common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="where episodes and reports go (default out/eval/ and the command's name)")
     parser.add_argument("--workers", type=int, default=2, help="simulator processes (default 2)")
     parser.add_argument("--threads", type=int, default=1, help="of the server that is started for --bundle; 0: every core (default 1)")
-    parser.add_argument("--kernels", default="", help="of that server: ggml, portable, neon, avx2, avx512, avx512_bf16, amx, float32, bf16, int8, int4 (default: the best for the bundle's dtype)")
+    parser.add_argument("--kernels", default="", help="of that server: ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx, float32, bf16, int8, int4 (default: the best for the bundle's dtype)")
     parser.add_argument("--vla", default="", metavar="FILE", help="the program `vla` (default: VLA_BINARY, or the PATH's)")
     parser.add_argument("--json", action="store_true", help="end with the summary as one JSON object on standard output")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -25,6 +25,14 @@ void multiply_add_neon(long n_round) { VLA_SUM_LOOP("fmla v\\sum\\().4s, v30.4s,
   VLA_SUM_LOOP("sdot v\\sum\\().4s, v30.16b, v31.16b");
 }
 
+[[gnu::target("arch=armv8.2-a+bf16")]] void multiply_add_bf16(long n_round) {
+  VLA_SUM_LOOP("bfmmla v\\sum\\().4s, v30.8h, v31.8h");
+}
+
+[[gnu::target("arch=armv8.2-a+i8mm")]] void multiply_add_i8mm(long n_round) {
+  VLA_SUM_LOOP("smmla v\\sum\\().4s, v30.16b, v31.16b");
+}
+
 #undef VLA_SUM_LOOP
 
 }  // namespace
@@ -33,6 +41,8 @@ std::span<const PeakProbe> machine::peak_probes() {
   static const PeakProbe all[] = {
       {"neon f32", {Feature::neon}, Number::f32, 28 * 4 * 2, multiply_add_neon},
       {"dotprod int8", {Feature::dotprod}, Number::int8, 28 * 16 * 2, multiply_add_dotprod},
+      {"neon bf16", {Feature::neon_bf16}, Number::bf16, 28 * 16 * 2, multiply_add_bf16},
+      {"i8mm int8", {Feature::i8mm}, Number::int8, 28 * 32 * 2, multiply_add_i8mm},
   };
   return all;
 }

@@ -24,6 +24,19 @@ struct Neon : Lanes<4> {
     const Int four = (index & 7) * 0x04040404 + 0x03020100;  // where the four bytes of a number stand
     return vreinterpretq_f32_u8(vqtbl2q_u8(bytes, std::bit_cast<uint8x16_t>(four)));
   }
+  /// An estimate of 8 bits and one correction, which leave 2^-16.
+  static VLA_INLINE Float reciprocal(Float x) {
+    const Float estimate = vrecpeq_f32(x);
+    return estimate * vrecpsq_f32(x, estimate);
+  }
+  static VLA_INLINE Float fraction(Float x) {
+    const Float whole = vrndmq_f32(x);
+    return whole == x ? Float{} : x - whole;  // zero of infinity too
+  }
+  static VLA_INLINE Float times_power_of_two(Float y, Float x) {
+    const Int n = vmaxq_s32(vminq_s32(vcvtmq_s32_f32(x), vdupq_n_s32(254)), vdupq_n_s32(-252)), half = n >> 1;
+    return y * std::bit_cast<Float>((half + 127) << 23) * std::bit_cast<Float>((n - half + 127) << 23);
+  }
 };
 
 }  // namespace vla::kernels

@@ -24,6 +24,8 @@ struct Avx512Bf16Tile {
       store_bf16(to + i, load<V>(from + i, n - i), n - i > 16 ? load<V>(from + i + 16, n - i - 16) : V::Float{});
   }
 
+  static VLA_INLINE void copy(const X* from, std::int64_t n, X* to) { copy_padded(from, n, to); }
+
   static void multiply(DType, int n_row, const X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
                        const Ahead& ahead) {
     multiply_rows<Pairs>(n_row, x, panel, depth, c, add, ahead);
