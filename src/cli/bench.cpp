@@ -135,7 +135,7 @@ Command add_bench(CLI::App& app) {
   command->add_option("--warmup", options->n_warmup, "Rounds before them")
       ->check(CLI::Range(0, 1000))
       ->capture_default_str();
-  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core, of big and little ones the big")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);

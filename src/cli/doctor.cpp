@@ -172,7 +172,7 @@ Command add_doctor(CLI::App& app) {
       "Takes seconds, and a few acts of the policy. Exit codes beside those of vla run: 16 where a chunk is executed "
       "before the next one is there.");
   add_bundle(*command, options->bundle, false);
-  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core, of big and little ones the big")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);

@@ -115,7 +115,9 @@ Command add_replay(CLI::App& app) {
       ->needs(bundle);
   add_text(*command, "--device", options->device, "NAME", std::string(kDeviceHelp) + "; with --bundle")->needs(bundle);
   add_text(*command, "--embodiment", options->embodiment, "TAG", "As for vla serve; with --bundle")->needs(bundle);
-  command->add_option("--threads", options->n_thread, "CPU threads, with --bundle; 0 takes every core")
+  command
+      ->add_option("--threads", options->n_thread,
+                   "CPU threads, with --bundle; 0 takes every core, of big and little ones the big")
       ->needs(bundle)
       ->check(CLI::Range(0, 512));
   command->add_option("--first", options->replay.first, "Only so many requests; 0: all")->capture_default_str();

@@ -292,7 +292,7 @@ Command add_run(CLI::App& app) {
   add_text(*command, "--taps-out", options->taps_out, "FILE", "Where the recorded values go (GGUF), for vla compare");
   add_text(*command, "--inject", options->inject, "FILE",
            "Replace computed values by these: a GGUF file of named values, as --taps-out writes it");
-  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core, of big and little ones the big")
       ->type_name("N")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();

@@ -183,7 +183,7 @@ Command add_serve(CLI::App& app) {
       ->allow_extra_args(false)
       ->capture_default_str();
   add_other_protocols(*command, server);
-  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core")
+  command->add_option("--threads", options->n_thread, "CPU threads; 0 takes every core, of big and little ones the big")
       ->check(CLI::Range(0, 512))
       ->capture_default_str();
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);

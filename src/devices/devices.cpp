@@ -3,7 +3,6 @@
 #include "devices/devices.h"
 
 #include <fmt/format.h>
-#include <sched.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -11,6 +10,7 @@
 
 #include "devices/libraries.h"
 #include "ggml/reference.h"
+#include "kernels/cores.h"
 #include "lower/cpu/cpu_device.h"
 
 namespace vla {
@@ -19,10 +19,7 @@ namespace {
 constexpr const char* kKinds[] = {"vulkan", "cuda"};
 constexpr int kMaxThreads = 512;
 
-int usable_cores() {
-  cpu_set_t set;
-  return sched_getaffinity(0, sizeof(set), &set) == 0 ? CPU_COUNT(&set) : 1;
-}
+int usable_cores() { return static_cast<int>(kernels::big_cores(kernels::allowed_cores()).size()); }
 
 DeviceInfo cpu() {
   const auto pages = [](int which) {

@@ -11,6 +11,7 @@
 #include <map>
 #include <system_error>
 
+#include "kernels/cores.h"
 #include "kernels/pages.h"
 
 namespace vla::kernels {
@@ -51,8 +52,14 @@ Result<std::shared_ptr<Executor>> Executor::shared(int n_thread) {
 Executor::Executor(int n_thread) : n_thread_(n_thread), n_stretch_(std::min(n_thread, kMaxStretches)) {}
 
 Status Executor::start() {
+  const std::vector<int> all = allowed_cores(), big = big_cores(all);
+  const bool fits = big.size() < all.size() && static_cast<std::size_t>(n_thread_) <= big.size();
   try {
-    for (int i = 1; i < n_thread_; ++i) threads_.emplace_back([this, i] { serve(i); });
+    for (int i = 1; i < n_thread_; ++i)
+      threads_.emplace_back([this, i, only = fits ? big : std::vector<int>{}] {
+        if (!only.empty()) stay_on(only);
+        serve(i);
+      });
   } catch (const std::system_error& error) {
     return Error{Code::device, "threads", std::to_string(n_thread_), error.what(), "use fewer threads"};
   }
@@ -67,7 +74,7 @@ Executor::~Executor() {
 }
 
 Status Executor::reserve(std::size_t size) {
-  constexpr std::size_t kPage = 4096;
+  constexpr std::size_t kPage = 4096;  // no less than a line of a cache; pages of the system may be larger
   const std::lock_guard lock(turn_);
   if (size <= scratch_size_) return {};
   size = (size + kPage - 1) / kPage * kPage;
@@ -82,7 +89,10 @@ Status Executor::reserve(std::size_t size) {
   return {};
 }
 
-void Executor::touch() { want_memory_now(scratch_.get(), scratch_size()); }
+void Executor::touch() {
+  const std::lock_guard lock(turn_);
+  want_memory_now(scratch_.get(), scratch_size());
+}
 
 void Executor::run(std::span<const Phase> phases) {
   if (phases.empty()) return;

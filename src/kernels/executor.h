@@ -17,7 +17,7 @@
 
 namespace vla::kernels {
 
-/// A thread that takes items of a phase, with scratch memory of its own at a multiple of a page. An item must not rely
+/// A thread that takes items of a phase, with scratch memory of its own at a multiple of 4 KiB. An item must not rely
 /// on what lies there, unless items of its own job left it: the memory is the job's until another one takes it.
 class Worker {
  public:
@@ -118,7 +118,7 @@ class Executor {
   const int n_thread_, n_stretch_;
   std::mutex turn_;  // of those who run
   std::vector<std::thread> threads_;
-  std::size_t scratch_size_ = 0;
+  std::atomic<std::size_t> scratch_size_ = 0;  // told while others load
   struct Free {
     void operator()(std::byte* memory) const;
   };
