@@ -104,8 +104,9 @@ void Log::event(Level level, const char* name, const Fields& fields) noexcept {
   if (level < min_level_) return;
   try {
     const std::uint64_t dropped = writer_.n_dropped();
-    const std::uint64_t told = n_told_.exchange(dropped);
-    if (dropped > told) writer_.put(line(Level::warn, "log_dropped", {{"lines", dropped - told}}));
+    std::uint64_t told = n_told_;
+    if (dropped > told && n_told_.compare_exchange_strong(told, dropped))  // another thread may tell it, or more
+      writer_.put(line(Level::warn, "log_dropped", {{"lines", dropped - told}}));
     writer_.put(line(level, name, fields));
   } catch (const std::exception&) {  // no memory for a line: the server goes on without it
   }
