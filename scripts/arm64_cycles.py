@@ -59,16 +59,15 @@ def loops(lines):
             yield [text for place, text in lines[:i] if place >= int(branch[1], 16)] + [text]
 
 
-def inner_loop(path, name, add, count):
-    """The smallest loop with so many multiply-adds in the functions of a name."""
-    bodies = [
-        body
-        for function, lines in functions(path).items()
-        if re.search(name, function)
-        for body in loops(lines)
-        if sum(line.split()[0] == add for line in body) == count
-    ]
-    return min(bodies, key=len, default=None)
+def smallest_loop(functions, add, count):
+    """The smallest loop with so many multiply-adds."""
+    bodies = (body for lines in functions for body in loops(lines))
+    return min((body for body in bodies if sum(line.split()[0] == add for line in body) == count), key=len, default=None)
+
+
+def wasted(body):
+    """Accesses to the stack, and moves of vectors."""
+    return sum("[sp" in line for line in body), sum(line.startswith("mov v") for line in body)
 
 
 def cycles(mca, cpu, body):
@@ -98,13 +97,13 @@ def main():
     print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
     wrong = False
     for source, title, name, add, count in LOOPS:
-        body = inner_loop(args.objects / f"{source}.cpp.o", name, add, count)
+        named = [lines for function, lines in functions(args.objects / f"{source}.cpp.o").items() if re.search(name, function)]
+        body = smallest_loop(named, add, count)
         if body is None:
             print(f"| {title} | not found |")
             wrong = True
             continue
-        spills = sum("[sp" in line for line in body)
-        moves = sum(line.startswith("mov v") for line in body)
+        spills, moves = wasted(body)
         wrong |= spills + moves > 0
         shares = [share(args.mca, cpu, add, count, body) for cpu in cpus]
         print(f"| {' | '.join(map(str, [title, count, len(body), spills, moves, *shares]))} |")
