@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test test-arm64 test-cuda test-vulkan build vulkan cuda wheel deb packages asan tsan fuzz format clean
+.PHONY: help demo libero test arm64 test-arm64 test-cuda test-vulkan build vulkan cuda wheel wheel-arm64 deb deb-arm64 packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -16,12 +16,13 @@ help:
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make test-cuda   all tests of our kernels for CUDA, without a GPU (downloads 102 MB: NVIDIA's compiler)"
 	@echo "make test-vulkan all golden cases on --device vulkan, of which make test tries one of each family"
-	@echo "make test-arm64  build for 64-bit ARM, and run the tests of that under an emulator"
+	@echo "make test-arm64  build for 64-bit ARM with both packages, and test that under an emulator; no part of make test, whose time its build alone would exceed"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 525 MB of NVIDIA's compiler and libraries)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make deb       out/vla_*.deb for this system: the program, its manual, and the server as a unit of systemd"
+	@echo "make deb-arm64, make wheel-arm64   the same two for 64-bit ARM, built here"
 	@echo "make tsan      run the tests of executor, engine and server under the thread sanitizer"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
 	@echo "make format    format the C++ sources"
@@ -133,11 +134,23 @@ test-cuda: build
 	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 VLA_ALL_ARCHITECTURES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
 
 # Downloads 90 MB of Debian's libraries for ARM into .cache.
-test-arm64: build
+SYSROOT := .cache/sysroot-arm64
+arm64: packages $(STAMP)
 	@scripts/packages.sh arm64
-	@scripts/sysroot.sh .cache/sysroot-arm64
+	@scripts/sysroot.sh $(SYSROOT)
 	@test -f build/arm64/build.ninja || cmake --preset arm64 $(CMAKE_ARGS)
 	cmake --build --preset arm64
+
+# For the release of Debian that the libraries are of; without a list of components (scripts/sbom.py looks at installed packages).
+deb-arm64: arm64
+	cpack --config build/arm64/CPackConfig.cmake -B out \
+	  -D CPACK_DEBIAN_PACKAGE_DEPENDS="$$(scripts/arm64_depends.sh $(SYSROOT) build/arm64/bin/vla build/arm64/lib/libvla.so.1)"
+	@rm -rf out/_CPack_Packages
+
+wheel-arm64: arm64
+	VLA_SYSROOT=$(CURDIR)/$(SYSROOT) VLA_BUILD_DIR=build/arm64 $(VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps -w out ./python
+
+test-arm64: build deb-arm64 wheel-arm64
 	$(VENV)/bin/python scripts/test.py --preset arm64
 
 SECONDS ?= 600

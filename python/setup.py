@@ -8,6 +8,7 @@ An editable install compiles nothing: it finds the library in the build of the s
     VLA_BUILD_DIR   build folder to use or to make, below the source tree unless absolute (default: build/cpu where it was configured,
                     else build/wheel)
     CMAKE_ARGS      for the first configuration of it, e.g. -DVLA_NATIVE=ON for a ggml of this machine alone
+    VLA_SYSROOT     where that folder is a build for 64-bit ARM, the libraries that it was built with (make wheel-arm64)
 """
 
 import os
@@ -25,6 +26,7 @@ from setuptools.command.build_py import build_py
 ROOT = Path(__file__).resolve().parent.parent
 LIBRARY = "libvla.so.1"
 # Part of every system with Python and NumPy; a second copy would conflict.
+SYSROOT = os.environ.get("VLA_SYSROOT")
 SYSTEM = re.compile(r"linux-vdso|ld-linux|lib(c|m|dl|rt|pthread|resolv|stdc\+\+|gcc_s)\.so")
 
 
@@ -52,9 +54,28 @@ def compile_runtime(build):
         raise SystemExit("the C++ runtime could not be compiled: pip install -v shows why")
 
 
+def output(*command):
+    return subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True).stdout
+
+
+def loaded(*files):
+    """{name: path} of the libraries that files load, those of the system left out."""
+    if not SYSROOT:
+        return {n: path for n, path in re.findall(r"^\s*(\S+) => (\S+)", output("ldd", *files), re.M) if not SYSTEM.match(n)}
+    found, waiting = {}, list(files)
+    while waiting:
+        for name in re.findall(r"\(NEEDED\).*\[(.*)\]", output("readelf", "--dynamic", "--wide", waiting.pop())):
+            if not SYSTEM.match(name) and name not in found:
+                found[name] = next(Path(SYSROOT).glob(f"**/lib/aarch64-linux-gnu/{name}"))
+                waiting.append(found[name])
+    return found
+
+
 def copy_licence(path, folder):
     """The licence of the Debian package that a carried library is from; other systems keep them elsewhere."""
     real = os.path.realpath(path)
+    if SYSROOT:  # as the same package's library is called here
+        real = "/" + os.path.relpath(real, os.path.realpath(SYSROOT)).replace("aarch64", platform.machine())
     patterns = [real, real.replace("/usr/lib/", "/lib/", 1)]
     try:
         owner = subprocess.run(["dpkg-query", "-S", *patterns], capture_output=True, text=True).stdout.split(":")[0]
@@ -85,11 +106,9 @@ def build_runtime(package):
     library, program = next(prefix.rglob(LIBRARY)), prefix / "bin/vla"
     shutil.copy(library, package / "lib")
     shutil.copy(program, package / "bin")
-    listing = subprocess.run(["ldd", str(program), str(library)], check=True, capture_output=True, text=True)
-    for name, path in re.findall(r"^\s*(\S+) => (\S+)", listing.stdout, re.M):
-        if not SYSTEM.match(name):
-            shutil.copy(path, package / "lib" / name)
-            copy_licence(path, package / "lib")
+    for name, path in loaded(program, library).items():
+        shutil.copy(path, package / "lib" / name)
+        copy_licence(path, package / "lib")
     for notice in ("LICENSE", "LICENSES-third-party.md"):
         shutil.copy(ROOT / notice, package / "lib")
 
@@ -104,7 +123,7 @@ class BuildWithRuntime(build_py):
 def needed_libc(package):
     """The oldest glibc 2.N of a system that has what the carried files need of its C and C++ libraries, as auditwheel tells it."""
     files = [*package.glob("lib/*.so*"), package / "bin/vla"]
-    needs = subprocess.run(["readelf", "--version-info", "--wide", *map(str, files)], check=True, capture_output=True, text=True).stdout
+    needs = output("readelf", "--version-info", "--wide", *files)
     c, cpp = (max(map(int, re.findall(rf"\b{name}(\d+)\b", needs))) for name in (r"GLIBC_2\.", r"GLIBCXX_3\.4\."))
     if cpp > 30:  # newer than the table: as new as here
         return int(platform.libc_ver()[1].split(".")[1])
@@ -117,7 +136,8 @@ class PlatformWheel(bdist_wheel):
         package = Path(self.get_finalized_command("build_py").build_lib) / "vla_cpp"
         if platform.libc_ver()[0] != "glibc" or not (package / "bin").is_dir():  # an editable install carries nothing
             return "py3", "none", super().get_tag()[2]
-        return "py3", "none", f"manylinux_2_{needed_libc(package)}_{platform.machine()}"
+        machine = "aarch64" if SYSROOT else platform.machine()
+        return "py3", "none", f"manylinux_2_{needed_libc(package)}_{machine}"
 
 
 class PlatformDistribution(Distribution):

@@ -10,7 +10,8 @@ folder=$(mkdir -p "$1" && cd "$1" && pwd)
 state=$folder/.apt
 packages=(libfmt-dev libpng-dev libjpeg62-turbo-dev libxxhash-dev libutf8proc-dev nlohmann-json3-dev libcli11-dev doctest-dev
           libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev prometheus-cpp-dev libmsgpack-cxx-dev libboost-dev libc6-dev libstdc++-12-dev)
-[ "$(cat "$folder/.complete" 2>/dev/null)" = "${packages[*]}" ] && exit 0
+content="${packages[*]}, and .shlibs"
+[ "$(cat "$folder/.complete" 2>/dev/null)" = "$content" ] && exit 0
 rm -rf "$state" && mkdir -p "$state"/{lists/partial,cache/archives/partial,state}
 : > "$state/status"  # nothing is installed: all that is needed is downloaded
 cat > "$state/apt.conf" <<CONF
@@ -27,10 +28,15 @@ export APT_CONFIG=$state/apt.conf
 echo "sysroot: downloading arm64 libraries into $folder (90 MB, once)"
 apt-get update -qq
 apt-get install -qq -y --no-install-recommends --download-only "${packages[@]}" >/dev/null
-for package in "$state"/cache/archives/*.deb; do dpkg-deb -x "$package" "$folder"; done
+# .shlibs: which package a program that needs a library depends on.
+: > "$folder/.shlibs"
+for package in "$state"/cache/archives/*.deb; do
+  dpkg-deb -x "$package" "$folder"
+  dpkg-deb -I "$package" shlibs 2>/dev/null >> "$folder/.shlibs" || true
+done
 # Links that name a file from the root of the machine would leave the folder.
 find "$folder/usr/lib" "$folder/lib" -type l -lname '/*' 2>/dev/null | while read -r link; do
   ln -sfn "$(realpath -m --relative-to="$(dirname "$link")" "$folder$(readlink "$link")")" "$link"
 done
 rm -rf "$state"
-echo "${packages[*]}" > "$folder/.complete"
+echo "$content" > "$folder/.complete"

@@ -7,6 +7,7 @@ The emulator is a hundred times slower than a machine and shows nothing of time 
 
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -16,9 +17,11 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "tests/cli")]
+sys.path[:0] = [str(ROOT / "tests/cli"), str(ROOT / "python")]
 
 from golden_cases import NAMES, Golden  # noqa: E402
+
+import vla_cpp  # noqa: E402
 
 HERE, ARM, EMULATOR = os.environ["VLA_BINARY_HERE"], os.environ["VLA_BINARY"], shlex.split(os.environ["VLA_EMULATOR"])
 # A processor of robots' boards, and one with everything that the emulator knows.
@@ -60,14 +63,14 @@ def test_any_number_of_threads_gives_the_same_bytes(name, tmp_path):
     assert made[0] == made[1] == made[2]
 
 
-@pytest.mark.parametrize("kernels", ["int8", "int4"])
+@pytest.mark.parametrize("kernels", ["bf16", "int8", "int4"])
 def test_quantized_the_shipped_policy_acts_alike_on_any_number_of_threads_and_nearly_so_on_another_machine(kernels):
     image = next((ROOT / "examples/metaworld/episodes").rglob("*.png"))
     observation = ["--image", f"corner4={image}", "--state", "0,0.4,0.2,1", "--text", "open the faucet", "--seed", "3", "--json"]
-    act = ["run", ROOT / "models/metaworld-tiny.gguf", *observation, "--kernels", kernels]
-    one, two = (json.loads(run(*EMULATOR, ARM, *act, "--threads", str(n)))["actions"] for n in (1, 2))
+    act = ["run", ROOT / "models/metaworld-tiny.gguf", *observation, "--kernels"]
+    one, two = (json.loads(run(*EMULATOR, ARM, *act, kernels, "--threads", str(n)))["actions"] for n in (1, 2))
     assert one == two
-    here = json.loads(run(HERE, *act))["actions"]
+    here = json.loads(run(HERE, *act, "float32" if kernels == "bf16" else kernels))["actions"]  # not all machines have bf16
     # The sums are whole numbers and equal; a norm's last bit may still move a row's code by one.
     assert np.abs(np.array(one) - here).max() < 2e-2
 
@@ -78,6 +81,36 @@ def test_portable_kernels_give_the_bytes_of_another_machine(name, tmp_path):
     options = ["--kernels", "portable"]
     here = taps(tmp_path / "here.gguf", name, *options, emulated=False).read_bytes()
     assert taps(tmp_path / "arm.gguf", name, *options).read_bytes() == here
+
+
+def test_the_c_interface_gives_the_chunk_of_the_program(tmp_path):
+    case, act = Golden("smolvla/two_views"), tmp_path / "act"
+    library = Path(os.environ["VLA_LIBRARY"])
+    (tmp_path / "libvla.so").symlink_to(library)
+    sysroot = EMULATOR[EMULATOR.index("-L") + 1]
+    source = [f"-I{ROOT / 'include'}", ROOT / "examples/c/act.c", f"-L{tmp_path}", "-lvla", f"-Wl,-rpath,{library.parent}"]
+    run("aarch64-linux-gnu-gcc", "-std=c99", f"--sysroot={sysroot}", *source, "-o", act)
+    images = [f"{view}={file or ''}" for view, file in case.images.items()]
+    told = run(*EMULATOR, act, case.bundle, case.text, ",".join(map(str, case.state)), "3", *images)
+    got = np.array([line.split() for line in told.splitlines()], np.float32)
+    arguments = case.arguments(options=["--seed", "3", "--json"])
+    at = arguments.index("--noise")
+    assert np.array_equal(got, np.float32(json.loads(run(*EMULATOR, ARM, *arguments[:at], *arguments[at + 2 :]))["actions"]))
+
+
+def test_a_client_on_this_machine_is_answered_by_the_server_on_that_one():
+    case = Golden("smolvla/two_views")
+    command = [*EMULATOR, ARM, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "2", "--kernels", "neon"]
+    server = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True, env={**os.environ, "QEMU_CPU": "cortex-a76"})
+    try:
+        address = re.search(r"tcp://127\.0\.0\.1:\d+", server.stdout.readline())[0]
+        with vla_cpp.Client(address, timeout=300) as client:
+            images = {view: None if file is None else file.read_bytes() for view, file in case.images.items()}
+            answers = [client.act(images=images, state=case.state, text=case.text, seed=s).actions for s in (1, 1, 2)]
+    finally:
+        server.terminate()
+        assert server.wait(300) == 0
+    assert np.array_equal(answers[0], answers[1]) and not np.array_equal(answers[0], answers[2])
 
 
 def test_noise_pixels_and_codes_of_weights_are_those_of_another_machine():
