@@ -4,6 +4,7 @@
 """The figures of `vla serve` under load, as rows of a Markdown table.
 
 scripts/serve_load.py overhead     one client, two raw views of 256 x 256: what server and network add to the engine
+scripts/serve_load.py protocols    the same act through each protocol that the server speaks, by turns, as their clients in Python make it
 scripts/serve_load.py jpeg         the same with JPEG files, and libjpeg-turbo's own time for them
 scripts/serve_load.py many         64 clients, 100,000 acts: lost and crossed answers, fairness, resident memory
 scripts/serve_load.py busy         the shipped policy with default threads: processor time while idle, and one client's
@@ -23,13 +24,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tools")]
+sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tools"), str(ROOT / "tests/client")]
 from busy_loops import busy_loops  # noqa: E402
 from goldens.build import make  # noqa: E402
 
@@ -38,14 +39,14 @@ WARM = 3  # tenths of the acts of `many`, until the allocator holds what 64 clie
 
 
 @contextmanager
-def serving(options):
+def serving(options, *more):
     """(address, process) of a server of its own."""
     threads = ["--threads", options.threads] if options.threads else []
-    command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", *threads]
+    command = [options.vla, "serve", options.bundle, "--bind", "tcp://127.0.0.1:0", *threads, *more]
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
     try:
         line = process.stdout.readline()
-        yield re.search(r"address=(\S+)", line)[1], process
+        yield re.search(r"address='?([^\s']+)", line)[1], process
     finally:
         process.terminate()
         process.communicate()
@@ -111,6 +112,98 @@ def overhead(options):
         ("the server's copy of the frames, part of the engine time", spread(tool["decode_ms"]), ""),
     ]
     return {"cpp": tool, "python": package}, rows
+
+
+def openpi_client(stack, address, scene, text):
+    import msgpack
+    from drop_in import openpi_array, unpack
+    from websockets.sync.client import connect
+
+    socket = stack.enter_context(connect(address, compression=None, max_size=None))
+    socket.recv()
+
+    def act():
+        socket.send(msgpack.packb({**scene, "prompt": text}, default=openpi_array))
+        return unpack(socket.recv())["actions"]
+
+    return act
+
+
+def gr00t_client(stack, address, scene, text):
+    import zmq
+    from drop_in import numpy_array, pack, unpack
+
+    socket = stack.enter_context(stack.enter_context(zmq.Context()).socket(zmq.REQ))
+    socket.connect(address)
+    observation = {("state." if key == "state" else "video.") + key: value[None, None] for key, value in scene.items()}
+
+    def act():
+        data = {"observation": {**observation, "annotation.task": [text]}, "options": None}
+        socket.send(pack({"endpoint": "get_action", "data": data}, numpy_array))
+        return next(iter(unpack(socket.recv())[0].values()))
+
+    return act
+
+
+def lerobot_client(stack, address, scene, text):
+    import lerobot_pickles
+    from lerobot_test import Robot
+
+    robot = stack.enter_context(Robot(address))
+    motors = {f"motor_{i}": x for i, x in enumerate(scene["state"].tolist())}
+    cameras = {key: frame for key, frame in scene.items() if key != "state"}
+    robot.begin(lerobot_pickles.setup_of(motors, cameras))
+    seen = {**motors, **cameras, "task": text}
+    data = lerobot_pickles.dumps(lerobot_pickles.TimedObservation(0.0, 0, seen, True))
+
+    def act():
+        robot.observe(data)
+        return robot.actions()
+
+    return act
+
+
+def has_lerobot(options):
+    """Whether the build has its protocol, and this Python gRPC."""
+    try:
+        import grpc  # noqa: F401
+    except ImportError:
+        return False
+    command = [options.vla, "serve", options.bundle, "--lerobot", "here"]
+    return "libgrpc++" not in subprocess.run(list(map(str, command)), capture_output=True, text=True).stderr
+
+
+def protocols(options):
+    import vla_cpp
+    from vla_cpp.observation import robot_of
+
+    kinds = [("openpi", openpi_client, 0.5), ("gr00t", gr00t_client, 0.5)]
+    kinds += [("lerobot", lerobot_client, 1.0)] if has_lerobot(options) else []
+    with vla_cpp.Policy(str(options.bundle), threads=1) as policy:
+        spec = robot_of(policy.spec, None)
+    names = {one.name.rpartition(".")[2]: one.name for one in (*spec.views, *spec.states)}
+    more = [part for name, *_ in kinds for part in ("--" + name, "127.0.0.1:0")]
+    more += [part for key, name in names.items() for part in ("--map", f"{key}={name}")]
+    state = np.full(spec.states[0].width, 0.1, np.float32)
+    scene = {key: state if key == "state" else image(i) for i, key in enumerate(names)}
+    text, took = "open the drawer", {}
+    with serving(options, *more) as (addresses, _), ExitStack() as stack:
+        native, *others = addresses.split(",")
+        client = stack.enter_context(vla_cpp.Client(native, timeout=60))
+        images = {name: scene[key] for key, name in names.items() if key != "state"}
+        acts = {"native": lambda: client.act(images=images, state={names["state"]: scene["state"]}, text=text)}
+        for (name, make_client, _), address in zip(kinds, others):
+            acts[name] = make_client(stack, address.removeprefix("gr00t+"), scene, text)
+        for _ in range(options.requests):
+            for name, act in acts.items():
+                start = time.perf_counter()
+                act()
+                took.setdefault(name, []).append(1e3 * (time.perf_counter() - start))
+    more = {name: float(np.median(took[name]) - np.median(took["native"])) for name, *_ in kinds}
+    rows = [("native, round trip", spread(quantiles(took["native"])), "")]
+    rows += [(f"{name}, p50 beyond that", f"{more[name]:+.3f} ms", f"{bar:g}") for name, _, bar in kinds]
+    rows += [("load of the machine in the last minute", f"{os.getloadavg()[0]:.1f}", "")]
+    return {"protocols": {**more, "flawless": True}}, rows
 
 
 def jpegs(options):
@@ -184,7 +277,7 @@ def spread(figures):
     return f"p50 {figures['p50']:.3f}, p99 {figures['p99']:.3f} ms"
 
 
-FIGURES = {"overhead": (overhead, 2000), "jpeg": (jpegs, 2000), "many": (many, 100_000), "busy": (busy, 100)}
+FIGURES = {"overhead": (overhead, 2000), "protocols": (protocols, 500), "jpeg": (jpegs, 2000), "many": (many, 100_000), "busy": (busy, 100)}
 
 
 def parse():
@@ -197,7 +290,7 @@ def parse():
     parser.add_argument("--threads", type=int, help="of the engine; default: 1, of `busy` the server's own")
     parser.add_argument("--clients", type=int, default=64, help="of `many`; default: 64")
     parser.add_argument("--side", type=int, default=64, help="of the raw frames of `many`; default: 64 pixels")
-    parser.add_argument("--requests", type=int, help="default: 100,000 of `many`, 100 of `busy`, 2,000 else")
+    parser.add_argument("--requests", type=int, help="default: 100,000 of `many`, 100 of `busy`, 500 of `protocols`, 2,000 else")
     parser.add_argument("--json", action="store_true")
     return parser.parse_args()
 

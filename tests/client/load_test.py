@@ -37,3 +37,8 @@ def test_the_overhead_is_told_for_raw_and_for_jpeg_views():
     assert 0 < report["cpp"]["overhead_ms"]["p50"] <= report["cpp"]["overhead_ms"]["p99"]
     assert 0 < report["python"]["overhead_ms"]["p50"]
     assert measured("jpeg", "--requests", "50")["ratio"] > 0.5
+
+
+def test_every_protocol_is_told_beside_the_native_one():
+    report = measured("protocols", "--requests", "20")["protocols"]
+    assert {"openpi", "gr00t"} <= set(report)

@@ -103,11 +103,12 @@ def serving(vla, *options):
         process.wait()
 
 
-def drive(command, environment, episode):
-    """Lets a client drive: every action that it executed, every whole chunk that it showed."""
+def drive(command, environment, folder, episode):
+    """Lets a client drive, which may write into a folder: every action that it executed, every whole chunk that it showed."""
     episode.begin()
     actions, chunks = [], []
-    client = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
+    pipes = {name: subprocess.PIPE for name in ("stdin", "stdout", "stderr")}
+    client = subprocess.Popen(command, env=environment, cwd=folder, **pipes)
     over = False
     while True:
         head, array = robot.receive(client.stdout)
@@ -169,7 +170,7 @@ def compare(vla, name, python, source, episode, native, folder):
         address = next(a for a in addresses if a.startswith(scheme)).removeprefix(scheme)
         command = [python, str(HERE / f"{kind}_robot.py"), address, str(ROWS)]
         command += ["broker"] if "broker" in name else ["n1.5"] if "n1.5" in name else []
-        actions, shown = drive(command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}, episode)
+        actions, shown = drive(command, {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}, folder, episode)
     result = episode.result()
     seeds = [act.answer.seed for act in acts_of(Recording(folder / "record"))]
     again, chunks = play_again(vla, native, episode, seeds, n_skipped, folder)
@@ -193,6 +194,7 @@ def main():
         for client in args.client:
             name, _, where = client.partition("=")
             python, _, source = where.partition(":")
+            source = source and str(Path(source).resolve())
             n_skipped = int(name.startswith("lerobot"))
             episodes = {"recorded": Recorded(RECORDED / tasks[0], n_skipped), **scenes}
             for label, episode in episodes.items():

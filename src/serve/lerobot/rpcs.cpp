@@ -6,6 +6,7 @@
 #include <grpcpp/generic/async_generic_service.h>
 #include <grpcpp/grpcpp.h>
 #include <grpcpp/resource_quota.h>
+#include <grpcpp/support/proto_buffer_reader.h>
 
 #include <atomic>
 #include <boost/asio/post.hpp>
@@ -23,6 +24,7 @@ namespace {
 
 constexpr int kMaxPiece = 4 << 20;  // of LeRobot's channels
 constexpr int kMaxStreams = 16;     // of a connection
+constexpr int kReadAtOnce = 64 << 10;
 constexpr int kHandshakeMs = 10'000, kKeepaliveMs = 20'000;
 constexpr auto kReceiptPatience = std::chrono::seconds(60);
 
@@ -91,6 +93,9 @@ class Rpcs::All : public grpc::CallbackGenericService {
     // Frames of cameras come at once, not by turns of 64 kB.
     builder.AddChannelArgument(GRPC_ARG_HTTP2_STREAM_LOOKAHEAD_BYTES, kMaxPiece);
     builder.AddChannelArgument(GRPC_ARG_HTTP2_MAX_FRAME_SIZE, kMaxPiece);
+    builder.AddChannelArgument(GRPC_ARG_HTTP2_BDP_PROBE, 0);
+    builder.AddChannelArgument(GRPC_ARG_TCP_READ_CHUNK_SIZE, kReadAtOnce);
+    builder.AddChannelArgument(GRPC_ARG_TCP_MIN_READ_CHUNK_SIZE, kReadAtOnce);
     builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_TIME_MS, kKeepaliveMs);
     builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveMs);
     builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_PERMIT_WITHOUT_CALLS, 1);
@@ -180,15 +185,16 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
   }
 
   Status take_piece() {
-    grpc::Slice slice;
-    if (!in_.DumpToSingleSlice(&slice).ok()) return Error{Code::out_of_memory, "call", "", "no memory for it"};
     if (rpc_.method != "SendObservations") {
+      grpc::Slice slice;
+      if (!in_.DumpToSingleSlice(&slice).ok()) return Error{Code::out_of_memory, "call", "", "no memory for it"};
       rpc_.message.assign(reinterpret_cast<const char*>(slice.begin()), slice.size());
       is_whole_ = true;
       return {};
     }
+    grpc::ProtoBufferReader reader(&in_);
     transport::Observation piece;
-    if (!piece.ParseFromArray(slice.begin(), static_cast<int>(slice.size())))
+    if (!reader.status().ok() || !piece.ParseFromZeroCopyStream(&reader))
       return Error{Code::bad_request, "Observation", "LeRobot's message", "other bytes"};
     if (piece.transfer_state() == transport::TRANSFER_BEGIN) rpc_.message.clear();
     if (piece.transfer_state() == transport::TRANSFER_UNKNOWN)
@@ -198,7 +204,11 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
     n_held_ += piece.data().size();
     if ((all_.n_held_ += piece.data().size()) > all_.limits_.receipt)
       return Error{Code::busy, "Observation", fmt::format("at most {} bytes in receipt", all_.limits_.receipt), "more"};
-    rpc_.message += piece.data();
+    if (rpc_.message.empty()) {
+      rpc_.message = std::move(*piece.mutable_data());
+    } else {
+      rpc_.message += piece.data();
+    }
     is_whole_ = piece.transfer_state() == transport::TRANSFER_END;
     return {};
   }
