@@ -165,8 +165,8 @@ struct Calls {
   static int device_count(int* count) { return *count = state.driver.n_device, 0; }
   static int device_get(int* device, int ordinal) { return *device = ordinal, 0; }
   static int device_attribute(int* value, int attribute, int) {
-    if (attribute != 75 && attribute != 76) return kInvalidValue;
-    *value = attribute == 75 ? state.driver.major : state.driver.minor;
+    if (attribute != 16 && attribute != 75 && attribute != 76) return kInvalidValue;
+    *value = attribute == 16 ? state.driver.n_sm : attribute == 75 ? state.driver.major : state.driver.minor;
     return 0;
   }
   static int context_retain(Handle* context, int) { return *context = &state, ++state.driver.n_handle, 0; }

@@ -5,6 +5,8 @@
 // device in the place of the CPU's kernels in float32.
 #include <doctest/doctest.h>
 
+#include <algorithm>
+#include <cmath>
 #include <cstdlib>
 
 #include "cuda/fake_driver.h"
@@ -27,28 +29,79 @@ Result<std::unique_ptr<Device>> wrapped_open_device(int, const std::string&, con
 Result<std::unique_ptr<Device>> wrapped_open_device(int n_thread, const std::string& kernels,
                                                     const std::string& device) {
   if (kernels == "ggml") return real_open_device(n_thread, kernels, device);
-  return lower::CudaDevice::open(test::cuda::fake_driver_table(), 0, test::cuda::modules_of_tests());
+  const Rounding at_load = kernels == "bf16"   ? Rounding::bf16
+                           : kernels == "int8" ? Rounding::int8
+                           : kernels.empty()   ? Rounding::none
+                                               : Rounding::float32;
+  return lower::CudaDevice::open(test::cuda::fake_driver_table(), 0, test::cuda::modules_of_tests(), at_load);
 }
 
 }  // namespace vla
 
-TEST_CASE("policies on our own kernels for CUDA match the reference at every tap within 1e-4") {
+namespace {
+
+/// Golden cases whose path has VLA_FAMILY in it, or those of all families, or of SmolVLA and BitVLA.
+std::vector<std::string> cases() {
   const bool all = std::getenv("VLA_ALL_FAMILIES") != nullptr;
-  for (const std::string& path : golden_paths()) {
-    const bool is_ternary = path.find("/bitvla/") != path.npos;
-    if (is_ternary || (!all && path.find("/smolvla/") == path.npos)) continue;
+  const char* family = std::getenv("VLA_FAMILY");
+  std::vector<std::string> paths = golden_paths();
+  std::erase_if(paths, [&](const std::string& path) {
+    if (family != nullptr) return path.find(family) == path.npos;
+    return !all && path.find("/smolvla/") == path.npos && path.find("/bitvla/") == path.npos;
+  });
+  return paths;
+}
+
+ActionChunk act(Engine& engine, const GoldenCase& golden) {
+  auto chunk = engine.act(golden.observation, golden.noise);
+  REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message() + test::cuda::fake_driver().fault));
+  return std::move(*chunk);
+}
+
+double norm_of_difference(const std::vector<float>& a, const std::vector<float>& b, bool largest) {
+  double most = 0, squares = 0;
+  REQUIRE(a.size() == b.size());
+  for (std::size_t i = 0; i < a.size(); ++i) {
+    const double difference = std::abs(double{a[i]} - double{b[i]});
+    most = std::max(most, difference), squares += difference * difference;
+  }
+  return largest ? most : std::sqrt(squares / static_cast<double>(a.size()));
+}
+
+}  // namespace
+
+TEST_CASE("policies on our own kernels for CUDA match the reference at every tap within 1e-4") {
+  for (const std::string& path : cases()) {
     CAPTURE(path);
     test::cuda::reset_fake_driver();
     const GoldenCase golden = GoldenCase::read(path);
     const auto engine = load_engine(golden.bundle(), "*", "float32");
-    const auto chunk = engine->act(golden.observation, golden.noise);
-    REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message() + test::cuda::fake_driver().fault));
+    const ActionChunk chunk = act(*engine, golden);
     for (const Tap& expected : golden.expected()) {
       if (expected.path == "chunk.bf16" || expected.path.starts_with("position_ids")) continue;
-      const auto difference = compare_taps({expected}, {find_tap(chunk->taps, expected.path)}).front();
+      const auto difference = compare_taps({expected}, {find_tap(chunk.taps, expected.path)}).front();
       CAPTURE(expected.path);
       CAPTURE(difference.relative);
       CHECK(difference.within(1e-4));
+    }
+  }
+}
+
+// Tensor cores are emulated with sums in float32, one product after the other.
+TEST_CASE("products of bf16 give a chunk nearer to the float32 reference than PyTorch's bf16, by both norms") {
+  for (const std::string& path : cases()) {
+    CAPTURE(path);
+    test::cuda::reset_fake_driver();
+    const GoldenCase golden = GoldenCase::read(path);
+    const auto engine = load_engine(golden.bundle(), "chunk");
+    const ActionChunk chunk = act(*engine, golden);
+    const auto expected = golden.expected();
+    const auto &reference = find_tap(expected, "chunk").values, &bf16 = find_tap(expected, "chunk.bf16").values;
+    const auto& ours = find_tap(chunk.taps, "chunk").values;
+    MESSAGE(path, ": ", engine->device().linear_kernels());
+    for (const bool largest : {false, true}) {
+      MESSAGE(norm_of_difference(ours, reference, largest), " of ", norm_of_difference(bf16, reference, largest));
+      CHECK(norm_of_difference(ours, reference, largest) <= norm_of_difference(bf16, reference, largest));
     }
   }
 }

@@ -7,7 +7,7 @@ namespace {
 
 // Values of CUDA Driver API 13.0.
 constexpr int kOutOfMemory = 2, kNotFound = 500;
-constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kMaxDynamicShared = 8;
+constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kCountSm = 16, kMaxDynamicShared = 8;
 constexpr unsigned kNonBlocking = 1, kNoTiming = 2, kFreeShared = 48 << 10;
 constexpr int kThreadLocal = 1;
 
@@ -52,6 +52,7 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   VLA_CHECK(CALL(device_get, &device_, device));
   VLA_CHECK(CALL(device_attribute, &major, kCapabilityMajor, device_));
   VLA_CHECK(CALL(device_attribute, &minor, kCapabilityMinor, device_));
+  VLA_CHECK(CALL(device_attribute, &n_sm_, kCountSm, device_));
   if (major * 10 + minor < kMinCapability)
     return Error{Code::device, "cuda:" + std::to_string(device), "compute capability 8.0 or newer (Ampere)",
                  std::to_string(major) + "." + std::to_string(minor)};

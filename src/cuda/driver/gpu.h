@@ -94,6 +94,8 @@ class Gpu {
   Gpu(const Gpu&) = delete;
   ~Gpu();
 
+  /// Blocks of big kernels that run at a time, about.
+  int n_sm() const { return n_sm_; }
   /// out_of_memory with both sizes where less is free.
   Result<Buffer> allocate(std::size_t size, const std::string& what);
   /// Memory of the host that the device reads and writes without the processor.
@@ -110,7 +112,7 @@ class Gpu {
   Result<Owned> own(const char* call, int result, Handle handle, Owned::Release release) const;
 
   Driver driver_;
-  int device_ = -1;
+  int device_ = -1, n_sm_ = 1;
   bool has_context_ = false;
   std::vector<Owned> modules_;
   struct Function {

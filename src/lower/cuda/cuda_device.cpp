@@ -5,7 +5,8 @@
 #include <algorithm>
 #include <limits>
 
-#include "kernels/numbers.h"
+#include "cuda/kernels/rows.h"
+#include "lower/cpu/precision.h"
 #include "lower/cuda/cuda_program.h"
 
 namespace vla::lower {
@@ -14,47 +15,28 @@ namespace {
 constexpr std::size_t kAlignment = 256;
 constexpr std::size_t aligned(std::size_t size) { return (size + kAlignment - 1) / kAlignment * kAlignment; }
 
-/// Kernels in float32 that take one product at a time, and no norm on the way.
+/// Kernels that take one product at a time; those that round x norm it on the way.
 class CudaTarget final : public Target {
  public:
-  const void* multiplier(const Param&) const override { return &encoding_; }
+  CudaTarget(const CudaWeights& weights, std::int64_t min_rounded_keys)
+      : weights_(weights), min_rounded_keys_(min_rounded_keys) {}
+
+  const void* multiplier(const Param& matrix) const override {
+    return &kKinds[static_cast<int>(weights_[matrix].kind)];
+  }
   std::size_t max_products() const override { return 1; }
-  std::int64_t max_norm(const Param&) const override { return 0; }
-  const Encoding& encoding(const Param&) const override { return encoding_; }
-  std::int64_t min_rounded_keys() const override { return std::numeric_limits<std::int64_t>::max(); }
+  std::int64_t max_norm(const Param& matrix) const override {
+    return weights_[matrix].kind == MatrixKind::f32 ? 0 : cuda::kMaxNorm;
+  }
+  const Encoding& encoding(const Param& matrix) const override { return weights_[matrix].encoding; }
+  std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
   std::size_t alignment() const override { return kAlignment; }
 
  private:
-  Encoding encoding_;  // float32
+  static constexpr char kKinds[4] = {};  // places to tell them apart
+  const CudaWeights& weights_;
+  std::int64_t min_rounded_keys_;
 };
-
-bool widens(const Param& param) { return param.storage != Storage::table; }
-std::size_t resident_size(const Param& param) {
-  return dtype_size(widens(param) ? DType::f32 : param.encoding.type, param.count());
-}
-
-/// A parameter as it is resident; rooms are for what is read. Null where the file has changed.
-const std::byte* resident(const Bundle& bundle, const Param& param, Room& room, Room& scale_room,
-                          std::vector<float>& wide) {
-  const std::byte* stored = bundle.content()->read(param.source->data, room);
-  const DType type = param.encoding.type;
-  if (stored == nullptr || !widens(param) || type == DType::f32) return stored;
-  const std::byte* scales = nullptr;
-  if (type == DType::i8) {
-    scales = bundle.content()->read(param.scales->source->data, scale_room);
-    if (scales == nullptr) return nullptr;
-  }
-  wide.resize(static_cast<std::size_t>(param.count()));
-  for (std::int64_t i = 0; i < param.count(); ++i) {
-    float& to = wide[static_cast<std::size_t>(i)];
-    if (type == DType::i8)
-      to = static_cast<float>(std::to_integer<std::int8_t>(stored[i])) *
-           kernels::stored_number(DType::f32, scales, i / param.encoding.group);
-    else
-      to = kernels::stored_number(type, stored, i);
-  }
-  return reinterpret_cast<const std::byte*>(wide.data());
-}
 
 }  // namespace
 
@@ -64,8 +46,10 @@ Status CudaDevice::Shared::keep(Status status) {
 }
 
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
-                                                 const std::vector<std::string>& modules) {
-  std::unique_ptr<CudaDevice> device(new CudaDevice);
+                                                 const std::vector<std::string>& modules, Rounding at_load) {
+  if (at_load == Rounding::int4)
+    return Error{Code::unsupported, "kernels", "float32, bf16 or int8", "int4", "products of int4 are the CPU's"};
+  std::unique_ptr<CudaDevice> device(new CudaDevice(at_load));
   device->shared_ = std::make_shared<Shared>();
   VLA_TRY(device->shared_->gpu, cuda::Gpu::open(driver, index, modules));
   VLA_TRY(cuda::Stream stream, device->shared_->gpu->stream());
@@ -74,32 +58,23 @@ Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int
 }
 
 Status CudaDevice::load(const ParamList& params, bool fill) {
-  int n_matrix = 0;
-  std::size_t size = 0;
-  std::vector<std::size_t> begins;
-  for (const Param& param : params.params()) {
-    if (param.encoding.type == DType::ternary)
-      return Error{Code::unsupported, param.name, "a matrix of floats", "a ternary one", "use --kernels ggml"};
-    n_matrix += param.storage == Storage::matrix;
-    begins.push_back(size);
-    size += aligned(resident_size(param));
-  }
-  text_ = "linear_f32 (" + std::to_string(n_matrix) + ")";
-  VLA_TRY(cuda::Buffer memory, shared_->gpu->allocate(std::max<std::size_t>(size, 1), "weights"));
-  weights_ = std::make_shared<cuda::Buffer>(std::move(memory));
-  places_.clear();
-  for (const std::size_t begin : begins) places_.push_back(weights_->address() + begin);
-  Room room, scale_room;
-  std::vector<float> wide;
-  for (const Param& param : params.params()) {
-    if (!fill || param.source == nullptr) continue;
-    const std::byte* from = resident(*params.bundle(), param, room, scale_room, wide);
-    if (from == nullptr) return params.bundle()->content()->changed();
-    VLA_CHECK(shared_->keep(
-        shared_->stream->upload(places_[static_cast<std::size_t>(param.id)], from, resident_size(param))));
-    VLA_CHECK(shared_->keep(shared_->stream->wait()));  // the rooms are used again
-  }
+  const auto upload = [&](cuda::Address to, const void* from, std::size_t size) {
+    Status done = shared_->keep(shared_->stream->upload(to, from, size));
+    return done ? shared_->keep(shared_->stream->wait()) : done;
+  };
+  VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, *shared_->gpu, upload));
+  // Attention rounds where products do, as on the CPU.
+  const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
+  min_rounded_keys_ = rounds ? vla::min_rounded_keys(params) : std::numeric_limits<std::int64_t>::max();
   return {};
+}
+
+Precision CudaDevice::precision() const {
+  if (weights_.has(MatrixKind::int8) || weights_.has(MatrixKind::ternary)) return Precision::int8;
+  return weights_.has(MatrixKind::bf16) ? Precision::bf16 : Precision::f32;
+}
+std::string CudaDevice::kernels() const {
+  return precision() == Precision::f32 ? "float32" : precision_name(precision());
 }
 
 Status CudaDevice::allocate(Slots& slots) {
@@ -132,8 +107,8 @@ void CudaDevice::get(const Slot& slot, void* data, std::size_t size) const {
 Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const LowerOptions& options) {
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
-  const CudaTarget target;
-  CudaLowering l = {{.graph = graph, .options = options, .target = target}, places_};
+  const CudaTarget target(weights_, min_rounded_keys_);
+  CudaLowering l = {{.graph = graph, .options = options, .target = target}, weights_, shared_->gpu->n_sm()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);
@@ -149,7 +124,7 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
     VLA_TRY(cuda::Buffer memory, shared_->gpu->allocate(std::max<std::size_t>(l.arena_size, 1), "working memory"));
     arena_ = std::make_shared<cuda::Buffer>(std::move(memory));
   }
-  return CudaProgram::make(l, shared_, {weights_, arena_});
+  return CudaProgram::make(l, shared_, {weights_.memory(), arena_});
 }
 
 }  // namespace vla::lower

@@ -4,17 +4,17 @@
 
 #include "cuda/driver/gpu.h"
 #include "graph/device.h"
+#include "lower/cuda/cuda_weights.h"
 
 namespace vla::lower {
 
-/// A GPU that our own kernels run on (cuda/kernels), in float32. Each program is one captured graph.
+/// A GPU that our own kernels run on (cuda/kernels). Each program is one captured graph.
 class CudaDevice final : public Device {
  public:
-  /// modules: the kernels as PTX. Errors: device.
+  /// modules: the kernels as PTX. at_load: as CudaWeights::load takes it. Errors: device, unsupported for int4.
   static Result<std::unique_ptr<Device>> open(const cuda::Driver& driver, int index,
-                                              const std::vector<std::string>& modules);
+                                              const std::vector<std::string>& modules, Rounding at_load);
 
-  /// Errors: also unsupported for ternary matrices, which have products of their own.
   Status load(const ParamList& params, bool fill) override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
@@ -25,12 +25,12 @@ class CudaDevice final : public Device {
   std::string name() const override { return "cuda, own kernels"; }
   int n_thread() const override { return 1; }
   bool is_host() const override { return false; }
-  std::string kernels() const override { return "float32"; }
-  Precision precision() const override { return Precision::f32; }
-  Rounding rounding() const override { return Rounding::none; }
-  bool has_bf16() const override { return false; }
-  const std::string& linear_kernels() const override { return text_; }
-  std::size_t weights_size() const override { return weights_ ? weights_->size() : 0; }
+  std::string kernels() const override;
+  Precision precision() const override;
+  Rounding rounding() const override { return rounding_; }
+  bool has_bf16() const override { return true; }
+  const std::string& linear_kernels() const override { return weights_.text(); }
+  std::size_t weights_size() const override { return weights_.memory() ? weights_.memory()->size() : 0; }
   std::size_t working_size() const override { return arena_ ? arena_->size() : 0; }
 
   /// What programs and the device share: the stream, and the first failure.
@@ -44,12 +44,13 @@ class CudaDevice final : public Device {
   };
 
  private:
-  CudaDevice() = default;
+  explicit CudaDevice(Rounding at_load) : rounding_(at_load) {}
 
   std::shared_ptr<Shared> shared_;  // goes after all memory
-  std::shared_ptr<cuda::Buffer> weights_, arena_;
-  std::vector<cuda::Address> places_;  // of parameters, by Param::id; 0 for those that are not there
-  std::string text_;
+  CudaWeights weights_;
+  std::shared_ptr<cuda::Buffer> arena_;
+  Rounding rounding_;
+  std::int64_t min_rounded_keys_ = 0;
 };
 
 }  // namespace vla::lower

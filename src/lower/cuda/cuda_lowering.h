@@ -5,38 +5,61 @@
 #include <functional>
 
 #include "lower/cuda/cuda_device.h"
+#include "lower/cuda/cuda_weights.h"
 #include "lower/lowering.h"
 
 /// The passes of a GPU: what its kernels need to lie contiguously, and a launch for each operation.
 namespace vla::lower {
 
-/// Rows of heads, normed and turned, for attention.
+/// Rows of heads, normed and turned, for attention, which may want them as bf16.
 struct HeadOp {
   Prepared rows;
 };
+/// x, or its norm, as products of codes or of bf16 read it. Once for all products of one x.
+struct RoundOp {
+  ValueId x;
+  const Node* norm;
+  ValueId weight, bias;
+};
 
 struct CudaOp : Step {
-  std::variant<LinearOp, HeadOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
+  std::variant<LinearOp, HeadOp, RoundOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
   ValueId gate = kNone;                                // of a gated product, what its first matrix makes
+  int n_split = 1;                                     // shares of the depth, or of keys, of blocks of their own
+  ValueId partial = kNone;                             // what those leave
   std::vector<std::pair<ValueId, ValueId>> keys = {};  // of attention, keys and values of each segment
 };
 
 struct CudaLowering : Lowering {
-  const std::vector<cuda::Address>& params;  // by Param::id
+  const CudaWeights& weights;
+  int n_sm;  // blocks that run at a time
   std::vector<CudaOp> ops = {};
   std::vector<cuda::Address> data = {};  // of each base, when memory is there
 
+  /// Elements of values that are not float32 are those of a whole base.
   cuda::Address address(ValueId id) const {
     const Value& v = value(id);
     return data[static_cast<std::size_t>(v.base)] + static_cast<cuda::Address>(v.offset) * 4;
   }
-  float* floats(ValueId id) const { return id == kNone ? nullptr : reinterpret_cast<float*>(address(id)); }
-  cuda::Address param(const Param* of) const { return of == nullptr ? 0 : params[static_cast<std::size_t>(of->id)]; }
+  template <class T = float>
+  T* at(ValueId id) const {
+    return id == kNone ? nullptr : reinterpret_cast<T*>(address(id));
+  }
+  template <class T = float>
+  const T* param(const Param* of) const {
+    return of == nullptr ? nullptr : reinterpret_cast<const T*>(weights[*of].data);
+  }
+  const CudaWeight& matrix(const Node& linear) const { return weights[*linear.as<op::Linear>()->weight]; }
 };
 
-/// Has operations read what their kernels can: copies what lies otherwise, and norms and turns heads before attention,
-/// which takes keys and values where they lie.
+/// Has operations read what their kernels can: copies what lies otherwise, rounds what is multiplied as bf16 or codes,
+/// and norms and turns heads before attention, which takes keys and values where they lie, or as bf16. What is only
+/// rounded is stored so at once. Also how the depth of a product is split.
 void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
+
+/// How blocks of a product cut rows: in 128, in 64, or few rows bound by reading the matrix.
+enum class ProductShape { few, rows64, rows128 };
+ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm);
 
 /// One launch, or several one after the other.
 using Call = std::function<Status(cuda::Stream&)>;

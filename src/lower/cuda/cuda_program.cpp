@@ -15,9 +15,17 @@ std::size_t aligned(const Lowering& l, std::size_t size) {
 
 /// Words for a printed graph.
 struct KindOf {
-  const char* operator()(const LinearOp&) const { return "linear_f32"; }
+  const CudaLowering& l;
+
+  const char* operator()(const LinearOp& linear) const {
+    constexpr const char* kNames[] = {"linear_f32", "linear_bf16", "linear_ternary", "linear_int8"};
+    return kNames[static_cast<int>(l.matrix(*linear.linears[0]).kind)];
+  }
   const char* operator()(const HeadOp&) const { return "head_rows"; }
-  const char* operator()(const AttentionOp&) const { return "attention_f32"; }
+  const char* operator()(const RoundOp& round) const { return round.norm != nullptr ? "norm_rows" : "round_rows"; }
+  const char* operator()(const AttentionOp& attention) const {
+    return attention.rounds ? "attention_bf16" : "attention_f32";
+  }
   const char* operator()(const RowOp& row) const {
     return std::holds_alternative<op::Norm>(row.what) ? "norm_rows" : op_name(row.node->op);
   }
@@ -75,7 +83,7 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
       case Value::Home::slot:
         return reinterpret_cast<cuda::Address>(value.slot->place);
       case Value::Home::parameter:
-        return l.param(value.node->as<op::Parameter>()->param);
+        return l.weights[*value.node->as<op::Parameter>()->param].data;
       case Value::Home::constant:
         return own_->address() + kept + begins[i];
       case Value::Home::thread:
@@ -96,7 +104,7 @@ Status CudaProgram::make_calls(const CudaLowering& l) {
     std::vector<Call>& all = op.phase < l.n_prepare ? prepare_ : calls_;
     all.insert(all.end(), calls.begin(), calls.end());
     if (!op.invariant) work_[stage_of(l, op)].flop += flop_of_op(op);
-    text_ += std::to_string(op.phase) + " " + std::visit(KindOf{}, op.op) + "\n";
+    text_ += std::to_string(op.phase) + " " + std::visit(KindOf{l}, op.op) + "\n";
   }
   return {};
 }

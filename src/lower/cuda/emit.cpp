@@ -3,9 +3,12 @@
 #include <cmath>
 
 #include "cuda/kernels/attention.h"
+#include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_f32.h"
+#include "cuda/kernels/linear_int8.h"
 #include "cuda/kernels/map.h"
 #include "cuda/kernels/rows.h"
+#include "kernels/quantized.h"
 #include "lower/cuda/cuda_lowering.h"
 
 namespace vla::lower {
@@ -40,31 +43,81 @@ struct Emit {
   const CudaLowering& l;
   const CudaOp& op;
 
-  float* result() const { return l.floats(op.writes[0]); }
+  float* result() const { return l.at(op.writes[0]); }
 
   Calls operator()(const LinearOp& linear) const {
-    const Value& x = l.value(linear.x);
     std::vector<Call> calls;
     for (std::size_t i = 0; i < linear.linears.size(); ++i) {
-      const auto& product = *linear.linears[i]->as<op::Linear>();
-      if (product.rule != op::Rule::floats)
-        return Error{Code::unsupported, product.weight->name, "a matrix of floats", "a ternary one",
+      const Node& node = *linear.linears[i];
+      const auto& product = *node.as<op::Linear>();
+      const CudaWeight& matrix = l.matrix(node);
+      if (product.rule != op::Rule::floats && matrix.kind != MatrixKind::ternary)
+        return Error{Code::unsupported, product.weight->name, "a ternary matrix", dtype_name(matrix.encoding.type),
                      "use --kernels ggml"};
       const bool is_gate = linear.gated && i == 0;
-      cuda::LinearF32Job job = {};
-      job.x = l.floats(linear.x), job.x_stride = row_stride(x);
-      job.weight = reinterpret_cast<const float*>(l.param(product.weight));
-      job.n_row = narrow(n_row(x.shape)), job.n_column = narrow(product.weight->shape[1]),
-      job.depth = narrow(x.shape[0]);
-      job.end.bias = reinterpret_cast<const float*>(l.param(product.bias));
-      job.end.y = is_gate ? l.floats(op.gate) : result(), job.end.y_stride = job.n_column;
+      const ValueId to = is_gate ? op.gate : op.writes[0];
+      cuda::Epilogue end = {};
+      end.bias = l.param(product.bias), end.y = l.at(to);
+      end.is_bf16 = l.value(to).type == DType::bf16;
+      end.y_stride = end.is_bf16 ? l.value(to).stride[1] : product.weight->shape[1];
       if (!is_gate) {
-        job.end.activation = linear.activation, job.end.gate = l.floats(op.gate);
-        job.end.factor = l.floats(linear.factor), job.end.residual = l.floats(linear.residual);
+        end.activation = linear.activation, end.gate = l.at(op.gate);
+        end.factor = l.at(linear.factor), end.residual = l.at(linear.residual);
       }
-      calls.push_back(call(cuda::linear_f32(job), job));
+      add_product(calls, linear, matrix, *product.weight, end);
     }
     return calls;
+  }
+  void add_product(std::vector<Call>& calls, const LinearOp& linear, const CudaWeight& matrix, const Param& weight,
+                   const cuda::Epilogue& end) const {
+    const Value& x = l.value(linear.x);
+    const int rows = narrow(n_row(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
+    const ProductShape shape = product_shape(matrix.kind, rows, columns, l.n_sm);
+    switch (matrix.kind) {
+      case MatrixKind::f32: {
+        const cuda::LinearF32Job job = {l.at(linear.x), l.param(&weight), row_stride(x), rows, columns, depth, end};
+        calls.push_back(call(cuda::linear_f32(job), job));
+        return;
+      }
+      case MatrixKind::bf16: {
+        const cuda::LinearBf16Job job = {l.at<std::uint16_t>(linear.x),
+                                         l.param<std::uint16_t>(&weight),
+                                         x.stride[1],
+                                         bf16_stride(depth),
+                                         rows,
+                                         columns,
+                                         depth,
+                                         op.n_split,
+                                         l.at(op.partial),
+                                         end};
+        const cuda::Bf16Shape tile = shape == ProductShape::few      ? cuda::Bf16Shape::few
+                                     : shape == ProductShape::rows64 ? cuda::Bf16Shape::rows64
+                                                                     : cuda::Bf16Shape::rows128;
+        calls.push_back(call(cuda::linear_bf16(tile, job), job));
+        if (job.n_split > 1) calls.push_back(call(cuda::finish_bf16_partial(job), job));
+        return;
+      }
+      case MatrixKind::ternary:
+      case MatrixKind::int8: {
+        const cuda::LinearInt8Job job = {l.at<std::byte>(linear.x),
+                                         l.param<std::byte>(&weight),
+                                         reinterpret_cast<const float*>(matrix.scales),
+                                         x.stride[1],
+                                         rows,
+                                         columns,
+                                         narrow(kernels::quantized_depth(depth)),
+                                         op.n_split,
+                                         l.at<int>(op.partial),
+                                         end};
+        const cuda::Int8Shape tile = shape == ProductShape::few      ? cuda::Int8Shape::few
+                                     : shape == ProductShape::rows64 ? cuda::Int8Shape::rows64
+                                                                     : cuda::Int8Shape::rows128;
+        const auto kind = matrix.kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
+        calls.push_back(call(cuda::linear_int8(kind, tile, job), job));
+        if (job.n_split > 1) calls.push_back(call(cuda::finish_int8_partial(job), job));
+        return;
+      }
+    }
   }
 
   /// Heads of a value, normed or turned, to a contiguous one.
@@ -72,7 +125,7 @@ struct Emit {
     const Value& x = l.value(id);
     if (x.shape[0] > cuda::kMaxHead) return unsupported("heads", "heads of at most", cuda::kMaxHead, x.shape[0]);
     const Shape to = contiguous_strides(x.shape);
-    const cuda::HeadJob job = {l.floats(id),
+    const cuda::HeadJob job = {l.at(id),
                                result(),
                                weight,
                                table,
@@ -87,14 +140,14 @@ struct Emit {
                                narrow(x.shape[2]),
                                narrow(x.shape[3]),
                                eps,
-                               false};
+                               l.value(op.writes[0]).type == DType::bf16};
     return std::vector<Call>{call(cuda::head_rows(job), job)};
   }
   Calls operator()(const HeadOp& head) const {
     const auto* norm = head.rows.norm != nullptr ? head.rows.norm->as<op::Norm>() : nullptr;
     if (norm != nullptr && norm->kind != op::NormKind::rms)
       return Error{Code::unsupported, "heads", "an RMS norm", "a layer norm", "use --kernels ggml"};
-    return heads(head.rows.x, l.floats(head.rows.weight), norm != nullptr ? norm->eps : 0, l.floats(head.rows.table));
+    return heads(head.rows.x, l.at(head.rows.weight), norm != nullptr ? norm->eps : 0, l.at(head.rows.table));
   }
 
   Calls operator()(const AttentionOp& attention) const {
@@ -106,16 +159,38 @@ struct Emit {
     cuda::AttentionJob job = {};
     const auto rows = [&](ValueId id) {
       const Shape& stride = l.value(id).stride;
-      return cuda::HeadRows{l.floats(id), stride[1], stride[2], stride[3]};
+      return cuda::HeadRows{l.at<void>(id), stride[1], stride[2], stride[3]};
     };
     job.q = rows(attention.q.x);
     for (std::size_t i = 0; i < op.keys.size(); ++i)
       job.segment[job.n_segment++] = {rows(op.keys[i].first), rows(op.keys[i].second), narrow(attention.n_key[i])};
-    job.mask = l.floats(attention.mask), job.y = result();
+    job.mask = l.at(attention.mask), job.y = result();
     job.scale = 1 / std::sqrt(static_cast<float>(q.shape[0]));
     job.d_head = narrow(q.shape[0]), job.n_head = narrow(q.shape[1]), job.n_query = narrow(q.shape[2]);
-    job.n_batch = narrow(q.shape[3]), job.n_head_kv = narrow(l.value(op.keys[0].first).shape[1]), job.n_split = 1;
-    return std::vector<Call>{call(cuda::attention_f32(job), job)};
+    job.n_batch = narrow(q.shape[3]), job.n_head_kv = narrow(l.value(op.keys[0].first).shape[1]);
+    job.n_split = op.n_split, job.partial = l.at(op.partial), job.is_bf16 = l.value(op.writes[0]).type == DType::bf16;
+    std::vector<Call> calls = {call(attention.rounds ? cuda::attention_bf16(job) : cuda::attention_f32(job), job)};
+    if (job.n_split > 1) calls.push_back(call(cuda::finish_attention(job), job));
+    return calls;
+  }
+
+  Calls operator()(const RoundOp& round) const {
+    const Value &x = l.value(round.x), &y = l.value(op.writes[0]);
+    if (x.shape[0] > cuda::kMaxNorm) return unsupported("product", "rows of at most", cuda::kMaxNorm, x.shape[0]);
+    cuda::NormJob job = norm_of(round.x, round.norm != nullptr ? round.norm->as<op::Norm>() : nullptr);
+    job.weight = l.at(round.weight), job.bias = l.at(round.bias), job.y_stride = y.stride[1];
+    job.type = y.type == DType::i8 ? cuda::RowType::codes : cuda::RowType::bf16;
+    return std::vector<Call>{call(cuda::norm_rows(job), job)};
+  }
+  /// Rows of x, normed unless there is no norm, to the result.
+  cuda::NormJob norm_of(ValueId id, const op::Norm* norm) const {
+    const Value& x = l.value(id);
+    cuda::NormJob job = {};
+    job.x = l.at(id), job.y = result(), job.x_stride = row_stride(x), job.y_stride = x.shape[0];
+    job.n_row = narrow(n_row(x.shape)), job.n = narrow(x.shape[0]);
+    if (norm == nullptr) return job;
+    job.eps = norm->eps, job.norm = norm->kind == op::NormKind::rms ? cuda::RowNorm::rms : cuda::RowNorm::layer;
+    return job;
   }
 
   Calls operator()(const RowOp& row) const {
@@ -124,15 +199,11 @@ struct Emit {
   Calls rows(const RowOp& row, const op::Norm& norm) const {
     const Value& x = l.value(row.x);
     if (x.shape[0] > cuda::kMaxNorm) return unsupported("norm", "rows of at most", cuda::kMaxNorm, x.shape[0]);
-    const cuda::NormJob job = {
-        l.floats(row.x),    nullptr,         nullptr,
-        l.floats(row.w),    l.floats(row.b), result(),
-        row_stride(x),      x.shape[0],      narrow(n_row(x.shape)),
-        narrow(x.shape[0]), norm.eps,        norm.kind == op::NormKind::rms ? cuda::RowNorm::rms : cuda::RowNorm::layer,
-        cuda::RowType::f32};
+    cuda::NormJob job = norm_of(row.x, &norm);
+    job.weight = l.at(row.w), job.bias = l.at(row.b);
     return std::vector<Call>{call(cuda::norm_rows(job), job)};
   }
-  Calls rows(const RowOp& row, const op::Rope&) const { return heads(row.x, nullptr, 0, l.floats(row.w)); }
+  Calls rows(const RowOp& row, const op::Rope&) const { return heads(row.x, nullptr, 0, l.at(row.w)); }
   Calls rows(const RowOp& row, const op::Activate& activate) const {
     cuda::MapJob job = map_of(row);
     job.activation = activate.activation;
@@ -148,19 +219,19 @@ struct Emit {
   Calls with_other(const RowOp& row, cuda::MapOperation operation) const {
     cuda::MapJob job = map_of(row);
     const Value& w = l.value(row.w);
-    job.operation = operation, job.b = l.floats(row.w);
+    job.operation = operation, job.b = l.at(row.w);
     for (std::size_t i = 0; i < 4; ++i) job.b_step[i] = w.shape[i] == 1 ? 0 : w.stride[i];
     return std::vector<Call>{call(cuda::map_elements(job), job)};
   }
   cuda::MapJob map_of(const RowOp& row) const {
     const Shape& shape = row.node->shape;
-    return lower::map_of(shape, l.floats(row.x), l.value(row.x).stride, result(), contiguous_strides(shape));
+    return lower::map_of(shape, l.at(row.x), l.value(row.x).stride, result(), contiguous_strides(shape));
   }
 
   Calls operator()(const CopyOp& copy) const {
     std::vector<Call> calls;
     for (const CopyOp::Part& part : copy.parts) {
-      const cuda::MapJob job = lower::map_of(part.shape, l.floats(part.from) + part.from_offset, part.from_stride,
+      const cuda::MapJob job = lower::map_of(part.shape, l.at(part.from) + part.from_offset, part.from_stride,
                                              result() + part.to_offset, part.to_stride);
       if (job.count() > 0) calls.push_back(call(cuda::map_elements(job), job));
     }
@@ -170,17 +241,16 @@ struct Emit {
   Calls operator()(const LookupOp& lookup) const {
     const Node& node = *lookup.node;
     cuda::LookupJob job = {};
-    job.ids = reinterpret_cast<const std::int32_t*>(l.address(lookup.ids)), job.y = result();
+    job.ids = l.at<std::int32_t>(lookup.ids), job.y = result();
     job.n = narrow(node.shape[0]), job.n_row = narrow(node.shape[1]);
     if (const auto* embedding = node.as<op::Embedding>()) {
       const DType type = embedding->table->encoding.type;
-      job.table = reinterpret_cast<const void*>(l.param(embedding->table)),
-      job.n_table = narrow(embedding->table->shape[1]);
+      job.table = l.param<void>(embedding->table), job.n_table = narrow(embedding->table->shape[1]);
       job.type = type == DType::f32   ? cuda::TableType::f32
                  : type == DType::f16 ? cuda::TableType::f16
                                       : cuda::TableType::bf16;
     } else {
-      job.table = l.floats(lookup.table), job.n_table = narrow(l.value(lookup.table).shape[1]);
+      job.table = l.at(lookup.table), job.n_table = narrow(l.value(lookup.table).shape[1]);
     }
     return std::vector<Call>{call(cuda::lookup_rows(job), job)};
   }
@@ -191,7 +261,7 @@ struct Emit {
               height = narrow(node.in[0].dim(1));
     const std::int64_t columns = width / size, lines = height / size, area = std::int64_t{size} * size;
     const std::int64_t w = width, patch = 3 * area;
-    const cuda::MapJob job = {l.floats(patches.images),
+    const cuda::MapJob job = {l.at(patches.images),
                               nullptr,
                               result(),
                               {size, size, 3, narrow(columns), narrow(lines), narrow(node.in[0].dim(3))},
