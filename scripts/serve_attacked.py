@@ -13,6 +13,7 @@ shares with them here. Fails where an answer is lost or wrong, or a row misses i
 
 import argparse
 import contextlib
+import importlib.util
 import io
 import itertools
 import json
@@ -36,6 +37,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tests/client")]
 import hostile  # noqa: E402
 import hostile_images  # noqa: E402
+import http2  # noqa: E402
+import lerobot_calls  # noqa: E402
+import lerobot_pickles  # noqa: E402
 from drop_in import WebSocket, numpy_array, openpi_array, pack, unpack  # noqa: E402
 
 import vla_cpp  # noqa: E402
@@ -46,7 +50,7 @@ MAX_MESSAGE_MIB, MAX_PIXELS = 32, 1 << 20
 HEALTH_MS, LATE_MS, ACT_RATIO = 20, 20, 2  # the bars
 PERIOD = 0.03  # seconds between the acts of a robot that behaves
 HALF_SENT = hostile.HANDSHAKE + hostile.long_frame(30_000_000)
-OTHER_PERIOD = 0.15  # of those that speak openpi's and GR00T's protocols
+OTHER_PERIOD = 0.15  # of those that speak other protocols
 
 
 # --- attacks: each runs in a process of its own until that is ended --------------------------------------------------
@@ -169,6 +173,42 @@ def openpi(target):
     )
 
 
+def lerobot(target):
+    """The same at that of LeRobot, in HTTP/2: streams that are begun and reset, pieces that stay half, pickles that are deep or would execute."""
+    with contextlib.suppress(ImportError):
+        import grpc
+    begin = http2.PREFACE + http2.frame(http2.SETTINGS, 0, 0)
+    call = http2.frame(http2.HEADERS, http2.END_HEADERS, 1, http2.headers("/transport.AsyncInference/SendObservations"))
+    bodies = [b"\x80\x04" + b"(" * 100_000, b"\x80\x04" + b"]q\x00" * 30_000, bytes(1_000_000), b"\x80\x04\x8c\x02os\x8c\x06system\x93."]
+    target = argparse.Namespace(address=target.lerobot)
+
+    def pickles():
+        with lerobot_calls.Robot(target.address.removeprefix("tcp://")) as robot:
+            for body in itertools.cycle(bodies):
+                with contextlib.suppress(grpc.RpcError):
+                    robot.begin(body)
+                time.sleep(0.05)
+
+    def half():
+        with lerobot_calls.Robot(target.address.removeprefix("tcp://")) as robot, contextlib.suppress(grpc.RpcError):
+            robot._observe(lerobot_calls.halves(10))
+
+    resets = b"".join(
+        http2.frame(http2.HEADERS, http2.END_HEADERS, n, http2.headers("/transport.AsyncInference/GetActions"))
+        + http2.frame(http2.RST_STREAM, 0, n, bytes(4))
+        for n in range(1, 401, 2)
+    )
+    again_and_again(
+        *([half] * 20 + [pickles] * 2 if importlib.util.find_spec("grpc") else []),
+        *[lambda: silent(target, b"")] * 50,
+        *[lambda: silent(target, http2.PREFACE[:10])] * 50,
+        *[lambda: silent(target, begin + call)] * 50,
+        lambda: send(target, begin, itertools.repeat(http2.frame(http2.PING, 0, 0, bytes(8)) * 100)),
+        lambda: send(target, begin, itertools.repeat(http2.frame(http2.SETTINGS, 0, 0) * 100)),
+        lambda: send(target, begin, [resets], pause=0.05),
+    )
+
+
 def drip_http(target):
     """60 HTTP requests that come a byte at a time, and take the page a byte at a time."""
     host = urlsplit(target.metrics)
@@ -250,7 +290,7 @@ def ask_for_ever(target, acts, n_connection=70, source=ATTACKER):
 ATTACKS = {
     f.__name__: f
     for f in (
-        half_sent, flood, connections, drip, gr00t, openpi, drip_http, hostile_png, heavy_images, own_address, many_addresses,
+        half_sent, flood, connections, drip, gr00t, openpi, lerobot, drip_http, hostile_png, heavy_images, own_address, many_addresses,
     )
 }  # fmt: skip
 
@@ -298,6 +338,12 @@ def png(width, height, rows=None, texts=0):
 # --- who behaves -------------------------------------------------------------------------------------------------------
 
 
+def has_lerobot(options):
+    """Whether the build speaks LeRobot's protocol."""
+    command = [options.vla, "serve", options.bundle, "--lerobot", "here"]
+    return "libgrpc++" not in subprocess.run(list(map(str, command)), capture_output=True, text=True).stderr
+
+
 class Target:
     """A server of its own, or where it is."""
 
@@ -310,10 +356,13 @@ class Target:
             for i, name in enumerate(keys[f"observation.{kind}s"]):
                 command += ["--map", f"{kind}{i}={name}"]
         command += ["--threads", str(options.threads), "--max-message", str(MAX_MESSAGE_MIB), "--max-pixels", str(MAX_PIXELS)]
+        if has_lerobot(options):
+            command += ["--lerobot", "127.0.0.1:0"]
         self.process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         line = self.process.stdout.readline()
         addresses = re.search(r"address='?([^\s']+)", line)[1].split(",")
-        self.address, openpi, gr00t = addresses
+        self.address, openpi, gr00t, *lerobot = addresses
+        self.lerobot = lerobot[0].replace("grpc://", "tcp://") if lerobot else ""
         self.openpi, self.gr00t = openpi.replace("ws://", "tcp://"), gr00t.removeprefix("gr00t+")
         self.metrics = "http://" + re.search(r"metrics='?([^\s']+)", line)[1]
 
@@ -338,18 +387,25 @@ class Behaved:
         self._gr00t.linger, self._gr00t.rcvtimeo = 0, 20_000
         self._gr00t.connect(target.gr00t)
         self._messages = pack(openpi_act(spec, 1), openpi_array), pack(gr00t_act(spec, 1), numpy_array)
+        self._lerobot = None
+        if target.lerobot and importlib.util.find_spec("grpc"):
+            self._lerobot, n = lerobot_calls.Robot(target.lerobot.removeprefix("tcp://")), spec.states[0].width
+            cameras = {name.removeprefix("observation.images."): frame for name, frame in images.items()}
+            motors = {f"motor{i}": 0.1 for i in range(n)}
+            self._lerobot.begin(lerobot_pickles.setup_of(motors, cameras))
+            seen = {**motors, **cameras, "task": "open the drawer"}
+            self._pickle = lerobot_pickles.dumps(lerobot_pickles.TimedObservation(0.0, 0, seen, True))
 
     def watch(self, seconds):
         """Milliseconds of acts, of health, of /healthz, and then how long after its deadline LATE came."""
         self._until = time.monotonic() + seconds
-        times = {"act": [], "openpi": [], "gr00t": [], "health": [], "healthz": [], "late": []}
-        threads = [
-            threading.Thread(target=self._repeat, args=(times[name], what, period))
-            for name, what, period in (
-                ("act", self._act, PERIOD), ("openpi", self._act_openpi, OTHER_PERIOD), ("gr00t", self._act_gr00t, OTHER_PERIOD),
-                ("health", self._probe.health, 0.02), ("healthz", self._healthz, 0.02)
-            )
+        what = [
+            ("act", self._act, PERIOD), ("openpi", self._act_openpi, OTHER_PERIOD), ("gr00t", self._act_gr00t, OTHER_PERIOD),
+            ("health", self._probe.health, 0.02), ("healthz", self._healthz, 0.02),
         ]  # fmt: skip
+        what += [("lerobot", self._act_lerobot, OTHER_PERIOD)] if self._lerobot else []
+        times = {"late": [], **{name: [] for name, *_ in what}}
+        threads = [threading.Thread(target=self._repeat, args=(times[name], act, period)) for name, act, period in what]
         self._failed = []
         [thread.start() for thread in threads]
         [thread.join() for thread in threads]
@@ -382,6 +438,10 @@ class Behaved:
         self._gr00t.send(self._messages[1])
         answer = unpack(self._gr00t.recv())
         assert isinstance(answer, list) and len(answer) == 2, answer
+
+    def _act_lerobot(self):
+        self._lerobot.observe(self._pickle)
+        assert self._lerobot.actions()
 
     def _healthz(self):
         with urllib.request.urlopen(self._target.metrics + "/healthz", timeout=20) as page:
@@ -464,8 +524,10 @@ def measure(options):
         behaved.watch(1)  # warm
         quiet = behaved.watch(options.seconds)
         before = target.memory_mib()
-        for name in options.attack or ATTACKS:
-            command = [sys.executable, __file__, "--as", name, target.address, target.metrics, target.openpi, target.gr00t]
+        names = [name for name in options.attack or ATTACKS if target.lerobot or name != "lerobot"]
+        for name in names:
+            where = [target.address, target.metrics, target.openpi, target.gr00t, target.lerobot]
+            command = [sys.executable, __file__, "--as", name, *where]
             attackers.append(subprocess.Popen(command, stdout=subprocess.PIPE))
         [attacker.stdout.readline() for attacker in attackers]
         time.sleep(1)
@@ -474,7 +536,7 @@ def measure(options):
         upload.start()
         attacked = behaved.watch(options.seconds)
         upload.join()
-        ended = [name for name, a in zip(options.attack or ATTACKS, attackers) if a.poll() is not None]
+        ended = [name for name, a in zip(names, attackers) if a.poll() is not None]
         grown = target.memory_mib("VmHWM") - before
     finally:
         [a.kill() for a in attackers]
@@ -489,7 +551,7 @@ def rows_of(options, quiet, attacked, rest):
     loose = options.loose
     memory = 24 * MAX_MESSAGE_MIB + 15 * 16 + 10  # docs/security.md
     rows = []
-    for name, q in itertools.product(("act", "openpi", "gr00t"), (50, 95)):
+    for name, q in itertools.product([n for n in ("act", "openpi", "gr00t", "lerobot") if n in quiet], (50, 95)):
         before, after = p(quiet[name], q), p(attacked[name], q)
         what = name if name == "act" else f"act by {name}"
         rows.append((f"{what} p{q}, ms", f"{before:.1f}", f"{after:.1f} ({after / before:.2f}x)",
@@ -520,7 +582,7 @@ def parse():
         "--real-time", action="store_true", help="server and robot have their cores before all other work of the machine; takes root"
     )
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--as", dest="role", nargs=5, help=argparse.SUPPRESS)  # attack, then Target's addresses
+    parser.add_argument("--as", dest="role", nargs=6, help=argparse.SUPPRESS)  # attack, then Target's addresses
     return parser.parse_args()
 
 
@@ -530,7 +592,7 @@ def main():
         attack, *addresses = options.role
         print("attacking", flush=True)
         last_of_all()  # what is imported before that is not part of the attack
-        return ATTACKS[attack](argparse.Namespace(**dict(zip(("address", "metrics", "openpi", "gr00t"), addresses))))
+        return ATTACKS[attack](argparse.Namespace(**dict(zip(("address", "metrics", "openpi", "gr00t", "lerobot"), addresses))))
     quiet, attacked, rest = measure(options)
     rows = rows_of(options, quiet, attacked, rest)
     if options.json:

@@ -147,7 +147,7 @@ def gr00t_client(stack, address, scene, text):
 
 def lerobot_client(stack, address, scene, text):
     import lerobot_pickles
-    from lerobot_test import Robot
+    from lerobot_calls import Robot
 
     robot = stack.enter_context(Robot(address))
     motors = {f"motor_{i}": x for i, x in enumerate(scene["state"].tolist())}
