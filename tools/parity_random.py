@@ -15,6 +15,9 @@ Products must agree within 1e-6, other parts within 1e-5; whole blocks, inside o
 With --bf16 the weights are float32 numbers that bfloat16 rounds and the bundle is in bf16: its actions must not lie further from
 the reference's in float32 than those of the reference in the dtypes of a published file.  With --stored the checkpoint has the dtypes
 of a published file, so has the bundle (vla-convert --dtype stored), and the runtime chooses its kernels: the same must hold.
+
+With --leftover the chunk goes on from rows of a previous one (real-time chunking), whose number, delay and guidance the seed draws too;
+the runtime is the engine in this process (VLA_LIBRARY).
 """
 import argparse
 import contextlib
@@ -30,7 +33,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, smolvla
+from goldens import bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -320,6 +323,37 @@ def compare(arch, seed, vla, folder, dtype):
     return judge_rounding(expected, got, published) if published else judge(expected, got)
 
 
+def compare_leftover(arch, seed, folder):
+    """The chunk of a guided policy."""
+    import vla_cpp
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        expected, stopped = run_reference(DRAWN[arch](seed), folder)
+    if expected is None:
+        return True, f"reference: {stopped}"
+    cases.write_bundle(folder, dtype="f32")
+    horizon, d_action = expected["chunk"].shape
+    r, draw_rows = random.Random(seed), np.random.default_rng(seed)
+    n_row = r.randint(1, horizon)
+    delay, schedule, guidance = r.randint(0, n_row), r.choice(rtc.SCHEDULES), r.choice((0.5, 1.0, 5.0, 10.0))
+    rows = draw_rows.normal(0, 0.5, (n_row, d_action)).astype(np.float32)
+    if (folder / "checkpoint/norm_stats.json").is_file():
+        return True, "the authors' server of Evo-1 has no real-time chunking"
+    with contextlib.redirect_stdout(io.StringIO()):
+        wanted = rtc.chunk_of(folder, rows, schedule, delay, guidance)
+    seen = json.loads((folder / "observation.json").read_text())
+    images = {view: file and (folder / file).read_bytes() for view, file in seen["images"].items()}
+    with vla_cpp.Policy(folder / "bundle.gguf", kernels="float32", threads=1) as policy:
+        if not policy.spec.real_time_chunking:
+            return True, "relative actions: the runtime refuses real-time chunking"
+        named = {state.name.removeprefix("observation."): seen["state"] for state in policy.spec.states}
+        state = seen["state"] if isinstance(seen["state"], dict) else named
+        chunk = policy.act(images=images, state=state, text=seen["text"], noise=np.load(folder / "noise.npy"),
+                           leftover=vla_cpp.Leftover(rows, delay, schedule, guidance)).normalized
+    far, moved = (np.abs(x - wanted).max() / np.abs(wanted).max() for x in (chunk, expected["chunk"]))
+    return far <= TOLERANCE, f"{n_row} of {horizon} rows, delay {delay}, {schedule}, at most {guidance}: {far:.1e}; moved by {moved:.1e}"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("arch", choices=(*DRAWN, "bitvla"))
@@ -329,6 +363,7 @@ def main():
     costs = parser.add_mutually_exclusive_group()
     costs.add_argument("--bf16", action="store_const", const="bf16", dest="dtype", default="f32", help="what rounding the weights costs, instead of every block")
     costs.add_argument("--stored", action="store_const", const="stored", dest="dtype", help="what rounding activations costs, with weights as published")
+    costs.add_argument("--leftover", action="store_true", help="real-time chunking (smolvla, pi0, pi05, evo1)")
     parser.add_argument("--keep", type=Path, help="folder for the cases, instead of one that is removed")
     args = parser.parse_args()
     if args.arch != "bitvla":
@@ -339,7 +374,7 @@ def main():
         for seed in range(args.first, args.last + 1):
             folder = (args.keep or Path(scratch)) / str(seed)
             folder.mkdir(parents=True)
-            agree, what = compare(args.arch, seed, args.vla, folder, args.dtype)
+            agree, what = compare_leftover(args.arch, seed, folder) if args.leftover else compare(args.arch, seed, args.vla, folder, args.dtype)
             n_wrong += not agree
             print(f"seed {seed}: {'agree' if agree else 'DIFFER'}; {what}", flush=True)
     print(f"{args.last - args.first + 1 - n_wrong} of {args.last - args.first + 1} seeds agree")

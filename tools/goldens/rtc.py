@@ -15,7 +15,7 @@ SCHEDULES = ("linear", "exp", "ones", "zeros")
 N_ROW, DELAY, MAX_GUIDANCE = 4, 2, 5.0
 
 
-def chunk_of(case, previous, schedule):
+def chunk_of(case, previous, schedule, delay=DELAY, max_guidance=MAX_GUIDANCE):
     """LeRobot's chunk for the case's observation and noise, (horizon, d_action). previous: (row, d_action)."""
     import torch
 
@@ -23,14 +23,14 @@ def chunk_of(case, previous, schedule):
     torch.inference_mode = torch.no_grad  # the guidance asks for gradients
     policy, before, _ = load(case / "checkpoint")
     kind = type(getattr(policy, "policy", policy))  # GR00T's and Evo-1's are wrapped, to be given their noise
-    predict, set_up = kind.predict_action_chunk, settings(schedule, len(previous))
+    predict, set_up = kind.predict_action_chunk, settings(schedule, len(previous), max_guidance)
 
     def with_leftover(self, batch, **kwargs):
         if set_up:
             self.config.rtc_config = set_up
             self.init_rtc_processor()
             kwargs["execution_horizon"] = len(previous)
-        return predict(self, batch, **kwargs, inference_delay=DELAY, prev_chunk_left_over=torch.from_numpy(previous)[None])
+        return predict(self, batch, **kwargs, inference_delay=delay, prev_chunk_left_over=torch.from_numpy(previous)[None])
 
     kind.predict_action_chunk = with_leftover
     try:
@@ -41,12 +41,12 @@ def chunk_of(case, previous, schedule):
         kind.predict_action_chunk = predict
 
 
-def settings(schedule, n_row):
+def settings(schedule, n_row, max_guidance):
     from lerobot.configs import RTCAttentionSchedule
     from lerobot.policies.rtc import RTCConfig
 
     return schedule and RTCConfig(prefix_attention_schedule=RTCAttentionSchedule[schedule.upper()],
-                                  max_guidance_weight=MAX_GUIDANCE, execution_horizon=n_row)
+                                  max_guidance_weight=max_guidance, execution_horizon=n_row)
 
 
 def write_leftover(case, seed, out):
