@@ -5,7 +5,7 @@
 
     scripts/arm64_cycles.py [--objects FOLDER] [--mca llvm-mca-19] [--cpus neoverse-n1,neoverse-v1]
 
-Reads the loops from the objects of src/kernels/arm (those of make test-arm64). Every load hits the first cache in a model, so that the
+Reads the loops from the objects of src/kernels/arm (those of make test-arm64). Every load hits L1 in a model, so that the
 shares are upper bounds. The limit is what the same model takes for as many multiply-adds on registers that do not wait for each other.
 Exits with 1 where a loop that the table names spills registers or moves vectors, or is not there; --mca "" asks for nothing else.
 """

@@ -27,7 +27,7 @@ std::string_view after(std::string_view header, std::string_view key) {
   return value == std::string_view::npos ? std::string_view() : header.substr(value);
 }
 
-/// The numbers of `(2, 3)`; false where the text is anything else or the product overflows.
+/// The integers of `(2, 3)`; false where the text is anything else or the product overflows.
 bool parse_shape(std::string_view text, std::vector<std::size_t>& shape, std::size_t& count) {
   if (text.empty() || text.front() != '(') return false;
   text.remove_prefix(1);

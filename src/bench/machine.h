@@ -25,9 +25,9 @@ struct Roofs {
 /// Takes a second or less. The machine should do nothing else.
 Roofs measure_roofs(int n_thread);
 
-/// As the system names it; of ARM64 its cores, of which it says the numbers only: "4 Cortex-A55, 4 Cortex-A76".
+/// As the system names it; of ARM64 its cores, of which it says the part numbers only: "4 Cortex-A55, 4 Cortex-A76".
 std::string cpu_name();
-/// The cores that /proc/cpuinfo lists by ARM's numbers, in its order; empty where it lists none.
+/// The cores that /proc/cpuinfo lists by ARM's part numbers, in its order; empty where it lists none.
 std::string arm_cores(std::istream& cpuinfo);
 
 /// Seconds that all threads of this process have run.

@@ -193,7 +193,7 @@ std::uint16_t to_16_bits(float value, DType type) {
   return static_cast<std::uint16_t>((bits >> 16 & 0x8000) | (exponent - 112) << 10 | (bits >> 13 & 0x3FF));
 }
 
-/// The bytes of `count` numbers, evenly drawn from -0.04 to 0.04: rows of any length keep the size of what they
+/// The bytes of `count` elements, evenly drawn from -0.04 to 0.04: rows of any length keep the size of what they
 /// multiply.
 std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
   const std::size_t size = dtype_size(type, 1);
@@ -206,7 +206,7 @@ std::string random_bytes(std::size_t count, DType type, std::uint64_t seed) {
   return bytes;
 }
 
-/// Bytes of four random ternary numbers.
+/// Bytes of four random ternary elements.
 std::string random_codes(std::size_t count, std::uint64_t seed) {
   std::string bytes(count, '\0');
   for (char& four : bytes)
@@ -215,7 +215,7 @@ std::string random_codes(std::size_t count, std::uint64_t seed) {
 }
 
 /// Where the values of tensors come from: random ones for matrices and tables; ones for the weights of norms and zeros
-/// for biases, so that numbers stay finite through any depth.
+/// for biases, so that elements stay finite through any depth.
 class Values {
  public:
   Values(const ParamList& list, const RandomSizes& sizes) {
@@ -240,7 +240,7 @@ class Values {
   }
 
  private:
-  static constexpr std::size_t kPool = std::size_t{1} << 22;  // numbers that are drawn before they repeat
+  static constexpr std::size_t kPool = std::size_t{1} << 22;  // elements that are drawn before they repeat
 
   static std::size_t longest_vector(const ParamList& list) {
     std::int64_t longest = 1;

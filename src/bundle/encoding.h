@@ -14,8 +14,8 @@ namespace vla {
 enum class DType { f32, f16, bf16, i32, i8, f64, ternary, int4 };
 
 /// 64 elements of a row of an int4 matrix: a step from 0 to 17, then codes from 1 to 15, those of elements 2 i and
-/// 2 i + 1 in the lower and the higher bits of byte i. (code - 8) * step is a whole number of at most 119, which counts
-/// as an int8 code: so sums of products are whole numbers as well. The largest step is the one whose product with the
+/// 2 i + 1 in the lower and the higher bits of byte i. (code - 8) * step is an integer of at most 119, which counts
+/// as an int8 code: so sums of products are integers as well. The largest step is the one whose product with the
 /// largest code fits into a byte without sign.
 struct Int4Block {
   static constexpr std::int64_t kElements = 64;

@@ -177,7 +177,7 @@ bool is_for_machine(std::string_view key) {
   return key.starts_with("tokenizer.") || key.starts_with("processor.");
 }
 
-/// Everything else may be displayed: the source, tags, and names of features, numbers and units.
+/// Everything else may be displayed: the source, tags, and names of features, columns and units.
 Status check_shown(const Cursor& cursor, const std::string& key, const Value& value) {
   if (is_for_machine(key)) return {};
   if (const auto* text = std::get_if<std::string>(&value)) return check_shown(cursor, key, *text);

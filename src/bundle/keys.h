@@ -26,7 +26,7 @@ struct Range {
 
 inline constexpr Range kAnySize = {0, 2147483647};
 
-/// Ranges of numbers that are read in several places.
+/// Ranges of values that are read in several places.
 inline constexpr Range kNormEps = {1e-12, 0.01};
 inline constexpr Range kRopeBase = {1, 1e9};
 inline constexpr Range kTokenScale = {1e-4, 1e4};

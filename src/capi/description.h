@@ -28,7 +28,7 @@ class Description {
   void fill_common(const vla::Description& d);
   void fill_robot(const vla::Description& d);
   const char* keep(const std::string& text) { return kept_.emplace_back(text).c_str(); }
-  /// Names and units of numbers as arrays of pointers.
+  /// Names and units of elements as arrays of pointers.
   const char* const* keep_names(const std::vector<vla::Description::Number>& numbers);
   const char* const* keep_units(const std::vector<vla::Description::Number>& numbers);
 

@@ -69,7 +69,7 @@ Status print_manifest(const std::string& arch) {
   return {};
 }
 
-/// Values of `stats.<feature>.*` beside the names of a feature's numbers.
+/// Values of `stats.<feature>.*` beside the names of a feature's elements.
 struct StatsColumns {
   std::vector<std::string> names;
   std::vector<std::vector<double>> values;

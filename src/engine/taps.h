@@ -31,7 +31,7 @@ struct TapDifference {
   double max_abs = 0;      // largest difference of two elements
   double relative = 0;     // the same, in units of the largest expected magnitude
   double cosine = 1;       // of the two values as vectors
-  bool comparable = true;  // same shape, all numbers finite
+  bool comparable = true;  // same shape, all values finite
   bool within(double tolerance) const { return comparable && relative <= tolerance; }
 };
 

@@ -22,7 +22,7 @@ Result<ggml_backend_reg_t> GgmlBackend::registry() const {
   return opened;
 }
 
-/// With driver and version, which a question about wrong numbers starts from.
+/// With driver and version, which a question about wrong values starts from.
 Result<std::vector<DeviceInfo>> GgmlBackend::list() const {
   VLA_TRY(ggml_backend_reg_t found, registry());
   std::vector<DeviceInfo> devices;

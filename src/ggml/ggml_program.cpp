@@ -47,9 +47,9 @@ class Translator {
                                                     : ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
     return op.bias != nullptr ? ggml_add(c, y, device_.weight(op.bias)) : y;
   }
-  /// Codes are whole numbers in float32, and so small that their sums are exact.
+  /// Codes are integers in float32, and so small that their sums are exact.
   ggml_tensor* int8_product(const op::Linear& op) {
-    constexpr float kRound = 0x1.8p23f;  // adding it rounds to a whole number, ties to even
+    constexpr float kRound = 0x1.8p23f;  // adding it rounds to an integer, ties to even
     constexpr float kSmallest = 1e-5f;
     ggml_tensor* x = contiguous(in(0));
     const int d_in = static_cast<int>(x->ne[0]);

@@ -16,7 +16,7 @@
 
 namespace vla {
 
-/// What operands of large products are rounded to; sums are float32, or whole numbers of int8.
+/// What operands of large products are rounded to; sums are float32, or integers of int8.
 enum class Precision { f32, bf16, int8 };
 
 constexpr const char* precision_name(Precision precision) {

@@ -21,7 +21,7 @@ struct Input {
   static constexpr const char* kName = "input";
   const Slot* slot;
 };
-/// Leaf: numbers that depend on shapes and configuration alone (masks, rotary tables, ids).
+/// Leaf: values that depend on shapes and configuration alone (masks, rotary tables, ids).
 struct Constant {
   static constexpr const char* kName = "constant";
   std::variant<std::vector<float>, std::vector<std::int32_t>> values;
@@ -109,7 +109,7 @@ struct Slice {
 struct Repeat {
   static constexpr const char* kName = "repeat";
 };
-/// The same numbers in the same order.
+/// The same elements in the same order.
 struct Reshape {
   static constexpr const char* kName = "reshape";
 };

@@ -4,7 +4,7 @@
 
 #include "bundle/params.h"
 
-/// Matrices in other numbers than those of the bundle, because somebody asked for it.
+/// Matrices in another encoding than that of the bundle, because somebody asked for it.
 namespace vla {
 
 /// What matrices become when they are loaded: large ones of floats are rounded to bf16, int8 or int4, or quantized ones

@@ -19,7 +19,7 @@ using Shape = std::array<std::int64_t, 4>;
 constexpr std::int64_t count(const Shape& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
 /// "[720, 50]": all dimensions up to the last that is not 1.
 std::string shape_text(const Shape& shape);
-/// The same as numbers.
+/// The same as elements.
 std::vector<std::int64_t> dims(const Shape& shape);
 
 /// A tensor that outlives the graphs which read and write it: inputs, the cache, x, tables made at load. Float32 or

@@ -10,11 +10,11 @@
 
 namespace vla::kernels {
 
-/// Rows of d_head numbers: which one is the first, and how many from one head, token or batch to the next.
+/// Rows of d_head elements: which one is the first, and how many from one head, token or batch to the next.
 struct HeadRows {
   const std::byte* data;
   std::int64_t first, head, token, batch;
-  /// Where not none: bf16 instead of floats, in rows of `d` numbers that are laid out so.
+  /// Where not none: bf16 instead of floats, in rows of `d` elements that are laid out so.
   RoundedLayout layout = RoundedLayout::none;
   std::int64_t d = 0;
 
@@ -50,7 +50,7 @@ struct AttentionJob {
   float scale;
   HeadRows q;
   RowPrep prep;       // of queries
-  const float* mask;  // [n_key, n_query] of any numbers but +infinity, or null
+  const float* mask;  // [n_key, n_query] of any values but +infinity, or null
   int n_segment;
   Segment segment[kMaxSegment];
   std::byte* out;  // floats [d_head, n_head, n_query, n_batch], or bf16 in out_layout
@@ -73,7 +73,7 @@ struct AttentionKernel {
   /// Cuts a job into items for so many threads, and says how many there are.
   std::int64_t (*cut)(AttentionJob& job, int n_thread);
   void (*run)(const AttentionJob& job, std::int64_t item);
-  /// How `out` may lie instead of float32 rows, its rows a multiple of kSquare long; and queries, keys and values to
+  /// How `out` may lie instead of float32 rows, its rows a multiple of kTileSide long; and queries, keys and values to
   /// which nothing is done first.
   RoundedLayout rounded;
 };

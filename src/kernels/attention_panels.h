@@ -26,10 +26,10 @@ class AttentionPanels {
 
   const std::int64_t d_head;
   const std::int64_t n_key;      // keys with those that fill the last panel
-  const std::int64_t key_depth;  // numbers of a key, with what fills up the depth
+  const std::int64_t key_depth;  // elements of a key, with what fills up the depth
   const std::int64_t d_value;    // columns of all panels of features
 
-  /// Numbers that one unit takes.
+  /// Elements that one unit takes.
   std::int64_t unit_size() const { return n_key * (key_depth + d_value); }
   /// Where the keys of a unit begin, and its values.
   std::int64_t keys(std::int64_t unit) const { return unit * unit_size(); }
@@ -53,7 +53,7 @@ class AttentionPanels {
       P::put_values(rows + i, first, panels.width(i), packed + panels.values(unit) + i * panels.n_key);
   }
 
-  /// The d_head numbers of a token, and zeros up to `n_padded`. What follows them in steps of two vectors is written
+  /// The d_head elements of a token, and zeros up to `n_padded`. What follows them in steps of two vectors is written
   /// too.
   VLA_INLINE void copy_row(const HeadRows& rows, std::int64_t head, std::int64_t token, std::int64_t batch,
                            const RowPrep& prep, std::int64_t n_padded, Number* to) const {
@@ -76,15 +76,15 @@ class AttentionPanels {
     const auto* from = reinterpret_cast<const Number*>(rows.data);
     for_pieces(P::kRounded, place / rows.d, place % rows.d, d_head, rows.d,
                [&](std::int64_t i, std::int64_t at, std::int64_t n) VLA_LAMBDA {
-                 if (n == kSquare)  // a size that the compiler knows
-                   std::memcpy(to + i, from + at, kSquare * sizeof(*to));
+                 if (n == kTileSide)  // a size that the compiler knows
+                   std::memcpy(to + i, from + at, kTileSide * sizeof(*to));
                  else
                    std::memcpy(to + i, from + at, static_cast<std::size_t>(n) * sizeof(*to));
                });
     if (d_head < n_padded) std::memset(to + d_head, 0, static_cast<std::size_t>(n_padded - d_head) * sizeof(*to));
   }
 
-  /// Keys or values of kPanel tokens from `first` on, as numbers and padded to `n_padded`; missing tokens are zeros.
+  /// Keys or values of kPanel tokens from `first` on, as elements and padded to `n_padded`; missing tokens are zeros.
   /// The next tokens are prefetched: they are too far apart for the hardware prefetcher.
   VLA_INLINE void copy_rows(const PackJob& job, const HeadRows& from, const RowPrep& prep, std::int64_t unit,
                             std::int64_t first, std::int64_t n_padded, Number* rows) const {

@@ -6,12 +6,12 @@
 #include "kernels/math.h"
 
 /// The arithmetics that attention computes in: float32, pairs of bf16 by vector instructions, pairs of bf16 by tiles.
-/// Both products of attention have the same form: rows of numbers times panels, which hold every column's number for
+/// Both products of attention have the same form: rows of elements times panels, which hold every column's element for
 /// each step of the depth.
 namespace vla::kernels {
 
-/// From one row of a block to the next, where a row may have n numbers: a little apart from powers of two, so that rows
-/// do not compete for the same lines of the cache.
+/// From one row of a block to the next, where a row may have n elements: a little apart from powers of two, so that
+/// rows do not compete for the same lines of the cache.
 constexpr int row_stride(int n) { return n + 32; }
 constexpr int kHeadStride = row_stride(kMaxHead);
 
@@ -33,7 +33,7 @@ struct FloatProducts {
   static constexpr float kLogOfE = 1, kSlack = 0;
   static VLA_INLINE Float power(Float x) { return exp_of_negative<V>(x); }
 
-  /// Two vectors as numbers.
+  /// Two vectors as elements.
   static VLA_INLINE void store(Number* to, Float a, Float b) {
     V::store(to, a);
     V::store(to + V::width, b);
@@ -99,7 +99,7 @@ struct FloatProducts {
   }
 };
 
-/// Numbers rounded to bf16, sums in float32, and how panels hold them. `Pairs` rounds two vectors: store(to, a, b).
+/// Elements rounded to bf16, sums in float32, and how panels hold them. `Pairs` rounds two vectors: store(to, a, b).
 template <class V, class Pairs>
 struct PairPanels {
   using Vector = V;
@@ -120,7 +120,7 @@ struct PairPanels {
 
   static VLA_INLINE void store(Number* to, Float a, Float b) { Pairs::store(to, a, b); }
 
-  /// A pair of consecutive numbers stays a word, so that a tile is the transpose of 16 rows of words.
+  /// A pair of consecutive elements stays a word, so that a tile is the transpose of 16 rows of words.
   static VLA_INLINE void put_keys(const Number* rows, std::int64_t depth, Number* panel) {
     for (std::int64_t k = 0; k < depth; k += 2 * V::width)
       for (int n = 0; n < kPanel; n += V::width) {
@@ -132,7 +132,7 @@ struct PairPanels {
       }
   }
 
-  /// The pairs are numbers of consecutive rows here.
+  /// The pairs are elements of consecutive rows here.
   static VLA_INLINE void put_values(const Number* rows, std::int64_t k, std::int64_t, Number* panel) {
     panel += place(k, 0);
     for (int i = 0; i < kPanel; i += 2)
@@ -156,8 +156,8 @@ struct PairPanels {
   static VLA_INLINE void store_words(Number* p, Float x) { std::memcpy(p, &x, sizeof(x)); }
 };
 
-/// A vector instruction adds the products of both numbers of a pair: `Pairs` has add(sum, pairs, pairs). Rows of a tile
-/// times 32 columns, a pair of the row broadcast.
+/// A vector instruction adds the products of both elements of a pair: `Pairs` has add(sum, pairs, pairs). Rows of a
+/// tile times 32 columns, a pair of the row broadcast.
 template <class V, int kRowsOfTile, class Pairs>
 struct VectorPairProducts : PairPanels<V, Pairs> {
   using Base = PairPanels<V, Pairs>;
@@ -199,7 +199,7 @@ struct VectorPairProducts : PairPanels<V, Pairs> {
 };
 
 /// 32 rows times 32 columns through a tile type (AMX, or its emulation) that holds the sums between `open` and `close`,
-/// adds 32 of the depth in each `step`, and rounds. Strides are numbers from one row to the next.
+/// adds 32 of the depth in each `step`, and rounds. Strides are elements from one row to the next.
 template <class V, class Tile>
 struct PairProducts : PairPanels<V, Tile> {
   using Base = PairPanels<V, Tile>;

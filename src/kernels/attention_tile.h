@@ -7,7 +7,7 @@
 #include "kernels/attention_panels.h"
 
 /// Attention with an online softmax. Rows of a block (queries of every head that shares keys) meet the keys in chunks:
-/// a chunk's scores lie in the first caches, become weights there, and are mixed into the block's output, which is
+/// a chunk's scores lie in the L1 and L2 caches, become weights there, and are mixed into the block's output, which is
 /// scaled down whenever a much larger score turns up.
 ///
 /// In one pass a part of the rows meets one chunk. Where the products have a unit of their own (P::kBeside), those of
@@ -296,7 +296,7 @@ class AttentionTile {
       }
     }
 
-    /// The numbers of one head of a row, from a column on.
+    /// The elements of one head of a row, from a column on.
     void write_rounded(const float* from, float factor, std::int64_t row, std::int64_t column) const {
       alignas(64) Number room[kHeadStride];
       for (std::int64_t i = 0; i < job.d_head; i += 2 * kWidth)

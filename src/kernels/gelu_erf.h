@@ -48,7 +48,7 @@ VLA_INLINE typename V::Float gelu_erf(typename V::Float x) {
   using Float = typename V::Float;
   using Int = typename V::Int;
   using normal_tail::kPieces;
-  // Products with e^(-y^2/2) are kept times 2^64, so that nothing leaves the normal numbers before the last step.
+  // Products with e^(-y^2/2) are kept times 2^64, so that nothing leaves the normal floats before the last step.
   constexpr float kUnit = 0x1p-64f, kShift = 0x1.8p23f + 127 + 64;
   constexpr float kCoarse = 0x1.8p18f;  // adding it rounds to a multiple of 2^-5
   const Float size = size_of<V>(x), y = V::min(V::set(14.5f), size);

@@ -11,7 +11,7 @@
 ///
 /// A panel's columns are taken a step of the depth at a time, which stays in a cache while all rows of a block of x
 /// pass by. Two or four bits for a number are expanded to bytes once for them; of few rows the tile unpacks them. Sums
-/// are whole numbers, so that they are the same in every order.
+/// are integers, so that they are the same in every order.
 namespace vla::kernels {
 
 /// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the
@@ -40,7 +40,7 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
 ///     and write rows up to kRows.
 /// Where products have a unit of their own (kBeside), multiply calls between() for every 64 of the depth before it
 /// writes sums: some rows of the tile before are finished there.
-/// Where an instruction takes two rows by two columns (kPairs), rows are copied in pairs and numbers of any width
+/// Where an instruction takes two rows by two columns (kPairs), rows are copied in pairs and elements of any width
 /// rearranged, both by the tile: pair(first, second, depth, to) and expand(strips, depth, to); then multiply has the
 /// latter's bytes for `strips` and no between().
 /// A file that includes this is compiled with -ffp-contract=off: what follows the sums is rounded one by one.
@@ -52,7 +52,7 @@ class Int8Loop {
   using Finish = typename Stripes::Finish;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
-  static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks numbers for
+  static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks weights for
   static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
   static constexpr bool kPacked = !std::is_same_v<Weights, BytePanels>;
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;

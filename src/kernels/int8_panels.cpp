@@ -13,7 +13,7 @@ std::size_t size_of(const MatrixDesc& desc) {
                                   Panels::strip_size(desc.d_in));
 }
 
-/// Four bytes of four codes each, as four by four numbers of two bits: rows become columns.
+/// Four bytes of four codes each, as four by four codes of two bits: rows become columns.
 std::uint32_t transposed(std::uint32_t codes) {
   std::uint32_t moved = (codes ^ codes >> 6) & 0x00CC00CC;
   codes ^= moved ^ moved << 6;

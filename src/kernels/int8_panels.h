@@ -11,8 +11,8 @@
 /// How a ternary matrix, or one of int4 or int8, lies in memory for the kernels, from load on.
 ///
 /// A *strip* holds 16 columns of the product (rows of W) over the whole depth (d_in). Kernels multiply a line of 64
-/// bytes at a time, four consecutive numbers of every column, as instructions that sum products of four bytes take
-/// them. Numbers may be stored with an offset, which comes off the sums again. Zeros fill strips up to four, and the
+/// bytes at a time, four consecutive elements of every column, as instructions that sum products of four bytes take
+/// them. Elements may be stored with an offset, which comes off the sums again. Zeros fill strips up to four, and the
 /// depth up to 64, where x has zeros.
 namespace vla::kernels {
 
@@ -48,9 +48,9 @@ struct BytePanels : Int8Panels {
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 };
 
-/// Where a tile reads the numbers of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a byte
-/// on of the line that holds numbers k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they lie as they are
-/// multiplied.
+/// Where a tile reads the elements of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a
+/// byte on of the line that holds elements k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they lie as they
+/// are multiplied.
 template <int kStrips>
 struct BytePanels::Strips {
   const std::byte* strips;
@@ -69,7 +69,7 @@ struct BytePanels::Strips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// Two bits for a number, -1 to 1 plus 1: byte 4 n + i of a line has numbers i, 4 + i, 8 + i and 12 + i of column n,
+/// Two bits for an element, -1 to 1 plus 1: byte 4 n + i of a line has elements i, 4 + i, 8 + i and 12 + i of column n,
 /// the first in its lowest bits. So what is left of the line after a shift by 2 s and a mask is one as it is
 /// multiplied.
 struct TernaryPanels : Int8Panels {
@@ -106,7 +106,7 @@ struct TernaryPanels::Strips {
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
 
-/// Codes of four bits and a step for each 64 of a column (Int4Block), which give the numbers of BytePanels: byte 4 n +
+/// Codes of four bits and a step for each 64 of a column (Int4Block), which give the elements of BytePanels: byte 4 n +
 /// i of a line has codes i and 4 + i of column n. Behind the lines of a strip are its steps, 16 for each 64 of the
 /// depth.
 struct Int4Panels : Int8Panels {
@@ -181,9 +181,9 @@ struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
 };
 static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kZero == 8);
 
-/// Numbers of a panel that were expanded to bytes: lines of 64 with four numbers of 16 columns, of one strip after the
-/// other, then the next four numbers. fetch(k, s, i) asks for the line that is loaded kAhead groups of four numbers
-/// later: a long step lies in the L2 cache.
+/// Elements of a panel that were expanded to bytes: lines of 64 with four elements of 16 columns, of one strip after
+/// the other, then the next four elements. fetch(k, s, i) asks for the line that is loaded kAhead groups of four
+/// elements later: a long step lies in the L2 cache.
 template <int kStrips, class Packed>
 struct ExpandedStrips {
   static constexpr std::int64_t kAhead = 8;

@@ -13,7 +13,7 @@ namespace vla::kernels {
 
 /// Matrix products of one x, with their epilogues: operands and addresses.
 struct LinearJob {
-  /// y = activation(W x + bias) * factor + residual. y and residual are contiguous rows of d_out numbers, one for each
+  /// y = activation(W x + bias) * factor + residual. y and residual are contiguous rows of d_out elements, one for each
   /// row of x; bias, factor [d_out] and residual may be null.
   struct Part {
     DType type;               // of the stored weight
@@ -34,7 +34,7 @@ struct LinearJob {
     const float *weight = nullptr, *bias = nullptr;
     float eps = 0;
 
-    /// The row x of n numbers as it is multiplied, in `room` where it is normed.
+    /// The row x of n elements as it is multiplied, in `room` where it is normed.
     VLA_INLINE const float* operator()(const float* x, std::int64_t n, float* room) const {
       if (run == nullptr) return x;
       run(x, weight, bias, eps, room, n);
@@ -42,8 +42,8 @@ struct LinearJob {
     }
   };
 
-  const std::byte* x;     // n_row rows of d_in numbers
-  std::int64_t x_stride;  // numbers from one row to the next
+  const std::byte* x;     // n_row rows of d_in elements
+  std::int64_t x_stride;  // elements from one row to the next
   Norm norm;              // what is multiplied is the norm of each row
   std::int64_t n_row, d_in;
   int n_part;

@@ -37,17 +37,17 @@ struct LinearKernel {
   /// to this depth, as partial sums of deeper ones lie in y.
   RoundedLayout rounded = RoundedLayout::none;
   std::int64_t max_rounded_depth = 0;
-  /// What computes products of at most `max_few` rows in its place, from the same packed matrix; null where it does so
-  /// itself.
-  const LinearKernel* few = nullptr;
-  std::int64_t max_few = 0;
-  /// Where x must come as rows of int8 codes (quantized.h): makes one of them, of n numbers. Else null.
+  /// What computes products of at most `max_small_batch` rows in its place, from the same packed matrix; null where it
+  /// does so itself.
+  const LinearKernel* small_batch = nullptr;
+  std::int64_t max_small_batch = 0;
+  /// Where x must come as rows of int8 codes (quantized.h): makes one of them, of n elements. Else null.
   void (*quantize)(const float* x, std::int64_t n, std::byte* row) = nullptr;
-  /// Numbers of x that the second cache keeps beside what passes through it, where x is read as the product before left
+  /// Elements of x that the L2 cache keeps beside what passes through it, where x is read as the product before left
   /// it; 0 where it is copied first.
-  std::int64_t kept_x = 0;
+  std::int64_t l2_elements = 0;
 
-  const LinearKernel& for_rows(std::int64_t n_row) const { return n_row <= max_few ? *few : *this; }
+  const LinearKernel& for_batch(std::int64_t n_row) const { return n_row <= max_small_batch ? *small_batch : *this; }
   RoundedLayout y_layout(std::int64_t d_in) const { return d_in <= max_rounded_depth ? rounded : RoundedLayout::none; }
 };
 

@@ -8,14 +8,14 @@
 /// The loops around a tile: items, cache blocking, edges, epilogue.
 ///
 /// A tile multiplies a few rows of x by the columns of a panel (linear_panels.h) over some depth of d_in. A block of
-/// rows of x is copied to rows of a fixed stride in the second cache, so that neither their addresses nor their width
+/// rows of x is copied to rows of a fixed stride in the L2 cache, so that neither their addresses nor their width
 /// matter to the inner loop; then one panel after the other passes by, a step of the depth at a time, which stays in
-/// the first cache while all rows of the block are multiplied by it. Source of the method: Goto and van de Geijn,
+/// the L1 cache while all rows of the block are multiplied by it. Source of the method: Goto and van de Geijn,
 /// Anatomy of High-Performance Matrix Multiplication (2008).
 namespace vla::kernels {
 
 /// A part of a panel that will be multiplied next.
-struct Ahead {
+struct Prefetch {
   const std::byte* from;
   std::int64_t size;
 };
@@ -24,7 +24,7 @@ struct Ahead {
 /// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kStep (of the depth, most),
 /// kRounds (x becomes bf16), kEven (tiles of equal height), and
 ///   place(r, k)                       where number k of row r of the block lies, if not behind k others of its row
-///   copy(from, n, to)                 n numbers of x, zeros up to a multiple of 32; where kRounds also from bf16
+///   copy(from, n, to)                 n elements of x, zeros up to a multiple of 32; where kRounds also from bf16
 ///   store_rounded(to, vector, left)   y as bf16, where kRounds
 ///   multiply(type, n_row, x, panel, depth, c, add, ahead)
 ///     c [kColumns] x n_row <= kRows, += where `add`; prefetches ahead
@@ -54,9 +54,9 @@ class LinearLoop {
  public:
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
-                                       const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
-    return {name,    Layout::packed_size, Layout::pack, supports, cut, run, sizeof(Scratch), Tile::kMaxDepth,
-            kLayout, Tile::kMaxDepth,     few,          max_few};
+                                       const LinearKernel* small_batch = nullptr, std::int64_t max_small_batch = 0) {
+    return {name,    Layout::packed_size, Layout::pack, supports,       cut, run, sizeof(Scratch), Tile::kMaxDepth,
+            kLayout, Tile::kMaxDepth,     small_batch,  max_small_batch};
   }
 
  private:
@@ -128,7 +128,7 @@ class LinearLoop {
   }
 
   /// y of the stripe (+)= the block of x times the panel; `next` will be read after it. Whatever follows the product is
-  /// done while a tile of sums lies in the first cache.
+  /// done while a tile of sums lies in the L1 cache.
   void multiply(const Stripe& s, const std::byte* next) {
     const LinearJob::Part& part = job_.part[s.part];
     if (job_.gated)

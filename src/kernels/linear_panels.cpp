@@ -12,7 +12,7 @@ void put_words(const std::byte* from, std::int64_t size, std::byte* to) {
   if (size > 0) std::memcpy(to, from, static_cast<std::size_t>(size));
 }
 
-/// n numbers of a row to a column of a block.
+/// n elements of a row to a column of a block.
 void put(DType type, const std::byte* numbers, std::int64_t n, std::byte* column) {
   if (type == DType::f16) return put_words<2, 32>(numbers, 2 * n, column);
   put_words<4, 64>(numbers, n * number_size(type), column);

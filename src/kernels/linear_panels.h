@@ -18,7 +18,7 @@ namespace vla::kernels {
 
 constexpr std::int64_t kPanelBlock = 1024, kPanelDepth = 32;
 
-/// n numbers of a row of x, and zeros up to where a panel's depth may end.
+/// n elements of a row of x, and zeros up to where a panel's depth may end.
 template <class X>
 VLA_INLINE void copy_padded(const X* from, std::int64_t n, X* to) {
   std::memcpy(to, from, static_cast<std::size_t>(n) * sizeof(X));

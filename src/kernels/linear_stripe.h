@@ -176,7 +176,7 @@ struct LinearStripes {
       }
     }
 
-    /// The numbers of a row from its column i on.
+    /// The elements of a row from its column i on.
     template <bool kWhole, bool kRounded, Activation kActivation>
     VLA_INLINE typename V::Float value_at(std::int64_t i_row, std::int64_t i) const {
       const std::int64_t r = first_ + i_row, place = (s_.row + r) * d_out_ + s_.column + i;
@@ -196,13 +196,13 @@ struct LinearStripes {
       return value;
     }
 
-    /// Where the stripe's numbers of a row go.
+    /// Where the stripe's elements of a row go.
     template <bool kWhole>
     VLA_INLINE std::uint16_t* rounded_row(std::int64_t row, std::int64_t d_out) const {
       auto* y = reinterpret_cast<std::uint16_t*>(y_);
       if constexpr (kLayout == RoundedLayout::rows) return y + row * d_out + s_.column;
       y += place_in_tiles(row, s_.column, d_out);
-      if constexpr (!kWhole) std::memset(y, 0, kSquare * sizeof(*y));  // what is beyond the last column
+      if constexpr (!kWhole) std::memset(y, 0, kTileSide * sizeof(*y));  // what is beyond the last column
       return y;
     }
 

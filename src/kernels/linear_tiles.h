@@ -8,14 +8,14 @@
 /// The loops around tile registers, which multiply so fast that everything else must be done beside them.
 ///
 /// x is rounded to bf16, as PyTorch rounds the activations of a bf16 layer, and lies in tiles (rounded.h): where the
-/// product before left it so, as it is, else as a copy of some rows in the second cache. A block of rows is multiplied
-/// by one panel after the other, a step of the depth at a time, which stays in the first cache. What follows the sums
+/// product before left it so, as it is, else as a copy of some rows in the L2 cache. A block of rows is multiplied
+/// by one panel after the other, a step of the depth at a time, which stays in the L1 cache. What follows the sums
 /// of a square of 32 x 32 is done some rows at a time between the instructions that multiply later squares.
 namespace vla::kernels {
 
 /// `Tile` has: V (a type of vec.h), Session (held while a thread works), and
-///   copy(from, n, to)                 n <= 32 numbers of x, and zeros up to 32
-///   store_rounded(to, vector, left)   y as bf16; and (to, vector, vector) where 32 numbers are two vectors
+///   copy(from, n, to)                 n <= 32 elements of x, and zeros up to 32
+///   store_rounded(to, vector, left)   y as bf16; and (to, vector, vector) where 32 elements are two vectors
 ///   multiply(half, x, panel, n_square, c, add, between)
 ///     a square c of sums, += where `add`, or its first 16 rows; calls between() n_square times
 template <class Tile>
@@ -23,24 +23,24 @@ class TileLoop {
   using V = typename Tile::V;
   using X = std::uint16_t;
   struct Shape : Tile {
-    static constexpr int kRows = kSquare, kColumns = kSquare;
+    static constexpr int kRows = kTileSide, kColumns = kTileSide;
     static constexpr bool kEven = false;
   };
-  using Layout = Panels<kSquare>;
+  using Layout = Panels<kTileSide>;
   using Stripes = LinearStripes<Shape, RoundedLayout::tiles>;
   using Finish = typename Stripes::Finish;
 
   static constexpr std::int64_t kMaxRows = 512;     // of a block: the more, the fewer times a panel is read
-  static constexpr std::int64_t kMaxX = 512 << 10;  // numbers of x in a block, half of the second cache
+  static constexpr std::int64_t kMaxX = 512 << 10;  // elements of x in a block, half of the L2 cache
   static constexpr std::int64_t kMaxDepth = 2048;   // of such a block
-  static constexpr std::int64_t kStep = 512;        // of the depth: a panel's step stays in the first cache
+  static constexpr std::int64_t kStep = 512;        // of the depth: a panel's step stays in the L1 cache
   static constexpr std::int64_t kRowsAhead = 4;     // of x and y, which memory is asked for
   static constexpr std::int64_t kMinItems = 16;     // for each thread, where there are so many
   // A greater depth takes several blocks, and an item keeps the sums of a group of panels from one to the next. Each
   // group reads all of the block of x.
   static constexpr std::int64_t kSplitDepth = 1024, kSplitRows = 256, kMinGroup = 4, kMaxGroup = 24;
   static constexpr std::int64_t kMinSplitItems = 8;
-  static constexpr std::int64_t kMaxSums = kMaxGroup * kSplitRows * kSquare;
+  static constexpr std::int64_t kMaxSums = kMaxGroup * kSplitRows * kTileSide;
   // So many bytes of weights come from memory for each block of rows, unless threads multiply the same panels at the
   // same time: blocks may then be larger, and all threads share them evenly.
   static constexpr std::int64_t kFarWeights = 16 << 20, kFarX = 640 << 10, kFarRows = 320;
@@ -56,10 +56,20 @@ class TileLoop {
  public:
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
-                                       const LinearKernel* few = nullptr, std::int64_t max_few = 0) {
-    LinearKernel row = {name,      Layout::packed_size,  Layout::pack, supports, cut,    run, sizeof(Scratch),
-                        kMaxDepth, RoundedLayout::tiles, kAnyDepth,    few,      max_few};
-    row.kept_x = kMaxX;
+                                       const LinearKernel* small_batch = nullptr, std::int64_t max_small_batch = 0) {
+    LinearKernel row = {name,
+                        Layout::packed_size,
+                        Layout::pack,
+                        supports,
+                        cut,
+                        run,
+                        sizeof(Scratch),
+                        kMaxDepth,
+                        RoundedLayout::tiles,
+                        kAnyDepth,
+                        small_batch,
+                        max_small_batch};
+    row.l2_elements = kMaxX;
     return row;
   }
 
@@ -70,7 +80,7 @@ class TileLoop {
     const bool whole = loop.whole_depth();
     const std::int64_t n_item = n_thread == 1 ? 1 : n_thread * (whole ? kMinItems : kMinSplitItems);
     job.n_group = min(ceil_div(n_item, loop.n_block_), ceil_div(loop.n_panel_, whole ? 1 : kMinGroup));
-    const std::int64_t room = whole ? 1 : ceil_div(loop.n_panel_, kMaxSums / (job.block_rows * kSquare));
+    const std::int64_t room = whole ? 1 : ceil_div(loop.n_panel_, kMaxSums / (job.block_rows * kTileSide));
     if (job.n_group < room) job.n_group = room;
     return loop.n_block_ * job.n_group;
   }
@@ -86,27 +96,28 @@ class TileLoop {
 
   explicit TileLoop(const LinearJob& job)
       : job_(job),
-        block_depth_(has_whole_depth(job) ? job.d_in : even_block(job.d_in, kSplitDepth, kSquare)),
+        block_depth_(has_whole_depth(job) ? job.d_in : even_block(job.d_in, kSplitDepth, kTileSide)),
         block_rows_(job.block_rows),
         n_block_(ceil_div(job.n_row, block_rows_)),
         n_panel_(Stripes::n_panel(job)) {}
 
   /// Few rows leave room for a greater depth.
   static bool has_whole_depth(const LinearJob& job) {
-    return job.d_in <= kMaxDepth || job.d_in <= kMaxX / round_up(job.n_row, kSquare) / kSquare * kSquare;
+    return job.d_in <= kMaxDepth || job.d_in <= kMaxX / round_up(job.n_row, kTileSide) / kTileSide * kTileSide;
   }
   bool whole_depth() const { return block_depth_ >= job_.d_in; }
 
   static std::int64_t block_rows(const LinearJob& job, int n_thread) {
     const auto n_block = [&](std::int64_t max_x, std::int64_t max_split_rows) {
-      const std::int64_t max_rows = min(kMaxRows, max_x / round_up(job.d_in, kSquare) / kSquare * kSquare);
+      const std::int64_t max_rows = min(kMaxRows, max_x / round_up(job.d_in, kTileSide) / kTileSide * kTileSide);
       return ceil_div(job.n_row, has_whole_depth(job) ? max_rows : max_split_rows);
     };
     std::int64_t n = n_block(kMaxX, kSplitRows), size = 0;
-    for (int i = 0; i < job.n_part; ++i) size += Layout::size(job.part[i].type, job.d_in) * job.part[i].d_out / kSquare;
+    for (int i = 0; i < job.n_part; ++i)
+      size += Layout::size(job.part[i].type, job.d_in) * job.part[i].d_out / kTileSide;
     if (n > 1 && size >= kFarWeights)
       for (n = n_block(kFarX, kFarRows); n % n_thread != 0 && n_thread % n != 0;) ++n;
-    return n == 0 ? kSquare : round_up(ceil_div(job.n_row, n), kSquare);
+    return n == 0 ? kTileSide : round_up(ceil_div(job.n_row, n), kTileSide);
   }
 
   /// Some panels by a block of rows.
@@ -117,9 +128,9 @@ class TileLoop {
     for (k_ = 0; k_ < job_.d_in; k_ += block_depth_) {
       depth_ = min(block_depth_, job_.d_in - k_);
       if (job_.x_type != DType::bf16) take_rows();
-      n_finish_ = ceil_div(kSquare * kSquare, depth_ * (job_.gated ? 2 : 1));
+      n_finish_ = ceil_div(kTileSide * kTileSide, depth_ * (job_.gated ? 2 : 1));
       for (std::int64_t panel = begin; panel < end; ++panel)
-        multiply(panel, (whole_depth() ? panel % 2 : panel - begin) * block_rows_ * kSquare,
+        multiply(panel, (whole_depth() ? panel % 2 : panel - begin) * block_rows_ * kTileSide,
                  Stripes::behind(job_, begin, end, panel, k_, depth_));
     }
     finish_summed();
@@ -133,8 +144,8 @@ class TileLoop {
       const float* row = reinterpret_cast<const float*>(job_.x) + (row_ + r) * job_.x_stride;
       for (std::int64_t i = k_; i < k_ + depth_; i += 16) __builtin_prefetch(row + kRowsAhead * job_.x_stride + i);
       const float* x = job_.norm(row, job_.d_in, scratch_->normed) + k_;
-      for (std::int64_t i = 0; i < depth_; i += kSquare)
-        Tile::copy(x + i, min(kSquare, depth_ - i), scratch_->x + place_in_tiles(r, i, depth_));
+      for (std::int64_t i = 0; i < depth_; i += kTileSide)
+        Tile::copy(x + i, min(kTileSide, depth_ - i), scratch_->x + place_in_tiles(r, i, depth_));
     }
   }
 
@@ -156,18 +167,18 @@ class TileLoop {
 
   /// sums (+)= the block of x times a panel. `finish`: these were the last, y is made of them.
   void sum(const LinearJob::Part& part, const Stripe& s, float* sums, const std::byte* next_panel, bool finish) {
-    const std::int64_t depth = round_up(depth_, kSquare), step = even_block(depth, kStep, kSquare);
-    const std::int64_t n_tile = ceil_div(n_row_, kSquare);
+    const std::int64_t depth = round_up(depth_, kTileSide), step = even_block(depth, kStep, kTileSide);
+    const std::int64_t n_tile = ceil_div(n_row_, kTileSide);
     const std::byte* panel = Stripes::panel_of(job_, part, s.column, k_);
     for (std::int64_t k = 0; k < depth; k += step) {
       const std::int64_t d = min(step, depth - k), size = Layout::size(part.type, d);
       const std::byte* next = k + d < depth ? panel + size : next_panel;
       const bool is_last = finish && k + d == depth;
       for (std::int64_t t = 0; t < n_tile; ++t) {
-        const std::int64_t r = t * kSquare, n_row = min(kSquare, n_row_ - r);
-        Between between(*this, d / kSquare, next + size * t / n_tile, size / n_tile);
-        Tile::multiply(n_row <= kSquare / 2, square_of_x(r, k), panel, d / kSquare, sums + r * kSquare, k_ + k > 0,
-                       between);
+        const std::int64_t r = t * kTileSide, n_row = min(kTileSide, n_row_ - r);
+        Between between(*this, d / kTileSide, next + size * t / n_tile, size / n_tile);
+        Tile::multiply(n_row <= kTileSide / 2, square_of_x(r, k), panel, d / kTileSide, sums + r * kTileSide,
+                       k_ + k > 0, between);
         if (!is_last) continue;
         if (t == 0) finish_summed(), finish_ = Finish(job_, s, sums, 0, n_row_), n_finished_ = 0;
         n_summed_ = r + n_row;

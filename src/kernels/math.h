@@ -7,13 +7,13 @@
 /// Transcendental functions of a vector of float32, in float32 throughout. `V` is a type of vec.h.
 namespace vla::kernels {
 
-/// Two in the power of the whole numbers n, -127 <= n <= 127; -127 gives zero.
+/// Two in the power of the integers n, -127 <= n <= 127; -127 gives zero.
 template <class V>
 VLA_INLINE typename V::Float power_of_two(typename V::Int n) {
   return std::bit_cast<typename V::Float>((n + 127) << 23);
 }
 
-/// e^x for x <= 0, zero below -87.68, where it leaves the normal numbers: what a softmax needs, in float32 throughout.
+/// e^x for x <= 0, zero below -87.68, where it leaves the normal floats: what a softmax needs, in float32 throughout.
 /// x = n ln 2 + rest with |rest| <= ln2 / 2. Two constants make ln 2, so that the rest is exact to float32.
 template <class V>
 VLA_INLINE typename V::Float exp_of_negative(typename V::Float x) {
@@ -40,7 +40,7 @@ VLA_INLINE typename V::Float size_of(typename V::Float x) {
 /// SiLU and GELU's tanh form are x / (1 + 2^-s) with s = x (a + b x^2). Of y = |x|, and of s at y, they are
 ///     max(x, 0) - y / (1 + 2^s),
 /// whose last step rounds once, subnormal results included. For those 2^s grows to 2^158: the divisor is kept times
-/// kUnit, so that nothing leaves the normal numbers on the way.
+/// kUnit, so that nothing leaves the normal floats on the way.
 ///
 /// An error of s is one of 2^s relative to it. So the whole part n of s is taken away before anything is rounded: the
 /// product that makes s meets -n in one fused step, and what its factors had lost is added to the small rest.

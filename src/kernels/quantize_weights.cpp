@@ -10,18 +10,18 @@
 namespace vla::kernels {
 namespace {
 
-constexpr float kLeast = 1e-30f;     // 127 / most is finite; numbers below it are as good as zero
-constexpr float kRound = 0x1.8p23f;  // adding it leaves a whole number in the lowest bits, ties to even
+constexpr float kMinScale = 1e-30f;  // 127 / max_abs is finite; values below it are as good as zero
+constexpr float kRound = 0x1.8p23f;  // adding it leaves an integer in the lowest bits, ties to even
 
 /// Widens a row, and gives its greatest number without sign: NaN or infinity where one is not finite.
 template <DType kType>
 float widen(const std::byte* stored, std::int64_t n, float* row) {
-  std::int32_t most = 0;  // without their signs, floats are ordered as whole numbers are, and NaN is above them all
+  std::int32_t max_abs = 0;  // without their signs, floats are ordered as integers are, and NaN is above them all
   for (std::int64_t k = 0; k < n; ++k) {
     row[k] = stored_number(kType, stored, k);
-    most = std::max(most, std::bit_cast<std::int32_t>(row[k]) & 0x7fffffff);
+    max_abs = std::max(max_abs, std::bit_cast<std::int32_t>(row[k]) & 0x7fffffff);
   }
-  return std::bit_cast<float>(most);
+  return std::bit_cast<float>(max_abs);
 }
 
 float widen(DType type, const std::byte* stored, std::int64_t n, float* row) {
@@ -30,7 +30,7 @@ float widen(DType type, const std::byte* stored, std::int64_t n, float* row) {
                               : widen<DType::bf16>(stored, n, row);
 }
 
-/// The codes of a block for numbers that are code * step, and the sum of squares of what they miss.
+/// The codes of a block for values that are code * step, and the sum of squares of what they miss.
 float try_step(const float* x, float step, float* codes) {
   constexpr int kLanes = 8;  // of sums, whose order is part of the result
   constexpr auto kMost = static_cast<float>(Int4Block::kMost);
@@ -52,12 +52,12 @@ float try_step(const float* x, float step, float* codes) {
 /// or a smaller one, which cuts that number and is finer for the others.
 Int4Block best_block(const float* x, float unit) {
   constexpr int kMaxStep = Int4Block::kMaxStep;
-  float most = 0, codes[Int4Block::kElements], best_codes[Int4Block::kElements] = {};
-  for (int k = 0; k < Int4Block::kElements; ++k) most = std::max(most, std::max(x[k], -x[k]));
-  const int widest = std::min(kMaxStep, static_cast<int>(most / (Int4Block::kMost * unit)) + 1);
+  float max_abs = 0, codes[Int4Block::kElements], best_codes[Int4Block::kElements] = {};
+  for (int k = 0; k < Int4Block::kElements; ++k) max_abs = std::max(max_abs, std::max(x[k], -x[k]));
+  const int widest = std::min(kMaxStep, static_cast<int>(max_abs / (Int4Block::kMost * unit)) + 1);
   Int4Block block = {.step = 0, .codes = {}};
   float least = std::numeric_limits<float>::infinity();
-  for (int step = widest; most > 0 && step > 0 && 2 * step >= widest; --step) {
+  for (int step = widest; max_abs > 0 && step > 0 && 2 * step >= widest; --step) {
     const float missed = try_step(x, static_cast<float>(step) * unit, codes);
     if (missed >= least) continue;
     least = missed, block.step = static_cast<std::uint8_t>(step);
@@ -71,7 +71,7 @@ Int4Block best_block(const float* x, float unit) {
   return block;
 }
 
-/// The scale that makes what is left of the row least: the numbers' projection on their codes.
+/// The scale that makes what is left of the row least: the values' projection on their codes.
 float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, float otherwise) {
   double product = 0, square = 0;
   for (std::int64_t k = 0; k < n; ++k) {
@@ -86,9 +86,9 @@ float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, fl
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* codes,
                       float* scales, float* row) {
   for (std::int64_t n = 0; n < d_out; ++n, stored += d_in * number_size(type), codes += d_in) {
-    const float most = widen(type, stored, d_in, row);
-    const bool is_finite = most <= std::numeric_limits<float>::max();
-    const float a = is_finite ? most : 0, s = a > kLeast ? 127 / a : 0;
+    const float max_abs = widen(type, stored, d_in, row);
+    const bool is_finite = max_abs <= std::numeric_limits<float>::max();
+    const float a = is_finite ? max_abs : 0, s = a > kMinScale ? 127 / a : 0;
     scales[n] = !is_finite ? std::numeric_limits<float>::quiet_NaN() : s > 0 ? a / 127 : 0;
     for (std::int64_t k = 0; k < d_in; ++k)
       codes[k] = s > 0 ? static_cast<std::byte>(std::bit_cast<std::int32_t>(row[k] * s + kRound)) : std::byte{0};
@@ -99,10 +99,10 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
                       float* scales, float* row) {
   const std::int64_t n_block = d_in / Int4Block::kElements;
   for (std::int64_t n = 0; n < d_out; ++n, stored += d_in * number_size(type), blocks += n_block) {
-    const float most = widen(type, stored, d_in, row);
-    const bool is_finite = most <= std::numeric_limits<float>::max();
-    if (!is_finite || most <= kLeast) std::fill(row, row + d_in, 0.0f);
-    const float unit = most / (Int4Block::kMost * Int4Block::kMaxStep);
+    const float max_abs = widen(type, stored, d_in, row);
+    const bool is_finite = max_abs <= std::numeric_limits<float>::max();
+    if (!is_finite || max_abs <= kMinScale) std::fill(row, row + d_in, 0.0f);
+    const float unit = max_abs / (Int4Block::kMost * Int4Block::kMaxStep);
     for (std::int64_t i = 0; i < n_block; ++i) blocks[i] = best_block(row + i * Int4Block::kElements, unit);
     scales[n] = is_finite ? fitted_scale(row, blocks, d_in, 0) : std::numeric_limits<float>::quiet_NaN();
   }

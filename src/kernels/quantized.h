@@ -45,12 +45,12 @@ VLA_INLINE RowScale row_scale(const std::byte* row, std::int64_t d_in) {
 /// s = (1 / a) * 127 with a = max |x|, at least 1e-5, in two roundings; code = x * s to the nearest, ties to even, so
 /// that a becomes 127. A row with a number that is not finite gets a scale that makes its products not finite.
 /// The file that includes this must be compiled without fused multiply-adds (-ffp-contract=off): x * s is rounded
-/// before it becomes a whole number. Source: BitVLA modeling_bitnet.py ActQuant; torch makes 127 / a as here.
+/// before it becomes an integer. Source: BitVLA modeling_bitnet.py ActQuant; torch makes 127 / a as here.
 template <class V>
 VLA_INLINE void quantize_row(const float* x, std::int64_t n, std::byte* to) {
   using Float = typename V::Float;
   using Int = typename V::Int;
-  // Without their signs, floats are ordered as whole numbers are, and NaN is above them all.
+  // Without their signs, floats are ordered as integers are, and NaN is above them all.
   Int most = {};
   for (std::int64_t i = 0; i < n; i += V::width) {
     const Int size = std::bit_cast<Int>(load<V>(x + i, n - i)) & 0x7fffffff;
@@ -61,7 +61,7 @@ VLA_INLINE void quantize_row(const float* x, std::int64_t n, std::byte* to) {
   const auto a = std::bit_cast<float>(largest);
   RowScale scale = {1.0f / (a < 1e-5f ? 1e-5f : a) * 127.0f, 0};
 
-  constexpr float kRound = 0x1.8p23f;  // adding it leaves a whole number in the lowest bits, ties to even
+  constexpr float kRound = 0x1.8p23f;  // adding it leaves an integer in the lowest bits, ties to even
   typedef signed char Codes __attribute__((vector_size(V::width)));
   Int sum = {};
   for (std::int64_t i = 0; i < n; i += V::width) {

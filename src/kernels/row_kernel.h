@@ -21,7 +21,7 @@ struct RowPrep {
   const float* table = nullptr;  // [d_head, n_token]
 
   explicit operator bool() const { return norm != nullptr || rotate != nullptr; }
-  /// The row x of token i, in `room` for d_head numbers where anything is done to it.
+  /// The row x of token i, in `room` for d_head elements where anything is done to it.
   VLA_INLINE const float* operator()(const float* x, std::int64_t i, std::int64_t d_head, float* room) const {
     if (norm != nullptr) norm(x, weight, nullptr, eps, room, d_head), x = room;
     if (rotate != nullptr) rotate(x, table + i * d_head, nullptr, 0, room, d_head), x = room;

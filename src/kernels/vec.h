@@ -47,7 +47,7 @@ struct Lanes {
   }
 };
 
-/// A vector from p where `left` numbers remain; lanes beyond them are zeros.
+/// A vector from p where `left` elements remain; lanes beyond them are zeros.
 template <class V>
 VLA_INLINE typename V::Float load(const float* p, std::int64_t left) {
   return left >= V::width ? V::load(p) : V::load_part(p, static_cast<int>(left));
@@ -75,7 +75,7 @@ VLA_INLINE void transpose(typename V::Float (&x)[V::width]) {
   }
 }
 
-/// In lane i all of x[i], put together by `join` (a sum, a maximum), which sees numbers in an order of its own.
+/// In lane i all of x[i], put together by `join` (a sum, a maximum), which sees elements in an order of its own.
 template <class V, class Join>
 VLA_INLINE typename V::Float across(typename V::Float (&x)[V::width], Join join) {
 #pragma GCC unroll 4

@@ -23,7 +23,7 @@ Result<Arithmetic> with(const KernelSet& set, Features machine) {
                "leave the choice to the program"};
 }
 
-/// The best of the machine, with large matrices in these numbers.
+/// The best of the machine, with large matrices of this dtype.
 Arithmetic rounding(Rounding at_load, Arithmetic best) {
   best.at_load = at_load;
   return best;

@@ -8,7 +8,7 @@
 
 namespace vla {
 
-/// What computes products, and in which numbers: the meaning of `--kernels`, which nothing else reads.
+/// What computes products, and at which precision: the meaning of `--kernels`, which nothing else reads.
 struct Arithmetic {
   enum class Backend { own, ggml };
 

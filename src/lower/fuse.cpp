@@ -164,7 +164,7 @@ class Fuser {
     return node;
   }
 
-  /// [d] of numbers that follow each other, for every row of a result.
+  /// [d] of elements that follow each other, for every row of a result.
   bool is_vector(Tensor factor, const Node& result) const {
     return factor.dim(0) == result.shape[0] && count(factor.shape()) == factor.dim(0) &&
            l.value(factor.node()->id).stride[0] == 1;

@@ -24,7 +24,7 @@ constexpr ValueId kNone = -1;
 struct Value {
   /// Memory that programs share, or of the program, or of a slot, ... thread:
   /// of whoever computes it, for its readers in the same operation.
-  enum class Home { arena, kept, slot, constant, parameter, thread };
+  enum class Placement { arena, kept, slot, constant, parameter, thread };
 
   const Node* node = nullptr;  // none for packed keys and values, and for what targets add
   DType type = DType::f32;
@@ -38,7 +38,7 @@ struct Value {
   int layout = 0;
 
   // Of a base alone.
-  Home home = Home::arena;
+  Placement placement = Placement::arena;
   std::size_t size = 0, begin = 0;  // bytes, and those before it in the arena or
                                     // among what is kept
   const Slot* slot = nullptr;

@@ -9,54 +9,55 @@ namespace vla::lower {
 namespace {
 
 /// The phases in which a value must stand in memory.
-struct Life {
+struct Lifetime {
   int first = 0, last = -1;
-  bool overlaps(const Life& other) const { return first <= other.last && other.first <= last; }
+  bool overlaps(const Lifetime& other) const { return first <= other.last && other.first <= last; }
 };
 
-std::vector<Life> find_lives(const Lowering& l, const std::vector<Step*>& steps) {
-  std::vector<Life> lives(l.values.size());
-  const auto at = [&](ValueId id) -> Life& { return lives[static_cast<std::size_t>(l.value(id).base)]; };
+std::vector<Lifetime> find_lifetimes(const Lowering& l, const std::vector<Step*>& steps) {
+  std::vector<Lifetime> lifetimes(l.values.size());
+  const auto at = [&](ValueId id) -> Lifetime& { return lifetimes[static_cast<std::size_t>(l.value(id).base)]; };
   for (const Step* step : steps)
     for (const ValueId id : step->writes) at(id) = {step->phase, step->phase};
   for (const Step* step : steps)
     for (const ValueId id : step->reads) at(id).last = std::max(at(id).last, step->phase);
   for (const Node& node : l.graph.nodes())
     if (node.tapped) at(node.id).last = l.n_phase;
-  return lives;
+  return lifetimes;
 }
 
 }  // namespace
 
 /// Values one after the other, largest first, each at the lowest place that no other value takes while it lives.
 void place(Lowering& l, const std::vector<Step*>& steps) {
-  const std::vector<Life> lives = find_lives(l, steps);
+  const std::vector<Lifetime> lifetimes = find_lifetimes(l, steps);
   const std::size_t alignment = l.target.alignment();
   std::vector<std::size_t> order(l.values.size());
   std::iota(order.begin(), order.end(), std::size_t{0});
   std::stable_sort(order.begin(), order.end(),
                    [&](std::size_t a, std::size_t b) { return l.values[a].size > l.values[b].size; });
   struct Taken {
-    Life life;
+    Lifetime lifetime;
     std::size_t begin, end;
   };
   std::vector<Taken> taken;  // by where they begin
   for (const std::size_t i : order) {
     Value& value = l.values[i];
-    const Life& life = lives[i];
-    if (value.home != Value::Home::arena || value.base != static_cast<ValueId>(i) || life.last < 0) continue;
+    const Lifetime& lifetime = lifetimes[i];
+    if (value.placement != Value::Placement::arena || value.base != static_cast<ValueId>(i) || lifetime.last < 0)
+      continue;
     const std::size_t size = (value.size + alignment - 1) / alignment * alignment;
-    if (life.first < l.n_prepare && life.last >= l.n_prepare) {  // made by prepare, for every run
-      value.home = Value::Home::kept;
+    if (lifetime.first < l.n_prepare && lifetime.last >= l.n_prepare) {  // made by prepare, for every run
+      value.placement = Value::Placement::kept;
       value.begin = l.kept_size;
       l.kept_size += size;
       continue;
     }
     std::size_t begin = 0;
     for (const Taken& other : taken)
-      if (other.life.overlaps(life) && other.begin < begin + size && other.end > begin) begin = other.end;
+      if (other.lifetime.overlaps(lifetime) && other.begin < begin + size && other.end > begin) begin = other.end;
     value.begin = begin;
-    const Taken now = {life, begin, begin + size};
+    const Taken now = {lifetime, begin, begin + size};
     taken.insert(std::upper_bound(taken.begin(), taken.end(), begin,
                                   [](std::size_t b, const Taken& other) { return b < other.begin; }),
                  now);

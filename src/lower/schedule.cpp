@@ -20,7 +20,7 @@ void find_invariants(const Lowering& l, const std::vector<Step*>& steps) {
     const bool changes = std::any_of(step->reads.begin(), step->reads.end(),
                                      [&](ValueId id) { return varies[static_cast<std::size_t>(l.value(id).base)]; });
     const bool stores = std::any_of(step->writes.begin(), step->writes.end(),
-                                    [&](ValueId id) { return l.base(id).home == Value::Home::slot; });
+                                    [&](ValueId id) { return l.base(id).placement == Value::Placement::slot; });
     step->invariant = !varying.empty() && !changes && !stores;
     for (const ValueId id : step->writes) varies[static_cast<std::size_t>(id)] = !step->invariant;
   }
@@ -37,7 +37,7 @@ int schedule_part(const Lowering& l, const std::vector<Step*>& steps, bool invar
   std::vector<int> made(l.values.size(), first - 1);  // the phase that makes a value
   std::map<const Slot*, SlotUse> slots;
   const auto use_of = [&](ValueId id) -> SlotUse* {
-    return l.base(id).home == Value::Home::slot ? &slots[l.base(id).slot] : nullptr;
+    return l.base(id).placement == Value::Placement::slot ? &slots[l.base(id).slot] : nullptr;
   };
   int end = first, stage_first = first;
   std::size_t stage = 0;

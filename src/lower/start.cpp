@@ -35,7 +35,7 @@ std::int64_t row_stride(const Value& value) {
 
 namespace {
 
-/// Strides of the same numbers in another shape, where that takes no copy: every dimension of the one must be cut from
+/// Strides of the same elements in another shape, where that takes no copy: every dimension of the one must be cut from
 /// dimensions of the other that follow each other in memory.
 std::optional<Shape> reshape_strides(const Value& value, const Shape& to) {
   std::vector<std::int64_t> sizes, strides;  // of the old shape, dimensions joined where they follow each other
@@ -82,12 +82,12 @@ struct MakeValue {
   Value operator()(const op::Write& op) const { return in_slot(*op.slot); }
   Value operator()(const op::Constant&) const {
     Value value = own(node);
-    value.home = Value::Home::constant;
+    value.placement = Value::Placement::constant;
     return value;
   }
   Value operator()(const op::Parameter&) const {
     Value value = own(node);
-    value.home = Value::Home::parameter;
+    value.placement = Value::Placement::parameter;
     return value;
   }
 
@@ -123,10 +123,10 @@ struct MakeValue {
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }
   /// What a slot holds may be overwritten later in the run, so that a tap records a copy.
-  bool must_copy() const { return node.tapped && l.base(x().base).home == Value::Home::slot; }
+  bool must_copy() const { return node.tapped && l.base(x().base).placement == Value::Placement::slot; }
   Value in_slot(const Slot& slot) const {
     Value value = own(node);
-    value.home = Value::Home::slot, value.slot = &slot;
+    value.placement = Value::Placement::slot, value.slot = &slot;
     return value;
   }
 };

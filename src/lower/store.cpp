@@ -17,7 +17,7 @@ bool may_write(const Lowering& l, const std::vector<FusedOp>& ops, const Node& w
   if (writer == ops.end()) return false;
   for (const FusedOp& op : ops)
     for (const ValueId id : op.reads) {
-      if (l.base(id).home != Value::Home::slot || l.base(id).slot != slot) continue;
+      if (l.base(id).placement != Value::Placement::slot || l.base(id).slot != slot) continue;
       if (op.order > writer->order) return false;
       if (op.order < writer->order) continue;
       const Value& value = l.value(id);
@@ -34,8 +34,8 @@ void store(Lowering& l, std::vector<FusedOp>& ops, const Node& write) {
   Value& value = l.value(from);
   Value& base = l.base(from);
   const bool is_whole = is_contiguous(value) && value.offset == 0 && count(value.shape) == count(base.shape);
-  if (is_whole && base.home == Value::Home::arena && may_write(l, ops, write, value.base)) {
-    base.home = Value::Home::slot, base.slot = l.value(write.id).slot;
+  if (is_whole && base.placement == Value::Placement::arena && may_write(l, ops, write, value.base)) {
+    base.placement = Value::Placement::slot, base.slot = l.value(write.id).slot;
     return;
   }
   FusedOp& op = ops.emplace_back();

@@ -28,9 +28,9 @@ Tensor prepend_token(Graph& g, Tensor token, Tensor x) {
   return concat_tokens(g, {g.add(op::Repeat{}, {token}, {x.dim(0), 1, x.dim(2), 1}), x});
 }
 
-Tensor first_features(Graph& g, Tensor x, int count) {
+Tensor zero_features_after(Graph& g, Tensor x, int count) {
   const std::int64_t d = x.dim(0);
-  const Tensor kept = g.constant(fmt::format("first_features/{}/{}", d, count), {d, 1, 1, 1}, [&] {
+  const Tensor kept = g.constant(fmt::format("zero_features_after/{}/{}", d, count), {d, 1, 1, 1}, [&] {
     std::vector<float> values(static_cast<std::size_t>(d), 0.0f);
     std::fill_n(values.begin(), count, 1.0f);
     return values;
@@ -38,9 +38,9 @@ Tensor first_features(Graph& g, Tensor x, int count) {
   return multiply(g, x, kept);
 }
 
-Tensor one_column(Graph& g, Tensor x) { return g.add(op::Reshape{}, {x}, {x.dim(0) * x.dim(1), 1, 1, 1}); }
+Tensor flatten(Graph& g, Tensor x) { return g.add(op::Reshape{}, {x}, {x.dim(0) * x.dim(1), 1, 1, 1}); }
 
-Tensor columns(Graph& g, Tensor x, std::int64_t d) {
+Tensor reshape_width(Graph& g, Tensor x, std::int64_t d) {
   return g.add(op::Reshape{}, {x}, {d, x.dim(1) * x.dim(0) / d, x.dim(2), 1});
 }
 

@@ -53,11 +53,11 @@ Tensor flatten_views(Graph& g, Tensor x);
 /// A token in front of every view's: token [d], x [d, n, n_view] -> [d, 1 + n, n_view].
 Tensor prepend_token(Graph& g, Tensor token, Tensor x);
 /// x with zeros in all features but the first `count`: [d, n] -> the same shape.
-Tensor first_features(Graph& g, Tensor x, int count);
+Tensor zero_features_after(Graph& g, Tensor x, int count);
 /// The columns of a matrix below each other: [d, n] -> [d * n, 1].
-Tensor one_column(Graph& g, Tensor x);
-/// The same numbers as tokens of another width: [d_x, n, n_view] -> [d, n * d_x / d, n_view].
-Tensor columns(Graph& g, Tensor x, std::int64_t d);
+Tensor flatten(Graph& g, Tensor x);
+/// The same elements as tokens of another width: [d_x, n, n_view] -> [d, n * d_x / d, n_view].
+Tensor reshape_width(Graph& g, Tensor x, std::int64_t d);
 /// Squares of `factor` x `factor` patches become one token: [d, side^2, n_view] -> [d * factor^2, (side / factor)^2,
 /// n_view]. Within a token the patches follow each other row by row. Source: transformers modeling_smolvlm.py
 /// pixel_shuffle.

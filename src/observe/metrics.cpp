@@ -106,7 +106,7 @@ void Metrics::answered(const Answered& answered) try {
   const int code = answered.error == nullptr ? 0 : exit_code(answered.error->code);
   prometheus::Counter*& count = request_[{request.kind, code}];
   if (count == nullptr) count = &requests_.Add({{"kind", kind_name(request.kind)}, {"code", answered.code()}});
-  if (answered.is_beyond) beyond_.Increment();
+  if (answered.out_of_range) beyond_.Increment();
   count->Increment();
   if (answered.stages.empty()) return;
   observe("queue", seconds(answered.started - request.at));

@@ -47,7 +47,7 @@ struct Answered {
   /// The serialized v1::Request and v1::Response, valid during the call only: those that went over the wire, or what an
   /// act of another protocol would have been. Empty where it was refused in that protocol.
   std::span<const std::byte> in, out;
-  bool is_beyond = false;              // answered though the state is beyond the bundle's bound
+  bool out_of_range = false;           // answered though the state is beyond the bundle's bound
   std::span<const std::string> notes;  // of the chunk: warnings, valid during the call only
   const char* code() const { return error == nullptr ? "ok" : code_name(error->code); }
 };

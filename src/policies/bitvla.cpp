@@ -10,7 +10,7 @@
 #include "modules/language/qwen.h"
 #include "modules/language/view_places.h"
 #include "modules/vision/siglip.h"
-#include "nn/only_tokens.h"
+#include "nn/compute_tokens.h"
 #include "nn/tokens.h"
 #include "policies/policy.h"
 
@@ -63,7 +63,7 @@ class BitVla final : public Policy {
     const Tensor stop = lm_.embed(g, constant_ids(g, "stop", {stop_token_}));
     const Tensor y = lm_.bidirectional(g, g.name("prefix", concat_tokens(g, {prompt, actions, stop})));
     // The reference reads each action one row before its slot.
-    cache.put(g, "action_rows", columns(g, only_tokens(g, y, n_text - 1, n_action_token_), d_row_));
+    cache.put(g, "action_rows", reshape_width(g, compute_tokens(g, y, n_text - 1, n_action_token_), d_row_));
   }
 
   Tensor velocity(Graph& g, Tensor /*x_t*/, Tensor /*condition*/, const Cache& cache) const override {
@@ -72,7 +72,7 @@ class BitVla final : public Policy {
 
  private:
   /// Index of the token that the state replaces: the one behind the views.
-  int state_place() const { return places_.n_least(); }
+  int state_place() const { return places_.min_tokens(); }
   Tensor embed(Graph& g, Tensor tokens, int first, int count) const {
     return lm_.embed(g, slice_ids(g, tokens, first, count));
   }

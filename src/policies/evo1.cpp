@@ -73,8 +73,8 @@ class Evo1 final : public Policy {
         masked_rows_(
             static_cast<MaskedRows>(s.choice("masked_rows", {"zero_attention", "causal_attention", "unseen"}))),
         time_scale_(s.precise("time_scale", {1, 1e6})) {
-    s.require(places_.n_least() <= n_token_, "view_starts", fmt::format("places within {} tokens", n_token_),
-              std::to_string(places_.n_least()));
+    s.require(places_.min_tokens() <= n_token_, "view_starts", fmt::format("places within {} tokens", n_token_),
+              std::to_string(places_.min_tokens()));
     s.require(d_robot_ <= d_action_, "d_robot", fmt::format("at most d_action {}", d_action_),
               std::to_string(d_robot_));
   }
@@ -86,9 +86,9 @@ class Evo1 final : public Policy {
     if (shape.n_view > places_.max_views())
       return Error{Code::bad_bundle, "policy.max_views", fmt::format("{} or more, one for each view", shape.n_view),
                    std::to_string(places_.max_views())};
-    if (shape.n_text < places_.n_least() || shape.n_text > n_token_)
+    if (shape.n_text < places_.min_tokens() || shape.n_text > n_token_)
       return Error{Code::bad_bundle, "processor.recipe.text",
-                   fmt::format("{} to {} tokens", places_.n_least(), n_token_), std::to_string(shape.n_text)};
+                   fmt::format("{} to {} tokens", places_.min_tokens(), n_token_), std::to_string(shape.n_text)};
     return check_prefix(1, n_token_, 1);
   }
 
@@ -120,12 +120,12 @@ class Evo1 final : public Policy {
   }
 
   Tensor velocity(Graph& g, Tensor x_t, Tensor time, const Cache& cache) const override {
-    const Tensor action = activate(g, action_in_(g, first_features(g, x_t, d_robot_)), Activation::relu);
+    const Tensor action = activate(g, action_in_(g, zero_features_after(g, x_t, d_robot_)), Activation::relu);
     const Tensor placed = add(g, action, action_position_(g, arange(g, horizon_)));  // [d_model, horizon]
     const Tensor token = action_token_(g, activate(g, action_mix_(g, placed), Activation::relu));
-    const Tensor pooled = pool_(g, one_column(g, head_(g, token, time, cache)));  // [d_model, 1]
+    const Tensor pooled = pool_(g, flatten(g, head_(g, token, time, cache)));  // [d_model, 1]
     const Tensor hidden = activate(g, velocity_in_(g, pooled), Activation::relu);
-    return columns(g, velocity_out_(g, hidden), d_action_);  // [d_action, horizon]
+    return reshape_width(g, velocity_out_(g, hidden), d_action_);  // [d_action, horizon]
   }
 
  private:

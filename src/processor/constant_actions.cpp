@@ -16,7 +16,7 @@ std::vector<std::string> constant_actions(const Processor& processor, int horizo
   };
   const auto low = processor.decode(chunk_of(-1.0f), horizon, d_action, state);
   const auto high = processor.decode(chunk_of(1.0f), horizon, d_action, state);
-  if (!low || !high) return {};  // poses that a chunk of equal numbers is none of
+  if (!low || !high) return {};  // poses that a chunk of equal values is none of
   const std::vector<std::string>& names = processor.action_names();
   std::vector<std::string> constant;
   for (std::size_t column = 0; column < names.size(); ++column) {

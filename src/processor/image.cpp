@@ -22,7 +22,7 @@ constexpr std::int64_t kMaxSide = 1 << 14;
 Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits) {
   const std::string found = fmt::format("{} x {}", width, height);
   if (width < 1 || height < 1) return refused(where, "an image with at least one pixel", found);
-  // Divided, because the product of two hostile numbers may not fit.
+  // Divided, because the product of two hostile sizes may not fit.
   if (width > limits.max_pixels / height)
     return Error{limits.over, where, fmt::format("at most {} pixels", limits.max_pixels), found,
                  "scale the image down"};

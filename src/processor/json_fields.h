@@ -36,7 +36,7 @@ class JsonFields {
   Result<double> wide_number(const std::string& name, Range range);
   /// A list of integers in [low, high], none of them twice.
   Result<std::vector<int>> integers(const std::string& name, int low, int high);
-  /// A list of `count` numbers in `range`.
+  /// A list of `count` elements in `range`.
   Result<std::vector<float>> numbers(const std::string& name, std::size_t count, Range range);
   Result<bool> boolean(const std::string& name);
   Result<std::string> string(const std::string& name);

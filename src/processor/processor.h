@@ -133,7 +133,7 @@ class Processor {
   bool views_behind_ = false;
   std::int32_t view_token_ = -1;
   std::string view_token_text_;
-  std::size_t n_state_ = 0;  // numbers of all states together
+  std::size_t n_state_ = 0;  // values of all states together
   int d_action_ = 0;         // of the network
   int n_row_ = 0;            // that the recipe keeps; 0: all
   bool relative_actions_ = false;

@@ -25,7 +25,7 @@ std::vector<std::uint8_t> resample_opencv(std::span<const std::uint8_t> rgb, int
                                           int to_height);
 
 /// The same with INTER_AREA, for images of three channels: the mean of the part of the image that an output pixel
-/// covers, in integers where both sides shrink by whole numbers and else in float32; where a side grows, two pixels are
+/// covers, in integers where both sides shrink by whole factors and else in float32; where a side grows, two pixels are
 /// blended with weights of 11 binary digits. Source: as above.
 std::vector<std::uint8_t> resample_opencv_area(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                                int to_height);

@@ -51,7 +51,7 @@ std::vector<Tap> make_area_taps(int n_in, int n_out) {
   return taps;
 }
 
-/// One row of the image at its new width; numbers are 2048 times as large as bytes.
+/// One row of the image at its new width; values are 2048 times as large as bytes.
 void widen(const std::uint8_t* row, const std::vector<Tap>& columns, int* out) {
   for (const Tap& tap : columns)
     for (int c = 0; c < 3; ++c)

@@ -20,7 +20,7 @@ Error not_a_request(std::string where, std::string expected, std::string found);
 /// and a hundred when it is parsed into an object, so their number is bounded here, before anything is parsed.
 class Fields {
  public:
-  static constexpr int kMax = 1 << 14;  // the numbers of a state or of noise that are not packed are fields
+  static constexpr int kMax = 1 << 14;  // the values of a state or of noise that are not packed are fields
 
   Fields(std::span<const std::byte> bytes, const char* where);
 

@@ -90,8 +90,8 @@ struct Trial {
   Trial(const LinearKernel& kernel, const MatrixDesc& d, std::int64_t n_row, int n_thread, bool rounded)
       : desc(d),
         s{n_row, d.d_in, d.d_out},
-        x(static_cast<std::size_t>(quantized_size(round_up(s.n_row, kSquare), s.d_in)) * 4),
-        y(static_cast<std::size_t>(round_up(s.n_row, kSquare) * round_up(s.d_out, kSquare)) * 4),
+        x(static_cast<std::size_t>(quantized_size(round_up(s.n_row, kTileSide), s.d_in)) * 4),
+        y(static_cast<std::size_t>(round_up(s.n_row, kTileSide) * round_up(s.d_out, kTileSide)) * 4),
         stored(dtype_size(d.type, s.d_in * s.d_out)),
         packed(kernel.packed_size(desc)),
         scale(static_cast<std::size_t>(s.d_out), 1.0f) {

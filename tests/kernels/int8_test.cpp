@@ -443,7 +443,7 @@ bool lacks(const std::string& name) {
 TEST_CASE("few rows go to a kernel that reads the same packed matrix and the same codes") {
   for (const auto& kernels : {ternary_kernels(), int4_kernels(), int8_kernels()})
     for (const LinearKernel* kernel : kernels) {
-      const LinearKernel& few = kernel->for_rows(1);
+      const LinearKernel& small_batch = kernel->for_batch(1);
       CHECK((few.pack == kernel->pack));
       CHECK((few.quantize != nullptr));
     }

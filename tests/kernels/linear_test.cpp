@@ -80,7 +80,7 @@ class Trial {
   void run() {
     const auto [n_row, d_in, unused] = case_.shape;
     std::vector<std::uint16_t> rounded(
-        static_cast<std::size_t>(rounded_count(kernel_.rounded, round_up(n_row, kSquare), d_in)));
+        static_cast<std::size_t>(rounded_count(kernel_.rounded, round_up(n_row, kTileSide), d_in)));
     for (std::int64_t row = 0; row < n_row; ++row)
       for (std::int64_t k = 0; k < d_in; ++k)
         rounded[place(row, k, d_in)] = to_bf16(x_[static_cast<std::size_t>(row * d_in + k + 1)]);
@@ -130,7 +130,7 @@ class Trial {
     double value, tolerance;
   };
 
-  /// Where number i of a row lies when it is rounded.
+  /// Where element i of a row lies when it is rounded.
   std::size_t place(std::int64_t row, std::int64_t i, std::int64_t d) const {
     return static_cast<std::size_t>(rounded_place(kernel_.rounded, row, i, d));
   }
@@ -385,11 +385,11 @@ TEST_CASE("every machine takes the first row that it can run, and ggml asks for 
 TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds nothing") {
   const MatrixDesc desc = {DType::bf16, 80, 70};
   for (const LinearKernel* kernel : linear_kernels()) {
-    CHECK(&kernel->for_rows(1000) == kernel);
+    CHECK(&kernel->for_batch(1000) == kernel);
     if (kernel->few == nullptr) continue;
-    const LinearKernel& few = kernel->for_rows(kernel->max_few);
+    const LinearKernel& small_batch = kernel->for_batch(kernel->max_small_batch);
     CHECK(&few == kernel->few);
-    CHECK(&kernel->for_rows(kernel->max_few + 1) == kernel);
+    CHECK(&kernel->for_batch(kernel->max_small_batch + 1) == kernel);
     CHECK(few.rounded == RoundedLayout::none);
     CHECK((few.pack == kernel->pack));
     CHECK(few.packed_size(desc) == kernel->packed_size(desc));

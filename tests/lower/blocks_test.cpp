@@ -91,6 +91,6 @@ TEST_CASE("amx: rows stay whole where blocks do not pay" * doctest::skip(lacks(k
     return run(Mlp(inner), false, n_row, n_thread).text.find("blocks") != std::string::npos;
   };
   CHECK(blocks(kInner, kRows, 8));
-  CHECK_FALSE(blocks(kInner, 1024, 2));  // the second cache keeps them all
+  CHECK_FALSE(blocks(kInner, 1024, 2));  // the L2 cache keeps them all
   CHECK_FALSE(blocks(4128, 300, 1));     // too few rows of such a width
 }

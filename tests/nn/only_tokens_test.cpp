@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "nn/only_tokens.h"
+#include "nn/compute_tokens.h"
 
 #include <doctest/doctest.h>
 
@@ -97,7 +97,7 @@ Outcome run(Choose choose, const KernelSet& kernels, const std::string& tap = ""
 TEST_CASE("tokens that are computed alone are those of all, from less work") {
   for (const KernelSet& set : usable_kernels()) {
     CAPTURE(name_of(set));
-    const Outcome all = run(slice_tokens, set), some = run(only_tokens, set);
+    const Outcome all = run(slice_tokens, set), some = run(compute_tokens, set);
     REQUIRE(some.values.size() == kModel * kCount);
     REQUIRE(all.values.size() == some.values.size());
     for (std::size_t i = 0; i < some.values.size(); ++i) CHECK(std::abs(some.values[i] - all.values[i]) <= 1e-5);
@@ -111,7 +111,7 @@ TEST_CASE("what is tapped is computed whole, once") {
   const KernelSet set = usable_kernels().back();
   for (const char* tap : {"first", "second"}) {
     CAPTURE(tap);
-    const Outcome all = run(slice_tokens, set, tap), some = run(only_tokens, set, tap);
+    const Outcome all = run(slice_tokens, set, tap), some = run(compute_tokens, set, tap);
     CHECK((some.flop < all.flop) == (std::string(tap) == "first"));
     CHECK(some.flop <= all.flop);
   }

@@ -66,11 +66,11 @@ TEST_CASE("rows of a table by a part of a list of ids") {
 }
 
 TEST_CASE("features beyond the first few become zero in every column") {
-  CHECK(run_graph([](Graph& g) { return first_features(g, numbers(g, {3, 2}), 2); }) == Values{0, 1, 0, 3, 4, 0});
+  CHECK(run_graph([](Graph& g) { return zero_features_after(g, numbers(g, {3, 2}), 2); }) == Values{0, 1, 0, 3, 4, 0});
 }
 
 TEST_CASE("a matrix as one column and back keeps the order of its columns") {
-  CHECK(run_graph([](Graph& g) { return columns(g, one_column(g, numbers(g, {3, 2})), 2); }) == counted(6));
+  CHECK(run_graph([](Graph& g) { return reshape_width(g, flatten(g, numbers(g, {3, 2})), 2); }) == counted(6));
 }
 
 TEST_CASE("a causal mask hides what comes later and what is never seen, from itself too") {
@@ -101,8 +101,8 @@ TEST_CASE(
   Values both = first;
   for (const float value : first) both.push_back(value + 16);
   CHECK(run_graph(shuffled) == both);
-  CHECK(run_graph([&](Graph& g) { return columns(g, shuffled(g), 2); }) == both);
-  CHECK(run_graph([&](Graph& g) { return one_view(g, columns(g, shuffled(g), 2), 1); }) ==
+  CHECK(run_graph([&](Graph& g) { return reshape_width(g, shuffled(g), 2); }) == both);
+  CHECK(run_graph([&](Graph& g) { return one_view(g, reshape_width(g, shuffled(g), 2), 1); }) ==
         Values(both.begin() + 16, both.end()));
 }
 

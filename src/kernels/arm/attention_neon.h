@@ -7,7 +7,7 @@
 
 namespace vla::kernels {
 
-/// Float32: 6 rows times four vectors, by lanes: four numbers of a row are one load.
+/// Float32: 6 rows times four vectors, by lanes: four elements of a row are one load.
 struct NeonProducts : FloatProducts<Neon, 6, 4> {
   static constexpr int kMinPanel = kPanel, kDepth = 4;
 

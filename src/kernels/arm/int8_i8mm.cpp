@@ -39,7 +39,7 @@ struct MatrixTile {
     }
   }
 
-  /// Lines of four numbers of each column become pairs of columns of eight.
+  /// Lines of four elements of each column become pairs of columns of eight.
   template <class Strips>
   static VLA_INLINE void expand(const Strips& strips, std::int64_t depth, std::byte* to) {
     for (std::int64_t k = 0; k < depth; k += Int8Panels::kGroup, to += 256)
@@ -67,9 +67,9 @@ bool supports(const MatrixDesc& desc, Features use) {
 
 /// Few rows do not repay the two arrangements of pairs: SDOT takes them as they are.
 template <class Panels>
-constexpr LinearKernel kernel(const LinearKernel& few) {
+constexpr LinearKernel kernel(const LinearKernel& small_batch) {
   LinearKernel row = Int8Loop<MatrixTile, Panels>::kernel("i8mm_int8", supports);
-  row.few = &few, row.max_few = 32;
+  row.small_batch = &small_batch, row.max_small_batch = 32;
   return row;
 }
 

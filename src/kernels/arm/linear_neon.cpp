@@ -7,7 +7,7 @@
 namespace vla::kernels {
 namespace {
 
-/// 6 rows by 4 vectors: 24 of the 32 registers are sums. Four numbers of a row of x are one load, and a multiply-add
+/// 6 rows by 4 vectors: 24 of the 32 registers are sums. Four elements of a row of x are one load, and a multiply-add
 /// takes one of them by its lane.
 struct NeonTile {
   using V = Neon;
@@ -20,7 +20,7 @@ struct NeonTile {
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
   static void multiply(DType type, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c,
-                       bool add, const Ahead& ahead) {
+                       bool add, const Prefetch& ahead) {
     with_height<kRows>(n_row, [&]<int n>() {
       if (type == DType::bf16)
         tile<n, Pairs>(x, panel, depth, c, add, ahead.from);
@@ -85,7 +85,7 @@ struct NeonTile {
 #pragma GCC unroll 6
       for (Float& sum : column) sum = zero;
     for (const float* end = x + depth; x < end; x += 4, line += Line::kSize, ahead += 16) {
-      __builtin_prefetch(ahead, 0, 2);  // to the second cache
+      __builtin_prefetch(ahead, 0, 2);  // to the L2 cache
       Float rows[kCount];
 #pragma GCC unroll 6
       for (int r = 0; r < kCount; ++r) rows[r] = V::load(x + r * kXStride);

@@ -10,7 +10,7 @@ namespace {
 
 /// BFMMLA adds the products of four bf16 to a sum in two steps of two. In each it rounds the sum of the two products,
 /// and then their sum with what is there, to odd: to whichever neighbour has an odd last bit, which errs by less than
-/// a unit in the last place, where IEEE's rounding errs by half of one. Numbers below 2^-126 become zeros.
+/// a unit in the last place, where IEEE's rounding errs by half of one. Values below 2^-126 become zeros.
 /// Source: Arm Architecture Reference Manual, BFMatMulAddH and BFRound, where FPCR.EBF is 0, as Linux leaves it.
 struct Bf16Pairs {
   using Sum = float;
@@ -43,7 +43,7 @@ struct NeonBf16Tile {
     std::memcpy(to, &numbers, left >= V::width ? sizeof(numbers) : static_cast<std::size_t>(left) * sizeof(*to));
   }
 
-  // n numbers of a row, and zeros up to a multiple of 32.
+  // n elements of a row, and zeros up to a multiple of 32.
   static VLA_INLINE void copy(const float* from, std::int64_t n, X* to) {
     for (std::int64_t k = 0; k < round_up(n, kPanelDepth); k += kQuad, to += 2 * kQuad)
       store_rounded(to, k < n ? load<V>(from + k, n - k) : V::Float{}, kQuad);
@@ -56,13 +56,13 @@ struct NeonBf16Tile {
   }
 
   static void multiply(DType, int n_row, const X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
-                       const Ahead& ahead) {
+                       const Prefetch& ahead) {
     const std::int64_t n_step = depth / kQuad;
     multiply_mmla<Bf16Pairs>(n_row, reinterpret_cast<const std::byte*>(x), 2 * kXStride * std::int64_t{sizeof(X)},
                              panel, n_step, c, add, {ahead.from, ahead.size / n_step});
   }
 
-  /// Panels of quads: four numbers of each column after the other.
+  /// Panels of quads: four elements of each column after the other.
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
     constexpr std::int64_t kSize = sizeof(X);
     const std::int64_t panel = Panels<kColumns>::size(DType::bf16, round_up(desc.d_in, kPanelDepth));
@@ -90,7 +90,7 @@ struct QuadTile {
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
   static void multiply(DType, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
-                       const Ahead& ahead) {
+                       const Prefetch& ahead) {
     with_height<kRows>(n_row, [&]<int n>() { tile<n>(x, panel, depth, c, add, ahead.from); });
   }
 

@@ -21,7 +21,7 @@ struct PortableTile {
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
   static void multiply(DType type, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c,
-                       bool add, const Ahead&) {
+                       bool add, const Prefetch&) {
     with_height<kRows>(n_row, [&]<int n>() {
       if (type == DType::bf16)
         tile<n, Pairs>(x, panel, depth, c, add);

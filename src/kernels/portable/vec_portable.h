@@ -33,7 +33,7 @@ struct Portable : Lanes<4> {
   }
   /// 1 / x with a relative error of at most 2^-14, zero for infinity.
   static VLA_INLINE Float reciprocal(Float x) { return 1.0f / x; }
-  /// What x is above the whole number below it, and y times two in the power of that whole number.
+  /// What x is above the integer below it, and y times two in the power of that integer.
   static VLA_INLINE Float fraction(Float x) {
     for (int i = 0; i < width; ++i) x[i] = __builtin_isinf(x[i]) ? 0.0f : x[i] - __builtin_floorf(x[i]);
     return x;

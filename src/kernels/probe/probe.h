@@ -34,7 +34,7 @@ const PeakProbe* int8_probe_of(Features use, bool ternary);
 /// bursts within about `seconds`: what the machine can do now, not what other programs leave of it.
 double measure_peak(const PeakProbe& probe, int n_thread, double seconds);
 
-/// Bytes per second that `n_thread` threads read side by side from a memory several times larger than the last cache,
+/// Bytes per second that `n_thread` threads read side by side from a memory several times larger than the L3 cache,
 /// in wall time; the best of the passes within about `seconds`, of which the first pass takes as long as it needs.
 /// 0 where the system does not give the memory.
 double measure_read_bandwidth(int n_thread, double seconds);

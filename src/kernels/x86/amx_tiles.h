@@ -37,9 +37,9 @@ VLA_INLINE void before_tile_loads() { asm volatile("" ::: "memory"); }
 /// After some 2,300 cycles without 512-bit arithmetic the processor turns off what it needs for that, and the next
 /// store of a tile waits for about 950 cycles (measured on Granite Rapids). A loop of tile instructions that may take
 /// so long keeps it awake by a vector addition in each round.
-class AwakeVectors {
+class KeepVectorUnitPowered {
  public:
-  VLA_INLINE ~AwakeVectors() { asm volatile("" ::"m"(sum_)); }  // the compiler does not drop the sum
+  VLA_INLINE ~KeepVectorUnitPowered() { asm volatile("" ::"m"(sum_)); }  // the compiler does not drop the sum
   VLA_INLINE void keep() { sum_ += 1.0f; }
 
  private:

@@ -19,7 +19,7 @@ struct AmxInt8Tile : AmxRounding {
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const ExpandedStrips<2, Packed>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
     // Rows that x does not have are multiplied too; nobody looks at their sums.
-    AwakeVectors vectors;
+    KeepVectorUnitPowered vectors;
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
       add_products(n_row, x + k, x_stride, strips.lines + k * kColumns, kLineOfPair, Int8Panels::kLine);
@@ -47,7 +47,7 @@ struct AmxInt8Tile : AmxRounding {
   template <class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const BytePanels::Strips<2>& strips,
                        std::int64_t depth, std::int32_t* sums, bool add, const Between& between) {
-    AwakeVectors vectors;
+    KeepVectorUnitPowered vectors;
     open(n_row, sums, add);
     for (std::int64_t k = 0; k < depth; k += kDepth) {
       add_products(n_row, x + k, x_stride, strips.strips + k * Int8Panels::kColumns, Int8Panels::kLine, strips.strip);
@@ -77,7 +77,7 @@ struct AmxInt8Tile : AmxRounding {
     _tile_loadd(3, sums + 16 * kColumns + 16, kLine);
   }
 
-  /// x streams past the first cache, where the panel stays. The first operand has a sign, the second has none: lines of
+  /// x streams past the L1 cache, where the panel stays. The first operand has a sign, the second has none: lines of
   /// two strips, with their distances.
   static VLA_INLINE void add_products(int n_row, const std::byte* x, std::int64_t x_stride, const std::byte* lines,
                                       std::size_t line, std::int64_t strip) {

@@ -3,10 +3,10 @@
 //
 // Products of ternary matrices where permutations look sums up beside VNNI.
 //
-// Three ternary numbers by three codes of x have one of 27 sums. A *table* has them all, in 16 bits, in one register.
-// With three numbers of each of 32 columns as indices vpermw finds 32 sums in it, which vpaddw adds: 96 multiply-adds
+// Three ternary elements by three codes of x have one of 27 sums. A *table* has them all, in 16 bits, in one register.
+// With three elements of each of 32 columns as indices vpermw finds 32 sums in it, which vpaddw adds: 96 multiply-adds
 // by two instructions, where VNNI makes 64 by one. Cores of AMD permute and add beside multiplying, so that both ways
-// run side by side: of seven numbers of a column, four are multiplied and three looked up. The sums are the same.
+// run side by side: of seven elements of a column, four are multiplied and three looked up. The sums are the same.
 #include "kernels/int8_loop.h"
 #include "kernels/x86/vec_avx512.h"
 
@@ -20,12 +20,12 @@ using V = Avx512;
 constexpr std::int64_t kRows = 4, kColumns = 64, kStrips = kColumns / Int8Panels::kColumns;
 constexpr std::int64_t kRegister = 64;  // bytes
 
-/// A part of the depth, from k on: n_lookup times three numbers that are looked up, then n_group times four that are
+/// A part of the depth, from k on: n_lookup times three elements that are looked up, then n_group times four that are
 /// multiplied. A tile looks up one and multiplies one at a time, and multiplies the groups that are left over alone.
 struct Step {
   std::int64_t k, n_lookup, n_group;
 
-  /// In lines of 16 numbers, of which three make 16 tables.
+  /// In lines of 16 elements, of which three make 16 tables.
   static constexpr std::int64_t kTableLines = 3, kLines = 14, kMaxLookup = 32, kMaxGroup = 4 * (2 * kLines - 1);
   static_assert(kMaxLookup * 2 * 3 * 127 <= 32767, "sums of 16 bits");
 
@@ -39,7 +39,7 @@ struct Step {
     return {line * Int8Panels::kGroup, n_table * Int8Panels::kGroup, 4 * (lines - kTableLines * n_table)};
   }
   std::int64_t depth() const { return 3 * n_lookup + 4 * n_group; }
-  /// Where the numbers that are multiplied begin.
+  /// Where the elements that are multiplied begin.
   std::int64_t multiplied() const { return k + 3 * n_lookup; }
 };
 
@@ -85,7 +85,7 @@ VLA_INLINE void make_tables(const std::byte* x, std::byte* to) {
   }
 }
 
-/// Indices of a panel's columns into those tables: numbers k of three lines of each strip. A register has those of two
+/// Indices of a panel's columns into those tables: elements k of three lines of each strip. A register has those of two
 /// strips in turn, in the lowest five bits of 16; vpermw ignores the rest.
 VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::byte* to) {
   for (int pair = 0; pair < kStrips / 2; ++pair)
@@ -108,7 +108,7 @@ VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::b
 }
 
 // Registers of a tile: 0 to 15 are sums of four rows by four strips, 16 to 23 those of 16 bits of four rows by two
-// strips in turn, 25 to 28 the numbers of a group, 29 and 30 its indices.
+// strips in turn, 25 to 28 the elements of a group, 29 and 30 its indices.
 // clang-format off
 #define VLA_FOR_SUMS(what)                                                                  \
   what("0", "0") what("1", "64") what("2", "128") what("3", "192")                          \
@@ -203,7 +203,7 @@ void tile(const std::byte* x, std::int64_t stride, const std::byte* numbers, con
 /// block; tables are made of four rows at a time, which all panels share.
 class LookupLoop {
   static constexpr std::int64_t kBlockRows = 108;
-  static constexpr std::int64_t kPanels = 20;                   // whose steps and sums lie in the second cache
+  static constexpr std::int64_t kPanels = 20;                   // whose steps and sums lie in the L2 cache
   static constexpr std::int64_t kManyPanels = 8;                // share the time of making tables
   static constexpr std::int64_t kMinItems = 2, kManyItems = 8;  // for each thread, where there are so many
 
@@ -339,8 +339,8 @@ const LinearKernel kTernaryLookup = {
     .run = LookupLoop::run,
     .scratch_size = LookupLoop::kScratch,
     .max_norm = kAnyDepth,
-    .few = &kTernaryAvx512,
-    .max_few = kFewRows,
+    .small_batch = &kTernaryAvx512,
+    .max_small_batch = kFewRows,
     .quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); },
 };
 

@@ -21,14 +21,14 @@ struct AmxTile : AmxRounding {
   }
 
  private:
-  static constexpr std::size_t kLineX = kSquare * sizeof(std::uint16_t), kLineC = kSquare * sizeof(float);
-  static constexpr std::int64_t kHalf = kSquare / 2 * kSquare;  // numbers of the upper half of a square
+  static constexpr std::size_t kLineX = kTileSide * sizeof(std::uint16_t), kLineC = kTileSide * sizeof(float);
+  static constexpr std::int64_t kHalf = kTileSide / 2 * kTileSide;  // elements of the upper half of a square
 
-  /// All 32 rows, or the first 16. x streams past the first cache, where the panel stays for the next rows.
+  /// All 32 rows, or the first 16. x streams past the L1 cache, where the panel stays for the next rows.
   template <bool kAll, class Between>
   static VLA_INLINE void product(const std::uint16_t* x, const std::byte* panel, std::int64_t n_square, float* c,
                                  bool add, Between& between) {
-    AwakeVectors vectors;
+    KeepVectorUnitPowered vectors;
     before_tile_loads();
     if (add) {
       _tile_loadd(0, c, kLineC);

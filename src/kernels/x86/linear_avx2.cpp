@@ -8,7 +8,7 @@ namespace vla::kernels {
 namespace {
 
 /// 6 rows by 2 vectors: twelve of the sixteen registers are sums, enough to hide the latency of two multiply-adds a
-/// cycle. What widens stored numbers runs beside the multiply-adds.
+/// cycle. What widens stored elements runs beside the multiply-adds.
 struct Avx2Tile {
   using V = Avx2;
   using X = float;
@@ -20,7 +20,7 @@ struct Avx2Tile {
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
   static void multiply(DType type, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c,
-                       bool add, const Ahead& ahead) {
+                       bool add, const Prefetch& ahead) {
     with_height<kRows>(n_row, [&]<int n>() {
       if (type == DType::bf16)
         tile<n, Pairs>(x, panel, depth, c, add, ahead.from);
@@ -61,7 +61,7 @@ struct Avx2Tile {
 #pragma GCC unroll 6
     for (int r = 0; r < kCount; ++r) left[r] = right[r] = _mm256_setzero_ps();
     for (const float* end = x + depth; x < end; ahead += 128) {
-      __builtin_prefetch(ahead, 0, 2);  // to the second cache
+      __builtin_prefetch(ahead, 0, 2);  // to the L2 cache
       __builtin_prefetch(ahead + 64, 0, 2);
       for (int i = 0; i < kPanelDepth; i += Line::kDepth, line += Line::kSize, x += Line::kDepth)
 #pragma GCC unroll 2

@@ -5,8 +5,8 @@
 namespace vla::kernels {
 namespace {
 
-/// 12 rows by 2 vectors: 24 sums. Numbers of a panel are widened as they are loaded, so that a step of it takes half of
-/// the first cache and leaves the rest to x.
+/// 12 rows by 2 vectors: 24 sums. Elements of a panel are widened as they are loaded, so that a step of it takes half
+/// of the L1 cache and leaves the rest to x.
 struct Avx512Tile {
   using V = Avx512;
   using X = float;
@@ -18,7 +18,7 @@ struct Avx512Tile {
   static VLA_INLINE void copy(const float* from, std::int64_t n, float* to) { copy_padded(from, n, to); }
 
   static void multiply(DType type, int n_row, const float* x, const std::byte* panel, std::int64_t depth, float* c,
-                       bool add, const Ahead& ahead) {
+                       bool add, const Prefetch& ahead) {
     const auto rows = type == DType::bf16  ? multiply_rows<Pairs>
                       : type == DType::f16 ? multiply_rows<Halves>
                                            : multiply_rows<Floats>;

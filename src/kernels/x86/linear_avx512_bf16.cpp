@@ -27,7 +27,7 @@ struct Avx512Bf16Tile {
   static VLA_INLINE void copy(const X* from, std::int64_t n, X* to) { copy_padded(from, n, to); }
 
   static void multiply(DType, int n_row, const X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
-                       const Ahead& ahead) {
+                       const Prefetch& ahead) {
     multiply_rows<Pairs>(n_row, x, panel, depth, c, add, ahead);
   }
 

@@ -11,12 +11,12 @@ namespace vla::kernels {
 
 constexpr int kAvx512Rows = 12;
 
-/// `Step` says what a step multiplies: X and kCount (numbers of x), kXStride (from one row of x to the next), kBlock
+/// `Step` says what a step multiplies: X and kCount (elements of x), kXStride (from one row of x to the next), kBlock
 /// (the depth of a panel's block), kSize (bytes of a number in the panel), load(panel, i) (a vector of 16 columns for
-/// step i from `panel` on), everywhere(x) (one step of x for all columns), and add(sum, value, numbers).
+/// step i from `panel` on), everywhere(x) (one step of x for all columns), and add(sum, value, weights).
 template <class Step, int kCount>
 void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
-                   const Ahead& ahead) {
+                   const Prefetch& ahead) {
   constexpr int kSteps = 4, kDepth = kSteps * Step::kCount;
   const std::int64_t n_line = ceil_div(ahead.size * kDepth, 64 * depth);  // of the cache, for each kDepth of the depth
   const std::byte* next = ahead.from;
@@ -50,7 +50,7 @@ void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64
 /// The same for any number of rows.
 template <class Step>
 void multiply_rows(int n_row, const typename Step::X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
-                   const Ahead& ahead) {
+                   const Prefetch& ahead) {
   with_height<kAvx512Rows>(n_row, [&]<int n>() { multiply_tile<Step, n>(x, panel, depth, c, add, ahead); });
 }
 

@@ -61,7 +61,7 @@ constexpr float kFactor = 0.999f, kTerm = 0.001f;
   VLA_SUM_LOOP(VLA_28_SUMS, "vdpbf16ps %%zmm30, %%zmm31, %%zmm\\sum\n", VLA_32_REGISTERS);
 }
 
-/// Sums of three numbers that a permutation looks up, 32 of them, beside VNNI (int8_lookup_avx512.cpp): 96
+/// Sums of three elements that a permutation looks up, 32 of them, beside VNNI (int8_lookup_avx512.cpp): 96
 /// multiply-adds by each permutation and its addition, two products of 64 meanwhile.
 [[gnu::target("avx512f")]] void multiply_add_lookup(long n_round) {
   VLA_SUM_LOOP("0,1,2,3,4,5,6,7",
@@ -99,7 +99,7 @@ struct alignas(64) TileConfig {
 
 constexpr TileConfig kTiles;  // constant memory: the intrinsic does not tell the compiler that it reads all of it
 
-/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero. With numbers that differ the same loop has 86 % of this
+/// Tiles 0 to 5 sum products of tiles 6 and 7, which are zero. With elements that differ the same loop has 86 % of this
 /// rate on Granite Rapids (docs/performance.md), so that no product reaches it.
 // clang-format off
 #define VLA_TILE_LOOP(multiply_add)                                                \

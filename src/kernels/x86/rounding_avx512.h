@@ -19,7 +19,7 @@ VLA_INLINE void store_bf16(std::uint16_t* to, Avx512::Float a, Avx512::Float b) 
   std::memcpy(to, &numbers, sizeof(numbers));
 }
 
-/// A vector, or the `left` numbers of it that there are.
+/// A vector, or the `left` elements of it that there are.
 VLA_INLINE void store_bf16(std::uint16_t* to, Avx512::Float x, std::int64_t left) {
   const __m256bh numbers = _mm512_cvtneps_pbh(x);
   std::memcpy(to, &numbers, left >= 16 ? sizeof(numbers) : static_cast<std::size_t>(left) * sizeof(*to));

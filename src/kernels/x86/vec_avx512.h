@@ -10,7 +10,7 @@ namespace vla::kernels {
 struct Avx512 : Lanes<16> {
   static VLA_INLINE Float set(float x) { return _mm512_set1_ps(x); }
   static VLA_INLINE Float fma(Float a, Float b, Float c) { return _mm512_fmadd_ps(a, b, c); }
-  /// For 1 / b among the normal numbers, with a relative error of 2^-23.9: the instruction's 2^-14 and one correction,
+  /// For 1 / b among the normal floats, with a relative error of 2^-23.9: the instruction's 2^-14 and one correction,
   /// in a third of the time of a division.
   static VLA_INLINE Float divide(Float a, Float b) {
     const Float inverse = reciprocal(b), quotient = a * inverse;

@@ -12,13 +12,13 @@ namespace {
 /// Each block reads all weights: of fewer rows they would not come as fast as they are multiplied.
 constexpr std::int64_t kMinBlockRows = 128;
 
-/// How many blocks of rows keep `x` in the second cache from the product that makes it to the one that reads it; 0
+/// How many blocks of rows keep `x` in the L2 cache from the product that makes it to the one that reads it; 0
 /// where it stays there without blocks, or would not with blocks that pay.
 std::int64_t n_block_of(const CpuLowering& l, const Value& x, const kernels::LinearKernel& reader) {
   if (rounded(x) != kernels::RoundedLayout::tiles) return 0;
-  const std::int64_t d = kernels::round_up(x.shape[0], kernels::kSquare), n_row = count(x.shape) / x.shape[0];
-  const std::int64_t max_rows = reader.kept_x / d / kernels::kSquare * kernels::kSquare;
-  if (max_rows < kMinBlockRows || n_row * d <= 2 * reader.kept_x) return 0;
+  const std::int64_t d = kernels::round_up(x.shape[0], kernels::kTileSide), n_row = count(x.shape) / x.shape[0];
+  const std::int64_t max_rows = reader.l2_elements / d / kernels::kTileSide * kernels::kTileSide;
+  if (max_rows < kMinBlockRows || n_row * d <= 2 * reader.l2_elements) return 0;
   const std::int64_t n_block = kernels::round_up(kernels::ceil_div(n_row, max_rows), l.n_thread);
   return n_row / n_block >= kMinBlockRows ? n_block : 0;
 }
@@ -34,7 +34,7 @@ std::map<ValueId, std::vector<CpuOp*>> readers_of(CpuLowering& l) {
 /// `up` becomes part of `down`, which alone reads what it makes, and is left without results.
 void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block) {
   const ValueId inner = up.writes[0];
-  l.value(inner).home = Value::Home::thread;
+  l.value(inner).placement = Value::Placement::thread;
   CpuOp both;
   both.reads = up.reads, both.writes = down.writes, both.order = down.order;
   std::copy_if(down.reads.begin(), down.reads.end(), std::back_inserter(both.reads),
@@ -57,7 +57,7 @@ void choose_blocks(CpuLowering& l) {
     if (found == readers.end() || found->second.size() != 1) continue;
     CpuOp& down = *found->second[0];
     const auto* reader = std::get_if<LinearOp>(&down.op);
-    if (reader == nullptr || reader->x != inner || l.value(inner).home != Value::Home::arena) continue;
+    if (reader == nullptr || reader->x != inner || l.value(inner).placement != Value::Placement::arena) continue;
     if (const std::int64_t n_block = n_block_of(l, l.value(inner), kernel_of(l, *reader))) join(l, up, down, n_block);
   }
   std::erase_if(l.ops, [](const CpuOp& op) { return op.writes.empty(); });

@@ -26,24 +26,24 @@ Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& 
 Status CpuProgram::give_addresses(CpuLowering& l) {
   std::size_t size = aligned(l.kept_size);
   for (const Value& value : l.values)
-    if (value.home == Value::Home::constant) size += aligned(value.size);
+    if (value.placement == Value::Placement::constant) size += aligned(value.size);
   VLA_TRY(own_, Memory::allocate(size, "constants"));
   std::byte* next = own_.data() + aligned(l.kept_size);
   const auto address = [&](const Value& value) -> std::byte* {
-    switch (value.home) {
-      case Value::Home::arena:
+    switch (value.placement) {
+      case Value::Placement::arena:
         return arena_.data() + value.begin;
-      case Value::Home::kept:
+      case Value::Placement::kept:
         return own_.data() + value.begin;
-      case Value::Home::slot:
+      case Value::Placement::slot:
         return static_cast<std::byte*>(value.slot->place);
-      case Value::Home::parameter:
+      case Value::Placement::parameter:
         return const_cast<std::byte*>(l.weights.data(value.node->as<op::Parameter>()->param));
-      case Value::Home::constant:
+      case Value::Placement::constant:
         std::visit([&](const auto& elements) { std::memcpy(next, elements.data(), value.size); },
                    value.node->as<op::Constant>()->values);
         return std::exchange(next, next + aligned(value.size));
-      case Value::Home::thread:
+      case Value::Placement::thread:
         break;
     }
     return nullptr;  // a thread's own

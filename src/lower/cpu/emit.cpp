@@ -17,7 +17,7 @@ using kernels::Worker;
 
 /// A product of fewer operations takes about as long as waking a thread.
 constexpr double kMinSharedFlop = 2e6;
-/// Numbers of an item of what is not a product.
+/// Elements of an item of what is not a product.
 constexpr std::int64_t kItemNumbers = 16384;
 
 std::byte* address(const CpuLowering& l, ValueId id) {
@@ -47,9 +47,9 @@ struct BlockedTask : Task {
   std::size_t inner;
 
   void run(std::int64_t item, Worker& worker) const override {
-    const std::int64_t n_square = kernels::ceil_div(job[0].n_row, kernels::kSquare);
-    const std::int64_t first = n_square * item / n_item * kernels::kSquare;
-    const std::int64_t n = kernels::min(n_square * (item + 1) / n_item * kernels::kSquare, job[0].n_row) - first;
+    const std::int64_t n_square = kernels::ceil_div(job[0].n_row, kernels::kTileSide);
+    const std::int64_t first = n_square * item / n_item * kernels::kTileSide;
+    const std::int64_t n = kernels::min(n_square * (item + 1) / n_item * kernels::kTileSide, job[0].n_row) - first;
     kernels::LinearJob up = rows_of(job[0], first, n), down = rows_of(job[1], first, n);
     // Each product starts anew: jobs of other blocks lay at the same addresses.
     up.part[up.n_part - 1].y = worker.scratch_from(inner);
@@ -59,7 +59,7 @@ struct BlockedTask : Task {
   }
 
  private:
-  /// The job for n rows from `first` on, a multiple of kSquare, since bf16 lies in tiles.
+  /// The job for n rows from `first` on, a multiple of kTileSide, since bf16 lies in tiles.
   static kernels::LinearJob rows_of(kernels::LinearJob job, std::int64_t first, std::int64_t n) {
     const auto offset = [&](DType type, std::int64_t d, std::int64_t stride) {
       return type == DType::bf16 ? 2 * kernels::place_in_tiles(first, 0, d)
@@ -209,7 +209,7 @@ struct PatchesTask : Task {
   }
 };
 
-/// Cuts rows of d numbers into items for the threads, and says how many rows an item has.
+/// Cuts rows of d elements into items for the threads, and says how many rows an item has.
 std::int64_t item_rows(const CpuLowering& l, std::int64_t n_row, std::int64_t d, std::int64_t& n_item) {
   const std::int64_t wanted = l.n_thread == 1 ? 1 : std::min<std::int64_t>(n_row * d / kItemNumbers, 8 * l.n_thread);
   const std::int64_t rows = kernels::ceil_div(n_row, std::max<std::int64_t>(1, wanted));
@@ -308,14 +308,14 @@ std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const LinearOp
   return task;
 }
 
-/// Scratch memory of a thread: the kernels', and behind it the numbers between the products of a block.
+/// Scratch memory of a thread: the kernels', and behind it the elements between the products of a block.
 struct BlockedScratch {
   std::size_t kernels, inner;
 };
 BlockedScratch scratch_sizes(const CpuLowering& l, const BlockedOp& blocked) {
   const Value& inner = l.value(blocked.products[0].writes[0]);
-  const std::int64_t d = inner.shape[0], n_square = kernels::ceil_div(count(inner.shape) / d, kernels::kSquare);
-  const std::int64_t n_row = kernels::ceil_div(n_square, blocked.n_block) * kernels::kSquare;
+  const std::int64_t d = inner.shape[0], n_square = kernels::ceil_div(count(inner.shape) / d, kernels::kTileSide);
+  const std::int64_t n_row = kernels::ceil_div(n_square, blocked.n_block) * kernels::kTileSide;
   return {aligned(std::max(scratch_of(l, blocked.products[0]), scratch_of(l, blocked.products[1]))),
           2 * static_cast<std::size_t>(kernels::rounded_count(rounded(inner), n_row, d))};
 }

@@ -36,7 +36,7 @@ class Layouts {
     const ValueId copy = static_cast<ValueId>(l.values.size());
     Value& to = l.values.emplace_back(Value(l.value(id)));
     to.shape[0] = d;
-    to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.home = Value::Home::arena;
+    to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.placement = Value::Placement::arena;
     to.slot = nullptr, to.size = static_cast<std::size_t>(count(to.shape)) * 4;
     Shape from_stride = l.value(id).stride;
     if (l.value(id).shape[0] != d) from_stride[0] = 0;
@@ -50,7 +50,7 @@ class Layouts {
   void require(ValueId& id, bool fits) {
     if (!fits) id = copied(id, l.value(id).shape[0]);
   }
-  /// Numbers of a row follow each other.
+  /// Elements of a row follow each other.
   void require_rows(ValueId& id) {
     if (id != kNone) require(id, l.value(id).shape[0] == 1 || l.value(id).stride[0] == 1);
   }
@@ -126,7 +126,7 @@ class Layouts {
     for (const ValueId id : op.writes) round_result(id, kernel_of(l, linear).y_layout(linear.linears[0]->in[0].dim(0)));
   }
   void round_result(const CpuOp& op, const AttentionOp& node) {
-    if (l.value(op.writes[0]).shape[0] % kernels::kSquare == 0)
+    if (l.value(op.writes[0]).shape[0] % kernels::kTileSide == 0)
       round_result(op.writes[0], attention(node.rounds).rounded);
   }
 
@@ -137,7 +137,7 @@ class Layouts {
   /// What only products and attention read is stored as they would round it.
   void round_result(ValueId id, kernels::RoundedLayout layout) {
     Value& y = l.value(id);
-    if (layout == kernels::RoundedLayout::none || y.home != Value::Home::arena) return;
+    if (layout == kernels::RoundedLayout::none || y.placement != Value::Placement::arena) return;
     for (const Value* view : views_[id])
       if (view->node != nullptr && view->node->tapped) return;
     for (const auto& [op, read] : reads_[id])
@@ -182,7 +182,7 @@ class Layouts {
 
 const kernels::LinearKernel& kernel_of(const CpuLowering& l, const LinearOp& op) {
   const Shape& x = op.linears[0]->in[0].node()->shape;
-  return l.weights.kernel(op.linears[0]->as<op::Linear>()->weight)->for_rows(count(x) / x[0]);
+  return l.weights.kernel(op.linears[0]->as<op::Linear>()->weight)->for_batch(count(x) / x[0]);
 }
 
 void choose_layouts(CpuLowering& l, std::vector<FusedOp> ops) { Layouts(l).run(std::move(ops)); }

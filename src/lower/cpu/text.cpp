@@ -61,14 +61,14 @@ struct Describe {
 
 std::string layout(const CpuLowering& l, ValueId id) {
   const Value& value = l.value(id);
-  const char* home = l.base(id).home == Value::Home::slot     ? "@slot"
-                     : l.base(id).home == Value::Home::kept   ? "@kept"
-                     : l.base(id).home == Value::Home::thread ? "@thread"
-                                                              : "";
+  const char* place = l.base(id).placement == Value::Placement::slot     ? "@slot"
+                      : l.base(id).placement == Value::Placement::kept   ? "@kept"
+                      : l.base(id).placement == Value::Placement::thread ? "@thread"
+                                                                         : "";
   if (value.node == nullptr && value.size > 0 && value.stride == Shape{1, 1, 1, 1})
-    return fmt::format("panels{}", home);
+    return fmt::format("panels{}", place);
   return fmt::format("{}{}{}{}", dtype_name(value.type),
-                     rounded(value) == kernels::RoundedLayout::tiles ? " tiles " : "", shape_text(value.shape), home);
+                     rounded(value) == kernels::RoundedLayout::tiles ? " tiles " : "", shape_text(value.shape), place);
 }
 
 }  // namespace

@@ -61,7 +61,7 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
   std::vector<std::size_t> begins(l.values.size(), 0);
   for (std::size_t i = 0; i < l.values.size(); ++i) {
     const Value& value = l.values[i];
-    if (value.home != Value::Home::constant || value.base != static_cast<ValueId>(i)) continue;
+    if (value.placement != Value::Placement::constant || value.base != static_cast<ValueId>(i)) continue;
     begins[i] = constants.size();
     constants.resize(constants.size() + aligned(l, value.size));
     std::visit([&](const auto& elements) { std::memcpy(&constants[begins[i]], elements.data(), value.size); },
@@ -75,18 +75,18 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
   }
   const auto address = [&](std::size_t i) -> cuda::Address {
     const Value& value = l.values[i];
-    switch (value.home) {
-      case Value::Home::arena:
+    switch (value.placement) {
+      case Value::Placement::arena:
         return arena.address() + value.begin;
-      case Value::Home::kept:
+      case Value::Placement::kept:
         return own_->address() + value.begin;
-      case Value::Home::slot:
+      case Value::Placement::slot:
         return reinterpret_cast<cuda::Address>(value.slot->place);
-      case Value::Home::parameter:
+      case Value::Placement::parameter:
         return l.weights[*value.node->as<op::Parameter>()->param].data;
-      case Value::Home::constant:
+      case Value::Placement::constant:
         return own_->address() + kept + begins[i];
-      case Value::Home::thread:
+      case Value::Placement::thread:
         break;
     }
     return 0;

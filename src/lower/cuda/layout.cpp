@@ -160,7 +160,8 @@ class Layouts {
   /// What a product or attention makes and nobody else reads is stored rounded.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
-    const bool is_whole = x.base == what.x && x.home == Value::Home::arena && x.node != nullptr && !x.node->tapped;
+    const bool is_whole =
+        x.base == what.x && x.placement == Value::Placement::arena && x.node != nullptr && !x.node->tapped;
     if (what.norm != nullptr || to.type != DType::bf16 || !is_whole || n_reader_[what.x] != 1) return;
     const auto maker = std::find_if(l.ops.begin(), l.ops.end(),
                                     [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == what.x; });

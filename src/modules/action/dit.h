@@ -49,7 +49,7 @@ class Dit {
 
   int d_model() const { return d_model_; }
   int d_out() const { return d_out_; }
-  /// Numbers in a column of modulations.
+  /// Elements in a column of modulations.
   int d_modulations() const { return 2 * d_model_ * (static_cast<int>(blocks_.size()) + 1); }
 
  private:

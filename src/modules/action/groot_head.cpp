@@ -44,7 +44,7 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
 }
 
 Tensor GrootHead::condition(Graph& g, std::span<const SolverTime> times) const {
-  // The reference makes a whole number of the time in double.
+  // The reference makes an integer of the time in double.
   std::vector<int> buckets;
   for (const SolverTime& time : times) buckets.push_back(static_cast<int>(time.exact * n_bucket_));
   const auto embedded = [&](int d, BucketWaves waves) {
@@ -63,7 +63,7 @@ Tensor GrootHead::context(Graph& g, Tensor features) const {
 
 void GrootHead::prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const {
   dit_.prepare(g, text, image, cache);
-  const Tensor rows = n_state_row_ > 1 ? columns(g, state, state.dim(0) / n_state_row_) : state;
+  const Tensor rows = n_state_row_ > 1 ? reshape_width(g, state, state.dim(0) / n_state_row_) : state;
   const Tensor hidden = activate(g, state_in_(g, rows), Activation::relu);
   cache.put(g, state_out_.path(), state_out_.forward(g, hidden));  // [d_dit, n_state_row]
   if (future_) cache.put(g, future_->path(), future_->forward(g, arange(g, n_future_)));

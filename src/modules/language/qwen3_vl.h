@@ -13,7 +13,7 @@
 
 namespace vla {
 
-/// mRoPE position ids of a prompt's tokens: those of a image of n_row x n_column tokens, which starts at each of
+/// mRoPE position ids of a prompt's tokens: those of an image of n_row x n_column tokens, which starts at each of
 /// `view_starts`, share a time and count rows and columns from it; text counts on behind the farthest of them. Source:
 /// transformers modeling_qwen3_vl.py Qwen3VLModel.get_rope_index.
 std::vector<PositionId> mrope_position_ids(std::span<const int> view_starts, int n_row, int n_column, int n_token);

@@ -18,13 +18,13 @@ ViewPlaces::ViewPlaces(const Scope& s, int n_view_token, Count count)
   for (const int n : counts_) apart = apart && n > 0;
   if (apart) {
     // Text sees text: the first token is no image's.
-    n_least_ = back ? 1 + counts_.front() : counts_.back() + n_view_token_;
+    min_tokens_ = back ? 1 + counts_.front() : counts_.back() + n_view_token_;
     int end = 1;
-    for (const int start : starts(n_least_)) {
+    for (const int start : starts(min_tokens_)) {
       apart = apart && start >= end;
       end = start + n_view_token_;
     }
-    apart = apart && end <= n_least_;
+    apart = apart && end <= min_tokens_;
   }
   s.require(apart, back ? "view_starts_from_end" : "view_starts",
             fmt::format("max_views places of {} tokens each, behind the first token", n_view_token_),
@@ -42,8 +42,8 @@ Status ViewPlaces::check(int n_view, int n_token) const {
   if (n_view != max_views())
     return Error{Code::bad_bundle, "policy.max_views", fmt::format("{}, one for each view", n_view),
                  std::to_string(max_views())};
-  if (n_token >= n_least_) return {};
-  return Error{Code::bad_bundle, "processor.recipe.text", fmt::format("{} tokens or more, for the views", n_least_),
+  if (n_token >= min_tokens_) return {};
+  return Error{Code::bad_bundle, "processor.recipe.text", fmt::format("{} tokens or more, for the views", min_tokens_),
                std::to_string(n_token)};
 }
 

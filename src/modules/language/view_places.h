@@ -44,10 +44,10 @@ class ViewPlaces {
   /// Index of the first token of every view.
   std::vector<int> starts(int n_token) const;
   /// Tokens of the shortest prompt.
-  int n_least() const { return n_least_; }
+  int min_tokens() const { return min_tokens_; }
 
  private:
-  int n_view_token_, n_least_ = 1;
+  int n_view_token_, min_tokens_ = 1;
   Count count_;
   std::vector<int> counts_;  // as the key has them
 };

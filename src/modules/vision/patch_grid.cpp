@@ -33,7 +33,7 @@ struct Window {
   int at(std::size_t i) const { return first + static_cast<int>(i); }
 };
 
-/// torch's bilinear resize of `n_in` numbers to `n_out`, antialiased.
+/// torch's bilinear resize of `n_in` values to `n_out`, antialiased.
 std::vector<Window> windows(int n_in, int n_out) {
   const double scale = static_cast<double>(n_in) / n_out, support = std::max(scale, 1.0);
   std::vector<Window> windows;

@@ -10,7 +10,7 @@
 
 namespace vla {
 
-/// Rows and columns of the patches of a image whose squares of `merge` x `merge` patches follow each other row by
+/// Rows and columns of the patches of an image whose squares of `merge` x `merge` patches follow each other row by
 /// row, and the patches of a square likewise: [n_row * n_column], time 0. Source: transformers modeling_qwen3_vl.py
 /// Qwen3VLVisionModel.rot_pos_emb.
 std::vector<PositionId> merge_block_places(int n_row, int n_column, int merge);
@@ -27,7 +27,7 @@ struct PositionBlend {
 /// fast_pos_embed_interpolate.
 PositionBlend blend_positions(const std::vector<PositionId>& places, int n_row, int n_column, int n_side);
 
-/// The same table resized as a image is: bilinear, with antialiasing where it shrinks, for patches row by row.
+/// The same table resized as an image is: bilinear, with antialiasing where it shrinks, for patches row by row.
 /// Source: transformers modeling_siglip2.py Siglip2VisionEmbeddings.resize_positional_embeddings.
 PositionBlend resize_positions(int n_row, int n_column, int n_side);
 

@@ -15,7 +15,8 @@ PatchMerger::PatchMerger(const Scope& s, Norm norm, int d_vision, int count, int
       down_(s / "down", d_token_, d_model, Bias::yes) {}
 
 Tensor PatchMerger::forward(Graph& g, Tensor x) const {
-  const Tensor token = kind_ == Norm::patch ? columns(g, norm_(g, x), d_token_) : norm_(g, columns(g, x, d_token_));
+  const Tensor token =
+      kind_ == Norm::patch ? reshape_width(g, norm_(g, x), d_token_) : norm_(g, reshape_width(g, x, d_token_));
   return down_.forward(g, activate(g, up_(g, token), Activation::gelu_erf));
 }
 

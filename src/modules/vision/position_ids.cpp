@@ -12,9 +12,9 @@
 namespace vla {
 namespace {
 
-/// torch.arange(1/n, 1, 1/n) in float32. Vectors of `width` numbers start at a rounded multiple and count on from there
-/// in double; they come in pairs, and what is left over is made one by one. So the last bits depend on the machine: 8
-/// with AVX2 and AVX-512, 4 with NEON, 1 without vectors.
+/// torch.arange(1/n, 1, 1/n) in float32. Vectors of `width` elements start at a rounded multiple and count on from
+/// there in double; they come in pairs, and what is left over is made one by one. So the last bits depend on the
+/// machine: 8 with AVX2 and AVX-512, 4 with NEON, 1 without vectors.
 std::vector<float> boundaries(int n_table, int width) {
   const double step = 1.0 / n_table;
   const int count = static_cast<int>(std::ceil((1.0 - step) / step));

@@ -58,7 +58,7 @@ void QwenVit::keep(Graph& g, Cache& cache) const {
 
 std::vector<Tensor> QwenVit::operator()(Graph& g, Tensor images, const Cache& cache) const {
   const Tensor pixels = patches(g, images, patch_size_);
-  const Tensor ordered = columns(g, pixel_shuffle(g, pixels, n_column_, merge_), pixels.dim(0));
+  const Tensor ordered = reshape_width(g, pixel_shuffle(g, pixels, n_column_, merge_), pixels.dim(0));
   Tensor x = add(g, patch_embed_.forward(g, ordered), patch_embed_next_(g, ordered));
   x = add(g, g.name(patch_embed_.path(), x), cache.get(g, position_.path()));
   const Tensor rotary = grid_rotary_table(g, d_model_ / n_head_, rope_base_, places());

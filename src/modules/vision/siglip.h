@@ -25,7 +25,7 @@ class Siglip {
 
   int d_model() const { return d_model_; }
   int patch_size() const { return patch_size_; }
-  /// Rows of the position table: patches of a image of `image_size`.
+  /// Rows of the position table: patches of an image of `image_size`.
   int n_position() const { return n_table_ * n_table_; }
 
  private:

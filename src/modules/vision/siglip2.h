@@ -11,7 +11,7 @@
 namespace vla {
 
 /// The vision tower of SigLIP 2 on images of any aspect, every view in one batch: its position table is resized to
-/// the patches of a image. Source: transformers modeling_siglip2.py Siglip2VisionTransformer.
+/// the patches of an image. Source: transformers modeling_siglip2.py Siglip2VisionTransformer.
 class Siglip2 {
  public:
   explicit Siglip2(const Scope& s);

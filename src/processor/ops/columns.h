@@ -56,7 +56,7 @@ struct Clip {
   SomeColumns columns = {};
 };
 
-/// Numbers to whole numbers: how many of `count` evenly spaced edges from `low` on (`high` left out) are not above,
+/// Values to integers: how many of `count` evenly spaced edges from `low` on (`high` left out) are not above,
 /// less 1.
 struct Bins {
   double low = 0.0;
@@ -67,7 +67,7 @@ struct Bins {
 /// Conventions of robots and of prompts, on single columns of a state or of an action row. The reference computes them
 /// in double precision, and each result is rounded to float32 once. Columns must lie inside `values`.
 
-/// `x * scale + shift`, in place: a flipped joint is scale -1, a gripper's range is any two numbers.
+/// `x * scale + shift`, in place: a flipped joint is scale -1, a gripper's range is any two values.
 void map_columns(const ColumnAffine& op, std::span<float> values);
 
 /// The angle of a gripper's servo horn (radians) from the opening x (metres) that a value stands for, in place:
@@ -87,7 +87,7 @@ void map_columns(const Sign& op, std::span<float> values);
 /// is still found.
 void hold(const Clip& op, std::span<float> values);
 
-/// The whole number of each value: how many edges low + i * (high - low) / count, i in [0, count), are not above it,
+/// The integer of each value: how many edges low + i * (high - low) / count, i in [0, count), are not above it,
 /// less 1. So it is -1 below `low` and count - 1 from the last edge on. Comparisons are exact. NaN must not come here.
 /// Source: numpy digitize and linspace, as in lerobot policies/pi05/processor_pi05.py.
 std::vector<int> bins(const Bins& op, std::span<const float> values);

@@ -23,7 +23,7 @@ struct NormRule {
   /// eps both ways. Without any, where the spread is 0: zero gives 0 for x, kept leaves x as it is, kept_both_ways also
   /// on the way back.
   enum class Eps { divides, replaces_zero, added, zero, kept, kept_both_ways };
-  /// numpy: float32 numbers and float64 statistics in one formula, as numpy does it. What has no statistic in it is
+  /// numpy: float32 values and float64 statistics in one formula, as numpy does it. What has no statistic in it is
   /// rounded to float32; what a range gives back is not rounded.
   enum class Arithmetic { float32, float64, numpy };
 
@@ -44,7 +44,7 @@ std::span<const NormRule> norm_rules();
 /// The rule of a kind that exists.
 const NormRule& norm_rule(std::string_view kind);
 
-/// Maps numbers between world units and the network's, per column, in the reference's order of operations.
+/// Maps values between world units and the network's, per column, in the reference's order of operations.
 class Normalizer {
  public:
   enum class Direction { normalize, unnormalize };
@@ -58,7 +58,7 @@ class Normalizer {
   Normalizer(const NormRule& rule, Direction direction, double eps, std::vector<double> low,
              const std::vector<double>& high);
 
-  /// What a number of a column becomes, in the action with this index where the numbers are actions.
+  /// What a value of a column becomes, in the action with this index where the values are actions.
   double map(float x, std::size_t column, std::size_t row = 0) const;
 
  private:

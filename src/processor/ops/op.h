@@ -77,9 +77,9 @@ struct StateLayout {
   const Bundle& bundle;
   const FeatureNames& features;
   std::span<const int> dims;  // of each feature
-  std::size_t n_state;        // numbers of all features together
+  std::size_t n_state;        // values of all features together
   std::size_t width;          // what the ops so far leave of them
-  std::size_t n_unmoved;      // the first numbers, which ops that widen a state leave at their places
+  std::size_t n_unmoved;      // the first values, which ops that widen a state leave at their places
 };
 
 class StateOp {
@@ -122,7 +122,7 @@ class ActionOp {
   virtual ~ActionOp() = default;
   /// Reads statistics, checks sizes, and changes the layout where the op does. Errors: bad_bundle.
   virtual Status bind(ActionLayout& layout, const std::string& where) = 0;
-  /// One row, in place. Its numbers are float32, but for those of an op that says otherwise; the last are rounded.
+  /// One row, in place. Its values are float32, but for those of an op that says otherwise; the last are rounded.
   virtual void apply(std::vector<double>& row, const RowPlace& place) const = 0;
   /// Whether `apply` takes this column from the network's units by statistics.
   virtual bool unnormalizes(std::size_t /*column*/) const { return false; }
@@ -136,7 +136,7 @@ inline constexpr int kMaxViews = 32;
 inline constexpr std::size_t kMaxOpText = 1 << 12;     // bytes of a text that an op looks for or writes
 inline constexpr std::size_t kMaxViewsText = 1 << 20;  // bytes that a views op adds
 
-/// Numbers of pixels, states and actions: far beyond any of them, and far from the end of float32.
+/// Values of pixels, states and actions: far beyond any of them, and far from the end of float32.
 inline constexpr Range kPlain = {-1e9, 1e9};
 
 inline Error misfit(std::string where, std::string expected, std::string found) {

@@ -31,7 +31,7 @@ Matrix nearest_rotation(Matrix m) {
   return m;
 }
 
-/// As numpy has it: products are rounded to the numbers' type, their sum is made in double precision.
+/// As numpy has it: products are rounded to the elements' type, their sum is made in double precision.
 template <class T>
 T dot(const T* a, const T* b) {
   const T x = a[0] * b[0], y = a[1] * b[1], z = a[2] * b[2];

@@ -3,7 +3,7 @@
 //
 // A rotation in another representation: of a state as the network sees it, of an action as the robot takes it. Each
 // product and sum is rounded to float32 in the order of the reference. Its sines and angles come from torch, whose last
-// digits differ between machines; here they are the nearest float32 numbers.
+// digits differ between machines; here they are the nearest float32 values.
 // Source: Isaac-GR00T (N1.5) gr00t/data/transform/state_action.py (RotationTransform) over pytorch3d 0.7.6
 // transforms/rotation_conversions.py.
 #include <fmt/format.h>
@@ -22,7 +22,7 @@ namespace {
 using Matrix = Matrix3<float>;
 using Axes = std::array<std::size_t, 3>;
 
-constexpr std::size_t kRows = 6;  // numbers of the representation that is the first two rows of a matrix
+constexpr std::size_t kRows = 6;  // elements of the representation that is the first two rows of a matrix
 
 /// The angles are of turns around these axes, roll (x), pitch (y) and yaw (z), the last of which is made first.
 struct EulerOrder {
@@ -71,7 +71,7 @@ Matrix of_euler_angles(const Axes& axes, const float* angles) {
   return product(first, around(axes[2], angles[2]));
 }
 
-/// The angle around one of two axes from the numbers of the matrix that are its sine and cosine times something.
+/// The angle around one of two axes from the elements of the matrix that are its sine and cosine times something.
 /// `line`: the row, of the last axis, or the column, of the first axis, that holds them.
 float outer_angle(std::size_t axis, std::size_t middle, const std::array<float, 3>& line, bool is_row) {
   std::size_t i = (axis + 2) % 3, k = (axis + 1) % 3;
@@ -96,7 +96,7 @@ void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out
 struct RotationStateOp final : StateOp {
   int from = 0;  // 0: quaternion, 1: axis and angle, from 2 on an order of Euler angles
   int column = 0;
-  bool scales = false;  // from [-1, 1] to [-1, 1], in which numbers lose digits
+  bool scales = false;  // from [-1, 1] to [-1, 1], in which values lose digits
 
   Stage stage() const override { return Stage::widened; }
   Status bind(StateLayout& layout, const std::string& where) override {
@@ -153,7 +153,7 @@ Status parse_state(JsonFields& fields, Recipe& recipe) {
   return {};
 }
 
-/// Three numbers of an action, an axis times an angle, as Euler angles.
+/// Three values of an action, an axis times an angle, as Euler angles.
 struct RotationActionOp final : ActionOp {
   int column = 0;
   Axes axes{};

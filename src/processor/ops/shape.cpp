@@ -33,7 +33,7 @@ struct PadOp final : StateOp {
   }
 };
 
-/// The state goes into the prompt as whole numbers.
+/// The state goes into the prompt as integers.
 struct BinsOp final : StateOp {
   Bins params;
   Stage stage() const override { return Stage::end; }

@@ -32,7 +32,7 @@ std::string replace_all(std::string_view text, std::string_view from, std::strin
 /// Whether a template names `{instruction}` once, `{state}` once at most, and has no other braces.
 bool is_template(std::string_view text);
 
-/// The template with its places filled; the numbers of the state with single blanks between them.
+/// The template with its places filled; the values of the state with single blanks between them.
 /// Source: lerobot policies/pi05/processor_pi05.py (Pi05PrepareStateTokenizerProcessorStep).
 std::string fill_template(std::string_view text, std::string_view instruction, std::span<const int> state);
 

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "nn/only_tokens.h"
+#include "nn/compute_tokens.h"
 
 #include <map>
 #include <optional>
@@ -107,6 +107,6 @@ class Narrowing {
 
 }  // namespace
 
-Tensor only_tokens(Graph& g, Tensor y, int first, int count) { return Narrowing(g, y, first, count).result(); }
+Tensor compute_tokens(Graph& g, Tensor y, int first, int count) { return Narrowing(g, y, first, count).result(); }
 
 }  // namespace vla

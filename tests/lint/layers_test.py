@@ -2,7 +2,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 """Includes point down only: reads the #include lines under src/ and names every pair that does not. 
-    python3 tests/lint/floors_test.py
+    python3 tests/lint/layers_test.py
 """
 import re
 import tempfile
@@ -12,9 +12,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 GRAPH = {"base", "bundle", "graph"}
 NETWORK = {"nn", "modules", "policies"}
-# What each room may include besides itself. Policies and modules record operations and know neither devices nor the
+# What each library may include besides itself. Policies and modules record operations and know neither devices nor the
 # host side.
-ROOMS = {
+MAY_INCLUDE = {
     "base": set(),
     "bundle": {"base"},
     "graph": {"base", "bundle"},
@@ -37,11 +37,11 @@ ROOMS = {
     "observe": {"base", "engine", "net", "wire"},
     "serve": {"engine", "processor", "bundle", "base", "net", "zmtp", "wire", "observe"},
     "capi": {"engine", "policies", "processor", "bundle", "base"},
-    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "observe", "zmtp", "wire", "bench", "quantize"},  # doors that the program opens
+    "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "observe", "zmtp", "wire", "bench", "quantize"},  # front ends that the program opens
 }
-# Libraries that belong to some rooms: no other sees their headers, not through any number of ours either. The engine's taps are a
+# Libraries that belong to some libraries: no other sees their headers, not through any number of ours either. The engine's taps are a
 # GGUF file of tensors.
-LIBRARIES = [
+EXTERNAL = [
     (re.compile(r"gguf\.h"), {"bundle", "engine"}),
     (re.compile(r"ggml(-.*)?\.h"), {"ggml", "vulkan", "cuda"}),
     (re.compile(r"vulkan/.*"), {"vulkan"}),
@@ -63,11 +63,11 @@ EVERY_MACHINE = re.compile(r"lower/(?!arithmetic)\w+\.(h|cpp)")
 INCLUDE = re.compile(r'^\s*#\s*include\s*(?:"([^"]+)"|<([^>]+)>)', re.M)
 
 
-def library_problem(room, header):
-    """Why `room` may not include <header>, or None."""
-    for pattern, rooms in LIBRARIES:
+def external_problem(folder, header):
+    """Why `folder` may not include <header>, or None."""
+    for pattern, libraries in EXTERNAL:
         if pattern.fullmatch(header):
-            return None if room in rooms else f"belongs to {', '.join(sorted(rooms))}"
+            return None if folder in libraries else f"belongs to {', '.join(sorted(libraries))}"
     return None
 
 
@@ -86,33 +86,33 @@ def reached(src, header, known):
 
 
 def problems(src):
-    """`file: includes "x": reason` for every include that points up, or shows a library of another room."""
+    """`file: includes "x": reason` for every include that points up, or shows a library of another library."""
     found, known = [], {}
     for file in sorted(p for p in src.rglob("*") if p.suffix in (".h", ".cpp", ".inc", ".cu", ".cuh")):
         name = file.relative_to(src).as_posix()
-        room = name.split("/")[0]
-        if room not in ROOMS:
-            found.append(f"{name}: is in no room of the house; rooms are {', '.join(ROOMS)}")
+        folder = name.split("/")[0]
+        if folder not in MAY_INCLUDE:
+            found.append(f"{name}: is in no library; libraries are {', '.join(MAY_INCLUDE)}")
             continue
         for quoted, angled in includes(file):
             header = quoted or angled
             other = header.split("/")[0]
-            reason = library_problem(room, header)
-            if other in ROOMS and other != room and other not in ROOMS[room]:
-                reason = f"{room} may include {', '.join(sorted(ROOMS[room])) or 'only itself'}"
+            reason = external_problem(folder, header)
+            if other in MAY_INCLUDE and other != folder and other not in MAY_INCLUDE[folder]:
+                reason = f"{folder} may include {', '.join(sorted(MAY_INCLUDE[folder])) or 'only itself'}"
             elif EVERY_MACHINE.fullmatch(name) and header.startswith(("kernels/", "ggml/", "cuda/", "lower/cpu/", "lower/cuda/")):
                 reason = "holds for every machine"
-            elif quoted and other not in ROOMS:
-                reason = reason or "is named by no room; write the path from src/"
+            elif quoted and other not in MAY_INCLUDE:
+                reason = reason or "is named by no library; write the path from src/"
             for library, through in reached(src, quoted, known).items() if quoted and not reason else ():
-                if problem := library_problem(room, library):
+                if problem := external_problem(folder, library):
                     reason = f"shows <{library}> through {through}, which {problem}"
             if reason:
                 found.append(f'{name}: includes "{header}": {reason}')
     return found
 
 
-class Floors(unittest.TestCase):
+class Layers(unittest.TestCase):
     maxDiff = None
 
     def check(self, files):
@@ -127,7 +127,7 @@ class Floors(unittest.TestCase):
         found = problems(ROOT / "src")
         self.assertFalse(found, "\n" + "\n".join(found))
 
-    def test_an_include_of_a_higher_room_is_named_with_its_file(self):
+    def test_an_include_of_a_higher_library_is_named_with_its_file(self):
         found = self.check({"nn/linear.cpp": '#include "engine/engine.h"\n#include "graph/graph.h"\n'})
         self.assertEqual(len(found), 1)
         self.assertIn('nn/linear.cpp: includes "engine/engine.h"', found[0])
@@ -153,8 +153,8 @@ class Floors(unittest.TestCase):
         [found] = self.check(files)
         self.assertIn('devices/open.cpp: includes "ggml/device.h": shows <ggml.h>', found)
 
-    def test_a_folder_that_is_no_room_is_refused(self):
-        self.assertIn("is in no room", self.check({"utils/misc.h": "\n"})[0])
+    def test_a_folder_that_is_no_library_is_refused(self):
+        self.assertIn("is in no library", self.check({"utils/misc.h": "\n"})[0])
 
 
 if __name__ == "__main__":
