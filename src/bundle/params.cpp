@@ -79,9 +79,9 @@ const char* Param::storage_text() const {
 
 /// A module of the network has one ternary matrix, and BitLinear's scale has its name; other matrices may lie side by
 /// side.
-std::string Param::scales_name() const {
-  if (encoding.type != DType::ternary) return name + "_scale";
-  return name.substr(0, name.rfind('.') + 1) + "scale";
+std::string scales_name(const std::string& param, const Encoding& encoding) {
+  if (encoding.type != DType::ternary) return param + "_scale";
+  return param.substr(0, param.rfind('.') + 1) + "scale";
 }
 
 std::int64_t Param::count() const {
@@ -122,7 +122,7 @@ const Param& ParamList::declare(std::string name, Storage storage, std::vector<s
   param.encoding = encoding;
   if (bundle_ != nullptr) look_up(param);
   if (const std::int64_t n = param.encoding.n_scale(param.count()); n > 0)
-    param.scales = &declare(param.scales_name(), Storage::vector, {n});
+    param.scales = &declare(scales_name(param.name, param.encoding), Storage::vector, {n});
   return param;
 }
 

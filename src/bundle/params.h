@@ -36,9 +36,10 @@ struct Param {
   bool is_packed() const { return dtype_bits(encoding.type) < 8; }
   /// What `vla inspect` calls it: the storage, or the dtype of codes.
   const char* storage_text() const;
-  /// Of its scales, where the encoding has some.
-  std::string scales_name() const;
 };
+
+/// Of the scales of a parameter, where its encoding has some.
+std::string scales_name(const std::string& param, const Encoding& encoding);
 
 /// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they
 /// record, and `report` gives all problems in one error, so that a wrong bundle is understood at the first try.

@@ -145,7 +145,8 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
     codes.shape[0] = static_cast<std::int64_t>(dtype_size(wanted->type, codes.shape[0]));
     const std::int64_t d_out = tensor.shape[1];
     // No bundle has a matrix with rows of fewer bytes than a scale.
-    tensors.push_back({tensor.name + "_scale", DType::f32, {d_out}, tensor.data.first(dtype_size(DType::f32, d_out))});
+    tensors.push_back(
+        {scales_name(tensor.name, *wanted), DType::f32, {d_out}, tensor.data.first(dtype_size(DType::f32, d_out))});
   }
   return tensors;
 }

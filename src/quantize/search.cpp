@@ -84,15 +84,11 @@ class Search {
     found_.moved = found_.all_int4;
     while (found_.moved.rms > most) {
       // Where a choice misses more than was expected of it, less must be expected of the next one.
-      const double aim = most * std::min(1.0, expected() / found_.moved.rms);
-      do {
-        VLA_TRY(Block* const block, next([](const Block&) { return true; }));
-        if (block == nullptr)
-          return Error{Code::unsupported, "--error", fmt::format("{:.3g} or more", found_.moved.rms),
-                       fmt::format("{:.3g}", most), "that is with every matrix as it is stored"};
-        give_back(*block);
-      } while (expected() > aim);
-      VLA_TRY(found_.moved, compute());
+      VLA_TRY(const bool given, give_back_until(most * std::min(1.0, expected() / found_.moved.rms)));
+      if (!given)
+        return Error{Code::unsupported, "--error", fmt::format("{:.3g} or more", found_.moved.rms),
+                     fmt::format("{:.3g}", most), "that is with every matrix as it is stored"};
+      VLA_TRY(found_.moved, compute(found_.blocks));
     }
     return {};
   }
@@ -106,35 +102,34 @@ class Search {
                    "that is with all large matrices in int4"};
     VLA_CHECK(measure_int4());
     if (may_keep) VLA_CHECK(measure_int8());
-    set_all(Rounding::int4);
     for (;;) {
       VLA_TRY(Block* const block, next([&](const Block& b) { return size() + added(b) <= most; }));
       if (block == nullptr) break;
       give_back(*block);
     }
-    VLA_TRY(found_.moved, compute());
+    VLA_TRY(found_.moved, compute(found_.blocks));
     return {};
   }
 
   Found take() { return std::move(found_); }
 
  private:
-  void set_all(Rounding codes) {
-    for (Block& block : found_.blocks) block.codes = codes;
+  void set_all(Rounding codes) { found_.blocks = all(codes); }
+  std::vector<Block> all(Rounding codes) const {
+    std::vector<Block> blocks = found_.blocks;
+    for (Block& block : blocks) block.codes = codes;
+    return blocks;
   }
-  Result<Moved> with_all(Rounding codes) {
-    set_all(codes);
-    return compute();
+  /// All in int8 but one.
+  Result<Moved> with_one(std::size_t one, Rounding codes) {
+    std::vector<Block> blocks = all(Rounding::int8);
+    blocks[one].codes = codes;
+    return compute(blocks);
   }
-  Result<Moved> with_one(Block& one, Rounding codes) {
-    set_all(Rounding::int8);
-    one.codes = codes;
-    return compute();
-  }
-  Result<Moved> compute() {
-    const bool is_stored = std::ranges::all_of(found_.blocks, [](const Block& b) { return b.codes == Rounding::none; });
+  Result<Moved> compute(const std::vector<Block>& blocks) {
+    const bool is_stored = std::ranges::all_of(blocks, [](const Block& b) { return b.codes == Rounding::none; });
     if (!is_stored)
-      if (const auto made = quantize(from_, trial_, choice_of(found_.blocks), {}, [](QuantizeProgress) {}); !made)
+      if (const auto made = quantize(from_, trial_, choice_of(blocks), {}, [](QuantizeProgress) {}); !made)
         return made.error();
     VLA_TRY(const auto got, chunks_of(is_stored ? from_ : trial_, options_, judged_));
     const Moved result = moved(expected_, got);
@@ -171,10 +166,17 @@ class Search {
     if (!candidates.empty())
       return *std::ranges::max_element(candidates, {}, [](auto* block) { return worth(*block); });
     if (knows_int8_ || std::ranges::none_of(found_.blocks, fits)) return static_cast<Block*>(nullptr);
-    const std::vector<Block> chosen = found_.blocks;
     VLA_CHECK(measure_int8());
-    for (std::size_t i = 0; i < chosen.size(); ++i) found_.blocks[i].codes = chosen[i].codes;
     return next(fits);
+  }
+  /// Whether there was anything to give back.
+  Result<bool> give_back_until(double most) {
+    for (bool given = false;; given = true) {
+      VLA_TRY(Block* const block, next([](const Block&) { return true; }));
+      if (block == nullptr) return given;
+      give_back(*block);
+      if (expected() <= most) return true;
+    }
   }
   static double worth(const Block& block) {
     const double moved = block.codes == Rounding::int4 ? block.moved_by_int4 : block.moved_by_int8;
@@ -185,20 +187,20 @@ class Search {
     EngineOptions float32 = options_;
     float32.kernels = "float32";
     VLA_TRY(expected_, chunks_of(from_, float32, judged_));
-    VLA_TRY(found_.all_int8, with_all(Rounding::int8));
-    VLA_TRY(found_.all_int4, with_all(Rounding::int4));
-    for (Block& block : found_.blocks) {
-      VLA_TRY(const Moved moved, with_one(block, Rounding::int4));
-      block.moved_by_int4 = beyond(moved.rms, found_.all_int8.rms);
+    VLA_TRY(found_.all_int8, compute(all(Rounding::int8)));
+    VLA_TRY(found_.all_int4, compute(all(Rounding::int4)));
+    for (std::size_t i = 0; i < found_.blocks.size(); ++i) {
+      VLA_TRY(const Moved moved, with_one(i, Rounding::int4));
+      found_.blocks[i].moved_by_int4 = beyond(moved.rms, found_.all_int8.rms);
     }
     return {};
   }
 
   Status measure_int8() {
     knows_int8_ = true;
-    for (Block& block : found_.blocks) {
-      VLA_TRY(const Moved moved, with_one(block, Rounding::none));
-      block.moved_by_int8 = beyond(found_.all_int8.rms, moved.rms);
+    for (std::size_t i = 0; i < found_.blocks.size(); ++i) {
+      VLA_TRY(const Moved moved, with_one(i, Rounding::none));
+      found_.blocks[i].moved_by_int8 = beyond(found_.all_int8.rms, moved.rms);
     }
     return {};
   }
