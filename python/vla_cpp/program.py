@@ -6,17 +6,23 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
+from typing import List
 
 from .installed import PACKAGE, source_tree
 
 
-def main() -> int:
+def candidates() -> List[Path]:
+    """Where the program may be, best first."""
     root = source_tree()
-    candidates = [PACKAGE / "bin/vla", *([root / "build/cpu/bin/vla"] if root else [])]
-    for path in candidates:
+    return [PACKAGE / "bin/vla", *([root / "build/cpu/bin/vla"] if root else [])]
+
+
+def main() -> int:
+    for path in candidates():
         if path.is_file():
             os.execv(path, ["vla", *sys.argv[1:]])
-    print(f"vla: expected {' or '.join(map(str, candidates))}, found no such file", file=sys.stderr)
+    print(f"vla: expected {' or '.join(map(str, candidates()))}, found no such file", file=sys.stderr)
     return 9
 
 

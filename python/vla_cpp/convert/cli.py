@@ -26,6 +26,8 @@ It refuses what it does not fully understand, and lists all problems at once."""
 EPILOG = """\
 Without --dtype the stored type is kept if all matrices share it; mixed types become f32, which is exact. --dtype stored
 keeps the type of each, which is exact too: matrices of bf16 are then computed in bf16, as PyTorch does, the others in f32.
+--dtype int8 and int4 convert so too, into a folder beside OUT.gguf, and then run `vla quantize` (VLA_BINARY, or the program
+of this package) on the result; `vla quantize --judge` on a bundle chooses codes by how far the actions move.
 
 --position-precision: the reference computes the rows of the vision position table in the precision of its tower, and that
 is bfloat16 when config.json says load_vlm_weights: true or the backbone's vision_config says bfloat16, else float32. The
@@ -100,11 +102,13 @@ def report(summary: Summary) -> str:
     """The summary as text, a line per fact."""
     lines = [
         "wrote {}: {}, {} tensors, {}, {:,} bytes".format(
-            summary.path, summary.arch, summary.n_tensor, summary.dtype, summary.n_bytes
+            summary.path, summary.arch, summary.n_tensor, summary.codes or summary.dtype, summary.n_bytes
         )
     ]
     error, tensor = summary.rounding
-    if summary.dtype != "f32":
+    if summary.codes:
+        lines.append("  rounding  {} codes of {}; vla inspect shows what became of each matrix".format(summary.codes, summary.dtype))
+    elif summary.dtype != "f32":
         lines.append(
             "  rounding  "
             + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor))

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Callable, Dict, Iterator, List, Tuple
@@ -19,9 +20,10 @@ from .checkpoint import Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
 from .embodiments import plan_robots
 from .errors import Code, Problems, refuse
-from .options import STORED
+from .options import CODES, STORED
+from .quantized import program, quantize
 from .safetensors_file import Entry
-from .ternary import quantize
+from .ternary import quantize as quantize_ternary
 from .units import add_units
 
 Progress = Callable[[str, int, int], None]  # what is being written, bytes done, bytes in all
@@ -34,6 +36,7 @@ class Summary:
     path: str
     arch: str
     dtype: str
+    codes: str = ""  # int8 or int4, where `vla quantize` made some of matrices of that dtype
     n_tensor: int = 0
     n_bytes: int = 0
     dropped: Dict[str, List[str]] = field(default_factory=dict)  # reason -> tensors
@@ -47,6 +50,8 @@ def convert_checkpoint(
 ) -> Summary:
     """Writes `out` or raises ConvertError and leaves nothing behind."""
     _check_out(out, force)
+    if options.dtype in CODES:
+        return _convert_to_codes(source, out, options, force, progress)
     _check_state_bound(options)
     checkpoint = open_checkpoint(source, archs.authors())
     options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
@@ -66,6 +71,19 @@ def convert_checkpoint(
     summary = Summary(out, arch, dtype, dropped=dropped, notes=checkpoint.notes)
     _write(checkpoint, plan, summary, problems, progress)
     summary.n_bytes = os.path.getsize(out)
+    return summary
+
+
+def _convert_to_codes(source: str, out: str, options: Options, force: bool, progress: Progress) -> Summary:
+    """By way of a bundle of the stored floats, which lies beside `out` meanwhile."""
+    vla = program()
+    with tempfile.TemporaryDirectory(dir=os.path.dirname(os.path.abspath(out)), prefix=".vla-convert-") as folder:
+        stored = os.path.join(folder, "stored.gguf")
+        summary = convert_checkpoint(source, stored, options.replaced(dtype=""), progress=progress)
+        progress("quantizing", 0, 1)
+        quantize(vla, stored, out, options.dtype, force)
+    summary.path, summary.n_bytes = out, os.path.getsize(out)
+    summary.codes = options.dtype
     return summary
 
 
@@ -224,7 +242,7 @@ def _stream(
 
 
 def _stream_ternary(entry: Entry, weight: Weight, out: BundleWriter, summary: Summary, problems: Problems) -> None:
-    found = quantize(entry)
+    found = quantize_ternary(entry)
     if weight.kind == TERNARY:
         out.write(weight.target, found.codes)
         summary.ternary = min(summary.ternary, (found.margin, weight.target))

@@ -33,6 +33,7 @@ class Option(NamedTuple):
 
 
 STORED = "stored"  # --dtype: every matrix as it is stored
+CODES = ("int8", "int4")  # --dtype: by `vla quantize`
 COMMON = (
     Option(
         "--backbone",
@@ -42,7 +43,7 @@ COMMON = (
     Option(
         "--dtype",
         "storage of matrices and tables; vectors and statistics are always f32",
-        choices=("f32", "bf16", "f16", STORED),
+        choices=("f32", "bf16", "f16", STORED, *CODES),
     ),
     Option("--dataset-info", "meta/info.json of the LeRobot data set: names of state and action numbers, control rate", "INFO.json"),
     Option(
