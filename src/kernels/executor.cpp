@@ -102,7 +102,7 @@ void Executor::run(std::span<const Phase> phases) {
     for (const Phase& phase : phases) {
       self.begin(++ticket_, scratch_.get());
       for (const Task* task : phase.tasks)
-        for (std::int64_t item = 0; item < task->n_item; ++item) task->run(item, self);
+        for (std::int64_t item = 0; item < task->n_item; ++item) task->take(item, self);
       if (phase.done != nullptr) *phase.done = std::chrono::steady_clock::now();
     }
     return;
@@ -152,7 +152,7 @@ bool Executor::work(Worker& worker) {
 
 void Executor::run_item(std::int64_t item, Worker& worker) {
   for (const Task* task : phases_[i_phase_].tasks) {
-    if (item < task->n_item) return task->run(item, worker);
+    if (item < task->n_item) return task->take(item, worker);
     item -= task->n_item;
   }
 }

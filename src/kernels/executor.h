@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "base/result.h"
+#include "kernels/kind_clock.h"
 
 namespace vla::kernels {
 
@@ -62,7 +63,18 @@ class Task {
  public:
   virtual ~Task() = default;
   virtual void run(std::int64_t item, Worker& worker) const = 0;
+
+  /// Runs an item, whose time counts for the task's kind while the clock runs.
+  void take(std::int64_t item, Worker& worker) const {
+    if (clock == nullptr || !clock->runs.load(std::memory_order_relaxed)) return run(item, worker);
+    const auto start = std::chrono::steady_clock::now();
+    run(item, worker);
+    clock->add(kind, std::chrono::steady_clock::now() - start);
+  }
+
   std::int64_t n_item = 1;
+  KindClock::Kind kind = KindClock::others;
+  KindClock* clock = nullptr;  // which outlives the task
 };
 
 /// Tasks that do not depend on each other: their items are taken side by side.

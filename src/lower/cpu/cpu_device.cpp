@@ -119,8 +119,8 @@ void CpuDevice::count_times(bool on) {
 
 std::vector<std::pair<std::string, double>> CpuDevice::times() const {
   std::vector<std::pair<std::string, double>> times;
-  for (std::size_t i = 0; i < KindClock::count; ++i)
-    times.emplace_back(KindClock::kNames[i], 1e-9 * static_cast<double>(clock_->nanoseconds[i].load()));
+  for (std::size_t i = 0; i < kernels::KindClock::count; ++i)
+    times.emplace_back(kernels::KindClock::kNames[i], 1e-9 * static_cast<double>(clock_->nanoseconds[i].load()));
   return times;
 }
 

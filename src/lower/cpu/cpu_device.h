@@ -4,9 +4,9 @@
 
 #include "graph/device.h"
 #include "kernels/executor.h"
+#include "kernels/kind_clock.h"
 #include "lower/arithmetic.h"
 #include "lower/cpu/cpu_weights.h"
-#include "lower/cpu/kind_clock.h"
 
 namespace vla::lower {
 
@@ -46,7 +46,7 @@ class CpuDevice final : public Device {
   Arithmetic arithmetic_;
   std::int64_t min_rounded_keys_ = 0;
   std::shared_ptr<kernels::Executor> executor_;
-  std::shared_ptr<KindClock> clock_ = std::make_shared<KindClock>();
+  std::shared_ptr<kernels::KindClock> clock_ = std::make_shared<kernels::KindClock>();
   CpuWeights weights_;
   Memory arena_;  // of values that live within a run: programs share it, since one runs at a time
 };

@@ -10,10 +10,16 @@
 #include "lower/cpu/emit.h"
 
 namespace vla::lower {
+namespace {
+
+/// Of host memory, estimated: the largest task, and what lists and allocator keep for it.
+constexpr std::size_t kTaskSize = sizeof(kernels::LinearJob) + 2 * sizeof(void*) + 256;
+
+}  // namespace
 
 Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& arena,
                                                   std::shared_ptr<kernels::Executor> executor,
-                                                  std::shared_ptr<KindClock> clock) {
+                                                  std::shared_ptr<kernels::KindClock> clock) {
   std::unique_ptr<CpuProgram> program(new CpuProgram);
   program->executor_ = std::move(executor), program->clock_ = std::move(clock);
   program->arena_ = arena, program->tables_ = l.weights.tables(), program->weights_ = l.weights.table();
@@ -63,14 +69,15 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   work_.resize(stages.size() + 1);
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
   for (const CpuOp& op : l.ops) {
-    tasks_.push_back(std::make_unique<TimedTask>(emit(l, op, uses_), kind_of(op), clock_));
+    tasks_.push_back(emit(l, op, uses_));
+    tasks_.back()->kind = kind_of(op), tasks_.back()->clock = clock_.get();
     const auto phase = static_cast<std::size_t>(op.phase);
     phases_[phase].tasks.push_back(tasks_.back().get());
     text_ += text_of(l, op) + "\n";
     const std::size_t stage = stage_of(l, op);
     if (!op.invariant) work_[stage] += work_of(l, op);
     if (stage < stages.size() && !op.invariant) stage_end[stage] = std::max(stage_end[stage], phase + 1);
-    host_size_ += sizeof(kernels::LinearJob) + 2 * sizeof(void*) + 256;
+    host_size_ += kTaskSize;
   }
   for (const Graph::Stage& stage : stages) stages_.push_back({stage.name, {}});
   for (std::size_t i = 0; i < stages.size(); ++i)

@@ -14,7 +14,7 @@ class CpuProgram final : public Program {
   /// The last pass: addresses and tasks. Errors: out_of_memory.
   static Result<std::unique_ptr<Program>> make(CpuLowering& l, const Memory& arena,
                                                std::shared_ptr<kernels::Executor> executor,
-                                               std::shared_ptr<KindClock> clock);
+                                               std::shared_ptr<kernels::KindClock> clock);
 
   Status prepare() override;
   Status run() override;
@@ -37,7 +37,7 @@ class CpuProgram final : public Program {
   void make_taps(const CpuLowering& l);
 
   std::shared_ptr<kernels::Executor> executor_;
-  std::shared_ptr<KindClock> clock_;
+  std::shared_ptr<kernels::KindClock> clock_;
   std::shared_ptr<const Tables> tables_;
   Memory arena_, own_;  // own: constants, and what prepare leaves
   std::shared_ptr<const WeightTable> weights_;

@@ -12,13 +12,14 @@
 namespace vla::lower {
 namespace {
 
+using kernels::KindClock;
 using kernels::Task;
 using kernels::Worker;
 
 /// A product of fewer operations takes about as long as waking a thread.
 constexpr double kMinSharedFlop = 2e6;
 /// Elements of an item of what is not a product.
-constexpr std::int64_t kItemNumbers = 16384;
+constexpr std::int64_t kItemElements = 16384;
 
 std::byte* address(const CpuLowering& l, ValueId id) {
   const Value& value = l.value(id);
@@ -211,7 +212,7 @@ struct PatchesTask : Task {
 
 /// Cuts rows of d elements into items for the threads, and says how many rows an item has.
 std::int64_t item_rows(const CpuLowering& l, std::int64_t n_row, std::int64_t d, std::int64_t& n_item) {
-  const std::int64_t wanted = l.n_thread == 1 ? 1 : std::min<std::int64_t>(n_row * d / kItemNumbers, 8 * l.n_thread);
+  const std::int64_t wanted = l.n_thread == 1 ? 1 : std::min<std::int64_t>(n_row * d / kItemElements, 8 * l.n_thread);
   const std::int64_t rows = kernels::ceil_div(n_row, std::max<std::int64_t>(1, wanted));
   n_item = kernels::ceil_div(n_row, rows);
   return rows;

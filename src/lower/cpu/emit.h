@@ -7,7 +7,6 @@
 #include "kernels/attention_kernel.h"
 #include "kernels/executor.h"
 #include "lower/cpu/cpu_lowering.h"
-#include "lower/cpu/kind_clock.h"
 
 namespace vla::lower {
 
@@ -30,7 +29,7 @@ std::size_t scratch_of(const CpuLowering& l, const CpuOp& op);
 /// Operations and bytes of an operation.
 Work work_of(const CpuLowering& l, const CpuOp& op);
 /// What its time counts for. A norm that a product computes as it copies x is part of the product.
-KindClock::Kind kind_of(const CpuOp& op);
+kernels::KindClock::Kind kind_of(const CpuOp& op);
 /// One line: what is computed, the kernel, shapes and layouts.
 std::string text_of(const CpuLowering& l, const CpuOp& op);
 

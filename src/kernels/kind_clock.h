@@ -1,0 +1,25 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+
+namespace vla::kernels {
+
+/// What operations take by kind, while somebody wants to know: two readings of the clock for each item.
+struct KindClock {
+  enum Kind { products, attention, norms, others, count };
+  static constexpr const char* kNames[] = {"products", "attention", "norms and codes", "others"};
+
+  void add(Kind kind, std::chrono::nanoseconds time) {
+    nanoseconds[kind].fetch_add(time.count(), std::memory_order_relaxed);
+  }
+
+  std::atomic<bool> runs = false;
+  std::array<std::atomic<std::int64_t>, count> nanoseconds = {};  // of all threads together
+};
+
+}  // namespace vla::kernels
