@@ -33,7 +33,14 @@ class AttentionTile {
 
  public:
   static constexpr AttentionKernel kernel() {
-    return {Panels::packed_size, Panels::n_pack, Panels::pack, cut, run, P::kRounded};
+    return {
+        .packed_size = Panels::packed_size,
+        .n_pack = Panels::n_pack,
+        .pack = Panels::pack,
+        .cut = cut,
+        .run = run,
+        .rounded = P::kRounded,
+    };
   }
 
  private:

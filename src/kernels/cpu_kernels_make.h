@@ -17,8 +17,20 @@ class CpuKernelsMaker {
 
  public:
   static constexpr CpuKernels make() {
-    return {map<Silu>, map<GeluTanh>, map<GeluErf>, map<Relu>,  map<ReluSquared>, layer_norm,
-            rms_norm,  rotate_half,   map<Plus>,    map<Times>, scaled,           AttentionTile<Products>::kernel()};
+    return {
+        .silu = map<Silu>,
+        .gelu_tanh = map<GeluTanh>,
+        .gelu_erf = map<GeluErf>,
+        .relu = map<Relu>,
+        .relu_squared = map<ReluSquared>,
+        .layer_norm = layer_norm,
+        .rms_norm = rms_norm,
+        .rotate_half = rotate_half,
+        .add = map<Plus>,
+        .multiply = map<Times>,
+        .scale = scaled,
+        .attention = AttentionTile<Products>::kernel(),
+    };
   }
 
  private:

@@ -71,10 +71,19 @@ class Int8Loop {
  public:
   /// The row of the table that this tile makes. Whoever quantizes x computes its norm, of any width.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use)) {
-    LinearKernel row = {name, Weights::packed_size, Weights::pack, supports,      cut,
-                        run,  sizeof(Scratch),      kAnyDepth,     Tile::kLayout, kAnyDepth};
-    row.quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); };
-    return row;
+    return {
+        .name = name,
+        .packed_size = Weights::packed_size,
+        .pack = Weights::pack,
+        .supports = supports,
+        .cut = cut,
+        .run = run,
+        .scratch_size = sizeof(Scratch),
+        .max_norm = kAnyDepth,
+        .rounded = Tile::kLayout,
+        .max_rounded_depth = kAnyDepth,
+        .quantize = [](const float* x, std::int64_t n, std::byte* to) { quantize_row<V>(x, n, to); },
+    };
   }
 
  private:

@@ -55,8 +55,20 @@ class LinearLoop {
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
                                        const LinearKernel* small_batch = nullptr, std::int64_t max_small_batch = 0) {
-    return {name,    Layout::packed_size, Layout::pack, supports,       cut, run, sizeof(Scratch), Tile::kMaxDepth,
-            kLayout, Tile::kMaxDepth,     small_batch,  max_small_batch};
+    return {
+        .name = name,
+        .packed_size = Layout::packed_size,
+        .pack = Layout::pack,
+        .supports = supports,
+        .cut = cut,
+        .run = run,
+        .scratch_size = sizeof(Scratch),
+        .max_norm = Tile::kMaxDepth,
+        .rounded = kLayout,
+        .max_rounded_depth = Tile::kMaxDepth,
+        .small_batch = small_batch,
+        .max_small_batch = max_small_batch,
+    };
   }
 
  private:

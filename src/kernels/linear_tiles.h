@@ -57,20 +57,21 @@ class TileLoop {
   /// The row of the table that this tile makes.
   static constexpr LinearKernel kernel(const char* name, bool (*supports)(const MatrixDesc& desc, Features use),
                                        const LinearKernel* small_batch = nullptr, std::int64_t max_small_batch = 0) {
-    LinearKernel row = {name,
-                        Layout::packed_size,
-                        Layout::pack,
-                        supports,
-                        cut,
-                        run,
-                        sizeof(Scratch),
-                        kMaxDepth,
-                        RoundedLayout::tiles,
-                        kAnyDepth,
-                        small_batch,
-                        max_small_batch};
-    row.l2_elements = kMaxX;
-    return row;
+    return {
+        .name = name,
+        .packed_size = Layout::packed_size,
+        .pack = Layout::pack,
+        .supports = supports,
+        .cut = cut,
+        .run = run,
+        .scratch_size = sizeof(Scratch),
+        .max_norm = kMaxDepth,
+        .rounded = RoundedLayout::tiles,
+        .max_rounded_depth = kAnyDepth,
+        .small_batch = small_batch,
+        .max_small_batch = max_small_batch,
+        .l2_elements = kMaxX,
+    };
   }
 
  private:

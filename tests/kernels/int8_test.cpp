@@ -444,8 +444,8 @@ TEST_CASE("few rows go to a kernel that reads the same packed matrix and the sam
   for (const auto& kernels : {ternary_kernels(), int4_kernels(), int8_kernels()})
     for (const LinearKernel* kernel : kernels) {
       const LinearKernel& small_batch = kernel->for_batch(1);
-      CHECK((few.pack == kernel->pack));
-      CHECK((few.quantize != nullptr));
+      CHECK((small_batch.pack == kernel->pack));
+      CHECK((small_batch.quantize != nullptr));
     }
 }
 

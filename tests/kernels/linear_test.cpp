@@ -323,7 +323,7 @@ const LinearKernel& row(const std::string& name) {
     check(row("neon_bf16"));                                                                                    \
   }                                                                                                             \
   TEST_CASE("neon_bf16, few rows: " sentence* doctest::skip(vla::test::lacks(kernel_set::neon_bf16))) {         \
-    check(*row("neon_bf16").few);                                                                               \
+    check(*row("neon_bf16").small_batch);                                                                               \
   }                                                                                                             \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx2))) { check(row("avx2")); }       \
   VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                           \
@@ -386,13 +386,13 @@ TEST_CASE("few rows go to a kernel that reads the same packed matrix and rounds 
   const MatrixDesc desc = {DType::bf16, 80, 70};
   for (const LinearKernel* kernel : linear_kernels()) {
     CHECK(&kernel->for_batch(1000) == kernel);
-    if (kernel->few == nullptr) continue;
+    if (kernel->small_batch == nullptr) continue;
     const LinearKernel& small_batch = kernel->for_batch(kernel->max_small_batch);
-    CHECK(&few == kernel->few);
+    CHECK(&small_batch == kernel->small_batch);
     CHECK(&kernel->for_batch(kernel->max_small_batch + 1) == kernel);
-    CHECK(few.rounded == RoundedLayout::none);
-    CHECK((few.pack == kernel->pack));
-    CHECK(few.packed_size(desc) == kernel->packed_size(desc));
+    CHECK(small_batch.rounded == RoundedLayout::none);
+    CHECK((small_batch.pack == kernel->pack));
+    CHECK(small_batch.packed_size(desc) == kernel->packed_size(desc));
   }
 }
 
