@@ -58,7 +58,7 @@ def wheel(tmp_path_factory):
 
 
 def check(emulator, program):
-    assert re.fullmatch(r"vla \d+\.\d+\.\d+.*\n?", output(*emulator, program, "--version"))
+    assert re.fullmatch(r"\d+\.\d+\.\d+\n", output(*emulator, program, "--version"))
     assert "smolvla" in output(*emulator, program, "inspect", BUNDLE)
     assert output(*emulator, program, "run", BUNDLE, *ACT, "--threads", "2").startswith("step")
 
