@@ -159,6 +159,28 @@ class Translator {
     ggml_tensor* split = reshaped(x, {x->ne[0] * f, op.n_column / f, f, n_row / f * x->ne[2]});
     return reshaped(ggml_cont(c, ggml_permute(c, split, 0, 2, 1, 3)), node_->shape);
   }
+  /// ggml's images are [width, height, d], as are the rows of what it unfolds.
+  ggml_tensor* translate(const op::Unfold& op) {
+    const auto [size, stride, padding] = op.window;
+    const Shape& s = node_->shape;
+    const std::int64_t d = node_->in[0].dim(0), area = std::int64_t{size} * size;
+    ggml_tensor* image = ggml_cont(c, ggml_permute(c, in(0), 2, 0, 1, 3));
+    ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, size, size, d, 1);  // read for its shape only
+    ggml_tensor* rows = ggml_im2col(c, kernel, image, stride, stride, padding, padding, 1, 1, true, GGML_TYPE_F32);
+    ggml_tensor* split = reshaped(rows, {area, d, s[1] * s[2], s[3]});
+    return reshaped(ggml_cont(c, ggml_permute(c, split, 1, 0, 2, 3)), s);
+  }
+  /// ggml's own leaves NaN out; what is not finite stays so.
+  ggml_tensor* translate(const op::MaxPool& op) {
+    const auto [size, stride, padding] = op.window;
+    ggml_tensor* image = ggml_cont(c, ggml_permute(c, in(0), 2, 0, 1, 3));
+    const auto pool = [&, n = size, step = stride, pad = static_cast<float>(padding)](ggml_op_pool kind,
+                                                                                      ggml_tensor* x) {
+      return ggml_pool_2d(c, x, kind, n, n, step, step, pad, pad);
+    };
+    ggml_tensor* nothing = pool(GGML_OP_POOL_AVG, ggml_scale(c, image, 0.0f));
+    return ggml_cont(c, ggml_permute(c, ggml_add(c, pool(GGML_OP_POOL_MAX, image), nothing), 1, 2, 0, 3));
+  }
   ggml_tensor* translate(const op::Write& op) { return ggml_cpy(c, in(0), static_cast<ggml_tensor*>(op.slot->place)); }
 
   ggml_context *c, *constants_;

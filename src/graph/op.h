@@ -125,6 +125,23 @@ struct PixelShuffle {
   static constexpr const char* kName = "pixel_shuffle";
   int n_column, factor;
 };
+/// A square of size x size pixels that moves over an image in steps of `stride`, over `padding` more pixels at each
+/// side than the image has. Along a side of n pixels it has (n + 2 padding - size) / stride + 1 places.
+struct Window {
+  int size, stride, padding;
+};
+/// x [d, width, height, n_view] -> what the window covers at each of its places, pixels row by row, zeros beyond the
+/// image: [d * size^2, n_column, n_row, n_view]. A product of it is a convolution.
+struct Unfold {
+  static constexpr const char* kName = "unfold";
+  Window window;
+};
+/// x [d, width, height, n_view] -> the largest of each feature in the window, pixels beyond the image left out; NaN
+/// where one is NaN: [d, n_column, n_row, n_view]. The padding is at most half of the size.
+struct MaxPool {
+  static constexpr const char* kName = "max_pool";
+  Window window;
+};
 /// Stores x in a slot of its shape.
 struct Write {
   static constexpr const char* kName = "write";
@@ -137,7 +154,7 @@ namespace vla {
 
 using Op = std::variant<op::Input, op::Constant, op::Parameter, op::Linear, op::Embedding, op::Gather, op::Norm,
                         op::Rope, op::Attention, op::Activate, op::Add, op::Multiply, op::Scale, op::Concat, op::Slice,
-                        op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Write>;
+                        op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Unfold, op::MaxPool, op::Write>;
 
 /// The operation's word, for messages and printed graphs.
 inline const char* op_name(const Op& op) {

@@ -117,6 +117,22 @@ struct Rules {
     const bool fits = f > 0 && op.n_column % f == 0 && n % op.n_column == 0 && n / op.n_column % f == 0;
     return {fits && of(0)[3] == 1, {of(0)[0] * f * f, n / (f * f), of(0)[2], 1}};
   }
+  ShapeCheck operator()(const op::Unfold& op) const {
+    const std::int64_t area = std::int64_t{op.window.size} * op.window.size;
+    return places(op.window, op.window.padding >= 0, area);
+  }
+  ShapeCheck operator()(const op::MaxPool& op) const {
+    return places(op.window, op.window.padding >= 0 && 2 * op.window.padding <= op.window.size, 1);
+  }
+  /// A column of `area` times x's numbers for each place of the window.
+  ShapeCheck places(const op::Window& w, bool fits, std::int64_t area) const {
+    if (!has(1) || !floats() || !fits || w.size < 1 || w.stride < 1) return {false};
+    const auto n_place = [&](std::int64_t n) {
+      return n + 2 * w.padding < w.size ? 0 : (n + 2 * w.padding - w.size) / w.stride + 1;
+    };
+    const std::int64_t n_column = n_place(of(0)[1]), n_row = n_place(of(0)[2]);
+    return {n_column > 0 && n_row > 0, {of(0)[0] * area, n_column, n_row, of(0)[3]}};
+  }
   ShapeCheck operator()(const op::Write& op) const {
     return has(1) && of(0) == op.slot->shape && in[0].node()->type == op.slot->type ? same_as_first(true)
                                                                                     : ShapeCheck{false};

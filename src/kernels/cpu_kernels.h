@@ -16,6 +16,7 @@ struct CpuKernels {
   /// Turns the pairs (x_i, x_{i + n/2}) by n/2 cosines in w and n/2 sines behind them.
   RowKernel rotate_half;
   RowKernel add, multiply;  // y = x + w, x * w
+  RowKernel largest;        // y = the larger of x and w, NaN where one is
   RowKernel scale;          // y = x * s
   AttentionKernel attention;
 

@@ -28,6 +28,7 @@ class CpuKernelsMaker {
         .rotate_half = rotate_half,
         .add = map<Plus>,
         .multiply = map<Times>,
+        .largest = map<Larger>,
         .scale = scaled,
         .attention = AttentionTile<Products>::kernel(),
     };
@@ -56,6 +57,11 @@ class CpuKernelsMaker {
   };
   struct Times {
     static VLA_INLINE Float of(Float x, Float w) { return x * w; }
+    static constexpr bool kBinary = true;
+  };
+
+  struct Larger {
+    static VLA_INLINE Float of(Float x, Float w) { return (x > w) | (x != x) ? x : w; }
     static constexpr bool kBinary = true;
   };
 

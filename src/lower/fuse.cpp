@@ -54,6 +54,8 @@ class Fuser {
   void visit(const Node& node, const op::Embedding&) { add(LookupOp{&node, operand(node, 0)}, node); }
   void visit(const Node& node, const op::Gather&) { add(LookupOp{&node, operand(node, 1), operand(node, 0)}, node); }
   void visit(const Node& node, const op::Patches&) { add(PatchesOp{&node, operand(node, 0)}, node); }
+  void visit(const Node& node, const op::Unfold& op) { add(WindowOp{&node, op.window, false, operand(node, 0)}, node); }
+  void visit(const Node& node, const op::MaxPool& op) { add(WindowOp{&node, op.window, true, operand(node, 0)}, node); }
 
   void visit(const Node& node, const op::Norm& op) { add_rows(node, op); }
   void visit(const Node& node, const op::Rope& op) { add_rows(node, op); }
@@ -313,6 +315,7 @@ class Fuser {
   static std::vector<ValueId> operands(const RowOp& op) { return {op.x, op.w, op.b}; }
   static std::vector<ValueId> operands(const LookupOp& op) { return {op.table, op.ids}; }
   static std::vector<ValueId> operands(const PatchesOp& op) { return {op.images}; }
+  static std::vector<ValueId> operands(const WindowOp& op) { return {op.x}; }
 
   Lowering& l;
   std::vector<FusedOp> ops_;

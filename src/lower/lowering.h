@@ -102,6 +102,13 @@ struct PatchesOp {
   const Node* node;
   ValueId images;
 };
+/// unfold, max_pool
+struct WindowOp {
+  const Node* node;
+  op::Window window;
+  bool takes_largest;  // of the pixels that the window covers; else all of them
+  ValueId x;
+};
 
 /// What the passes behind fusion know of an operation.
 struct Step {
@@ -112,7 +119,7 @@ struct Step {
 };
 /// One operation of the program: nodes that were fused.
 struct FusedOp : Step {
-  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp> op;
+  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp> op;
 };
 
 struct Lowering {

@@ -119,6 +119,8 @@ struct MakeValue {
   Value operator()(const op::Concat&) const { return own(node); }
   Value operator()(const op::Patches&) const { return own(node); }
   Value operator()(const op::PixelShuffle&) const { return own(node); }
+  Value operator()(const op::Unfold&) const { return own(node); }
+  Value operator()(const op::MaxPool&) const { return own(node); }
 
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }

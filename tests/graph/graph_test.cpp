@@ -126,6 +126,14 @@ TEST_CASE_FIXTURE(Fixture, "images are cut into whole patches, and patches joine
   accepts(op::Patches{4}, {f32({9, 13, 3, 2})}, {48, 6, 2, 1});  // what is left of a patch is dropped
   refuses(op::Patches{4}, {f32({3, 8, 3, 1})});
   refuses(op::Patches{4}, {f32({8, 8, 1, 1})});
+  accepts(op::Unfold{{3, 2, 1}}, {f32({5, 9, 14, 2})}, {45, 5, 7, 2});
+  accepts(op::Unfold{{7, 2, 3}}, {f32({3, 1, 2, 1})}, {147, 1, 1, 1});
+  refuses(op::Unfold{{4, 1, 0}}, {f32({5, 3, 9, 1})});  // no place along the first side
+  refuses(op::Unfold{{0, 1, 0}}, {f32({5, 9, 9, 1})});
+  refuses(op::Unfold{{3, 0, 0}}, {f32({5, 9, 9, 1})});
+  refuses(op::Unfold{{3, 1, -1}}, {f32({5, 9, 9, 1})});
+  accepts(op::MaxPool{{3, 2, 1}}, {f32({5, 9, 14, 2})}, {5, 5, 7, 2});
+  refuses(op::MaxPool{{3, 2, 2}}, {f32({5, 9, 14, 2})});  // a window of no pixel
   accepts(op::PixelShuffle{6, 2}, {f32({3, 24, 2, 1})}, {12, 6, 2, 1});
   refuses(op::PixelShuffle{5, 2}, {f32({3, 20, 2, 1})});
   refuses(op::PixelShuffle{6, 2}, {f32({3, 18, 2, 1})});

@@ -143,6 +143,42 @@ TEST_CASE("patches of several views whose sides a patch need not divide, and squ
   }
 }
 
+TEST_CASE("windows over images, of every size, stride and padding that a convolution has") {
+  const op::Window windows[] = {{7, 2, 3}, {3, 1, 1}, {3, 2, 1}, {1, 2, 0}, {1, 1, 0}, {2, 1, 0}, {5, 3, 4}};
+  for (const auto operand : kOperands)
+    for (const Shape& images : {Shape{3, 11, 6, 2}, Shape{35, 4, 5, 1}, Shape{1, 1, 3, 1}})
+      for (const op::Window& window : windows) {
+        if (images[1] + 2 * window.padding < window.size) continue;
+        CAPTURE(shape_text(images));
+        CAPTURE(window.size);
+        CAPTURE(window.stride);
+        check_like_ggml([&](GraphRunner& r, const LowerParams&) {
+          return r.graph.add(op::Unfold{window}, {operand(r, images, 1)});
+        });
+        if (2 * window.padding > window.size) continue;
+        check_like_ggml([&](GraphRunner& r, const LowerParams&) {
+          return r.graph.add(op::MaxPool{window}, {operand(r, images, 1)});
+        });
+      }
+}
+
+TEST_CASE("the largest of a window has no zeros from beyond the image, and is NaN where a pixel is") {
+  const LowerParams params;
+  for (const KernelSet& set : usable_kernels()) {
+    CAPTURE(name_of(set));
+    const auto pooled = [&](float first) {
+      return result_of(name_of(set), params, [&](GraphRunner& r, const LowerParams&) {
+        const Tensor image = constant(r.graph, {first, -2, -3, -4, -5, -6, -7, -8, -9}, {1, 3, 3});
+        return r.graph.add(op::MaxPool{{3, 2, 1}}, {image});
+      });
+    };
+    CHECK(pooled(-1) == std::vector<float>{-1, -2, -4, -5});
+    const std::vector<float> with_nan = pooled(NAN);
+    CHECK(std::isnan(with_nan[0]));
+    CHECK(std::vector(with_nan.begin() + 1, with_nan.end()) == std::vector<float>{-2, -4, -5});
+  }
+}
+
 TEST_CASE("products of x of any strides, with everything that may follow them") {
   for (const auto operand : kOperands)
     for (const auto residual : kOperands) {
@@ -260,6 +296,8 @@ TEST_CASE("one graph has every operation there is, and gives the same on all ker
     const Tensor ids = g.add(op::Constant{std::vector<std::int32_t>{2, 0, 1}}, {}, {3, 1, 1, 1});
     const Tensor rows = g.add(op::Gather{}, {g.add(op::Embedding{p.table()}, {ids}), ids});
     const Tensor patches = g.add(op::Patches{2}, {input(r, {4, 4, 3, 1})});
+    const Tensor pooled = g.add(op::MaxPool{{3, 2, 1}}, {reshape(g, patches, {3, 4, 4, 1})});
+    const Tensor windows = g.add(op::Unfold{{3, 1, 1}}, {pooled});
     const Tensor squares = g.add(op::PixelShuffle{2, 2}, {patches});
     const Tensor x = add(g, norm(g, op::NormKind::rms, {rows, p.parameter(g, 35)}), p.linear(g, rows, 35));
     const Tensor heads =
@@ -270,8 +308,10 @@ TEST_CASE("one graph has every operation there is, and gives the same on all ker
     const Tensor all = concat(g, {gated, one}, 0);
     const Slot* kept = r.slot(std::vector<float>(36 * 3), {36, 3, 1, 1});
     g.add(op::Write{const_cast<Slot*>(kept)}, {all});
-    const Tensor result =
-        concat(g, {reshape(g, all, {108, 1, 1, 1}), reshape(g, squares, {48, 1, 1, 1}), constant(g, {1, 2}, {2})}, 0);
+    const Tensor result = concat(g,
+                                 {reshape(g, all, {108, 1, 1, 1}), reshape(g, squares, {48, 1, 1, 1}),
+                                  reshape(g, windows, {108, 1, 1, 1}), constant(g, {1, 2}, {2})},
+                                 0);
     for (const Node& node : g.nodes()) recorded[node.op.index()] = true;
     return result;
   });

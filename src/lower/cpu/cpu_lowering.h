@@ -26,7 +26,7 @@ struct BlockedOp {
 };
 
 struct CpuOp : Step {
-  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, BlockedOp> op;
+  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, BlockedOp> op;
 };
 
 struct CpuLowering : Lowering {

@@ -8,6 +8,7 @@
 #include "kernels/cpu_kernels.h"
 #include "kernels/numbers.h"
 #include "kernels/sizes.h"
+#include "kernels/window.h"
 
 namespace vla::lower {
 namespace {
@@ -210,6 +211,26 @@ struct PatchesTask : Task {
   }
 };
 
+/// What the window covers, or the largest of it; an item is a row of places.
+struct WindowTask : Task {
+  kernels::Window window;
+  kernels::RowKernel largest;  // null: all of it
+  const float* x;
+  float* y;
+
+  void run(std::int64_t item, Worker&) const override {
+    const std::int64_t n_row = window.n_row, view = item / n_row, row = item % n_row;
+    const std::int64_t d = largest != nullptr ? window.d : window.width_of_place();
+    for (std::int64_t column = 0; column < window.n_column; ++column) {
+      const std::int64_t place = (view * n_row + row) * window.n_column + column;
+      if (largest != nullptr)
+        window.largest(largest, x, place, y + place * d);
+      else
+        window.copy(x, place, 0, d, y + place * d);
+    }
+  }
+};
+
 /// Cuts rows of d elements into items for the threads, and says how many rows an item has.
 std::int64_t item_rows(const CpuLowering& l, std::int64_t n_row, std::int64_t d, std::int64_t& n_item) {
   const std::int64_t wanted = l.n_thread == 1 ? 1 : std::min<std::int64_t>(n_row * d / kItemElements, 8 * l.n_thread);
@@ -249,6 +270,7 @@ struct FlopOf {
   double operator()(const CopyOp&) const { return 0; }
   double operator()(const LookupOp&) const { return 0; }
   double operator()(const PatchesOp&) const { return 0; }
+  double operator()(const WindowOp&) const { return 0; }
 
  private:
   template <class Of, class Flop>
@@ -452,6 +474,20 @@ std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const PatchesO
   return task;
 }
 
+kernels::Window window_of(const Shape& x, const op::Window& w, const Shape& y) {
+  return {x[0], x[1], x[2], w.size, w.stride, w.padding, y[1], y[2]};
+}
+
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const WindowOp& at, MatrixUses&) {
+  auto task = std::make_unique<WindowTask>();
+  const Node& node = *at.node;
+  task->window = window_of(node.in[0].shape(), at.window, node.shape);
+  task->largest = at.takes_largest ? cpu(l).largest : nullptr;
+  task->x = floats(l, at.x), task->y = floats(l, op.writes[0]);
+  task->n_item = node.shape[2] * node.shape[3];
+  return task;
+}
+
 std::size_t bytes_of(const Value& value) { return dtype_size(value.type, count(value.shape)); }
 
 }  // namespace
@@ -484,6 +520,7 @@ struct ScratchOf {
   std::size_t operator()(const CopyOp&) const { return 0; }
   std::size_t operator()(const LookupOp&) const { return 0; }
   std::size_t operator()(const PatchesOp&) const { return 0; }
+  std::size_t operator()(const WindowOp&) const { return 0; }
 };
 
 struct KindOf {
@@ -500,6 +537,7 @@ struct KindOf {
   Kind operator()(const CopyOp&) const { return KindClock::others; }
   Kind operator()(const LookupOp&) const { return KindClock::others; }
   Kind operator()(const PatchesOp&) const { return KindClock::others; }
+  Kind operator()(const WindowOp&) const { return KindClock::others; }
 };
 
 }  // namespace

@@ -120,6 +120,7 @@ class Layouts {
     require_contiguous(op.ids);
   }
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
+  void require_layouts(WindowOp& op) { require_contiguous(op.x); }
 
   void round_result(const CpuOp& op, const LinearOp& linear) {
     if (linear.residual != kNone || linear.factor != kNone) return;

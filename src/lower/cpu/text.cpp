@@ -56,6 +56,9 @@ struct Describe {
     return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), "copy", op.ids};
   }
   Words operator()(const PatchesOp& op) const { return {"patches", "copy", op.images}; }
+  Words operator()(const WindowOp& op) const {
+    return {op_name(op.node->op), op.takes_largest ? name_of(l.use) : "copy", op.x};
+  }
   Words operator()(const BlockedOp&) const { return {}; }  // its products are described
 };
 

@@ -32,6 +32,7 @@ struct KindOf {
   const char* operator()(const CopyOp&) const { return "copy"; }
   const char* operator()(const LookupOp&) const { return "lookup_rows"; }
   const char* operator()(const PatchesOp&) const { return "patches"; }
+  const char* operator()(const WindowOp& op) const { return op_name(op.node->op); }
 };
 
 /// Products alone are counted.

@@ -274,6 +274,11 @@ struct Emit {
                               false};
     return std::vector<Call>{call(cuda::map_elements(job), job)};
   }
+
+  Calls operator()(const WindowOp& op) const {
+    return Error{Code::unsupported, op.node->path, "an operation that there is a kernel for", op_name(op.node->op),
+                 "use --kernels ggml"};
+  }
 };
 
 }  // namespace

@@ -202,6 +202,7 @@ class Layouts {
     require_contiguous(op.ids);
   }
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
+  void require_layouts(WindowOp&) {}  // which emit refuses
 
   CudaLowering& l;
   Step* step_ = nullptr;  // the operation at hand
