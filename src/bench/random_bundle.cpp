@@ -95,7 +95,9 @@ std::string recipe(const ImageSize& image, const ViewPlaces& places, int max_tok
   const Json take = {{"op", "take"}, {"size", d_robot}};
   Json root;
   root["image"] = Json::array({letterbox, affine});
-  root["text"] = places.count > 0 ? Json::array({views, tokenize}) : Json::array({tokenize});
+  root["text"] = max_tokens == 0    ? Json::array()
+                 : places.count > 0 ? Json::array({views, tokenize})
+                                    : Json::array({tokenize});
   root["state"] = Json::array({state});
   root["action"] = Json::array({take});
   return root.dump();
@@ -129,7 +131,8 @@ Status add_keys(Keys& keys, const std::string& arch, const RandomSizes& sizes) {
   VLA_TRY(const int d_action, keys.integer("policy.d_action", kAnySize));
   VLA_TRY(const ViewPlaces places, view_places(keys, image));
   const int d_robot = std::min({kRobot, d_state > 0 ? d_state : kRobot, d_action});
-  const int max_tokens = places.count * places.size() + sizes.max_tokens;
+  // A policy without a vocabulary reads no instruction.
+  const int max_tokens = keys.has("lm.n_vocab") ? places.count * places.size() + sizes.max_tokens : 0;
   std::vector<std::string> tokens = byte_tokens();
   if (places.count > 0) tokens.emplace_back(ViewPlaces::kToken);
   const std::vector<std::string> views = numbered("observation.images.view", sizes.n_view);

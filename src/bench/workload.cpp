@@ -51,6 +51,7 @@ int most_text(const Processor& processor) { return processor.recipe().max_tokens
 
 /// A text of exactly `n_token` tokens: the same word again and again, for a few words that tokenizers cut differently.
 Result<std::string> find_text(const Processor& processor, int n_token) {
+  if (n_token == 0 && most_text(processor) == 0) return std::string();
   const int most = most_text(processor);
   if (n_token > most)
     return Error{Code::usage, "--tokens", fmt::format("at most {}, which the bundle allows", most),

@@ -46,7 +46,7 @@ Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& c
     : tap_pattern_(context.tap_pattern),
       device_(context.device),
       images_(slots_.add_f32({shape.width, shape.height, 3, shape.n_view})),
-      tokens_(slots_.add_i32({shape.n_text, 1, 1, 1})),
+      tokens_(shape.n_text > 0 ? slots_.add_i32({shape.n_text, 1, 1, 1}) : nullptr),
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
       x_(slots_.add_f32({network.d_action, network.horizon, 1, 1})),
       k_(slots_.add_i32({1, 1, 1, 1})),
@@ -69,10 +69,8 @@ Tensor Plan::steered(Graph& g, Tensor x, Tensor k, Tensor velocity) const {
 Status Plan::lower(const Network& network, bool dry) {
   Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
   Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_step));
-  network.policy.prefix(
-      prefix,
-      {prefix.input(images_), prefix.input(tokens_), state_ != nullptr ? prefix.input(state_) : Tensor(), views_},
-      cache_);
+  const auto input = [&](const Slot* slot) { return slot != nullptr ? prefix.input(slot) : Tensor(); };
+  network.policy.prefix(prefix, {input(images_), input(tokens_), input(state_), views_}, cache_);
   const Tensor x = step.input(x_), k = step.input(k_);
   const Tensor condition = network.conditions != nullptr ? column(step, step.input(network.conditions), k) : Tensor();
   Tensor answer = network.policy.velocity(step, x, condition, cache_);
@@ -86,8 +84,9 @@ Status Plan::lower(const Network& network, bool dry) {
 
   VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
-  LowerOptions varying = {{images_, tokens_}};
-  if (state_ != nullptr) varying.varying.push_back(state_);
+  LowerOptions varying = {{images_}};
+  for (const Slot* slot : {tokens_, state_})
+    if (slot != nullptr) varying.varying.push_back(slot);
   for (const Slot* slot : injection_.slots()) varying.varying.push_back(slot), changing.varying.push_back(slot);
   VLA_TRY(prefix_, device_.lower(prefix, varying));
   VLA_TRY(step_, device_.lower(step, changing));
@@ -104,7 +103,7 @@ Result<std::unique_ptr<Plan>> Plan::build(const Network& network, const InputSha
 void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens,
                       std::span<const float> state) {
   device_.set(*images_, pixels.data(), pixels.size_bytes());
-  device_.set(*tokens_, tokens.data(), tokens.size_bytes());
+  if (tokens_ != nullptr) device_.set(*tokens_, tokens.data(), tokens.size_bytes());
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());
 }
 

@@ -76,8 +76,8 @@ class Plan {
   std::string tap_pattern_;
   Device& device_;
   Slots slots_;
-  // What an act sets, side by side in the order in which it does: one upload. The state may be null; the last three are
-  // null where nothing is steered.
+  // What an act sets, side by side in the order in which it does: one upload. Tokens and state may be null; the last
+  // three are null where nothing is steered.
   Slot *images_, *tokens_, *state_, *x_, *k_, *target_, *keep_, *pull_;
   std::uint32_t views_;
   Cache cache_;

@@ -19,7 +19,7 @@ namespace vla {
 /// appear.
 struct PrefixInputs {
   Tensor images;            // [width, height, 3, n_view], in the range that the image recipe makes
-  Tensor tokens;            // [n_text] i32
+  Tensor tokens;            // [n_text] i32; none where the policy reads no instruction
   Tensor state;             // [d_state, 1], normalized and padded; none where policy.d_state is 0
   std::uint32_t views = 0;  // bit i: view i of the bundle is among the images; 0 where only their number matters
 };

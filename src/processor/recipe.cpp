@@ -88,7 +88,7 @@ Result<Recipe> parse_recipe(const std::string& json) {
                    "this bundle needs a newer vla"};
   if (recipe.width == 0)
     return Error{Code::bad_bundle, std::string(kWhere) + ".image", "a letterbox, a resize or a size", "none"};
-  if (recipe.max_tokens == 0)
+  if (recipe.max_tokens == 0 && !recipe.text.empty())
     return Error{Code::bad_bundle, std::string(kWhere) + ".text", "tokenize as the last op", "none"};
   VLA_CHECK(check_state(recipe));
   return recipe;

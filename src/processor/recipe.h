@@ -19,8 +19,8 @@ struct Recipe {
   int width = 0, height = 0;                    // of those planes
   std::vector<std::unique_ptr<PlaneOp>> image;  // the others
   std::vector<std::unique_ptr<TextOp>> text;    // all but the last op, which is tokenize
-  int max_tokens = 0;
-  bool keep_last = false;  // of more tokens the last are kept, else the first
+  int max_tokens = 0;                           // 0: the policy reads no instruction
+  bool keep_last = false;                       // of more tokens the last are kept, else the first
   std::vector<std::unique_ptr<StateOp>> state;
   std::vector<std::unique_ptr<ActionOp>> action;
 
