@@ -61,7 +61,11 @@ class OneFit final : public Fit {
 /// Works on planes (3, height, width).
 class PlaneOp {
  public:
+  static constexpr int kEveryView = -1;
+
   virtual ~PlaneOp() = default;
+  /// Which view's planes it is for: an index into the bundle's views, or kEveryView.
+  virtual int view() const { return kEveryView; }
   virtual void apply(std::span<float> planes) const = 0;
 };
 

@@ -60,6 +60,8 @@ struct ClipOp final : PlaneOp {
 
 struct StandardizeOp final : PlaneOp {
   Standardize by;
+  int of_view = kEveryView;
+  int view() const override { return of_view; }
   void apply(std::span<float> planes) const override { standardize(planes, by); }
 };
 
@@ -83,6 +85,9 @@ Status read(JsonFields& fields, StandardizeOp& op) {
   op.by.arithmetic = static_cast<Standardize::Arithmetic>(arithmetic);
   std::copy(mean.begin(), mean.end(), op.by.mean.begin());
   std::copy(std.begin(), std.end(), op.by.std.begin());
+  if (fields.has("view")) {
+    VLA_TRY(op.of_view, fields.integer("view", 0, kMaxViews - 1));
+  }
   return {};
 }
 
