@@ -97,21 +97,22 @@ Status Processor::encode_images(const Observation& observation, Inputs& inputs) 
     inputs.views |= 1U << index;
     VLA_CHECK(check_frame(*frame, *name));
     if (const auto note = codecs::suspicious(*frame)) inputs.notes.push_back(fmt::format("{}: {}", *name, *note));
-    VLA_CHECK(encode_view(*frame, *name, {inputs.pixels.data() + i * size, size}));
+    VLA_CHECK(encode_view(*frame, *name, static_cast<int>(index), {inputs.pixels.data() + i * size, size}));
   }
   return {};
 }
 
-Status Processor::encode_view(const Frame& frame, const std::string& name, std::span<float> out) const {
+Status Processor::encode_view(const Frame& frame, const std::string& name, int view, std::span<float> out) const {
   VLA_CHECK(recipe_.fit->apply(frame, out, name));
-  for (const auto& op : recipe_.image) op->apply(out);
+  for (const auto& op : recipe_.image)
+    if (op->view() == PlaneOp::kEveryView || op->view() == view) op->apply(out);
   return {};
 }
 
 std::vector<float> Processor::absent_view() const {
   std::vector<float> pixels(view_size(recipe_));
   const Frame black{recipe_.width, recipe_.height, std::vector<std::uint8_t>(pixels.size())};
-  (void)encode_view(black, "absent view", pixels);  // bytes of the expected size are never refused
+  (void)encode_view(black, "absent view", PlaneOp::kEveryView, pixels);  // bytes of the expected size are never refused
   return pixels;
 }
 
@@ -125,6 +126,11 @@ Result<std::string> Processor::fill_prompt(const std::string& instruction, std::
 }
 
 Status Processor::encode_text(const Observation& observation, Inputs& inputs) const {
+  if (recipe_.max_tokens == 0) {
+    inputs.tokens.clear();
+    if (!observation.text.empty()) inputs.notes.push_back("instruction: not read, since this policy knows one task");
+    return {};
+  }
   if (observation.text.empty()) return bad_observation("instruction", "a sentence", "empty text");
   if (observation.text.size() > Tokenizer::kMaxText ||
       unicode::valid_prefix(observation.text) < observation.text.size())

@@ -49,7 +49,8 @@ inline constexpr double kStateBound = 10.0;
 /// Turns observations into inputs and chunks into actions, by the recipe and statistics of a bundle.
 class Processor {
  public:
-  /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*`, `stats.*`, `lm.n_vocab`, `policy.d_state`,
+  /// Reads `processor.*`, `observation.*`, `action.names`, `tokenizer.*` and `lm.n_vocab` if the recipe has a text,
+  /// `stats.*`, `policy.d_state`,
   /// `policy.d_action`, `policy.view_starts*` if the text has places for views, `policy.horizon` if the recipe drops
   /// rows, and checks that they fit each other. The bundle may be closed afterwards. Errors: bad_bundle.
   /// `tokenizer`: shared with a processor of the same `tokenizer.*` and `lm.n_vocab`; null makes one.
@@ -94,6 +95,7 @@ class Processor {
   /// Tokens that every prompt has around its places for views; 0 where the text has no such places.
   int n_view_tokens() const { return static_cast<int>(view_tokens_.size()); }
   const Recipe& recipe() const { return recipe_; }
+  /// Null where the policy reads no instruction.
   const std::shared_ptr<const Tokenizer>& tokenizer() const { return tokenizer_; }
   /// Features that --identity-stats left unnormalized, which every answer reports.
   const std::vector<std::string>& degraded() const { return degraded_; }
@@ -111,7 +113,7 @@ class Processor {
   };
   Result<std::vector<PresentView>> present_views(const Observation& observation) const;
   Result<std::string> fill_prompt(const std::string& instruction, std::span<const int> state) const;
-  Status encode_view(const Frame& frame, const std::string& name, std::span<float> out) const;
+  Status encode_view(const Frame& frame, const std::string& name, int view, std::span<float> out) const;
   Status check_view_places(std::span<const std::int32_t> tokens) const;
   void cut_tokens(std::vector<std::int32_t>& tokens) const;
   Status read_degraded(const Keys& keys);

@@ -58,12 +58,14 @@ Result<Processor> Processor::create(const Bundle& bundle, std::shared_ptr<const 
   VLA_CHECK(processor.bind_state(bundle));
   VLA_CHECK(processor.bind_action(bundle));
   processor.tokenizer_ = std::move(tokenizer);
-  if (processor.tokenizer_ == nullptr) {
+  const bool has_text = processor.recipe_.max_tokens > 0;
+  if (has_text && processor.tokenizer_ == nullptr) {
     VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
     VLA_TRY(Tokenizer read, Tokenizer::create(keys, n_vocab));
     processor.tokenizer_ = std::make_shared<const Tokenizer>(std::move(read));
   }
-  VLA_TRY(const int max_text_tokens, keys.integer("observation.max_text_tokens", {1, kMaxVector}));
+  VLA_TRY(const int max_text_tokens,
+          keys.integer("observation.max_text_tokens", {has_text ? 1.0 : 0.0, has_text ? kMaxVector : 0.0}));
   if (processor.recipe_.max_tokens > max_text_tokens)
     return misfit("processor.recipe.text",
                   fmt::format("at most {} tokens (observation.max_text_tokens)", max_text_tokens),
@@ -85,6 +87,9 @@ Status Processor::read_features(const Bundle& bundle) {
   VLA_CHECK(check_size("observation.view_optional", view_optional_, views.size()));
   if (views.size() > static_cast<std::size_t>(kMaxViews))
     return misfit("observation.views", fmt::format("at most {} views", kMaxViews), std::to_string(views.size()));
+  const auto is_missing = [&](const auto& op) { return op->view() >= static_cast<int>(views.size()); };
+  if (std::any_of(recipe_.image.begin(), recipe_.image.end(), is_missing))
+    return misfit("processor.recipe.image", fmt::format("ops of the {} views", views.size()), "one of a later view");
   views_ = FeatureNames("view", std::move(views), std::move(aliases));
 
   VLA_TRY(std::vector<std::string> states, keys.strings("observation.states"));

@@ -52,16 +52,17 @@ def write_observation(case, folder):
         if frame:
             image = Image.fromarray(smooth_frame(frame[0], frame[1], generator))
             image.save(folder / images[view], **({"quality": 92} if frame[2] == "jpg" else {"optimize": True}))
-    state = generator.normal(checkpoint.d_state) * f32(0.4)
+    widths = getattr(checkpoint, "states", None)  # feature -> width
+    state = generator.normal(sum(widths.values()) if widths else checkpoint.d_state) * f32(0.4)
     for i in checkpoint.zero_spread:  # what never moved in the data does not move here; otherwise eps would rule the chunk
         state[i] = statistics(checkpoint.d_state, checkpoint.d_action, case.seed)["observation.state"]["mean"][i]
     state = list(case.state) or state.tolist()
-    if hasattr(checkpoint, "states"):  # feature -> width
+    if widths:
         numbers = iter(state)
-        state = {name: [next(numbers) for _ in range(n)] for name, n in checkpoint.states.items()}
+        state = {name: [next(numbers) for _ in range(n)] for name, n in widths.items()}
     observation = {"images": images, "state": state, "text": case.text}
     (folder / "observation.json").write_text(json.dumps(observation, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    shape = checkpoint.policy["chunk_size"], checkpoint.policy["max_action_dim"]
+    shape = checkpoint.policy["chunk_size"], checkpoint.policy.get("max_action_dim", checkpoint.d_action)
     if getattr(checkpoint, "noise", "normal") == "uniform":  # multiples of 2^-20: they survive what a reference makes of a draw
         noise = np.rint((2 * generator.uniform(*shape) - 1) * 2**20) / f32(2**20)
     else:

@@ -15,6 +15,7 @@ import numpy as np
 from .. import __version__
 from . import archs
 from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
+from .batch_norm import folded, shapes
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
 from .checkpoint import Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
@@ -104,6 +105,9 @@ def _check_state_bound(options: Options) -> None:
 def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, List[str]]:
     """Compares what the configs ask for with what the file has: every missing, extra and misshapen tensor in one report."""
     expected = {weight.source: weight.stored for weight in plan.weights}
+    for weight in plan.weights:
+        if weight.batch_norm:
+            expected.update(shapes(weight.batch_norm, weight.stored[0]))
     optional = {row.source: row for row in plan.dropped}
     for source in expected:
         shared = checkpoint.aliases.get(source)
@@ -187,7 +191,7 @@ def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Probl
         with BundleWriter(summary.path, keys, tensors) as out:
             for weight, tensor in zip(plan.weights, tensors):
                 progress(weight.target, done, total)
-                _stream(checkpoint.tensors[weight.source], weight, tensor, out, summary, problems)
+                _stream(checkpoint, weight, tensor, out, summary, problems)
                 done += tensor.n_bytes
             for name, value in plan.statistics.items():
                 out.write(name, value)
@@ -217,13 +221,17 @@ def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
 
 
 def _stream(
-    entry: Entry, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems
+    checkpoint: Checkpoint, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems
 ) -> None:
+    entry = checkpoint.tensors[weight.source]
     if weight.kind in (TERNARY, SCALE):
         return _stream_ternary(entry, weight, out, summary, problems)
     finite, overflow = True, False
-    for raw in _pieces(entry, weight):
-        part = convert(raw, entry.dtype, tensor.dtype)
+    pieces, stored = _pieces(entry, weight), entry.dtype
+    if weight.batch_norm:
+        pieces, stored = iter([folded(entry, weight.batch_norm, checkpoint.tensors)]), "F32"
+    for raw in pieces:
+        part = convert(raw, stored, tensor.dtype)
         if weight.in_bf16:
             part = convert(from_f32(to_f32(raw, entry.dtype), "bf16"), "BF16", tensor.dtype)
         finite, overflow = finite and part.finite, overflow or part.overflow

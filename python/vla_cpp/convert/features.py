@@ -9,7 +9,7 @@ from typing import Dict, List, Optional, Sequence
 from .bundle import Key
 from .errors import Problems
 from .files import member, read_json
-from .recipe import ACTION, STATE
+from .recipe import ACTION
 
 
 def views_of(views: Sequence[str], aliases: Sequence[str], optional: Sequence[int], min_views: int = 1) -> List[Key]:
@@ -39,9 +39,10 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
     if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
         problems.add(info_path + ": fps", "a rate in Hz", repr(rate))
         rate = 0
+    states = [name for feature in dims if feature != ACTION for name in names[feature]]
     return [
-        Key("observation.state_names", "string[]", names[STATE]),
-        Key("observation.state_units", "string[]", [""] * dims[STATE]),
+        Key("observation.state_names", "string[]", states),
+        Key("observation.state_units", "string[]", [""] * len(states)),
         Key("action.names", "string[]", names[ACTION]),
         Key("action.units", "string[]", [""] * dims[ACTION]),
         Key("action.rate_hz", "f32", float(rate)),

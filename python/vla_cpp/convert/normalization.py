@@ -85,11 +85,16 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
             "fine-tune or save the policy with its data set's statistics, or accept unnormalized numbers by --identity-stats "
             + feature,
         )
-    chosen = {name: found.values[name] for name in names if name in found.values}
+    chosen = {name: _plain(found.values[name]) for name in names if name in found.values}
     for name, value in chosen.items():
         widths = (context.min_widths.get(feature, dim), dim)
         _check_statistic("statistics of {}: {}".format(feature, name), name, value, widths, context)
     return Normalization(kind, eps, chosen)
+
+
+def _plain(value: np.ndarray) -> np.ndarray:
+    """Statistics of pixels are stored as (3, 1, 1), to be broadcast over images."""
+    return value.ravel() if value.shape == (3, 1, 1) else value
 
 
 def _others(known: Sequence[str]) -> str:

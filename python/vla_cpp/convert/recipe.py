@@ -9,7 +9,7 @@ Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_proc
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Dict, List, Optional, Sequence
+from typing import Dict, List, Mapping, Optional, Sequence
 
 import numpy as np
 
@@ -67,11 +67,12 @@ class Processors:
     own_tokenizer: str = ""  # folder inside the checkpoint
     state: Normalization = field(default_factory=Normalization)
     action: Normalization = field(default_factory=Normalization)
+    others: Dict[str, Normalization] = field(default_factory=dict)  # of further features of the observation
 
-    def statistics(self) -> Dict[str, np.ndarray]:
-        """By the name of the bundle's tensor."""
-        both = ((STATE, self.state), (ACTION, self.action))
-        return {"stats.{}.{}".format(f, name): v for f, norm in both for name, v in norm.statistics.items()}
+    def statistics(self, without: Sequence[str] = ()) -> Dict[str, np.ndarray]:
+        """By the name of the bundle's tensor. `without`: features whose statistics are no tensors there."""
+        known = ((STATE, self.state), (ACTION, self.action), *self.others.items())
+        return {"stats.{}.{}".format(f, name): v for f, norm in known if f not in without for name, v in norm.statistics.items()}
 
 
 class _Reader:
@@ -85,7 +86,9 @@ class _Reader:
         problems: Problems,
         own: Steps,
         min_widths: Dict[str, int],
+        others: Mapping[str, str],
     ) -> None:
+        self.others = others
         self.steps = {file: {**STEPS[file], **own.get(file, {})} for file in STEPS}
         self.checkpoint, self.problems, self.result = checkpoint, problems, Processors()
         self.context = Context(dims, identity, checkpoint.notes, checkpoint.degraded, problems, min_widths)
@@ -209,13 +212,17 @@ class _Reader:
                 str(stated)[:80],
             )
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
+        for feature, kind in self.others.items():
+            if config.get("normalize_observation_keys") is not None and feature not in keys:
+                self.problems.unsupported(where + ": normalize_observation_keys", feature + " among them", str(keys)[:80])
+            self.result.others[feature] = self.normalization(where, config, step, feature, kind)
 
     def _unnormalizer(self, where: str, config: dict, step: dict) -> None:
         self.result.action = self.normalization(where, config, step, ACTION, "ACTION")
 
     def normalization(self, where: str, config: dict, step: dict, feature: str, kind: str) -> Normalization:
         modes = member(config, "norm_map", dict, where)
-        if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
+        if modes.get("VISUAL", "IDENTITY") != "IDENTITY" and not self.normalizes_pixels():
             self.problems.unsupported(
                 where + ": norm_map.VISUAL",
                 "IDENTITY",
@@ -240,6 +247,9 @@ class _Reader:
             self.problems.add(where + ": eps", "a small number", repr(eps))
         return choose(feature, modes.get(kind, "IDENTITY"), eps, found, self.context)
 
+    def normalizes_pixels(self) -> bool:
+        return "VISUAL" in self.others.values()
+
     def finish(self, file: str, required: Sequence[str]) -> None:
         for name in required:
             if name not in self.seen:
@@ -260,11 +270,14 @@ def read_processors(
     problems: Problems,
     own: Steps,
     min_widths: Optional[Dict[str, int]] = None,
+    others: Optional[Mapping[str, str]] = None,
+    reads_text: bool = True,
 ) -> Processors:
     """Both pipelines, or in the older layout what today's pipelines would be with the statistics from the weights. `own`: the
     steps that this architecture has beside those of all policies. `min_widths`: for a policy that pads before it normalizes and whose
-    `dims` are the padded widths, those of the robot; such a policy also builds its prompt itself."""
-    reader = _Reader(checkpoint, dims, identity, problems, own, min_widths or {})
+    `dims` are the padded widths, those of the robot; such a policy also builds its prompt itself. `others`: features of the observation beside the state that the
+    policy normalizes, with their kind. `reads_text`: without it a checkpoint needs no tokenizer."""
+    reader = _Reader(checkpoint, dims, identity, problems, own, min_widths or {}, others or {})
     for feature in identity:
         if feature not in dims:
             problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
@@ -274,7 +287,7 @@ def read_processors(
         found = "processor files, which have those of one robot"
         problems.add("--stats", "a checkpoint with statistics of several robots", found, "leave the option out", Code.USAGE)
     required = {PRE: ["normalizer_processor"], POST: ["unnormalizer_processor"]}
-    if min_widths is None:
+    if min_widths is None and reads_text:
         required[PRE].insert(0, "tokenizer_processor")
     for file, content in zip((PRE, POST), checkpoint.processors):
         reader.pipeline(file, content)
@@ -291,7 +304,7 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
     )
     config = checkpoint.config
     modes = member(config, "normalization_mapping", dict, "config.json")
-    if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
+    if modes.get("VISUAL", "IDENTITY") != "IDENTITY" and not reader.normalizes_pixels():
         reader.problems.unsupported("config.json: normalization_mapping.VISUAL", "IDENTITY", str(modes["VISUAL"]))
     result = Processors(
         newline=True,
@@ -300,6 +313,9 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
     for feature, kind, attribute in ((STATE, "STATE", "state"), (ACTION, "ACTION", "action")):
         found = from_weights(checkpoint, feature, reader.problems)
         setattr(result, attribute, choose(feature, modes.get(kind, "MEAN_STD"), 1e-8, found, reader.context))
+    for feature, kind in reader.others.items():
+        found = from_weights(checkpoint, feature, reader.problems)
+        result.others[feature] = choose(feature, modes.get(kind, "IDENTITY"), 1e-8, found, reader.context)
     return result
 
 

@@ -37,6 +37,7 @@ class Weight(NamedTuple):
     pick: Optional[Tuple[int, int]] = None  # one index of one axis of the source: (axis, index)
     transpose: bool = False  # what is left after `pick`, stored as (in, out)
     in_bf16: bool = False  # the reference rounds it to bfloat16 when it loads it, whatever it is stored as
+    batch_norm: str = ""  # a convolution's matrix, or the bias that it gets, with the frozen batch norm of this name behind it
     regroup: int = 0  # the last axis is stored as groups of this many numbers: the bundle has all first ones, all second ones, ...
 
 

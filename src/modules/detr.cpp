@@ -1,0 +1,53 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "modules/detr.h"
+
+#include <fmt/format.h>
+
+namespace vla {
+
+DetrFamily DetrFamily::read(const Scope& s) {
+  DetrFamily family = {
+      s.dim("d_model"), s.dim("n_head", 1024), s.dim("d_ff"), Activation::none, false, s.number("norm_eps", kNormEps)};
+  family.activation = s.choice("activation", {"relu", "gelu_erf"}) == 0 ? Activation::relu : Activation::gelu_erf;
+  family.pre_norm = s.choice("norm", {"after", "before"}) == 1;
+  s.require(family.d_model % family.n_head == 0, "n_head", fmt::format("a divisor of d_model {}", family.d_model),
+            std::to_string(family.n_head));
+  return family;
+}
+
+Tensor PlacedAttention::operator()(Graph& g, Tensor x, Tensor position) const {
+  return norm_(g, x, [&](Tensor h) {
+    const Tensor placed = add(g, h, position);
+    return attention_(g, placed, {}, {attention_.project()(g, placed, h, {})});
+  });
+}
+
+DetrEncoderLayer::DetrEncoderLayer(const Scope& s, const DetrFamily& family)
+    : Module(s),
+      among_(s, family),
+      ffn_norm_(s / "ffn_norm", family),
+      mlp_(s, family.d_model, family.d_ff, family.activation) {}
+
+Tensor DetrEncoderLayer::forward(Graph& g, Tensor x, Tensor position) const {
+  return ffn_norm_(g, among_(g, x, position), [&](Tensor h) { return mlp_(g, h); });
+}
+
+DetrDecoderLayer::DetrDecoderLayer(const Scope& s, const DetrFamily& family)
+    : Module(s),
+      among_(s, family),
+      cross_norm_(s / "cross" / "attn_norm", family),
+      cross_(s / "cross", family.d_model, family.d_model, PlacedAttention::heads(family)),
+      ffn_norm_(s / "ffn_norm", family),
+      mlp_(s, family.d_model, family.d_ff, family.activation) {}
+
+KeyValue DetrDecoderLayer::project(Graph& g, Tensor tokens, Tensor position) const {
+  return cross_.project()(g, add(g, tokens, position), tokens, {});
+}
+
+Tensor DetrDecoderLayer::forward(Graph& g, Tensor x, Tensor position, const KeyValue& seen) const {
+  x = cross_norm_(g, x, [&](Tensor h) { return cross_(g, add(g, h, position), {}, {seen}); });
+  return ffn_norm_(g, x, [&](Tensor h) { return mlp_(g, h); });
+}
+
+}  // namespace vla

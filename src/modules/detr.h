@@ -1,0 +1,84 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "modules/attention.h"
+#include "nn/mlp.h"
+
+namespace vla {
+
+/// How the layers of a transformer like DETR's are built.
+struct DetrFamily {
+  int d_model, n_head, d_ff;
+  Activation activation;
+  bool pre_norm;  // norms are in front of attention and MLP, else behind the sum with their input
+  float norm_eps;
+
+  /// Reads d_model, n_head, d_ff, activation, norm and norm_eps of `s`.
+  static DetrFamily read(const Scope& s);
+};
+
+/// One branch of a layer with its norm: x + branch(norm(x)), or norm(x + branch(x)).
+class NormedSum {
+ public:
+  NormedSum(const Scope& s, const DetrFamily& family)
+      : norm_(s, family.d_model, family.norm_eps), pre_norm_(family.pre_norm) {}
+  template <class Branch>
+  Tensor operator()(Graph& g, Tensor x, const Branch& branch) const {
+    if (pre_norm_) return add(g, x, branch(norm_(g, x)));
+    return norm_(g, add(g, x, branch(x)));
+  }
+
+ private:
+  LayerNorm norm_;
+  bool pre_norm_;
+};
+
+/// Attention of tokens to each other, in which positions are added to what makes queries and keys, but not values.
+class PlacedAttention {
+ public:
+  PlacedAttention(const Scope& s, const DetrFamily& family)
+      : norm_(s / "attn_norm", family), attention_(s, family.d_model, family.d_model, heads(family)) {}
+  /// x, position [d_model, n] -> [d_model, n].
+  Tensor operator()(Graph& g, Tensor x, Tensor position) const;
+  static Heads heads(const DetrFamily& family) { return Heads::even(family.d_model, family.n_head); }
+
+ private:
+  NormedSum norm_;
+  Attention attention_;
+};
+
+/// Self-attention and an MLP. x, position [d_model, n] -> [d_model, n].
+/// Source: lerobot policies/act/modeling_act.py ACTEncoderLayer.
+class DetrEncoderLayer : public Module<DetrEncoderLayer> {
+ public:
+  DetrEncoderLayer(const Scope& s, const DetrFamily& family);
+  Tensor forward(Graph& g, Tensor x, Tensor position) const;
+
+ private:
+  PlacedAttention among_;
+  NormedSum ffn_norm_;
+  Mlp mlp_;
+};
+
+/// Self-attention of queries, attention to the encoder's tokens (`cross`), and an MLP.
+/// Source: lerobot policies/act/modeling_act.py ACTDecoderLayer.
+class DetrDecoderLayer : public Module<DetrDecoderLayer> {
+ public:
+  DetrDecoderLayer(const Scope& s, const DetrFamily& family);
+  /// What the layer keeps of the encoder's tokens, and their positions, both [d_model, n].
+  KeyValue project(Graph& g, Tensor tokens, Tensor position) const;
+  /// Its first part, which depends on nothing else: x, position [d_model, n_query] -> [d_model, n_query].
+  Tensor among(Graph& g, Tensor x, Tensor position) const { return among_(g, x, position); }
+  /// What follows: x as `among` left it.
+  Tensor forward(Graph& g, Tensor x, Tensor position, const KeyValue& seen) const;
+
+ private:
+  PlacedAttention among_;
+  NormedSum cross_norm_;
+  Attention cross_;
+  NormedSum ffn_norm_;
+  Mlp mlp_;
+};
+
+}  // namespace vla

@@ -1,0 +1,30 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "nn/linear.h"
+
+namespace vla {
+
+/// The pixels of images one after the other: [width, height, d, n_view] -> [d, width, height, n_view], for three
+/// features d, which is the order of what follows.
+Tensor pixels_first(Graph& g, Tensor images);
+
+/// A convolution with bias as a product of what its window covers: x [d_in, width, height, n_view] -> [d_out, n_column,
+/// n_row, n_view], with size / 2 zeros beyond each side. Columns of the matrix: row, column, feature.
+/// Source: torch.nn.Conv2d(padding = kernel_size // 2).
+class Convolution : public Module<Convolution> {
+ public:
+  Convolution(const Scope& s, int d_in, int d_out, int size, int stride);
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  op::Window window_;
+  Linear product_;
+};
+
+/// The largest number of each feature in a window: x [d, width, height, n_view] -> [d, n_column, n_row, n_view].
+/// Source: torch.nn.MaxPool2d(padding = kernel_size // 2).
+Tensor max_pool(Graph& g, Tensor x, int size, int stride);
+
+}  // namespace vla

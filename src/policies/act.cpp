@@ -1,0 +1,132 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// ACT: ResNet towers, a transformer encoder over the cells of all views and the robot's state, and a decoder that turns
+// a learned query for each row of the chunk into an action. It reads no instruction and knows no noise: one pass. The
+// style variable of its training is zero, so that its encoder is no part of the policy.
+// Reference: lerobot src/lerobot/policies/act/modeling_act.py (ACT.forward).
+
+#include "modules/detr.h"
+#include "modules/vision/resnet.h"
+#include "nn/embedding.h"
+#include "nn/sine_positions.h"
+#include "nn/tokens.h"
+#include "policies/policy.h"
+
+namespace vla {
+namespace {
+
+class Act final : public Policy {
+  int d_state_, d_environment_, horizon_;
+  int n_token_;  // in front of the views': style, robot, environment
+  DetrFamily family_;
+  ResNet vision_;  // observation rate
+  Linear projector_;
+  Embedding position_;
+  const Param* style_;
+  Linear state_in_;
+  std::optional<Linear> environment_in_;
+  std::vector<DetrEncoderLayer> encoder_;
+  std::optional<LayerNorm> encoder_norm_;
+  Embedding query_;  // step rate
+  std::vector<DetrDecoderLayer> decoder_;
+  LayerNorm decoder_norm_;
+  Linear action_out_;
+
+ public:
+  explicit Act(const Scope& s)
+      : d_state_(s.dim("d_robot_state")),
+        d_environment_(s.index("d_environment_state", 1 << 16)),
+        horizon_(s.dim("horizon", 4096)),
+        n_token_(d_environment_ > 0 ? 3 : 2),
+        family_(DetrFamily::read(s / "transformer")),
+        vision_(s / "vision"),
+        projector_(s / "projector", vision_.d_model(), family_.d_model, Bias::yes),
+        position_(s / "position", family_.d_model, n_token_),
+        style_((s / "style").vector("weight", family_.d_model)),
+        state_in_(s / "state_in", d_state_, family_.d_model, Bias::yes),
+        query_(s / "query", family_.d_model, horizon_),
+        decoder_norm_(s / "decoder" / "norm", family_.d_model, family_.norm_eps),
+        action_out_(s / "action_out", family_.d_model, s.dim("d_action"), Bias::yes) {
+    s.require(family_.d_model % 4 == 0, "transformer.d_model", "a multiple of 4, for positions in two directions",
+              std::to_string(family_.d_model));
+    s.require(s.dim("d_state") == d_state_ + d_environment_, "d_state", "the robot's and the environment's state",
+              std::to_string(s.dim("d_state")));
+    if (d_environment_ > 0) environment_in_.emplace(s / "environment_in", d_environment_, family_.d_model, Bias::yes);
+    const int n_encoder = (s / "encoder").n_layer("n_layer"), n_decoder = (s / "decoder").n_layer("n_layer");
+    for (int i = 0; i < n_encoder; ++i) encoder_.emplace_back(s / "encoder" / "blk" / i, family_);
+    for (int i = 0; i < n_decoder; ++i) decoder_.emplace_back(s / "decoder" / "blk" / i, family_);
+    if (family_.pre_norm) encoder_norm_.emplace(s / "encoder" / "norm", family_.d_model, family_.norm_eps);
+  }
+
+  Status check(const InputShape& shape) const override {
+    VLA_CHECK(vision_.check(shape.width, shape.height));
+    return check_prefix(shape.n_view, ResNet::n_cell(shape.width) * ResNet::n_cell(shape.height), n_token_);
+  }
+
+  /// Queries start from zero: what the first layer's self-attention makes of them depends on nothing else.
+  void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
+    const Tensor zero = full(g, 0.0f, family_.d_model, horizon_);
+    cache.put(g, "queries", decoder_.front().among(g, zero, queries(g)));
+  }
+
+  void prefix(Graph& g, const PrefixInputs& in, Cache& cache) const override {
+    const Tensor map = vision_(g, in.images);  // [512, n_column, n_row, n_view]
+    const Tensor image = projector_(g, map);
+    g.end_stage("vision");
+    std::vector<Tensor> tokens = {g.parameter(style_), state_in_(g, slice(g, in.state, 0, 0, d_state_))};
+    if (environment_in_) tokens.push_back((*environment_in_)(g, slice(g, in.state, 0, d_state_, d_environment_)));
+    tokens.push_back(cells(g, image));
+    Tensor x = g.name("prefix", concat_tokens(g, tokens));
+    const Tensor position = positions(g, map);
+    for (const DetrEncoderLayer& layer : encoder_) x = layer(g, x, position);
+    if (encoder_norm_) x = (*encoder_norm_)(g, x);
+    for (const DetrDecoderLayer& layer : decoder_) put(g, cache, layer.path(), layer.project(g, x, position));
+  }
+
+  Tensor velocity(Graph& g, Tensor /*x_t*/, Tensor /*condition*/, const Cache& cache) const override {
+    Tensor x = cache.get(g, "queries");
+    for (const DetrDecoderLayer& layer : decoder_) {
+      if (&layer != &decoder_.front()) x = layer.among(g, x, queries(g));
+      x = layer(g, x, queries(g), get(g, cache, layer.path()));
+    }
+    return action_out_(g, decoder_norm_(g, x));  // [d_action, horizon]
+  }
+
+ private:
+  Tensor queries(Graph& g) const { return query_.forward(g, arange(g, horizon_)); }
+  /// Every cell of a feature map as a token: [d_model, n_column, n_row, n_view] -> [d_model, n].
+  static Tensor cells(Graph& g, Tensor map) {
+    return g.add(op::Reshape{}, {map}, {map.dim(0), map.dim(1) * map.dim(2) * map.dim(3), 1, 1});
+  }
+  /// Of all tokens of the encoder; views are not told apart.
+  Tensor positions(Graph& g, Tensor map) const {
+    const Tensor of_cells =
+        sine_positions(g, static_cast<int>(map.dim(1)), static_cast<int>(map.dim(2)), family_.d_model);
+    std::vector<Tensor> parts = {position_.forward(g, arange(g, n_token_))};
+    parts.insert(parts.end(), static_cast<std::size_t>(map.dim(3)), of_cells);
+    return concat_tokens(g, parts);
+  }
+};
+
+/// The published size for ALOHA: two cameras of 640 x 480, 52 M parameters. Source: lerobot
+/// policies/act/configuration_act.py.
+Keys published() {
+  // clang-format off
+  return Keys({
+      {"policy.d_state", 14}, {"policy.d_robot_state", 14}, {"policy.d_environment_state", 0},
+      {"policy.d_action", 14}, {"policy.horizon", 100},
+      {"vision.n_block", std::vector<std::int64_t>{2, 2, 2, 2}},
+      {"vision.image_width", 640}, {"vision.image_height", 480},
+      {"transformer.d_model", 512}, {"transformer.n_head", 8}, {"transformer.d_ff", 3200},
+      {"transformer.activation", "relu"}, {"transformer.norm", "after"}, {"transformer.norm_eps", 1e-5},
+      {"encoder.n_layer", 4}, {"decoder.n_layer", 1},
+      {"solver.kind", "direct"}, {"solver.steps", 1}, {"solver.noise", "none"}});
+  // clang-format on
+}
+
+}  // namespace
+
+PolicyEntry act_policy() { return policy_entry<Act>("act", published); }
+
+}  // namespace vla
