@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""ACT: what its checkpoint states, as keys and tensors of a bundle.
+
+Reference: lerobot src/lerobot/policies/act (configuration_act.py, modeling_act.py, processor_act.py) and torchvision models/resnet.py.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Dict, List
+
+from ... import recipe
+from ...bundle import Key
+from ...checkpoint import Checkpoint
+from ...errors import Problems
+from ...features import feature_keys, states_of, views_of
+from ...images import standardized
+from .. import Options, Plan
+from .config import ENVIRONMENT, Sizes, read_sizes
+from .mapping import dropped, hints, network_keys, weights
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    s = read_sizes(checkpoint, options, problems)
+    problems.raise_any()
+    others = {**({ENVIRONMENT: "ENV"} if s.d_environment else {}), **dict.fromkeys(s.views, "VISUAL")}
+    dims = {recipe.STATE: s.d_state, recipe.ACTION: s.d_action, ENVIRONMENT: s.d_environment, **dict.fromkeys(s.views, 3)}
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, {}, others=others, reads_text=False)
+    document = json.dumps(recipe_document(s, processors, problems), ensure_ascii=False)
+    keys = [
+        *network_keys(s),
+        *_feature_keys(checkpoint, options, s, processors, problems),
+        Key("processor.recipe", "string", document),
+    ]
+    problems.raise_any()
+    return Plan(keys, weights(s), dropped(s), processors.statistics(without=s.views), hints(s))
+
+
+def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems) -> Dict[str, List[dict]]:
+    """The reference resizes nothing: frames of another size than the data set's are refused."""
+    width, height = s.frame
+    size = {"width": width, "height": height}
+    states = [(recipe.STATE, processors.state)] + ([(ENVIRONMENT, processors.others[ENVIRONMENT])] if s.d_environment else [])
+    return {
+        "image": [
+            {"op": "camera_size", **size},
+            {"op": "size", **size},
+            *standardized([(view, processors.others[view]) for view in s.views], problems),
+        ],
+        "text": [],
+        "state": [
+            {**op, **({"feature": name} if s.d_environment else {})} for name, norm in states for op in norm.op("normalize", name)
+        ],
+        "action": processors.action.op("unnormalize", recipe.ACTION),
+    }
+
+
+def _feature_keys(
+    checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems
+) -> List[Key]:
+    """The reference needs every view."""
+    dims = {recipe.STATE: s.d_state, **({ENVIRONMENT: s.d_environment} if s.d_environment else {})}
+    aliases = recipe.view_aliases(s.views, processors, checkpoint.notes, problems)
+    return [
+        *views_of(s.views, aliases, [0] * len(s.views), len(s.views)),
+        *states_of(dims),
+        Key("observation.max_text_tokens", "u32", 0),
+        *feature_keys(options.dataset_info, {**dims, recipe.ACTION: s.d_action}, checkpoint.notes, problems),
+    ]
