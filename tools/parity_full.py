@@ -36,7 +36,7 @@ def write_case(case, arch):
     """The published size with random weights, two smooth frames, a state, noise."""
     module = family(arch)
     frames, options = getattr(module, "FRAMES", FRAMES), getattr(module, "OPTIONS", {})
-    text, views = "pick up the red cube and place it in the basket", {view: frame[:2] for view, frame in frames.items()}
+    text, views = getattr(module, "TEXT", "pick up the red cube and place it in the basket"), {view: frame[:2] for view, frame in frames.items()}
     described = cases.Case(SEED, frames, text, module.published(views, arch), options=options)
     cases.write_observation(described, case)
     print(f"{cases.write_checkpoint(described, case):,} random parameters")
@@ -148,7 +148,7 @@ def main():
     reference = torch_runs["float32"]
     checkpoint, bundle = case / "checkpoint", case / "bundle.gguf"
     backbone = cases.backbone_folder(checkpoint)
-    convert = [sys.executable, "-m", "vla_cpp.convert.cli", checkpoint, "--backbone", backbone, "-o", bundle]
+    convert = [sys.executable, "-m", "vla_cpp.convert.cli", checkpoint, *(["--backbone", backbone] if backbone else []), "-o", bundle]
     os.environ["PYTHONPATH"] = str(ROOT / "python")
     start = time.perf_counter()
     _, convert_peak = child([*convert, "--dtype", args.dtype, "--force", *cases.conversion_options(case)])

@@ -33,7 +33,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla
+from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -147,6 +147,28 @@ def draw_bitvla(seed):
     options = {} if len(cameras) == 2 else {"views": list(cameras)}
     words = r.choice(("open the drawer", "Put the WHITE mug on the plate", "don't 12345 stop!", "naïve café 漢字", "a", "word " * 20))
     return bitvla.case(seed, cameras, words, checkpoint, **options), r.choice(("bitvla", "openvla"))
+
+
+def draw_act(seed):
+    """The same for ACT: towers have one width, everything else is drawn; in one of ten a width that positions cannot be told in."""
+    r = random.Random(f"act {seed}")
+    heads = r.choice((1, 2, 3, 4, 5))
+    d_model = 4 * heads * r.choice((1, 2, 3, 5)) if r.random() < 0.9 else 2 * heads * r.choice((3, 5, 7))
+    height, width = r.randint(12, 80), r.randint(12, 80)
+    frames = {f"cam{i}": (height, width, r.choice(("png", "png", "jpg"))) for i in range(r.randint(1, 3))}
+    old, n_environment = r.random() < 0.2, r.choice((0, 0, 0, 1, 9))
+    pixels = ("MEAN_STD",) if old else ("MEAN_STD", "MEAN_STD", "MIN_MAX", "QUANTILES", "QUANTILE10", "IDENTITY")
+    states = ("MEAN_STD", "IDENTITY") if old else MODES
+    modes = {"VISUAL": r.choice(pixels), "STATE": r.choice(states), "ACTION": r.choice(states)}
+    if r.random() < 0.5:
+        modes["ENV"] = r.choice(states)
+    policy = act.policy(
+        r.randint(1, 14), d_model, heads, r.choice((20, 50, 72)), (r.randint(1, 4), r.choice((1, 1, 2, 3)), r.randint(1, 2)),
+        vision_backbone=r.choice(("resnet18", "resnet18", "resnet34")), pre_norm=r.random() < 0.4, use_vae=r.random() < 0.7,
+        feedforward_activation=r.choice(("relu", "relu", "gelu")), latent_dim=r.choice((8, 32)), normalization_mapping=modes)
+    checkpoint = act.Checkpoint(policy, {view: frame[:2] for view, frame in frames.items()}, r.randint(1, 20), r.randint(1, 20), n_environment,
+                                exact=False, imagenet=r.random() < 0.5, dtype=r.choice(("F32", "F32", "BF16")), old=old)
+    return act.case(seed, frames, checkpoint)
 
 
 # Of what a part of BitVLA reads: names of values that the reference records. A whole block starts from the one before.
@@ -304,7 +326,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

@@ -170,9 +170,13 @@ def layer(at, d, d_ff, attentions):
     return out
 
 
+FRAMES = {"top": (480, 640, "png"), "wrist": (480, 640, "png")}  # of the published size
+TEXT = ""
+
+
 def published(views, arch="act"):
     """The published size for ALOHA: 52 M parameters."""
-    return Checkpoint({}, views, d_state=14, d_action=14)
+    return Checkpoint({"chunk_size": CONFIG["chunk_size"]}, views, d_state=14, d_action=14)
 
 
 # --- cases -----------------------------------------------------------------------------------------------------------
@@ -222,8 +226,10 @@ def load(checkpoint, dtype="float32"):
     folder = str(checkpoint)
     config = PreTrainedConfig.from_pretrained(folder)
     policy = ACTPolicy.from_pretrained(folder, config=config, strict=not is_old(checkpoint)).float().eval()
+    predict = policy.predict_action_chunk
     if dtype == "published":
-        policy.predict_action_chunk = torch.autocast("cpu", torch.bfloat16)(policy.predict_action_chunk)
+        predict = torch.autocast("cpu", torch.bfloat16)(predict)
+    policy.predict_action_chunk = lambda batch, noise=None: predict(batch)  # it knows no noise
     before, after = migrated(policy, checkpoint) if is_old(checkpoint) else make_pre_post_processors(config, pretrained_path=folder)
 
     def apart(batch):
