@@ -27,6 +27,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     others = {**({ENVIRONMENT: "ENV"} if s.d_environment else {}), **dict.fromkeys(s.views, "VISUAL")}
     dims = {recipe.STATE: s.d_state, recipe.ACTION: s.d_action, ENVIRONMENT: s.d_environment, **dict.fromkeys(s.views, 3)}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, {}, others=others, reads_text=False)
+    problems.raise_any()
     document = json.dumps(recipe_document(s, processors, problems), ensure_ascii=False)
     keys = [
         *network_keys(s),

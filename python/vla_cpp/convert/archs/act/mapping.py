@@ -41,7 +41,7 @@ def network_keys(s: Sizes) -> List[Key]:
             "solver": dict(steps=1, kind="direct", noise="none"),
         }
     )
-    return [*keys, Key("vision.n_block", "u32[]", s.n_block)]
+    return [*keys, Key("vision.n_block", "u32[]", [*s.n_block])]
 
 
 def weights(s: Sizes) -> List[Weight]:
