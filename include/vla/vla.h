@@ -134,7 +134,7 @@ struct vla_description {
   const vla_view_info* const* views; /* in the order in which the network sees them */
   size_t n_state;
   const vla_state_info* const* states;
-  size_t max_text_tokens; /* longer instructions are truncated, which a note of the chunk says */
+  size_t max_text_tokens; /* longer instructions are truncated, which a note of the chunk says; 0: none is read */
 
   size_t horizon, d_action;        /* a chunk has `horizon` rows of d_action numbers */
   const char* const* action_names; /* d_action of each */
@@ -202,7 +202,8 @@ typedef struct vla_observation {
   size_t n_view;
   const vla_state* states; /* an array */
   size_t n_state;
-  const char* text;   /* the instruction, UTF-8; a NUL at the end is not needed and not counted */
+  const char* text;   /* the instruction, UTF-8; a NUL at the end is not needed and not counted. Empty, not
+                         NULL, for a policy that reads none, with max_text_tokens 0 */
   size_t text_size;   /* bytes */
   const float* noise; /* the solver's start, (noise_rows, d_noise) row by row, or NULL */
   size_t n_noise;     /* noise_rows * d_noise */

@@ -81,7 +81,7 @@ class Policy(Handle):
         *,
         images: Mapping[str, Image],
         state: State,
-        text: str,
+        text: str = "",
         seed: Optional[int] = None,
         noise: object = None,
         leftover: Optional[Leftover] = None,

@@ -113,7 +113,10 @@ void print_features(const Description& d, const Robot& robot) {
   say(stdout, "action       {} rows of {} numbers{}\n", d.horizon, d.actions.size(),
       d.rate_hz > 0 ? fmt::format(", {:g} rows a second", d.rate_hz) : ", control rate unstated");
   print_numbers(d.actions, read_stats(robot.bundle(), "action"));
-  say(stdout, "instruction  at most {} tokens\n", d.max_text_tokens);
+  if (d.max_text_tokens > 0)
+    say(stdout, "instruction  at most {} tokens\n", d.max_text_tokens);
+  else
+    say(stdout, "instruction  not read: the policy knows one task\n");
 }
 
 void print_modules(const Engine& engine) {

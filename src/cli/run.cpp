@@ -258,7 +258,7 @@ Command add_run(CLI::App& app) {
       ->type_name("[NAME=]v,v,...")
       ->required()
       ->allow_extra_args(false);
-  command->add_option("--text", options->text, "The instruction")->required();
+  command->add_option("--text", options->text, "The instruction; none for a policy that reads none");
   add_text(*command, "--noise", options->noise, "FILE",
            "The solver's starting noise: a float32 .npy file, horizon x padded action width, or a batch of one of it");
   command
