@@ -8,13 +8,14 @@
 #include "base/activation.h"
 #include "bundle/bundle.h"
 #include "kernels/row_kernel.h"
+#include "kernels/window.h"
 
 namespace vla::kernels {
 
 /// Matrix products of one x, with their epilogues: operands and addresses.
 struct LinearJob {
-  /// y = activation(W x + bias) * factor + residual. y and residual are contiguous rows of d_out elements, one for each
-  /// row of x; bias, factor [d_out] and residual may be null.
+  /// y = activation(W x + bias) * factor + residual, or the ReLU of that. y and residual are contiguous rows of d_out
+  /// elements, one for each row of x; bias, factor [d_out] and residual may be null.
   struct Part {
     DType type;               // of the stored weight
     const std::byte* weight;  // packed for its kernel
@@ -45,10 +46,12 @@ struct LinearJob {
   const std::byte* x;     // n_row rows of d_in elements
   std::int64_t x_stride;  // elements from one row to the next
   Norm norm;              // what is multiplied is the norm of each row
+  Window window = {};     // where its size is not 0: rows are its places, and x the images under it, in float32
   std::int64_t n_row, d_in;
   int n_part;
   Part part[kMaxPart];
   Activation activation;
+  bool ends_in_relu = false;  // behind the residual
   /// Two parts, gate and up, make one y, which is that of up: activation(gate) * up.
   bool gated;
   /// f32, or bf16 where the kernel rounds what it multiplies, laid out as LinearKernel::rounded says, or i8: rows as

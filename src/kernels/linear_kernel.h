@@ -46,6 +46,7 @@ struct LinearKernel {
   /// Elements of x that the L2 cache keeps beside what passes through it, where x is read as the product before left
   /// it; 0 where it is copied first.
   std::int64_t l2_elements = 0;
+  bool takes_windows = false;  // x may be images under a window
 
   const LinearKernel& for_batch(std::int64_t n_row) const { return n_row <= max_small_batch ? *small_batch : *this; }
   RoundedLayout y_layout(std::int64_t d_in) const { return d_in <= max_rounded_depth ? rounded : RoundedLayout::none; }

@@ -46,7 +46,7 @@ class LinearLoop {
     // copies it once.
     std::int64_t row, depth;
     alignas(64) X x[(kBlockRows + kRows) * Tile::kXStride];  // a tile may read rows beyond the block
-    alignas(64) float normed[Tile::kMaxDepth];
+    alignas(64) float row_of_x[Tile::kMaxDepth];             // as it is multiplied, where that is made on the way
     alignas(64) float sums[(kBlockRows + kRows) * kColumns];
     alignas(64) float gates[(kBlockRows + kRows) * kGateColumns];
   };
@@ -68,6 +68,7 @@ class LinearLoop {
         .max_rounded_depth = Tile::kMaxDepth,
         .small_batch = small_batch,
         .max_small_batch = max_small_batch,
+        .takes_windows = true,
     };
   }
 
@@ -130,11 +131,16 @@ class LinearLoop {
     scratch_->row = row, scratch_->depth = k;
     for (std::int64_t r = 0; r < n_row; ++r) {
       X* to = scratch_->x + place(r, 0);
+      if (job_.window.size > 0) {
+        job_.window.copy(reinterpret_cast<const float*>(job_.x), row + r, k, depth, scratch_->row_of_x);
+        Tile::copy(scratch_->row_of_x, depth, to);
+        continue;
+      }
       const std::int64_t from = (row + r) * job_.x_stride;
       if (Tile::kRounds && job_.x_type == DType::bf16)
         Tile::copy(reinterpret_cast<const X*>(job_.x) + from + k, depth, to);
       else
-        Tile::copy(job_.norm(reinterpret_cast<const float*>(job_.x) + from, job_.d_in, scratch_->normed) + k, depth,
+        Tile::copy(job_.norm(reinterpret_cast<const float*>(job_.x) + from, job_.d_in, scratch_->row_of_x) + k, depth,
                    to);
     }
   }

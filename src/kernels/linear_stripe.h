@@ -110,6 +110,7 @@ struct LinearStripes {
       const LinearJob::Part &part = job_->part[s_.part], &gate = job_->part[0];
       const auto at_column = [&](const float* vector) { return vector != nullptr ? vector + s_.column : nullptr; };
       bias_ = at_column(part.bias), factor_ = at_column(part.factor), residual_ = part.residual;
+      ends_in_relu_ = job_->ends_in_relu;
       if (job_->gated) gates_ = s_.gates, gate_bias_ = at_column(gate.bias);
       if constexpr (kLayout != RoundedLayout::none)
         if (part.y_type == DType::bf16) return activated<kWhole, true>();
@@ -193,6 +194,7 @@ struct LinearStripes {
       }
       if (factor_ != nullptr) value *= load<V>(factor_ + i, left);
       if (residual_ != nullptr) value += load<V>(residual_ + place, left);
+      if (ends_in_relu_) value = relu<V>(value);
       return value;
     }
 
@@ -214,6 +216,7 @@ struct LinearStripes {
     float* y_ = nullptr;
     // Of what follows the product, null where nothing does.
     const float *bias_ = nullptr, *factor_ = nullptr, *residual_ = nullptr, *gates_ = nullptr, *gate_bias_ = nullptr;
+    bool ends_in_relu_ = false;
   };
 
   /// All rows of a tile.

@@ -48,8 +48,8 @@ class TileLoop {
   struct Scratch {
     std::int64_t row, depth;  // which rows of x the copy holds, and from which depth on
     alignas(64) X x[kFarX];
-    alignas(64) float normed[kMaxDepth];
-    alignas(64) float sums[kMaxSums];  // of a panel and the one before, or of a group
+    alignas(64) float row_of_x[kMaxDepth];  // as it is multiplied, where that is made on the way
+    alignas(64) float sums[kMaxSums];       // of a panel and the one before, or of a group
     alignas(64) float gates[kMaxSums];
   };
 
@@ -71,6 +71,7 @@ class TileLoop {
         .small_batch = small_batch,
         .max_small_batch = max_small_batch,
         .l2_elements = kMaxX,
+        .takes_windows = true,
     };
   }
 
@@ -141,13 +142,25 @@ class TileLoop {
   void take_rows() {
     if (row_ == scratch_->row && k_ == scratch_->depth) return;
     scratch_->row = row_, scratch_->depth = k_;
+    if (job_.window.size > 0) return take_places();
     for (std::int64_t r = 0; r < n_row_; ++r) {
       const float* row = reinterpret_cast<const float*>(job_.x) + (row_ + r) * job_.x_stride;
       for (std::int64_t i = k_; i < k_ + depth_; i += 16) __builtin_prefetch(row + kRowsAhead * job_.x_stride + i);
-      const float* x = job_.norm(row, job_.d_in, scratch_->normed) + k_;
+      const float* x = job_.norm(row, job_.d_in, scratch_->row_of_x) + k_;
       for (std::int64_t i = 0; i < depth_; i += kTileSide)
         Tile::copy(x + i, min(kTileSide, depth_ - i), scratch_->x + place_in_tiles(r, i, depth_));
     }
+  }
+
+  /// The same of images under a window.
+  void take_places() {
+    for (std::int64_t r = 0; r < n_row_; ++r)
+      for (std::int64_t i = 0; i < depth_; i += kMaxDepth) {
+        const std::int64_t n = min(kMaxDepth, depth_ - i);
+        job_.window.copy(reinterpret_cast<const float*>(job_.x), row_ + r, k_ + i, n, scratch_->row_of_x);
+        for (std::int64_t j = 0; j < n; j += kSquare)
+          Tile::copy(scratch_->row_of_x + j, min(kSquare, n - j), scratch_->x + place_in_tiles(r, i + j, depth_));
+      }
   }
 
   /// The square of x that begins at row r and number k of the block.

@@ -5,8 +5,8 @@
 #include <cstdint>
 #include <cstring>
 
-#include "kernels/numbers.h"
 #include "kernels/row_kernel.h"
+#include "kernels/sizes.h"
 
 namespace vla::kernels {
 

@@ -21,10 +21,12 @@ class Fuser {
       if (l.needed[at(&node)] && !l.fused[at(&node)]) visit(node);
     join_products();
     fuse_norms();
-    // A norm that its readers compute is no operation.
+    fuse_windows();
+    // A norm or a window that its readers compute is no operation.
     std::erase_if(ops_, [&](const FusedOp& op) {
       const auto* row = std::get_if<RowOp>(&op.op);
-      return row != nullptr && l.fused[at(row->node)];
+      const auto* window = std::get_if<WindowOp>(&op.op);
+      return (row != nullptr && l.fused[at(row->node)]) || (window != nullptr && l.fused[at(window->node)]);
     });
     for (FusedOp& op : ops_) note_operands(op);
     std::stable_sort(ops_.begin(), ops_.end(), [](const FusedOp& a, const FusedOp& b) { return a.order < b.order; });
@@ -157,8 +159,16 @@ class Fuser {
         const Tensor other = next->in[next->in[0].node() == result ? 1 : 0];
         if (other.shape() == result->shape) op.residual = other.node()->id, result = take(next);
       }
+      if (op.residual != kNone && l.target.convolves(weight(linear)))
+        if (const Node* next = only_reader(*result); next != nullptr && is_relu(*next))
+          op.ends_in_relu = true, result = take(next);
     }
     add(std::move(op), *result);
+  }
+
+  static bool is_relu(const Node& node) {
+    const auto* activate = node.as<op::Activate>();
+    return activate != nullptr && activate->activation == Activation::relu;
   }
 
   const Node* take(const Node* node) {
@@ -291,6 +301,23 @@ class Fuser {
       linear->norm = norm, linear->x = operand(*norm, 0);
       linear->norm_weight = operand(*norm, 1), linear->norm_bias = operand(*norm, 2);
       l.fused[at(norm)] = true;
+    }
+  }
+
+  /// What a window covers is taken by the products that read it, place by place as they copy x.
+  void fuse_windows() {
+    for (FusedOp& op : ops_) {
+      auto* linear = std::get_if<LinearOp>(&op.op);
+      if (linear == nullptr || linear->norm != nullptr) continue;
+      const Node* unfold = l.node(linear->x);
+      if (unfold == nullptr || unfold->as<op::Unfold>() == nullptr || unfold->tapped) continue;
+      const bool takes =
+          std::all_of(l.readers[at(unfold)].begin(), l.readers[at(unfold)].end(), [&](const Node* reader) {
+            return reader->as<op::Linear>() != nullptr && l.target.convolves(weight(*reader));
+          });
+      if (!takes) continue;
+      linear->unfold = unfold, linear->x = operand(*unfold, 0);
+      l.fused[at(unfold)] = true;
     }
   }
 

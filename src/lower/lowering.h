@@ -52,15 +52,17 @@ struct Prepared {
   ValueId weight = kNone, table = kNone;
 };
 
-/// activation(W x + b) * factor + residual, or up to three products of the same
+/// activation(W x + b) * factor + residual, or the ReLU of that, or up to three products of the same
 /// x, or gate and up of a gated MLP.
 struct LinearOp {
   std::vector<const Node*> linears;
   ValueId x;
-  const Node* norm = nullptr;  // x is what this node normalizes
+  const Node* norm = nullptr;    // x is what this node normalizes
+  const Node* unfold = nullptr;  // x is what this node moves a window over
   ValueId norm_weight = kNone, norm_bias = kNone;
   Activation activation = Activation::none;
   bool gated = false;
+  bool ends_in_relu = false;
   ValueId factor = kNone, residual = kNone;
 };
 /// Keys and values as attention reads them: once for all attention over them.

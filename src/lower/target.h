@@ -23,6 +23,8 @@ class Target {
   /// The widest row whose norm a product computes as it reads x; 0: it computes
   /// none.
   virtual std::int64_t max_norm(const Param& matrix) const = 0;
+  /// Whether a product takes x as images under a window, and a ReLU behind its residual.
+  virtual bool convolves(const Param& matrix) const = 0;
   /// How a matrix lies in memory.
   virtual const Encoding& encoding(const Param& matrix) const = 0;
   /// Attention over fewer keys is float32.

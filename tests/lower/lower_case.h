@@ -63,13 +63,14 @@ class LowerParams {
   static constexpr int kTableWidth = 35, kTableRows = 9;
 
  private:
-  static constexpr std::pair<int, int> kMatrices[] = {{35, 67}, {35, 67}, {67, 35}, {35, 35},
-                                                      {24, 24}, {24, 24}, {24, 48}, {48, 24}};
+  static constexpr std::pair<int, int> kMatrices[] = {{35, 67}, {35, 67}, {67, 35}, {35, 35}, {24, 24}, {24, 24},
+                                                      {24, 48}, {48, 24}, {8, 24},  {32, 24}, {32, 24}};
   static constexpr int kVectors[] = {35, 67, 24, 48, 8};
 
   static std::string matrix_name(int d_in, int d_out) {
     static int n = 0;  // matrices of the same sizes
-    return "w_" + std::to_string(d_in) + "_" + std::to_string(d_out) + "_" + std::to_string(n++ % 8);
+    return "w_" + std::to_string(d_in) + "_" + std::to_string(d_out) + "_" +
+           std::to_string(n++ % static_cast<int>(std::size(kMatrices)));
   }
   static std::string vector_name(int d) { return "v_" + std::to_string(d); }
   static std::vector<ParamSet::Piece> pieces(DType type) {

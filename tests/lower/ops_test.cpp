@@ -206,6 +206,53 @@ TEST_CASE("products of x of any strides, with everything that may follow them") 
   });
 }
 
+TEST_CASE("convolutions, with everything that may follow them") {
+  const Shape images = {8, 9, 7, 2};
+  for (const auto operand : kOperands)
+    for (const op::Window& window : {op::Window{1, 2, 0}, op::Window{2, 1, 1}})
+      for (const int n_after : {0, 1, 2, 3}) {
+        CAPTURE(window.size);
+        CAPTURE(n_after);
+        check_like_ggml([&](GraphRunner& r, const LowerParams& p) {
+          Graph& g = r.graph;
+          const Tensor x = g.add(op::Unfold{window}, {operand(r, images, 1)});  // [8 or 32, ...]
+          Tensor y = p.linear(g, x, 24);
+          if (n_after > 0) y = add(g, y, operand(r, y.shape(), 1));
+          if (n_after > 1) y = activate(g, y, n_after == 2 ? Activation::relu : Activation::silu);
+          return y;
+        });
+      }
+  check_like_ggml([](GraphRunner& r, const LowerParams& p) {  // two of one window, then others that read it too
+    Graph& g = r.graph;
+    const Tensor x = g.add(op::Unfold{{2, 2, 0}}, {input(r, {8, 6, 4, 1})});
+    const Tensor a = p.linear(g, x, 24, true, 0), b = p.linear(g, x, 24, false, 1);
+    return add(g, activate(g, a, Activation::relu), b);
+  });
+  check_like_ggml([](GraphRunner& r, const LowerParams& p) {
+    Graph& g = r.graph;
+    const Tensor x = g.add(op::Unfold{{2, 2, 0}}, {input(r, {8, 6, 4, 1})});
+    return concat(g, {p.linear(g, x, 24), x}, 0);
+  });
+}
+
+TEST_CASE("a product takes a window only where nobody else reads what it covers") {
+  const LowerParams params;
+  const auto text = [&](bool tapped, bool read_again) {
+    GraphRunner r(params.list(), "portable");
+    Graph& g = r.graph;
+    Tensor x = g.add(op::Unfold{{2, 2, 0}}, {input(r, {8, 6, 4, 1})});
+    if (tapped) x = g.name("result", x);
+    Tensor y = activate(g, add(g, params.linear(g, x, 24), input(r, {24, 3, 2, 1})), Activation::relu);
+    if (read_again) y = concat(g, {y, x}, 0);
+    g.write(y, r.slot(std::vector<float>(static_cast<std::size_t>(count(y.shape()))), y.shape()));
+    return r.lower().text();
+  };
+  CHECK(text(false, false).find("unfold, linear") != std::string::npos);
+  CHECK(text(false, false).find("residual, relu") != std::string::npos);
+  CHECK(text(true, false).find("unfold, linear") == std::string::npos);
+  CHECK(text(false, true).find("unfold, linear") == std::string::npos);
+}
+
 TEST_CASE("gated products, whichever of gate and up is recorded first") {
   for (const bool gate_first : {true, false})
     for (const bool gate_left : {true, false})

@@ -51,7 +51,8 @@ void join(CpuLowering& l, CpuOp& up, CpuOp& down, std::int64_t n_block) {
 void choose_blocks(CpuLowering& l) {
   const auto readers = readers_of(l);
   for (CpuOp& up : l.ops) {
-    if (!std::holds_alternative<LinearOp>(up.op) || up.writes.size() != 1) continue;
+    const auto* made = std::get_if<LinearOp>(&up.op);
+    if (made == nullptr || made->unfold != nullptr || up.writes.size() != 1) continue;
     const ValueId inner = up.writes[0];
     const auto found = readers.find(inner);
     if (found == readers.end() || found->second.size() != 1) continue;

@@ -27,6 +27,7 @@ class CpuTarget final : public Target {
   const void* multiplier(const Param& matrix) const override { return weights_.kernel(&matrix); }
   std::size_t max_products() const override { return kernels::LinearJob::kMaxPart; }
   std::int64_t max_norm(const Param& matrix) const override { return weights_.kernel(&matrix)->max_norm; }
+  bool convolves(const Param& matrix) const override { return weights_.kernel(&matrix)->takes_windows; }
   const Encoding& encoding(const Param& matrix) const override { return weights_.encoding(&matrix); }
   std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
   std::size_t alignment() const override { return kAlignment; }

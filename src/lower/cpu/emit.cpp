@@ -294,14 +294,20 @@ kernels::LinearJob::Norm norm_of(const CpuLowering& l, const Reader& op) {
           operand(l, op.norm_bias), norm.eps};
 }
 
+kernels::Window window_of(const Shape& x, const op::Window& w, const Shape& y) {
+  return {x[0], x[1], x[2], w.size, w.stride, w.padding, y[1], y[2]};
+}
+
 /// All but the addresses of matrices.
 kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op) {
   const auto& linear = std::get<LinearOp>(op.op);
   kernels::LinearJob job = {};
   const Value& x = l.value(linear.x);
   job.x = address(l, linear.x), job.x_type = x.type, job.x_stride = row_stride(x);
-  job.d_in = x.shape[0], job.n_row = count(x.shape) / x.shape[0];
-  job.activation = linear.activation, job.gated = linear.gated;
+  const Shape& rows = linear.unfold != nullptr ? linear.unfold->shape : x.shape;
+  job.d_in = rows[0], job.n_row = count(rows) / rows[0];
+  if (linear.unfold != nullptr) job.window = window_of(x.shape, linear.unfold->as<op::Unfold>()->window, rows);
+  job.activation = linear.activation, job.gated = linear.gated, job.ends_in_relu = linear.ends_in_relu;
   job.norm = norm_of(l, linear);
   for (const Node* node : linear.linears) {
     const auto& product = *node->as<op::Linear>();
@@ -472,10 +478,6 @@ std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const PatchesO
   task->width = node.in[0].dim(0), task->height = node.in[0].dim(1), task->size = node.as<op::Patches>()->size;
   task->n_item = task->height / task->size * node.in[0].dim(3);
   return task;
-}
-
-kernels::Window window_of(const Shape& x, const op::Window& w, const Shape& y) {
-  return {x[0], x[1], x[2], w.size, w.stride, w.padding, y[1], y[2]};
 }
 
 std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const WindowOp& at, MatrixUses&) {

@@ -67,7 +67,7 @@ class Layouts {
     require_contiguous(op.residual);
     const kernels::LinearKernel& kernel = kernel_of(l, op);
     if (kernel.quantize != nullptr) return quantize(op, kernel);
-    require(op.x, row_stride(l.value(op.x)) >= 0);
+    require(op.x, op.unfold != nullptr ? is_contiguous(l.value(op.x)) : row_stride(l.value(op.x)) >= 0);
     require_rows(op.norm_weight);
     require_rows(op.norm_bias);
   }
@@ -151,8 +151,8 @@ class Layouts {
   /// as rows of heads to which attention does nothing first.
   bool takes(const CpuOp& op, ValueId id, kernels::RoundedLayout layout) const {
     if (const auto* linear = std::get_if<LinearOp>(&op.op))
-      return id == linear->x && id == l.value(id).base && linear->norm == nullptr && id != linear->residual &&
-             id != linear->factor && kernel_of(l, *linear).rounded == layout;
+      return id == linear->x && id == l.value(id).base && linear->norm == nullptr && linear->unfold == nullptr &&
+             id != linear->residual && id != linear->factor && kernel_of(l, *linear).rounded == layout;
     const auto takes_heads = [&](const Prepared& rows, bool rounds) {
       const bool is_plain = id != rows.x || (rows.norm == nullptr && rows.rope == nullptr);
       return is_plain && id != rows.table && attention(rounds).rounded == layout && lies_in_rows(id);

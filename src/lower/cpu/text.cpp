@@ -28,11 +28,13 @@ struct Describe {
   Words operator()(const LinearOp& op) const {
     std::vector<std::string> names;
     for (const Node* node : op.linears) names.push_back(path_of(*node));
-    std::string what = fmt::format("{}linear {}", op.norm != nullptr ? "norm, " : "", fmt::join(names, " | "));
+    const char* before = op.norm != nullptr ? "norm, " : op.unfold != nullptr ? "unfold, " : "";
+    std::string what = fmt::format("{}linear {}", before, fmt::join(names, " | "));
     if (op.activation != Activation::none) what += fmt::format(", {}", activation_name(op.activation));
     if (op.gated) what += ", gate";
     if (op.factor != kNone) what += ", factor";
     if (op.residual != kNone) what += ", residual";
+    if (op.ends_in_relu) what += ", relu";
     return {what, kernel_of(l, op).name, op.x};
   }
   Words operator()(const QuantizeOp& op) const {

@@ -28,6 +28,7 @@ class CudaTarget final : public Target {
   std::int64_t max_norm(const Param& matrix) const override {
     return weights_[matrix].kind == MatrixKind::f32 ? 0 : cuda::kMaxNorm;
   }
+  bool convolves(const Param&) const override { return false; }
   const Encoding& encoding(const Param& matrix) const override { return weights_[matrix].encoding; }
   std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
   std::size_t alignment() const override { return kAlignment; }
