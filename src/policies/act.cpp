@@ -61,6 +61,8 @@ class Act final : public Policy {
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
+    if (shape.n_text > 0)
+      return Error{Code::bad_bundle, "processor.recipe.text", "none, since the network reads no text", "tokenize"};
     return check_prefix(shape.n_view, ResNet::n_cell(shape.width) * ResNet::n_cell(shape.height), n_token_);
   }
 

@@ -59,6 +59,9 @@ Result<Processor> Processor::create(const Bundle& bundle, std::shared_ptr<const 
   VLA_CHECK(processor.bind_action(bundle));
   processor.tokenizer_ = std::move(tokenizer);
   const bool has_text = processor.recipe_.max_tokens > 0;
+  if (keys.has("lm.n_vocab") != has_text)
+    return misfit("processor.recipe.text", has_text ? "none, without lm.n_vocab" : "tokenize as the last op",
+                  has_text ? "tokenize" : "none");
   if (has_text && processor.tokenizer_ == nullptr) {
     VLA_TRY(const int n_vocab, keys.integer("lm.n_vocab", {1, 1 << 24}));
     VLA_TRY(Tokenizer read, Tokenizer::create(keys, n_vocab));

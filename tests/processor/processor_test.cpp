@@ -461,3 +461,64 @@ TEST_CASE("a feature that passes unnormalized by permission is told with every a
   bundle.set("vla.degraded", std::vector<std::string>{"gripper"});
   CHECK(contains(refusal(create(bundle), Code::bad_bundle), "vla.degraded: expected action, observation.state"));
 }
+
+namespace {
+
+/// A bundle of a policy that reads no instruction.
+EditableBundle wordless() {
+  EditableBundle bundle = sample();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["text"] = Json::array();
+  bundle.set("processor.recipe", recipe.dump());
+  bundle.set("observation.max_text_tokens", std::int64_t{0});
+  bundle.remove_key("lm.n_vocab");
+  return bundle;
+}
+
+}  // namespace
+
+TEST_CASE("a policy that reads no instruction needs no tokenizer, and notes an instruction that is given") {
+  EditableBundle bundle = wordless();
+  bundle.remove_key("tokenizer.kind");
+  const Processor processor = make(bundle);
+  CHECK(processor.tokenizer() == nullptr);
+  Observation seen = observation();
+  seen.text = "";
+  const auto silent = processor.encode(seen), told = processor.encode(observation());
+  REQUIRE_MESSAGE(silent.ok(), silent.error().message());
+  REQUIRE_MESSAGE(told.ok(), told.error().message());
+  CHECK(silent->notes.empty());
+  REQUIRE(told->notes.size() == 1);
+  CHECK(contains(told->notes[0], "instruction: not read"));
+  CHECK(silent->tokens.empty());
+  CHECK(told->tokens.empty());
+  CHECK(told->pixels == silent->pixels);
+}
+
+TEST_CASE("a recipe without a text and a vocabulary, or a text without one, are refused") {
+  EditableBundle bundle = wordless();
+  bundle.set("lm.n_vocab", std::int64_t{4096});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.text: expected tokenize"));
+  bundle = sample();
+  bundle.remove_key("lm.n_vocab");
+  CHECK(
+      contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.text: expected none, without lm.n_vocab"));
+  bundle = wordless();
+  bundle.set("observation.max_text_tokens", std::int64_t{8});
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "observation.max_text_tokens"));
+}
+
+TEST_CASE("an op of one view leaves the pixels of the others alone") {
+  EditableBundle bundle = sample();
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  recipe["image"][1] = Json::parse(R"({"op": "standardize", "mean": [0.5, 0.5, 0.5], "std": [0.25, 0.25, 0.25],
+                                       "arithmetic": "float32", "view": 1})");
+  bundle.set("processor.recipe", recipe.dump());
+  const auto inputs = make(bundle).encode(observation());
+  REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+  CHECK(inputs->pixels.front() == 0.0f);
+  CHECK(inputs->pixels.back() == 2.0f);
+  recipe["image"][1]["view"] = 3;
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "processor.recipe.image: expected ops of the 3 views"));
+}
