@@ -5,14 +5,15 @@
 
 #include "kernels/cpu_kernels.h"
 #include "kernels/quantized.h"
+#include "lower/copies.h"
 #include "lower/cpu/emit.h"
 
 namespace vla::lower {
 namespace {
 
-class Layouts {
+class Layouts : Copies<CpuLowering> {
  public:
-  explicit Layouts(CpuLowering& lowering) : l(lowering) {}
+  explicit Layouts(CpuLowering& lowering) : Copies(lowering) {}
 
   void run(std::vector<FusedOp> ops) {
     for (FusedOp& op : ops) {
@@ -30,33 +31,7 @@ class Layouts {
   }
 
  private:
-  /// A contiguous copy of a value, made just before the operation at hand, which reads that instead. A value with 1 in
-  /// the first dimension may be copied `d` times.
-  ValueId copied(ValueId id, std::int64_t d) {
-    const ValueId copy = static_cast<ValueId>(l.values.size());
-    Value& to = l.values.emplace_back(Value(l.value(id)));
-    to.shape[0] = d;
-    to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.placement = Value::Placement::arena;
-    to.slot = nullptr, to.size = static_cast<std::size_t>(count(to.shape)) * 4;
-    Shape from_stride = l.value(id).stride;
-    if (l.value(id).shape[0] != d) from_stride[0] = 0;
-    CpuOp& op = l.ops.emplace_back();
-    op.op = CopyOp{{{id, to.shape, from_stride, to.stride, 0}}};
-    op.reads = {id}, op.writes = {copy}, op.order = step_->order;
-    std::replace(step_->reads.begin(), step_->reads.end(), id, copy);
-    return copy;
-  }
-
-  void require(ValueId& id, bool fits) {
-    if (!fits) id = copied(id, l.value(id).shape[0]);
-  }
-  /// Elements of a row follow each other.
-  void require_rows(ValueId& id) {
-    if (id != kNone) require(id, l.value(id).shape[0] == 1 || l.value(id).stride[0] == 1);
-  }
-  void require_contiguous(ValueId& id) {
-    if (id != kNone) require(id, is_contiguous(l.value(id)));
-  }
+  using Copies::require_rows;
   void require_rows(Prepared& rows) {
     require_rows(rows.x);
     require_rows(rows.weight);
@@ -171,8 +146,6 @@ class Layouts {
            x.offset % d + (x.shape[1] - 1) * x.stride[1] + x.shape[0] <= d;
   }
 
-  CpuLowering& l;
-  Step* step_ = nullptr;                                      // of the operation at hand
   std::map<std::pair<ValueId, const Node*>, ValueId> codes_;  // of x, or of its norm
   // Of each base: who reads it or a view of it, and itself with its views.
   std::map<ValueId, std::vector<std::pair<const CpuOp*, ValueId>>> reads_;

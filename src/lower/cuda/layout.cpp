@@ -9,14 +9,15 @@
 #include "cuda/kernels/linear_int8.h"
 #include "cuda/kernels/rows.h"
 #include "kernels/quantized.h"
+#include "lower/copies.h"
 #include "lower/cuda/cuda_lowering.h"
 
 namespace vla::lower {
 namespace {
 
-class Layouts {
+class Layouts : Copies<CudaLowering> {
  public:
-  explicit Layouts(CudaLowering& lowering) : l(lowering) {}
+  explicit Layouts(CudaLowering& lowering) : Copies(lowering) {}
 
   void run(std::vector<FusedOp> ops) {
     for (FusedOp& op : ops) {
@@ -59,27 +60,6 @@ class Layouts {
     made_.partial = new_value({n, made_.n_split, 1, 1});
     step_->writes.push_back(made_.partial);
   }
-  /// A contiguous copy, made just before the operation at hand.
-  ValueId copied(ValueId id) {
-    const Shape shape = l.value(id).shape;
-    const ValueId copy = new_value(shape);
-    CudaOp& op = l.ops.emplace_back();
-    op.op = CopyOp{{{id, shape, l.value(id).stride, contiguous_strides(shape), 0}}};
-    op.reads = {id}, op.writes = {copy}, op.order = step_->order;
-    std::replace(step_->reads.begin(), step_->reads.end(), id, copy);
-    return copy;
-  }
-  void require(ValueId& id, bool fits) {
-    if (!fits) id = copied(id);
-  }
-  /// Elements of a row follow each other.
-  void require_rows(ValueId& id) {
-    if (id != kNone) require(id, l.value(id).shape[0] == 1 || l.value(id).stride[0] == 1);
-  }
-  void require_contiguous(ValueId& id) {
-    if (id != kNone) require(id, is_contiguous(l.value(id)));
-  }
-
   /// x normed and turned, as an operation just before the one at hand; x itself where nothing is done to it.
   void prepare(Prepared& rows, bool rounds) {
     require_rows(rows.x);
@@ -204,9 +184,7 @@ class Layouts {
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
   void require_layouts(WindowOp&) {}  // which emit refuses
 
-  CudaLowering& l;
-  Step* step_ = nullptr;  // the operation at hand
-  CudaOp made_;           // what is added to it
+  CudaOp made_;  // what is added to the operation at hand
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;
   std::map<std::tuple<ValueId, const Node*, DType>, ValueId> rounded_;
   std::map<ValueId, int> n_reader_;  // of each base and its views
