@@ -30,9 +30,10 @@ constexpr Case kCases[] = {
 };
 
 struct Operands {
-  explicit Operands(const Case& of) : c(of) {
+  Operands(const Case& of, bool rounds_x) : c(of) {
     Numbers numbers;
-    x = rounded_to_bf16(numbers.floats(c.n_row * c.depth));
+    x = numbers.floats(c.n_row * c.depth);
+    if (rounds_x) x = rounded_to_bf16(x);
     weight = rounded_to_bf16(numbers.floats(c.n_column * c.depth, 1 / std::sqrt(static_cast<float>(c.depth))));
     bias = numbers.floats(c.n_column), factor = numbers.floats(c.n_column);
     gate = numbers.floats(c.n_row * c.n_column), residual = numbers.floats(c.n_row * c.n_column);
@@ -81,21 +82,30 @@ std::vector<float> run(const Operands& of, Multiply multiply) {
 
 }  // namespace
 
-TEST_CASE("bf16 products of every shape are within 1e-6 of doubles, or a rounding of y to bf16") {
+TEST_CASE("bf16 products of every shape are within 1e-6 of doubles, or a rounding of y; few rows are not rounded") {
   counts = {};
   for (const Case& c : kCases) {
-    const Operands of(c);
-    const std::vector<double> expected = of.expected();
-    const std::int64_t stride = round_up(c.depth, 8) + 8;
     for (Bf16Shape shape : {Bf16Shape::few, Bf16Shape::rows64, Bf16Shape::rows128}) {
       INFO("shape ", static_cast<int>(shape), ", ", c.n_row, " x ", c.depth, " x ", c.n_column);
+      const bool is_few = shape == Bf16Shape::few;
+      const Operands of(c, !is_few);
+      const std::vector<double> expected = of.expected();
+      const std::int64_t stride = round_up(c.depth, 8) + 8;
       in_every_schedule([&] {
         const std::vector<float> y = run(of, [&](const Epilogue& end) {
-          const Device<std::uint16_t> x(bf16_rows(of.x, c.depth, stride)),
+          const Device<float> few(of.x), partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column));
+          const Device<std::uint16_t> rounded(bf16_rows(of.x, c.depth, stride)),
               weight(bf16_rows(of.weight, c.depth, stride));
-          const Device<float> partial(static_cast<std::size_t>(c.n_split * c.n_row * c.n_column));
-          const LinearBf16Job job = {x.get(),    weight.get(), stride,    stride,        c.n_row,
-                                     c.n_column, c.depth,      c.n_split, partial.get(), end};
+          const LinearBf16Job job = {is_few ? static_cast<const void*>(few.get()) : rounded.get(),
+                                     weight.get(),
+                                     is_few ? c.depth : stride,
+                                     stride,
+                                     c.n_row,
+                                     c.n_column,
+                                     c.depth,
+                                     c.n_split,
+                                     partial.get(),
+                                     end};
           launch(linear_bf16(shape, job), job);
           if (c.n_split > 1) launch(finish_bf16_partial(job), job);
         });
@@ -106,9 +116,9 @@ TEST_CASE("bf16 products of every shape are within 1e-6 of doubles, or a roundin
   CHECK(counts.bank_conflicts == 0);
 }
 
-TEST_CASE("float32 products are within 1e-6 of doubles") {
+TEST_CASE("float32 products are within 2e-6 of doubles") {
   for (const Case& c : kCases) {
-    const Operands of(c);
+    const Operands of(c, false);
     INFO(c.n_row, " x ", c.depth, " x ", c.n_column);
     in_every_schedule([&] {
       const std::vector<float> y = run(of, [&](const Epilogue& end) {
@@ -116,7 +126,7 @@ TEST_CASE("float32 products are within 1e-6 of doubles") {
         const LinearF32Job job = {x.get(), weight.get(), c.depth, c.n_row, c.n_column, c.depth, end};
         launch(linear_f32(job), job);
       });
-      CHECK(error(y, of.expected()) < (c.is_bf16 ? 4e-3 : 1e-6));
+      CHECK(error(y, of.expected()) < (c.is_bf16 ? 4e-3 : 2e-6));
     });
   }
 }

@@ -52,7 +52,7 @@ VLA_DEVICE void fetch(std::byte* to, const std::uint16_t* from, std::int64_t str
 }
 template <class S>
 VLA_DEVICE void fetch(const LinearBf16Job& job, int row0, int column0, int step, std::byte* stage) {
-  fetch<S::kRows>(stage, job.x, job.x_stride, row0, job.n_row, step, job.depth);
+  fetch<S::kRows>(stage, static_cast<const std::uint16_t*>(job.x), job.x_stride, row0, job.n_row, step, job.depth);
   fetch<S::kColumns>(stage + S::kRows * S::kRowBytes, job.weight, job.weight_stride, column0, job.n_column, step,
                      job.depth);
 }
@@ -115,6 +115,20 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
   });
 }
 
+/// Numbers k to k + 7 of a row, zero from `end` on. `is_aligned`: every row begins at a multiple of 16 bytes.
+VLA_DEVICE void eight(const float* row, int k, int end, bool is_aligned, float (&to)[8]) {
+  if (is_aligned && k + 8 <= end) {
+#pragma unroll
+    for (int i = 0; i < 8; i += 4) {
+      const float4 four = *reinterpret_cast<const float4*>(row + k + i);
+      to[i] = four.x, to[i + 1] = four.y, to[i + 2] = four.z, to[i + 3] = four.w;
+    }
+  } else {
+#pragma unroll
+    for (int i = 0; i < 8; ++i) to[i] = k + i < end ? row[k + i] : 0;
+  }
+}
+
 /// A warp has two columns and up to kBf16FewRows rows; its lanes share the depth.
 VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
   const int lane = thread_index() % kLanes, column = (static_cast<int>(blockIdx.x) * 4 + thread_index() / kLanes) * 2;
@@ -123,10 +137,12 @@ VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
   const bool has_second = column + 1 < job.n_column;
   const Share share(job);
   const int end = share.end * kBf16Depth < job.depth ? share.end * kBf16Depth : job.depth;
+  const auto* rows = static_cast<const float*>(job.x) + row0 * job.x_stride;
+  const bool is_aligned = reinterpret_cast<std::uint64_t>(job.x) % 16 == 0 && job.x_stride % 4 == 0;
   float sum[kBf16FewRows][2] = {};
   for (int k = share.first * kBf16Depth + lane * 8; k < end; k += kLanes * 8) {
-    const auto eight = [&](const std::uint16_t* from, float(&to)[8]) {
-      const uint4 words = *reinterpret_cast<const uint4*>(from + k);  // rows are padded to 8
+    const auto weights = [&](int of, float(&to)[8]) {
+      const uint4 words = *reinterpret_cast<const uint4*>(job.weight + of * job.weight_stride + k);  // padded to 8
       const unsigned pairs[4] = {words.x, words.y, words.z, words.w};
 #pragma unroll
       for (int i = 0; i < 8; ++i) {
@@ -135,13 +151,13 @@ VLA_DEVICE void multiply_few(const LinearBf16Job& job) {
       }
     };
     float w[2][8];
-    eight(job.weight + column * job.weight_stride, w[0]);
-    eight(job.weight + (has_second ? column + 1 : column) * job.weight_stride, w[1]);
+    weights(column, w[0]);
+    weights(has_second ? column + 1 : column, w[1]);
 #pragma unroll
     for (int r = 0; r < kBf16FewRows; ++r) {
       if (row0 + r >= job.n_row) break;
       float x[8];
-      eight(job.x + (row0 + r) * job.x_stride, x);
+      eight(rows + r * job.x_stride, k, end, is_aligned, x);
 #pragma unroll
       for (int i = 0; i < 8; ++i) sum[r][0] += x[i] * w[0][i], sum[r][1] += x[i] * w[1][i];
     }

@@ -5,11 +5,12 @@
 #include "cuda/kernels/epilogue.h"
 #include "cuda/kernels/launch.h"
 
-/// Products of bf16 rows and a bf16 matrix with sums in float32, and the epilogue.
+/// Products of rows and a bf16 matrix with sums in float32, and the epilogue. Tensor cores want rows of bf16; few rows
+/// are float32, as rounding them would save nothing.
 namespace vla::cuda {
 
 struct LinearBf16Job {
-  const std::uint16_t* x;       // n_row rows, x_stride elements apart, a multiple of 8
+  const void* x;                // n_row rows, x_stride elements apart: float32 for few, else bf16 and a multiple of 8
   const std::uint16_t* weight;  // n_column rows, weight_stride apart, a multiple of 8
   std::int64_t x_stride, weight_stride;
   int n_row, n_column, depth;  // what lies behind the depth in a row is not looked at

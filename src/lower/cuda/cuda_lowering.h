@@ -15,7 +15,7 @@ namespace vla::lower {
 struct HeadOp {
   Prepared rows;
 };
-/// x, or its norm, as products of codes or of bf16 read it. Once for all products of one x.
+/// x, or its norm, as products read it: in codes, bf16 or float32. Once for all products of one x.
 struct RoundOp {
   ValueId x;
   const Node* norm;

@@ -80,9 +80,9 @@ struct Emit {
         return;
       }
       case MatrixKind::bf16: {
-        const cuda::LinearBf16Job job = {l.at<std::uint16_t>(linear.x),
+        const cuda::LinearBf16Job job = {l.at<void>(linear.x),
                                          l.param<std::uint16_t>(&weight),
-                                         x.stride[1],
+                                         row_stride(x),
                                          bf16_stride(depth),
                                          rows,
                                          columns,
@@ -179,7 +179,9 @@ struct Emit {
     if (x.shape[0] > cuda::kMaxNorm) return unsupported("product", "rows of at most", cuda::kMaxNorm, x.shape[0]);
     cuda::NormJob job = norm_of(round.x, round.norm != nullptr ? round.norm->as<op::Norm>() : nullptr);
     job.weight = l.at(round.weight), job.bias = l.at(round.bias), job.y_stride = y.stride[1];
-    job.type = y.type == DType::i8 ? cuda::RowType::codes : cuda::RowType::bf16;
+    job.type = y.type == DType::i8     ? cuda::RowType::codes
+               : y.type == DType::bf16 ? cuda::RowType::bf16
+                                       : cuda::RowType::f32;
     return std::vector<Call>{call(cuda::norm_rows(job), job)};
   }
   /// Rows of x, normed unless there is no norm, to the result.

@@ -92,10 +92,15 @@ class Layouts : Copies<CudaLowering> {
     const MatrixKind kind = l.matrix(*op.linears[0]).kind;
     const Shape y = op.linears[0]->shape;
     const std::int64_t depth = l.value(op.x).shape[0], n_row = count(y) / y[0];
-    if (kind == MatrixKind::f32)
-      require(op.x, row_stride(l.value(op.x)) >= 0);
+    const bool is_few = product_shape(kind, n_row, y[0], l.n_sm) == ProductShape::few;
+    if (kind == MatrixKind::ternary || kind == MatrixKind::int8)
+      convert(op, DType::i8);
+    else if (kind == MatrixKind::bf16 && !is_few)
+      convert(op, DType::bf16);
+    else if (op.norm != nullptr)
+      convert(op, DType::f32);
     else
-      round(op, kind == MatrixKind::bf16 ? DType::bf16 : DType::i8);
+      require(op.x, row_stride(l.value(op.x)) >= 0);
     if (op.gated) {
       made_.gate = new_value(y);
       step_->writes.push_back(made_.gate);
@@ -116,8 +121,8 @@ class Layouts : Copies<CudaLowering> {
         std::clamp<std::int64_t>(l.n_sm / std::max<std::int64_t>(n_block, 1), 1, std::max<std::int64_t>(most, 1)));
   }
 
-  /// The product reads x, or its norm, rounded.
-  void round(LinearOp& op, DType type) {
+  /// The product reads x, or its norm, as this.
+  void convert(LinearOp& op, DType type) {
     const auto [known, is_new] = rounded_.try_emplace({op.x, op.norm, type}, kNone);
     if (is_new) {
       const Shape shape = l.value(op.x).shape;
@@ -125,8 +130,7 @@ class Layouts : Copies<CudaLowering> {
       require(made.x, row_stride(l.value(made.x)) >= 0);
       require_contiguous(made.weight);
       require_contiguous(made.bias);
-      known->second =
-          new_value(shape, type, type == DType::i8 ? kernels::quantized_stride(shape[0]) : bf16_stride(shape[0]));
+      known->second = new_value(shape, type, converted_stride(type, shape[0]));
       CudaOp& rounded = l.ops.emplace_back();
       for (const ValueId id : {made.x, made.weight, made.bias})
         if (id != kNone) rounded.reads.push_back(id);
@@ -136,6 +140,9 @@ class Layouts : Copies<CudaLowering> {
     step_->reads = {op.x};
     for (const ValueId id : {op.factor, op.residual})
       if (id != kNone) step_->reads.push_back(id);
+  }
+  static std::int64_t converted_stride(DType type, std::int64_t n) {
+    return type == DType::i8 ? kernels::quantized_stride(n) : type == DType::bf16 ? bf16_stride(n) : n;
   }
   /// What a product or attention makes and nobody else reads is stored rounded.
   void round_at_once(CudaOp& round, const RoundOp& what) {
