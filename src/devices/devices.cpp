@@ -29,9 +29,14 @@ DeviceInfo cpu() {
           pages(_SC_AVPHYS_PAGES), rounds_to_bf16(this_cpu()) ? "f32, bf16" : "f32"};
 }
 
-Result<std::vector<DeviceInfo>> list(const std::string& kind) {
-  VLA_TRY(const DeviceLibrary* library, device_library(kind));
-  return library->list();
+Result<std::vector<DeviceInfo>> list(const std::string& library) {
+  VLA_TRY(const DeviceLibrary* loaded, device_library(library));
+  return loaded->list();
+}
+
+/// Of a kind whose own kernels are one library, and ggml's backend another.
+std::string library_of(const std::string& kind, Arithmetic::Backend backend) {
+  return kind == "cuda" && backend == Arithmetic::Backend::ggml ? "cuda-ggml" : kind;
 }
 
 Result<std::unique_ptr<Device>> open_cpu(int n_thread, const std::string& kernels) {
@@ -81,11 +86,25 @@ DeviceList list_devices() {
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device) {
   VLA_TRY(const DeviceName name, DeviceName::parse(device));
   if (name.kind == "cpu") return open_cpu(n_thread, kernels);
-  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.text()));
-  const Result<std::vector<DeviceInfo>> found = list(name.kind);
+  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.kind));
+  const std::string library = library_of(name.kind, arithmetic.backend);
+  const Result<std::vector<DeviceInfo>> found = list(library);
   if (!found) return absent(name, found.error().found);
   if (static_cast<std::size_t>(name.index) >= found->size()) return absent(name, "none with this number");
-  return (*device_library(name.kind))->open(name.index, arithmetic.at_load);
+  return (*device_library(library))->open(name.index, arithmetic.at_load);
+}
+
+Result<std::unique_ptr<Device>> open_model(const std::string& model, const std::string& kernels,
+                                           const std::string& device) {
+  VLA_TRY(const DeviceName name, DeviceName::parse(device));
+  if (name.kind != "cuda")
+    return Error{Code::usage, "model", "device cuda", name.text(), "other devices have no model"};
+  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.kind));
+  const Result<const DeviceLibrary*> library = device_library(library_of(name.kind, arithmetic.backend));
+  if (!library) return library.error();
+  if ((*library)->model == nullptr)
+    return Error{Code::usage, "model", "our own kernels", "--kernels " + kernels, "leave --kernels out"};
+  return (*library)->model(model, arithmetic.at_load);
 }
 
 }  // namespace vla

@@ -26,9 +26,14 @@ DeviceList list_devices();
 
 /// What `--device` names (DeviceName::parse); empty text is the CPU. On the CPU `n_thread` threads run, 0 for every
 /// core that the process may use, with the kernels of Arithmetic: our own, or ggml's operations as the reference of all
-/// others; `bf16` and `int8` round large matrices when they are loaded, which no other name does. Other devices have
-/// the kernels of ggml alone, in float32, or with `bf16` in such products. A device that is absent is refused, and
-/// nothing takes its place. Errors: device, usage.
+/// others; `bf16` and `int8` round large matrices when they are loaded, which no other name does. Other devices take
+/// what Arithmetic::on_device says. A device that is absent is refused, and nothing takes its place. Errors: device,
+/// usage.
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device = "");
+
+/// A device of a kind that is not there, by the name of a model (DeviceLibrary::model). Errors: device, usage,
+/// unsupported.
+Result<std::unique_ptr<Device>> open_model(const std::string& model, const std::string& kernels,
+                                           const std::string& device);
 
 }  // namespace vla

@@ -6,9 +6,9 @@
 
 namespace vla {
 
-/// The library of devices of a kind: libvla-vulkan.so or libvla-cuda.so, looked for where the running code lies (the
-/// program's folder, or that of libvla.so) and in the library folder beside it, loaded once and kept. Errors: device,
-/// with the reason as `found`.
+/// A library of devices: libvla-vulkan.so, libvla-cuda.so or libvla-cuda-ggml.so by what follows `libvla-`, looked for
+/// where the running code lies (the program's folder, or that of libvla.so) and in the library folder beside it, loaded
+/// once and kept. Errors: device, with the reason as `found`.
 Result<const DeviceLibrary*> device_library(const std::string& kind);
 
 }  // namespace vla

@@ -22,7 +22,8 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   std::unique_ptr<Engine> engine(new Engine(options));
   VLA_CHECK(engine->take_injected(options.inject));
   VLA_CHECK(engine->open_robots(std::move(file), options));
-  VLA_TRY(engine->device_, open_device(options.n_thread, options.kernels, options.device));
+  VLA_TRY(engine->device_, options.model.empty() ? open_device(options.n_thread, options.kernels, options.device)
+                                                 : open_model(options.model, options.kernels, options.device));
   VLA_CHECK(engine->device_->load(engine->params(), !options.dry));
   for (const auto& robot : engine->robots_) VLA_CHECK(robot->compute_constants(*engine->device_, options.dry));
   VLA_CHECK(engine->make_plans());
@@ -117,6 +118,11 @@ Result<std::string> Engine::program_text(Part part) {
   return (part == Part::prefix ? plan->prefix() : plan->step()).text();
 }
 
+Result<StagePredictions> Engine::predict() {
+  VLA_TRY(const Plan* plan, plans_->for_shape(robot().network(), robot().largest_shape()));
+  return plan->predict(robot().solver().n_step);
+}
+
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
                                 const std::optional<Leftover>& leftover) noexcept {
   VLA_CHECK(prepare(observation, noise, leftover, prepared_));
@@ -155,15 +161,15 @@ Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
   clock.lap(timing, "plan");
   VLA_CHECK(plan->run_prefix(taps));
-  for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(timing, stage.name, stage.done);
-  clock.lap(timing, "prefix");
   for (int k = 0; k < robot.solver().n_step; ++k) {
     VLA_CHECK(plan->run_step(k));
     plan->collect_step_taps(k, taps);
   }
-  clock.lap(timing, "steps");
-  const std::vector<float> x = plan->x();
+  const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
   VLA_CHECK(device_->failure());
+  for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(timing, stage.name, stage.done);
+  clock.lap(timing, "prefix", plan->prefix_ended());
+  clock.lap(timing, "steps");
   VLA_TRY(ActionChunk chunk, robot.decode(x, in));
   clock.lap(timing, "postprocess");
   record(taps, "chunk", {chunk.d_action, chunk.horizon}, chunk.normalized);

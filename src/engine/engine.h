@@ -17,6 +17,7 @@ namespace vla {
 struct EngineOptions {
   int n_thread = 0;         // 0: every core that the process may use
   std::string kernels;      // as open_device takes them; empty: the best that the machine has for the bundle's dtype
+  std::string model;        // of a device that is not there, as open_model takes it; only where `dry`
   std::string device;       // cpu, vulkan:N or cuda:N, as open_device takes them; empty: the CPU
   std::string tap_pattern;  // empty: nothing is recorded, and the graphs are the production graphs
   /// Values at taps that take the place of the computed ones: as the network's own, or as `pixels` and `state`.
@@ -70,6 +71,10 @@ class Engine {
   Result<std::string> program_text(Part part);
   /// What the network computed for the last observation; empty before the first, and where its plan is gone.
   StageWork work() const;
+
+  /// How long a model of a device (EngineOptions::model) says that the first robot's largest observation takes. Errors:
+  /// out_of_memory.
+  Result<StagePredictions> predict();
 
   const Device& device() const { return *device_; }
   Device& device() { return *device_; }

@@ -124,7 +124,9 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
   VLA_CHECK(prefix_->run());
   for (std::size_t i = 0; i < prefix_->taps().size(); ++i)
     taps.push_back({prefix_->taps()[i].path, dims(prefix_->taps()[i].shape), prefix_->tap(i)});
-  return step_->prepare();  // in the memory that the prefix worked in
+  VLA_CHECK(step_->prepare());  // in the memory that the prefix worked in
+  prefix_ended_ = std::chrono::steady_clock::now();
+  return {};
 }
 
 Status Plan::run_step(int k) {
@@ -139,6 +141,18 @@ StageWork Plan::work(int n_step) const {
   const std::vector<Work> prefix = prefix_->work();
   for (std::size_t i = 0; i < prefix.size(); ++i) parts[i].second = prefix[i];
   parts.emplace_back("steps", step_->work().front().times(n_step));
+  return parts;
+}
+
+StagePredictions Plan::predict(int n_step) const {
+  const std::vector<Program::Prediction> prefix = prefix_->predictions(), step = step_->predictions();
+  if (prefix.empty() || step.empty()) return {};
+  StagePredictions parts;
+  for (std::size_t i = 0; i + 2 < prefix.size(); ++i) parts.emplace_back(prefix_->stages()[i].name, prefix[i]);
+  parts.emplace_back("prefix", prefix[prefix.size() - 2]);
+  Program::Prediction steps = step.back();  // once for all of them
+  for (int k = 0; k < n_step; ++k) steps += step.front();
+  parts.emplace_back("steps", steps);
   return parts;
 }
 

@@ -17,6 +17,8 @@ namespace vla {
 /// Work by stage, under the names that Timing has.
 using StageWork = std::vector<std::pair<std::string, Work>>;
 
+using StagePredictions = std::vector<std::pair<std::string, Program::Prediction>>;
+
 /// A robot's network, as its plans are built from it.
 struct Network {
   const Policy& policy;
@@ -54,13 +56,18 @@ class Plan {
   /// Solver step k, which follows step k - 1: x <- the solver's next x.
   Status run_step(int k);
 
-  /// The stages that the policy's prefix names, with the times of the last run.
+  /// The stages that the policy's prefix names, with the times of the last run, once x was read.
   const std::vector<Program::Stage>& prefix_stages() const { return prefix_->stages(); }
+  /// When it had ended, once x was read.
+  Program::Time prefix_ended() const { return prefix_->ended().value_or(prefix_ended_); }
   const Program& prefix() const { return *prefix_; }
   const Program& step() const { return *step_; }
 
   /// What the network computes for one observation: the prefix, stage by stage, and `n_step` solver steps.
   StageWork work(int n_step) const;
+
+  /// How long a model of a device says that takes; of other devices nothing (Program::predictions).
+  StagePredictions predict(int n_step) const;
 
   /// What the last step recorded, as `step.<k>.<path>`.
   void collect_step_taps(int k, std::vector<Tap>& taps) const;
@@ -83,6 +90,7 @@ class Plan {
   Cache cache_;
   Injection injection_;
   std::unique_ptr<Program> prefix_, step_;
+  Program::Time prefix_ended_;
 };
 
 /// The cached plans of all robots of an engine, within one memory limit.

@@ -27,7 +27,7 @@ struct GgmlBackend {
 template <const GgmlBackend& backend>
 DeviceLibrary library_of() {
   return {kDeviceBuild, [] { return backend.list(); },
-          [](int index, Rounding rounding) { return backend.open_device(index, rounding); }};
+          [](int index, Rounding rounding) { return backend.open_device(index, rounding); }, nullptr};
 }
 
 }  // namespace vla

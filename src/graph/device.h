@@ -4,6 +4,7 @@
 
 #include <chrono>
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <utility>
@@ -48,8 +49,26 @@ class Program {
     Time done;  // of the last run
   };
   virtual const std::vector<Stage>& stages() const = 0;
+  /// When the last run ended, of a device that runs on while `run` returns: then stages too have their times once a
+  /// result was got.
+  virtual std::optional<Time> ended() const { return {}; }
   /// The work of a run: one entry for each stage, then one for all that follows the last.
   virtual std::vector<Work> work() const = 0;
+  /// What a model of a device that is not there says of a run.
+  struct Prediction {
+    double seconds = 0;
+    // Of them, if nothing overlapped: products at the rate of their units, bytes at the memory's, and launches.
+    double products = 0, bytes = 0, launches = 0;
+    int n_launch = 0;
+
+    Prediction& operator+=(const Prediction& other) {
+      seconds += other.seconds, products += other.products, bytes += other.bytes, launches += other.launches;
+      n_launch += other.n_launch;
+      return *this;
+    }
+  };
+  /// One entry for each stage, then one for all that follows the last, and one for `prepare`. Empty of other devices.
+  virtual std::vector<Prediction> predictions() const { return {}; }
 
   struct Tap {
     std::string path;

@@ -17,6 +17,9 @@ struct DeviceLibrary {
   Result<std::vector<DeviceInfo>> (*list)();
   /// `rounding`: none or bf16. Errors: device, unsupported.
   Result<std::unique_ptr<Device>> (*open)(int index, Rounding rounding);
+  /// A device by the name of a model that says how long programs would take (Program::predictions), to be loaded
+  /// without being filled; null where there are no such models. Errors: usage, unsupported.
+  Result<std::unique_ptr<Device>> (*model)(const std::string& name, Rounding rounding);
 };
 
 constexpr const char* kDeviceLibrarySymbol = "vla_device_library";

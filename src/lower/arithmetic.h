@@ -20,8 +20,10 @@ struct Arithmetic {
   /// to bf16, large matrices too, "int8" for the best with large matrices quantized, or nothing for the best. Errors:
   /// usage for an unknown name, device for one that the processor cannot run.
   static Result<Arithmetic> on_cpu(const std::string& kernels, Features machine);
-  /// On another device: "float32", "ggml" or nothing, or "bf16". Errors: usage.
-  static Result<Arithmetic> on_device(const std::string& kernels, const std::string& device);
+  /// On a device of another kind. On CUDA our own kernels compute, with matrices as they are stored or, as on the CPU,
+  /// with "float32", "bf16" or "int8"; "ggml" is ggml's backend in float32. Vulkan has ggml's alone: "float32", "ggml"
+  /// or nothing, or "bf16". Errors: usage.
+  static Result<Arithmetic> on_device(const std::string& kernels, const std::string& kind);
 };
 
 }  // namespace vla

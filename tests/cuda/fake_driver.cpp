@@ -3,11 +3,14 @@
 #include "cuda/fake_driver.h"
 
 #include <algorithm>
+#include <chrono>
 #include <cstring>
 #include <functional>
 #include <memory>
+#include <mutex>
 #include <random>
 #include <set>
+#include <thread>
 #include <vector>
 
 #include "cuda/emulation.h"
@@ -40,16 +43,22 @@ struct Function {
 struct Stream {
   std::vector<std::size_t> last;
   bool captures = false, begins_capture = false;
+  std::vector<std::size_t> kept;  // `last` of what waits, while it captures
+
+  void begin_capture() { captures = true, kept = std::move(last), last.clear(); }
+  void end_capture() { captures = begins_capture = false, last = std::move(kept), kept.clear(); }
 };
 struct Event {
   std::vector<std::size_t> nodes;
   bool captured = false;
+  using Time = std::chrono::steady_clock::time_point;
+  std::shared_ptr<Time> time;  // of events that note it
 };
 
 struct State {
   FakeDriver driver;
   bool is_lost = false;
-  bool has_context = false;
+  std::set<std::thread::id> users;  // threads that have the context
   std::map<Address, std::size_t> memory;
   std::map<Handle, std::unique_ptr<Stream>> streams;
   std::map<Handle, std::unique_ptr<Event>> events;
@@ -61,6 +70,7 @@ struct State {
   std::minstd_rand random;
 };
 State state;
+std::mutex calls;  // one at a time
 
 /// Nodes one after the other, in any order that their dependencies allow.
 void run_all(const Nodes& nodes) {
@@ -86,8 +96,7 @@ void run_all(const Nodes& nodes) {
 Nodes take_waiting() {
   Nodes nodes;
   nodes.swap(state.waiting);
-  for (auto& [handle, stream] : state.streams)
-    if (!stream->captures) stream->last.clear();
+  for (auto& [handle, stream] : state.streams) stream->captures ? stream->kept.clear() : stream->last.clear();
   for (auto& [handle, event] : state.events)
     if (!event->captured) event->nodes.clear();
   return nodes;
@@ -171,7 +180,15 @@ struct Calls {
   }
   static int context_retain(Handle* context, int) { return *context = &state, ++state.driver.n_handle, 0; }
   static int context_release(int) { return --state.driver.n_handle, 0; }
-  static int context_use(Handle context) { return state.has_context = context != nullptr, 0; }
+  static int context_use(Handle context) {
+    if (context != &state) return kInvalidContext;
+    return state.users.insert(std::this_thread::get_id()), 0;
+  }
+  static int device_name(char* name, int size, int) {
+    std::snprintf(name, static_cast<std::size_t>(size), "a GPU of tests");
+    return 0;
+  }
+  static int memory_size(std::size_t* size, int) { return *size = state.driver.memory, 0; }
 
   static int memory_info(std::size_t* free, std::size_t* total) {
     *total = state.driver.memory, *free = state.driver.memory - state.driver.used;
@@ -182,6 +199,7 @@ struct Calls {
     if (size == 0) return kInvalidValue;
     if (size > state.driver.memory - state.driver.used) return kOutOfMemory;
     *address = reinterpret_cast<Address>(device_memory().allocate(size));
+    if (!state.driver.computes) std::memset(reinterpret_cast<void*>(*address), 0, size);
     state.memory[*address] = size, state.driver.used += size;
     return 0;
   }
@@ -205,6 +223,10 @@ struct Calls {
     std::free(memory);
     return --state.driver.n_handle, 0;
   }
+  static int fill(Address to, unsigned char value, std::size_t size, Handle stream) {
+    if (!is_allocated(to, size)) return kInvalidValue;
+    return enqueue(stream, [=] { std::memset(reinterpret_cast<void*>(to), value, size); });
+  }
   static int upload(Address to, const void* from, std::size_t size, Handle stream) {
     if (!is_allocated(to, size)) return kInvalidValue;
     return enqueue(stream, [=] { std::memcpy(reinterpret_cast<void*>(to), from, size); });
@@ -227,19 +249,38 @@ struct Calls {
     Stream* stream = find(state.streams, handle);
     const Event* event = find(state.events, of);
     if (stream == nullptr || event == nullptr) return kInvalidHandle;
-    if (event->captured && !stream->captures) stream->captures = true, stream->last.clear();
+    if (event->captured && !stream->captures) stream->begin_capture();
     if (event->captured != stream->captures) return kCaptureUnsupported;
     for (std::size_t node : event->nodes)
       if (std::find(stream->last.begin(), stream->last.end(), node) == stream->last.end()) stream->last.push_back(node);
     return 0;
   }
-  static int event_create(Handle* event, unsigned) { return give(state.events, event, std::make_unique<Event>()), 0; }
+  static int event_create(Handle* event, unsigned flags) {
+    constexpr unsigned kNoTiming = 2;
+    auto made = std::make_unique<Event>();
+    if (flags != kNoTiming) made->time = std::make_shared<Event::Time>();
+    return give(state.events, event, std::move(made)), 0;
+  }
   static int event_record(Handle of, Handle handle) {
     Event* event = find(state.events, of);
     const Stream* stream = find(state.streams, handle);
     if (stream == nullptr || event == nullptr) return kInvalidHandle;
     event->nodes = stream->last, event->captured = stream->captures;
     return 0;
+  }
+  /// As a node of a graph.
+  static int event_record_flags(Handle of, Handle handle, unsigned flags) {
+    const Event* event = find(state.events, of);
+    const Stream* stream = find(state.streams, handle);
+    if (event == nullptr || event->time == nullptr || stream == nullptr) return kInvalidHandle;
+    if (flags != 1 || !stream->captures) return kInvalidValue;
+    return enqueue(handle, [time = event->time] { *time = std::chrono::steady_clock::now(); });
+  }
+  static int event_elapsed(float* ms, Handle first, Handle second) {
+    const Event *from = find(state.events, first), *to = find(state.events, second);
+    if (from == nullptr || to == nullptr || from->time == nullptr || to->time == nullptr) return kInvalidHandle;
+    if (*from->time == Event::Time() || *to->time == Event::Time()) return kInvalidHandle;  // not noted yet
+    return *ms = std::chrono::duration<float, std::milli>(*to->time - *from->time).count(), 0;
   }
   static int event_destroy(Handle event) { return take_back(state.events, event); }
 
@@ -281,6 +322,7 @@ struct Calls {
         z == 0 || y > most || z > most)
       return kInvalidValue;
     const std::size_t size = function->ptx ? function->ptx->param_size : function->entry->job_size;
+    if (!state.driver.computes) return enqueue(stream, [] {});
     const auto* from = static_cast<const std::byte*>(parameters[0]);
     const std::vector<std::byte> bytes(from, from + size);
     // A job is aligned as its type is, at most as memory is.
@@ -299,7 +341,8 @@ struct Calls {
     if (stream == nullptr) return kInvalidHandle;
     if (captures()) return kCaptureUnsupported;
     state.captured.clear();
-    stream->captures = stream->begins_capture = true, stream->last.clear();
+    stream->begin_capture();
+    stream->begins_capture = true;
     return 0;
   }
   static int capture_end(Handle handle, Handle* graph) {
@@ -313,9 +356,7 @@ struct Calls {
         if (before[i]) before[node] = true;
     const bool joined = std::find(before.begin(), before.end(), false) == before.end();
     for (auto& [other, stream] : state.streams) {
-      if (!stream->captures) continue;
-      stream->captures = stream->begins_capture = false;
-      stream->last.clear();
+      if (stream->captures) stream->end_capture();
     }
     if (!joined) return *graph = nullptr, kCaptureUnjoined;
     auto nodes = std::make_shared<Nodes>(std::move(state.captured));
@@ -350,7 +391,11 @@ bool has_word(const std::string& symbol, std::initializer_list<const char*> word
 /// Counts a call, and fails it where it is told to. What is given back is given back, whatever is answered.
 template <auto kCall, class... Args>
 int counted(const std::string& symbol, Args... args) {
+  const std::lock_guard<std::mutex> lock(calls);
   ++state.driver.n_call[symbol];
+  if (state.driver.logs) state.driver.log.push_back(symbol);
+  if (state.driver.counts != nullptr)
+    std::fprintf(state.driver.counts, "%s\n", symbol.c_str()), std::fflush(state.driver.counts);
   const bool fails = ++state.driver.n_calls == state.driver.fail_at;
   if (fails) state.driver.failed_call = symbol, state.is_lost = state.driver.is_lost_then;
   if (fails || state.is_lost) {
@@ -358,7 +403,9 @@ int counted(const std::string& symbol, Args... args) {
     if (has_word(symbol, {"Free", "Destroy", "Unload", "Release"})) kCall(args...);
     return state.driver.failure;
   }
-  if (!state.has_context && !has_word(symbol, {"cuInit", "cuDriver", "cuDevice", "cuCtx"})) return kInvalidContext;
+  if (!has_word(symbol, {"cuInit", "cuDriver", "cuDevice", "cuCtx"}) &&
+      !state.users.contains(std::this_thread::get_id()))
+    return kInvalidContext;
   return kCall(args...);
 }
 

@@ -2,8 +2,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <cstdio>
 #include <map>
 #include <string>
+#include <vector>
 
 #include "cuda/driver/driver.h"
 
@@ -27,11 +29,16 @@ struct FakeDriver {
   long fail_at = 0;
   int failure = kLaunchFailed;
   bool is_lost_then = false;
+  /// Else kernels leave what was there, and memory is zeros at first: for tests of calls alone.
+  bool computes = true;
+  std::FILE* counts = nullptr;  // gets a line for each call
 
   std::map<std::string, long> n_call;  // by symbol
   long n_calls = 0;
-  std::string failed_call;  // the first that was told to fail
-  std::string fault;        // why a kernel failed
+  bool logs = false;
+  std::vector<std::string> log;  // of symbols, where it logs
+  std::string failed_call;       // the first that was told to fail
+  std::string fault;             // why a kernel failed
   std::size_t used = 0;
   long n_handle = 0;  // contexts, streams, events, modules, graphs and host memory that were not given back
 };

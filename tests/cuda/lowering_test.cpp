@@ -28,6 +28,7 @@ Result<std::unique_ptr<Device>> wrapped_open_device(int, const std::string&, con
 
 Result<std::unique_ptr<Device>> wrapped_open_device(int n_thread, const std::string& kernels,
                                                     const std::string& device) {
+  if (kernels.starts_with("model:")) return lower::CudaDevice::model(kernels.substr(6), Rounding::float32);
   if (kernels == "ggml") return real_open_device(n_thread, kernels, device);
   const Rounding at_load = kernels == "bf16"   ? Rounding::bf16
                            : kernels == "int8" ? Rounding::int8

@@ -23,6 +23,8 @@ using Handle = void*;           // a context, stream, event, module, function or
   CALL(device_count, cuDeviceGetCount, int* count)                                                                   \
   CALL(device_get, cuDeviceGet, int* device, int ordinal)                                                            \
   CALL(device_attribute, cuDeviceGetAttribute, int* value, int attribute, int device)                                \
+  CALL(device_name, cuDeviceGetName, char* name, int size, int device)                                               \
+  CALL(memory_size, cuDeviceTotalMem_v2, std::size_t* size, int device)                                            \
   CALL(context_retain, cuDevicePrimaryCtxRetain, Handle* context, int device)                                        \
   CALL(context_release, cuDevicePrimaryCtxRelease_v2, int device)                                                    \
   CALL(context_use, cuCtxSetCurrent, Handle context)                                                                 \
@@ -31,6 +33,7 @@ using Handle = void*;           // a context, stream, event, module, function or
   CALL(release, cuMemFree_v2, Address address)                                                                       \
   CALL(host_allocate, cuMemHostAlloc, void** memory, std::size_t size, unsigned flags)                               \
   CALL(host_release, cuMemFreeHost, void* memory)                                                                    \
+  CALL(fill, cuMemsetD8Async, Address to, unsigned char value, std::size_t size, Handle stream)                      \
   CALL(upload, cuMemcpyHtoDAsync_v2, Address to, const void* from, std::size_t size, Handle stream)                  \
   CALL(download, cuMemcpyDtoHAsync_v2, void* to, Address from, std::size_t size, Handle stream)                      \
   CALL(stream_create, cuStreamCreate, Handle* stream, unsigned flags)                                                \
@@ -39,6 +42,8 @@ using Handle = void*;           // a context, stream, event, module, function or
   CALL(stream_wait_event, cuStreamWaitEvent, Handle stream, Handle event, unsigned flags)                            \
   CALL(event_create, cuEventCreate, Handle* event, unsigned flags)                                                   \
   CALL(event_record, cuEventRecord, Handle event, Handle stream)                                                     \
+  CALL(event_record_flags, cuEventRecordWithFlags, Handle event, Handle stream, unsigned flags)                      \
+  CALL(event_elapsed, cuEventElapsedTime, float* ms, Handle first, Handle second)                                    \
   CALL(event_destroy, cuEventDestroy_v2, Handle event)                                                               \
   CALL(module_load, cuModuleLoadDataEx, Handle* module, const void* image, unsigned n_option, int* options,          \
        void** values)                                                                                                \

@@ -19,13 +19,49 @@ std::string version_text(int version) {
 
 #define CALL(name, ...) check(#name, driver_.name(__VA_ARGS__))
 
-Status Gpu::check(const char* call, int result) const {
+namespace {
+
+Status check_call(const Driver& driver, const char* call, int result) {
   if (result == 0) return {};
   const char *name = nullptr, *text = nullptr;
-  driver_.error_name(result, &name), driver_.error_text(result, &text);
+  driver.error_name(result, &name), driver.error_text(result, &text);
   return Error{result == kOutOfMemory ? Code::out_of_memory : Code::device, std::string("cuda ") + call, "",
                (name ? name : "error " + std::to_string(result)) + (text ? std::string(", ") + text : "")};
 }
+
+/// How many devices there are. Errors: device, for a driver that is too old too.
+Result<int> start_driver(const Driver& driver) {
+  int version = 0, n_device = 0;
+  VLA_CHECK(check_call(driver, "init", driver.init(0)));
+  VLA_CHECK(check_call(driver, "driver_version", driver.driver_version(&version)));
+  if (version < Gpu::kMinDriver)
+    return Error{Code::device, "cuda", "a driver for CUDA " + version_text(Gpu::kMinDriver) + " or newer",
+                 "one for CUDA " + version_text(version)};
+  VLA_CHECK(check_call(driver, "device_count", driver.device_count(&n_device)));
+  return n_device;
+}
+
+}  // namespace
+
+Result<std::vector<GpuInfo>> list_gpus(const Driver& driver) {
+  VLA_TRY(const int n_device, start_driver(driver));
+  if (n_device == 0) return Error{Code::device, "cuda", "a device", "its driver shows no device"};
+  int version = 0;
+  VLA_CHECK(check_call(driver, "driver_version", driver.driver_version(&version)));
+  std::vector<GpuInfo> all;
+  for (int i = 0; i < n_device; ++i) {
+    int device = 0;
+    char name[256] = {};
+    std::size_t memory = 0;
+    VLA_CHECK(check_call(driver, "device_get", driver.device_get(&device, i)));
+    VLA_CHECK(check_call(driver, "device_name", driver.device_name(name, sizeof(name) - 1, device)));
+    VLA_CHECK(check_call(driver, "memory_size", driver.memory_size(&memory, device)));
+    all.push_back({name, "driver for CUDA " + version_text(version), memory});
+  }
+  return all;
+}
+
+Status Gpu::check(const char* call, int result) const { return check_call(driver_, call, result); }
 
 Result<Owned> Gpu::own(const char* call, int result, Handle handle, Owned::Release release) const {
   VLA_CHECK(check(call, result));
@@ -39,13 +75,8 @@ Result<std::unique_ptr<Gpu>> Gpu::open(const Driver& driver, int device, const s
 }
 
 Status Gpu::start(int device, const std::vector<std::string>& modules) {
-  VLA_CHECK(CALL(init, 0));
-  int version = 0, n_device = 0, major = 0, minor = 0;
-  VLA_CHECK(CALL(driver_version, &version));
-  if (version < kMinDriver)
-    return Error{Code::device, "cuda", "a driver for CUDA " + version_text(kMinDriver) + " or newer",
-                 "one for CUDA " + version_text(version)};
-  VLA_CHECK(CALL(device_count, &n_device));
+  VLA_TRY(const int n_device, start_driver(driver_));
+  int major = 0, minor = 0;
   if (device < 0 || device >= n_device)
     return Error{Code::device, "cuda:" + std::to_string(device), "a device below " + std::to_string(n_device),
                  "none of this number"};
@@ -56,10 +87,11 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   if (major * 10 + minor < kMinCapability)
     return Error{Code::device, "cuda:" + std::to_string(device), "compute capability 8.0 or newer (Ampere)",
                  std::to_string(major) + "." + std::to_string(minor)};
-  Handle context = nullptr;
-  VLA_CHECK(CALL(context_retain, &context, device_));
-  has_context_ = true;
-  VLA_CHECK(CALL(context_use, context));
+  char name[256] = {};
+  VLA_CHECK(CALL(device_name, name, sizeof(name) - 1, device_));
+  name_ = name;
+  VLA_CHECK(CALL(context_retain, &context_, device_));
+  VLA_CHECK(use());
   for (const std::string& text : modules) {
     Handle module = nullptr;
     const int result = driver_.module_load(&module, text.c_str(), 0, nullptr, nullptr);
@@ -70,24 +102,42 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
 }
 
 Gpu::~Gpu() {
+  if (context_ == nullptr) return;
+  driver_.context_use(context_);
   modules_.clear();
-  if (has_context_) driver_.context_release(device_);
+  driver_.context_release(device_);
+}
+
+Status Gpu::use() const { return CALL(context_use, context_); }
+
+Buffer::~Buffer() {
+  if (gpu_ == nullptr || address_ == 0) return;
+  gpu_->driver_.context_use(gpu_->context_);
+  gpu_->driver_.release(address_);
 }
 
 Result<Buffer> Gpu::allocate(std::size_t size, const std::string& what) {
+  VLA_CHECK(use());
   Address address = 0;
   const int result = driver_.allocate(&address, size);
   if (result == kOutOfMemory) {
-    std::size_t free = 0, total = 0;
-    VLA_CHECK(CALL(memory_info, &free, &total));
+    VLA_TRY(const std::size_t free, free_memory());
     return Error{Code::out_of_memory, what, std::to_string(size) + " bytes of device memory",
                  std::to_string(free) + " free"};
   }
   VLA_CHECK(check("allocate", result));
-  return Buffer(driver_, address, size);
+  return Buffer(this, address, size);
+}
+
+Result<std::size_t> Gpu::free_memory() const {
+  VLA_CHECK(use());
+  std::size_t free = 0, total = 0;
+  VLA_CHECK(CALL(memory_info, &free, &total));
+  return free;
 }
 
 Result<Owned> Gpu::allocate_host(std::size_t size) {
+  VLA_CHECK(use());
   void* memory = nullptr;
   const int result = driver_.host_allocate(&memory, size, 0);
   return own("host_allocate", result, memory, driver_.host_release);
@@ -100,6 +150,18 @@ Result<Stream> Gpu::stream() {
   const int made_event = driver_.event_create(&event, kNoTiming);
   VLA_TRY(Owned owned_event, own("event_create", made_event, event, driver_.event_destroy));
   return Stream(*this, std::move(owned), std::move(owned_event));
+}
+
+Result<Owned> Gpu::event() {
+  Handle event = nullptr;
+  const int made = driver_.event_create(&event, 0);
+  return own("event_create", made, event, driver_.event_destroy);
+}
+
+Result<float> Gpu::elapsed(const Owned& first, const Owned& second) const {
+  float ms = 0;
+  VLA_CHECK(CALL(event_elapsed, &ms, first.get(), second.get()));
+  return ms;
 }
 
 /// The function of a kernel, which is allowed the shared memory that the launch asks for.
@@ -128,6 +190,9 @@ Result<Handle> Gpu::kernel(const Launch& how) {
 #undef CALL
 #define CALL(name, ...) gpu_->check(#name, gpu_->driver_.name(__VA_ARGS__))
 
+Status Stream::fill(Address to, unsigned char value, std::size_t size) {
+  return CALL(fill, to, value, size, stream_.get());
+}
 Status Stream::upload(Address to, const void* from, std::size_t size) {
   return CALL(upload, to, from, size, stream_.get());
 }
@@ -139,6 +204,11 @@ Status Stream::wait() { return CALL(stream_wait, stream_.get()); }
 Status Stream::after(Stream& other) {
   VLA_CHECK(CALL(event_record, other.event_.get(), other.stream_.get()));
   return CALL(stream_wait_event, stream_.get(), other.event_.get(), 0);
+}
+
+Status Stream::note_time(const Owned& event) {
+  constexpr unsigned kExternal = 1;  // a node of the graph, instead of a point that other streams wait for
+  return CALL(event_record_flags, event.get(), stream_.get(), kExternal);
 }
 
 Status Stream::launch_job(const Launch& how, const void* job) {

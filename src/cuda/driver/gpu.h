@@ -26,17 +26,17 @@ class Owned {
   std::unique_ptr<void, Release> held_ = {nullptr, nullptr};
 };
 
-/// Device memory.
+class Gpu;
+
+/// Device memory; it goes before the device does. Without a Gpu it is none, and its address says where it would lie.
 class Buffer {
  public:
-  Buffer(const Driver& driver, Address address, std::size_t size) : driver_(&driver), address_(address), size_(size) {}
-  Buffer(Buffer&& other) noexcept : driver_(other.driver_), address_(other.address_), size_(other.size_) {
+  Buffer(const Gpu* gpu, Address address, std::size_t size) : gpu_(gpu), address_(address), size_(size) {}
+  Buffer(Buffer&& other) noexcept : gpu_(other.gpu_), address_(other.address_), size_(other.size_) {
     other.address_ = 0;
   }
   Buffer& operator=(Buffer&&) = delete;
-  ~Buffer() {
-    if (address_ != 0) driver_->release(address_);
-  }
+  ~Buffer();
   /// As kernels' jobs take it; the host must not follow it.
   template <class T>
   T* as(std::size_t offset = 0) const {
@@ -46,16 +46,15 @@ class Buffer {
   std::size_t size() const { return size_; }
 
  private:
-  const Driver* driver_;
+  const Gpu* gpu_;
   Address address_;
   std::size_t size_;
 };
 
-class Gpu;
-
 /// Operations in order. Between streams only events order them.
 class Stream {
  public:
+  Status fill(Address to, unsigned char value, std::size_t size);
   /// Host memory must stay until the stream was waited for.
   Status upload(Address to, const void* from, std::size_t size);
   Status download(void* to, Address from, std::size_t size);
@@ -63,10 +62,14 @@ class Stream {
   Status launch(const Launch& how, const Job& job) {
     return launch_job(how, &job);
   }
+  /// `job` points at what the kernel takes.
+  Status launch_job(const Launch& how, const void* job);
   /// Until all operations are done.
   Status wait();
   /// What comes next begins when all that is in `other` has ended.
   Status after(Stream& other);
+  /// While operations are captured: has `event` note the time whenever the graph comes here.
+  Status note_time(const Owned& event);
 
   /// Operations, also of streams that come after this one, become a graph instead of running; those must be waited for
   /// with after() before the end.
@@ -78,31 +81,51 @@ class Stream {
  private:
   friend class Gpu;
   Stream(Gpu& gpu, Owned stream, Owned event) : gpu_(&gpu), stream_(std::move(stream)), event_(std::move(event)) {}
-  Status launch_job(const Launch& how, const void* job);
 
   Gpu* gpu_;
   Owned stream_, event_;
 };
+
+/// A GPU that may be opened.
+struct GpuInfo {
+  std::string name, driver;
+  std::size_t memory;  // bytes
+};
+/// In the order of their numbers. Errors: device where there is none, or the driver is too old, with the reason as
+/// `found`.
+Result<std::vector<GpuInfo>> list_gpus(const Driver& driver);
 
 class Gpu {
  public:
   /// Driver version and compute capability that our kernels need.
   static constexpr int kMinDriver = 12060, kMinCapability = 80;
 
-  /// Takes the device's context for the calling thread and loads the modules, texts of PTX.
+  /// Takes the device's context and loads the modules, texts of PTX.
   static Result<std::unique_ptr<Gpu>> open(const Driver& driver, int device, const std::vector<std::string>& modules);
   Gpu(const Gpu&) = delete;
   ~Gpu();
 
+  /// Makes this the device of the calling thread, which it must be for every call of the driver. What allocates or
+  /// gives back does so itself.
+  Status use() const;
+
   /// Blocks of big kernels that run at a time, about.
   int n_sm() const { return n_sm_; }
+  const std::string& name() const { return name_; }
   /// out_of_memory with both sizes where less is free.
   Result<Buffer> allocate(std::size_t size, const std::string& what);
   /// Memory of the host that the device reads and writes without the processor.
   Result<Owned> allocate_host(std::size_t size);
   Result<Stream> stream();
+  /// For Stream::note_time.
+  Result<Owned> event();
+  /// Milliseconds between the times that two events noted.
+  Result<float> elapsed(const Owned& first, const Owned& second) const;
+  /// Bytes of device memory.
+  Result<std::size_t> free_memory() const;
 
  private:
+  friend class Buffer;
   friend class Stream;
   explicit Gpu(const Driver& driver) : driver_(driver) {}
   Status start(int device, const std::vector<std::string>& modules);
@@ -113,7 +136,8 @@ class Gpu {
 
   Driver driver_;
   int device_ = -1, n_sm_ = 1;
-  bool has_context_ = false;
+  std::string name_;
+  Handle context_ = nullptr;
   std::vector<Owned> modules_;
   struct Function {
     Handle handle;

@@ -41,29 +41,27 @@ class CudaTarget final : public Target {
 
 }  // namespace
 
-Status CudaDevice::Shared::keep(Status status) {
-  if (!status && failure) failure = status;
-  return status;
-}
-
 Result<std::unique_ptr<Device>> CudaDevice::open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules, Rounding at_load) {
   if (at_load == Rounding::int4)
     return Error{Code::unsupported, "kernels", "float32, bf16 or int8", "int4", "products of int4 are the CPU's"};
-  std::unique_ptr<CudaDevice> device(new CudaDevice(at_load));
-  device->shared_ = std::make_shared<Shared>();
-  VLA_TRY(device->shared_->gpu, cuda::Gpu::open(driver, index, modules));
-  VLA_TRY(cuda::Stream stream, device->shared_->gpu->stream());
-  device->shared_->stream = std::make_unique<cuda::Stream>(std::move(stream));
+  VLA_TRY(std::shared_ptr<CudaQueue> queue, CudaQueue::open(driver, index, modules));
+  const std::string name = "cuda:" + std::to_string(index) + ", " + queue->device_name();
+  return std::unique_ptr<Device>(new CudaDevice(name, std::move(queue), at_load));
+}
+
+Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Rounding at_load) {
+  VLA_TRY(const GpuModel found, find_gpu_model(name));
+  std::unique_ptr<CudaDevice> device(
+      new CudaDevice(std::string("model of ") + found.description, std::make_shared<CudaQueue>(found.n_sm), at_load));
+  device->model_ = found;
   return std::unique_ptr<Device>(std::move(device));
 }
 
 Status CudaDevice::load(const ParamList& params, bool fill) {
-  const auto upload = [&](cuda::Address to, const void* from, std::size_t size) {
-    Status done = shared_->keep(shared_->stream->upload(to, from, size));
-    return done ? shared_->keep(shared_->stream->wait()) : done;
-  };
-  VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, *shared_->gpu, upload));
+  if (model_ && fill) return Error{Code::usage, "model", "a device that is there", name_, "it says times alone"};
+  if (!fill) queue_->set_dry();
+  VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, *queue_));
   // Attention rounds where products do, as on the CPU.
   const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
   min_rounded_keys_ = rounds ? vla::min_rounded_keys(params) : std::numeric_limits<std::int64_t>::max();
@@ -81,35 +79,29 @@ std::string CudaDevice::kernels() const {
 Status CudaDevice::allocate(Slots& slots) {
   std::size_t size = 0;
   for (const Slot& slot : slots.all()) size += aligned(slot.size());
-  size = std::max<std::size_t>(size, 1);
-  VLA_TRY(cuda::Buffer made, shared_->gpu->allocate(size, "inputs and cache"));
-  const auto memory = std::make_shared<cuda::Buffer>(std::move(made));
+  VLA_TRY(const std::shared_ptr<cuda::Buffer> memory, queue_->allocate(size, "inputs and cache"));
   cuda::Address place = memory->address();
   for (Slot& slot : slots.all()) slot.place = reinterpret_cast<void*>(place), place += aligned(slot.size());
-  const std::vector<std::byte> zeros(size);
-  VLA_CHECK(shared_->keep(shared_->stream->upload(memory->address(), zeros.data(), size)));
-  VLA_CHECK(shared_->keep(shared_->stream->wait()));
+  VLA_CHECK(queue_->fill_zeros(*memory));
   // With the device, which must not go before its memory.
-  slots.hold(std::make_shared<std::pair<std::shared_ptr<Shared>, std::shared_ptr<cuda::Buffer>>>(shared_, memory),
+  slots.hold(std::make_shared<std::pair<std::shared_ptr<CudaQueue>, std::shared_ptr<cuda::Buffer>>>(queue_, memory),
              size);
   return {};
 }
 
 void CudaDevice::set(const Slot& slot, const void* data, std::size_t size) {
-  if (shared_->keep(shared_->stream->upload(reinterpret_cast<cuda::Address>(slot.place), data, size)))
-    static_cast<void>(shared_->keep(shared_->stream->wait()));  // `data` is the caller's again
+  queue_->set(reinterpret_cast<cuda::Address>(slot.place), data, size);
 }
 
 void CudaDevice::get(const Slot& slot, void* data, std::size_t size) const {
-  if (shared_->keep(shared_->stream->download(data, reinterpret_cast<cuda::Address>(slot.place), size)))
-    static_cast<void>(shared_->keep(shared_->stream->wait()));
+  queue_->get(data, reinterpret_cast<cuda::Address>(slot.place), size);
 }
 
 Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const LowerOptions& options) {
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
   const CudaTarget target(weights_, min_rounded_keys_);
-  CudaLowering l = {{.graph = graph, .options = options, .target = target}, weights_, shared_->gpu->n_sm()};
+  CudaLowering l = {{.graph = graph, .options = options, .target = target}, weights_, queue_->n_sm()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);
   store(l, ops);
@@ -122,10 +114,9 @@ Result<std::unique_ptr<Program>> CudaDevice::lower(const Graph& graph, const Low
     return std::pair(a.phase, a.order) < std::pair(b.phase, b.order);
   });
   if (!arena_ || l.arena_size > arena_->size()) {  // programs made before keep the memory that they were given
-    VLA_TRY(cuda::Buffer memory, shared_->gpu->allocate(std::max<std::size_t>(l.arena_size, 1), "working memory"));
-    arena_ = std::make_shared<cuda::Buffer>(std::move(memory));
+    VLA_TRY(arena_, queue_->allocate(l.arena_size, "working memory"));
   }
-  return CudaProgram::make(l, shared_, {weights_.memory(), arena_});
+  return CudaProgram::make(l, queue_, {weights_.memory(), arena_}, model_ ? &*model_ : nullptr);
 }
 
 }  // namespace vla::lower

@@ -2,9 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <functional>
-
-#include "lower/cuda/cuda_device.h"
+#include "lower/cuda/cuda_queue.h"
 #include "lower/cuda/cuda_weights.h"
 #include "lower/lowering.h"
 
@@ -61,9 +59,7 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 enum class ProductShape { few, rows64, rows128 };
 ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm);
 
-/// One launch, or several one after the other.
-using Call = std::function<Status(cuda::Stream&)>;
 /// Errors: unsupported for sizes that no kernel has.
-Result<std::vector<Call>> emit(const CudaLowering& l, const CudaOp& op);
+Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
 
 }  // namespace vla::lower

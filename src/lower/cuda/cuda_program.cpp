@@ -46,13 +46,16 @@ double flop_of_op(const CudaOp& op) {
 
 }  // namespace
 
-Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaDevice::Shared> shared,
-                                                   std::vector<std::shared_ptr<cuda::Buffer>> memory) {
+Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
+                                                   std::vector<std::shared_ptr<cuda::Buffer>> memory,
+                                                   const GpuModel* model) {
   std::unique_ptr<CudaProgram> program(new CudaProgram);
-  program->shared_ = std::move(shared), program->memory_ = std::move(memory);
+  program->queue_ = std::move(queue), program->memory_ = std::move(memory);
   VLA_CHECK(program->give_addresses(l, *program->memory_.back()));
-  VLA_CHECK(program->make_calls(l));
+  VLA_CHECK(program->make_parts(l));
+  VLA_CHECK(program->make_marks(l));
   program->make_taps(l);
+  if (model != nullptr) program->predictions_ = predict(l, *model);
   return std::unique_ptr<Program>(std::move(program));
 }
 
@@ -68,12 +71,8 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
     std::visit([&](const auto& elements) { std::memcpy(&constants[begins[i]], elements.data(), value.size); },
                value.node->as<op::Constant>()->values);
   }
-  VLA_TRY(cuda::Buffer own, shared_->gpu->allocate(std::max<std::size_t>(kept + constants.size(), 1), "constants"));
-  own_ = std::make_unique<cuda::Buffer>(std::move(own));
-  if (!constants.empty()) {
-    VLA_CHECK(shared_->stream->upload(own_->address() + kept, constants.data(), constants.size()));
-    VLA_CHECK(shared_->stream->wait());
-  }
+  VLA_TRY(own_, queue_->allocate(kept + constants.size(), "constants"));
+  if (!constants.empty()) VLA_CHECK(queue_->upload(own_->address() + kept, constants.data(), constants.size()));
   const auto address = [&](std::size_t i) -> cuda::Address {
     const Value& value = l.values[i];
     switch (value.placement) {
@@ -97,17 +96,44 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
   return {};
 }
 
-Status CudaProgram::make_calls(const CudaLowering& l) {
+CudaProgram::~CudaProgram() {
+  queue_->forget(prepare_);
+  queue_->forget(run_);
+}
+
+Status CudaProgram::make_parts(const CudaLowering& l) {
   for (const Graph::Stage& stage : l.graph.stages()) stages_.push_back({stage.name, {}});
   work_.resize(stages_.size() + 1);
+  prepare_.phases.resize(static_cast<std::size_t>(l.n_prepare));
+  run_.phases.resize(static_cast<std::size_t>(l.n_phase - l.n_prepare));
   for (const CudaOp& op : l.ops) {
-    VLA_TRY(std::vector<Call> calls, emit(l, op));
-    std::vector<Call>& all = op.phase < l.n_prepare ? prepare_ : calls_;
-    all.insert(all.end(), calls.begin(), calls.end());
+    VLA_TRY(Calls calls, emit(l, op));
+    const bool is_prepared = op.phase < l.n_prepare;
+    CudaPart& part = is_prepared ? prepare_ : run_;
+    part.phases[static_cast<std::size_t>(is_prepared ? op.phase : op.phase - l.n_prepare)].push_back(std::move(calls));
     if (!op.invariant) work_[stage_of(l, op)].flop += flop_of_op(op);
     text_ += std::to_string(op.phase) + " " + std::visit(KindOf{l}, op.op) + "\n";
   }
   return {};
+}
+
+/// A mark behind the last phase of each stage, and one at the end.
+Status CudaProgram::make_marks(const CudaLowering& l) {
+  std::vector<std::size_t> ends(stages_.size(), 0);
+  for (const CudaOp& op : l.ops)
+    for (std::size_t stage = stage_of(l, op); op.phase >= l.n_prepare && stage < ends.size(); ++stage)
+      ends[stage] = std::max(ends[stage], static_cast<std::size_t>(op.phase - l.n_prepare + 1));
+  const auto add = [&](std::size_t n_phase, Time* time) -> Status {
+    VLA_TRY(cuda::Owned event, queue_->event());
+    run_.marks.push_back({n_phase, std::move(event), time});
+    return {};
+  };
+  for (std::size_t i = 0; i < stages_.size(); ++i) VLA_CHECK(add(ends[i], &stages_[i].done));
+  return stages_.empty() ? Status() : add(run_.phases.size(), &ended_);
+}
+
+std::optional<Program::Time> CudaProgram::ended() const {
+  return stages_.empty() ? std::nullopt : std::optional(ended_);
 }
 
 void CudaProgram::make_taps(const CudaLowering& l) {
@@ -118,37 +144,12 @@ void CudaProgram::make_taps(const CudaLowering& l) {
   }
 }
 
-Status CudaProgram::prepare() {
-  for (const Call& call : prepare_) VLA_CHECK(shared_->keep(call(*shared_->stream)));
-  return shared_->keep(shared_->stream->wait());
-}
-
-Status CudaProgram::run() {
-  VLA_CHECK(shared_->failure);
-  VLA_CHECK(shared_->keep(run_captured()));
-  for (Stage& stage : stages_) stage.done = std::chrono::steady_clock::now();  // one graph: they end together
-  return {};
-}
-
-Status CudaProgram::run_captured() {
-  if (calls_.empty()) return {};
-  if (!graph_) {
-    VLA_CHECK(shared_->stream->begin_capture());
-    for (const Call& call : calls_) VLA_CHECK(call(*shared_->stream));
-    VLA_TRY(graph_, shared_->stream->end_capture());
-  }
-  VLA_CHECK(shared_->stream->launch(*graph_));
-  return shared_->stream->wait();
-}
-
 std::vector<float> CudaProgram::tap(std::size_t i) const {
   const auto& [data, shape, stride] = tap_places_[i];
   std::int64_t last = 0;
   for (std::size_t d = 0; d < 4; ++d) last += (shape[d] - 1) * stride[d];
   std::vector<float> all(static_cast<std::size_t>(last + 1)), values;
-  if (!shared_->keep(shared_->stream->download(all.data(), data, all.size() * sizeof(float))) ||
-      !shared_->keep(shared_->stream->wait()))
-    return {};
+  queue_->get(all.data(), data, all.size() * sizeof(float));
   values.reserve(static_cast<std::size_t>(count(shape)));
   for (std::int64_t a = 0; a < shape[3]; ++a)
     for (std::int64_t b = 0; b < shape[2]; ++b)

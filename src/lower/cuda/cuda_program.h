@@ -5,20 +5,25 @@
 #include <optional>
 
 #include "lower/cuda/cuda_lowering.h"
+#include "lower/cuda/gpu_model.h"
 
 namespace vla::lower {
 
-/// Launches in an order that their operands allow: one captured graph for a run.
+/// Launches in phases that their operands allow.
 class CudaProgram final : public Program {
  public:
   /// The last pass: addresses and launches. Errors: device, out_of_memory, unsupported.
-  static Result<std::unique_ptr<Program>> make(CudaLowering& l, std::shared_ptr<CudaDevice::Shared> shared,
-                                               std::vector<std::shared_ptr<cuda::Buffer>> memory);
+  static Result<std::unique_ptr<Program>> make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
+                                               std::vector<std::shared_ptr<cuda::Buffer>> memory,
+                                               const GpuModel* model);
+  ~CudaProgram() override;
 
-  Status prepare() override;
-  Status run() override;
+  Status prepare() override { return queue_->run(prepare_); }
+  Status run() override { return queue_->run(run_); }
+  std::optional<Time> ended() const override;
   const std::vector<Stage>& stages() const override { return stages_; }
   std::vector<Work> work() const override { return work_; }
+  std::vector<Prediction> predictions() const override { return predictions_; }
   const std::vector<Tap>& taps() const override { return taps_; }
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
@@ -30,17 +35,18 @@ class CudaProgram final : public Program {
     Shape shape, stride;
   };
   Status give_addresses(CudaLowering& l, const cuda::Buffer& arena);
-  Status make_calls(const CudaLowering& l);
+  Status make_parts(const CudaLowering& l);
+  Status make_marks(const CudaLowering& l);
   void make_taps(const CudaLowering& l);
-  Status run_captured();
 
-  std::shared_ptr<CudaDevice::Shared> shared_;
+  std::shared_ptr<CudaQueue> queue_;
   std::vector<std::shared_ptr<cuda::Buffer>> memory_;  // weights and arena
-  std::unique_ptr<cuda::Buffer> own_;                  // what prepare leaves, and constants
-  std::vector<Call> prepare_, calls_;
-  std::optional<cuda::Owned> graph_;
+  std::shared_ptr<cuda::Buffer> own_;                  // what prepare leaves, and constants
+  CudaPart prepare_, run_;
   std::vector<Stage> stages_;
+  Time ended_;
   std::vector<Work> work_;
+  std::vector<Prediction> predictions_;
   std::vector<Tap> taps_;
   std::vector<TapPlace> tap_places_;
   std::string text_;

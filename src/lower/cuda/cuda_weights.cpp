@@ -123,8 +123,7 @@ bool CudaWeights::has(MatrixKind kind) const {
   return std::any_of(all_.begin(), all_.end(), [&](const CudaWeight& weight) { return weight.kind == kind; });
 }
 
-Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, bool fill, cuda::Gpu& gpu,
-                                      const Upload& upload) {
+Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, bool fill, CudaQueue& queue) {
   VLA_CHECK(check_rounding(list, rounding));
   CudaWeights weights;
   std::map<std::pair<MatrixKind, std::string>, int> counts;
@@ -141,8 +140,7 @@ Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, 
   for (const auto& [what, n] : counts)
     weights.text_ += (weights.text_.empty() ? "" : ", ") + std::string(kKernels[static_cast<int>(what.first)]) + " (" +
                      std::to_string(n) + " " + what.second + ")";
-  VLA_TRY(cuda::Buffer memory, gpu.allocate(std::max<std::size_t>(size, 1), "weights"));
-  weights.memory_ = std::make_shared<cuda::Buffer>(std::move(memory));
+  VLA_TRY(weights.memory_, queue.allocate(size, "weights"));
   for (CudaWeight& weight : weights.all_)
     weight.data += weights.memory_->address(), weight.scales += weights.memory_->address();
   if (!fill || list.params().empty()) return weights;
@@ -151,8 +149,9 @@ Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, 
     if (param.source == nullptr) continue;
     const CudaWeight& weight = weights[param];
     if (!reader.read(param, weight)) return list.bundle()->content()->changed();
-    VLA_CHECK(upload(weight.data, reader.data(), size_of(param, weight.kind)));
-    if (has_codes(weight.kind)) VLA_CHECK(upload(weight.scales, reader.scales().data(), reader.scales().size() * 4));
+    VLA_CHECK(queue.upload(weight.data, reader.data(), size_of(param, weight.kind)));
+    if (has_codes(weight.kind))
+      VLA_CHECK(queue.upload(weight.scales, reader.scales().data(), reader.scales().size() * 4));
   }
   return weights;
 }

@@ -2,12 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <functional>
+#include <memory>
 #include <string>
 #include <vector>
 
-#include "cuda/driver/gpu.h"
 #include "graph/rounding.h"
+#include "lower/cuda/cuda_queue.h"
 
 namespace vla::lower {
 
@@ -27,14 +27,10 @@ constexpr std::int64_t bf16_stride(std::int64_t n) { return cuda::round_up(n, 8)
 
 class CudaWeights {
  public:
-  /// Takes bytes to a place in device memory; they are the caller's again afterwards.
-  using Upload = std::function<Status(cuda::Address to, const void* from, std::size_t size)>;
-
   /// Matrices that are stored as bf16 are multiplied so, and with bf16 or
   /// int8 large ones of floats become that; with float32 all but ternary ones are float32. fill: whether to read them.
   /// Errors: out_of_memory, bad_bundle, device.
-  static Result<CudaWeights> load(const ParamList& list, Rounding rounding, bool fill, cuda::Gpu& gpu,
-                                  const Upload& upload);
+  static Result<CudaWeights> load(const ParamList& list, Rounding rounding, bool fill, CudaQueue& queue);
 
   const CudaWeight& operator[](const Param& param) const { return all_[static_cast<std::size_t>(param.id)]; }
   const std::shared_ptr<cuda::Buffer>& memory() const { return memory_; }

@@ -14,7 +14,7 @@
 namespace vla::lower {
 namespace {
 
-using Calls = Result<std::vector<Call>>;
+using Emitted = Result<Calls>;
 
 /// more: "heads of at most".
 Error unsupported(const char* what, const char* more, std::int64_t most, std::int64_t found) {
@@ -23,7 +23,8 @@ Error unsupported(const char* what, const char* more, std::int64_t most, std::in
 
 template <class Job>
 Call call(const cuda::Launch& how, const Job& job) {
-  return [how, job](cuda::Stream& stream) { return stream.launch(how, job); };
+  const auto* bytes = reinterpret_cast<const std::byte*>(&job);
+  return {how, {bytes, bytes + sizeof(job)}};
 }
 int narrow(std::int64_t n) { return static_cast<int>(n); }
 std::int64_t n_row(const Shape& shape) { return count(shape) / shape[0]; }
@@ -45,8 +46,8 @@ struct Emit {
 
   float* result() const { return l.at(op.writes[0]); }
 
-  Calls operator()(const LinearOp& linear) const {
-    std::vector<Call> calls;
+  Emitted operator()(const LinearOp& linear) const {
+    Calls calls;
     for (std::size_t i = 0; i < linear.linears.size(); ++i) {
       const Node& node = *linear.linears[i];
       const auto& product = *node.as<op::Linear>();
@@ -68,7 +69,7 @@ struct Emit {
     }
     return calls;
   }
-  void add_product(std::vector<Call>& calls, const LinearOp& linear, const CudaWeight& matrix, const Param& weight,
+  void add_product(Calls& calls, const LinearOp& linear, const CudaWeight& matrix, const Param& weight,
                    const cuda::Epilogue& end) const {
     const Value& x = l.value(linear.x);
     const int rows = narrow(n_row(x.shape)), columns = narrow(weight.shape[1]), depth = narrow(x.shape[0]);
@@ -121,7 +122,7 @@ struct Emit {
   }
 
   /// Heads of a value, normed or turned, to a contiguous one.
-  Calls heads(ValueId id, const float* weight, float eps, const float* table) const {
+  Emitted heads(ValueId id, const float* weight, float eps, const float* table) const {
     const Value& x = l.value(id);
     if (x.shape[0] > cuda::kMaxHead) return unsupported("heads", "heads of at most", cuda::kMaxHead, x.shape[0]);
     const Shape to = contiguous_strides(x.shape);
@@ -141,16 +142,16 @@ struct Emit {
                                narrow(x.shape[3]),
                                eps,
                                l.value(op.writes[0]).type == DType::bf16};
-    return std::vector<Call>{call(cuda::head_rows(job), job)};
+    return Calls{call(cuda::head_rows(job), job)};
   }
-  Calls operator()(const HeadOp& head) const {
+  Emitted operator()(const HeadOp& head) const {
     const auto* norm = head.rows.norm != nullptr ? head.rows.norm->as<op::Norm>() : nullptr;
     if (norm != nullptr && norm->kind != op::NormKind::rms)
       return Error{Code::unsupported, "heads", "an RMS norm", "a layer norm", "use --kernels ggml"};
     return heads(head.rows.x, l.at(head.rows.weight), norm != nullptr ? norm->eps : 0, l.at(head.rows.table));
   }
 
-  Calls operator()(const AttentionOp& attention) const {
+  Emitted operator()(const AttentionOp& attention) const {
     const Value& q = l.value(attention.q.x);
     if (q.shape[0] > cuda::kMaxHead) return unsupported("attention", "heads of at most", cuda::kMaxHead, q.shape[0]);
     if (op.keys.size() > static_cast<std::size_t>(cuda::AttentionJob::kMaxSegment))
@@ -169,12 +170,12 @@ struct Emit {
     job.d_head = narrow(q.shape[0]), job.n_head = narrow(q.shape[1]), job.n_query = narrow(q.shape[2]);
     job.n_batch = narrow(q.shape[3]), job.n_head_kv = narrow(l.value(op.keys[0].first).shape[1]);
     job.n_split = op.n_split, job.partial = l.at(op.partial), job.is_bf16 = l.value(op.writes[0]).type == DType::bf16;
-    std::vector<Call> calls = {call(attention.rounds ? cuda::attention_bf16(job) : cuda::attention_f32(job), job)};
+    Calls calls = {call(attention.rounds ? cuda::attention_bf16(job) : cuda::attention_f32(job), job)};
     if (job.n_split > 1) calls.push_back(call(cuda::finish_attention(job), job));
     return calls;
   }
 
-  Calls operator()(const RoundOp& round) const {
+  Emitted operator()(const RoundOp& round) const {
     const Value &x = l.value(round.x), &y = l.value(op.writes[0]);
     if (x.shape[0] > cuda::kMaxNorm) return unsupported("product", "rows of at most", cuda::kMaxNorm, x.shape[0]);
     cuda::NormJob job = norm_of(round.x, round.norm != nullptr ? round.norm->as<op::Norm>() : nullptr);
@@ -182,7 +183,7 @@ struct Emit {
     job.type = y.type == DType::i8     ? cuda::RowType::codes
                : y.type == DType::bf16 ? cuda::RowType::bf16
                                        : cuda::RowType::f32;
-    return std::vector<Call>{call(cuda::norm_rows(job), job)};
+    return Calls{call(cuda::norm_rows(job), job)};
   }
   /// Rows of x, normed unless there is no norm, to the result.
   cuda::NormJob norm_of(ValueId id, const op::Norm* norm) const {
@@ -195,43 +196,43 @@ struct Emit {
     return job;
   }
 
-  Calls operator()(const RowOp& row) const {
+  Emitted operator()(const RowOp& row) const {
     return std::visit([&](const auto& what) { return rows(row, what); }, row.what);
   }
-  Calls rows(const RowOp& row, const op::Norm& norm) const {
+  Emitted rows(const RowOp& row, const op::Norm& norm) const {
     const Value& x = l.value(row.x);
     if (x.shape[0] > cuda::kMaxNorm) return unsupported("norm", "rows of at most", cuda::kMaxNorm, x.shape[0]);
     cuda::NormJob job = norm_of(row.x, &norm);
     job.weight = l.at(row.w), job.bias = l.at(row.b);
-    return std::vector<Call>{call(cuda::norm_rows(job), job)};
+    return Calls{call(cuda::norm_rows(job), job)};
   }
-  Calls rows(const RowOp& row, const op::Rope&) const { return heads(row.x, nullptr, 0, l.at(row.w)); }
-  Calls rows(const RowOp& row, const op::Activate& activate) const {
+  Emitted rows(const RowOp& row, const op::Rope&) const { return heads(row.x, nullptr, 0, l.at(row.w)); }
+  Emitted rows(const RowOp& row, const op::Activate& activate) const {
     cuda::MapJob job = map_of(row);
     job.activation = activate.activation;
-    return std::vector<Call>{call(cuda::map_elements(job), job)};
+    return Calls{call(cuda::map_elements(job), job)};
   }
-  Calls rows(const RowOp& row, const op::Scale& scale) const {
+  Emitted rows(const RowOp& row, const op::Scale& scale) const {
     cuda::MapJob job = map_of(row);
     job.factor = scale.factor;
-    return std::vector<Call>{call(cuda::map_elements(job), job)};
+    return Calls{call(cuda::map_elements(job), job)};
   }
-  Calls rows(const RowOp& row, const op::Add&) const { return with_other(row, cuda::MapOperation::add); }
-  Calls rows(const RowOp& row, const op::Multiply&) const { return with_other(row, cuda::MapOperation::multiply); }
-  Calls with_other(const RowOp& row, cuda::MapOperation operation) const {
+  Emitted rows(const RowOp& row, const op::Add&) const { return with_other(row, cuda::MapOperation::add); }
+  Emitted rows(const RowOp& row, const op::Multiply&) const { return with_other(row, cuda::MapOperation::multiply); }
+  Emitted with_other(const RowOp& row, cuda::MapOperation operation) const {
     cuda::MapJob job = map_of(row);
     const Value& w = l.value(row.w);
     job.operation = operation, job.b = l.at(row.w);
     for (std::size_t i = 0; i < 4; ++i) job.b_step[i] = w.shape[i] == 1 ? 0 : w.stride[i];
-    return std::vector<Call>{call(cuda::map_elements(job), job)};
+    return Calls{call(cuda::map_elements(job), job)};
   }
   cuda::MapJob map_of(const RowOp& row) const {
     const Shape& shape = row.node->shape;
     return lower::map_of(shape, l.at(row.x), l.value(row.x).stride, result(), contiguous_strides(shape));
   }
 
-  Calls operator()(const CopyOp& copy) const {
-    std::vector<Call> calls;
+  Emitted operator()(const CopyOp& copy) const {
+    Calls calls;
     for (const CopyOp::Part& part : copy.parts) {
       const cuda::MapJob job = lower::map_of(part.shape, l.at(part.from) + part.from_offset, part.from_stride,
                                              result() + part.to_offset, part.to_stride);
@@ -240,7 +241,7 @@ struct Emit {
     return calls;
   }
 
-  Calls operator()(const LookupOp& lookup) const {
+  Emitted operator()(const LookupOp& lookup) const {
     const Node& node = *lookup.node;
     cuda::LookupJob job = {};
     job.ids = l.at<std::int32_t>(lookup.ids), job.y = result();
@@ -254,10 +255,10 @@ struct Emit {
     } else {
       job.table = l.at(lookup.table), job.n_table = narrow(l.value(lookup.table).shape[1]);
     }
-    return std::vector<Call>{call(cuda::lookup_rows(job), job)};
+    return Calls{call(cuda::lookup_rows(job), job)};
   }
 
-  Calls operator()(const PatchesOp& patches) const {
+  Emitted operator()(const PatchesOp& patches) const {
     const Node& node = *patches.node;
     const int size = node.as<op::Patches>()->size, width = narrow(node.in[0].dim(0)),
               height = narrow(node.in[0].dim(1));
@@ -274,7 +275,7 @@ struct Emit {
                               cuda::MapOperation::copy,
                               Activation::none,
                               false};
-    return std::vector<Call>{call(cuda::map_elements(job), job)};
+    return Calls{call(cuda::map_elements(job), job)};
   }
 
   Calls operator()(const WindowOp& op) const {
@@ -285,6 +286,6 @@ struct Emit {
 
 }  // namespace
 
-Result<std::vector<Call>> emit(const CudaLowering& l, const CudaOp& op) { return std::visit(Emit{l, op}, op.op); }
+Result<Calls> emit(const CudaLowering& l, const CudaOp& op) { return std::visit(Emit{l, op}, op.op); }
 
 }  // namespace vla::lower

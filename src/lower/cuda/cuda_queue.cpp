@@ -1,0 +1,226 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cuda/cuda_queue.h"
+
+#include <algorithm>
+#include <cstring>
+
+namespace vla::lower {
+namespace {
+
+/// Streams that a graph forks to: products of one x are three at most, and four small kernels fill no device.
+constexpr std::size_t kStreams = 4;
+/// A driver takes about as many nodes as it has memory for; many steps are several launches.
+constexpr std::size_t kMaxLaunches = 20000;
+/// Slots begin at multiples of it, so that what is missing between two of them is padding.
+constexpr std::size_t kPadding = 256;
+
+std::size_t n_launch(const CudaPart& part) {
+  std::size_t n = 0;
+  for (const auto& phase : part.phases)
+    for (const Calls& calls : phase) n += calls.size();
+  return n;
+}
+
+}  // namespace
+
+Result<std::unique_ptr<CudaQueue>> CudaQueue::open(const cuda::Driver& driver, int index,
+                                                   const std::vector<std::string>& modules) {
+  VLA_TRY(std::unique_ptr<cuda::Gpu> gpu, cuda::Gpu::open(driver, index, modules));
+  std::unique_ptr<CudaQueue> queue(new CudaQueue(std::move(gpu)));
+  VLA_TRY(cuda::Stream main, queue->gpu_->stream());
+  queue->main_ = std::make_unique<cuda::Stream>(std::move(main));
+  while (queue->side_.size() + 1 < kStreams) {
+    VLA_TRY(cuda::Stream side, queue->gpu_->stream());
+    queue->side_.push_back(std::move(side));
+  }
+  VLA_TRY(queue->end_, queue->gpu_->event());
+  return queue;
+}
+
+CudaQueue::~CudaQueue() {
+  if (gpu_) static_cast<void>(gpu_->use());
+}
+
+Result<std::shared_ptr<cuda::Buffer>> CudaQueue::allocate(std::size_t size, const std::string& what) {
+  size = std::max<std::size_t>(size, 1);
+  if (is_dry_) {
+    const cuda::Address address = next_;
+    next_ += (size + kPadding - 1) / kPadding * kPadding;
+    return std::make_shared<cuda::Buffer>(nullptr, address, size);
+  }
+  VLA_CHECK(failure_);
+  Result<cuda::Buffer> made = gpu_->allocate(size, what);
+  if (made) return std::make_shared<cuda::Buffer>(std::move(*made));
+  // Memory may be there later; a device that failed is not.
+  if (made.error().code != Code::out_of_memory) static_cast<void>(keep(made.error()));
+  return made.error();
+}
+
+Status CudaQueue::fill_zeros(const cuda::Buffer& memory) {
+  if (is_dry_) return {};
+  VLA_CHECK(failure_);
+  VLA_CHECK(keep(gpu_->use()));
+  return keep(main_->fill(memory.address(), 0, memory.size()));
+}
+
+Result<cuda::Owned> CudaQueue::event() {
+  if (is_dry_) return cuda::Owned();
+  VLA_CHECK(failure_);
+  VLA_CHECK(keep(gpu_->use()));
+  Result<cuda::Owned> made = gpu_->event();
+  if (!made) static_cast<void>(keep(made.error()));
+  return made;
+}
+
+Status CudaQueue::keep(Status status) {
+  if (!status && failure_) failure_ = status;
+  return status;
+}
+
+Status CudaQueue::grow(HostMemory& memory, std::size_t size) {
+  if (memory.size >= size) return {};
+  VLA_TRY(memory.memory, gpu_->allocate_host(size));
+  memory.size = size;
+  return {};
+}
+
+void CudaQueue::set(cuda::Address to, const void* from, std::size_t size) {
+  if (!is_dry_ && failure_) static_cast<void>(keep(stage(to, from, size)));
+}
+
+Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
+  VLA_CHECK(gpu_->use());
+  VLA_CHECK(launch());  // it reads what was there before
+  std::size_t gap = kPadding;
+  if (!uploads_.empty()) {
+    const cuda::Address end = uploads_.back().to + uploads_.back().size;
+    if (to >= end && to - end < kPadding) gap = static_cast<std::size_t>(to - end);
+  }
+  const bool joins = gap < kPadding;
+  if (n_staged_ + size + kPadding > staging_.size) {
+    VLA_CHECK(start_uploads());
+    VLA_CHECK(wait());
+    VLA_CHECK(grow(staging_, 2 * size + kPadding));
+    return stage(to, from, size);
+  }
+  if (joins) {
+    std::memset(staging_.at(n_staged_), 0, gap);
+    uploads_.back().size += gap + size, n_staged_ += gap;
+  } else {
+    uploads_.push_back({to, n_staged_, size});
+  }
+  std::memcpy(staging_.at(n_staged_), from, size);
+  n_staged_ += size;
+  return {};
+}
+
+Status CudaQueue::upload(cuda::Address to, const void* from, std::size_t size) {
+  if (is_dry_) return {};
+  VLA_CHECK(failure_);
+  VLA_CHECK(keep(gpu_->use()));
+  VLA_CHECK(keep(main_->upload(to, from, size)));
+  return keep(wait());
+}
+
+Status CudaQueue::run(const CudaPart& part) {
+  VLA_CHECK(failure_);
+  if (is_dry_) return Error{Code::internal, "cuda", "a device with memory", "a dry one"};
+  const std::size_t n = n_launch(part);
+  if (n == 0 && part.marks.empty()) return {};
+  if (n_pending_ > 0 && n_pending_ + n > kMaxLaunches) VLA_CHECK(keep(launch()));
+  pending_.push_back(&part), n_pending_ += n;
+  return {};
+}
+
+void CudaQueue::get(void* to, cuda::Address from, std::size_t size) {
+  if (!is_dry_ && failure_) static_cast<void>(keep(download(to, from, size)));
+}
+
+Status CudaQueue::download(void* to, cuda::Address from, std::size_t size) {
+  VLA_CHECK(gpu_->use());
+  VLA_CHECK(launch());
+  VLA_CHECK(start_uploads());
+  VLA_CHECK(grow(landing_, size));
+  VLA_CHECK(main_->download(landing_.at(0), from, size));
+  VLA_CHECK(wait());
+  std::memcpy(to, landing_.at(0), size);
+  return note_times();
+}
+
+Status CudaQueue::start_uploads() {
+  for (const Upload& upload : uploads_) VLA_CHECK(main_->upload(upload.to, staging_.at(upload.begin), upload.size));
+  uploads_.clear();
+  return {};
+}
+
+Status CudaQueue::launch() {
+  if (pending_.empty()) return {};
+  VLA_CHECK(gpu_->use());
+  VLA_CHECK(start_uploads());
+  const Parts parts = std::move(pending_);
+  pending_.clear(), n_pending_ = 0;
+  if (!graphs_.contains(parts)) VLA_CHECK(capture(parts));
+  VLA_CHECK(main_->launch(graphs_.at(parts)));
+  launched_.insert(launched_.end(), parts.begin(), parts.end());
+  return {};
+}
+
+Status CudaQueue::wait() {
+  VLA_CHECK(main_->wait());
+  if (uploads_.empty()) n_staged_ = 0;
+  return {};
+}
+
+/// Device times end when waiting has: from there they are counted back.
+Status CudaQueue::note_times() {
+  const auto now = std::chrono::steady_clock::now();
+  const Parts parts = std::move(launched_);
+  launched_.clear();
+  for (const CudaPart* part : parts)
+    for (const CudaPart::Mark& mark : part->marks) {
+      VLA_TRY(const float ms, gpu_->elapsed(mark.event, end_));
+      *mark.time = now - std::chrono::duration_cast<std::chrono::nanoseconds>(
+                             std::chrono::duration<float, std::milli>(std::max(ms, 0.0f)));
+    }
+  return {};
+}
+
+Status CudaQueue::capture(const Parts& parts) {
+  VLA_CHECK(main_->begin_capture());
+  for (const CudaPart* part : parts) VLA_CHECK(capture(*part));
+  VLA_CHECK(main_->note_time(end_));
+  VLA_TRY(graphs_[parts], main_->end_capture());
+  return {};
+}
+
+/// Operations of a phase take turns on as many streams as there are.
+Status CudaQueue::capture(const CudaPart& part) {
+  auto mark = part.marks.begin();
+  for (std::size_t phase = 0; phase <= part.phases.size(); ++phase) {
+    for (; mark != part.marks.end() && mark->n_phase == phase; ++mark) VLA_CHECK(main_->note_time(mark->event));
+    if (phase == part.phases.size()) break;
+    const std::vector<Calls>& operations = part.phases[phase];
+    const std::size_t n_stream = std::min(operations.size(), kStreams);
+    for (std::size_t i = 1; i < n_stream; ++i) VLA_CHECK(side_[i - 1].after(*main_));
+    for (std::size_t i = 0; i < operations.size(); ++i) {
+      cuda::Stream& stream = i % n_stream == 0 ? *main_ : side_[i % n_stream - 1];
+      for (const Call& call : operations[i]) VLA_CHECK(stream.launch_job(call.how, call.job.data()));
+    }
+    for (std::size_t i = 1; i < n_stream; ++i) VLA_CHECK(main_->after(side_[i - 1]));
+  }
+  return {};
+}
+
+void CudaQueue::forget(const CudaPart& part) {
+  const auto has = [&](const Parts& parts) { return std::find(parts.begin(), parts.end(), &part) != parts.end(); };
+  if (failure_ && (has(pending_) || has(launched_))) {
+    static_cast<void>(keep(launch()));
+    static_cast<void>(keep(wait()));
+  }
+  if (gpu_) static_cast<void>(gpu_->use());
+  std::erase(pending_, &part), std::erase(launched_, &part);
+  std::erase_if(graphs_, [&](const auto& graph) { return has(graph.first); });
+}
+
+}  // namespace vla::lower

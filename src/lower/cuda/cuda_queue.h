@@ -1,0 +1,113 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <chrono>
+#include <cstddef>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "cuda/driver/gpu.h"
+
+namespace vla::lower {
+
+/// A launch and what the kernel takes.
+struct Call {
+  cuda::Launch how;
+  std::vector<std::byte> job;
+};
+/// Launches one after the other.
+using Calls = std::vector<Call>;
+
+/// What is launched together: phases one after the other, whose operations are independent.
+struct CudaPart {
+  using Time = std::chrono::steady_clock::time_point;
+  /// Has a time noted that is behind so many phases.
+  struct Mark {
+    std::size_t n_phase;
+    cuda::Owned event;
+    Time* time;
+  };
+  std::vector<std::vector<Calls>> phases;
+  std::vector<Mark> marks;  // in the order of phases
+};
+
+/// What a device is asked for, in order. Parts are launched when somebody wants a result, or changes an input: then all
+/// since are one graph, which is captured the first time that these parts follow each other. So an act is one launch.
+/// The first failure is kept, and is the answer to every later call. Errors: device, out_of_memory.
+class CudaQueue {
+ public:
+  static Result<std::unique_ptr<CudaQueue>> open(const cuda::Driver& driver, int index,
+                                                 const std::vector<std::string>& modules);
+  /// Of no device: dry from the beginning.
+  explicit CudaQueue(int n_sm) : n_sm_(n_sm), is_dry_(true) {}
+  ~CudaQueue();
+
+  int n_sm() const { return n_sm_; }
+  /// As the driver names the device.
+  std::string device_name() const { return gpu_ ? gpu_->name() : ""; }
+  const Status& failure() const { return failure_; }
+  /// From now on nothing is allocated, and what would be written is passed over.
+  void set_dry() { is_dry_ = true; }
+
+  /// Device memory, which the caller gives back before the queue goes.
+  Result<std::shared_ptr<cuda::Buffer>> allocate(std::size_t size, const std::string& what);
+  Status fill_zeros(const cuda::Buffer& memory);
+  /// For a mark.
+  Result<cuda::Owned> event();
+  /// Bytes on their way to the device, before what runs next. Those that lie side by side there go together. They are
+  /// the caller's again.
+  void set(cuda::Address to, const void* from, std::size_t size);
+  /// The same at once, for much.
+  Status upload(cuda::Address to, const void* from, std::size_t size);
+  /// The part must stay until it is forgotten.
+  Status run(const CudaPart& part);
+  /// Waits for all that was asked for. Marks have their times then.
+  void get(void* to, cuda::Address from, std::size_t size);
+  /// A part that goes.
+  void forget(const CudaPart& part);
+
+ private:
+  using Parts = std::vector<const CudaPart*>;
+  explicit CudaQueue(std::unique_ptr<cuda::Gpu> gpu) : n_sm_(gpu->n_sm()), is_dry_(false), gpu_(std::move(gpu)) {}
+  /// Bytes in host memory that the device reads and writes by itself.
+  struct HostMemory {
+    cuda::Owned memory;
+    std::size_t size = 0;
+    std::byte* at(std::size_t offset) const { return static_cast<std::byte*>(memory.get()) + offset; }
+  };
+  struct Upload {
+    cuda::Address to;
+    std::size_t begin, size;  // in staging_
+  };
+
+  Status keep(Status status);
+  Status grow(HostMemory& memory, std::size_t size);
+  Status stage(cuda::Address to, const void* from, std::size_t size);
+  Status download(void* to, cuda::Address from, std::size_t size);
+  Status start_uploads();
+  Status launch();
+  Status wait();
+  Status note_times();
+  Status capture(const Parts& parts);
+  Status capture(const CudaPart& part);
+
+  int n_sm_;
+  bool is_dry_;
+  cuda::Address next_ = 1 << 20;  // where memory would lie that is not allocated
+  std::unique_ptr<cuda::Gpu> gpu_;
+  std::unique_ptr<cuda::Stream> main_;
+  std::vector<cuda::Stream> side_;
+  cuda::Owned end_;  // of a graph
+  HostMemory staging_, landing_;
+  std::size_t n_staged_ = 0;  // bytes that are not to be written over
+  std::vector<Upload> uploads_;
+  Parts pending_, launched_;
+  std::size_t n_pending_ = 0;  // launches
+  std::map<Parts, cuda::Owned> graphs_;
+  Status failure_;
+};
+
+}  // namespace vla::lower

@@ -1,0 +1,137 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cuda/gpu_model.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace vla::lower {
+namespace {
+
+constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
+constexpr std::size_t kGiB = std::size_t{1} << 30;
+
+// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. Of the H100's tensor units
+// mma.sync, which is what our kernels use, is known to reach 0.62. Launches are what graphs of small kernels are
+// commonly measured to take.
+constexpr GpuModel kModels[] = {
+    {"orin-agx", "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz", 16, 64 * kGiB, 42.6 * kTera, 85 * kTera, 5.3 * kTera,
+     10.6 * kTera, 204.8 * kGiga, 2.5 * kMicro, 1.35},
+    {"rtx-3060", "GeForce RTX 3060 12 GB, 28 SMs at 1.78 GHz", 28, 12 * kGiB, 25.5 * kTera, 102 * kTera, 12.7 * kTera,
+     25.5 * kTera, 360 * kGiga, 1.3 * kMicro, 1.0},
+    {"rtx-5090", "GeForce RTX 5090 32 GB, 170 SMs at 2.41 GHz", 170, 32 * kGiB, 209.5 * kTera, 838 * kTera,
+     104.8 * kTera, 209.6 * kTera, 1792 * kGiga, 1.0 * kMicro, 1.0},
+    {"h100", "H100 SXM 80 GB, 132 SMs at 1.83 GHz", 132, 80 * kGiB, 0.62 * 989 * kTera, 0.62 * 1979 * kTera,
+     66.9 * kTera, 133.8 * kTera, 3350 * kGiga, 1.0 * kMicro, 1.35},
+};
+
+/// What an operation asks of a GPU.
+struct Cost {
+  double products = 0;  // seconds of all SMs, were they all at work
+  double alone = 0;     // seconds where nothing else runs: whole waves of blocks
+  double bytes = 0;
+  int n_launch = 0;
+};
+
+double size_of(const Value& value) { return static_cast<double>(dtype_size(value.type, count(value.shape))); }
+
+class Costs {
+ public:
+  Costs(const CudaLowering& lowering, const GpuModel& model) : l(lowering), gpu(model) {}
+
+  /// `n_launch`: of the kernels that the operation is.
+  Cost of(const CudaOp& op, int n_launch) const {
+    Cost cost;
+    cost.n_launch = n_launch;
+    for (const ValueId id : op.reads) cost.bytes += size_of(l.value(id));
+    for (const ValueId id : op.writes) cost.bytes += size_of(l.value(id));
+    if (op.partial != kNone) cost.bytes += size_of(l.value(op.partial));  // read as well
+    if (const auto* linear = std::get_if<LinearOp>(&op.op)) add_products(cost, op, *linear);
+    if (const auto* attention = std::get_if<AttentionOp>(&op.op)) add_attention(cost, op, *attention);
+    if (const auto* lookup = std::get_if<LookupOp>(&op.op); lookup != nullptr && lookup->table != kNone)
+      cost.bytes -= size_of(l.value(lookup->table));  // some rows of it alone
+    return cost;
+  }
+
+ private:
+  /// Blocks of equal work, which SMs take one after the other.
+  void add_blocks(Cost& cost, double n_block, double flop, double rate) const {
+    const double of_block = flop / n_block / (rate / gpu.n_sm), n_sm = gpu.n_sm;
+    cost.products += flop / rate;
+    cost.alone += std::ceil(n_block / n_sm) * of_block;
+  }
+  void add_products(Cost& cost, const CudaOp& op, const LinearOp& linear) const {
+    for (const Node* node : linear.linears) {
+      const Param& weight = *node->as<op::Linear>()->weight;
+      const MatrixKind kind = l.matrix(*node).kind;
+      const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
+      const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
+      cost.bytes += static_cast<double>(weight.count()) * (kind == MatrixKind::ternary ? 0.25
+                                                           : kind == MatrixKind::int8  ? 1
+                                                           : kind == MatrixKind::bf16  ? 2
+                                                                                       : 4);
+      ProductShape shape = product_shape(kind, rows, columns, l.n_sm);
+      if (kind == MatrixKind::f32) shape = ProductShape::rows64;
+      const std::int64_t size = shape == ProductShape::rows128 ? 128 : 64;
+      const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
+      // Rows and columns behind the last are multiplied as well.
+      const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
+      if (shape == ProductShape::few)
+        add_blocks(cost, gpu.n_sm, flop_of(*node), has_codes ? gpu.dot4 : gpu.f32);
+      else
+        add_blocks(cost, tiles * op.n_split, padded,
+                   has_codes                  ? gpu.int8
+                   : kind == MatrixKind::bf16 ? gpu.bf16
+                                              : gpu.f32);
+    }
+  }
+  void add_attention(Cost& cost, const CudaOp& op, const AttentionOp& attention) const {
+    const Shape& q = l.value(attention.q.x).shape;
+    const std::int64_t size = attention.rounds ? 64 : 8;
+    const double blocks = static_cast<double>((q[2] + size - 1) / size * q[1] * q[3]) * op.n_split;
+    const double padded = static_cast<double>((q[2] + size - 1) / size * size) / static_cast<double>(q[2]);
+    add_blocks(cost, blocks, flop_of(*attention.node) * (attention.rounds ? padded * gpu.attention : 1),
+               attention.rounds ? gpu.bf16 : gpu.f32);
+  }
+
+  const CudaLowering& l;
+  const GpuModel& gpu;
+};
+
+}  // namespace
+
+Result<GpuModel> find_gpu_model(const std::string& name) {
+  std::string names;
+  for (const GpuModel& model : kModels) {
+    if (name == model.name) return model;
+    names += (names.empty() ? "" : ", ") + std::string(model.name);
+  }
+  return Error{Code::usage, "model", "one of " + names, name};
+}
+
+std::vector<Program::Prediction> predict(const CudaLowering& l, const GpuModel& gpu) {
+  const Costs costs(l, gpu);
+  const std::size_t n_stage = l.graph.stages().size() + 1;
+  std::vector<Program::Prediction> all(n_stage + 1);  // the last is that of `prepare`
+  // Operations of a phase run side by side, and share units and memory.
+  for (std::size_t first = 0, end = 0; first < l.ops.size(); first = end) {
+    Cost together;
+    double alone = 0;
+    int longest = 0, n_launch = 0;
+    for (; end < l.ops.size() && l.ops[end].phase == l.ops[first].phase; ++end) {
+      const Result<Calls> calls = emit(l, l.ops[end]);
+      const Cost cost = costs.of(l.ops[end], calls ? static_cast<int>(calls->size()) : 0);
+      together.products += cost.products, together.bytes += cost.bytes;
+      alone = std::max(alone, cost.alone), longest = std::max(longest, cost.n_launch), n_launch += cost.n_launch;
+    }
+    const bool is_prepared = l.ops[first].phase < l.n_prepare;
+    Program::Prediction prediction;
+    prediction.products = std::max(together.products, alone), prediction.bytes = together.bytes / gpu.bandwidth;
+    prediction.launches = longest * gpu.launch, prediction.n_launch = n_launch;
+    prediction.seconds = std::max(prediction.products, prediction.bytes) + prediction.launches;
+    all[is_prepared ? n_stage : stage_of(l, l.ops[first])] += prediction;
+  }
+  return all;
+}
+
+}  // namespace vla::lower

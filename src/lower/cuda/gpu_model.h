@@ -1,0 +1,32 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <string>
+
+#include "lower/cuda/cuda_lowering.h"
+
+namespace vla::lower {
+
+/// What is published of a GPU, without sparsity and at the clock that the maker's peaks are told for: what predictions
+/// of GPUs that are not there stand on.
+struct GpuModel {
+  const char *name, *description;
+  int n_sm;
+  std::size_t memory;  // bytes
+  double bf16, int8;   // operations a second of tensor units by our instructions (mma.sync), sums in float32 and int32
+  double f32, dot4;    // of fused multiply-adds of floats, and of four bytes at a time
+  double bandwidth;    // bytes a second
+  double launch;       // seconds between a kernel of a graph and one that waits for it
+  double attention;    // times the tensor units' time, as other units need more (docs/gpu.md)
+};
+
+/// Errors: usage.
+Result<GpuModel> find_gpu_model(const std::string& name);
+
+/// How long the phases of a program take on it at best: products in whole waves of blocks at the peak of their units,
+/// or all operands once over the memory, whichever takes longer, and a launch. Entries as Program::predictions has
+/// them.
+std::vector<Program::Prediction> predict(const CudaLowering& l, const GpuModel& gpu);
+
+}  // namespace vla::lower
