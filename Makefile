@@ -19,7 +19,8 @@ help:
 	@echo "make test-arm64  build for 64-bit ARM with both packages, and test that under an emulator; no part of make test, whose time its build alone would exceed"
 	@echo "make build     build/cpu/bin/vla, and vla-convert in $(VENV)/bin"
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
-	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 525 MB of NVIDIA's compiler and libraries)"
+	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 102 MB: NVIDIA's compiler)"
+	@echo "make cuda GGML=1   libvla-cuda-ggml.so too, for --kernels ggml there (downloads 525 MB more, with cuBLAS)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make deb       out/vla_*.deb for this system: the program, its manual, and the server as a unit of systemd"
 	@echo "make deb-arm64, make wheel-arm64   the same two for 64-bit ARM, built here"
@@ -47,10 +48,10 @@ vulkan: build
 	  cmake build/cpu -DVLA_VULKAN=ON >/dev/null && cmake --build --preset cpu; \
 	else echo "make: libvla-vulkan.so is not built"; fi
 
-# libvla-cuda.so for build/cpu. No other target asks for it, as it downloads NVIDIA's compiler.
+# libvla-cuda.so for build/cpu. With GGML=1 also ggml's backend.
 cuda: build
-	cmake build/cpu -DVLA_CUDA=ON >/dev/null
-	cmake --build --preset cpu --target vla_cuda
+	cmake build/cpu -DVLA_CUDA=ON -DVLA_CUDA_GGML=$(if $(GGML),ON,OFF) >/dev/null
+	cmake --build --preset cpu --target vla_cuda $(if $(GGML),vla_cuda_ggml)
 
 # A wheel for any x86-64 machine with a system as old as this one's: pip installs it in seconds.
 wheel: packages $(STAMP)

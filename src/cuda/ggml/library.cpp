@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// libvla-cuda.so: ggml's CUDA backend.
+// libvla-cuda-ggml.so: ggml's CUDA backend, for --kernels ggml.
 #include <cuda_runtime_api.h>
 #include <ggml-cuda.h>
 
