@@ -10,6 +10,7 @@
 #include <cstring>
 #include <memory>
 #include <nlohmann/json.hpp>
+#include <optional>
 
 #include "bundle/gguf_writer.h"
 #include "policies/policy.h"
@@ -265,10 +266,13 @@ bool write_bundle(int file, const Keys& keys, const ParamList& list, const Rando
     tensors.push_back(std::move(tensor));
   }
   BundleFile out(file, keys, tensors);
-  const Values values(list, sizes);
+  std::optional<Values> values;
+  if (sizes.is_filled) values.emplace(list, sizes);
   for (std::size_t i = 0; i < tensors.size(); ++i) {
-    values.each_piece(list.params()[i], tensors[i].data.size(),
-                      [&](std::string_view piece) { out.put(std::as_bytes(std::span(piece))); });
+    if (!values) out.put_zeros(tensors[i].data.size());
+    if (values)
+      values->each_piece(list.params()[i], tensors[i].data.size(),
+                         [&](std::string_view piece) { out.put(std::as_bytes(std::span(piece))); });
     out.end_tensor();
   }
   return out.seal();

@@ -13,6 +13,7 @@ struct RandomSizes {
   int n_view = 2, max_tokens = 48, n_step = 10;
   DType dtype = DType::bf16;  // of matrices and tables
   std::uint64_t seed = 0;
+  bool is_filled = true;  // else weights are zeros that take no memory
 };
 
 /// A sound bundle of random weights in memory: what a network of that size costs, without a checkpoint. Nothing is

@@ -100,6 +100,19 @@ void BundleFile::put(std::span<const std::byte> bytes) {
   if (!failed_ && !write_all(file_, bytes)) failed_ = true, errno_ = errno;
 }
 
+void BundleFile::put_zeros(std::size_t size) {
+  static constexpr std::byte kZeros[1 << 16] = {};
+  for (std::size_t left = size; left > 0;) {
+    const std::size_t n = std::min(left, sizeof(kZeros));
+    XXH3_64bits_update(state_.get(), kZeros, n);
+    left -= n;
+  }
+  size_ += size;
+  const auto end = static_cast<off_t>(size_);
+  if (!failed_ && (::ftruncate(file_, end) != 0 || ::lseek(file_, end, SEEK_SET) != end))
+    failed_ = true, errno_ = errno;
+}
+
 void BundleFile::end_tensor() {
   constexpr std::byte kZeros[kGgufAlignment] = {};
   put(std::span(kZeros).first((kGgufAlignment - size_ % kGgufAlignment) % kGgufAlignment));

@@ -34,6 +34,8 @@ class BundleFile {
   ~BundleFile();
 
   void put(std::span<const std::byte> bytes);
+  /// So many zeros, which take no place on the way.
+  void put_zeros(std::size_t size);
   /// After the last byte of a tensor.
   void end_tensor();
   /// Writes the checksum into the head. False with errno set if anything could not be written.

@@ -7,6 +7,7 @@
 
 #include "base/file.h"
 #include "bench/bench.h"
+#include "bench/prediction.h"
 #include "bench/roofline.h"
 #include "bench/versus.h"
 #include "cli/commands.h"
@@ -16,7 +17,7 @@ namespace vla::cli {
 namespace {
 
 struct BenchOptions {
-  std::string bundle, arch, size, dtype = "bf16", image_size, kernels, device, plot, vs, embodiment;
+  std::string bundle, arch, size, dtype = "bf16", image_size, kernels, device, model, plot, vs, embodiment;
   std::optional<int> n_view, n_text;
   std::vector<int> steps;
   int n_thread = 0, n_round = 7, n_warmup = 1;
@@ -30,6 +31,9 @@ Status check(const BenchOptions& options) {
     return Error{Code::usage, "--size", "--arch and --size together", "one of them"};
   if (!options.plot.empty() && !options.device.empty() && options.device != "cpu")
     return Error{Code::usage, "--plot", "the CPU, whose roofline is measured", "--device " + options.device};
+  if (!options.model.empty() && (options.markdown || !options.plot.empty() || !options.vs.empty() || options.paced))
+    return Error{Code::usage, "--model", "at most --json beside the policy", "--markdown, --plot, --vs or --paced",
+                 "a prediction is no measurement"};
   if (options.json && options.markdown)
     return Error{Code::usage, "--json", "--json or --markdown", "both", "run it twice to have both"};
   return {};
@@ -67,6 +71,11 @@ Status run_bench(const BenchOptions& options) {
                          options.kernels, options.device,  options.embodiment};
   request.sizes = {options.n_view, 0, 0, options.n_text};
   if (!options.image_size.empty()) VLA_CHECK(parse_size(options.image_size, request.sizes));
+  if (!options.model.empty()) {
+    VLA_TRY(const bench::GpuPrediction prediction, bench::predict(request, options.model));
+    say_lines(stdout, options.json ? to_json(prediction) + "\n" : to_text(prediction));
+    return {};
+  }
   std::optional<bench::Earlier> earlier;
   if (!options.vs.empty()) {
     VLA_TRY(earlier, bench::Earlier::read(options.vs));
@@ -141,6 +150,10 @@ Command add_bench(CLI::App& app) {
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
   add_text(*command, "--device", options->device, "NAME",
            std::string(kDeviceHelp) + ". Shares of a peak are the CPU's alone");
+  add_text(
+      *command, "--model", options->model, "NAME",
+      "With --device cuda: run nothing, and print what counts and published rates predict for a GPU that need not be "
+      "there: orin-agx, rtx-3060, rtx-5090 or h100");
   add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--json", options->json, "Print one JSON object as the last line of output");
   command->add_flag("--markdown", options->markdown, "Print a table for a document");

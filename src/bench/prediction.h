@@ -1,0 +1,30 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <string>
+
+#include "bench/bench.h"
+
+namespace vla::bench {
+
+/// What a model of a GPU says of an act, stage by stage, from counts and published rates. Nothing runs.
+struct GpuPrediction {
+  std::string policy, device, linear_kernels;
+  int n_view = 0, n_text = 0, n_step = 0;
+  std::size_t memory = 0;  // bytes: weights, plan and working memory
+  StagePredictions stages;
+
+  /// `total`, of all stages.
+  Program::Prediction total() const;
+};
+
+/// Of the request's bundle, or of zeros in the place of random weights; a request has no threads or rounds here.
+/// Errors: usage, and those of Engine::load.
+Result<GpuPrediction> predict(const Request& request, const std::string& model);
+
+/// For display, and as one JSON object on one line.
+std::string to_text(const GpuPrediction& prediction);
+std::string to_json(const GpuPrediction& prediction);
+
+}  // namespace vla::bench
