@@ -20,8 +20,8 @@ Result<std::vector<DeviceInfo>> list() {
   VLA_TRY(const std::vector<cuda::GpuInfo> found, cuda::list_gpus(*driver()));
   std::vector<DeviceInfo> devices;
   for (const cuda::GpuInfo& gpu : found)
-    devices.push_back(
-        {"cuda:" + std::to_string(devices.size()), gpu.name + "; " + gpu.driver, gpu.memory, 0, "f32, bf16, int8"});
+    devices.push_back({"cuda:" + std::to_string(devices.size()), gpu.name + "; " + gpu.driver, gpu.memory,
+                       0 /* its context would have to be made */, "f32, bf16, int8"});
   return devices;
 }
 

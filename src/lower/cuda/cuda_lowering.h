@@ -59,6 +59,10 @@ void choose_layouts(CudaLowering& l, std::vector<FusedOp> ops);
 enum class ProductShape { few, rows64, rows128 };
 ProductShape product_shape(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, int n_sm);
 
+/// As Program::work counts it.
+Work work_of(const CudaLowering& l, const CudaOp& op);
+/// The operation's line of Program::text.
+std::string text_of(const CudaLowering& l, const CudaOp& op, const Calls& calls);
 /// Errors: unsupported for sizes that no kernel has.
 Result<Calls> emit(const CudaLowering& l, const CudaOp& op);
 

@@ -13,37 +13,6 @@ std::size_t aligned(const Lowering& l, std::size_t size) {
   return (size + unit - 1) / unit * unit;
 }
 
-/// Words for a printed graph.
-struct KindOf {
-  const CudaLowering& l;
-
-  const char* operator()(const LinearOp& linear) const {
-    constexpr const char* kNames[] = {"linear_f32", "linear_bf16", "linear_ternary", "linear_int8"};
-    return kNames[static_cast<int>(l.matrix(*linear.linears[0]).kind)];
-  }
-  const char* operator()(const HeadOp&) const { return "head_rows"; }
-  const char* operator()(const RoundOp& round) const { return round.norm != nullptr ? "norm_rows" : "round_rows"; }
-  const char* operator()(const AttentionOp& attention) const {
-    return attention.rounds ? "attention_bf16" : "attention_f32";
-  }
-  const char* operator()(const RowOp& row) const {
-    return std::holds_alternative<op::Norm>(row.what) ? "norm_rows" : op_name(row.node->op);
-  }
-  const char* operator()(const CopyOp&) const { return "copy"; }
-  const char* operator()(const LookupOp&) const { return "lookup_rows"; }
-  const char* operator()(const PatchesOp&) const { return "patches"; }
-  const char* operator()(const WindowOp& op) const { return op_name(op.node->op); }
-};
-
-/// Products alone are counted.
-double flop_of_op(const CudaOp& op) {
-  double flop = 0;
-  if (const auto* linear = std::get_if<LinearOp>(&op.op))
-    for (const Node* node : linear->linears) flop += flop_of(*node);
-  if (const auto* attention = std::get_if<AttentionOp>(&op.op)) flop = flop_of(*attention->node);
-  return flop;
-}
-
 }  // namespace
 
 Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_ptr<CudaQueue> queue,
@@ -110,9 +79,9 @@ Status CudaProgram::make_parts(const CudaLowering& l) {
     VLA_TRY(Calls calls, emit(l, op));
     const bool is_prepared = op.phase < l.n_prepare;
     CudaPart& part = is_prepared ? prepare_ : run_;
+    if (!op.invariant) work_[stage_of(l, op)] += work_of(l, op);
+    text_ += text_of(l, op, calls);
     part.phases[static_cast<std::size_t>(is_prepared ? op.phase : op.phase - l.n_prepare)].push_back(std::move(calls));
-    if (!op.invariant) work_[stage_of(l, op)].flop += flop_of_op(op);
-    text_ += std::to_string(op.phase) + " " + std::visit(KindOf{l}, op.op) + "\n";
   }
   return {};
 }

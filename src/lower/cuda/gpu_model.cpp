@@ -33,8 +33,6 @@ struct Cost {
   int n_launch = 0;
 };
 
-double size_of(const Value& value) { return static_cast<double>(dtype_size(value.type, count(value.shape))); }
-
 class Costs {
  public:
   Costs(const CudaLowering& lowering, const GpuModel& model) : l(lowering), gpu(model) {}
@@ -43,13 +41,9 @@ class Costs {
   Cost of(const CudaOp& op, int n_launch) const {
     Cost cost;
     cost.n_launch = n_launch;
-    for (const ValueId id : op.reads) cost.bytes += size_of(l.value(id));
-    for (const ValueId id : op.writes) cost.bytes += size_of(l.value(id));
-    if (op.partial != kNone) cost.bytes += size_of(l.value(op.partial));  // read as well
+    cost.bytes = work_of(l, op).bytes;
     if (const auto* linear = std::get_if<LinearOp>(&op.op)) add_products(cost, op, *linear);
     if (const auto* attention = std::get_if<AttentionOp>(&op.op)) add_attention(cost, op, *attention);
-    if (const auto* lookup = std::get_if<LookupOp>(&op.op); lookup != nullptr && lookup->table != kNone)
-      cost.bytes -= size_of(l.value(lookup->table));  // some rows of it alone
     return cost;
   }
 
@@ -66,10 +60,6 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
-      cost.bytes += static_cast<double>(weight.count()) * (kind == MatrixKind::ternary ? 0.25
-                                                           : kind == MatrixKind::int8  ? 1
-                                                           : kind == MatrixKind::bf16  ? 2
-                                                                                       : 4);
       ProductShape shape = product_shape(kind, rows, columns, l.n_sm);
       if (kind == MatrixKind::f32) shape = ProductShape::rows64;
       const std::int64_t size = shape == ProductShape::rows128 ? 128 : 64;
