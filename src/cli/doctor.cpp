@@ -39,7 +39,8 @@ void print_machine(const bench::Machine& machine, const DeviceList& devices) {
       machine.load > 0.5 ? ": other programs take part of what is measured" : "");
   say(stdout, "build     vla {}, {} the server\n", VLA_VERSION, kServer ? "with" : "without");
   for (const DeviceInfo& device : devices.devices)
-    say(stdout, "device    {}, {} free: {}\n", device.name, gigabytes(device.free), device.description);
+    say(stdout, "device    {}{}: {}\n", device.name,
+        device.free > 0 ? fmt::format(", {} free", gigabytes(device.free)) : "", device.description);
   for (const auto& [kind, reason] : devices.absent) say(stdout, "          no {}: {}\n", kind, reason);
 }
 
@@ -97,8 +98,9 @@ Json machine_json(const bench::Machine& machine, const DeviceList& devices) {
   json["governor"] = machine.governor.empty() ? Json() : Json(machine.governor);
   for (const auto& peak : machine.roofs.peaks) json["peaks_gflops"][peak.name] = 1e-9 * peak.all;
   for (const DeviceInfo& device : devices.devices)
-    json["devices"].push_back(
-        {{"name", device.name}, {"description", device.description}, {"free_bytes", device.free}});
+    json["devices"].push_back({{"name", device.name},
+                               {"description", device.description},
+                               {"free_bytes", device.free > 0 ? Json(device.free) : Json()}});
   json["absent_devices"] = Json::object();
   for (const auto& [kind, reason] : devices.absent) json["absent_devices"][kind] = reason;
   return json;

@@ -200,8 +200,8 @@ Status print_devices() {
   say(stdout, "{:<9}  {:>10}  {:>10}  {:<9}  {}\n", "device", "memory", "free", "products", "description");
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
   for (const DeviceInfo& device : list.devices)
-    say(stdout, "{:<9}  {:>10}  {:>10}  {:<9}  {}\n", device.name, size(device.memory), size(device.free),
-        device.precision, device.description);
+    say(stdout, "{:<9}  {:>10}  {:>10}  {:<9}  {}\n", device.name, size(device.memory),
+        device.free > 0 ? size(device.free) : "not told", device.precision, device.description);
   for (const auto& [kind, reason] : list.absent) say(stdout, "no {}: {}\n", kind, reason);
   return {};
 }
@@ -213,7 +213,7 @@ Status print_devices_json() {
     root["devices"].push_back({{"name", device.name},
                                {"description", device.description},
                                {"memory_bytes", device.memory},
-                               {"free_bytes", device.free},
+                               {"free_bytes", device.free > 0 ? Json(device.free) : Json()},
                                {"products", device.precision}});
   for (const auto& [kind, reason] : list.absent) root["absent"][kind] = reason;
   say_lines(stdout, text_of(root, 2) + "\n");

@@ -86,7 +86,7 @@ DeviceList list_devices() {
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device) {
   VLA_TRY(const DeviceName name, DeviceName::parse(device));
   if (name.kind == "cpu") return open_cpu(n_thread, kernels);
-  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.kind));
+  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.text()));
   const std::string library = library_of(name.kind, arithmetic.backend);
   const Result<std::vector<DeviceInfo>> found = list(library);
   if (!found) return absent(name, found.error().found);
@@ -99,7 +99,7 @@ Result<std::unique_ptr<Device>> open_model(const std::string& model, const std::
   VLA_TRY(const DeviceName name, DeviceName::parse(device));
   if (name.kind != "cuda")
     return Error{Code::usage, "model", "device cuda", name.text(), "other devices have no model"};
-  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.kind));
+  VLA_TRY(const Arithmetic arithmetic, Arithmetic::on_device(kernels, name.text()));
   const Result<const DeviceLibrary*> library = device_library(library_of(name.kind, arithmetic.backend));
   if (!library) return library.error();
   if ((*library)->model == nullptr)

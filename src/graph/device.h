@@ -93,7 +93,7 @@ struct LowerOptions {
 /// A device that is there.
 struct DeviceInfo {
   std::string name, description;
-  std::size_t memory = 0, free = 0;  // bytes
+  std::size_t memory = 0, free = 0;  // bytes; none are free where only opening it would tell
   std::string precision;             // of products: "f32, bf16"
 };
 

@@ -50,8 +50,8 @@ Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machi
                "ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx, float32, bf16, int8 or int4", kernels};
 }
 
-Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& kind) {
-  const bool has_own = kind == "cuda";
+Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& device) {
+  const bool has_own = device.starts_with("cuda");
   if (kernels == kernel_set::ggml.name) return Arithmetic{Backend::ggml, {}};
   if (kernels.empty()) return Arithmetic{has_own ? Backend::own : Backend::ggml, {}};
   if (kernels == kFloat32)
@@ -59,7 +59,7 @@ Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::
   if (kernels == kBf16) return Arithmetic{has_own ? Backend::own : Backend::ggml, {}, Rounding::bf16};
   if (kernels == kInt8 && has_own) return Arithmetic{Backend::own, {}, Rounding::int8};
   return Error{Code::usage, "kernels",
-               fmt::format("none, float32, bf16{} or ggml with device {}", has_own ? ", int8" : "", kind), kernels,
+               fmt::format("none, float32, bf16{} or ggml with device {}", has_own ? ", int8" : "", device), kernels,
                "other kernels are the CPU's"};
 }
 

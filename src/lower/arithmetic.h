@@ -23,7 +23,7 @@ struct Arithmetic {
   /// On a device of another kind. On CUDA our own kernels compute, with matrices as they are stored or, as on the CPU,
   /// with "float32", "bf16" or "int8"; "ggml" is ggml's backend in float32. Vulkan has ggml's alone: "float32", "ggml"
   /// or nothing, or "bf16". Errors: usage.
-  static Result<Arithmetic> on_device(const std::string& kernels, const std::string& kind);
+  static Result<Arithmetic> on_device(const std::string& kernels, const std::string& device);
 };
 
 }  // namespace vla

@@ -2,11 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """One suite for every kind of device: VLA_TEST_DEVICE names it, vulkan or cuda.
 
-Vulkan without a GPU: Mesa's lavapipe computes on the CPU. VK_DRIVER_FILES names another driver.
+Vulkan without a GPU: Mesa's lavapipe computes on the CPU. VK_DRIVER_FILES names another driver. CUDA without a GPU: VLA_FAKE_CUDA is
+a folder with libcuda.so.1 and libvla-cuda.so of tests/cuda/library; with VLA_CUDA_LIBRARY that one takes the place of the second, and
+its PTX is run.
 """
 
 import os
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -27,6 +31,19 @@ os.environ.setdefault("MESA_SHADER_CACHE_DIR", str(ROOT / "build/shaders"))
 
 
 KIND = os.environ.get("VLA_TEST_DEVICE", "vulkan")
+FAKE = KIND == "cuda" and os.environ.get("VLA_FAKE_CUDA")
+if FAKE:  # a folder of its own for the program, beside which libraries of devices are looked for
+    folder = Path(tempfile.mkdtemp(prefix="vla-fake-cuda-"))
+    library = os.environ.get("VLA_CUDA_LIBRARY") or Path(FAKE) / "libvla-cuda.so"
+    for file, name in ((BINARY, "vla"), (os.environ["VLA_LIBRARY"], "libvla.so.1"), (library, "libvla-cuda.so")):
+        shutil.copy(file, folder / name)
+    BINARY = folder / "vla"
+    os.environ["VLA_LIBRARY"], os.environ["LD_LIBRARY_PATH"] = str(folder / "libvla.so.1"), FAKE
+
+
+def pytest_unconfigure():
+    if FAKE:
+        shutil.rmtree(BINARY.parent)
 
 
 @pytest.fixture(scope="session")

@@ -24,7 +24,7 @@ struct NormJob {
   RowNorm norm;
   RowType type;
 };
-constexpr int kMaxNorm = 16384;  // a row stays in shared memory
+constexpr int kMaxNorm = 24576;  // a row stays in shared memory
 inline Launch norm_rows(const NormJob& job) {
   return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(job.n * 4 + 64)};
 }

@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Our own kernels for CUDA at the program's doors, on a driver that counts, refuses and fails (tests/cuda/library/libcuda.cpp)."""
+
+import json
+import re
+import subprocess
+
+import numpy as np
+import pytest
+from conftest import FAKE
+from golden_cases import FLOAT32, NAMES, ROOT
+from gpu_test import with_environment
+from program import EXIT
+
+pytestmark = pytest.mark.skipif(not FAKE, reason="no driver of tests: VLA_FAKE_CUDA")
+DEVICE = ["--device", "cuda"]
+IN_FLOAT32 = [*DEVICE, *FLOAT32]
+FAMILIES = sorted({name.split("/")[0] for name in NAMES})
+
+
+def test_in_int8_an_answer_is_nearer_to_that_of_the_cpus_codes_than_to_float32(vla):
+    """The same codes of the same matrices; what lies between products is rounded in other places."""
+    frame = ROOT / "examples/metaworld/episodes/faucet-open/step_00.png"
+    seen = ["--image", f"corner4={frame}", "--state", "0.0045,0.4003,0.1957,1", "--text", "open the faucet", "--seed", "1", "--json"]
+    run = lambda *options: vla("run", ROOT / "models/metaworld-tiny.gguf", *seen, *options, limit=300).json()  # noqa: E731
+    int8 = ["--kernels", "int8"]
+    gpu = run(*DEVICE, *int8)
+    assert gpu["precision"] == "int8"
+    cpu, gpu, exact = (np.array(answer["actions"]) for answer in (run(*int8), gpu, run(*FLOAT32)))
+    assert 0 < np.abs(gpu - cpu).max() < np.abs(cpu - exact).max()
+
+
+def test_kernels_that_a_build_lacks_are_refused_by_the_library_that_has_them(vla, golden):
+    answer = vla(*golden.arguments(options=[*DEVICE, "--kernels", "ggml"]))
+    answer.refused("device", "cuda:0: expected one of cpu", "no libvla-cuda-ggml.so in ")
+    vla(*golden.arguments(options=[*DEVICE, "--kernels", "int4"])).refused("usage", "with device cuda:0, found int4")
+
+
+def test_too_little_memory_an_old_driver_and_an_old_gpu_are_refused(vla, golden):
+    arguments = golden.arguments(options=IN_FLOAT32)
+    with_environment(vla, VLA_FAKE_MEMORY="100000")(*arguments).refused(
+        "out_of_memory", "weights: expected ", " bytes of device memory, found 100000 free"
+    )
+    with_environment(vla, VLA_FAKE_VERSION="12020")(*arguments).refused("device", "found one for CUDA 12.2")
+    with_environment(vla, VLA_FAKE_CAPABILITY="75")(*arguments).refused("device", "expected compute capability 8.0", "found 7.5")
+
+
+def test_a_device_that_is_lost_is_the_error_device_and_a_server_ends_with_it(vla, golden, tmp_path):
+    import vla_cpp
+
+    counts = tmp_path / "calls"
+    arguments = golden.arguments(options=IN_FLOAT32)
+    assert with_environment(vla, VLA_FAKE_COUNTS=str(counts))(*arguments).code == 0
+    calls = counts.read_text().split()
+    launch = 1 + len(calls) - 1 - calls[::-1].index("cuGraphLaunch")
+    for at in (1 + calls.index("cuMemAlloc_v2"), 1 + calls.index("cuMemcpyHtoDAsync_v2"), launch):
+        lost = with_environment(vla, VLA_FAKE_FAILS_AT=str(at), VLA_FAKE_LOST="1")
+        answer = lost(*arguments)
+        assert answer.code == EXIT["device"] and "CUDA_ERROR_LAUNCH_FAILED" in answer.err, answer.err
+    server = with_environment(vla, VLA_FAKE_FAILS_AT=str(len(calls) + 40), VLA_FAKE_LOST="1")  # in a later act
+    command = [server.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *IN_FLOAT32]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=server.environment) as process:
+        try:
+            line = process.stdout.readline()
+            images = {view: file.read_bytes() for view, file in golden.images.items()}
+            with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=60) as client:
+                with pytest.raises(vla_cpp.DeviceError, match="CUDA_ERROR_LAUNCH_FAILED"):
+                    for _ in range(20):
+                        client.act(images=images, state=golden.state, text=golden.text, seed=1)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == EXIT["device"], err
+
+
+def test_sizes_are_told_without_memory(vla, golden):
+    small = with_environment(vla, VLA_FAKE_MEMORY="1000")
+    assert small("inspect", golden.bundle, "--json", *IN_FLOAT32).code == 0
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_family_of_its_published_size_has_kernels_and_a_prediction(vla, family):
+    """Nothing is there but counts: every operation has a kernel for its sizes."""
+    seconds = []
+    for model in ("orin-agx", "h100"):
+        answer = vla("bench", "--arch", family, "--size", "full", *DEVICE, "--model", model, "--json")
+        told = answer.json()
+        stages = dict(told["stages"])
+        total = stages.pop("total")
+        assert told["prediction"] is True and list(stages)[-2:] == ["prefix", "steps"]
+        assert total["ms"] == pytest.approx(sum(stage["ms"] for stage in stages.values()))
+        assert all(stage["ms"] >= max(stage["products_ms"], stage["memory_ms"]) / 1.001 for stage in stages.values())
+        seconds.append(total["ms"])
+    assert seconds[0] > seconds[1] > 1
+
+
+def test_a_prediction_is_called_one_and_takes_no_option_of_a_measurement(vla):
+    arguments = ["bench", "--arch", "smolvla", "--size", "full", *DEVICE, "--model"]
+    assert vla(*arguments, "h100").out.startswith("prediction, not a measurement: smolvla on a model of H100")
+    vla(*arguments, "tpu").refused("usage", "expected one of orin-agx, rtx-3060, rtx-5090, h100, found tpu")
+    vla(*arguments, "h100", "--markdown").refused("usage", "--model")
+    vla("bench", "--arch", "smolvla", "--size", "full", "--model", "h100").refused("usage", "model: expected device cuda")
+    assert json.loads(vla(*arguments, "h100", "--steps", "5", "--json").out)["n_step"] == 5
