@@ -60,7 +60,6 @@ struct Connections {
     while (!connections.empty()) connections.begin()->second->close();
   }
 
- private:
   Standings standings() const {
     Standings all;
     all.reserve(connections.size());

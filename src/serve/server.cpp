@@ -31,7 +31,8 @@ constexpr std::size_t kKeptDescriptors = 16;
 /// The options with as few connections as there are descriptors for: what watches a server has to reach one that has
 /// all of its connections.
 Result<ServerOptions> within_descriptors(ServerOptions options) {
-  const std::size_t n_front = std::size_t{1} + !options.openpi.empty() + !options.gr00t.empty();
+  const std::size_t n_front =
+      std::size_t{1} + !options.openpi.empty() + !options.gr00t.empty() + 2 * !options.lerobot.empty();  // gRPC's too
   const std::size_t spare = net::spare_descriptors();
   if (spare < kKeptDescriptors + n_front)
     return Error{Code::io, "ulimit -n",

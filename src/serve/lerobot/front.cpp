@@ -14,8 +14,7 @@ namespace {
 constexpr auto kPatience = std::chrono::seconds(2);  // of GetActions without an observation, as the reference's
 constexpr double kRateHz = 30;                       // the reference's, where the bundle says none
 
-/// `ipv4:127.0.0.1:40000` -> `ipv4:127.0.0.1`.
-std::string host_of(const std::string& peer) { return peer.substr(0, peer.rfind(':')); }
+std::string name_of(const Peer& peer) { return "lerobot-" + std::to_string(peer.connection); }
 
 }  // namespace
 
@@ -60,7 +59,8 @@ Result<std::unique_ptr<serve::Front>> Front::open(net::Loop& loop, const ServerO
 
 Front::Front(net::Loop& loop, const ServerOptions& options)
     : options_(options),
-      rpcs_(loop, {options.max_message, options.max_connections, kReceiptMessages * options.max_message}),
+      rpcs_(loop,
+            {options.max_message, options.max_connections, kReceiptMessages * (options.max_message + Rpcs::kMaxPiece)}),
       sweeper_(loop.context()) {}
 
 Status Front::serve(const Engine& engine, const v1::Description& description) {
@@ -84,7 +84,7 @@ void Front::called(Rpc rpc) {
   client.used = Clock::now();
   if (rpc.method == "GetActions" && client.setup) {
     client.asking.push_back({rpc.id, client.used});
-    return submit_next(rpc.peer, client);
+    return submit_next(client);
   }
   const Result<std::string> answer = answer_now(rpc, client);
   if (!answer) {
@@ -92,7 +92,7 @@ void Front::called(Rpc rpc) {
     return rpcs_.refuse(rpc.id, answer.error());
   }
   rpcs_.answer(rpc.id, *answer);
-  submit_next(rpc.peer, client);
+  submit_next(client);
 }
 
 /// What needs no engine. An empty message is the serialized Empty.
@@ -118,19 +118,20 @@ Result<std::string> Front::answer_now(Rpc& rpc, Client& client) {
                  "start the robot's client again"};
   VLA_TRY(const auto observed, read_observation(std::move(rpc.message), *client.setup));
   if (client.filter.takes(*observed)) client.observed = observed;
+  bound_observed();
   return std::string();
 }
 
 /// A robot whose connection broke comes back on another one, and does not say again what it is.
-Front::Client& Front::client_of(const std::string& peer) {
-  const auto found = clients_.find(peer);
+Front::Client& Front::client_of(const Peer& peer) {
+  const auto found = clients_.find(peer.connection);
   if (found != clients_.end()) return found->second;
   make_room();
-  Client& client = clients_[peer];
-  client.number = ++n_client_;
+  Client& client = clients_[peer.connection];
+  client.peer = peer;
   const Client* before = nullptr;
-  for (const auto& [name, other] : clients_)
-    if (&other != &client && host_of(name) == host_of(peer) && (before == nullptr || other.used > before->used))
+  for (const auto& [connection, other] : clients_)
+    if (&other != &client && other.peer.address == peer.address && (before == nullptr || other.used > before->used))
       before = &other;
   if (before != nullptr) client.setup = before->setup;
   return client;
@@ -146,15 +147,32 @@ void Front::make_room() {
   clients_.erase(oldest);
 }
 
-void Front::submit_next(const std::string& peer, Client& client) {
+/// Observations that nobody asked for yet hold no more than requests in receipt may: one of those whose group holds
+/// most is dropped.
+void Front::bound_observed() {
+  const std::size_t most = kReceiptMessages * options_.max_message;
+  for (;;) {
+    net::Standings all;
+    for (const auto& [connection, client] : clients_)
+      if (client.observed)
+        all.push_back(
+            {connection, net::group_of(client.peer.address), true, {}, client.used, client.observed->bytes.size()});
+    const auto chosen = net::to_interrupt(all, 0, options_.max_message, most, Clock::now());
+    if (!chosen) return;
+    clients_.at(*chosen).observed.reset();
+  }
+}
+
+void Front::submit_next(Client& client) {
   if (!client.observed || client.asking.empty()) return;
   const std::shared_ptr<const Observed> observed = std::exchange(client.observed, nullptr);
   const std::uint64_t rpc = client.asking.front().rpc;
   client.asking.pop_front();
   client.filter.computes(*observed);
   Job job;
-  job.client = "lerobot-" + std::to_string(client.number);
-  job.peer = host_of(peer);
+  job.client = name_of(client.peer);
+  job.peer = client.peer.address;
+  job.share = {net::group_of(client.peer.address), client.peer.since};
   job.is_first = client.n_request == 0;
   job.size = observed->bytes.size();
   job.at = Clock::now();
@@ -166,13 +184,18 @@ void Front::submit_next(const std::string& peer, Client& client) {
 }
 
 void Front::cancelled(std::uint64_t rpc) {
-  for (auto& [peer, client] : clients_)
+  for (auto& [connection, client] : clients_)
     std::erase_if(client.asking, [&](const Client::Asking& asking) { return asking.rpc == rpc; });
   rpcs_.refuse(rpc, {Code::late, "call", "", "the client has cancelled it"});
 }
 
+void Front::ended(const Peer& peer, const std::string& why, const std::string& detail) {
+  if (const auto found = clients_.find(peer.connection); found != clients_.end()) found->second.observed.reset();
+  if (!why.empty()) io_->dropped({name_of(peer), peer.address, "", why, detail});
+}
+
 void Front::sweep() {
-  for (auto& [peer, client] : clients_)
+  for (auto& [connection, client] : clients_)
     while (!client.asking.empty() && Clock::now() - client.asking.front().since > kPatience) {
       rpcs_.answer(client.asking.front().rpc, {});  // nothing yet
       client.asking.pop_front();

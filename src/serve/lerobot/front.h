@@ -31,7 +31,7 @@ class Front final : public serve::Front, Rpcs::Handler {
   class Request;
   /// A robot: one connection.
   struct Client {
-    std::uint64_t number = 0;
+    Peer peer;
     std::shared_ptr<const Setup> setup;
     Filter filter;
     std::shared_ptr<const Observed> observed;  // the newest that is to be computed
@@ -47,10 +47,12 @@ class Front final : public serve::Front, Rpcs::Handler {
   Front(net::Loop& loop, const ServerOptions& options);
   void called(Rpc rpc) override;
   void cancelled(std::uint64_t rpc) override;
+  void ended(const Peer& peer, const std::string& why, const std::string& detail) override;
   Result<std::string> answer_now(Rpc& rpc, Client& client);
-  Client& client_of(const std::string& peer);
+  Client& client_of(const Peer& peer);
   void make_room();
-  void submit_next(const std::string& peer, Client& client);
+  void bound_observed();
+  void submit_next(Client& client);
   void sweep();
 
   const ServerOptions options_;
@@ -60,9 +62,8 @@ class Front final : public serve::Front, Rpcs::Handler {
   v1::Description description_;
   Names names_;
   ActLimits limits_;
-  double period_ = 0;  // seconds between rows of a chunk
-  std::map<std::string, Client> clients_;
-  std::uint64_t n_client_ = 0;
+  double period_ = 0;                        // seconds between rows of a chunk
+  std::map<std::uint64_t, Client> clients_;  // by their connections, also past ones
   Io* io_ = nullptr;
 };
 

@@ -16,14 +16,12 @@
 #include "base/clock.h"
 #include "base/printable.h"
 #include "net/sweeper.h"
-#include "net/tcp.h"
 #include "serve/lerobot/async_inference.pb.h"
 
 namespace vla::serve::lerobot {
 namespace {
 
-constexpr int kMaxPiece = 4 << 20;  // of LeRobot's channels
-constexpr int kMaxStreams = 16;     // of a connection
+constexpr int kPiece = static_cast<int>(Rpcs::kMaxPiece);
 constexpr int kReadAtOnce = 64 << 10;
 constexpr int kHandshakeMs = 10'000, kKeepaliveMs = 20'000;
 constexpr auto kReceiptPatience = std::chrono::seconds(60);
@@ -58,10 +56,11 @@ grpc::Status status_of(const Error& error) {
 }  // namespace
 
 /// What all calls share. gRPC's threads and the loop's use it.
-class Rpcs::All : public grpc::CallbackGenericService {
+class Rpcs::All : public grpc::CallbackGenericService, Connections::Handler {
  public:
   class Call;
-  All(net::Loop& loop, const Limits& limits) : limits_(limits), context_(loop.context()), sweeper_(loop.context()) {}
+  All(net::Loop& loop, const Limits& limits)
+      : limits_(limits), connections_(loop, limits), context_(loop.context()), sweeper_(loop.context()) {}
   ~All() override {
     std::map<std::uint64_t, Call*> left;
     {
@@ -75,24 +74,20 @@ class Rpcs::All : public grpc::CallbackGenericService {
   }
 
   Result<std::string> bind(const std::string& address, const char* option, bool insecure) {
-    VLA_TRY(const auto endpoint, net::tcp_endpoint_of(address, option, insecure));
-    const std::string host = endpoint.address().to_string();
-    const std::string where =
-        fmt::format("{}:{}", endpoint.address().is_v6() ? "[" + host + "]" : host, endpoint.port());
+    VLA_TRY(std::string bound, connections_.bind(address, option, insecure));
     grpc::ResourceQuota quota;
     quota.Resize(limits_.receipt + (16u << 20));
     grpc::ServerBuilder builder;
-    int port = 0;
-    builder.AddListeningPort(where, grpc::InsecureServerCredentials(), &port);
+    acceptor_ = builder.experimental().AddExternalConnectionAcceptor(
+        grpc::ServerBuilder::experimental_type::ExternalConnectionType::FROM_FD, grpc::InsecureServerCredentials());
     builder.RegisterCallbackGenericService(this);
     builder.SetResourceQuota(quota);
-    builder.SetMaxReceiveMessageSize(kMaxPiece + 1024);
-    builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);
-    builder.AddChannelArgument(GRPC_ARG_MAX_CONCURRENT_STREAMS, kMaxStreams);
+    builder.SetMaxReceiveMessageSize(kPiece);
+    builder.AddChannelArgument(GRPC_ARG_MAX_CONCURRENT_STREAMS, static_cast<int>(Connections::kMaxCalls));
     builder.AddChannelArgument(GRPC_ARG_SERVER_HANDSHAKE_TIMEOUT_MS, kHandshakeMs);
     // Frames of cameras come at once, not by turns of 64 kB.
-    builder.AddChannelArgument(GRPC_ARG_HTTP2_STREAM_LOOKAHEAD_BYTES, kMaxPiece);
-    builder.AddChannelArgument(GRPC_ARG_HTTP2_MAX_FRAME_SIZE, kMaxPiece);
+    builder.AddChannelArgument(GRPC_ARG_HTTP2_STREAM_LOOKAHEAD_BYTES, kPiece);
+    builder.AddChannelArgument(GRPC_ARG_HTTP2_MAX_FRAME_SIZE, kPiece);
     builder.AddChannelArgument(GRPC_ARG_HTTP2_BDP_PROBE, 0);
     builder.AddChannelArgument(GRPC_ARG_TCP_READ_CHUNK_SIZE, kReadAtOnce);
     builder.AddChannelArgument(GRPC_ARG_TCP_MIN_READ_CHUNK_SIZE, kReadAtOnce);
@@ -100,14 +95,13 @@ class Rpcs::All : public grpc::CallbackGenericService {
     builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveMs);
     builder.AddChannelArgument(GRPC_ARG_KEEPALIVE_PERMIT_WITHOUT_CALLS, 1);
     server_ = builder.BuildAndStart();
-    if (!server_ || port == 0)
-      return Error{Code::io, address, "a free address of this machine", "one that cannot be bound",
-                   fmt::format("choose another with {}; port 0 takes a free one", option)};
-    return fmt::format("{}:{}", address.substr(0, address.rfind(':')), port);
+    if (!server_) return Error{Code::io, option, "a server of gRPC", "none", "report this"};
+    return bound;
   }
 
   void begin(Rpcs::Handler& handler) {
     handler_ = &handler;
+    connections_.begin(*this);
     sweeper_.begin([this] { sweep(); });
   }
   bool has_answers() const { return n_leaving_ > 0; }
@@ -132,9 +126,18 @@ class Rpcs::All : public grpc::CallbackGenericService {
   }
 
   const Limits limits_;
-  std::atomic<std::size_t> n_held_ = 0, n_leaving_ = 0;  // bytes in receipt; calls that end
+  Connections connections_;
+  std::atomic<std::size_t> n_leaving_ = 0;  // calls that end
 
  private:
+  void came(int descriptor) override {
+    grpc::experimental::ExternalConnectionAcceptor::NewConnectionParameters connection;
+    connection.fd = descriptor;
+    acceptor_->HandleNewConnection(&connection);
+  }
+  void ended(const Peer& peer, const std::string& why, const std::string& detail) override {
+    handler_->ended(peer, why, detail);
+  }
   static Error shutting_down() { return {Code::shutting_down, "call", "", "the server stops"}; }
   void sweep();
 
@@ -145,15 +148,17 @@ class Rpcs::All : public grpc::CallbackGenericService {
   std::map<std::uint64_t, Call*> live_;
   std::uint64_t n_call_ = 0;
   bool is_closed_ = false;
+  std::unique_ptr<grpc::experimental::ExternalConnectionAcceptor> acceptor_;
   std::unique_ptr<grpc::Server> server_;
 };
 
 /// One call. gRPC does not destroy it before it was ended.
 class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
  public:
-  Call(All& all, std::uint64_t id, const grpc::GenericCallbackServerContext& context) : all_(all), id_(id) {
+  Call(All& all, std::uint64_t id, Peer peer, const grpc::GenericCallbackServerContext& context)
+      : all_(all), id_(id), connection_(peer.connection) {
     rpc_.id = id;
-    rpc_.peer = context.peer();
+    rpc_.peer = std::move(peer);
     rpc_.method = context.method().substr(context.method().rfind('/') + 1);
   }
   void start() { StartRead(&in_); }
@@ -171,7 +176,7 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
       if (!ok) return is_whole_ ? void() : fail({Code::bad_request, "call", "a whole message", "one that is cut off"});
       if (Status sound = take_piece(); !sound) return fail(sound.error());
       if (!is_whole_) return StartRead(&in_);
-      all_.n_held_ -= std::exchange(n_held_, 0);
+      all_.connections_.received(connection_, std::exchange(n_held_, 0), true);
       all_.hand_over(std::move(rpc_));
     } catch (const std::exception&) {
       fail({Code::out_of_memory, "call", "", "no memory for it"});
@@ -179,7 +184,8 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
   }
   void OnCancel() override { all_.cancelled(id_); }
   void OnDone() override {
-    all_.n_held_ -= n_held_;
+    all_.connections_.received(connection_, n_held_, false);
+    all_.connections_.call_ends(connection_);
     --all_.n_leaving_;
     delete this;
   }
@@ -202,8 +208,7 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
     if (rpc_.message.size() + piece.data().size() > all_.limits_.message)
       return Error{Code::too_large, "Observation", fmt::format("at most {} bytes", all_.limits_.message), "more"};
     n_held_ += piece.data().size();
-    if ((all_.n_held_ += piece.data().size()) > all_.limits_.receipt)
-      return Error{Code::busy, "Observation", fmt::format("at most {} bytes in receipt", all_.limits_.receipt), "more"};
+    all_.connections_.receives(connection_, piece.data().size());
     if (rpc_.message.empty()) {
       rpc_.message = std::move(*piece.mutable_data());
     } else {
@@ -218,22 +223,22 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
 
   All& all_;
   Rpc rpc_;
-  const std::uint64_t id_;
+  const std::uint64_t id_, connection_;
   const Clock::time_point began_ = Clock::now();
   grpc::ByteBuffer in_, out_;
-  std::size_t n_held_ = 0;
+  std::size_t n_held_ = kMaxPiece;  // the one that gRPC has a part of, and those before
   std::atomic<bool> is_whole_ = false;
 };
 
 grpc::ServerGenericBidiReactor* Rpcs::All::CreateReactor(grpc::GenericCallbackServerContext* context) {
+  const std::optional<Peer> peer = connections_.call_begins(context->peer(), kMaxPiece);
   std::optional<Error> refused;
   Call* call = nullptr;
   {
     const std::lock_guard lock(mutex_);
-    call = new Call(*this, ++n_call_, *context);
+    call = new Call(*this, ++n_call_, peer.value_or(Peer{}), *context);
     if (is_closed_) refused = shutting_down();
-    if (live_.size() >= limits_.connections)
-      refused = Error{Code::busy, "calls", fmt::format("at most {} at once", limits_.connections), "more"};
+    if (!peer) refused = Error{Code::busy, "connection", "one that is open", "one that gave way"};
     if (refused) {
       ++n_leaving_;
     } else {
