@@ -151,43 +151,30 @@ class Queue {
   /// unfair.
   template <class Amount>
   Place to_give_way(const Job& job, Amount amount, std::size_t added) {
-    const auto group = [](const Job& j) { return j.share.group; };
-    const Generations generations = generations_of(job.share.group, {job.share.since});
-    const auto generation = [&](const Job& j) { return generations.of(j.share.since); };
-    const auto place = last_of_most(
-        job, group, [](const Job&) { return true; }, amount, added);
-    if (place != line_.end()) return last_of_largest_generation(place->share.group, amount);
-    return last_of_most(
-        job, generation, [&](const Job& j) { return j.share.group == job.share.group; }, amount, added);
+    std::map<std::string, std::size_t> sums = {{job.share.group, added}};
+    for (const Job& j : line_) sums[j.share.group] += amount(j);
+    const auto most = std::max_element(sums.begin(), sums.end(), [](auto& a, auto& b) { return a.second < b.second; });
+    if (most->second > sums[job.share.group]) return last_of_largest_generation(most->first, amount);
+    return last_of_largest_generation(job.share.group, amount, &job, added);
   }
 
-  /// Of a group's jobs the last one of the generation that amounts to most; of equal ones it is the newest.
+  /// Of a group's jobs the last one of the generation that amounts to most; of equal ones it is the newest. None where
+  /// a newcomer's own generation would have as much by what it adds.
   template <class Amount>
-  Place last_of_largest_generation(const std::string& group, Amount amount) {
-    const Generations generations = generations_of(group);
-    std::map<std::size_t, std::size_t> sums;
+  Place last_of_largest_generation(const std::string& group, Amount amount, const Job* newcomer = nullptr,
+                                   std::size_t added = 0) {
+    std::vector<Clock::time_point> times;
+    if (newcomer != nullptr) times.push_back(newcomer->share.since);
+    const Generations generations = generations_of(group, std::move(times));
+    std::vector<std::size_t> sums(generations.size());
     for (const Job& job : line_)
       if (job.share.group == group) sums[generations.of(job.share.since)] += amount(job);
-    const auto most =
-        std::max_element(sums.rbegin(), sums.rend(), [](auto& a, auto& b) { return a.second < b.second; });
+    const auto largest = std::max_element(sums.rbegin(), sums.rend());
+    if (newcomer != nullptr && *largest <= sums[generations.of(newcomer->share.since)] + added) return line_.end();
+    const auto generation = static_cast<std::size_t>(sums.rend() - largest) - 1;
     const auto last = std::find_if(line_.rbegin(), line_.rend(), [&](const Job& job) {
-      return job.share.group == group && generations.of(job.share.since) == most->first;
+      return job.share.group == group && generations.of(job.share.since) == generation;
     });
-    return std::prev(last.base());
-  }
-
-  /// Of jobs that share a key, the last one of those that amount to most, where that is more than those with the given
-  /// one's key would have.
-  template <class Key, class Among, class Amount>
-  Place last_of_most(const Job& job, Key key, Among among, Amount amount, std::size_t added) {
-    std::map<decltype(key(job)), std::size_t> sums;
-    for (const Job& j : line_)
-      if (among(j)) sums[key(j)] += amount(j);
-    const std::size_t own = sums[key(job)] + added;
-    const auto most = std::max_element(sums.begin(), sums.end(), [](auto& a, auto& b) { return a.second < b.second; });
-    if (most->first == key(job) || most->second <= own) return line_.end();
-    const auto last =
-        std::find_if(line_.rbegin(), line_.rend(), [&](const Job& j) { return among(j) && key(j) == most->first; });
     return std::prev(last.base());
   }
 
