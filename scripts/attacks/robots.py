@@ -5,6 +5,7 @@
 import importlib.util
 import io
 import json
+import random
 import re
 import subprocess
 import sys
@@ -113,13 +114,15 @@ class Behaved:
         return times
 
     def _repeat(self, times, what, period):
+        """At uneven times: robots whose periods were in step would meet at the engine always, or never."""
+        draw = random.Random(period)
         try:
             while time.monotonic() < self._until:
                 start = time.perf_counter()
                 what()
                 took = time.perf_counter() - start
                 times.append(1e3 * took)
-                time.sleep(max(0, period - took))
+                time.sleep(max(0, period * draw.uniform(0.5, 1.5) - took))
         except Exception as failure:
             self._failed.append(failure)
 
