@@ -124,7 +124,7 @@ struct Rules {
   ShapeCheck operator()(const op::MaxPool& op) const {
     return places(op.window, op.window.padding >= 0 && 2 * op.window.padding <= op.window.size, 1);
   }
-  /// A column of `area` times x's numbers for each place of the window.
+  /// A column of `area` times x's elements for each place of the window.
   ShapeCheck places(const op::Window& w, bool fits, std::int64_t area) const {
     if (!has(1) || !floats() || !fits || w.size < 1 || w.stride < 1) return {false};
     const auto n_place = [&](std::int64_t n) {

@@ -158,8 +158,8 @@ class TileLoop {
       for (std::int64_t i = 0; i < depth_; i += kMaxDepth) {
         const std::int64_t n = min(kMaxDepth, depth_ - i);
         job_.window.copy(reinterpret_cast<const float*>(job_.x), row_ + r, k_ + i, n, scratch_->row_of_x);
-        for (std::int64_t j = 0; j < n; j += kSquare)
-          Tile::copy(scratch_->row_of_x + j, min(kSquare, n - j), scratch_->x + place_in_tiles(r, i + j, depth_));
+        for (std::int64_t j = 0; j < n; j += kTileSide)
+          Tile::copy(scratch_->row_of_x + j, min(kTileSide, n - j), scratch_->x + place_in_tiles(r, i + j, depth_));
       }
   }
 

@@ -10,17 +10,17 @@
 
 namespace vla::kernels {
 
-/// A square of `size` pixels that moves over images of d numbers a pixel, one image after the other, in steps of
+/// A square of `size` pixels that moves over images of d elements a pixel, one image after the other, in steps of
 /// `stride` over `padding` more pixels at each side (op::Window). Places are numbered row by row, image by image.
 struct Window {
   std::int64_t d, width, height;
   std::int64_t size, stride, padding;
   std::int64_t n_column, n_row;  // places of an image
 
-  /// Numbers that the window covers.
+  /// Elements that the window covers.
   VLA_INLINE std::int64_t width_of_place() const { return d * size * size; }
 
-  /// Numbers first to first + n - 1 of those that the window covers at a place, pixels row by row, zeros beyond the
+  /// Elements first to first + n - 1 of those that the window covers at a place, pixels row by row, zeros beyond the
   /// image.
   VLA_INLINE void copy(const float* images, std::int64_t place, std::int64_t first, std::int64_t n, float* to) const {
     const Corner corner = corner_of(place);
@@ -59,11 +59,11 @@ struct Window {
     return {place / n, place % n_column * stride - padding, place % n / n_column * stride - padding};
   }
 
-  /// Numbers `from` to `until` of a row of the window.
+  /// Elements `from` to `until` of a row of the window.
   VLA_INLINE void copy_line(const float* images, const Corner& corner, std::int64_t row, std::int64_t from,
                             std::int64_t until, float* to) const {
     const std::int64_t y = corner.y + row;
-    // Of the row's numbers those inside the image.
+    // Of the row's elements those inside the image.
     const bool inside = y >= 0 && y < height;
     const std::int64_t begin = inside ? min(until, max(from, -corner.x * d)) : until;
     const std::int64_t end = inside ? max(begin, min(until, (width - corner.x) * d)) : until;

@@ -21,7 +21,7 @@ class Copies {
     const auto copy = static_cast<ValueId>(l.values.size());
     Value& to = l.values.emplace_back(Value(l.value(id)));
     to.shape[0] = d;
-    to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.home = Value::Home::arena;
+    to.base = copy, to.offset = 0, to.stride = contiguous_strides(to.shape), to.placement = Value::Placement::arena;
     to.slot = nullptr, to.size = static_cast<std::size_t>(count(to.shape)) * 4;
     Shape from_stride = l.value(id).stride;
     if (l.value(id).shape[0] != d) from_stride[0] = 0;
@@ -35,7 +35,7 @@ class Copies {
   void require(ValueId& id, bool fits) {
     if (!fits) id = copied(id, l.value(id).shape[0]);
   }
-  /// Numbers of a row follow each other.
+  /// Elements of a row follow each other.
   void require_rows(ValueId& id) {
     if (id != kNone) require(id, l.value(id).shape[0] == 1 || l.value(id).stride[0] == 1);
   }

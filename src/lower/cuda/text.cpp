@@ -49,14 +49,15 @@ struct Describe {
     return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), op.ids};
   }
   Words operator()(const PatchesOp& op) const { return {"patches", op.images}; }
+  Words operator()(const WindowOp& op) const { return {op_name(op.node->op), op.x}; }
 };
 
 std::string layout(const CudaLowering& l, ValueId id) {
   const Value& value = l.value(id);
-  const char* home = l.base(id).home == Value::Home::slot   ? "@slot"
-                     : l.base(id).home == Value::Home::kept ? "@kept"
-                                                            : "";
-  return fmt::format("{}{}{}", dtype_name(value.type), shape_text(value.shape), home);
+  const char* place = l.base(id).placement == Value::Placement::slot   ? "@slot"
+                      : l.base(id).placement == Value::Placement::kept ? "@kept"
+                                                                       : "";
+  return fmt::format("{}{}{}", dtype_name(value.type), shape_text(value.shape), place);
 }
 
 }  // namespace
