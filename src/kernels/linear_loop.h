@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <type_traits>
+
 #include "kernels/linear_panels.h"
 #include "kernels/linear_stripe.h"
 
@@ -132,8 +134,14 @@ class LinearLoop {
     for (std::int64_t r = 0; r < n_row; ++r) {
       X* to = scratch_->x + place(r, 0);
       if (job_.window.size > 0) {
-        job_.window.copy(reinterpret_cast<const float*>(job_.x), row + r, k, depth, scratch_->row_of_x);
-        Tile::copy(scratch_->row_of_x, depth, to);
+        // Where x stays as it is, what the window covers is put where it is multiplied.
+        float* room = scratch_->row_of_x;
+        if constexpr (std::is_same_v<X, float>) room = to;
+        job_.window.copy(reinterpret_cast<const float*>(job_.x), row + r, k, depth, room);
+        if (static_cast<const void*>(room) != to)
+          Tile::copy(room, depth, to);
+        else
+          std::memset(room + depth, 0, static_cast<std::size_t>(round_up(depth, kPanelDepth) - depth) * sizeof(float));
         continue;
       }
       const std::int64_t from = (row + r) * job_.x_stride;
