@@ -14,6 +14,7 @@
 #include "devices/devices.h"
 #include "lower/cuda/cuda_device.h"
 #include "support/golden_case.h"
+#include "support/editable_bundle.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -70,6 +71,13 @@ double norm_of_difference(const std::vector<float>& a, const std::vector<float>&
 }
 
 }  // namespace
+
+TEST_CASE("a policy with convolutions is refused by the operation's name") {
+  const auto engine = Engine::load(golden_path("act/two_views/bundle.gguf"), {.n_thread = 1, .kernels = "float32"});
+  REQUIRE_FALSE(engine.ok());
+  CHECK(engine.error().code == Code::unsupported);
+  CHECK((engine.error().where == "unfold" || engine.error().where == "max_pool"));
+}
 
 TEST_CASE("policies on our own kernels for CUDA match the reference at every tap within 1e-4") {
   for (const std::string& path : cases()) {

@@ -278,9 +278,9 @@ struct Emit {
     return Calls{call(cuda::map_elements(job), job)};
   }
 
-  Calls operator()(const WindowOp& op) const {
-    return Error{Code::unsupported, op.node->path, "an operation that there is a kernel for", op_name(op.node->op),
-                 "use --kernels ggml"};
+  Calls operator()(const WindowOp& window) const {
+    return Error{Code::unsupported, op_name(window.node->op), "an operation that our kernels for CUDA have",
+                 "none of windows over images", "use --kernels ggml"};
   }
 };
 
