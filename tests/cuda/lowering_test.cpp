@@ -13,8 +13,8 @@
 #include "cuda/machine.h"
 #include "devices/devices.h"
 #include "lower/cuda/cuda_device.h"
-#include "support/golden_case.h"
 #include "support/editable_bundle.h"
+#include "support/golden_case.h"
 
 using namespace vla;
 using namespace vla::test;
