@@ -144,6 +144,18 @@ MISTAKES = {
         "const int left = 16,",
     ),
     "depth of few rows ends too late": ("linear_bf16.cu", "linear_bf16", "k + i < end ?", "true ?"),
+    "few rows anywhere are read in 16 bytes": (
+        "linear_bf16.cu",
+        "linear_bf16",
+        "const bool is_aligned = reinterpret_cast",
+        "const bool is_aligned = true || reinterpret_cast",
+    ),
+    "few rows are rounded": (
+        "linear_bf16.cu",
+        "linear_bf16",
+        "k + i < end ? row[k + i] : 0;",
+        "k + i < end ? dev::float_of(static_cast<int>(dev::to_bf16(0, row[k + i]))) : 0;",
+    ),
     "columns of two tiles swapped": (
         "linear_bf16.cu",
         "linear_bf16",
@@ -247,6 +259,8 @@ MISTAKES = {
         "sqrtf(sum_of_block(squares, room) / static_cast<float>(n) + job.eps)",
         "(sqrtf(sum_of_block(squares, room) / static_cast<float>(n)) + 100 * job.eps)",
     ),
+    "a wide row is kept all the same": ("rows.cu", "rows", "const bool is_kept = n <= kMaxKept;", "const bool is_kept = true;"),
+    "a wide row without what was added": ("rows.cu", "rows", ": load(i); };", ": job.x[row * job.x_stride + i]; };"),
     "heads turn the other way": ("rows.cu", "rows", "low * cosine - high * sine", "low * cosine + high * sine"),
     "the table's row of another token": (
         "rows.cu",

@@ -49,19 +49,23 @@ VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
 
 }  // namespace
 
-/// A block has a row, which it keeps in shared memory.
+/// A block has a row, which it keeps in shared memory where it fits.
 VLA_KERNEL(norm_rows, 256, 4, NormJob) {
   std::byte *room = dev::shared_memory(), *row_room = room + 64;
   const std::int64_t row = blockIdx.x;
   const int n = job.n, n_thread = static_cast<int>(blockDim.x);
-  const auto at = [&](int i) { return dev::read<float>(row_room + i * 4); };
+  const bool is_kept = n <= kMaxKept;
+  const auto load = [&](int i) {
+    const float x = job.x[row * job.x_stride + i];
+    return job.residual ? x + job.residual[row * n + i] : x;
+  };
+  const auto at = [&](int i) { return is_kept ? dev::read<float>(row_room + i * 4) : load(i); };
 
   float sum = 0;
   for (int i = thread_index(); i < n; i += n_thread) {
-    float x = job.x[row * job.x_stride + i];
-    if (job.residual) x += job.residual[row * n + i];
+    const float x = load(i);
     if (job.sum) job.sum[row * n + i] = x;
-    dev::write(row_room + i * 4, x);
+    if (is_kept) dev::write(row_room + i * 4, x);
     sum += x;
   }
   float mean = 0, factor = 1;

@@ -24,9 +24,10 @@ struct NormJob {
   RowNorm norm;
   RowType type;
 };
-constexpr int kMaxNorm = 24576;  // a row stays in shared memory
+constexpr int kMaxKept = 24576;  // wider rows are read again where narrower ones stay in shared memory
 inline Launch norm_rows(const NormJob& job) {
-  return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(job.n * 4 + 64)};
+  const int n_kept = job.n <= kMaxKept ? job.n : 0;
+  return {"norm_rows", {static_cast<unsigned>(job.n_row)}, 256, static_cast<unsigned>(n_kept * 4 + 64)};
 }
 
 /// Rows of heads: an RMS norm over the head where there is a weight, then a rotation of the pairs (x_i, x_{i +

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <limits>
 
-#include "cuda/kernels/rows.h"
 #include "lower/cpu/precision.h"
 #include "lower/cuda/cuda_program.h"
 
@@ -26,7 +25,7 @@ class CudaTarget final : public Target {
   }
   std::size_t max_products() const override { return 1; }
   std::int64_t max_norm(const Param& matrix) const override {
-    return weights_[matrix].kind == MatrixKind::f32 ? 0 : cuda::kMaxNorm;
+    return weights_[matrix].kind == MatrixKind::f32 ? 0 : std::numeric_limits<std::int64_t>::max();
   }
   bool convolves(const Param&) const override { return false; }
   const Encoding& encoding(const Param& matrix) const override { return weights_[matrix].encoding; }

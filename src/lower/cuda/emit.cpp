@@ -176,8 +176,7 @@ struct Emit {
   }
 
   Emitted operator()(const RoundOp& round) const {
-    const Value &x = l.value(round.x), &y = l.value(op.writes[0]);
-    if (x.shape[0] > cuda::kMaxNorm) return unsupported("product", "rows of at most", cuda::kMaxNorm, x.shape[0]);
+    const Value& y = l.value(op.writes[0]);
     cuda::NormJob job = norm_of(round.x, round.norm != nullptr ? round.norm->as<op::Norm>() : nullptr);
     job.weight = l.at(round.weight), job.bias = l.at(round.bias), job.y_stride = y.stride[1];
     job.type = y.type == DType::i8     ? cuda::RowType::codes
@@ -200,8 +199,6 @@ struct Emit {
     return std::visit([&](const auto& what) { return rows(row, what); }, row.what);
   }
   Emitted rows(const RowOp& row, const op::Norm& norm) const {
-    const Value& x = l.value(row.x);
-    if (x.shape[0] > cuda::kMaxNorm) return unsupported("norm", "rows of at most", cuda::kMaxNorm, x.shape[0]);
     cuda::NormJob job = norm_of(row.x, &norm);
     job.weight = l.at(row.w), job.bias = l.at(row.b);
     return Calls{call(cuda::norm_rows(job), job)};
