@@ -71,5 +71,6 @@ done
 say "products"
 sizes=()
 [ "${SIZES:-all}" = all ] || sizes=("$SIZES")
+[ -z "$try" ] || sizes=(1 1)
 keep "$out/products.jsonl" "$build/bin/bench_products" "${sizes[@]}"
 "$python" "$root/scripts/gpu_table.py" "$out" > "$out/table.md" && cat "$out/table.md"

@@ -29,23 +29,23 @@ constexpr Size kSizes[] = {{1, 2048, 2048},   {4, 960, 2560},    {50, 720, 2048}
                            {113, 960, 2560},  {642, 2560, 2560}, {642, 2560, 6912}, {642, 6912, 2560},
                            {512, 1152, 4304}, {968, 2048, 16384}};
 constexpr int kSplits[] = {1, 2, 4, 8};
-constexpr int kLaunches = 20;
 
-/// Microseconds of one of a graph of launches.
+/// Microseconds of one of a graph of so many launches.
 template <class Job>
-Result<float> time_launches(Gpu& gpu, Stream& stream, const Job& job, const std::vector<Launch>& launches) {
+Result<float> time_launches(Gpu& gpu, Stream& stream, const Job& job, const std::vector<Launch>& launches,
+                            int n_launch) {
   VLA_TRY(const Owned first, gpu.event());
   VLA_TRY(const Owned last, gpu.event());
   VLA_CHECK(stream.begin_capture());
   VLA_CHECK(stream.note_time(first));
-  for (int i = 0; i < kLaunches; ++i)
+  for (int i = 0; i < n_launch; ++i)
     for (const Launch& launch : launches) VLA_CHECK(stream.launch(launch, job));
   VLA_CHECK(stream.note_time(last));
   VLA_TRY(const Owned graph, stream.end_capture());
   for (int i = 0; i < 2; ++i) VLA_CHECK(stream.launch(graph));  // the first one warms it up
   VLA_CHECK(stream.wait());
   VLA_TRY(const float ms, gpu.elapsed(first, last));
-  return 1e3f * ms / kLaunches;
+  return 1e3f * ms / static_cast<float>(n_launch);
 }
 
 void tell(const char* kind, const Size& size, const char* shape, int n_split, float us) {
@@ -56,7 +56,7 @@ void tell(const char* kind, const Size& size, const char* shape, int n_split, fl
       kind, size.n_row, size.depth, size.n_column, shape, n_split, us, 1e-6 * flop / us);
 }
 
-Status run(int n_size) {
+Status run(int n_size, int n_launch) {
   VLA_TRY(const Driver driver, load_driver());
   VLA_TRY(const std::unique_ptr<Gpu> gpu, Gpu::open(driver, 0, kernel_modules()));
   VLA_TRY(Stream stream, gpu->stream());
@@ -84,7 +84,7 @@ Status run(int n_size) {
         if (shape == Bf16Shape::few && size.n_row > 4 * kBf16FewRows) continue;
         std::vector<Launch> launches = {linear_bf16(shape, bf16)};
         if (n_split > 1) launches.push_back(finish_bf16_partial(bf16));
-        VLA_TRY(const float us, time_launches(*gpu, stream, bf16, launches));
+        VLA_TRY(const float us, time_launches(*gpu, stream, bf16, launches, n_launch));
         tell("bf16", size, name, n_split, us);
       }
       const LinearInt8Job codes = {x.as<std::byte>(),
@@ -103,7 +103,7 @@ Status run(int n_size) {
           if (shape == Int8Shape::few && size.n_row > 16) continue;
           std::vector<Launch> launches = {linear_int8(code, shape, codes)};
           if (n_split > 1) launches.push_back(finish_int8_partial(codes));
-          VLA_TRY(const float us, time_launches(*gpu, stream, codes, launches));
+          VLA_TRY(const float us, time_launches(*gpu, stream, codes, launches, n_launch));
           tell(kind, size, name, n_split, us);
         }
     }
@@ -113,11 +113,12 @@ Status run(int n_size) {
 
 }  // namespace
 
-/// bench_products [N]: the first N sizes; all without it.
+/// bench_products [N [LAUNCHES]]: the first N sizes, all without it; so many launches for each time, else 20.
 int main(int n_argument, char** arguments) {
   constexpr int kMost = static_cast<int>(std::size(kSizes));
   const int n_size = n_argument > 1 ? std::clamp(std::atoi(arguments[1]), 1, kMost) : kMost;
-  const Status status = run(n_size);
+  const int n_launch = n_argument > 2 ? std::clamp(std::atoi(arguments[2]), 1, 1000) : 20;
+  const Status status = run(n_size, n_launch);
   if (!status) fmt::print(stderr, "error: {}\n", status.error().message());
   return status ? 0 : 1;
 }
