@@ -136,7 +136,7 @@ test-vulkan: vulkan
 # All mistakes that are made in kernels for CUDA, all families of policies and all architectures; `make test` tries some.
 test-cuda: build
 	@scripts/cuda.sh .cache/nvcc nvcc
-	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 VLA_ALL_ARCHITECTURES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
+	VLA_ALL_MISTAKES=1 VLA_ALL_FAMILIES=1 VLA_ALL_ARCHITECTURES=1 VLA_ALL_FAULTS=1 VLA_ALL_CASES=1 ctest --preset cpu -R '^cuda_' --output-on-failure
 
 # Downloads 90 MB of Debian's libraries for ARM into .cache.
 SYSROOT := .cache/sysroot-arm64

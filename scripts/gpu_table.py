@@ -6,10 +6,10 @@
     scripts/gpu_table.py OUT
 """
 
+import argparse
 import json
 import re
 import statistics
-import sys
 from pathlib import Path
 
 NONE = "not measured"
@@ -63,7 +63,9 @@ def products(out):
 
 
 def main():
-    out = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    out = parser.parse_args().out
     ladder = (out / "ladder.txt").read_text() if (out / "ladder.txt").is_file() else ""
     said = re.findall(r"^=*\s*(\d+ .*?(?:passed|failed).*?)\s*=*$", ladder, re.M)
     print(f"{(out / 'machine.txt').read_text().strip()}; golden cases: {said[-1] if said else 'not run'}. Milliseconds, medians.\n")

@@ -18,7 +18,8 @@ constexpr const char* kKernelsHelp =
     "and less exact; "
     "not given: on the CPU the best for the bundle's dtype, which multiplies bf16 (by neon_bf16, avx512_bf16 or amx) "
     "if the "
-    "bundle is stored as bf16. Other devices take float32 (not given) and bf16";
+    "bundle is stored as bf16. On Vulkan float32 (not given) or bf16; on CUDA as stored (not given), float32, bf16, "
+    "int8, or ggml for its backend";
 
 /// Of --device, wherever a policy is loaded.
 constexpr const char* kDeviceHelp =

@@ -24,7 +24,7 @@ using Handle = void*;           // a context, stream, event, module, function or
   CALL(device_get, cuDeviceGet, int* device, int ordinal)                                                            \
   CALL(device_attribute, cuDeviceGetAttribute, int* value, int attribute, int device)                                \
   CALL(device_name, cuDeviceGetName, char* name, int size, int device)                                               \
-  CALL(memory_size, cuDeviceTotalMem_v2, std::size_t* size, int device)                                            \
+  CALL(memory_size, cuDeviceTotalMem_v2, std::size_t* size, int device)                                              \
   CALL(context_retain, cuDevicePrimaryCtxRetain, Handle* context, int device)                                        \
   CALL(context_release, cuDevicePrimaryCtxRelease_v2, int device)                                                    \
   CALL(context_use, cuCtxSetCurrent, Handle context)                                                                 \

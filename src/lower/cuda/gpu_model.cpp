@@ -11,9 +11,9 @@ namespace {
 constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
 constexpr std::size_t kGiB = std::size_t{1} << 30;
 
-// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. Of the H100's tensor units
-// mma.sync, which is what our kernels use, is known to reach 0.62. Launches are what graphs of small kernels are
-// commonly measured to take.
+// Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. That mma.sync, which our
+// kernels use, reaches 0.62 of the H100's tensor units, and what launches in graphs take, are from memory of what
+// others report, and never checked.
 constexpr GpuModel kModels[] = {
     {"orin-agx", "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz", 16, 64 * kGiB, 42.6 * kTera, 85 * kTera, 5.3 * kTera,
      10.6 * kTera, 204.8 * kGiga, 2.5 * kMicro, 1.35},
