@@ -9,8 +9,9 @@ scripts/serve_attacked.py --each         a row for each attack alone
 scripts/serve_attacked.py --real-time    on a machine that does other work beside it
 
 The attacks are in scripts/attacks/. They come from 127.0.0.2 (`own_address` from the robot's 127.0.0.1 and
-`many_addresses` from 256 others) and run at the lowest priority, since they are to attack the server and not the cores that it shares
-with them here. Fails where an answer is lost or wrong, or a row misses its bar. docs/security.md says what is promised.
+`many_addresses` from 256 others), after all other work of the machine, since they are to attack the server and not the
+cores that it shares with them here; with --real-time as other work, and server and robots before it. Fails where an
+answer is lost or wrong, or a row misses its bar. docs/security.md says what is promised.
 """
 
 import argparse
@@ -36,9 +37,17 @@ def p(values, percent):
     return float(np.percentile(values, percent)) if values else float("nan")
 
 
-def last_of_all():
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    os.nice(19)
+def give_way(options):
+    """To the server and to who behaves: they are before all other work of the machine, or this comes after it."""
+    os.sched_setscheduler(0, os.SCHED_OTHER if options.real_time else os.SCHED_IDLE, os.sched_param(0))
+    if not options.real_time:
+        os.nice(19)
+
+
+def cpu_seconds(process):
+    """That it has used so far."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(options, attacks):
@@ -53,14 +62,16 @@ def measure(options, attacks):
         names = [name for name in attacks if target.lerobot or name != "lerobot"]
         for name in names:
             where = [getattr(target, place) for place in Target.PLACES]
-            command = [sys.executable, __file__, "--as", name, *where]
+            command = [sys.executable, __file__, "--as", name, *where, *["--real-time"] * options.real_time]
             attackers.append(subprocess.Popen(command, stdout=subprocess.PIPE))
         [attacker.stdout.readline() for attacker in attackers]
         time.sleep(1)
         uploaded = []
         upload = threading.Thread(target=slow_upload, args=(target, options.seconds * 0.8, uploaded))
         upload.start()
+        used = sum(map(cpu_seconds, attackers))
         attacked = behaved.watch(options.seconds)
+        used = sum(map(cpu_seconds, attackers)) - used
         upload.join()
         ended = [name for name, a in zip(names, attackers) if a.poll() is not None]
         grown = target.memory_mib("VmHWM") - before
@@ -69,7 +80,7 @@ def measure(options, attacks):
         [a.wait() for a in attackers]
         target.process.terminate()
     status = target.process.wait(20)
-    return quiet, attacked, dict(grown_mib=grown, uploaded=bool(uploaded), ended=ended, status=status)
+    return quiet, attacked, dict(grown_mib=grown, used_s=used, uploaded=bool(uploaded), ended=ended, status=status)
 
 
 def rows_of(options, quiet, attacked, rest):
@@ -91,6 +102,7 @@ def rows_of(options, quiet, attacked, rest):
     rows += [
         ("memory beyond the policy, MiB", "", f"{rest['grown_mib']:.0f}", f"{memory}", rest["grown_mib"] <= memory),
         ("a slow upload is answered", "", str(rest["uploaded"]), "True", rest["uploaded"]),
+        ("processor time of the attacks, s", "", f"{rest['used_s']:.1f}", "", True),
         ("attacks that gave up", "", ", ".join(rest["ended"]) or "none", "none", not rest["ended"]),
         ("exit status", "", str(rest["status"]), "0", rest["status"] == 0),
     ]
@@ -117,14 +129,15 @@ def row_of(options, attack, quiet, attacked, rest):
     times = [f"{p(quiet[n], 95):.1f} → {p(attacked[n], 95):.1f}" if n in quiet else "" for n in ROBOTS]
     others = [f"{p(attacked[n], 95):.1f}" for n in ("health", "healthz", "late")]
     missed = [what for what, *_, holds in rows_of(options, quiet, attacked, rest) if not holds]
-    cells = [f"`{attack}`", *times, *others, f"{rest['grown_mib']:.0f}", ", ".join(missed) or "none"]
+    cells = [f"`{attack}`", *times, *others, f"{rest['grown_mib']:.0f}", f"{rest['used_s']:.1f}"]
+    cells.append(", ".join(missed) or "none")
     print(f"| {' | '.join(cells)} |", flush=True)
     return not missed
 
 
 def each(options):
     """A table with a row for each attack."""
-    print("| attack | act | openpi | GR00T | LeRobot | health | /healthz | LATE | MiB | missed |\n|" + " --- |" * 10)
+    print("| attack | act | openpi | GR00T | LeRobot | health | /healthz | LATE | MiB | its CPU, s | missed |\n|" + " --- |" * 11)
     attacks = options.attack or ATTACKS
     return all([row_of(options, attack, *measure(options, [attack])) for attack in attacks])
 
@@ -148,7 +161,7 @@ def main():
     if options.role:
         attack, *addresses = options.role
         print("attacking", flush=True)
-        last_of_all()  # what is imported before that is not part of the attack
+        give_way(options)  # what is imported before that is not part of the attack
         return ATTACKS[attack](argparse.Namespace(**dict(zip(Target.PLACES, addresses))))
     if options.real_time:  # the server inherits it
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
