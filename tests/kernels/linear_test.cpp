@@ -323,7 +323,7 @@ const LinearKernel& row(const std::string& name) {
     check(row("neon_bf16"));                                                                                    \
   }                                                                                                             \
   TEST_CASE("neon_bf16, few rows: " sentence* doctest::skip(vla::test::lacks(kernel_set::neon_bf16))) {         \
-    check(*row("neon_bf16").small_batch);                                                                               \
+    check(*row("neon_bf16").small_batch);                                                                       \
   }                                                                                                             \
   TEST_CASE("avx2: " sentence* doctest::skip(vla::test::lacks(kernel_set::avx2))) { check(row("avx2")); }       \
   VLA_EMULATED_TEST("avx512", sentence, check(kEmulatedLinearAvx512))                                           \
