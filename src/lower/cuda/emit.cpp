@@ -275,14 +275,16 @@ struct Emit {
     return Calls{call(cuda::map_elements(job), job)};
   }
 
-  Calls operator()(const WindowOp& window) const {
-    return Error{Code::unsupported, op_name(window.node->op), "an operation that our kernels for CUDA have",
-                 "none of windows over images", "use --kernels ggml"};
+  Error operator()(const WindowOp& window) const {
+    return {Code::unsupported, op_name(window.node->op), "an operation that our kernels for CUDA have",
+            "none of windows over images", "use --kernels ggml"};
   }
 };
 
 }  // namespace
 
-Result<Calls> emit(const CudaLowering& l, const CudaOp& op) { return std::visit(Emit{l, op}, op.op); }
+Result<Calls> emit(const CudaLowering& l, const CudaOp& op) {
+  return std::visit([&](const auto& what) -> Result<Calls> { return Emit{l, op}(what); }, op.op);
+}
 
 }  // namespace vla::lower
