@@ -157,7 +157,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   plan->set_x(steering ? steering->start : observation.x);
   if (steering) plan->set_steering(*steering);
   record(taps, "pixels", {in.width, in.height, 3, in.n_view}, in.pixels);
-  record(taps, "tokens", {static_cast<std::int64_t>(in.tokens.size())}, in.tokens);
+  if (!in.tokens.empty()) record(taps, "tokens", {static_cast<std::int64_t>(in.tokens.size())}, in.tokens);
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
   clock.lap(timing, "plan");
   VLA_CHECK(plan->run_prefix(taps));

@@ -57,14 +57,20 @@ def test_options_of_run_that_contradict_or_miss_something_are_a_usage_error(vla,
     assert answer.err.startswith("error: usage: ") and answer.err.count("\n") == 1
 
 
-@pytest.mark.parametrize("left_out", ["--image", "--state", "--text"])
-def test_run_without_an_image_a_state_or_a_text_is_a_usage_error_that_names_it(vla, golden, left_out):
+@pytest.mark.parametrize("left_out", ["--image", "--state"])
+def test_run_without_an_image_or_a_state_is_a_usage_error_that_names_it(vla, golden, left_out):
     arguments = golden.arguments()
     while left_out in arguments:
         at = arguments.index(left_out)
         del arguments[at : at + 2]
     answer = vla(*arguments)
     assert answer.code == 2 and answer.out == "" and left_out in answer.err and answer.err.count("\n") == 1
+
+
+def test_run_without_a_text_is_refused_by_a_policy_that_reads_one(vla, golden):
+    arguments = golden.arguments()
+    at = arguments.index("--text")
+    vla(*arguments[:at], *arguments[at + 2 :]).refused("bad_observation", "instruction: expected a sentence, found empty text")
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,12 @@ namespace {
 constexpr Activation kActivations[] = {Activation::gelu_tanh, Activation::gelu_erf, Activation::silu, Activation::relu,
                                        Activation::relu_squared};
 
+#ifdef VLA_WITHOUT_WINDOWS
+constexpr bool kHasWindows = false;
+#else
+constexpr bool kHasWindows = true;
+#endif
+
 /// Contiguous, and a part of something wider.
 constexpr Tensor (*kOperands[])(GraphRunner&, const Shape&, float) = {input, strided};
 
@@ -143,7 +149,8 @@ TEST_CASE("patches of several views whose sides a patch need not divide, and squ
   }
 }
 
-TEST_CASE("windows over images, of every size, stride and padding that a convolution has") {
+TEST_CASE("windows over images, of every size, stride and padding that a convolution has" *
+          doctest::skip(!kHasWindows)) {
   const op::Window windows[] = {{7, 2, 3}, {3, 1, 1}, {3, 2, 1}, {1, 2, 0}, {1, 1, 0}, {2, 1, 0}, {5, 3, 4}};
   for (const auto operand : kOperands)
     for (const Shape& images : {Shape{3, 11, 6, 2}, Shape{35, 4, 5, 1}, Shape{1, 1, 3, 1}})
@@ -162,7 +169,8 @@ TEST_CASE("windows over images, of every size, stride and padding that a convolu
       }
 }
 
-TEST_CASE("the largest of a window has no zeros from beyond the image, and is NaN where a pixel is") {
+TEST_CASE("the largest of a window has no zeros from beyond the image, and is NaN where a pixel is" *
+          doctest::skip(!kHasWindows)) {
   const LowerParams params;
   for (const KernelSet& set : usable_kernels()) {
     CAPTURE(name_of(set));
@@ -206,7 +214,7 @@ TEST_CASE("products of x of any strides, with everything that may follow them") 
   });
 }
 
-TEST_CASE("convolutions, with everything that may follow them") {
+TEST_CASE("convolutions, with everything that may follow them" * doctest::skip(!kHasWindows)) {
   const Shape images = {8, 9, 7, 2};
   for (const auto operand : kOperands)
     for (const op::Window& window : {op::Window{1, 2, 0}, op::Window{2, 1, 1}})
@@ -235,7 +243,7 @@ TEST_CASE("convolutions, with everything that may follow them") {
   });
 }
 
-TEST_CASE("a product takes a window only where nobody else reads what it covers") {
+TEST_CASE("a product takes a window only where nobody else reads what it covers" * doctest::skip(!kHasWindows)) {
   const LowerParams params;
   const auto text = [&](bool tapped, bool read_again) {
     GraphRunner r(params.list(), "portable");
@@ -336,7 +344,7 @@ TEST_CASE("attention with more segments or wider heads than its kernels have roo
   }
 }
 
-TEST_CASE("one graph has every operation there is, and gives the same on all kernels") {
+TEST_CASE("one graph has every operation there is, and gives the same on all kernels" * doctest::skip(!kHasWindows)) {
   std::vector<bool> recorded(std::variant_size_v<Op>);
   check_like_ggml([&](GraphRunner& r, const LowerParams& p) {
     Graph& g = r.graph;
