@@ -43,9 +43,15 @@ class Translator {
     return ggml_new_tensor(constants_, op.values.index() == 1 ? GGML_TYPE_I32 : GGML_TYPE_F32, 4, node_->shape.data());
   }
   ggml_tensor* translate(const op::Linear& op) {
-    ggml_tensor* y = op.rule == op::Rule::int8_rows ? int8_product(op)
-                                                    : ggml_mul_mat(c, device_.weight(op.weight), contiguous(in(0)));
+    ggml_tensor* y = op.rule == op::Rule::int8_rows ? int8_product(op) : product(device_.weight(op.weight));
     return op.bias != nullptr ? ggml_add(c, y, device_.weight(op.bias)) : y;
+  }
+  /// Vulkan repeats no matrix along the fourth dimension: there all rows are one matrix.
+  ggml_tensor* product(ggml_tensor* weight) {
+    ggml_tensor* x = contiguous(in(0));
+    if (x->ne[3] == 1) return ggml_mul_mat(c, weight, x);
+    ggml_tensor* rows = ggml_reshape_2d(c, x, x->ne[0], ggml_nrows(x));
+    return reshaped(ggml_mul_mat(c, weight, rows), node_->shape);
   }
   /// Codes are integers in float32, and so small that their sums are exact.
   ggml_tensor* int8_product(const op::Linear& op) {
