@@ -2,6 +2,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "net/tcp.h"
 
+#include <fmt/format.h>
+
 #include <charconv>
 
 #include "net/endpoint.h"
@@ -26,6 +28,18 @@ Result<tcp::endpoint> tcp_endpoint_of(const std::string& address, const char* op
   unsigned short port = 0;
   std::from_chars(address.data() + colon + 1, address.data() + address.size(), port);
   return tcp::endpoint(ip, port);
+}
+
+Result<std::string> bind_tcp(std::optional<Listener<tcp>>& listener, boost::asio::io_context& context,
+                             const std::string& address, const char* option, bool insecure) {
+  VLA_TRY(const tcp::endpoint endpoint, tcp_endpoint_of(address, option, insecure));
+  try {
+    listener.emplace(context, endpoint);
+    return fmt::format("{}:{}", address.substr(0, address.rfind(':')), listener->endpoint().port());
+  } catch (const boost::system::system_error& error) {
+    return Error{Code::io, address, "a free address of this machine", error.code().message(),
+                 fmt::format("choose another with {}; port 0 takes a free one", option)};
+  }
 }
 
 }  // namespace vla::net

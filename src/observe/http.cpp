@@ -95,14 +95,7 @@ class Http::Server {
   }
 
   Status start(const std::string& address, const char* option, bool insecure) {
-    VLA_TRY(const tcp::endpoint endpoint, net::tcp_endpoint_of(address, option, insecure));
-    try {
-      listener_.emplace(context_, endpoint);
-      address_ = fmt::format("{}:{}", address.substr(0, address.rfind(':')), listener_->endpoint().port());
-    } catch (const boost::system::system_error& error) {
-      return Error{Code::io, address, "a free address of this machine", error.code().message(),
-                   fmt::format("choose another with {}; port 0 takes a free one", option)};
-    }
+    VLA_TRY(address_, net::bind_tcp(listener_, context_, address, option, insecure));
     VLA_TRY(thread_, start_thread(option, [this] { run(); }));
     return {};
   }
