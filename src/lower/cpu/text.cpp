@@ -4,11 +4,10 @@
 #include <fmt/ranges.h>
 
 #include "lower/cpu/emit.h"
+#include "lower/words.h"
 
 namespace vla::lower {
 namespace {
-
-std::string path_of(const Node& node) { return node.path.empty() ? fmt::format("%{}", node.id) : node.path; }
 
 /// The parts of a fused operation in the order in which they are computed.
 struct Describe {
@@ -21,45 +20,20 @@ struct Describe {
     ValueId x;
   };
 
-  static std::string prepared(const Prepared& rows) {
-    return fmt::format("{}{}", rows.norm != nullptr ? "norm " : "", rows.rope != nullptr ? "rope " : "");
-  }
-
-  Words operator()(const LinearOp& op) const {
-    std::vector<std::string> names;
-    for (const Node* node : op.linears) names.push_back(path_of(*node));
-    const char* before = op.norm != nullptr ? "norm, " : op.unfold != nullptr ? "unfold, " : "";
-    std::string what = fmt::format("{}linear {}", before, fmt::join(names, " | "));
-    if (op.activation != Activation::none) what += fmt::format(", {}", activation_name(op.activation));
-    if (op.gated) what += ", gate";
-    if (op.factor != kNone) what += ", factor";
-    if (op.residual != kNone) what += ", residual";
-    if (op.ends_in_relu) what += ", relu";
-    return {what, kernel_of(l, op).name, op.x};
-  }
+  Words operator()(const LinearOp& op) const { return {words_of(op), kernel_of(l, op).name, op.x}; }
   Words operator()(const QuantizeOp& op) const {
     return {fmt::format("{}quantize", op.norm != nullptr ? "norm, " : ""), op.kernel->name, op.x};
   }
   Words operator()(const PackOp& op) const {
-    return {prepared(op.k) + "pack keys and values", name_of(l.features(op.rounds)), op.k.x};
+    return {words_of(op.k) + "pack keys and values", name_of(l.features(op.rounds)), op.k.x};
   }
-  Words operator()(const AttentionOp& op) const {
-    return {fmt::format("{}attention {} over {} keys{}", prepared(op.q), path_of(*op.node), fmt::join(op.n_key, " + "),
-                        op.mask != kNone ? ", mask" : ""),
-            name_of(l.features(op.rounds)), op.q.x};
-  }
-  Words operator()(const RowOp& op) const {
-    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), name_of(l.use), op.x};
-  }
-  Words operator()(const CopyOp& op) const {
-    return {fmt::format("copy {} part{}", op.parts.size(), op.parts.size() == 1 ? "" : "s"), "copy", op.parts[0].from};
-  }
-  Words operator()(const LookupOp& op) const {
-    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), "copy", op.ids};
-  }
-  Words operator()(const PatchesOp& op) const { return {"patches", "copy", op.images}; }
+  Words operator()(const AttentionOp& op) const { return {words_of(op), name_of(l.features(op.rounds)), op.q.x}; }
+  Words operator()(const RowOp& op) const { return {words_of(op), name_of(l.use), op.x}; }
+  Words operator()(const CopyOp& op) const { return {words_of(op), "copy", op.parts[0].from}; }
+  Words operator()(const LookupOp& op) const { return {words_of(op), "copy", op.ids}; }
+  Words operator()(const PatchesOp& op) const { return {words_of(op), "copy", op.images}; }
   Words operator()(const WindowOp& op) const {
-    return {op_name(op.node->op), op.takes_largest ? name_of(l.use) : "copy", op.x};
+    return {words_of(op), op.takes_largest ? name_of(l.use) : "copy", op.x};
   }
   Words operator()(const BlockedOp&) const { return {}; }  // its products are described
 };

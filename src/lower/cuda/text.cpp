@@ -4,11 +4,11 @@
 #include <fmt/ranges.h>
 
 #include "lower/cuda/cuda_lowering.h"
+#include "lower/words.h"
 
 namespace vla::lower {
 namespace {
 
-std::string path_of(const Node& node) { return node.path.empty() ? fmt::format("%{}", node.id) : node.path; }
 double size_of(const Value& value) { return static_cast<double>(dtype_size(value.type, count(value.shape))); }
 
 /// What an operation computes, and the value that it is computed of.
@@ -18,38 +18,16 @@ struct Describe {
     ValueId x;
   };
 
-  static std::string prepared(const Prepared& rows) {
-    return fmt::format("{}{}", rows.norm != nullptr ? "norm " : "", rows.rope != nullptr ? "rope " : "");
-  }
-
-  Words operator()(const LinearOp& op) const {
-    std::vector<std::string> names;
-    for (const Node* node : op.linears) names.push_back(path_of(*node));
-    std::string what = fmt::format("linear {}", fmt::join(names, " | "));
-    if (op.activation != Activation::none) what += fmt::format(", {}", activation_name(op.activation));
-    if (op.gated) what += ", gate";
-    if (op.factor != kNone) what += ", factor";
-    if (op.residual != kNone) what += ", residual";
-    return {what, op.x};
-  }
-  Words operator()(const HeadOp& op) const { return {prepared(op.rows) + "heads", op.rows.x}; }
+  Words operator()(const HeadOp& op) const { return {words_of(op.rows) + "heads", op.rows.x}; }
   Words operator()(const RoundOp& op) const { return {op.norm != nullptr ? "norm, round" : "round", op.x}; }
-  Words operator()(const AttentionOp& op) const {
-    return {fmt::format("attention {} over {} keys{}", path_of(*op.node), fmt::join(op.n_key, " + "),
-                        op.mask != kNone ? ", mask" : ""),
-            op.q.x};
+  Words operator()(const AttentionOp& op) const { return {words_of(op), op.q.x}; }
+  Words operator()(const CopyOp& op) const { return {words_of(op), op.parts[0].from}; }
+  Words operator()(const LookupOp& op) const { return {words_of(op), op.ids}; }
+  Words operator()(const PatchesOp& op) const { return {words_of(op), op.images}; }
+  template <class OfX>  // LinearOp, RowOp, WindowOp
+  Words operator()(const OfX& op) const {
+    return {words_of(op), op.x};
   }
-  Words operator()(const RowOp& op) const {
-    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), op.x};
-  }
-  Words operator()(const CopyOp& op) const {
-    return {fmt::format("copy {} part{}", op.parts.size(), op.parts.size() == 1 ? "" : "s"), op.parts[0].from};
-  }
-  Words operator()(const LookupOp& op) const {
-    return {fmt::format("{} {}", op_name(op.node->op), path_of(*op.node)), op.ids};
-  }
-  Words operator()(const PatchesOp& op) const { return {"patches", op.images}; }
-  Words operator()(const WindowOp& op) const { return {op_name(op.node->op), op.x}; }
 };
 
 std::string layout(const CudaLowering& l, ValueId id) {
