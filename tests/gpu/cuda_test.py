@@ -3,14 +3,12 @@
 """Our own kernels for CUDA at the program's doors, on a driver that counts, refuses and fails (tests/cuda/library/libcuda.cpp)."""
 
 import json
-import re
-import subprocess
 
 import numpy as np
 import pytest
 from conftest import FAKE
 from golden_cases import FLOAT32, NAMES, ROOT
-from gpu_test import with_environment
+from gpu_test import serve_until_lost, with_environment
 from program import EXIT
 
 pytestmark = pytest.mark.skipif(not FAKE, reason="no driver of tests: VLA_FAKE_CUDA")
@@ -47,8 +45,6 @@ def test_too_little_memory_an_old_driver_and_an_old_gpu_are_refused(vla, golden)
 
 
 def test_a_device_that_is_lost_is_the_error_device_and_a_server_ends_with_it(vla, golden, tmp_path):
-    import vla_cpp
-
     counts = tmp_path / "calls"
     arguments = golden.arguments(options=IN_FLOAT32)
     assert with_environment(vla, VLA_FAKE_COUNTS=str(counts))(*arguments).code == 0
@@ -59,20 +55,7 @@ def test_a_device_that_is_lost_is_the_error_device_and_a_server_ends_with_it(vla
         answer = lost(*arguments)
         assert answer.code == EXIT["device"] and "CUDA_ERROR_LAUNCH_FAILED" in answer.err, answer.err
     server = with_environment(vla, VLA_FAKE_FAILS_AT=str(len(calls) + 40), VLA_FAKE_LOST="1")  # in a later act
-    command = [server.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *IN_FLOAT32]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=server.environment) as process:
-        try:
-            line = process.stdout.readline()
-            images = {view: file.read_bytes() for view, file in golden.images.items()}
-            with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=60) as client:
-                with pytest.raises(vla_cpp.DeviceError, match="CUDA_ERROR_LAUNCH_FAILED"):
-                    for _ in range(20):
-                        client.act(images=images, state=golden.state, text=golden.text, seed=1)
-            _, err = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == EXIT["device"], err
+    serve_until_lost(server, golden, IN_FLOAT32, "CUDA_ERROR_LAUNCH_FAILED", 20, 60, seed=1)
 
 
 def test_sizes_are_told_without_memory(vla, golden):

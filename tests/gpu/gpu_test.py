@@ -215,25 +215,31 @@ def test_a_device_that_is_lost_is_an_error_wherever_it_happens(losing, golden, t
         assert re.search(rf"^error: device: vulkan:0, [^\n]+: {LOST}", answer.err, re.M), (at, answer.err)
 
 
-def test_a_server_whose_device_is_lost_answers_device_and_ends(losing, golden, tmp_path):
+def serve_until_lost(program, golden, options, lost, n_act, limit, **solver):
+    """Acts of a server until one answers that the device is lost, within n_act of them. What the server, which must end, says."""
     import vla_cpp
 
-    losing()(*golden.arguments(options=["--json", *DEVICE]), limit=LIMIT)
-    program = losing((tmp_path / "n").stat().st_size + 1)  # after the act that warms it up, in the first or second one
-    command = [program.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *DEVICE]
+    command = [program.path, "serve", golden.bundle, "--bind", "tcp://127.0.0.1:0", *options]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=program.environment) as server:
         try:
             line = server.stdout.readline()
             images = {view: file.read_bytes() for view, file in golden.images.items()}
-            with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=LIMIT) as client:
-                with pytest.raises(vla_cpp.DeviceError, match="ErrorDeviceLost"):
-                    for _ in range(3):
-                        client.act(images=images, state=golden.state, text=golden.text, noise=np.load(golden.noise))
+            with vla_cpp.Client(re.search(r"address=(\S+)", line)[1], timeout=limit) as client:
+                with pytest.raises(vla_cpp.DeviceError, match=lost):
+                    for _ in range(n_act):
+                        client.act(images=images, state=golden.state, text=golden.text, **solver)
             _, err = server.communicate(timeout=60)
         finally:
             server.kill()
     assert server.returncode == EXIT["device"], err
+    return err
+
+
+def test_a_server_whose_device_is_lost_answers_device_and_ends(losing, golden, tmp_path):
+    losing()(*golden.arguments(options=["--json", *DEVICE]), limit=LIMIT)
+    program = losing((tmp_path / "n").stat().st_size + 1)  # after the act that warms it up, in the first or second one
+    err = serve_until_lost(program, golden, DEVICE, "ErrorDeviceLost", 3, LIMIT, noise=np.load(golden.noise))
     assert re.search(rf"^error: device: vulkan:0, [^\n]+: {LOST}", err, re.M), err
 
 
