@@ -13,11 +13,7 @@ namespace {
 Result<RandomBundle> make_random(const Request& request, const Watcher& watcher) {
   VLA_TRY(const PolicyEntry entry, find_policy(request.arch));
   watcher.tell(fmt::format("filling {} with random weights", request.arch));
-  RandomSizes sizes;
-  sizes.n_view = request.sizes.n_view.value_or(sizes.n_view);
-  sizes.max_tokens = request.sizes.n_text.value_or(sizes.max_tokens);
-  sizes.dtype = request.dtype;
-  return RandomBundle::make(request.arch, entry.published(), sizes);
+  return RandomBundle::make(request.arch, entry.published(), random_sizes(request));
 }
 
 /// Before the machine is measured, which takes seconds. Errors: those of Bundle::open.
@@ -49,6 +45,14 @@ Result<std::vector<Series>> run_all(Engine& engine, Workload& workload, const st
 }
 
 }  // namespace
+
+RandomSizes random_sizes(const Request& request) {
+  RandomSizes sizes;
+  sizes.n_view = request.sizes.n_view.value_or(sizes.n_view);
+  sizes.max_tokens = request.sizes.n_text.value_or(sizes.max_tokens);
+  sizes.dtype = request.dtype;
+  return sizes;
+}
 
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,
                        const Watcher& watcher) {

@@ -19,6 +19,9 @@ struct Request {
   std::string kernels, device, embodiment;
 };
 
+/// Of the random weights that stand in for a bundle.
+RandomSizes random_sizes(const Request& request);
+
 /// Measures the machine, then the policy, then the machine again. `accept` sees the conditions before the first round
 /// and may refuse them. Errors: usage, out_of_memory, and those of Engine.
 Result<Report> measure(const Request& request, const std::function<Status(const Conditions&)>& accept,

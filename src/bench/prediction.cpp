@@ -16,10 +16,8 @@ constexpr double kMs = 1e3;
 
 Result<RandomBundle> make_zeros(const Request& request) {
   VLA_TRY(const PolicyEntry entry, find_policy(request.arch));
-  RandomSizes sizes;
-  sizes.n_view = request.sizes.n_view.value_or(sizes.n_view);
-  sizes.max_tokens = request.sizes.n_text.value_or(sizes.max_tokens);
-  sizes.dtype = request.dtype, sizes.is_filled = false;
+  RandomSizes sizes = random_sizes(request);
+  sizes.is_filled = false;
   return RandomBundle::make(request.arch, entry.published(), sizes);
 }
 
