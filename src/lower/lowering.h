@@ -148,6 +148,8 @@ std::size_t stage_of(const Lowering& l, const Step& step);
 /// Strides of elements that lie one after the other.
 Shape contiguous_strides(const Shape& shape);
 bool is_contiguous(const Value& value);
+/// The elements of a value one after the other.
+std::vector<float> contiguous(const float* data, const Shape& shape, const Shape& stride);
 /// Whether all rows lie at the same distance: then that, else -1.
 std::int64_t row_stride(const Value& value);
 

@@ -18,6 +18,17 @@ bool is_contiguous(const Value& value) {
   return true;
 }
 
+std::vector<float> contiguous(const float* data, const Shape& shape, const Shape& stride) {
+  std::vector<float> values;
+  values.reserve(static_cast<std::size_t>(count(shape)));
+  for (std::int64_t a = 0; a < shape[3]; ++a)
+    for (std::int64_t b = 0; b < shape[2]; ++b)
+      for (std::int64_t c = 0; c < shape[1]; ++c)
+        for (std::int64_t d = 0; d < shape[0]; ++d)
+          values.push_back(data[a * stride[3] + b * stride[2] + c * stride[1] + d * stride[0]]);
+  return values;
+}
+
 std::int64_t row_stride(const Value& value) {
   if (value.shape[0] != 1 && value.stride[0] != 1) return -1;
   std::int64_t row = value.shape[0], n = 0;  // rows seen so far

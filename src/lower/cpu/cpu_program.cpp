@@ -117,14 +117,7 @@ Status CpuProgram::run(std::span<const kernels::Phase> phases) {
 
 std::vector<float> CpuProgram::tap(std::size_t i) const {
   const auto& [data, shape, stride] = tap_places_[i];
-  std::vector<float> values;
-  values.reserve(static_cast<std::size_t>(count(shape)));
-  for (std::int64_t a = 0; a < shape[3]; ++a)
-    for (std::int64_t b = 0; b < shape[2]; ++b)
-      for (std::int64_t c = 0; c < shape[1]; ++c)
-        for (std::int64_t d = 0; d < shape[0]; ++d)
-          values.push_back(data[a * stride[3] + b * stride[2] + c * stride[1] + d * stride[0]]);
-  return values;
+  return contiguous(data, shape, stride);
 }
 
 }  // namespace vla::lower

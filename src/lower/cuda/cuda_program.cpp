@@ -21,10 +21,10 @@ Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_
   std::unique_ptr<CudaProgram> program(new CudaProgram);
   program->queue_ = std::move(queue), program->memory_ = std::move(memory);
   VLA_CHECK(program->give_addresses(l, *program->memory_.back()));
-  VLA_CHECK(program->make_parts(l));
+  VLA_TRY(const std::vector<int> n_launch, program->make_parts(l));
   VLA_CHECK(program->make_marks(l));
   program->make_taps(l);
-  if (model != nullptr) program->predictions_ = predict(l, *model);
+  if (model != nullptr) program->predictions_ = predict(l, n_launch, *model);
   return std::unique_ptr<Program>(std::move(program));
 }
 
@@ -70,7 +70,8 @@ CudaProgram::~CudaProgram() {
   queue_->forget(run_);
 }
 
-Status CudaProgram::make_parts(const CudaLowering& l) {
+Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
+  std::vector<int> n_launch;
   for (const Graph::Stage& stage : l.graph.stages()) stages_.push_back({stage.name, {}});
   work_.resize(stages_.size() + 1);
   prepare_.phases.resize(static_cast<std::size_t>(l.n_prepare));
@@ -81,9 +82,10 @@ Status CudaProgram::make_parts(const CudaLowering& l) {
     CudaPart& part = is_prepared ? prepare_ : run_;
     if (!op.invariant) work_[stage_of(l, op)] += work_of(l, op);
     text_ += text_of(l, op, calls);
+    n_launch.push_back(static_cast<int>(calls.size()));
     part.phases[static_cast<std::size_t>(is_prepared ? op.phase : op.phase - l.n_prepare)].push_back(std::move(calls));
   }
-  return {};
+  return n_launch;
 }
 
 /// A mark behind the last phase of each stage, and one at the end.
@@ -117,16 +119,9 @@ std::vector<float> CudaProgram::tap(std::size_t i) const {
   const auto& [data, shape, stride] = tap_places_[i];
   std::int64_t last = 0;
   for (std::size_t d = 0; d < 4; ++d) last += (shape[d] - 1) * stride[d];
-  std::vector<float> all(static_cast<std::size_t>(last + 1)), values;
+  std::vector<float> all(static_cast<std::size_t>(last + 1));
   queue_->get(all.data(), data, all.size() * sizeof(float));
-  values.reserve(static_cast<std::size_t>(count(shape)));
-  for (std::int64_t a = 0; a < shape[3]; ++a)
-    for (std::int64_t b = 0; b < shape[2]; ++b)
-      for (std::int64_t c = 0; c < shape[1]; ++c)
-        for (std::int64_t d = 0; d < shape[0]; ++d)
-          values.push_back(
-              all[static_cast<std::size_t>(a * stride[3] + b * stride[2] + c * stride[1] + d * stride[0])]);
-  return values;
+  return contiguous(all.data(), shape, stride);
 }
 
 }  // namespace vla::lower

@@ -35,7 +35,8 @@ class CudaProgram final : public Program {
     Shape shape, stride;
   };
   Status give_addresses(CudaLowering& l, const cuda::Buffer& arena);
-  Status make_parts(const CudaLowering& l);
+  /// How many kernels each operation is.
+  Result<std::vector<int>> make_parts(const CudaLowering& l);
   Status make_marks(const CudaLowering& l);
   void make_taps(const CudaLowering& l);
 

@@ -9,20 +9,51 @@ namespace vla::lower {
 namespace {
 
 constexpr double kTera = 1e12, kGiga = 1e9, kMicro = 1e-6;
-constexpr std::size_t kGiB = std::size_t{1} << 30;
 
 // Sources: NVIDIA's data sheets and white papers of AGX Orin, GA102, GB202 and H100. That mma.sync, which our
 // kernels use, reaches 0.62 of the H100's tensor units, and what launches in graphs take, are from memory of what
 // others report, and never checked.
 constexpr GpuModel kModels[] = {
-    {"orin-agx", "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz", 16, 64 * kGiB, 42.6 * kTera, 85 * kTera, 5.3 * kTera,
-     10.6 * kTera, 204.8 * kGiga, 2.5 * kMicro, 1.35},
-    {"rtx-3060", "GeForce RTX 3060 12 GB, 28 SMs at 1.78 GHz", 28, 12 * kGiB, 25.5 * kTera, 102 * kTera, 12.7 * kTera,
-     25.5 * kTera, 360 * kGiga, 1.3 * kMicro, 1.0},
-    {"rtx-5090", "GeForce RTX 5090 32 GB, 170 SMs at 2.41 GHz", 170, 32 * kGiB, 209.5 * kTera, 838 * kTera,
-     104.8 * kTera, 209.6 * kTera, 1792 * kGiga, 1.0 * kMicro, 1.0},
-    {"h100", "H100 SXM 80 GB, 132 SMs at 1.83 GHz", 132, 80 * kGiB, 0.62 * 989 * kTera, 0.62 * 1979 * kTera,
-     66.9 * kTera, 133.8 * kTera, 3350 * kGiga, 1.0 * kMicro, 1.35},
+    {.name = "orin-agx",
+     .description = "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz",
+     .n_sm = 16,
+     .bf16 = 42.6 * kTera,
+     .int8 = 85 * kTera,
+     .f32 = 5.3 * kTera,
+     .dot4 = 10.6 * kTera,
+     .bandwidth = 204.8 * kGiga,
+     .launch = 2.5 * kMicro,
+     .attention = 1.35},
+    {.name = "rtx-3060",
+     .description = "GeForce RTX 3060 12 GB, 28 SMs at 1.78 GHz",
+     .n_sm = 28,
+     .bf16 = 25.5 * kTera,
+     .int8 = 102 * kTera,
+     .f32 = 12.7 * kTera,
+     .dot4 = 25.5 * kTera,
+     .bandwidth = 360 * kGiga,
+     .launch = 1.3 * kMicro,
+     .attention = 1.0},
+    {.name = "rtx-5090",
+     .description = "GeForce RTX 5090 32 GB, 170 SMs at 2.41 GHz",
+     .n_sm = 170,
+     .bf16 = 209.5 * kTera,
+     .int8 = 838 * kTera,
+     .f32 = 104.8 * kTera,
+     .dot4 = 209.6 * kTera,
+     .bandwidth = 1792 * kGiga,
+     .launch = 1.0 * kMicro,
+     .attention = 1.0},
+    {.name = "h100",
+     .description = "H100 SXM 80 GB, 132 SMs at 1.83 GHz",
+     .n_sm = 132,
+     .bf16 = 0.62 * 989 * kTera,
+     .int8 = 0.62 * 1979 * kTera,
+     .f32 = 66.9 * kTera,
+     .dot4 = 133.8 * kTera,
+     .bandwidth = 3350 * kGiga,
+     .launch = 1.0 * kMicro,
+     .attention = 1.35},
 };
 
 /// What an operation asks of a GPU.
@@ -99,7 +130,7 @@ Result<GpuModel> find_gpu_model(const std::string& name) {
   return Error{Code::usage, "model", "one of " + names, name};
 }
 
-std::vector<Program::Prediction> predict(const CudaLowering& l, const GpuModel& gpu) {
+std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vector<int>& n_launch, const GpuModel& gpu) {
   const Costs costs(l, gpu);
   const std::size_t n_stage = l.graph.stages().size() + 1;
   std::vector<Program::Prediction> all(n_stage + 1);  // the last is that of `prepare`
@@ -107,17 +138,16 @@ std::vector<Program::Prediction> predict(const CudaLowering& l, const GpuModel& 
   for (std::size_t first = 0, end = 0; first < l.ops.size(); first = end) {
     Cost together;
     double alone = 0;
-    int longest = 0, n_launch = 0;
+    int longest = 0, n_kernel = 0;
     for (; end < l.ops.size() && l.ops[end].phase == l.ops[first].phase; ++end) {
-      const Result<Calls> calls = emit(l, l.ops[end]);
-      const Cost cost = costs.of(l.ops[end], calls ? static_cast<int>(calls->size()) : 0);
+      const Cost cost = costs.of(l.ops[end], n_launch[end]);
       together.products += cost.products, together.bytes += cost.bytes;
-      alone = std::max(alone, cost.alone), longest = std::max(longest, cost.n_launch), n_launch += cost.n_launch;
+      alone = std::max(alone, cost.alone), longest = std::max(longest, cost.n_launch), n_kernel += cost.n_launch;
     }
     const bool is_prepared = l.ops[first].phase < l.n_prepare;
     Program::Prediction prediction;
     prediction.products = std::max(together.products, alone), prediction.bytes = together.bytes / gpu.bandwidth;
-    prediction.launches = longest * gpu.launch, prediction.n_launch = n_launch;
+    prediction.launches = longest * gpu.launch, prediction.n_launch = n_kernel;
     prediction.seconds = std::max(prediction.products, prediction.bytes) + prediction.launches;
     all[is_prepared ? n_stage : stage_of(l, l.ops[first])] += prediction;
   }

@@ -13,12 +13,11 @@ namespace vla::lower {
 struct GpuModel {
   const char *name, *description;
   int n_sm;
-  std::size_t memory;  // bytes
-  double bf16, int8;   // operations a second of tensor units by our instructions (mma.sync), sums in float32 and int32
-  double f32, dot4;    // of fused multiply-adds of floats, and of four bytes at a time
-  double bandwidth;    // bytes a second
-  double launch;       // seconds between a kernel of a graph and one that waits for it
-  double attention;    // times the tensor units' time, as other units need more (docs/gpu.md)
+  double bf16, int8;  // operations a second of tensor units by our instructions (mma.sync), sums in float32 and int32
+  double f32, dot4;   // of fused multiply-adds of floats, and of four bytes at a time
+  double bandwidth;   // bytes a second
+  double launch;      // seconds between a kernel of a graph and one that waits for it
+  double attention;   // times the tensor units' time, as other units need more (docs/gpu.md)
 };
 
 /// Errors: usage.
@@ -26,7 +25,7 @@ Result<GpuModel> find_gpu_model(const std::string& name);
 
 /// How long the phases of a program take on it at best: products in whole waves of blocks at the peak of their units,
 /// or all operands once over the memory, whichever takes longer, and a launch. Entries as Program::predictions has
-/// them.
-std::vector<Program::Prediction> predict(const CudaLowering& l, const GpuModel& gpu);
+/// them. n_launch: of the kernels that each operation is.
+std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vector<int>& n_launch, const GpuModel& gpu);
 
 }  // namespace vla::lower
