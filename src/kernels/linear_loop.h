@@ -134,14 +134,7 @@ class LinearLoop {
     for (std::int64_t r = 0; r < n_row; ++r) {
       X* to = scratch_->x + place(r, 0);
       if (job_.window.size > 0) {
-        // Where x stays as it is, what the window covers is put where it is multiplied.
-        float* room = scratch_->row_of_x;
-        if constexpr (std::is_same_v<X, float>) room = to;
-        job_.window.copy(reinterpret_cast<const float*>(job_.x), row + r, k, depth, room);
-        if (static_cast<const void*>(room) != to)
-          Tile::copy(room, depth, to);
-        else
-          std::memset(room + depth, 0, static_cast<std::size_t>(round_up(depth, kPanelDepth) - depth) * sizeof(float));
+        take_place(row + r, k, depth, to);
         continue;
       }
       const std::int64_t from = (row + r) * job_.x_stride;
@@ -150,6 +143,18 @@ class LinearLoop {
       else
         Tile::copy(job_.norm(reinterpret_cast<const float*>(job_.x) + from, job_.d_in, scratch_->row_of_x) + k, depth,
                    to);
+    }
+  }
+
+  /// What the window covers at a place, from depth k on: where x stays as it is, straight to where it is multiplied.
+  void take_place(std::int64_t place, std::int64_t k, std::int64_t depth, X* to) {
+    const auto* images = reinterpret_cast<const float*>(job_.x);
+    if constexpr (std::is_same_v<X, float>) {
+      job_.window.copy(images, place, k, depth, to);
+      std::memset(to + depth, 0, static_cast<std::size_t>(round_up(depth, kPanelDepth) - depth) * sizeof(float));
+    } else {
+      job_.window.copy(images, place, k, depth, scratch_->row_of_x);
+      Tile::copy(scratch_->row_of_x, depth, to);
     }
   }
 

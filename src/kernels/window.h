@@ -32,7 +32,7 @@ struct Window {
     }
   }
 
-  /// Of each number of a pixel the largest that the window covers inside the image.
+  /// Of each element of a pixel the largest that the window covers inside the image.
   VLA_INLINE void largest(RowKernel larger, const float* images, std::int64_t place, float* to) const {
     const Corner corner = corner_of(place);
     bool is_first = true;
@@ -52,7 +52,6 @@ struct Window {
   struct Corner {
     std::int64_t image, x, y;
   };
-  static VLA_INLINE std::int64_t max(std::int64_t a, std::int64_t b) { return a > b ? a : b; }
 
   VLA_INLINE Corner corner_of(std::int64_t place) const {
     const std::int64_t n = n_column * n_row;

@@ -52,12 +52,12 @@ Result<Arithmetic> Arithmetic::on_cpu(const std::string& kernels, Features machi
 
 Result<Arithmetic> Arithmetic::on_device(const std::string& kernels, const std::string& device) {
   const bool has_own = device.starts_with("cuda");
+  const Backend best = has_own ? Backend::own : Backend::ggml;
   if (kernels == kernel_set::ggml.name) return Arithmetic{Backend::ggml, {}};
-  if (kernels.empty()) return Arithmetic{has_own ? Backend::own : Backend::ggml, {}};
-  if (kernels == kFloat32)
-    return has_own ? Arithmetic{Backend::own, {}, Rounding::float32} : Arithmetic{Backend::ggml, {}};
-  if (kernels == kBf16) return Arithmetic{has_own ? Backend::own : Backend::ggml, {}, Rounding::bf16};
-  if (kernels == kInt8 && has_own) return Arithmetic{Backend::own, {}, Rounding::int8};
+  if (kernels.empty()) return Arithmetic{best, {}};
+  if (kernels == kFloat32) return Arithmetic{best, {}, has_own ? Rounding::float32 : Rounding::none};
+  if (kernels == kBf16) return Arithmetic{best, {}, Rounding::bf16};
+  if (kernels == kInt8 && has_own) return Arithmetic{best, {}, Rounding::int8};
   return Error{Code::usage, "kernels",
                fmt::format("none, float32, bf16{} or ggml with device {}", has_own ? ", int8" : "", device), kernels,
                "other kernels are the CPU's"};
