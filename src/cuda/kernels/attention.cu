@@ -74,10 +74,7 @@ VLA_DEVICE void store_y(const AttentionJob& job, const Unit& unit, int row, int 
                            head_of(job, unit, row)) *
                               job.d_head +
                           i;
-  if (job.is_bf16)
-    static_cast<std::uint16_t*>(job.y)[at] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
-  else
-    static_cast<float*>(job.y)[at] = value;
+  store(job.y, job.is_bf16, at, value);
 }
 
 // On tensor cores: a warp has 16 rows, a block 64

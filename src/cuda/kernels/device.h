@@ -124,6 +124,13 @@ constexpr int kLanes = 32;
 
 VLA_DEVICE int thread_index() { return static_cast<int>(threadIdx.x); }
 VLA_DEVICE float from_bf16(std::uint16_t bits) { return dev::float_of(static_cast<int>(bits) << 16); }
+/// Element `at` of what is bf16 or float32.
+VLA_DEVICE void store(void* y, bool is_bf16, std::int64_t at, float value) {
+  if (is_bf16)
+    static_cast<std::uint16_t*>(y)[at] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
+  else
+    static_cast<float*>(y)[at] = value;
+}
 
 /// Over the lanes of a warp, for all of them, in the same order everywhere.
 VLA_DEVICE float sum_of_warp(float x) {

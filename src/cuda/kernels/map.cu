@@ -24,10 +24,7 @@ VLA_KERNEL(map_elements, 256, 4, MapJob) {
     if (job.operation == MapOperation::multiply) value = dev::multiply(value, job.b[b]);
     value = activate(job.activation, value);
     if (job.factor != 1) value = dev::multiply(value, job.factor);  // a copy keeps any bits
-    if (job.is_bf16)
-      static_cast<std::uint16_t*>(job.y)[y] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
-    else
-      static_cast<float*>(job.y)[y] = value;
+    store(job.y, job.is_bf16, y, value);
   }
 }
 

@@ -83,13 +83,8 @@ VLA_KERNEL(norm_rows, 256, 4, NormJob) {
   };
   if (job.type == RowType::codes)
     return store_codes(static_cast<std::byte*>(job.y) + row * job.y_stride, n, room, normed);
-  for (int i = thread_index(); i < n; i += n_thread) {
-    if (job.type == RowType::bf16)
-      static_cast<std::uint16_t*>(job.y)[row * job.y_stride + i] =
-          static_cast<std::uint16_t>(dev::to_bf16(normed(i), 0));
-    else
-      static_cast<float*>(job.y)[row * job.y_stride + i] = normed(i);
-  }
+  for (int i = thread_index(); i < n; i += n_thread)
+    store(job.y, job.type == RowType::bf16, row * job.y_stride + i, normed(i));
 }
 
 /// A warp has a row of a head; a lane the pairs (i, i + d_head / 2) of every 32nd i.
@@ -108,18 +103,12 @@ VLA_KERNEL(head_rows, 128, 4, HeadJob) {
   }
   const auto normed = [&](int i) { return job.weight ? x[i] * factor * job.weight[i] : x[i]; };
   const std::int64_t to = head * job.y_head + token * job.y_token + batch * job.y_batch;
-  const auto store = [&](int i, float value) {
-    if (job.is_bf16)
-      static_cast<std::uint16_t*>(job.y)[to + i] = static_cast<std::uint16_t>(dev::to_bf16(value, 0));
-    else
-      static_cast<float*>(job.y)[to + i] = value;
-  };
   for (int i = lane; i < half; i += kLanes) {
     const float low = normed(i), high = normed(i + half);
     const float cosine = job.table ? job.table[token * job.d_head + i] : 1;
     const float sine = job.table ? job.table[token * job.d_head + half + i] : 0;
-    store(i, low * cosine - high * sine);
-    store(i + half, high * cosine + low * sine);
+    store(job.y, job.is_bf16, to + i, low * cosine - high * sine);
+    store(job.y, job.is_bf16, to + i + half, high * cosine + low * sine);
   }
 }
 
