@@ -159,7 +159,7 @@ class Fuser {
         const Tensor other = next->in[next->in[0].node() == result ? 1 : 0];
         if (other.shape() == result->shape) op.residual = other.node()->id, result = take(next);
       }
-      if (op.residual != kNone && l.target.convolves(weight(linear)))
+      if (op.residual != kNone && l.target.takes_relu(weight(linear)))
         if (const Node* next = only_reader(*result); next != nullptr && is_relu(*next))
           op.ends_in_relu = true, result = take(next);
     }
@@ -313,7 +313,7 @@ class Fuser {
       if (unfold == nullptr || unfold->as<op::Unfold>() == nullptr || unfold->tapped) continue;
       const bool takes =
           std::all_of(l.readers[at(unfold)].begin(), l.readers[at(unfold)].end(), [&](const Node* reader) {
-            return reader->as<op::Linear>() != nullptr && l.target.convolves(weight(*reader));
+            return reader->as<op::Linear>() != nullptr && l.target.takes_windows(weight(*reader));
           });
       if (!takes) continue;
       linear->unfold = unfold, linear->x = operand(*unfold, 0);

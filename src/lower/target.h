@@ -23,8 +23,10 @@ class Target {
   /// The widest row whose norm a product computes as it reads x; 0: it computes
   /// none.
   virtual std::int64_t max_norm(const Param& matrix) const = 0;
-  /// Whether a product takes x as images under a window, and a ReLU behind its residual.
-  virtual bool convolves(const Param& matrix) const = 0;
+  /// Whether a product takes x as images under a window.
+  virtual bool takes_windows(const Param& matrix) const = 0;
+  /// Whether a ReLU behind its residual is part of a product.
+  virtual bool takes_relu(const Param& matrix) const = 0;
   /// How a matrix lies in memory.
   virtual const Encoding& encoding(const Param& matrix) const = 0;
   /// Attention over fewer keys is float32.

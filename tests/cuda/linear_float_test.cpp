@@ -16,7 +16,8 @@ namespace {
 struct Case {
   int n_row, depth, n_column, n_split;
   Activation activation = Activation::none;
-  bool has_bias = false, has_factor = false, has_gate = false, has_residual = false, is_bf16 = false;
+  bool has_bias = false, has_factor = false, has_gate = false, has_residual = false, is_bf16 = false,
+       ends_in_relu = false;
 };
 // Fewer than a tile, and a little more; depths that end within a step and within 16 bytes; every activation and each
 // part of the epilogue.
@@ -27,6 +28,7 @@ constexpr Case kCases[] = {
     {129, 72, 130, 1, Activation::silu, true, true, true, true, true},
     {67, 301, 70, 3, Activation::gelu_erf, true, false, false, true},
     {16, 1000, 35, 4, Activation::relu_squared, false, true},
+    {65, 48, 66, 1, Activation::none, true, false, false, true, false, true},
 };
 
 struct Operands {
@@ -50,7 +52,8 @@ struct Operands {
                  static_cast<double>(weight[static_cast<std::size_t>(n * c.depth + k)]);
         sum = c.has_gate ? activated(c.activation, static_cast<double>(gate[at])) * sum : activated(c.activation, sum);
         if (c.has_factor) sum *= static_cast<double>(factor[column]);
-        y.push_back(sum + (c.has_residual ? static_cast<double>(residual[at]) : 0));
+        if (c.has_residual) sum += static_cast<double>(residual[at]);
+        y.push_back(c.ends_in_relu ? activated(Activation::relu, sum) : sum);
       }
     return y;
   }
@@ -69,7 +72,8 @@ std::vector<float> run(const Operands& of, Multiply multiply) {
   const Device<std::uint16_t> half(static_cast<std::size_t>(c.n_row * stride));
   multiply(Epilogue{c.has_bias ? bias.get() : nullptr, c.has_factor ? factor.get() : nullptr,
                     c.has_gate ? gate.get() : nullptr, c.has_residual ? residual.get() : nullptr,
-                    c.is_bf16 ? static_cast<void*>(half.get()) : y.get(), stride, c.activation, c.is_bf16});
+                    c.is_bf16 ? static_cast<void*>(half.get()) : y.get(), stride, c.activation, c.is_bf16,
+                    c.ends_in_relu});
   const std::vector<float> rows = c.is_bf16 ? widened(half.host()) : y.host();
   std::vector<float> out;
   for (int r = 0; r < c.n_row; ++r) {

@@ -69,6 +69,7 @@ class Trial {
                y.get(),
                c_.d_out,
                Activation::none,
+               false,
                false};
     launch(linear_int8(kind_, shape, job), job);
     if (c_.n_split > 1) launch(finish_int8_partial(job), job);

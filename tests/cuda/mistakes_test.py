@@ -172,8 +172,14 @@ MISTAKES = {
     "the factor comes after the residual": (
         "finish.h",
         "linear_bf16",
-        "return e.residual ? dev::add(sum, e.residual[at]) : sum;",
-        "return e.residual ? dev::add(sum, e.residual[at]) * (e.factor ? e.factor[column] : 1) : sum;",
+        "sum = dev::add(sum, e.residual[at]);",
+        "sum = dev::add(sum, e.residual[at]) * (e.factor ? e.factor[column] : 1);",
+    ),
+    "the last ReLU comes before the residual": (
+        "finish.h",
+        "linear_bf16",
+        "if (e.residual) sum =",
+        "if (e.ends_in_relu) sum = activate(Activation::relu, sum);\n  if (e.residual) return",
     ),
     "no barrier before x is written again": (
         "linear_f32.cu",
@@ -271,9 +277,21 @@ MISTAKES = {
     "an id outside of the table": ("rows.cu", "rows", "id >= 0 && id < job.n_table;", "id < job.n_table;"),
     "steps of another operand": ("map.cu", "map", "b += i * job.b_step[d]", "b += i * job.a_step[d]"),
     "elements behind the last": ("map.cu", "map", "if (rest >= n) return;", ""),
+    # Windows over images.
+    "pixels of the line above": ("window.cu", "window", "column >= job.width || row < 0", "row < 0"),
+    "pixels behind the last line": ("window.cu", "window", " || row >= job.height)", ")"),
+    "a window turned": (
+        "window.cu",
+        "window",
+        "place.column + pixel % job.size,\n                                                    place.row + pixel / job.size",
+        "place.column + pixel / job.size, place.row + pixel % job.size",
+    ),
+    "zeros beyond the image are the largest": ("window.cu", "window", "float most = -INFINITY;", "float most = 0;"),
+    "NaN is not the largest": ("window.cu", "window", "x > most || x != x", "x > most"),
+    "an image too far": ("window.cu", "window", "view * job.height * job.width", "view * job.height * job.height"),
 }
 TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*",
-         "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*"}  # fmt: skip
+         "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*"}  # fmt: skip
 
 
 def outcome(name, ptx, folder):

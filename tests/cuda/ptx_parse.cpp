@@ -218,6 +218,9 @@ class Reader {
     }
     if (starts_with(name, "ld.") || starts_with(name, "st.")) return decode_access(one, name, operands);
     const PtxOperation* operation = find_operation(name);
+    if (starts_with(name, "cvt.") && operation != nullptr && operation->operands[1] == 'd')
+      if (const auto found = registers_.find(operands.at(1)); found != registers_.end() && found->second.type == 'q')
+        operation = find_operation(name + " of 64 bits");  // the bits above those that it takes are passed over
     if (operation == nullptr) throw Fault("unknown instruction " + name);
     one.run = operation->run, one.kind = operation->kind;
     const std::string_view types = operation->operands;

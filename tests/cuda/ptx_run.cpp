@@ -338,6 +338,7 @@ const PtxOperation kOperations[] = {
     {"setp.eq.b64", "pqq", COMPARE(u64, a == b)},
     {"setp.eq.b32", "pdd", COMPARE(u32, a == b)},
     {"cvt.s64.s32", "qd", ONE(i64, i32, a)},
+    {"cvt.s64.s32 of 64 bits", "qq", ONE(i64, i64, static_cast<i32>(a))},
     {"cvt.u64.u32", "qd", ONE(u64, u32, a)},
     {"cvt.u32.u64", "dq", ONE(u32, u64, static_cast<u32>(a))},
     {"cvt.u32.u16", "dd", ONE(u32, u32, a & 0xffff)},

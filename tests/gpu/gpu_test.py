@@ -25,8 +25,6 @@ IN_BF16 = ["--device", KIND, "--kernels", "bf16"]
 LIMITS_OF_VULKAN = pytest.mark.skipif(KIND != "vulkan", reason="only Vulkan's buffers can be made small")
 # Of each family one case on a driver in software; make test-vulkan tries all of them.
 CASES = NAMES if "VLA_ALL_CASES" in os.environ else list({name.split("/")[0]: name for name in NAMES}.values())
-if KIND == "cuda":  # our kernels refuse windows over images
-    CASES = [name for name in CASES if not name.startswith("act/")]
 LIMIT = 300  # seconds, where every shader is compiled for the first time
 # Sums in another order, and a driver's own exp, sin and division: 1e-6 to 1e-5 of the largest in each operation.
 TOLERANCE = 1e-4

@@ -130,3 +130,21 @@ TEST_CASE("attention over few keys rounds nothing, and shares no packed keys wit
   CHECK(n_line("avx512_bf16", "attention") == 1);
   CHECK(n_line("avx512_bf16", "pack") == 2);
 }
+
+TEST_CASE("a product takes a window only where nobody else reads what it covers") {
+  const LowerParams params;
+  const auto text = [&](bool tapped, bool read_again) {
+    GraphRunner r(params.list(), "portable");
+    Graph& g = r.graph;
+    Tensor x = g.add(op::Unfold{{2, 2, 0}}, {input(r, {8, 6, 4, 1})});
+    if (tapped) x = g.name("result", x);
+    Tensor y = activate(g, add(g, params.linear(g, x, 24), input(r, {24, 3, 2, 1})), Activation::relu);
+    if (read_again) y = concat(g, {y, x}, 0);
+    g.write(y, r.slot(std::vector<float>(static_cast<std::size_t>(count(y.shape()))), y.shape()));
+    return r.lower().text();
+  };
+  CHECK(text(false, false).find("unfold, linear") != std::string::npos);
+  CHECK(text(false, false).find("residual, relu") != std::string::npos);
+  CHECK(text(true, false).find("unfold, linear") == std::string::npos);
+  CHECK(text(false, true).find("unfold, linear") == std::string::npos);
+}

@@ -12,12 +12,6 @@ namespace {
 constexpr Activation kActivations[] = {Activation::gelu_tanh, Activation::gelu_erf, Activation::silu, Activation::relu,
                                        Activation::relu_squared};
 
-#ifdef VLA_WITHOUT_WINDOWS
-constexpr bool kHasWindows = false;
-#else
-constexpr bool kHasWindows = true;
-#endif
-
 /// Contiguous, and a part of something wider.
 constexpr Tensor (*kOperands[])(GraphRunner&, const Shape&, float) = {input, strided};
 
@@ -149,8 +143,7 @@ TEST_CASE("patches of several views whose sides a patch need not divide, and squ
   }
 }
 
-TEST_CASE("windows over images, of every size, stride and padding that a convolution has" *
-          doctest::skip(!kHasWindows)) {
+TEST_CASE("windows over images, of every size, stride and padding that a convolution has") {
   const op::Window windows[] = {{7, 2, 3}, {3, 1, 1}, {3, 2, 1}, {1, 2, 0}, {1, 1, 0}, {2, 1, 0}, {5, 3, 4}};
   for (const auto operand : kOperands)
     for (const Shape& images : {Shape{3, 11, 6, 2}, Shape{35, 4, 5, 1}, Shape{1, 1, 3, 1}})
@@ -169,8 +162,7 @@ TEST_CASE("windows over images, of every size, stride and padding that a convolu
       }
 }
 
-TEST_CASE("the largest of a window has no zeros from beyond the image, and is NaN where a pixel is" *
-          doctest::skip(!kHasWindows)) {
+TEST_CASE("the largest of a window has no zeros from beyond the image, and is NaN where a pixel is") {
   const LowerParams params;
   for (const KernelSet& set : usable_kernels()) {
     CAPTURE(name_of(set));
@@ -214,7 +206,7 @@ TEST_CASE("products of x of any strides, with everything that may follow them") 
   });
 }
 
-TEST_CASE("convolutions, with everything that may follow them" * doctest::skip(!kHasWindows)) {
+TEST_CASE("convolutions, with everything that may follow them") {
   const Shape images = {8, 9, 7, 2};
   for (const auto operand : kOperands)
     for (const op::Window& window : {op::Window{1, 2, 0}, op::Window{2, 1, 1}})
@@ -241,24 +233,6 @@ TEST_CASE("convolutions, with everything that may follow them" * doctest::skip(!
     const Tensor x = g.add(op::Unfold{{2, 2, 0}}, {input(r, {8, 6, 4, 1})});
     return concat(g, {p.linear(g, x, 24), x}, 0);
   });
-}
-
-TEST_CASE("a product takes a window only where nobody else reads what it covers" * doctest::skip(!kHasWindows)) {
-  const LowerParams params;
-  const auto text = [&](bool tapped, bool read_again) {
-    GraphRunner r(params.list(), "portable");
-    Graph& g = r.graph;
-    Tensor x = g.add(op::Unfold{{2, 2, 0}}, {input(r, {8, 6, 4, 1})});
-    if (tapped) x = g.name("result", x);
-    Tensor y = activate(g, add(g, params.linear(g, x, 24), input(r, {24, 3, 2, 1})), Activation::relu);
-    if (read_again) y = concat(g, {y, x}, 0);
-    g.write(y, r.slot(std::vector<float>(static_cast<std::size_t>(count(y.shape()))), y.shape()));
-    return r.lower().text();
-  };
-  CHECK(text(false, false).find("unfold, linear") != std::string::npos);
-  CHECK(text(false, false).find("residual, relu") != std::string::npos);
-  CHECK(text(true, false).find("unfold, linear") == std::string::npos);
-  CHECK(text(false, true).find("unfold, linear") == std::string::npos);
 }
 
 TEST_CASE("gated products, whichever of gate and up is recorded first") {
@@ -344,7 +318,7 @@ TEST_CASE("attention with more segments or wider heads than its kernels have roo
   }
 }
 
-TEST_CASE("one graph has every operation there is, and gives the same on all kernels" * doctest::skip(!kHasWindows)) {
+TEST_CASE("one graph has every operation there is, and gives the same on all kernels") {
   std::vector<bool> recorded(std::variant_size_v<Op>);
   check_like_ggml([&](GraphRunner& r, const LowerParams& p) {
     Graph& g = r.graph;

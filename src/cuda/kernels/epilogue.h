@@ -7,8 +7,8 @@
 
 namespace vla::cuda {
 
-/// What follows the sums of a product: y = activation(sum + bias) * factor + residual; or, where there is a gate,
-/// y = activation(gate) * (sum + bias) * factor + residual. All but y may be null.
+/// What follows the sums of a product: y = activation(sum + bias) * factor + residual, or the ReLU of that; or, where
+/// there is a gate, y = activation(gate) * (sum + bias) * factor + residual. All but y may be null.
 struct Epilogue {
   const float* bias;      // [n_column]
   const float* factor;    // [n_column]
@@ -18,6 +18,7 @@ struct Epilogue {
   std::int64_t y_stride;
   Activation activation;
   bool is_bf16;  // y; else float32
+  bool ends_in_relu;
 };
 
 }  // namespace vla::cuda

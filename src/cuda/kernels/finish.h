@@ -25,7 +25,8 @@ VLA_DEVICE float finish(const Epilogue& e, float sum, std::int64_t row, int colu
   if (e.bias) sum = dev::add(sum, e.bias[column]);
   sum = e.gate ? dev::multiply(activate(e.activation, e.gate[at]), sum) : activate(e.activation, sum);
   if (e.factor) sum = dev::multiply(sum, e.factor[column]);
-  return e.residual ? dev::add(sum, e.residual[at]) : sum;
+  if (e.residual) sum = dev::add(sum, e.residual[at]);
+  return e.ends_in_relu ? activate(Activation::relu, sum) : sum;
 }
 
 /// Stores y of two sums side by side, of which the second may lie behind the last column.

@@ -27,7 +27,8 @@ class CpuTarget final : public Target {
   const void* multiplier(const Param& matrix) const override { return weights_.kernel(&matrix); }
   std::size_t max_products() const override { return kernels::LinearJob::kMaxPart; }
   std::int64_t max_norm(const Param& matrix) const override { return weights_.kernel(&matrix)->max_norm; }
-  bool convolves(const Param& matrix) const override { return weights_.kernel(&matrix)->takes_windows; }
+  bool takes_windows(const Param& matrix) const override { return weights_.kernel(&matrix)->takes_windows; }
+  bool takes_relu(const Param& matrix) const override { return takes_windows(matrix); }
   const Encoding& encoding(const Param& matrix) const override { return weights_.encoding(&matrix); }
   std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
   std::size_t alignment() const override { return kAlignment; }

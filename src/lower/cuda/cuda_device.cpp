@@ -27,7 +27,8 @@ class CudaTarget final : public Target {
   std::int64_t max_norm(const Param& matrix) const override {
     return weights_[matrix].kind == MatrixKind::f32 ? 0 : std::numeric_limits<std::int64_t>::max();
   }
-  bool convolves(const Param&) const override { return false; }
+  bool takes_windows(const Param&) const override { return false; }
+  bool takes_relu(const Param&) const override { return true; }
   const Encoding& encoding(const Param& matrix) const override { return weights_[matrix].encoding; }
   std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
   std::size_t alignment() const override { return kAlignment; }

@@ -8,6 +8,7 @@
 #include "cuda/kernels/linear_int8.h"
 #include "cuda/kernels/map.h"
 #include "cuda/kernels/rows.h"
+#include "cuda/kernels/window.h"
 #include "kernels/quantized.h"
 #include "lower/cuda/cuda_lowering.h"
 
@@ -62,7 +63,7 @@ struct Emit {
       end.is_bf16 = l.value(to).type == DType::bf16;
       end.y_stride = end.is_bf16 ? l.value(to).stride[1] : product.weight->shape[1];
       if (!is_gate) {
-        end.activation = linear.activation, end.gate = l.at(op.gate);
+        end.activation = linear.activation, end.gate = l.at(op.gate), end.ends_in_relu = linear.ends_in_relu;
         end.factor = l.at(linear.factor), end.residual = l.at(linear.residual);
       }
       add_product(calls, linear, matrix, *product.weight, end);
@@ -275,9 +276,14 @@ struct Emit {
     return Calls{call(cuda::map_elements(job), job)};
   }
 
-  Error operator()(const WindowOp& window) const {
-    return {Code::unsupported, op_name(window.node->op), "an operation that our kernels for CUDA have",
-            "none of windows over images", "use --kernels ggml"};
+  Emitted operator()(const WindowOp& window) const {
+    const Shape &x = l.value(window.x).shape, &places = window.node->shape;
+    const Value& y = l.value(op.writes[0]);
+    const cuda::WindowJob job = {
+        l.at(window.x),    result(),          y.stride[1],          narrow(x[0]),         narrow(x[1]),
+        narrow(x[2]),      narrow(x[3]),      window.window.size,   window.window.stride, window.window.padding,
+        narrow(places[1]), narrow(places[2]), window.takes_largest, y.type == DType::bf16};
+    return Calls{call(cuda::window_elements(job), job)};
   }
 };
 

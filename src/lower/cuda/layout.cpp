@@ -144,7 +144,7 @@ class Layouts : Copies<CudaLowering> {
   static std::int64_t converted_stride(DType type, std::int64_t n) {
     return type == DType::i8 ? kernels::quantized_stride(n) : type == DType::bf16 ? bf16_stride(n) : n;
   }
-  /// What a product or attention makes and nobody else reads is stored rounded.
+  /// What a product, attention or a window makes and nobody else reads is stored rounded.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
     const bool is_whole =
@@ -154,7 +154,8 @@ class Layouts : Copies<CudaLowering> {
                                     [&](const CudaOp& op) { return !op.writes.empty() && op.writes[0] == what.x; });
     if (maker == l.ops.end()) return;
     const bool is_attention = std::holds_alternative<AttentionOp>(maker->op) && x.shape[0] % 8 == 0;
-    if (!is_attention && !std::holds_alternative<LinearOp>(maker->op)) return;
+    const bool is_other = std::holds_alternative<LinearOp>(maker->op) || std::holds_alternative<WindowOp>(maker->op);
+    if (!is_attention && !is_other) return;
     maker->writes[0] = round.writes[0];
     round.writes.clear();
   }
@@ -189,7 +190,7 @@ class Layouts : Copies<CudaLowering> {
     require_contiguous(op.ids);
   }
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
-  void require_layouts(WindowOp&) {}  // which emit refuses
+  void require_layouts(WindowOp& op) { require_contiguous(op.x); }
 
   CudaOp made_;  // what is added to the operation at hand
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;

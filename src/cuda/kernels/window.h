@@ -1,0 +1,28 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "cuda/kernels/launch.h"
+
+/// What a window covers as it moves over images (op::Window): rows for the product that makes a convolution of them,
+/// or the largest of each feature.
+namespace vla::cuda {
+
+struct WindowJob {
+  const float* x;         // [d, width, height, n_view]
+  void* y;                // a row for each place: d * size * size elements, or d of the largest; float32 or bf16
+  std::int64_t y_stride;  // elements from one row to the next
+  int d, width, height, n_view;
+  int size, stride, padding;
+  int n_column, n_row;  // places of an image
+  bool takes_largest, is_bf16;
+
+  VLA_HOST_DEVICE std::int64_t n_of_row() const {
+    return static_cast<std::int64_t>(takes_largest ? 1 : size * size) * d;
+  }
+  VLA_HOST_DEVICE std::int64_t count() const { return n_of_row() * n_column * n_row * n_view; }
+};
+
+inline Launch window_elements(const WindowJob& job) { return {"window_elements", {blocks(job.count(), 1024)}, 256}; }
+
+}  // namespace vla::cuda
