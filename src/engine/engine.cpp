@@ -125,12 +125,22 @@ Result<StagePredictions> Engine::predict() {
 
 Result<ActionChunk> Engine::act(const Observation& observation, const Noise& noise,
                                 const std::optional<Leftover>& leftover) noexcept {
-  VLA_CHECK(prepare(observation, noise, leftover, prepared_));
+  VLA_CHECK(encode(observation, noise, leftover, prepared_));
   return act(prepared_);
 }
 
 Status Engine::prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                        EncodedObservation& to) const noexcept try {
+  VLA_CHECK(encode(observation, noise, leftover, to));
+  to.pixels_ahead = device_->send(to.inputs.pixels.data(), to.inputs.pixels.size() * sizeof(float));
+  return {};
+} catch (const std::bad_alloc&) {
+  return no_memory();
+}
+
+Status Engine::encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                      EncodedObservation& to) const noexcept try {
+  to.pixels_ahead.reset();
   VLA_TRY(to.robot, robot(observation.embodiment));
   VLA_CHECK(to.robot->encode(observation, noise, leftover, to));
   return inject_inputs(to.inputs);
@@ -153,7 +163,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   std::vector<Tap> taps;
   last_ = {&robot, robot.shape_of(observation)};
   VLA_TRY(Plan * plan, plans_->for_shape(robot.network(), last_->second));
-  plan->set_inputs(in.pixels, in.tokens, in.state);
+  plan->set_inputs(in.pixels, observation.pixels_ahead.get(), in.tokens, in.state);
   plan->set_x(steering ? steering->start : observation.x);
   if (steering) plan->set_steering(*steering);
   record(taps, "pixels", {in.width, in.height, 3, in.n_view}, in.pixels);
@@ -167,6 +177,7 @@ Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   }
   const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
   VLA_CHECK(device_->failure());
+  observation.pixels_ahead.reset();
   for (const Program::Stage& stage : plan->prefix_stages()) clock.lap(timing, stage.name, stage.done);
   clock.lap(timing, "prefix", plan->prefix_ended());
   clock.lap(timing, "steps");

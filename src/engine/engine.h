@@ -57,7 +57,8 @@ class Engine {
   Result<ActionChunk> act(const Observation& observation, const Noise& noise,
                           const std::optional<Leftover>& leftover = {}) noexcept;
   /// The two halves of it: the host's, and the device's with unnormalization. Any thread may prepare an observation
-  /// while another one acts. Errors: of the first bad_observation, unsupported and out_of_memory.
+  /// while another one acts; its images then go to the device meanwhile. Errors: of the first bad_observation,
+  /// unsupported and out_of_memory.
   Status prepare(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                  EncodedObservation& to) const noexcept;
   Result<ActionChunk> act(EncodedObservation& prepared) noexcept;
@@ -101,6 +102,8 @@ class Engine {
   Status open_robots(Bundle file, const EngineOptions& options);
   Status take_injected(const std::vector<Tap>& given);
   Status make_plans();
+  Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
+                EncodedObservation& to) const noexcept;
   Status inject_inputs(Inputs& inputs) const;
   Result<ActionChunk> run(EncodedObservation& observation);
   template <class T>

@@ -100,9 +100,12 @@ Result<std::unique_ptr<Plan>> Plan::build(const Network& network, const InputSha
   return plan;
 }
 
-void Plan::set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens,
+void Plan::set_inputs(std::span<const float> pixels, const Device::Sent* ahead, std::span<const std::int32_t> tokens,
                       std::span<const float> state) {
-  device_.set(*images_, pixels.data(), pixels.size_bytes());
+  if (ahead != nullptr)
+    device_.take(*images_, *ahead);
+  else
+    device_.set(*images_, pixels.data(), pixels.size_bytes());
   if (tokens_ != nullptr) device_.set(*tokens_, tokens.data(), tokens.size_bytes());
   if (state_ != nullptr) device_.set(*state_, state.data(), state.size_bytes());
 }

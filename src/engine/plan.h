@@ -44,7 +44,9 @@ class Plan {
   static Result<std::unique_ptr<Plan>> build(const Network& network, const InputShape& shape,
                                              const PlanContext& context);
 
-  void set_inputs(std::span<const float> pixels, std::span<const std::int32_t> tokens, std::span<const float> state);
+  /// `ahead`: the pixels, where they were sent before; or null.
+  void set_inputs(std::span<const float> pixels, const Device::Sent* ahead, std::span<const std::int32_t> tokens,
+                  std::span<const float> state);
   /// Where the first step starts.
   void set_x(std::span<const float> x);
   std::vector<float> x() const { return device_.get(*x_); }

@@ -26,6 +26,7 @@ struct EncodedObservation {
   std::vector<float> x;  // what the solver starts from
   std::optional<Steering> steering;
   Timing timing;
+  std::unique_ptr<Device::Sent> pixels_ahead;  // where they are on their way to the device already
 };
 
 /// The answer to one observation.

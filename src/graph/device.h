@@ -110,6 +110,16 @@ class Device {
   virtual Status allocate(Slots& slots) = 0;
   virtual void set(const Slot& slot, const void* data, std::size_t size) = 0;
   virtual void get(const Slot& slot, void* data, std::size_t size) const = 0;
+  /// Bytes that went ahead to a device that computes. They must stay until a result of what took them was got.
+  class Sent {
+   public:
+    virtual ~Sent() = default;
+  };
+  /// Sends bytes ahead, which are the caller's again, from any thread. Null where the device, or its memory, is not
+  /// made for it: then they are set. What goes wrong on the way is the failure of the device that takes them.
+  virtual std::unique_ptr<Sent> send(const void* /*data*/, std::size_t /*size*/) { return nullptr; }
+  /// Sets a slot with what this device sent, as large as the slot is.
+  virtual void take(const Slot& /*slot*/, const Sent& /*sent*/) {}
   /// What went wrong once in a call of the device, after which no other succeeds. Errors: device, out_of_memory.
   virtual Status failure() const { return {}; }
   /// The graph's slots must have memory; the graph is not needed afterwards. Errors: out_of_memory, internal,

@@ -59,6 +59,7 @@ struct State {
   FakeDriver driver;
   bool is_lost = false;
   std::set<std::thread::id> users;  // threads that have the context
+  std::thread::id capturing;        // the last that began
   std::map<Address, std::size_t> memory;
   std::map<Handle, std::unique_ptr<Stream>> streams;
   std::map<Handle, std::unique_ptr<Event>> events;
@@ -149,8 +150,10 @@ int enqueue(Handle handle, std::function<void()> run) {
   stream->last = {nodes.size() - 1};
   return 0;
 }
+/// Whether this thread does: others may call what those that capture may not.
 bool captures() {
-  return std::any_of(state.streams.begin(), state.streams.end(), [](const auto& one) { return one.second->captures; });
+  return state.capturing == std::this_thread::get_id() &&
+         std::any_of(state.streams.begin(), state.streams.end(), [](const auto& one) { return one.second->captures; });
 }
 /// Whether [address, address + size) lies in one allocation.
 bool is_allocated(Address address, std::size_t size) {
@@ -234,6 +237,12 @@ struct Calls {
   static int download(void* to, Address from, std::size_t size, Handle stream) {
     if (!is_allocated(from, size)) return kInvalidValue;
     return enqueue(stream, [=] { std::memcpy(to, reinterpret_cast<const void*>(from), size); });
+  }
+
+  static int copy(Address to, Address from, std::size_t size, Handle stream) {
+    if (!is_allocated(to, size) || !is_allocated(from, size)) return kInvalidValue;
+    return enqueue(stream,
+                   [=] { std::memcpy(reinterpret_cast<void*>(to), reinterpret_cast<const void*>(from), size); });
   }
 
   static int stream_create(Handle* stream, unsigned) {
@@ -342,7 +351,7 @@ struct Calls {
     if (captures()) return kCaptureUnsupported;
     state.captured.clear();
     stream->begin_capture();
-    stream->begins_capture = true;
+    stream->begins_capture = true, state.capturing = std::this_thread::get_id();
     return 0;
   }
   static int capture_end(Handle handle, Handle* graph) {

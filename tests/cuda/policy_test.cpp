@@ -5,6 +5,7 @@
 #include <doctest/doctest.h>
 
 #include <cstdlib>
+#include <future>
 #include <map>
 #include <set>
 
@@ -61,18 +62,22 @@ Counts calls_since(const Counts& before) {
 const Counts kAct = {
     {"cuMemcpyHtoDAsync_v2", 1}, {"cuGraphLaunch", 1}, {"cuMemcpyDtoHAsync_v2", 1}, {"cuStreamSynchronize", 1}};
 
-/// Everything that a program does with a policy: the first error, or none.
+/// Everything that a program does with a policy: the first error, or none. A server prepares an act before the one
+/// before is computed.
 Status load_and_act(const GoldenCase& golden) {
   VLA_TRY(const auto engine, Engine::load(golden.bundle(), {.kernels = "float32"}));
   Status first;
-  for (int i = 0; i < 2; ++i) {
-    const auto chunk = engine->act(golden.observation, golden.noise);
+  const auto check = [&](const Result<ActionChunk>& chunk) {
     if (!first) {
       REQUIRE(!chunk.ok());  // a device that failed once fails
       CHECK(chunk.error().message() == first.error().message());
     }
     if (!chunk && first) first = chunk.error();
-  }
+  };
+  for (int i = 0; i < 2; ++i) check(engine->act(golden.observation, golden.noise));
+  EncodedObservation prepared[2];
+  for (EncodedObservation& one : prepared) VLA_CHECK(engine->prepare(golden.observation, golden.noise, {}, one));
+  for (EncodedObservation& one : prepared) check(engine->act(one));
   return first;
 }
 
@@ -133,6 +138,65 @@ TEST_CASE_FIXTURE(Driver, "so is an act that continues the last chunk, after ano
         {"cuMemcpyHtoDAsync_v2", 2}, {"cuGraphLaunch", 2}, {"cuMemcpyDtoHAsync_v2", 2}, {"cuStreamSynchronize", 2}};
     if (i > 0) CHECK(calls_since(before) == twice);
   }
+}
+
+TEST_CASE_FIXTURE(Driver, "images of an act that is prepared travel before the act before is computed") {
+  reset_without_computing();
+  const GoldenCase golden = small_case();
+  const auto engine = load_engine(golden.bundle(), "", "float32");
+  EncodedObservation acts[2];
+  const auto prepare = [&](int i) { REQUIRE(engine->prepare(golden.observation, golden.noise, {}, acts[i % 2])); };
+  prepare(0);
+  for (int i = 0; i < 5; ++i) {
+    Counts before = fake_driver().n_call;
+    prepare(i + 1);
+    const Counts sent = {{"cuMemcpyHtoDAsync_v2", 1}, {"cuEventRecord", 1}};
+    if (i > 0) CHECK(calls_since(before) == sent);
+    before = fake_driver().n_call;
+    REQUIRE(engine->act(acts[i % 2]).ok());
+    Counts computed = kAct;  // the upload is of what is small
+    computed["cuStreamWaitEvent"] = computed["cuMemcpyDtoDAsync_v2"] = 1;
+    if (i > 1) CHECK(calls_since(before) == computed);
+  }
+}
+
+TEST_CASE_FIXTURE(Driver, "acts that another thread prepares meanwhile answer what they answer alone") {
+  test::cuda::reset_fake_driver();
+  const GoldenCase golden = small_case();
+  GoldenCase dark = small_case();
+  for (auto& [view, frame] : dark.observation.views)
+    std::visit([](auto& numbers) { std::fill(numbers.begin(), numbers.end(), 0); }, frame->rgb);
+  const auto engine = load_engine(golden.bundle(), "", "float32");
+  const auto alone = [&](const GoldenCase& one) { return engine->act(one.observation, one.noise)->actions; };
+  const std::vector<float> expected[2] = {alone(golden), alone(dark)};
+  CHECK(expected[0] != expected[1]);
+  EncodedObservation acts[2];
+  const auto prepare = [&](int i) {
+    const GoldenCase& one = i % 2 == 0 ? golden : dark;
+    return engine->prepare(one.observation, one.noise, {}, acts[i % 2]).ok();
+  };
+  REQUIRE(prepare(0));
+  for (int i = 0; i < 4; ++i) {
+    auto next = std::async(std::launch::async, prepare, i + 1);
+    const auto chunk = engine->act(acts[i % 2]);
+    REQUIRE(next.get());
+    REQUIRE_MESSAGE(chunk.ok(), (chunk ? "" : chunk.error().message()));
+    CHECK(chunk->actions == expected[i % 2]);
+  }
+  for (int i = 0; i < 6; ++i) {  // at once: the images are still on their way
+    REQUIRE(prepare(i));
+    CHECK(engine->act(acts[i % 2])->actions == expected[i % 2]);
+  }
+  // One that nobody computes leaves its memory to the next, and one for which memory is short is uploaded in its turn.
+  REQUIRE(prepare(1));
+  REQUIRE(prepare(1));
+  CHECK(engine->act(acts[1])->actions == expected[1]);
+  EncodedObservation third;
+  fake_driver().memory = fake_driver().used;
+  REQUIRE((prepare(0) && prepare(1)));
+  REQUIRE(engine->prepare(golden.observation, golden.noise, {}, third));
+  CHECK(third.pixels_ahead == nullptr);
+  CHECK(engine->act(third)->actions == expected[0]);
 }
 
 TEST_CASE_FIXTURE(Driver, "stages have the device's times, one after the other") {

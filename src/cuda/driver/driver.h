@@ -35,6 +35,7 @@ using Handle = void*;           // a context, stream, event, module, function or
   CALL(host_release, cuMemFreeHost, void* memory)                                                                    \
   CALL(fill, cuMemsetD8Async, Address to, unsigned char value, std::size_t size, Handle stream)                      \
   CALL(upload, cuMemcpyHtoDAsync_v2, Address to, const void* from, std::size_t size, Handle stream)                  \
+  CALL(copy, cuMemcpyDtoDAsync_v2, Address to, Address from, std::size_t size, Handle stream)                        \
   CALL(download, cuMemcpyDtoHAsync_v2, void* to, Address from, std::size_t size, Handle stream)                      \
   CALL(stream_create, cuStreamCreate, Handle* stream, unsigned flags)                                                \
   CALL(stream_destroy, cuStreamDestroy_v2, Handle stream)                                                            \

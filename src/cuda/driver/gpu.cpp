@@ -144,17 +144,16 @@ Result<Owned> Gpu::allocate_host(std::size_t size) {
 }
 
 Result<Stream> Gpu::stream() {
-  Handle stream = nullptr, event = nullptr;
+  Handle stream = nullptr;
   const int made = driver_.stream_create(&stream, kNonBlocking);
   VLA_TRY(Owned owned, own("stream_create", made, stream, driver_.stream_destroy));
-  const int made_event = driver_.event_create(&event, kNoTiming);
-  VLA_TRY(Owned owned_event, own("event_create", made_event, event, driver_.event_destroy));
-  return Stream(*this, std::move(owned), std::move(owned_event));
+  VLA_TRY(Owned ending, event(false));
+  return Stream(*this, std::move(owned), std::move(ending));
 }
 
-Result<Owned> Gpu::event() {
+Result<Owned> Gpu::event(bool has_time) {
   Handle event = nullptr;
-  const int made = driver_.event_create(&event, 0);
+  const int made = driver_.event_create(&event, has_time ? 0 : kNoTiming);
   return own("event_create", made, event, driver_.event_destroy);
 }
 
@@ -199,12 +198,15 @@ Status Stream::upload(Address to, const void* from, std::size_t size) {
 Status Stream::download(void* to, Address from, std::size_t size) {
   return CALL(download, to, from, size, stream_.get());
 }
+Status Stream::copy(Address to, Address from, std::size_t size) { return CALL(copy, to, from, size, stream_.get()); }
 Status Stream::wait() { return CALL(stream_wait, stream_.get()); }
 
 Status Stream::after(Stream& other) {
-  VLA_CHECK(CALL(event_record, other.event_.get(), other.stream_.get()));
-  return CALL(stream_wait_event, stream_.get(), other.event_.get(), 0);
+  VLA_CHECK(other.record(other.event_));
+  return after(other.event_);
 }
+Status Stream::record(const Owned& event) { return CALL(event_record, event.get(), stream_.get()); }
+Status Stream::after(const Owned& event) { return CALL(stream_wait_event, stream_.get(), event.get(), 0); }
 
 Status Stream::note_time(const Owned& event) {
   constexpr unsigned kExternal = 1;  // a node of the graph, instead of a point that other streams wait for

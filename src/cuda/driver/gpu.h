@@ -58,6 +58,8 @@ class Stream {
   /// Host memory must stay until the stream was waited for.
   Status upload(Address to, const void* from, std::size_t size);
   Status download(void* to, Address from, std::size_t size);
+  /// On the device.
+  Status copy(Address to, Address from, std::size_t size);
   template <class Job>
   Status launch(const Launch& how, const Job& job) {
     return launch_job(how, &job);
@@ -68,6 +70,10 @@ class Stream {
   Status wait();
   /// What comes next begins when all that is in `other` has ended.
   Status after(Stream& other);
+  /// `event` stands for all that is in here until now.
+  Status record(const Owned& event);
+  /// What comes next begins when all has ended that `event` stands for.
+  Status after(const Owned& event);
   /// While operations are captured: has `event` note the time whenever the graph comes here.
   Status note_time(const Owned& event);
 
@@ -117,8 +123,8 @@ class Gpu {
   /// Memory of the host that the device reads and writes without the processor.
   Result<Owned> allocate_host(std::size_t size);
   Result<Stream> stream();
-  /// For Stream::note_time.
-  Result<Owned> event();
+  /// For Stream::note_time, or for `record` where it has no time.
+  Result<Owned> event(bool has_time);
   /// Milliseconds between the times that two events noted.
   Result<float> elapsed(const Owned& first, const Owned& second) const;
   /// Bytes of device memory.

@@ -93,6 +93,10 @@ void CudaDevice::set(const Slot& slot, const void* data, std::size_t size) {
   queue_->set(reinterpret_cast<cuda::Address>(slot.place), data, size);
 }
 
+void CudaDevice::take(const Slot& slot, const Sent& sent) {
+  queue_->take(reinterpret_cast<cuda::Address>(slot.place), static_cast<const CudaSent&>(sent), slot.size());
+}
+
 void CudaDevice::get(const Slot& slot, void* data, std::size_t size) const {
   queue_->get(data, reinterpret_cast<cuda::Address>(slot.place), size);
 }

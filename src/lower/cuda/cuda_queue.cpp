@@ -34,7 +34,8 @@ Result<std::unique_ptr<CudaQueue>> CudaQueue::open(const cuda::Driver& driver, i
     VLA_TRY(cuda::Stream side, queue->gpu_->stream());
     queue->side_.push_back(std::move(side));
   }
-  VLA_TRY(queue->end_, queue->gpu_->event());
+  VLA_TRY(queue->end_, queue->gpu_->event(true));
+  VLA_TRY(queue->sender_, CudaSender::open(queue->gpu_));
   return queue;
 }
 
@@ -68,7 +69,7 @@ Result<cuda::Owned> CudaQueue::event() {
   if (is_dry_) return cuda::Owned();
   VLA_CHECK(failure_);
   VLA_CHECK(keep(gpu_->use()));
-  Result<cuda::Owned> made = gpu_->event();
+  Result<cuda::Owned> made = gpu_->event(true);
   if (!made) static_cast<void>(keep(made.error()));
   return made;
 }
@@ -98,10 +99,11 @@ Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
     if (to >= end && to - end < kPadding) gap = static_cast<std::size_t>(to - end);
   }
   const bool joins = gap < kPadding;
-  if (n_staged_ + size + kPadding > staging_.size) {
+  if (n_staged_ + size + kPadding > staging_.size) {  // until there is room for all that an act sets
+    const std::size_t enough = 2 * (n_staged_ + size) + kPadding;
     VLA_CHECK(start_uploads());
     VLA_CHECK(wait());
-    VLA_CHECK(grow(staging_, 2 * size + kPadding));
+    VLA_CHECK(grow(staging_, enough));
     return stage(to, from, size);
   }
   if (joins) {
@@ -113,6 +115,23 @@ Status CudaQueue::stage(cuda::Address to, const void* from, std::size_t size) {
   std::memcpy(staging_.at(n_staged_), from, size);
   n_staged_ += size;
   return {};
+}
+
+std::unique_ptr<CudaSent> CudaQueue::send(const void* data, std::size_t size) {
+  return is_dry_ || size == 0 ? nullptr : sender_->send(data, size);
+}
+
+void CudaQueue::take(cuda::Address to, const CudaSent& sent, std::size_t size) {
+  if (failure_) static_cast<void>(keep(copy(to, sent, size)));
+}
+
+Status CudaQueue::copy(cuda::Address to, const CudaSent& sent, std::size_t size) {
+  VLA_CHECK(sent.status());
+  VLA_CHECK(gpu_->use());
+  VLA_CHECK(launch());  // it reads what was there before
+  VLA_CHECK(start_uploads());
+  VLA_CHECK(main_->after(sent.arrived()));
+  return main_->copy(to, sent.address(), size);
 }
 
 Status CudaQueue::upload(cuda::Address to, const void* from, std::size_t size) {

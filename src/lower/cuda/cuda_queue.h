@@ -9,7 +9,7 @@
 #include <string>
 #include <vector>
 
-#include "cuda/driver/gpu.h"
+#include "lower/cuda/cuda_sender.h"
 
 namespace vla::lower {
 
@@ -60,7 +60,10 @@ class CudaQueue {
   /// Bytes on their way to the device, before what runs next. Those that lie side by side there go together. They are
   /// the caller's again.
   void set(cuda::Address to, const void* from, std::size_t size);
-  /// The same at once, for much.
+  /// Bytes ahead of the act that takes them, from any thread; null of a dry device, and where memory is short.
+  std::unique_ptr<CudaSent> send(const void* data, std::size_t size);
+  void take(cuda::Address to, const CudaSent& sent, std::size_t size);
+  /// As `set`, at once, for much.
   Status upload(cuda::Address to, const void* from, std::size_t size);
   /// The part must stay until it is forgotten.
   Status run(const CudaPart& part);
@@ -71,7 +74,7 @@ class CudaQueue {
 
  private:
   using Parts = std::vector<const CudaPart*>;
-  explicit CudaQueue(std::unique_ptr<cuda::Gpu> gpu) : n_sm_(gpu->n_sm()), is_dry_(false), gpu_(std::move(gpu)) {}
+  explicit CudaQueue(std::shared_ptr<cuda::Gpu> gpu) : n_sm_(gpu->n_sm()), is_dry_(false), gpu_(std::move(gpu)) {}
   /// Bytes in host memory that the device reads and writes by itself.
   struct HostMemory {
     cuda::Owned memory;
@@ -86,6 +89,7 @@ class CudaQueue {
   Status keep(Status status);
   Status grow(HostMemory& memory, std::size_t size);
   Status stage(cuda::Address to, const void* from, std::size_t size);
+  Status copy(cuda::Address to, const CudaSent& sent, std::size_t size);
   Status download(void* to, cuda::Address from, std::size_t size);
   Status start_uploads();
   Status launch();
@@ -97,10 +101,11 @@ class CudaQueue {
   int n_sm_;
   bool is_dry_;
   cuda::Address next_ = 1 << 20;  // where memory would lie that is not allocated
-  std::unique_ptr<cuda::Gpu> gpu_;
+  std::shared_ptr<cuda::Gpu> gpu_;
   std::unique_ptr<cuda::Stream> main_;
   std::vector<cuda::Stream> side_;
   cuda::Owned end_;  // of a graph
+  std::shared_ptr<CudaSender> sender_;
   HostMemory staging_, landing_;
   std::size_t n_staged_ = 0;  // bytes that are not to be written over
   std::vector<Upload> uploads_;

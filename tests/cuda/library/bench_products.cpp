@@ -34,8 +34,8 @@ constexpr int kSplits[] = {1, 2, 4, 8};
 template <class Job>
 Result<float> time_launches(Gpu& gpu, Stream& stream, const Job& job, const std::vector<Launch>& launches,
                             int n_launch) {
-  VLA_TRY(const Owned first, gpu.event());
-  VLA_TRY(const Owned last, gpu.event());
+  VLA_TRY(const Owned first, gpu.event(true));
+  VLA_TRY(const Owned last, gpu.event(true));
   VLA_CHECK(stream.begin_capture());
   VLA_CHECK(stream.note_time(first));
   for (int i = 0; i < n_launch; ++i)

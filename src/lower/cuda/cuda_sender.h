@@ -1,0 +1,67 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "cuda/driver/gpu.h"
+#include "graph/device.h"
+
+namespace vla::lower {
+
+class CudaSent;
+
+/// Sends bytes to a device while it computes: over a stream of their own, to memory beside the slots, which the act
+/// before may still read. Any thread may send.
+class CudaSender : public std::enable_shared_from_this<CudaSender> {
+ public:
+  /// Errors: device.
+  static Result<std::shared_ptr<CudaSender>> open(std::shared_ptr<cuda::Gpu> gpu);
+  ~CudaSender();
+
+  /// Null where memory is short.
+  std::unique_ptr<CudaSent> send(const void* data, std::size_t size);
+
+ private:
+  friend class CudaSent;
+  /// Memory of the host that the device reads by itself, as much on the device, and what stands for the way between.
+  struct Parcel {
+    std::size_t size;
+    cuda::Owned host;
+    cuda::Buffer device;
+    cuda::Owned arrived;
+  };
+  CudaSender(std::shared_ptr<cuda::Gpu> gpu, cuda::Stream stream) : gpu_(std::move(gpu)), stream_(std::move(stream)) {}
+  Result<std::unique_ptr<Parcel>> take(std::size_t size);
+  Result<std::unique_ptr<Parcel>> start(const void* data, std::size_t size);
+  void give_back(std::unique_ptr<Parcel> parcel);
+
+  std::shared_ptr<cuda::Gpu> gpu_;
+  cuda::Stream stream_;
+  std::mutex mutex_;
+  std::vector<std::unique_ptr<Parcel>> idle_;  // as many as were on their way at once
+  std::size_t n_made_ = 0;
+};
+
+/// What was sent, or why it was not.
+class CudaSent final : public Device::Sent {
+ public:
+  ~CudaSent() override;
+  Status status() const { return parcel_ ? Status() : parcel_.error(); }
+  // Where it was:
+  cuda::Address address() const { return (*parcel_)->device.address(); }
+  const cuda::Owned& arrived() const { return (*parcel_)->arrived; }
+
+ private:
+  friend class CudaSender;
+  using Parcel = std::unique_ptr<CudaSender::Parcel>;
+  CudaSent(std::shared_ptr<CudaSender> sender, Result<Parcel> parcel)
+      : sender_(std::move(sender)), parcel_(std::move(parcel)) {}
+
+  std::shared_ptr<CudaSender> sender_;
+  Result<Parcel> parcel_;
+};
+
+}  // namespace vla::lower
