@@ -7,6 +7,8 @@
 
 #include <cmath>
 
+#include "processor/ops/pipeline.h"
+
 namespace vla::bench {
 namespace {
 
@@ -38,10 +40,9 @@ Result<std::vector<std::byte>> write_png(const std::vector<std::uint8_t>& rgb, i
   return file;
 }
 
-Result<int> count_tokens(const Processor& processor, const std::string& text) {
-  Observation observation;
-  observation.text = text;
+Result<int> count_tokens(const Processor& processor, const Observation& observation) {
   Inputs inputs;
+  VLA_CHECK(processor.encode_state(observation, inputs));  // which a prompt may tell
   VLA_CHECK(processor.encode_text(observation, inputs));
   return static_cast<int>(inputs.tokens.size()) - processor.n_view_tokens();
 }
@@ -50,17 +51,18 @@ Result<int> count_tokens(const Processor& processor, const std::string& text) {
 int most_text(const Processor& processor) { return processor.recipe().max_tokens - processor.n_view_tokens(); }
 
 /// A text of exactly `n_token` tokens: the same word again and again, for a few words that tokenizers cut differently.
-Result<std::string> find_text(const Processor& processor, int n_token) {
+Result<std::string> find_text(const Processor& processor, Observation observation, int n_token) {
   if (n_token == 0 && most_text(processor) == 0) return std::string();
   const int most = most_text(processor);
   if (n_token > most)
     return Error{Code::usage, "--tokens", fmt::format("at most {}, which the bundle allows", most),
                  std::to_string(n_token)};
   for (const char* word : {"the ", "a", "1", "!?"}) {
-    std::string text;
+    std::string& text = observation.text;
+    text.clear();
     for (int i = 0; i < n_token; ++i) {
       text += word;
-      const auto count = count_tokens(processor, text);
+      const auto count = count_tokens(processor, observation);
       if (!count || *count > n_token) break;  // a vocabulary need not have this word
       if (*count == n_token) return text;
     }
@@ -80,8 +82,9 @@ Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes&
                  fmt::format("{} to {}, which the bundle allows", processor.min_views(), views.size()),
                  std::to_string(n_view)};
   const Recipe& recipe = processor.recipe();
-  workload.width_ = sizes.width > 0 ? sizes.width : recipe.width;
-  workload.height_ = sizes.height > 0 ? sizes.height : recipe.height;
+  const CameraSize camera = camera_size(*recipe.fit).value_or(CameraSize{recipe.width, recipe.height});
+  workload.width_ = sizes.width > 0 ? sizes.width : camera.width;
+  workload.height_ = sizes.height > 0 ? sizes.height : camera.height;
   for (int i = 0; i < static_cast<int>(views.size()); ++i) {
     const std::string& view = views[static_cast<std::size_t>(i)];
     workload.observation_.views[view] = std::nullopt;
@@ -94,7 +97,7 @@ Result<Workload> Workload::make(const Processor& processor, const WorkloadSizes&
   for (std::size_t i = 0; i < states.size(); ++i)
     workload.observation_.states[states[i]].assign(static_cast<std::size_t>(processor.state_dims()[i]), 0.0f);
   workload.n_text_ = sizes.n_text.value_or(most_text(processor));
-  VLA_TRY(workload.observation_.text, find_text(processor, workload.n_text_));
+  VLA_TRY(workload.observation_.text, find_text(processor, workload.observation_, workload.n_text_));
   return workload;
 }
 

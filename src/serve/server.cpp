@@ -12,6 +12,7 @@
 #include "base/out_of_memory.h"
 #include "base/thread.h"
 #include "net/descriptors.h"
+#include "processor/ops/pipeline.h"
 #include "serve/gr00t/front.h"
 #ifdef VLA_LEROBOT
 #include "serve/lerobot/front.h"
@@ -58,7 +59,7 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
 Observation largest_observation(const Robot& robot) {
   const Processor& processor = robot.processor();
   const Recipe& recipe = processor.recipe();
-  const int width = recipe.width, height = recipe.height;
+  const auto [width, height] = camera_size(*recipe.fit).value_or(CameraSize{recipe.width, recipe.height});
   const std::vector<std::uint8_t> grey(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3, 128);
   Observation observation;
   for (const std::string& view : processor.views().names()) observation.views.emplace(view, Frame{width, height, grey});

@@ -216,6 +216,22 @@ TEST_CASE("an instruction has exactly the tokens that were asked for") {
   CHECK(Workload::make(*processor, {5, 0, 0, 7}).error().where == "--views");
 }
 
+TEST_CASE("a policy that takes one camera's frames alone, and one whose prompt tells the state, get what they take") {
+  for (const char* name : {"gr00t_n1_5/arms", "pi05/two_views"}) {
+    CAPTURE(name);
+    const auto bundle = Bundle::open(test::golden_path(name + std::string("/bundle.gguf")));
+    REQUIRE(bundle.ok());
+    const auto processor = Processor::create(*bundle);
+    REQUIRE(processor.ok());
+    auto workload = Workload::make(*processor, {});
+    REQUIRE_MESSAGE(workload.ok(), (workload ? "" : workload.error().message()));
+    REQUIRE(workload->decode().ok());
+    const auto inputs = processor->encode(workload->observation());
+    REQUIRE_MESSAGE(inputs.ok(), (inputs ? "" : inputs.error().message()));
+    CHECK(static_cast<int>(inputs->tokens.size()) == processor->recipe().max_tokens);
+  }
+}
+
 TEST_CASE("memory that a process could take is what the system and its group leave") {
   const std::string meminfo = "MemTotal:  8000 kB\nMemAvailable:    2000 kB\n";
   CHECK(free_memory(meminfo, "", "") == 2'048'000);

@@ -157,6 +157,13 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   return {};
 }
 
+std::optional<CameraSize> camera_size(const Fit& fit) {
+  if (const auto* const pipeline = dynamic_cast<const OneFit<Pipeline>*>(&fit))
+    for (const ByteOp& op : pipeline->op.ops)
+      if (const auto* camera = std::get_if<CameraSize>(&op)) return *camera;
+  return {};
+}
+
 std::int64_t fit_work(const Fit& fit, int width, int height) {
   const auto* const pipeline = dynamic_cast<const OneFit<Pipeline>*>(&fit);
   return pipeline != nullptr ? pipeline_work(pipeline->op, width, height) : 0;
