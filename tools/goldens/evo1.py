@@ -358,7 +358,7 @@ def load(checkpoint, dtype="float32"):
         draw = torch.rand
         torch.rand = lambda *shape, **options: (noise.reshape(shape) + 1) / 2  # the head makes 2 * rand - 1 of it
         try:
-            with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=published):
+            with torch.no_grad(), torch.autocast(noise.device.type, torch.bfloat16, enabled=published):
                 return predict(batch)[..., : policy.d_robot]
         finally:
             torch.rand = draw

@@ -5,7 +5,8 @@
     python tools/peers/gpu.py --case DIR --mode eager|compiled|graphs [--rounds 20] [--device cuda]
 
 DIR is what tools/parity_full.py --only write leaves: checkpoint/, frames, an observation, noise.npy.  compiled is torch.compile as it
-comes, graphs the same with CUDA graphs (mode reduce-overhead).  The processor's work is not part of an inference here.
+comes, graphs the same with CUDA graphs (mode reduce-overhead).  The processor's work is not part of an inference here, but of BitVLA's,
+whose reference has no door behind it.
 """
 import argparse
 import json
@@ -27,6 +28,17 @@ def to_device(value, device):
     return value.to(device) if hasattr(value, "to") else value
 
 
+def move(policy, device):
+    """LeRobot's policies are modules. References of authors hold some, and make tensors where torch does by default."""
+    import torch
+
+    modules = [policy] if isinstance(policy, torch.nn.Module) else [part for part in vars(policy).values() if isinstance(part, torch.nn.Module)]
+    for module in modules:
+        module.to(device)
+    if modules != [policy]:
+        torch.set_default_device(device)
+
+
 def main():
     import numpy as np
     import torch
@@ -44,8 +56,8 @@ def main():
     policy, before, _ = recorder.load(args.case / "checkpoint", args.dtype)
     batch = to_device(dict(before(recorder.read_observation(args.case))), args.device)
     noise = torch.from_numpy(np.load(args.case / "noise.npy"))[None].to(args.device)
-    policy = policy.to(args.device)
-    act = policy.predict_action_chunk
+    move(policy, args.device)
+    act = getattr(policy, "predict_action_chunk", None) or (lambda batch, noise: policy.run(batch))
     if MODES[args.mode]:
         act = torch.compile(act, mode=MODES[args.mode])
     wait = torch.cuda.synchronize if args.device.startswith("cuda") else lambda: None
