@@ -53,23 +53,22 @@ void put_in_order(Characters& characters) {
   }
 }
 
-/// No function of the library fails here: the text is UTF-8, the buffer is large enough, and nothing else is taken.
-void append_composed(std::string_view text, std::string& out) {
+void compose(Characters& characters) {
   constexpr auto kCompose = static_cast<utf8proc_option_t>(UTF8PROC_STABLE | UTF8PROC_COMPOSE);
-  Characters characters = decomposed(text);
-  put_in_order(characters);
   const utf8proc_ssize_t count =
       utf8proc_normalize_utf32(characters.data(), static_cast<utf8proc_ssize_t>(characters.size()), kCompose);
-  for (utf8proc_ssize_t i = 0; i < count; ++i) {
-    utf8proc_uint8_t bytes[4];
-    const utf8proc_ssize_t size = utf8proc_encode_char(characters[static_cast<std::size_t>(i)], bytes);
-    out.append(reinterpret_cast<const char*>(bytes), static_cast<std::size_t>(size));
-  }
+  characters.resize(static_cast<std::size_t>(count));
 }
 
-}  // namespace
+/// No function of the library fails here: the text is UTF-8, the buffer is large enough, and nothing else is taken.
+void append_normal(std::string_view text, bool composed, std::string& out) {
+  Characters characters = decomposed(text);
+  put_in_order(characters);
+  if (composed) compose(characters);
+  for (const utf8proc_int32_t c : characters) unicode::append(out, static_cast<std::uint32_t>(c));
+}
 
-std::string nfc(std::string_view text) {
+std::string normal(std::string_view text, bool composed) {
   std::string out;
   out.reserve(text.size());
   while (!text.empty()) {
@@ -78,10 +77,15 @@ std::string nfc(std::string_view text) {
     out.append(text.substr(0, size));
     text.remove_prefix(size);
     size = run(text, true);
-    if (size > 0) append_composed(text.substr(0, size), out);
+    if (size > 0) append_normal(text.substr(0, size), composed, out);
     text.remove_prefix(size);
   }
   return out;
 }
+
+}  // namespace
+
+std::string nfc(std::string_view text) { return normal(text, true); }
+std::string nfd(std::string_view text) { return normal(text, false); }
 
 }  // namespace vla

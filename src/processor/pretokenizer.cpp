@@ -15,7 +15,9 @@ constexpr std::size_t kMaxSteps = 8;  // no real tokenizer has more than two
 constexpr std::uint8_t kLetterNumberSpace = unicode::kLetter | unicode::kNumber | unicode::kSpace;
 
 /// The one of the expression's classes that a character is in; 0 is `[^\s\p{L}\p{N}]`.
-std::uint8_t kind(std::uint32_t code_point) { return unicode::classes(code_point) & kLetterNumberSpace; }
+std::uint8_t kind(std::uint32_t code_point) {
+  return static_cast<std::uint8_t>(unicode::classes(code_point) & kLetterNumberSpace);
+}
 
 /// Bytes of the longest run of one kind at the start.
 std::size_t run(std::string_view text, std::uint8_t wanted) {

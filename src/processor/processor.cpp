@@ -166,14 +166,14 @@ Status Processor::check_view_places(std::span<const std::int32_t> tokens) const 
                          "the places of the views are made by the runtime; remove it from the text");
 }
 
-/// Keeps as many tokens as the recipe says. The prefix of every text is not part of it and stays.
+/// Keeps as many tokens as the recipe says. What stands around every text is not part of it and stays.
 void Processor::cut_tokens(std::vector<std::int32_t>& tokens) const {
   const auto limit = static_cast<std::size_t>(recipe_.max_tokens);
-  if (recipe_.keep_last) {
-    const auto front = tokens.begin() + static_cast<std::ptrdiff_t>(std::min(tokenizer_->prefix().size(), limit));
-    tokens.erase(front, front + static_cast<std::ptrdiff_t>(tokens.size() - limit));
-  }
-  tokens.resize(limit);
+  const std::size_t n_cut = tokens.size() - limit;
+  const std::size_t first = recipe_.keep_last ? std::min(tokenizer_->prefix().size(), limit)
+                                              : limit - std::min(tokenizer_->suffix().size(), limit);
+  const auto cut = tokens.begin() + static_cast<std::ptrdiff_t>(first);
+  tokens.erase(cut, cut + static_cast<std::ptrdiff_t>(n_cut));
 }
 
 Status Processor::gather_states(const Observation& observation, std::vector<float>& state) const {

@@ -67,6 +67,11 @@ Result<Processor> Processor::create(const Bundle& bundle, std::shared_ptr<const 
     VLA_TRY(Tokenizer read, Tokenizer::create(keys, n_vocab));
     processor.tokenizer_ = std::make_shared<const Tokenizer>(std::move(read));
   }
+  const int n_around =
+      has_text ? static_cast<int>(processor.tokenizer_->prefix().size() + processor.tokenizer_->suffix().size()) : 0;
+  if (processor.recipe_.max_tokens < n_around)
+    return misfit("processor.recipe.text", fmt::format("{} tokens or more, which stand around every text", n_around),
+                  std::to_string(processor.recipe_.max_tokens));
   VLA_TRY(const int max_text_tokens,
           keys.integer("observation.max_text_tokens", {has_text ? 1.0 : 0.0, has_text ? kMaxVector : 0.0}));
   if (processor.recipe_.max_tokens > max_text_tokens)

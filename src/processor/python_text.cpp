@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <iterator>
 
+#include "processor/capitals.h"
 #include "processor/unicode.h"
 
 namespace vla::python {
@@ -23,12 +24,6 @@ constexpr Run kRuns[] = {
 #include "processor/python_classes.inc"
 };
 
-/// Every `step`-th code point from `first` to `last` has its small letter `distance` away.
-struct Capitals {
-  std::uint32_t first, last, step;
-  std::int32_t distance;
-};
-
 constexpr Capitals kCapitals[] = {
 #include "processor/python_lower.inc"
 };
@@ -39,29 +34,6 @@ std::uint8_t classes(std::uint32_t c) {
   const auto after = std::upper_bound(std::begin(kRuns), std::end(kRuns), c,
                                       [](std::uint32_t code_point, const Run& run) { return code_point < run.start; });
   return std::prev(after)->classes;  // the first run starts at 0
-}
-
-std::uint32_t small(std::uint32_t c) {
-  const auto after =
-      std::upper_bound(std::begin(kCapitals), std::end(kCapitals), c,
-                       [](std::uint32_t code_point, const Capitals& run) { return code_point < run.first; });
-  if (after == std::begin(kCapitals)) return c;
-  const Capitals& run = *std::prev(after);
-  if (c > run.last || (c - run.first) % run.step != 0) return c;
-  return static_cast<std::uint32_t>(static_cast<std::int32_t>(c) + run.distance);
-}
-
-void append(std::string& out, std::uint32_t c) {
-  const auto tail = [&](int shift) { out.push_back(static_cast<char>(0x80 | ((c >> shift) & 0x3F))); };
-  if (c < 0x80) {
-    out.push_back(static_cast<char>(c));
-  } else if (c < 0x800) {
-    out.push_back(static_cast<char>(0xC0 | c >> 6)), tail(0);
-  } else if (c < 0x10000) {
-    out.push_back(static_cast<char>(0xE0 | c >> 12)), tail(6), tail(0);
-  } else {
-    out.push_back(static_cast<char>(0xF0 | c >> 18)), tail(12), tail(6), tail(0);
-  }
 }
 
 /// Whether the first character that is not ignorable is cased. `before`: of the end of the text, looking back.
@@ -96,7 +68,7 @@ std::string lower(std::string_view text) {
       const bool ends_word = meets_cased(text.substr(0, at), true) && !meets_cased(text.substr(next), false);
       out += ends_word ? "\u03c2" : "\u03c3";
     } else {
-      append(out, small(c.code_point));
+      unicode::append(out, small_letter(kCapitals, c.code_point));
     }
     at = next;
   }

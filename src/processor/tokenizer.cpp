@@ -2,19 +2,44 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "processor/tokenizer.h"
 
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
+#include <algorithm>
+#include <iterator>
+
 #include "processor/nfc.h"
 #include "processor/unicode.h"
 
 namespace vla {
 namespace {
 
-constexpr std::size_t kMaxPrefix = 8;  // no real tokenizer puts more than two ids in front
+constexpr std::size_t kMaxAround = 8;  // no real tokenizer puts more than two ids in front of a text or behind it
 
-Result<bool> is_byte_level(const Keys& keys) {
+/// In the order of `kKinds`.
+enum class Kind { byte_level, byte_fallback, wordpiece };
+constexpr std::string_view kKinds[] = {"byte_level_bpe", "byte_fallback_bpe", "wordpiece"};
+
+Result<Kind> read_kind(const Keys& keys) {
   VLA_TRY(const std::string kind, keys.string("tokenizer.kind"));
-  if (kind == "byte_level_bpe" || kind == "byte_fallback_bpe") return kind == "byte_level_bpe";
-  return Error{Code::bad_bundle, "tokenizer.kind", "byte_level_bpe or byte_fallback_bpe", kind,
+  const auto found = std::find(std::begin(kKinds), std::end(kKinds), kind);
+  if (found != std::end(kKinds)) return static_cast<Kind>(found - std::begin(kKinds));
+  return Error{Code::bad_bundle, "tokenizer.kind", fmt::format("{}", fmt::join(kKinds, " or ")), kind,
                "this bundle needs a newer vla"};
+}
+
+/// Ids that stand in front of every text or behind it.
+Result<std::vector<std::int32_t>> read_around(const Keys& keys, const char* key, std::size_t n_token) {
+  VLA_TRY(std::vector<std::int32_t> ids, keys.integers(key, {0, static_cast<double>(n_token) - 1.0}));
+  if (ids.size() <= kMaxAround) return ids;
+  return Error{Code::bad_bundle, key, "at most " + std::to_string(kMaxAround) + " ids", std::to_string(ids.size())};
+}
+
+std::vector<bool> marks_of(const std::vector<AddedToken>& added, std::size_t n_token) {
+  std::vector<bool> is_added(n_token);
+  for (const AddedToken& token : added)
+    if (token.id != kNoRow) is_added[static_cast<std::size_t>(token.id)] = true;
+  return is_added;
 }
 
 /// The text of an added token is in the list of tokens too, so that the list is complete.
@@ -34,20 +59,22 @@ Status check_added(const std::vector<AddedToken>& added, const std::vector<std::
   return {};
 }
 
-/// Whether text between the added tokens is composed.
-Result<bool> is_composed(const Keys& keys, bool byte_level) {
+/// What happens to text between the added tokens.
+Status read_normalization(const Keys& keys, Kind kind, AddedTokens::Normalize& normalize) {
   constexpr const char* kKey = "tokenizer.normalization";
-  if (!keys.has(kKey)) return false;
+  normalize = kind == Kind::byte_fallback ? ByteFallbackBpe::mark_blanks : nullptr;
+  if (!keys.has(kKey) && kind != Kind::wordpiece) return {};
   VLA_TRY(const std::string form, keys.string(kKey));
-  if (byte_level && form == "nfc") return true;
-  return Error{Code::bad_bundle, kKey, byte_level ? "nfc, or no such key" : "no such key beside byte_fallback_bpe",
-               form};
+  if (kind == Kind::byte_level && form == "nfc") return normalize = nfc, Status();
+  if (kind == Kind::wordpiece && form == "bert_uncased") return normalize = WordPiece::normalize, Status();
+  constexpr const char* kExpected[] = {"nfc, or no such key", "no such key beside byte_fallback_bpe", "bert_uncased"};
+  return Error{Code::bad_bundle, kKey, kExpected[static_cast<int>(kind)], form};
 }
 
 }  // namespace
 
 Result<Tokenizer> Tokenizer::create(const Keys& keys, int n_vocab) {
-  VLA_TRY(const bool byte_level, is_byte_level(keys));
+  VLA_TRY(const Kind kind, read_kind(keys));
   VLA_TRY(const std::vector<std::string> tokens, keys.strings("tokenizer.tokens"));
   VLA_TRY(const std::string added_json, keys.string("tokenizer.added"));
   if (n_vocab < 1 || tokens.size() > static_cast<std::size_t>(n_vocab))
@@ -56,15 +83,16 @@ Result<Tokenizer> Tokenizer::create(const Keys& keys, int n_vocab) {
   VLA_TRY(std::vector<AddedToken> added, parse_added_tokens(added_json, n_vocab));
 
   Tokenizer tokenizer;
-  if (byte_level) {
+  if (kind == Kind::byte_level) {
     VLA_CHECK(tokenizer.read_byte_level(keys, tokens, added));
+  } else if (kind == Kind::wordpiece) {
+    VLA_CHECK(tokenizer.read_wordpiece(keys, tokens, added));
   } else {
     VLA_CHECK(check_added(added, tokens, false));
     VLA_CHECK(tokenizer.read_byte_fallback(keys, tokens));
   }
-  VLA_TRY(const bool composed, is_composed(keys, byte_level));
-  AddedTokens::Normalize normalize = byte_level ? nullptr : ByteFallbackBpe::mark_blanks;
-  if (composed) normalize = nfc;
+  AddedTokens::Normalize normalize = nullptr;
+  VLA_CHECK(read_normalization(keys, kind, normalize));
   tokenizer.added_ = AddedTokens(std::move(added), normalize);
   return tokenizer;
 }
@@ -75,32 +103,36 @@ Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::strin
   VLA_TRY(const std::string pre, keys.string("tokenizer.pre"));
   VLA_TRY(const bool ignore_merges, keys.boolean("tokenizer.ignore_merges"));
   VLA_CHECK(check_added(added, tokens, ignore_merges));
-  std::vector<bool> is_added(tokens.size());
-  for (const AddedToken& token : added)
-    if (token.id != kNoRow) is_added[static_cast<std::size_t>(token.id)] = true;
   ByteLevel model;
   VLA_TRY(model.pretokenizer, Pretokenizer::parse(pre));
-  VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, is_added));
+  VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, marks_of(added, tokens.size())));
   model_ = std::move(model);
-  return keys.has("tokenizer.prefix_ids") ? read_prefix(keys, tokens.size()) : Status();
+  if (!keys.has("tokenizer.prefix_ids")) return {};
+  VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
+  return {};
 }
 
 Status Tokenizer::read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens) {
   VLA_TRY(const std::vector<std::string> merges, keys.strings("tokenizer.merges"));
-  VLA_CHECK(read_prefix(keys, tokens.size()));
+  VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
   VLA_TRY(model_, ByteFallbackBpe::create(tokens, merges));
   return {};
 }
 
-Status Tokenizer::read_prefix(const Keys& keys, std::size_t n_token) {
-  VLA_TRY(prefix_, keys.integers("tokenizer.prefix_ids", {0, static_cast<double>(n_token) - 1.0}));
-  if (prefix_.size() <= kMaxPrefix) return {};
-  return Error{Code::bad_bundle, "tokenizer.prefix_ids", "at most " + std::to_string(kMaxPrefix) + " ids",
-               std::to_string(prefix_.size())};
+/// A word is a token as a whole, or may be: an added one that is passed over must not come back as such.
+Status Tokenizer::read_wordpiece(const Keys& keys, const std::vector<std::string>& tokens,
+                                 const std::vector<AddedToken>& added) {
+  VLA_CHECK(check_added(added, tokens, true));
+  VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
+  VLA_TRY(suffix_, read_around(keys, "tokenizer.suffix_ids", tokens.size()));
+  VLA_TRY(const int unknown, keys.integer("tokenizer.unknown_id", {0, static_cast<double>(tokens.size()) - 1.0}));
+  VLA_TRY(model_, WordPiece::create(tokens, marks_of(added, tokens.size()), unknown));
+  return {};
 }
 
 void Tokenizer::encode_piece(std::string_view piece, Ids& ids) const {
   if (const auto* fallback = std::get_if<ByteFallbackBpe>(&model_)) return fallback->encode(piece, ids);
+  if (const auto* wordpiece = std::get_if<WordPiece>(&model_)) return wordpiece->encode(piece, ids);
   const auto& byte_level = std::get<ByteLevel>(model_);
   byte_level.pretokenizer.split(piece, [&](std::string_view word) { byte_level.bpe.encode(word, ids); });
 }
@@ -123,6 +155,7 @@ Result<std::vector<std::int32_t>> Tokenizer::encode(std::string_view text, std::
   if (no_row)
     return Error{Code::bad_observation, "instruction", "text without tokens that the embedding has no row for",
                  "such a token, e.g. <image>", "remove it from the text"};
+  ids.insert(ids.end(), suffix_.begin(), suffix_.end());
   return ids;
 }
 

@@ -14,11 +14,13 @@
 #include "processor/bpe.h"
 #include "processor/byte_fallback_bpe.h"
 #include "processor/pretokenizer.h"
+#include "processor/wordpiece.h"
 
 namespace vla {
 
-/// Text to token ids, equal to the Hugging Face `tokenizers` library (0.22) on every string. There are two kinds,
-/// byte-level BPE and BPE with byte fallback; the keys that describe them are in docs/bundle.md. Nothing is cut.
+/// Text to token ids, equal to the Hugging Face `tokenizers` library (0.22) on every string. There are three kinds,
+/// byte-level BPE, BPE with byte fallback and WordPiece; the keys that describe them are in docs/bundle.md. Nothing is
+/// cut.
 class Tokenizer {
  public:
   /// Longest text, in bytes. An instruction is a sentence; what is longer is a mistake or an attack.
@@ -28,12 +30,14 @@ class Tokenizer {
   static Result<Tokenizer> create(const Keys& keys, int n_vocab);
 
   /// Ids of `text`, which must be UTF-8 of at most `max_bytes` bytes, a prompt around an instruction being longer; NUL
-  /// is a character like any other. The ids of `prefix()` stand in front. Errors: bad_observation, also for an added
-  /// token that the embedding has no row for.
+  /// is a character like any other. The ids of `prefix()` and `suffix()` stand around. Errors: bad_observation, also
+  /// for an added token that the embedding has no row for.
   Result<std::vector<std::int32_t>> encode(std::string_view text, std::size_t max_bytes = kMaxText) const;
 
   /// The ids in front of every text (`<bos>`), where the tokenizer puts some.
   const std::vector<std::int32_t>& prefix() const { return prefix_; }
+  /// The ids behind every text (`[SEP]`).
+  const std::vector<std::int32_t>& suffix() const { return suffix_; }
 
  private:
   struct ByteLevel {
@@ -46,12 +50,12 @@ class Tokenizer {
   Status read_byte_level(const Keys& keys, const std::vector<std::string>& tokens,
                          const std::vector<AddedToken>& added);
   Status read_byte_fallback(const Keys& keys, const std::vector<std::string>& tokens);
-  Status read_prefix(const Keys& keys, std::size_t n_token);
+  Status read_wordpiece(const Keys& keys, const std::vector<std::string>& tokens, const std::vector<AddedToken>& added);
   void encode_piece(std::string_view piece, Ids& ids) const;
 
   AddedTokens added_;
-  std::variant<ByteLevel, ByteFallbackBpe> model_;
-  Ids prefix_;
+  std::variant<ByteLevel, ByteFallbackBpe, WordPiece> model_;
+  Ids prefix_, suffix_;
 };
 
 }  // namespace vla

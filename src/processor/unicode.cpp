@@ -5,16 +5,22 @@
 #include <algorithm>
 #include <iterator>
 
+#include "processor/capitals.h"
+
 namespace vla::unicode {
 namespace {
 
 struct Run {
   std::uint32_t start;
-  std::uint8_t classes;
+  std::uint16_t classes;
 };
 
 constexpr Run kRuns[] = {
 #include "processor/unicode_classes.inc"
+};
+
+constexpr Capitals kCapitals[] = {
+#include "processor/unicode_lower.inc"
 };
 
 bool continues(std::string_view text, std::size_t i) {
@@ -25,11 +31,13 @@ std::uint32_t payload(std::string_view text, std::size_t i) { return static_cast
 
 }  // namespace
 
-std::uint8_t classes(std::uint32_t code_point) {
+std::uint16_t classes(std::uint32_t code_point) {
   const auto after = std::upper_bound(std::begin(kRuns), std::end(kRuns), code_point,
                                       [](std::uint32_t c, const Run& run) { return c < run.start; });
   return std::prev(after)->classes;  // the first run starts at 0
 }
+
+std::uint32_t lower(std::uint32_t code_point) { return small_letter(kCapitals, code_point); }
 
 Char first(std::string_view text) {
   if (text.empty()) return {};
@@ -52,6 +60,19 @@ Char last(std::string_view text) {
   std::size_t start = text.size() - 1;
   while (start > 0 && continues(text, start)) --start;
   return first(text.substr(start));
+}
+
+void append(std::string& out, std::uint32_t c) {
+  const auto tail = [&](int shift) { out.push_back(static_cast<char>(0x80 | ((c >> shift) & 0x3F))); };
+  if (c < 0x80) {
+    out.push_back(static_cast<char>(c));
+  } else if (c < 0x800) {
+    out.push_back(static_cast<char>(0xC0 | c >> 6)), tail(0);
+  } else if (c < 0x10000) {
+    out.push_back(static_cast<char>(0xE0 | c >> 12)), tail(6), tail(0);
+  } else {
+    out.push_back(static_cast<char>(0xF0 | c >> 18)), tail(12), tail(6), tail(0);
+  }
 }
 
 std::size_t valid_prefix(std::string_view text) {

@@ -4,6 +4,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <string>
 #include <string_view>
 
 /// UTF-8 and character classes as the reference tokenizer sees them.
@@ -14,16 +15,23 @@
 namespace vla::unicode {
 
 /// Bits of `classes`.
-enum Class : std::uint8_t {
-  kLetter = 1,   // \p{L} of the splitting expression
-  kNumber = 2,   // \p{N} of the splitting expression
-  kSpace = 4,    // \s of the splitting expression and of added tokens
-  kDigit = 8,    // what the digits step calls numeric; a few code points newer than kNumber
-  kWord = 16,    // \w of added tokens
-  kNormal = 32,  // takes part in the normalization NFC: composes, decomposes or is put in order
+enum Class : std::uint16_t {
+  kLetter = 1,         // \p{L} of the splitting expression
+  kNumber = 2,         // \p{N} of the splitting expression
+  kSpace = 4,          // \s of the splitting expression and of added tokens
+  kDigit = 8,          // what the digits step calls numeric; a few code points newer than kNumber
+  kWord = 16,          // \w of added tokens
+  kNormal = 32,        // takes part in the normalization NFC: composes, decomposes or is put in order
+  kControl = 64,       // what BERT's cleaning removes; the three that it keeps as blanks are not among them
+  kPunctuation = 128,  // a word of its own for BERT
+  kMark = 256,         // an accent that BERT's normalization removes
 };
 
-std::uint8_t classes(std::uint32_t code_point);
+std::uint16_t classes(std::uint32_t code_point);
+
+/// The small letter of a character as BERT's normalization makes it, or the character itself. U+0130, whose small
+/// letter is two characters, decomposes before it is asked for.
+std::uint32_t lower(std::uint32_t code_point);
 
 struct Char {
   std::uint32_t code_point = 0;
@@ -36,6 +44,9 @@ Char first(std::string_view text);
 
 /// The last character of valid, non-empty UTF-8.
 Char last(std::string_view text);
+
+/// Appends the UTF-8 of a code point.
+void append(std::string& out, std::uint32_t code_point);
 
 /// Bytes before the first place that is not UTF-8; `text.size()` when all of it is.
 std::size_t valid_prefix(std::string_view text);

@@ -392,6 +392,33 @@ TEST_CASE("a text that is cut at its start keeps what stands in front of every t
   }
 }
 
+TEST_CASE("a text that is cut keeps what stands around every text") {
+  EditableBundle bundle = sample();
+  const Keys bert = tokenizer_keys("bert");
+  for (const auto& [key, value] : bert.all()) bundle.set(key, value);
+  for (const char* key : {"tokenizer.pre", "tokenizer.ignore_merges", "tokenizer.merges"}) bundle.remove_key(key);
+  Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));
+  Observation seen = observation();
+  seen.text = "pick up the red cube and place it in the bowl";
+  const auto all = *Tokenizer::create(bert, 4096)->encode(seen.text);
+  const auto cut_to = [&](int n, const char* side) {
+    recipe["text"][1]["max_tokens"] = n;
+    recipe["text"][1]["truncate"] = side;
+    bundle.set("processor.recipe", recipe.dump());
+    const auto inputs = make(bundle).encode(seen);
+    REQUIRE_MESSAGE(inputs.ok(), inputs.error().message());
+    return inputs->tokens;
+  };
+  using Ids = std::vector<std::int32_t>;
+  CHECK(cut_to(4, "right") == Ids{all.front(), all[1], all[2], all.back()});
+  CHECK(cut_to(4, "left") == Ids{all.front(), all[all.size() - 3], all[all.size() - 2], all.back()});
+  CHECK(cut_to(2, "right") == Ids{all.front(), all.back()});
+  CHECK(cut_to(2, "left") == Ids{all.front(), all.back()});
+  recipe["text"][1]["max_tokens"] = 1;
+  bundle.set("processor.recipe", recipe.dump());
+  CHECK(contains(refusal(create(bundle), Code::bad_bundle), "2 tokens or more, which stand around every text"));
+}
+
 TEST_CASE("a prompt that ops would blow up is refused before it is made") {
   EditableBundle bundle = sample();
   Json recipe = Json::parse(*bundle.keys.string("processor.recipe"));

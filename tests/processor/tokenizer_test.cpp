@@ -53,7 +53,7 @@ std::string refused_added(const std::string& tokenizer, const char* field, const
 
 }  // namespace
 
-TEST_CASE("nine tokenizers give the reference's ids on four and a half thousand texts") {
+TEST_CASE("twelve tokenizers give the reference's ids on six thousand texts") {
   int compared = 0;
   const Json all = data_json("tokenizer_cases.json");
   for (const auto& item : all.items()) {
@@ -67,11 +67,11 @@ TEST_CASE("nine tokenizers give the reference's ids on four and a half thousand 
       ++compared;
     }
   }
-  CHECK(compared == 5000);
+  CHECK(compared == 6000);
 }
 
 TEST_CASE("a word of 64 KiB takes milliseconds") {
-  for (const char* name : {"smol", "tangled", "qwen", "llama", "gemma"}) {
+  for (const char* name : {"smol", "tangled", "qwen", "llama", "gemma", "bert"}) {
     const Keys keys = tokenizer_keys(name);
     std::string longest, word;  // repeated, the longest token of letters merges most
     const auto tokens = *keys.strings("tokenizer.tokens");
@@ -287,11 +287,59 @@ TEST_CASE("another kind of tokenizer and a missing key are refused") {
   Keys keys = tokenizer_keys("smol");
   keys.set("tokenizer.kind", std::string("sentencepiece"));
   CHECK(contains(refused_keys(keys),
-                 "tokenizer.kind: expected byte_level_bpe or byte_fallback_bpe, found sentencepiece"));
+                 "tokenizer.kind: expected byte_level_bpe or byte_fallback_bpe or wordpiece, found sentencepiece"));
   for (const char* key : {"tokenizer.kind", "tokenizer.tokens", "tokenizer.merges", "tokenizer.pre", "tokenizer.added",
                           "tokenizer.ignore_merges"}) {
     auto values = tokenizer_keys("smol").all();
     values.erase(values.find(key));
     CHECK(contains(refused_keys(Keys(values)), key));
   }
+}
+
+TEST_CASE("a word of BERT's is cut from the left into its longest tokens, or unknown as a whole") {
+  Keys keys = tokenizer_keys("bert");
+  keys.set("tokenizer.tokens",
+           std::vector<std::string>{"[UNK]", "un", "able", "##want", "##w", "##able", "##d", "a", "##a"});
+  keys.set("tokenizer.added", std::string("[]"));
+  keys.set("tokenizer.unknown_id", std::int64_t{0});
+  keys.set("tokenizer.prefix_ids", std::vector<std::int64_t>{});
+  keys.set("tokenizer.suffix_ids", std::vector<std::int64_t>{});
+  const Tokenizer tokenizer = make(keys);
+  const std::vector<std::int32_t> unwantable = {1, 3, 5}, two = {1, 4, 5, 0, 2};
+  CHECK(encode(tokenizer, "  UNWantABLE") == unwantable);
+  CHECK(encode(tokenizer, "unwable - able") == two);
+  CHECK(encode(tokenizer, "unwants") == std::vector<std::int32_t>{0});
+  CHECK(encode(tokenizer, std::string(100, 'a')).size() == 100);
+  CHECK(encode(tokenizer, std::string(101, 'a')) == std::vector<std::int32_t>{0});
+}
+
+TEST_CASE("normalization for BERT takes capitals, accents and control characters from text") {
+  CHECK(WordPiece::normalize("Caf\u00c9\u0301 \u0130Z\u200b\u0001\t\u00c5") == "cafe iz a");
+  CHECK(WordPiece::normalize("a\u4e2d") == "a \u4e2d ");
+  CHECK(WordPiece::normalize("\uac00") == "\u1100\u1161");
+  CHECK(WordPiece::normalize(std::string("a\0b\ufffd", 6)) == "ab");
+}
+
+TEST_CASE("the keys of a WordPiece tokenizer are checked") {
+  for (const char* key :
+       {"tokenizer.normalization", "tokenizer.prefix_ids", "tokenizer.suffix_ids", "tokenizer.unknown_id"}) {
+    auto values = tokenizer_keys("bert").all();
+    values.erase(values.find(key));
+    CHECK(contains(refused_keys(Keys(values)), key));
+  }
+  Keys keys = tokenizer_keys("bert");
+  keys.set("tokenizer.normalization", std::string("nfc"));
+  CHECK(contains(refused_keys(keys), "tokenizer.normalization: expected bert_uncased, found nfc"));
+  keys = tokenizer_keys("bert");
+  keys.set("tokenizer.suffix_ids", std::vector<std::int64_t>(9, 2));
+  CHECK(contains(refused_keys(keys), "tokenizer.suffix_ids"));
+  keys = tokenizer_keys("bert");
+  keys.set("tokenizer.unknown_id", std::int64_t{kVocab});
+  CHECK(contains(refused_keys(keys), "tokenizer.unknown_id"));
+  auto tokens = *tokenizer_keys("bert").strings("tokenizer.tokens");
+  tokens.push_back(tokens.back());
+  keys = tokenizer_keys("bert");
+  keys.set("tokenizer.tokens", tokens);
+  CHECK(contains(refused_keys(keys), "every token once"));
+  CHECK(contains(refused_added("bert", "single_word", true), "single_word"));
 }

@@ -4,22 +4,24 @@
 
 import json
 
-ORDER = ["tokenizer." + name for name in ("kind", "tokens", "merges", "pre", "normalization", "added", "ignore_merges", "prefix_ids")]
+ORDER = ["tokenizer." + name for name in ("kind", "tokens", "merges", "pre", "normalization", "added", "ignore_merges", "prefix_ids", "suffix_ids", "unknown_id")]
 
 
 def keys_of(tokenizer) -> dict:
     spec = json.loads(tokenizer.to_str())
     model = spec["model"]
-    assert model["type"] == "BPE"
     tokens = {id: text for text, id in model["vocab"].items()}
     tokens.update({token["id"]: token["content"] for token in spec["added_tokens"]})
     assert sorted(tokens) == list(range(len(tokens)))
     common = {
         "tokenizer.tokens": [tokens[i] for i in range(len(tokens))],
-        "tokenizer.merges": [merge if isinstance(merge, str) else " ".join(merge) for merge in model["merges"]],
         "tokenizer.added": json.dumps(spec["added_tokens"]),
     }
-    keys = {**common, **(byte_fallback(spec) if model["byte_fallback"] else byte_level(spec))}
+    if model["type"] == "WordPiece":
+        keys = {**common, **wordpiece(spec)}
+    else:
+        common["tokenizer.merges"] = [merge if isinstance(merge, str) else " ".join(merge) for merge in model["merges"]]
+        keys = {**common, **(byte_fallback(spec) if model["byte_fallback"] else byte_level(spec))}
     return {key: keys[key] for key in ORDER if key in keys}
 
 
@@ -45,6 +47,17 @@ def byte_fallback(spec: dict) -> dict:
     assert spec["pre_tokenizer"] is None or spec["pre_tokenizer"]["pattern"] == {"String": " "}
     front = [] if spec["post_processor"] is None else prefix(spec["post_processor"])
     return {"tokenizer.kind": "byte_fallback_bpe", "tokenizer.prefix_ids": front}
+
+
+def wordpiece(spec: dict) -> dict:
+    model, template = spec["model"], spec["post_processor"]
+    assert (model["continuing_subword_prefix"], model["max_input_chars_per_word"]) == ("##", 100)
+    assert spec["normalizer"] == dict(type="BertNormalizer", clean_text=True, handle_chinese_chars=True, strip_accents=None, lowercase=True)
+    at = template["single"].index({"Sequence": {"id": "A", "type_id": 0}})
+    front, behind = (prefix(dict(template, single=parts)) for parts in (template["single"][:at], template["single"][at:]))
+    unknown = model["vocab"][model["unk_token"]]
+    return {"tokenizer.kind": "wordpiece", "tokenizer.normalization": "bert_uncased", "tokenizer.unknown_id": unknown,
+            "tokenizer.prefix_ids": front, "tokenizer.suffix_ids": behind}
 
 
 def prefix(template: dict) -> list:

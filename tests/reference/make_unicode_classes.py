@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes src/processor/unicode_classes.inc: the character classes of the reference tokenizer, found by asking it.
+"""Writes unicode_classes.inc and unicode_lower.inc: characters as the reference tokenizer sees them, found by asking it.
 
-    python tests/reference/make_unicode_classes.py src/processor/unicode_classes.inc
+    python tests/reference/make_unicode_classes.py src/processor
 
 Needs the Hugging Face `tokenizers` package, the release that the lab environment pins.  Every code point is put through the
-three engines that look at characters (the regular expression of ByteLevel, Digits, and the word and space tests of
-added tokens), and what each did with it is recorded.  Code points are not read from Python's own Unicode tables, whose
+engines that look at characters (the regular expression of ByteLevel, Digits, the word and space tests of added tokens, BERT's
+normalization and splitting), and what each did with it is recorded.  Code points are not read from Python's own Unicode tables, whose
 version is another.
 """
 
@@ -15,7 +15,7 @@ import sys
 import tokenizers
 from tokenizers import AddedToken, Tokenizer, models, normalizers, pre_tokenizers
 
-LETTER, NUMBER, SPACE, DIGIT, WORD, NORMAL = 1, 2, 4, 8, 16, 32
+LETTER, NUMBER, SPACE, DIGIT, WORD, NORMAL, CONTROL, PUNCTUATION, MARK = (1 << i for i in range(9))
 CODE_POINTS = [c for c in range(0x110000) if not 0xD800 <= c <= 0xDFFF]
 
 
@@ -36,6 +36,43 @@ def normal() -> set[int]:
         if nfd.normalize_str(c + low) != c + low or nfd.normalize_str(high + c) != high + c:
             found.add(ord(c))
     return found | {ord("\u0327"), ord("\u0345")}
+
+
+def bert(**steps):
+    """BERT's normalization with these of its steps."""
+    every = dict.fromkeys(("clean_text", "handle_chinese_chars", "strip_accents", "lowercase"), False)
+    return normalizers.BertNormalizer(**every | steps).normalize_str
+
+
+def classify_for_bert(flags: list[int]) -> None:
+    clean, strip, nfd = bert(clean_text=True), bert(strip_accents=True), normalizers.NFD()
+    words = pre_tokenizers.BertPreTokenizer()
+    for c in CODE_POINTS:
+        cleaned = clean(chr(c))
+        flags[c] |= CONTROL * (cleaned == "") + MARK * (strip(chr(c)) == "")
+        flags[c] |= PUNCTUATION * (len(words.pre_tokenize_str("a" + chr(c) + "a")) == 3)
+        # What is left is a blank where \s says so, and else itself; accents go character by character.
+        assert cleaned in ("", " " if flags[c] & SPACE else chr(c)), hex(c)
+    for c in CODE_POINTS:
+        assert strip(chr(c)) == "".join(x for x in nfd.normalize_str(chr(c)) if not flags[ord(x)] & MARK), hex(c)
+
+
+def lowered() -> list[list[int]]:
+    """[first, last, step, distance] of characters whose lower case lies equally far away."""
+    lower, runs = bert(lowercase=True), []
+    for c in CODE_POINTS:
+        small = lower(chr(c))
+        if small == chr(c) or c == 0x130:
+            continue
+        assert len(small) == 1, hex(c)  # U+0130 alone becomes two
+        distance = ord(small) - c
+        if runs and runs[-1][3] == distance:
+            first, last, step, _ = runs[-1]
+            if c - last == step or (first == last and c - last <= 2):
+                runs[-1] = [first, c, c - last, distance]
+                continue
+        runs.append([c, c, 1, distance])
+    return runs
 
 
 def classify() -> list[int]:
@@ -60,25 +97,31 @@ def classify() -> list[int]:
         for c, encoding in zip(block, strip.encode_batch(["qz" + chr(c) for c in block])):
             # Two engines test for white space; one class serves both as long as they agree.
             assert (encoding.offsets[0][1] == 3) == bool(flags[c] & SPACE), hex(c)
+    classify_for_bert(flags)
     return flags
 
 
-def main() -> None:
-    flags = classify()
-    runs = [(c, flags[c]) for c in range(0x110000) if c == 0 or flags[c] != flags[c - 1]]
-    cells = [f"{{0x{c:x}, {f}}}," for c, f in runs]
+def write(path: str, what: str, cells: list[str]) -> None:
     lines = []
     for cell in cells:
         if not lines or len(lines[-1]) + len(cell) + 1 > 118:
             lines.append(cell)
         else:
             lines[-1] += " " + cell
-    with open(sys.argv[1], "w") as out:
+    with open(path, "w") as out:
         out.write("// SPDX-FileCopyrightText: The vla.cpp authors\n// SPDX-License-Identifier: Apache-2.0\n")
         out.write("// Written by tests/reference/make_unicode_classes.py from tokenizers ")
-        out.write(f"{tokenizers.__version__}: first code point of a run, classes.\n// clang-format off\n")
+        out.write(f"{tokenizers.__version__}: {what}.\n// clang-format off\n")
         out.write("\n".join(lines) + "\n")
-    print(f"{len(runs)} runs")
+    print(f"{path}: {len(cells)} runs")
+
+
+def main() -> None:
+    flags = classify()
+    runs = [(c, flags[c]) for c in range(0x110000) if c == 0 or flags[c] != flags[c - 1]]
+    write(sys.argv[1] + "/unicode_classes.inc", "first code point of a run, classes", [f"{{0x{c:x}, {f}}}," for c, f in runs])
+    cells = [f"{{0x{a:x}, 0x{b:x}, {step}, {d}}}," for a, b, step, d in lowered()]
+    write(sys.argv[1] + "/unicode_lower.inc", "first and last of a run, step, distance to lower case", cells)
 
 
 main()

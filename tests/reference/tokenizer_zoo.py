@@ -246,6 +246,33 @@ def gemma_tangled() -> Tokenizer:
     return byte_fallback(vocab, merges, [AddedToken("<bos>", normalized=False, special=True)], ["<bos>", "<unk>"])
 
 
+def wordpiece(vocab_size: int, sentences: list[str]) -> Tokenizer:
+    """What BERT publishes, with another vocabulary."""
+    specials = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]"]
+    tokenizer = Tokenizer(models.WordPiece(unk_token="[UNK]"))
+    tokenizer.normalizer, tokenizer.pre_tokenizer = normalizers.BertNormalizer(), pre_tokenizers.BertPreTokenizer()
+    trainer = trainers.WordPieceTrainer(vocab_size=vocab_size, special_tokens=specials, show_progress=False)
+    tokenizer.train_from_iterator(sentences, trainer)
+    front, behind = ((text, tokenizer.token_to_id(text)) for text in ("[CLS]", "[SEP]"))
+    tokenizer.post_processor = processors.TemplateProcessing("[CLS] $A [SEP]", special_tokens=[front, behind])
+    return tokenizer
+
+
+def bert() -> Tokenizer:
+    """The shape of BERT's: letters of the sentences alone are tokens, so that many words are unknown."""
+    return wordpiece(600, SENTENCES * 3)
+
+
+def bert_awkward() -> Tokenizer:
+    """Every letter on its own is a token, within a word too; added tokens that change when they are normalized."""
+    letters = [c for c in map(chr, [*range(0x180), *range(0x370, 0x460)]) if c.isprintable() and not c.isspace()]
+    tokenizer = with_words(wordpiece(300, SENTENCES * 3), [*letters, *("##" + c for c in letters), "##", "###a", "ab", "##bc"])
+    options = [dict(lstrip=True), dict(rstrip=True), {}]
+    texts = ["<l>", "Caf\u00e9 x", "[NEW]", "e\u0301", "\u4e2d", " A", "CUBE", "bow", "\u0130", "#", "<<", "\u200b", "\ufb01"]
+    tokenizer.add_tokens([AddedToken(text, normalized=i % 2 == 0, **options[i % 3]) for i, text in enumerate(texts)])
+    return tokenizer
+
+
 ZOO = {
     "smol": smol,
     "awkward": awkward,
@@ -257,6 +284,8 @@ ZOO = {
     "gemma": gemma,
     "gemma_awkward": gemma_awkward,
     "gemma_tangled": gemma_tangled,
+    "bert": bert,
+    "bert_awkward": bert_awkward,
 }
 
 SPACES = [c for c in map(chr, range(0x110000)) if c.isspace()] + list("\u200b\u200c\u200d\u2060\ufeff\u180e\u00ad")

@@ -16,8 +16,9 @@ inline Keys keys_of(const nlohmann::json& document) {
   for (const auto& item : document.items()) {
     if (item.value().is_boolean()) keys.set(item.key(), item.value().get<bool>());
     if (item.value().is_string()) keys.set(item.key(), item.value().get<std::string>());
+    if (item.value().is_number()) keys.set(item.key(), item.value().get<std::int64_t>());
     if (!item.value().is_array()) continue;
-    if (item.key() == "tokenizer.prefix_ids") {
+    if (item.key().ends_with("_ids")) {
       keys.set(item.key(), item.value().get<std::vector<std::int64_t>>());
     } else {
       keys.set(item.key(), item.value().get<std::vector<std::string>>());
