@@ -48,6 +48,22 @@ TEST_CASE("resize equals OpenCV and torch byte for byte, up, down and to half") 
   CHECK(compared == 28);
 }
 
+TEST_CASE("torch's bilinear filter blends two neighbours in each direction and rounds nothing") {
+  const Frame frame{2, 1, std::vector<std::uint8_t>{0, 51, 255, 102, 51, 255}};
+  const auto near = [](float x) { return doctest::Approx(x).epsilon(1e-6); };
+  for (const Frame& given : {frame, as_floats(frame)}) {
+    const std::vector<float> out = resized(given, {4, 2, Filter::torch_bilinear});
+    for (const std::size_t row : {0, 4}) {
+      CHECK(out[row] == 0.0f);
+      CHECK(out[row + 1] == near(0.1f));
+      CHECK(out[row + 2] == near(0.3f));
+      CHECK(out[row + 3] == 0.4f);
+      CHECK(out[8 + row + 1] == 0.2f);
+    }
+    CHECK(resized(given, {2, 1, Filter::torch_bilinear}) == std::vector<float>{0.0f, 0.4f, 0.2f, 0.2f, 1.0f, 1.0f});
+  }
+}
+
 TEST_CASE("pixels as floats are cut to bytes for torch's filter and refused for OpenCV's") {
   const Frame frame{2, 2, std::vector<float>{0.999f, 0.5f, 0.0f, 1.0f, 0.25f, 0.002f, 0, 0, 0, 0, 0, 0}};
   const std::vector<float> out = resized(frame, {2, 2, Filter::torch_bicubic_8bit});

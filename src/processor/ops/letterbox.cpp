@@ -122,6 +122,12 @@ std::vector<std::uint8_t> resized_8bit(const Frame& frame, const Target& target)
   return resample_8bit(bytes, frame.width, frame.height, target.width, target.height);
 }
 
+void place(const Frame& frame, const Target& target) {
+  if (const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb))
+    return place(ByteSource{bytes->data(), byte_table().data()}, frame.width, frame.height, target);
+  place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target);
+}
+
 }  // namespace
 
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where) {
@@ -144,12 +150,15 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
   if (to.antialias) {
     const std::vector<std::uint8_t> bytes = resized_8bit(frame, target);
     copy(ByteSource{bytes.data(), byte_table().data()}, target);
-  } else if (const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb)) {
-    place(ByteSource{bytes->data(), byte_table().data()}, frame.width, frame.height, target);
   } else {
-    place(FloatSource{std::get<std::vector<float>>(frame.rgb).data()}, frame.width, frame.height, target);
+    place(frame, target);
   }
   return {};
+}
+
+void stretch(const Frame& frame, int width, int height, std::span<float> out) {
+  const auto stride = static_cast<std::size_t>(width);
+  place(frame, {out.data(), stride * static_cast<std::size_t>(height), stride, width, height});
 }
 
 namespace {

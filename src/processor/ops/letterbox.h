@@ -35,4 +35,7 @@ struct Letterbox {
 /// Errors: bad_observation when a side of the resized image is shorter than a pixel.
 Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, const std::string& where);
 
+/// The same resampling to `width` x `height`, the aspect not kept.
+void stretch(const Frame& frame, int width, int height, std::span<float> out);
+
 }  // namespace vla

@@ -4,6 +4,7 @@
 
 #include "processor/byte_pixels.h"
 #include "processor/json_fields.h"
+#include "processor/ops/letterbox.h"
 #include "processor/ops/pipeline.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"
@@ -11,6 +12,7 @@
 namespace vla {
 
 Status resize(const Frame& frame, const Resize& to, std::span<float> out, const std::string& where) {
+  if (to.filter == Resize::Filter::torch_bilinear) return stretch(frame, to.width, to.height, out), Status();
   const bool opencv = to.filter == Resize::Filter::opencv_bilinear;
   std::vector<std::uint8_t> cut;
   const auto* bytes = std::get_if<std::vector<std::uint8_t>>(&frame.rgb);
@@ -37,7 +39,7 @@ Result<Resize> read_resize(JsonFields& fields) {
   Resize op;
   VLA_TRY(op.width, fields.integer("width", kMinSide, kMaxImageSide));
   VLA_TRY(op.height, fields.integer("height", kMinSide, kMaxImageSide));
-  VLA_TRY(const int filter, fields.choice("filter", {"opencv_bilinear", "torch_bicubic_8bit"}));
+  VLA_TRY(const int filter, fields.choice("filter", {"opencv_bilinear", "torch_bicubic_8bit", "torch_bilinear"}));
   op.filter = static_cast<Resize::Filter>(filter);
   return op;
 }
