@@ -6,6 +6,7 @@
 #include <fmt/ranges.h>
 
 #include <cmath>
+#include <numbers>
 #include <numeric>
 
 namespace vla {
@@ -60,6 +61,34 @@ Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<Pos
     for (int i = 0; i < d_head / 4; ++i)
       pairs.push_back({axis, static_cast<float>(2 * i) / static_cast<float>(d_head / 2)});
   return make_table(g, base, RotaryAngle::product, pairs, positions);
+}
+
+Tensor centre_rotary_table(Graph& g, int d_head, float base, int n_first, int n_row, int n_column) {
+  const int n_period = d_head / 4;
+  const auto put = [&](std::vector<float>& table, float x, float y, double (*turned)(double)) {
+    for (const float at : {y, x})
+      for (int i = 0; i < n_period; ++i) {
+        const auto exponent = static_cast<float>(i * (4.0 / d_head));
+        const float frequency = 1.0f / static_cast<float>(std::pow(double{base}, double{exponent}));
+        table.push_back(static_cast<float>(turned(double{2 * std::numbers::pi_v<float> * at * frequency})));
+      }
+  };
+  const auto centre = [](int i, int n) {
+    return 2.0f * ((static_cast<float>(i) + 0.5f) / static_cast<float>(n)) - 1.0f;
+  };
+  const auto make = [&] {
+    std::vector<float> table;
+    const auto put_token = [&](float x, float y) {
+      put(table, x, y, [](double angle) { return std::cos(angle); });
+      put(table, x, y, [](double angle) { return std::sin(angle); });
+    };
+    for (int i = 0; i < n_first; ++i) put_token(0, 0);
+    for (int row = 0; row < n_row; ++row)
+      for (int column = 0; column < n_column; ++column) put_token(centre(column, n_column), centre(row, n_row));
+    return table;
+  };
+  return g.constant(fmt::format("centre_rope/{}/{}/{}/{}/{}", d_head, base, n_first, n_row, n_column),
+                    {d_head, n_first + std::int64_t{n_row} * n_column, 1, 1}, make);
 }
 
 Tensor mrope_table(Graph& g, int d_head, float base, const std::array<int, 3>& sections,

@@ -31,6 +31,12 @@ using PositionId = std::array<int, 3>;
 /// likewise. d_head must be divisible by 4. Source: transformers modeling_qwen3_vl.py Qwen3VLVisionModel.rot_pos_emb.
 Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<PositionId>& positions);
 
+/// The table of `n_first` tokens that do not turn and the patches of an image behind them, row by row. The first half
+/// of the pairs turns by 2 pi y / base^(4i/d), the second half by x likewise, for a patch whose centre is at (x, y) of
+/// an image from -1 to 1. d_head must be divisible by 4. Source: transformers modeling_dinov3_vit.py
+/// DINOv3ViTRopePositionEmbedding.
+Tensor centre_rotary_table(Graph& g, int d_head, float base, int n_first, int n_row, int n_column);
+
 /// The mRoPE table of images within text: pair i turns by one of the three / base^(2i/d). Rows have the pairs 1, 4, 7,
 /// ..., `sections[1]` of them, columns the `sections[2]` pairs 2, 5, 8, ..., time all others. Source: the same file,
 /// Qwen3VLTextRotaryEmbedding.apply_interleaved_mrope.

@@ -24,8 +24,8 @@ Tensor repeat_like(Graph& g, Tensor x, Tensor like) { return g.add(op::Repeat{},
 
 Tensor flatten_views(Graph& g, Tensor x) { return g.add(op::Reshape{}, {x}, {x.dim(0), x.dim(1) * x.dim(2), 1, 1}); }
 
-Tensor prepend_token(Graph& g, Tensor token, Tensor x) {
-  return concat_tokens(g, {g.add(op::Repeat{}, {token}, {x.dim(0), 1, x.dim(2), 1}), x});
+Tensor prepend_tokens(Graph& g, Tensor tokens, Tensor x) {
+  return concat_tokens(g, {g.add(op::Repeat{}, {tokens}, {x.dim(0), tokens.dim(1), x.dim(2), 1}), x});
 }
 
 Tensor zero_features_after(Graph& g, Tensor x, int count) {

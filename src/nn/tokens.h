@@ -50,8 +50,8 @@ inline Tensor silu(Graph& g, Tensor x) { return activate(g, x, Activation::silu)
 
 /// All tokens of all views as one sequence: [d, n, n_view] -> [d, n * n_view].
 Tensor flatten_views(Graph& g, Tensor x);
-/// A token in front of every view's: token [d], x [d, n, n_view] -> [d, 1 + n, n_view].
-Tensor prepend_token(Graph& g, Tensor token, Tensor x);
+/// The same tokens in front of every view's: tokens [d, n_first], x [d, n, n_view] -> [d, n_first + n, n_view].
+Tensor prepend_tokens(Graph& g, Tensor tokens, Tensor x);
 /// x with zeros in all features but the first `count`: [d, n] -> the same shape.
 Tensor zero_features_after(Graph& g, Tensor x, int count);
 /// The columns of a matrix below each other: [d, n] -> [d * n, 1].

@@ -5,6 +5,7 @@
 #include <doctest/doctest.h>
 
 #include <cmath>
+#include <numbers>
 
 #include "kernels/kernel_set.h"
 #include "support/graph_runner.h"
@@ -115,6 +116,23 @@ TEST_CASE("patches turn by their row in the first half of the pairs and by their
         [&](int j, int i) {
           const PositionId& place = places[static_cast<std::size_t>(j)];
           return place[i < quarter ? 1 : 2] / std::pow(1e4, 4.0 * (i % quarter) / d_head);
+        });
+  }
+}
+
+TEST_CASE("patches turn by where their centre is on an image from -1 to 1, and the tokens in front of them do not") {
+  constexpr int kFirst = 2, kRows = 2, kColumns = 3;
+  for (const int d_head : {64, 12}) {
+    const int quarter = d_head / 4;
+    check_turned(
+        d_head, kFirst + kRows * kColumns,
+        [&](Graph& g) { return centre_rotary_table(g, d_head, 100.0f, kFirst, kRows, kColumns); },
+        [&](int j, int i) {
+          if (j < kFirst) return 0.0;
+          const int patch = j - kFirst;
+          const double y = (patch / kColumns + 0.5) / kRows, x = (patch % kColumns + 0.5) / kColumns;
+          const double at = 2 * (i < quarter ? y : x) - 1;
+          return 2 * std::numbers::pi * at / std::pow(100.0, 4.0 * (i % quarter) / d_head);
         });
   }
 }

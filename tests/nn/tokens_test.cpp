@@ -35,9 +35,13 @@ constexpr float kHidden = -std::numeric_limits<float>::infinity();
 
 TEST_CASE("a token in front of every view's is dropped again without a trace") {
   const auto with = [](Graph& g) {
-    return prepend_token(g, test::constant(g, Values{-1, -2}, {2}), numbers(g, {2, 3, 2}));
+    return prepend_tokens(g, test::constant(g, Values{-1, -2}, {2}), numbers(g, {2, 3, 2}));
   };
   CHECK(run_graph(with) == Values{-1, -2, 0, 1, 2, 3, 4, 5, -1, -2, 6, 7, 8, 9, 10, 11});
+  const auto two = [](Graph& g) {
+    return prepend_tokens(g, test::constant(g, Values{-1, -2}, {1, 2}), numbers(g, {1, 1, 2}));
+  };
+  CHECK(run_graph(two) == Values{-1, -2, 0, -1, -2, 1});
   CHECK(run_graph([&](Graph& g) { return slice_tokens(g, with(g), 1, 3); }) == counted(12));
 }
 

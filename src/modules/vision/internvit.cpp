@@ -30,7 +30,7 @@ Status InternVit::check(int width, int height) const {
 }
 
 Tensor InternVit::operator()(Graph& g, Tensor images) const {
-  Tensor x = prepend_token(g, g.parameter(class_token_), patch_embed_(g, images));
+  Tensor x = prepend_tokens(g, g.parameter(class_token_), patch_embed_(g, images));
   x = add(g, x, position_(g, arange(g, static_cast<int>(x.dim(1)))));
   for (const EncoderBlock& block : blocks_) x = block(g, x);
   return slice_tokens(g, x, 1, static_cast<int>(x.dim(1)) - 1);
