@@ -27,7 +27,7 @@ struct Range {
 inline constexpr Range kAnySize = {0, 2147483647};
 
 /// Ranges of values that are read in several places.
-inline constexpr Range kNormEps = {1e-12, 0.01};
+inline constexpr Range kNormEps = {1e-13, 0.01};
 inline constexpr Range kRopeBase = {1, 1e9};
 inline constexpr Range kTokenScale = {1e-4, 1e4};
 inline constexpr Range kTokenIndex = {0, 65535};

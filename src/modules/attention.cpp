@@ -49,7 +49,7 @@ Tensor head_rows(Graph& g, Tensor x, int n_head, const std::optional<RmsNorm>& n
 
 KeyValueProjection::KeyValueProjection(const Scope& s, int d_context, const Heads& heads)
     : n_head_(heads.n_head_kv),
-      k_(s / "attn_k", d_context, heads.d_key(), heads.bias, heads.rule),
+      k_(s / "attn_k", d_context, heads.d_key(), heads.plain_keys ? Bias::no : heads.bias, heads.rule),
       v_(s / "attn_v", d_context, heads.d_key(), heads.bias, heads.rule),
       norm_(head_norm(s / "attn_k_norm", heads)) {}
 

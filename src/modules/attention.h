@@ -24,6 +24,7 @@ struct Heads {
   std::optional<float> sub_norm_eps = {};  // what all heads give passes an RMS norm before the output product
   float rope_base = 0;                     // 0: nothing turns by position alone
   RotaryAngle rope_angle = RotaryAngle::product;
+  bool plain_keys = false;  // keys have no bias, whatever `bias` says
 
   int d_query() const { return n_head * d_head; }
   int d_key() const { return n_head_kv * d_head; }

@@ -5,6 +5,11 @@
 #include <fmt/format.h>
 
 namespace vla {
+namespace {
+
+Tensor placed(Graph& g, Tensor x, Tensor position) { return position ? add(g, x, position) : x; }
+
+}  // namespace
 
 DetrFamily DetrFamily::read(const Scope& s) {
   DetrFamily family = {
@@ -18,8 +23,8 @@ DetrFamily DetrFamily::read(const Scope& s) {
 
 Tensor PlacedAttention::operator()(Graph& g, Tensor x, Tensor position) const {
   return norm_(g, x, [&](Tensor h) {
-    const Tensor placed = add(g, h, position);
-    return attention_(g, placed, {}, {attention_.project()(g, placed, h, {})});
+    const Tensor x_placed = placed(g, h, position);
+    return attention_(g, x_placed, {}, {attention_.project()(g, x_placed, h, {})});
   });
 }
 
@@ -42,11 +47,11 @@ DetrDecoderLayer::DetrDecoderLayer(const Scope& s, const DetrFamily& family)
       mlp_(s, family.d_model, family.d_ff, family.activation) {}
 
 KeyValue DetrDecoderLayer::project(Graph& g, Tensor tokens, Tensor position) const {
-  return cross_.project()(g, add(g, tokens, position), tokens, {});
+  return cross_.project()(g, placed(g, tokens, position), tokens, {});
 }
 
 Tensor DetrDecoderLayer::forward(Graph& g, Tensor x, Tensor position, const KeyValue& seen) const {
-  x = cross_norm_(g, x, [&](Tensor h) { return cross_(g, add(g, h, position), {}, {seen}); });
+  x = cross_norm_(g, x, [&](Tensor h) { return cross_(g, placed(g, h, position), {}, {seen}); });
   return ffn_norm_(g, x, [&](Tensor h) { return mlp_(g, h); });
 }
 

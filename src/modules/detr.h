@@ -7,7 +7,7 @@
 
 namespace vla {
 
-/// How the layers of a transformer like DETR's are built.
+/// How the layers of a transformer of plain attention and MLPs are built, DETR's and BERT's among them.
 struct DetrFamily {
   int d_model, n_head, d_ff;
   Activation activation;
@@ -34,7 +34,8 @@ class NormedSum {
   bool pre_norm_;
 };
 
-/// Attention of tokens to each other, in which positions are added to what makes queries and keys, but not values.
+/// Attention of tokens to each other, in which positions are added to what makes queries and keys, but not values;
+/// everywhere here they may be none.
 class PlacedAttention {
  public:
   PlacedAttention(const Scope& s, const DetrFamily& family)
@@ -49,7 +50,7 @@ class PlacedAttention {
 };
 
 /// Self-attention and an MLP. x, position [d_model, n] -> [d_model, n].
-/// Source: lerobot policies/act/modeling_act.py ACTEncoderLayer.
+/// Sources: lerobot policies/act/modeling_act.py ACTEncoderLayer; transformers modeling_bert.py BertLayer.
 class DetrEncoderLayer : public Module<DetrEncoderLayer> {
  public:
   DetrEncoderLayer(const Scope& s, const DetrFamily& family);
@@ -62,7 +63,8 @@ class DetrEncoderLayer : public Module<DetrEncoderLayer> {
 };
 
 /// Self-attention of queries, attention to the encoder's tokens (`cross`), and an MLP.
-/// Source: lerobot policies/act/modeling_act.py ACTDecoderLayer.
+/// Sources: lerobot policies/act/modeling_act.py ACTDecoderLayer; lerobot_policy_turbovla action_decoder.py
+/// TurboVLADecoderLayer.
 class DetrDecoderLayer : public Module<DetrDecoderLayer> {
  public:
   DetrDecoderLayer(const Scope& s, const DetrFamily& family);

@@ -5,11 +5,20 @@
 #include "nn/adaptive_norm.h"
 
 namespace vla {
+namespace {
+
+Heads heads(int d_model, int n_head, const EncoderFamily& family) {
+  Heads even = Heads::even(d_model, n_head, family.rule);
+  even.plain_keys = family.plain_keys;
+  return even;
+}
+
+}  // namespace
 
 EncoderBlock::EncoderBlock(const Scope& s, int d_model, int n_head, int d_ff, float eps, EncoderFamily family)
     : Module(s),
       attn_norm_(s / "attn_norm", d_model, eps),
-      attention_(s, d_model, d_model, Heads::even(d_model, n_head, family.rule)),
+      attention_(s, d_model, d_model, heads(d_model, n_head, family)),
       ffn_norm_(s / "ffn_norm", d_model, eps),
       mlp_(s, d_model, d_ff, family.activation, family.rule) {
   if (!family.scaled) return;

@@ -12,13 +12,16 @@ struct EncoderFamily {
   Activation activation;  // of the MLP
   bool scaled;            // attention and MLP are multiplied feature by feature before they are added (LayerScale)
   Rule rule = Rule::floats;
+  bool plain_keys = false;  // keys have no bias
 };
 constexpr EncoderFamily kPlainEncoder = {Activation::gelu_tanh, false};
 constexpr EncoderFamily kInternEncoder = {Activation::gelu_erf, true};
+constexpr EncoderFamily kDinoEncoder = {Activation::gelu_erf, true, Rule::floats, true};
 constexpr EncoderFamily kTernaryEncoder = {Activation::gelu_tanh, false, Rule::int8_rows};
 
 /// One pre-norm encoder layer: attention in which all tokens of a view see each other, then a GELU MLP.
-/// Sources: transformers modeling_siglip.py SiglipEncoderLayer, modeling_qwen3_vl.py Qwen3VLVisionBlock; InternVL
+/// Sources: transformers modeling_siglip.py SiglipEncoderLayer, modeling_qwen3_vl.py Qwen3VLVisionBlock,
+/// modeling_dinov3_vit.py DINOv3ViTLayer; InternVL
 /// internvl_chat/internvl/model/internvl_chat/modeling_intern_vit.py InternVisionEncoderLayer; lerobot
 /// policies/groot/action_head/cross_attention_dit.py BasicTransformerBlock (layer_norm); BitVLA modeling_siglip.py
 /// SiglipEncoderLayer (ternary weights).
