@@ -179,13 +179,13 @@ def given_backbone(checkpoint: Checkpoint, given: str) -> str:
     return given
 
 
-def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_model_name") -> str:
-    """The folder with the backbone's config.json: as given, inside the checkpoint, or the one that the policy's config states."""
+def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_model_name", own: str = "vlm") -> str:
+    """The folder with the backbone's config.json: as given, `own` inside the checkpoint, or the one that the policy's config states."""
     if given:
         return given
-    inside = checkpoint.path("vlm")
+    inside = checkpoint.path(own)
     if os.path.exists(os.path.join(inside, "config.json")):
-        checkpoint.notes.append("backbone config and tokenizer: from vlm/ inside the checkpoint")
+        checkpoint.notes.append("backbone config and tokenizer: from {}/ inside the checkpoint".format(own))
         return inside
     if isinstance(named, str) and os.path.isabs(named) and os.path.isdir(named):
         checkpoint.notes.append(
@@ -194,7 +194,7 @@ def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_mod
         return named
     raise refuse(
         "backbone {}, which config.json: {} names".format(str(named)[:100], key),
-        "--backbone DIR, or vlm/ inside the checkpoint",
+        "--backbone DIR, or {}/ inside the checkpoint".format(own),
         "neither",
         "run vla-convert again with --backbone hub:{}@{}".format(named, BACKBONES[named])
         if isinstance(named, str) and named in BACKBONES

@@ -201,6 +201,15 @@ class _Reader:
 
     def _normalizer(self, where: str, config: dict, step: dict) -> None:
         keys = member(config, "normalize_observation_keys", list, where)
+        if STATE in self.context.dims:
+            self._state(where, config, step)
+        for feature, kind in self.others.items():
+            if config.get("normalize_observation_keys") is not None and feature not in keys:
+                self.problems.unsupported(where + ": normalize_observation_keys", feature + " among them", str(keys)[:80])
+            self.result.others[feature] = self.normalization(where, config, step, feature, kind)
+
+    def _state(self, where: str, config: dict, step: dict) -> None:
+        keys = member(config, "normalize_observation_keys", list, where)
         if config.get("normalize_observation_keys") is not None and STATE not in keys:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
@@ -212,10 +221,6 @@ class _Reader:
                 str(stated)[:80],
             )
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
-        for feature, kind in self.others.items():
-            if config.get("normalize_observation_keys") is not None and feature not in keys:
-                self.problems.unsupported(where + ": normalize_observation_keys", feature + " among them", str(keys)[:80])
-            self.result.others[feature] = self.normalization(where, config, step, feature, kind)
 
     def _unnormalizer(self, where: str, config: dict, step: dict) -> None:
         self.result.action = self.normalization(where, config, step, ACTION, "ACTION")

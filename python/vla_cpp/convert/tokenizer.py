@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """tokenizer.json, or the older files that replace it, as the keys of a bundle, after checking that the runtime implements this tokenizer.
 
-Two kinds are known, each with a module of its own: byte-level BPE and BPE with byte fallback. What they share stands in
-tokenizer_parts.py.
+Three kinds are known, each with a module of its own: byte-level BPE, BPE with byte fallback and WordPiece. What they share stands
+in tokenizer_parts.py.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from . import (
     tokenizer_byte_level,
     tokenizer_sentencepiece,
     tokenizer_vocab_files,
+    tokenizer_wordpiece,
 )
 from .bundle import Key
 from .errors import Code, Problems, refuse
@@ -43,7 +44,7 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
     """`n_vocab`: rows of the embedding table, which no id may reach."""
     spec, config = _read_files(folder, problems, notes)
     model = member(spec, "model", dict, JSON_FILE)
-    kind = tokenizer_byte_fallback if model.get("byte_fallback") is True else tokenizer_byte_level
+    kind = _kind(model)
     config = kind.with_defaults(config)
     added = added_tokens(spec, problems)
     check_config_tokens(config, added, problems)
@@ -53,11 +54,17 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
     keys = [
         Key("tokenizer.kind", "string", kind.KIND),
         Key("tokenizer.tokens", "string[]", tokens),
-        Key("tokenizer.merges", "string[]", merges_of(model.get("merges"), model["vocab"], problems)),
+        *([] if kind is tokenizer_wordpiece else [Key("tokenizer.merges", "string[]", merges_of(model.get("merges"), model["vocab"], problems))]),
         Key("tokenizer.added", "string", to_json(_with_rows(added, n_vocab))),
         *own,
     ]
     return TokenizerPlan(keys, _truncation_side(spec, config, problems))
+
+
+def _kind(model: dict):
+    if model.get("type") == "WordPiece":
+        return tokenizer_wordpiece
+    return tokenizer_byte_fallback if model.get("byte_fallback") is True else tokenizer_byte_level
 
 
 def _read_files(folder: str, problems: Problems, notes: List[str]) -> Tuple[dict, dict]:

@@ -200,7 +200,7 @@ def prefix_ids(tokenizer: Tokenizer, problems: Problems) -> List[int]:
     """The ids in front of every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
     config and then keeps the template all the same; a config that contradicts it may mean another release."""
     config = tokenizer.config
-    ids = _template(tokenizer, problems)
+    ids, _ = around_ids(tokenizer, problems, "a template of special tokens and then the text", may_follow=False)
     if config.get("add_eos_token", False) not in (False, None):
         problems.unsupported(CONFIG_FILE + ": add_eos_token", "False", repr(config["add_eos_token"]))
     if config.get("add_bos_token") is not None and bool(config["add_bos_token"]) != bool(ids):
@@ -213,26 +213,31 @@ def prefix_ids(tokenizer: Tokenizer, problems: Problems) -> List[int]:
     return ids
 
 
-def _template(tokenizer: Tokenizer, problems: Problems) -> List[int]:
+def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow: bool) -> Tuple[List[int], List[int]]:
+    """The ids in front of every text and behind it, as the file's template has them; `wanted` says what it may have."""
     # ByteLevel only trims offsets.
     posts = [post for post in one_or_sequence(tokenizer.spec.get("post_processor"), "processors") if not _is_byte_level(post)]
     if not posts:
-        return []
+        return [], []
     post = posts[0] if len(posts) == 1 else None
     single = post.get("single") if isinstance(post, dict) else None
     parts = single if isinstance(single, list) and post.get("type") == "TemplateProcessing" else []
     kinds = [next(iter(part), None) if isinstance(part, dict) else None for part in parts]
-    if kinds != ["SpecialToken"] * (len(parts) - 1) + ["Sequence"]:
-        problems.unsupported(
-            JSON_FILE + ": post_processor", "a template of special tokens and then the text", to_json(tokenizer.spec["post_processor"])[:120]
-        )
-        return []
+    at = kinds.index("Sequence") if "Sequence" in kinds else -1
+    others = kinds[:at] + kinds[at + 1 :]
+    if at < 0 or others != ["SpecialToken"] * len(others) or (at < len(others) and not may_follow):
+        problems.unsupported(JSON_FILE + ": post_processor", wanted, to_json(tokenizer.spec["post_processor"])[:120])
+        return [], []
     special = member(post, "special_tokens", dict, JSON_FILE)
+    return _ids_of(parts[:at], special, tokenizer, problems), _ids_of(parts[at + 1 :], special, tokenizer, problems)
+
+
+def _ids_of(parts: List[dict], special: dict, tokenizer: Tokenizer, problems: Problems) -> List[int]:
     ids: List[int] = []
-    for part in parts[:-1]:
+    for part in parts:
         name = member(part, "SpecialToken", dict, JSON_FILE).get("id")
         ids += member(member(special, name, dict, JSON_FILE) if isinstance(name, str) else {}, "ids", list, JSON_FILE)
-    if len(ids) < len(parts) - 1 or not all(isinstance(i, int) and 0 <= i < tokenizer.n_vocab for i in ids):
+    if len(ids) < len(parts) or not all(isinstance(i, int) and 0 <= i < tokenizer.n_vocab for i in ids):
         problems.add(JSON_FILE + ": post_processor.special_tokens", "an id below {} for each token".format(tokenizer.n_vocab), str(ids))
     return ids
 

@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""TurboVLA: what its checkpoint states, as keys and tensors of a bundle.
+
+Reference: lerobot_policy_turbovla (configuration_turbovla.py, modeling_turbovla.py, vl_interaction.py, action_decoder.py,
+processor_turbovla.py) and transformers models/dinov3_vit and models/bert.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Dict, List
+
+from ... import recipe
+from ...bundle import Key
+from ...checkpoint import Checkpoint
+from ...errors import Problems
+from ...features import feature_keys, states_of, views_of
+from ...tokenizer import read_tokenizer
+from .. import Options, Plan
+from .config import Sizes, read_sizes
+from .mapping import dropped, hints, network_keys, weights
+
+# What the reference's own normalization subtracts and divides by, whatever the data.
+IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    s = read_sizes(checkpoint, options, problems)
+    problems.raise_any()
+    dims = {**({recipe.STATE: s.d_state} if s.d_state else {}), recipe.ACTION: s.d_action}
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, {}, reads_text=False)
+    tokenizer = read_tokenizer(s.lm_folder, s.lm.n_vocab, problems, checkpoint.notes)
+    problems.raise_any()
+    keys = [
+        *network_keys(s),
+        *_feature_keys(checkpoint, options, s, dims, processors, problems),
+        *tokenizer.keys,
+        Key("processor.recipe", "string", json.dumps(recipe_document(s, processors, tokenizer.truncate), ensure_ascii=False)),
+    ]
+    problems.raise_any()
+    return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))
+
+
+def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str) -> Dict[str, List[dict]]:
+    side = s.vision.image_size
+    return {
+        "image": [
+            {"op": "resize", "width": side, "height": side, "filter": "torch_bilinear"},
+            {"op": "standardize", **IMAGENET, "arithmetic": "float32"},
+        ],
+        "text": [{"op": "tokenize", "max_tokens": s.max_tokens, "truncate": truncate}],
+        "state": processors.state.op("normalize", recipe.STATE) if s.d_state else [],
+        "action": processors.action.op("unnormalize", recipe.ACTION),
+    }
+
+
+def _feature_keys(
+    checkpoint: Checkpoint, options: Options, s: Sizes, dims: Dict[str, int], processors: recipe.Processors, problems: Problems
+) -> List[Key]:
+    """The reference needs every view."""
+    aliases = recipe.view_aliases(s.views, processors, checkpoint.notes, problems)
+    return [
+        *views_of(s.views, aliases, [0] * len(s.views), len(s.views)),
+        *states_of({name: dim for name, dim in dims.items() if name == recipe.STATE}),
+        Key("observation.max_text_tokens", "u32", s.max_tokens),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+    ]
