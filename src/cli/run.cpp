@@ -201,6 +201,9 @@ Status run(RunOptions& options) {
   observation.text = options.text;
   observation.reject_out_of_range = options.strict_state;
   for (const std::string& image : options.images) VLA_CHECK(add_image(observation, image, robot.processor().views()));
+  const FeatureNames& features = robot.processor().states();
+  if (options.states.empty() && !features.names().empty())
+    return Error{Code::usage, "--state", "the numbers of " + features.listed(), "none"};
   for (const std::string& state : options.states) VLA_CHECK(add_state(observation, state, robot.processor()));
   clock.lap(before, "decode");
   VLA_TRY(const Noise noise, read_noise(options, robot));
@@ -256,7 +259,6 @@ Command add_run(CLI::App& app) {
   command
       ->add_option("--state", options->states, "The robot's state in its own units; NAME= where the policy has several")
       ->type_name("[NAME=]v,v,...")
-      ->required()
       ->allow_extra_args(false);
   command->add_option("--text", options->text, "The instruction; none for a policy that reads none");
   add_text(*command, "--noise", options->noise, "FILE",
