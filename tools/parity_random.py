@@ -33,7 +33,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla
+from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -169,6 +169,26 @@ def draw_act(seed):
     checkpoint = act.Checkpoint(policy, {view: frame[:2] for view, frame in frames.items()}, r.randint(1, 20), r.randint(1, 20), n_environment,
                                 exact=False, imagenet=r.random() < 0.5, dtype=r.choice(("F32", "F32", "BF16")), old=old)
     return act.case(seed, frames, checkpoint)
+
+
+def draw_turbovla(seed):
+    """The same for TurboVLA, whose instruction may have letters of every kind; in one of ten an image that patches do not fill."""
+    r = random.Random(f"turbovla {seed}")
+    vision_heads, text_heads, heads, patch = r.choice((1, 2, 3)), r.choice((1, 2, 3, 5)), r.choice((1, 2, 3, 5)), r.choice((4, 5, 8, 14))
+    side, n_position = patch * r.randint(1, 5) + (r.random() < 0.1), r.choice((12, 20, 40))
+    frames = {f"cam{i}": (r.randint(12, 90), r.randint(12, 90), r.choice(("png", "png", "jpg"))) for i in range(r.randint(1, 4))}
+    if r.random() < 0.2:
+        frames = {view: (side, side, "png") for view in frames}
+    vision = turbovla.vision(4 * vision_heads * r.choice((2, 3, 5)), r.randint(1, 4), vision_heads, r.choice((20, 36, 50)), patch, r.choice((0, 1, 4, 4)),
+                             layer_norm_eps=r.choice((1e-5, 1e-6)), rope_theta=r.choice((100.0, 100.0, 37.5, 1e4)))
+    text = turbovla.text(4 * text_heads * r.choice((1, 2, 3)), r.randint(1, 4), text_heads, r.choice((20, 36, 50)), n_position)
+    policy = turbovla.policy(
+        r.randint(1, 14), 4 * heads * r.choice((1, 2, 3)), heads, r.choice((20, 50, 72)), (r.randint(1, 4), r.randint(1, 4)), side,
+        max_language_tokens=r.randint(3, n_position), feedforward_activation=r.choice(("relu", "relu", "gelu")),
+        normalization_mapping={"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)})
+    checkpoint = turbovla.Checkpoint(vision, text, policy, {view: frame[:2] for view, frame in frames.items()}, r.choice((0, 1, 7, 20)), r.randint(1, 20),
+                                     dtype=r.choice(("F32", "F32", "BF16")))
+    return cases.Case(seed, frames, r.choice((*TEXTS, "Ouvre le TIROIR à côté de l'évier, 한국어 Ⅷ ﬁn", "[SEP]a[MASK] [cls]")), checkpoint)
 
 
 # Of what a part of BitVLA reads: names of values that the reference records. A whole block starts from the one before.
@@ -326,7 +346,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

@@ -53,11 +53,11 @@ def write_observation(case, folder):
             image = Image.fromarray(smooth_frame(frame[0], frame[1], generator))
             image.save(folder / images[view], **({"quality": 92} if frame[2] == "jpg" else {"optimize": True}))
     widths = getattr(checkpoint, "states", None)  # feature -> width
-    state = generator.normal(sum(widths.values()) if widths else checkpoint.d_state) * f32(0.4)
+    state = generator.normal(checkpoint.d_state if widths is None else sum(widths.values())) * f32(0.4)
     for i in checkpoint.zero_spread:  # what never moved in the data does not move here; otherwise eps would rule the chunk
         state[i] = statistics(checkpoint.d_state, checkpoint.d_action, case.seed)["observation.state"]["mean"][i]
     state = list(case.state) or state.tolist()
-    if widths:
+    if widths is not None:
         numbers = iter(state)
         state = {name: [next(numbers) for _ in range(n)] for name, n in widths.items()}
     observation = {"images": images, "state": state, "text": case.text}

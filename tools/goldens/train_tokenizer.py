@@ -127,6 +127,19 @@ def eagle(folder):
     write_slow(spec, folder)
 
 
+def bert(folder, n_piece=110):
+    """BERT's rules for text without capitals, around another vocabulary."""
+    from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, trainers
+    from transformers import BertTokenizer
+
+    fast = Tokenizer(models.WordPiece(unk_token="[UNK]"))
+    fast.normalizer, fast.pre_tokenizer = normalizers.BertNormalizer(), pre_tokenizers.BertPreTokenizer()
+    special = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]"]
+    fast.train_from_iterator([t + "!" for t in TASKS], trainers.WordPieceTrainer(
+        vocab_size=len(special) + n_piece, special_tokens=special, show_progress=False))
+    BertTokenizer(vocab=fast.get_vocab(), model_max_length=512).save_pretrained(folder)
+
+
 def bitvla(folder, n_merge=120):
     """Llama 3's rules with other merges; the added tokens follow the vocabulary in the published order, with a few action tokens."""
     from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, processors, trainers
@@ -153,4 +166,4 @@ def bitvla(folder, n_merge=120):
 
 
 if __name__ == "__main__":
-    {"bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))
+    {"bert": bert, "bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))
