@@ -64,27 +64,25 @@ Tensor grid_rotary_table(Graph& g, int d_head, float base, const std::vector<Pos
 }
 
 Tensor centre_rotary_table(Graph& g, int d_head, float base, int n_first, int n_row, int n_column) {
-  const int n_period = d_head / 4;
-  const auto put = [&](std::vector<float>& table, float x, float y, double (*turned)(double)) {
+  const auto put_token = [&](std::vector<float>& table, float x, float y) {
+    std::vector<double> angles;
     for (const float at : {y, x})
-      for (int i = 0; i < n_period; ++i) {
+      for (int i = 0; i < d_head / 4; ++i) {
         const auto exponent = static_cast<float>(i * (4.0 / d_head));
         const float frequency = 1.0f / static_cast<float>(std::pow(double{base}, double{exponent}));
-        table.push_back(static_cast<float>(turned(double{2 * std::numbers::pi_v<float> * at * frequency})));
+        angles.push_back(double{2 * std::numbers::pi_v<float> * at * frequency});
       }
+    for (const double angle : angles) table.push_back(static_cast<float>(std::cos(angle)));
+    for (const double angle : angles) table.push_back(static_cast<float>(std::sin(angle)));
   };
   const auto centre = [](int i, int n) {
     return 2.0f * ((static_cast<float>(i) + 0.5f) / static_cast<float>(n)) - 1.0f;
   };
   const auto make = [&] {
     std::vector<float> table;
-    const auto put_token = [&](float x, float y) {
-      put(table, x, y, [](double angle) { return std::cos(angle); });
-      put(table, x, y, [](double angle) { return std::sin(angle); });
-    };
-    for (int i = 0; i < n_first; ++i) put_token(0, 0);
+    for (int i = 0; i < n_first; ++i) put_token(table, 0, 0);
     for (int row = 0; row < n_row; ++row)
-      for (int column = 0; column < n_column; ++column) put_token(centre(column, n_column), centre(row, n_row));
+      for (int column = 0; column < n_column; ++column) put_token(table, centre(column, n_column), centre(row, n_row));
     return table;
   };
   return g.constant(fmt::format("centre_rope/{}/{}/{}/{}/{}", d_head, base, n_first, n_row, n_column),

@@ -35,7 +35,8 @@ Result<std::vector<std::int32_t>> read_around(const Keys& keys, const char* key,
   return Error{Code::bad_bundle, key, "at most " + std::to_string(kMaxAround) + " ids", std::to_string(ids.size())};
 }
 
-std::vector<bool> marks_of(const std::vector<AddedToken>& added, std::size_t n_token) {
+/// By id, whether it is that of an added token.
+std::vector<bool> are_added(const std::vector<AddedToken>& added, std::size_t n_token) {
   std::vector<bool> is_added(n_token);
   for (const AddedToken& token : added)
     if (token.id != kNoRow) is_added[static_cast<std::size_t>(token.id)] = true;
@@ -105,7 +106,7 @@ Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::strin
   VLA_CHECK(check_added(added, tokens, ignore_merges));
   ByteLevel model;
   VLA_TRY(model.pretokenizer, Pretokenizer::parse(pre));
-  VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, marks_of(added, tokens.size())));
+  VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, are_added(added, tokens.size())));
   model_ = std::move(model);
   if (!keys.has("tokenizer.prefix_ids")) return {};
   VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
@@ -126,7 +127,7 @@ Status Tokenizer::read_wordpiece(const Keys& keys, const std::vector<std::string
   VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
   VLA_TRY(suffix_, read_around(keys, "tokenizer.suffix_ids", tokens.size()));
   VLA_TRY(const int unknown, keys.integer("tokenizer.unknown_id", {0, static_cast<double>(tokens.size()) - 1.0}));
-  VLA_TRY(model_, WordPiece::create(tokens, marks_of(added, tokens.size()), unknown));
+  VLA_TRY(model_, WordPiece::create(tokens, are_added(added, tokens.size()), unknown));
   return {};
 }
 

@@ -69,7 +69,7 @@ TEST_CASE("a ternary code that stands for no number and a factor that is missing
 TEST_CASE("a bundle of an architecture that this build does not know is unsupported") {
   EditableBundle bundle = sound_bundle();
   bundle.set("vla.arch", Value(std::string("octo")));
-  check_refused(bundle, Code::unsupported, "smolvla, found octo");
+  check_refused(bundle, Code::unsupported, "turbovla, found octo");
 }
 
 TEST_CASE("missing, extra and misshapen tensors are named in one error") {
@@ -125,6 +125,23 @@ TEST_CASE("sizes that do not go together are refused before memory is taken") {
     bundle.set(key, Value(value));
     CHECK_FALSE(Engine::load(bundle.write("changed.gguf"), {.n_thread = 1}).ok());
   }
+}
+
+TEST_CASE("TurboVLA is refused with fewer cameras than views, fewer positions than tokens, or norms behind the sums") {
+  const EditableBundle sound = EditableBundle::read(golden_path("turbovla/two_views") + "/bundle.gguf");
+  const auto with_rows = [&](const char* key, const std::string& table, std::int64_t n) {
+    EditableBundle bundle = sound;
+    bundle.set(key, Value(n));
+    auto& tensor = bundle.tensor(table);
+    tensor.data.resize(tensor.data.size() / static_cast<std::size_t>(tensor.shape[1]) * static_cast<std::size_t>(n));
+    tensor.shape[1] = n;
+    return bundle;
+  };
+  check_refused(with_rows("policy.n_view", "camera.weight", 1), Code::bad_bundle, "policy.n_view: expected 2 or more");
+  check_refused(with_rows("lm.n_position", "lm.position.weight", 31), Code::bad_bundle, "at most 31 tokens");
+  EditableBundle bundle = sound;
+  bundle.set("transformer.norm", Value(std::string("after")));
+  check_refused(bundle, Code::bad_bundle, "transformer.norm");
 }
 
 TEST_CASE("every number of every architecture has a range, and one beyond it is refused by its key") {

@@ -23,6 +23,7 @@ constexpr const char* kLists[][2] = {
     {"image", R"([{"op": "resize", "width": 6, "height": 4, "filter": "torch_bicubic_8bit"},
                   {"op": "standardize", "mean": [0.5, 0.4, 0.3], "std": [0.2, 0.2, 0.2], "arithmetic": "bfloat16"}])"},
     {"image", R"([{"op": "resize", "width": 5, "height": 9, "filter": "opencv_bilinear"}])"},
+    {"image", R"([{"op": "resize", "width": 7, "height": 3, "filter": "torch_bilinear"}])"},
     {"text",
      R"([{"op": "strip"}, {"op": "lower"}, {"op": "replace", "from": "p", "to": "q r"}, {"op": "drop_punctuation"},
                  {"op": "template", "text": "Do: {instruction}!"}, {"op": "tokenize", "max_tokens": 8, "truncate": "left"}])"},

@@ -68,19 +68,19 @@ def weights(s: Sizes) -> List[Weight]:
         rows.append(Weight("state_token.weight", "model.state_embed", VECTOR, (1, 1, d), (d,)))
     for i in range(s.n_fusion):
         target, source = "fusion.blk.{}.".format(i), "{}layers.{}.".format(fusion, i)
-        rows += _branches(target + "image.", source, "norm_vision_attn", "text_to_vision_attn", s)
+        rows += _attention(target + "image.", source, "norm_vision_attn", "text_to_vision_attn", s)
         rows += _mlp(target + "image.", source + "norm_vision_ffn", source + "vision_ffn", s)
-        rows += _branches(target + "text.", source, "norm_text_attn", "vision_to_text_attn", s)
+        rows += _attention(target + "text.", source, "norm_text_attn", "vision_to_text_attn", s)
         rows += _mlp(target + "text.", source + "norm_text_ffn", source + "text_ffn", s)
     for i in range(s.n_decoder):
         target, source = "decoder.blk.{}.".format(i), "{}layers.{}.".format(decoder, i)
-        rows += _branches(target, source, "norm_self_attn", "self_attn", s)
-        rows += _branches(target + "cross.", source, "norm_cross_attn", "cross_attn", s)
+        rows += _attention(target, source, "norm_self_attn", "self_attn", s)
+        rows += _attention(target + "cross.", source, "norm_cross_attn", "cross_attn", s)
         rows += _mlp(target, source + "norm_ffn", source + "ffn", s)
     return rows
 
 
-def _branches(target: str, source: str, norm_name: str, attention: str, s: Sizes) -> List[Weight]:
+def _attention(target: str, source: str, norm_name: str, attention: str, s: Sizes) -> List[Weight]:
     """An attention with its norm."""
     rows = norm(target + "attn_norm", source + norm_name, s.d_model)
     for part, name in zip(("attn_q", "attn_k", "attn_v", "attn_out"), QKV):
