@@ -230,7 +230,7 @@ TEST_CASE("a number out of its range names the range, and one of another type bo
   keys.set("lm.norm_eps", 1e30);
   keys.set("lm.n_layer", std::int64_t{1} << 40);
   keys.set("lm.sections", std::vector<std::int64_t>{1, -1});
-  CHECK(keys.number("lm.norm_eps", kNormEps).error().message() == "lm.norm_eps: expected 1e-12 to 0.01, found 1e+30");
+  CHECK(keys.number("lm.norm_eps", kNormEps).error().message() == "lm.norm_eps: expected 1e-13 to 0.01, found 1e+30");
   CHECK(keys.integer("lm.n_layer", {1, 512}).error().message() == "lm.n_layer: expected 1 to 512, found 1099511627776");
   CHECK(contains(keys.integers("lm.sections", kAnySize).error().message(), "expected 0 to 2147483647, found -1"));
   keys.set("lm.norm_eps", std::numeric_limits<double>::quiet_NaN());
