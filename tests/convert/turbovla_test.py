@@ -13,7 +13,7 @@ from manifests import check_keys, check_parameters
 from vla_cpp.convert.archs import Options, load
 from vla_cpp.convert.archs.turbovla import mapping
 from vla_cpp.convert.archs.turbovla.config import read_sizes
-from vla_cpp.convert.checkpoint import open_checkpoint
+from vla_cpp.convert.checkpoint import Checkpoint, open_checkpoint
 from vla_cpp.convert.errors import ConvertError, Problems
 
 VIEWS = {"top": (33, 40), "wrist": (20, 24)}
@@ -28,14 +28,12 @@ def configs(checkpoint, folder):
     write_json(folder / "config.json", checkpoint.config)
     language = {"model_type": "bert", "vocab_size": checkpoint.n_vocab} | checkpoint.text
     write_json(folder / "language_encoder/config.json", language)
-    from vla_cpp.convert.checkpoint import Checkpoint
-
     return Checkpoint("published", str(folder), "", checkpoint.config, {}, {}, {}, None)
 
 
-def sizes_of(checkpoint, options=None):
+def sizes_of(checkpoint):
     problems = Problems("published")
-    sizes = read_sizes(checkpoint, options or Options(), problems)
+    sizes = read_sizes(checkpoint, Options(), problems)
     problems.raise_any()
     return sizes
 
@@ -112,6 +110,12 @@ def test_the_tokenizer_puts_two_tokens_around_a_text(planned):
         "[UNK]",
     ]
     assert "tokenizer.merges" not in keys
+
+
+def test_a_model_of_an_older_file_states_no_type(planned, folder):
+    model = json.loads((folder / "language_encoder/tokenizer.json").read_text())["model"]
+    keys, _ = planned("language_encoder/tokenizer.json", "model", {k: v for k, v in model.items() if k != "type"})
+    assert keys["tokenizer.kind"] == "wordpiece"
 
 
 def test_the_language_models_folder_is_given_or_inside(planned, folder):

@@ -54,15 +54,16 @@ def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[st
     keys = [
         Key("tokenizer.kind", "string", kind.KIND),
         Key("tokenizer.tokens", "string[]", tokens),
-        *([] if kind is tokenizer_wordpiece else [Key("tokenizer.merges", "string[]", merges_of(model.get("merges"), model["vocab"], problems))]),
         Key("tokenizer.added", "string", to_json(_with_rows(added, n_vocab))),
         *own,
     ]
+    if kind is not tokenizer_wordpiece:
+        keys.insert(2, Key("tokenizer.merges", "string[]", merges_of(model.get("merges"), model["vocab"], problems)))
     return TokenizerPlan(keys, _truncation_side(spec, config, problems))
 
 
 def _kind(model: dict):
-    if model.get("type") == "WordPiece":
+    if model.get("type", tokenizer_wordpiece.untyped(model)) == "WordPiece":
         return tokenizer_wordpiece
     return tokenizer_byte_fallback if model.get("byte_fallback") is True else tokenizer_byte_level
 

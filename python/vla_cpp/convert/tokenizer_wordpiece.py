@@ -32,13 +32,18 @@ CONFIG = {"do_lower_case": (True,), "tokenize_chinese_chars": (True,), "strip_ac
 TOKENS = {name + "_token": "[{}]".format(name.upper()) for name in ("unk", "sep", "pad", "cls", "mask")}
 
 
+def untyped(model: dict) -> str:
+    """The type of a model as files of older releases have it, which state none: they are told by what a model has."""
+    return "WordPiece" if "max_input_chars_per_word" in model and "continuing_subword_prefix" in model else ""
+
+
 def with_defaults(config: dict) -> dict:
     """The class's own defaults, which it adds to the vocabulary like stated ones."""
     return dict(TOKENS, **config) if config.get("tokenizer_class") in BERT else config
 
 
 def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key]:
-    check_model(tokenizer.model, MODEL, "byte-level BPE, BPE with byte fallback and WordPiece", problems)
+    check_model({"type": untyped(tokenizer.model), **tokenizer.model}, MODEL, "byte-level BPE, BPE with byte fallback and WordPiece", problems)
     check_class(tokenizer.config, GENERIC + BERT, problems)
     _check_settings(tokenizer.spec.get("normalizer"), "normalizer", "BertNormalizer", problems)
     _check_settings(tokenizer.spec.get("pre_tokenizer"), "pre_tokenizer", "BertPreTokenizer", problems)
