@@ -26,10 +26,23 @@ std::uint32_t transposed(std::uint32_t codes) {
 std::size_t BytePanels::packed_size(const MatrixDesc& desc) { return size_of<BytePanels>(desc); }
 
 void BytePanels::pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
-  std::memset(packed, 0, packed_size(desc));
-  for (std::int64_t n = 0; n < desc.d_out; ++n, stored += desc.d_in) {
-    std::byte* to = packed + n / kColumns * strip_size(desc.d_in) + n % kColumns * 4;
-    for (std::int64_t k = 0; k < desc.d_in; ++k) to[k / 4 * kLine + k % 4] = stored[k] ^ std::byte{kOffset};
+  constexpr std::uint32_t kOffsets = kOffset * 0x01010101U;
+  const std::int64_t d_in = desc.d_in, n_whole = d_in / 4 * 4;
+  if (n_whole < quantized_depth(d_in) || desc.d_out % (kColumns * kUnitStrips) != 0)
+    std::memset(packed, 0, packed_size(desc));
+  for (std::int64_t first = 0; first < desc.d_out; first += kColumns, packed += strip_size(d_in)) {
+    const std::int64_t n_column = min(desc.d_out - first, kColumns);
+    const std::byte* const rows = stored + first * d_in;
+    for (std::int64_t k = 0; k < n_whole; k += 4)
+      for (std::int64_t n = 0; n < n_column; ++n) {
+        std::uint32_t codes;
+        std::memcpy(&codes, rows + n * d_in + k, sizeof(codes));
+        codes ^= kOffsets;
+        std::memcpy(packed + k / 4 * kLine + 4 * n, &codes, sizeof(codes));
+      }
+    for (std::int64_t k = n_whole; k < d_in; ++k)
+      for (std::int64_t n = 0; n < n_column; ++n)
+        packed[k / 4 * kLine + 4 * n + k % 4] = rows[n * d_in + k] ^ std::byte{kOffset};
   }
 }
 
