@@ -9,6 +9,7 @@
 #include <fstream>
 #include <utility>
 
+#include "base/process.h"
 #include "kernels/probe/probe.h"
 
 namespace vla::bench {
@@ -98,7 +99,7 @@ double cpu_seconds() {
   return static_cast<double>(time.tv_sec) + 1e-9 * static_cast<double>(time.tv_nsec);
 }
 
-ProcessMemory process_memory() { return {status_bytes("VmHWM"), status_bytes("VmRSS")}; }
+ProcessMemory process_memory() { return {status_bytes("VmHWM"), resident_size()}; }
 
 bool forget_peak_memory() {
   std::ofstream out("/proc/self/clear_refs");

@@ -4,10 +4,10 @@
 
 #include <prometheus/gauge.h>
 #include <prometheus/text_serializer.h>
-#include <unistd.h>
 
-#include <fstream>
 #include <new>
+
+#include "base/process.h"
 
 namespace vla::serve {
 namespace {
@@ -16,14 +16,6 @@ const prometheus::Histogram::BucketBoundaries kSeconds = {1e-4, 2.5e-4, 5e-4, 1e
                                                           0.05, 0.1,    0.25, 0.5,  1,      2.5,  5,    10};
 
 double seconds(Clock::duration time) { return std::chrono::duration<double>(time).count(); }
-
-/// Second number of /proc/self/statm, in pages; 0 where there is none.
-double resident_bytes() {
-  std::ifstream file("/proc/self/statm");
-  double size = 0, resident = 0;
-  file >> size >> resident;
-  return resident * static_cast<double>(::sysconf(_SC_PAGESIZE));
-}
 
 prometheus::MetricFamily gauge(const char* name, const char* help, double value) {
   prometheus::MetricFamily family{name, help, prometheus::MetricType::Gauge, {}};
@@ -84,7 +76,8 @@ std::string Metrics::text(const Health& health) const {
   families.push_back(gauge("vla_queue_depth", "Acts that wait", static_cast<double>(health.n_waiting)));
   families.push_back(gauge("vla_computing", "1 while the engine computes", health.computing ? 1 : 0));
   families.push_back(gauge("vla_uptime_seconds", "Time since the server became ready", health.uptime_s));
-  families.push_back(gauge("process_resident_memory_bytes", "Resident memory of the process", resident_bytes()));
+  families.push_back(
+      gauge("process_resident_memory_bytes", "Resident memory of the process", static_cast<double>(resident_size())));
   return prometheus::TextSerializer().Serialize(families);
 }
 
