@@ -45,6 +45,18 @@ inline CLI::Option* add_text(CLI::App& command, const char* name, std::string& v
   return command.add_option(name, value, help)->type_name(type)->check(CLI::Validator(given, ""));
 }
 
+/// Digits for what 1.5GB, 800M and 2GiB stand for. What comes back is the problem, or empty.
+std::string read_bytes(std::string& text);
+
+/// An option that takes bytes.
+template <class Bytes>
+CLI::Option* add_bytes(CLI::App& command, const char* name, Bytes& bytes, const std::string& help) {
+  return command.add_option(name, bytes, help)->type_name("BYTES")->transform(CLI::Validator(read_bytes, ""));
+}
+
+/// The memory that the process may take, wherever a policy is loaded.
+void add_memory(CLI::App& command, std::size_t& bytes);
+
 /// Where vla-pull has put what a name `hub:OWNER/NAME@REVISION` stands for; every other text is a file's name. What
 /// comes back is the problem, or empty.
 std::string find_pulled(std::string& bundle);

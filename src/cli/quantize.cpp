@@ -112,11 +112,8 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
               "The fewest bytes whose chunks move by at most this share of float32's, by root mean square: 0.01")
           ->type_name("SHARE")
           ->check(CLI::Range(1e-6, 1.0));
-  CLI::Option* size =
-      command
-          .add_option("--size", options.bound.bytes, "The least error of a file of at most so many bytes: 1.8GB, 900MB")
-          ->type_name("BYTES")
-          ->transform(CLI::AsSizeValue(true));
+  CLI::Option* size = add_bytes(command, "--size", options.bound.bytes,
+                                "The least error of a file of at most so many bytes: 1.8GB, 900MB");
   error->needs(judge)->excludes(size);
   size->needs(judge)->excludes("--dtype");
   error->excludes("--dtype");
