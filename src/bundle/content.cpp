@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <chrono>
 #include <cstring>
 
 namespace vla {
@@ -87,6 +88,7 @@ Status Content::seal(const std::function<void(std::span<const std::byte>)>& see)
     see(bytes_);
     return {};
   }
+  const auto start = std::chrono::steady_clock::now();
   Room room;
   sums_.reserve(bytes_.size() / kBlock + 1);
   for (std::size_t offset = 0; offset < bytes_.size(); offset += kPiece) {
@@ -100,6 +102,8 @@ Status Content::seal(const std::function<void(std::span<const std::byte>)>& see)
     for (std::size_t i = 0; i < piece.size(); i += kBlock)
       sums_.push_back(XXH3_64bits(piece.data() + i, std::min(kBlock, piece.size() - i)));
   }
+  read_rate_ = static_cast<double>(bytes_.size()) /
+               std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
   auto* const first = const_cast<std::byte*>(bytes_.data());
   ::madvise(first, shown_, MADV_DONTNEED);
   ::mprotect(first, shown_, PROT_NONE);  // zeros would pass for weights
@@ -117,6 +121,24 @@ const std::byte* Content::read(std::span<const std::byte> part, Room& room) cons
   for (std::size_t i = 0; i < blocks.size(); i += kBlock)
     if (XXH3_64bits(&blocks[i], std::min(kBlock, blocks.size() - i)) != sums_[(first + i) / kBlock]) return nullptr;
   return &blocks[offset - first];
+}
+
+void Content::forget(std::span<const std::byte> part) const {
+  if (file_ < 0) return;
+  ::posix_fadvise(file_, part.data() - bytes_.data(), static_cast<off_t>(part.size()), POSIX_FADV_DONTNEED);
+}
+
+std::size_t Content::n_cached() const {
+  if (file_ < 0) return 0;
+  void* const addresses = ::mmap(nullptr, bytes_.size(), PROT_READ, MAP_SHARED, file_, 0);
+  if (addresses == MAP_FAILED) return 0;
+  const auto page = static_cast<std::size_t>(::sysconf(_SC_PAGESIZE));
+  std::vector<unsigned char> pages((bytes_.size() + page - 1) / page);
+  const bool is_known = ::mincore(addresses, bytes_.size(), pages.data()) == 0;
+  ::munmap(addresses, bytes_.size());
+  if (!is_known) return 0;
+  return page *
+         static_cast<std::size_t>(std::ranges::count_if(pages, [](unsigned char bits) { return bits % 2 == 1; }));
 }
 
 Error Content::changed() const {

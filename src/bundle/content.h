@@ -54,10 +54,16 @@ class Content {
   /// Passes all bytes to `see`, one part after the other, and ends what is shown. Errors: io, bad_bundle.
   Status seal(const std::function<void(std::span<const std::byte>)>& see);
 
+  /// Bytes a second that `seal` read and compared; 0 of memory.
+  double read_rate() const { return read_rate_; }
   /// A part of `bytes()`, in `room` where there is a file; null where the file has not these bytes any more. Once
   /// `room` is as large as `room_for` the part, this takes no memory. Threads may read at a time.
   const std::byte* read(std::span<const std::byte> part, Room& room) const;
   static constexpr std::size_t room_for(std::size_t size) { return (size / kBlock + 2) * kBlock; }
+  /// Lets the system give up what it keeps of a part of the file: nobody is about to read it again.
+  void forget(std::span<const std::byte> part) const;
+  /// Bytes of the file that the system keeps in memory, which it gives up where others need it; 0 of memory.
+  std::size_t n_cached() const;
   /// What to say where `read` gave null.
   Error changed() const;
 
@@ -69,6 +75,7 @@ class Content {
   std::string path_;
   std::span<const std::byte> bytes_;
   std::size_t shown_ = 0;
+  double read_rate_ = 0;
   std::vector<std::uint64_t> sums_;  // of the blocks of a file
 };
 

@@ -114,7 +114,7 @@ ggml_type GgmlDevice::resident_type(const Param& param) const {
   return param.storage == Storage::table || (param.storage == Storage::matrix && kept) ? type : GGML_TYPE_F32;
 }
 
-Status GgmlDevice::load(const ParamList& params, bool fill) {
+Status GgmlDevice::load(const ParamList& params, bool fill, const WeightPlan&) {
   VLA_CHECK(check_rounding(params, rounding_));
   if (!fill) memory().set_dry();
   VLA_TRY(weight_context_, make_context(params.params().size()));

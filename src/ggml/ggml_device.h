@@ -27,7 +27,7 @@ class GgmlDevice final : public Device {
                                               Rounding rounding);
   ~GgmlDevice() override;
 
-  Status load(const ParamList& params, bool fill) override;
+  Status load(const ParamList& params, bool fill, const WeightPlan& plan) override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;

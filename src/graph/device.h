@@ -97,15 +97,33 @@ struct DeviceInfo {
   std::string precision;             // of products: "f32, bf16"
 };
 
+/// Where matrices are, if memory is too small for all of them.
+struct WeightPlan {
+  /// Those that come from the bundle's file in every act, in groups, in the order in which the prefix reads them.
+  /// Empty: all of them stay in memory.
+  std::vector<std::vector<const Param*>> streamed;
+  std::size_t window = 0;    // bytes of memory that the largest group takes
+  std::size_t n_read = 0;    // bytes of the file that an act reads
+  std::size_t smallest = 0;  // bytes of memory that parameters take at least
+};
+
 /// Something that graphs run on: it keeps parameters, slots and working memory, and lowers graphs for itself.
 class Device {
  public:
   virtual ~Device() = default;
 
-  /// Makes the parameters resident, laid out for this device. Every one must have its source: call ParamList::report
-  /// first. `fill` false reserves memory without touching it, which is enough to learn sizes; no source is needed.
-  /// Errors: out_of_memory, bad_bundle.
-  virtual Status load(const ParamList& params, bool fill) = 0;
+  /// Makes the parameters resident but those that `plan` has elsewhere, laid out for this device. Every one must have
+  /// its source: call ParamList::report first. `fill` false reserves memory without touching it, which is enough to
+  /// learn sizes; no source is needed. Errors: out_of_memory, bad_bundle, device.
+  virtual Status load(const ParamList& params, bool fill, const WeightPlan& plan = {}) = 0;
+  /// How parameters take at most `size` bytes of memory, or as few as they can. Of each act `prefix` is run once and
+  /// `step` several times; both were lowered after a `load` of all parameters, which may have filled nothing. Errors:
+  /// unsupported of devices that keep all parameters.
+  virtual Result<WeightPlan> plan_weights(const Program& /*prefix*/, const Program& /*step*/,
+                                          std::size_t /*size*/) const {
+    return Error{Code::unsupported, "memory", "the CPU's kernels, which read matrices as they need them",
+                 name() + ", which keeps all of them", "leave the budget out, or use --device cpu"};
+  }
   /// Gives slots memory, filled with zeros. Errors: out_of_memory.
   virtual Status allocate(Slots& slots) = 0;
   virtual void set(const Slot& slot, const void* data, std::size_t size) = 0;

@@ -12,6 +12,7 @@
 #include "kernels/pages.h"
 #include "lower/cpu/cpu_program.h"
 #include "lower/cpu/precision.h"
+#include "lower/cpu/weight_plan.h"
 
 namespace vla::lower {
 namespace {
@@ -70,11 +71,15 @@ Result<std::unique_ptr<Device>> CpuDevice::open(int n_thread, const Arithmetic& 
 
 std::string CpuDevice::name() const { return fmt::format("cpu, {} thread{}", n_thread(), n_thread() == 1 ? "" : "s"); }
 
-Status CpuDevice::load(const ParamList& params, bool fill) {
+Status CpuDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   min_rounded_keys_ = min_rounded_keys(params);
   arithmetic_.use = features_for(params, arithmetic_.use, arithmetic_.at_load);
-  VLA_TRY(weights_, CpuWeights::load(params, {arithmetic_.use, arithmetic_.at_load, n_thread(), fill}));
+  VLA_TRY(weights_, CpuWeights::load(params, {arithmetic_.use, arithmetic_.at_load, n_thread(), fill}, plan));
   return {};
+}
+
+Result<WeightPlan> CpuDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
+  return plan_streams(weights_, static_cast<const CpuProgram&>(prefix), static_cast<const CpuProgram&>(step), size);
 }
 
 Status CpuDevice::allocate(Slots& slots) {

@@ -16,7 +16,8 @@ class CpuDevice final : public Device {
   /// Errors: device.
   static Result<std::unique_ptr<Device>> open(int n_thread, const Arithmetic& arithmetic);
 
-  Status load(const ParamList& params, bool fill) override;
+  Status load(const ParamList& params, bool fill, const WeightPlan& plan = {}) override;
+  Result<WeightPlan> plan_weights(const Program& prefix, const Program& step, std::size_t size) const override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;

@@ -23,8 +23,10 @@ Result<std::unique_ptr<Program>> CpuProgram::make(CpuLowering& l, const Memory& 
   std::unique_ptr<CpuProgram> program(new CpuProgram);
   program->executor_ = std::move(executor), program->clock_ = std::move(clock);
   program->arena_ = arena, program->tables_ = l.weights.tables(), program->weights_ = l.weights.table();
+  program->stream_ = l.weights.stream();
   VLA_CHECK(program->give_addresses(l));
   VLA_CHECK(program->make_tasks(l));
+  VLA_CHECK(program->cut(l.weights));
   program->make_taps(l);
   return std::unique_ptr<Program>(std::move(program));
 }
@@ -64,15 +66,17 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   for (const CpuOp& op : l.ops) scratch = std::max(scratch, scratch_of(l, op));
   VLA_CHECK(executor_->reserve(scratch));
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
-  phases_.resize(static_cast<std::size_t>(l.n_phase));
+  phases_.resize(static_cast<std::size_t>(l.n_phase)), matrices_.resize(phases_.size());
   const auto& stages = l.graph.stages();
   work_.resize(stages.size() + 1);
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
   for (const CpuOp& op : l.ops) {
+    const std::size_t n_use = uses_.size();
     tasks_.push_back(emit(l, op, uses_));
     tasks_.back()->kind = kind_of(op), tasks_.back()->clock = clock_.get();
     const auto phase = static_cast<std::size_t>(op.phase);
     phases_[phase].tasks.push_back(tasks_.back().get());
+    for (const MatrixUse& use : std::span(uses_).subspan(n_use)) matrices_[phase].push_back(use.matrix);
     text_ += text_of(l, op) + "\n";
     const std::size_t stage = stage_of(l, op);
     if (!op.invariant) work_[stage] += work_of(l, op);
@@ -96,21 +100,39 @@ void CpuProgram::make_taps(const CpuLowering& l) {
   }
 }
 
-Status CpuProgram::prepare() { return run(std::span(phases_).first(n_prepare_)); }
-Status CpuProgram::run() { return run(std::span(phases_).subspan(n_prepare_)); }
+Status CpuProgram::cut(const CpuWeights& weights) {
+  std::vector<Groups> groups(phases_.size());
+  for (std::size_t i = 0; i < phases_.size(); ++i)
+    for (const Param* matrix : matrices_[i]) groups[i].add(weights.group_of(matrix->id));
+  for (const Groups& all : groups)
+    if (all.last - all.first >= WeightStream::kWindows)
+      return Error{Code::unsupported, "memory",
+                   fmt::format("phases that read at most {} groups of matrices", WeightStream::kWindows),
+                   std::to_string(all.last - all.first + 1), "give a larger budget"};
+  prepare_ = cut_phases(std::span(groups).first(n_prepare_), 0);
+  run_ = cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_);
+  return {};
+}
+
+Status CpuProgram::prepare() { return run(prepare_); }
+Status CpuProgram::run() { return run(run_); }
 
 /// Matrices are where the table has them.
 void CpuProgram::bind() {
   for (const auto& [part, matrix] : uses_) {
-    const auto& [data, scales] = weights_->entries[static_cast<std::size_t>(matrix)];
+    const auto& [data, scales] = weights_->at(matrix);
     part->weight = data, part->scale = scales;
   }
   bound_ = weights_->version;
 }
 
-Status CpuProgram::run(std::span<const kernels::Phase> phases) {
+Status CpuProgram::run(const std::vector<Segment>& segments) {
   if (bound_ != weights_->version) bind();
-  executor_->run(phases);
+  for (const Segment& segment : segments) {
+    if (segment.groups.any()) VLA_CHECK(stream_->bring(segment.groups.first, segment.groups.last));
+    executor_->run(std::span(phases_).subspan(segment.begin, segment.end - segment.begin));
+    if (segment.released >= 0) stream_->release(segment.released);
+  }
   for (const auto& [param, rows] : *tables_) VLA_CHECK(rows->status());
   return {};
 }

@@ -5,6 +5,7 @@
 #include <deque>
 
 #include "lower/cpu/emit.h"
+#include "lower/cpu/segments.h"
 
 namespace vla::lower {
 
@@ -23,6 +24,9 @@ class CpuProgram final : public Program {
   const std::vector<Tap>& taps() const override { return taps_; }
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
+  /// The matrices that each phase of `run` reads, and before it those of `prepare`.
+  const std::vector<std::vector<const Param*>>& matrices() const { return matrices_; }
+  std::size_t n_prepare() const { return n_prepare_; }
   std::size_t size() const override { return own_.size() + host_size_; }
 
  private:
@@ -30,10 +34,11 @@ class CpuProgram final : public Program {
     const float* data;
     Shape shape, stride;
   };
-  Status run(std::span<const kernels::Phase> phases);
+  Status run(const std::vector<Segment>& segments);
   void bind();
   Status give_addresses(CpuLowering& l);
   Status make_tasks(const CpuLowering& l);
+  Status cut(const CpuWeights& weights);
   void make_taps(const CpuLowering& l);
 
   std::shared_ptr<kernels::Executor> executor_;
@@ -45,6 +50,9 @@ class CpuProgram final : public Program {
   std::uint64_t bound_ = 0;  // the version of the table that tasks know
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;
+  std::vector<std::vector<const Param*>> matrices_;  // of each phase
+  std::vector<Segment> prepare_, run_;
+  std::shared_ptr<WeightStream> stream_;  // null where all matrices are resident
   std::size_t n_prepare_ = 0, host_size_ = 0;
   std::vector<Stage> stages_;
   std::vector<Work> work_;

@@ -7,10 +7,9 @@
 #include <string>
 #include <vector>
 
-#include "bundle/params.h"
-#include "graph/rounding.h"
-#include "kernels/linear_kernel.h"
+#include "graph/device.h"
 #include "lower/cpu/table_rows.h"
+#include "lower/cpu/weight_stream.h"
 
 namespace vla::lower {
 
@@ -29,8 +28,9 @@ struct WeightTable {
   const Entry& at(const Param* param) const { return entries[static_cast<std::size_t>(param->id)]; }
 };
 
-/// The parameters of a policy, resident for the CPU's kernels. Matrices are packed in panels, encoded as in the bundle
-/// or rounded; vectors are copied. Tables stay with the bundle, since a row that is looked up is widened exactly.
+/// The parameters of a policy for the CPU's kernels. Matrices are packed in panels, encoded as in the bundle or
+/// rounded, and resident or streamed; vectors are copied. Tables stay with the bundle, since a row that is looked up is
+/// widened exactly.
 class CpuWeights {
  public:
   struct Options {
@@ -39,9 +39,9 @@ class CpuWeights {
     int n_thread;
     bool fill = true;  // else memory is reserved and never touched
   };
-  /// Every parameter must have its source. Errors: out_of_memory, bad_bundle where the file has been changed since it
-  /// was opened, unsupported where nothing is worth rounding (graph/rounding.h).
-  static Result<CpuWeights> load(const ParamList& list, const Options& options);
+  /// Every parameter must have its source. Errors: out_of_memory, device, bad_bundle where the file has been changed
+  /// since it was opened, unsupported where nothing is worth rounding (graph/rounding.h).
+  static Result<CpuWeights> load(const ParamList& list, const Options& options, const WeightPlan& plan);
 
   const std::byte* data(const Param* param) const { return table_->at(param).data; }
   const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
@@ -49,6 +49,12 @@ class CpuWeights {
   const Encoding& encoding(const Param* param) const { return place(param).encoding; }
   /// What multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
+  /// Bytes of a matrix.
+  std::size_t size_of(const Param& matrix) const { return place(&matrix).size_of(matrix); }
+  /// Its group among those of the plan that are streamed, or -1.
+  int group_of(int matrix) const { return groups_[static_cast<std::size_t>(matrix)]; }
+  /// What reads those; null where there are none, or nothing is filled.
+  const std::shared_ptr<WeightStream>& stream() const { return stream_; }
   /// Where everything is; programs keep it.
   const std::shared_ptr<WeightTable>& table() const { return table_; }
   /// All tables that have their source.
@@ -60,24 +66,27 @@ class CpuWeights {
   }
   /// Whether matrices of floats are int8 codes, as they are stored or rounded.
   bool has_int8() const;
-  /// Bytes in memory; of tables those of the rows that may be kept.
+  /// Bytes in memory; of tables those of the rows that may be kept, of streamed matrices those of their windows.
   std::size_t size() const { return memory_.size() + table_size_; }
   /// Which kernel multiplies how many matrices, for display: `avx2 (98 bf16)`.
   const std::string& text() const { return text_; }
 
  private:
-  struct Place {
-    Encoding encoding;
-    const kernels::LinearKernel* kernel = nullptr;
-  };
-  const Place& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
+  const MatrixPlace& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
+  MatrixPlace& place(const Param* param) { return places_[static_cast<std::size_t>(param->id)]; }
+  Status choose(const ParamList& list, const Options& options);
+  Status give_places(const ParamList& list, const Options& options, const WeightPlan& plan);
+  Status fill(const ParamList& list, const WeightPlan& plan, int n_thread) const;
+  Status start_stream(const ParamList& list, const WeightPlan& plan, int n_thread);
 
   Memory memory_;
   std::shared_ptr<WeightTable> table_;
   std::shared_ptr<const Tables> tables_;
   std::size_t table_size_ = 0;
-  std::vector<Place> places_;
+  std::vector<MatrixPlace> places_;
+  std::vector<int> groups_;
   std::string text_;
+  std::shared_ptr<WeightStream> stream_;  // goes before the memory that it writes to
 };
 
 }  // namespace vla::lower

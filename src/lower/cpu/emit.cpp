@@ -326,7 +326,7 @@ kernels::LinearJob job_of(const CpuLowering& l, const CpuOp& op) {
 
 void note_uses(const LinearOp& linear, kernels::LinearJob& job, MatrixUses& uses) {
   for (std::size_t i = 0; i < linear.linears.size(); ++i)
-    uses.push_back({&job.part[i], linear.linears[i]->as<op::Linear>()->weight->id});
+    uses.push_back({&job.part[i], linear.linears[i]->as<op::Linear>()->weight});
 }
 
 std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const LinearOp& linear, MatrixUses& uses) {

@@ -13,10 +13,10 @@ namespace vla::lower {
 /// Keys and values as a kernel's job, without addresses.
 kernels::PackJob pack_sizes(const CpuLowering& l, const PackOp& op);
 
-/// Where a task keeps the address of a matrix, and its index in the WeightTable.
+/// Where a task keeps the address of a matrix, and the matrix.
 struct MatrixUse {
   kernels::LinearJob::Part* part;
-  int matrix;
+  const Param* matrix;
 };
 using MatrixUses = std::vector<MatrixUse>;
 /// What the executor runs for an operation, when every value has its address. Matrices get theirs before each run: they

@@ -9,18 +9,27 @@
 
 namespace vla::lower {
 
-Result<Memory> Memory::allocate(std::size_t size, const std::string& what) {
+Result<Memory> Memory::map(std::size_t size, const std::string& what, int protection, int flags) {
   Memory memory;
   if (size == 0) return memory;
-  void* data = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+  void* data = mmap(nullptr, size, protection, MAP_PRIVATE | MAP_ANONYMOUS | flags, -1, 0);
   if (data == MAP_FAILED)
     return Error{Code::out_of_memory, what, "",
                  fmt::format("the system refused {:.1f} MB", 1e-6 * static_cast<double>(size)),
                  "free memory or use a smaller model"};
   memory.data_.reset(static_cast<std::byte*>(data), [size](std::byte* bytes) { munmap(bytes, size); });
   memory.size_ = size;
-  want_large_pages(data, size);
   return memory;
+}
+
+Result<Memory> Memory::allocate(std::size_t size, const std::string& what) {
+  VLA_TRY(Memory memory, map(size, what, PROT_READ | PROT_WRITE, 0));
+  if (size > 0) want_large_pages(memory.data(), size);
+  return memory;
+}
+
+Result<Memory> Memory::reserve(std::size_t size, const std::string& what) {
+  return map(size, what, PROT_NONE, MAP_NORESERVE);
 }
 
 }  // namespace vla::lower

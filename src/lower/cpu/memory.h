@@ -20,12 +20,16 @@ class Memory {
   Memory() = default;
   /// `what` is for the error. Errors: out_of_memory.
   static Result<Memory> allocate(std::size_t size, const std::string& what);
+  /// Addresses that nobody may read or write, also of more than the system has.
+  static Result<Memory> reserve(std::size_t size, const std::string& what);
 
   std::byte* data() const { return data_.get(); }
   std::size_t size() const { return size_; }
   const std::shared_ptr<std::byte>& shared() const { return data_; }
 
  private:
+  static Result<Memory> map(std::size_t size, const std::string& what, int protection, int flags);
+
   std::shared_ptr<std::byte> data_;
   std::size_t size_ = 0;
 };

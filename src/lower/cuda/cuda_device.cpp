@@ -58,7 +58,7 @@ Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Round
   return std::unique_ptr<Device>(std::move(device));
 }
 
-Status CudaDevice::load(const ParamList& params, bool fill) {
+Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan&) {
   if (model_ && fill) return Error{Code::usage, "model", "a device that is there", name_, "it says times alone"};
   if (!fill) queue_->set_dry();
   VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, *queue_));

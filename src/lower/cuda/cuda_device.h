@@ -18,7 +18,7 @@ class CudaDevice final : public Device {
   /// A GPU that is not there (DeviceLibrary::model). Errors: usage for an unknown name, unsupported.
   static Result<std::unique_ptr<Device>> model(const std::string& name, Rounding at_load);
 
-  Status load(const ParamList& params, bool fill) override;
+  Status load(const ParamList& params, bool fill, const WeightPlan& plan) override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;

@@ -1,0 +1,51 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cpu/segments.h"
+
+#include <algorithm>
+
+namespace vla::lower {
+namespace {
+
+/// Phases that read groups, joined where those are in memory already, with what lies between.
+std::vector<Segment> find_readers(std::span<const Groups> phases, std::size_t begin) {
+  std::vector<Segment> readers;
+  for (std::size_t i = 0; i < phases.size(); ++i) {
+    if (!phases[i].any()) continue;
+    if (!readers.empty() && readers.back().groups.holds(phases[i]))
+      readers.back().end = begin + i + 1;
+    else
+      readers.push_back({begin + i, begin + i + 1, phases[i]});
+  }
+  return readers;
+}
+
+/// The last group that goes when `now` is done and `then` is next.
+int released(const Groups& now, const Groups& then) {
+  const bool goes_on = now.first <= then.first && then.first <= now.last;
+  if (!goes_on) return now.last;
+  return then.first > now.first ? then.first - 1 : -1;
+}
+
+}  // namespace
+
+void Groups::add(int group) {
+  if (group < 0) return;
+  first = any() ? std::min(first, group) : group, last = std::max(last, group);
+}
+
+std::vector<Segment> cut_phases(std::span<const Groups> phases, std::size_t begin) {
+  std::vector<Segment> segments;
+  const std::vector<Segment> readers = find_readers(phases, begin);
+  std::size_t next = begin;
+  for (std::size_t i = 0; i < readers.size(); ++i) {
+    if (readers[i].begin > next) segments.push_back({next, readers[i].begin});
+    segments.push_back(readers[i]);
+    segments.back().released = released(readers[i].groups, i + 1 < readers.size() ? readers[i + 1].groups : Groups());
+    next = readers[i].end;
+  }
+  if (next < begin + phases.size()) segments.push_back({next, begin + phases.size()});
+  return segments;
+}
+
+}  // namespace vla::lower

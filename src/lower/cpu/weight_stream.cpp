@@ -1,0 +1,115 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "lower/cpu/weight_stream.h"
+
+#include "base/thread.h"
+
+namespace vla::lower {
+
+Result<std::unique_ptr<WeightStream>> WeightStream::start(std::shared_ptr<const Content> content,
+                                                          std::vector<std::vector<PackPart>> groups, int n_thread) {
+  std::unique_ptr<WeightStream> stream(new WeightStream(std::move(content), std::move(groups)));
+  Packer packer;
+  for (const std::vector<PackPart>& parts : stream->groups_) packer.reserve(parts);
+  for (int i = 0; i < n_thread; ++i) {
+    VLA_TRY(std::thread thread,
+            start_thread("threads that read weights", [all = stream.get(), packer] { all->serve(packer); }));
+    stream->threads_.push_back(std::move(thread));
+  }
+  return stream;
+}
+
+/// Empty groups fill the last windows of a round, so that every round has its groups in the same ones.
+WeightStream::WeightStream(std::shared_ptr<const Content> content, std::vector<std::vector<PackPart>> groups)
+    : content_(std::move(content)), groups_(std::move(groups)) {
+  while (groups_.size() % kWindows != 0) groups_.emplace_back();
+}
+
+WeightStream::~WeightStream() {
+  {
+    const std::lock_guard lock(mutex_);
+    stop_ = true;
+  }
+  may_read_.notify_all();
+  for (std::thread& thread : threads_) thread.join();
+}
+
+/// What a thread does: a part after the other, as long as there are free windows.
+void WeightStream::serve(Packer packer) {
+  Lock lock(mutex_);
+  while (true) {
+    may_read_.wait(lock, [this] { return stop_ || has_part(); });
+    if (stop_) return;
+    const Turn turn = reading_;
+    const PackPart& part = take_part();
+    ++n_busy_;
+    lock.unlock();
+    const bool is_there = packer.run(*content_, part);
+    lock.lock();
+    --n_busy_;
+    if (is_there)
+      --n_left(turn);
+    else
+      has_failed_ = true;
+    if (n_left(turn) == 0 || n_busy_ == 0) has_read_.notify_all();
+  }
+}
+
+/// Empty groups are passed on the way.
+bool WeightStream::has_part() {
+  if (has_failed_ || moves_) return false;
+  for (; reading_ < oldest_ + kWindows; ++reading_) {
+    if (!parts(reading_).empty()) return true;
+    n_left(reading_) = 0;
+  }
+  return false;
+}
+
+const PackPart& WeightStream::take_part() {
+  const std::vector<PackPart>& all = parts(reading_);
+  if (next_part_ == 0) n_left(reading_) = all.size();
+  const PackPart& part = all[next_part_++];
+  if (next_part_ == all.size()) ++reading_, next_part_ = 0;
+  return part;
+}
+
+Status WeightStream::bring(int first, int last) {
+  Lock lock(mutex_);
+  const Turn begin = turn_of(first), end = begin + static_cast<Turn>(last - first) + 1;
+  if (begin > oldest_ || has_failed_) go_to(begin, lock);
+  has_read_.wait(lock, [&] { return are_loaded(begin, end) || has_failed_; });
+  return has_failed_ ? Status(content_->changed()) : Status();
+}
+
+void WeightStream::release(int group) {
+  Lock lock(mutex_);
+  go_to(turn_of(group) + 1, lock);
+}
+
+/// The next one of this group.
+WeightStream::Turn WeightStream::turn_of(int group) const {
+  const Turn n = groups_.size();
+  return oldest_ + (static_cast<Turn>(group) + n - oldest_ % n) % n;
+}
+
+bool WeightStream::are_loaded(Turn begin, Turn end) const {
+  for (Turn turn = begin; turn < end; ++turn)
+    if (turn >= reading_ || n_left(turn) > 0) return false;
+  return true;
+}
+
+/// Frees the windows of what comes before `turn`. Where the threads have not come that far they read on from there, and
+/// none may still write to a window that is freed.
+void WeightStream::go_to(Turn turn, Lock& lock) {
+  if (has_failed_ || !are_loaded(oldest_, turn)) {
+    moves_ = true;
+    has_read_.wait(lock, [this] { return n_busy_ == 0; });
+    moves_ = false;
+    if (has_failed_ || turn > reading_) reading_ = turn, next_part_ = 0;
+    has_failed_ = false;
+  }
+  oldest_ = turn;
+  may_read_.notify_all();
+}
+
+}  // namespace vla::lower
