@@ -45,6 +45,7 @@ class Options(_Struct):
         ("strict_state", c_int32),
         ("device", c_char_p),
         ("embodiment", c_char_p),
+        ("memory", c_uint64),
     ]
 
 

@@ -36,6 +36,8 @@ class Policy(Handle):
     strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
     device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". A device that is absent is a DeviceError, which lists what is there
     embodiment  of a bundle for several robots, the tag of the one to load; None: all of them, and each `act` names its robot
+    memory   bytes that the process may take; 0: no limit. Matrices that do not fit stay in the file and are read in every act; actions
+             are the same to the bit. Too few are an OutOfMemory that tells how many would do
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy
     of its parent, since the threads that compute stay behind, nor can it be pickled.
@@ -52,6 +54,7 @@ class Policy(Handle):
         strict_state: bool = False,
         device: Optional[str] = None,
         embodiment: Optional[str] = None,
+        memory: int = 0,
     ) -> None:
         self._handle = ctypes.c_void_p()
         self._lock = threading.Lock()
@@ -60,12 +63,15 @@ class Policy(Handle):
         self._library = _capi.load()
         if not isinstance(threads, int) or not 0 <= threads <= 512:
             raise UsageError("threads", "a whole number from 0 to 512", repr(threads))
+        if not isinstance(memory, int) or not 0 <= memory < 1 << 64:
+            raise UsageError("memory", "bytes, or 0 for no limit", repr(memory))
         options = _capi.Options(
             n_thread=threads,
             kernels=None if kernels is None else _encoded("kernels", kernels, UsageError),
             strict_state=bool(strict_state),
             device=None if device is None else _encoded("device", device, UsageError),
             embodiment=None if embodiment is None else _encoded("embodiment", embodiment, UsageError),
+            memory=memory,
         )
         if self._library.vla_open(_path_of(path), options, ctypes.byref(self._handle)):
             raise self._last_error(None)

@@ -74,7 +74,8 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
           Engine::load(random ? random->path() : request.bundle, {.n_thread = request.n_thread,
                                                                   .kernels = request.kernels,
                                                                   .device = request.device,
-                                                                  .embodiment = request.embodiment}));
+                                                                  .embodiment = request.embodiment,
+                                                                  .memory = request.memory}));
   clock.lap(load, "load");
   report.load = load.front().second;
 
@@ -87,6 +88,7 @@ Result<Report> measure(const Request& request, const std::function<Status(const 
   VLA_TRY(const std::vector<Series> all, run_all(*engine, workload, steps, request, watcher));
   report.predicted = engine->memory();
   report.process = process_memory();
+  report.budget = engine->budget(), report.n_cached = engine->robot().bundle().content()->n_cached();
   watcher.tell("measuring what the machine can do now");
   report.after = measure_roofs(device->n_thread());
   summarize(all.back(), report);

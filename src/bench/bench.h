@@ -17,6 +17,7 @@ struct Request {
   int n_round = 7, n_warmup = 1;
   int n_thread = 0;  // as EngineOptions has them
   std::string kernels, device, embodiment;
+  std::size_t memory = 0;
 };
 
 /// Of the random weights that stand in for a bundle.

@@ -177,6 +177,11 @@ std::string to_json(const Report& report) {
   root["load_ms"] = report.load;
   root["memory_bytes"] = {
       {"predicted", report.predicted.total()}, {"peak", report.process.peak}, {"resident", report.process.now}};
+  if (report.budget.size > 0) {
+    root["memory_bytes"]["budget"] = report.budget.size;
+    root["memory_bytes"]["read_in_every_act"] = report.budget.n_read;
+    root["memory_bytes"]["cached"] = report.n_cached;
+  }
   if (report.fit) {
     root["fit"] = {{"prefix_ms", report.fit->prefix}, {"step_ms", report.fit->step}, {"worst_ms", report.fit->worst}};
     for (const auto& [n_step, ms] : report.fit->points) root["fit"]["points"].push_back({n_step, ms});

@@ -47,6 +47,8 @@ struct Report {
   Roofs before, after;
   MemoryUse predicted;
   ProcessMemory process;
+  MemoryBudget budget;
+  std::size_t n_cached = 0;  // bytes of the bundle's file that the system keeps
   std::vector<Round> rounds;
   std::vector<StageRow> stages;  // in order of time, then `network` and `total`
   /// Of the time that threads worked for the network in the last round before the measured ones. Empty without one.

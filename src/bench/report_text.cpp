@@ -68,6 +68,11 @@ std::vector<std::string> around(const Report& report) {
                               report.load, 1e-6 * static_cast<double>(report.predicted.total()),
                               1e-6 * static_cast<double>(report.process.peak),
                               1e-6 * static_cast<double>(report.process.now)));
+  if (report.budget.size > 0)
+    lines.push_back(
+        fmt::format("budget {:.0f} MB: every act reads {:.0f} MB of the file, of which the system keeps {:.0f} MB",
+                    1e-6 * static_cast<double>(report.budget.size), 1e-6 * static_cast<double>(report.budget.n_read),
+                    1e-6 * static_cast<double>(report.n_cached)));
   if (report.fit) {
     std::vector<std::string> points;
     for (const auto& [n_step, ms] : report.fit->points) points.push_back(fmt::format("{}: {:.1f}", n_step, ms));

@@ -55,7 +55,8 @@ Result<Options> read_options(const vla_options* given) {
     return usage("options.n_thread", fmt::format("0 to {}", kMaxThread), std::to_string(known.n_thread));
   if (known.strict_state != 0 && known.strict_state != 1)
     return usage("options.strict_state", "0 or 1", std::to_string(known.strict_state));
-  Options options{{.n_thread = known.n_thread, .all_robots = true}, known.strict_state == 1};
+  Options options{{.n_thread = known.n_thread, .all_robots = true, .memory = static_cast<std::size_t>(known.memory)},
+                  known.strict_state == 1};
   if (known.kernels != nullptr) {
     VLA_TRY(options.engine.kernels, read_name(known.kernels, "options.kernels"));
   }

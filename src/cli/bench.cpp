@@ -21,6 +21,7 @@ struct BenchOptions {
   std::optional<int> n_view, n_text;
   std::vector<int> steps;
   int n_thread = 0, n_round = 7, n_warmup = 1;
+  std::size_t memory = 0;
   bool json = false, markdown = false, paced = false;
 };
 
@@ -68,7 +69,7 @@ Status run_bench(const BenchOptions& options) {
   VLA_CHECK(check(options));
   bench::Request request{options.bundle,  options.arch,    dtype_of(options.dtype), {},
                          options.steps,   options.n_round, options.n_warmup,        options.n_thread,
-                         options.kernels, options.device,  options.embodiment};
+                         options.kernels, options.device,  options.embodiment,      options.memory};
   request.sizes = {options.n_view, 0, 0, options.n_text};
   if (!options.image_size.empty()) VLA_CHECK(parse_size(options.image_size, request.sizes));
   if (!options.model.empty()) {
@@ -150,6 +151,7 @@ Command add_bench(CLI::App& app) {
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
   add_text(*command, "--device", options->device, "NAME",
            std::string(kDeviceHelp) + ". Shares of a peak are the CPU's alone");
+  add_memory(*command, options->memory);
   add_text(
       *command, "--model", options->model, "NAME",
       "With --device cuda: run nothing, and print what counts and published rates predict for a GPU that need not be "

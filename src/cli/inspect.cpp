@@ -3,6 +3,7 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <cmath>
 #include <map>
 
 #include "cli/commands.h"
@@ -16,6 +17,7 @@ namespace {
 
 struct InspectOptions {
   std::string bundle, manifest, graph, kernels, device, embodiment;
+  std::size_t memory = 0;
   bool json = false, devices = false;
 };
 
@@ -130,6 +132,20 @@ void print_modules(const Engine& engine) {
   say(stdout, "             {:<18}  {:>14}\n", "all", n_param);
 }
 
+void print_budget(const Engine& engine) {
+  const MemoryBudget& budget = engine.budget();
+  const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
+  const std::size_t file = engine.robot().bundle().file_size();
+  say(stdout, "budget       {}, of which the process itself takes {}; {:.0f} MB is the least that does\n",
+      size(budget.size), size(budget.process), std::ceil(1e-6 * static_cast<double>(budget.smallest)));
+  if (budget.n_read == 0) return say(stdout, "             all matrices stay in memory\n");
+  const double rate = engine.robot().bundle().content()->read_rate();
+  say(stdout,
+      "             every act reads {} of the file's {}: {:.2f} s at the {}/s of opening it, while others are "
+      "multiplied\n",
+      size(budget.n_read), size(file), static_cast<double>(budget.n_read) / rate, human_size(rate));
+}
+
 void print_human(const Engine& engine) {
   const Robot& robot = engine.robot();
   const Description d = describe(engine, robot);
@@ -163,6 +179,7 @@ void print_human(const Engine& engine) {
   say(stdout, "products     {}: {}\n", engine.linear_kernels(), engine.arithmetic());
   say(stdout, "memory       {} in all: weights {}, inputs and cache {}, working memory {}\n", size(d.memory.total()),
       size(d.memory.weights), size(d.memory.plan), size(d.memory.working));
+  if (const MemoryBudget& budget = engine.budget(); budget.size > 0) print_budget(engine);
 }
 
 void print_json(const Engine& engine) {
@@ -188,6 +205,11 @@ void print_json(const Engine& engine) {
   const MemoryUse memory = engine.memory();
   root["memory_bytes"] = {
       {"weights", memory.weights}, {"plan", memory.plan}, {"working", memory.working}, {"total", memory.total()}};
+  if (const MemoryBudget& budget = engine.budget(); budget.size > 0)
+    root["memory_budget_bytes"] = {{"size", budget.size},
+                                   {"process", budget.process},
+                                   {"smallest", budget.smallest},
+                                   {"read_in_every_act", budget.n_read}};
   auto exact = nlohmann::ordered_json::parse(text_of(root));  // its numbers are double
   for (const TensorInfo& tensor : bundle.tensors())
     if (tensor.name.starts_with("stats.") && tensor.type == DType::f64)
@@ -234,10 +256,11 @@ Status inspect(const InspectOptions& options) {
   if (options.devices) return options.json ? print_devices_json() : print_devices();
   if (!options.manifest.empty()) return print_manifest(options.manifest);
   // A dry load checks everything that a run would check and reserves the memory that it would take, without filling it.
-  VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(
-              options.bundle,
-              {.kernels = options.kernels, .device = options.device, .dry = true, .embodiment = options.embodiment}));
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.kernels = options.kernels,
+                                                                              .device = options.device,
+                                                                              .dry = true,
+                                                                              .embodiment = options.embodiment,
+                                                                              .memory = options.memory}));
   if (!options.graph.empty()) return print_graph(*engine, options.graph);
   options.json ? print_json(*engine) : print_human(*engine);
   return {};
@@ -266,6 +289,7 @@ Command add_inspect(CLI::App& app) {
       ->check(CLI::IsMember({"prefix", "step"}));
   add_text(*command, "--kernels", options->kernels, "NAME", "As for vla run: what the program is made of");
   add_text(*command, "--device", options->device, "NAME", "As for vla run: whose memory and program are shown");
+  add_memory(*command, options->memory);
   add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--devices", options->devices, "List what --device may name here, and why the others are absent");
   command->add_flag("--json", options->json, "Print JSON for machines");

@@ -26,6 +26,7 @@ struct RunOptions {
   std::optional<int> delay;
   std::optional<double> max_guidance;
   int n_thread = 0;
+  std::size_t memory = 0;
   bool json = false, strict_state = false;
 };
 
@@ -194,7 +195,8 @@ Status run(RunOptions& options) {
                                                                               .device = options.device,
                                                                               .tap_pattern = options.tap,
                                                                               .inject = std::move(inject),
-                                                                              .embodiment = options.embodiment}));
+                                                                              .embodiment = options.embodiment,
+                                                                              .memory = options.memory}));
   const Robot& robot = engine->robot();
   clock.lap(before, "load");
   Observation observation;
@@ -300,6 +302,7 @@ Command add_run(CLI::App& app) {
       ->capture_default_str();
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
   add_text(*command, "--device", options->device, "NAME", kDeviceHelp);
+  add_memory(*command, options->memory);
   add_text(*command, "--embodiment", options->embodiment, "TAG", kEmbodimentHelp);
   command->add_flag("--strict-state", options->strict_state, kStrictStateHelp);
   return [options] { return run(*options); };

@@ -29,6 +29,7 @@ namespace {
 struct ServeOptions {
   std::string bundle, kernels, device, embodiment;
   int n_thread = 0;
+  std::size_t memory = 0;
   bool restarts = false;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
@@ -63,7 +64,8 @@ std::string quoted(const std::string& value) {
 }
 
 /// One line that programs can split as a shell would.
-void print_ready(const serve::Server& server, const Engine& engine, double warm_up_ms, const Watch& watch) {
+void print_ready(const serve::Server& server, const Engine& engine, double load_ms, double warm_up_ms,
+                 const Watch& watch) {
   std::vector<std::string> features, tags, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
@@ -90,8 +92,11 @@ void print_ready(const serve::Server& server, const Engine& engine, double warm_
   add("precision", description.runtime().precision());
   add("kernels", description.runtime().kernels());
   add("memory_mb", fmt::format("{:.1f}", static_cast<double>(engine.memory().total()) / 1e6));
+  if (const std::size_t n_read = engine.budget().n_read; n_read > 0)
+    add("read_mb", fmt::format("{:.1f}", static_cast<double>(n_read) / 1e6));
   add("connections", std::to_string(server.max_connections()));
   add("features", fmt::format("{}", fmt::join(features, ",")));
+  add("load_ms", fmt::format("{:.1f}", load_ms));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
   if (const std::string metrics = watch.metrics_address(); !metrics.empty()) add("metrics", metrics);
   if (const std::string page = watch.page_url(); !page.empty()) add("page", page);
@@ -123,17 +128,21 @@ Status serve(ServeOptions& options, bool& ready) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Watch> watch, Watch::start(options.watch, *server, options.server.insecure));
+  StageClock clock;
+  Timing load;
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
                                                                               .kernels = options.kernels,
                                                                               .device = options.device,
                                                                               .embodiment = options.embodiment,
-                                                                              .all_robots = true}));
+                                                                              .all_robots = true,
+                                                                              .memory = options.memory}));
+  clock.lap(load, "load");
   VLA_CHECK(server->load(*engine));
   watch->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
   watch->ready(warm_up_ms);
-  print_ready(*server, *engine, warm_up_ms, *watch);
+  print_ready(*server, *engine, load.front().second, warm_up_ms, *watch);
   ready = true;
   const Status status = server->run(*engine, watch->observers());
   watch->ended(status);
@@ -188,6 +197,7 @@ Command add_serve(CLI::App& app) {
       ->capture_default_str();
   add_text(*command, "--kernels", options->kernels, "NAME", kKernelsHelp);
   add_text(*command, "--device", options->device, "NAME", kDeviceHelp);
+  add_memory(*command, options->memory);
   add_text(*command, "--embodiment", options->embodiment, "TAG",
            "Serve one robot of a bundle for several; not given: all");
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")

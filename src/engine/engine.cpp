@@ -5,8 +5,12 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <malloc.h>
 #include <algorithm>
+#include <cmath>
 #include <new>
+
+#include "base/process.h"
 
 namespace vla {
 namespace {
@@ -22,11 +26,14 @@ Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const Engi
   std::unique_ptr<Engine> engine(new Engine(options));
   VLA_CHECK(engine->take_injected(options.inject));
   VLA_CHECK(engine->open_robots(std::move(file), options));
+  malloc_trim(0);  // what a vocabulary needed while it was read: hundreds of megabytes of the largest
   VLA_TRY(engine->device_, options.model.empty() ? open_device(options.n_thread, options.kernels, options.device)
                                                  : open_model(options.model, options.kernels, options.device));
-  VLA_CHECK(engine->device_->load(engine->params(), !options.dry));
-  for (const auto& robot : engine->robots_) VLA_CHECK(robot->compute_constants(*engine->device_, options.dry));
-  VLA_CHECK(engine->make_plans());
+  WeightPlan plan;
+  if (options.memory > 0) {
+    VLA_TRY(plan, engine->plan_weights(options.memory));
+  }
+  VLA_CHECK(engine->build(plan, options.dry));
   if (!options.dry) engine->device_->touch();
   return engine;
 }
@@ -46,14 +53,38 @@ Status Engine::open_robots(Bundle file, const EngineOptions& options) {
   return {};
 }
 
+/// All that an act needs.
+Status Engine::build(const WeightPlan& plan, bool dry) {
+  VLA_CHECK(device_->load(params(), !dry, plan));
+  for (const auto& robot : robots_) VLA_CHECK(robot->compute_constants(*device_, dry));
+  return make_plans(dry);
+}
+
+/// Sizes, and the order in which an act reads matrices, are those of programs that never run.
+Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
+  VLA_CHECK(build({}, true));
+  VLA_TRY(const Plan* largest, plans_->for_shape(robot().network(), robot().largest_shape()));
+  budget_.size = budget, budget_.process = resident_size();
+  const std::size_t others = budget_.process + memory().total() - device_->weights_size();
+  VLA_TRY(WeightPlan plan,
+          device_->plan_weights(largest->prefix(), largest->step(), budget > others ? budget - others : 0));
+  plans_.reset();
+  budget_.smallest = others + plan.smallest, budget_.n_read = plan.n_read;
+  if (budget >= budget_.smallest) return plan;
+  return Error{Code::out_of_memory, "memory",
+               fmt::format("{:.0f} MB or more", std::ceil(1e-6 * static_cast<double>(budget_.smallest))),
+               fmt::format("{:.0f} MB", 1e-6 * static_cast<double>(budget)),
+               "give more, or make the bundle smaller with vla quantize"};
+}
+
 /// The largest plan of every robot is built, so that the working memory is known before the first request and does not
 /// grow after it.
-Status Engine::make_plans() {
-  plans_.emplace(PlanContext{*device_, tap_pattern_, dry_});
+Status Engine::make_plans(bool dry) {
+  plans_.emplace(PlanContext{*device_, tap_pattern_, dry});
   for (const auto& robot : robots_)
     if (const auto plan = plans_->for_shape(robot->network(), robot->largest_shape()); !plan) return plan.error();
   // Injected values fit the shape of their observation.
-  if (!injected_.empty()) plans_.emplace(PlanContext{*device_, tap_pattern_, dry_, &injected_});
+  if (!injected_.empty()) plans_.emplace(PlanContext{*device_, tap_pattern_, dry, &injected_});
   return {};
 }
 
@@ -104,7 +135,7 @@ Status Engine::inject_inputs(Inputs& inputs) const {
 Status Engine::set_steps(int n_step) {
   VLA_CHECK(robots_.front()->set_steps(n_step, *device_, dry_));
   last_.reset();
-  return make_plans();
+  return make_plans(dry_);
 }
 
 template <class T>

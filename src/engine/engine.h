@@ -25,6 +25,7 @@ struct EngineOptions {
   bool dry = false;             // reserve memory without filling it: sizes are exact, and `act` must not be called
   std::string embodiment = {};  // the robot, by its tag; empty where the bundle is for one
   bool all_robots = false;      // without a tag: every robot of a bundle of several
+  std::size_t memory = 0;       // bytes that the process may take, for which matrices stay in the file; 0: no limit
 };
 
 /// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
@@ -34,13 +35,21 @@ struct MemoryUse {
   std::size_t total() const { return weights + plan + working; }
 };
 
+/// How EngineOptions::memory is kept, in bytes.
+struct MemoryBudget {
+  std::size_t size = 0;
+  std::size_t process = 0;   // what the process took without the engine's memory
+  std::size_t smallest = 0;  // the least budget that would do
+  std::size_t n_read = 0;    // of the file, in every act; 0: all matrices stay in memory
+};
+
 /// A loaded bundle, ready to act: the device with the parameters, the bundle's robots, and their plans. It owns the
 /// loop that every architecture runs: prefix, cache, solver steps, unnormalize. One thread at a time may call it, and
 /// others its const functions meanwhile.
 class Engine {
  public:
   /// Opens, checks and loads a bundle, and builds the largest plans. Errors: io, bad_bundle, unsupported,
-  /// out_of_memory, device.
+  /// out_of_memory (also where the budget is too small, with the least that would do), device.
   static Result<std::unique_ptr<Engine>> load(const std::string& path, const EngineOptions& options);
 
   /// In the bundle's order; at least one.
@@ -82,6 +91,8 @@ class Engine {
   /// Of all robots.
   const ParamList& params() const { return robot().params(); }
   MemoryUse memory() const;
+  /// All zeros without a budget.
+  const MemoryBudget& budget() const { return budget_; }
   /// Which kernel multiplies how many matrices, and how those are stored: `avx2 (98 bf16)`.
   const std::string& linear_kernels() const { return device_->linear_kernels(); }
   /// The kernels in use, as `--kernels` names them: those of the machine, or others where the bundle's dtype asks for
@@ -101,7 +112,9 @@ class Engine {
       : tap_pattern_(options.tap_pattern), dry_(options.dry), chose_kernels_(!options.kernels.empty()) {}
   Status open_robots(Bundle file, const EngineOptions& options);
   Status take_injected(const std::vector<Tap>& given);
-  Status make_plans();
+  Status build(const WeightPlan& plan, bool dry);
+  Result<WeightPlan> plan_weights(std::size_t budget);
+  Status make_plans(bool dry);
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 EncodedObservation& to) const noexcept;
   Status inject_inputs(Inputs& inputs) const;
@@ -118,6 +131,7 @@ class Engine {
   std::vector<std::unique_ptr<Robot>> robots_;
   std::optional<Plans> plans_;
   std::optional<std::pair<const Robot*, InputShape>> last_;
+  MemoryBudget budget_;
   EncodedObservation prepared_;  // of the last observation that came to `act` as a whole
 };
 

@@ -49,6 +49,7 @@ Status Robot::read_policy() {
 
 Status Robot::compute_constants(Device& device, bool dry) {
   VLA_CHECK(make_conditions(device, dry));
+  constant_slots_ = Slots(), constants_ = Cache();
   const Recipe& recipe = processor_.recipe();
   Graph graph(constant_slots_);
   const auto absent_view = [&] {

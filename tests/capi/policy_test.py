@@ -208,6 +208,8 @@ def test_an_error_carries_all_its_parts(act):
         ("", {}, vla_cpp.UsageError, "path"),
         (Golden("two_views").bundle, {"threads": -1}, vla_cpp.UsageError, "threads"),
         (Golden("two_views").bundle, {"threads": 2**40}, vla_cpp.UsageError, "threads"),
+        (Golden("two_views").bundle, {"memory": -1}, vla_cpp.UsageError, "memory"),
+        (Golden("two_views").bundle, {"memory": 1}, vla_cpp.OutOfMemory, "memory"),
         (Golden("two_views").bundle, {"kernels": "abacus"}, vla_cpp.UsageError, "abacus"),
     ],
 )

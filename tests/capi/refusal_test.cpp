@@ -194,6 +194,10 @@ TEST_CASE("a file that cannot be read or is no bundle is a typed error, and opti
   options = VLA_OPTIONS_INIT;
   options.kernels = "abacus";
   check_error(nullptr, vla_open(sound.golden.bundle().c_str(), &options, &policy), VLA_USAGE, "abacus");
+  options = VLA_OPTIONS_INIT;
+  options.memory = 1;
+  check_error(nullptr, vla_open(sound.golden.bundle().c_str(), &options, &policy), VLA_OUT_OF_MEMORY, "memory");
+  options = VLA_OPTIONS_INIT;
   options.kernels = "ggml";
   REQUIRE(vla_open(sound.golden.bundle().c_str(), &options, &policy) == VLA_OK);
   CHECK(std::string(vla_describe(policy)->kernels) == "ggml");

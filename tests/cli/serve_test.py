@@ -54,13 +54,14 @@ def serve(vla):
 def test_the_ready_line_says_where_and_what_and_the_address_is_open(serve, golden):
     ready = serve(golden.bundle, "--bind", "tcp://127.0.0.1:0").ready
     assert set(ready) == {
-        "address", "bundle", "arch", "device", "precision", "kernels", "memory_mb", "connections", "features", "warm_up_ms",
+        "address", "bundle", "arch", "device", "precision", "kernels", "memory_mb", "connections", "features", "load_ms",
+        "warm_up_ms",
     }  # fmt: skip
     host, port = re.fullmatch(r"tcp://(127\.0\.0\.1):(\d+)", ready["address"]).groups()
     socket.create_connection((host, int(port)), timeout=5).close()
     assert ready["arch"] == "smolvla" and ready["bundle"] == "bundle.gguf"
     assert "observation.state" in ready["features"].split(",")
-    assert float(ready["warm_up_ms"]) > 0 and float(ready["memory_mb"]) > 0
+    assert all(float(ready[number]) > 0 for number in ("load_ms", "warm_up_ms", "memory_mb"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
