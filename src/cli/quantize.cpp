@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "quantize/search.h"
+#include "quantize/smoothing.h"
 
 #include <fmt/format.h>
 #include <unistd.h>
@@ -19,7 +19,8 @@ namespace {
 struct QuantizeOptions {
   std::string from, to, dtype = "int8";
   bool force = false, quiet = false;
-  std::string recording;  // to judge by
+  std::string recording;    // to judge by
+  std::string calibration;  // to smooth by
   Bound bound;
   int n_observation = 32, n_thread = 0;
 };
@@ -55,6 +56,11 @@ void print_progress(QuantizeProgress at) {
   say(stderr, "\rquantizing {:>3} %{}", percent, percent >= 100 ? "\n" : "");
 }
 
+/// The same codes for all matrices.
+Choice all(const std::string& dtype) {
+  return [codes = dtype == "int4" ? Rounding::int4 : Rounding::int8](const std::string&) { return codes; };
+}
+
 #ifdef VLA_SERVER
 std::string percent(const Moved& moved) {
   return fmt::format("{:.3f} % (largest {:.3f} %)", 100 * moved.rms, 100 * moved.largest);
@@ -85,10 +91,43 @@ std::string told(const Found& found, const QuantizeOptions& options, std::size_t
                      n(Rounding::int4), n(Rounding::int8), n(Rounding::none), n_observation, percent(found.moved));
 }
 
+/// Observations of a recording.
+Result<std::vector<Judged>> observations(const QuantizeOptions& options, const std::string& recording) {
+  return read_observations(recording, options.from, static_cast<std::size_t>(options.n_observation));
+}
+
+/// How far the chunks move where `bundle` is quantized.
+Result<Moved> moved_by_codes(const QuantizeOptions& options, const std::string& bundle,
+                             std::span<const Judged> judged) {
+  const std::string trial = options.to + ".trial";
+  if (const auto made = quantize(bundle, trial, all(options.dtype), {}, [](QuantizeProgress) {}); !made)
+    return made.error();
+  Result<Moved> moved = compare_chunks(options.from, trial, judged, options.n_thread);
+  std::error_code ignored;
+  std::filesystem::remove(trial, ignored);
+  return moved;
+}
+
+/// Writes a smoothed bundle, if the observations move less with it. What the new bundle says of it, or nothing.
+Result<std::string> smooth_first(const QuantizeOptions& options, const std::string& smoothed) {
+  VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
+  VLA_TRY(const Smoothed made, smooth(options.from, smoothed, seen, options.n_thread));
+  VLA_TRY(const Moved before, moved_by_codes(options, options.from, seen));
+  VLA_TRY(const Moved after, moved_by_codes(options, smoothed, seen));
+  const bool helps = after.rms < before.rms;
+  const std::string text = fmt::format(
+      "{} over {} observations: {} channels of {} norms and MLPs divided, by {:g} at most; {} moves chunks by {} "
+      "instead "
+      "of {}",
+      helps ? "smoothed" : "not smoothed", seen.size(), made.n_channel, made.n_place, made.largest, options.dtype,
+      percent(after), percent(before));
+  if (!options.quiet) say(stdout, "{}\n\n", text);
+  return helps ? text : std::string();
+}
+
 /// Codes block by block, and why.
 Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, bool shows) {
-  VLA_TRY(const std::vector<Judged> judged,
-          read_observations(options.recording, options.from, static_cast<std::size_t>(options.n_observation)));
+  VLA_TRY(const std::vector<Judged> judged, observations(options, options.recording));
   const auto progress = [shows](int trial, const Moved& moved) {
     if (shows) say(stderr, "\rtrial {:>3}: {:<40}", trial, percent(moved));
   };
@@ -114,34 +153,31 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
           ->check(CLI::Range(1e-6, 1.0));
   CLI::Option* size = add_bytes(command, "--size", options.bound.bytes,
                                 "The least error of a file of at most so many bytes: 1.8GB, 900MB");
+  add_text(command, "--calibrate", options.calibration, "DIR",
+           "A recording of vla serve --record: first divide channels of activations that are far larger than the "
+           "others, and multiply the matrices that read them. Float32's actions stay as they are");
   error->needs(judge)->excludes(size);
   size->needs(judge)->excludes("--dtype");
   error->excludes("--dtype");
-  command
-      .add_option("--observations", options.n_observation, "Of the recording, evenly spread (1 to 4096; default 32)")
-      ->needs(judge)
+  command.add_option("--observations", options.n_observation, "Of a recording, evenly spread (1 to 4096; default 32)")
       ->check(CLI::Range(1, 4096));
-  command.add_option("--threads", options.n_thread, "CPU threads; 0 takes every core")
-      ->needs(judge)
-      ->check(CLI::Range(0, 512));
+  command.add_option("--threads", options.n_thread, "CPU threads; 0 takes every core")->check(CLI::Range(0, 512));
 }
 #endif
 
-Status run(const QuantizeOptions& options) {
-  std::error_code ignored;
-  if (std::filesystem::exists(options.to, ignored) && !options.force)
-    return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
+/// `smoothing`: what was done to `options.from` before.
+Status write_codes(const QuantizeOptions& options, const std::string& smoothing) {
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
   const auto progress = [shows](QuantizeProgress at) {
     if (shows) print_progress(at);
   };
-  const Rounding codes = options.dtype == "int4" ? Rounding::int4 : Rounding::int8;
-  std::pair<Choice, std::string> chosen([codes](const std::string&) { return codes; }, "");
+  std::pair<Choice, std::string> chosen(all(options.dtype), smoothing);
 #ifdef VLA_SERVER
   if (!options.recording.empty()) {
     if (!options.bound.error && !options.bound.bytes)
       return Error{Code::usage, "--judge", "--error or --size", "neither"};
     VLA_TRY(chosen, choose(options, shows));
+    if (!smoothing.empty()) chosen.second = smoothing + "; " + chosen.second;
   }
 #endif
   VLA_TRY(const std::vector<QuantizedModule> rows,
@@ -149,6 +185,23 @@ Status run(const QuantizeOptions& options) {
   if (shows) say(stderr, "\r{:<16}\r", "");
   if (!options.quiet) print(rows);
   return {};
+}
+
+Status run(QuantizeOptions options) {
+  std::error_code ignored;
+  if (std::filesystem::exists(options.to, ignored) && !options.force)
+    return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
+#ifdef VLA_SERVER
+  if (!options.calibration.empty()) {
+    const std::string smoothed = options.to + ".smoothed";
+    const Result<std::string> smoothing = smooth_first(options, smoothed);
+    if (smoothing && !smoothing->empty()) options.from = smoothed;
+    const Status written = smoothing ? write_codes(options, *smoothing) : Status(smoothing.error());
+    std::filesystem::remove(smoothed, ignored);
+    return written;
+  }
+#endif
+  return write_codes(options, "");
 }
 
 }  // namespace
@@ -162,6 +215,7 @@ Command add_quantize(CLI::App& app) {
       "smaller and ready sooner. int4 has codes of four bits and a step for each 64 of a row, and moves actions more.\n"
       "How far actions move from float32 is judged on your own observations, by the program or by you:\n"
       "  vla quantize policy.gguf -o policy.small.gguf --judge RECORDING --error 0.01\n"
+      "  vla quantize policy.gguf -o policy.small.gguf --calibrate RECORDING --judge RECORDING --size 1.8GB\n"
       "  vla quantize policy.gguf -o policy.int8.gguf\n"
       "  vla run policy.gguf ... --kernels float32 --tap '*' --taps-out expected.gguf\n"
       "  vla run policy.int8.gguf ... --tap '*' --taps-out got.gguf\n"

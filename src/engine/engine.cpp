@@ -80,7 +80,7 @@ Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
 /// The largest plan of every robot is built, so that the working memory is known before the first request and does not
 /// grow after it.
 Status Engine::make_plans(bool dry) {
-  plans_.emplace(PlanContext{*device_, tap_pattern_, dry});
+  plans_.emplace(PlanContext{*device_, tap_pattern_, dry, nullptr, see_graph_});
   for (const auto& robot : robots_)
     if (const auto plan = plans_->for_shape(robot->network(), robot->largest_shape()); !plan) return plan.error();
   // Injected values fit the shape of their observation.

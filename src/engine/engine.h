@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <optional>
 #include <string>
@@ -25,7 +26,8 @@ struct EngineOptions {
   bool dry = false;             // reserve memory without filling it: sizes are exact, and `act` must not be called
   std::string embodiment = {};  // the robot, by its tag; empty where the bundle is for one
   bool all_robots = false;      // without a tag: every robot of a bundle of several
-  std::size_t memory = 0;       // bytes that the process may take, for which matrices stay in the file; 0: no limit
+  std::function<void(const Graph&)> see_graph = {};  // is shown the graphs of every plan, before they are lowered
+  std::size_t memory = 0;  // bytes that the process may take, for which matrices stay in the file; 0: no limit
 };
 
 /// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
@@ -109,7 +111,10 @@ class Engine {
 
  private:
   explicit Engine(const EngineOptions& options)
-      : tap_pattern_(options.tap_pattern), dry_(options.dry), chose_kernels_(!options.kernels.empty()) {}
+      : tap_pattern_(options.tap_pattern),
+        see_graph_(options.see_graph),
+        dry_(options.dry),
+        chose_kernels_(!options.kernels.empty()) {}
   Status open_robots(Bundle file, const EngineOptions& options);
   Status take_injected(const std::vector<Tap>& given);
   Status build(const WeightPlan& plan, bool dry);
@@ -124,6 +129,7 @@ class Engine {
               const std::vector<T>& values) const;
 
   std::string tap_pattern_;
+  std::function<void(const Graph&)> see_graph_;
   bool dry_, chose_kernels_;         // somebody chose them
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads

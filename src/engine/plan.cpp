@@ -66,7 +66,7 @@ Tensor Plan::steered(Graph& g, Tensor x, Tensor k, Tensor velocity) const {
   return add(g, multiply(g, velocity, of_rows(keep_)), multiply(g, off, of_rows(pull_)));
 }
 
-Status Plan::lower(const Network& network, bool dry) {
+Status Plan::lower(const Network& network, const PlanContext& context) {
   Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
   Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_step));
   const auto input = [&](const Slot* slot) { return slot != nullptr ? prefix.input(slot) : Tensor(); };
@@ -82,6 +82,8 @@ Status Plan::lower(const Network& network, bool dry) {
   step.write(step.name("x", network.solver.next(step, x, answer)), x_);
   if (condition || target_ != nullptr) step.write(after(step, k, network.solver.n_step), k_);
 
+  if (context.see_graph)
+    for (const Graph* graph : {&prefix, &step}) context.see_graph(*graph);
   VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
   LowerOptions varying = {{images_}};
@@ -90,13 +92,13 @@ Status Plan::lower(const Network& network, bool dry) {
   for (const Slot* slot : injection_.slots()) varying.varying.push_back(slot), changing.varying.push_back(slot);
   VLA_TRY(prefix_, device_.lower(prefix, varying));
   VLA_TRY(step_, device_.lower(step, changing));
-  return dry ? Status() : prefix_->prepare();
+  return context.dry ? Status() : prefix_->prepare();
 }
 
 Result<std::unique_ptr<Plan>> Plan::build(const Network& network, const InputShape& shape, const PlanContext& context) {
   VLA_CHECK(network.policy.check(shape));
   std::unique_ptr<Plan> plan(new Plan(network, shape, context));
-  VLA_CHECK(plan->lower(network, context.dry));
+  VLA_CHECK(plan->lower(network, context));
   return plan;
 }
 

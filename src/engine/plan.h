@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <functional>
 #include <map>
 #include <memory>
 
@@ -34,6 +35,7 @@ struct PlanContext {
   std::string tap_pattern;
   bool dry;                               // nothing is computed
   const std::vector<Tap>* injected = {};  // null: nothing
+  std::function<void(const Graph&)> see_graph = {};
 };
 
 /// The two programs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
@@ -79,7 +81,7 @@ class Plan {
 
  private:
   Plan(const Network& network, const InputShape& shape, const PlanContext& context);
-  Status lower(const Network& network, bool dry);
+  Status lower(const Network& network, const PlanContext& context);
   Tensor steered(Graph& step, Tensor x, Tensor k, Tensor velocity) const;
 
   std::string tap_pattern_;

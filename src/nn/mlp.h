@@ -32,7 +32,8 @@ class GatedMlp {
  public:
   GatedMlp(const Scope& s, int d_model, int d_ff, Activation activation, Rule rule = Rule::floats,
            std::optional<float> sub_norm_eps = {})
-      : gate_(s / "ffn_gate", d_model, d_ff, Bias::no, rule),
+      : hidden_path_((s / "ffn_hidden").path()),
+        gate_(s / "ffn_gate", d_model, d_ff, Bias::no, rule),
         up_(s / "ffn_up", d_model, d_ff, Bias::no, rule),
         down_(s / "ffn_down", d_ff, d_model, Bias::no, rule),
         activation_(activation) {
@@ -40,11 +41,12 @@ class GatedMlp {
   }
   Tensor operator()(Graph& g, Tensor x) const {
     const Tensor up = up_(g, x);  // on its own: compilers differ in which argument they evaluate first
-    const Tensor h = multiply(g, activate(g, gate_(g, x), activation_), up);
+    const Tensor h = g.name(hidden_path_, multiply(g, activate(g, gate_(g, x), activation_), up));
     return down_(g, sub_norm_ ? (*sub_norm_)(g, h) : h);
   }
 
  private:
+  std::string hidden_path_;
   Linear gate_, up_, down_;
   std::optional<RmsNorm> sub_norm_;
   Activation activation_;

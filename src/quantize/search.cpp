@@ -226,6 +226,15 @@ Choice choice_of(const std::vector<Block>& blocks) {
   };
 }
 
+Result<Moved> compare_chunks(const std::string& from, const std::string& bundle, std::span<const Judged> judged,
+                             int n_thread) {
+  EngineOptions options = {.n_thread = n_thread, .all_robots = true};
+  VLA_TRY(const auto got, chunks_of(bundle, options, judged));
+  options.kernels = "float32";
+  VLA_TRY(const auto expected, chunks_of(from, options, judged));
+  return moved(expected, got);
+}
+
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
                      const Bound& bound, int n_thread, const std::function<void(int, const Moved&)>& report) {
   Search search(from, trial, judged, n_thread, report);

@@ -21,6 +21,10 @@ struct Judged {
   Noise noise;
 };
 
+/// How far the chunks of `bundle` are from those of `from` in float32. Errors: those of Engine.
+Result<Moved> compare_chunks(const std::string& from, const std::string& bundle, std::span<const Judged> judged,
+                             int n_thread);
+
 /// One of the two.
 struct Bound {
   std::optional<double> error;        // Moved::rms at most

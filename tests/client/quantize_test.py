@@ -6,12 +6,13 @@ import re
 import subprocess
 from types import SimpleNamespace
 
+import gguf
 import numpy as np
 import pytest
 from server_process import ROOT, SECONDS, VLA, Server
 
 import vla_cpp
-from vla_cpp.convert.bundle import read_bundle
+from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle
 
 SHIPPED = SimpleNamespace(bundle=ROOT / "models/metaworld-tiny.gguf")
 SCENES = [("faucet-open", "open the faucet"), ("drawer-close", "close the drawer")]
@@ -88,3 +89,78 @@ def test_a_recording_of_another_policy_is_refused(case, tmp_path):
     assert server.stop() == 0
     answer = quantize("-o", tmp_path / "small.gguf", "--judge", tmp_path / "acts", "--error", 0.1)
     assert "error: bad_request: " in answer.stderr and "expected acts of this policy, found " in answer.stderr, answer
+
+
+def planted(path, factors=(32, 64), every=23):
+    """The shipped policy as a trained language model is: a few channels of what matrices read are far larger than the others. The
+    function is the same, since columns of the matrices are smaller by what channels are larger: powers of two change no digit."""
+    content = read_bundle(str(SHIPPED.bundle))
+    floats = {n: (v.astype(np.uint32) << 16).view(np.float32) if content.dtypes[n] == "bf16" else v.copy() for n, v in content.tensors.items()}
+
+    def channels(d):
+        by = np.ones(d, np.float32)
+        by[::every] = np.resize(np.array(factors, np.float32), len(by[::every]))
+        return by
+
+    for name in [name for name in floats if name.endswith("norm.weight") and ".blk." in name]:
+        block, by = name[: name.rindex(".", 0, -len(".weight"))], channels(len(floats[name]))
+        readers = ("attn_q", "attn_k", "attn_v") if name.endswith("attn_norm.weight") else ("ffn_gate", "ffn_up")
+        for vector in (name, name.replace("weight", "bias")):
+            if vector in floats:
+                floats[vector] *= by
+        for matrix in (floats.get(f"{block}.{reader}.weight") for reader in readers):
+            if matrix is not None and matrix.shape[1] == len(by):  # of cross-attention, keys and values read something else
+                matrix /= by
+    for name in [name for name in floats if name.endswith("ffn_gate.weight")]:
+        up, down = name.replace("gate", "up"), name.replace("gate", "down")
+        by = channels(len(floats[up]))
+        floats[up] *= by[:, None]
+        floats[down] /= by
+    keys = keys_of(SHIPPED.bundle)
+    tensors = [TensorInfo(name, values.shape, content.dtypes[name]) for name, values in content.tensors.items()]
+    with BundleWriter(str(path), keys, tensors) as out:
+        for name, values in floats.items():
+            bits = values.view(np.uint32)
+            out.write(name, (bits >> 16).astype(np.uint16) if content.dtypes[name] == "bf16" else values)
+    return path
+
+
+def keys_of(bundle):
+    kinds = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
+    fields = gguf.GGUFReader(bundle).fields.items()
+    return [
+        Key(name, kinds[int(field.types[-1])] + ("[]" if field.types[0] == 9 else ""), field.contents())
+        for name, field in fields
+        if not name.startswith("GGUF.") and name != "vla.checksum"
+    ]
+
+
+def chunks(bundle, kernels):
+    with vla_cpp.Policy(bundle, kernels=kernels, threads=1) as policy:
+        return np.array([policy.act(**scene(*s)).normalized for s in SCENES])
+
+
+def test_channels_that_are_far_larger_than_the_others_are_smoothed(recording, tmp_path):
+    outliers = planted(tmp_path / "planted.gguf")
+    expected = chunks(SHIPPED.bundle, "float32")
+    assert np.array_equal(chunks(outliers, "float32"), expected), "the planted policy computes something else"
+
+    def error(name, *options, dtype="int8"):
+        out = tmp_path / name
+        answer = subprocess.run([VLA, "quantize", outliers, "-o", out, "--dtype", dtype, *map(str, options)], capture_output=True, text=True, timeout=300)  # fmt: skip
+        assert answer.returncode == 0, answer.stderr
+        return np.sqrt(np.mean((chunks(out, None) - expected) ** 2) / np.mean(expected**2)), answer.stdout
+
+    rough, _ = error("rough.gguf")
+    smooth, told = error("smooth.gguf", "--calibrate", recording)
+    assert rough > 3 * smooth, (rough, smooth)
+    assert smooth < 1.5 * moved_int8(expected), (smooth, moved_int8(expected))
+    assert re.match(r"smoothed over 2 observations: \d+ channels of \d+ norms and MLPs divided, by \d+ at most; int8 moves chunks by ", told)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["planted.gguf", "rough.gguf", "smooth.gguf"]
+    assert "smoothed over 2 observations" in read_bundle(str(tmp_path / "smooth.gguf")).keys["vla.quantization"]
+
+
+def moved_int8(expected):
+    """What int8 moves the policy without outliers."""
+    got = chunks(SHIPPED.bundle, "int8")
+    return np.sqrt(np.mean((got - expected) ** 2) / np.mean(expected**2))

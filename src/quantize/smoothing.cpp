@@ -1,0 +1,223 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "quantize/smoothing.h"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+
+#include "base/bf16.h"
+#include "base/file.h"
+#include "bundle/gguf_writer.h"
+#include "kernels/numbers.h"
+#include "quantize/smoothing_places.h"
+
+namespace vla {
+namespace {
+
+constexpr std::int64_t kPartRows = 64;  // of a matrix that are in memory at a time
+// Powers of two of a factor. Channels that stand out less are left, since weights of four bits lose more by a factor
+// than activations of eight gain.
+constexpr int kLeastPower = 2, kMostPower = 12;
+
+/// The largest magnitude of each channel of a value, over tokens, solver steps and observations.
+using Ranges = std::map<std::string, std::vector<float>>;
+
+void widen_range(std::vector<float>& range, const Tap& tap) {
+  const auto d = static_cast<std::size_t>(tap.shape.front());
+  range.resize(d);
+  for (std::size_t i = 0; i < tap.values.size(); ++i) range[i % d] = std::max(range[i % d], std::abs(tap.values[i]));
+}
+
+/// `lm.blk.0.attn_norm` of `step.3.lm.blk.0.attn_norm`.
+std::string path_of(const Tap& tap) {
+  if (!tap.path.starts_with("step.")) return tap.path;
+  return tap.path.substr(tap.path.find('.', tap.path.find('.') + 1) + 1);
+}
+
+Result<Ranges> measure_ranges(const std::string& bundle, const std::vector<SmoothingPlace>& places,
+                              std::span<const Judged> observations, int n_thread) {
+  EngineOptions options = {.n_thread = n_thread, .kernels = "float32", .all_robots = true};
+  for (const SmoothingPlace& place : places) options.tap_pattern += fmt::format("{0},step.*.{0},", place.path);
+  options.tap_pattern.pop_back();
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(bundle, options));
+  Ranges ranges;
+  for (const Judged& one : observations) {
+    VLA_TRY(const ActionChunk chunk, engine->act(one.observation, one.noise));
+    for (const Tap& tap : chunk.taps) widen_range(ranges[path_of(tap)], tap);
+  }
+  return ranges;
+}
+
+/// Factors of rows and columns of a tensor; empty where all are 1. A vector is a row.
+struct Factors {
+  std::vector<float> rows, columns;
+};
+
+/// Reads and writes tensors part by part, with factors.
+class Scaler {
+ public:
+  explicit Scaler(const Bundle& bundle) : bundle_(bundle) {}
+
+  /// Rows of a tensor as floats, for `see`.
+  Status each_row(const TensorInfo& tensor, const std::function<void(std::int64_t row, std::span<float>)>& see) {
+    const std::int64_t d = tensor.shape.front(), n_row = tensor.count() / d;
+    const std::size_t row_size = dtype_size(tensor.type, d);
+    for (std::int64_t first = 0; first < n_row; first += kPartRows) {
+      const std::int64_t n = std::min(kPartRows, n_row - first);
+      VLA_TRY(const auto part, bundle_.read(tensor.data.subspan(static_cast<std::size_t>(first) * row_size,
+                                                                static_cast<std::size_t>(n) * row_size),
+                                            room_));
+      row_.resize(static_cast<std::size_t>(d));
+      for (std::int64_t i = 0; i < n; ++i) {
+        for (std::int64_t k = 0; k < d; ++k)
+          row_[static_cast<std::size_t>(k)] = kernels::stored_number(tensor.type, part.data(), i * d + k);
+        see(first + i, row_);
+      }
+    }
+    return {};
+  }
+
+  Status write(const TensorInfo& tensor, const Factors& factors, BundleFile& out) {
+    std::vector<std::uint16_t> rounded;
+    return each_row(tensor, [&](std::int64_t row, std::span<float> values) {
+      const float of_row = factors.rows.empty() ? 1 : factors.rows[static_cast<std::size_t>(row)];
+      for (std::size_t k = 0; k < values.size(); ++k)
+        values[k] *= of_row * (factors.columns.empty() ? 1 : factors.columns[k]);
+      if (tensor.type == DType::f32) return out.put(std::as_bytes(values));
+      rounded.assign(values.size(), 0);
+      std::ranges::transform(values, rounded.begin(), to_bf16);
+      out.put(std::as_bytes(std::span(rounded)));
+    });
+  }
+
+ private:
+  const Bundle& bundle_;
+  Room room_;
+  std::vector<float> row_;
+};
+
+/// The nearest one; 1 for what is not far from it.
+float power_of_two(double value) {
+  const int power = std::clamp(static_cast<int>(std::lround(std::log2(value))), -kMostPower, kMostPower);
+  return std::abs(power) < kLeastPower ? 1 : std::ldexp(1.0f, power);
+}
+
+/// What channels are divided by: beside the geometric mean of all, so that most of them stay.
+std::vector<float> divisors(const std::vector<float>& x, const std::vector<float>& w) {
+  std::vector<double> ratios;
+  double sum = 0;
+  int n = 0;
+  for (std::size_t i = 0; i < x.size(); ++i) {
+    const bool is_read = x[i] > 0 && w[i] > 0 && std::isfinite(x[i] / w[i]);
+    ratios.push_back(is_read ? std::sqrt(double{x[i]} / w[i]) : 0);
+    if (is_read) sum += std::log2(ratios.back()), ++n;
+  }
+  const double mean = n > 0 ? std::exp2(sum / n) : 1;
+  std::vector<float> by;
+  for (const double ratio : ratios) by.push_back(ratio > 0 ? power_of_two(ratio / mean) : 1);
+  return by;
+}
+
+void multiply(std::vector<float>& factors, const std::vector<float>& by, bool inverse) {
+  factors.resize(by.size(), 1);
+  for (std::size_t i = 0; i < by.size(); ++i) factors[i] *= inverse ? 1 / by[i] : by[i];
+}
+
+/// Factors of tensors by where they lie in the file, which robots of a bundle share.
+class Scaling {
+ public:
+  Scaling(const Bundle& bundle, const Bundle& opened) : opened_(opened), scaler_(bundle) {
+    for (const TensorInfo& tensor : bundle.tensors()) by_offset_[offset(bundle, tensor)] = &tensor;
+  }
+
+  Status add(const SmoothingPlace& place, const std::vector<float>& range, Smoothed& told) {
+    std::vector<float> w(range.size());
+    for (const Param* matrix : place.readers)
+      VLA_CHECK(scaler_.each_row(tensor_of(matrix), [&](std::int64_t, std::span<float> row) {
+        for (std::size_t k = 0; k < row.size(); ++k) w[k] = std::max(w[k], std::abs(row[k]));
+      }));
+    const std::vector<float> by = divisors(range, w);
+    for (const Param* matrix : place.readers) multiply(factors_[&tensor_of(matrix)].columns, by, false);
+    for (const Param* param : {place.weight, place.bias}) {
+      if (param == nullptr) continue;
+      Factors& factors = factors_[&tensor_of(param)];
+      multiply(param->storage == Storage::matrix ? factors.rows : factors.columns, by, true);
+    }
+    ++told.n_place;
+    for (const float factor : by) told.n_channel += factor != 1, told.largest = std::max(told.largest, factor);
+    return {};
+  }
+
+  const Factors* find(const TensorInfo& tensor) const {
+    const auto found = factors_.find(&tensor);
+    return found != factors_.end() ? &found->second : nullptr;
+  }
+  Scaler& scaler() { return scaler_; }
+
+ private:
+  static std::ptrdiff_t offset(const Bundle& bundle, const TensorInfo& tensor) {
+    return tensor.data.data() - bundle.content()->bytes().data();
+  }
+  const TensorInfo& tensor_of(const Param* param) const { return *by_offset_.at(offset(opened_, *param->source)); }
+
+  const Bundle& opened_;  // whose parameters these are
+  Scaler scaler_;
+  std::map<std::ptrdiff_t, const TensorInfo*> by_offset_;
+  std::map<const TensorInfo*, Factors> factors_;
+};
+
+Status write_tensors(const Bundle& bundle, Scaling& scaling, BundleFile& out) {
+  Room room;
+  constexpr std::size_t kPart = std::size_t{1} << 22;
+  for (const TensorInfo& tensor : bundle.tensors()) {
+    if (const Factors* factors = scaling.find(tensor)) {
+      VLA_CHECK(scaling.scaler().write(tensor, *factors, out));
+    } else {
+      for (std::size_t at = 0; at < tensor.data.size(); at += kPart) {
+        VLA_TRY(const auto part, bundle.read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at)), room));
+        out.put(part);
+      }
+    }
+    out.end_tensor();
+  }
+  return {};
+}
+
+}  // namespace
+
+Result<Smoothed> smooth(const std::string& from, const std::string& to, std::span<const Judged> observations,
+                        int n_thread) {
+  SmoothingPlaces finder;
+  VLA_TRY(const std::unique_ptr<Engine> engine,
+          Engine::load(from, {.n_thread = n_thread,
+                              .kernels = "float32",
+                              .dry = true,
+                              .all_robots = true,
+                              .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
+  const std::vector<SmoothingPlace> places = finder.found();
+  if (places.empty())
+    return Error{Code::unsupported, from, "norms or gated MLPs whose channels may be divided", "none",
+                 "leave out --calibrate"};
+  VLA_TRY(const Ranges ranges, measure_ranges(from, places, observations, n_thread));
+  VLA_TRY(const Bundle bundle, Bundle::open(from));
+  Scaling scaling(bundle, engine->robot().bundle());
+  Smoothed told;
+  for (const SmoothingPlace& place : places)
+    if (const auto range = ranges.find(place.path); range != ranges.end())
+      VLA_CHECK(scaling.add(place, range->second, told));
+  Keys keys = bundle.keys();
+  keys.set("vla.checksum", std::string(kNoChecksum));
+  Status made;
+  VLA_CHECK(write_file(to, [&](int file) {
+    BundleFile out(file, keys, bundle.tensors());
+    made = write_tensors(bundle, scaling, out);
+    return made && out.seal();
+  }));
+  VLA_CHECK(made);
+  return told;
+}
+
+}  // namespace vla

@@ -1,0 +1,133 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Channels that are divided where they come from and multiplied where they are read.
+#include "quantize/smoothing.h"
+
+#include <doctest/doctest.h>
+
+#include "quantize/smoothing_places.h"
+#include "support/editable_bundle.h"
+#include "support/golden_case.h"
+#include "support/param_set.h"
+
+using namespace vla;
+using namespace vla::test;
+
+namespace {
+
+constexpr int kWidth = 8;
+
+/// Graphs over a norm, an MLP and what may read them.
+struct Places {
+  Places() {
+    const Scope s = set.scope();
+    norm = s.vector("norm", kWidth), bias = s.vector("bias", kWidth);
+    for (const char* name : {"a", "b", "gate", "up", "down"}) matrices[name] = s.matrix(name, kWidth, kWidth);
+    x = g.input(slots.add_f32({kWidth, 4, 1, 1}));
+  }
+  Tensor normed() {
+    return g.name("n", g.add(op::Norm{op::NormKind::layer, 1e-5f}, {x, g.parameter(norm), g.parameter(bias)}));
+  }
+  Tensor product(const char* matrix, Tensor of, const Param* with = nullptr) {
+    return g.add(op::Linear{matrices.at(matrix), with}, {of});
+  }
+  std::vector<std::string> paths() {
+    SmoothingPlaces finder;
+    finder.see(g);
+    std::vector<std::string> paths;
+    for (const SmoothingPlace& place : finder.found()) paths.push_back(place.path);
+    return paths;
+  }
+
+  static std::vector<ParamSet::Piece> pieces() {
+    std::vector<ParamSet::Piece> all;
+    for (const char* name : {"a", "b", "gate", "up", "down"})
+      all.push_back({name, {kWidth, kWidth}, std::vector<float>(kWidth * kWidth, 1)});
+    for (const char* name : {"norm", "bias"}) all.push_back({name, {kWidth}, std::vector<float>(kWidth, 1)});
+    return all;
+  }
+  ParamSet set{pieces()};
+  const Param *norm, *bias;
+  std::map<std::string, const Param*> matrices;
+  Slots slots;
+  Graph g{slots};
+  Tensor x;
+};
+
+using Paths = std::vector<std::string>;
+
+}  // namespace
+
+TEST_CASE("a norm whose channels only matrices read may be smoothed, also through some of its tokens") {
+  Places p;
+  const Tensor n = p.normed();
+  p.product("a", n);
+  p.product("b", p.g.add(op::Slice{1, 2}, {n}, {kWidth, 2, 1, 1}));
+  CHECK(p.paths() == Paths{"n"});
+}
+
+TEST_CASE("a norm that something else reads, or whose matrices or weights have other readers, may not") {
+  SUBCASE("the result is added to") {
+    Places p;
+    const Tensor n = p.normed();
+    p.g.add(op::Add{}, {p.product("a", n), n});
+    CHECK(p.paths().empty());
+  }
+  SUBCASE("some of its channels are read") {
+    Places p;
+    const Tensor n = p.normed();
+    p.product("a", n);
+    p.g.add(op::Slice{0, 2}, {n}, {2, 4, 1, 1});
+    CHECK(p.paths().empty());
+  }
+  SUBCASE("a matrix multiplies something else too") {
+    Places p;
+    p.product("a", p.normed());
+    p.product("a", p.x);
+    CHECK(p.paths().empty());
+  }
+  SUBCASE("its bias is another's") {
+    Places p;
+    p.product("a", p.normed(), p.bias);
+    CHECK(p.paths().empty());
+  }
+  SUBCASE("nobody can tap it") {
+    Places p;
+    p.product("a", p.g.add(op::Norm{op::NormKind::rms, 1e-5f}, {p.x, p.g.parameter(p.norm)}));
+    CHECK(p.paths().empty());
+  }
+}
+
+TEST_CASE("rows of an MLP's up may be divided, and its columns multiplied") {
+  Places p;
+  const Tensor n = p.normed(), up = p.product("up", n);
+  const Tensor gate = p.g.add(op::Activate{Activation::silu}, {p.product("gate", n)});
+  p.product("down", p.g.name("h", p.g.add(op::Multiply{}, {gate, up})));
+  CHECK(p.paths() == Paths{"h", "n"});
+  p.product("a", up);
+  CHECK(p.paths() == Paths{"n"});
+}
+
+TEST_CASE("a smoothed policy acts as before in float32, to the bit") {
+  int n_smoothed = 0;
+  for (const std::string& name : golden_paths()) {
+    CAPTURE(name);
+    const GoldenCase golden = GoldenCase::read(name);
+    const std::string to = write_file("smoothed.gguf", "");
+    const Judged seen = {golden.observation, golden.noise};
+    const auto smoothed = smooth(golden.bundle(), to, std::span(&seen, 1), 1);
+    if (!smoothed) {
+      CHECK_MESSAGE(smoothed.error().code == Code::unsupported, smoothed.error().message());
+      continue;
+    }
+    n_smoothed += smoothed->n_channel > 0;
+    const auto before = load_engine(golden.bundle(), "", "float32"), after = load_engine(to, "", "float32");
+    const auto expected = before->act(golden.observation, golden.noise);
+    const auto got = after->act(golden.observation, golden.noise);
+    REQUIRE(expected.ok());
+    REQUIRE(got.ok());
+    CHECK(got->actions == expected->actions);
+  }
+  CHECK(n_smoothed > 10);
+}
