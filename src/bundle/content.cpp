@@ -123,10 +123,11 @@ const std::byte* Content::read(std::span<const std::byte> part, Room& room) cons
   return &blocks[offset - first];
 }
 
-void Content::forget(std::span<const std::byte> part) const {
-  if (file_ < 0) return;
-  ::posix_fadvise(file_, part.data() - bytes_.data(), static_cast<off_t>(part.size()), POSIX_FADV_DONTNEED);
+void Content::advise(std::span<const std::byte> part, int advice) const {
+  if (file_ >= 0) ::posix_fadvise(file_, part.data() - bytes_.data(), static_cast<off_t>(part.size()), advice);
 }
+void Content::expect(std::span<const std::byte> part) const { advise(part, POSIX_FADV_WILLNEED); }
+void Content::forget(std::span<const std::byte> part) const { advise(part, POSIX_FADV_DONTNEED); }
 
 std::size_t Content::n_cached() const {
   if (file_ < 0) return 0;

@@ -60,6 +60,8 @@ class Content {
   /// `room` is as large as `room_for` the part, this takes no memory. Threads may read at a time.
   const std::byte* read(std::span<const std::byte> part, Room& room) const;
   static constexpr std::size_t room_for(std::size_t size) { return (size / kBlock + 2) * kBlock; }
+  /// Has the system read a part of the file ahead, without waiting for it.
+  void expect(std::span<const std::byte> part) const;
   /// Lets the system give up what it keeps of a part of the file: nobody is about to read it again.
   void forget(std::span<const std::byte> part) const;
   /// Bytes of the file that the system keeps in memory, which it gives up where others need it; 0 of memory.
@@ -70,6 +72,7 @@ class Content {
  private:
   Content(int file, std::string path) : file_(file), path_(std::move(path)) {}
   Status fill(std::size_t offset, std::span<std::byte> to) const;
+  void advise(std::span<const std::byte> part, int advice) const;
 
   int file_ = -1;
   std::string path_;

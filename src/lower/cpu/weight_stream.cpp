@@ -41,9 +41,12 @@ void WeightStream::serve(Packer packer) {
     may_read_.wait(lock, [this] { return stop_ || has_part(); });
     if (stop_) return;
     const Turn turn = reading_;
+    const bool begins = next_part_ == 0;
     const PackPart& part = take_part();
     ++n_busy_;
     lock.unlock();
+    if (begins)
+      for (const PackPart& next : parts(turn + 1)) content_->expect(next.from);
     const bool is_there = packer.run(*content_, part);
     lock.lock();
     --n_busy_;
