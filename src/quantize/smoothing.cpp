@@ -88,7 +88,7 @@ class Scaler {
         values[k] *= of_row * (factors.columns.empty() ? 1 : factors.columns[k]);
       if (tensor.type == DType::f32) return out.put(std::as_bytes(values));
       rounded.assign(values.size(), 0);
-      std::ranges::transform(values, rounded.begin(), to_bf16);
+      std::ranges::transform(values, rounded.begin(), [](float value) { return to_bf16(value); });
       out.put(std::as_bytes(std::span(rounded)));
     });
   }
