@@ -12,10 +12,11 @@ import pytest
 
 import wire
 from golden_cases import ROOT
+from program import EXIT
 from serve_test import serve  # noqa: F401, a fixture
 
 SHIPPED = ROOT / "models/metaworld-tiny.gguf"
-LEAST = re.compile(r"expected (\d+) MB or more, found 1 MB")
+LEAST = re.compile(r"expected (\d+) MB or more, found \d+ MB")
 IMAGE = sorted((ROOT / "examples/metaworld/episodes").rglob("*.png"))[0]
 OBSERVATION = SimpleNamespace(images={"corner4": IMAGE}, state=[0, 0.4, 0.2, 1], text="open the faucet")
 
@@ -31,8 +32,30 @@ def run(vla):
 
 def least(answer):
     """Megabytes that the refusal of too few asks for."""
-    answer.refused("out_of_memory", "memory", "vla quantize")
+    assert answer.code == EXIT["out_of_memory"], answer.err
     return int(LEAST.search(answer.err)[1])
+
+
+def within(ask, more):
+    """What `ask` answers with so many megabytes more than the least, which is not the same in every run: a process differs."""
+    smallest = least(ask("1MB"))
+    for _ in range(20):
+        answer = ask(f"{smallest + more}MB")
+        if answer.code == 0:
+            return answer
+        smallest = least(answer)
+    raise AssertionError(answer.err)
+
+
+def serving(vla, serve, options, more):
+    """A server with so many megabytes more than the least."""
+    for _ in range(20):
+        budget = least(vla("serve", *options, "--memory", "1MB")) + more
+        try:
+            return serve(*options, "--memory", f"{budget}MB")
+        except ValueError:  # no ready line
+            continue
+    raise AssertionError("no server within its budget")
 
 
 @pytest.mark.parametrize("kernels", ["float32", "bf16", "int8", "portable"])
@@ -40,9 +63,8 @@ def least(answer):
 def test_actions_are_the_same_to_the_bit_within_any_budget(run, kernels, threads):
     options = ("--kernels", kernels, "--threads", threads)
     expected = run(*options).json()["actions"]
-    smallest = least(run(*options, "--memory", "1MB"))
     for more in (1, 2, 3, 100):
-        assert run(*options, "--memory", f"{smallest + more}MB").json()["actions"] == expected
+        assert within(lambda budget: run(*options, "--memory", budget), more).json()["actions"] == expected
 
 
 def memory_of(server):
@@ -53,9 +75,10 @@ def memory_of(server):
 
 
 def test_a_budget_is_kept(vla, serve):
+    if vla.is_sanitized():
+        pytest.skip("a sanitizer takes more memory than the policy")
     options = (SHIPPED, "--bind", "tcp://127.0.0.1:0", "--kernels", "float32")
-    budget = least(vla("serve", *options, "--memory", "1MB")) + 1
-    tight, roomy = serve(*options, "--memory", f"{budget}MB"), serve(*options)
+    tight, roomy = serving(vla, serve, options, 1), serve(*options)
     assert memory_of(tight) < memory_of(roomy) - 2_000_000
     assert float(tight.ready["read_mb"]) > 1 and "read_mb" not in roomy.ready
 
@@ -67,25 +90,25 @@ def inspected(vla, budget):
 def test_inspect_tells_what_is_read_in_every_act(vla):
     roomy = inspected(vla, "1GB")["memory_budget_bytes"]
     assert roomy["size"] == 10**9 and roomy["read_in_every_act"] == 0
-    budget = f"{roomy['smallest'] // 10**6 + 2}MB"
-    tight = inspected(vla, budget)
+    tight = json.loads(within(lambda budget: vla("inspect", SHIPPED, "--memory", budget, "--json"), 2).out)
     assert 10**6 < tight["memory_budget_bytes"]["read_in_every_act"] < SHIPPED.stat().st_size
     all_of_it = tight["memory_bytes"]["total"] + tight["memory_budget_bytes"]["process"]
     assert tight["memory_budget_bytes"]["smallest"] <= all_of_it <= tight["memory_budget_bytes"]["size"]
-    text = vla("inspect", SHIPPED, "--memory", budget).out
+    text = within(lambda budget: vla("inspect", SHIPPED, "--memory", budget), 2).out
     assert re.search(r"budget .* MB is the least that does\n +every act reads .* of the file's 9\.2 MB", text)
     assert "all matrices stay in memory" in vla("inspect", SHIPPED, "--memory", "1GB").out
     assert "budget" not in vla("inspect", SHIPPED).out
 
 
 def test_a_bench_tells_what_was_read_and_what_the_system_keeps(vla):
-    options = ("--runs", "1", "--warmup", "0", "--threads", "1")
-    budget = f"{inspected(vla, '1GB')['memory_budget_bytes']['smallest'] // 10**6 + 3}MB"
-    memory = vla("bench", SHIPPED, "--memory", budget, *options, "--json").json()["memory_bytes"]
+    def bench(*more):
+        return vla("bench", SHIPPED, "--runs", "1", "--warmup", "0", "--threads", "1", *more)
+
+    memory = within(lambda budget: bench("--json", "--memory", budget), 2).json()["memory_bytes"]
     assert 0 < memory["read_in_every_act"] <= SHIPPED.stat().st_size and memory["read_in_every_act"] <= memory["cached"]
-    text = vla("bench", SHIPPED, "--memory", budget, *options).out
+    text = within(lambda budget: bench("--memory", budget), 2).out
     assert re.search(r"budget \d+ MB: every act reads \d+ MB of the file", text)
-    assert "budget" not in vla("bench", SHIPPED, *options).out
+    assert "budget" not in bench().out
 
 
 @pytest.mark.parametrize(
@@ -100,6 +123,10 @@ def test_what_is_no_number_of_bytes_is_refused(run, given):
     run(f"--memory={given}").refused("usage", "--memory")
 
 
+def test_too_small_a_budget_is_refused_with_the_least_that_does(run):
+    run("--memory", "1MB").refused("out_of_memory", "memory", "MB or more, found 1 MB; give more", "vla quantize")
+
+
 def test_kernels_that_keep_all_weights_refuse_a_budget(run):
     run("--kernels", "ggml", "--memory", "1GB").refused("unsupported", "memory", "leave the budget out")
 
@@ -110,7 +137,7 @@ def test_a_bundle_that_changes_while_it_is_read_is_refused_until_its_bytes_are_b
     shutil.copy(SHIPPED, path)
     stored = path.read_bytes()
     options = (path, "--bind", "tcp://127.0.0.1:0", "--threads", "1", "--kernels", "float32")
-    server = serve(*options, "--memory", f"{least(vla('serve', *options, '--memory', '1MB')) + 2}MB")
+    server = serving(vla, serve, options, 2)
     peer = wire.Peer(server.ready["address"])
     before = [wire.actions(peer.ask(wire.act(1, OBSERVATION, seed=seed))) for seed in range(3)]
     half = len(stored) // 2
