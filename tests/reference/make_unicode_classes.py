@@ -14,9 +14,9 @@ import sys
 
 import tokenizers
 from tokenizers import AddedToken, Tokenizer, models, normalizers, pre_tokenizers
+from unicode_tables import CODE_POINTS, write_classes, write_lowered
 
 LETTER, NUMBER, SPACE, DIGIT, WORD, NORMAL, CONTROL, PUNCTUATION, MARK = (1 << i for i in range(9))
-CODE_POINTS = [c for c in range(0x110000) if not 0xD800 <= c <= 0xDFFF]
 
 
 def added_token_tokenizer(**options) -> Tokenizer:
@@ -57,24 +57,6 @@ def classify_for_bert(flags: list[int]) -> None:
         assert strip(chr(c)) == "".join(x for x in nfd.normalize_str(chr(c)) if not flags[ord(x)] & MARK), hex(c)
 
 
-def lowered() -> list[list[int]]:
-    """[first, last, step, distance] of characters whose lower case lies equally far away."""
-    lower, runs = bert(lowercase=True), []
-    for c in CODE_POINTS:
-        small = lower(chr(c))
-        if small == chr(c) or c == 0x130:
-            continue
-        assert len(small) == 1, hex(c)  # U+0130 alone becomes two
-        distance = ord(small) - c
-        if runs and runs[-1][3] == distance:
-            first, last, step, _ = runs[-1]
-            if c - last == step or (first == last and c - last <= 2):
-                runs[-1] = [first, c, c - last, distance]
-                continue
-        runs.append([c, c, 1, distance])
-    return runs
-
-
 def classify() -> list[int]:
     flags = [0] * 0x110000
     for c in normal():
@@ -101,27 +83,10 @@ def classify() -> list[int]:
     return flags
 
 
-def write(path: str, what: str, cells: list[str]) -> None:
-    lines = []
-    for cell in cells:
-        if not lines or len(lines[-1]) + len(cell) + 1 > 118:
-            lines.append(cell)
-        else:
-            lines[-1] += " " + cell
-    with open(path, "w") as out:
-        out.write("// SPDX-FileCopyrightText: The vla.cpp authors\n// SPDX-License-Identifier: Apache-2.0\n")
-        out.write("// Written by tests/reference/make_unicode_classes.py from tokenizers ")
-        out.write(f"{tokenizers.__version__}: {what}.\n// clang-format off\n")
-        out.write("\n".join(lines) + "\n")
-    print(f"{path}: {len(cells)} runs")
-
-
 def main() -> None:
-    flags = classify()
-    runs = [(c, flags[c]) for c in range(0x110000) if c == 0 or flags[c] != flags[c - 1]]
-    write(sys.argv[1] + "/unicode_classes.inc", "first code point of a run, classes", [f"{{0x{c:x}, {f}}}," for c, f in runs])
-    cells = [f"{{0x{a:x}, 0x{b:x}, {step}, {d}}}," for a, b, step, d in lowered()]
-    write(sys.argv[1] + "/unicode_lower.inc", "first and last of a run, step, distance to lower case", cells)
+    source = f"tests/reference/make_unicode_classes.py from tokenizers {tokenizers.__version__}"
+    write_classes(sys.argv[1] + "/unicode_classes.inc", source, classify())
+    write_lowered(sys.argv[1] + "/unicode_lower.inc", source, bert(lowercase=True))
 
 
 main()
