@@ -4,8 +4,8 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-
 #include <malloc.h>
+
 #include <algorithm>
 #include <cmath>
 #include <new>

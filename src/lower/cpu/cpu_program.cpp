@@ -66,17 +66,15 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   for (const CpuOp& op : l.ops) scratch = std::max(scratch, scratch_of(l, op));
   VLA_CHECK(executor_->reserve(scratch));
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
-  phases_.resize(static_cast<std::size_t>(l.n_phase)), matrices_.resize(phases_.size());
+  phases_.resize(static_cast<std::size_t>(l.n_phase)), uses_.resize(phases_.size());
   const auto& stages = l.graph.stages();
   work_.resize(stages.size() + 1);
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
   for (const CpuOp& op : l.ops) {
-    const std::size_t n_use = uses_.size();
-    tasks_.push_back(emit(l, op, uses_));
-    tasks_.back()->kind = kind_of(op), tasks_.back()->clock = clock_.get();
     const auto phase = static_cast<std::size_t>(op.phase);
+    tasks_.push_back(emit(l, op, uses_[phase]));
+    tasks_.back()->kind = kind_of(op), tasks_.back()->clock = clock_.get();
     phases_[phase].tasks.push_back(tasks_.back().get());
-    for (const MatrixUse& use : std::span(uses_).subspan(n_use)) matrices_[phase].push_back(use.matrix);
     text_ += text_of(l, op) + "\n";
     const std::size_t stage = stage_of(l, op);
     if (!op.invariant) work_[stage] += work_of(l, op);
@@ -103,7 +101,7 @@ void CpuProgram::make_taps(const CpuLowering& l) {
 Status CpuProgram::cut(const CpuWeights& weights) {
   std::vector<Groups> groups(phases_.size());
   for (std::size_t i = 0; i < phases_.size(); ++i)
-    for (const Param* matrix : matrices_[i]) groups[i].add(weights.group_of(matrix->id));
+    for (const MatrixUse& use : uses_[i]) groups[i].add(weights.group_of(use.matrix->id));
   for (const Groups& all : groups)
     if (all.last - all.first >= WeightStream::kWindows)
       return Error{Code::unsupported, "memory",
@@ -119,10 +117,11 @@ Status CpuProgram::run() { return run(run_); }
 
 /// Matrices are where the table has them.
 void CpuProgram::bind() {
-  for (const auto& [part, matrix] : uses_) {
-    const auto& [data, scales] = weights_->at(matrix);
-    part->weight = data, part->scale = scales;
-  }
+  for (const MatrixUses& phase : uses_)
+    for (const auto& [part, matrix] : phase) {
+      const auto& [data, scales] = weights_->at(matrix);
+      part->weight = data, part->scale = scales;
+    }
   bound_ = weights_->version;
 }
 

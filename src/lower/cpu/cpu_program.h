@@ -24,8 +24,8 @@ class CpuProgram final : public Program {
   const std::vector<Tap>& taps() const override { return taps_; }
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
-  /// The matrices that each phase of `run` reads, and before it those of `prepare`.
-  const std::vector<std::vector<const Param*>>& matrices() const { return matrices_; }
+  /// The matrices that each phase reads: first those of `prepare`, then those of `run`.
+  const std::vector<MatrixUses>& uses() const { return uses_; }
   std::size_t n_prepare() const { return n_prepare_; }
   std::size_t size() const override { return own_.size() + host_size_; }
 
@@ -46,11 +46,10 @@ class CpuProgram final : public Program {
   std::shared_ptr<const Tables> tables_;
   Memory arena_, own_;  // own: constants, and what prepare leaves
   std::shared_ptr<const WeightTable> weights_;
-  MatrixUses uses_;
-  std::uint64_t bound_ = 0;  // the version of the table that tasks know
+  std::vector<MatrixUses> uses_;  // of each phase
+  std::uint64_t bound_ = 0;       // the version of the table that tasks know
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;
-  std::vector<std::vector<const Param*>> matrices_;  // of each phase
   std::vector<Segment> prepare_, run_;
   std::shared_ptr<WeightStream> stream_;  // null where all matrices are resident
   std::size_t n_prepare_ = 0, host_size_ = 0;

@@ -13,7 +13,8 @@ using Group = std::vector<const Param*>;
 class Planner {
  public:
   Planner(const CpuWeights& weights, const CpuProgram& prefix, const CpuProgram& step) : weights_(weights) {
-    for (const Group& phase : step.matrices()) resident_.insert(phase.begin(), phase.end());
+    for (const MatrixUses& phase : step.uses())
+      for (const MatrixUse& use : phase) resident_.insert(use.matrix);
     group_phases(prefix);
   }
 
@@ -37,10 +38,10 @@ class Planner {
   void group_phases(const CpuProgram& prefix) {
     std::vector<Group> phases;
     std::set<const Param*> seen = resident_;
-    for (std::size_t i = prefix.n_prepare(); i < prefix.matrices().size(); ++i) {
+    for (std::size_t i = prefix.n_prepare(); i < prefix.uses().size(); ++i) {
       Group& phase = phases.emplace_back();
-      std::copy_if(prefix.matrices()[i].begin(), prefix.matrices()[i].end(), std::back_inserter(phase),
-                   [&](const Param* matrix) { return seen.insert(matrix).second; });
+      for (const MatrixUse& use : prefix.uses()[i])
+        if (seen.insert(use.matrix).second) phase.push_back(use.matrix);
       window_ = std::max(window_, size(phase));
     }
     for (const Group& phase : phases) {
