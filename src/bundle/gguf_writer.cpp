@@ -100,6 +100,17 @@ void BundleFile::put(std::span<const std::byte> bytes) {
   if (!failed_ && !write_all(file_, bytes)) failed_ = true, errno_ = errno;
 }
 
+Status BundleFile::copy(const Bundle& bundle, const TensorInfo& tensor, const std::function<void(std::size_t)>& see) {
+  constexpr std::size_t kPart = std::size_t{1} << 22;
+  for (std::size_t at = 0; at < tensor.data.size(); at += kPart) {
+    VLA_TRY(const auto part, bundle.read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at)), room_));
+    put(part);
+    see(part.size());
+  }
+  end_tensor();
+  return {};
+}
+
 void BundleFile::put_zeros(std::size_t size) {
   static constexpr std::byte kZeros[1 << 16] = {};
   for (std::size_t left = size; left > 0;) {

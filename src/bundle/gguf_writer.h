@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <functional>
 #include <memory>
 #include <span>
 #include <string>
@@ -34,6 +35,9 @@ class BundleFile {
   ~BundleFile();
 
   void put(std::span<const std::byte> bytes);
+  /// A tensor of a bundle as it is; `see` is told the bytes of every part. Errors: bad_bundle where the bundle's file
+  /// has been changed since it was opened.
+  Status copy(const Bundle& bundle, const TensorInfo& tensor, const std::function<void(std::size_t)>& see);
   /// So many zeros, which take no place on the way.
   void put_zeros(std::size_t size);
   /// After the last byte of a tensor.
@@ -47,6 +51,7 @@ class BundleFile {
   int errno_ = 0;
   std::size_t size_ = 0, digits_ = 0;  // bytes written, and where the checksum's digits are
   std::unique_ptr<XXH3_state_s, int (*)(XXH3_state_s*)> state_;
+  Room room_;
 };
 
 }  // namespace vla

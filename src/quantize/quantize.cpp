@@ -80,13 +80,7 @@ class Writer {
       : bundle_(bundle), out_(out), report_(report) {}
 
   Status copy(const TensorInfo& tensor) {
-    constexpr std::size_t kPart = std::size_t{1} << 22;
-    for (std::size_t at = 0; at < tensor.data.size(); at += kPart) {
-      VLA_TRY(const auto part, read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at))));
-      out_.put(part);
-    }
-    out_.end_tensor();
-    return {};
+    return out_.copy(bundle_, tensor, [this](std::size_t size) { tell(size); });
   }
 
   /// Codes, then scales: two tensors.
@@ -115,8 +109,11 @@ class Writer {
  private:
   Result<std::span<const std::byte>> read(std::span<const std::byte> part) {
     VLA_TRY(const auto bytes, bundle_.read(part, room_));
-    report_({done_ += static_cast<std::int64_t>(part.size()), static_cast<std::int64_t>(bundle_.file_size())});
+    tell(part.size());
     return bytes;
+  }
+  void tell(std::size_t size) {
+    report_({done_ += static_cast<std::int64_t>(size), static_cast<std::int64_t>(bundle_.file_size())});
   }
 
   const Bundle& bundle_;

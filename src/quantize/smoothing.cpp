@@ -82,7 +82,7 @@ class Scaler {
 
   Status write(const TensorInfo& tensor, const Factors& factors, BundleFile& out) {
     std::vector<std::uint16_t> rounded;
-    return each_row(tensor, [&](std::int64_t row, std::span<float> values) {
+    const Status written = each_row(tensor, [&](std::int64_t row, std::span<float> values) {
       const float of_row = factors.rows.empty() ? 1 : factors.rows[static_cast<std::size_t>(row)];
       for (std::size_t k = 0; k < values.size(); ++k)
         values[k] *= of_row * (factors.columns.empty() ? 1 : factors.columns[k]);
@@ -91,6 +91,8 @@ class Scaler {
       std::ranges::transform(values, rounded.begin(), [](float value) { return to_bf16(value); });
       out.put(std::as_bytes(std::span(rounded)));
     });
+    out.end_tensor();
+    return written;
   }
 
  private:
@@ -170,18 +172,10 @@ class Scaling {
 };
 
 Status write_tensors(const Bundle& bundle, Scaling& scaling, BundleFile& out) {
-  Room room;
-  constexpr std::size_t kPart = std::size_t{1} << 22;
   for (const TensorInfo& tensor : bundle.tensors()) {
-    if (const Factors* factors = scaling.find(tensor)) {
-      VLA_CHECK(scaling.scaler().write(tensor, *factors, out));
-    } else {
-      for (std::size_t at = 0; at < tensor.data.size(); at += kPart) {
-        VLA_TRY(const auto part, bundle.read(tensor.data.subspan(at, std::min(kPart, tensor.data.size() - at)), room));
-        out.put(part);
-      }
-    }
-    out.end_tensor();
+    const Factors* const factors = scaling.find(tensor);
+    VLA_CHECK(factors != nullptr ? scaling.scaler().write(tensor, *factors, out)
+                                 : out.copy(bundle, tensor, [](std::size_t) {}));
   }
   return {};
 }
