@@ -96,29 +96,31 @@ Result<std::vector<Judged>> observations(const QuantizeOptions& options, const s
   return read_observations(recording, options.from, static_cast<std::size_t>(options.n_observation));
 }
 
-/// How far the chunks move where `bundle` is quantized.
-Result<Moved> moved_by_codes(const QuantizeOptions& options, const std::string& bundle,
-                             std::span<const Judged> judged) {
+/// The chunks of `bundle` where it is quantized.
+Result<Chunks> quantized_chunks(const QuantizeOptions& options, const std::string& bundle,
+                                std::span<const Judged> judged) {
   const std::string trial = options.to + ".trial";
   if (const auto made = quantize(bundle, trial, all(options.dtype), {}, [](QuantizeProgress) {}); !made)
     return made.error();
-  Result<Moved> moved = compare_chunks(options.from, trial, judged, options.n_thread);
+  Result<Chunks> chunks = chunks_of(trial, {.n_thread = options.n_thread, .all_robots = true}, judged);
   std::error_code ignored;
   std::filesystem::remove(trial, ignored);
-  return moved;
+  return chunks;
 }
 
 /// Writes a smoothed bundle, if the observations move less with it. What the new bundle says of it, or nothing.
 Result<std::string> smooth_first(const QuantizeOptions& options, const std::string& smoothed) {
   VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
   VLA_TRY(const Smoothed made, smooth(options.from, smoothed, seen, options.n_thread));
-  VLA_TRY(const Moved before, moved_by_codes(options, options.from, seen));
-  VLA_TRY(const Moved after, moved_by_codes(options, smoothed, seen));
+  const EngineOptions float32 = {.n_thread = options.n_thread, .kernels = "float32", .all_robots = true};
+  VLA_TRY(const Chunks expected, chunks_of(options.from, float32, seen));
+  VLA_TRY(const Chunks as_it_was, quantized_chunks(options, options.from, seen));
+  VLA_TRY(const Chunks as_smoothed, quantized_chunks(options, smoothed, seen));
+  const Moved before = moved(expected, as_it_was), after = moved(expected, as_smoothed);
   const bool helps = after.rms < before.rms;
   const std::string text = fmt::format(
       "{} over {} observations: {} channels of {} norms and MLPs divided, by {:g} at most; {} moves chunks by {} "
-      "instead "
-      "of {}",
+      "instead of {}",
       helps ? "smoothed" : "not smoothed", seen.size(), made.n_channel, made.n_place, made.largest, options.dtype,
       percent(after), percent(before));
   if (!options.quiet) say(stdout, "{}\n\n", text);

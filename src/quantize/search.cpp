@@ -35,29 +35,6 @@ std::int64_t bytes_of(const Block& block) {
   return block.codes == Rounding::int4 ? block.int4 : block.codes == Rounding::int8 ? block.int8 : block.stored;
 }
 
-/// Chunks of a bundle for the observations.
-Result<std::vector<std::vector<float>>> chunks_of(const std::string& bundle, const EngineOptions& options,
-                                                  std::span<const Judged> judged) {
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(bundle, options));
-  std::vector<std::vector<float>> chunks;
-  for (const Judged& one : judged) {
-    VLA_TRY(ActionChunk chunk, engine->act(one.observation, one.noise));
-    chunks.push_back(std::move(chunk.normalized));
-  }
-  return chunks;
-}
-
-Moved moved(const std::vector<std::vector<float>>& expected, const std::vector<std::vector<float>>& got) {
-  double value = 0, missed = 0, largest_value = 0, largest = 0;
-  for (std::size_t k = 0; k < expected.size(); ++k)
-    for (std::size_t i = 0; i < expected[k].size(); ++i) {
-      const double x = expected[k][i], d = got[k][i] - x;
-      value += x * x, missed += d * d;
-      largest_value = std::max(largest_value, std::abs(x)), largest = std::max(largest, std::abs(d));
-    }
-  return value > 0 ? Moved{std::sqrt(missed / value), largest / largest_value} : Moved{};
-}
-
 /// Squares, so that those of several blocks add.
 double beyond(double larger, double smaller) { return std::sqrt(std::max(0.0, larger * larger - smaller * smaller)); }
 
@@ -211,11 +188,32 @@ class Search {
   EngineOptions options_;
   std::int64_t n_byte_ = 0;  // of the file as it is
   bool knows_int8_ = false;
-  std::vector<std::vector<float>> expected_;
+  Chunks expected_;
   Found found_;
 };
 
 }  // namespace
+
+Result<Chunks> chunks_of(const std::string& bundle, const EngineOptions& options, std::span<const Judged> judged) {
+  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(bundle, options));
+  Chunks chunks;
+  for (const Judged& one : judged) {
+    VLA_TRY(ActionChunk chunk, engine->act(one.observation, one.noise));
+    chunks.push_back(std::move(chunk.normalized));
+  }
+  return chunks;
+}
+
+Moved moved(const Chunks& expected, const Chunks& got) {
+  double value = 0, missed = 0, largest_value = 0, largest = 0;
+  for (std::size_t k = 0; k < expected.size(); ++k)
+    for (std::size_t i = 0; i < expected[k].size(); ++i) {
+      const double x = expected[k][i], d = got[k][i] - x;
+      value += x * x, missed += d * d;
+      largest_value = std::max(largest_value, std::abs(x)), largest = std::max(largest, std::abs(d));
+    }
+  return value > 0 ? Moved{std::sqrt(missed / value), largest / largest_value} : Moved{};
+}
 
 Choice choice_of(const std::vector<Block>& blocks) {
   std::map<std::string, Rounding> codes;
@@ -224,15 +222,6 @@ Choice choice_of(const std::vector<Block>& blocks) {
     const auto found = codes.find(block_of(tensor));
     return found == codes.end() ? Rounding::none : found->second;
   };
-}
-
-Result<Moved> compare_chunks(const std::string& from, const std::string& bundle, std::span<const Judged> judged,
-                             int n_thread) {
-  EngineOptions options = {.n_thread = n_thread, .all_robots = true};
-  VLA_TRY(const auto got, chunks_of(bundle, options, judged));
-  options.kernels = "float32";
-  VLA_TRY(const auto expected, chunks_of(from, options, judged));
-  return moved(expected, got);
 }
 
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,

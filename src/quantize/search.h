@@ -21,9 +21,11 @@ struct Judged {
   Noise noise;
 };
 
-/// How far the chunks of `bundle` are from those of `from` in float32. Errors: those of Engine.
-Result<Moved> compare_chunks(const std::string& from, const std::string& bundle, std::span<const Judged> judged,
-                             int n_thread);
+/// Chunks of observations, before unnormalization.
+using Chunks = std::vector<std::vector<float>>;
+/// Those of a bundle. Errors: those of Engine.
+Result<Chunks> chunks_of(const std::string& bundle, const EngineOptions& options, std::span<const Judged> judged);
+Moved moved(const Chunks& expected, const Chunks& got);
 
 /// One of the two.
 struct Bound {
