@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """`vla quantize`: a bundle of codes gives the actions that --kernels int8 or int4 makes of the floats, and float32 those of its codes."""
 
-import gguf
 import numpy as np
 import pytest
 
+from bundle_keys import bundle_keys
 from golden_cases import ROOT, data_offset, sealed
-from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle
+from vla_cpp.convert.bundle import BundleWriter, TensorInfo, read_bundle
 
 SHIPPED = ROOT / "models/metaworld-tiny.gguf"
 MATRIX = "vision.blk.0.attn_q.weight"
@@ -106,13 +106,7 @@ def test_it_gives_the_actions_of_kernels_of_its_dtype_to_the_bit(actions, bundle
 def test_float32_of_its_codes_is_asked_for_by_name(actions, bundles, tmp_path, kernels, dtype):
     quantized, floats = bundles / f"{dtype}.gguf", read_bundle(str(SHIPPED))
     content = read_bundle(str(quantized))
-    kinds = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
-    keys = []
-    for name, field in gguf.GGUFReader(quantized).fields.items():
-        if not name.startswith("GGUF.") and name != "vla.checksum":
-            kind = kinds[int(field.types[-1])] + ("[]" if field.types[0] == 9 else "")
-            value = "f32" if name == "vla.dtype" else field.contents()
-            keys.append(Key(name, kind, value))
+    keys = [key._replace(value="f32") if key.name == "vla.dtype" else key for key in bundle_keys(quantized)]
     wide = {}
     for name, values in content.tensors.items():
         if content.dtypes[name] == "i8":

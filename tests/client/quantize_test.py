@@ -6,13 +6,13 @@ import re
 import subprocess
 from types import SimpleNamespace
 
-import gguf
 import numpy as np
 import pytest
+from bundle_keys import bundle_keys
 from server_process import ROOT, SECONDS, VLA, Server
 
 import vla_cpp
-from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle
+from vla_cpp.convert.bundle import BundleWriter, TensorInfo, read_bundle
 
 SHIPPED = SimpleNamespace(bundle=ROOT / "models/metaworld-tiny.gguf")
 SCENES = [("faucet-open", "open the faucet"), ("drawer-close", "close the drawer")]
@@ -36,17 +36,19 @@ def recording(tmp_path_factory):
     return folder
 
 
-def quantize(*arguments):
-    return subprocess.run([VLA, "quantize", SHIPPED.bundle, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+def quantize(*arguments, bundle=SHIPPED.bundle):
+    return subprocess.run([VLA, "quantize", bundle, *map(str, arguments)], capture_output=True, text=True, timeout=300)
 
 
-def moved(bundle):
-    """Of float32's chunks, by root mean square."""
-    chunks = []
-    for path, kernels in ((SHIPPED.bundle, "float32"), (bundle, None)):
-        with vla_cpp.Policy(path, kernels=kernels, threads=1) as policy:
-            chunks.append(np.array([policy.act(**scene(*s)).normalized for s in SCENES]))
-    return np.sqrt(np.mean((chunks[1] - chunks[0]) ** 2) / np.mean(chunks[0] ** 2))
+def chunks(bundle, kernels=None):
+    with vla_cpp.Policy(bundle, kernels=kernels, threads=1) as policy:
+        return np.array([policy.act(**scene(*s)).normalized for s in SCENES])
+
+
+def moved(bundle, kernels=None):
+    """Of float32's chunks of the shipped policy, by root mean square."""
+    expected = chunks(SHIPPED.bundle, "float32")
+    return np.sqrt(np.mean((chunks(bundle, kernels) - expected) ** 2) / np.mean(expected**2))
 
 
 def test_blocks_get_the_codes_that_keep_the_error(recording, tmp_path):
@@ -116,51 +118,28 @@ def planted(path, factors=(32, 64), every=23):
         by = channels(len(floats[up]))
         floats[up] *= by[:, None]
         floats[down] /= by
-    keys = keys_of(SHIPPED.bundle)
     tensors = [TensorInfo(name, values.shape, content.dtypes[name]) for name, values in content.tensors.items()]
-    with BundleWriter(str(path), keys, tensors) as out:
+    with BundleWriter(str(path), bundle_keys(SHIPPED.bundle), tensors) as out:
         for name, values in floats.items():
             bits = values.view(np.uint32)
             out.write(name, (bits >> 16).astype(np.uint16) if content.dtypes[name] == "bf16" else values)
     return path
 
 
-def keys_of(bundle):
-    kinds = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
-    fields = gguf.GGUFReader(bundle).fields.items()
-    return [
-        Key(name, kinds[int(field.types[-1])] + ("[]" if field.types[0] == 9 else ""), field.contents())
-        for name, field in fields
-        if not name.startswith("GGUF.") and name != "vla.checksum"
-    ]
-
-
-def chunks(bundle, kernels):
-    with vla_cpp.Policy(bundle, kernels=kernels, threads=1) as policy:
-        return np.array([policy.act(**scene(*s)).normalized for s in SCENES])
-
-
 def test_channels_that_are_far_larger_than_the_others_are_smoothed(recording, tmp_path):
     outliers = planted(tmp_path / "planted.gguf")
-    expected = chunks(SHIPPED.bundle, "float32")
-    assert np.array_equal(chunks(outliers, "float32"), expected), "the planted policy computes something else"
+    assert np.array_equal(chunks(outliers, "float32"), chunks(SHIPPED.bundle, "float32")), "the planted policy computes something else"
 
-    def error(name, *options, dtype="int8"):
-        out = tmp_path / name
-        answer = subprocess.run([VLA, "quantize", outliers, "-o", out, "--dtype", dtype, *map(str, options)], capture_output=True, text=True, timeout=300)  # fmt: skip
+    def error(name, *options):
+        answer = quantize("-o", tmp_path / name, *options, bundle=outliers)
         assert answer.returncode == 0, answer.stderr
-        return np.sqrt(np.mean((chunks(out, None) - expected) ** 2) / np.mean(expected**2)), answer.stdout
+        return moved(tmp_path / name), answer.stdout
 
     rough, _ = error("rough.gguf")
     smooth, told = error("smooth.gguf", "--calibrate", recording)
+    int8 = moved(SHIPPED.bundle, "int8")  # without outliers
     assert rough > 3 * smooth, (rough, smooth)
-    assert smooth < 1.5 * moved_int8(expected), (smooth, moved_int8(expected))
+    assert smooth < 1.5 * int8, (smooth, int8)
     assert re.match(r"smoothed over 2 observations: \d+ channels of \d+ norms and MLPs divided, by \d+ at most; int8 moves chunks by ", told)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["planted.gguf", "rough.gguf", "smooth.gguf"]
     assert "smoothed over 2 observations" in read_bundle(str(tmp_path / "smooth.gguf")).keys["vla.quantization"]
-
-
-def moved_int8(expected):
-    """What int8 moves the policy without outliers."""
-    got = chunks(SHIPPED.bundle, "int8")
-    return np.sqrt(np.mean((got - expected) ** 2) / np.mean(expected**2))

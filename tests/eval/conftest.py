@@ -4,11 +4,12 @@ import os
 import sys
 from pathlib import Path
 
-import gguf
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "python")]
+sys.path[:0] = [str(ROOT / "python"), str(ROOT / "tests/cli")]
+
+from bundle_keys import bundle_keys  # noqa: E402
 
 from vla_cpp.convert.bundle import BundleWriter, Key, TensorInfo, read_bundle  # noqa: E402
 
@@ -21,16 +22,12 @@ def bundle():
 @pytest.fixture(scope="session")
 def robots(bundle, tmp_path_factory):
     """The same weights for two robots, whose camera has different names."""
-    kinds = {4: "u32", 6: "f32", 7: "bool", 8: "string", 12: "f64"}
     keys = [Key("embodiments", "string[]", ["left", "right"])]
-    for name, field in gguf.GGUFReader(bundle).fields.items():
-        if name.startswith("GGUF.") or name == "vla.checksum":
-            continue
-        kind = kinds[field.types[-1]] + ("[]" if field.types[0] == 9 else "")
-        if name == "observation.views":
-            keys += [Key(f"embodiment.{tag}.{name}", kind, [f"observation.images.{tag}"]) for tag in ("left", "right")]
+    for key in bundle_keys(bundle):
+        if key.name == "observation.views":
+            keys += [Key(f"embodiment.{tag}.{key.name}", key.kind, [f"observation.images.{tag}"]) for tag in ("left", "right")]
         else:
-            keys.append(Key(name, kind, field.contents()))
+            keys.append(key)
     content = read_bundle(bundle)
     tensors = [TensorInfo(name, data.shape, content.dtypes[name]) for name, data in content.tensors.items()]
     path = tmp_path_factory.mktemp("robots") / "two.gguf"

@@ -1,0 +1,20 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""The keys of a bundle, for tests that write another one like it."""
+
+from typing import List
+
+import gguf
+
+from vla_cpp.convert.bundle import Key
+
+KINDS = {4: "u32", 5: "u32", 6: "f32", 7: "bool", 8: "string", 10: "u32", 11: "u32", 12: "f64"}
+
+
+def bundle_keys(path) -> List[Key]:
+    """In the order of the file, without the checksum."""
+    return [
+        Key(name, KINDS[int(field.types[-1])] + ("[]" if field.types[0] == 9 else ""), field.contents())
+        for name, field in gguf.GGUFReader(path).fields.items()
+        if not name.startswith("GGUF.") and name != "vla.checksum"
+    ]
