@@ -289,7 +289,9 @@ class HeadTaps(Taps):
         self.before(head.state_encoder, lambda x: self.put("state", x[0].flatten()))
         self.after(head.state_encoder, lambda x: self.put("state_out", x[0]))
         self.before(head.action_encoder, self.on_step)
-        dit = head.model
+        self.dit(head.model)
+
+    def dit(self, dit):
         dit.register_forward_pre_hook(lambda m, args, kw: self.at_step("action_token", kw["hidden_states"][:, self.n_front :]), with_kwargs=True)
         for i, block in enumerate(dit.transformer_blocks):
             self.stepwise(block, f"dit.blk.{i}")

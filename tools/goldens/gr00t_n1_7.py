@@ -281,13 +281,11 @@ class Reference:
 # --- recording ----------------------------------------------------------------------------------------------------
 
 
-class Recorder(HeadTaps):
-    """One request without pads; every view has the same size."""
+class QwenTaps(HeadTaps):
+    """Hooks on Qwen3-VL; one request without pads; every view has the same size."""
 
-    def __init__(self, reference):
-        self.reference, model = reference, reference.model
-        head, visual, lm = model.action_head, model.backbone.visual, model.backbone.language_model
-        super().__init__(head.num_inference_timesteps)
+    def backbone(self, visual, lm, image_token):
+        self.visual, self.image_token = visual, image_token
         self.after(visual.patch_embed, lambda x: self.views("vision.patch_embed", x))
         for i, block in enumerate(visual.blocks):
             self.after(block, lambda x, i=i: self.views(f"vision.blk.{i}", x))
@@ -295,7 +293,6 @@ class Recorder(HeadTaps):
             self.after(merger, lambda x, k=k: self.views(f"deepstack.{k}", x))
         self.after(visual.merger, lambda x: self.views("connector", x))
         self.language(lm, len(visual.deepstack_merger_list))
-        self.action_head(head)
 
     def views(self, name, x):
         self.put(name, x.unflatten(0, (self.n_view, -1)))
@@ -311,18 +308,26 @@ class Recorder(HeadTaps):
     def on_batch(self, batch):
         """Tokens, where the images are among them, and the pixels of the patches' rows."""
         grid, ids = batch["image_grid_thw"], batch["input_ids"][0]
-        vision = self.reference.model.backbone.visual.config
         if not bool(batch["attention_mask"].all()) or not bool((grid == grid[:1]).all()):
             raise ValueError("a golden case has no pads, and views of one size")
         self.n_view, (_, rows, columns) = len(grid), grid[0].tolist()
-        self.image = ids == self.reference.model.backbone.model.config.image_token_id
+        self.image = ids == self.image_token
         self.put("tokens", ids)
+        vision = self.visual.config
         p, m = vision.patch_size, vision.spatial_merge_size
         x = batch["pixel_values"].view(self.n_view, rows // m, columns // m, m, m, 3, vision.temporal_patch_size, p, p)
         if not bool((x == x[:, :, :, :, :, :, :1]).all()):
             raise ValueError("an image differs from its copy in time")
         x = x[:, :, :, :, :, :, 0].permute(0, 5, 1, 3, 6, 2, 4, 7)  # view, channel, then block, row or column in it, pixel
         self.put("pixels", x.reshape(self.n_view, 3, rows * p, columns * p))
+
+
+class Recorder(QwenTaps):
+    def __init__(self, reference):
+        self.reference, model = reference, reference.model
+        super().__init__(model.action_head.num_inference_timesteps)
+        self.backbone(model.backbone.visual, model.backbone.language_model, model.backbone.model.config.image_token_id)
+        self.action_head(model.action_head)
 
     def run(self, batch, noise):
         """Every tap of one inference."""
