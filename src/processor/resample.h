@@ -42,7 +42,15 @@ std::vector<std::uint8_t> resample_torch(std::span<const std::uint8_t> rgb, int 
 std::vector<std::uint8_t> resample_torch_linear(std::span<const std::uint8_t> rgb, int width, int height, int to_width,
                                                 int to_height);
 
-/// The same by tf.image.resize with lanczos3 and antialiasing (TensorFlow 2.18): rows first, summed in float32, rounded
+/// Float pixels by the same bicubic filter with antialiasing: nothing is clamped or rounded, so that edges overshoot.
+/// Source: torchvision transforms/v2/functional/_geometry.py resize_image, of a float tensor.
+std::vector<float> resample_torch_cubic(std::vector<float> rgb, int width, int height, int to_width, int to_height);
+
+/// Float pixels by areas: the mean of every pixel that an output pixel touches, each with the same weight. Source:
+/// torch F.interpolate(mode="area"), aten/src/ATen/native/cpu/AdaptiveAvgPoolKernel.cpp.
+std::vector<float> resample_torch_area(std::span<const float> rgb, int width, int height, int to_width, int to_height);
+
+/// Bytes by tf.image.resize with lanczos3 and antialiasing (TensorFlow 2.18): rows first, summed in float32, rounded
 /// half to even. Sources: tensorflow core/kernels/image/scale_and_translate_op.cc, sampling_kernels.h.
 std::vector<std::uint8_t> resample_tensorflow_lanczos3(std::span<const std::uint8_t> rgb, int width, int height,
                                                        int to_width, int to_height);

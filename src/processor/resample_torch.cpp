@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <iterator>
+#include <type_traits>
 
 #include "processor/byte_pixels.h"
 #include "processor/resample.h"
@@ -132,14 +133,14 @@ std::uint8_t rounded(float x) {
   return static_cast<std::uint8_t>(std::clamp(x, 0.0f, 255.0f) + kNoFraction - kNoFraction);
 }
 
-/// Columns first. `finish` makes a byte of a sum.
+/// Columns first. `finish` makes a pixel's value of a sum.
 template <class Finish>
-std::vector<std::uint8_t> resample(std::vector<float> pixels, int width, int height, int to_width, int to_height,
-                                   const Filter& filter, Finish finish) {
+auto resample(std::vector<float> pixels, int width, int height, int to_width, int to_height, const Filter& filter,
+              Finish finish) {
   if (to_width != width)
     pixels = widened(pixels, static_cast<std::size_t>(width), static_cast<std::size_t>(to_width), filter);
   const std::size_t row_size = static_cast<std::size_t>(to_width) * 3;
-  std::vector<std::uint8_t> out;
+  std::vector<std::invoke_result_t<Finish, float>> out;
   out.reserve(row_size * static_cast<std::size_t>(to_height));
   if (to_height == height) {
     std::transform(pixels.begin(), pixels.end(), std::back_inserter(out), finish);
@@ -167,6 +168,32 @@ std::vector<std::uint8_t> resample_torch_linear(std::span<const std::uint8_t> rg
   for (const std::uint8_t byte : rgb) pixels.push_back(byte_table()[byte]);
   return resample(std::move(pixels), width, height, to_width, to_height, kTriangle,
                   [](float x) { return static_cast<std::uint8_t>(std::clamp(255.0f * x, 0.0f, 255.0f)); });
+}
+
+std::vector<float> resample_torch_cubic(std::vector<float> rgb, int width, int height, int to_width, int to_height) {
+  return resample(std::move(rgb), width, height, to_width, to_height, kCubic, [](float x) { return x; });
+}
+
+std::vector<float> resample_torch_area(std::span<const float> rgb, int width, int height, int to_width, int to_height) {
+  struct Stretch {
+    std::int64_t first, end;
+  };
+  const auto covered = [](std::int64_t i, std::int64_t n_in, std::int64_t n_out) {
+    return Stretch{i * n_in / n_out, ((i + 1) * n_in + n_out - 1) / n_out};
+  };
+  std::vector<float> out;
+  out.reserve(static_cast<std::size_t>(to_width) * static_cast<std::size_t>(to_height) * 3);
+  for (int row = 0; row < to_height; ++row)
+    for (int column = 0; column < to_width; ++column) {
+      const Stretch y = covered(row, height, to_height), x = covered(column, width, to_width);
+      for (std::int64_t c = 0; c < 3; ++c) {
+        float sum = 0.0f;
+        for (std::int64_t i = y.first; i < y.end; ++i)
+          for (std::int64_t j = x.first; j < x.end; ++j) sum += rgb[static_cast<std::size_t>((i * width + j) * 3 + c)];
+        out.push_back(sum / static_cast<float>(y.end - y.first) / static_cast<float>(x.end - x.first));
+      }
+    }
+  return out;
 }
 
 }  // namespace vla

@@ -3,6 +3,7 @@
 #include "processor/ops/text.h"
 
 #include "processor/ops/columns.h"
+#include "processor/recipe.h"
 #include "processor/support.h"
 
 using namespace vla;
@@ -48,4 +49,20 @@ TEST_CASE("replace_all goes from left to right and does not look at what it has 
   CHECK(replace_all("aaa", "aa", "a") == "aa");
   CHECK(replace_all("a_b__", "_", "__") == "a__b____");
   CHECK(replace_all("ab", "c", "d") == "ab");
+}
+
+TEST_CASE("an instruction with a text that the recipe refuses is refused, and ops before it are refused too") {
+  const auto parsed = [](const std::string& ops) {
+    return parse_recipe(
+        R"({"image": [{"op": "resize", "width": 2, "height": 2, "filter": "torch_bilinear"}], "text": [)" + ops +
+        R"({"op": "tokenize", "max_tokens": 8, "truncate": "left"}], "state": [], "action": []})");
+  };
+  const std::string ops = R"({"op": "refuse", "text": "<|a|>"}, {"op": "refuse", "text": "<|b|>"},)";
+  const auto recipe = parsed(ops);
+  REQUIRE_MESSAGE(recipe.ok(), recipe.error().message());
+  CHECK(*recipe->text.at(1)->apply("go <|a|", {}) == "go <|a|");
+  CHECK(contains(refusal(recipe->text.at(1)->apply("go <|b|>", {}), Code::bad_observation),
+                 "instruction: expected text without <|b|>"));
+  CHECK(contains(refusal(parsed(R"({"op": "strip"},)" + ops), Code::bad_bundle), "text[1].op"));
+  CHECK(contains(refusal(parsed(R"({"op": "refuse", "text": ""},)"), Code::bad_bundle), "text[0].text"));
 }

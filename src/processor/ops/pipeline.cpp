@@ -10,6 +10,7 @@
 #include "processor/byte_pixels.h"
 #include "processor/image_codecs.h"
 #include "processor/json_fields.h"
+#include "processor/ops/resize_floats.h"
 #include "processor/recipe.h"
 #include "processor/resample.h"
 
@@ -122,9 +123,7 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   for (const ByteOp& op : pipeline.ops) {
     const auto* camera = std::get_if<CameraSize>(&op);
     if (camera != nullptr && (camera->width != frame.width || camera->height != frame.height))
-      return Error{Code::bad_observation, where, fmt::format("an image of {} x {}", camera->width, camera->height),
-                   fmt::format("{} x {}", frame.width, frame.height),
-                   "this policy takes the images of the cameras that it was trained with"};
+      return wrong_camera(frame, *camera, where);
   }
   // All sizes come before any image, so that none is made which nothing needs or no memory holds.
   const double most_grown = most_pixels_grown(frame);
@@ -157,7 +156,14 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   return {};
 }
 
+Error wrong_camera(const Frame& frame, const CameraSize& camera, const std::string& where) {
+  return {Code::bad_observation, where, fmt::format("an image of {} x {}", camera.width, camera.height),
+          fmt::format("{} x {}", frame.width, frame.height),
+          "this policy takes the images of the cameras that it was trained with"};
+}
+
 std::optional<CameraSize> camera_size(const Fit& fit) {
+  if (const auto* const floats = dynamic_cast<const OneFit<FloatResizes>*>(&fit)) return floats->op.camera;
   if (const auto* const pipeline = dynamic_cast<const OneFit<Pipeline>*>(&fit))
     for (const ByteOp& op : pipeline->op.ops)
       if (const auto* camera = std::get_if<CameraSize>(&op)) return *camera;

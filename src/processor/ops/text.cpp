@@ -5,6 +5,8 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <algorithm>
+
 #include "processor/json_fields.h"
 #include "processor/python_text.h"
 #include "processor/recipe.h"
@@ -117,6 +119,16 @@ struct ReplaceOp final : TextOp {
   }
 };
 
+/// Of what the instruction may not have. It comes before ops that add text, so that an empty one passes.
+struct RefuseOp final : TextOp {
+  std::string text;
+  Result<std::string> apply(std::string given, std::span<const int>) const override {
+    if (given.find(text) == std::string::npos) return given;
+    return Error{Code::bad_observation, "instruction", "text without " + text, "such a text",
+                 "the prompt's own tokens tell the network where to look; remove it from the text"};
+  }
+};
+
 struct EnsureSuffixOp final : TextOp {
   std::string suffix;
   Result<std::string> apply(std::string text, std::span<const int>) const override {
@@ -148,6 +160,14 @@ Status read(JsonFields& fields, ReplaceOp& op, Recipe&) {
   VLA_TRY(op.from, read_text(fields, "from"));
   VLA_TRY(op.to, read_text(fields, "to"));
   return op.from.empty() ? fields.wrong("from", "text to look for") : Status();
+}
+
+Status read(JsonFields& fields, RefuseOp& op, Recipe& recipe) {
+  const auto refuses = [](const auto& before) { return dynamic_cast<const RefuseOp*>(before.get()) != nullptr; };
+  if (!std::all_of(recipe.text.begin(), recipe.text.end(), refuses))
+    return misplaced(fields, "refuse before other ops");
+  VLA_TRY(op.text, read_text(fields, "text"));
+  return op.text.empty() ? fields.wrong("text", "text to look for") : Status();
 }
 
 Status read(JsonFields& fields, EnsureSuffixOp& op, Recipe&) {
@@ -210,6 +230,7 @@ Ops text_ops() {
           {"text", "lower", parse<EditOp<python::lower>>},
           {"text", "drop_punctuation", parse<EditOp<python::drop_punctuation>>},
           {"text", "replace", parse<ReplaceOp>},
+          {"text", "refuse", parse<RefuseOp>},
           {"text", "ensure_suffix", parse<EnsureSuffixOp>},
           {"text", "template", parse<TemplateOp>},
           {"text", "views", parse<ViewsOp>},
