@@ -9,10 +9,19 @@
 namespace vla {
 
 GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
-    : vl_norm_(s / "vl" / "norm", d_context, (s / "vl").number("norm_eps", kNormEps)),
-      n_state_row_(family.state_rows ? s.dim("n_state_row", 64) : 1),
-      state_in_(s / "state_in", s.dim("d_state") / n_state_row_, (s / "dit").dim("d_hidden"), Bias::yes),
-      state_out_(s / "state_out", (s / "dit").dim("d_hidden"), (s / "dit").dim("d_model"), Bias::yes),
+    : vl_norm_(family.norm ? std::make_optional<LayerNorm>(s / "vl" / "norm", d_context,
+                                                           (s / "vl").number("norm_eps", kNormEps))
+                           : std::nullopt),
+      d_state_(family.may_lack_state ? s.index("d_state", 1 << 16) : s.dim("d_state")),
+      n_state_row_(d_state_ == 0       ? 0
+                   : family.state_rows ? s.dim("n_state_row", 64)
+                                       : 1),
+      state_in_(d_state_ > 0 ? std::make_optional<Linear>(s / "state_in", d_state_ / n_state_row_,
+                                                          (s / "dit").dim("d_hidden"), Bias::yes)
+                             : std::nullopt),
+      state_out_(d_state_ > 0 ? std::make_optional<Linear>(s / "state_out", (s / "dit").dim("d_hidden"),
+                                                           (s / "dit").dim("d_model"), Bias::yes)
+                              : std::nullopt),
       n_future_(family.future_tokens ? s.dim("n_future", 4096) : 0),
       dit_(s / "dit", d_context, family.alternating),
       action_in_(s / "action_in", s.dim("d_action"), dit_.d_model(), Bias::yes),
@@ -35,8 +44,8 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
     vl.require(n_layer == 0 || d_context % n_head == 0, "n_head", fmt::format("a divisor of lm.d_model {}", d_context),
                std::to_string(n_head));
   }
-  s.require(s.dim("d_state") % n_state_row_ == 0, "n_state_row",
-            fmt::format("a divisor of policy.d_state {}", s.dim("d_state")), std::to_string(n_state_row_));
+  s.require(d_state_ == 0 || d_state_ % n_state_row_ == 0, "n_state_row",
+            fmt::format("a divisor of policy.d_state {}", d_state_), std::to_string(n_state_row_));
   s.require(horizon_ <= s.dim("n_position"), "n_position", fmt::format("at least the horizon {}", horizon_),
             std::to_string(s.dim("n_position")));
   (s / "dit").require(d_time_ % 2 == 0 && d_time_ > 2, "d_time", "an even number above 2", std::to_string(d_time_));
@@ -56,16 +65,18 @@ Tensor GrootHead::condition(Graph& g, std::span<const SolverTime> times) const {
 }
 
 Tensor GrootHead::context(Graph& g, Tensor features) const {
-  Tensor x = vl_norm_(g, features);
+  Tensor x = (*vl_norm_)(g, features);
   for (const EncoderBlock& block : vl_blocks_) x = block(g, x);
   return x;
 }
 
 void GrootHead::prepare(Graph& g, Tensor text, Tensor image, Tensor state, Cache& cache) const {
   dit_.prepare(g, text, image, cache);
-  const Tensor rows = n_state_row_ > 1 ? reshape_width(g, state, state.dim(0) / n_state_row_) : state;
-  const Tensor hidden = activate(g, state_in_(g, rows), Activation::relu);
-  cache.put(g, state_out_.path(), state_out_.forward(g, hidden));  // [d_dit, n_state_row]
+  if (state_in_) {
+    const Tensor rows = n_state_row_ > 1 ? reshape_width(g, state, d_state_ / n_state_row_) : state;
+    const Tensor hidden = activate(g, (*state_in_)(g, rows), Activation::relu);
+    cache.put(g, state_out_->path(), state_out_->forward(g, hidden));  // [d_dit, n_state_row]
+  }
   if (future_) cache.put(g, future_->path(), future_->forward(g, arange(g, n_future_)));
 }
 
@@ -75,7 +86,8 @@ Tensor GrootHead::velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& 
   const Tensor timed = concat_features(g, action, repeat_like(g, time, action));
   const Tensor token = action_token_.forward(g, silu(g, action_mix_(g, timed)));
   const Tensor placed = add(g, token, action_position_(g, arange(g, horizon_)));
-  std::vector<Tensor> tokens = {cache.get(g, state_out_.path())};
+  std::vector<Tensor> tokens;
+  if (state_out_) tokens.push_back(cache.get(g, state_out_->path()));
   if (future_) tokens.push_back(cache.get(g, future_->path()));
   tokens.push_back(g.name(action_token_.path(), placed));
   const Tensor x = dit_(g, concat_tokens(g, tokens), condition, cache);

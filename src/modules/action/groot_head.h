@@ -20,12 +20,15 @@ struct GrootFamily {
   bool mixing;         // `vl.n_layer` layers of self-attention over the features
   bool alternating;    // even layers look at the text or at the images (`dit.attend_text_every_n_blocks`), else at all
                        // rows
+  bool norm = true;    // features are normalized and mixed by `context`, else they pass as they are
+  bool may_lack_state = false;  // `policy.d_state` may be 0, and then no token is the state's
 };
 
 /// The action head of GR00T: self-attention over the features, a diffusion transformer over tokens of state and
 /// actions, and around it layers that each robot has of its own. Flow matching from noise (t = 0) to actions (t = 1).
 /// Reads `vl.*`, `dit.*` and `policy.*`. Source: lerobot policies/groot/groot_n1_7.py GR00TN17ActionHead; before it
-/// Isaac-GR00T gr00t/model/action_head/flow_matching_action_head.py (future tokens).
+/// Isaac-GR00T gr00t/model/action_head/flow_matching_action_head.py (future tokens). VLA-JEPA's is the same, for one
+/// robot: lerobot policies/vla_jepa/action_head.py VLAJEPAActionHead.
 class GrootHead {
  public:
   /// `s` is the root of the tree; `d_context`: width of the features.
@@ -41,10 +44,10 @@ class GrootHead {
   Tensor velocity(Graph& g, Tensor x_t, Tensor condition, const Cache& cache) const;
 
  private:
-  LayerNorm vl_norm_;  // observation rate
+  std::optional<LayerNorm> vl_norm_;  // observation rate
   std::vector<EncoderBlock> vl_blocks_;
-  int n_state_row_;
-  Linear state_in_, state_out_;
+  int d_state_, n_state_row_;
+  std::optional<Linear> state_in_, state_out_;
   std::optional<Embedding> future_;
   int n_future_;
   Dit dit_;
