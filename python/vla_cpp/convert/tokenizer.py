@@ -9,7 +9,7 @@ in tokenizer_parts.py.
 from __future__ import annotations
 
 import os
-from typing import List, NamedTuple, Tuple
+from typing import List, NamedTuple, Sequence, Tuple
 
 from . import (
     tokenizer_byte_fallback,
@@ -25,6 +25,7 @@ from .tokenizer_parts import (
     CONFIG_FILE,
     JSON_FILE,
     Tokenizer,
+    add_special,
     added_tokens,
     check_config_tokens,
     merges_of,
@@ -40,14 +41,17 @@ class TokenizerPlan(NamedTuple):
     truncate: str  # the side on which a text that is too long loses tokens: left or right
 
 
-def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str]) -> TokenizerPlan:
-    """`n_vocab`: rows of the embedding table, which no id may reach."""
+def read_tokenizer(
+    folder: str, n_vocab: int, problems: Problems, notes: List[str], more: Sequence[str] = ()
+) -> TokenizerPlan:
+    """`n_vocab`: rows of the embedding table, which no id may reach. `more`: special tokens that the reference's own code adds."""
     spec, config = _read_files(folder, problems, notes)
     model = member(spec, "model", dict, JSON_FILE)
     kind = _kind(model)
     config = kind.with_defaults(config)
     added = added_tokens(spec, problems)
     check_config_tokens(config, added, problems)
+    add_special(added, model, more, problems)
     tokenizer = Tokenizer(spec, config, model, added, n_vocab)
     own = kind.keys(tokenizer, problems, notes)
     tokens = vocabulary(tokenizer, problems)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import json
-from typing import Dict, Iterable, List, NamedTuple, Optional, Tuple
+from typing import Dict, Iterable, List, NamedTuple, Optional, Sequence, Tuple
 
 from .errors import Problems, refuse
 from .files import member
@@ -83,6 +83,19 @@ def added_tokens(spec: dict, problems: Problems) -> List[dict]:
             continue
         added.append({"id": number, "content": content, **{flag: bool(token.get(flag, False)) for flag in FLAGS}})
     return added
+
+
+def add_special(added: List[dict], model: dict, texts: Sequence[str], problems: Problems) -> None:
+    """As transformers adds special tokens: one that is there stays as it is, another gets the next id (tokenizers
+    added_vocabulary.rs, add_tokens)."""
+    vocab = member(model, "vocab", dict, JSON_FILE) if texts else {}
+    there = {token["content"] for token in added}
+    for text in (text for text in texts if text not in there):
+        if text in vocab:
+            problems.unsupported(JSON_FILE + ": model.vocab", "no token " + text + " of the model's", "one", "text would split around it")
+        number = max([len(vocab), *(token["id"] + 1 for token in added)])
+        added.append({"id": number, "content": text, **dict.fromkeys(FLAGS, False), "special": True})
+        there.add(text)
 
 
 def _content(token) -> Optional[str]:

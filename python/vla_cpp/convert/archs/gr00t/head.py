@@ -96,7 +96,7 @@ def _read_attention(policy: Section, s: Sizes) -> None:
 
 
 def weights(s: Sizes) -> List[Weight]:
-    return [*_features(s), *_transformer_rows(s), *_robot(s)]
+    return [*_features(s), *transformer_rows(s), *_robot(s)]
 
 
 def _attention_and_ffn(target: str, block: str, d: int, d_in: int, d_ff: int) -> List[Weight]:
@@ -122,7 +122,7 @@ def _features(s: Sizes) -> List[Weight]:
     return rows
 
 
-def _transformer_rows(s: Sizes) -> List[Weight]:
+def transformer_rows(s: Sizes) -> List[Weight]:
     d, source = s.d_dit, HEAD + "model."
     time = source + "timestep_encoder.timestep_embedder."
     rows = linear("time_in", time + "linear_1", d, s.d_time, bias=True) + linear(

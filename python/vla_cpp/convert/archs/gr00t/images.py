@@ -50,7 +50,7 @@ def read_images(processor: Section, area: Area, options: Options, notes: List[st
     if 0.0 < fraction < 1.0:
         ops += [{"op": "crop_fraction", "fraction": fraction}, smallest]
         width, height = _smallest_side(max(1, int(width * fraction)), max(1, int(height * fraction)), edge)
-    held = _held(width, height, area, problems)
+    held = held_size(width, height, area, "--camera-size", problems)
     if held != (width, height):
         ops.append({"op": "resize", "width": held[0], "height": held[1], "filter": area.filter})
     width, height = held
@@ -121,8 +121,8 @@ def _smallest_side(width: int, height: int, edge: int) -> Tuple[int, int]:
     return max(1, int(round(width * scale))), max(1, int(round(height * scale)))
 
 
-def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int, int]:
-    """The size that the backbone's image processor makes of an image (smart_resize)."""
+def held_size(width: int, height: int, area: Area, where: str, problems: Problems) -> Tuple[int, int]:
+    """The size that the backbone's image processor makes of an image (smart_resize). `where` says what the sizes are from."""
     unit = area.multiple
     sides = [max(area.shortest, round(side / unit) * unit) for side in (width, height)]
     size = sides[0] * sides[1]
@@ -133,7 +133,5 @@ def _held(width: int, height: int, area: Area, problems: Problems) -> Tuple[int,
         grow = math.sqrt(area.min_pixels / (width * height))
         sides = [math.ceil(side * grow / unit) * unit for side in (width, height)]
     if max(width, height) > 200 * min(width, height) or max(sides) > MAX_SIDE:
-        problems.unsupported(
-            "--camera-size", "images of at most 200 times the other side", "{}x{}".format(width, height)
-        )
+        problems.unsupported(where, "images of at most 200 times the other side", "{}x{}".format(width, height))
     return sides[0], sides[1]

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""VLA-JEPA: what its checkpoint states, as keys and tensors of a bundle.
+
+Reference: lerobot src/lerobot/policies/vla_jepa (configuration_vla_jepa.py, modeling_vla_jepa.py, qwen_interface.py, action_head.py,
+processor_vla_jepa.py) and transformers models/qwen3_vl.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Dict, List
+
+import numpy as np
+
+from ... import recipe
+from ...bundle import Key
+from ...checkpoint import PROCESSORS, Checkpoint
+from ...errors import Problems
+from ...features import feature_keys, states_of, views_of
+from ...files import member
+from ...tokenizer import read_tokenizer
+from .. import Options, Plan
+from ..gr00t import qwen3_vl
+from .config import FOLDER, PLACEHOLDERS, Sizes, read_sizes
+from .mapping import dropped, hints, network_keys, weights
+
+CLIP, SNAP, BINARIZE = "vla_jepa_clip_actions", "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
+GRIPPER = {"gripper_dim": recipe.ANY, "threshold": recipe.ANY}
+OWN_STEPS: recipe.Steps = {recipe.POST: {CLIP: {}, SNAP: GRIPPER, BINARIZE: GRIPPER}}
+# Of processor_vla_jepa.py. LeRobot saves neither number with the steps, and loads them as these again.
+GRIPPER_DIM, GRIPPER_THRESHOLD = 6, 0.5
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    if checkpoint.processors is None:
+        problems.add(" and ".join(PROCESSORS), "the pipelines that LeRobot saves with this policy", "none")
+        problems.raise_any()
+    s = read_sizes(checkpoint, options, problems)
+    problems.raise_any()
+    dims = {**({recipe.STATE: s.d_state} if s.d_state else {}), recipe.ACTION: s.d_action}
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, OWN_STEPS, reads_text=False)
+    own = [*s.action_tokens, s.embodied_token]
+    tokenizer = read_tokenizer(s.folder, s.lm.n_vocab + len(own), problems, checkpoint.notes, own)
+    problems.raise_any()
+    # The reference gives its table of tokens more rows where it has too few.
+    s.lm.n_vocab = max(s.lm.n_vocab, *(len(key.value) for key in tokenizer.keys if key.name == "tokenizer.tokens"))
+    prompt = qwen3_vl.read_prompt(tokenizer, s.folder, s, problems)
+    prompt = prompt._replace(n_token=min(prompt.n_token + len(s.prompt.encode()), s.n_context))
+    document = {
+        "image": image_ops(s),
+        "text": text_ops(s, prompt.n_token),
+        "state": processors.state.op("normalize", recipe.STATE) if s.d_state else [],
+        "action": action_ops(checkpoint, s, processors, problems),
+    }
+    keys = [
+        *network_keys(s),
+        *prompt.keys(),
+        *_feature_keys(checkpoint, options, s, dims, processors, problems),
+        *tokenizer.keys,
+        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+    ]
+    problems.raise_any()
+    return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))
+
+
+def image_ops(s: Sizes) -> List[dict]:
+    """In floats throughout: the reference gives its images to the backbone's processor as they are, without rescaling."""
+    size = {"op": "resize_floats", "width": s.image_width, "height": s.image_height, "filter": "bicubic"}
+    if s.area == (0, 0):
+        sizes = [{**size, "from_width": s.frame[0], "from_height": s.frame[1]}]
+    else:
+        sizes = [{"op": "resize_floats", "width": s.area[0], "height": s.area[1], "filter": "area"}, size]
+    return [*sizes, {"op": "standardize", "mean": [0.5] * 3, "std": [0.5] * 3, "arithmetic": "float32"}]
+
+
+def text_ops(s: Sizes, n_token: int) -> List[dict]:
+    """An instruction with a token of the prompt's own would give the head more rows, or images a place too many. One that is too long
+    loses the views' places, and is refused: the reference cuts none."""
+    views = {"open": qwen3_vl.OPEN, "token": qwen3_vl.IMAGE, "repeat": s.n_view_token, "close": qwen3_vl.CLOSE}
+    return [
+        *({"op": "refuse", "text": text} for text in (s.embodied_token, *PLACEHOLDERS)),
+        {"op": "template", "text": s.prompt},
+        {"op": "views", "count": s.max_views, **views},
+        {"op": "template", "text": qwen3_vl.TEMPLATE.before + "{instruction}"},
+        {"op": "tokenize", "max_tokens": n_token, "truncate": "left"},
+    ]
+
+
+def action_ops(checkpoint: Checkpoint, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[dict]:
+    """The steps of the saved pipeline in its order."""
+    ops: List[dict] = []
+    for i, step in enumerate(member(checkpoint.processors[1], "steps", list, recipe.POST)):
+        name = step["registry_name"]
+        if name == "unnormalizer_processor":
+            ops += processors.action.op("unnormalize", recipe.ACTION)
+        elif name == CLIP:
+            ops.append({"op": "clip", "low": -1.0, "high": 1.0})
+        elif name in (SNAP, BINARIZE):
+            ops += gripper_ops(name, "{}: steps[{}] {}".format(recipe.POST, i, name), step.get("config", {}), s, problems)
+    return ops
+
+
+def gripper_ops(name: str, where: str, config: dict, s: Sizes, problems: Problems) -> List[dict]:
+    """A chunk without this column passes. The reference compares float32 numbers, one of them with >=, the runtime always with >."""
+    column, threshold = config.get("gripper_dim", GRIPPER_DIM), config.get("threshold", GRIPPER_THRESHOLD)
+    if type(column) is not int or column < 0:
+        problems.unsupported(where + ": gripper_dim", "a column from 0 on", repr(column))
+        return []
+    if not isinstance(threshold, (int, float)) or isinstance(threshold, bool) or not abs(threshold) < 1e6:
+        problems.add(where + ": threshold", "a number", repr(threshold))
+        return []
+    if column >= s.d_action:
+        return []
+    above = np.float32(threshold)
+    if name == SNAP:
+        return [{"op": "threshold", "columns": [column], "above": float(np.nextafter(above, np.float32(-np.inf))), "then": 1.0, "else": 0.0}]
+    return [{"op": "threshold", "columns": [column], "above": float(above), "then": -1.0, "else": 1.0}]
+
+
+def _feature_keys(
+    checkpoint: Checkpoint, options: Options, s: Sizes, dims: Dict[str, int], processors: recipe.Processors, problems: Problems
+) -> List[Key]:
+    """The reference needs every view."""
+    aliases = recipe.view_aliases(s.views, processors, checkpoint.notes, problems)
+    return [
+        *views_of(s.views, aliases, [0] * len(s.views), len(s.views)),
+        *states_of({name: dim for name, dim in dims.items() if name == recipe.STATE}),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+    ]

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keys of the network and names, storage and shapes of every tensor of VLA-JEPA: Qwen3-VL as GR00T N1.7 has it, and the layers of GR00T's
+head, for one robot."""
+
+from __future__ import annotations
+
+from typing import Dict, List
+
+from ...bundle import Key, keys_by_type
+from ...layers import linear
+from .. import TABLE, Dropped, Weight
+from ..gr00t import head, language, qwen3_vl
+from .config import Sizes
+
+QWEN, HEAD = "model.qwen.model.", "model.action_model."
+TABLE_NAME = QWEN + "model.language_model.embed_tokens.weight"
+
+
+def network_keys(s: Sizes) -> List[Key]:
+    groups: Dict[str, Dict[str, object]] = {"u32": {"policy.n_future": s.n_embodied, "policy.n_embodied": s.n_embodied}}
+    for part in (head.keys(s), qwen3_vl.keys(s), language.keys(s)):
+        for kind, values in part.items():
+            groups[kind] = {**groups.get(kind, {}), **{key: value for key, value in values.items() if not key.startswith("vl.")}}
+    return keys_by_type(groups)
+
+
+def weights(s: Sizes) -> List[Weight]:
+    """The head is float32 in the reference whatever the backbone is."""
+    backbone = [_moved(row, "backbone.model.", QWEN)._replace(in_bf16=s.in_bf16) for row in qwen3_vl.weights(s)]
+    return [*backbone, *(row._replace(keep_f32=True) for row in _head(s))]
+
+
+def _moved(row: Weight, ours: str, theirs: str) -> Weight:
+    """A tensor of GR00T at the place where this policy has it."""
+    assert row.source.startswith(ours)
+    return row._replace(source=theirs + row.source[len(ours) :])
+
+
+def _head(s: Sizes) -> List[Weight]:
+    d, positions, future = s.d_dit, (s.n_position, s.d_dit), (s.n_embodied, s.d_dit)
+    rows = [_moved(row, head.HEAD, HEAD) for row in head.transformer_rows(s)]
+    if s.d_state:
+        rows += linear("state_in", HEAD + "state_encoder.layer1", s.d_hidden, s.d_state, bias=True)
+        rows += linear("state_out", HEAD + "state_encoder.layer2", d, s.d_hidden, bias=True)
+    return [
+        *rows,
+        *linear("action_in", HEAD + "action_encoder.layer1", d, s.d_action, bias=True),
+        *linear("action_mix", HEAD + "action_encoder.layer2", d, 2 * d, bias=True),
+        *linear("action_token", HEAD + "action_encoder.layer3", d, d, bias=True),
+        Weight("action_position.weight", HEAD + "position_embedding.weight", TABLE, positions, positions),
+        Weight("future.weight", HEAD + "future_tokens.weight", TABLE, future, future),
+        *linear("decode_in", HEAD + "action_decoder.layer1", s.d_hidden, s.d_hidden, bias=True),
+        *linear("decode_out", HEAD + "action_decoder.layer2", s.d_action, s.d_hidden, bias=True),
+    ]
+
+
+def dropped(s: Sizes) -> List[Dropped]:
+    norm = "final language norm: the head reads the last layer as it is before it"
+    return [
+        Dropped(QWEN + "model.language_model.norm.weight", (s.lm.d_model,), norm),
+        Dropped(QWEN + "lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "language head"),
+        *(Dropped(name, shape, "world model, which learns beside the policy") for name, shape in s.world_model.items()),
+    ]
+
+
+def hints(s: Sizes) -> Dict[str, str]:
+    return {
+        QWEN + "model.language_model.layers.": "num_hidden_layers of the backbone is {}".format(s.lm.n_layer),
+        QWEN + "model.visual.blocks.": "depth of the backbone is {}".format(s.vision.n_layer),
+        HEAD + "model.transformer_blocks.": "action_num_layers is {}".format(s.n_dit_layer),
+        HEAD + "state_encoder.": "state_dim is 0",
+        "model.video_": "config.json has no world model: enable_world_model, freeze_qwen",
+    }
