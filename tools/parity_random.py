@@ -33,7 +33,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla
+from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, vla_jepa
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -191,6 +191,33 @@ def draw_turbovla(seed):
     return cases.Case(seed, frames, r.choice((*TEXTS, "Ouvre le TIROIR à côté de l'évier, 한국어 Ⅷ ﬁn", "[SEP]a[MASK] [cls]")), checkpoint)
 
 
+def draw_vla_jepa(seed):
+    """The same for VLA-JEPA: prompts, tokens, cameras, steps of the pipeline; in one of ten an instruction that the backbone takes an image for."""
+    r = random.Random(f"vla_jepa {seed}")
+    heads, kv, d_head = r.choice(((4, 2, 8), (3, 1, 12), (6, 3, 8), (5, 5, 8), (2, 2, 16), (1, 1, 12)))
+    vision_heads, depth, side, n_view = r.choice((1, 2, 3)), r.randint(3, 5), 8 * r.choice((2, 3, 4)), r.randint(1, 3)
+    deepstack = sorted(r.sample(range(depth), r.choice((1, 2, 3))))
+    sizes = (gr00t_n1_7.vision(vision_heads * 4 * r.choice((2, 3, 4)), depth, vision_heads, 2 * r.randint(8, 20), r.randint(3, 7), deepstack),
+             gr00t_n1_7.text(2 * r.randint(6, 18), r.randint(4, 6), heads, kv, d_head, r.choice((32, 50)), {8: (2, 1, 1), 12: (2, 2, 2), 16: (4, 2, 2)}[d_head])
+             | r.choice(({}, {"vocab_size": gr00t_n1_7.N_VOCAB + 60})))
+    frames = {f"cam{i}": (r.randint(12, 60), r.randint(12, 60), r.choice(("png", "png", "jpg"))) for i in range(n_view)}
+    area = [r.randint(10, 40), r.randint(10, 40)] if r.random() < 0.6 else None
+    if area is None:
+        frames = {view: (*frames["cam0"][:2], frame[2]) for view, frame in frames.items()}
+    world_model, video = r.random() < 0.5, r.choice((4, 6, 8))
+    modes = {"VISUAL": "IDENTITY", "STATE": r.choice(MODES), "ACTION": r.choice(MODES)}
+    flags = {key: r.random() < 0.6 for key in ("clip_normalized_actions", "pre_snap_gripper_action", "binarize_gripper_action")}
+    policy = vla_jepa.policy(
+        r.randint(1, 12), r.choice((1, 2, 4, 7)), r.choice(((2, 6), (3, 4), (1, 10), (None, None))), r.randint(1, 5), r.randint(6, 30), r.randint(1, 12),
+        action_model_type="DiT-test", resize_images_to=area, enable_world_model=world_model, num_video_frames=video, torch_dtype=r.choice(("float32", "bfloat16")),
+        num_action_tokens_per_timestep=r.randint(1, 8), normalization_mapping=modes, action_num_timestep_buckets=r.choice((1000, 1000, 100)),
+        prompt_template=r.choice((vla_jepa.PROMPT, vla_jepa.SHORT, "{instruction}{e_actions}", "{actions} {instruction}\n{e_actions}!")), **flags)
+    checkpoint = vla_jepa.Checkpoint(*sizes, policy, {view: frame[:2] for view, frame in frames.items()}, r.choice((0, 1, 7, 20)), r.randint(1, 12), side,
+                                     tubelet=r.choice((1, 2)), dtype=r.choice(("BF16", "BF16", "F32")), prunes=r.choice(("embed_tokens", "lm_head", "")))
+    text = r.choice((*TEXTS, "{actions} of %s {0}")) if r.random() < 0.9 else "go<|placeholder|>"
+    return cases.Case(seed, frames, text, checkpoint)
+
+
 # Of what a part of BitVLA reads: names of values that the reference records. A whole block starts from the one before.
 INPUTS = [(r"(.*)\.attn_[qkv]", r"\1.attn_norm"), (r"(lm\..*)\.attn_out", r"\1.attn_sub_norm"), (r"(.*)\.ffn_(up|gate)", r"\1.ffn_norm"),
           (r"(lm\..*)\.ffn_down", r"\1.ffn_sub_norm"), (r"lm\.blk\.0(\.attn_norm)?", "prefix"), (r"vision\.patch_embed", "pixels"),
@@ -346,7 +373,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "vla_jepa": draw_vla_jepa, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

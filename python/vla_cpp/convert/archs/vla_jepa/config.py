@@ -8,7 +8,7 @@ Qwen3-VL but neither its config nor its tokenizer: both come with its folder.
 
 from __future__ import annotations
 
-import os
+import re
 from dataclasses import dataclass, field
 from typing import Dict, List, Sequence, Tuple
 
@@ -174,8 +174,8 @@ def _read_prompt(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
         expected = "text with {instruction} and behind it {e_actions}, {actions} once at most, and no other braces"
         policy.bad("prompt_template", expected, unsupported=True)
         template = POLICY["prompt_template"]
-    own = [embodied, *PLACEHOLDERS]
-    if any(text in template or text in action.format("") for text in own) or embodied in s.action_tokens:
+    words = [*re.split("|".join(map(re.escape, PLACES)), template), *s.action_tokens]
+    if any(text in word for text in (embodied, *PLACEHOLDERS) for word in words):
         policy.bad("prompt_template", "no token of images, and no embodied one but in {e_actions}", unsupported=True)
     n_frame = _n_moment(policy, checkpoint, s)
     frames = "".join(token * policy.count("num_action_tokens_per_timestep") for token in s.action_tokens[:n_frame])
