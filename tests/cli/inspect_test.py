@@ -106,7 +106,7 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
 
 
 def test_the_manifest_of_an_unknown_architecture_is_unsupported(vla):
-    vla("inspect", "--manifest", "octo").refused("unsupported", "turbovla, found octo")
+    vla("inspect", "--manifest", "octo").refused("unsupported", "vla_jepa, found octo")
 
 
 def test_inspect_takes_no_more_memory_for_weights_than_the_file_has(vla):

@@ -69,7 +69,7 @@ TEST_CASE("a ternary code that stands for no number and a factor that is missing
 TEST_CASE("a bundle of an architecture that this build does not know is unsupported") {
   EditableBundle bundle = sound_bundle();
   bundle.set("vla.arch", Value(std::string("octo")));
-  check_refused(bundle, Code::unsupported, "turbovla, found octo");
+  check_refused(bundle, Code::unsupported, "vla_jepa, found octo");
 }
 
 TEST_CASE("missing, extra and misshapen tensors are named in one error") {

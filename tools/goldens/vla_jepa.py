@@ -155,7 +155,7 @@ TEXT = "pick up the black bowl between the plate and the ramekin and place it on
 def published(views, arch="vla_jepa"):
     """The published size, with the robot of LIBERO: 2.3 B parameters, without those of the world model."""
     sizes = vision(1024, 24, 16, 4096, 48, (5, 11, 17), 16), text(2048, 28, 16, 8, 128, 6144, (24, 20, 20)) | {"vocab_size": 151936}
-    return Checkpoint(*sizes, {"enable_world_model": False, "resize_images_to": [224, 224]}, views, side=256)
+    return Checkpoint(*sizes, {"chunk_size": CONFIG["chunk_size"], "enable_world_model": False, "resize_images_to": [224, 224]}, views, side=256)
 
 
 # --- cases -----------------------------------------------------------------------------------------------------------
