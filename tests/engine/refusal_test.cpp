@@ -144,6 +144,42 @@ TEST_CASE("TurboVLA is refused with fewer cameras than views, fewer positions th
   check_refused(bundle, Code::bad_bundle, "transformer.norm");
 }
 
+TEST_CASE(
+    "VLA-JEPA is refused where its prompt has no room for the embodied tokens, or tensors belong to another head") {
+  const EditableBundle sound = EditableBundle::read(golden_path("vla_jepa/libero") + "/bundle.gguf");
+  const auto with = [&](const char* key, std::int64_t value) {
+    EditableBundle bundle = sound;
+    bundle.set(key, Value(value));
+    return bundle;
+  };
+  check_refused(with("policy.n_embodied", 4000), Code::bad_bundle, "tokens or more, for the views");
+  check_refused(with("policy.n_future", 7), Code::bad_bundle, "wrong shape     future.weight");
+  check_refused(with("policy.d_state", 0), Code::bad_bundle, "expected 0 numbers at the end (policy.d_state)");
+}
+
+TEST_CASE("VLA-JEPA refuses instructions that its prompt has no place for, and frames of another camera") {
+  const GoldenCase golden = GoldenCase::read(golden_path("vla_jepa/camera"));
+  const auto engine = load_engine(golden.bundle());
+  const auto refused = [&](const Observation& bad) {
+    const auto chunk = engine->act(bad, golden.noise);
+    REQUIRE_FALSE(chunk.ok());
+    CHECK(chunk.error().code == Code::bad_observation);
+    CHECK(engine->act(golden.observation, golden.noise).ok());
+    return chunk.error().message();
+  };
+  for (const char* token : {"<|embodied_action|>", "<|image_pad|>", "<|video_pad|>", "<|placeholder|>"}) {
+    Observation bad = golden.observation;
+    bad.text = std::string("go ") + token;
+    CHECK(refused(bad).find(std::string("instruction: expected text without ") + token) != std::string::npos);
+  }
+  Observation bad = golden.observation;
+  for (int i = 0; i < 2000; ++i) bad.text += " go";
+  CHECK(refused(bad).find("shorten the instruction") != std::string::npos);
+  bad = golden.observation;
+  bad.views["front"] = Frame{36, 48, std::get<std::vector<std::uint8_t>>(bad.views["front"]->rgb)};
+  CHECK(refused(bad).find("front: expected an image of 48 x 36, found 36 x 48") != std::string::npos);
+}
+
 TEST_CASE("every number of every architecture has a range, and one beyond it is refused by its key") {
   std::string arch;
   int n_checked = 0;
