@@ -178,7 +178,7 @@ CASES = {
         {"image": (28, 28), "wrist_image": (31, 28)}, d_state=5, side=24)),
     # One camera of 4:3, shrunk as it is; no state; five steps; a tokenizer with room for the policy's tokens; a short prompt; an
     # instruction with letters in two parts, other scripts, special tokens of all kinds and braces.
-    "vla_jepa/camera": Case(52, {"front": (36, 48, "png")},
+    "vla_jepa/camera": Case(82, {"front": (36, 48, "png")},
         " Öffne \"Schublade_12\"{actions} -- don't\nPlätze 开抽屉 %s<|im_end|>{{0}} #42", Checkpoint(
         vision(12, 5, 3, 20, 6, (1, 2, 4)), text(16, 4, 3, 1, 8, 24, (2, 1, 1)) | {"vocab_size": N_VOCAB + 40},
         policy(4, 5, (2, 6), 4, 14, 9, prompt_template=SHORT, num_action_tokens_per_timestep=3, enable_world_model=False,
@@ -186,7 +186,7 @@ CASES = {
         {"front": (36, 48)}, d_state=0, d_action=6, side=32, prunes="lm_head")),
     # Three cameras, enlarged by areas to a size that the backbone takes; a preset's heads; action tokens behind the embodied ones; actions
     # as they are; weights in float32, the table stored twice; another name of a view.
-    "vla_jepa/three_views": Case(53, {"top": (10, 13, "png"), "left": (20, 14, "jpg"), "right": (12, 12, "png")}, "stack the cups", Checkpoint(
+    "vla_jepa/three_views": Case(62, {"top": (10, 13, "png"), "left": (20, 14, "jpg"), "right": (12, 12, "png")}, "stack the cups", Checkpoint(
         vision(16, 4, 1, 24, 3, (0, 1, 3)), text(24, 4, 2, 2, 12, 20, (2, 2, 2)),
         policy(6, 3, (None, None), 2, 18, 4, action_model_type="DiT-test", resize_images_to=[16, 24], num_video_frames=6,
                prompt_template="{instruction}, {e_actions}{actions}", num_action_tokens_per_timestep=2, clip_normalized_actions=False,
@@ -196,7 +196,7 @@ CASES = {
         rename={"observation.images.cam": "observation.images.top"})),
     # Frames that the backbone takes as they are; one step, one layer, one embodied token; a number that never moved; a gripper that is
     # snapped and not turned.
-    "vla_jepa/small": Case(54, {"camera": (16, 24, "png")}, "Go on", Checkpoint(
+    "vla_jepa/small": Case(77, {"camera": (16, 24, "png")}, "Go on", Checkpoint(
         vision(12, 3, 1, 16, 4, (0, 1, 2)), text(16, 4, 2, 1, 8, 16, (2, 1, 1)),
         policy(3, 1, (1, 10), 1, 12, 1, prompt_template=SHORT, num_video_frames=4, jepa_tubelet_size=1, binarize_gripper_action=False,
                enable_world_model=False, normalization_mapping=layout.IDENTITY | {"STATE": "QUANTILES", "ACTION": "IDENTITY"}),
