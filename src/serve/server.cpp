@@ -55,6 +55,18 @@ v1::Limits limits_told(const ServerOptions& options, const Engine& engine) {
   return limits;
 }
 
+/// As many words as the prompt takes: where its own tokens must stay whole, fewer than it has tokens.
+std::string longest_text(const Processor& processor, Observation observation) {
+  Inputs inputs;
+  for (int n_word = processor.recipe().max_tokens; n_word > 0; n_word = n_word * 3 / 4) {
+    observation.text.clear();
+    for (int i = 0; i < n_word; ++i) observation.text += "go ";
+    if (processor.encode_state(observation, inputs) && processor.encode_text(observation, inputs))
+      return observation.text;
+  }
+  return {};
+}
+
 /// An observation of a robot with every view and the longest text.
 Observation largest_observation(const Robot& robot) {
   const Processor& processor = robot.processor();
@@ -66,7 +78,7 @@ Observation largest_observation(const Robot& robot) {
   for (std::size_t i = 0; i < processor.states().names().size(); ++i)
     observation.states.emplace(processor.states().names()[i],
                                std::vector<float>(static_cast<std::size_t>(processor.state_dims()[i])));
-  for (int i = 0; i < recipe.max_tokens; ++i) observation.text += "go ";
+  observation.text = longest_text(processor, observation);
   observation.embodiment = robot.bundle().embodiment();
   return observation;
 }

@@ -199,3 +199,10 @@ TEST_CASE("the warm-up runs the largest act that the bundle allows") {
   REQUIRE(ms.ok());
   CHECK(*ms > 0);
 }
+
+TEST_CASE("the warm-up shortens a text that would cut the prompt's own tokens") {
+  const auto engine = load_engine(golden_path("vla_jepa/libero") + "/bundle.gguf");
+  const std::size_t before = engine->memory().plan;
+  REQUIRE(serve::warm_up(*engine).ok());
+  CHECK(engine->memory().plan > before);
+}
