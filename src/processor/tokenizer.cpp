@@ -108,8 +108,10 @@ Status Tokenizer::read_byte_level(const Keys& keys, const std::vector<std::strin
   VLA_TRY(model.pretokenizer, Pretokenizer::parse(pre));
   VLA_TRY(model.bpe, Bpe::create(tokens, merges, ignore_merges, are_added(added, tokens.size())));
   model_ = std::move(model);
-  if (!keys.has("tokenizer.prefix_ids")) return {};
-  VLA_TRY(prefix_, read_around(keys, "tokenizer.prefix_ids", tokens.size()));
+  for (const auto& [key, ids] : {std::pair("tokenizer.prefix_ids", &prefix_), {"tokenizer.suffix_ids", &suffix_}})
+    if (keys.has(key)) {
+      VLA_TRY(*ids, read_around(keys, key, tokens.size()));
+    }
   return {};
 }
 

@@ -67,11 +67,11 @@ TEST_CASE("twelve tokenizers give the reference's ids on six thousand texts") {
       ++compared;
     }
   }
-  CHECK(compared == 6000);
+  CHECK(compared == 6500);
 }
 
 TEST_CASE("a word of 64 KiB takes milliseconds") {
-  for (const char* name : {"smol", "tangled", "qwen", "llama", "gemma", "bert"}) {
+  for (const char* name : {"smol", "tangled", "qwen", "llama", "gemma", "bert", "bart"}) {
     const Keys keys = tokenizer_keys(name);
     std::string longest, word;  // repeated, the longest token of letters merges most
     const auto tokens = *keys.strings("tokenizer.tokens");

@@ -32,9 +32,12 @@ def byte_level(spec: dict) -> dict:
     normalization = {"tokenizer.normalization": "nfc"} if spec["normalizer"] else {}
     posts = (spec["post_processor"] or {}).get("processors", [spec["post_processor"]])
     front = [ids for post in posts if post and post["type"] == "TemplateProcessing" for ids in prefix(post)]
+    roberta = [post for post in posts if post and post["type"] == "RobertaProcessing"]
+    front, behind = front + [post["cls"][1] for post in roberta], [post["sep"][1] for post in roberta]
     return {
         **normalization,
         **({"tokenizer.prefix_ids": front} if front else {}),
+        **({"tokenizer.suffix_ids": behind} if behind else {}),
         "tokenizer.kind": "byte_level_bpe",
         "tokenizer.pre": json.dumps([step_of(step) for step in steps]),
         "tokenizer.ignore_merges": spec["model"]["ignore_merges"],

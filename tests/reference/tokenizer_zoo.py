@@ -273,6 +273,15 @@ def bert_awkward() -> Tokenizer:
     return tokenizer
 
 
+def bart() -> Tokenizer:
+    """The shape of BART's: every text stands between two tokens, and the last token takes the blanks in front of it."""
+    specials = ["<s>", "<pad>", "</s>", "<unk>"]
+    tokenizer = train(pre_tokenizers.ByteLevel(add_prefix_space=False), 700, specials)
+    tokenizer.add_special_tokens([AddedToken("<mask>", lstrip=True, special=True)])
+    tokenizer.post_processor = processors.RobertaProcessing(sep=("</s>", 2), cls=("<s>", 0), add_prefix_space=False)
+    return tokenizer
+
+
 ZOO = {
     "smol": smol,
     "awkward": awkward,
@@ -286,6 +295,7 @@ ZOO = {
     "gemma_tangled": gemma_tangled,
     "bert": bert,
     "bert_awkward": bert_awkward,
+    "bart": bart,
 }
 
 SPACES = [c for c in map(chr, range(0x110000)) if c.isspace()] + list("\u200b\u200c\u200d\u2060\ufeff\u180e\u00ad")

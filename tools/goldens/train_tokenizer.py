@@ -140,6 +140,21 @@ def bert(folder, n_piece=110):
     BertTokenizer(vocab=fast.get_vocab(), model_max_length=512).save_pretrained(folder)
 
 
+def bart(folder, n_merge=40):
+    """A byte-level BPE between <s> and </s>, in the order of facebook/bart-large: <mask> is the last token."""
+    from tokenizers import Tokenizer, models, pre_tokenizers, trainers
+    from transformers import BartTokenizer
+
+    fast, special = Tokenizer(models.BPE()), ["<s>", "<pad>", "</s>", "<unk>"]
+    fast.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    alphabet = pre_tokenizers.ByteLevel.alphabet()
+    fast.train_from_iterator(TASKS, trainers.BpeTrainer(
+        vocab_size=len(special) + len(alphabet) + n_merge, special_tokens=special, initial_alphabet=alphabet, show_progress=False))
+    spec = json.loads(fast.to_str())["model"]
+    vocab = spec["vocab"] | {"<mask>": len(spec["vocab"])}
+    BartTokenizer(vocab=vocab, merges=[tuple(m) for m in spec["merges"]], model_max_length=1024).save_pretrained(folder)
+
+
 def bitvla(folder, n_merge=120):
     """Llama 3's rules with other merges; the added tokens follow the vocabulary in the published order, with a few action tokens."""
     from tokenizers import AddedToken, Regex, Tokenizer, decoders, models, pre_tokenizers, processors, trainers
@@ -166,4 +181,4 @@ def bitvla(folder, n_merge=120):
 
 
 if __name__ == "__main__":
-    {"bert": bert, "bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))
+    {"bart": bart, "bert": bert, "bitvla": bitvla, "eagle": eagle, "smolvla": smolvla, "pi": pi, "evo1": evo1, "gr00t": gr00t}[sys.argv[1]](Path(sys.argv[2]))

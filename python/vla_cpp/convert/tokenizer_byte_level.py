@@ -1,14 +1,15 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Byte-level BPE: what SmolLM2, Qwen2 and the other descendants of GPT-2 publish.
+"""Byte-level BPE: what SmolLM2, Qwen2, BART and the other descendants of GPT-2 publish.
 
 Which pre-tokenizer and normalizer count follows the class that transformers 5.4 to 5.5 builds for `tokenizer_class`: the generic
-classes keep tokenizer.json as it is, GPT2Tokenizer and Qwen2Tokenizer take vocabulary and merges from it and bring their own.
+classes keep tokenizer.json as it is, GPT2Tokenizer, Qwen2Tokenizer and BartTokenizer take vocabulary and merges from it and bring
+their own.
 """
 
 from __future__ import annotations
 
-from typing import List, NamedTuple, Optional
+from typing import List, NamedTuple, Optional, Tuple
 
 from .bundle import Key
 from .errors import Problems
@@ -21,14 +22,17 @@ from .tokenizer_parts import (
     check_ids,
     check_model,
     check_symbols,
+    content_of,
     one_or_sequence,
     prefix_ids,
+    stated_around,
     to_json,
 )
 
 KIND = "byte_level_bpe"
 GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
 QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
+BART = ("BartTokenizer", "BartTokenizerFast", "RobertaTokenizer", "RobertaTokenizerFast")  # one class under several names
 # The splitting expressions of Qwen2 and Llama 3, as src/processor/pretokenizer.h has them.
 QWEN2_WORDS = (
     r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
@@ -40,8 +44,16 @@ SPLITS = {
 }
 # What a class names where its config is silent.
 DEFAULTS = {
-    **dict.fromkeys(GPT2, ("unk_token", "bos_token", "eos_token")),
-    **dict.fromkeys(QWEN2, ("unk_token", "eos_token", "pad_token")),
+    **dict.fromkeys(GPT2, dict.fromkeys(("unk_token", "bos_token", "eos_token"), "<|endoftext|>")),
+    **dict.fromkeys(QWEN2, dict.fromkeys(("unk_token", "eos_token", "pad_token"), "<|endoftext|>")),
+    **dict.fromkeys(
+        BART,
+        {
+            **dict.fromkeys(("bos_token", "cls_token"), "<s>"),
+            **dict.fromkeys(("eos_token", "sep_token"), "</s>"),
+            **{name + "_token": "<{}>".format(name) for name in ("unk", "pad", "mask")},
+        },
+    ),
 }
 MODEL = {
     "type": ("BPE",),
@@ -61,8 +73,7 @@ def byte_symbols() -> List[str]:
 
 def with_defaults(config: dict) -> dict:
     """The class's own defaults, which it adds to the vocabulary like stated ones."""
-    names = DEFAULTS.get(str(config.get("tokenizer_class")), ())
-    return dict(dict.fromkeys(names, "<|endoftext|>"), **config)
+    return dict(DEFAULTS.get(str(config.get("tokenizer_class")), {}), **config)
 
 
 class _Splitting(NamedTuple):
@@ -74,7 +85,8 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     check_model(tokenizer.model, MODEL, "byte-level BPE and BPE with byte fallback", problems)
     check_symbols(tokenizer.model, byte_symbols(), problems)
     _check_surroundings(tokenizer, problems)
-    spec, config, prefix = tokenizer.spec, tokenizer.config, prefix_ids(tokenizer, problems)
+    spec, config = tokenizer.spec, tokenizer.config
+    front, behind = _around(tokenizer, problems)
     splitting = _Splitting(
         _pre_tokenizer(spec.get("pre_tokenizer"), problems), _normalization(spec.get("normalizer"), problems)
     )
@@ -92,14 +104,30 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     return [
         Key("tokenizer.pre", "string", to_json(splitting.pre)),
         *normalization,
-        *([Key("tokenizer.prefix_ids", "u32[]", prefix)] if prefix else []),
+        *([Key("tokenizer.prefix_ids", "u32[]", front)] if front else []),
+        *([Key("tokenizer.suffix_ids", "u32[]", behind)] if behind else []),
         Key("tokenizer.ignore_merges", "bool", bool(tokenizer.model.get("ignore_merges", False)) and own is None),
     ]
 
 
+def _around(tokenizer: Tokenizer, problems: Problems) -> Tuple[List[int], List[int]]:
+    """BART's class makes the template itself, of two tokens of the config: both must say the same."""
+    config, post = tokenizer.config, tokenizer.spec.get("post_processor")
+    is_bart = isinstance(post, dict) and post.get("type") == "RobertaProcessing" and config.get("tokenizer_class") not in GPT2 + QWEN2
+    if not is_bart and config.get("tokenizer_class") not in BART:
+        return prefix_ids(tokenizer, problems), []
+    around = stated_around(tokenizer, problems, "a template of special tokens around the text", may_follow=True)
+    if config.get("tokenizer_class") in BART:
+        ids = {token["content"]: token["id"] for token in tokenizer.added}
+        own = tuple([ids.get(content_of(config[name]), -1)] for name in ("cls_token", "sep_token"))
+        if own != around:
+            problems.add(JSON_FILE + ": post_processor", "cls_token and sep_token of {}: {}".format(CONFIG_FILE, own), str(around))
+    return around
+
+
 def _of_class(config: dict) -> Optional[_Splitting]:
     name, prefix_space = config.get("tokenizer_class"), bool(config.get("add_prefix_space") or False)
-    if name in GPT2:
+    if name in GPT2 + BART:
         return _Splitting([_byte_level(prefix_space, True)], None)
     if name in QWEN2:
         return _Splitting([{"type": "split", "pattern": QWEN2_WORDS}, _byte_level(prefix_space, False)], "nfc")
@@ -120,7 +148,7 @@ def _normalization(normalizer, problems: Problems) -> Optional[str]:
 
 
 def _check_surroundings(tokenizer: Tokenizer, problems: Problems) -> None:
-    check_class(tokenizer.config, GENERIC + GPT2 + QWEN2, problems)
+    check_class(tokenizer.config, GENERIC + GPT2 + QWEN2 + BART, problems)
     check_ids({token["content"]: token["id"] for token in tokenizer.added}, tokenizer.n_vocab, problems)
 
 

@@ -98,7 +98,7 @@ def add_special(added: List[dict], model: dict, texts: Sequence[str], problems: 
         there.add(text)
 
 
-def _content(token) -> Optional[str]:
+def content_of(token) -> Optional[str]:
     return token.get("content") if isinstance(token, dict) else token
 
 
@@ -114,7 +114,7 @@ def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> 
             if isinstance(value, list)
             else [value]
         )
-        for token in (_content(v) for v in values if v is not None):
+        for token in (content_of(v) for v in values if v is not None):
             if not isinstance(token, str) or token not in by_content:
                 problems.add(
                     "{}: {}".format(CONFIG_FILE, key),
@@ -123,7 +123,7 @@ def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> 
                     "load the tokenizer with transformers and save it again",
                 )
     for number, token in member(config, "added_tokens_decoder", dict, CONFIG_FILE).items():
-        content = _content(token)
+        content = content_of(token)
         own = by_content.get(content) if isinstance(content, str) else None
         stated = {flag: bool(token.get(flag, False)) for flag in FLAGS} if isinstance(token, dict) else {}
         if own is None or str(own["id"]) != number or any(own[flag] != value for flag, value in stated.items()):
@@ -210,20 +210,25 @@ def merges_of(merges, vocab: Dict[str, int], problems: Problems) -> List[str]:
 
 
 def prefix_ids(tokenizer: Tokenizer, problems: Problems) -> List[int]:
-    """The ids in front of every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
+    """The ids in front of every text, behind which none stand."""
+    return stated_around(tokenizer, problems, "a template of special tokens and then the text", may_follow=False)[0]
+
+
+def stated_around(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow: bool) -> Tuple[List[int], List[int]]:
+    """The ids around every text: those of the file's template. transformers 5.5 reads add_bos_token and add_eos_token of the
     config and then keeps the template all the same; a config that contradicts it may mean another release."""
     config = tokenizer.config
-    ids, _ = around_ids(tokenizer, problems, "a template of special tokens and then the text", may_follow=False)
+    front, behind = around_ids(tokenizer, problems, wanted, may_follow)
     if config.get("add_eos_token", False) not in (False, None):
         problems.unsupported(CONFIG_FILE + ": add_eos_token", "False", repr(config["add_eos_token"]))
-    if config.get("add_bos_token") is not None and bool(config["add_bos_token"]) != bool(ids):
+    if config.get("add_bos_token") is not None and bool(config["add_bos_token"]) != bool(front):
         problems.add(
             CONFIG_FILE + ": add_bos_token",
-            "{}, as the template of {} has it".format(bool(ids), JSON_FILE),
+            "{}, as the template of {} has it".format(bool(front), JSON_FILE),
             repr(config["add_bos_token"]),
             "load the tokenizer with transformers and save it again",
         )
-    return ids
+    return front, behind
 
 
 def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow: bool) -> Tuple[List[int], List[int]]:
@@ -232,7 +237,7 @@ def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow
     posts = [post for post in one_or_sequence(tokenizer.spec.get("post_processor"), "processors") if not _is_byte_level(post)]
     if not posts:
         return [], []
-    post = posts[0] if len(posts) == 1 else None
+    post = _template(posts[0]) if len(posts) == 1 else None
     single = post.get("single") if isinstance(post, dict) else None
     parts = single if isinstance(single, list) and post.get("type") == "TemplateProcessing" else []
     kinds = [next(iter(part), None) if isinstance(part, dict) else None for part in parts]
@@ -243,6 +248,19 @@ def around_ids(tokenizer: Tokenizer, problems: Problems, wanted: str, may_follow
         return [], []
     special = member(post, "special_tokens", dict, JSON_FILE)
     return _ids_of(parts[:at], special, tokenizer, problems), _ids_of(parts[at + 1 :], special, tokenizer, problems)
+
+
+def _template(post):
+    """RoBERTa's own step, which BART's files have, as the template that it is: cls, text, sep. Its other fields trim offsets."""
+    if not isinstance(post, dict) or post.get("type") != "RobertaProcessing":
+        return post
+    known = {"type", "sep", "cls", "trim_offsets", "add_prefix_space"}
+    pairs = {name: post.get(name) for name in ("cls", "sep")}
+    if set(post) - known or not all(isinstance(p, list) and len(p) == 2 and isinstance(p[0], str) for p in pairs.values()):
+        return None
+    special = {name: {"id": name, "ids": [number], "tokens": [name]} for name, number in pairs.values()}
+    single = [{"SpecialToken": {"id": pairs["cls"][0]}}, {"Sequence": {"id": "A"}}, {"SpecialToken": {"id": pairs["sep"][0]}}]
+    return {"type": "TemplateProcessing", "single": single, "special_tokens": special}
 
 
 def _ids_of(parts: List[dict], special: dict, tokenizer: Tokenizer, problems: Problems) -> List[int]:
