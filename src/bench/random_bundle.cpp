@@ -237,7 +237,7 @@ class Values {
   void each_piece(const Param& param, std::size_t size, Use use) const {
     const std::string& source = !is_float(param.encoding.type)     ? codes_
                                 : param.storage != Storage::vector ? pool_
-                                : param.name.ends_with("bias")     ? zeros_
+                                : is_added(param)                  ? zeros_
                                                                    : ones_;
     for (std::size_t at = 0; at < size; at += source.size())
       use(std::string_view(source).substr(0, std::min(source.size(), size - at)));
@@ -246,6 +246,8 @@ class Values {
  private:
   static constexpr std::size_t kPool = std::size_t{1} << 22;  // elements that are drawn before they repeat
 
+  /// A kernel is that of a convolution whose result is added to what it reads.
+  static bool is_added(const Param& param) { return param.name.ends_with("bias") || param.name.ends_with("kernel"); }
   static std::size_t longest_vector(const ParamList& list) {
     std::int64_t longest = 1;
     for (const Param& param : list.params())

@@ -167,14 +167,17 @@ class Translator {
   }
   /// ggml's images are [width, height, d], as are the rows of what it unfolds.
   ggml_tensor* translate(const op::Unfold& op) {
-    const auto [size, stride, padding] = op.window;
+    return reshaped(ggml_cont(c, ggml_permute(c, covered(op.window), 1, 0, 2, 3)), node_->shape);
+  }
+  /// What a window covers: [size^2, d, n_place, n_view].
+  ggml_tensor* covered(const op::Window& window) {
+    const auto [size, stride, padding] = window;
     const Shape& s = node_->shape;
     const std::int64_t d = node_->in[0].dim(0), area = std::int64_t{size} * size;
     ggml_tensor* image = ggml_cont(c, ggml_permute(c, in(0), 2, 0, 1, 3));
     ggml_tensor* kernel = ggml_new_tensor_4d(c, GGML_TYPE_F32, size, size, d, 1);  // read for its shape only
     ggml_tensor* rows = ggml_im2col(c, kernel, image, stride, stride, padding, padding, 1, 1, true, GGML_TYPE_F32);
-    ggml_tensor* split = reshaped(rows, {area, d, s[1] * s[2], s[3]});
-    return reshaped(ggml_cont(c, ggml_permute(c, split, 1, 0, 2, 3)), s);
+    return reshaped(rows, {area, d, s[1] * s[2], s[3]});
   }
   /// ggml's own leaves NaN out; what is not finite stays so.
   ggml_tensor* translate(const op::MaxPool& op) {
@@ -186,6 +189,25 @@ class Translator {
     };
     ggml_tensor* nothing = pool(GGML_OP_POOL_AVG, ggml_scale(c, image, 0.0f));
     return ggml_cont(c, ggml_permute(c, ggml_add(c, pool(GGML_OP_POOL_MAX, image), nothing), 1, 2, 0, 3));
+  }
+  ggml_tensor* translate(const op::Depthwise& op) {
+    const Shape& s = node_->shape;
+    const std::int64_t area = std::int64_t{op.window.size} * op.window.size;
+    ggml_tensor* weight = ggml_cont(c, ggml_transpose(c, reshaped(in(1), {s[0], area, 1, 1})));  // [size^2, d]
+    ggml_tensor* sums = ggml_sum_rows(c, ggml_mul(c, covered(op.window), weight));               // [1, d, ...]
+    return ggml_add(c, reshaped(sums, s), contiguous(in(2)));
+  }
+  /// Rows of tokens: [n, d_group, n_group, n_view].
+  ggml_tensor* translate(const op::ChannelAttention& op) {
+    const Shape& s = node_->shape;
+    const Shape split = {s[0] / op.n_group, op.n_group, s[1], s[2]};
+    const auto rows = [&](std::size_t i) { return ggml_cont(c, ggml_permute(c, reshaped(in(i), split), 1, 2, 0, 3)); };
+    ggml_tensor* score = ggml_mul_mat(c, rows(1), rows(0));  // [d_group of keys, of queries, n_group, n_view]
+    const float scale = 1.0f / std::sqrt(static_cast<float>(s[1]));
+    ggml_tensor* weight = ggml_soft_max_ext(c, score, nullptr, scale, 0.0f);
+    ggml_tensor* value = ggml_cont(c, ggml_permute(c, reshaped(in(2), split), 0, 2, 1, 3));  // [d_group, n, ...]
+    ggml_tensor* mixed = ggml_mul_mat(c, weight, value);  // [d_group of queries, n, n_group, n_view]
+    return reshaped(ggml_cont(c, ggml_permute(c, mixed, 0, 2, 1, 3)), s);
   }
   ggml_tensor* translate(const op::Write& op) { return ggml_cpy(c, in(0), static_cast<ggml_tensor*>(op.slot->place)); }
 

@@ -142,6 +142,21 @@ struct MaxPool {
   static constexpr const char* kName = "max_pool";
   Window window;
 };
+/// x [d, width, height, n_view], weight [d * size^2], bias [d] -> of each feature what the window covers at each of its
+/// places, times that feature's weights, and its bias: [d, n_column, n_row, n_view]. Weights: row, column, feature;
+/// pixels beyond the image are zeros.
+struct Depthwise {
+  static constexpr const char* kName = "depthwise";
+  Window window;
+};
+/// q, k, v [d, n, n_view] -> the same shape. The features of each of `n_group` equal groups attend to each other, over
+/// all tokens of a view: y_i = sum over j of softmax_j(q_i k_j / sqrt(n)) v_j, where q_i, k_j, v_j are rows of n
+/// tokens.
+struct ChannelAttention {
+  static constexpr const char* kName = "channel_attention";
+  static constexpr int kMaxGroup = 64;  // features of a group
+  int n_group;
+};
 /// Stores x in a slot of its shape.
 struct Write {
   static constexpr const char* kName = "write";
@@ -154,7 +169,8 @@ namespace vla {
 
 using Op = std::variant<op::Input, op::Constant, op::Parameter, op::Linear, op::Embedding, op::Gather, op::Norm,
                         op::Rope, op::Attention, op::Activate, op::Add, op::Multiply, op::Scale, op::Concat, op::Slice,
-                        op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Unfold, op::MaxPool, op::Write>;
+                        op::Repeat, op::Reshape, op::Patches, op::PixelShuffle, op::Unfold, op::MaxPool, op::Depthwise,
+                        op::ChannelAttention, op::Write>;
 
 /// The operation's word, for messages and printed graphs.
 inline const char* op_name(const Op& op) {

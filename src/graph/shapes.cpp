@@ -119,14 +119,25 @@ struct Rules {
   }
   ShapeCheck operator()(const op::Unfold& op) const {
     const std::int64_t area = std::int64_t{op.window.size} * op.window.size;
-    return places(op.window, op.window.padding >= 0, area);
+    return places(op.window, has(1) && op.window.padding >= 0, area);
   }
   ShapeCheck operator()(const op::MaxPool& op) const {
-    return places(op.window, op.window.padding >= 0 && 2 * op.window.padding <= op.window.size, 1);
+    return places(op.window, has(1) && op.window.padding >= 0 && 2 * op.window.padding <= op.window.size, 1);
+  }
+  ShapeCheck operator()(const op::Depthwise& op) const {
+    if (!has(3)) return {false};
+    const std::int64_t area = std::int64_t{op.window.size} * op.window.size;
+    const bool fits = count(of(1)) == of(0)[0] * area && count(of(2)) == of(0)[0];
+    return places(op.window, fits && op.window.padding >= 0, 1);
+  }
+  ShapeCheck operator()(const op::ChannelAttention& op) const {
+    if (!has(3) || !floats() || op.n_group < 1) return {false};
+    const bool fits = of(0)[0] % op.n_group == 0 && of(0)[0] / op.n_group <= op::ChannelAttention::kMaxGroup;
+    return same_as_first(fits && of(0)[3] == 1 && of(1) == of(0) && of(2) == of(0));
   }
   /// A column of `area` times x's elements for each place of the window.
   ShapeCheck places(const op::Window& w, bool fits, std::int64_t area) const {
-    if (!has(1) || !floats() || !fits || w.size < 1 || w.stride < 1) return {false};
+    if (in.empty() || !has(in.size()) || !floats() || !fits || w.size < 1 || w.stride < 1) return {false};
     const auto n_place = [&](std::int64_t n) {
       return n + 2 * w.padding < w.size ? 0 : (n + 2 * w.padding - w.size) / w.stride + 1;
     };

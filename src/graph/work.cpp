@@ -7,6 +7,8 @@ namespace vla {
 double flop_of(const Node& node) {
   const auto result = static_cast<double>(count(node.shape));
   if (node.as<op::Linear>() != nullptr) return 2.0 * result * static_cast<double>(node.in[0].dim(0));
+  if (const auto* channels = node.as<op::ChannelAttention>())
+    return 4.0 * result * static_cast<double>(node.shape[0] / channels->n_group);
   const auto* attention = node.as<op::Attention>();
   if (attention == nullptr) return 0;  // counted are products alone
   std::int64_t n_key = 0;

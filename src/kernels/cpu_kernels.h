@@ -4,6 +4,7 @@
 
 #include "base/activation.h"
 #include "kernels/attention_kernel.h"
+#include "kernels/channel_attention.h"
 #include "kernels/kernel_set.h"
 
 namespace vla::kernels {
@@ -17,8 +18,10 @@ struct CpuKernels {
   RowKernel rotate_half;
   RowKernel add, multiply;  // y = x + w, x * w
   RowKernel largest;        // y = the larger of x and w, NaN where one is
+  RowKernel multiply_add;   // y = x * w + b
   RowKernel scale;          // y = x * s
   AttentionKernel attention;
+  ChannelAttentionKernel channel_attention;
 
   RowKernel activation(Activation activation) const;
 };

@@ -29,8 +29,10 @@ class CpuKernelsMaker {
         .add = map<Plus>,
         .multiply = map<Times>,
         .largest = map<Larger>,
+        .multiply_add = multiply_add,
         .scale = scaled,
         .attention = AttentionTile<Products>::kernel(),
+        .channel_attention = channel_attention,
     };
   }
 
@@ -72,6 +74,13 @@ class CpuKernelsMaker {
       if constexpr (requires { F::kBinary; }) second = load<V>(w + i, n - i);
       store<V>(y + i, F::of(load<V>(x + i, n - i), second), n - i);
     }
+  }
+
+  static void channel_attention(const ChannelAttentionJob& job, std::int64_t unit) { attend_channels<V>(job, unit); }
+
+  static void multiply_add(const float* x, const float* w, const float* b, float, float* y, std::int64_t n) {
+    for (std::int64_t i = 0; i < n; i += V::width)
+      store<V>(y + i, V::fma(load<V>(x + i, n - i), load<V>(w + i, n - i), load<V>(b + i, n - i)), n - i);
   }
 
   static void scaled(const float* x, const float*, const float*, float s, float* y, std::int64_t n) {

@@ -34,17 +34,26 @@ struct Window {
 
   /// Of each element of a pixel the largest that the window covers inside the image.
   VLA_INLINE void largest(RowKernel larger, const float* images, std::int64_t place, float* to) const {
-    const Corner corner = corner_of(place);
     bool is_first = true;
-    for (std::int64_t row = max(0, -corner.y); row < min(size, height - corner.y); ++row)
-      for (std::int64_t column = max(0, -corner.x); column < min(size, width - corner.x); ++column) {
-        const float* pixel = images + ((corner.image * height + corner.y + row) * width + corner.x + column) * d;
-        if (is_first)
-          std::memcpy(to, pixel, static_cast<std::size_t>(d) * sizeof(float));
-        else
-          larger(pixel, to, nullptr, 0, to, d);
-        is_first = false;
-      }
+    for_covered(images, corner_of(place), [&](const float* pixel, std::int64_t) VLA_LAMBDA {
+      if (is_first)
+        std::memcpy(to, pixel, static_cast<std::size_t>(d) * sizeof(float));
+      else
+        larger(pixel, to, nullptr, 0, to, d);
+      is_first = false;
+    });
+  }
+
+  /// Of each element of a pixel the sum of what the window covers, times that element's weights, and its bias.
+  /// `multiply_add`: y = x * w + b.
+  VLA_INLINE void weigh(RowKernel multiply_add, const float* images, const float* weight, const float* bias,
+                        std::int64_t place, float* to) const {
+    const float* sum = bias;
+    for_covered(images, corner_of(place), [&](const float* pixel, std::int64_t i) VLA_LAMBDA {
+      multiply_add(pixel, weight + i * d, sum, 0, to, d);
+      sum = to;
+    });
+    if (sum == bias) std::memcpy(to, bias, static_cast<std::size_t>(d) * sizeof(float));
   }
 
  private:
@@ -56,6 +65,14 @@ struct Window {
   VLA_INLINE Corner corner_of(std::int64_t place) const {
     const std::int64_t n = n_column * n_row;
     return {place / n, place % n_column * stride - padding, place % n / n_column * stride - padding};
+  }
+
+  /// Calls visit(pixel, its number in the window) for those inside the image.
+  template <class Visit>
+  VLA_INLINE void for_covered(const float* images, const Corner& corner, const Visit& visit) const {
+    for (std::int64_t row = max(0, -corner.y); row < min(size, height - corner.y); ++row)
+      for (std::int64_t column = max(0, -corner.x); column < min(size, width - corner.x); ++column)
+        visit(images + ((corner.image * height + corner.y + row) * width + corner.x + column) * d, row * size + column);
   }
 
   /// Elements `from` to `until` of a row of the window.

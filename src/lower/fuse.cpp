@@ -59,6 +59,13 @@ class Fuser {
   void visit(const Node& node, const op::Unfold& op) { add(WindowOp{&node, op.window, false, operand(node, 0)}, node); }
   void visit(const Node& node, const op::MaxPool& op) { add(WindowOp{&node, op.window, true, operand(node, 0)}, node); }
 
+  void visit(const Node& node, const op::Depthwise& op) {
+    add(WindowOp{&node, op.window, false, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
+  }
+  void visit(const Node& node, const op::ChannelAttention&) {
+    add(ChannelOp{&node, operand(node, 0), operand(node, 1), operand(node, 2)}, node);
+  }
+
   void visit(const Node& node, const op::Norm& op) { add_rows(node, op); }
   void visit(const Node& node, const op::Rope& op) { add_rows(node, op); }
   void visit(const Node& node, const op::Activate& op) { add_rows(node, op); }
@@ -342,7 +349,8 @@ class Fuser {
   static std::vector<ValueId> operands(const RowOp& op) { return {op.x, op.w, op.b}; }
   static std::vector<ValueId> operands(const LookupOp& op) { return {op.table, op.ids}; }
   static std::vector<ValueId> operands(const PatchesOp& op) { return {op.images}; }
-  static std::vector<ValueId> operands(const WindowOp& op) { return {op.x}; }
+  static std::vector<ValueId> operands(const WindowOp& op) { return {op.x, op.weight, op.bias}; }
+  static std::vector<ValueId> operands(const ChannelOp& op) { return {op.q, op.k, op.v}; }
 
   Lowering& l;
   std::vector<FusedOp> ops_;

@@ -104,12 +104,16 @@ struct PatchesOp {
   const Node* node;
   ValueId images;
 };
-/// unfold, max_pool
+/// unfold, max_pool, depthwise
 struct WindowOp {
   const Node* node;
   op::Window window;
-  bool takes_largest;  // of the pixels that the window covers; else all of them
-  ValueId x;
+  bool takes_largest;  // of the pixels that the window covers; else all of them, or their sum where there are weights
+  ValueId x, weight = kNone, bias = kNone;
+};
+struct ChannelOp {
+  const Node* node;
+  ValueId q, k, v;
 };
 
 /// What the passes behind fusion know of an operation.
@@ -121,7 +125,7 @@ struct Step {
 };
 /// One operation of the program: nodes that were fused.
 struct FusedOp : Step {
-  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp> op;
+  std::variant<LinearOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, ChannelOp> op;
 };
 
 struct Lowering {

@@ -132,6 +132,8 @@ struct MakeValue {
   Value operator()(const op::PixelShuffle&) const { return own(node); }
   Value operator()(const op::Unfold&) const { return own(node); }
   Value operator()(const op::MaxPool&) const { return own(node); }
+  Value operator()(const op::Depthwise&) const { return own(node); }
+  Value operator()(const op::ChannelAttention&) const { return own(node); }
 
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }

@@ -46,4 +46,9 @@ std::string words_of(const PatchesOp&) { return "patches"; }
 
 std::string words_of(const WindowOp& op) { return op_name(op.node->op); }
 
+std::string words_of(const ChannelOp& op) {
+  const int n_group = op.node->as<op::ChannelAttention>()->n_group;
+  return fmt::format("{} of {} groups", op_name(op.node->op), n_group);
+}
+
 }  // namespace vla::lower

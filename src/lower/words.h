@@ -17,5 +17,6 @@ std::string words_of(const CopyOp& op);
 std::string words_of(const LookupOp& op);
 std::string words_of(const PatchesOp& op);
 std::string words_of(const WindowOp& op);
+std::string words_of(const ChannelOp& op);
 
 }  // namespace vla::lower

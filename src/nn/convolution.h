@@ -23,6 +23,25 @@ class Convolution : public Module<Convolution> {
   Linear product_;
 };
 
+/// A convolution of each feature for itself, with bias: x [d, width, height, n_view] -> the same shape, with size / 2
+/// zeros beyond each side. `kernel`: row, column, feature. Source: torch.nn.Conv2d(groups = d, padding = size // 2).
+class DepthwiseConvolution : public Module<DepthwiseConvolution> {
+ public:
+  /// `size` is odd.
+  DepthwiseConvolution(const Scope& s, int d, int size)
+      : Module(s),
+        window_{size, 1, size / 2},
+        weight_(s.vector("kernel", size * size * d)),
+        bias_(s.vector("bias", d)) {}
+  Tensor forward(Graph& g, Tensor x) const {
+    return g.add(op::Depthwise{window_}, {x, g.parameter(weight_), g.parameter(bias_)});
+  }
+
+ private:
+  op::Window window_;
+  const Param *weight_, *bias_;
+};
+
 /// The largest number of each feature in a window: x [d, width, height, n_view] -> [d, n_column, n_row, n_view].
 /// Source: torch.nn.MaxPool2d(padding = kernel_size // 2).
 Tensor max_pool(Graph& g, Tensor x, int size, int stride);

@@ -283,15 +283,21 @@ MISTAKES = {
     "a window turned": (
         "window.cu",
         "window",
-        "place.column + pixel % job.size,\n                                                    place.row + pixel / job.size",
+        "place.column + pixel % job.size,\n                                                          place.row + pixel / job.size",
         "place.column + pixel / job.size, place.row + pixel % job.size",
     ),
+    "a sum without its bias": ("window.cu", "window", "float sum = job.bias[i];", "float sum = 0;"),
+    "weights of another pixel": ("window.cu", "window", "job.weight[pixel * job.d + i]", "job.weight[i * job.size * job.size + pixel]"),
+    # Features that attend to features.
+    "features of another group": ("channel_attention.cu", "channel_attention", "blockIdx.x) * d,", "blockIdx.y) * d,"),
+    "queries and keys change places": ("channel_attention.cu", "channel_attention", "q + pair % d, k + pair / d", "q + pair / d, k + pair % d"),
+    "a softmax over the tokens' number": ("channel_attention.cu", "channel_attention", "kLogOfE / sqrtf(static_cast<float>(job.n))", "kLogOfE / static_cast<float>(job.n)"),
     "zeros beyond the image are the largest": ("window.cu", "window", "float most = -INFINITY;", "float most = 0;"),
     "NaN is not the largest": ("window.cu", "window", "x > most || x != x", "x > most"),
     "an image too far": ("window.cu", "window", "view * job.height * job.width", "view * job.height * job.height"),
 }
 TESTS = {"linear_int8": "*linear_int8_test*", "linear_bf16": "*linear_float_test*", "linear_f32": "*linear_float_test*",
-         "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*"}  # fmt: skip
+         "attention": "*attention_test*", "rows": "*rows_test*", "map": "*rows_test*", "window": "*window_test*", "channel_attention": "*channel_attention_test*"}  # fmt: skip
 
 
 def outcome(name, ptx, folder):

@@ -107,3 +107,27 @@ TEST_CASE("the largest of a window is NaN where a pixel is, and minus infinity w
   CHECK(std::isnan(found[0]));
   for (std::size_t i = 1; i < found.size(); ++i) CHECK(found[i] == expected[i]);
 }
+
+TEST_CASE("the weighted sum of a window has its own weights for each feature and pixel, and a bias") {
+  for (WindowJob job : {job_of(4, 9, 3, 1, 1), job_of(11, 6, 5, 2, 2)}) {
+    CAPTURE(job.size);
+    Numbers numbers;
+    const int area = job.size * job.size;
+    const std::vector<float> x = numbers.floats(job.d * job.width * job.height * job.n_view),
+                             weight = numbers.floats(job.d * area), bias = numbers.floats(job.d);
+    const Device<float> gx(x), gw(weight), gb(bias);
+    job.x = gx.get(), job.weight = gw.get(), job.bias = gb.get(), job.y_stride = job.d + 3;
+    const Device<float> y(static_cast<std::size_t>(job.y_stride * (job.count() / job.n_of_row())));
+    job.y = y.get();
+    launch(window_elements(job), job);
+    const std::vector<float> found = rows(job, y.host()), all = covered(job, x, 0);
+    REQUIRE(found.size() * static_cast<std::size_t>(area) == all.size());
+    for (std::size_t at = 0; at < found.size(); ++at) {
+      const auto d = static_cast<std::size_t>(job.d), i = at % d;
+      double sum = bias[i];
+      for (std::size_t pixel = 0; pixel < static_cast<std::size_t>(area); ++pixel)
+        sum += double{all[(at / d * static_cast<std::size_t>(area) + pixel) * d + i]} * weight[pixel * d + i];
+      CHECK(found[at] == doctest::Approx(sum).epsilon(1e-5));
+    }
+  }
+}

@@ -122,6 +122,18 @@ TEST_CASE_FIXTURE(Fixture, "parts are joined and cut along one dimension") {
   refuses(op::Reshape{}, {a}, {12, 3, 1, 1});
 }
 
+TEST_CASE_FIXTURE(Fixture, "features attend to those of their group, of which each has at most 64") {
+  const Tensor x = f32({12, 5, 2, 1});
+  accepts(op::ChannelAttention{3}, {x, x, x}, x.shape());
+  refuses(op::ChannelAttention{5}, {x, x, x});
+  refuses(op::ChannelAttention{0}, {x, x, x});
+  refuses(op::ChannelAttention{3}, {x, x});
+  refuses(op::ChannelAttention{3}, {x, f32({12, 4, 2, 1}), x});
+  const Tensor wide = f32({130, 5, 1, 1});
+  accepts(op::ChannelAttention{5}, {wide, wide, wide}, wide.shape());
+  refuses(op::ChannelAttention{2}, {wide, wide, wide});
+}
+
 TEST_CASE_FIXTURE(Fixture, "images are cut into whole patches, and patches joined in whole squares") {
   accepts(op::Patches{4}, {f32({9, 13, 3, 2})}, {48, 6, 2, 1});  // what is left of a patch is dropped
   refuses(op::Patches{4}, {f32({3, 8, 3, 1})});
@@ -134,6 +146,10 @@ TEST_CASE_FIXTURE(Fixture, "images are cut into whole patches, and patches joine
   refuses(op::Unfold{{3, 1, -1}}, {f32({5, 9, 9, 1})});
   accepts(op::MaxPool{{3, 2, 1}}, {f32({5, 9, 14, 2})}, {5, 5, 7, 2});
   refuses(op::MaxPool{{3, 2, 2}}, {f32({5, 9, 14, 2})});  // a window of no pixel
+  accepts(op::Depthwise{{3, 2, 1}}, {f32({5, 9, 14, 2}), f32({45, 1, 1, 1}), f32({5, 1, 1, 1})}, {5, 5, 7, 2});
+  refuses(op::Depthwise{{3, 2, 1}}, {f32({5, 9, 14, 2}), f32({44, 1, 1, 1}), f32({5, 1, 1, 1})});
+  refuses(op::Depthwise{{3, 2, 1}}, {f32({5, 9, 14, 2}), f32({45, 1, 1, 1}), f32({1, 1, 1, 1})});
+  refuses(op::Depthwise{{3, 2, 1}}, {f32({5, 9, 14, 2}), f32({45, 1, 1, 1})});
   accepts(op::PixelShuffle{6, 2}, {f32({3, 24, 2, 1})}, {12, 6, 2, 1});
   refuses(op::PixelShuffle{5, 2}, {f32({3, 20, 2, 1})});
   refuses(op::PixelShuffle{6, 2}, {f32({3, 18, 2, 1})});

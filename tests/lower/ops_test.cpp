@@ -155,11 +155,31 @@ TEST_CASE("windows over images, of every size, stride and padding that a convolu
         check_like_ggml([&](GraphRunner& r, const LowerParams&) {
           return r.graph.add(op::Unfold{window}, {operand(r, images, 1)});
         });
+        check_like_ggml([&](GraphRunner& r, const LowerParams&) {
+          const Tensor weight = operand(r, {images[0] * window.size * window.size, 1, 1, 1}, 2);
+          return r.graph.add(op::Depthwise{window},
+                             {operand(r, images, 1), weight, operand(r, {images[0], 1, 1, 1}, 3)});
+        });
         if (2 * window.padding > window.size) continue;
         check_like_ggml([&](GraphRunner& r, const LowerParams&) {
           return r.graph.add(op::MaxPool{window}, {operand(r, images, 1)});
         });
       }
+}
+
+TEST_CASE("attention of features to those of their group, of every width and number of tokens") {
+  for (const auto operand : kOperands)
+    for (const auto& [shape, n_group] : {std::pair(Shape{12, 7, 2, 1}, 3),
+                                         {Shape{35, 130, 1, 1}, 1},
+                                         {Shape{6, 1, 3, 1}, 6},
+                                         {Shape{128, 65, 2, 1}, 2},
+                                         {Shape{64, 49, 1, 1}, 2}}) {
+      CAPTURE(shape_text(shape));
+      check_like_ggml([&, n = n_group, of = shape](GraphRunner& r, const LowerParams&) {
+        const Tensor q = operand(r, of, 1), k = operand(r, of, 2);
+        return r.graph.add(op::ChannelAttention{n}, {q, k, operand(r, of, 3)});
+      });
+    }
 }
 
 TEST_CASE("the largest of a window has no zeros from beyond the image, and is NaN where a pixel is") {

@@ -38,6 +38,16 @@ VLA_DEVICE float largest(const WindowJob& job, const Place& place, int i) {
   return most;
 }
 
+/// Times the feature's weights, in the order of the window's pixels.
+VLA_DEVICE float weighted(const WindowJob& job, const Place& place, int i) {
+  float sum = job.bias[i];
+  for (int pixel = 0; pixel < job.size * job.size; ++pixel) {
+    const float x = feature(job, place.image, place.column + pixel % job.size, place.row + pixel / job.size, i, 0);
+    sum += x * job.weight[pixel * job.d + i];
+  }
+  return sum;
+}
+
 }  // namespace
 
 /// A thread has four elements, 256 apart, so that a warp's lie side by side.
@@ -48,9 +58,10 @@ VLA_KERNEL(window_elements, 256, 4, WindowJob) {
     if (at >= n) return;
     const Place place = place_of(job, at / n_of_row);
     const int i = static_cast<int>(at % n_of_row), pixel = i / job.d;
-    const float value = job.takes_largest ? largest(job, place, i)
-                                          : feature(job, place.image, place.column + pixel % job.size,
-                                                    place.row + pixel / job.size, i % job.d, 0);
+    const float value = job.takes_largest       ? largest(job, place, i)
+                        : job.weight != nullptr ? weighted(job, place, i)
+                                                : feature(job, place.image, place.column + pixel % job.size,
+                                                          place.row + pixel / job.size, i % job.d, 0);
     store(job.y, job.is_bf16, at / n_of_row * job.y_stride + i, value);
   }
 }

@@ -5,12 +5,13 @@
 #include "cuda/kernels/launch.h"
 
 /// What a window covers as it moves over images (op::Window): rows for the product that makes a convolution of them,
-/// or the largest of each feature.
+/// or of each feature the largest, or a weighted sum.
 namespace vla::cuda {
 
 struct WindowJob {
-  const float* x;         // [d, width, height, n_view]
-  void* y;                // a row for each place: d * size * size elements, or d of the largest; float32 or bf16
+  const float* x;              // [d, width, height, n_view]
+  const float *weight, *bias;  // [d, size * size], [d], or null
+  void* y;  // a row for each place: d * size * size elements, or d of the largest or of the sums; float32 or bf16
   std::int64_t y_stride;  // elements from one row to the next
   int d, width, height, n_view;
   int size, stride, padding;
@@ -18,7 +19,7 @@ struct WindowJob {
   bool takes_largest, is_bf16;
 
   VLA_HOST_DEVICE std::int64_t n_of_row() const {
-    return static_cast<std::int64_t>(takes_largest ? 1 : size * size) * d;
+    return static_cast<std::int64_t>(takes_largest || weight != nullptr ? 1 : size * size) * d;
   }
   VLA_HOST_DEVICE std::int64_t count() const { return n_of_row() * n_column * n_row * n_view; }
 };

@@ -26,7 +26,9 @@ struct BlockedOp {
 };
 
 struct CpuOp : Step {
-  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, BlockedOp> op;
+  std::variant<LinearOp, QuantizeOp, PackOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, ChannelOp,
+               BlockedOp>
+      op;
 };
 
 struct CpuLowering : Lowering {

@@ -211,24 +211,34 @@ struct PatchesTask : Task {
   }
 };
 
-/// What the window covers, or the largest of it; an item is a row of places.
+/// What the window covers, or the largest of it, or its weighted sum; an item is a row of places.
 struct WindowTask : Task {
   kernels::Window window;
-  kernels::RowKernel largest;  // null: all of it
-  const float* x;
+  kernels::RowKernel largest, multiply_add;  // both null: all of it
+  const float *x, *weight, *bias;
   float* y;
 
   void run(std::int64_t item, Worker&) const override {
     const std::int64_t n_row = window.n_row, view = item / n_row, row = item % n_row;
-    const std::int64_t d = largest != nullptr ? window.d : window.width_of_place();
+    const std::int64_t d = largest != nullptr || multiply_add != nullptr ? window.d : window.width_of_place();
     for (std::int64_t column = 0; column < window.n_column; ++column) {
       const std::int64_t place = (view * n_row + row) * window.n_column + column;
       if (largest != nullptr)
         window.largest(largest, x, place, y + place * d);
+      else if (multiply_add != nullptr)
+        window.weigh(multiply_add, x, weight, bias, place, y + place * d);
       else
         window.copy(x, place, 0, d, y + place * d);
     }
   }
+};
+
+/// An item is a group of a view.
+struct ChannelTask : Task {
+  kernels::ChannelAttentionKernel kernel;
+  kernels::ChannelAttentionJob job;
+
+  void run(std::int64_t item, Worker&) const override { kernel(job, item); }
 };
 
 /// Cuts rows of d elements into items for the threads, and says how many rows an item has.
@@ -271,6 +281,7 @@ struct FlopOf {
   double operator()(const LookupOp&) const { return 0; }
   double operator()(const PatchesOp&) const { return 0; }
   double operator()(const WindowOp&) const { return 0; }
+  double operator()(const ChannelOp& op) const { return flop_of(*op.node); }
 
  private:
   template <class Of, class Flop>
@@ -485,8 +496,30 @@ std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const WindowOp
   const Node& node = *at.node;
   task->window = window_of(node.in[0].shape(), at.window, node.shape);
   task->largest = at.takes_largest ? cpu(l).largest : nullptr;
-  task->x = floats(l, at.x), task->y = floats(l, op.writes[0]);
+  task->multiply_add = at.weight != kNone ? cpu(l).multiply_add : nullptr;
+  task->x = floats(l, at.x), task->weight = operand(l, at.weight), task->bias = operand(l, at.bias);
+  task->y = floats(l, op.writes[0]);
   task->n_item = node.shape[2] * node.shape[3];
+  return task;
+}
+
+std::unique_ptr<Task> make(const CpuLowering& l, const CpuOp& op, const ChannelOp& at, MatrixUses&) {
+  static_assert(op::ChannelAttention::kMaxGroup <= kernels::kMaxChannels);
+  auto task = std::make_unique<ChannelTask>();
+  const Shape& shape = at.node->shape;
+  task->kernel = cpu(l).channel_attention;
+  task->job = {floats(l, at.q),
+               floats(l, at.k),
+               floats(l, at.v),
+               floats(l, op.writes[0]),
+               row_stride(l.value(at.q)),
+               row_stride(l.value(at.k)),
+               row_stride(l.value(at.v)),
+               shape[0],
+               shape[1],
+               shape[2],
+               at.node->as<op::ChannelAttention>()->n_group};
+  task->n_item = task->job.n_unit();
   return task;
 }
 
@@ -523,6 +556,7 @@ struct ScratchOf {
   std::size_t operator()(const LookupOp&) const { return 0; }
   std::size_t operator()(const PatchesOp&) const { return 0; }
   std::size_t operator()(const WindowOp&) const { return 0; }
+  std::size_t operator()(const ChannelOp&) const { return 0; }
 };
 
 struct KindOf {
@@ -540,6 +574,7 @@ struct KindOf {
   Kind operator()(const LookupOp&) const { return KindClock::others; }
   Kind operator()(const PatchesOp&) const { return KindClock::others; }
   Kind operator()(const WindowOp&) const { return KindClock::others; }
+  Kind operator()(const ChannelOp&) const { return KindClock::attention; }
 };
 
 }  // namespace

@@ -95,7 +95,14 @@ class Layouts : Copies<CpuLowering> {
     require_contiguous(op.ids);
   }
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
-  void require_layouts(WindowOp& op) { require_contiguous(op.x); }
+  void require_layouts(WindowOp& op) {
+    require_contiguous(op.x);
+    require_contiguous(op.weight);
+    require_contiguous(op.bias);
+  }
+  void require_layouts(ChannelOp& op) {
+    for (ValueId* id : {&op.q, &op.k, &op.v}) require(*id, row_stride(l.value(*id)) >= 0);
+  }
 
   void round_result(const CpuOp& op, const LinearOp& linear) {
     if (linear.residual != kNone || linear.factor != kNone) return;

@@ -33,8 +33,9 @@ struct Describe {
   Words operator()(const LookupOp& op) const { return {words_of(op), "copy", op.ids}; }
   Words operator()(const PatchesOp& op) const { return {words_of(op), "copy", op.images}; }
   Words operator()(const WindowOp& op) const {
-    return {words_of(op), op.takes_largest ? name_of(l.use) : "copy", op.x};
+    return {words_of(op), op.takes_largest || op.weight != kNone ? name_of(l.use) : "copy", op.x};
   }
+  Words operator()(const ChannelOp& op) const { return {words_of(op), name_of(l.use), op.q}; }
   Words operator()(const BlockedOp&) const { return {}; }  // its products are described
 };
 

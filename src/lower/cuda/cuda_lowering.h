@@ -21,7 +21,7 @@ struct RoundOp {
 };
 
 struct CudaOp : Step {
-  std::variant<LinearOp, HeadOp, RoundOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp> op;
+  std::variant<LinearOp, HeadOp, RoundOp, AttentionOp, RowOp, CopyOp, LookupOp, PatchesOp, WindowOp, ChannelOp> op;
   ValueId gate = kNone;                                // of a gated product, what its first matrix makes
   int n_split = 1;                                     // shares of the depth, or of keys, of blocks of their own
   ValueId partial = kNone;                             // what those leave

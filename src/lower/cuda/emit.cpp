@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "cuda/kernels/attention.h"
+#include "cuda/kernels/channel_attention.h"
 #include "cuda/kernels/linear_bf16.h"
 #include "cuda/kernels/linear_f32.h"
 #include "cuda/kernels/linear_int8.h"
@@ -279,11 +280,28 @@ struct Emit {
   Emitted operator()(const WindowOp& window) const {
     const Shape &x = l.value(window.x).shape, &places = window.node->shape;
     const Value& y = l.value(op.writes[0]);
-    const cuda::WindowJob job = {
-        l.at(window.x),    result(),          y.stride[1],          narrow(x[0]),         narrow(x[1]),
-        narrow(x[2]),      narrow(x[3]),      window.window.size,   window.window.stride, window.window.padding,
-        narrow(places[1]), narrow(places[2]), window.takes_largest, y.type == DType::bf16};
+    const cuda::WindowJob job = {l.at(window.x),    l.at(window.weight), l.at(window.bias),    result(),
+                                 y.stride[1],       narrow(x[0]),        narrow(x[1]),         narrow(x[2]),
+                                 narrow(x[3]),      window.window.size,  window.window.stride, window.window.padding,
+                                 narrow(places[1]), narrow(places[2]),   window.takes_largest, y.type == DType::bf16};
     return Calls{call(cuda::window_elements(job), job)};
+  }
+
+  Emitted operator()(const ChannelOp& channels) const {
+    const Shape& x = channels.node->shape;
+    static_assert(op::ChannelAttention::kMaxGroup <= cuda::kMaxChannels);
+    const cuda::ChannelAttentionJob job = {l.at(channels.q),
+                                           l.at(channels.k),
+                                           l.at(channels.v),
+                                           result(),
+                                           row_stride(l.value(channels.q)),
+                                           row_stride(l.value(channels.k)),
+                                           row_stride(l.value(channels.v)),
+                                           narrow(x[0]),
+                                           narrow(x[1]),
+                                           narrow(x[2]),
+                                           channels.node->as<op::ChannelAttention>()->n_group};
+    return Calls{call(cuda::channel_attention(job), job)};
   }
 };
 

@@ -190,7 +190,14 @@ class Layouts : Copies<CudaLowering> {
     require_contiguous(op.ids);
   }
   void require_layouts(PatchesOp& op) { require_contiguous(op.images); }
-  void require_layouts(WindowOp& op) { require_contiguous(op.x); }
+  void require_layouts(WindowOp& op) {
+    require_contiguous(op.x);
+    require_contiguous(op.weight);
+    require_contiguous(op.bias);
+  }
+  void require_layouts(ChannelOp& op) {
+    for (ValueId* id : {&op.q, &op.k, &op.v}) require(*id, row_stride(l.value(*id)) >= 0);
+  }
 
   CudaOp made_;  // what is added to the operation at hand
   std::map<ValueId, std::pair<ValueId, ValueId>> keys_;

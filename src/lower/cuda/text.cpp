@@ -24,6 +24,7 @@ struct Describe {
   Words operator()(const CopyOp& op) const { return {words_of(op), op.parts[0].from}; }
   Words operator()(const LookupOp& op) const { return {words_of(op), op.ids}; }
   Words operator()(const PatchesOp& op) const { return {words_of(op), op.images}; }
+  Words operator()(const ChannelOp& op) const { return {words_of(op), op.q}; }
   template <class OfX>  // LinearOp, RowOp, WindowOp
   Words operator()(const OfX& op) const {
     return {words_of(op), op.x};
@@ -58,6 +59,7 @@ Work work_of(const CudaLowering& l, const CudaOp& op) {
       work.weights += bits / 8 * static_cast<double>(node->as<op::Linear>()->weight->count());
     }
   if (const auto* attention = std::get_if<AttentionOp>(&op.op)) work.flop += flop_of(*attention->node);
+  if (const auto* channels = std::get_if<ChannelOp>(&op.op)) work.flop += flop_of(*channels->node);
   if (const auto* lookup = std::get_if<LookupOp>(&op.op); lookup != nullptr && lookup->table != kNone)
     work.bytes -= size_of(l.value(lookup->table));  // some rows of it alone, as many as there are results
   work.bytes += work.weights;
