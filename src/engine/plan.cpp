@@ -50,6 +50,7 @@ Plan::Plan(const Network& network, const InputShape& shape, const PlanContext& c
       state_(shape.d_state > 0 ? slots_.add_f32({shape.d_state, 1, 1, 1}) : nullptr),
       x_(slots_.add_f32({network.d_action, network.horizon, 1, 1})),
       k_(slots_.add_i32({1, 1, 1, 1})),
+      start_(network.solver.renoises ? slots_.add_f32(x_->shape) : nullptr),
       target_(shape.steered ? slots_.add_f32(x_->shape) : nullptr),
       keep_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
       pull_(shape.steered ? slots_.add_f32({network.horizon, network.solver.n_step, 1, 1}) : nullptr),
@@ -79,8 +80,9 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
     answer = steered(step, x, k, answer);
     changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
   }
-  step.write(step.name("x", network.solver.next(step, x, answer)), x_);
-  if (condition || target_ != nullptr) step.write(after(step, k, network.solver.n_step), k_);
+  const Tensor start = start_ != nullptr ? step.input(start_) : Tensor();
+  step.write(step.name("x", network.solver.next(step, x, answer, start, k)), x_);
+  if (condition || target_ != nullptr || start_ != nullptr) step.write(after(step, k, network.solver.n_step), k_);
 
   if (context.see_graph)
     for (const Graph* graph : {&prefix, &step}) context.see_graph(*graph);
@@ -116,6 +118,7 @@ void Plan::set_x(std::span<const float> x) {
   constexpr std::int32_t kFirst = 0;
   device_.set(*x_, x.data(), x.size_bytes());
   device_.set(*k_, &kFirst, sizeof(kFirst));
+  if (start_ != nullptr) device_.set(*start_, x.data(), x.size_bytes());
 }
 
 void Plan::set_steering(const Steering& steering) {

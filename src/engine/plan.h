@@ -87,9 +87,9 @@ class Plan {
   std::string tap_pattern_;
   Device& device_;
   Slots slots_;
-  // What an act sets, side by side in the order in which it does: one upload. Tokens and state may be null; the last
-  // three are null where nothing is steered.
-  Slot *images_, *tokens_, *state_, *x_, *k_, *target_, *keep_, *pull_;
+  // What an act sets, side by side in the order in which it does: one upload. Tokens and state may be null, and so is
+  // the start but for a solver that renoises; the last three are null where nothing is steered.
+  Slot *images_, *tokens_, *state_, *x_, *k_, *start_, *target_, *keep_, *pull_;
   std::uint32_t views_;
   Cache cache_;
   Injection injection_;

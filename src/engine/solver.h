@@ -14,9 +14,12 @@ namespace vla {
 /// The solver as data: the times at which the action head is evaluated, and the update rule.
 ///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
 ///   direct                one pass: x <- what the network gives, from a start of zeros
+///   renoise               the network gives actions, x <- t * start + (1 - t) * actions at the next step's time t,
+///   from
+///                         1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
 struct Solver {
   int n_step = 0;
-  bool direct = false;
+  bool direct = false, renoises = false;
   double t_end = 0;
   float dt = 0;  // (t_end - t_start) / n_step, made in double and rounded once, as the reference scales by it
   /// t_k; t_end is never evaluated. `euler`: t_start + k * dt, made in double and rounded once, as LeRobot.
@@ -29,8 +32,12 @@ struct Solver {
   /// models_pytorch/pi0_pytorch.py sample_actions.
   static Result<Solver> read(const Keys& keys);
 
-  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x.
-  Tensor next(Graph& g, Tensor x, Tensor answer) const;
+  /// Records a step: x and the network's answer, both [d_action, horizon] -> the next x. Of a solver that renoises
+  /// `start` is the first x, and `k` [1] i32 the step.
+  Tensor next(Graph& g, Tensor x, Tensor answer, Tensor start = {}, Tensor k = {}) const;
+
+ private:
+  Tensor blend(Graph& g, Tensor answer, Tensor start, Tensor k) const;
 };
 
 }  // namespace vla

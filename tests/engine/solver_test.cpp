@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "engine/solver.h"
 
+#include "nn/embedding.h"
 #include "support/graph_runner.h"
 
 using namespace vla;
@@ -38,7 +39,25 @@ TEST_CASE("another kind of solver is refused with those that there are") {
   const auto refused = read("heun", 10);
   REQUIRE_FALSE(refused.ok());
   CHECK(refused.error().code == Code::bad_bundle);
-  CHECK(refused.error().message().find("euler, euler_float32 or direct, found heun") != std::string::npos);
+  CHECK(refused.error().message().find("euler, euler_float32, direct or renoise, found heun") != std::string::npos);
+}
+
+TEST_CASE("a solver that renoises mixes the answer with the start again, less of it at every step") {
+  const auto solver = read("renoise", 4);
+  REQUIRE(solver.ok());
+  CHECK(solver->renoises);
+  std::vector<float> times;
+  for (const SolverTime& time : solver->times) times.push_back(time.value);
+  CHECK(times == std::vector<float>{1.0F, 0.75F, 0.5F, 0.25F});
+  const auto next = [&](int k) {
+    return test::run_graph([&](Graph& g) {
+      const Tensor x = test::constant(g, {7, 7}, {2, 1}), answer = test::constant(g, {4, -8}, {2, 1});
+      return solver->next(g, x, answer, test::constant(g, {16, 32}, {2, 1}), constant_ids(g, "k", {k}));
+    });
+  };
+  CHECK(next(0) == std::vector<float>{13, 22});
+  CHECK(next(2) == std::vector<float>{7, 2});
+  CHECK(next(3) == std::vector<float>{4, -8});
 }
 
 TEST_CASE("a direct head answers the chunk in one pass, from no noise") {
