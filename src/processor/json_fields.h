@@ -28,6 +28,7 @@ class JsonFields {
 
   const std::string& where() const { return where_; }
   bool has(const std::string& name) const { return object_->contains(name); }
+  bool has_list(const std::string& name) const { return has(name) && object_->at(name).is_array(); }
 
   /// An integer in [low, high].
   Result<int> integer(const std::string& name, int low, int high);

@@ -20,7 +20,7 @@ std::vector<float> boxed(const Frame& frame, const Letterbox& box) {
 }
 
 std::vector<float> boxed(const Frame& frame, int width, int height, float fill = 0.0f) {
-  return boxed(frame, Letterbox{width, height, fill});
+  return boxed(frame, Letterbox{width, height, {fill, fill, fill}});
 }
 
 }  // namespace
@@ -33,7 +33,7 @@ TEST_CASE("letterbox and affine equal torch and Pillow bit for bit at every size
   for (const auto& sizes : data_json("letterbox.json")) {
     CAPTURE(sizes.dump());
     const Frame frame = frame_of(sizes[0], sizes[1]);
-    Letterbox box{sizes[2], sizes[3], 0.0f};
+    Letterbox box{sizes[2], sizes[3]};
     if (sizes[4] != "bottom_right") box.align = Letterbox::Align::center;
     box.antialias = sizes[4] == "pillow";
     std::vector<float> found = boxed(frame, box);
@@ -60,18 +60,25 @@ TEST_CASE("letterbox puts the image at the bottom right and fills the rest") {
 }
 
 TEST_CASE("a centred image leaves the smaller half of an odd rest at the left and at the top") {
-  Letterbox box{5, 2, 0.25f, Letterbox::Align::center};
+  Letterbox box{5, 2, {0.25f, 0.25f, 0.25f}, Letterbox::Align::center};
   const std::vector<float> wide = boxed({1, 1, std::vector<std::uint8_t>(3, 255)}, box);  // 2 x 2 of the 5 x 2
   CHECK(std::vector<float>(wide.begin(), wide.begin() + 5) == std::vector<float>{0.25f, 1.0f, 1.0f, 0.25f, 0.25f});
-  box = {2, 5, 0.25f, Letterbox::Align::center};
+  box = {2, 5, {0.25f, 0.25f, 0.25f}, Letterbox::Align::center};
   const std::vector<float> tall = boxed({1, 1, std::vector<std::uint8_t>(3, 255)}, box);
   CHECK(tall[0] == 0.25f);
   CHECK(tall[2] == 1.0f);
   CHECK(tall[6] == 0.25f);
 }
 
+TEST_CASE("what is beside an image has a number for each channel") {
+  Letterbox box{2, 1, {0.25f, 0.5f, 0.75f}};
+  box.align = Letterbox::Align::bottom_right;
+  const std::vector<float> out = boxed({1, 1, std::vector<std::uint8_t>(3, 255)}, box);
+  CHECK(out == std::vector<float>{0.25f, 1.0f, 0.5f, 1.0f, 0.75f, 1.0f});
+}
+
 TEST_CASE("antialiasing cuts float frames to bytes, also at the right size") {
-  Letterbox box{2, 1, 0.0f, Letterbox::Align::center, true};
+  Letterbox box{2, 1, {}, Letterbox::Align::center, true};
   const Frame frame{2, 1, std::vector<float>{0.999f, 0.5f, 0.0f, 1.0f, 0.25f, 0.002f}};
   const std::vector<float> out = boxed(frame, box);
   CHECK(out[0] == 254.0f / 255.0f);
@@ -95,9 +102,8 @@ TEST_CASE("a frame of the right size is copied untouched") {
 
 TEST_CASE("an image too narrow to leave a pixel is refused") {
   std::vector<float> out(3 * 16 * 16);
-  CHECK(contains(refusal(letterbox(frame_of(1000, 2), Letterbox{16, 16, 0.0f}, out, "top"), Code::bad_observation),
-                 "top: "));
-  refusal(letterbox(frame_of(2, 1000), Letterbox{16, 16, 0.0f}, out, "top"), Code::bad_observation);
+  CHECK(contains(refusal(letterbox(frame_of(1000, 2), Letterbox{16, 16}, out, "top"), Code::bad_observation), "top: "));
+  refusal(letterbox(frame_of(2, 1000), Letterbox{16, 16}, out, "top"), Code::bad_observation);
 }
 
 TEST_CASE("affine rounds the product before it adds") {

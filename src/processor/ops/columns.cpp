@@ -44,6 +44,13 @@ void map_columns(const Sign& op, std::span<float> values) {
   }
 }
 
+void map_columns(const Sigmoid& op, std::span<float> values) {
+  for (const int column : op.columns) {
+    float& value = values[static_cast<std::size_t>(column)];
+    value = static_cast<float>(1.0 / (1.0 + std::exp(-static_cast<double>(value))));
+  }
+}
+
 void hold(const Clip& op, std::span<float> values) {
   for (const int column : chosen_columns(op.columns, values.size())) {
     float& value = values[static_cast<std::size_t>(column)];
@@ -110,6 +117,11 @@ Status read(JsonFields& fields, Threshold& op) {
 }
 
 Status read(JsonFields& fields, Sign& op) {
+  VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
+  return {};
+}
+
+Status read(JsonFields& fields, Sigmoid& op) {
   VLA_TRY(op.columns, fields.integers("columns", 0, kMaxVector - 1));
   return {};
 }
@@ -241,6 +253,7 @@ Ops columns_ops() {
           {"action", "affine", parse_action<ColumnActionOp<ColumnAffine>>},
           {"action", "threshold", parse_action<ColumnActionOp<Threshold>>},
           {"action", "sign", parse_action<ColumnActionOp<Sign>>},
+          {"action", "sigmoid", parse_action<ColumnActionOp<Sigmoid>>},
           {"action", "clip", parse_action<ClipActionOp>},
           {"action", "add_state", parse_add_state}};
 }

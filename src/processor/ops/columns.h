@@ -50,6 +50,11 @@ struct Sign {
   std::vector<int> columns;
 };
 
+/// In the columns named, 1 / (1 + exp(-x)).
+struct Sigmoid {
+  std::vector<int> columns;
+};
+
 struct Clip {
   float low = 0.0f;
   float high = 0.0f;
@@ -82,6 +87,9 @@ void map_columns(const Threshold& op, std::span<float> values);
 
 /// The sign of every value, in place: 0 of 0. What is not a number stays, so that it is still found.
 void map_columns(const Sign& op, std::span<float> values);
+
+/// The sigmoid of every value, in place. Source: lerobot policies/xvla/action_hub.py (postprocess).
+void map_columns(const Sigmoid& op, std::span<float> values);
 
 /// Every value of its columns held between the two of a clip, in place. What is not a finite number stays, so that it
 /// is still found.

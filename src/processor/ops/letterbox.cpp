@@ -142,7 +142,8 @@ Status letterbox(const Frame& frame, const Letterbox& to, std::span<float> out, 
       return Error{Code::bad_observation, where,
                    fmt::format("an image that fits {} x {} with both sides", to.width, to.height),
                    fmt::format("{} x {}, which leaves a side shorter than a pixel", frame.width, frame.height)};
-    std::fill(out.begin(), out.end(), to.fill);
+    for (std::size_t c = 0; c < 3; ++c)
+      std::fill_n(out.begin() + static_cast<std::ptrdiff_t>(c * target.plane), target.plane, to.fill[c]);
   }
   const int share = to.align == Letterbox::Align::center ? 2 : 1;  // of the rest that lies at the left and at the top
   target.out += static_cast<std::size_t>((to.height - target.height) / share) * stride +
@@ -163,6 +164,16 @@ void stretch(const Frame& frame, int width, int height, std::span<float> out) {
 
 namespace {
 
+/// One number for all channels, or one for each.
+Result<std::array<float, 3>> read_fill(JsonFields& fields) {
+  if (!fields.has_list("fill")) {
+    VLA_TRY(const float all, fields.number("fill", {0, 1}));
+    return std::array{all, all, all};
+  }
+  VLA_TRY(const std::vector<float> each, fields.numbers("fill", 3, {0, 1}));
+  return std::array{each[0], each[1], each[2]};
+}
+
 Result<Letterbox> read_letterbox(JsonFields& fields) {
   Letterbox op;
   VLA_TRY(op.width, fields.integer("width", 1, kMaxImageSide));
@@ -171,7 +182,7 @@ Result<Letterbox> read_letterbox(JsonFields& fields) {
   VLA_TRY(op.antialias, fields.boolean("antialias"));
   VLA_TRY(const int align, fields.choice("align", {"bottom_right", "center"}));
   op.align = static_cast<Letterbox::Align>(align);
-  VLA_TRY(op.fill, fields.number("fill", {0, 1}));
+  VLA_TRY(op.fill, read_fill(fields));
   return op;
 }
 

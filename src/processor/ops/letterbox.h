@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
 #include <span>
 #include <string>
 
@@ -16,7 +17,7 @@ struct Letterbox {
 
   int width = 0;
   int height = 0;
-  float fill = 0.0f;
+  std::array<float, 3> fill = {};     // of each channel
   Align align = Align::bottom_right;  // where the image is; of an odd rest `center` leaves less at the left and top
   bool antialias = false;             // as Pillow resamples 8-bit images, see below
 };
