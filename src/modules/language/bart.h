@@ -1,0 +1,35 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <vector>
+
+#include "modules/detr.h"
+#include "nn/embedding.h"
+
+namespace vla {
+
+/// BART's encoder, over embedded tokens of any kind: all see each other, norms are behind the sums, positions are
+/// learned. Source: transformers modeling_bart.py BartEncoder.
+class BartEncoder {
+ public:
+  explicit BartEncoder(const Scope& s);
+
+  /// ids [n] i32 -> rows of the token table, [d_model, n].
+  Tensor embed(Graph& g, Tensor ids) const { return token_.forward(g, ids); }
+  /// x [d_model, n] -> the same shape.
+  Tensor operator()(Graph& g, Tensor x) const;
+  /// Errors: bad_bundle for more tokens than positions.
+  Status check(int n_token) const;
+
+  int d_model() const { return family_.d_model; }
+
+ private:
+  DetrFamily family_;
+  int n_position_;
+  Embedding token_, position_;
+  LayerNorm norm_;
+  std::vector<DetrEncoderLayer> layers_;
+};
+
+}  // namespace vla

@@ -1,0 +1,141 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <vector>
+
+#include "graph/cache.h"
+#include "nn/attention.h"
+#include "nn/convolution.h"
+#include "nn/mlp.h"
+
+namespace vla {
+
+/// A map of cells that is cut into windows of size x size cells from the upper left. Beyond the map the reference puts
+/// zeros in front of the attention's products, so that those cells are keys and values too, all with the same ones:
+/// the biases. One key with the logarithm of their count in the mask stands for all of a window's.
+class Windows {
+ public:
+  Windows(int n_column, int n_row, int size);
+
+  /// Windows that hold as many cells of the map as each other.
+  struct Kind {
+    int n_cell;             // of one window
+    int n_beyond;           // cells beyond the map
+    std::vector<int> cell;  // of all of them, window by window: row * n_column + column
+  };
+  const std::vector<Kind>& kinds() const { return kinds_; }
+  bool reach_beyond() const;
+  /// x [d, n, n_view] -> [d, n * n_view], tokens by kind, view and window.
+  Tensor cut(Graph& g, Tensor x) const;
+  /// The way back.
+  Tensor join(Graph& g, Tensor x, Tensor like) const;
+
+ private:
+  std::vector<std::int32_t> order(int n_view) const;  // where each token of `cut` comes from
+  int n_column_, n_row_, size_;
+  std::vector<Kind> kinds_;
+};
+
+/// Queries, keys and values of one product each, and the product behind attention, with biases.
+struct AttentionProducts {
+  AttentionProducts(const Scope& s, int d_model);
+  Linear q, k, v, out;
+};
+
+/// Sizes of a stage's blocks.
+struct DavitStage {
+  int d_model, n_head, n_group, d_ff, n_column, n_row, window;
+  float norm_eps;
+};
+
+/// What the blocks have in common: x + conv(x), attention, x + conv(x), MLP. Source: transformers modeling_florence2.py
+/// Florence2VisionSpatialBlock, Florence2VisionChannelBlock.
+class DavitBlock {
+ public:
+  DavitBlock(const Scope& s, const DavitStage& stage);
+  /// x [d_model, n_column, n_row, n_view] -> the same shape; `attend` has normed tokens [d_model, n, n_view].
+  template <class Attend>
+  Tensor operator()(Graph& g, Tensor x, const Attend& attend) const;
+
+ private:
+  DepthwiseConvolution conv1_;
+  LayerNorm attn_norm_;
+  DepthwiseConvolution conv2_;
+  LayerNorm ffn_norm_;
+  Mlp mlp_;
+};
+
+/// Cells of a window attend to each other. Source: Florence2VisionSpatialBlock.
+class SpatialBlock : public Module<SpatialBlock> {
+ public:
+  SpatialBlock(const Scope& s, const DavitStage& stage);
+  Tensor forward(Graph& g, Tensor x, const Cache& cache) const;
+  /// Load rate: key and value of a cell beyond the map.
+  void keep(Graph& g, Cache& cache) const;
+
+ private:
+  Tensor attend(Graph& g, Tensor x, const Cache& cache) const;
+  int d_model_, n_head_;
+  Windows windows_;
+  DavitBlock block_;
+  AttentionProducts products_;
+};
+
+/// Features of a group attend to each other. Source: Florence2VisionChannelBlock.
+class ChannelBlock : public Module<ChannelBlock> {
+ public:
+  ChannelBlock(const Scope& s, const DavitStage& stage);
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  int n_group_;
+  DavitBlock block_;
+  AttentionProducts products_;
+};
+
+/// A convolution that makes the map smaller, with a norm in front of it or behind.
+/// Source: Florence2VisionConvEmbed.
+class ConvEmbed : public Module<ConvEmbed> {
+ public:
+  ConvEmbed(const Scope& s, int d_in, int d_out, int size, int stride, bool pre_norm, float eps);
+  Tensor forward(Graph& g, Tensor x) const;
+
+ private:
+  bool pre_norm_;
+  LayerNorm norm_;
+  Convolution convolution_;
+};
+
+/// DaViT: stages of spatial and channel blocks in turn. Source: transformers modeling_florence2.py
+/// Florence2VisionBackbone.
+class Davit {
+ public:
+  /// Reads the lists d_model, n_layer, n_head, n_group, d_ff, patch_size, patch_stride and pre_norm, a number for each
+  /// stage, and window, image_width, image_height and norm_eps.
+  explicit Davit(const Scope& s);
+
+  /// images [width, height, 3, n_view], standardized -> [d_model, n_column, n_row, n_view].
+  Tensor operator()(Graph& g, Tensor images, const Cache& cache) const;
+  /// Load rate.
+  void keep(Graph& g, Cache& cache) const;
+  /// Images have one size. Errors: unsupported.
+  Status check(int width, int height) const;
+
+  int d_model() const { return d_model_; }  // of the last stage
+  int n_head() const { return n_head_; }
+  int n_column() const { return n_column_; }
+  int n_row() const { return n_row_; }
+
+ private:
+  struct Stage {
+    ConvEmbed embed;
+    std::vector<SpatialBlock> spatial;
+    std::vector<ChannelBlock> channel;
+  };
+  int width_, height_;
+  int d_model_ = 3, n_head_ = 1, n_column_, n_row_;
+  std::vector<Stage> stages_;
+};
+
+}  // namespace vla
