@@ -229,7 +229,7 @@ class ChunkRecorder(Taps):
 def network_order(name):
     """Sort key: inputs, vision, prefix, language layers with keys and values before their output, steps, result."""
     stages = ("pixels", "tokens", "state", "position_ids", "vision", "deepstack", "connector", "connector_down", "projector", "prefix", "encoder", "lm",
-              "vl", "state_in", "state_out", "expert", "head", "dit", "step", "chunk")
+              "vl", "vlm_in", "aux_in", "state_in", "state_out", "expert", "head", "dit", "step", "chunk")
     parts = name.split(".")
     stage = stages.index(parts[0]) if parts[0] in stages else len(stages)
     i = next((int(p) for p in parts if p.isdigit()), 1000 if name in ("vision.post_norm", "lm.norm") else -1)

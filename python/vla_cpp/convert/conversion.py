@@ -206,7 +206,7 @@ def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
     """The numbers of a row of the mapping in the bundle's order, in pieces; what is rearranged comes whole."""
     if weight.first is not None:
         entry = entry.rows(weight.first, weight.shape[0])
-    if weight.pick is None and not weight.transpose and not weight.regroup:
+    if weight.pick is None and not weight.transpose and not weight.regroup and not weight.axes:
         yield from entry.chunks()
         return
     axis, index = weight.pick or (0, 0)
@@ -215,6 +215,8 @@ def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
     whole = np.concatenate([*entry.chunks()]).reshape(entry.shape)
     if weight.pick:
         whole = whole.take(index, axis)
+    if weight.axes:
+        whole = whole.transpose(weight.axes)
     if weight.regroup:
         whole = whole.reshape(*whole.shape[:-1], -1, weight.regroup).swapaxes(-1, -2)
     yield (whole.T if weight.transpose else whole).ravel()

@@ -28,6 +28,9 @@ def plan_robots(module: Any, checkpoint: Checkpoint, options: Options, problems:
 
 
 def _tags(module: Any, checkpoint: Checkpoint, options: Options) -> List[str]:
+    if options.embodiment and not hasattr(module, "embodiments"):
+        found = "a checkpoint of one robot"
+        raise refuse("--embodiment", "a checkpoint of several robots, or of several domains", found, "leave the option out", Code.USAGE)
     tags = module.embodiments(checkpoint) if options.embodiment == ALL else options.embodiment.split(",")
     if len(tags) > 1 and (len(set(tags)) < len(tags) or any("." in tag for tag in tags)):
         raise refuse("--embodiment", "different tags without dots", ",".join(tags), code=Code.USAGE)

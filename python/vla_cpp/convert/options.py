@@ -73,6 +73,13 @@ POSITION_PRECISION = Option(
 )
 
 
+DOMAIN = Option(
+    "--embodiment",
+    "X-VLA: number of the domain, that of the preprocessor by default; A,B,... puts several into one bundle, all every one",
+    "TAG",
+)
+
+
 def variant(what: str) -> Option:
     return Option("--variant", what, "NAME")
 

@@ -17,7 +17,7 @@ import numpy as np
 from ..bundle import Key
 from ..checkpoint import LEROBOT, OPENPI, Layout
 from ..errors import Code, Problems, refuse
-from ..options import COMMON, IDENTITY_STATS, POSITION_PRECISION, Option, stats, variant
+from ..options import COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, Option, stats, variant
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
@@ -38,6 +38,7 @@ class Weight(NamedTuple):
     transpose: bool = False  # what is left after `pick`, stored as (in, out)
     in_bf16: bool = False  # the reference rounds it to bfloat16 when it loads it, whatever it is stored as
     batch_norm: str = ""  # a convolution's matrix, or the bias that it gets, with the frozen batch norm of this name behind it
+    axes: Tuple[int, ...] = ()  # the source's axes in the order in which the bundle has them
     regroup: int = 0  # the last axis is stored as groups of this many numbers: the bundle has all first ones, all second ones, ...
 
 
@@ -98,7 +99,7 @@ def load(name):
 
 
 LAYOUTS = {
-    LEROBOT: Layout("LeRobot", (IDENTITY_STATS, POSITION_PRECISION, stats("whose, where the weights have those of several data sets"))),
+    LEROBOT: Layout("LeRobot", (IDENTITY_STATS, POSITION_PRECISION, DOMAIN, stats("whose, where the weights have those of several data sets"))),
     OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),)),
 }
 

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: The vla.cpp authors
+# SPDX-License-Identifier: Apache-2.0
+"""X-VLA: what its checkpoint states, as keys and tensors of a bundle.
+
+A checkpoint holds layers and prompts of many domains, a bundle those that --embodiment names, or that of the preprocessor.
+Reference: lerobot src/lerobot/policies/xvla (configuration_xvla.py, modeling_xvla.py, soft_transformer.py, action_hub.py,
+processor_xvla.py) and transformers models/florence2 and models/bart.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Dict, List, Sequence
+
+from ... import recipe
+from ...bundle import Key
+from ...checkpoint import Checkpoint
+from ...errors import Code, Problems, refuse
+from ...features import feature_keys, states_of
+from ...files import HUB_FORM, read_json
+from ...lerobot import tokenizer_folder, view_keys
+from ...tokenizer import TokenizerPlan, read_tokenizer
+from ...tokenizer_parts import CONFIG_FILE, content_of
+from .. import Options, Plan
+from .config import Sizes, read_domain, read_sizes
+from .mapping import dropped, hints, network_keys, weights
+
+TOKENIZER = "facebook/bart-large"
+TO_FLOAT, NORMALIZE, DOMAIN = "xvla_image_to_float", "xvla_imagenet_normalize", "xvla_add_domain_id"
+STEPS: recipe.Steps = {
+    recipe.PRE: {
+        # Frames enter in [0, 1] here. One that is black but for a few ones, as bytes, the reference does not divide by 255.
+        TO_FLOAT: {"image_keys": (None,), "validate_range": (True, False)},
+        NORMALIZE: {"image_keys": (None,)},
+        DOMAIN: {"domain_id": recipe.ANY},
+    }
+}
+# What the reference's own normalization subtracts and divides by, whatever the data.
+IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
+
+
+def embodiments(checkpoint: Checkpoint) -> List[str]:
+    """Domains are told by their numbers."""
+    count = checkpoint.config.get("num_domains", 30)
+    return [str(domain) for domain in range(count if isinstance(count, int) else 0)]
+
+
+def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
+    if checkpoint.processors is None:
+        hint = "the domain and what happens to pixels stand there; save the policy again"
+        raise refuse(recipe.PRE, "the file beside model.safetensors", "none", hint, Code.UNSUPPORTED)
+    steps = _steps(checkpoint.processors[0])
+    s = read_sizes(checkpoint, options, problems)
+    s.domain = read_domain(options, steps.get(DOMAIN, {}), s.n_domain, problems)
+    problems.raise_any()
+    dims = {**({recipe.STATE: s.state_dim} if s.state_dim else {}), recipe.ACTION: s.action_dim}
+    processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
+    _check_order(list(steps), problems)
+    folder = _tokenizer_folder(checkpoint, options, processors)
+    tokenizer = read_tokenizer(folder, s.n_vocab, problems, checkpoint.notes)
+    if steps.get("tokenizer_processor", {}).get("padding", "max_length") == "max_length":
+        s.n_token, s.pad_token = processors.max_tokens, _pad_token(folder, tokenizer, problems)
+    problems.raise_any()
+    keys = [
+        *network_keys(s),
+        *view_keys(checkpoint, s.views, processors, problems),
+        *states_of({name: dim for name, dim in dims.items() if name == recipe.STATE}),
+        Key("observation.max_text_tokens", "u32", processors.max_tokens),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+        *tokenizer.keys,
+        Key("processor.recipe", "string", json.dumps(recipe_document(s, processors, tokenizer.truncate, NORMALIZE in steps), ensure_ascii=False)),
+    ]
+    problems.raise_any()
+    return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))
+
+
+def _steps(preprocessor: dict) -> Dict[str, dict]:
+    """Settings by name, in their order; what is amiss with them recipe.read_processors tells."""
+    steps = preprocessor.get("steps")
+    found = [step for step in steps if isinstance(step, dict)] if isinstance(steps, list) else []
+    configs = {step.get("registry_name"): step.get("config", {}) for step in found}
+    return {str(name): config if isinstance(config, dict) else {} for name, config in configs.items()}
+
+
+def _check_order(steps: Sequence[str], problems: Problems) -> None:
+    if TO_FLOAT in steps and NORMALIZE in steps and steps.index(TO_FLOAT) > steps.index(NORMALIZE):
+        problems.unsupported(recipe.PRE, TO_FLOAT + " in front of " + NORMALIZE, "the opposite order", "the reference refuses it too")
+
+
+def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str, is_normalized: bool) -> Dict[str, List[dict]]:
+    """The reference resizes pixels that are normalized, and puts zeros beside them: in [0, 1] those are the mean."""
+    width, height = s.frame
+    size = {"width": width, "height": height}
+    fit = [{"op": "camera_size", **size}, {"op": "size", **size}]
+    if s.resizes:
+        box = recipe.letterbox(width, height, "bottom_right")
+        fit = [{**box, "fill": IMAGENET["mean"]} if is_normalized else box]
+    grippers = [{"op": "sigmoid", "columns": s.grippers}] if s.grippers else []
+    take = [{"op": "take", "size": s.action_dim}] if s.action_dim < s.d_action else []
+    return {
+        "image": fit + ([{"op": "standardize", **IMAGENET, "arithmetic": "float32"}] if is_normalized else []),
+        "text": recipe.text_ops(processors, truncate),
+        "state": [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}] if s.state_dim else [],
+        "action": [*grippers, *take, *processors.action.op("unnormalize", recipe.ACTION)],
+    }
+
+
+def _tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
+    found = tokenizer_folder(checkpoint, options, processors) or options.backbone
+    if found:
+        return found
+    hint = "the reference takes that of {}, which --backbone {} fetches".format(TOKENIZER, HUB_FORM)
+    raise refuse("tokenizer", "--backbone DIR, or tokenizer/ inside the checkpoint", "neither", hint, Code.IO)
+
+
+def _pad_token(folder: str, tokenizer: TokenizerPlan, problems: Problems) -> int:
+    """The reference hides no padding from its network, so that its id counts."""
+    path = os.path.join(folder, CONFIG_FILE)
+    stated = content_of((read_json(path) if os.path.exists(path) else {}).get("pad_token", "<pad>"))
+    tokens = next(key.value for key in tokenizer.keys if key.name == "tokenizer.tokens")
+    if stated in tokens:
+        return tokens.index(stated)
+    problems.add(CONFIG_FILE + ": pad_token", "a token, since text is padded", repr(stated))
+    return 0
