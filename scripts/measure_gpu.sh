@@ -19,7 +19,7 @@ build=${VLA_BUILD_DIR:-$root/build/cpu}
 vla=$build/bin/vla python=$root/.venv/bin/python
 rounds=${ROUNDS:-20} try=${TRY:-} torch_device=cuda
 families=("$@")
-[ ${#families[@]} -gt 0 ] || families=(act bitvla evo1 gr00t_n1_5 gr00t_n1_6 gr00t_n1_7 pi0 pi05 smolvla turbovla vla_jepa)
+[ ${#families[@]} -gt 0 ] || families=(act bitvla evo1 gr00t_n1_5 gr00t_n1_6 gr00t_n1_7 pi0 pi05 smolvla turbovla vla_jepa xvla)
 if [ -n "$try" ]; then
   export LD_LIBRARY_PATH=$build/fake_cuda
   torch_device=cpu

@@ -33,7 +33,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, vla_jepa
+from goldens import act, bitvla, cases, evo1, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7, pi, recorder, rtc, smolvla, turbovla, vla_jepa, xvla
 from parity_full import ROOT, distance, run_vla
 
 TOLERANCE = 1e-4  # of the largest magnitude of a block, as the golden tests
@@ -218,6 +218,47 @@ def draw_vla_jepa(seed):
     return cases.Case(seed, frames, text, checkpoint)
 
 
+def draw_xvla(seed):
+    """The same for X-VLA: stages, windows and groups of every size, all action spaces, both spellings of the backbone; in one of ten more
+    tokens than positions."""
+    r = random.Random(f"xvla {seed}")
+    n_stage = r.randint(1, 4)
+    heads = [r.choice((1, 2, 3)) for _ in range(n_stage)]
+    widths = [h * g for h, g in zip(heads, [2 * r.choice((2, 3, 4, 5)) for _ in range(n_stage)])]
+    groups = [r.choice([g for g in (1, 2, 3, 4, 6, 8) if w % g == 0]) for w in widths]
+    patch = [r.choice((3, 5, 7)), *(r.choice((1, 3, 3)) for _ in range(3))]
+    stride, prenorm = [r.choice((2, 3, 4)), *(r.choice((1, 2, 2)) for _ in range(3))], [r.random() < 0.5 for _ in range(4)]
+    lm_heads = r.choice((1, 2, 3))
+    d_lm = 4 * lm_heads * r.choice((1, 2, 3))
+    vision = xvla.vision(widths, [r.randint(1, 2) for _ in widths], heads, groups, r.choice((2, 3, 4, 12)), d_lm, patch, stride[:n_stage], prenorm,
+                         mlp_ratio=r.choice((2.0, 4.0, 1.3)))
+    mode, frames = r.choice(("ee6d", "ee6d", "auto", "joint", "agibot_ee6d", "franka_joint7", "so101_bimanual")), {}
+    for i in range(r.randint(1, 4)):
+        frames[f"cam{i}"] = (r.randint(12, 50), r.randint(12, 50), r.choice(("png", "png", "jpg"))) if i == 0 or r.random() < 0.8 else None
+    size = (r.randint(12, 36), r.randint(12, 36))
+    resizes = r.random() < 0.8
+    if not resizes:
+        frames = {view: frame and (*size, "png") for view, frame in frames.items()}
+    reads_state = mode in ("ee6d", "joint", "so101_bimanual") or r.random() < 0.6
+    d_action = r.randint(1, 9) if mode == "auto" else xvla.OUTPUTS[mode]
+    columns = {"auto": d_action + r.randint(0, 3), "joint": 14}.get(mode, 20)
+    d_state = r.choice((7, 12, 20)) if reads_state else 0
+    max_state = 20 if mode == "so101_bimanual" else max(20, d_state) + r.randint(0, 4)
+    head = r.choice((1, 2, 4))
+    more = {"resize_imgs_with_padding": size if resizes else None, "action_mode": mode, "max_action_dim": columns, "use_proprio": reads_state,
+            "max_state_dim": max_state, "num_image_views": r.choice((None, None, 1, 4)), "empty_cameras": r.choice((0, 0, 1)) if resizes else 0,
+            "use_hetero_proj": r.random() < 0.3, "len_soft_prompts": r.choice((0, 1, 5)), "dim_time": r.choice((4, 7, 32)), "mlp_ratio": r.choice((4.0, 1.7)),
+            "tokenizer_max_length": r.randint(4, 40), "pad_language_to": r.choice(("max_length", "max_length", "longest")),
+            "max_len_seq": r.choice((1500, 1500, 1500, 60)),
+            "normalization_mapping": {"VISUAL": "IDENTITY", "STATE": r.choice(("IDENTITY", *MODES)), "ACTION": r.choice(("IDENTITY", *MODES))}}
+    policy = xvla.policy(r.randint(1, 9), r.choice((1, 2, 5, 10)), 4 * head * r.choice((1, 2, 3)), r.randint(1, 4), head, **more)
+    views = {view: frame[:2] if frame else size for view, frame in frames.items()}
+    text = xvla.text(d_lm, r.randint(1, 3), lm_heads, r.choice((12, 30, 50)), r.choice((900, 900, 900, 40)))
+    checkpoint = xvla.Checkpoint(vision, text, policy, views, d_state, d_action, r.randint(0, 2), dtype=r.choice(("F32", "F32", "BF16")),
+                                 vendored=r.random() < 0.4)
+    return cases.Case(seed, frames, r.choice((*TEXTS, "Ouvre le TIROIR à côté de l'évier, 한국어 Ⅷ ﬁn", "</s>a<mask>  <pad>it's")), checkpoint)
+
+
 # Of what a part of BitVLA reads: names of values that the reference records. A whole block starts from the one before.
 INPUTS = [(r"(.*)\.attn_[qkv]", r"\1.attn_norm"), (r"(lm\..*)\.attn_out", r"\1.attn_sub_norm"), (r"(.*)\.ffn_(up|gate)", r"\1.ffn_norm"),
           (r"(lm\..*)\.ffn_down", r"\1.ffn_sub_norm"), (r"lm\.blk\.0(\.attn_norm)?", "prefix"), (r"vision\.patch_embed", "pixels"),
@@ -373,7 +414,7 @@ def judge_rounding(expected, got, published):
     return ours <= theirs, f"actions {ours:.1e}, of the reference in published dtypes {theirs:.1e}"
 
 
-DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "vla_jepa": draw_vla_jepa, "smolvla": draw, "evo1": draw_evo1} | {
+DRAWN = {"act": draw_act, "turbovla": draw_turbovla, "vla_jepa": draw_vla_jepa, "xvla": draw_xvla, "smolvla": draw, "evo1": draw_evo1} | {
     arch: functools.partial(draw_family, arch)
     for draw_family, archs in ((draw_pi, ("pi0", "pi05")), (draw_gr00t, ("gr00t_n1_5", "gr00t_n1_6", "gr00t_n1_7"))) for arch in archs}
 

@@ -100,13 +100,14 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
     other = {
         "act/environment": {"environment_in.weight", "environment_in.bias"},
         "act/pre_norm": {"encoder.norm.weight", "encoder.norm.bias"},
+        "xvla/joints": {"prompt.weight"},
         "turbovla/no_state": {"state_in.weight", "state_in.bias", "state_token.weight", "vision.registers.weight"},
     }
     assert without_numbers(bundle) == without_numbers(p["name"] for p in manifest["parameters"]) ^ other.get(name, set())
 
 
 def test_the_manifest_of_an_unknown_architecture_is_unsupported(vla):
-    vla("inspect", "--manifest", "octo").refused("unsupported", "vla_jepa, found octo")
+    vla("inspect", "--manifest", "octo").refused("unsupported", "xvla, found octo")
 
 
 def test_inspect_takes_no_more_memory_for_weights_than_the_file_has(vla):

@@ -69,7 +69,7 @@ TEST_CASE("a ternary code that stands for no number and a factor that is missing
 TEST_CASE("a bundle of an architecture that this build does not know is unsupported") {
   EditableBundle bundle = sound_bundle();
   bundle.set("vla.arch", Value(std::string("octo")));
-  check_refused(bundle, Code::unsupported, "vla_jepa, found octo");
+  check_refused(bundle, Code::unsupported, "xvla, found octo");
 }
 
 TEST_CASE("missing, extra and misshapen tensors are named in one error") {
@@ -178,6 +178,25 @@ TEST_CASE("VLA-JEPA refuses instructions that its prompt has no place for, and f
   bad = golden.observation;
   bad.views["front"] = Frame{36, 48, std::get<std::vector<std::uint8_t>>(bad.views["front"]->rgb)};
   CHECK(refused(bad).find("front: expected an image of 48 x 36, found 36 x 48") != std::string::npos);
+}
+
+TEST_CASE(
+    "X-VLA is refused with fewer places than views, fewer positions than tokens, or a gripper that is no column") {
+  const EditableBundle sound = EditableBundle::read(golden_path("xvla/two_views") + "/bundle.gguf");
+  const auto with = [&](const char* key, Value value) {
+    EditableBundle bundle = sound;
+    bundle.set(key, std::move(value));
+    return bundle;
+  };
+  const auto number = [](std::int64_t n) { return Value(n); };
+  check_refused(with("policy.n_view", number(1)), Code::bad_bundle, "policy.n_view: expected 2 or more");
+  check_refused(with("policy.n_view", number(32)), Code::bad_bundle, "transformer.n_position: expected 185 or more");
+  check_refused(with("policy.n_token", number(80)), Code::bad_bundle, "lm.n_position: expected 85 or more");
+  check_refused(with("policy.grippers", Value(std::vector<std::int64_t>{9, 20})), Code::bad_bundle, "policy.grippers");
+  check_refused(with("vision.n_group", Value(std::vector<std::int64_t>{3, 2, 5})), Code::bad_bundle, "vision.n_group");
+  check_refused(with("vision.n_head", Value(std::vector<std::int64_t>{2, 4})), Code::bad_bundle, "vision.n_head");
+  check_refused(with("vision.patch_size", Value(std::vector<std::int64_t>{7, 3, 4})), Code::bad_bundle, "odd numbers");
+  check_refused(with("vision.image_width", number(36)), Code::unsupported, "images of 36 x 32");
 }
 
 TEST_CASE("every number of every architecture has a range, and one beyond it is refused by its key") {
