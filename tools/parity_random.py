@@ -378,7 +378,7 @@ def run_reference(case, folder, low_bits=False):
         add_low_bits(folder / "checkpoint" / "model.safetensors", case.seed)
     try:
         return recorder.run_case(folder), None
-    except (RuntimeError, ValueError, AssertionError) as error:
+    except (RuntimeError, ValueError, AssertionError, IndexError) as error:
         return None, f"{type(error).__name__} {error}".splitlines()[0][:90]
 
 

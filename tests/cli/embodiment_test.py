@@ -54,6 +54,14 @@ def test_each_robot_of_a_bundle_of_two_answers_the_bits_of_its_bundle_alone(vla,
     assert answer_of(vla, case, "--embodiment", OTHER, bundle=bundle, **other) == answer_of(vla, case, bundle=alone, **other)
 
 
+def test_each_domain_of_xvla_answers_the_bits_of_its_bundle_alone(vla, tmp_path):
+    case, bundle = converted("xvla/two_views", tmp_path, ("0", "1", "2"))
+    answers = [answer_of(vla, case, "--embodiment", tag, bundle=bundle) for tag in ("0", "1", "2")]
+    assert answers[1] == answer_of(vla, case)  # that of the preprocessor
+    _, alone = converted("xvla/two_views", tmp_path, ("2",))
+    assert answers[2] == answer_of(vla, case, bundle=alone) != answers[0]
+
+
 @pytest.mark.parametrize("command", ["run", "bench", "inspect"])
 @pytest.mark.parametrize("given, found", [([], "none"), (["--embodiment", "dog"], "dog")])
 def test_a_robot_that_is_not_named_or_not_there_is_refused_with_the_list(vla, both, command, given, found):

@@ -210,7 +210,7 @@ def published(views, arch="xvla"):
     large = vision((256, 512, 1024, 2048), (1, 1, 9, 1), (8, 16, 32, 64), (8, 16, 32, 64), 12, 1024)
     settings = policy(30, 10, 1024, 24, 16, resize_imgs_with_padding=(224, 224), num_domains=30, len_soft_prompts=32, dim_time=32,
                       max_len_seq=512, tokenizer_max_length=50, max_state_dim=20, max_action_dim=20)
-    return Checkpoint(large, text(1024, 12, 16, 4096, 4096), settings, views, d_state=20, n_vocab=51289)
+    return Checkpoint(large, text(1024, 12, 16, 4096, 4096), settings, views, d_state=20, n_vocab=51289, dtype="BF16")
 
 
 # --- cases -----------------------------------------------------------------------------------------------------------
