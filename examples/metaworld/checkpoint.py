@@ -59,10 +59,10 @@ def main() -> int:
     args.out.mkdir(parents=True)
     train.save_backbone(args.out / "vlm")
     parts = train.make_policy(args.out / "vlm", statistics)
-    train.save(*parts, args.out)
+    train.small.save(*parts, args.out)
     train.describe(args.out)
     fill(parts[0], tensors, args.out)
-    train.save(*parts, args.out)
+    train.small.save(*parts, args.out)
     with tempfile.TemporaryDirectory() as scratch:
         again = Path(scratch) / "again.gguf"
         info = str(args.out / "meta/info.json")

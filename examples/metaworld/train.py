@@ -16,108 +16,41 @@ differences between runtimes come from their arithmetic alone.
 """
 import argparse
 import json
-import math
 import sys
 import time
 from pathlib import Path
 from typing import Any, Dict, List, Tuple
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from vla_cpp.eval import lerobot_reference as reference  # before lerobot
 import numpy as np
 import torch
 
+import small_smolvla as small
 from sim import ACTION_NAMES, CAMERA, EXECUTE, HORIZON, RATE_HZ, SIZE, STATE_NAMES, TASKS
 
 CAMERA_KEY = f"observation.images.{CAMERA}"
-FLOW_STEPS = 10  # Euler steps from noise to chunk
-VOCABULARY = 384  # 256 bytes, the special tokens and merges learned from the sentences
-SPECIAL = ["<|endoftext|>", "<|im_start|>", "<|im_end|>"]
-IMAGE = {"image_token": "<image>", "fake_image_token": "<fake_token_around_image>", "global_image_token": "<global-img>"}
-END = "<end_of_utterance>"
-BACKBONE_NAME = "vlm"  # what config.json calls the backbone; load() in lerobot_reference.py looks in the checkpoint's own folder
 
 
-def make_tokenizer() -> Any:
-    """A byte-level BPE as SmolLM2 has one, digits split off singly, trained on the sentences; any text can be encoded."""
-    from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
-
-    bpe = Tokenizer(models.BPE())
-    digits, byte_level = pre_tokenizers.Digits(individual_digits=True), pre_tokenizers.ByteLevel(add_prefix_space=False)
-    bpe.pre_tokenizer = pre_tokenizers.Sequence([digits, byte_level])
-    bpe.decoder = decoders.ByteLevel()
-    trainer = trainers.BpeTrainer(vocab_size=VOCABULARY, special_tokens=SPECIAL, show_progress=False,
-                                  initial_alphabet=pre_tokenizers.ByteLevel.alphabet())
+def lines() -> List[str]:
+    """What the tokenizer is trained on: the sentences, and others like them."""
     verbs, places = ["open", "close", "press", "push", "pull", "turn"], ["from above", "from the side", "to the left", "to the right"]
     things = ["faucet", "button", "drawer", "door", "window", "handle"]
-    other = [f"{v} the {t} {p}\n" for v in verbs for t in things for p in places]
-    bpe.train_from_iterator([s + "\n" for s in TASKS.values()] * len(other) + other, trainer)
-    bpe.add_special_tokens([AddedToken(t, special=True, normalized=False) for t in [*IMAGE.values(), END]])
-    return bpe
+    other = [f"{v} the {t} {p}" for v in verbs for t in things for p in places]
+    return list(TASKS.values()) * len(other) + other
 
 
 def save_backbone(folder: Path) -> None:
-    """Config, tokenizer and processor files, as the backbone's repository would hold them, without weights."""
-    from transformers import (PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor,
-                              SmolVLMVideoProcessor)
-
-    bpe = make_tokenizer()
-    pad = bpe.token_to_id("<|im_end|>")
-    SmolVLMConfig(
-        vision_config=dict(hidden_size=192, intermediate_size=768, num_hidden_layers=4, num_attention_heads=6,
-                           image_size=SIZE, patch_size=16),
-        text_config=dict(model_type="llama", hidden_size=192, intermediate_size=512, num_hidden_layers=4,
-                         num_attention_heads=6, num_key_value_heads=2, head_dim=32, rms_norm_eps=1e-5, rope_theta=100000.0,
-                         vocab_size=-(-bpe.get_vocab_size() // 8) * 8, max_position_embeddings=512,
-                         bos_token_id=bpe.token_to_id("<|im_start|>"), eos_token_id=pad, pad_token_id=pad, tie_word_embeddings=False),
-        scale_factor=2, image_token_id=bpe.token_to_id("<image>"), pad_token_id=pad, tie_word_embeddings=False,
-    ).save_pretrained(folder)
-    fast = PreTrainedTokenizerFast(tokenizer_object=bpe, bos_token="<|im_start|>", eos_token=END, unk_token="<|endoftext|>",
-                                   pad_token="<|im_end|>", model_max_length=512, extra_special_tokens=IMAGE)
-    patches = (SIZE // 16 // 2) ** 2
-    SmolVLMProcessor(SmolVLMImageProcessor(), fast, SmolVLMVideoProcessor(), image_seq_len=patches,
-                     chat_template="{{ messages }}").save_pretrained(folder)
+    small.save_backbone(folder, lines(), SIZE)
 
 
 def make_policy(backbone: Path, statistics: Dict[str, Dict[str, torch.Tensor]]) -> Tuple[Any, Any, Any]:
     """The policy with random weights, its pre- and its post-processor."""
-    from lerobot.configs import FeatureType, PolicyFeature
-    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
-    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-    from lerobot.policies.smolvla.processor_smolvla import make_smolvla_pre_post_processors
-
-    config = SmolVLAConfig(
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (4,)),
-                        CAMERA_KEY: PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
-        vlm_model_name=str(backbone), load_vlm_weights=False, num_vlm_layers=4, expert_width_multiplier=0.75,
-        chunk_size=HORIZON, n_action_steps=EXECUTE, num_steps=FLOW_STEPS, max_state_dim=8, max_action_dim=8,
-        resize_imgs_with_padding=(SIZE, SIZE), tokenizer_max_length=24, pad_language_to="max_length",
-        freeze_vision_encoder=False, train_expert_only=False, device="cpu", push_to_hub=False)
-    policy = SmolVLAPolicy(config).float()
-    for name, parameter in policy.named_parameters():  # the class freezes the last language layer; here all of them are new
-        parameter.requires_grad_("lm_head" not in name)
-    return (policy, *make_smolvla_pre_post_processors(config, statistics))
-
-
-def save(policy: Any, before: Any, after: Any, out: Path) -> None:
-    """Rounds the parameters to bfloat16 values and writes the published layout (see the top of this file)."""
-    with torch.no_grad():
-        for parameter in policy.parameters():
-            parameter.copy_(parameter.bfloat16().float())
-    local = policy.config.vlm_model_name
-    steps = [s for s in before.steps if hasattr(s, "tokenizer_name")]
-    policy.config.vlm_model_name = steps[0].tokenizer_name = BACKBONE_NAME
-    for part in (policy, before, after):
-        part.save_pretrained(out)
-    policy.config.vlm_model_name = steps[0].tokenizer_name = local
+    return small.make_policy(backbone, {CAMERA_KEY: SIZE}, len(STATE_NAMES), len(ACTION_NAMES), (HORIZON, EXECUTE), 24, statistics)
 
 
 def describe(out: Path) -> None:
-    """meta/info.json as a LeRobot data set has it: the names of the numbers and the control rate, for the converter."""
-    features = {"observation.state": STATE_NAMES, "action": ACTION_NAMES}
-    info = {"fps": RATE_HZ, "features": {k: {"dtype": "float32", "shape": [len(names)], "names": names} for k, names in features.items()}}
-    (out / "meta").mkdir(exist_ok=True)
-    (out / "meta" / "info.json").write_text(json.dumps(info, indent=1) + "\n")
+    small.describe(out, RATE_HZ, STATE_NAMES, ACTION_NAMES)
 
 
 def read_demonstrations(folder: Path) -> Tuple[Dict[str, torch.Tensor], List[str]]:
@@ -145,18 +78,6 @@ def measure(data: Dict[str, torch.Tensor]) -> Dict[str, Dict[str, torch.Tensor]]
     action = data["action"][~data["pad"]]
     return {"observation.state": {"mean": data["state"].mean(0), "std": data["state"].std(0).clamp_min(0.01)},
             "action": {"mean": action.mean(0), "std": action.std(0).clamp_min(0.05)}}
-
-
-def light(frames: torch.Tensor, random: torch.Generator) -> torch.Tensor:
-    """(n, 3, h, w) in [0, 1]: a little other brightness, contrast and colour for each image."""
-    n = len(frames)
-    gain = 1 + 0.1 * torch.randn(n, 1, 1, 1, generator=random) + 0.05 * torch.randn(n, 3, 1, 1, generator=random)
-    return (frames * gain + 0.03 * torch.randn(n, 3, 1, 1, generator=random)).clamp(0, 1)
-
-
-def rate(progress: float, step: int, warm_up: int) -> float:
-    """Share of the peak learning rate: linear over the first steps, then a cosine that is 0 at progress 1."""
-    return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
 def main() -> int:
@@ -213,10 +134,10 @@ def main() -> int:
                 order, at = torch.randperm(len(sentences), generator=random), 0
             pick, at = order[at : at + a.batch], at + a.batch
             batch = before({
-                CAMERA_KEY: light(data["frame"][pick].float() / 255, random), "observation.state": data["state"][pick],
+                CAMERA_KEY: small.light(data["frame"][pick].float() / 255, random), "observation.state": data["state"][pick],
                 "action": data["action"][pick], "action_is_pad": data["pad"][pick], "task": [sentences[i] for i in pick]})
             for group in optimizer.param_groups:
-                group["lr"] = a.rate * rate(progress, step, 100)
+                group["lr"] = a.rate * small.rate(progress, step, 100)
             loss, _ = policy.forward(dict(batch))
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -233,7 +154,7 @@ def main() -> int:
             if step % 250 == 0:
                 keep()
     keep()
-    save(policy, before, after, a.out)
+    small.save(policy, before, after, a.out)
     describe(a.out)
     curve = [sum(losses[i : i + 100]) / len(losses[i : i + 100]) for i in range(0, len(losses), 100)]
     summary = {"steps": step, "minutes": round(spent / 60, 2), "batch": a.batch, "frames": len(sentences), "parameters": size,
