@@ -23,6 +23,20 @@ ABOVE, WAY, HIGH, RELEASE = 0.12, 0.24, 0.32, 0.26  # metres: of the hand over t
 LIMIT = 280
 
 
+def matrix_of(quaternion):
+    """(x, y, z, w) -> rotation matrix (3, 3)"""
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * (w * cross + cross @ cross)
+
+
+def turn_of(matrix):
+    """Rotation matrix -> its rotation vector in radians; for turns well below half a circle, where the axis is plain."""
+    axis = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+    sine = np.linalg.norm(axis)
+    return axis if sine == 0 else axis / sine * np.arctan2(sine, (np.trace(matrix) - 1) / 2)
+
+
 class Expert:
     """Decides step by step for one episode of an environment that was reset.
 
@@ -62,12 +76,9 @@ class Expert:
 
     def _turn(self) -> np.ndarray:
         """The rotation vector (world, radians) from the hand's orientation to the one that is wanted."""
-        import robosuite.utils.transform_utils as transform
-
         cosine, sine = np.cos(self._yaw), np.sin(self._yaw)
         wanted = np.array([[cosine, sine, 0], [sine, -cosine, 0], [0, 0, -1]])  # fingers down
-        error = wanted @ transform.quat2mat(self._env.sensors()["robot0_eef_quat"]).T
-        return transform.quat2axisangle(transform.mat2quat(error))
+        return turn_of(wanted @ matrix_of(self._env.sensors()["robot0_eef_quat"]).T)
 
     def _over(self, hand):
         target = self._grasp + [0, 0, ABOVE]
@@ -132,6 +143,24 @@ def episode(environment: Libero, seed: int):
     return False, LIMIT, expert.tries
 
 
+def record(path):
+    """One episode as arrays for tests/eval/libero_expert_test.py: what the expert looks at before each step, and its action."""
+    from scipy.spatial import ConvexHull
+
+    environment, rows = Libero("libero_object/0"), []
+    environment.reset(0)
+    expert, (thing, basket) = Expert(environment), environment.objects()
+    for _ in range(LIMIT):
+        sensors = environment.sensors()
+        row = {"robot0_eef_pos": sensors["robot0_eef_pos"], "robot0_eef_quat": sensors["robot0_eef_quat"], "basket_pos": sensors[f"{basket}_pos"]}
+        rows.append(row | {"corners": environment.corners(thing), "action": expert.act()})
+        if environment.step(rows[-1]["action"]):
+            break
+    arrays = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+    arrays["corners"] = arrays["corners"][:, ConvexHull(arrays["corners"][0]).vertices]  # the others decide nothing
+    np.savez_compressed(path, **arrays)
+
+
 def _work(tasks, seeds, results):
     for task in iter(tasks.get, None):
         environment = Libero(f"libero_object/{task}")
@@ -149,7 +178,11 @@ def main():
     parser.add_argument("--episodes", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--record", metavar="FILE", help="write one episode for the tests instead")
     a = parser.parse_args()
+    if a.record:
+        record(a.record)
+        return 0
     context = multiprocessing.get_context("spawn")
     tasks, results = context.Queue(), context.Queue()
     for task in [*a.tasks.split(","), *[None] * a.workers]:
@@ -175,4 +208,6 @@ def main():
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)  # MuJoCo's destructors print errors at a normal exit

@@ -27,6 +27,7 @@ import small_smolvla as small  # noqa: E402  (before torch and lerobot)
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
+from vla_cpp.eval.environments.libero import SENTENCES  # noqa: E402
 
 SIZE, FRAME = 128, 256  # pixels: what the policy sees, and what LIBERO shows it
 HORIZON, EXECUTE, RATE_HZ = 16, 8, 20
@@ -34,8 +35,6 @@ N_TOKEN = 20  # of a sentence, padded
 VIEWS = ("image", "image2")
 STATE_NAMES = ["x", "y", "z", "rx", "ry", "rz", "finger_left", "finger_right"]
 ACTION_NAMES = ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"]
-THINGS = ["alphabet soup", "cream cheese", "salad dressing", "bbq sauce", "ketchup", "tomato sauce", "butter", "milk", "chocolate pudding", "orange juice"]
-SENTENCES = [f"pick up the {thing} and place it in the basket" for thing in THINGS]
 DISTANCE = 0.1  # metres that the question for places counts as 1
 AVERAGE = 0.995  # of the weights that are written: what remains of the mean after a step
 
@@ -118,7 +117,7 @@ class Training:
         torch.manual_seed(a.seed)
         saved = torch.load(self.state_file, weights_only=True) if self.state_file.exists() else None
         self.statistics = saved["statistics"] if saved else data.statistics()
-        small.save_backbone(a.out / "vlm", SENTENCES * 20, SIZE)
+        small.save_backbone(a.out / "vlm", list(SENTENCES.values()) * 20, SIZE)
         views = {f"observation.images.{view}": FRAME for view in VIEWS}
         self.policy, self.before, self.after = small.make_policy(
             a.out / "vlm", views, len(STATE_NAMES), len(ACTION_NAMES), (HORIZON, EXECUTE), N_TOKEN, self.statistics
