@@ -38,15 +38,18 @@ def make_tokenizer(lines: Sequence[str]) -> Any:
     return bpe
 
 
-def save_backbone(folder: Path, lines: Sequence[str], size: int) -> None:
-    """Config, tokenizer and processor files, as the backbone's repository would hold them, without weights. size: pixels, both ways."""
+def save_backbone(folder: Path, lines: Sequence[str], size: int, width: int = 192) -> None:
+    """Config, tokenizer and processor files, as the backbone's repository would hold them, without weights.
+
+    size: pixels of a frame, both ways; width: of the vision tower
+    """
     from transformers import (PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor,
                               SmolVLMVideoProcessor)  # fmt: skip
 
     bpe = make_tokenizer(lines)
     pad = bpe.token_to_id("<|im_end|>")
     SmolVLMConfig(
-        vision_config=dict(hidden_size=192, intermediate_size=768, num_hidden_layers=4, num_attention_heads=6,
+        vision_config=dict(hidden_size=width, intermediate_size=4 * width, num_hidden_layers=4, num_attention_heads=width // 32,
                            image_size=size, patch_size=PATCH),
         text_config=dict(model_type="llama", hidden_size=192, intermediate_size=512, num_hidden_layers=4,
                          num_attention_heads=6, num_key_value_heads=2, head_dim=32, rms_norm_eps=1e-5, rope_theta=100000.0,

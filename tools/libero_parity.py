@@ -49,6 +49,9 @@ def family_case(arch):
         names = ("camera1", "camera2") if arch == "smolvla" else ("base", "wrist")
         given = replace(given, **SHAPE, rename={}, policy={k: v for k, v in given.policy.items() if k != "empty_cameras"})
         assert set(names) <= set(case.frames)
+    elif arch in ("act", "turbovla"):
+        views = dict.fromkeys(given.views, SIZE)
+        given = replace(given, views=views, d_state=8, d_action=7)
     elif arch == "evo1":
         given = replace(given, views=VIEWS)
         case = replace(case, options=case.options | {"views": list(VIEWS)})

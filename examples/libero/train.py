@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Trains LeRobot's own SmolVLA class, at five million parameters, on the demonstrations of collect.py.
+"""Trains LeRobot's own SmolVLA class, at four million parameters, on the demonstrations of collect.py.
 
     python train.py --data data --out checkpoint --minutes 120
 
@@ -30,6 +30,7 @@ from torch.nn import functional as F  # noqa: E402
 from vla_cpp.eval.environments.libero import SENTENCES  # noqa: E402
 
 SIZE, FRAME = 128, 256  # pixels: what the policy sees, and what LIBERO shows it
+VISION = 128  # width of the vision tower
 HORIZON, EXECUTE, RATE_HZ = 16, 8, 20
 N_TOKEN = 20  # of a sentence, padded
 VIEWS = ("image", "image2")
@@ -117,7 +118,7 @@ class Training:
         torch.manual_seed(a.seed)
         saved = torch.load(self.state_file, weights_only=True) if self.state_file.exists() else None
         self.statistics = saved["statistics"] if saved else data.statistics()
-        small.save_backbone(a.out / "vlm", list(SENTENCES.values()) * 20, SIZE)
+        small.save_backbone(a.out / "vlm", list(SENTENCES.values()) * 20, SIZE, VISION)
         views = {f"observation.images.{view}": FRAME for view in VIEWS}
         self.policy, self.before, self.after = small.make_policy(
             a.out / "vlm", views, len(STATE_NAMES), len(ACTION_NAMES), (HORIZON, EXECUTE), N_TOKEN, self.statistics
