@@ -84,10 +84,11 @@ def _curves(draw: ImageDraw.ImageDraw, box: Tuple[int, int, int, int], look: Loo
     for value in (-1, 0, 1):
         draw.line([(x0, up(value)), (x1, up(value))], fill=GRID)
         draw.text((x0 - 6, up(value)), f"{value:+d}" if value else "0", font=_font(11), fill=FAINT, anchor="rm")
+    apart = min(92, (x1 - x0 - 8) // d_action)  # pixels from one name to the next
     for j in range(d_action):
         colour = CURVES[j % len(CURVES)]
         draw.line([(at(k), up(actions[k, j])) for k in range(horizon)], fill=colour, width=2)
-        draw.text((x0 + 8 + 92 * j, y1 + 6), names[j][:12], font=_font(12), fill=colour)
+        draw.text((x0 + 8 + apart * j, y1 + 6), names[j][: apart // 7], font=_font(12), fill=colour)
     now = at(min(max(step - look.step, 0), horizon - 1))
     draw.line([(now, y0), (now, y1)], fill=INK, width=2)
 
