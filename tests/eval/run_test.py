@@ -193,6 +193,8 @@ def test_suites_become_episodes_task_by_task():
     jobs = [(job.task, job.seed) for job in _jobs("libero", arguments)]
     assert jobs[:3] == [("libero_object/0", 7), ("libero_object/0", 8), ("libero_object/1", 7)]
     assert jobs[-1] == ("libero_goal_swap/9", 8) and len(jobs) == 40
+    study = build_parser().parse_args(["replan", "--environment", "libero", "--random", "--suite", "object", "--episodes", "1"])
+    assert [job.task for job in _jobs("libero", study)] == [f"libero_object/{i}" for i in range(10)]
 
 
 def test_a_large_task_is_closed_before_the_next_is_made(monkeypatch, tmp_path):
@@ -216,6 +218,7 @@ def test_a_large_task_is_closed_before_the_next_is_made(monkeypatch, tmp_path):
         (["--task", "fly"], "null has no task 'fly'; there are: drift, still"),
         (["--episodes", "0"], "take 1 or more"),
         (["libero", "--suite", "object,moon"], "--suite: libero has no 'moon'; there are: spatial, object, goal, 10, spatial_lan"),
+        (["replan", "--suite", "object"], "--suite: metaworld has no 'object'; it has no suites"),
         (["libero"], "libero has 290 tasks: give --suite or --task"),
         (["libero", "--task", "libero_goal/10"], "libero has no task 'libero_goal/10'; there are: libero_spatial/0 to 9"),
         (["--against", "random"], "go together"),
@@ -226,7 +229,7 @@ def test_a_large_task_is_closed_before_the_next_is_made(monkeypatch, tmp_path):
     ],
 )
 def test_a_wrong_call_says_what_is_wrong(call, more, told, capsys):
-    arguments = [*more, "--random"] if more[0] == "libero" else call("wrong", *more)
+    arguments = [*more, "--random"] if more[0] in ("libero", "replan") else call("wrong", *more)
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2 and told in capsys.readouterr().err

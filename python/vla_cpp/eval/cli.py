@@ -48,6 +48,11 @@ def _common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
+def _suites(parser: argparse.ArgumentParser, suites: Dict[str, List[str]]) -> None:
+    text = f"every task of these suites, with commas, e.g. object,spatial; there are: {', '.join(map(_short, suites))}"
+    parser.add_argument("--suite", metavar="NAMES", help=text)
+
+
 def build_parser() -> argparse.ArgumentParser:
     formatter = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("vla-eval", description=__doc__, epilog=EPILOG, formatter_class=formatter)
@@ -57,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=(find(name).__doc__ or text), formatter_class=formatter)
         _common(command)
         if find(name).suites():
-            command.add_argument("--suite", metavar="NAMES", help=f"every task of these suites, with commas, e.g. object,spatial; there are: {', '.join(map(_short, find(name).suites()))}")
+            _suites(command, find(name).suites())
         command.add_argument("--replan-every", type=int, default=0, metavar="S", help="steps executed of a chunk (default: the environment's)")
         command.add_argument("--mode", choices=("sync", "async", "rtc"), default="sync", help="how chunks follow each other: the robot waits for each; it goes on with the one before meanwhile; the same, and the policy goes on from its rows (default sync)")
         command.add_argument("--latency-ms", type=float, default=0.0, metavar="MS", help="let this time of the simulator pass between an observation and its chunk (default 0)")
@@ -69,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     _common(replan)
     replan.add_argument("--intervals", default="1,2,4,8,16", help="steps executed of a chunk (default 1,2,4,8,16)")
     replan.add_argument("--environment", choices=NAMES, default="metaworld")
+    _suites(replan, {suite: tasks for name in NAMES for suite, tasks in find(name).suites().items()})
     from . import demo
 
     demo.add_command(commands)
@@ -117,7 +123,8 @@ def _of_suites(name: str, suites: Dict[str, List[str]], given: str) -> List[str]
     wanted = [part.strip() for part in given.split(",") if part.strip()]
     for suite in wanted:
         if suite not in named:
-            raise SystemExit(_usage(f"--suite: {name} has no '{suite}'; there are: {', '.join(map(_short, suites))}"))
+            others = f"there are: {', '.join(map(_short, suites))}" if suites else "it has no suites"
+            raise SystemExit(_usage(f"--suite: {name} has no '{suite}'; {others}"))
     return [task for suite in wanted for task in named[suite]]
 
 
