@@ -40,6 +40,20 @@ DISTANCE = 0.1  # metres that the question for places counts as 1
 AVERAGE = 0.995  # of the weights that are written: what remains of the mean after a step
 
 
+def save_backbone(folder):
+    small.save_backbone(folder, list(SENTENCES.values()) * 20, SIZE, VISION)
+
+
+def make_policy(backbone, statistics):
+    """The policy with random weights, its pre- and its post-processor."""
+    views = {f"observation.images.{view}": FRAME for view in VIEWS}
+    return small.make_policy(backbone, views, len(STATE_NAMES), len(ACTION_NAMES), (HORIZON, EXECUTE), N_TOKEN, statistics)
+
+
+def describe(out):
+    small.describe(out, RATE_HZ, STATE_NAMES, ACTION_NAMES)
+
+
 class Demonstrations:
     """All kept steps of all files of a folder; `read` adds those that are new.
 
@@ -118,11 +132,8 @@ class Training:
         torch.manual_seed(a.seed)
         saved = torch.load(self.state_file, weights_only=True) if self.state_file.exists() else None
         self.statistics = saved["statistics"] if saved else data.statistics()
-        small.save_backbone(a.out / "vlm", list(SENTENCES.values()) * 20, SIZE, VISION)
-        views = {f"observation.images.{view}": FRAME for view in VIEWS}
-        self.policy, self.before, self.after = small.make_policy(
-            a.out / "vlm", views, len(STATE_NAMES), len(ACTION_NAMES), (HORIZON, EXECUTE), N_TOKEN, self.statistics
-        )
+        save_backbone(a.out / "vlm")
+        self.policy, self.before, self.after = make_policy(a.out / "vlm", self.statistics)
         self.asked = torch.nn.Linear(192, 6)
         self.mean = copy.deepcopy(self.policy)
         self.trained = [p for p in (*self.policy.parameters(), *self.asked.parameters()) if p.requires_grad]
@@ -144,7 +155,7 @@ class Training:
 
     def export(self):
         small.save(copy.deepcopy(self.mean), self.before, self.after, self.a.out)
-        small.describe(self.a.out, RATE_HZ, STATE_NAMES, ACTION_NAMES)
+        describe(self.a.out)
         summary = {"steps": self.step, "minutes": round(self.spent / 60, 1), "batch": self.a.batch, "draws": self.a.draws,
                    "episodes": self.data.episodes(), "looks": len(self.data.sentence), "curve": self.curve}  # fmt: skip
         (self.a.out / "training.json").write_text(json.dumps(summary, indent=1) + "\n")
@@ -160,7 +171,8 @@ class Training:
         place = (self.data.place[pick] - raw["observation.state"][:, :3].repeat(1, 2)) / DISTANCE
         for group in self.optimizer.param_groups:
             group["lr"] = self.a.rate * self.rate()
-        flow, where = losses(self.policy, self.asked, self.before(raw), self.data.pad[pick], place, self.a.draws)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.a.autocast):
+            flow, where = losses(self.policy, self.asked, self.before(raw), self.data.pad[pick], place, self.a.draws)
         self.optimizer.zero_grad(set_to_none=True)
         (flow + self.a.place * where).backward()
         torch.nn.utils.clip_grad_norm_(self.trained, 1.0)
@@ -204,6 +216,7 @@ def main():
     parser.add_argument("--place", type=float, default=0.5, help="weight of the question for places (default 0.5)")
     parser.add_argument("--rate", type=float, default=8e-4, help="peak learning rate (default 8e-4)")
     parser.add_argument("--export", type=float, default=5, help="minutes from one written checkpoint to the next (default 5)")
+    parser.add_argument("--autocast", action="store_true", help="products in bfloat16: a quarter quicker where the processor has AVX512_BF16")
     parser.add_argument("--threads", type=int, default=2, help="default 2")
     parser.add_argument("--seed", type=int, default=0, help="of the weights and of the order of the data (default 0)")
     a = parser.parse_args()

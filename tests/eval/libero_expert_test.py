@@ -179,7 +179,7 @@ def test_the_training_loss_is_lerobots(tmp_path):
 
     episode_file(tmp_path / "0.npz", 6)
     data = train.Demonstrations(tmp_path)
-    options = SimpleNamespace(out=tmp_path, seed=0, rate=1e-3, batch=4, draws=3, minutes=1.0, steps=4, place=0.5)
+    options = SimpleNamespace(out=tmp_path, seed=0, rate=1e-3, batch=4, draws=3, minutes=1.0, steps=4, place=0.5, autocast=False)
     training = train.Training(options, data)
     raw = data.batch(torch.arange(4), torch.Generator().manual_seed(1))
     pad, place = torch.zeros(4, 16, dtype=torch.bool), torch.zeros(4, 6)
