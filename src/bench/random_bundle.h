@@ -16,7 +16,7 @@ struct RandomSizes {
   bool is_filled = true;  // else weights are zeros that take no memory
 };
 
-/// A sound bundle of random weights in memory: what a network of that size costs, without a checkpoint. Nothing is
+/// A valid bundle of random weights in memory: what a network of that size costs, without a checkpoint. Nothing is
 /// written to a disk; the memory goes with the object. The values repeat after some millions, which no product notices.
 class RandomBundle {
  public:

@@ -16,8 +16,8 @@
 #include <fstream>
 
 #include "cli/commands.h"
+#include "cli/observability.h"
 #include "cli/say.h"
-#include "cli/watch.h"
 #include "processor/constant_actions.h"
 #include "serve/names.h"
 #include "serve/native/codec.h"
@@ -33,7 +33,7 @@ struct ServeOptions {
   bool restarts = false;
   std::size_t max_message_mb = 32;
   serve::ServerOptions server;
-  WatchOptions watch;
+  ObservabilityOptions observability;
 };
 
 serve::Server* stopped_by_signals = nullptr;
@@ -65,7 +65,7 @@ std::string quoted(const std::string& value) {
 
 /// One line that programs can split as a shell would.
 void print_ready(const serve::Server& server, const Engine& engine, double load_ms, double warm_up_ms,
-                 const Watch& watch) {
+                 const Observability& observability) {
   std::vector<std::string> features, tags, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
@@ -98,8 +98,8 @@ void print_ready(const serve::Server& server, const Engine& engine, double load_
   add("features", fmt::format("{}", fmt::join(features, ",")));
   add("load_ms", fmt::format("{:.1f}", load_ms));
   add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
-  if (const std::string metrics = watch.metrics_address(); !metrics.empty()) add("metrics", metrics);
-  if (const std::string page = watch.page_url(); !page.empty()) add("page", page);
+  if (const std::string metrics = observability.metrics_address(); !metrics.empty()) add("metrics", metrics);
+  if (const std::string page = observability.page_url(); !page.empty()) add("page", page);
   if (!constant.empty()) add("CONSTANT", fmt::format("{}", fmt::join(constant, ",")));
   if (!degraded.empty()) add("DEGRADED", fmt::format("{}", fmt::join(degraded, ",")));
   say(stdout, "{}\n", line);
@@ -127,7 +127,8 @@ Error start_again() {
 Status serve(ServeOptions& options, bool& ready) {
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
-  VLA_TRY(const std::unique_ptr<Watch> watch, Watch::start(options.watch, *server, options.server.insecure));
+  VLA_TRY(const std::unique_ptr<Observability> observability,
+          Observability::start(options.observability, *server, options.server.insecure));
   StageClock clock;
   Timing load;
   VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
@@ -138,14 +139,14 @@ Status serve(ServeOptions& options, bool& ready) {
                                                                               .memory = options.memory}));
   clock.lap(load, "load");
   VLA_CHECK(server->load(*engine));
-  watch->loaded(*engine);
+  observability->loaded(*engine);
   VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
   stop_on_signals(*server);
-  watch->ready(warm_up_ms);
-  print_ready(*server, *engine, load.front().second, warm_up_ms, *watch);
+  observability->ready(warm_up_ms);
+  print_ready(*server, *engine, load.front().second, warm_up_ms, *observability);
   ready = true;
-  const Status status = server->run(*engine, watch->observers());
-  watch->ended(status);
+  const Status status = server->run(*engine, observability->observers());
+  observability->ended(status);
   return status;
 }
 
@@ -225,7 +226,7 @@ Command add_serve(CLI::App& app) {
       ->check(CLI::ExistingFile);
   command->add_option("--curve-clients", server.curve_clients, "Public keys of the admitted clients, one per line")
       ->check(CLI::ExistingFile);
-  add_watch_options(*command, options->watch);
+  add_observability_options(*command, options->observability);
   command
       ->add_flag("--restart-on-device-loss", options->restarts,
                  "Start again when a GPU is lost; not given: end with exit code 8")

@@ -32,14 +32,14 @@ struct Connections {
     return found == connections.end() ? nullptr : found->second;
   }
   /// Drops connections until no more are left than `limits.connections`.
-  void make_room() {
+  void evict_idle() {
     while (const auto chosen = to_evict(standings(), limits.connections, Clock::now()))
       connections.at(*chosen)->drop("connections",
                                     fmt::format("more than {}, or {} in their handshake, and this one gives way",
                                                 limits.connections, max_handshakes(limits.connections)));
   }
   /// Drops connections until requests in receipt hold no more than `limits.receipt`.
-  void bound_receipt() {
+  void evict_slow_uploads() {
     while (n_held > limits.receipt) {
       const auto chosen = to_interrupt(standings(), limits.connections, limits.message, limits.receipt, Clock::now());
       if (!chosen) return;

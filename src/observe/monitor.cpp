@@ -9,9 +9,9 @@ HttpReply reply_to(const Monitor::Sources& sources, const std::string& path) {
   if (path == "/healthz") return {.body = "ok\n"};
   if (path == "/metrics") return {.type = "text/plain; version=0.0.4; charset=utf-8", .body = sources.metrics()};
   if (path != "/readyz") return {.status = 404, .body = "/metrics, /healthz and /readyz are here\n"};
-  const std::string obstacle = sources.obstacle();
-  if (obstacle.empty()) return {.body = "ready\n"};
-  return {.status = 503, .body = obstacle + "\n"};
+  const std::string not_ready_reason = sources.not_ready_reason();
+  if (not_ready_reason.empty()) return {.body = "ready\n"};
+  return {.status = 503, .body = not_ready_reason + "\n"};
 }
 
 }  // namespace

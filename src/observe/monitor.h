@@ -11,8 +11,8 @@ namespace vla::serve {
 class Monitor {
  public:
   struct Sources {
-    std::function<std::string()> metrics;   // text of the exposition format
-    std::function<std::string()> obstacle;  // why no act is taken; empty: they are
+    std::function<std::string()> metrics;           // text of the exposition format
+    std::function<std::string()> not_ready_reason;  // why no act is taken; empty: they are
   };
   /// As Http::open; the functions are called on the thread of Http.
   static Result<std::unique_ptr<Monitor>> open(const std::string& address, bool insecure, Sources sources);

@@ -17,12 +17,12 @@ Error shutting_down() { return {Code::shutting_down, "act", "", "the server drai
 
 }  // namespace
 
-void Vitals::begin() noexcept {
+void ServerState::begin() noexcept {
   ready = true;
   ready_since = Clock::now().time_since_epoch().count();
 }
 
-Health Vitals::health(const Exchange& exchange) const {
+Health ServerState::health(const Exchange& exchange) const {
   const Clock::rep since = ready_since;  // before `ready`, which begin() sets first: up and not ready is draining
   const Clock::duration up = Clock::now().time_since_epoch() - Clock::duration(since);
   return {ready,
@@ -33,8 +33,9 @@ Health Vitals::health(const Exchange& exchange) const {
           n_error};
 }
 
-Io::Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, Vitals& vitals, std::span<Observer* const> observers)
-    : loop_(loop), fronts_(fronts), exchange_(exchange), vitals_(vitals), observers_(observers) {}
+Io::Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, ServerState& state,
+       std::span<Observer* const> observers)
+    : loop_(loop), fronts_(fronts), exchange_(exchange), state_(state), observers_(observers) {}
 
 void Io::run() {
   for (;;) {
@@ -42,10 +43,10 @@ void Io::run() {
     std::uint64_t signals;
     [[maybe_unused]] const auto drained = ::read(exchange_.fd(), &signals, sizeof(signals));
     deliver_waiting();
-    if (vitals_.stopping) {
-      vitals_.ready = false;
+    if (state_.stopping) {
+      state_.ready = false;
       exchange_.close();
-      if (!vitals_.device_lost) refuse_waiting();
+      if (!state_.device_lost) refuse_waiting();
       if (exchange_.drained()) break;
     }
   }
@@ -65,7 +66,7 @@ bool Io::has_answers() const {
 }
 
 void Io::stop() noexcept {
-  vitals_.stopping = true;
+  state_.stopping = true;
   exchange_.wake();
 }
 
@@ -87,7 +88,7 @@ void Io::answer(Job job, std::string response) {
 
 /// An act that waits has its answer still to come, so nothing may throw once it is in line.
 void Io::submit(Job job) {
-  if (vitals_.stopping) return refuse(std::move(job), shutting_down);
+  if (state_.stopping) return refuse(std::move(job), shutting_down);
   if (const auto allowed = job.deadline_ms) {
     if (*allowed == 0 || *allowed > kMaxDeadlineMs)
       return refuse(std::move(job), [&] {
@@ -114,16 +115,16 @@ void Io::submit(Job job) {
 }
 
 /// Sends an answer. A client whose answer there is no memory for hears of that.
-void Io::settle(Answer& answer) noexcept {
+void Io::send_answer(Answer& answer) noexcept {
   try {
     if (answer.error) answer.response = answer.job.call->encode(*answer.error);
     deliver(answer);
   } catch (const std::exception&) {
-    settle_without_memory(answer);
+    send_without_memory(answer);
   }
 }
 
-void Io::settle_without_memory(Answer& answer) noexcept {
+void Io::send_without_memory(Answer& answer) noexcept {
   answer.response = {};
   answer.job.call->send_out_of_memory();
   count_error();
@@ -149,7 +150,7 @@ void Io::deliver(Answer& answer) {
   if (answer.error) {
     count_error();
   } else if (job.kind == Kind::act) {
-    ++vitals_.n_chunk;
+    ++state_.n_chunk;
   }
   answered.sent = Clock::now();
   for (Observer* observer : observers_) observer->answered(answered);
@@ -161,7 +162,7 @@ void Io::refuse_waiting() {
 }
 
 void Io::deliver_waiting() {
-  while (std::optional<Answer> answer = exchange_.take_answer()) settle(*answer);
+  while (std::optional<Answer> answer = exchange_.take_answer()) send_answer(*answer);
   while (std::optional<Job> job = exchange_.take_late(Clock::now())) {
     const std::uint64_t allowed = *job->deadline_ms;
     refuse(std::move(*job), [allowed] {

@@ -14,7 +14,7 @@
 namespace vla::serve {
 
 /// What both threads and every observer may read.
-struct Vitals {
+struct ServerState {
   std::atomic<bool> ready = false, stopping = false;
   std::atomic<bool> device_lost = false;  // acts that wait get the device's error
   std::atomic<std::uint64_t> n_chunk = 0, n_error = 0;
@@ -30,7 +30,8 @@ class Io {
  public:
   using Fronts = std::vector<std::unique_ptr<Front>>;
   /// Everything outlives the thread.
-  Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, Vitals& vitals, std::span<Observer* const> observers);
+  Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, ServerState& state,
+     std::span<Observer* const> observers);
 
   /// Until the server is stopped, what is computed is answered, and what waits is refused.
   void run();
@@ -50,18 +51,18 @@ class Io {
     try {
       answer.error = error();
     } catch (const std::exception&) {
-      return settle_without_memory(answer);
+      return send_without_memory(answer);
     }
-    settle(answer);
+    send_answer(answer);
   }
   void dropped(const Dropped& connection);
-  void count_error() noexcept { ++vitals_.n_error; }  // of a request that was refused without a job
-  void stop() noexcept;                               // as Server::stop
-  Health health() const { return vitals_.health(exchange_); }
+  void count_error() noexcept { ++state_.n_error; }  // of a request that was refused without a job
+  void stop() noexcept;                              // as Server::stop
+  Health health() const { return state_.health(exchange_); }
 
  private:
-  void settle(Answer& answer) noexcept;
-  void settle_without_memory(Answer& answer) noexcept;
+  void send_answer(Answer& answer) noexcept;
+  void send_without_memory(Answer& answer) noexcept;
   void deliver(Answer& answer);
   void deliver_waiting();
   void refuse_waiting();
@@ -71,7 +72,7 @@ class Io {
   net::Loop& loop_;
   const Fronts& fronts_;
   Exchange& exchange_;
-  Vitals& vitals_;
+  ServerState& state_;
   std::span<Observer* const> observers_;
 };
 

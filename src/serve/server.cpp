@@ -17,10 +17,10 @@
 #ifdef VLA_LEROBOT
 #include "serve/lerobot/front.h"
 #endif
+#include "serve/double_buffer.h"
 #include "serve/native/codec.h"
 #include "serve/native/front.h"
 #include "serve/openpi/front.h"
-#include "serve/relay.h"
 
 namespace vla::serve {
 namespace {
@@ -89,8 +89,8 @@ Result<double> warm_up(Engine& engine) {
   const auto start = Clock::now();
   for (const Robot* robot : engine.robots()) {
     EncodedObservation prepared;  // its memory is not kept: every act that is served brings its own
-    const Status sound = engine.prepare(largest_observation(*robot), Noise(std::uint64_t{0}), {}, prepared);
-    const auto chunk = sound ? engine.act(prepared) : Result<ActionChunk>(sound.error());
+    const Status valid = engine.prepare(largest_observation(*robot), Noise(std::uint64_t{0}), {}, prepared);
+    const auto chunk = valid ? engine.act(prepared) : Result<ActionChunk>(valid.error());
     if (!chunk && chunk.error().code != Code::bad_observation && chunk.error().code != Code::bad_action)
       return chunk.error();
   }
@@ -137,7 +137,7 @@ std::vector<std::string> Server::addresses() const {
 }
 
 void Server::stop() noexcept {
-  vitals_.stopping = true;
+  state_.stopping = true;
   exchange_.wake();
 }
 
@@ -162,20 +162,20 @@ std::vector<std::string> Server::told() const {
 Status Server::run(Engine& engine, std::span<Observer* const> observers) {
   observers_ = observers;
   records_ = std::any_of(observers.begin(), observers.end(), [](const Observer* o) { return o->records(); });
-  vitals_.begin();
-  Io io(loop_, fronts_, exchange_, vitals_, observers);
-  Relay<Act> relay;
+  state_.begin();
+  Io io(loop_, fronts_, exchange_, state_, observers);
+  DoubleBuffer<Act> acts;
   std::thread preparing;
   if (!engine.device().is_host()) {
     VLA_TRY(preparing, start_thread("preparing thread", [&] {
-              while (prepare_next(engine, relay.to_prepare())) relay.prepared();
-              relay.close();
+              while (prepare_next(engine, acts.to_prepare())) acts.prepared();
+              acts.close();
             }));
   }
   Result<std::thread> talking = start_thread("I/O thread", [&] { io.run(); });
   if (!talking) exchange_.close();
   if (preparing.joinable()) {
-    while (Act* act = relay.to_compute()) compute(engine, *act), relay.computed();
+    while (Act* act = acts.to_compute()) compute(engine, *act), acts.computed();
     preparing.join();
   } else {
     for (Act act; prepare_next(engine, act);) compute(engine, act);
@@ -216,7 +216,7 @@ void Server::compute(Engine& engine, Act& act) {
   act.request = {};
   exchange_.put(std::move(act.answer));
   if (engine.device().failure()) return;
-  vitals_.device_lost = true;  // no act after this one can succeed
+  state_.device_lost = true;  // no act after this one can succeed
   stop();
 }
 

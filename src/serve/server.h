@@ -44,9 +44,9 @@ class Server {
   v1::Description describe(const Engine& engine) const;
   /// From any thread or signal handler.
   void stop() noexcept;
-  bool is_stopping() const noexcept { return vitals_.stopping; }
+  bool is_stopping() const noexcept { return state_.stopping; }
   /// From any thread.
-  Health health() const { return vitals_.health(exchange_); }
+  Health health() const { return state_.health(exchange_); }
 
  private:
   explicit Server(const ServerOptions& options) : options_(options), exchange_(limits_of(options)) {}
@@ -71,7 +71,7 @@ class Server {
   std::span<Observer* const> observers_;
   bool records_ = false;  // one of them does
   v1::Description description_;
-  Vitals vitals_;
+  ServerState state_;
   Exchange exchange_;
   net::Loop loop_;
   Io::Fronts fronts_;

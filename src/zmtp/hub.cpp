@@ -209,7 +209,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
                       fmt::format("expected {}, found {}", message.error().expected, message.error().found));
         hold(session_.n_held());
         if (!*message) {
-          shared_.bound_receipt();
+          shared_.evict_slow_uploads();
           if (!is_closed_) read();
           return;
         }
@@ -308,7 +308,7 @@ class Hub::Sockets : public Shared {
     const auto connection = std::make_shared<Connection>(*this, std::move(socket), std::move(client));
     connections.emplace(n_connection_, connection);
     connection->start();
-    make_room();
+    evict_idle();
   }
 
   void sweep() {

@@ -272,10 +272,10 @@ TEST_CASE("clients that never read, or that go away while their act waits, cost 
 TEST_CASE("a server that begins to take acts never looks as if it drained") {
   const serve::Exchange exchange({1, 1});
   for (int round = 0; round < 2000; ++round) {
-    serve::Vitals vitals;
-    std::thread begins([&] { vitals.begin(); });
+    serve::ServerState state;
+    std::thread begins([&] { state.begin(); });
     serve::Health health;
-    while ((health = vitals.health(exchange)).uptime_s == 0) {
+    while ((health = state.health(exchange)).uptime_s == 0) {
     }
     begins.join();
     REQUIRE(health.ready);

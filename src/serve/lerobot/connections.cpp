@@ -74,7 +74,7 @@ class Connections::All {
     found->n_held += n_byte, table_.n_held += n_byte;
     ++n_call_;
     bound_calls();
-    table_.bound_receipt();
+    table_.evict_slow_uploads();
     return table_.find(found->peer.connection) ? std::optional(found->peer) : std::nullopt;
   }
   void receives(std::uint64_t connection, std::size_t n_byte) {
@@ -82,7 +82,7 @@ class Connections::All {
     const auto found = table_.find(connection);
     if (!found) return;
     found->n_held += n_byte, table_.n_held += n_byte;
-    table_.bound_receipt();
+    table_.evict_slow_uploads();
   }
   void received(std::uint64_t connection, std::size_t n_byte, bool is_whole) {
     const std::lock_guard lock(mutex_);
@@ -132,7 +132,7 @@ class Connections::All {
     connection->socket.async_wait(tcp::socket::wait_error, [this, connection](error_code) { forget(*connection); });
     handler_->came(descriptor);
     const std::lock_guard lock(mutex_);
-    table_.make_room();
+    table_.evict_idle();
   }
   void forget(Connection& connection) {
     const std::lock_guard lock(mutex_);

@@ -126,7 +126,7 @@ Result<std::string> Front::answer_now(Rpc& rpc, Client& client) {
 Front::Client& Front::client_of(const Peer& peer) {
   const auto found = clients_.find(peer.connection);
   if (found != clients_.end()) return found->second;
-  make_room();
+  evict_idle();
   Client& client = clients_[peer.connection];
   client.peer = peer;
   const Client* before = nullptr;
@@ -138,7 +138,7 @@ Front::Client& Front::client_of(const Peer& peer) {
 }
 
 /// The robot that was silent longest is forgotten for a new one.
-void Front::make_room() {
+void Front::evict_idle() {
   if (clients_.size() < options_.max_connections) return;
   const auto oldest = std::min_element(clients_.begin(), clients_.end(),
                                        [](const auto& a, const auto& b) { return a.second.used < b.second.used; });

@@ -50,7 +50,7 @@ class Front final : public serve::Front, Rpcs::Handler {
   void ended(const Peer& peer, const std::string& why, const std::string& detail) override;
   Result<std::string> answer_now(Rpc& rpc, Client& client);
   Client& client_of(const Peer& peer);
-  void make_room();
+  void evict_idle();
   void bound_observed();
   void submit_next(Client& client);
   void sweep();

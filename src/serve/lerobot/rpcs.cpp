@@ -174,7 +174,7 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
   void OnReadDone(bool ok) override {
     try {
       if (!ok) return is_whole_ ? void() : fail({Code::bad_request, "call", "a whole message", "one that is cut off"});
-      if (Status sound = take_piece(); !sound) return fail(sound.error());
+      if (Status valid = take_piece(); !valid) return fail(valid.error());
       if (!is_whole_) return StartRead(&in_);
       all_.connections_.received(connection_, std::exchange(n_held_, 0), true);
       all_.hand_over(std::move(rpc_));

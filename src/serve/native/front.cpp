@@ -107,11 +107,11 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
   const bool delimiter = message.delimiter;
   std::uint64_t request_id = 0;
   try {
-    Status sound = message.refused ? Status(*message.refused) : Status();
+    Status valid = message.refused ? Status(*message.refused) : Status();
     wire::Envelope envelope;  // first: a refusal for lack of memory has the request's number
     const Status read = wire::read_envelope(message.bytes.span(), envelope);
     request_id = envelope.request_id;
-    if (sound) sound = read;
+    if (valid) valid = read;
     Job job;
     job.client = std::to_string(connection);
     job.peer = client.peer;
@@ -126,7 +126,7 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
     job.call = std::make_unique<Request>(*this, connection, std::move(message), envelope);
     ++client.n_request;
     io_->received(job);
-    handle(client, std::move(job), envelope, sound);
+    handle(client, std::move(job), envelope, valid);
   } catch (const std::bad_alloc&) {
     send_out_of_memory(connection, request_id, delimiter);
     io_->count_error();
@@ -139,8 +139,8 @@ void NativeFront::send_out_of_memory(std::uint64_t connection, std::uint64_t req
 } catch (const std::exception&) {  // not even for that: the client's patience ends it
 }
 
-void NativeFront::handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& sound) {
-  if (!sound) return io_->refuse(std::move(job), [&] { return sound.error(); });
+void NativeFront::handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& valid) {
+  if (!valid) return io_->refuse(std::move(job), [&] { return valid.error(); });
   if (job.kind == Kind::act) return io_->submit(std::move(job));
   auto response = answer_now(client, job, envelope);
   job.name = client.name;  // a hello tells it

@@ -27,7 +27,7 @@ class NativeFront final : public Front, zmtp::Hub::Handler {
   Status bind();
   void received(zmtp::Client& client, zmtp::Message message) override;
   void dropped(const zmtp::Client& client, const std::string& why, const std::string& detail) override;
-  void handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& sound);
+  void handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& valid);
   Result<v1::Response> answer_now(zmtp::Client& client, const Job& job, const wire::Envelope& envelope) const;
   Result<ActRequest> decode(std::span<const std::byte> act) const;
   void send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;

@@ -96,13 +96,13 @@ void Front::received(Peer& peer, std::string message, bool is_text) {
   job.share = {net::group_of(peer.address), peer.since};
   job.request_id = ++peer.n_request;
   auto request = std::make_unique<Request>(*this, peer, std::move(message));
-  const Status sound = request->read(is_text);
+  const Status valid = request->read(is_text);
   const bool is_reset = request->is_reset();
   job.kind = is_reset ? Kind::unknown : Kind::act;
   job.deadline_ms = request->extension().deadline_ms;
   job.call = std::move(request);
   io_->received(job);
-  if (!sound) return io_->refuse(std::move(job), [&] { return sound.error(); });
+  if (!valid) return io_->refuse(std::move(job), [&] { return valid.error(); });
   if (is_reset) return io_->answer(std::move(job), encode_omni_reset());
   io_->submit(std::move(job));
 }

@@ -173,7 +173,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     silent_ = 0;
     if (n_held_ == 0) began_ = Clock::now();
     hold(buffer_.size());
-    shared_.bound_receipt();
+    shared_.evict_slow_uploads();
     if (is_closed_) return;
     if (!stream_.is_message_done()) return read();
     is_waiting_ = true;
@@ -275,7 +275,7 @@ class Sockets::All : public Shared {
     const auto connection = std::make_shared<Connection>(*this, std::move(socket), std::move(peer));
     connections.emplace(n_connection_, connection);
     connection->start();
-    make_room();
+    evict_idle();
   }
 
   std::optional<net::Listener<tcp>> listener_;

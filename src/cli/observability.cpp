@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "cli/watch.h"
+#include "cli/observability.h"
 
 #include <fmt/format.h>
 #include <unistd.h>
@@ -19,7 +19,7 @@ namespace {
 using serve::Level;
 
 /// With --log the level is info, otherwise warn.
-Level level_of(const WatchOptions& options) {
+Level level_of(const ObservabilityOptions& options) {
   const auto found = std::find(std::begin(serve::kLevelNames), std::end(serve::kLevelNames), options.level);
   if (found == std::end(serve::kLevelNames)) return options.log.empty() ? Level::warn : Level::info;
   return static_cast<Level>(found - std::begin(serve::kLevelNames));
@@ -52,7 +52,7 @@ void add_ranges(const Robot& robot, std::map<std::string, serve::Page::Range>& r
 
 }  // namespace
 
-void add_watch_options(CLI::App& command, WatchOptions& options) {
+void add_observability_options(CLI::App& command, ObservabilityOptions& options) {
   add_text(command, "--metrics", options.metrics, "ADDRESS:PORT",
            "HTTP: /metrics (Prometheus), /healthz, /readyz; port 0 takes a free one");
   add_text(command, "--page", options.page, "ADDRESS:PORT",
@@ -70,30 +70,31 @@ void add_watch_options(CLI::App& command, WatchOptions& options) {
       ->capture_default_str();
 }
 
-Watch::Watch(const WatchOptions& options, const serve::Server& server)
+Observability::Observability(const ObservabilityOptions& options, const serve::Server& server)
     : server_(server),
       log_(STDERR_FILENO, options.log == "json" ? serve::LogFormat::json : serve::LogFormat::text, level_of(options)) {}
 
-Result<std::unique_ptr<Watch>> Watch::start(const WatchOptions& options, const serve::Server& server, bool insecure) {
-  std::unique_ptr<Watch> watch(new Watch(options, server));
-  VLA_CHECK(watch->open(options, insecure));
-  watch->log_.event(Level::info, "start",
-                    {{"version", VLA_VERSION},
-                     {"pid", ::getpid()},
-                     {"address", server.addresses()},
-                     {"metrics", watch->metrics_address()}});
-  return watch;
+Result<std::unique_ptr<Observability>> Observability::start(const ObservabilityOptions& options,
+                                                            const serve::Server& server, bool insecure) {
+  std::unique_ptr<Observability> observability(new Observability(options, server));
+  VLA_CHECK(observability->open(options, insecure));
+  observability->log_.event(Level::info, "start",
+                            {{"version", VLA_VERSION},
+                             {"pid", ::getpid()},
+                             {"address", server.addresses()},
+                             {"metrics", observability->metrics_address()}});
+  return observability;
 }
 
-Status Watch::open(const WatchOptions& options, bool insecure) {
+Status Observability::open(const ObservabilityOptions& options, bool insecure) {
   if (!options.trace.empty()) {
     VLA_TRY(trace_, serve::Trace::open(options.trace));
   }
   if (!options.metrics.empty()) {
     metrics_ = std::make_unique<serve::Metrics>();
-    VLA_TRY(monitor_,
-            serve::Monitor::open(options.metrics, insecure,
-                                 {[this] { return metrics_->text(server_.health()); }, [this] { return obstacle(); }}));
+    VLA_TRY(monitor_, serve::Monitor::open(options.metrics, insecure,
+                                           {[this] { return metrics_->text(server_.health()); },
+                                            [this] { return not_ready_reason(); }}));
   }
   if (!options.page.empty()) {
     VLA_TRY(page_, serve::Page::open(options.page, insecure,
@@ -108,18 +109,18 @@ Status Watch::open(const WatchOptions& options, bool insecure) {
   return {};
 }
 
-Watch::~Watch() {
+Observability::~Observability() {
   if (trace_ && trace_->n_dropped() > 0) log_.event(Level::warn, "trace_dropped", {{"requests", trace_->n_dropped()}});
 }
 
 /// Requests that come between the ready line and the first turn of the server wait for it: it is ready.
-std::string Watch::obstacle() const {
+std::string Observability::not_ready_reason() const {
   if (const char* phase = phase_) return phase;
   const serve::Health health = server_.health();
   return health.ready || health.uptime_s == 0 ? "" : "draining";
 }
 
-void Watch::loaded(const Engine& engine) {
+void Observability::loaded(const Engine& engine) {
   const v1::Description description = server_.describe(engine);
   if (metrics_) metrics_->describe(description, engine.memory());
   if (recorder_) recorder_->describe(description);
@@ -140,19 +141,19 @@ void Watch::loaded(const Engine& engine) {
   phase_ = "warming up";
 }
 
-void Watch::ready(double warm_up_ms) {
+void Observability::ready(double warm_up_ms) {
   phase_ = nullptr;
   log_.event(Level::info, "ready", {{"warm_up_ms", warm_up_ms}});
 }
 
-void Watch::ended(const Status& status) {
+void Observability::ended(const Status& status) {
   const serve::Health health = server_.health();
   serve::Log::Fields fields = {{"chunks", health.n_chunk}, {"errors", health.n_error}, {"uptime_s", health.uptime_s}};
   if (!status) fields.emplace_back("error", status.error().message());
   log_.event(status ? Level::info : Level::error, "shutdown", fields);
 }
 
-std::vector<serve::Observer*> Watch::observers() {
+std::vector<serve::Observer*> Observability::observers() {
   std::vector<serve::Observer*> all;
   for (serve::Observer* observer :
        std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recorder_.get(), page_.get()})

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "serve/relay.h"
+#include "serve/double_buffer.h"
 
 #include <doctest/doctest.h>
 
@@ -8,27 +8,27 @@
 #include <thread>
 #include <vector>
 
-using vla::serve::Relay;
+using vla::serve::DoubleBuffer;
 
 TEST_CASE("acts are computed in the order in which they were prepared, and at most two are under way") {
   constexpr int kN = 2000;
-  Relay<int> relay;
+  DoubleBuffer<int> acts;
   std::atomic<int> n_under_way = 0, most = 0;
   std::thread preparing([&] {
     for (int i = 0; i < kN; ++i) {
-      int& act = relay.to_prepare();
+      int& act = acts.to_prepare();
       const int now = ++n_under_way;
       if (now > most) most = now;
       act = i;
-      relay.prepared();
+      acts.prepared();
     }
-    relay.close();
+    acts.close();
   });
   std::vector<int> computed;
-  while (const int* act = relay.to_compute()) {
+  while (const int* act = acts.to_compute()) {
     computed.push_back(*act);
     --n_under_way;
-    relay.computed();
+    acts.computed();
   }
   preparing.join();
   REQUIRE(computed.size() == kN);
@@ -37,12 +37,12 @@ TEST_CASE("acts are computed in the order in which they were prepared, and at mo
 }
 
 TEST_CASE("an act that is prepared before the end is still computed") {
-  Relay<int> relay;
-  relay.to_prepare() = 7;
-  relay.prepared();
-  relay.close();
-  REQUIRE(relay.to_compute() != nullptr);
-  CHECK(*relay.to_compute() == 7);
-  relay.computed();
-  CHECK(relay.to_compute() == nullptr);
+  DoubleBuffer<int> acts;
+  acts.to_prepare() = 7;
+  acts.prepared();
+  acts.close();
+  REQUIRE(acts.to_compute() != nullptr);
+  CHECK(*acts.to_compute() == 7);
+  acts.computed();
+  CHECK(acts.to_compute() == nullptr);
 }

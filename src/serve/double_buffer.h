@@ -11,7 +11,7 @@ namespace vla::serve {
 
 /// Two acts that take turns: one thread prepares one of them while another thread computes the other.
 template <class Act>
-class Relay {
+class DoubleBuffer {
  public:
   /// The act to prepare next, once its last turn is over; `prepared` hands it over.
   Act& to_prepare() {

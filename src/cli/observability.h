@@ -19,19 +19,20 @@
 
 namespace vla::cli {
 
-struct WatchOptions {
+struct ObservabilityOptions {
   std::string metrics, page, log, level, trace, record;
   std::uint64_t record_limit_mb = 1024;
 };
 
-void add_watch_options(CLI::App& command, WatchOptions& options);
+void add_observability_options(CLI::App& command, ObservabilityOptions& options);
 
 /// Everything that watches a server: what the options ask for, and nothing else. It lives as long as the server runs.
-class Watch {
+class Observability {
  public:
   /// Before the bundle is loaded, so that readiness can be polled. Errors: usage, io.
-  static Result<std::unique_ptr<Watch>> start(const WatchOptions& options, const serve::Server& server, bool insecure);
-  ~Watch();
+  static Result<std::unique_ptr<Observability>> start(const ObservabilityOptions& options, const serve::Server& server,
+                                                      bool insecure);
+  ~Observability();
 
   /// The bundle is loaded, or even warm.
   void loaded(const Engine& engine);
@@ -46,9 +47,9 @@ class Watch {
   std::string page_url() const { return page_ ? page_->url() : std::string(); }
 
  private:
-  Watch(const WatchOptions& options, const serve::Server& server);
-  Status open(const WatchOptions& options, bool insecure);
-  std::string obstacle() const;
+  Observability(const ObservabilityOptions& options, const serve::Server& server);
+  Status open(const ObservabilityOptions& options, bool insecure);
+  std::string not_ready_reason() const;
 
   const serve::Server& server_;
   std::atomic<const char*> phase_ = "loading";  // null: serving
