@@ -7,5 +7,7 @@
 namespace vla {
 
 using Clock = std::chrono::steady_clock;
+/// Tells the present time: Clock::now, or a test's, which need not wait.
+using Now = Clock::time_point (*)();
 
 }  // namespace vla

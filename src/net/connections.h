@@ -9,6 +9,7 @@
 #include <memory>
 
 #include "net/eviction.h"
+#include "net/loop.h"
 
 namespace vla::net {
 
@@ -22,6 +23,7 @@ struct ConnectionLimits {
 /// `drop(why, detail)`, which takes it out of the table.
 template <class Connection>
 struct Connections {
+  Loop& loop;
   ConnectionLimits limits;
   std::map<std::uint64_t, std::shared_ptr<Connection>> connections = {};  // oldest first
   std::size_t n_held = 0;                                                 // bytes of requests that are not whole
@@ -33,7 +35,7 @@ struct Connections {
   }
   /// Drops connections until no more are left than `limits.connections`.
   void evict_idle() {
-    while (const auto chosen = to_evict(standings(), limits.connections, Clock::now()))
+    while (const auto chosen = to_evict(standings(), limits.connections, loop.now()))
       connections.at(*chosen)->drop("connections",
                                     fmt::format("more than {}, or {} in their handshake, and this one gives way",
                                                 limits.connections, max_handshakes(limits.connections)));
@@ -41,7 +43,7 @@ struct Connections {
   /// Drops connections until requests in receipt hold no more than `limits.receipt`.
   void evict_slow_uploads() {
     while (n_held > limits.receipt) {
-      const auto chosen = to_interrupt(standings(), limits.connections, limits.message, limits.receipt, Clock::now());
+      const auto chosen = to_interrupt(standings(), limits.connections, limits.message, limits.receipt, loop.now());
       if (!chosen) return;
       connections.at(*chosen)->drop(
           "receipt",

@@ -13,19 +13,19 @@ namespace vla::net {
 namespace {
 
 constexpr int kRound = 64;  // steps of sockets before the caller has its turn
-constexpr auto kLongest = std::chrono::seconds(1);
+constexpr Clock::duration kLongest = std::chrono::seconds(1);
 
 }  // namespace
 
 class Loop::Waiting {
  public:
-  void wait(const std::function<void()>& begin, int fd, std::optional<Clock::time_point> until) {
+  void wait(const std::function<void()>& begin, int fd, Clock::duration at_most) {
     try {
       begin();
       watch(fd);
       context.restart();
       is_woken_ = false;
-      context.run_one_until(std::min(until.value_or(Clock::time_point::max()), Clock::now() + kLongest));
+      context.run_one_for(at_most);
       for (int n = 0; n < kRound && !is_woken_ && context.poll_one() > 0; ++n) {
       }
     } catch (const std::exception&) {  // no memory: what was not begun is begun by the next call
@@ -49,11 +49,11 @@ class Loop::Waiting {
   bool is_watching_ = false, is_woken_ = false;
 };
 
-Loop::Loop() : waiting_(std::make_unique<Waiting>()) {}
+Loop::Loop(Now its_now) : now_(its_now), waiting_(std::make_unique<Waiting>()) {}
 Loop::~Loop() = default;
 boost::asio::io_context& Loop::context() { return waiting_->context; }
 void Loop::wait(const std::function<void()>& begin, int fd, std::optional<Clock::time_point> until) {
-  waiting_->wait(begin, fd, until);
+  waiting_->wait(begin, fd, until ? std::clamp(*until - now(), Clock::duration::zero(), kLongest) : kLongest);
 }
 
 }  // namespace vla::net

@@ -19,10 +19,12 @@ namespace vla::net {
 class Loop {
  public:
   /// Errors: std::runtime_error where the system has no descriptor.
-  Loop();
+  explicit Loop(Now now = Clock::now);
   ~Loop();
 
   boost::asio::io_context& context();
+  /// From any thread.
+  Clock::time_point now() const { return now_(); }
   /// Handles what sockets and timers bring until `fd`, the same in every call, can be read or `until` has come, for a
   /// second at most, and for one turn at least. `begin` starts what waits: where it throws for lack of memory, the next
   /// call begins the rest.
@@ -30,6 +32,7 @@ class Loop {
 
  private:
   class Waiting;
+  const Now now_;
   std::unique_ptr<Waiting> waiting_;
 };
 

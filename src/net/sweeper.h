@@ -2,32 +2,28 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <boost/asio/io_context.hpp>
-#include <boost/asio/steady_timer.hpp>
 #include <chrono>
-#include <functional>
+
+#include "net/loop.h"
 
 namespace vla::net {
 
 /// Calls a function once a second, as far as this process runs: a machine that stood still counts no second.
 class Sweeper {
  public:
-  explicit Sweeper(boost::asio::io_context& context) : timer_(context) {}
+  explicit Sweeper(const Loop& loop) : loop_(loop), last_(loop.now()) {}
 
-  /// To be called before every turn of the loop: it waits for the next second where it does not yet.
-  void begin(const std::function<void()>& sweep) {
-    if (is_waiting_) return;
-    timer_.expires_after(std::chrono::seconds(1));
-    timer_.async_wait([this, sweep](boost::system::error_code) {
-      is_waiting_ = false;
-      sweep();
-    });
-    is_waiting_ = true;
+  /// To be called before every turn of the loop, which comes at least once a second.
+  template <class Sweep>
+  void turn(Sweep sweep) {
+    if (loop_.now() - last_ < std::chrono::seconds(1)) return;
+    last_ = loop_.now();
+    sweep();
   }
 
  private:
-  boost::asio::steady_timer timer_;
-  bool is_waiting_ = false;
+  const Loop& loop_;
+  Clock::time_point last_;
 };
 
 }  // namespace vla::net

@@ -11,7 +11,8 @@
 
 namespace vla::serve {
 
-Exchange::Exchange(Jobs::Limits limits) : fd_(eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC)), jobs_(limits) {}
+Exchange::Exchange(Jobs::Limits limits, Now now)
+    : fd_(eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC)), now_(now), jobs_(limits) {}
 
 Exchange::~Exchange() {
   if (fd_ >= 0) ::close(fd_);
@@ -28,7 +29,7 @@ std::optional<Job> Exchange::next() {
   std::unique_lock lock(mutex_);
   for (;;) {
     const auto deadline = jobs_.first_deadline();
-    const bool has_late = deadline && *deadline <= Clock::now();
+    const bool has_late = deadline && *deadline <= now_();
     if (has_late) {
       wake();  // the I/O thread takes it out and comes back
     } else if (!jobs_.empty() && !(jobs_.is_crowded() && n_taken_ > 0)) {

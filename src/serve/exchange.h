@@ -29,7 +29,7 @@ struct Answer {
 class Exchange {
  public:
   using Jobs = Queue<Job>;
-  explicit Exchange(Jobs::Limits limits);
+  explicit Exchange(Jobs::Limits limits, Now now = Clock::now);
   ~Exchange();
   Exchange(const Exchange&) = delete;
   Exchange& operator=(const Exchange&) = delete;
@@ -57,6 +57,7 @@ class Exchange {
 
  private:
   int fd_;  // an eventfd
+  const Now now_;
   mutable std::mutex mutex_;
   std::condition_variable work_;
   Jobs jobs_;

@@ -50,7 +50,7 @@ void Io::run() {
       if (exchange_.drained()) break;
     }
   }
-  for (const auto end = Clock::now() + kLinger; has_answers() && Clock::now() < end;) wait(end);
+  for (const auto end = now() + kLinger; has_answers() && now() < end;) wait(end);
 }
 
 void Io::wait(std::optional<Clock::time_point> until) {
@@ -152,7 +152,7 @@ void Io::deliver(Answer& answer) {
   } else if (job.kind == Kind::act) {
     ++state_.n_chunk;
   }
-  answered.sent = Clock::now();
+  answered.sent = now();
   for (Observer* observer : observers_) observer->answered(answered);
 }
 
@@ -163,7 +163,7 @@ void Io::refuse_waiting() {
 
 void Io::deliver_waiting() {
   while (std::optional<Answer> answer = exchange_.take_answer()) send_answer(*answer);
-  while (std::optional<Job> job = exchange_.take_late(Clock::now())) {
+  while (std::optional<Job> job = exchange_.take_late(now())) {
     const std::uint64_t allowed = *job->deadline_ms;
     refuse(std::move(*job), [allowed] {
       return Error{Code::late, "deadline_ms", fmt::format("its turn within {} ms", allowed), "later",

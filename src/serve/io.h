@@ -58,6 +58,7 @@ class Io {
   void dropped(const Dropped& connection);
   void count_error() noexcept { ++state_.n_error; }  // of a request that was refused without a job
   void stop() noexcept;                              // as Server::stop
+  Clock::time_point now() const { return loop_.now(); }
   Health health() const { return state_.health(exchange_); }
 
  private:

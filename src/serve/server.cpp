@@ -101,9 +101,9 @@ Exchange::Jobs::Limits Server::limits_of(const ServerOptions& options) {
   return {options.max_queue, kQueueMessages * options.max_message};
 }
 
-Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked) try {
+Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked, Now now) try {
   VLA_TRY(const ServerOptions options, within_descriptors(asked));
-  std::unique_ptr<Server> server(new Server(options));
+  std::unique_ptr<Server> server(new Server(options, now));
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
   VLA_TRY(auto native, NativeFront::open(server->loop_, options));
   server->fronts_.push_back(std::move(native));
@@ -204,7 +204,7 @@ bool Server::prepare_next(const Engine& engine, Act& act) {
   for (Observer* observer : observers_) observer->started(*job);
   act.answer = {};
   act.answer.job = std::move(*job);
-  act.answer.started = Clock::now();
+  act.answer.started = loop_.now();
   act.clock = {};
   attempt(act, [&] { return prepare(engine, act); });
   return true;
@@ -212,7 +212,7 @@ bool Server::prepare_next(const Engine& engine, Act& act) {
 
 void Server::compute(Engine& engine, Act& act) {
   if (!act.answer.error) attempt(act, [&] { return respond(engine, act); });
-  act.answer.finished = Clock::now();
+  act.answer.finished = loop_.now();
   act.request = {};
   exchange_.put(std::move(act.answer));
   if (engine.device().failure()) return;

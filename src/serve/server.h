@@ -23,7 +23,7 @@ class Server {
  public:
   /// Binds the addresses. Requests that come before `run` wait. Errors: usage (an address or a key that is none; an
   /// address that others can reach, without keys), io (in use, not of this machine; no file descriptors).
-  static Result<std::unique_ptr<Server>> open(const ServerOptions& options);
+  static Result<std::unique_ptr<Server>> open(const ServerOptions& options, Now now = Clock::now);
 
   /// What was bound, ports filled in.
   std::vector<std::string> addresses() const;
@@ -49,7 +49,7 @@ class Server {
   Health health() const { return state_.health(exchange_); }
 
  private:
-  explicit Server(const ServerOptions& options) : options_(options), exchange_(limits_of(options)) {}
+  Server(const ServerOptions& options, Now now) : options_(options), exchange_(limits_of(options), now), loop_(now) {}
   static Exchange::Jobs::Limits limits_of(const ServerOptions& options);
 
   /// An act on its way to its answer.

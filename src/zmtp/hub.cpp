@@ -114,7 +114,6 @@ class Connection;
 
 /// What the connections of a hub share.
 struct Shared : net::Connections<Connection> {
-  asio::io_context& context;
   const CurveKeys* keys;
   Hub::Handler* handler = nullptr;
   bool has_freed = false;  // since the last sweep: answers of connections that closed
@@ -190,7 +189,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
                             [self = shared_from_this()](error_code error, std::size_t n) {
                               if (error) return self->close();
                               self->silent_ = 0;
-                              if (!self->session_.is_receiving()) self->began_ = Clock::now();
+                              if (!self->session_.is_receiving()) self->began_ = self->shared_.loop.now();
                               self->session_.filled(n);
                               self->handle();
                             });
@@ -213,12 +212,12 @@ class Connection : public std::enable_shared_from_this<Connection> {
           if (!is_closed_) read();
           return;
         }
-        began_ = served_ = Clock::now();
+        began_ = served_ = shared_.loop.now();
         if (!session_.client_key().empty()) client_.peer = session_.client_key();
         shared_.handler->received(client_, std::move(**message));
         if (is_closed_) return;
       }
-      asio::post(shared_.context, [self = shared_from_this()] { self->handle(); });
+      asio::post(shared_.loop.context(), [self = shared_from_this()] { self->handle(); });
     });
   }
 
@@ -250,7 +249,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   const std::string group_;  // of its address
   Session session_;
   std::deque<std::string> out_;  // the first one is on its way
-  Clock::time_point began_ = Clock::now(), served_ = {};
+  Clock::time_point began_ = client_.since, served_ = {};
   int age_ = 0, silent_ = 0, slow_ = 0;  // sweeps: since it came, since a byte, since a request began
   std::size_t n_held_ = 0, n_unread_ = 0;
   bool is_paused_ = false, is_closed_ = false;
@@ -260,8 +259,8 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
 class Hub::Sockets : public Shared {
  public:
-  Sockets(net::Loop& loop, const Limits& its_limits, const CurveKeys* its_keys)
-      : Shared{{its_limits}, loop.context(), its_keys} {}
+  Sockets(net::Loop& its_loop, const Limits& its_limits, const CurveKeys* its_keys)
+      : Shared{{its_loop, its_limits}, its_keys} {}
   ~Sockets() {
     for (const std::string& path : paths_) ::unlink(path.c_str());
     close_all();
@@ -277,12 +276,12 @@ class Hub::Sockets : public Shared {
           ::unlink(path.c_str());  // it was checked that no process serves it
           paths_.push_back(path);
         }
-        locals_.emplace_back(context, Local::endpoint(path));
+        locals_.emplace_back(loop.context(), Local::endpoint(path));
         return endpoint;
       }
       const auto wanted = tcp_endpoint(endpoint.substr(6));
       if (!wanted) return cannot_bind(endpoint, error_code(ENODEV, boost::system::system_category()));
-      tcps_.emplace_back(context, *wanted);
+      tcps_.emplace_back(loop.context(), *wanted);
       return text_of(tcps_.back().endpoint());
     } catch (const boost::system::system_error& error) {
       return cannot_bind(endpoint, error.code());
@@ -293,7 +292,7 @@ class Hub::Sockets : public Shared {
     handler = &its_handler;
     for (auto& listener : tcps_) listener.listen([this](tcp::socket socket) { add(std::move(socket)); });
     for (auto& listener : locals_) listener.listen([this](Local::socket socket) { add(std::move(socket)); });
-    sweeper_.begin([this] { sweep(); });
+    sweeper_.turn([this] { sweep(); });
   }
 
   void send(std::uint64_t connection, std::string_view response, bool delimiter) {
@@ -304,7 +303,7 @@ class Hub::Sockets : public Shared {
   template <class Socket>
   void add(Socket socket) {
     set_options(socket);
-    Client client{++n_connection_, peer_of(socket), {}, 0};
+    Client client{++n_connection_, peer_of(socket), {}, loop.now()};
     const auto connection = std::make_shared<Connection>(*this, std::move(socket), std::move(client));
     connections.emplace(n_connection_, connection);
     connection->start();
@@ -319,7 +318,7 @@ class Hub::Sockets : public Shared {
   std::list<net::Listener<tcp>> tcps_;
   std::list<net::Listener<Local>> locals_;
   std::vector<std::string> paths_;
-  net::Sweeper sweeper_{context};
+  net::Sweeper sweeper_{loop};
   std::uint64_t n_connection_ = 0;
 };
 

@@ -16,10 +16,10 @@ namespace vla::zmtp {
 /// The peer of a connection.
 struct Client {
   std::uint64_t connection = 0;
-  std::string peer;             // with keys, the client's public key; else its address, or `ipc` and its user
-  std::string name;             // as it calls itself in a hello
-  std::uint64_t n_request = 0;  // that came so far
-  Clock::time_point since = Clock::now();
+  std::string peer;              // with keys, the client's public key; else its address, or `ipc` and its user
+  std::string name;              // as it calls itself in a hello
+  Clock::time_point since = {};  // it is connected
+  std::uint64_t n_request = 0;   // that came so far
 };
 
 /// The sockets of a ZeroMQ ROUTER: what listens, and the connections that came. All of it runs inside the loop's

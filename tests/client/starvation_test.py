@@ -109,26 +109,6 @@ def test_with_few_file_descriptors_fewer_connections_are_taken_and_health_is_tol
         assert server.stop() == 0
 
 
-def test_a_slow_request_is_answered_while_those_who_fall_silent_lose_their_connection(server):
-    silent = [hostile.connect(server.address, data) for data in (b"", hostile.GREETING, hostile.HANDSHAKE)]
-    frame = bytes([0, len(HEALTH)]) + HEALTH
-    with hostile.connect(server.address, hostile.HANDSHAKE) as raw:
-        for i in range(len(frame)):
-            raw.sendall(frame[i : i + 1])
-            time.sleep(22 / len(frame))
-        raw.settimeout(SECONDS)
-        came = b""
-        while b"\x32" not in came[100:]:  # field 6 of a response: health
-            part = raw.recv(4096)
-            assert part, "the connection was closed"
-            came += part
-    for raw in silent:
-        raw.settimeout(SECONDS)
-        while raw.recv(4096):  # until the server has closed it
-            pass
-        raw.close()
-
-
 def test_all_of_it_at_once_leaves_a_client_that_behaves_its_answers(server, robot):
     robot.acts(5)
     before, stopped = resident_mib(server), threading.Event()

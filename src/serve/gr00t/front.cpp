@@ -117,7 +117,7 @@ void Front::received(zmtp::Client& client, zmtp::Message message) {
   job.peer = client.peer;
   job.is_first = client.n_request == 0;
   job.size = message.size;
-  job.at = Clock::now();
+  job.at = io_->now();
   job.share = {net::group_of(client.peer), client.since};
   job.request_id = ++client.n_request;
   const std::optional<Error> refused = message.refused;

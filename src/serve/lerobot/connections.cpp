@@ -49,13 +49,13 @@ std::optional<tcp::endpoint> endpoint_of(std::string_view peer) {
 /// Calls of gRPC's threads and handlers of the loop's meet at the lock.
 class Connections::All {
  public:
-  All(net::Loop& loop, const net::ConnectionLimits& limits) : context_(loop.context()), table_{limits} {}
+  All(net::Loop& loop, const net::ConnectionLimits& limits) : loop_(loop), table_{loop, limits} {}
   ~All() {
     for (const auto& [number, connection] : table_.connections) connection->shut();
   }
 
   Result<std::string> bind(const std::string& address, const char* option, bool insecure) {
-    return net::bind_tcp(listener_, context_, address, option, insecure);
+    return net::bind_tcp(listener_, loop_.context(), address, option, insecure);
   }
   void begin(Handler& handler) {
     handler_ = &handler;
@@ -68,7 +68,7 @@ class Connections::All {
     const auto number = endpoint ? numbers_.find(*endpoint) : numbers_.end();
     const auto found = number == numbers_.end() ? nullptr : table_.find(number->second);
     if (!found) return std::nullopt;
-    if (found->n_held == 0) found->began = Clock::now();
+    if (found->n_held == 0) found->began = loop_.now();
     found->is_open = true;
     ++found->n_call;
     found->n_held += n_byte, table_.n_held += n_byte;
@@ -89,7 +89,7 @@ class Connections::All {
     const auto found = table_.find(connection);
     if (!found) return;
     found->n_held -= n_byte, table_.n_held -= n_byte;
-    if (is_whole) found->served = Clock::now();
+    if (is_whole) found->served = loop_.now();
   }
   void call_ends(std::uint64_t connection) {
     const std::lock_guard lock(mutex_);
@@ -121,7 +121,7 @@ class Connections::All {
     const tcp::endpoint endpoint = plain(socket.remote_endpoint(gone));
     const int descriptor = gone ? -1 : ::dup(socket.native_handle());
     if (descriptor < 0) return;
-    const Peer peer{++n_connection_, endpoint.address().to_string(), Clock::now()};
+    const Peer peer{++n_connection_, endpoint.address().to_string(), loop_.now()};
     const std::shared_ptr<Connection> connection(new Connection{*this, peer, endpoint, std::move(socket)});
     {
       const std::lock_guard lock(mutex_);
@@ -141,7 +141,7 @@ class Connections::All {
     if (table_.find(connection.peer.connection)) take_out(connection, "", "");
   }
   void take_out(Connection& connection, const std::string& why, const std::string& detail) {
-    asio::post(context_, [this, peer = connection.peer, why, detail] { handler_->ended(peer, why, detail); });
+    asio::post(loop_.context(), [this, peer = connection.peer, why, detail] { handler_->ended(peer, why, detail); });
     n_call_ -= connection.n_call, table_.n_held -= connection.n_held;
     connection.shut();
     table_.connections.erase(connection.peer.connection);
@@ -153,13 +153,13 @@ class Connections::All {
     while (n_call_ > most) {
       net::Standings all = table_.standings();
       for (net::Standing& standing : all) standing.n_held = table_.connections.at(standing.connection)->n_call;
-      const auto chosen = net::to_interrupt(all, most, kMaxCalls, most, Clock::now());
+      const auto chosen = net::to_interrupt(all, most, kMaxCalls, most, loop_.now());
       if (!chosen) return;
       table_.connections.at(*chosen)->drop("calls", fmt::format("more than {} at once, and these give way", most));
     }
   }
 
-  asio::io_context& context_;
+  net::Loop& loop_;
   std::optional<net::Listener<tcp>> listener_;
   Handler* handler_ = nullptr;
   std::uint64_t n_connection_ = 0;

@@ -59,9 +59,10 @@ Result<std::unique_ptr<serve::Front>> Front::open(net::Loop& loop, const ServerO
 
 Front::Front(net::Loop& loop, const ServerOptions& options)
     : options_(options),
+      loop_(loop),
       rpcs_(loop,
             {options.max_message, options.max_connections, kReceiptMessages * (options.max_message + Rpcs::kMaxPiece)}),
-      sweeper_(loop.context()) {}
+      sweeper_(loop) {}
 
 Status Front::serve(const Engine& engine, const v1::Description& description) {
   VLA_TRY(const Robot* robot, only_robot(engine, "--lerobot"));
@@ -76,12 +77,12 @@ Status Front::serve(const Engine& engine, const v1::Description& description) {
 void Front::begin(Io& io) {
   io_ = &io;
   rpcs_.begin(*this);
-  sweeper_.begin([this] { sweep(); });
+  sweeper_.turn([this] { sweep(); });
 }
 
 void Front::called(Rpc rpc) {
   Client& client = client_of(rpc.peer);
-  client.used = Clock::now();
+  client.used = loop_.now();
   if (rpc.method == "GetActions" && client.setup) {
     client.asking.push_back({rpc.id, client.used});
     return submit_next(client);
@@ -157,7 +158,7 @@ void Front::bound_observed() {
       if (client.observed)
         all.push_back(
             {connection, net::group_of(client.peer.address), true, {}, client.used, client.observed->bytes.size()});
-    const auto chosen = net::to_interrupt(all, 0, options_.max_message, most, Clock::now());
+    const auto chosen = net::to_interrupt(all, 0, options_.max_message, most, loop_.now());
     if (!chosen) return;
     clients_.at(*chosen).observed.reset();
   }
@@ -175,7 +176,7 @@ void Front::submit_next(Client& client) {
   job.share = {net::group_of(client.peer.address), client.peer.since};
   job.is_first = client.n_request == 0;
   job.size = observed->bytes.size();
-  job.at = Clock::now();
+  job.at = loop_.now();
   job.request_id = ++client.n_request;
   job.kind = Kind::act;
   job.call = std::make_unique<Request>(*this, rpc, observed, client.setup);
@@ -196,7 +197,7 @@ void Front::ended(const Peer& peer, const std::string& why, const std::string& d
 
 void Front::sweep() {
   for (auto& [connection, client] : clients_)
-    while (!client.asking.empty() && Clock::now() - client.asking.front().since > kPatience) {
+    while (!client.asking.empty() && loop_.now() - client.asking.front().since > kPatience) {
       rpcs_.answer(client.asking.front().rpc, {});  // nothing yet
       client.asking.pop_front();
     }

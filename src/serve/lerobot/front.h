@@ -56,6 +56,7 @@ class Front final : public serve::Front, Rpcs::Handler {
   void sweep();
 
   const ServerOptions options_;
+  const net::Loop& loop_;
   Rpcs rpcs_;
   net::Sweeper sweeper_;
   std::string address_, embodiment_;

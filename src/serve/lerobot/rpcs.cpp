@@ -9,6 +9,7 @@
 #include <grpcpp/support/proto_buffer_reader.h>
 
 #include <atomic>
+#include <boost/asio/io_context.hpp>
 #include <boost/asio/post.hpp>
 #include <map>
 #include <mutex>
@@ -60,7 +61,7 @@ class Rpcs::All : public grpc::CallbackGenericService, Connections::Handler {
  public:
   class Call;
   All(net::Loop& loop, const Limits& limits)
-      : limits_(limits), connections_(loop, limits), context_(loop.context()), sweeper_(loop.context()) {}
+      : loop_(loop), limits_(limits), connections_(loop, limits), sweeper_(loop) {}
   ~All() override {
     std::map<std::uint64_t, Call*> left;
     {
@@ -102,7 +103,7 @@ class Rpcs::All : public grpc::CallbackGenericService, Connections::Handler {
   void begin(Rpcs::Handler& handler) {
     handler_ = &handler;
     connections_.begin(*this);
-    sweeper_.begin([this] { sweep(); });
+    sweeper_.turn([this] { sweep(); });
   }
   bool has_answers() const { return n_leaving_ > 0; }
 
@@ -119,12 +120,13 @@ class Rpcs::All : public grpc::CallbackGenericService, Connections::Handler {
   }
   static void end(Call& call, const Error& error);
   void hand_over(Rpc rpc) {
-    boost::asio::post(context_, [this, rpc = std::move(rpc)]() mutable { handler_->called(std::move(rpc)); });
+    boost::asio::post(loop_.context(), [this, rpc = std::move(rpc)]() mutable { handler_->called(std::move(rpc)); });
   }
   void cancelled(std::uint64_t id) {
-    boost::asio::post(context_, [this, id] { handler_->cancelled(id); });
+    boost::asio::post(loop_.context(), [this, id] { handler_->cancelled(id); });
   }
 
+  net::Loop& loop_;
   const Limits limits_;
   Connections connections_;
   std::atomic<std::size_t> n_leaving_ = 0;  // calls that end
@@ -141,7 +143,6 @@ class Rpcs::All : public grpc::CallbackGenericService, Connections::Handler {
   static Error shutting_down() { return {Code::shutting_down, "call", "", "the server stops"}; }
   void sweep();
 
-  boost::asio::io_context& context_;
   net::Sweeper sweeper_;
   Rpcs::Handler* handler_ = nullptr;
   std::mutex mutex_;
@@ -224,7 +225,7 @@ class Rpcs::All::Call final : public grpc::ServerGenericBidiReactor {
   All& all_;
   Rpc rpc_;
   const std::uint64_t id_, connection_;
-  const Clock::time_point began_ = Clock::now();
+  const Clock::time_point began_ = all_.loop_.now();
   grpc::ByteBuffer in_, out_;
   std::size_t n_held_ = kMaxPiece;  // the one that gRPC has a part of, and those before
   std::atomic<bool> is_whole_ = false;
@@ -260,7 +261,7 @@ void Rpcs::All::sweep() {
   {
     const std::lock_guard lock(mutex_);
     for (const auto& [id, call] : live_)
-      if (call->is_stuck(Clock::now())) stuck.push_back(id);
+      if (call->is_stuck(loop_.now())) stuck.push_back(id);
   }
   for (const std::uint64_t id : stuck)
     if (Call* const call = take(id)) end(*call, {Code::late, "call", "a whole message within 60 s", "a part"});

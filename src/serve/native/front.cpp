@@ -120,7 +120,7 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
     job.request_id = request_id;
     job.kind = envelope.kind;
     job.size = message.size;
-    job.at = Clock::now();
+    job.at = io_->now();
     job.share = {net::group_of(client.peer), client.since};
     job.deadline_ms = envelope.deadline_ms;
     job.call = std::make_unique<Request>(*this, connection, std::move(message), envelope);

@@ -92,7 +92,7 @@ void Front::received(Peer& peer, std::string message, bool is_text) {
   job.peer = peer.address;
   job.is_first = peer.n_request == 0;
   job.size = message.size();
-  job.at = Clock::now();
+  job.at = io_->now();
   job.share = {net::group_of(peer.address), peer.since};
   job.request_id = ++peer.n_request;
   auto request = std::make_unique<Request>(*this, peer, std::move(message));

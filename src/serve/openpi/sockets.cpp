@@ -54,7 +54,6 @@ class Connection;
 
 /// What the connections share.
 struct Shared : net::Connections<Connection> {
-  asio::io_context& context;
   std::string api_key;
   Sockets::Handler* handler = nullptr;
 };
@@ -171,7 +170,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   }
   void handle() {
     silent_ = 0;
-    if (n_held_ == 0) began_ = Clock::now();
+    if (n_held_ == 0) began_ = shared_.loop.now();
     hold(buffer_.size());
     shared_.evict_slow_uploads();
     if (is_closed_) return;
@@ -184,7 +183,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     if (!is_waiting_ || is_busy_ || is_failed_) return;
     is_waiting_ = false;
     is_busy_ = true;
-    served_ = Clock::now();
+    served_ = shared_.loop.now();
     const auto data = buffer_.data();
     std::string message(static_cast<const char*>(data.data()), data.size());
     buffer_.consume(buffer_.size());
@@ -210,7 +209,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   }
   void answered() {
     is_busy_ = false;
-    peer_.total_ms = std::chrono::duration<double, std::milli>(Clock::now() - served_).count();
+    peer_.total_ms = std::chrono::duration<double, std::milli>(shared_.loop.now() - served_).count();
   }
   /// Code and reason of the reference.
   void end() {
@@ -241,7 +240,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   http::request_parser<http::empty_body> parser_;
   Response response_;
   std::deque<Out> out_;  // the first one is on its way
-  Clock::time_point began_ = Clock::now(), served_ = {};
+  Clock::time_point began_ = peer_.since, served_ = {};
   int age_ = 0, silent_ = 0;  // sweeps: since it came, since a sign of life
   std::size_t n_held_ = 0;
   bool is_open_ = false, is_greeted_ = false, is_busy_ = false, is_waiting_ = false;
@@ -252,18 +251,18 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
 class Sockets::All : public Shared {
  public:
-  All(net::Loop& loop, const Limits& its_limits, std::string its_key)
-      : Shared{{its_limits}, loop.context(), std::move(its_key)} {}
+  All(net::Loop& its_loop, const Limits& its_limits, std::string its_key)
+      : Shared{{its_loop, its_limits}, std::move(its_key)} {}
   ~All() { close_all(); }
 
   Result<std::string> bind(const std::string& address, const char* option, bool insecure) {
-    return net::bind_tcp(listener_, context, address, option, insecure);
+    return net::bind_tcp(listener_, loop.context(), address, option, insecure);
   }
 
   void begin(Handler& its_handler) {
     handler = &its_handler;
     listener_->listen([this](tcp::socket socket) { add(std::move(socket)); });
-    sweeper_.begin([this] { sweep_all(); });
+    sweeper_.turn([this] { sweep_all(); });
   }
 
  private:
@@ -271,7 +270,7 @@ class Sockets::All : public Shared {
     error_code gone;
     socket.set_option(tcp::no_delay(true), gone);
     const auto endpoint = socket.remote_endpoint(gone);
-    Peer peer{++n_connection_, gone ? "" : endpoint.address().to_string()};
+    Peer peer{++n_connection_, gone ? "" : endpoint.address().to_string(), loop.now()};
     const auto connection = std::make_shared<Connection>(*this, std::move(socket), std::move(peer));
     connections.emplace(n_connection_, connection);
     connection->start();
@@ -279,7 +278,7 @@ class Sockets::All : public Shared {
   }
 
   std::optional<net::Listener<tcp>> listener_;
-  net::Sweeper sweeper_{context};
+  net::Sweeper sweeper_{loop};
   std::uint64_t n_connection_ = 0;
 };
 

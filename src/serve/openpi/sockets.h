@@ -17,9 +17,9 @@ namespace vla::serve::openpi {
 struct Peer {
   std::uint64_t connection = 0;
   std::string address;
+  Clock::time_point since = {};         // it is connected
   std::uint64_t n_request = 0;          // that came so far
   std::optional<double> total_ms = {};  // from the receipt of the last request to its answer's departure
-  Clock::time_point since = Clock::now();
 };
 
 /// WebSocket connections at one address, and HTTP's `/healthz`. All of it runs inside the loop's `wait`, and no peer is
