@@ -2,10 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/executor.h"
 
-#include <linux/futex.h>
-#include <sys/syscall.h>
-#include <unistd.h>
-
 #include <algorithm>
 #include <cstdlib>
 #include <map>
@@ -31,8 +27,6 @@ void pause() {
   asm volatile("yield");
 #endif
 }
-
-std::uint32_t* address(std::atomic<std::uint32_t>& word) { return reinterpret_cast<std::uint32_t*>(&word); }
 
 }  // namespace
 
@@ -69,7 +63,7 @@ Status Executor::start() {
 Executor::~Executor() {
   stop_ = true;
   ++opened_;
-  syscall(SYS_futex, address(opened_), FUTEX_WAKE_PRIVATE, n_thread_, nullptr, nullptr, 0);
+  opened_.notify_all();
   for (std::thread& thread : threads_) thread.join();
 }
 
@@ -163,7 +157,7 @@ void Executor::finish_item() {
   if (phase.done != nullptr) *phase.done = std::chrono::steady_clock::now();
   if (i_phase_ + 1 < phases_.size()) return open(i_phase_ + 1);
   finished_.store(true, std::memory_order_seq_cst);
-  wake(caller_word_, caller_sleeps_, 1);
+  wake(caller_word_, caller_sleeps_, false);
 }
 
 void Executor::open(std::size_t i_phase) {
@@ -180,8 +174,8 @@ void Executor::open(std::size_t i_phase) {
   }
   // A single item goes to the first thread, usually the one that opens the phase.
   if (n > 1) {
-    wake(opened_, n_sleeping_, static_cast<int>(std::min<std::int64_t>(n - 1, n_thread_)));
-    wake(caller_word_, caller_sleeps_, 1);
+    wake(opened_, n_sleeping_, n > 2);
+    wake(caller_word_, caller_sleeps_, false);
   }
 }
 
@@ -197,14 +191,13 @@ void Executor::wait(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleepi
   } while (std::chrono::steady_clock::now() - start < kSpin);
   n_sleeping.fetch_add(1, std::memory_order_seq_cst);
   const std::uint32_t seen = word.load(std::memory_order_seq_cst);
-  if (!ready()) syscall(SYS_futex, address(word), FUTEX_WAIT_PRIVATE, seen, nullptr, nullptr, 0);
+  if (!ready()) word.wait(seen);
   n_sleeping.fetch_sub(1, std::memory_order_seq_cst);
 }
 
-void Executor::wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, int n) {
+void Executor::wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, bool all) {
   word.fetch_add(1, std::memory_order_seq_cst);
-  if (n_sleeping.load(std::memory_order_seq_cst) > 0)
-    syscall(SYS_futex, address(word), FUTEX_WAKE_PRIVATE, n, nullptr, nullptr, 0);
+  if (n_sleeping.load(std::memory_order_seq_cst) > 0) all ? word.notify_all() : word.notify_one();
 }
 
 }  // namespace vla::kernels

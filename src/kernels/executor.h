@@ -125,7 +125,7 @@ class Executor {
   bool has_work() const;
   template <class Ready>
   void wait(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, const Ready& ready);
-  void wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, int n);
+  void wake(std::atomic<std::uint32_t>& word, std::atomic<int>& n_sleeping, bool all);
 
   const int n_thread_, n_stretch_;
   std::mutex turn_;  // of those who run
