@@ -11,7 +11,8 @@ import unittest
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.append(str(ROOT / "scripts"))
+sys.path += [str(ROOT / "scripts"), str(ROOT / "tools")]
+from goldens.recorder import EVERY_TAP  # noqa: E402
 from model_tables import registered, written  # noqa: E402
 
 
@@ -25,6 +26,8 @@ def problems(root):
                 found.append(f"{name}: missing {paths[0]}")
         if not list((root / "tests/golden" / name).glob("*/expected.gguf")):
             found.append(f"{name}: missing a case with expected.gguf under tests/golden/{name}/")
+        if not any(case.startswith(f"{name}/") for case in EVERY_TAP):
+            found.append(f"{name}: missing a case of which every tap is kept, in tools/goldens/recorder.py")
         if not (root / f"docs/models/{name}.json").is_file():
             found.append(f"{name}: missing docs/models/{name}.json")
     return found

@@ -35,7 +35,7 @@ def record(name, case):
     if not (recorded / "observation.json").is_file():
         write_observation(case, recorded)
     folder = make(accept=True) / name
-    taps = write_expected(folder, case.seed, recorded)
+    taps = write_expected(folder, name, case.seed, recorded)
     largest = np.abs(taps["chunk"]).max()
     print(f"{name}: {len(taps)} taps, chunk up to {largest:.2f}, published dtypes "
           f"{np.abs(taps['chunk.bf16'] - taps['chunk']).max() / largest:.1e} away")
