@@ -8,6 +8,7 @@ import os
 import random
 import threading
 import time
+from dataclasses import replace
 from typing import Any, Callable, Dict, Mapping, Optional, Union
 
 import zmq
@@ -32,6 +33,8 @@ class Client(Handle):
             chunk = policy.act(images={"top": frame}, state=q, text="open the drawer")
 
     address             tcp://HOST:PORT or ipc://PATH
+    policy              its name, where the server has several. A client that names its policy goes on where another version takes its
+                        place (`vla ctl load`), which has the same views, states and actions; `chunk.bundle` tells which one answered
     timeout             seconds that a call may take, connecting included
     server_key          for a server with CURVE: its public key, and with it
     secret_key          this client's secret key: 40 characters each, or the files of `vla keygen` (server.public, robot.secret)
@@ -47,6 +50,7 @@ class Client(Handle):
         self,
         address: str,
         *,
+        policy: Optional[str] = None,
         timeout: float = 10.0,
         server_key: Union[str, os.PathLike, None] = None,
         secret_key: Union[str, os.PathLike, None] = None,
@@ -55,7 +59,7 @@ class Client(Handle):
             raise UsageError("timeout", "seconds above 0", str(timeout))
         if (server_key is None) != (secret_key is None):
             raise UsageError("CURVE", "server_key and secret_key", "one of them")
-        self.address, self.timeout = address, timeout
+        self.address, self.policy, self.timeout = address, policy, timeout
         self._curve = curve_keys(server_key, secret_key) if server_key is not None and secret_key is not None else None
         self._pid = os.getpid()
         self._lock = threading.RLock()
@@ -80,7 +84,7 @@ class Client(Handle):
         """What the policy takes and gives; asked for once. Errors: Timeout, Disconnected, Incompatible."""
         with self._lock:
             if self._spec is None:
-                description = self._ask("description", self.timeout, _describe).result()
+                description = self._ask("description", self.timeout, self._describe).result()
                 self._spec, self._limits = wire.spec_of(description), description.limits
             return self._spec
 
@@ -140,6 +144,7 @@ class Client(Handle):
         deadline_ms = timeout * 1000 if deadline_ms is None else deadline_ms
 
         def write(request: Any) -> bytes:
+            request.act.policy = self.policy or ""
             return wire.act_bytes(request, spec, limits, seed=seed, noise=noise, deadline_ms=deadline_ms, **observation)
 
         capture_time_ns = observation.get("capture_time_ns")
@@ -194,7 +199,7 @@ class Client(Handle):
             hello.hello.client_name, hello.hello.client_version = "vla-cpp-python", __version__
             self._connection.send(hello.SerializeToString())
             if self._spec is not None:  # the server may be another one by now
-                self._connection.send(_describe(self._new_request()))
+                self._connection.send(self._describe(self._new_request()))
         return self._connection
 
     def _check_process(self) -> None:
@@ -266,9 +271,16 @@ class Client(Handle):
 
     def _check_bundle(self, bundle: Any) -> None:
         known = self._spec.bundle if self._spec else bundle
-        if bundle.checksum != known.checksum:
+        if bundle.checksum != known.checksum and self._spec and self.policy is not None:
+            self._spec = replace(self._spec, bundle=wire.bundle_of(bundle))  # the server sees to it that nothing else differs
+        elif bundle.checksum != known.checksum:
             expected, found = (f"{b.name} ({b.checksum})" for b in (known, bundle))
             raise Incompatible(self.address, expected, found, "make a new Client, and read its spec")
+
+    def _describe(self, request: Any) -> bytes:
+        request.describe.policy = self.policy or ""
+        request.describe.SetInParent()
+        return request.SerializeToString()
 
     def _drop(self, error: VlaError) -> None:
         """Ends the connection, and with it every request under way."""
@@ -278,11 +290,6 @@ class Client(Handle):
         for pending in self._pending.values():
             pending._error = error
         self._pending.clear()
-
-
-def _describe(request: Any) -> bytes:
-    request.describe.SetInParent()
-    return request.SerializeToString()
 
 
 def _health(request: Any) -> bytes:

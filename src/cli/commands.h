@@ -61,6 +61,9 @@ void add_memory(CLI::App& command, std::size_t& bytes);
 /// comes back is the problem, or empty.
 std::string find_pulled(std::string& bundle);
 
+/// The name and the bundle of `NAME=FILE`; a file alone has the name that it has without folders and `.gguf`.
+std::pair<std::string, std::string> named_bundle(const std::string& text);
+
 inline void add_bundle(CLI::App& command, std::string& bundle, bool required) {
   command
       .add_option("BUNDLE", bundle,
@@ -78,6 +81,7 @@ Command add_inspect(CLI::App& app);
 Command add_compare(CLI::App& app);
 Command add_serve(CLI::App& app);
 Command add_keygen(CLI::App& app);
+Command add_ctl(CLI::App& app);
 Command add_bench(CLI::App& app);
 Command add_doctor(CLI::App& app);
 Command add_quantize(CLI::App& app);

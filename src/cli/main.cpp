@@ -87,6 +87,7 @@ int run(int argc, char** argv) {
 #ifdef VLA_SERVER
   choose("serve", vla::cli::add_serve(app));
   choose("keygen", vla::cli::add_keygen(app));
+  choose("ctl", vla::cli::add_ctl(app));
   choose("replay", vla::cli::add_replay(app));
 #endif
 

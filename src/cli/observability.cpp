@@ -120,8 +120,8 @@ std::string Observability::not_ready_reason() const {
   return health.ready || health.uptime_s == 0 ? "" : "draining";
 }
 
-void Observability::loaded(const Engine& engine) {
-  const v1::Description description = server_.describe(engine);
+void Observability::loaded(const std::string& name, const Engine& engine) {
+  const v1::Description description = server_.describe(name, engine);
   if (metrics_) metrics_->describe(description, engine.memory());
   if (recorder_) recorder_->describe(description);
   if (page_) {
@@ -130,15 +130,21 @@ void Observability::loaded(const Engine& engine) {
     page_->describe(description, ranges);
   }
   const v1::Bundle& bundle = description.bundle();
+  if (phase_ != nullptr) phase_ = "warming up";
   log_.event(Level::info, "loaded",
-             {{"bundle", bundle.name()},
+             {{"policy", name},
+              {"bundle", bundle.name()},
               {"arch", bundle.arch()},
               {"checksum", bundle.checksum()},
               {"device", description.runtime().device()},
               {"precision", description.runtime().precision()},
               {"kernels", description.runtime().kernels()},
               {"memory_mb", static_cast<double>(engine.memory().total()) / 1e6}});
-  phase_ = "warming up";
+}
+
+void Observability::unloaded(const std::string& name) {
+  if (metrics_) metrics_->forget(name);
+  log_.event(Level::info, "unloaded", {{"policy", name}});
 }
 
 void Observability::ready(double warm_up_ms) {

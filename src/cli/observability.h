@@ -34,9 +34,11 @@ class Observability {
                                                       bool insecure);
   ~Observability();
 
-  /// The bundle is loaded, or even warm.
-  void loaded(const Engine& engine);
+  /// A policy is loaded that answers under this name; all of them are warm, after so many milliseconds.
+  void loaded(const std::string& name, const Engine& engine);
   void ready(double warm_up_ms);
+  /// A policy answers no more.
+  void unloaded(const std::string& name);
   /// How the server ended. The log says so.
   void ended(const Status& status);
 

@@ -65,4 +65,12 @@ std::string find_pulled(std::string& bundle) {
   return "";
 }
 
+std::pair<std::string, std::string> named_bundle(const std::string& text) {
+  const std::size_t equals = text.find('=');
+  if (equals != std::string::npos) return {text.substr(0, equals), text.substr(equals + 1)};
+  std::string name = text.substr(text.rfind('/') + 1);
+  if (name.ends_with(".gguf")) name.resize(name.size() - 5);
+  return {name, text};
+}
+
 }  // namespace vla::cli

@@ -68,19 +68,20 @@ Result<serve::ServerOptions> limits_of(const v1::Limits& limits) {
 Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOptions& options) {
   VLA_TRY(const serve::ServerOptions limits, limits_of(recording.description().limits()));
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(limits));
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
-                                                                              .kernels = options.kernels,
-                                                                              .device = options.device,
-                                                                              .embodiment = options.embodiment,
-                                                                              .all_robots = true}));
-  VLA_CHECK(server->load(*engine));
+  VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
+                                                                        .kernels = options.kernels,
+                                                                        .device = options.device,
+                                                                        .embodiment = options.embodiment,
+                                                                        .all_robots = true}));
+  VLA_CHECK(server->add(recording.description().policy(), std::move(engine)));
+  VLA_CHECK(server->begin());
   options.replay.address = server->addresses().front();
   std::optional<Result<serve::ReplayReport>> result;
   VLA_TRY(std::thread client, start_thread("replay", [&]() noexcept {
             result = serve::replay(recording, options.replay);
             server->stop();
           }));
-  const Status served = server->run(*engine);
+  const Status served = server->run();
   client.join();
   VLA_CHECK(served);
   return std::move(*result);

@@ -14,8 +14,10 @@
 #include <cstring>
 #include <filesystem>
 #include <fstream>
+#include <map>
 
 #include "cli/commands.h"
+#include "cli/control.h"
 #include "cli/observability.h"
 #include "cli/say.h"
 #include "processor/constant_actions.h"
@@ -27,7 +29,8 @@ namespace vla::cli {
 namespace {
 
 struct ServeOptions {
-  std::string bundle, kernels, device, embodiment;
+  std::vector<std::string> bundles;  // FILE or NAME=FILE
+  std::string kernels, device, embodiment, control;
   int n_thread = 0;
   std::size_t memory = 0;
   bool restarts = false;
@@ -63,47 +66,83 @@ std::string quoted(const std::string& value) {
   return out + "'";
 }
 
-/// One line that programs can split as a shell would.
-void print_ready(const serve::Server& server, const Engine& engine, double load_ms, double warm_up_ms,
-                 const Observability& observability) {
-  std::vector<std::string> features, tags, degraded, constant;  // of all robots
+/// A line that programs can split as a shell would.
+class Line {
+ public:
+  explicit Line(std::string first) : text_(std::move(first)) {}
+  Line& add(const char* name, const std::string& value) {
+    text_ += fmt::format(" {}={}", name, quoted(value));
+    return *this;
+  }
+  /// Nothing where there are no values.
+  Line& add(const char* name, const std::vector<std::string>& values, const char* between = ",") {
+    return values.empty() ? *this : add(name, fmt::format("{}", fmt::join(values, between)));
+  }
+  void print() const {
+    say(stdout, "{}\n", text_);
+    std::fflush(stdout);
+  }
+
+ private:
+  std::string text_;
+};
+
+void add_policy(Line& line, const LoadedPolicy& policy) {
+  const Engine& engine = *policy.engine;
+  std::vector<std::string> tags;
+  for (const Robot* robot : engine.robots())
+    if (const std::string& tag = robot->bundle().embodiment(); !tag.empty()) tags.push_back(tag);
+  const v1::Description description = serve::describe(engine, {});
+  line.add("bundle", description.bundle().name()).add("arch", description.bundle().arch()).add("embodiments", tags);
+  line.add("device", description.runtime().device()).add("precision", description.runtime().precision());
+  line.add("kernels", description.runtime().kernels());
+  line.add("memory_mb", fmt::format("{:.1f}", static_cast<double>(engine.memory().total()) / 1e6));
+  if (const std::size_t n_read = engine.budget().n_read; n_read > 0)
+    line.add("read_mb", fmt::format("{:.1f}", static_cast<double>(n_read) / 1e6));
+}
+
+/// What a user has to know before the policy moves a robot.
+void add_features(Line& line, const LoadedPolicy& policy) {
+  std::vector<std::string> features, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
       if (!text.empty() && std::find(all.begin(), all.end(), text) == all.end()) all.push_back(text);
   };
-  for (const Robot* robot : engine.robots()) {
+  for (const Robot* robot : policy.engine->robots()) {
     add_new(features, robot->processor().views().names());
     add_new(features, robot->processor().states().names());
     add_new(degraded, robot->processor().degraded());
     add_new(constant, constant_actions(robot->processor(), robot->solver_horizon(), robot->d_action_padded()));
-    add_new(tags, {robot->bundle().embodiment()});
   }
-  const v1::Description description = serve::describe(engine, {});
-  std::string line = "ready";
-  const auto add = [&](const char* name, const std::string& value) {
-    line += fmt::format(" {}={}", name, quoted(value));
-  };
-  add("address", fmt::format("{}", fmt::join(server.addresses(), ",")));
-  if (const auto names = server.told(); !names.empty()) add("names", fmt::format("{}", fmt::join(names, "; ")));
-  add("bundle", description.bundle().name());
-  add("arch", description.bundle().arch());
-  if (!tags.empty()) add("embodiments", fmt::format("{}", fmt::join(tags, ",")));
-  add("device", description.runtime().device());
-  add("precision", description.runtime().precision());
-  add("kernels", description.runtime().kernels());
-  add("memory_mb", fmt::format("{:.1f}", static_cast<double>(engine.memory().total()) / 1e6));
-  if (const std::size_t n_read = engine.budget().n_read; n_read > 0)
-    add("read_mb", fmt::format("{:.1f}", static_cast<double>(n_read) / 1e6));
-  add("connections", std::to_string(server.max_connections()));
-  add("features", fmt::format("{}", fmt::join(features, ",")));
-  add("load_ms", fmt::format("{:.1f}", load_ms));
-  add("warm_up_ms", fmt::format("{:.1f}", warm_up_ms));
-  if (const std::string metrics = observability.metrics_address(); !metrics.empty()) add("metrics", metrics);
-  if (const std::string page = observability.page_url(); !page.empty()) add("page", page);
-  if (!constant.empty()) add("CONSTANT", fmt::format("{}", fmt::join(constant, ",")));
-  if (!degraded.empty()) add("DEGRADED", fmt::format("{}", fmt::join(degraded, ",")));
-  say(stdout, "{}\n", line);
-  std::fflush(stdout);
+  line.add("features", features).add("load_ms", fmt::format("{:.1f}", policy.load_ms));
+  line.add("warm_up_ms", fmt::format("{:.1f}", policy.warm_up_ms)).add("CONSTANT", constant).add("DEGRADED", degraded);
+}
+
+/// Of several policies a line each, and then one of the server; of one a single line.
+void print_ready(const serve::Server& server, const std::map<std::string, LoadedPolicy>& policies,
+                 const ServeOptions& options, const Observability& observability) {
+  const bool is_one = policies.size() == 1;
+  for (const auto& [name, policy] : policies) {
+    if (is_one) break;
+    Line line("policy");
+    add_policy(line.add("name", name), policy);
+    add_features(line, policy);
+    line.print();
+  }
+  Line line("ready");
+  line.add("address", server.addresses()).add("names", server.told(), "; ");
+  if (is_one) add_policy(line, policies.begin()->second);
+  if (!is_one) {
+    std::vector<std::string> names;
+    for (const auto& [name, policy] : policies) names.push_back(name);
+    line.add("policies", names);
+  }
+  line.add("connections", std::to_string(server.max_connections()));
+  if (is_one) add_features(line, policies.begin()->second);
+  if (const std::string metrics = observability.metrics_address(); !metrics.empty()) line.add("metrics", metrics);
+  if (const std::string page = observability.page_url(); !page.empty()) line.add("page", page);
+  if (!options.control.empty()) line.add("control", options.control);
+  line.print();
 }
 
 /// The program in place of this process, with the same arguments: a driver that has lost its device finds it again in
@@ -123,29 +162,81 @@ Error start_again() {
   return {Code::io, program, "a program that starts again", std::strerror(errno)};
 }
 
+/// As every policy of the server is loaded.
+Result<LoadedPolicy> load_policy(const ServeOptions& options, std::string bundle) {
+  if (std::string problem = find_pulled(bundle); !problem.empty()) return Error{Code::usage, bundle, "", problem};
+  LoadedPolicy policy;
+  StageClock clock;
+  Timing load;
+  VLA_TRY(policy.engine, Engine::load(bundle, {.n_thread = options.n_thread,
+                                               .kernels = options.kernels,
+                                               .device = options.device,
+                                               .embodiment = options.embodiment,
+                                               .all_robots = true,
+                                               .memory = options.memory}));
+  clock.lap(load, "load");
+  policy.load_ms = load.front().second;
+  return policy;
+}
+
+/// Recordings and the page are of one policy, which stays the same.
+Status check_single(const ServeOptions& options) {
+  const char* of_one = !options.observability.record.empty() ? "--record"
+                       : !options.observability.page.empty() ? "--page"
+                                                             : nullptr;
+  if (of_one == nullptr || (options.bundles.size() == 1 && options.control.empty())) return {};
+  return Error{Code::usage, of_one, "one bundle, without --control",
+               options.control.empty() ? std::to_string(options.bundles.size()) + " bundles" : "--control",
+               "it shows one policy; serve the others from another process"};
+}
+
+/// The bundles by the names of their policies.
+Result<std::map<std::string, std::string>> named_bundles(const std::vector<std::string>& given) {
+  std::map<std::string, std::string> bundles;
+  for (const std::string& text : given) {
+    const auto [name, bundle] = named_bundle(text);
+    if (given.size() > 1) VLA_CHECK(check_policy_name(name));
+    if (!bundles.emplace(name, bundle).second)
+      return Error{Code::usage, "BUNDLE", "policies of different names", "two of " + name, "name one: NAME=FILE"};
+  }
+  return bundles;
+}
+
 /// `ready`: whether it came as far as that.
 Status serve(ServeOptions& options, bool& ready) {
+  VLA_CHECK(check_single(options));
+  VLA_TRY(const auto bundles, named_bundles(options.bundles));
   options.server.max_message = options.max_message_mb << 20;
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Observability> observability,
           Observability::start(options.observability, *server, options.server.insecure));
-  StageClock clock;
-  Timing load;
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
-                                                                              .kernels = options.kernels,
-                                                                              .device = options.device,
-                                                                              .embodiment = options.embodiment,
-                                                                              .all_robots = true,
-                                                                              .memory = options.memory}));
-  clock.lap(load, "load");
-  VLA_CHECK(server->load(*engine));
-  observability->loaded(*engine);
-  VLA_TRY(const double warm_up_ms, serve::warm_up(*engine));
+  std::unique_ptr<Control> control;
+  if (!options.control.empty()) {
+    VLA_TRY(control, Control::open(options.control, *server, *observability,
+                                   [&options](const std::string& bundle) -> Result<LoadedPolicy> {
+                                     VLA_TRY(LoadedPolicy policy, load_policy(options, bundle));
+                                     VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));
+                                     return policy;
+                                   }));
+  }
+  std::map<std::string, LoadedPolicy> policies;
+  double warm_up_ms = 0;
+  for (const auto& [name, bundle] : bundles) {
+    VLA_TRY(policies[name], load_policy(options, bundle));
+    LoadedPolicy& policy = policies[name];
+    VLA_CHECK(server->add(name, policy.engine));
+    observability->loaded(name, *policy.engine);
+    VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));
+    warm_up_ms += policy.warm_up_ms;
+  }
+  VLA_CHECK(server->begin());
   stop_on_signals(*server);
   observability->ready(warm_up_ms);
-  print_ready(*server, *engine, load.front().second, warm_up_ms, *observability);
+  print_ready(*server, policies, options, *observability);
+  policies.clear();  // the server's alone, so that one that is taken away is gone
+  if (control) VLA_CHECK(control->start());
   ready = true;
-  const Status status = server->run(*engine, observability->observers());
+  const Status status = server->run(observability->observers());
   observability->ended(status);
   return status;
 }
@@ -184,8 +275,19 @@ Command add_serve(CLI::App& app) {
       "Clients: docs/serving.md; the protocol: docs/protocol.md. SIGTERM or Ctrl-C finishes the act that runs, then "
       "ends.\n"
       "  vla serve policy.gguf\n"
-      "  vla serve policy.gguf --bind tcp://0.0.0.0:5555 --curve-secret server.secret --curve-clients clients.public");
-  add_bundle(*command, options->bundle, true);
+      "  vla serve policy.gguf --bind tcp://0.0.0.0:5555 --curve-secret server.secret --curve-clients clients.public\n"
+      "  vla serve pick=a.gguf place=b.gguf --control /run/user/1000/vla.sock   # acts name theirs; vla ctl swaps "
+      "them");
+  command
+      ->add_option("BUNDLE", options->bundles,
+                   "The policy, a .gguf file from vla-convert, or the hub:OWNER/NAME@REVISION of vla-pull. Several "
+                   "answer by name: NAME=BUNDLE, or that of the file")
+      ->type_name("")
+      ->required();
+  add_text(*command, "--default-policy", server.default_policy, "NAME",
+           "Of several, the one of clients that name none, as those of --openpi, --gr00t and --lerobot");
+  add_text(*command, "--control", options->control, "PATH",
+           "A socket through which vla ctl loads, swaps and unloads policies; for this user alone");
   command
       ->add_option("--bind", server.bind,
                    "tcp://ADDRESS:PORT (port 0: a free one) or ipc://PATH; may be given several times")

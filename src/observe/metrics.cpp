@@ -27,6 +27,10 @@ prometheus::Counter& counter(prometheus::Registry& registry, const char* name, c
   return prometheus::BuildCounter().Name(name).Help(help).Register(registry).Add({});
 }
 
+prometheus::Family<prometheus::Gauge>& gauges(prometheus::Registry& registry, const char* name, const char* help) {
+  return prometheus::BuildGauge().Name(name).Help(help).Register(registry);
+}
+
 }  // namespace
 
 Metrics::Metrics()
@@ -42,32 +46,45 @@ Metrics::Metrics()
                    .Name("vla_dropped_connections_total")
                    .Help("Connections that the server ended, by reason")
                    .Register(*registry_)),
+      bundles_(gauges(*registry_, "vla_bundle_info", "A bundle that answers")),
+      runtimes_(gauges(*registry_, "vla_runtime_info", "What computes")),
+      memory_(gauges(*registry_, "vla_engine_memory_bytes", "Memory of a policy, by what it holds")),
       received_bytes_(counter(*registry_, "vla_received_bytes_total", "Bytes of requests")),
       sent_bytes_(counter(*registry_, "vla_sent_bytes_total", "Bytes of answers")),
       clients_(counter(*registry_, "vla_clients_total", "Connections that have sent a request")),
       refused_(counter(*registry_, "vla_refused_clients_total", "Handshakes of clients whose key is not listed")),
       beyond_(counter(*registry_, "vla_state_beyond_total", "Acts answered though their state is beyond its bound")) {
-  info("vla_build_info", "Version of the server", {{"version", VLA_VERSION}});
+  gauges(*registry_, "vla_build_info", "Version of the server").Add({{"version", VLA_VERSION}}).Set(1);
 }
 
-void Metrics::info(const char* name, const char* help, const prometheus::Labels& labels) {
-  prometheus::BuildGauge().Name(name).Help(help).Register(*registry_).Add(labels).Set(1);
+void Metrics::set(const std::string& policy, Gauges& family, prometheus::Labels labels, double value) {
+  if (!policy.empty()) labels["policy"] = policy;
+  prometheus::Gauge& gauge = family.Add(labels);
+  gauge.Set(value);
+  gauges_.emplace(policy, std::pair(&family, &gauge));
 }
 
 void Metrics::describe(const v1::Description& description, const MemoryUse& memory) {
+  const std::string& policy = description.policy();
+  forget(policy);
+  const std::lock_guard lock(mutex_);
   const v1::Bundle& bundle = description.bundle();
-  info("vla_bundle_info", "The bundle that answers",
-       {{"name", bundle.name()}, {"arch", bundle.arch()}, {"checksum", bundle.checksum()}, {"dtype", bundle.dtype()}});
+  set(policy, bundles_,
+      {{"name", bundle.name()}, {"arch", bundle.arch()}, {"checksum", bundle.checksum()}, {"dtype", bundle.dtype()}},
+      1);
   const v1::Runtime& runtime = description.runtime();
-  info("vla_runtime_info", "What computes",
-       {{"device", runtime.device()}, {"precision", runtime.precision()}, {"kernels", runtime.kernels()}});
-  auto& family = prometheus::BuildGauge()
-                     .Name("vla_engine_memory_bytes")
-                     .Help("Memory of the engine, by what it holds")
-                     .Register(*registry_);
-  family.Add({{"part", "weights"}}).Set(static_cast<double>(memory.weights));
-  family.Add({{"part", "plan"}}).Set(static_cast<double>(memory.plan));
-  family.Add({{"part", "working"}}).Set(static_cast<double>(memory.working));
+  set(policy, runtimes_,
+      {{"device", runtime.device()}, {"precision", runtime.precision()}, {"kernels", runtime.kernels()}}, 1);
+  set(policy, memory_, {{"part", "weights"}}, static_cast<double>(memory.weights));
+  set(policy, memory_, {{"part", "plan"}}, static_cast<double>(memory.plan));
+  set(policy, memory_, {{"part", "working"}}, static_cast<double>(memory.working));
+}
+
+void Metrics::forget(const std::string& policy) {
+  const std::lock_guard lock(mutex_);
+  const auto [begin, end] = gauges_.equal_range(policy);
+  for (auto at = begin; at != end; ++at) at->second.first->Remove(at->second.second);
+  gauges_.erase(begin, end);
 }
 
 std::string Metrics::text(const Health& health) const {

@@ -3,10 +3,12 @@
 #pragma once
 
 #include <prometheus/counter.h>
+#include <prometheus/gauge.h>
 #include <prometheus/histogram.h>
 #include <prometheus/registry.h>
 
 #include <map>
+#include <mutex>
 #include <string>
 
 #include "engine/engine.h"
@@ -21,8 +23,9 @@ class Metrics final : public Observer {
  public:
   Metrics();
 
-  /// What answers, once it is known.
+  /// A policy that answers from now on, instead of one of the same name. From any thread, as `forget`.
   void describe(const v1::Description& description, const MemoryUse& memory);
+  void forget(const std::string& policy);
   /// Text of the exposition format 0.0.4, from any thread. Resident memory is read now.
   std::string text(const Health& health) const;
 
@@ -31,14 +34,18 @@ class Metrics final : public Observer {
   void answered(const Answered& answered) override;
 
  private:
-  void info(const char* name, const char* help, const prometheus::Labels& labels);
+  using Gauges = prometheus::Family<prometheus::Gauge>;
+  void set(const std::string& policy, Gauges& family, prometheus::Labels labels, double value);
   void observe(const std::string& stage, double seconds);
 
   std::shared_ptr<prometheus::Registry> registry_ = std::make_shared<prometheus::Registry>();
   prometheus::Family<prometheus::Counter>& requests_;
   prometheus::Family<prometheus::Histogram>& stages_;
   prometheus::Family<prometheus::Counter>& dropped_;
+  Gauges &bundles_, &runtimes_, &memory_;
   prometheus::Counter &received_bytes_, &sent_bytes_, &clients_, &refused_, &beyond_;
+  std::mutex mutex_;
+  std::multimap<std::string, std::pair<Gauges*, prometheus::Gauge*>> gauges_;  // by policy
   // Of the I/O thread:
   std::map<std::string, prometheus::Histogram*> stage_;
   std::map<std::pair<Kind, int>, prometheus::Counter*> request_;

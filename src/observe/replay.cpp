@@ -76,6 +76,8 @@ std::string interface_of(v1::Description description) {
   description.clear_bundle();
   description.clear_runtime();
   description.clear_limits();
+  description.clear_policy();
+  description.clear_policies();
   return description.SerializeAsString();
 }
 

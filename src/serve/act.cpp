@@ -10,9 +10,9 @@
 
 namespace vla::serve {
 
-Result<const Robot*> only_robot(const Engine& engine, const char* option) {
+Status check_one_robot(const Engine& engine, const char* option) {
   const std::vector<const Robot*> robots = engine.robots();
-  if (robots.size() == 1) return robots[0];
+  if (robots.size() == 1) return {};
   std::string tags;
   for (const Robot* robot : robots) tags += (tags.empty() ? "" : ", ") + robot->bundle().embodiment();
   return Error{Code::usage, option, "one robot", "a bundle for " + tags, "choose one with --embodiment"};

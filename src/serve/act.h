@@ -30,8 +30,8 @@ struct ActRequest {
   std::int64_t capture_time_ns = 0;
 };
 
-/// The robot of an engine that has one. Errors: usage for a bundle of several, which `option`'s clients cannot name.
-Result<const Robot*> only_robot(const Engine& engine, const char* option);
+/// Errors: usage for a bundle of several robots, which `option`'s clients cannot name.
+Status check_one_robot(const Engine& engine, const char* option);
 
 /// The bounds for one robot's acts.
 ActLimits act_limits(const ServerOptions& options, const Robot& robot);

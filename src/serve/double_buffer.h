@@ -6,6 +6,7 @@
 #include <condition_variable>
 #include <cstdint>
 #include <mutex>
+#include <utility>
 
 namespace vla::serve {
 
@@ -13,6 +14,8 @@ namespace vla::serve {
 template <class Act>
 class DoubleBuffer {
  public:
+  explicit DoubleBuffer(std::array<Act, 2> acts = {}) : acts_(std::move(acts)) {}
+
   /// The act to prepare next, once its last turn is over; `prepared` hands it over.
   Act& to_prepare() {
     std::unique_lock lock(mutex_);

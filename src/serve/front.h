@@ -11,6 +11,7 @@
 #include "net/eviction.h"
 #include "observe/observer.h"
 #include "serve/act.h"
+#include "serve/policies.h"
 #include "wire/vla.pb.h"
 
 namespace vla::serve {
@@ -35,9 +36,9 @@ class Call {
   virtual ~Call() = default;
   /// The act that it is, with its images decoded. On the thread that prepares. Errors: bad_request, too_large,
   /// bad_observation.
-  virtual Result<ActRequest> decode() = 0;
+  virtual Result<ActRequest> decode(const ServedPolicy& policy) = 0;
   /// The chunk's bytes. On the thread that computes.
-  virtual std::string encode(Reply reply) = 0;
+  virtual std::string encode(Reply reply, const ServedPolicy& policy) = 0;
   /// The refusal's bytes. On the I/O thread, as what follows.
   virtual std::string encode(const Error& error) = 0;
   /// Hands an answer to the socket. A client that is gone, or that does not read, does not get it.
@@ -51,6 +52,7 @@ class Call {
 /// A request on its way through the server.
 struct Job : Received {
   std::unique_ptr<Call> call;
+  std::shared_ptr<ServedPolicy> policy;      // that answers, once it is in line
   net::Share share;                          // whose turn it is
   std::optional<std::uint64_t> deadline_ms;  // from its receipt: when its turn has to have come
   std::optional<Clock::time_point> deadline;
@@ -63,8 +65,10 @@ class Front {
   virtual ~Front() = default;
   /// What was bound, ports filled in.
   virtual std::vector<std::string> addresses() const = 0;
-  /// The policy that answers, before `begin`. Errors: usage where the protocol cannot carry what the policy takes.
-  virtual Status serve(const Engine& engine, const v1::Description& description) = 0;
+  /// The policy of acts that name none, before `begin`. Errors: usage where the protocol cannot carry what it takes.
+  virtual Status serve(const ServedPolicy& policy) = 0;
+  /// Another version took its place: it differs in nothing but bundle and runtime. On the I/O thread.
+  virtual void replaced(const v1::Description&) {}
   /// The names that its clients give, and their conventions, for people; empty where they are the policy's own.
   virtual std::string told() const { return {}; }
   /// Takes connections from now on; called before every turn of the loop.

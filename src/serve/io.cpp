@@ -33,9 +33,9 @@ Health ServerState::health(const Exchange& exchange) const {
           n_error};
 }
 
-Io::Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, ServerState& state,
+Io::Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, Policies& policies, ServerState& state,
        std::span<Observer* const> observers)
-    : loop_(loop), fronts_(fronts), exchange_(exchange), state_(state), observers_(observers) {}
+    : loop_(loop), fronts_(fronts), exchange_(exchange), policies_(policies), state_(state), observers_(observers) {}
 
 void Io::run() {
   for (;;) {
@@ -43,6 +43,10 @@ void Io::run() {
     std::uint64_t signals;
     [[maybe_unused]] const auto drained = ::read(exchange_.fd(), &signals, sizeof(signals));
     deliver_waiting();
+    if (state_.draining) {
+      state_.ready = false;
+      if (exchange_.drained()) state_.stopping = true;
+    }
     if (state_.stopping) {
       state_.ready = false;
       exchange_.close();
@@ -51,6 +55,7 @@ void Io::run() {
     }
   }
   for (const auto end = now() + kLinger; has_answers() && now() < end;) wait(end);
+  state_.ended = true;
 }
 
 void Io::wait(std::optional<Clock::time_point> until) {
@@ -68,6 +73,13 @@ bool Io::has_answers() const {
 void Io::stop() noexcept {
   state_.stopping = true;
   exchange_.wake();
+}
+
+Result<v1::Description> Io::describe(const std::string& policy) const {
+  VLA_TRY(const std::shared_ptr<ServedPolicy> found, policies_.find(policy));
+  v1::Description description = found->description;
+  for (const std::string& name : policies_.names()) description.add_policies(name);
+  return description;
 }
 
 void Io::dropped(const Dropped& connection) {
@@ -88,7 +100,11 @@ void Io::answer(Job job, std::string response) {
 
 /// An act that waits has its answer still to come, so nothing may throw once it is in line.
 void Io::submit(Job job) {
-  if (state_.stopping) return refuse(std::move(job), shutting_down);
+  if (state_.stopping || state_.draining) return refuse(std::move(job), shutting_down);
+  Result<std::shared_ptr<ServedPolicy>> policy = policies_.find(job.policy_name);
+  if (!policy) return refuse(std::move(job), [&] { return policy.error(); });
+  job.policy = std::move(*policy);
+  job.policy_name = job.policy->name;
   if (const auto allowed = job.deadline_ms) {
     if (*allowed == 0 || *allowed > kMaxDeadlineMs)
       return refuse(std::move(job), [&] {

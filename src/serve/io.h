@@ -10,13 +10,16 @@
 
 #include "net/loop.h"
 #include "serve/exchange.h"
+#include "serve/policies.h"
 
 namespace vla::serve {
 
 /// What both threads and every observer may read.
 struct ServerState {
   std::atomic<bool> ready = false, stopping = false;
+  std::atomic<bool> draining = false;     // no act comes in line any more; it stops when the line is empty
   std::atomic<bool> device_lost = false;  // acts that wait get the device's error
+  std::atomic<bool> ended = false;        // the I/O thread has
   std::atomic<std::uint64_t> n_chunk = 0, n_error = 0;
   std::atomic<Clock::rep> ready_since = 0;
 
@@ -30,7 +33,7 @@ class Io {
  public:
   using Fronts = std::vector<std::unique_ptr<Front>>;
   /// Everything outlives the thread.
-  Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, ServerState& state,
+  Io(net::Loop& loop, const Fronts& fronts, Exchange& exchange, Policies& policies, ServerState& state,
      std::span<Observer* const> observers);
 
   /// Until the server is stopped, what is computed is answered, and what waits is refused.
@@ -59,6 +62,8 @@ class Io {
   void count_error() noexcept { ++state_.n_error; }  // of a request that was refused without a job
   void stop() noexcept;                              // as Server::stop
   Clock::time_point now() const { return loop_.now(); }
+  /// Of a policy by its name, as Policies::find, with the names of all.
+  Result<v1::Description> describe(const std::string& policy) const;
   Health health() const { return state_.health(exchange_); }
 
  private:
@@ -73,6 +78,7 @@ class Io {
   net::Loop& loop_;
   const Fronts& fronts_;
   Exchange& exchange_;
+  Policies& policies_;
   ServerState& state_;
   std::span<Observer* const> observers_;
 };

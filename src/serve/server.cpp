@@ -5,9 +5,13 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <boost/asio/io_context.hpp>
+#include <boost/asio/post.hpp>
 #include <exception>
+#include <future>
 #include <new>
 #include <stdexcept>
+#include <thread>
 
 #include "base/out_of_memory.h"
 #include "base/thread.h"
@@ -141,14 +145,80 @@ void Server::stop() noexcept {
   exchange_.wake();
 }
 
-v1::Description Server::describe(const Engine& engine) const {
-  return serve::describe(engine, limits_told(options_, engine));
+void Server::drain() noexcept {
+  state_.draining = true;
+  exchange_.wake();
 }
 
-Status Server::load(const Engine& engine) {
-  description_ = describe(engine);
-  for (const auto& front : fronts_) VLA_CHECK(front->serve(engine, description_));
+v1::Description Server::describe(const std::string& name, const Engine& engine) const {
+  v1::Description description = serve::describe(engine, limits_told(options_, engine));
+  description.set_policy(name);
+  return description;
+}
+
+std::shared_ptr<ServedPolicy> Server::served(const std::string& name, std::shared_ptr<Engine> engine) const {
+  auto policy = std::make_shared<ServedPolicy>();
+  policy->name = name;
+  policy->description = describe(name, *engine);
+  policy->engine = std::move(engine);
+  return policy;
+}
+
+Status Server::add(const std::string& name, std::shared_ptr<Engine> engine) {
+  VLA_TRY([[maybe_unused]] const auto before, policies_.put(served(name, std::move(engine))));
   return {};
+}
+
+Status Server::begin() {
+  if (fronts_.size() == 1 && policies_.all().size() > 1 && options_.default_policy.empty()) return {};
+  const auto policy = policies_.find("");
+  if (!policy)
+    return Error{Code::usage, "--default-policy", policy.error().expected,
+                 options_.default_policy.empty() ? "none" : options_.default_policy,
+                 "clients of other protocols name no policy"};
+  for (const auto& front : fronts_) VLA_CHECK(front->serve(**policy));
+  return {};
+}
+
+/// What the I/O thread has to do is posted to its loop, which ends before the server does.
+template <class Work>
+auto Server::on_io_thread(Work work) -> decltype(work()) {
+  const auto task = std::make_shared<std::packaged_task<decltype(work())()>>(std::move(work));
+  auto done = task->get_future();
+  boost::asio::post(loop_.context(), [task] { (*task)(); });
+  while (done.wait_for(std::chrono::milliseconds(20)) != std::future_status::ready)
+    if (state_.ended && done.wait_for(std::chrono::seconds(0)) != std::future_status::ready)
+      return Error{Code::shutting_down, "server", "", "it has stopped"};
+  return done.get();
+}
+
+/// Until nobody else holds it: its acts are answered, and its memory is given back on this thread.
+void Server::await_last_act(std::shared_ptr<ServedPolicy> policy) const {
+  while (policy != nullptr && policy.use_count() > 1 && !state_.ended)
+    std::this_thread::sleep_for(std::chrono::milliseconds(1));
+}
+
+Status Server::load(const std::string& name, std::shared_ptr<Engine> engine) {
+  using Replaced = Result<std::shared_ptr<ServedPolicy>>;
+  VLA_TRY(auto before, on_io_thread([this, policy = served(name, std::move(engine))]() -> Replaced {
+            VLA_TRY(auto before, policies_.put(policy));
+            const auto of_fronts = policies_.find("");
+            if (of_fronts && *of_fronts == policy)
+              for (const auto& front : fronts_) front->replaced(policy->description);
+            return before;
+          }));
+  await_last_act(std::move(before));
+  return {};
+}
+
+Status Server::unload(const std::string& name) {
+  VLA_TRY(auto policy, on_io_thread([this, name] { return policies_.remove(name); }));
+  await_last_act(std::move(policy));
+  return {};
+}
+
+Result<std::vector<std::shared_ptr<ServedPolicy>>> Server::policies() {
+  return on_io_thread([this]() -> Result<std::vector<std::shared_ptr<ServedPolicy>>> { return policies_.all(); });
 }
 
 std::vector<std::string> Server::told() const {
@@ -159,31 +229,32 @@ std::vector<std::string> Server::told() const {
 }
 
 /// Programs run on the thread that calls this.
-Status Server::run(Engine& engine, std::span<Observer* const> observers) {
+Status Server::run(std::span<Observer* const> observers) {
   observers_ = observers;
   records_ = std::any_of(observers.begin(), observers.end(), [](const Observer* o) { return o->records(); });
+  const bool is_host = policies_.all().front()->engine->device().is_host();
   state_.begin();
-  Io io(loop_, fronts_, exchange_, state_, observers);
-  DoubleBuffer<Act> acts;
+  Io io(loop_, fronts_, exchange_, policies_, state_, observers);
+  DoubleBuffer<Act> acts({Act{.place = 0}, Act{.place = 1}});
   std::thread preparing;
-  if (!engine.device().is_host()) {
+  if (!is_host) {
     VLA_TRY(preparing, start_thread("preparing thread", [&] {
-              while (prepare_next(engine, acts.to_prepare())) acts.prepared();
+              while (prepare_next(acts.to_prepare())) acts.prepared();
               acts.close();
             }));
   }
   Result<std::thread> talking = start_thread("I/O thread", [&] { io.run(); });
   if (!talking) exchange_.close();
   if (preparing.joinable()) {
-    while (Act* act = acts.to_compute()) compute(engine, *act), acts.computed();
+    while (Act* act = acts.to_compute()) compute(*act), acts.computed();
     preparing.join();
   } else {
-    for (Act act; prepare_next(engine, act);) compute(engine, act);
+    for (Act act; prepare_next(act);) compute(act);
   }
   if (!talking) return talking.error();
   talking->join();
   fronts_.clear();
-  return engine.device().failure();
+  return lost_device_;
 }
 
 /// An exception from a library fails this request, not the server.
@@ -198,7 +269,7 @@ void Server::attempt(Act& act, const Work& work) noexcept {
   }
 }
 
-bool Server::prepare_next(const Engine& engine, Act& act) {
+bool Server::prepare_next(Act& act) {
   std::optional<Job> job = exchange_.next();
   if (!job) return false;
   for (Observer* observer : observers_) observer->started(*job);
@@ -206,43 +277,47 @@ bool Server::prepare_next(const Engine& engine, Act& act) {
   act.answer.job = std::move(*job);
   act.answer.started = loop_.now();
   act.clock = {};
-  attempt(act, [&] { return prepare(engine, act); });
+  attempt(act, [&] { return prepare(act); });
   return true;
 }
 
-void Server::compute(Engine& engine, Act& act) {
-  if (!act.answer.error) attempt(act, [&] { return respond(engine, act); });
+void Server::compute(Act& act) {
+  if (!act.answer.error) attempt(act, [&] { return respond(act); });
   act.answer.finished = loop_.now();
   act.request = {};
+  const Status failure = act.policy().engine->device().failure();
   exchange_.put(std::move(act.answer));
-  if (engine.device().failure()) return;
+  if (failure) return;
+  lost_device_ = failure;
   state_.device_lost = true;  // no act after this one can succeed
   stop();
 }
 
-Status Server::prepare(const Engine& engine, Act& act) const {
-  VLA_TRY(act.request, act.answer.job.call->decode());
+Status Server::prepare(Act& act) const {
+  VLA_TRY(act.request, act.answer.job.call->decode(act.policy()));
   act.request.observation.reject_out_of_range = options_.strict_state;
   act.clock.lap(act.answer.stages, "decode");
-  VLA_CHECK(engine.prepare(act.request.observation, act.request.noise, act.request.leftover, act.prepared));
+  VLA_CHECK(
+      act.policy().engine->prepare(act.request.observation, act.request.noise, act.request.leftover, act.encoded()));
   act.clock = {};  // the wait for the device begins
   return {};
 }
 
-Status Server::respond(Engine& engine, Act& act) const {
+Status Server::respond(Act& act) const {
   Answer& answer = act.answer;
-  if (!engine.device().is_host()) act.clock.lap(act.prepared.timing, "wait");
-  VLA_TRY(ActionChunk chunk, engine.act(act.prepared));
+  const ServedPolicy& policy = act.policy();
+  if (!policy.engine->device().is_host()) act.clock.lap(act.encoded().timing, "wait");
+  VLA_TRY(ActionChunk chunk, policy.engine->act(act.encoded()));
   answer.stages.insert(answer.stages.end(), chunk.timing.begin(), chunk.timing.end());
   chunk.timing = answer.stages;
   answer.is_beyond = chunk.out_of_range, answer.notes = chunk.notes;
-  act.request.observation.embodiment = act.prepared.robot->bundle().embodiment();
+  act.request.observation.embodiment = act.encoded().robot->bundle().embodiment();
   const double queue_ms = std::chrono::duration<double, std::milli>(answer.started - answer.job.at).count();
   Reply reply{act.request, std::move(chunk), queue_ms};
   if (records_ && answer.job.call->native() == nullptr)
     answer.record =
-        record_of(answer.job.request_id, reply, description_of(description_, act.request.observation.embodiment));
-  answer.response = answer.job.call->encode(std::move(reply));
+        record_of(answer.job.request_id, reply, description_of(policy.description, act.request.observation.embodiment));
+  answer.response = answer.job.call->encode(std::move(reply), policy);
   return {};
 }
 

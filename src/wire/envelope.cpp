@@ -12,6 +12,8 @@
 namespace vla::wire {
 namespace {
 
+constexpr std::size_t kMaxName = 256;  // bytes
+
 Kind kind_of(int number) {
   switch (number) {
     case v1::Request::kHelloFieldNumber:
@@ -56,9 +58,16 @@ Status read_act(std::span<const std::byte> act, Envelope& envelope) {
   for (Fields field(act, "request.act");;) {
     VLA_TRY(const bool more, field.next());
     if (!more) return {};
-    if (field.number != v1::Act::kDeadlineMsFieldNumber) continue;
-    if (field.type != 'v') return field.unknown();
-    envelope.deadline_ms = field.varint;
+    if (field.number == v1::Act::kDeadlineMsFieldNumber) {
+      if (field.type != 'v') return field.unknown();
+      envelope.deadline_ms = field.varint;
+    } else if (field.number == v1::Act::kPolicyFieldNumber) {
+      if (field.type != 'b') return field.unknown();
+      if (field.value.size() > kMaxName)
+        return Error{Code::too_large, "policy", fmt::format("names of at most {} bytes", kMaxName),
+                     fmt::format("{} bytes", field.value.size())};
+      envelope.policy.assign(reinterpret_cast<const char*>(field.value.data()), field.value.size());
+    }
   }
 }
 

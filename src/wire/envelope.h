@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <optional>
 #include <span>
+#include <string>
 
 #include "base/result.h"
 
@@ -28,6 +29,7 @@ struct Envelope {
   Kind kind = Kind::unknown;
   std::size_t body_at = 0, body_size = 0;    // place of the serialized Hello, Describe, Act or Health in the request
   std::optional<std::uint64_t> deadline_ms;  // of an act
+  std::string policy;                        // of an act
 
   /// Not kept as a span: a message that ZeroMQ stores inside its own object moves with it.
   std::span<const std::byte> body(std::span<const std::byte> request) const {

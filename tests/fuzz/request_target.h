@@ -36,6 +36,9 @@ inline RequestFate check_request(std::span<const std::byte> bytes) {
   if (envelope.kind == serve::Kind::hello) {
     const auto reply = serve::answer_hello(envelope.body(bytes));
     if (!reply) return refuse(reply.error()), fate;
+  } else if (envelope.kind == serve::Kind::describe) {
+    const auto name = serve::read_describe(envelope.body(bytes));
+    if (!name) return refuse(name.error()), fate;
   } else if (envelope.kind != serve::Kind::act) {
     const Status empty = serve::check_empty(envelope.body(bytes));
     if (!empty) return refuse(empty.error()), fate;

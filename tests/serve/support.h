@@ -146,9 +146,10 @@ class Running {
     auto opened = serve::Server::open(options);
     REQUIRE_MESSAGE(opened.ok(), (opened ? "" : opened.error().message()));
     server = std::move(*opened);
-    const Status loaded = server->load(*engine);
+    const Status loaded = server->add("policy", engine);
     REQUIRE_MESSAGE(loaded.ok(), (loaded ? "" : loaded.error().message()));
-    thread_ = std::thread([this] { status_ = server->run(*engine, observers_); });
+    REQUIRE(server->begin());
+    thread_ = std::thread([this] { status_ = server->run(observers_); });
   }
   ~Running() {
     if (brake_ != nullptr) brake_->release();  // a test that failed has not let go
@@ -161,7 +162,7 @@ class Running {
     return status_;
   }
 
-  std::unique_ptr<Engine> engine;
+  std::shared_ptr<Engine> engine;
   std::unique_ptr<serve::Server> server;
 
  private:

@@ -46,16 +46,17 @@ class Front::Request final : public Call {
   }
   const Observed& observed() const { return observed_; }
 
-  Result<ActRequest> decode() override {
+  Result<ActRequest> decode(const ServedPolicy& policy) override {
+    const Robot& robot = policy.engine->robot();
     ActRequest request;
-    VLA_TRY(request.observation, observe(observed_.flat, front_.names_, front_.limits_));
-    request.observation.embodiment = front_.embodiment_;
+    VLA_TRY(request.observation, observe(observed_.flat, front_.names_, act_limits(front_.options_, robot)));
+    request.observation.embodiment = robot.bundle().embodiment();
     request.seed = observed_.extension.seed ? *observed_.extension.seed : fresh_seed();
     request.noise = *request.seed;
     return request;
   }
-  std::string encode(Reply reply) override {
-    return encode_reply(std::move(reply), observed_.dialect, front_.names_, front_.description_);
+  std::string encode(Reply reply, const ServedPolicy& policy) override {
+    return encode_reply(std::move(reply), observed_.dialect, front_.names_, policy.description);
   }
   std::string encode(const Error& error) override { return encode_error(error); }
   void send(const std::string& answer) override { front_.hub_.send(connection_, answer, delimiter_); }
@@ -91,12 +92,10 @@ Front::Front(net::Loop& loop, const ServerOptions& options, std::string api_toke
       api_token_(std::move(api_token)),
       hub_(loop, {options.max_message, options.max_connections, kReceiptMessages * options.max_message}, nullptr) {}
 
-Status Front::serve(const Engine& engine, const v1::Description& description) {
-  VLA_TRY(const Robot* robot, only_robot(engine, "--gr00t"));
-  VLA_TRY(names_, own_names(lines_of(options_.map, true), description, "--gr00t"));
-  embodiment_ = robot->bundle().embodiment();
-  limits_ = act_limits(options_, *robot);
-  description_ = description;
+Status Front::serve(const ServedPolicy& policy) {
+  VLA_CHECK(check_one_robot(*policy.engine, "--gr00t"));
+  VLA_TRY(names_, own_names(lines_of(options_.map, true), policy.description, "--gr00t"));
+  replaced(policy.description);
   if (options_.gr00t_n1_5) last_ = {msgpack::Framing::npy, true, true, false};
   return {};
 }

@@ -16,7 +16,8 @@ class Front final : public serve::Front, zmtp::Hub::Handler {
   static Result<std::unique_ptr<Front>> open(net::Loop& loop, const ServerOptions& options);
 
   std::vector<std::string> addresses() const override { return {"gr00t+" + address_}; }
-  Status serve(const Engine& engine, const v1::Description& description) override;
+  Status serve(const ServedPolicy& policy) override;
+  void replaced(const v1::Description& description) override { description_ = description; }
   std::string told() const override { return "gr00t=" + names_.told(); }
   void begin(Io& io) override;
   bool has_answers() const override { return hub_.has_answers(); }
@@ -31,10 +32,9 @@ class Front final : public serve::Front, zmtp::Hub::Handler {
   const ServerOptions options_;
   const std::string api_token_;
   zmtp::Hub hub_;
-  std::string address_, embodiment_;
+  std::string address_;
   v1::Description description_;
   Names names_;
-  ActLimits limits_;
   Dialect last_;  // of the last act: requests without arrays do not tell theirs
   Io* io_ = nullptr;
 };

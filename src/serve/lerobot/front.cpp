@@ -23,10 +23,12 @@ class Front::Request final : public Call {
   Request(Front& front, std::uint64_t rpc, std::shared_ptr<const Observed> observed, std::shared_ptr<const Setup> setup)
       : front_(front), rpc_(rpc), observed_(std::move(observed)), setup_(std::move(setup)) {}
 
-  Result<ActRequest> decode() override {
-    return decode_act(*observed_, *setup_, front_.names_, front_.limits_, front_.embodiment_);
+  Result<ActRequest> decode(const ServedPolicy& policy) override {
+    const Robot& robot = policy.engine->robot();
+    return decode_act(*observed_, *setup_, front_.names_, act_limits(front_.options_, robot),
+                      robot.bundle().embodiment());
   }
-  std::string encode(Reply reply) override {
+  std::string encode(Reply reply, const ServedPolicy&) override {
     transport::Actions actions;
     actions.set_data(encode_actions(std::move(reply), *observed_, *setup_, front_.names_, front_.period_));
     return actions.SerializeAsString();
@@ -64,13 +66,11 @@ Front::Front(net::Loop& loop, const ServerOptions& options)
             {options.max_message, options.max_connections, kReceiptMessages * (options.max_message + Rpcs::kMaxPiece)}),
       sweeper_(loop) {}
 
-Status Front::serve(const Engine& engine, const v1::Description& description) {
-  VLA_TRY(const Robot* robot, only_robot(engine, "--lerobot"));
-  VLA_TRY(names_, lerobot_names(options_.map, description));
-  embodiment_ = robot->bundle().embodiment();
-  limits_ = act_limits(options_, *robot);
-  description_ = description;
-  period_ = 1 / (description.rate_hz() > 0 ? description.rate_hz() : kRateHz);
+Status Front::serve(const ServedPolicy& policy) {
+  VLA_CHECK(check_one_robot(*policy.engine, "--lerobot"));
+  VLA_TRY(names_, lerobot_names(options_.map, policy.description));
+  description_ = policy.description;
+  period_ = 1 / (description_.rate_hz() > 0 ? description_.rate_hz() : kRateHz);
   return {};
 }
 

@@ -22,7 +22,7 @@ class Front final : public serve::Front, Rpcs::Handler {
   static Result<std::unique_ptr<serve::Front>> open(net::Loop& loop, const ServerOptions& options);
 
   std::vector<std::string> addresses() const override { return {"grpc://" + address_}; }
-  Status serve(const Engine& engine, const v1::Description& description) override;
+  Status serve(const ServedPolicy& policy) override;
   std::string told() const override { return "lerobot=" + names_.told(); }
   void begin(Io& io) override;
   bool has_answers() const override { return rpcs_.has_answers(); }
@@ -59,10 +59,9 @@ class Front final : public serve::Front, Rpcs::Handler {
   const net::Loop& loop_;
   Rpcs rpcs_;
   net::Sweeper sweeper_;
-  std::string address_, embodiment_;
+  std::string address_;
   v1::Description description_;
   Names names_;
-  ActLimits limits_;
   double period_ = 0;                        // seconds between rows of a chunk
   std::map<std::uint64_t, Client> clients_;  // by their connections, also past ones
   Io* io_ = nullptr;

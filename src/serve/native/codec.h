@@ -19,8 +19,11 @@ Result<ActRequest> decode_act(std::span<const std::byte> act, const ActLimits& l
 /// A serialized Hello -> the reply; `client` is how the client calls itself. Errors: bad_request, incompatible.
 Result<v1::HelloReply> answer_hello(std::span<const std::byte> hello, std::string* client = nullptr);
 
-/// Whether the body of a Describe or Health is the empty message that it has to be. Errors: bad_request.
+/// Whether the body of a Health is the empty message that it has to be. Errors: bad_request.
 Status check_empty(std::span<const std::byte> body);
+
+/// The policy that a serialized Describe names, or empty text. Errors: bad_request, too_large.
+Result<std::string> read_describe(std::span<const std::byte> describe);
 
 /// Which robot a serialized Act names, or empty text. Errors: bad_request, too_large.
 Result<std::string> named_embodiment(std::span<const std::byte> act);

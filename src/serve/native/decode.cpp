@@ -37,15 +37,17 @@ std::string_view text_of(std::span<const std::byte> bytes) {
 
 /// The fields of a message in the order of their numbers, from 1: v varint, u one of 32 bits, b bytes, t text, f floats
 /// (packed or not), d double, and a digit for a message, the index of its own row.
-constexpr std::array<const char*, 8> kFields = {
-    "15t3vvv7t",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover, embodiment
-    "t2bb4",      // 1 View: name, rgb, jpeg, png, absent
-    "uub",        // 2 RawRgb: width, height, rows
-    "uuf",        // 3 Noise: horizon, d_action, values
-    "",           // 4 Absent
-    "tf",         // 5 State: name, values
-    "uutt",       // 6 Hello: min_version, max_version, client_name, client_version
-    "uufutd",     // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
+constexpr std::array<const char*, 9> kFields = {
+    "15t3vvv7tt",  // 0 Act: views, states, text, noise, seed, capture_time_ns, deadline_ms, leftover, embodiment,
+                   // policy
+    "t2bb4",       // 1 View: name, rgb, jpeg, png, absent
+    "uub",         // 2 RawRgb: width, height, rows
+    "uuf",         // 3 Noise: horizon, d_action, values
+    "",            // 4 Absent
+    "tf",          // 5 State: name, values
+    "uutt",        // 6 Hello: min_version, max_version, client_name, client_version
+    "uufutd",      // 7 Leftover: n_row, d_action, values, delay, schedule, max_guidance
+    "t",           // 8 Describe: policy
 };
 
 /// Whether a field that was read is encoded as its type says.
@@ -222,6 +224,12 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
   return request;
 }
 
+Result<std::string> read_describe(std::span<const std::byte> describe) {
+  VLA_TRY(v1::Describe parsed, parse<v1::Describe>(describe, 8, "describe"));
+  VLA_CHECK(check_name(parsed.policy(), "policy"));
+  return std::move(*parsed.mutable_policy());
+}
+
 Result<std::string> named_embodiment(std::span<const std::byte> act) {
   std::string tag;
   for (Fields field(act, "act");;) {
@@ -253,6 +261,7 @@ Result<v1::HelloReply> answer_hello(std::span<const std::byte> bytes, std::strin
   reply.set_server_version(VLA_VERSION);
   reply.add_features("leftover");
   reply.add_features("embodiment");
+  reply.add_features("policy");
   return reply;
 }
 

@@ -42,10 +42,12 @@ class NativeFront::Request final : public Call {
         bytes_(std::move(message.bytes)),
         envelope_(envelope) {}
 
-  Result<ActRequest> decode() override { return front_.decode(envelope_.body(bytes_.span())); }
-  std::string encode(Reply reply) override {
+  Result<ActRequest> decode(const ServedPolicy& policy) override {
+    return front_.decode(envelope_.body(bytes_.span()), policy);
+  }
+  std::string encode(Reply reply, const ServedPolicy& policy) override {
     v1::Response response = response_to(envelope_.request_id);
-    const v1::Description& description = description_of(front_.description_, reply.request.observation.embodiment);
+    const v1::Description& description = description_of(policy.description, reply.request.observation.embodiment);
     *response.mutable_chunk() = encode_chunk(std::move(reply), description);
     return response.SerializeAsString();
   }
@@ -87,12 +89,6 @@ Status NativeFront::bind() {
   return {};
 }
 
-Status NativeFront::serve(const Engine& engine, const v1::Description& description) {
-  engine_ = &engine;
-  description_ = description;
-  return {};
-}
-
 void NativeFront::begin(Io& io) {
   io_ = &io;
   hub_.begin(*this);
@@ -119,6 +115,7 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
     job.is_first = client.n_request == 0;
     job.request_id = request_id;
     job.kind = envelope.kind;
+    job.policy_name = envelope.policy;
     job.size = message.size;
     job.at = io_->now();
     job.share = {net::group_of(client.peer), client.since};
@@ -156,11 +153,12 @@ Result<v1::Response> NativeFront::answer_now(zmtp::Client& client, const Job& jo
     VLA_TRY(*response.mutable_hello(), answer_hello(body, &client.name));
     return response;
   }
-  VLA_CHECK(check_empty(body));
   if (job.kind == Kind::describe) {
-    *response.mutable_description() = description_;
+    VLA_TRY(const std::string name, read_describe(body));
+    VLA_TRY(*response.mutable_description(), io_->describe(name));
     return response;
   }
+  VLA_CHECK(check_empty(body));
   const Health now = io_->health();
   v1::HealthReply& reply = *response.mutable_health();
   reply.set_ready(now.ready);
@@ -172,11 +170,11 @@ Result<v1::Response> NativeFront::answer_now(zmtp::Client& client, const Job& jo
   return response;
 }
 
-Result<ActRequest> NativeFront::decode(std::span<const std::byte> act) const {
+Result<ActRequest> NativeFront::decode(std::span<const std::byte> act, const ServedPolicy& policy) const {
   VLA_TRY(const std::string embodiment, named_embodiment(act));
-  VLA_TRY(const Robot* robot, engine_->robot(embodiment));
+  VLA_TRY(const Robot* robot, policy.engine->robot(embodiment));
   ActLimits limits = act_limits(options_, *robot);
-  limits.max_views = description_.limits().max_views();  // of all robots, as the description tells
+  limits.max_views = policy.description.limits().max_views();  // of all robots, as the description tells
   return decode_act(act, limits, robot->processor().views(), robot->processor().states());
 }
 

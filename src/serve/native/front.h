@@ -17,7 +17,7 @@ class NativeFront final : public Front, zmtp::Hub::Handler {
   static Result<std::unique_ptr<NativeFront>> open(net::Loop& loop, const ServerOptions& options);
 
   std::vector<std::string> addresses() const override { return addresses_; }
-  Status serve(const Engine& engine, const v1::Description& description) override;
+  Status serve(const ServedPolicy&) override { return {}; }
   void begin(Io& io) override;
   bool has_answers() const override { return hub_.has_answers(); }
 
@@ -29,15 +29,13 @@ class NativeFront final : public Front, zmtp::Hub::Handler {
   void dropped(const zmtp::Client& client, const std::string& why, const std::string& detail) override;
   void handle(zmtp::Client& client, Job job, const wire::Envelope& envelope, const Status& valid);
   Result<v1::Response> answer_now(zmtp::Client& client, const Job& job, const wire::Envelope& envelope) const;
-  Result<ActRequest> decode(std::span<const std::byte> act) const;
+  Result<ActRequest> decode(std::span<const std::byte> act, const ServedPolicy& policy) const;
   void send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept;
 
   const ServerOptions options_;
   const std::optional<zmtp::CurveKeys> keys_;
   zmtp::Hub hub_;
   std::vector<std::string> addresses_;
-  const Engine* engine_ = nullptr;
-  v1::Description description_;
   Io* io_ = nullptr;
 };
 

@@ -25,12 +25,14 @@ class Front::Request final : public Call {
   bool is_reset() const { return omni_.is_reset; }
   const Extension& extension() const { return extension_; }
 
-  Result<ActRequest> decode() override {
-    VLA_TRY(ActRequest request, decode_act(message_, front_.names_, front_.limits_, front_.embodiment_));
+  Result<ActRequest> decode(const ServedPolicy& policy) override {
+    const Robot& robot = policy.engine->robot();
+    VLA_TRY(ActRequest request,
+            decode_act(message_, front_.names_, act_limits(front_.options_, robot), robot.bundle().embodiment()));
     if (omni_.seed) request.noise = *(request.seed = omni_.seed);
     return request;
   }
-  std::string encode(Reply reply) override {
+  std::string encode(Reply reply, const ServedPolicy&) override {
     if (front_.options_.vllm_omni) return encode_omni_reply(std::move(reply), front_.names_);
     return encode_reply(std::move(reply), front_.names_, previous_ms_);
   }
@@ -68,14 +70,14 @@ Front::Front(net::Loop& loop, const ServerOptions& options, std::string api_key)
       sockets_(loop, {options.max_message, options.max_connections, kReceiptMessages * options.max_message},
                std::move(api_key)) {}
 
-Status Front::serve(const Engine& engine, const v1::Description& description) {
-  VLA_TRY(const Robot* robot, only_robot(engine, "--openpi"));
-  VLA_TRY(names_, names_for(options_.preset, lines_of(options_.map, false), description, "--openpi"));
-  embodiment_ = robot->bundle().embodiment();
-  limits_ = act_limits(options_, *robot);
-  metadata_ = encode_metadata(description, names_);
+Status Front::serve(const ServedPolicy& policy) {
+  VLA_CHECK(check_one_robot(*policy.engine, "--openpi"));
+  VLA_TRY(names_, names_for(options_.preset, lines_of(options_.map, false), policy.description, "--openpi"));
+  replaced(policy.description);
   return {};
 }
+
+void Front::replaced(const v1::Description& description) { metadata_ = encode_metadata(description, names_); }
 
 void Front::begin(Io& io) {
   io_ = &io;

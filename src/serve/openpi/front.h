@@ -16,7 +16,8 @@ class Front final : public serve::Front, Sockets::Handler {
   static Result<std::unique_ptr<Front>> open(net::Loop& loop, const ServerOptions& options);
 
   std::vector<std::string> addresses() const override { return {"ws://" + address_}; }
-  Status serve(const Engine& engine, const v1::Description& description) override;
+  Status serve(const ServedPolicy& policy) override;
+  void replaced(const v1::Description& description) override;
   std::string told() const override { return "openpi=" + names_.told(); }
   void begin(Io& io) override;
   bool has_answers() const override { return sockets_.has_answers(); }
@@ -30,9 +31,8 @@ class Front final : public serve::Front, Sockets::Handler {
 
   const ServerOptions options_;
   Sockets sockets_;
-  std::string address_, metadata_, embodiment_;
+  std::string address_, metadata_;
   Names names_;
-  ActLimits limits_;
   Io* io_ = nullptr;
 };
 

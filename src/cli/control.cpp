@@ -1,0 +1,242 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "cli/control.h"
+
+#include <fmt/format.h>
+#include <poll.h>
+#include <sys/eventfd.h>
+#include <sys/resource.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <cstring>
+#include <nlohmann/json.hpp>
+
+#include "base/out_of_memory.h"
+#include "base/thread.h"
+#include "serve/native/codec.h"
+
+namespace vla::cli {
+namespace {
+
+using nlohmann::ordered_json;
+
+constexpr std::size_t kMaxLine = 64 << 10;
+constexpr int kPatienceMs = 5000;  // for an order, once a client is connected
+constexpr int kLoadNice = 10;      // loading gives way to the acts of the policies that answer
+
+Result<sockaddr_un> address_of(const std::string& path) {
+  sockaddr_un address = {};
+  address.sun_family = AF_UNIX;
+  if (path.empty() || path.size() >= sizeof(address.sun_path))
+    return Error{Code::usage, "--control", fmt::format("a path of 1 to {} bytes", sizeof(address.sun_path) - 1), path};
+  std::copy(path.begin(), path.end(), address.sun_path);
+  return address;
+}
+
+Error failed(const std::string& path, const char* what) { return {Code::io, path, what, std::strerror(errno)}; }
+
+/// A line without its end; what came before the peer fell silent where there is none.
+std::string read_line(int socket, int patience_ms) {
+  std::string line;
+  while (line.size() < kMaxLine && line.find('\n') == std::string::npos) {
+    pollfd wait = {socket, POLLIN, 0};
+    char bytes[4096];
+    if (::poll(&wait, 1, patience_ms) <= 0) break;
+    const ssize_t n = ::recv(socket, bytes, sizeof(bytes), 0);
+    if (n <= 0) break;
+    line.append(bytes, static_cast<std::size_t>(n));
+  }
+  return line.substr(0, line.find('\n'));
+}
+
+bool write_line(int socket, std::string line) {
+  line += '\n';
+  for (std::size_t sent = 0; sent < line.size();) {
+    const ssize_t n = ::send(socket, line.data() + sent, line.size() - sent, MSG_NOSIGNAL);
+    if (n <= 0) return false;
+    sent += static_cast<std::size_t>(n);
+  }
+  return true;
+}
+
+/// Only the user of this process and root may give orders.
+bool may_order(int client) {
+  ucred peer = {};
+  socklen_t size = sizeof(peer);
+  return ::getsockopt(client, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0 && (peer.uid == ::geteuid() || peer.uid == 0);
+}
+
+ordered_json told(const serve::ServedPolicy& policy) {
+  const v1::Bundle& bundle = policy.description.bundle();
+  return {{"policy", policy.name},
+          {"bundle", bundle.name()},
+          {"arch", bundle.arch()},
+          {"checksum", bundle.checksum()},
+          {"memory_mb", static_cast<double>(policy.engine->memory().total()) / 1e6}};
+}
+
+std::string dumped(const ordered_json& json) {
+  return json.dump(-1, ' ', false, ordered_json::error_handler_t::replace);
+}
+
+std::string refused(const Error& error) {
+  return dumped({{"error",
+                  {{"code", exit_code(error.code)},
+                   {"where", error.where},
+                   {"expected", error.expected},
+                   {"found", error.found},
+                   {"hint", error.hint}}}});
+}
+
+Error bad_order(const std::string& found) {
+  return {Code::bad_request, "order", "list, load, unload or drain, as vla ctl sends them", found};
+}
+
+/// A socket that no process serves any more, as one that was killed leaves it.
+bool is_left_over(const std::string& path, const sockaddr_un& address) {
+  struct stat file = {};
+  if (::lstat(path.c_str(), &file) != 0 || !S_ISSOCK(file.st_mode)) return false;
+  const int probe = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  const bool served = ::connect(probe, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) == 0;
+  const bool refused = !served && errno == ECONNREFUSED;
+  ::close(probe);
+  return refused;
+}
+
+std::string text_of(const ordered_json& json, const char* key) {
+  const auto found = json.find(key);
+  return found != json.end() && found->is_string() ? found->get<std::string>() : std::string();
+}
+
+}  // namespace
+
+Status check_policy_name(const std::string& name) {
+  const auto is_plain = [](unsigned char c) { return std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-'; };
+  if (!name.empty() && name.size() <= 64 && std::all_of(name.begin(), name.end(), is_plain)) return {};
+  return Error{Code::usage, "policy", "a name of 1 to 64 letters, digits, '.', '_' and '-'", name,
+               "NAME=FILE gives a bundle another name"};
+}
+
+Result<std::unique_ptr<Control>> Control::open(const std::string& path, serve::Server& server,
+                                               Observability& observability, Load load) {
+  std::unique_ptr<Control> control(new Control(path, server, observability, std::move(load)));
+  VLA_CHECK(control->bind());
+  return control;
+}
+
+Status Control::bind() {
+  VLA_TRY(const sockaddr_un address, address_of(path_));
+  if (is_left_over(path_, address)) ::unlink(path_.c_str());
+  stopped_ = ::eventfd(0, EFD_CLOEXEC);
+  listener_ = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  if (stopped_ < 0 || listener_ < 0) return failed(path_, "a file descriptor");
+  // Before it has a name, so that nobody else can open it for a moment.
+  if (::fchmod(listener_, S_IRUSR | S_IWUSR) != 0 ||
+      ::bind(listener_, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) != 0)
+    return failed(path_, "a path that can be bound");
+  ::chmod(path_.c_str(), S_IRUSR | S_IWUSR);
+  if (::listen(listener_, 8) != 0) return failed(path_, "a socket that listens");
+  return {};
+}
+
+Status Control::start() {
+  VLA_TRY(thread_, start_thread("control", [this] { run(); }));
+  return {};
+}
+
+Control::~Control() {
+  if (thread_.joinable()) {
+    const std::uint64_t one = 1;
+    [[maybe_unused]] const auto written = ::write(stopped_, &one, sizeof(one));
+    thread_.join();
+  }
+  if (listener_ >= 0) ::unlink(path_.c_str());
+  for (const int descriptor : {listener_, stopped_})
+    if (descriptor >= 0) ::close(descriptor);
+}
+
+void Control::run() {
+  ::setpriority(PRIO_PROCESS, 0, ::getpriority(PRIO_PROCESS, 0) + kLoadNice);  // of this thread, and those it starts
+  for (;;) {
+    pollfd wait[] = {{listener_, POLLIN, 0}, {stopped_, POLLIN, 0}};
+    if (::poll(wait, 2, -1) < 0 && errno != EINTR) return;
+    if (wait[1].revents != 0) return;
+    const int client = ::accept4(listener_, nullptr, nullptr, SOCK_CLOEXEC);
+    if (client < 0) continue;
+    answer(client);
+    ::close(client);
+  }
+}
+
+/// An exception from a library fails this order, not the server.
+void Control::answer(int client) try {
+  if (!may_order(client)) return;
+  const std::string line = read_line(client, kPatienceMs);
+  std::string reply;
+  try {
+    reply = obey(line);
+  } catch (const std::bad_alloc&) {
+    reply = refused(out_of_memory("order"));
+  }
+  write_line(client, reply);
+} catch (const std::exception&) {  // not even for the refusal
+}
+
+std::string Control::obey(const std::string& line) {
+  const ordered_json given = ordered_json::parse(line, nullptr, false);
+  if (!given.is_object()) return refused(bad_order("another line"));
+  const std::string what = text_of(given, "do"), name = text_of(given, "policy");
+  if (what == "drain") {
+    server_.drain();
+    return dumped(ordered_json::object());
+  }
+  if (what == "list") {
+    const auto policies = server_.policies();
+    if (!policies) return refused(policies.error());
+    ordered_json all = ordered_json::array();
+    for (const auto& policy : *policies) all.push_back(told(*policy));
+    return dumped({{"policies", all}});
+  }
+  if (what == "unload") {
+    const Status unloaded = server_.unload(name);
+    if (!unloaded) return refused(unloaded.error());
+    observability_.unloaded(name);
+    return dumped(ordered_json::object());
+  }
+  if (what != "load") return refused(bad_order(what));
+  if (const Status valid = check_policy_name(name); !valid) return refused(valid.error());
+  Result<LoadedPolicy> loaded = load_(text_of(given, "bundle"));
+  if (!loaded) return refused(loaded.error());
+  const double memory_mb = static_cast<double>(loaded->engine->memory().total()) / 1e6;
+  const std::shared_ptr<Engine> engine = loaded->engine;
+  if (const Status served = server_.load(name, engine); !served) return refused(served.error());
+  observability_.loaded(name, *engine);
+  return dumped(
+      {{"policy", name}, {"load_ms", loaded->load_ms}, {"warm_up_ms", loaded->warm_up_ms}, {"memory_mb", memory_mb}});
+}
+
+Result<std::string> order(const std::string& path, const std::string& line) {
+  VLA_TRY(const sockaddr_un address, address_of(path));
+  const int socket = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  if (socket < 0) return failed(path, "a file descriptor");
+  const std::unique_ptr<const int, void (*)(const int*)> closed(&socket, [](const int* open) { ::close(*open); });
+  if (::connect(socket, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) != 0)
+    return failed(path, "the --control of a vla serve that runs");
+  if (!write_line(socket, line)) return failed(path, "an order that is taken");
+  const std::string reply = read_line(socket, -1);
+  const ordered_json json = ordered_json::parse(reply, nullptr, false);
+  if (!json.is_object())
+    return Error{Code::io, path, "an answer", reply.empty() ? "none: another user's server, or it ended" : reply};
+  const auto error = json.find("error");
+  if (error == json.end()) return reply;
+  const int code = error->value("code", 1);
+  return Error{static_cast<Code>(std::clamp(code, 1, exit_code(Code::shutting_down)) - 1), text_of(*error, "where"),
+               text_of(*error, "expected"), text_of(*error, "found"), text_of(*error, "hint")};
+}
+
+}  // namespace vla::cli

@@ -1,0 +1,45 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <array>
+#include <map>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "engine/engine.h"
+#include "wire/vla.pb.h"
+
+namespace vla::serve {
+
+/// A policy that the server answers with. It lives as long as one of its acts.
+struct ServedPolicy {
+  std::string name;
+  std::shared_ptr<Engine> engine;
+  v1::Description description;
+  std::array<EncodedObservation, 2> encoded;  // one is prepared while the other is computed
+};
+
+/// The policies that acts may name. One thread at a time.
+class Policies {
+ public:
+  explicit Policies(std::string default_name) : default_name_(std::move(default_name)) {}
+
+  /// Without a name the default, or the only one. Errors: bad_observation, with the names that there are.
+  Result<std::shared_ptr<ServedPolicy>> find(const std::string& name) const;
+  /// One of a name that is there takes the other's place, which is returned. Clients keep what they were told: errors:
+  /// incompatible where views, states, actions, rate or noise differ.
+  Result<std::shared_ptr<ServedPolicy>> put(std::shared_ptr<ServedPolicy> policy);
+  /// Takes one out. Errors: bad_observation where there is none of that name; usage for the last one and the default.
+  Result<std::shared_ptr<ServedPolicy>> remove(const std::string& name);
+
+  std::vector<std::shared_ptr<ServedPolicy>> all() const;
+  std::vector<std::string> names() const;
+
+ private:
+  const std::string default_name_;
+  std::map<std::string, std::shared_ptr<ServedPolicy>> policies_;
+};
+
+}  // namespace vla::serve
