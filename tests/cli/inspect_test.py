@@ -102,6 +102,7 @@ def test_a_bundle_has_the_names_of_the_manifest_layer_for_layer(vla, name):
         "act/pre_norm": {"encoder.norm.weight", "encoder.norm.bias"},
         "xvla/joints": {"prompt.weight"},
         "turbovla/no_state": {"state_in.weight", "state_in.bias", "state_token.weight", "vision.registers.weight"},
+        "vla_jepa/camera": {f"state_{layer}.{kind}" for layer in ("in", "out") for kind in ("weight", "bias")},
     }
     assert without_numbers(bundle) == without_numbers(p["name"] for p in manifest["parameters"]) ^ other.get(name, set())
 
