@@ -347,6 +347,10 @@ TEST_CASE("one graph has every operation there is, and gives the same on all ker
     const Tensor patches = g.add(op::Patches{2}, {input(r, {4, 4, 3, 1})});
     const Tensor pooled = g.add(op::MaxPool{{3, 2, 1}}, {reshape(g, patches, {3, 4, 4, 1})});
     const Tensor windows = g.add(op::Unfold{{3, 1, 1}}, {pooled});
+    const Tensor weighed =
+        g.add(op::Depthwise{{3, 1, 1}}, {pooled, input(r, {27, 1, 1, 1}), constant(g, {1, 2, 3}, {3})});
+    const Tensor cells = reshape(g, weighed, {3, 4, 1, 1});
+    const Tensor attended = g.add(op::ChannelAttention{1}, {cells, cells, cells});
     const Tensor squares = g.add(op::PixelShuffle{2, 2}, {patches});
     const Tensor x = add(g, norm(g, op::NormKind::rms, {rows, p.parameter(g, 35)}), p.linear(g, rows, 35));
     const Tensor heads =
@@ -357,10 +361,11 @@ TEST_CASE("one graph has every operation there is, and gives the same on all ker
     const Tensor all = concat(g, {gated, one}, 0);
     const Slot* kept = r.slot(std::vector<float>(36 * 3), {36, 3, 1, 1});
     g.add(op::Write{const_cast<Slot*>(kept)}, {all});
-    const Tensor result = concat(g,
-                                 {reshape(g, all, {108, 1, 1, 1}), reshape(g, squares, {48, 1, 1, 1}),
-                                  reshape(g, windows, {108, 1, 1, 1}), constant(g, {1, 2}, {2})},
-                                 0);
+    const Tensor result =
+        concat(g,
+               {reshape(g, all, {108, 1, 1, 1}), reshape(g, squares, {48, 1, 1, 1}),
+                reshape(g, windows, {108, 1, 1, 1}), reshape(g, attended, {12, 1, 1, 1}), constant(g, {1, 2}, {2})},
+               0);
     for (const Node& node : g.nodes()) recorded[node.op.index()] = true;
     return result;
   });

@@ -60,3 +60,15 @@ TEST_CASE("a threshold gives one of two values, and leaves what is no number to 
   CHECK(std::isinf(values[4]));
   CHECK(values[5] == 9.0f);
 }
+
+TEST_CASE("the sigmoid of a column's numbers is from 0 to 1, and what is no number stays to be found") {
+  std::vector<float> x = {0, -200, 200, 1.5f, NAN};
+  map_columns(Sigmoid{{0, 1, 2, 4}}, x);
+  CHECK(x[0] == 0.5f);
+  CHECK(x[1] < 1e-30f);
+  CHECK(x[2] == 1.0f);
+  CHECK(x[3] == 1.5f);
+  CHECK(std::isnan(x[4]));
+  map_columns(Sigmoid{{3}}, x);
+  CHECK(x[3] == 0.81757444f);  // torch.sigmoid(torch.tensor(1.5))
+}
