@@ -9,8 +9,8 @@
 
 namespace vla {
 
-/// What one graph leaves for the graphs that run after it, by path: the prefix for the solver steps, load time for
-/// both.
+/// The values that one graph leaves for the graphs that run after it, by path: the prefix for the solver steps, load
+/// time for both.
 class Cache {
  public:
   /// Keeps `value` under its path, which is a tap too. Called while the graph that computes it is recorded.
@@ -21,7 +21,7 @@ class Cache {
     entries_[path] = {slot, g.serial(), value};
   }
   bool has(const std::string& path) const { return entries_.count(path) != 0; }
-  /// What `put` kept: the value itself in the graph that computes it.
+  /// The value that `put` kept: itself in the graph that computes it.
   Tensor get(Graph& g, const std::string& path) const {
     const Entry& entry = entries_.at(path);
     return entry.graph == g.serial() ? entry.value : g.input(entry.slot);

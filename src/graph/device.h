@@ -17,7 +17,7 @@
 
 namespace vla {
 
-/// What operands of large products are rounded to; sums are float32, or integers of int8.
+/// The type that operands of large products are rounded to; sums are float32, or integers of int8.
 enum class Precision { f32, bf16, int8 };
 
 constexpr const char* precision_name(Precision precision) {
@@ -54,7 +54,7 @@ class Program {
   virtual std::optional<Time> ended() const { return {}; }
   /// The work of a run: one entry for each stage, then one for all that follows the last.
   virtual std::vector<Work> work() const = 0;
-  /// What a model of a device that is not there says of a run.
+  /// The time of a run that a model of a device that is not there predicts.
   struct Prediction {
     double seconds = 0;
     // Of them, if nothing overlapped: products at the rate of their units, bytes at the memory's, and launches.
@@ -97,7 +97,7 @@ struct DeviceInfo {
   std::string precision;             // of products: "f32, bf16"
 };
 
-/// Where matrices are, if memory is too small for all of them.
+/// The matrices to stream in every act, if memory is too small for all of them.
 struct WeightPlan {
   /// Those that come from the bundle's file in every act, in groups, in the order in which the prefix reads them.
   /// Empty: all of them stay in memory.
@@ -138,7 +138,7 @@ class Device {
   virtual std::unique_ptr<Sent> send(const void* /*data*/, std::size_t /*size*/) { return nullptr; }
   /// Sets a slot with what this device sent, as large as the slot is.
   virtual void take(const Slot& /*slot*/, const Sent& /*sent*/) {}
-  /// What went wrong once in a call of the device, after which no other succeeds. Errors: device, out_of_memory.
+  /// The first error of a call of the device, after which no other succeeds. Errors: device, out_of_memory.
   virtual Status failure() const { return {}; }
   /// The graph's slots must have memory; the graph is not needed afterwards. Errors: out_of_memory, internal,
   /// unsupported for sizes that the device has no kernel for.
@@ -151,11 +151,11 @@ class Device {
   virtual bool is_host() const { return true; }
   /// As `--kernels` names them.
   virtual std::string kernels() const = 0;
-  /// Of the processor, where its kernels use some.
+  /// The features of the processor that its kernels use, if any.
   virtual Features features() const { return {}; }
-  /// Of the large products.
+  /// The precision of the large products.
   virtual Precision precision() const = 0;
-  /// Of large matrices, when they are loaded.
+  /// The rounding of large matrices when they are loaded.
   virtual Rounding rounding() const = 0;
   /// Whether it has faster products of bf16, for whoever asks for them (graph/rounding.h).
   virtual bool has_bf16() const = 0;
@@ -166,7 +166,7 @@ class Device {
   virtual std::size_t working_size() const = 0;
   /// Counts from now on, from zero, how long each kind of operation takes, or stops counting.
   virtual void count_times(bool /*on*/) {}
-  /// What was counted: seconds of all threads together. Empty where the device does not know.
+  /// The times that were counted: seconds of all threads together. Empty where the device does not know.
   virtual std::vector<std::pair<std::string, double>> times() const { return {}; }
   /// Has the system back the shared memory now, so that no request waits for it.
   virtual void touch() {}

@@ -8,7 +8,7 @@
 
 namespace vla {
 
-/// What a library such as libvla-cuda.so exports: devices of one kind, opened as the Device that graphs run on. It
+/// The export of a library such as libvla-cuda.so: devices of one kind, opened as the Device that graphs run on. It
 /// carries everything that they need, so that it takes no symbol of the program that loads it, and no other program's
 /// ggml can be mistaken for ours. `build` makes sure that both know the same classes.
 struct DeviceLibrary {

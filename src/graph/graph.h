@@ -57,7 +57,7 @@ using Injector = std::function<const Slot*(const std::string& path, Tensor value
 /// A list of operations in the order in which they are recorded. It knows no device: a lowering makes a Program of it.
 class Graph {
  public:
-  /// What outlives a run and is made on the way goes to `slots`.
+  /// `slots` receives what is made on the way and outlives a run.
   explicit Graph(Slots& slots, TapFilter filter = {}, Injector injector = {});
   Graph(const Graph&) = delete;
   Graph& operator=(const Graph&) = delete;
@@ -90,7 +90,7 @@ class Graph {
 
   const std::deque<Node>& nodes() const { return nodes_; }
   const std::vector<Stage>& stages() const { return stages_; }
-  /// Of each node whether a write or a tap depends on it.
+  /// For each node, whether a write or a tap depends on it.
   std::vector<bool> needed() const;
   /// The first operation whose operands did not fit; empty where all did. A bug of ours, reported when it is lowered.
   const std::string& problem() const { return problem_; }

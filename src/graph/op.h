@@ -10,7 +10,7 @@
 #include "bundle/params.h"
 #include "graph/slot.h"
 
-/// What a graph is made of: plain structs that say what is computed and nothing about how. Operands are tensors, in the
+/// The operations of a graph: plain structs that say what is computed, not how. Operands are tensors, in the
 /// order of the comment; shapes follow ggml, fastest first. Graph::add checks them when an operation is recorded.
 /// Every pass has a function for each of them and none for the rest, so that one that it does not know fails to
 /// compile.

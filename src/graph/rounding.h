@@ -7,8 +7,8 @@
 /// Matrices in another encoding than that of the bundle, because somebody asked for it.
 namespace vla {
 
-/// What matrices become when they are loaded: large ones of floats are rounded to bf16, int8 or int4, or quantized ones
-/// become float32 again.
+/// The conversion of matrices as they are loaded: large ones of floats are rounded to bf16, int8 or int4, or quantized
+/// ones become float32 again.
 enum class Rounding { none, bf16, int8, int4, float32 };
 
 /// The encoding of a parameter in memory; int8 and int4 have a scale for each row of a matrix. Rows that are no whole

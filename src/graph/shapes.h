@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// What an operation makes of its operands.
+/// The result's shape and type, if the operands fit.
 struct ShapeCheck {
   bool fits;
   Shape shape = {1, 1, 1, 1};  // of the result

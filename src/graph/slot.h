@@ -42,7 +42,7 @@ class Slots {
   std::deque<Slot>& all() { return slots_; }
   /// Bytes of the memory.
   std::size_t size() const { return size_; }
-  /// What holds the slots, kept as long as this lives.
+  /// Keeps the memory that holds the slots, of `size` bytes, as long as this lives.
   void hold(std::shared_ptr<void> memory, std::size_t size) { memory_ = std::move(memory), size_ = size; }
 
  private:

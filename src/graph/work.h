@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// What a computation asks of a machine. `flop` counts matrix and attention products alone, two for each multiply-add:
+/// A computation's load on a machine. `flop` counts matrix and attention products alone, two for each multiply-add:
 /// everything else takes time without being the work that a peak is measured in. `bytes` counts every operand and
 /// result once per operation of the program, in its stored dtype, so that a fused operation asks for less.
 struct Work {
