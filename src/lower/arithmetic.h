@@ -8,7 +8,7 @@
 
 namespace vla {
 
-/// What computes products, and at which precision: the meaning of `--kernels`, which nothing else reads.
+/// The backend that computes products, and its precision: the meaning of `--kernels`, which nothing else reads.
 struct Arithmetic {
   enum class Backend { own, ggml };
 

@@ -311,7 +311,7 @@ class Fuser {
     }
   }
 
-  /// What a window covers is taken by the products that read it, place by place as they copy x.
+  /// Fuses Unfold into the products that read it: they take what a window covers place by place as they copy x.
   void fuse_windows() {
     for (FusedOp& op : ops_) {
       auto* linear = std::get_if<LinearOp>(&op.op);

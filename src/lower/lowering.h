@@ -19,8 +19,8 @@ namespace vla::lower {
 using ValueId = int;
 constexpr ValueId kNone = -1;
 
-/// Where elements lie: of a node's result, or of what a target makes on the
-/// way.
+/// The elements of a node's result, or of what a target makes on the way, and
+/// where they lie.
 struct Value {
   /// Memory that programs share, or of the program, or of a slot, ... thread:
   /// of whoever computes it, for its readers in the same operation.
@@ -44,8 +44,8 @@ struct Value {
   const Slot* slot = nullptr;
 };
 
-/// What is done to rows of queries or keys on the way: nodes that were fused,
-/// or null.
+/// Rows of queries or keys, and the nodes that were fused to prepare them, or
+/// null.
 struct Prepared {
   ValueId x;
   const Node *norm = nullptr, *rope = nullptr;
@@ -116,7 +116,7 @@ struct ChannelOp {
   ValueId q, k, v;
 };
 
-/// What the passes behind fusion know of an operation.
+/// An operation as the passes behind fusion see it.
 struct Step {
   std::vector<ValueId> reads, writes;
   int order = 0;           // the id of the node whose result it gives

@@ -8,7 +8,7 @@
 namespace vla::lower {
 namespace {
 
-/// What is computed from slots that do not vary stays the same.
+/// Marks the steps that compute from slots that do not vary: their results stay the same.
 void find_invariants(const Lowering& l, const std::vector<Step*>& steps) {
   const auto& varying = l.options.varying;
   std::vector<bool> varies(l.values.size(), false);

@@ -137,7 +137,7 @@ struct MakeValue {
 
  private:
   const Value& x() const { return l.value(node.in[0].node()->id); }
-  /// What a slot holds may be overwritten later in the run, so that a tap records a copy.
+  /// Whether a tap records a copy, since the value is in a slot, which may be overwritten later in the run.
   bool must_copy() const { return node.tapped && l.base(x().base).placement == Value::Placement::slot; }
   Value in_slot(const Slot& slot) const {
     Value value = own(node);

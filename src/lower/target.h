@@ -9,14 +9,14 @@
 
 namespace vla::lower {
 
-/// What a machine can do at a time. Passes that hold for every machine ask it;
+/// The abilities of a machine. Passes that hold for every machine ask for them;
 /// parameters must be loaded.
 class Target {
  public:
   virtual ~Target() = default;
 
-  /// What multiplies by a matrix, told apart by its address: products of one x
-  /// may be one operation, and so may gate and up, where it is the same.
+  /// The kernel that multiplies by a matrix, told apart by its address: products
+  /// of one x may be one operation, and so may gate and up, where it is the same.
   virtual const void* multiplier(const Param& matrix) const = 0;
   /// How many products of one x may be one operation.
   virtual std::size_t max_products() const = 0;

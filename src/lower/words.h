@@ -6,7 +6,7 @@
 
 #include "lower/lowering.h"
 
-/// What operations that every target has compute, as a printed program says it.
+/// Words for the operations that every target has: what they compute, as a printed program says it.
 namespace vla::lower {
 
 std::string words_of(const Prepared& rows);

@@ -43,7 +43,7 @@ struct CpuLowering : Lowering {
 };
 
 inline kernels::RoundedLayout rounded(const Value& value) { return static_cast<kernels::RoundedLayout>(value.layout); }
-/// What multiplies: all matrices of an operation have the same.
+/// The kernel that multiplies: all matrices of an operation have the same.
 const kernels::LinearKernel& kernel_of(const CpuLowering& l, const LinearOp& op);
 
 /// Chooses the dtype of values between products, makes codes of what those of codes read, and copies what its reader

@@ -12,7 +12,7 @@
 namespace vla::lower {
 namespace {
 
-/// Of host memory, estimated: the largest task, and what lists and allocator keep for it.
+/// Bytes of host memory for a task, estimated: the largest one, and what lists and allocator keep for it.
 constexpr std::size_t kTaskSize = sizeof(kernels::LinearJob) + 2 * sizeof(void*) + 256;
 
 }  // namespace

@@ -16,7 +16,7 @@ namespace vla::lower {
 /// The tables of a policy's bundle.
 using Tables = std::map<const Param*, std::unique_ptr<TableRows>>;
 
-/// Where parameters are, by their ids. Programs look matrices up when a run begins: until then one may move.
+/// The addresses of parameters, by their ids. Programs look matrices up when a run begins: until then one may move.
 struct WeightTable {
   struct Entry {
     std::byte* data = nullptr;
@@ -47,19 +47,19 @@ class CpuWeights {
   const float* floats(const Param* vector) const { return reinterpret_cast<const float*>(data(vector)); }
   /// How it lies in memory.
   const Encoding& encoding(const Param* param) const { return place(param).encoding; }
-  /// What multiplies by a matrix.
+  /// The kernel that multiplies by a matrix.
   const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
   /// Bytes of a matrix.
   std::size_t size_of(const Param& matrix) const { return place(&matrix).size_of(matrix); }
   /// Its group among those of the plan that are streamed, or -1.
   int group_of(int matrix) const { return groups_[static_cast<std::size_t>(matrix)]; }
-  /// What reads those; null where there are none, or nothing is filled.
+  /// The stream that reads those; null where there are none, or nothing is filled.
   const std::shared_ptr<WeightStream>& stream() const { return stream_; }
-  /// Where everything is; programs keep it.
+  /// The addresses of all parameters; programs keep the table.
   const std::shared_ptr<WeightTable>& table() const { return table_; }
   /// All tables that have their source.
   const std::shared_ptr<const Tables>& tables() const { return tables_; }
-  /// Of one of them; null where it has no source.
+  /// The rows of one of them; null where it has no source.
   TableRows* rows(const Param* table) const {
     const auto found = tables_->find(table);
     return found != tables_->end() ? found->second.get() : nullptr;

@@ -162,7 +162,7 @@ struct CopyTask : Task {
   }
 };
 
-/// Rows of a parameter, widened to float32 where they will lie: a row of two bytes a number fills the second half of
+/// Rows of a parameter, widened to float32 where they will lie: a row of two bytes an element fills the second half of
 /// its place first.
 struct EmbeddingTask : Task {
   TableRows* table;
@@ -211,7 +211,7 @@ struct PatchesTask : Task {
   }
 };
 
-/// What the window covers, or the largest of it, or its weighted sum; an item is a row of places.
+/// Copies the elements that a window covers, or their largest, or their weighted sum; an item is a row of places.
 struct WindowTask : Task {
   kernels::Window window;
   kernels::RowKernel largest, multiply_add;  // both null: all of it
@@ -296,7 +296,7 @@ double flop_of_op(const CpuOp& op) { return std::visit(FlopOf{}, op.op); }
 /// Threads that share an operation.
 int threads_for(const CpuLowering& l, const CpuOp& op) { return flop_of_op(op) < kMinSharedFlop ? 1 : l.n_thread; }
 
-/// What LinearOp and QuantizeOp do to the rows that they read.
+/// The norm that LinearOp and QuantizeOp apply to the rows that they read.
 template <class Reader>
 kernels::LinearJob::Norm norm_of(const CpuLowering& l, const Reader& op) {
   if (op.norm == nullptr) return {};

@@ -117,7 +117,7 @@ class Layouts : Copies<CpuLowering> {
     return kernels::cpu_kernels(l.features(rounds))->attention;
   }
 
-  /// What only products and attention read is stored as they would round it.
+  /// Stores a value that only products and attention read as they would round it.
   void round_result(ValueId id, kernels::RoundedLayout layout) {
     Value& y = l.value(id);
     if (layout == kernels::RoundedLayout::none || y.placement != Value::Placement::arena) return;

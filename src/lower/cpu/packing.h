@@ -38,7 +38,7 @@ struct PackPart {
 /// Cuts a matrix into parts of about a megabyte.
 void add_parts(const Param& matrix, const MatrixPlace& place, std::vector<PackPart>& parts);
 
-/// What one thread reads parts through, so that no more than a part for each thread stands in memory twice.
+/// One thread's buffers for reading parts, so that no more than a part for each thread stands in memory twice.
 class Packer {
  public:
   /// Takes the memory that these parts need, since threads must not run out of it. Throws std::bad_alloc.

@@ -7,7 +7,7 @@
 
 namespace vla {
 
-/// What kernels may use to compute with these parameters, of what they could use. Tiles of bf16 round whatever they
+/// The features that kernels may use to compute with these parameters, of `use`. Tiles of bf16 round whatever they
 /// multiply. A bundle asks for that by storing matrices as bf16: those are multiplied so, and attention of queries that
 /// they make rounds too. Matrices of another dtype, and attention of their queries, are float32, as they are in
 /// PyTorch: pi0's tower beside its language model. Without any of bf16 everything is. What is rounded counts as it is

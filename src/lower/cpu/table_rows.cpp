@@ -26,7 +26,7 @@ Result<std::unique_ptr<TableRows>> TableRows::make(const Bundle& bundle, const P
   return rows;
 }
 
-/// Where row i is, or may be kept: `index_` tells which.
+/// The place where row i is, or may be kept: `index_` tells which.
 std::byte* TableRows::place(std::int64_t i) {
   const auto n = static_cast<std::int64_t>(index_.size());
   std::int64_t at = i % n;

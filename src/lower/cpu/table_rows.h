@@ -20,7 +20,7 @@ class TableRows {
   /// Row i as it is stored; zeros where the bundle has not this row any more, which `status` then tells.
   void copy(std::int64_t i, std::byte* to);
   std::size_t row_size() const { return row_size_; }
-  /// Of the rows that were copied since it was asked for. Errors: bad_bundle, where the file has been changed.
+  /// The status of the rows copied since it was last asked for. Errors: bad_bundle, where the file has been changed.
   Status status();
   /// Bytes of the rows that are kept, at most.
   std::size_t size() const { return kept_.size(); }

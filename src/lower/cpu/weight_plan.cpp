@@ -18,7 +18,7 @@ class Planner {
     group_phases(prefix);
   }
 
-  /// Of those that fit the one that streams least.
+  /// The plan that streams least of those that fit.
   WeightPlan plan(std::size_t size) const {
     WeightPlan plan;
     plan.smallest = memory(groups_);
@@ -63,7 +63,7 @@ class Planner {
     for (const Param* matrix : group) bytes += weights_.size_of(*matrix);
     return bytes;
   }
-  /// Of all parameters, where these groups are streamed if that saves something.
+  /// Bytes of all parameters, where these groups are streamed if that saves something.
   std::size_t memory(const std::vector<Group>& streamed) const {
     std::size_t bytes = weights_.size() + WeightStream::kWindows * window_;
     for (const Group& group : streamed) bytes -= size(group);

@@ -34,7 +34,7 @@ WeightStream::~WeightStream() {
   for (std::thread& thread : threads_) thread.join();
 }
 
-/// What a thread does: a part after the other, as long as there are free windows.
+/// A thread's loop: reads one part after the other, as long as there are free windows.
 void WeightStream::serve(Packer packer) {
   Lock lock(mutex_);
   while (true) {

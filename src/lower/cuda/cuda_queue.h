@@ -21,7 +21,7 @@ struct Call {
 /// Launches one after the other.
 using Calls = std::vector<Call>;
 
-/// What is launched together: phases one after the other, whose operations are independent.
+/// Phases that are launched together, one after the other; the operations of each are independent.
 struct CudaPart {
   using Time = std::chrono::steady_clock::time_point;
   /// Has a time noted that is behind so many phases.
@@ -34,14 +34,14 @@ struct CudaPart {
   std::vector<Mark> marks;  // in the order of phases
 };
 
-/// What a device is asked for, in order. Parts are launched when somebody wants a result, or changes an input: then all
+/// A device's work, in order. Parts are launched when a result is wanted or an input changes: then all
 /// since are one graph, which is captured the first time that these parts follow each other. So an act is one launch.
 /// The first failure is kept, and is the answer to every later call. Errors: device, out_of_memory.
 class CudaQueue {
  public:
   static Result<std::unique_ptr<CudaQueue>> open(const cuda::Driver& driver, int index,
                                                  const std::vector<std::string>& modules);
-  /// Of no device: dry from the beginning.
+  /// A queue without a device: dry from the beginning.
   explicit CudaQueue(int n_sm) : n_sm_(n_sm), is_dry_(true) {}
   ~CudaQueue();
 

@@ -19,7 +19,7 @@ std::unique_ptr<CudaSent> CudaSender::send(const void* data, std::size_t size) {
   return std::unique_ptr<CudaSent>(new CudaSent(shared_from_this(), std::move(parcel)));
 }
 
-/// What was sent in a parcel before is no longer wanted, even if it is still on its way: the stream keeps the order.
+/// Fills a parcel whose bytes from before are no longer wanted, even if still on their way: the stream keeps the order.
 Result<std::unique_ptr<CudaSender::Parcel>> CudaSender::start(const void* data, std::size_t size) {
   VLA_CHECK(gpu_->use());
   VLA_TRY(std::unique_ptr<Parcel> parcel, take(size));

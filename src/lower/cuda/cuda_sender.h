@@ -45,7 +45,7 @@ class CudaSender : public std::enable_shared_from_this<CudaSender> {
   std::size_t n_made_ = 0;
 };
 
-/// What was sent, or why it was not.
+/// A parcel that was sent, or the reason why it was not.
 class CudaSent final : public Device::Sent {
  public:
   ~CudaSent() override;

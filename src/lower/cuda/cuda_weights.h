@@ -14,7 +14,7 @@ namespace vla::lower {
 /// Which kernels multiply by a matrix. bf16 ones read bf16 rows, ternary and int8 ones rows of int8 codes.
 enum class MatrixKind { f32, bf16, ternary, int8 };
 
-/// Where a parameter lies on the device, and how: vectors and f32 matrices as float32, tables as they are stored, other
+/// A parameter's place and layout on the device: vectors and f32 matrices as float32, tables as they are stored, other
 /// matrices as their kernels want them.
 struct CudaWeight {
   MatrixKind kind = MatrixKind::f32;

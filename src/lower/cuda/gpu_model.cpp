@@ -56,7 +56,7 @@ constexpr GpuModel kModels[] = {
      .attention = 1.35},
 };
 
-/// What an operation asks of a GPU.
+/// An operation's cost on a GPU.
 struct Cost {
   double products = 0;  // seconds of all SMs, were they all at work
   double alone = 0;     // seconds where nothing else runs: whole waves of blocks

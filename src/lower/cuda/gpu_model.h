@@ -8,8 +8,8 @@
 
 namespace vla::lower {
 
-/// What is published of a GPU, without sparsity and at the clock that the maker's peaks are told for: what predictions
-/// of GPUs that are not there stand on.
+/// A GPU's published figures, without sparsity and at the clock that the maker's peaks are told for: the basis of
+/// predictions for GPUs that are not there.
 struct GpuModel {
   const char *name, *description;
   int n_sm;

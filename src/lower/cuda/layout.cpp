@@ -74,7 +74,7 @@ class Layouts : Copies<CudaLowering> {
     std::replace(step_->reads.begin(), step_->reads.end(), rows.x, to);
     rows = {to};
   }
-  /// What attention reads in the place of what PackOp would write.
+  /// Notes the rows that attention reads in the place of what PackOp would write.
   void note_keys(FusedOp& step, PackOp pack) {
     step_ = &step;
     const bool rounds = rounds_heads(pack.rounds, pack.k);
@@ -108,7 +108,7 @@ class Layouts : Copies<CudaLowering> {
     made_.n_split = splits(kind, n_row, y[0], depth);
     take_partial(y[0] * n_row);
   }
-  /// Where blocks are fewer than the device runs at a time, each takes a share of the depth, of at least 8 steps.
+  /// The number of shares of the depth, each of 8 steps or more: 1 unless blocks are fewer than run at a time.
   int splits(MatrixKind kind, std::int64_t n_row, std::int64_t n_column, std::int64_t depth) const {
     if (kind == MatrixKind::f32) return 1;
     const ProductShape shape = product_shape(kind, n_row, n_column, l.n_sm);
@@ -144,7 +144,7 @@ class Layouts : Copies<CudaLowering> {
   static std::int64_t converted_stride(DType type, std::int64_t n) {
     return type == DType::i8 ? kernels::quantized_stride(n) : type == DType::bf16 ? bf16_stride(n) : n;
   }
-  /// What a product, attention or a window makes and nobody else reads is stored rounded.
+  /// Rounds the result of a product, attention or a window as it is stored, where nobody else reads it.
   void round_at_once(CudaOp& round, const RoundOp& what) {
     const Value &x = l.value(what.x), &to = l.value(round.writes[0]);
     const bool is_whole =

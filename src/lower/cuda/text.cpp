@@ -11,7 +11,7 @@ namespace {
 
 double size_of(const Value& value) { return static_cast<double>(dtype_size(value.type, count(value.shape))); }
 
-/// What an operation computes, and the value that it is computed of.
+/// Describes an operation: what it computes, and the value that it is computed of.
 struct Describe {
   struct Words {
     std::string what;
