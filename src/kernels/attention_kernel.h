@@ -14,7 +14,7 @@ namespace vla::kernels {
 struct HeadRows {
   const std::byte* data;
   std::int64_t first, head, token, batch;
-  /// Where not none: bf16 instead of floats, in rows of `d` elements that are laid out so.
+  /// The layout of bf16 elements, in rows of `d`; none: floats.
   RoundedLayout layout = RoundedLayout::none;
   std::int64_t d = 0;
 

@@ -31,7 +31,7 @@ class AttentionPanels {
 
   /// Elements that one unit takes.
   std::int64_t unit_size() const { return n_key * (key_depth + d_value); }
-  /// Where the keys of a unit begin, and its values.
+  /// The offsets of a unit's keys, and of its values.
   std::int64_t keys(std::int64_t unit) const { return unit * unit_size(); }
   std::int64_t values(std::int64_t unit) const { return keys(unit) + n_key * key_depth; }
   /// Columns of the panel of features that starts at feature i.

@@ -112,8 +112,8 @@ struct PairPanels {
   static constexpr float kLogOfE = 1.44269504f, kSlack = 8;
   static VLA_INLINE Float power(Float x) { return exp2_for_bf16<V>(x); }
 
-  /// Where a panel holds number `k` of column `n`: for each 32 of the depth two tiles of 16 columns; in each of their
-  /// 16 lines a pair of every column.
+  /// The place of element `k` of column `n` in a panel: for each 32 of the depth two tiles of 16 columns; in each of
+  /// their 16 lines a pair of every column.
   static constexpr std::int64_t place(std::int64_t k, std::int64_t n) {
     return k / 32 * 1024 + n / 16 * 512 + k % 32 / 2 * 32 + n % 16 * 2 + k % 2;
   }

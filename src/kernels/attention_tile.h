@@ -160,7 +160,7 @@ class AttentionTile {
       return next;
     }
 
-    /// What the block's queries see of a chunk.
+    /// Whether the block's queries see all of a chunk, some of it, or none.
     Seen look(std::int64_t key, int n) const {
       bool none = true, all = true;
       for (int r = 0; r < n_row && (none || all); ++r) {
@@ -260,7 +260,7 @@ class AttentionTile {
       V::store(sum + r * kWidth, even + odd);
     }
 
-    /// What was mixed before becomes relative to the greatest scores of now.
+    /// Makes what was mixed before relative to the greatest scores of now.
     void shrink_rows(const Pass& pass) {
       for (int r = pass.first; pass.sum && r < pass.end; ++r) {
         if (shrink[r] == 1.0f) continue;

@@ -10,11 +10,11 @@
 /// what lies in which cache.
 ///
 /// A panel's columns are taken a step of the depth at a time, which stays in a cache while all rows of a block of x
-/// pass by. Two or four bits for a number are expanded to bytes once for them; of few rows the tile unpacks them. Sums
+/// pass by. Two or four bits an element are expanded to bytes once for them; of few rows the tile unpacks them. Sums
 /// are integers, so that they are the same in every order.
 namespace vla::kernels {
 
-/// What sums of a row, of weights with an offset, stand for: float(sum) * (scale of W, or of its column / s of the
+/// The values of a row's sums, of weights with an offset: float(sum) * (scale of W, or of its column / s of the
 /// row).
 template <class V, class Weights, int kColumns, int kOffset>
 VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const RowScale& row, const std::int32_t* from,

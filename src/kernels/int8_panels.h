@@ -48,7 +48,7 @@ struct BytePanels : Int8Panels {
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 };
 
-/// Where a tile reads the elements of a panel of kStrips, with their offset: load(k, s, i, byte) is a vector from a
+/// The elements of a panel of kStrips as a tile reads them, with their offset: load(k, s, i, byte) is a vector from a
 /// byte on of the line that holds elements k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they lie as they
 /// are multiplied.
 template <int kStrips>

@@ -55,7 +55,7 @@ inline std::string name_of(Features use) { return kernel_set_of(use).name; }
 constexpr bool rounds_to_bf16(Features use) { return use.has(Feature::avx512_bf16) || use.has(Feature::neon_bf16); }
 constexpr bool rounds_to_bf16(const KernelSet& set) { return rounds_to_bf16(set.uses); }
 
-/// What takes their place where nothing may be rounded to bf16.
+/// The features that are left where nothing may be rounded to bf16.
 constexpr Features without_rounding(Features use) {
   return use.without({Feature::avx512_bf16, Feature::amx_bf16, Feature::amx_int8, Feature::neon_bf16});
 }

@@ -9,7 +9,7 @@
 
 namespace vla::kernels {
 
-/// What operations take by kind, while somebody wants to know: two readings of the clock for each item.
+/// The time of operations by kind, while somebody wants to know: two readings of the clock for each item.
 struct KindClock {
   enum Kind { products, attention, norms, others, count };
   static constexpr const char* kNames[] = {"products", "attention", "norms and codes", "others"};

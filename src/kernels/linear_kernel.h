@@ -37,11 +37,11 @@ struct LinearKernel {
   /// to this depth, as partial sums of deeper ones lie in y.
   RoundedLayout rounded = RoundedLayout::none;
   std::int64_t max_rounded_depth = 0;
-  /// What computes products of at most `max_small_batch` rows in its place, from the same packed matrix; null where it
-  /// does so itself.
+  /// The kernel for products of at most `max_small_batch` rows, from the same packed matrix; null where this one
+  /// computes them.
   const LinearKernel* small_batch = nullptr;
   std::int64_t max_small_batch = 0;
-  /// Where x must come as rows of int8 codes (quantized.h): makes one of them, of n elements. Else null.
+  /// Makes a row of int8 codes (quantized.h) of n elements of x, where x must come as such rows. Else null.
   void (*quantize)(const float* x, std::int64_t n, std::byte* row) = nullptr;
   /// Elements of x that the L2 cache keeps beside what passes through it, where x is read as the product before left
   /// it; 0 where it is copied first.

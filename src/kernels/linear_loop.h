@@ -25,7 +25,7 @@ struct Prefetch {
 /// `Tile` has: V (a type of vec.h), X (what x becomes), kRows and kColumns (of the product), kBlockRows (of the block
 /// of x), kMaxDepth and kXStride (how deep its rows may be, and from one to the next), kStep (of the depth, most),
 /// kRounds (x becomes bf16), kEven (tiles of equal height), and
-///   place(r, k)                       where number k of row r of the block lies, if not behind k others of its row
+///   place(r, k)                       where element k of row r of the block lies, if not behind k others of its row
 ///   copy(from, n, to)                 n elements of x, zeros up to a multiple of 32; where kRounds also from bf16
 ///   store_rounded(to, vector, left)   y as bf16, where kRounds
 ///   multiply(type, n_row, x, panel, depth, c, add, ahead)
@@ -146,7 +146,7 @@ class LinearLoop {
     }
   }
 
-  /// What the window covers at a place, from depth k on: where x stays as it is, straight to where it is multiplied.
+  /// Copies the window's elements at a place, from depth k on: if x stays as it is, straight to where it is multiplied.
   void take_place(std::int64_t place, std::int64_t k, std::int64_t depth, X* to) {
     const auto* images = reinterpret_cast<const float*>(job_.x);
     if constexpr (std::is_same_v<X, float>) {

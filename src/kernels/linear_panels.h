@@ -37,7 +37,7 @@ struct Panels {
   static std::size_t packed_size(const MatrixDesc& desc);
   static void pack(const MatrixDesc& desc, const std::byte* stored, std::byte* packed);
 
-  /// Number k of column n of a panel.
+  /// Element k of column n of a panel.
   static VLA_INLINE float number(DType type, const std::byte* panel, std::int64_t k, std::int64_t n) {
     return stored_number(type, panel + place(type, k, n), 0);
   }
@@ -45,7 +45,7 @@ struct Panels {
  private:
   static constexpr std::int64_t block_depth(DType type) { return type == DType::f32 ? 16 : 32; }
 
-  /// Offset of number k of column n.
+  /// Offset of element k of column n.
   static VLA_INLINE std::int64_t place(DType type, std::int64_t k, std::int64_t n) {
     const std::int64_t depth = block_depth(type), inner = k % depth, column = n % 16;
     const std::int64_t block = (k / depth * (kColumns / 16) + n / 16) * kPanelBlock;

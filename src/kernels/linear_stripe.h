@@ -8,7 +8,7 @@
 #include "kernels/rounded.h"
 #include "kernels/sizes.h"
 
-/// What the loops of products share: how a job is cut into stripes and tiles, and everything that follows a product.
+/// The common part of the loops of products: how a job is cut into stripes and tiles, and all that follows a product.
 namespace vla::kernels {
 
 /// One panel's columns of a part by the rows of a block of x, over a part of the depth.
@@ -49,8 +49,8 @@ struct LinearStripes {
            Layout::size(part.type, k);
   }
 
-  /// What is read behind panel `panel` at depths from k to k + depth by an item that takes panels begin to end, block
-  /// of the depth by block; behind its last block what an item beside it begins with.
+  /// The weights that an item reads behind panel `panel` at depths from k to k + depth; it takes panels begin to end,
+  /// block of the depth by block. Behind its last block those that an item beside it begins with.
   static const std::byte* behind(const LinearJob& job, std::int64_t begin, std::int64_t end, std::int64_t panel,
                                  std::int64_t k, std::int64_t depth) {
     const bool ends_block = panel + 1 == end, goes_on = ends_block && k + depth < job.d_in;
@@ -60,7 +60,7 @@ struct LinearStripes {
     return panel_of(job, job.part[job.gated ? 0 : s.part], s.column, goes_on ? k + depth : ends_block ? 0 : k);
   }
 
-  /// Where tile t of `n_row` rows begins: tiles are of nearly equal height, or whole but for the last.
+  /// The first row of tile t of `n_row` rows: tiles are of nearly equal height, or whole but for the last.
   static VLA_INLINE std::int64_t first_row(std::int64_t n_row, std::int64_t t) {
     return Tile::kEven ? n_row * t / ceil_div(n_row, kRows) : min(t * kRows, n_row);
   }
@@ -74,8 +74,8 @@ struct LinearStripes {
       fetch<0>(reinterpret_cast<const std::byte*>(part.residual + place), n_row, part.d_out * 4);
   }
 
-  /// What becomes of a tile's sums [kColumns] x n_row, rows first to first + n_row of the stripe: behind the last block
-  /// of the depth everything that follows the product, before it partial sums in y. Some rows of the tile may be
+  /// Finishes a tile's sums [kColumns] x n_row, rows first to first + n_row of the stripe: behind the last block of the
+  /// depth with everything that follows the product, before it as partial sums in y. Some rows of the tile may be
   /// finished now and others later.
   class Finish {
    public:
@@ -198,7 +198,7 @@ struct LinearStripes {
       return value;
     }
 
-    /// Where the stripe's elements of a row go.
+    /// The destination of the stripe's elements of a row.
     template <bool kWhole>
     VLA_INLINE std::uint16_t* rounded_row(std::int64_t row, std::int64_t d_out) const {
       auto* y = reinterpret_cast<std::uint16_t*>(y_);

@@ -163,7 +163,7 @@ class TileLoop {
       }
   }
 
-  /// The square of x that begins at row r and number k of the block.
+  /// The square of x that begins at row r and element k of the block.
   const X* square_of_x(std::int64_t r, std::int64_t k) const {
     if (job_.x_type != DType::bf16) return scratch_->x + place_in_tiles(r, k, depth_);
     return reinterpret_cast<const X*>(job_.x) + place_in_tiles(row_ + r, k_ + k, job_.d_in);
@@ -206,8 +206,8 @@ class TileLoop {
     n_finished_ = n_summed_;
   }
 
-  /// What is done between the instructions that multiply a square: rows of squares before are finished, and memory that
-  /// will be needed soon is asked for. As many rows at a time as makes all calls for a panel alike.
+  /// Work between the instructions that multiply a square: rows of squares before are finished, and memory that will be
+  /// needed soon is asked for. As many rows at a time as makes all calls for a panel alike.
   class Between {
    public:
     VLA_INLINE Between(TileLoop& loop, std::int64_t n_call, const std::byte* next, std::int64_t size)

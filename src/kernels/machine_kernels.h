@@ -6,8 +6,8 @@
 #include "kernels/linear_kernel.h"
 #include "kernels/probe/probe.h"
 
-/// What the processor's family adds to the portable kernels. The build takes one folder of x86, arm and other, which
-/// says all of it in its machine_kernels.cpp.
+/// The kernels that a processor's family adds to the portable ones. The build takes one folder of x86, arm and other,
+/// which says all of it in its machine_kernels.cpp.
 namespace vla::kernels::machine {
 
 using LinearKernels = std::span<const LinearKernel* const>;

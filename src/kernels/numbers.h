@@ -20,10 +20,10 @@ VLA_INLINE float from_f16(std::uint16_t x) {
   return sign != 0 ? -small : small;
 }
 
-/// Bytes of a stored number.
+/// Bytes of a stored element.
 constexpr VLA_INLINE std::int64_t number_size(DType type) { return type == DType::f32 ? 4 : 2; }
 
-/// Number i of a stored matrix.
+/// Element i of a stored matrix.
 VLA_INLINE float stored_number(DType type, const std::byte* stored, std::int64_t i) {
   if (type == DType::f32) {
     float x;

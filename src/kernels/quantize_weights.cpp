@@ -13,7 +13,7 @@ namespace {
 constexpr float kMinScale = 1e-30f;  // 127 / max_abs is finite; values below it are as good as zero
 constexpr float kRound = 0x1.8p23f;  // adding it leaves an integer in the lowest bits, ties to even
 
-/// Widens a row, and gives its greatest number without sign: NaN or infinity where one is not finite.
+/// Widens a row, and gives its greatest value without sign: NaN or infinity where one is not finite.
 template <DType kType>
 float widen(const std::byte* stored, std::int64_t n, float* row) {
   std::int32_t max_abs = 0;  // without their signs, floats are ordered as integers are, and NaN is above them all

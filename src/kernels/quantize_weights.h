@@ -6,8 +6,8 @@
 
 namespace vla::kernels {
 
-/// A matrix of floats as int8: the greatest number of a row of W becomes 127, and scale * code is nearly the number.
-/// A row with a number that is not finite gets a scale that makes its products not finite.
+/// A matrix of floats as int8: the greatest value of a row of W becomes 127, and scale * code is nearly the value.
+/// A row with a value that is not finite gets a scale that makes its products not finite.
 /// stored: d_out rows of d_in elements; codes the same in bytes; scales [d_out]; row: room for d_in elements.
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* codes,
                       float* scales, float* row);

@@ -43,7 +43,7 @@ VLA_INLINE RowScale row_scale(const std::byte* row, std::int64_t d_in) {
 }
 
 /// s = (1 / a) * 127 with a = max |x|, at least 1e-5, in two roundings; code = x * s to the nearest, ties to even, so
-/// that a becomes 127. A row with a number that is not finite gets a scale that makes its products not finite.
+/// that a becomes 127. A row with a value that is not finite gets a scale that makes its products not finite.
 /// The file that includes this must be compiled without fused multiply-adds (-ffp-contract=off): x * s is rounded
 /// before it becomes an integer. Source: BitVLA modeling_bitnet.py ActQuant; torch makes 127 / a as here.
 template <class V>

@@ -14,13 +14,13 @@ enum class RoundedLayout { none, rows, tiles };
 
 constexpr std::int64_t kTileSide = 32;
 
-/// Where element i of a row lies among tiles of rows of d elements.
+/// The place of element i of a row among tiles of rows of d elements.
 constexpr VLA_INLINE std::int64_t place_in_tiles(std::int64_t row, std::int64_t i, std::int64_t d) {
   return row / kTileSide * kTileSide * round_up(d, kTileSide) + i / kTileSide * kTileSide * kTileSide +
          row % kTileSide * kTileSide + i % kTileSide;
 }
 
-/// Where element i of a row lies among rows of d elements.
+/// The place of element i of a row among rows of d elements.
 constexpr VLA_INLINE std::int64_t rounded_place(RoundedLayout layout, std::int64_t row, std::int64_t i,
                                                 std::int64_t d) {
   return layout == RoundedLayout::tiles ? place_in_tiles(row, i, d) : row * d + i;

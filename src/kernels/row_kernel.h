@@ -11,7 +11,7 @@ namespace vla::kernels {
 /// y[n] of x[n], and its parameters: vectors w and b, a scalar s. x and y may be the same.
 using RowKernel = void (*)(const float* x, const float* w, const float* b, float s, float* y, std::int64_t n);
 
-/// What is done to a row of queries or keys before it is multiplied: a norm over the head, then a rotation. Each may be
+/// The steps that prepare a row of queries or keys for products: a norm over the head, then a rotation. Each may be
 /// missing.
 struct RowPrep {
   RowKernel norm = nullptr;

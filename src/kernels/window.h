@@ -32,7 +32,7 @@ struct Window {
     }
   }
 
-  /// Of each element of a pixel the largest that the window covers inside the image.
+  /// Writes for each element of a pixel the largest that the window covers inside the image.
   VLA_INLINE void largest(RowKernel larger, const float* images, std::int64_t place, float* to) const {
     bool is_first = true;
     for_covered(images, corner_of(place), [&](const float* pixel, std::int64_t) VLA_LAMBDA {
@@ -44,7 +44,7 @@ struct Window {
     });
   }
 
-  /// Of each element of a pixel the sum of what the window covers, times that element's weights, and its bias.
+  /// Writes for each element of a pixel the sum of what the window covers, times that element's weights, and its bias.
   /// `multiply_add`: y = x * w + b.
   VLA_INLINE void weigh(RowKernel multiply_add, const float* images, const float* weight, const float* bias,
                         std::int64_t place, float* to) const {

@@ -68,11 +68,11 @@ class Stream {
   Status launch_job(const Launch& how, const void* job);
   /// Until all operations are done.
   Status wait();
-  /// What comes next begins when all that is in `other` has ended.
+  /// Delays what comes next until all that is in `other` has ended.
   Status after(Stream& other);
   /// `event` stands for all that is in here until now.
   Status record(const Owned& event);
-  /// What comes next begins when all has ended that `event` stands for.
+  /// Delays what comes next until all has ended that `event` stands for.
   Status after(const Owned& event);
   /// While operations are captured: has `event` note the time whenever the graph comes here.
   Status note_time(const Owned& event);

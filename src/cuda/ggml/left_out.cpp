@@ -1,9 +1,9 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the rest of ggml's CUDA backend calls of the sources that are not built, because no graph of ours has their
-// operations (src/CMakeLists.txt lists those that are). The linker tells when one is missing here; a graph that needs
-// one ends the process with its name.
+// Stand-ins for sources of ggml's CUDA backend that are not built although the rest calls them, because no graph of
+// ours has their operations (src/CMakeLists.txt lists those that are built). The linker tells when one is missing here;
+// a graph that needs one ends the process with its name.
 #include <ggml-backend.h>
 #include <ggml.h>
 

@@ -10,7 +10,7 @@
 #include <cstdlib>
 #include <cstring>
 
-/// What ggml reads from the environment, but for the type that products are computed in.
+/// The environment as ggml reads it, but for the type that products are computed in.
 inline char* vla_cuda_setting(const char* name) {
   static char of_weights[] = "auto";
   return std::strcmp(name, "GGML_CUDA_CUBLAS_COMPUTE_TYPE") == 0 ? of_weights : std::getenv(name);

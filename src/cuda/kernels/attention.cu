@@ -10,7 +10,7 @@ namespace {
 constexpr float kLog2 = 1.4426950408889634f;
 constexpr float kMinusInfinity = -__builtin_huge_valf();
 
-/// What block y works on: a head of keys and values, of one batch.
+/// The work of block y: a head of keys and values, of one batch.
 struct Unit {
   int head_kv, batch;
   VLA_DEVICE explicit Unit(const AttentionJob& job)

@@ -23,7 +23,7 @@ struct AttentionJob {
 
   HeadRows q;
   Segment segment[kMaxSegment];
-  const float* mask;  // [n_key, n_query] of any numbers but +infinity, or null
+  const float* mask;  // [n_key, n_query] of any values but +infinity, or null
   void* y;            // [d_head, n_head, n_query, n_batch], float32 or bf16
   /// With more than one split, a share of the keys each: sums of values, and for every row its largest score and sum of
   /// weights, go to partial [d_head + 2, n_row, n_head_kv * n_batch, n_split]; `finish_attention` makes y of them.

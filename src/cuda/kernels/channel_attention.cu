@@ -11,8 +11,8 @@ namespace {
 
 constexpr float kLogOfE = 1.44269504f;  // to base 2
 
-/// Of feature i of the queries and feature j of the keys, over all tokens. Products of 64 tokens are added up before
-/// they are added to the rest, or thousands of them would cost a digit.
+/// The score of feature i of the queries and feature j of the keys, over all tokens. Products of 64 tokens are added up
+/// before they are added to the rest, or thousands of them would cost a digit.
 VLA_DEVICE float score(const ChannelAttentionJob& job, const float* q, const float* k) {
   float total = 0;
   for (int first = 0; first < job.n; first += 64) {

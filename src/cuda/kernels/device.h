@@ -93,7 +93,7 @@ VLA_DEVICE float add(float a, float b) { return __fadd_rn(a, b); }
 VLA_DEVICE float divide(float a, float b) { return __fdiv_rn(a, b); }
 VLA_DEVICE int bits_of(float x) { return __float_as_int(x); }
 VLA_DEVICE float float_of(int bits) { return __int_as_float(bits); }
-/// Two numbers rounded to bf16, the first in the lower half.
+/// Two values rounded to bf16, the first in the lower half.
 VLA_DEVICE unsigned to_bf16(float low, float high) {
   unsigned pair;
   asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(pair) : "f"(high), "f"(low));

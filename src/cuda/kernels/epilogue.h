@@ -7,7 +7,7 @@
 
 namespace vla::cuda {
 
-/// What follows the sums of a product: y = activation(sum + bias) * factor + residual, or the ReLU of that; or, where
+/// The steps behind a product's sums: y = activation(sum + bias) * factor + residual, or the ReLU of that; or, where
 /// there is a gate, y = activation(gate) * (sum + bias) * factor + residual. All but y may be null.
 struct Epilogue {
   const float* bias;      // [n_column]

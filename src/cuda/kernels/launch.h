@@ -19,7 +19,7 @@ struct Launch {
   unsigned shared = 0;  // bytes of shared memory whose size the launch tells
 };
 
-/// Of functions that kernels and their launches share.
+/// Marks functions that kernels and their launches share.
 #ifdef __CUDACC__
 #define VLA_HOST_DEVICE __host__ __device__
 #else

@@ -115,7 +115,7 @@ VLA_DEVICE void multiply(const LinearBf16Job& job) {
   });
 }
 
-/// Numbers k to k + 7 of a row, zero from `end` on. `is_aligned`: every row begins at a multiple of 16 bytes.
+/// Elements k to k + 7 of a row, zero from `end` on. `is_aligned`: every row begins at a multiple of 16 bytes.
 VLA_DEVICE void eight(const float* row, int k, int end, bool is_aligned, float (&to)[8]) {
   if (is_aligned && k + 8 <= end) {
 #pragma unroll

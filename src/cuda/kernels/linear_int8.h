@@ -41,7 +41,7 @@ enum class CodeKind { ternary, int8 };
 
 /// Bytes of a packed matrix.
 std::size_t packed_int8_size(CodeKind kind, std::int64_t d_in, std::int64_t d_out);
-/// codes: d_out rows of d_in numbers.
+/// codes: d_out rows of d_in elements.
 void pack_int8(CodeKind kind, const std::int8_t* codes, std::int64_t d_in, std::int64_t d_out, std::byte* packed);
 
 /// Rows of a block on tensor cores.

@@ -12,7 +12,7 @@ VLA_DEVICE float sum_of_block(float x, std::byte* room) {
   return across_warps(sum_of_warp(x), room, [](float a, float b) { return a + b; });
 }
 
-/// A normed row as codes, to the bit as quantize_row of kernels/quantized.h makes them. `value(i)` is number i.
+/// A normed row as codes, to the bit as quantize_row of kernels/quantized.h makes them. `value(i)` is element i.
 template <class Value>
 VLA_DEVICE void store_codes(std::byte* y, int n, std::byte* room, Value value) {
   constexpr float kRound = 12582912.0f;  // 1.5 * 2^23: adding it leaves a whole number in the lowest bits, ties to even

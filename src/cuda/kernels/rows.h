@@ -13,8 +13,8 @@ enum class RowType { f32, bf16, codes };
 
 /// y = norm(x + residual), row by row.
 struct NormJob {
-  const float* x;              // n_row rows of n numbers, x_stride elements apart
-  const float* residual;       // n_row rows of n numbers one after the other, or null
+  const float* x;              // n_row rows of n values, x_stride elements apart
+  const float* residual;       // n_row rows of n values one after the other, or null
   float* sum;                  // where x + residual goes, as residual lies, or null
   const float *weight, *bias;  // [n], or null
   void* y;                     // y_stride elements from one row to the next; bytes of codes

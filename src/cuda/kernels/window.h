@@ -4,8 +4,8 @@
 
 #include "cuda/kernels/launch.h"
 
-/// What a window covers as it moves over images (op::Window): rows for the product that makes a convolution of them,
-/// or of each feature the largest, or a weighted sum.
+/// A window that moves over images (op::Window): it gives rows for the product that makes a convolution of them, or of
+/// each feature the largest, or a weighted sum.
 namespace vla::cuda {
 
 struct WindowJob {

@@ -28,7 +28,7 @@ struct PortableTile {
   }
 
  private:
-  /// Number k of column n: a byte of the eight at a multiple of that.
+  /// Element k of column n: a byte of the eight at a multiple of that.
   template <class Strips>
   static VLA_INLINE int number(const Strips& panel, std::int64_t k, int n) {
     const int place = n % 16 * 4 + static_cast<int>(k % 4);

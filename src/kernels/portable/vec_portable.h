@@ -14,7 +14,7 @@ struct Portable : Lanes<4> {
     const auto x = __builtin_convertvector(a, Doubles), y = __builtin_convertvector(b, Doubles);
     return __builtin_convertvector(x * y + __builtin_convertvector(c, Doubles), Float);
   }
-  /// Of a number and NaN, `min` and `max` are the second.
+  /// `min` and `max` of a value and NaN are the second operand.
   static VLA_INLINE Float min(Float a, Float b) { return a < b ? a : b; }
   static VLA_INLINE Float max(Float a, Float b) { return a > b ? a : b; }
   static VLA_INLINE float max(Float x) {
@@ -25,7 +25,7 @@ struct Portable : Lanes<4> {
   /// The lower halves of a and b in turn, and the upper ones.
   static VLA_INLINE Float interleave_low(Float a, Float b) { return Float{a[0], b[0], a[1], b[1]}; }
   static VLA_INLINE Float interleave_high(Float a, Float b) { return Float{a[2], b[2], a[3], b[3]}; }
-  /// Lane by lane the number of a table that the lowest three bits of an index say.
+  /// Lane by lane the element of a table that the lowest three bits of an index say.
   static VLA_INLINE Float look_up(const float (&table)[8], Int index) {
     Float y;
     for (int i = 0; i < width; ++i) y[i] = table[index[i] & 7];
@@ -33,7 +33,7 @@ struct Portable : Lanes<4> {
   }
   /// 1 / x with a relative error of at most 2^-14, zero for infinity.
   static VLA_INLINE Float reciprocal(Float x) { return 1.0f / x; }
-  /// What x is above the integer below it, and y times two in the power of that integer.
+  /// x less the integer below it, and y times two to the power of that integer.
   static VLA_INLINE Float fraction(Float x) {
     for (int i = 0; i < width; ++i) x[i] = __builtin_isinf(x[i]) ? 0.0f : x[i] - __builtin_floorf(x[i]);
     return x;

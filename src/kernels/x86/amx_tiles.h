@@ -4,7 +4,7 @@
 
 #include "kernels/x86/rounding_avx512.h"
 
-/// What every product on AMX's tiles needs. Only files that are compiled for AMX may include this.
+/// Common parts of all products on AMX's tiles. Only files that are compiled for AMX may include this.
 namespace vla::kernels {
 
 /// All eight tiles as 16 lines of 64 bytes. Constant memory: GCC's intrinsic says that it reads eight bytes, and the

@@ -29,7 +29,7 @@ struct AmxInt8Tile : AmxRounding {
     close(n_row, sums);
   }
 
-  /// Of codes of less than a byte.
+  /// Multiplies by codes of less than a byte.
   template <class Strips, class Between>
   static void multiply(int n_row, const std::byte* x, std::int64_t x_stride, const Strips& strips, std::int64_t depth,
                        std::int32_t* sums, bool add, const Between& between) {

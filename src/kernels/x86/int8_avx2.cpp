@@ -17,7 +17,7 @@ struct FourProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return sum; }
 };
 
-/// Of ternary weights: two products of bytes summed to 16 bits, which hold 64 of such pairs: 2 * 2 * 127 each.
+/// Products of ternary weights: two of bytes summed to 16 bits, which hold 64 of such pairs: 2 * 2 * 127 each.
 struct TwoProducts {
   static constexpr int kRows = 6, kStep = 256;
   static constexpr bool kSigned = false;
@@ -30,8 +30,8 @@ struct TwoProducts {
   static VLA_INLINE __m256i total(__m256i sum) { return _mm256_madd_epi16(sum, _mm256_set1_epi16(1)); }
 };
 
-/// Of int8 weights: a pair of bytes up to 255 by codes would not fit into 16
-/// bits. So the weight gives its sign to the code, which is never -128, and is at most 128 itself; pairs are then
+/// Products of int8 weights: a pair of bytes up to 255 by codes would not fit into
+/// 16 bits. So the weight gives its sign to the code, which is never -128, and is at most 128 itself; pairs are then
 /// summed to 32 bits at once.
 struct SignedProducts {
   static constexpr int kRows = 4, kStep = 512;
@@ -93,7 +93,7 @@ struct Avx2Tile {
   }
 };
 
-/// Of int4 weights: two products of codes summed to 16 bits, which hold a block less eight times what x sums to in it:
+/// Products of int4 weights: two of codes summed to 16 bits, which hold a block less eight times what x sums to in it:
 /// 32 * 7 * 127. Its step multiplies that.
 struct Int4Tile {
   using V = Avx2;
@@ -145,7 +145,7 @@ struct Int4Tile {
     }
   }
 
-  /// What codes that stand for zero add to the two sums of a column, with the other sign.
+  /// The amounts that codes for zero add to the two sums of a column, with the other sign.
   static VLA_INLINE __m256i minus_zeros(const std::byte* x) {
     const __m256i zero = _mm256_set1_epi8(Int4Block::kZero);
     const auto* halves = reinterpret_cast<const __m256i*>(x);

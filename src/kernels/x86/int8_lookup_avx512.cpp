@@ -39,12 +39,12 @@ struct Step {
     return {line * Int8Panels::kGroup, n_table * Int8Panels::kGroup, 4 * (lines - kTableLines * n_table)};
   }
   std::int64_t depth() const { return 3 * n_lookup + 4 * n_group; }
-  /// Where the elements that are multiplied begin.
+  /// The first of the elements that are multiplied.
   std::int64_t multiplied() const { return k + 3 * n_lookup; }
 };
 
-/// Number 0 to 2 of each of the three that an index stands for: index = first + 3 second + 9 third. Byte 4 j + i is
-/// number i of index 8 (j / 4) + j % 4 (+ 4 in the second half), the order in which vpackssdw interleaves.
+/// Element 0 to 2 of each of the three that an index stands for: index = first + 3 second + 9 third. Byte 4 j + i is
+/// element i of index 8 (j / 4) + j % 4 (+ 4 in the second half), the order in which vpackssdw interleaves.
 struct TableNumbers {
   alignas(kRegister) std::uint8_t half[2][64] = {};
 
@@ -90,7 +90,7 @@ VLA_INLINE void make_tables(const std::byte* x, std::byte* to) {
 VLA_INLINE void make_indices(const std::byte* strips, std::int64_t strip, std::byte* to) {
   for (int pair = 0; pair < kStrips / 2; ++pair)
     for (int s = 0; s < 4; ++s) {
-      Words index[2];  // byte 4 n + i: of column n and number 4 s + i
+      Words index[2];  // byte 4 n + i: of column n and element 4 s + i
       for (int j = 0; j < 2; ++j) {
         const auto numbers = [&](int line) VLA_LAMBDA {
           Words codes;
@@ -308,7 +308,7 @@ class LookupLoop {
            scratch_.tables, step, scratch_.sums[i] + r * kColumns);
   }
 
-  /// What rows r to r + n of sums stand for.
+  /// Writes the values that rows r to r + n of sums stand for.
   void scale(const LinearJob::Part& part, const Stripe& s, const std::int32_t* sums, std::int64_t r, std::int64_t n,
              float* to) const {
     for (std::int64_t i = r; i < r + n; ++i, to += kColumns)

@@ -38,7 +38,7 @@ struct Avx512Tile {
 #endif
     }
   };
-  // Number k of 16 columns, as floats. With masks of ones where an instruction without one would do: GCC 12 warns of
+  // Element k of 16 columns, as floats. With masks of ones where an instruction without one would do: GCC 12 warns of
   // undefined lanes in its own header.
   struct Pairs : Number {
     static constexpr int kBlock = 32, kSize = 2;

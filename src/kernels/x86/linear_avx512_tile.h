@@ -12,7 +12,7 @@ namespace vla::kernels {
 constexpr int kAvx512Rows = 12;
 
 /// `Step` says what a step multiplies: X and kCount (elements of x), kXStride (from one row of x to the next), kBlock
-/// (the depth of a panel's block), kSize (bytes of a number in the panel), load(panel, i) (a vector of 16 columns for
+/// (the depth of a panel's block), kSize (bytes of an element in the panel), load(panel, i) (a vector of 16 columns for
 /// step i from `panel` on), everywhere(x) (one step of x for all columns), and add(sum, value, weights).
 template <class Step, int kCount>
 void multiply_tile(const typename Step::X* x, const std::byte* panel, std::int64_t depth, float* c, bool add,
