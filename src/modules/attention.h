@@ -46,7 +46,7 @@ KeyValue get(Graph& g, const Cache& cache, const std::string& path);
 class KeyValueProjection {
  public:
   KeyValueProjection(const Scope& s, int d_context, const Heads& heads);
-  /// Of a context [d_context, n, ...], keys turned by `rotary` [d_head, n] if given.
+  /// Keys and values of a context [d_context, n, ...], keys turned by `rotary` [d_head, n] if given.
   KeyValue operator()(Graph& g, Tensor context, Tensor rotary = {}) const {
     return (*this)(g, context, context, rotary);
   }
@@ -67,7 +67,7 @@ class Attention {
   Attention(const Scope& s, int d_model, int d_context, const Heads& heads);
 
   const KeyValueProjection& project() const { return kv_; }
-  /// What tokens x see of these segments: the shape of x. `rotary` [d_head, n] turns queries; mask [n_key, n] or none.
+  /// Attention of x to these segments: the shape of x. `rotary` [d_head, n] turns queries; mask [n_key, n] or none.
   Tensor operator()(Graph& g, Tensor x, Tensor rotary, const std::vector<KeyValue>& segments, Tensor mask = {}) const;
   /// Tokens that see each other.
   Tensor among(Graph& g, Tensor x, Tensor rotary, Tensor mask = {}) const {

@@ -68,11 +68,11 @@ class DetrEncoderLayer : public Module<DetrEncoderLayer> {
 class DetrDecoderLayer : public Module<DetrDecoderLayer> {
  public:
   DetrDecoderLayer(const Scope& s, const DetrFamily& family);
-  /// What the layer keeps of the encoder's tokens, and their positions, both [d_model, n].
+  /// Keys and values of the encoder's tokens, at these positions, both [d_model, n].
   KeyValue project(Graph& g, Tensor tokens, Tensor position) const;
   /// Its first part, which depends on nothing else: x, position [d_model, n_query] -> [d_model, n_query].
   Tensor among(Graph& g, Tensor x, Tensor position) const { return among_(g, x, position); }
-  /// What follows: x as `among` left it.
+  /// The rest of the layer: x as `among` left it.
   Tensor forward(Graph& g, Tensor x, Tensor position, const KeyValue& seen) const;
 
  private:

@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// What two streams of tokens are to each other: images and text, [d_model, n] each.
+/// Two streams of tokens: images and text, [d_model, n] each.
 struct Streams {
   Tensor image, text;
 };

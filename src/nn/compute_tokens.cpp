@@ -10,7 +10,7 @@
 namespace vla {
 namespace {
 
-/// Of an operand: the dimension of its tokens, of which only those of the result are read, or kWhole.
+/// In the place of the dimension of an operand's tokens: all of it is read, not only the tokens of the result.
 constexpr int kWhole = -1;
 
 /// The dimension of the old shape that is dimension `dim` of the new one, or kWhole where that is none of its own.
@@ -22,7 +22,7 @@ int dim_before_reshape(const Shape& from, const Shape& to, int dim) {
   return kWhole;
 }
 
-/// What an operation reads for some tokens of its result, which lie in dimension `dim`: for each operand the dimension
+/// An operation's reads for some tokens of its result, which lie in dimension `dim`: for each operand the dimension
 /// of its tokens, or kWhole. None where one token's result needs others in a way that is not told here.
 std::optional<std::vector<int>> operands_of_tokens(const Node& node, int dim) {
   std::vector<int> dims(node.in.size(), kWhole);

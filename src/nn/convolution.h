@@ -42,7 +42,7 @@ class DepthwiseConvolution : public Module<DepthwiseConvolution> {
   const Param *weight_, *bias_;
 };
 
-/// The largest number of each feature in a window: x [d, width, height, n_view] -> [d, n_column, n_row, n_view].
+/// The largest value of each feature in a window: x [d, width, height, n_view] -> [d, n_column, n_row, n_view].
 /// Source: torch.nn.MaxPool2d(padding = kernel_size // 2).
 Tensor max_pool(Graph& g, Tensor x, int size, int stride);
 

@@ -12,7 +12,7 @@
 namespace vla {
 namespace {
 
-/// What a pair turns by: the coordinate of a token on one axis, over base^exponent.
+/// The angle of a pair: the coordinate of a token on one axis, over base^exponent.
 struct Pair {
   int axis;
   float exponent;

@@ -31,7 +31,7 @@ inline Tensor slice_keys(Graph& g, Tensor x, int first, int count) { return slic
 /// One view's tokens: [d, n, n_view] -> [d, n].
 inline Tensor one_view(Graph& g, Tensor x, int view) { return slice(g, x, 2, view, 1); }
 
-/// A constant: [d, n] of the same number.
+/// A constant: [d, n] of the same value.
 Tensor full(Graph& g, float value, std::int64_t d, std::int64_t n);
 /// One vector for every token of `like`: [d, 1] -> [d, n].
 Tensor repeat_like(Graph& g, Tensor x, Tensor like);
@@ -41,7 +41,7 @@ inline Tensor column(Graph& g, Tensor table, Tensor index) { return g.add(op::Ga
 /// a + b; where b has 1 in a dimension it counts for all of a's.
 inline Tensor add(Graph& g, Tensor a, Tensor b) { return g.add(op::Add{}, {a, b}); }
 inline Tensor scale(Graph& g, Tensor x, float factor) { return g.add(op::Scale{factor}, {x}); }
-/// Number by number. A factor [d] counts for every token, and [1, n] for every number of a token.
+/// Element by element. A factor [d] counts for every token, and [1, n] for every element of a token.
 inline Tensor multiply(Graph& g, Tensor x, Tensor factor) { return g.add(op::Multiply{}, {x, factor}); }
 /// Source: torch gelu, silu, relu.
 inline Tensor activate(Graph& g, Tensor x, Activation activation) { return g.add(op::Activate{activation}, {x}); }

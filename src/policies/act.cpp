@@ -101,7 +101,7 @@ class Act final : public Policy {
   static Tensor cells(Graph& g, Tensor map) {
     return g.add(op::Reshape{}, {map}, {map.dim(0), map.dim(1) * map.dim(2) * map.dim(3), 1, 1});
   }
-  /// Of all tokens of the encoder; views are not told apart.
+  /// The positions of all tokens of the encoder; views are not told apart.
   Tensor positions(Graph& g, Tensor map) const {
     const Tensor of_cells =
         sine_positions(g, static_cast<int>(map.dim(1)), static_cast<int>(map.dim(2)), family_.d_model);

@@ -2,7 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // BitVLA: SigLIP and BitNet b1.58 with ternary weights and activations of 8 bits. Parallel decoding: the language model
-// reads a zero embedding for each number of a chunk behind the prompt, every token sees all others, and an MLP-ResNet
+// reads a zero embedding for each value of a chunk behind the prompt, every token sees all others, and an MLP-ResNet
 // turns the features there into actions, in one pass. Reference: BitVLA openvla-oft
 // bitvla/model/bitvla_for_action_prediction.py (predict_action).
 

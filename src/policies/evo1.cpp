@@ -24,7 +24,7 @@ namespace {
 constexpr int kTimes = 1000;  // rows of the reference's time table
 
 class Evo1 final : public Policy {
-  /// What becomes of the prompt's pads and of the image tokens of views that are absent.
+  /// The treatment of the prompt's pads and of the image tokens of views that are absent.
   enum class MaskedRows {
     zero_attention,    // flash-attention: a row for itself, which the head sees
     causal_attention,  // any other attention: it sees the rows before it, and the head sees it
@@ -129,7 +129,7 @@ class Evo1 final : public Policy {
   }
 
  private:
-  /// What the language model reads, and what only the head sees.
+  /// The rows that the language model reads, and those that only the head sees.
   struct Rows {
     std::vector<Tensor> parts;  // [d_model, n] each
     std::vector<int> positions;

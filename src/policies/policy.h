@@ -15,7 +15,7 @@
 
 namespace vla {
 
-/// What the processor made of one observation, as the prefix graph reads it. Absent views and text padding do not
+/// One observation as the processor made it and the prefix graph reads it. Absent views and text padding do not
 /// appear.
 struct PrefixInputs {
   Tensor images;            // [width, height, 3, n_view], in the range that the image recipe makes

@@ -71,7 +71,7 @@ class TurboVla final : public Policy {
   /// Each camera has a row of a table.
   bool depends_on_which_views() const override { return true; }
 
-  /// What the first layer's self-attention makes of the queries depends on nothing else.
+  /// Computes the first layer's self-attention of the queries, which depends on nothing else.
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
     cache.put(g, "queries", decoder_.front().among(g, query_(g, arange(g, horizon_)), {}));
   }

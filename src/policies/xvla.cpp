@@ -166,7 +166,7 @@ class XVla final : public Policy {
     return projector_norm_(g, projector_(g, concat_tokens(g, {mean(g, placed), placed})));
   }
 
-  /// Of the tokens of every view: what a query sees to which all keys are alike. [d, n, n_view] -> [d, 1, n_view].
+  /// The mean of each view's tokens: what a query sees to which all keys are alike. [d, n, n_view] -> [d, 1, n_view].
   Tensor mean(Graph& g, Tensor x) const {
     const Shape keys = {x.dim(0) / vision_.n_head(), vision_.n_head(), x.dim(1), x.dim(2)};
     const auto zeros = [&](std::int64_t n_token) {

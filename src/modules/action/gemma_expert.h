@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// What an expert's norms multiply with: a weight of their own (π0), or what they make of the time (π0.5).
+/// The factors of an expert's norms: weights of their own (π0), or what they make of the time (π0.5).
 enum class ExpertNorm { weighted, adaptive };
 
 /// One norm of the expert, of either kind. Source: lerobot policies/pi_gemma.py PiGemmaRMSNorm.
@@ -88,7 +88,7 @@ class GemmaExpert {
  private:
   /// In the order of their modulations: attention and MLP of every layer, then the final one.
   std::vector<const TimedNorm*> norms() const;
-  /// What layer i attends to: the prefix, with the tokens of `prefill` where there are any.
+  /// The keys and values that layer i attends to: the prefix, with the tokens of `prefill` where there are any.
   KeyValue past(Graph& g, const Cache& cache, std::size_t i) const;
   /// The part of norm number `i_norm` in a column of modulations: none for norms with weights.
   Tensor part(Graph& g, Tensor modulations, std::size_t i_norm) const;

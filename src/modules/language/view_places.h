@@ -17,7 +17,7 @@ struct PromptPiece {
   int slot;  // the view's number, or kText
 };
 
-/// Where the views stand among the tokens of a prompt: `policy.max_views` of them, in order. Where the instruction
+/// The places of the views among the tokens of a prompt: `policy.max_views` of them, in order. Where the instruction
 /// follows them, `policy.view_starts` counts from the first token; where it stands before them,
 /// `policy.view_starts_from_end` counts back from the end.
 class ViewPlaces {

@@ -49,7 +49,7 @@ struct DavitStage {
   float norm_eps;
 };
 
-/// What the blocks have in common: x + conv(x), attention, x + conv(x), MLP. Source: transformers modeling_florence2.py
+/// The blocks' common part: x + conv(x), attention, x + conv(x), MLP. Source: transformers modeling_florence2.py
 /// Florence2VisionSpatialBlock, Florence2VisionChannelBlock.
 class DavitBlock {
  public:

@@ -12,7 +12,7 @@
 namespace vla {
 namespace {
 
-/// Where patch i of n lies between two neighbours on a side of the table.
+/// The place of patch i of n between two neighbours on a side of the table.
 struct Stretch {
   int below, above;
   float fraction;
