@@ -48,8 +48,8 @@ class Features {
   std::uint32_t bits_ = 0;
 };
 
-/// What the processor under this process has, in a source of its own: a test program that emulates a better machine
-/// links another.
+/// Detects the features of the processor under this process, in a source of its own: a test program that emulates a
+/// better machine links another.
 Features detect_features();
 
 /// The same, asked once.

@@ -18,7 +18,7 @@ struct NpyArray {
   std::variant<std::vector<std::uint8_t>, std::vector<float>> values;
 };
 
-/// What a .npy file says of its data.
+/// The header of a .npy file.
 struct NpyHeader {
   std::string descr;  // NumPy's type string, such as `<f4`
   bool is_fortran_order = false;

@@ -42,7 +42,7 @@ constexpr const char* code_name(Code code) {
   return kNames[static_cast<int>(code)];
 }
 
-/// What went wrong: where, what was expected, what was found, and what to do next.
+/// A problem: where it is, what was expected, what was found, and what to do next.
 struct Error {
   Code code = Code::internal;
   std::string where;     // file, key, tensor path or feature name

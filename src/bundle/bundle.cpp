@@ -40,7 +40,7 @@ class Checksum {
   std::string text() const { return fmt::format("{:016x}", XXH3_64bits_digest(state_.get())); }
 
  private:
-  /// What `part` has of the file up to its byte `end`.
+  /// Hashes what `part` has of the file up to its byte `end`, or zeros in its place, and takes it off `part`.
   void take(std::span<const std::byte>& part, std::size_t end, bool as_zeros) {
     constexpr char kZeros[kDigits + 1] = "0000000000000000";
     const std::size_t size = done_ < end ? std::min(part.size(), end - done_) : 0;

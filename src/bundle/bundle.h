@@ -59,7 +59,7 @@ class Bundle {
   /// The bytes of a tensor or of a part of it, in `room` where they come from a file. Errors: bad_bundle, where the
   /// file has been changed since it was opened.
   Result<std::span<const std::byte>> read(std::span<const std::byte> part, Room& room) const;
-  /// What tensors are read from; it may outlive the bundle.
+  /// The file or memory that tensors are read from; it may outlive the bundle.
   const std::shared_ptr<const Content>& content() const { return content_; }
 
  private:

@@ -66,7 +66,7 @@ class Content {
   void forget(std::span<const std::byte> part) const;
   /// Bytes of the file that the system keeps in memory, which it gives up where others need it; 0 of memory.
   std::size_t n_cached() const;
-  /// What to say where `read` gave null.
+  /// The error to report where `read` gave null.
   Error changed() const;
 
  private:

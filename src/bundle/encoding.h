@@ -8,7 +8,7 @@
 
 namespace vla {
 
-/// What an element is stored as. Rows of ternary ones are whole bytes: element 4 i + j of a row is the code in bits 2 j
+/// The type of a stored element. Rows of ternary ones are whole bytes: element 4 i + j of a row is the code in bits 2 j
 /// and 2 j + 1 of byte i, and codes 0, 1 and 2 stand for -1, 0 and 1. Rows of int4 ones are blocks (Int4Block). A
 /// bundle's tensors are of the other dtypes: there the bytes of a ternary or int4 matrix are i8.
 enum class DType { f32, f16, bf16, i32, i8, f64, ternary, int4 };
@@ -48,7 +48,7 @@ struct Encoding {
   DType type = DType::f32;
   std::int64_t group = 0;
 
-  /// Of a matrix with so many elements.
+  /// The number of scales of a matrix with so many elements.
   std::int64_t n_scale(std::int64_t count) const { return group > 0 ? count / group : 0; }
   bool operator==(const Encoding&) const = default;
 };

@@ -23,7 +23,7 @@ std::string write_gguf_head(const Keys& keys, std::span<const TensorInfo> tensor
 /// The bytes of a GGUF file, version 3, that `read_gguf` reads back: keys in their order, then tensors in theirs.
 std::string write_gguf(const Keys& keys, std::span<const TensorInfo> tensors);
 
-/// What `vla.checksum` is before the bytes are known.
+/// The value of `vla.checksum` before the bytes are known.
 inline constexpr std::string_view kNoChecksum = "xxh3:0000000000000000";
 
 /// A bundle that grows in an open file, with its checksum: first the head, then the bytes of one tensor after the

@@ -15,7 +15,7 @@
 
 namespace vla {
 
-/// What a parameter is for: a matrix or a table may be in any float dtype of the bundle, a vector in f32 only. A matrix
+/// The use of a parameter: a matrix or a table may be in any float dtype of the bundle, a vector in f32 only. A matrix
 /// of floats may also be quantized: int8 codes, -127 to 127, or blocks of int4 ones, with a scale for each row.
 enum class Storage { matrix, table, vector };
 
@@ -30,15 +30,15 @@ struct Param {
   const Param* scales = nullptr;       // a vector, where the encoding has some
 
   std::int64_t count() const;
-  /// Of the bundle's tensor, in which elements of less than a byte are bytes.
+  /// The shape of the bundle's tensor, in which elements of less than a byte are bytes.
   std::vector<std::int64_t> stored_shape() const;
   DType stored_type() const { return is_packed() ? DType::i8 : encoding.type; }
   bool is_packed() const { return dtype_bits(encoding.type) < 8; }
-  /// What `vla inspect` calls it: the storage, or the dtype of codes.
+  /// The name that `vla inspect` gives it: the storage, or the dtype of codes.
   const char* storage_text() const;
 };
 
-/// Of the scales of a parameter, where its encoding has some.
+/// The name of a parameter's scales, where its encoding has some.
 std::string scales_name(const std::string& param, const Encoding& encoding);
 
 /// Everything that a policy's constructors declare, and every problem found on the way. Constructors cannot fail: they
@@ -55,11 +55,11 @@ class ParamList {
       : keys_(&bundle.keys()), bundle_(&bundle), declared_(other.declared_) {}
 
   const Keys& keys() const { return *keys_; }
-  /// Of all robots.
+  /// The parameters of all robots.
   const std::deque<Param>& params() const { return declared_->params; }
   const Bundle* bundle() const { return bundle_; }
 
-  /// Where `encoding` has scales, they are declared too, as the vector `scale` beside it.
+  /// Declares a parameter and, if `encoding` has scales, those too, as the vector `scale` beside it.
   const Param& declare(std::string name, Storage storage, std::vector<std::int64_t> shape, Encoding encoding = {});
   void problem(std::string line) { problems_.push_back(std::move(line)); }
   void problem(const Error& error);
@@ -111,7 +111,7 @@ class Scope {
   void require(bool holds, const std::string& key, const std::string& expected, const std::string& found) const;
 
   const Param* matrix(const std::string& name, int d_in, int d_out) const;
-  /// Of -1, 0 and 1, with one scale. d_in must be a multiple of 4.
+  /// A matrix of -1, 0 and 1, with one scale. d_in must be a multiple of 4.
   const Param* ternary(const std::string& name, int d_in, int d_out) const;
   const Param* table(const std::string& name, int d_model, int n_row) const;
   const Param* vector(const std::string& name, int size) const;

@@ -42,7 +42,7 @@ struct Matrices {
   }
 };
 
-/// What the policy of every robot reads as a large matrix. Errors: bad_bundle, unsupported.
+/// The large matrices that the policies of all robots read. Errors: bad_bundle, unsupported.
 Result<Matrices> find_matrices(const Bundle& bundle, const Choice& choice) {
   Matrices matrices;
   std::vector<std::string> tags = bundle.embodiments();

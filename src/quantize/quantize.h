@@ -12,7 +12,7 @@
 
 namespace vla {
 
-/// What became of the matrices of one module, the first level of their paths.
+/// The outcome for the matrices of one module, the first level of their paths.
 struct QuantizedModule {
   std::string path;
   int n_matrix = 0;                    // that were quantized
@@ -24,7 +24,7 @@ struct QuantizeProgress {
   std::int64_t done, all;  // bytes
 };
 
-/// What the matrix of this tensor becomes: int8, int4, or none.
+/// Chooses what the matrix of a tensor becomes: int8, int4, or none.
 using Choice = std::function<Rounding(const std::string& tensor)>;
 
 /// A large matrix of floats, and its bytes as stored, as int8 and as int4, scales included.

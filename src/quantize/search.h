@@ -15,7 +15,7 @@ struct Moved {
   double largest = 0;  // largest difference, of the largest magnitude
 };
 
-/// What a policy is judged by.
+/// An observation that a policy is judged by, and its noise.
 struct Judged {
   Observation observation;
   Noise noise;

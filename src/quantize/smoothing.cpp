@@ -107,7 +107,7 @@ float power_of_two(double value) {
   return std::abs(power) < kLeastPower ? 1 : std::ldexp(1.0f, power);
 }
 
-/// What channels are divided by: beside the geometric mean of all, so that most of them stay.
+/// The divisors of channels, relative to the geometric mean of all, so that most channels stay as they are.
 std::vector<float> divisors(const std::vector<float>& x, const std::vector<float>& w) {
   std::vector<double> ratios;
   double sum = 0;

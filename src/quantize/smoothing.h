@@ -6,7 +6,7 @@
 
 namespace vla {
 
-/// What was smoothed.
+/// The extent of a smoothing.
 struct Smoothed {
   int n_place = 0;    // norms and gated MLPs whose matrices all are floats and read nothing else
   int n_channel = 0;  // of them that were divided

@@ -11,8 +11,8 @@
 
 namespace vla {
 
-/// Where channels may be divided, since all who read them multiply them by matrices that can be multiplied: the result
-/// of a norm with weights, or of a gated MLP before `down`.
+/// A place where channels may be divided, since all its readers multiply them by matrices that can be multiplied: the
+/// result of a norm with weights, or of a gated MLP before `down`.
 struct SmoothingPlace {
   std::string path;               // of the value's tap
   const Param* weight = nullptr;  // of the norm, or of the MLP's `up`, whose rows are divided
@@ -28,7 +28,7 @@ class SmoothingPlaces {
   std::vector<SmoothingPlace> found() const;
 
  private:
-  /// What a parameter's elements are in the operations that read it: by the weight of the place, null for others.
+  /// The roles of a parameter's elements in the operations that read it: by the weight of the place, null for others.
   using Uses = std::map<const Param*, std::set<const Param*>>;
 
   std::map<const Param*, SmoothingPlace> places_;  // by weight
