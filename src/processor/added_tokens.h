@@ -33,7 +33,7 @@ Result<std::vector<AddedToken>> parse_added_tokens(const std::string& json, int 
 /// Source: tokenizers added_vocabulary.rs (extract_and_normalize, find_matches).
 class AddedTokens {
  public:
-  /// What happens to text, and to the contents of `normalized` tokens, before those are looked for.
+  /// Normalizes text, and the contents of `normalized` tokens, before those are looked for.
   using Normalize = std::string (*)(std::string_view);
 
   AddedTokens() = default;

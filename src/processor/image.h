@@ -35,7 +35,7 @@ struct ImageLimits {
 /// Errors: bad_observation.
 Result<Frame> decode_image(std::span<const std::byte> file, const std::string& where, const ImageLimits& limits = {});
 
-/// What `decode_image` guarantees, for frames that come from elsewhere: a size within the limits, as many elements as
+/// Checks what `decode_image` guarantees, for frames from elsewhere: a size within the limits, as many elements as
 /// the size says, floats in [0, 1]. Errors: bad_observation.
 Status check_frame(const Frame& frame, const std::string& where, const ImageLimits& limits = {});
 

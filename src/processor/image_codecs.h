@@ -17,7 +17,7 @@ namespace vla::codecs {
 
 using Bytes = std::span<const std::byte>;
 
-/// What a PNG or JPEG file holds, before orientation.
+/// The pixels and metadata of a PNG or JPEG file, before orientation.
 struct Image {
   int width = 0;
   int height = 0;
@@ -29,7 +29,7 @@ struct Image {
 Error refused(const std::string& where, std::string expected, std::string found, std::string hint = {});
 Status check_size(std::int64_t width, std::int64_t height, const std::string& where, const ImageLimits& limits);
 
-/// What a PNG or JPEG file says of itself before it is decoded.
+/// The size of a PNG or JPEG file's image, and the work of decoding it, from its header.
 struct ImageHeader {
   int width = 0, height = 0;  // as they are stored, before the image is turned upright
   std::int64_t work = 0;      // of decoding, counted in pixels of about 10 ns

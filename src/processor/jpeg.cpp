@@ -61,7 +61,7 @@ bool guarded_header(JpegReader& reader, Bytes file) {
   return true;
 }
 
-/// What the markers of a file say.
+/// The facts in a file's markers.
 struct Markers {
   std::int64_t width = 0, height = 0, n_scan = 0;
   bool may_turn = false;  // has EXIF data or XMP

@@ -57,7 +57,7 @@ class JsonFields {
   std::set<std::string> read_;
 };
 
-/// Of an op that stands where it may not.
+/// The error for an op that stands where it may not.
 inline Error misplaced(const JsonFields& fields, const char* expected) { return fields.wrong("op", expected); }
 
 }  // namespace vla

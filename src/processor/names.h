@@ -22,8 +22,8 @@ class FeatureNames {
   /// Index of the feature. A whole name goes before a last part. Errors: bad_observation for a name that the bundle
   /// does not have or that several features share.
   Result<int> find(std::string_view given) const;
-  /// Where an error about what was given under this name is: the feature's full name, or `view "x"` where there is
-  /// none.
+  /// The place to name in an error about what was given under this name: the feature's full name, or `view "x"` where
+  /// there is none.
   std::string place(std::string_view given) const;
   /// `observation.images.top`, in words for a message: the first 50 names that the bundle has.
   std::string listed() const;

@@ -122,7 +122,7 @@ bool expand_palette(PngReader& reader) {
   return true;
 }
 
-/// What a file's chunks say of how an image is to be turned.
+/// The chunks of a file that tell how an image is to be turned.
 struct Orientation {
   Bytes exif;            // the last eXIf chunk
   std::string_view xmp;  // the last XMP packet, with what stands before it

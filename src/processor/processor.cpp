@@ -194,7 +194,7 @@ Status Processor::gather_states(const Observation& observation, std::vector<floa
   return {};
 }
 
-/// A number of the concatenated states, by feature and name.
+/// A value of the concatenated states, by feature and name.
 std::string Processor::state_place(std::size_t i) const {
   std::size_t first = 0, feature = 0;
   for (; i - first >= static_cast<std::size_t>(state_dims_[feature]); ++feature)

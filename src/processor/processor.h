@@ -38,7 +38,7 @@ struct Inputs {
   std::vector<float> state;            // normalized, padded; empty where the network sees none
   std::vector<int> discretized_state;  // where the prompt has a place for it
   std::vector<float> raw_state;        // before its normalization, which actions may be relative to
-  bool out_of_range = false;           // the state has a number beyond the bundle's bound, as a note says
+  bool out_of_range = false;           // the state has a value beyond the bundle's bound, as a note says
   std::vector<std::string> notes;      // warnings, e.g. that the instruction was truncated
 };
 
@@ -129,7 +129,7 @@ class Processor {
   double state_bound_ = kStateBound;
   Recipe recipe_;
   std::shared_ptr<const Tokenizer> tokenizer_;
-  /// Where the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
+  /// If the text has places for views: the tokens of every prompt up to the last place, or from the first place on,
   /// and the token of a place.
   std::vector<std::int32_t> view_tokens_;
   bool views_behind_ = false;

@@ -36,7 +36,7 @@ struct Run {
   int start, size;
 };
 
-/// Of `longest` tokens at most: the next one begins another run.
+/// Runs of `token`, of `longest` tokens at most: the next one begins another run.
 std::vector<Run> runs_of(std::int32_t token, std::span<const std::int32_t> tokens, int longest) {
   std::vector<Run> runs;
   for (std::size_t i = 0; i < tokens.size(); ++i) {

@@ -63,7 +63,7 @@ std::vector<Window> make_windows(int n_in, int n_out, const Filter& filter) {
   return windows;
 }
 
-/// `x * weight` added to each number of a row.
+/// `x * weight` added to each element of a row.
 inline __attribute__((always_inline)) void add_row(std::span<const float> x, float weight, bool fused, float* sums) {
   if (fused) {
     for (std::size_t k = 0; k < x.size(); ++k) sums[k] = std::fma(x[k], weight, sums[k]);

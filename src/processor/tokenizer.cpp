@@ -60,7 +60,7 @@ Status check_added(const std::vector<AddedToken>& added, const std::vector<std::
   return {};
 }
 
-/// What happens to text between the added tokens.
+/// Reads how text between the added tokens is normalized.
 Status read_normalization(const Keys& keys, Kind kind, AddedTokens::Normalize& normalize) {
   constexpr const char* kKey = "tokenizer.normalization";
   normalize = kind == Kind::byte_fallback ? ByteFallbackBpe::mark_blanks : nullptr;

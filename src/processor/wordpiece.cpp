@@ -17,7 +17,7 @@ struct Range {
   std::uint32_t first, last;
 };
 
-/// What the reference takes for Chinese; its range of extension E begins 256 code points late.
+/// The ranges that the reference takes for Chinese; that of extension E begins 256 code points late.
 constexpr Range kChinese[] = {{0x3400, 0x4DBF},   {0x4E00, 0x9FFF},   {0xF900, 0xFAFF},  {0x20000, 0x2A6DF},
                               {0x2A700, 0x2B81F}, {0x2B920, 0x2CEAF}, {0x2F800, 0x2FA1F}};
 

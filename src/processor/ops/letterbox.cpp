@@ -47,7 +47,7 @@ struct FloatSource {
   float operator()(std::size_t i) const { return values[i]; }
 };
 
-/// Where an image of `width` x `height` lands in planes of `plane` floats whose rows are `stride` apart.
+/// The destination of an image of `width` x `height` in planes of `plane` floats whose rows are `stride` apart.
 struct Target {
   float* out;
   std::size_t plane, stride;

@@ -195,7 +195,7 @@ class NormalizeOp final : public StateOp {
  private:
   std::optional<Normalizer> normalizer_;  // none for identity
   std::size_t offset_ = 0;                // column of the first statistic
-  std::vector<bool> chosen_;              // of each number whether it is normalized
+  std::vector<bool> chosen_;              // of each value whether it is normalized
 };
 
 Status NormalizeOp::bind(StateLayout& layout, const std::string& where) {

@@ -58,7 +58,7 @@ class Normalizer {
   Normalizer(const NormRule& rule, Direction direction, double eps, std::vector<double> low,
              const std::vector<double>& high);
 
-  /// What a value of a column becomes, in the action with this index where the values are actions.
+  /// Maps a value of a column, in the action with this index where the values are actions.
   double map(float x, std::size_t column, std::size_t row = 0) const;
 
  private:

@@ -76,7 +76,7 @@ class TextOp {
   virtual Result<std::string> apply(std::string text, std::span<const int> state) const = 0;
 };
 
-/// What a state consists of.
+/// The layout of a state.
 struct StateLayout {
   const Bundle& bundle;
   const FeatureNames& features;
@@ -97,15 +97,15 @@ class StateOp {
   /// recipe. Errors: bad_bundle.
   virtual Status bind(StateLayout&, const std::string& /*where*/) { return {}; }
   virtual void apply(std::span<float> /*state*/) const {}
-  /// Whether `apply` has normalized this number by statistics.
+  /// Whether `apply` has normalized this value by statistics.
   virtual bool normalizes(std::size_t /*column*/) const { return false; }
-  /// Of kinds `widened` and `end`: what the network sees of the state, and what goes into the prompt. Errors:
+  /// For kinds `widened` and `end`: makes the state that the network sees, and what goes into the prompt. Errors:
   /// bad_observation.
   virtual Status finish(std::vector<float>& /*state*/, std::vector<int>& /*discretized*/) const { return {}; }
   virtual bool reads(const std::string& /*tensor*/) const { return false; }
 };
 
-/// What the ops so far leave of a chunk.
+/// The layout of a chunk after the ops so far.
 struct ActionLayout {
   const Bundle& bundle;
   std::size_t n_state;
@@ -115,7 +115,7 @@ struct ActionLayout {
   std::set<int> unnormalized = {};  // columns
 };
 
-/// What a row of a chunk belongs to.
+/// A row's place in a chunk, and the state that it belongs to.
 struct RowPlace {
   std::size_t index;                 // in the chunk
   std::span<const float> raw_state;  // the state before its normalization

@@ -44,7 +44,7 @@ Size size_after(const CropFraction& op, const Size& from) {
 
 Size size_after(const JpegRoundTrip&, const Size& from) { return from; }
 
-/// Of the ops that state a size.
+/// The size that an op states.
 template <class Op>
 Size size_after(const Op& op, const Size&) {
   return {static_cast<double>(op.width), static_cast<double>(op.height)};
@@ -95,8 +95,8 @@ bool follows_frame(const ByteOp& op) {
   return std::holds_alternative<SquarePad>(op) || std::holds_alternative<SmallestSide>(op);
 }
 
-/// What such ops may make of a frame: four times its pixels, which leaves room for sides of 4 to 1, so that an act
-/// costs no more than the pixels that were admitted; of a small frame more.
+/// The most pixels that such ops may make of a frame: four times its own, which leaves room for sides of 4 to 1, so
+/// that an act costs no more than the pixels that were admitted; of a small frame more.
 double most_pixels_grown(const Frame& frame) { return std::max(4.0 * frame.width * frame.height, 1024.0 * 1024.0); }
 
 Image applied(const ByteOp& op, const Image& from, int width, int height) {

@@ -82,10 +82,10 @@ struct Pipeline {
 /// Errors: bad_observation.
 Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<float> out, const std::string& where);
 
-/// What a fit costs with a frame of this size, counted in pixels of about 10 ns; 0 where it depends on the size it
+/// The work of a fit with a frame of this size, counted in pixels of about 10 ns; 0 where it depends on the size it
 /// makes.
 std::int64_t fit_work(const Fit& fit, int width, int height);
-/// Of a frame of another camera than the one whose frames alone are taken.
+/// The error for a frame of another camera than the one whose frames alone are taken.
 Error wrong_camera(const Frame& frame, const CameraSize& camera, const std::string& where);
 /// The size of frames where only one is taken.
 std::optional<CameraSize> camera_size(const Fit& fit);

@@ -9,7 +9,7 @@ namespace vla {
 
 /// `(x - mean) / std` of each channel of an image.
 struct Standardize {
-  /// float32; every number and result rounded to bfloat16; only the last result of float32; or float32 in bytes, where
+  /// float32; every value and result rounded to bfloat16; only the last result of float32; or float32 in bytes, where
   /// x, mean and std are 255 times as large, so that the division by 255 rounds nothing.
   enum class Arithmetic { float32, bfloat16, float32_then_bfloat16, float32_in_bytes };
 

@@ -80,7 +80,7 @@ float outer_angle(std::size_t axis, std::size_t middle, const std::array<float, 
   return is_row == even ? arc_tangent(line[i], line[k]) : arc_tangent(-line[k], line[i]);
 }
 
-/// Where rounding makes the sine of the middle angle larger than 1 that angle is not a number, as in the reference.
+/// Writes three angles; the middle one is NaN where rounding makes its sine larger than 1, as in the reference.
 void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out) {
   const auto [first, middle, last] = axes;
   const bool even = (first + 1) % 3 == middle;
@@ -92,7 +92,7 @@ void write_euler_angles(const Axes& axes, const Matrix& m, std::span<double> out
 
 // --- the ops "rotation" ---------------------------------------------------------------------------------------------
 
-/// What a state feature is, and the first two rows of its matrix in its place.
+/// Replaces a rotation in the state by the first two rows of its matrix.
 struct RotationStateOp final : StateOp {
   int from = 0;  // 0: quaternion, 1: axis and angle, from 2 on an order of Euler angles
   int column = 0;

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// What ends the list of a state, and what of a chunk is for the robot.
+// The ops that end the list of a state, and those that pick the robot's part of a chunk.
 #include <fmt/format.h>
 
 #include <utility>
