@@ -24,11 +24,11 @@ struct Standing {
 /// Oldest connection first.
 using Standings = std::vector<Standing>;
 
-/// What counts as one peer: an IPv6 address by its first 64 bits. Other text, such as an IPv4 address or a key, is its
-/// own group, also of this machine: a program there must not share its robot's.
+/// The group that counts as one peer: an IPv6 address by its first 64 bits. Other text, such as an IPv4 address or a
+/// key, is its own group, also of this machine: a program there must not share its robot's.
 std::string group_of(const std::string& peer);
 
-/// What decides in a queue whose turn it is.
+/// The facts that decide whose turn it is in a queue.
 struct Share {
   std::string group;             // `group_of` the peer
   Clock::time_point since = {};  // its connection

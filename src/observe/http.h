@@ -31,7 +31,7 @@ class Http {
                                             HttpHandler handler);
   ~Http();
 
-  /// What was bound, the port filled in.
+  /// The bound address, the port filled in.
   const std::string& address() const;
 
  private:

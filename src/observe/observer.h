@@ -66,7 +66,7 @@ class Observer {
   virtual bool records() const { return false; }
 };
 
-/// What the server is doing, from any thread.
+/// The state of the server, from any thread.
 struct Health {
   bool ready = false;         // takes acts; false while it drains
   std::size_t n_waiting = 0;  // acts in the queue

@@ -20,7 +20,7 @@ namespace vla::serve {
 class Page final : public Observer {
  public:
   struct Range {
-    std::vector<double> low, high;  // one for each number of a state, in world units
+    std::vector<double> low, high;  // one for each value of a state, in world units
   };
   struct Sources {
     std::string token;

@@ -71,7 +71,7 @@ void Comparison::chunk(const v1::ActionChunk& a, const v1::ActionChunk& b) {
   actions(a, b);
 }
 
-/// What a policy takes and gives, without who it is.
+/// A policy's inputs and outputs, without who it is.
 std::string interface_of(v1::Description description) {
   description.clear_bundle();
   description.clear_runtime();

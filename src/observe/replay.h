@@ -12,7 +12,7 @@ struct ReplayOptions {
   int timeout_ms = 60'000;  // for each answer
 };
 
-/// What a second answer has otherwise than the recorded one.
+/// A field in which a second answer differs from the recorded one.
 struct Difference {
   std::size_t index = 0;         // of the request in the recording, from 1
   std::uint64_t request_id = 0;  // the recorded answer's

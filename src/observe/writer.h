@@ -34,7 +34,7 @@ class Writer {
 
   /// From any thread. False where the piece was dropped.
   bool put(std::string piece) noexcept;
-  /// What comes after every piece that was put, and is not dropped.
+  /// Sets the text that comes after every piece that was put, and is not dropped.
   void set_tail(std::string tail) { tail_ = std::move(tail); }
   std::uint64_t n_dropped() const { return n_dropped_; }
   /// The system's number of what went wrong; from then on everything is dropped.

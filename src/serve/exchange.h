@@ -23,8 +23,8 @@ struct Answer {
   Record record;                   // of an act of another protocol, where one is kept
 };
 
-/// Where the I/O thread and those that compute meet: jobs one way, answers the other. None holds the lock for longer
-/// than a move takes. What the I/O thread has to look at is announced by `fd`, which it polls together with its
+/// The meeting point of the I/O thread and those that compute: jobs one way, answers the other. None holds the lock for
+/// longer than a move takes. `fd` announces what the I/O thread has to look at, which polls it together with its
 /// sockets.
 class Exchange {
  public:

@@ -63,7 +63,7 @@ struct Job : Received {
 class Front {
  public:
   virtual ~Front() = default;
-  /// What was bound, ports filled in.
+  /// The bound addresses, ports filled in.
   virtual std::vector<std::string> addresses() const = 0;
   /// The policy of acts that name none, before `begin`. Errors: usage where the protocol cannot carry what it takes.
   virtual Status serve(const ServedPolicy& policy) = 0;

@@ -14,7 +14,7 @@
 
 namespace vla::serve {
 
-/// What both threads and every observer may read.
+/// The state that both threads and every observer may read.
 struct ServerState {
   std::atomic<bool> ready = false, stopping = false;
   std::atomic<bool> draining = false;     // no act comes in line any more; it stops when the line is empty
@@ -62,7 +62,7 @@ class Io {
   void count_error() noexcept { ++state_.n_error; }  // of a request that was refused without a job
   void stop() noexcept;                              // as Server::stop
   Clock::time_point now() const { return loop_.now(); }
-  /// Of a policy by its name, as Policies::find, with the names of all.
+  /// The description of a policy by its name, as Policies::find, with the names of all.
   Result<v1::Description> describe(const std::string& policy) const;
   Health health() const { return state_.health(exchange_); }
 

@@ -11,7 +11,7 @@
 
 namespace vla::serve {
 
-/// How a client's numbers and colours become the policy's, and the policy's actions the client's.
+/// How a client's values and colours become the policy's, and the policy's actions the client's.
 struct Convention {
   bool is_bgr = false;      // images: blue comes first
   bool is_degrees = false;  // the client has degrees where the policy has radians
@@ -21,7 +21,7 @@ struct Convention {
   float to_client(float x) const;
 };
 
-/// What the names of a client's observation stand for, so that a protocol of other names needs no code: views, states
+/// The meaning of the names of a client's observation, so that a protocol of other names needs no code: views, states
 /// and the instruction by the client's keys. A key with slashes is looked up whole, then level by level.
 struct Names {
   struct Entry {
@@ -48,7 +48,7 @@ constexpr const char* kExtension = "vla";
 /// Preset names, for a message.
 std::string presets();
 
-/// Of lines for all protocols those whose keys are `video.`, `state.` and so on, or the others.
+/// Picks from lines for all protocols those whose keys are `video.`, `state.` and so on, or the others.
 std::vector<std::string> lines_of(const std::vector<std::string>& lines, bool of_modalities);
 
 /// The names of a preset, which may be empty, with lines `KEY=FEATURE[,bgr][,degrees][,flipped]` that replace and add
@@ -61,7 +61,7 @@ Result<Names> names_for(const std::string& preset, const std::vector<std::string
 /// The names of a protocol whose keys are `video.VIEW` and `state.STATE`: the last parts of the policy's own.
 Result<Names> own_names(const std::vector<std::string>& lines, const v1::Description& description, const char* option);
 
-/// What no observation of the protocol's own has: a map {seed, deadline_ms}, both optional integers, which a client
+/// An extension of the protocol's own observations: a map {seed, deadline_ms}, both optional integers, which a client
 /// that knows this server may send. Errors: bad_observation.
 struct Extension {
   std::optional<std::uint64_t> seed, deadline_ms;

@@ -10,7 +10,7 @@
 namespace vla::serve {
 namespace {
 
-/// What clients rely on between two acts.
+/// The part of a description that clients rely on between two acts.
 std::string interface_of(v1::Description description) {
   description.clear_bundle();
   description.clear_runtime();

@@ -125,14 +125,14 @@ class Queue {
         std::count_if(line_.begin(), line_.end(), [&](const Job& job) { return job.share.group == group; }));
   }
 
-  /// Of the clients of the group that wait, and the given ones.
+  /// The generations of the clients of the group that wait, and the given ones.
   Generations generations_of(const std::string& group, std::vector<Clock::time_point> times = {}) const {
     for (const Job& job : line_)
       if (job.share.group == group) times.push_back(job.share.since);
     return Generations(std::move(times));
   }
 
-  /// Of a crowd of the group, the first of those of the next older generation after the one that had the last turn;
+  /// The first job, in a crowd of the group, of the next older generation after the one that had the last turn;
   /// after the oldest comes the newest. Those that come meanwhile are newer: they delay nobody.
   Place next_generation(Turn& turn) {
     const Generations generations = generations_of(turn.group, {turn.last});  // it may have left the queue
@@ -158,7 +158,7 @@ class Queue {
     return last_of_largest_generation(job.share.group, amount, &job, added);
   }
 
-  /// Of a group's jobs the last one of the generation that amounts to most; of equal ones it is the newest. None where
+  /// The last of a group's jobs in the generation that amounts to most; of equal ones it is the newest. None where
   /// a newcomer's own generation would have as much by what it adds.
   template <class Amount>
   Place last_of_largest_generation(const std::string& group, Amount amount, const Job* newcomer = nullptr,

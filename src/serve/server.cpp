@@ -180,7 +180,7 @@ Status Server::begin() {
   return {};
 }
 
-/// What the I/O thread has to do is posted to its loop, which ends before the server does.
+/// Posts work for the I/O thread to its loop, which ends before the server does.
 template <class Work>
 auto Server::on_io_thread(Work work) -> decltype(work()) {
   const auto task = std::make_shared<std::packaged_task<decltype(work())()>>(std::move(work));

@@ -25,9 +25,9 @@ class Server {
   /// address that others can reach, without keys), io (in use, not of this machine; no file descriptors).
   static Result<std::unique_ptr<Server>> open(const ServerOptions& options, Now now = Clock::now);
 
-  /// What was bound, ports filled in.
+  /// The bound addresses, ports filled in.
   std::vector<std::string> addresses() const;
-  /// Of each protocol: fewer than asked for where the system gives this process few file descriptors.
+  /// The limit of each protocol: lower than asked for where the system gives this process few file descriptors.
   std::size_t max_connections() const { return options_.max_connections; }
 
   /// A policy that acts may name, before `run`. Errors: incompatible, as Policies::put.
@@ -43,7 +43,7 @@ class Server {
   /// Tells the front ends which policy clients get that name none; once policies were added. Errors: usage where there
   /// is none of that, or where a front end cannot carry what it takes.
   Status begin();
-  /// What front ends say of their names, for people; after `begin`.
+  /// The front ends' notes on their names, for people; after `begin`.
   std::vector<std::string> told() const;
 
   /// Serves on this thread, which computes, and a second one, which talks, until `stop` or the loss of the
@@ -51,7 +51,7 @@ class Server {
   /// the next act meanwhile. Observers outlive the call. Once for each server, after `begin`. Errors: device,
   /// out_of_memory.
   Status run(std::span<Observer* const> observers = {});
-  /// What `describe` is answered with once this engine is served under this name.
+  /// The answer to `describe` once this engine is served under this name.
   v1::Description describe(const std::string& name, const Engine& engine) const;
   /// From any thread or signal handler: what waits is refused.
   void stop() noexcept;

@@ -22,7 +22,7 @@ constexpr const char* kind_name(Kind kind) {
 /// The protocol versions that this build speaks.
 constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
 
-/// What the I/O thread knows of a request: enough to queue, answer or refuse it, without looking at an image.
+/// The I/O thread's view of a request: enough to queue, answer or refuse it, without looking at an image.
 struct Envelope {
   std::uint32_t version = 0;
   std::uint64_t request_id = 0;

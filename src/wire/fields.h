@@ -13,7 +13,7 @@
 
 namespace vla::wire {
 
-/// What a client that follows the schema never gets.
+/// The error that a client which follows the schema never gets.
 Error not_a_request(std::string where, std::string expected, std::string found);
 
 /// Walks over the fields of one serialized message, without copying or allocating. A field takes two bytes on the wire

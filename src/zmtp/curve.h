@@ -22,7 +22,7 @@ Result<std::set<std::string>> read_public_keys(const std::string& file);
 /// The public key of a secret one. Errors: usage.
 Result<std::string> public_key_of(const std::string& secret);
 
-/// What a server with keys knows. Errors: those of the two files.
+/// Reads the keys that a server knows. Errors: those of the two files.
 Result<CurveKeys> read_keys(const std::string& secret_file, const std::string& clients_file);
 
 }  // namespace vla::zmtp

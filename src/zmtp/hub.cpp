@@ -112,7 +112,7 @@ void set_options(Local::socket&) {}
 
 class Connection;
 
-/// What the connections of a hub share.
+/// The common state of the connections of a hub.
 struct Shared : net::Connections<Connection> {
   const CurveKeys* keys;
   Hub::Handler* handler = nullptr;

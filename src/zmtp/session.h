@@ -15,7 +15,7 @@
 
 namespace vla::zmtp {
 
-/// What a peer sent as one message.
+/// One message of a peer.
 struct Message {
   net::Bytes bytes;              // of its frame; the first ones only, where the message is refused
   bool delimiter = false;        // an empty frame came before it, as from REQ sockets
@@ -31,13 +31,13 @@ class Session {
   /// Without `keys` peers connect in clear text; else both sides have to prove theirs. `keys` outlive the session.
   Session(std::size_t max_message, const CurveKeys* keys);
 
-  /// Where the peer's next bytes go, and how many at most.
+  /// The place for the peer's next bytes, and how many at most.
   std::span<std::byte> room();
   void filled(std::size_t n);
   /// The next message among the bytes that came; none where more have to come. After an error the connection ends; its
   /// place says in a word why: `handshake`, `key`, `protocol`, `size` or `memory`.
   Result<std::optional<Message>> next();
-  /// What the peer has to get before anything else: greeting, handshake, answers to its heartbeats.
+  /// The bytes that the peer has to get before anything else: greeting, handshake, answers to its heartbeats.
   std::string take_output() { return std::exchange(output_, {}); }
 
   /// A message, or a heartbeat, as it goes over the socket. After the handshake.

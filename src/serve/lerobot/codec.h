@@ -15,7 +15,7 @@ namespace vla::serve::lerobot {
 /// them another feature. Errors: usage, also for a policy that has not one state.
 Result<Names> lerobot_names(const std::vector<std::string>& lines, const v1::Description& description);
 
-/// What a robot says before its first observation: how its readings become a state, and which cameras it has.
+/// A robot's set-up, sent before its first observation: how its readings become a state, and which cameras it has.
 struct Setup {
   struct Camera {
     std::string key;            // in an observation

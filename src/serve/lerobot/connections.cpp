@@ -146,8 +146,8 @@ class Connections::All {
     connection.shut();
     table_.connections.erase(connection.peer.connection);
   }
-  /// Of the group that has most calls, where all are alike that have no more than one connection may, the connection
-  /// whose calls began first gives way.
+  /// Drops connections while there are too many calls: of the group that has most, the one whose calls began first. All
+  /// groups are alike that have no more calls than one connection may.
   void bound_calls() {
     const std::size_t most = table_.limits.connections;
     while (n_call_ > most) {

@@ -42,7 +42,7 @@ class Connections {
 
   /// Binds an address as tcp_endpoint_of reads it. It with the port filled in. Errors: usage, io.
   Result<std::string> bind(const std::string& address, const char* option, bool insecure);
-  /// Of the loop, in whose `wait` the handler is called: to be called before every turn of it.
+  /// Begins to listen, before any turn of the loop, in whose `wait` the handler is called.
   void begin(Handler& handler);
 
   /// A call begins at gRPC's name of a peer, as ipv4:127.0.0.1:40000, for which gRPC may hold so many bytes that it has

@@ -96,7 +96,7 @@ void Front::called(Rpc rpc) {
   submit_next(client);
 }
 
-/// What needs no engine. An empty message is the serialized Empty.
+/// Answers a call that needs no engine. An empty message is the serialized Empty.
 Result<std::string> Front::answer_now(Rpc& rpc, Client& client) {
   if (rpc.method == "Ready") {
     client.filter.begin();

@@ -343,7 +343,7 @@ class Reader {
     return push({.type = Type::object, .name = std::move(name)});
   }
 
-  /// What a call of NumPy's functions would make.
+  /// Pushes what a call of NumPy's functions would make.
   Status reduce() {
     if (n_free() < 2) return nothing();
     const Value &function = *stack_[stack_.size() - 2], &arguments = *stack_.back();

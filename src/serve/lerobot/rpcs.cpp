@@ -56,7 +56,7 @@ grpc::Status status_of(const Error& error) {
 
 }  // namespace
 
-/// What all calls share. gRPC's threads and the loop's use it.
+/// The common state of all calls. gRPC's threads and the loop's use it.
 class Rpcs::All : public grpc::CallbackGenericService, Connections::Handler {
  public:
   class Call;

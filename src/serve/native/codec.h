@@ -28,7 +28,7 @@ Result<std::string> read_describe(std::span<const std::byte> describe);
 /// Which robot a serialized Act names, or empty text. Errors: bad_request, too_large.
 Result<std::string> named_embodiment(std::span<const std::byte> act);
 
-/// What stays the same in every answer, made once from a loaded engine.
+/// The description, which stays the same in every answer, made once from a loaded engine.
 v1::Description describe(const Engine& engine, const v1::Limits& limits);
 /// The part of it that is one robot's; all of it where there is one.
 const v1::Description& description_of(const v1::Description& all, const std::string& embodiment);
@@ -36,7 +36,7 @@ const v1::Description& description_of(const v1::Description& all, const std::str
 /// An answer of the engine -> its message; `names` and so on come from `description`.
 v1::ActionChunk encode_chunk(Reply reply, const v1::Description& description);
 
-/// What an act of another protocol and its answer would have been in this one.
+/// The record of an act of another protocol and its answer, as they would have been in this one.
 Record record_of(std::uint64_t request_id, const Reply& reply, const v1::Description& description);
 
 v1::Error encode_error(const Error& error);

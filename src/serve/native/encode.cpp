@@ -51,7 +51,7 @@ void write_bundle(const Description& d, v1::Bundle& out) {
   out.set_converter(d.converter);
 }
 
-/// What is the same for all robots.
+/// Writes the part that is the same for all robots.
 void write_common(const Description& d, const v1::Limits& limits, v1::Description& out) {
   *out.mutable_limits() = limits;
   write_bundle(d, *out.mutable_bundle());

@@ -130,7 +130,7 @@ void NativeFront::received(zmtp::Client& client, zmtp::Message message) {
   }
 }
 
-/// What was answered otherwise has been freed by now.
+/// Refuses a request for want of memory: what was answered otherwise has been freed by now.
 void NativeFront::send_out_of_memory(std::uint64_t connection, std::uint64_t request_id, bool delimiter) noexcept try {
   hub_.send(connection, refusal(request_id, out_of_memory("request")), delimiter);
 } catch (const std::exception&) {  // not even for that: the client's patience ends it

@@ -7,10 +7,10 @@
 
 namespace vla::serve::openpi {
 
-/// What a policy takes and gives, as the map that a connection begins with. Clients take its keys as they come.
+/// A policy's inputs and outputs, as the map that a connection begins with. Clients take its keys as they come.
 std::string encode_metadata(const v1::Description& description, const Names& names);
 
-/// What vLLM-Omni's clients put beside an observation.
+/// The keys that vLLM-Omni's clients put beside an observation.
 struct OmniKeys {
   bool is_reset = false;  // they ask to forget an episode, and a server keeps none
   std::optional<std::uint64_t> seed;

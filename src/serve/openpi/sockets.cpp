@@ -52,7 +52,7 @@ Response plain(const Request& request, http::status status, std::string body) {
 
 class Connection;
 
-/// What the connections share.
+/// The common state of the connections.
 struct Shared : net::Connections<Connection> {
   std::string api_key;
   Sockets::Handler* handler = nullptr;
