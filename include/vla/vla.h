@@ -123,7 +123,7 @@ typedef struct vla_view_info {
 typedef struct vla_state_info {
   size_t struct_size;
   const char* name;                /* in full: "observation.state" */
-  size_t width;                    /* how many numbers */
+  size_t width;                    /* how many values */
   const char* const* number_names; /* one per number */
   const char* const* units;        /* one per number, empty where the bundle does not state it */
 } vla_state_info;

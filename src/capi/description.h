@@ -11,7 +11,7 @@
 
 namespace vla::capi {
 
-/// What `vla_describe` returns, with the memory that its pointers point into; therefore it stays where it was made.
+/// The result of `vla_describe`, with the memory that its pointers point into; therefore it stays where it was made.
 class Description {
  public:
   /// One robot, or several.

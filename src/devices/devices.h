@@ -16,7 +16,7 @@ struct DeviceName {
   static Result<DeviceName> parse(const std::string& text);
 };
 
-/// What build and machine have: devices, and for each kind that has none the reason.
+/// The devices of this build and machine, and for each kind that has none the reason.
 struct DeviceList {
   std::vector<DeviceInfo> devices;                          // the CPU first
   std::vector<std::pair<std::string, std::string>> absent;  // kind, reason
@@ -24,11 +24,11 @@ struct DeviceList {
 
 DeviceList list_devices();
 
-/// What `--device` names (DeviceName::parse); empty text is the CPU. On the CPU `n_thread` threads run, 0 for every
-/// core that the process may use, with the kernels of Arithmetic: our own, or ggml's operations as the reference of all
-/// others; `bf16` and `int8` round large matrices when they are loaded, which no other name does. Other devices take
-/// what Arithmetic::on_device says. A device that is absent is refused, and nothing takes its place. Errors: device,
-/// usage.
+/// Opens the device that `--device` names (DeviceName::parse), the CPU for empty text. On the CPU `n_thread` threads
+/// run, 0 for every core that the process may use, with the kernels of Arithmetic: our own, or ggml's operations as the
+/// reference of all others; `bf16` and `int8` round large matrices as they are loaded, which no other name does. Other
+/// devices take what Arithmetic::on_device says. A device that is absent is refused, and nothing takes its place.
+/// Errors: device, usage.
 Result<std::unique_ptr<Device>> open_device(int n_thread, const std::string& kernels, const std::string& device = "");
 
 /// A device of a kind that is not there, by the name of a model (DeviceLibrary::model). Errors: device, usage,

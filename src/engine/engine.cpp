@@ -108,7 +108,7 @@ Result<const Robot*> Engine::robot(const std::string& tag) const {
                tag.empty() ? "none" : tag, "name the robot that the observation is of"};
 }
 
-/// What the host reads and writes has names too, beside those of the network.
+/// Takes values to inject. The host's inputs and results have names too, beside the network's.
 Status Engine::take_injected(const std::vector<Tap>& given) {
   for (const Tap& tap : given) {
     if (tap.path == "chunk" || tap.path == "actions" || tap.path == "tokens")

@@ -81,7 +81,7 @@ class Engine {
   /// kernel, MFLOP, MB, what is computed, and how its operand and results lie in memory. Errors: out_of_memory.
   enum class Part { prefix, step };
   Result<std::string> program_text(Part part);
-  /// What the network computed for the last observation; empty before the first, and where its plan is gone.
+  /// The work of the network for the last observation; empty before the first, and where its plan is gone.
   StageWork work() const;
 
   /// How long a model of a device (EngineOptions::model) says that the first robot's largest observation takes. Errors:
@@ -90,7 +90,7 @@ class Engine {
 
   const Device& device() const { return *device_; }
   Device& device() { return *device_; }
-  /// Of all robots.
+  /// The parameters of all robots.
   const ParamList& params() const { return robot().params(); }
   MemoryUse memory() const;
   /// All zeros without a budget.
@@ -100,8 +100,8 @@ class Engine {
   /// The kernels in use, as `--kernels` names them: those of the machine, or others where the bundle's dtype asks for
   /// float32.
   std::string kernels() const { return device_->kernels(); }
-  /// Of the large products: "int8" where activations are int8, and weights ternary or quantized because somebody asked
-  /// for it, "bf16" where activations are rounded to it (sums are float32), else "f32".
+  /// The precision of the large products: "int8" where activations are int8, and weights ternary or quantized on
+  /// request, "bf16" where activations are rounded to it (sums are float32), else "f32".
   Precision precision() const;
   bool has_int8_products() const { return precision() == Precision::int8; }
   /// The same as text for display.

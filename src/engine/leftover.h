@@ -25,7 +25,7 @@ struct Leftover {
 /// "guided", "inpainted", or empty for none.
 const char* kind_name(RealTimeChunking::Kind kind);
 
-/// What a Leftover makes of a solve: a start, and for every step k and row r the velocity
+/// The effect of a Leftover on a solve: a start, and for every step k and row r the velocity
 /// v' = keep * v + pull * (x - target).
 struct Steering {
   std::vector<float> start;       // (horizon, d_action)

@@ -11,7 +11,7 @@
 
 namespace vla {
 
-/// Where the solver starts: the values themselves, row by row (horizon, d_action), or a seed that draws them.
+/// The start of the solver: the values themselves, row by row (horizon, d_action), or a seed that draws them.
 using Noise = std::variant<std::vector<float>, std::uint64_t>;
 
 /// `count` values of `kind` ("normal": mean 0, deviation 1; "uniform": [-1, 1)) from a seed. The same seed gives the

@@ -29,7 +29,7 @@ struct Network {
   int d_action, horizon;
 };
 
-/// What all plans of an engine share.
+/// The context that all plans of an engine share.
 struct PlanContext {
   Device& device;
   std::string tap_pattern;
@@ -49,10 +49,10 @@ class Plan {
   /// `ahead`: the pixels, where they were sent before; or null.
   void set_inputs(std::span<const float> pixels, const Device::Sent* ahead, std::span<const std::int32_t> tokens,
                   std::span<const float> state);
-  /// Where the first step starts.
+  /// Sets the start of the first step.
   void set_x(std::span<const float> x);
   std::vector<float> x() const { return device_.get(*x_); }
-  /// Of a shape that is steered.
+  /// Sets the steering, of a shape that is steered.
   void set_steering(const Steering& steering);
 
   /// Fills the cache, appends what was recorded on the way, and computes what the steps need of the cache alone.
@@ -67,13 +67,13 @@ class Plan {
   const Program& prefix() const { return *prefix_; }
   const Program& step() const { return *step_; }
 
-  /// What the network computes for one observation: the prefix, stage by stage, and `n_step` solver steps.
+  /// The work of the network for one observation: the prefix, stage by stage, and `n_step` solver steps.
   StageWork work(int n_step) const;
 
   /// How long a model of a device says that takes; of other devices nothing (Program::predictions).
   StagePredictions predict(int n_step) const;
 
-  /// What the last step recorded, as `step.<k>.<path>`.
+  /// Appends the taps that the last step recorded, as `step.<k>.<path>`.
   void collect_step_taps(int k, std::vector<Tap>& taps) const;
 
   /// Bytes: slots, constants and the programs themselves.
@@ -102,7 +102,7 @@ class Plans {
  public:
   explicit Plans(PlanContext context) : context_(std::move(context)) {}
 
-  /// Where there is no such plan yet and memory is short, all others go. `network` must outlive its plans. Errors:
+  /// The plan of a shape. If it has to be built and memory is short, all others go. `network` must outlive it. Errors:
   /// those of Plan::build.
   Result<Plan*> for_shape(const Network& network, const InputShape& shape);
   /// Null where there is none.

@@ -19,7 +19,7 @@ namespace vla {
 
 class Robot;
 
-/// What the host makes of one observation before the device is needed. Vectors keep their memory when filled again.
+/// The host's part of one observation, made before the device is needed. Vectors keep their memory when filled again.
 struct EncodedObservation {
   const Robot* robot = nullptr;  // that the observation names
   Inputs inputs;
@@ -59,8 +59,8 @@ class Robot {
   /// Fills all of `to` but its robot. Errors: bad_observation, unsupported.
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 EncodedObservation& to) const;
-  /// What the network answered, (solver_horizon, d_action_padded), as the robot's rows and columns, with notes. Errors:
-  /// bad_action.
+  /// Turns the network's answer, (solver_horizon, d_action_padded), into the robot's rows and columns, with notes.
+  /// Errors: bad_action.
   Result<ActionChunk> decode(const std::vector<float>& x, const Inputs& inputs) const;
 
   const Bundle& bundle() const { return bundle_; }
@@ -70,7 +70,7 @@ class Robot {
   Network network() const { return {*policy_, solver_, conditions_, constants_, d_action_, horizon_}; }
   InputShape largest_shape() const;
   InputShape shape_of(const EncodedObservation& observation) const;
-  /// What an act does with a leftover: nothing where actions are relative to a state, which the rows would have lost.
+  /// The way an act uses a leftover: none where actions are relative to a state, which the rows would have lost.
   RealTimeChunking real_time_chunking() const;
   /// Rows of a chunk.
   int horizon() const { return processor_.n_row(horizon_); }

@@ -106,8 +106,8 @@ GgmlDevice::~GgmlDevice() {
   held->next = kept.exchange(held);
 }
 
-/// Where a backend's products of bf16 and f16 would round the activations first, matrices are widened unless that was
-/// asked for. Rows of a table are widened exactly when they are looked up.
+/// The type of a parameter on the device: matrices are widened where a backend's products of bf16 and f16 would round
+/// the activations first, unless that was asked for. Rows of a table are widened exactly when they are looked up.
 ggml_type GgmlDevice::resident_type(const Param& param) const {
   const ggml_type type = type_of(resident_encoding(param, rounding_).type);
   const bool kept = type == GGML_TYPE_F16 ? keeps_f16_ : type == GGML_TYPE_BF16 && rounding_ == Rounding::bf16;

@@ -80,7 +80,7 @@ class GgmlDevice final : public Device {
   std::byte* staging(std::size_t size);
   Status flush() const;
 
-  /// What the driver is asked to free.
+  /// Everything that the driver is asked to free.
   struct Held {
     // What threads share during a run; without one of ours ggml makes and frees one in every run.
     std::unique_ptr<ggml_threadpool, FreePool> pool;

@@ -23,7 +23,7 @@ struct GgmlBackend {
   Result<ggml_backend_reg_t> registry() const;
 };
 
-/// What the library of a backend exports.
+/// The export of a backend's library.
 template <const GgmlBackend& backend>
 DeviceLibrary library_of() {
   return {kDeviceBuild, [] { return backend.list(); },

@@ -14,7 +14,7 @@
 namespace vla {
 namespace {
 
-/// Where a tensor seems to be that has no memory. ggml takes null for a tensor that it has to place.
+/// The address that a tensor without memory seems to have. ggml takes null for a tensor that it has to place.
 void* const kNowhere = reinterpret_cast<void*>(std::uintptr_t{4096});
 
 std::string size_text(std::size_t bytes) {

@@ -9,7 +9,7 @@
 namespace vla {
 namespace {
 
-/// What ggml makes of one node: an operation, or a few. Where its own operation would differ from float32 in the last
+/// Translates each node to an operation of ggml, or a few. Where ggml's own would differ from float32 in the last
 /// digits it is composed of exact ones.
 class Translator {
  public:
@@ -169,7 +169,7 @@ class Translator {
   ggml_tensor* translate(const op::Unfold& op) {
     return reshaped(ggml_cont(c, ggml_permute(c, covered(op.window), 1, 0, 2, 3)), node_->shape);
   }
-  /// What a window covers: [size^2, d, n_place, n_view].
+  /// The elements that a window covers: [size^2, d, n_place, n_view].
   ggml_tensor* covered(const op::Window& window) {
     const auto [size, stride, padding] = window;
     const Shape& s = node_->shape;
@@ -228,7 +228,7 @@ Work work_of(const Node& node) {
   return work;
 }
 
-/// Of the operations that a node became, those that the backend lacks.
+/// Checks that the backend has the operations that a node became. Errors: unsupported, with the first that it lacks.
 Status check_supported(const GgmlDevice& device, ggml_cgraph* graph, int first, const Node& node) {
   for (int i = first; i < ggml_graph_n_nodes(graph); ++i) {
     const ggml_tensor* made = ggml_graph_node(graph, i);

@@ -11,7 +11,7 @@
 #include <cstring>
 #include <initializer_list>
 
-/// What ggml reads from the environment. Settings that change results are ours: products are computed in float32.
+/// The environment as ggml reads it. Settings that change results are ours: products are computed in float32.
 /// Without them shaders round operands to float16 wherever the device has it.
 inline char* vla_vulkan_setting(const char* name) {
   static char yes[] = "1";
