@@ -7,7 +7,7 @@
 
 namespace vla::bench {
 
-/// What to measure and how often.
+/// A measurement to make, and how often.
 struct Request {
   std::string bundle;  // a file; empty: random weights
   std::string arch;    // of the random weights, at their published size
@@ -20,7 +20,7 @@ struct Request {
   std::size_t memory = 0;
 };
 
-/// Of the random weights that stand in for a bundle.
+/// The sizes of the random weights that stand in for a bundle.
 RandomSizes random_sizes(const Request& request);
 
 /// Measures the machine, then the policy, then the machine again. `accept` sees the conditions before the first round

@@ -17,8 +17,8 @@ namespace {
 
 constexpr double kFewMs = 250;  // an act that is so short may be faster on one thread
 
-/// What float networks of every architecture reach of the peak (docs/performance.md). With other kernels they differ
-/// too much from one network to the next.
+/// The share of the peak that float networks of every architecture reach (docs/performance.md). With other kernels they
+/// differ too much from one network to the next.
 struct KnownShare {
   const char* kernels;
   double share;

@@ -6,7 +6,7 @@
 
 namespace vla::bench {
 
-/// What a machine has for a policy, and what else uses it.
+/// A machine's resources for a policy, and its load.
 struct Machine {
   std::string cpu;
   int n_core = 0;                    // that this process may use

@@ -9,7 +9,7 @@
 
 namespace vla::bench {
 
-/// What this machine can do, measured: multiply-adds by instruction set, and reading memory beyond the caches.
+/// The limits of this machine, measured: multiply-adds by instruction set, and reading memory beyond the caches.
 struct Roofs {
   struct Peak {
     std::string name;

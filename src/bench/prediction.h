@@ -8,7 +8,7 @@
 
 namespace vla::bench {
 
-/// What a model of a GPU says of an act, stage by stage, from counts and published rates. Nothing runs.
+/// The time of an act as a model of a GPU predicts it, stage by stage, from counts and published rates. Nothing runs.
 struct GpuPrediction {
   std::string policy, device, linear_kernels;
   int n_view = 0, n_text = 0, n_step = 0;
@@ -19,7 +19,7 @@ struct GpuPrediction {
   Program::Prediction total() const;
 };
 
-/// Of the request's bundle, or of zeros in the place of random weights; a request has no threads or rounds here.
+/// Predicts for the request's bundle, or zeros in the place of random weights; a request has no threads or rounds here.
 /// Errors: usage, and those of Engine::load.
 Result<GpuPrediction> predict(const Request& request, const std::string& model);
 

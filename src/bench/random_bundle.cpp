@@ -186,7 +186,7 @@ std::uint64_t next_random(std::uint64_t& state) {
   return z ^ (z >> 31);
 }
 
-/// The same number in 16 bits, cut off. Exact enough for random numbers of ordinary size; what f16 has no normal
+/// The same value in 16 bits, cut off. Exact enough for random values of ordinary size; what f16 has no normal
 /// number for becomes zero.
 std::uint16_t to_16_bits(float value, DType type) {
   std::uint32_t bits;
@@ -218,7 +218,7 @@ std::string random_codes(std::size_t count, std::uint64_t seed) {
   return bytes;
 }
 
-/// Where the values of tensors come from: random ones for matrices and tables; ones for the weights of norms and zeros
+/// The values of tensors: random ones for matrices and tables; ones for the weights of norms and zeros
 /// for biases, so that elements stay finite through any depth.
 class Values {
  public:

@@ -11,7 +11,7 @@
 
 namespace vla::bench {
 
-/// What was measured: two reports with the same conditions may be compared.
+/// The subject and the conditions of a measurement: two reports with the same ones may be compared.
 struct Conditions {
   std::string policy, weights, source;  // architecture, dtype, where the bundle's weights come from
   int n_view = 0, width = 0, height = 0, n_text = 0, n_step = 0, n_thread = 0;
@@ -51,11 +51,11 @@ struct Report {
   std::size_t n_cached = 0;  // bytes of the bundle's file that the system keeps
   std::vector<Round> rounds;
   std::vector<StageRow> stages;  // in order of time, then `network` and `total`
-  /// Of the time that threads worked for the network in the last round before the measured ones. Empty without one.
+  /// Shares of the time that threads worked for the network in the last round before the measured ones; empty without.
   std::vector<std::pair<std::string, double>> shares;
   std::optional<StepFit> fit;
 
-  /// What the machine can do, of a probe by name or of the one that shares refer to: the best that was measured before,
+  /// The machine's peak, of a probe by name or of the one that shares refer to: the best that was measured before,
   /// between and after the runs. Operations and bytes per second.
   double peak(const std::string& name) const;
   double peak() const { return peak(peak_name); }
@@ -64,7 +64,7 @@ struct Report {
   /// Whether something else had a part of the machine meanwhile: fewer cores or a lower peak than in most rounds.
   bool is_disturbed(const Round& round) const;
   double bandwidth() const { return std::max(before.bandwidth, after.bandwidth); }
-  /// Where the roofline bends: a stage with fewer operations per byte is bound by memory.
+  /// The bend of the roofline: a stage with fewer operations per byte is bound by memory.
   double ridge() const { return peak() / bandwidth(); }
   /// "compute", "memory", or "host" for a stage without counted work: which of its operands or its arithmetic takes
   /// longer at the machine's rates.

@@ -82,7 +82,7 @@ std::vector<std::string> around(const Report& report) {
   return lines;
 }
 
-/// What most readers came for.
+/// The line that most readers came for.
 std::string headline(const Report& report) {
   const StageRow* total = report.find("total");
   if (total == nullptr || total->p50 <= 0) return "";

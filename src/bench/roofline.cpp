@@ -140,7 +140,7 @@ class Drawing {
     slope();
   }
 
-  /// What memory allows: bytes per second times operations per byte, up to the highest roof.
+  /// Draws the limit of memory: bytes per second times operations per byte, up to the highest roof.
   void slope() {
     double highest = report_.peak();
     for (const Roofs::Peak& peak : report_.before.peaks) highest = std::max(highest, report_.peak(peak.name));

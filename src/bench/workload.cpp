@@ -12,7 +12,7 @@
 namespace vla::bench {
 namespace {
 
-/// A image that compresses like a camera's: smooth shapes under the noise of a sensor.
+/// An image that compresses like a camera's: smooth shapes under the noise of a sensor.
 std::vector<std::uint8_t> draw_frame(int width, int height, std::uint32_t seed) {
   std::vector<std::uint8_t> rgb;
   rgb.reserve(static_cast<std::size_t>(width) * static_cast<std::size_t>(height) * 3);

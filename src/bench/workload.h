@@ -10,7 +10,7 @@
 
 namespace vla::bench {
 
-/// What to send; what is not said is as large as the bundle allows.
+/// The sizes of observations to send; one that is not given is as large as the bundle allows.
 struct WorkloadSizes {
   std::optional<int> n_view;
   int width = 0, height = 0;  // of the raw frames; 0: what the recipe makes of them

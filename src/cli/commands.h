@@ -9,7 +9,7 @@
 
 namespace vla::cli {
 
-/// Of --kernels, wherever a policy is loaded.
+/// Help of --kernels, wherever a policy is loaded.
 constexpr const char* kKernelsHelp =
     "ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx, or float32: the best that does not round to "
     "bf16, "
@@ -21,17 +21,17 @@ constexpr const char* kKernelsHelp =
     "bundle is stored as bf16. On Vulkan float32 (not given) or bf16; on CUDA as stored (not given), float32, bf16, "
     "int8, or ggml for its backend";
 
-/// Of --device, wherever a policy is loaded.
+/// Help of --device, wherever a policy is loaded.
 constexpr const char* kDeviceHelp =
     "cpu, or vulkan[:N] or cuda[:N] where vla inspect --devices lists it; not given: cpu. An absent device is an "
     "error: "
     "there is no fallback";
 
-/// Of --embodiment, wherever a policy is loaded.
+/// Help of --embodiment, wherever a policy is loaded.
 constexpr const char* kEmbodimentHelp =
     "The robot, by its tag, where the bundle is for several; an error lists the valid ones";
 
-/// Of --strict-state, wherever observations come in.
+/// Help of --strict-state, wherever observations come in.
 constexpr const char* kStrictStateHelp =
     "Refuse a state that is far beyond what the policy has seen, instead of answering with a note";
 
@@ -57,7 +57,7 @@ CLI::Option* add_bytes(CLI::App& command, const char* name, Bytes& bytes, const 
 /// The memory that the process may take, wherever a policy is loaded.
 void add_memory(CLI::App& command, std::size_t& bytes);
 
-/// Where vla-pull has put what a name `hub:OWNER/NAME@REVISION` stands for; every other text is a file's name. What
+/// Replaces a name `hub:OWNER/NAME@REVISION` by the file that vla-pull has put there; other text names a file. What
 /// comes back is the problem, or empty.
 std::string find_pulled(std::string& bundle);
 

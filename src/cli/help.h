@@ -11,9 +11,9 @@ namespace vla::cli {
 /// Help of at most 120 columns: `--threads N (0 to 512; default 0)` and a wrapped description beside it.
 void format_help(CLI::App& app);
 
-/// What an option takes, e.g. `N` or `text|json`; empty where it takes nothing.
+/// The values that an option takes, e.g. `N` or `text|json`; empty where it takes nothing.
 std::string option_value(const CLI::Option& option);
-/// What it means, with its range, default and relations to others.
+/// The meaning of an option, with its range, default and relations to others.
 std::string option_text(const CLI::Option& option);
 /// The words that it takes, where it takes certain ones alone.
 std::vector<std::string> option_choices(const CLI::Option& option);

@@ -28,7 +28,7 @@ std::string human_size(double bytes) {
   return fmt::format("{:.{}f} {}", bytes, unit == 0 ? 0 : 1, kUnits[unit]);
 }
 
-/// What one module of the first two path levels weighs: `vision`, `lm`, `expert`, `action_in`, ...
+/// The size of one module of the first two path levels: `vision`, `lm`, `expert`, `action_in`, ...
 struct ModuleSize {
   std::int64_t n_param = 0;
   std::int64_t stored = 0;  // bytes in the file

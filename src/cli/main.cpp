@@ -40,8 +40,8 @@ int fail(const vla::Error& error) {
   return vla::exit_code(error.code);
 }
 
-/// What CLI11 says of a wrong call, in one line and with the help that explains it. A misspelled option is one too many
-/// and often one too few as well; the former says what to mend.
+/// Reports a wrong call in CLI11's words, in one line and with the help that explains it. A misspelled option is one
+/// too many and often one too few as well; the former says what to mend.
 int fail_usage(const CLI::App& app, const CLI::ParseError& parse_error) {
   const auto chosen = app.get_subcommands();
   const std::string command = chosen.empty() ? "vla" : "vla " + chosen.front()->get_name();

@@ -1,7 +1,7 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// What --help says, as a man page and as what bash completes: both are made from the commands themselves.
+// The texts of --help as a man page and as bash completions: both are made from the commands themselves.
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 

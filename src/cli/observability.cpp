@@ -33,7 +33,7 @@ std::string drawn_token() {
   return token;
 }
 
-/// Where the states of a robot were in training: their extremes or, where the bundle has none, three deviations around
+/// Adds the ranges of a robot's states in training: extremes or, where the bundle has none, three deviations around
 /// the mean. Keys are `tag/state`.
 void add_ranges(const Robot& robot, std::map<std::string, serve::Page::Range>& ranges) {
   for (const std::string& state : robot.processor().states().names()) {

@@ -43,9 +43,9 @@ class Observability {
   void ended(const Status& status);
 
   std::vector<serve::Observer*> observers();
-  /// Where HTTP listens; empty where it does not.
+  /// The address where HTTP listens; empty where it does not.
   std::string metrics_address() const { return monitor_ ? monitor_->address() : std::string(); }
-  /// Of the page, with its token; empty where there is none.
+  /// The URL of the page, with its token; empty where there is none.
   std::string page_url() const { return page_ ? page_->url() : std::string(); }
 
  private:

@@ -82,7 +82,7 @@ void print(const Found& found, std::size_t n_observation) {
       percent(found.moved), percent(found.all_int8), percent(found.all_int4));
 }
 
-/// What the bundle keeps of a search.
+/// The text about a search that the bundle keeps.
 std::string told(const Found& found, const QuantizeOptions& options, std::size_t n_observation) {
   const auto n = [&](Rounding codes) { return std::ranges::count(found.blocks, codes, &Block::codes); };
   const std::string bound = options.bound.error ? fmt::format("error at most {}", *options.bound.error)

@@ -101,7 +101,7 @@ void add_policy(Line& line, const LoadedPolicy& policy) {
     line.add("read_mb", fmt::format("{:.1f}", static_cast<double>(n_read) / 1e6));
 }
 
-/// What a user has to know before the policy moves a robot.
+/// Adds the facts that a user has to know before the policy moves a robot.
 void add_features(Line& line, const LoadedPolicy& policy) {
   std::vector<std::string> features, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
@@ -118,7 +118,7 @@ void add_features(Line& line, const LoadedPolicy& policy) {
   line.add("warm_up_ms", fmt::format("{:.1f}", policy.warm_up_ms)).add("CONSTANT", constant).add("DEGRADED", degraded);
 }
 
-/// Of several policies a line each, and then one of the server; of one a single line.
+/// Prints for several policies a line each, and then one of the server; for one a single line.
 void print_ready(const serve::Server& server, const std::map<std::string, LoadedPolicy>& policies,
                  const ServeOptions& options, const Observability& observability) {
   const bool is_one = policies.size() == 1;
@@ -241,7 +241,7 @@ Status serve(ServeOptions& options, bool& ready) {
   return status;
 }
 
-/// What lets clients of other servers in as they are.
+/// Adds the options that let clients of other servers in as they are.
 void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
   add_text(command, "--openpi", server.openpi, "ADDRESS:PORT",
            "Answer openpi's clients too: WebSocket (docs/drop_in.md)");
