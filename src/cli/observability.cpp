@@ -25,14 +25,6 @@ Level level_of(const ObservabilityOptions& options) {
   return static_cast<Level>(found - std::begin(serve::kLevelNames));
 }
 
-/// 128 bits of the system's, as hexadecimal digits.
-std::string drawn_token() {
-  std::random_device device;
-  std::string token;
-  for (int i = 0; i < 4; ++i) token += fmt::format("{:08x}", device());
-  return token;
-}
-
 /// Adds the ranges of a robot's states in training: extremes or, where the bundle has none, three deviations around
 /// the mean. Keys are `tag/state`.
 void add_ranges(const Robot& robot, std::map<std::string, serve::Page::Range>& ranges) {
@@ -51,6 +43,13 @@ void add_ranges(const Robot& robot, std::map<std::string, serve::Page::Range>& r
 }
 
 }  // namespace
+
+std::string drawn_token() {
+  std::random_device device;
+  std::string token;
+  for (int i = 0; i < 4; ++i) token += fmt::format("{:08x}", device());
+  return token;
+}
 
 void add_observability_options(CLI::App& command, ObservabilityOptions& options) {
   add_text(command, "--metrics", options.metrics, "ADDRESS:PORT",

@@ -24,6 +24,9 @@ struct ObservabilityOptions {
   std::uint64_t record_limit_mb = 1024;
 };
 
+/// What a page asks of who wants to see it: 128 bits of the system's, as hexadecimal digits.
+std::string drawn_token();
+
 void add_observability_options(CLI::App& command, ObservabilityOptions& options);
 
 /// Everything that watches a server: what the options ask for, and nothing else. It lives as long as the server runs.

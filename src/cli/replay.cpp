@@ -3,20 +3,26 @@
 #include "observe/replay.h"
 
 #include <fmt/format.h>
+#include <unistd.h>
 
 #include <algorithm>
+#include <atomic>
 #include <optional>
+#include <thread>
 
 #include "base/thread.h"
 #include "cli/commands.h"
+#include "cli/observability.h"
 #include "cli/say.h"
 #include "serve/server.h"
+#include "serve/token.h"
 
 namespace vla::cli {
 namespace {
 
 struct ReplayOptions {
-  std::string folder, bundle, kernels, device, embodiment, connect;
+  std::string folder, bundle, kernels, device, embodiment, connect, page;
+  double speed = 1;
   int n_thread = 0;
   serve::ReplayOptions replay;
 };
@@ -87,8 +93,32 @@ Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOpt
   return std::move(*result);
 }
 
+/// Shows the recording at the pace at which it came, and its acts until the process is ended.
+Status show(serve::Recording& recording, const ReplayOptions& options) {
+  std::atomic<std::uint64_t> n_shown = 0;
+  const auto health = [&n_shown] { return serve::Health{.ready = true, .n_chunk = n_shown}; };
+  VLA_TRY(const std::unique_ptr<serve::Page> page,
+          serve::Page::open(options.page, false, {drawn_token(), serve::is_same_secret, health}));
+  page->describe(recording.description(), {});
+  say(stdout, "page={}\n", page->url());
+  std::fflush(stdout);
+  std::optional<std::uint64_t> first_ns;
+  for (const auto start = Clock::now(); options.replay.first == 0 || n_shown < options.replay.first;) {
+    VLA_TRY(const std::optional<serve::Recording::Record> record, recording.next());
+    if (!record) break;
+    first_ns = std::min(first_ns.value_or(record->at_ns), record->at_ns);
+    const auto after = std::chrono::duration<double, std::nano>(static_cast<double>(record->at_ns - *first_ns));
+    std::this_thread::sleep_until(start + std::chrono::duration_cast<Clock::duration>(after / options.speed));
+    n_shown += page->show(*record);
+  }
+  say(stdout, "{} acts were shown; Ctrl-C ends the page\n", n_shown.load());
+  std::fflush(stdout);
+  for (;;) ::pause();
+}
+
 Status replay(ReplayOptions& options) {
   VLA_TRY(serve::Recording recording, serve::Recording::open(options.folder));
+  if (!options.page.empty()) return show(recording, options);
   if (!options.connect.empty()) options.replay.address = options.connect;
   VLA_TRY(const serve::ReplayReport result,
           options.bundle.empty() ? serve::replay(recording, options.replay) : replay_bundle(recording, options));
@@ -105,7 +135,8 @@ Command add_replay(CLI::App& app) {
   command->footer(
       "Recordings are made with vla serve --record (docs/serving.md). Exit code 10: an answer differed.\n"
       "  vla replay recording --bundle policy.gguf\n"
-      "  vla replay recording --connect tcp://127.0.0.1:5555");
+      "  vla replay recording --connect tcp://127.0.0.1:5555\n"
+      "  vla replay recording --page 127.0.0.1:8090   # asks nobody: shows it in a browser as it happened");
   command->add_option("DIR", options->folder, "The recording")->type_name("")->required();
   CLI::Option* connect = add_text(*command, "--connect", options->connect, "ENDPOINT",
                                   "Server to ask; not given, nor --bundle: tcp://127.0.0.1:5555");
@@ -121,6 +152,14 @@ Command add_replay(CLI::App& app) {
                    "CPU threads, with --bundle; 0 takes every core, of big and little ones the big")
       ->needs(bundle)
       ->check(CLI::Range(0, 512));
+  CLI::Option* page = add_text(*command, "--page", options->page, "ADDRESS:PORT",
+                               "Show the recording in a browser instead, at its own pace; the line that is printed has "
+                               "the address, which ends with a token");
+  page->excludes(connect)->excludes(bundle);
+  command->add_option("--speed", options->speed, "With --page: so many times as fast as it happened")
+      ->needs(page)
+      ->check(CLI::Range(0.1, 1000.0))
+      ->capture_default_str();
   command->add_option("--first", options->replay.first, "Only so many requests; 0: all")->capture_default_str();
   return [options] { return replay(*options); };
 }

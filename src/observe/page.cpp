@@ -4,6 +4,7 @@
 
 #include <fmt/format.h>
 
+#include <cctype>
 #include <charconv>
 #include <nlohmann/json.hpp>
 
@@ -100,6 +101,11 @@ Json act_json(const v1::Act& act) {
   return json;
 }
 
+std::string lower_case(std::string text) {
+  for (char& c : text) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
+  return text;
+}
+
 }  // namespace
 
 struct Page::Act {
@@ -150,25 +156,41 @@ void Page::describe(const v1::Description& description, const std::map<std::stri
   policy_ = text_of(json);
 }
 
-void Page::answered(const Answered& answered) {
+void Page::answered(const Answered& answered) try {
   if (answered.request.kind != Kind::act || answered.out.empty()) return;
-  const std::size_t size = answered.in.size() + answered.out.size();
-  if (size > kMaxBytes) return;
-  try {
-    const auto act = std::make_shared<Act>();
-    const auto age = Clock::now() - answered.request.at;
-    const auto at = std::chrono::system_clock::now() - age;
-    act->at_ms = std::chrono::duration_cast<std::chrono::milliseconds>(at.time_since_epoch()).count();
-    act->total_ms = std::chrono::duration<double, std::milli>(answered.sent - answered.request.at).count();
-    act->client = answered.request.client, act->name = answered.request.name, act->code = answered.code();
-    act->in = text_of(answered.in), act->out = text_of(answered.out), act->size = size;
-    const std::lock_guard lock(mutex_);
-    acts_.push_back(act);
-    act->id = ++n_act_;
-    bytes_ += size;
-    for (; bytes_ > kMaxBytes; acts_.pop_front()) bytes_ -= acts_.front()->size;
-  } catch (const std::exception&) {  // no memory: viewers miss this one
-  }
+  const auto act = std::make_shared<Act>();
+  const auto age = Clock::now() - answered.request.at;
+  const auto at = std::chrono::system_clock::now() - age;
+  act->at_ms = std::chrono::duration_cast<std::chrono::milliseconds>(at.time_since_epoch()).count();
+  act->total_ms = std::chrono::duration<double, std::milli>(answered.sent - answered.request.at).count();
+  act->client = answered.request.client, act->name = answered.request.name, act->code = answered.code();
+  act->in = text_of(answered.in), act->out = text_of(answered.out);
+  keep(act);
+} catch (const std::exception&) {  // no memory: viewers miss this one
+}
+
+bool Page::show(const Recording::Record& record) {
+  v1::Response response;
+  response.ParseFromString(record.response);
+  if (!response.has_chunk() && !response.has_error()) return false;
+  const auto act = std::make_shared<Act>();
+  act->at_ms = static_cast<std::int64_t>(record.at_ns / 1'000'000);
+  act->total_ms = response.chunk().queue_ms() + response.chunk().engine_ms();
+  act->client = fmt::format("{:08x}", record.client >> 32);
+  act->code = response.has_error() ? lower_case(v1::Error::Code_Name(response.error().code())) : "ok";
+  act->in = record.request, act->out = record.response;
+  keep(act);
+  return true;
+}
+
+void Page::keep(const std::shared_ptr<Act>& act) {
+  act->size = act->in.size() + act->out.size();
+  if (act->size > kMaxBytes) return;
+  const std::lock_guard lock(mutex_);
+  acts_.push_back(act);
+  act->id = ++n_act_;
+  bytes_ += act->size;
+  for (; bytes_ > kMaxBytes; acts_.pop_front()) bytes_ -= acts_.front()->size;
 }
 
 HttpReply Page::reply(const std::string& path, const std::string& query) {

@@ -9,6 +9,7 @@
 
 #include "observe/http.h"
 #include "observe/observer.h"
+#include "observe/recording.h"
 #include "wire/vla.pb.h"
 
 namespace vla::serve {
@@ -33,6 +34,8 @@ class Page final : public Observer {
   /// The policy and where its states were in training, by name; before the first request.
   void describe(const v1::Description& description, const std::map<std::string, Range>& ranges);
   void answered(const Answered& answered) override;
+  /// A request and its answer of a recording. False for one that is no act, which is not shown.
+  bool show(const Recording::Record& record);
   bool records() const override { return true; }
 
   const std::string& address() const { return http_->address(); }
@@ -44,6 +47,7 @@ class Page final : public Observer {
 
  private:
   explicit Page(Sources sources) : sources_(std::move(sources)) {}
+  void keep(const std::shared_ptr<Act>& act);
   HttpReply reply(const std::string& path, const std::string& query);
   HttpReply acts_after(std::uint64_t id);
   HttpReply image(std::uint64_t id, std::size_t view);

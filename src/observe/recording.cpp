@@ -167,7 +167,8 @@ Result<std::optional<Recording::Record>> Recording::next() {
   const std::uint64_t n_in = get<std::uint32_t>(head, 8), n_out = get<std::uint32_t>(head, 12);
   if (n_in + n_out > left - kHead)
     return damaged(fmt::format("{} bytes", kHead + n_in + n_out), fmt::format("{} and the end of the file", left));
-  Record record{n_record_, std::string(n_in, '\0'), std::string(n_out, '\0')};
+  Record record{n_record_, std::string(n_in, '\0'), std::string(n_out, '\0'), get<std::uint64_t>(head, 16),
+                get<std::uint64_t>(head, 24)};
   file_.read(record.request.data(), static_cast<std::streamsize>(n_in));
   file_.read(record.response.data(), static_cast<std::streamsize>(n_out));
   if (!file_ || seal(head, record.request, record.response) != get<std::uint64_t>(head, kSealed))

@@ -62,6 +62,8 @@ class Recording {
   struct Record {
     std::size_t index = 0;  // from 1
     std::string request, response;
+    std::uint64_t client = 0;  // tells connections apart
+    std::uint64_t at_ns = 0;   // when the request came, since 1970
   };
   /// Errors: io, bad_request (not a recording, damaged, cut off).
   static Result<Recording> open(const std::string& folder);

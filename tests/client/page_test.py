@@ -23,26 +23,16 @@ import vla_cpp
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
-class Watched:
-    """A server with a page, a robot, and what the page gives."""
+class Shown:
+    """A process with a page, and what the page gives."""
 
-    def __init__(self, case, *options):
-        command = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "1", "--page", "127.0.0.1:0", *options]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        ready = dict(word.partition("=")[::2] for word in shlex.split(self.process.stdout.readline())[1:])
-        self.url = ready["page"]
+    robot, n_act = None, 0
+
+    def __init__(self, *command):
+        self.process = subprocess.Popen([VLA, *command, "--page", "127.0.0.1:0"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.told = dict(word.partition("=")[::2] for word in shlex.split(self.process.stdout.readline()))
+        self.url = self.told["page"]
         self.token = parse_qs(urlsplit(self.url).query)["token"][0]
-        self.robot = vla_cpp.Client(ready["address"], timeout=SECONDS)
-        self.case = case
-        self.n_act = 0
-        self.sent = {name: frame if i else frame[:40, :60] for i, (name, frame) in enumerate(frames(case).items())}
-        self.files = {name: file.read_bytes() for name, file in list(case.images.items())[1:]}
-
-    def act(self, text="open the drawer", state=None, **options):
-        """The first view as pixels, the others as files."""
-        images = {**self.sent, **self.files}
-        self.n_act += 1
-        return self.robot.act(images=images, state=self.case.state if state is None else state, text=text, seed=1, **options)
 
     def get(self, path, token=None, **query):
         """Status, type and body."""
@@ -61,10 +51,30 @@ class Watched:
         return told
 
     def stop(self):
-        self.robot.close()
+        if self.robot:
+            self.robot.close()
         self.process.terminate()
         self.process.communicate(timeout=SECONDS)
         return self.process.returncode
+
+
+class Watched(Shown):
+    """A server with a page, and a robot."""
+
+    def __init__(self, case, *options):
+        super().__init__("serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "1", *options)
+        ready = self.told
+        self.robot = vla_cpp.Client(ready["address"], timeout=SECONDS)
+        self.case = case
+        self.n_act = 0
+        self.sent = {name: frame if i else frame[:40, :60] for i, (name, frame) in enumerate(frames(case).items())}
+        self.files = {name: file.read_bytes() for name, file in list(case.images.items())[1:]}
+
+    def act(self, text="open the drawer", state=None, **options):
+        """The first view as pixels, the others as files."""
+        images = {**self.sent, **self.files}
+        self.n_act += 1
+        return self.robot.act(images=images, state=self.case.state if state is None else state, text=text, seed=1, **options)
 
 
 @pytest.fixture(scope="module")
@@ -212,3 +222,31 @@ def test_a_browser_shows_what_happens_and_can_step_back(watched, browser):
         thread.join()
     assert not faults
     page.close()
+
+
+def test_a_recording_is_shown_as_it_happened(case, tmp_path):
+    recorder = subprocess.Popen([VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "1", "--record", tmp_path / "r"],
+                                stdout=subprocess.PIPE, text=True)  # fmt: skip
+    address = dict(word.partition("=")[::2] for word in shlex.split(recorder.stdout.readline()))["address"]
+    with vla_cpp.Client(address, timeout=SECONDS) as robot:
+        chunks = [robot.act(images=frames(case), state=case.state, text=text, seed=1) for text in ("open the drawer", "close it")]
+        with pytest.raises(vla_cpp.BadObservation):
+            robot.act(images=frames(case), state=[1.0], text="open the drawer")
+    recorder.terminate()
+    recorder.communicate(timeout=SECONDS)
+    shown = Shown("replay", tmp_path / "r", "--speed", "1000")
+    try:
+        shown.n_act = 3
+        *acts, refused = shown.acts()["acts"]
+        assert [act["text"] for act in acts] == ["open the drawer", "close it"]
+        assert refused["code"] == "bad_observation" and refused["error"]["where"] and "chunk" not in refused
+        for act, chunk in zip(acts, chunks):
+            assert np.array_equal(np.float32(act["chunk"]["actions"]).reshape(chunk.actions.shape), chunk.actions)
+            assert act["code"] == "ok" and abs(act["at_ms"] / 1000 - time.time()) < 60
+            assert act["total_ms"] == pytest.approx(chunk.queue_ms + sum(chunk.timing.values()))
+        assert shown.get("image", act=1, view=0)[0] == 200
+        assert json.loads(shown.get("policy")[2])["robots"][0]["horizon"] == chunks[0].actions.shape[0]
+        assert shown.process.stdout.readline() == "3 acts were shown; Ctrl-C ends the page\n"
+    finally:
+        shown.process.terminate()
+        shown.process.communicate(timeout=SECONDS)
