@@ -30,10 +30,17 @@ def test_options_of_other_layouts_are_refused(converter, options):
     assert "found one of GR00T" in converter.refusal(TinyGr00t(), embodiment=TAG, **options).message()
 
 
-@pytest.mark.parametrize("options", [dict(embodiment=TAG), dict(camera_size="40x30"), dict(letterbox=True)])
-def test_options_of_gr00t_are_refused_for_other_layouts(converter, tiny, options):
+@pytest.mark.parametrize(
+    "options, expected",
+    [
+        (dict(embodiment=TAG), "a checkpoint of several robots"),
+        (dict(camera_size="40x30"), "a checkpoint of GR00T"),
+        (dict(letterbox=True), "a checkpoint of GR00T"),
+    ],
+)
+def test_options_of_gr00t_are_refused_for_other_layouts(converter, tiny, options, expected):
     error = converter.refusal(tiny, **options)
-    assert "expected a checkpoint of GR00T" in error.message() and error.code == Code.USAGE
+    assert f"expected {expected}" in error.message() and error.code == Code.USAGE
 
 
 ARM = "robots/{}/".format(TAG)
