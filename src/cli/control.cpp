@@ -18,6 +18,7 @@
 
 #include "base/out_of_memory.h"
 #include "base/thread.h"
+#include "cli/commands.h"
 #include "serve/native/codec.h"
 
 namespace vla::cli {
@@ -114,13 +115,6 @@ std::string text_of(const ordered_json& json, const char* key) {
 }
 
 }  // namespace
-
-Status check_policy_name(const std::string& name) {
-  const auto is_plain = [](unsigned char c) { return std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-'; };
-  if (!name.empty() && name.size() <= 64 && std::all_of(name.begin(), name.end(), is_plain)) return {};
-  return Error{Code::usage, "policy", "a name of 1 to 64 letters, digits, '.', '_' and '-'", name,
-               "NAME=FILE gives a bundle another name"};
-}
 
 Result<std::unique_ptr<Control>> Control::open(const std::string& path, serve::Server& server,
                                                Observability& observability, Load load) {

@@ -47,9 +47,6 @@ class Control {
   std::thread thread_;
 };
 
-/// The errors of a name that a policy may have: letters, digits, `.`, `_` and `-`, at most 64.
-Status check_policy_name(const std::string& name);
-
 /// Sends an order to the server at this path. Its answer. Errors: io, and those of the order.
 Result<std::string> order(const std::string& path, const std::string& line);
 

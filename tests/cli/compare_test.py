@@ -47,7 +47,7 @@ def test_every_block_of_a_golden_case_agrees_with_the_reference_within_1e_5(vla,
 def test_taps_are_listed_in_the_order_in_which_the_reference_computes_them(vla, golden, taps):
     listed = [line.split()[0] for line in vla("compare", golden.expected, taps).out.splitlines()[1:-1]]
     order = [name for name in tensors(golden.expected) if name in listed]
-    assert listed == order and listed.index("pixels") < listed.index("vision.blk.0") < listed.index("chunk")
+    assert listed == order and listed.index("vision.patch_embed") < listed.index("vision.blk.0") < listed.index("chunk")
 
 
 def test_a_doctored_tap_fails_and_the_first_one_is_where_to_start(vla, golden, taps, doctored):

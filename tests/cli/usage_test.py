@@ -78,7 +78,7 @@ def test_run_without_a_text_is_refused_by_a_policy_that_reads_one(vla, golden):
     [
         (["runn"], "vla does not know runn; did you mean run? see vla --help"),
         (["run", "policy.gguf", "--images", "top=top.png"], "vla run does not know --images top=top.png; did you mean --image? see vla run --help"),
-        (["serve", "policy.gguf", "--port", "5555"], "vla serve does not know --port 5555; see vla serve --help"),
+        (["serve", "policy.gguf", "--port", "5555"], "vla serve does not know --port; see vla serve --help"),
     ],
     ids=str,
 )
