@@ -60,7 +60,7 @@ class OpenpiClient(Handle):
             raise UsageError("address", "openpi://HOST:PORT, ws://... or wss://...", address)
         self.address, self.timeout = address, timeout
         self._url = f"ws://{rest}" if scheme == "openpi" else address
-        self._names = _pairs_of(names)
+        self._names = pairs_of(names)
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         self._lock = threading.Lock()
         self._connection: Any = None
@@ -101,7 +101,7 @@ class OpenpiClient(Handle):
             if seed is not None:
                 message["vla"] = {"seed": self._checked(seed)}
             try:
-                connection.send(msgpack.packb(message, default=_packed))
+                connection.send(pack(message))
                 answer = connection.recv(timeout=max(0.0, until - time.monotonic()))
             except Exception as problem:  # a late answer must not be taken for that of the next call
                 self._drop()
@@ -109,7 +109,7 @@ class OpenpiClient(Handle):
             if isinstance(answer, str):
                 self._drop()  # the server ends the connection after it
                 raise _refusal(self.address, answer)
-        return self._chunk_of(_unpacked(answer, self.address))
+        return self._chunk_of(unpack(answer, self.address))
 
     def close(self) -> None:
         """Ends the connection. A second call does nothing."""
@@ -159,7 +159,7 @@ class OpenpiClient(Handle):
             except Exception as problem:
                 self._drop()
                 raise self._error_of(problem) from problem
-            metadata = None if isinstance(greeting, str) else _unpacked(greeting, self.address)
+            metadata = None if isinstance(greeting, str) else unpack(greeting, self.address)
             if not isinstance(metadata, dict):
                 self._drop()
                 raise Incompatible(self.address, "the metadata of an openpi server", f"{type(metadata).__name__}")
@@ -221,7 +221,8 @@ class OpenpiClient(Handle):
         return str(self.metadata.get("checksum", self.address))
 
 
-def _pairs_of(lines: Sequence[str]) -> List[Tuple[str, str]]:
+def pairs_of(lines: Sequence[str]) -> List[Tuple[str, str]]:
+    """Lines KEY=NAME in two. Errors: UsageError."""
     pairs = [(key, name) for key, _, name in (line.partition("=") for line in lines)]
     if not pairs or not all(key and name for key, name in pairs):
         raise UsageError(
@@ -234,6 +235,11 @@ def _frame(name: str, image: Any) -> np.ndarray:
     if not isinstance(image, np.ndarray) and not is_pillow(image):
         raise BadObservation(name, "a uint8 array (height, width, 3) or a Pillow image", type(image).__name__)
     return np.asarray(image_arg(name, image)[1])
+
+
+def pack(value: Any) -> bytes:
+    """A message with NumPy arrays in it."""
+    return msgpack.packb(value, default=_packed)
 
 
 def _packed(value: Any) -> Any:
@@ -255,8 +261,8 @@ def _array(value: Dict[Any, Any]) -> Any:
     return np.frombuffer(fields["data"], dtype).reshape(shape) if shape else np.frombuffer(fields["data"], dtype, 1)[0]
 
 
-def _unpacked(data: bytes, address: str) -> Any:
-    """Errors: Incompatible."""
+def unpack(data: bytes, address: str) -> Any:
+    """A message, whose arrays are those of `pack` or of the package msgpack-numpy; `address` is where it came from. Errors: Incompatible."""
     try:
         return msgpack.unpackb(data, object_hook=_array, strict_map_key=False)
     except (ValueError, TypeError, KeyError, RecursionError, msgpack.UnpackException) as problem:
