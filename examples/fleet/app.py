@@ -25,7 +25,7 @@ from front import Front, Lost  # noqa: E402
 from ray import serve  # noqa: E402
 from ray.exceptions import RayError, RayTaskError  # noqa: E402
 from ray.serve.config import AutoscalingConfig, RequestRouterConfig  # noqa: E402
-from ray.serve.exceptions import BackPressureError  # noqa: E402
+from ray.serve.exceptions import BackPressureError, RayServeException  # noqa: E402
 from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter  # noqa: E402
 
 
@@ -70,7 +70,7 @@ class Engines:
                 return "busy: the queue: expected room, found none"
             except RayTaskError as problem:  # a fault of ours; refusals are answers
                 return f"internal: {robot}: {problem.cause!r}"
-            except RayError as problem:
+            except (RayError, RayServeException) as problem:
                 died = type(problem).__name__
         raise Lost(f"two replicas failed ({died})")
 

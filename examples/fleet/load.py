@@ -20,7 +20,7 @@ import socket
 import sys
 import threading
 import time
-from typing import List, NamedTuple, Optional
+from typing import List, NamedTuple, Optional, Tuple
 
 import numpy as np
 
@@ -102,20 +102,20 @@ def kill_most_asked(robots) -> str:
     return replica
 
 
-def seconds_to_full_rate(acts: List[Act], rate: float, killed: float, end: float) -> Optional[float]:
-    """From the kill to the first window that has full rate and so have the two after it; None where there is none. An act that was
-    answered late does not count."""
+def rates_of(acts: List[Act], rate: float, killed: float, end: float) -> Tuple[float, Optional[float]]:
+    """Answers in time a second before the kill (median), and the seconds from the kill to the first window that has this rate and so
+    have the two after it; None where there is none."""
     done = np.sort([act.done for act in acts if act.kind == "right" and act.done <= act.due + 1 / rate])
 
     def counted(since):
         return np.searchsorted(done, since + WINDOW) - np.searchsorted(done, since)
 
     start = min(act.due for act in acts)
-    full = FULL * np.median([counted(since) for since in np.arange(start, killed - WINDOW, WINDOW)])
+    before = float(np.median([counted(since) for since in np.arange(start, killed - WINDOW, WINDOW)]))
     for since in np.arange(killed, end - 3 * WINDOW, 0.1):
-        if all(counted(since + i * WINDOW) >= full for i in range(3)):
-            return float(since - killed)
-    return None
+        if all(counted(since + i * WINDOW) >= FULL * before for i in range(3)):
+            return before / WINDOW, float(since - killed)
+    return before / WINDOW, None
 
 
 def report(acts: List[Act], rate: float, killed: Optional[float], end: float) -> dict:
@@ -133,7 +133,7 @@ def report(acts: List[Act], rate: float, killed: Optional[float], end: float) ->
     if killed is not None:
         told["under_way_at_kill"] = sum(act.asked <= killed <= act.done for act in acts)
         told["lost_beyond"] = sum(not act.asked <= killed <= act.done for act in lost)
-        told["full_rate_after_s"] = seconds_to_full_rate(acts, rate, killed, end)
+        told["in_time_a_second_before"], told["full_rate_after_s"] = rates_of(acts, rate, killed, end)
     return told
 
 

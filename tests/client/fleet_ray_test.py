@@ -5,6 +5,7 @@
 Runs where examples/fleet/requirements.txt is installed: python -m pytest tests/client/fleet_ray_test.py
 """
 
+import asyncio
 import contextlib
 import json
 import re
@@ -26,7 +27,11 @@ from websockets.sync.client import connect  # noqa: E402
 
 sys.path.append(str(ROOT / "examples/fleet"))
 
+from app import Engines  # noqa: E402
+from front import Lost  # noqa: E402
 from load import cases_of  # noqa: E402
+from ray.exceptions import ActorDiedError, RayTaskError  # noqa: E402
+from ray.serve.exceptions import BackPressureError, DeploymentUnavailableError  # noqa: E402
 
 from vla_cpp import openpi  # noqa: E402
 
@@ -72,10 +77,46 @@ def cases():
     return cases_of(BUNDLE, 1, None, 3)
 
 
+class Handle:
+    """Of a deployment whose calls end as told, one after the other."""
+
+    def __init__(self, *ends):
+        self._ends = list(ends)
+
+    def options(self, session_id, method_name):
+        assert (session_id, method_name) == ("arm", "act")
+        return self
+
+    async def remote(self, message):
+        end = self._ends.pop(0)
+        if isinstance(end, Exception):
+            raise end
+        return message + end
+
+
+@pytest.mark.parametrize(
+    "ends, answer",
+    [
+        ([b" done"], b"act done"),
+        ([ActorDiedError(), b" again"], b"act again"),
+        ([BackPressureError(1, 1)], "busy: the queue: expected room, found none"),
+        ([RayTaskError("act", "its traceback", ValueError("seven"))], "internal: arm: ValueError('seven')"),
+    ],
+)
+def test_an_act_whose_replica_died_is_asked_for_again(ends, answer):
+    assert asyncio.run(Engines(Handle(*ends)).act("arm", b"act")) == answer
+
+
+@pytest.mark.parametrize("end", [ActorDiedError(), DeploymentUnavailableError(None)])
+def test_an_act_that_two_replicas_could_not_answer_is_lost(end):
+    with pytest.raises(Lost, match=type(end).__name__):
+        asyncio.run(Engines(Handle(end, end, b"never")).act("arm", b"act"))
+
+
 class Arm:
     def __init__(self, address, name, cases):
         self._cases, self._n = cases, 0
-        self.socket = connect(f"{address}/{name}", compression=None, proxy=None)
+        self.socket = connect(f"{address}/{name}", compression=None, proxy=None).__enter__()
         self.greeting = openpi.unpack(self.socket.recv(SECONDS), address)
 
     def ask(self):

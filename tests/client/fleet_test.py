@@ -222,7 +222,7 @@ def test_draining_answers_the_act_under_way_and_sends_every_robot_away():
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1001, "the server drains; connect again")
         assert front.page("/healthz")[0] == 200 and front.page("/readyz") == (503, b"draining\n")
         with pytest.raises(InvalidStatus, match="503"):
-            front.connect()
+            front.connect().__enter__()
         assert not draining.done()
         free.set()
         assert busy.recv(SECONDS) == b"answer"
@@ -235,11 +235,11 @@ def test_draining_answers_the_act_under_way_and_sends_every_robot_away():
 def test_browsers_and_one_robot_too_many_are_refused():
     with door(echo, limit=1) as front:
         with pytest.raises(InvalidStatus, match="403"):
-            front.connect(origin="http://example.org")
+            front.connect(origin="http://example.org").__enter__()
         with front.connect() as robot:
             robot.recv(SECONDS)
             with pytest.raises(InvalidStatus, match="503"):
-                front.connect()
+                front.connect().__enter__()
 
 
 # --- load.py
@@ -274,7 +274,8 @@ def test_a_report_counts_and_times_what_a_kill_did():
     acts = steady(0, 10, 20) + lost + steady(10.6, 13, 10) + steady(13, 30, 20)
     told = report(acts, 20, 10.0, 30.0)
     assert (told["asked"], told["lost"], told["under_way_at_kill"], told["lost_beyond"]) == (len(acts), 2, 1, 1)
-    assert told["full_rate_after_s"] == pytest.approx(3.0, abs=0.3) and told["late"] == told["wrong"] == 0
+    assert told["full_rate_after_s"] == pytest.approx(3.0, abs=0.3) and told["in_time_a_second_before"] == 20
+    assert told["late"] == told["wrong"] == 0
     assert report(steady(0, 10, 20) + steady(10, 30, 10), 20, 10.0, 30.0)["full_rate_after_s"] is None
     late = report(steady(0, 10, 20) + steady(10, 30, 20, took=0.06), 20, 10.0, 30.0)
     assert late["late"] > 300 and late["full_rate_after_s"] is None  # answers that nobody waits for any more
