@@ -113,6 +113,13 @@ def test_an_act_that_two_replicas_could_not_answer_is_lost(end):
         asyncio.run(Engines(Handle(end, end, b"never")).act("arm", b"act"))
 
 
+@pytest.mark.parametrize("place, words", [("0.0.0.0:8000", "--insecure lets everybody in"), ("8000", "expected ADDRESS:PORT, found 8000")])
+def test_an_address_that_other_machines_reach_has_to_be_meant(place, words):
+    command = [sys.executable, FLEET / "app.py", BUNDLE, "--address", place]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=START)
+    assert done.returncode == 2 and words in done.stderr
+
+
 class Arm:
     def __init__(self, address, name, cases):
         self._cases, self._n = cases, 0
