@@ -178,4 +178,7 @@ def main():
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except vla_cpp.VlaError as error:  # of the bundle, or of the first connection
+        sys.exit(f"error: {error}")
