@@ -122,7 +122,7 @@ TEST_CASE("a server that drains answers the acts in line and takes no more") {
   running.server->drain();
   while (running.server->health().ready) std::this_thread::yield();
   CHECK(code_of(late.ask(act_request(golden(), 3))) == "SHUTTING_DOWN");
-  brake.release();
+  brake.let_go(2);
   CHECK(first.answer().chunk().horizon() > 0);
   CHECK(second.answer().chunk().horizon() > 0);
   CHECK(running.join().ok());
