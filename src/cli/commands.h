@@ -61,11 +61,6 @@ void add_memory(CLI::App& command, std::size_t& bytes);
 /// comes back is the problem, or empty.
 std::string find_pulled(std::string& bundle);
 
-/// Errors: usage for a name that no policy may have.
-Status check_policy_name(const std::string& name);
-/// The name and the bundle of `NAME=FILE`; a file alone has the name that it has without folders and `.gguf`.
-std::pair<std::string, std::string> named_bundle(const std::string& text);
-
 inline void add_bundle(CLI::App& command, std::string& bundle, bool required) {
   command
       .add_option("BUNDLE", bundle,

@@ -4,8 +4,8 @@
 #include <nlohmann/json.hpp>
 
 #include "cli/commands.h"
-#include "cli/control.h"
 #include "cli/say.h"
+#include "serve/control.h"
 
 namespace vla::cli {
 namespace {
@@ -18,8 +18,8 @@ struct CtlOptions {
 
 /// NAME=FILE, or a file whose name without `.gguf` is the policy's.
 Result<ordered_json> load_order(const std::string& text) {
-  const auto [name, bundle] = named_bundle(text);
-  VLA_CHECK(check_policy_name(name));
+  const auto [name, bundle] = serve::named_bundle(text);
+  VLA_CHECK(serve::check_policy_name(name));
   std::error_code failed;
   const std::string absolute = std::filesystem::absolute(bundle, failed);  // the server has a folder of its own
   if (failed) return Error{Code::io, bundle, "a path", failed.message()};
@@ -48,9 +48,8 @@ Status ctl(const CtlOptions& options) {
   } else if (options.what == "unload") {
     given["policy"] = options.policy;
   }
-  VLA_TRY(const std::string reply,
-          order(options.path, given.dump(-1, ' ', false, ordered_json::error_handler_t::replace)));
-  print(ordered_json::parse(reply));
+  VLA_TRY(const ordered_json reply, serve::order(options.path, given));
+  print(reply);
   return {};
 }
 

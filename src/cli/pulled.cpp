@@ -6,7 +6,6 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <cctype>
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
@@ -64,22 +63,6 @@ std::string find_pulled(std::string& bundle) {
     return fmt::format("{} bundles in {}: give the file", files.size(), printable(snapshot.string()));
   bundle = files.front();
   return "";
-}
-
-Status check_policy_name(const std::string& name) {
-  const auto is_plain = [](unsigned char c) { return std::isalnum(c) != 0 || c == '.' || c == '_' || c == '-'; };
-  if (!name.empty() && name.size() <= 64 && std::all_of(name.begin(), name.end(), is_plain)) return {};
-  return Error{Code::usage, "policy", "a name of 1 to 64 letters, digits, '.', '_' and '-'", printable(name),
-               "NAME=FILE gives a bundle another name"};
-}
-
-std::pair<std::string, std::string> named_bundle(const std::string& text) {
-  const std::size_t equals = text.find('=');
-  if (equals != std::string::npos && check_policy_name(text.substr(0, equals)))
-    return {text.substr(0, equals), text.substr(equals + 1)};
-  std::string name = text.substr(text.rfind('/') + 1);
-  if (name.ends_with(".gguf")) name.resize(name.size() - 5);
-  return {name, text};
 }
 
 }  // namespace vla::cli

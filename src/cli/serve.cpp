@@ -17,10 +17,10 @@
 #include <map>
 
 #include "cli/commands.h"
-#include "cli/control.h"
 #include "cli/observability.h"
 #include "cli/say.h"
 #include "processor/constant_actions.h"
+#include "serve/control.h"
 #include "serve/names.h"
 #include "serve/native/codec.h"
 #include "serve/server.h"
@@ -87,7 +87,7 @@ class Line {
   std::string text_;
 };
 
-void add_policy(Line& line, const LoadedPolicy& policy) {
+void add_policy(Line& line, const serve::LoadedPolicy& policy) {
   const Engine& engine = *policy.engine;
   std::vector<std::string> tags;
   for (const Robot* robot : engine.robots())
@@ -102,7 +102,7 @@ void add_policy(Line& line, const LoadedPolicy& policy) {
 }
 
 /// Adds the facts that a user has to know before the policy moves a robot.
-void add_features(Line& line, const LoadedPolicy& policy) {
+void add_features(Line& line, const serve::LoadedPolicy& policy) {
   std::vector<std::string> features, degraded, constant;  // of all robots
   const auto add_new = [](std::vector<std::string>& all, const std::vector<std::string>& some) {
     for (const std::string& text : some)
@@ -119,7 +119,7 @@ void add_features(Line& line, const LoadedPolicy& policy) {
 }
 
 /// Prints for several policies a line each, and then one of the server; for one a single line.
-void print_ready(const serve::Server& server, const std::map<std::string, LoadedPolicy>& policies,
+void print_ready(const serve::Server& server, const std::map<std::string, serve::LoadedPolicy>& policies,
                  const ServeOptions& options, const Observability& observability) {
   const bool is_one = policies.size() == 1;
   for (const auto& [name, policy] : policies) {
@@ -163,9 +163,9 @@ Error start_again() {
 }
 
 /// As every policy of the server is loaded.
-Result<LoadedPolicy> load_policy(const ServeOptions& options, std::string bundle) {
+Result<serve::LoadedPolicy> load_policy(const ServeOptions& options, std::string bundle) {
   if (std::string problem = find_pulled(bundle); !problem.empty()) return Error{Code::usage, bundle, "", problem};
-  LoadedPolicy policy;
+  serve::LoadedPolicy policy;
   StageClock clock;
   Timing load;
   VLA_TRY(policy.engine, Engine::load(bundle, {.n_thread = options.n_thread,
@@ -194,8 +194,8 @@ Status check_single(const ServeOptions& options) {
 Result<std::map<std::string, std::string>> named_bundles(const std::vector<std::string>& given) {
   std::map<std::string, std::string> bundles;
   for (const std::string& text : given) {
-    const auto [name, bundle] = named_bundle(text);
-    if (given.size() > 1) VLA_CHECK(check_policy_name(name));
+    const auto [name, bundle] = serve::named_bundle(text);
+    if (given.size() > 1) VLA_CHECK(serve::check_policy_name(name));
     if (!bundles.emplace(name, bundle).second)
       return Error{Code::usage, "BUNDLE", "policies of different names", "two of " + name, "name one: NAME=FILE"};
   }
@@ -210,20 +210,25 @@ Status serve(ServeOptions& options, bool& ready) {
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Observability> observability,
           Observability::start(options.observability, *server, options.server.insecure));
-  std::unique_ptr<Control> control;
+  std::unique_ptr<serve::Control> control;
   if (!options.control.empty()) {
-    VLA_TRY(control, Control::open(options.control, *server, *observability,
-                                   [&options](const std::string& bundle) -> Result<LoadedPolicy> {
-                                     VLA_TRY(LoadedPolicy policy, load_policy(options, bundle));
-                                     VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));
-                                     return policy;
-                                   }));
+    const auto load = [&options](const std::string& bundle) -> Result<serve::LoadedPolicy> {
+      VLA_TRY(serve::LoadedPolicy policy, load_policy(options, bundle));
+      VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));
+      return policy;
+    };
+    Observability& observed = *observability;
+    VLA_TRY(control,
+            serve::Control::open(
+                options.control, *server,
+                {load, [&observed](const std::string& name, const Engine& engine) { observed.loaded(name, engine); },
+                 [&observed](const std::string& name) { observed.unloaded(name); }}));
   }
-  std::map<std::string, LoadedPolicy> policies;
+  std::map<std::string, serve::LoadedPolicy> policies;
   double warm_up_ms = 0;
   for (const auto& [name, bundle] : bundles) {
     VLA_TRY(policies[name], load_policy(options, bundle));
-    LoadedPolicy& policy = policies[name];
+    serve::LoadedPolicy& policy = policies[name];
     VLA_CHECK(server->add(name, policy.engine));
     observability->loaded(name, *policy.engine);
     VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));

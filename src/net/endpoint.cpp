@@ -58,7 +58,7 @@ Result<Reach> reach_of(const std::string& endpoint) {
   return reach_of_host(host);
 }
 
-Status check_free(const std::string& endpoint) {
+Status check_free(const std::string& endpoint, const std::string& option) {
   const std::string path = endpoint.starts_with("ipc://") ? endpoint.substr(6) : std::string();
   struct stat info;
   if (path.empty() || ::stat(path.c_str(), &info) != 0) return {};
@@ -72,7 +72,7 @@ Status check_free(const std::string& endpoint) {
   if (fd >= 0) ::close(fd);
   if (!served) return {};
   return Error{Code::io, endpoint, "a free address", "one that a running program serves",
-               "stop it, or choose another with --bind"};
+               "stop it, or choose another with " + option};
 }
 
 }  // namespace vla::net

@@ -19,8 +19,8 @@ enum class Reach {
 /// local is remote. Errors: usage.
 Result<Reach> reach_of(const std::string& endpoint);
 
-/// ZeroMQ removes any file at an ipc path before it binds it. Anything but a socket without a server is refused here.
-/// Errors: io.
-Status check_free(const std::string& endpoint);
+/// A file at an ipc path is removed before it is bound. Anything but a socket without a server is refused here.
+/// `option`: the one that gave the endpoint. Errors: io.
+Status check_free(const std::string& endpoint, const std::string& option);
 
 }  // namespace vla::net

@@ -14,6 +14,7 @@
 
 #include "base/out_of_memory.h"
 #include "wire/envelope.h"
+#include "wire/interface.h"
 
 namespace vla::serve {
 namespace {
@@ -69,16 +70,6 @@ void Comparison::chunk(const v1::ActionChunk& a, const v1::ActionChunk& b) {
   field("notes", fmt::format("{}", fmt::join(a.notes(), "; ")), fmt::format("{}", fmt::join(b.notes(), "; ")));
   field("capture_time_ns", std::to_string(a.capture_time_ns()), std::to_string(b.capture_time_ns()));
   actions(a, b);
-}
-
-/// A policy's inputs and outputs, without who it is.
-std::string interface_of(v1::Description description) {
-  description.clear_bundle();
-  description.clear_runtime();
-  description.clear_limits();
-  description.clear_policy();
-  description.clear_policies();
-  return description.SerializeAsString();
 }
 
 /// Whether an answer depends on the load at that moment, so that it cannot be reproduced.
@@ -197,7 +188,7 @@ std::vector<Difference> compare_answers(const v1::Response& recorded, const v1::
                      v1::Error::Code_Name(replayed.error().code()));
     comparison.field("where", recorded.error().where(), replayed.error().where());
   } else if (recorded.has_description() &&
-             interface_of(recorded.description()) != interface_of(replayed.description())) {
+             wire::interface_of(recorded.description()) != wire::interface_of(replayed.description())) {
     comparison.field("description", "views, states and actions", "others");
   }
   return std::move(comparison.differences);

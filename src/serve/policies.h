@@ -6,12 +6,18 @@
 #include <map>
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "engine/engine.h"
 #include "wire/vla.pb.h"
 
 namespace vla::serve {
+
+/// Errors: usage for a name that no policy may have.
+Status check_policy_name(const std::string& name);
+/// The name and the bundle of `NAME=FILE`; a file alone has the name that it has without folders and `.gguf`.
+std::pair<std::string, std::string> named_bundle(const std::string& text);
 
 /// A policy that the server answers with. It lives as long as one of its acts.
 struct ServedPolicy {
@@ -38,6 +44,8 @@ class Policies {
   std::vector<std::string> names() const;
 
  private:
+  Error unknown(const std::string& name) const;
+
   const std::string default_name_;
   std::map<std::string, std::shared_ptr<ServedPolicy>> policies_;
 };

@@ -19,6 +19,12 @@ constexpr const char* kind_name(Kind kind) {
   return kNames[static_cast<int>(kind)];
 }
 
+/// The class of a code on the wire, which is an exit code; internal for a number that stands for none.
+constexpr Code code_of(int number) {
+  const bool is_known = number >= exit_code(Code::internal) && number <= exit_code(Code::shutting_down);
+  return is_known ? static_cast<Code>(number - exit_code(Code::internal)) : Code::internal;
+}
+
 /// The protocol versions that this build speaks.
 constexpr std::uint32_t kMinVersion = 1, kMaxVersion = 1;
 

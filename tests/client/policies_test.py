@@ -96,6 +96,22 @@ def test_only_this_user_may_give_orders(fleet):
     assert stat.S_IMODE(fleet.socket.stat().st_mode) == 0o600
 
 
+def test_the_socket_takes_no_path_that_is_in_use_but_that_of_a_server_that_was_killed(fleet, tmp_path):
+    plain = tmp_path / "plain"
+    plain.write_text("mine")
+    for path, found in ((plain, "a file that is no socket"), (fleet.socket, "one that a running program serves")):
+        answer = subprocess.run([VLA, "serve", PICK.bundle, "--bind", "tcp://127.0.0.1:0", "--control", path], capture_output=True, text=True, timeout=60)
+        assert (answer.returncode, found in answer.stderr) == (9, True), answer.stderr
+    assert plain.read_text() == "mine" and fleet.loaded() == {"pick", "place"}
+    killed = Fleet(tmp_path)
+    killed.process.kill()
+    killed.process.communicate(timeout=SECONDS)
+    assert killed.socket.exists()
+    again = Fleet(tmp_path)
+    assert again.loaded() == {"pick", "place"}
+    assert again.end() == 0
+
+
 def test_a_version_takes_the_place_of_another_while_robots_act_and_none_loses_an_answer(fleet, version):
     expected, checksums, problems, done = alone(PICK), [], [], threading.Event()
 

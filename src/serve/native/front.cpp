@@ -82,7 +82,7 @@ NativeFront::NativeFront(net::Loop& loop, const ServerOptions& options, std::opt
 
 Status NativeFront::bind() {
   for (const std::string& endpoint : options_.bind) {
-    VLA_CHECK(net::check_free(endpoint));
+    VLA_CHECK(net::check_free(endpoint, "--bind"));
     VLA_TRY(std::string bound, hub_.bind(endpoint));
     addresses_.push_back(std::move(bound));
   }

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "cli/control.h"
+#include "serve/control.h"
 
 #include <fmt/format.h>
 #include <poll.h>
@@ -18,10 +18,10 @@
 
 #include "base/out_of_memory.h"
 #include "base/thread.h"
-#include "cli/commands.h"
-#include "serve/native/codec.h"
+#include "net/endpoint.h"
+#include "wire/envelope.h"
 
-namespace vla::cli {
+namespace vla::serve {
 namespace {
 
 using nlohmann::ordered_json;
@@ -72,7 +72,7 @@ bool may_order(int client) {
   return ::getsockopt(client, SOL_SOCKET, SO_PEERCRED, &peer, &size) == 0 && (peer.uid == ::geteuid() || peer.uid == 0);
 }
 
-ordered_json told(const serve::ServedPolicy& policy) {
+ordered_json told(const ServedPolicy& policy) {
   const v1::Bundle& bundle = policy.description.bundle();
   return {{"policy", policy.name},
           {"bundle", bundle.name()},
@@ -81,32 +81,21 @@ ordered_json told(const serve::ServedPolicy& policy) {
           {"memory_mb", static_cast<double>(policy.engine->memory().total()) / 1e6}};
 }
 
-std::string dumped(const ordered_json& json) {
-  return json.dump(-1, ' ', false, ordered_json::error_handler_t::replace);
+bool write_json(int socket, const ordered_json& json) {
+  return write_line(socket, json.dump(-1, ' ', false, ordered_json::error_handler_t::replace));
 }
 
-std::string refused(const Error& error) {
-  return dumped({{"error",
-                  {{"code", exit_code(error.code)},
-                   {"where", error.where},
-                   {"expected", error.expected},
-                   {"found", error.found},
-                   {"hint", error.hint}}}});
+ordered_json refused(const Error& error) {
+  return {{"error",
+           {{"code", exit_code(error.code)},
+            {"where", error.where},
+            {"expected", error.expected},
+            {"found", error.found},
+            {"hint", error.hint}}}};
 }
 
 Error bad_order(const std::string& found) {
   return {Code::bad_request, "order", "list, load, unload or drain, as vla ctl sends them", found};
-}
-
-/// A socket that no process serves any more, as one that was killed leaves it.
-bool is_left_over(const std::string& path, const sockaddr_un& address) {
-  struct stat file = {};
-  if (::lstat(path.c_str(), &file) != 0 || !S_ISSOCK(file.st_mode)) return false;
-  const int probe = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
-  const bool served = ::connect(probe, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) == 0;
-  const bool refused = !served && errno == ECONNREFUSED;
-  ::close(probe);
-  return refused;
 }
 
 std::string text_of(const ordered_json& json, const char* key) {
@@ -116,16 +105,16 @@ std::string text_of(const ordered_json& json, const char* key) {
 
 }  // namespace
 
-Result<std::unique_ptr<Control>> Control::open(const std::string& path, serve::Server& server,
-                                               Observability& observability, Load load) {
-  std::unique_ptr<Control> control(new Control(path, server, observability, std::move(load)));
+Result<std::unique_ptr<Control>> Control::open(const std::string& path, Server& server, Program program) {
+  std::unique_ptr<Control> control(new Control(path, server, std::move(program)));
   VLA_CHECK(control->bind());
   return control;
 }
 
 Status Control::bind() {
   VLA_TRY(const sockaddr_un address, address_of(path_));
-  if (is_left_over(path_, address)) ::unlink(path_.c_str());
+  VLA_CHECK(net::check_free("ipc://" + path_, "--control"));
+  ::unlink(path_.c_str());  // what is there is a socket that no process serves
   stopped_ = ::eventfd(0, EFD_CLOEXEC);
   listener_ = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
   if (stopped_ < 0 || listener_ < 0) return failed(path_, "a file descriptor");
@@ -170,67 +159,63 @@ void Control::run() {
 /// An exception from a library fails this order, not the server.
 void Control::answer(int client) try {
   if (!may_order(client)) return;
-  const std::string line = read_line(client, kPatienceMs);
-  std::string reply;
+  const ordered_json given = ordered_json::parse(read_line(client, kPatienceMs), nullptr, false);
   try {
-    reply = obey(line);
+    const Result<ordered_json> reply = obey(given);
+    write_json(client, reply ? *reply : refused(reply.error()));
   } catch (const std::bad_alloc&) {
-    reply = refused(out_of_memory("order"));
+    write_json(client, refused(out_of_memory("order")));
   }
-  write_line(client, reply);
 } catch (const std::exception&) {  // not even for the refusal
 }
 
-std::string Control::obey(const std::string& line) {
-  const ordered_json given = ordered_json::parse(line, nullptr, false);
-  if (!given.is_object()) return refused(bad_order("another line"));
+Result<ordered_json> Control::obey(const ordered_json& given) {
+  if (!given.is_object()) return bad_order("another line");
   const std::string what = text_of(given, "do"), name = text_of(given, "policy");
+  if (what == "load") return load(name, text_of(given, "bundle"));
+  ordered_json done = ordered_json::object();
   if (what == "drain") {
     server_.drain();
-    return dumped(ordered_json::object());
+  } else if (what == "unload") {
+    VLA_CHECK(server_.unload(name));
+    program_.unloaded(name);
+  } else if (what == "list") {
+    VLA_TRY(const auto policies, server_.policies());
+    done["policies"] = ordered_json::array();
+    for (const auto& policy : policies) done["policies"].push_back(told(*policy));
+  } else {
+    return bad_order(what);
   }
-  if (what == "list") {
-    const auto policies = server_.policies();
-    if (!policies) return refused(policies.error());
-    ordered_json all = ordered_json::array();
-    for (const auto& policy : *policies) all.push_back(told(*policy));
-    return dumped({{"policies", all}});
-  }
-  if (what == "unload") {
-    const Status unloaded = server_.unload(name);
-    if (!unloaded) return refused(unloaded.error());
-    observability_.unloaded(name);
-    return dumped(ordered_json::object());
-  }
-  if (what != "load") return refused(bad_order(what));
-  if (const Status valid = check_policy_name(name); !valid) return refused(valid.error());
-  Result<LoadedPolicy> loaded = load_(text_of(given, "bundle"));
-  if (!loaded) return refused(loaded.error());
-  const double memory_mb = static_cast<double>(loaded->engine->memory().total()) / 1e6;
-  const std::shared_ptr<Engine> engine = loaded->engine;
-  if (const Status served = server_.load(name, engine); !served) return refused(served.error());
-  observability_.loaded(name, *engine);
-  return dumped(
-      {{"policy", name}, {"load_ms", loaded->load_ms}, {"warm_up_ms", loaded->warm_up_ms}, {"memory_mb", memory_mb}});
+  return done;
 }
 
-Result<std::string> order(const std::string& path, const std::string& line) {
+Result<ordered_json> Control::load(const std::string& policy, const std::string& bundle) {
+  VLA_CHECK(check_policy_name(policy));
+  VLA_TRY(const LoadedPolicy loaded, program_.load(bundle));
+  VLA_CHECK(server_.load(policy, loaded.engine));
+  program_.loaded(policy, *loaded.engine);
+  return ordered_json{{"policy", policy},
+                      {"load_ms", loaded.load_ms},
+                      {"warm_up_ms", loaded.warm_up_ms},
+                      {"memory_mb", static_cast<double>(loaded.engine->memory().total()) / 1e6}};
+}
+
+Result<ordered_json> order(const std::string& path, const ordered_json& given) {
   VLA_TRY(const sockaddr_un address, address_of(path));
   const int socket = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
   if (socket < 0) return failed(path, "a file descriptor");
   const std::unique_ptr<const int, void (*)(const int*)> closed(&socket, [](const int* open) { ::close(*open); });
   if (::connect(socket, reinterpret_cast<const sockaddr*>(&address), sizeof(address)) != 0)
     return failed(path, "the --control of a vla serve that runs");
-  if (!write_line(socket, line)) return failed(path, "an order that is taken");
+  if (!write_json(socket, given)) return failed(path, "an order that is taken");
   const std::string reply = read_line(socket, -1);
-  const ordered_json json = ordered_json::parse(reply, nullptr, false);
+  ordered_json json = ordered_json::parse(reply, nullptr, false);
   if (!json.is_object())
     return Error{Code::io, path, "an answer", reply.empty() ? "none: another user's server, or it ended" : reply};
   const auto error = json.find("error");
-  if (error == json.end()) return reply;
-  const int code = error->value("code", 1);
-  return Error{static_cast<Code>(std::clamp(code, 1, exit_code(Code::shutting_down)) - 1), text_of(*error, "where"),
-               text_of(*error, "expected"), text_of(*error, "found"), text_of(*error, "hint")};
+  if (error == json.end()) return json;
+  return Error{wire::code_of(error->value("code", 0)), text_of(*error, "where"), text_of(*error, "expected"),
+               text_of(*error, "found"), text_of(*error, "hint")};
 }
 
-}  // namespace vla::cli
+}  // namespace vla::serve

@@ -4,13 +4,13 @@
 
 #include <functional>
 #include <memory>
+#include <nlohmann/json_fwd.hpp>
 #include <string>
 #include <thread>
 
-#include "cli/observability.h"
 #include "serve/server.h"
 
-namespace vla::cli {
+namespace vla::serve {
 
 /// A bundle in memory that has computed an act, and how long both took.
 struct LoadedPolicy {
@@ -23,31 +23,35 @@ struct LoadedPolicy {
 /// {"do": "drain"}, and gets one back when it is done, with "error" in it where it was refused. One order at a time.
 class Control {
  public:
-  using Load = std::function<Result<LoadedPolicy>(const std::string& bundle)>;
+  /// The parts of the program that an order needs or changes; called on the thread of Control.
+  struct Program {
+    std::function<Result<LoadedPolicy>(const std::string& bundle)> load;
+    std::function<void(const std::string& policy, const Engine& engine)> loaded;
+    std::function<void(const std::string& policy)> unloaded;
+  };
   /// Binds the path. Everything outlives it. Errors: io, usage.
-  static Result<std::unique_ptr<Control>> open(const std::string& path, serve::Server& server,
-                                               Observability& observability, Load load);
+  static Result<std::unique_ptr<Control>> open(const std::string& path, Server& server, Program program);
   /// Takes orders from now on.
   Status start();
   ~Control();
 
  private:
-  Control(std::string path, serve::Server& server, Observability& observability, Load load)
-      : path_(std::move(path)), server_(server), observability_(observability), load_(std::move(load)) {}
+  Control(std::string path, Server& server, Program program)
+      : path_(std::move(path)), server_(server), program_(std::move(program)) {}
   Status bind();
   void run();
   void answer(int client);
-  std::string obey(const std::string& line);
+  Result<nlohmann::ordered_json> obey(const nlohmann::ordered_json& given);
+  Result<nlohmann::ordered_json> load(const std::string& policy, const std::string& bundle);
 
   const std::string path_;
-  serve::Server& server_;
-  Observability& observability_;
-  const Load load_;
+  Server& server_;
+  const Program program_;
   int listener_ = -1, stopped_ = -1;  // a socket, an eventfd
   std::thread thread_;
 };
 
 /// Sends an order to the server at this path. Its answer. Errors: io, and those of the order.
-Result<std::string> order(const std::string& path, const std::string& line);
+Result<nlohmann::ordered_json> order(const std::string& path, const nlohmann::ordered_json& given);
 
-}  // namespace vla::cli
+}  // namespace vla::serve

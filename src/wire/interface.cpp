@@ -1,0 +1,24 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#include "wire/interface.h"
+
+namespace vla::wire {
+namespace {
+
+void keep_interface(v1::Description& description) {
+  description.clear_bundle();
+  description.clear_runtime();
+  description.clear_limits();
+  description.clear_policy();
+  description.clear_policies();
+  for (v1::Description& robot : *description.mutable_embodiments()) keep_interface(robot);
+}
+
+}  // namespace
+
+std::string interface_of(v1::Description description) {
+  keep_interface(description);
+  return description.SerializeAsString();
+}
+
+}  // namespace vla::wire
