@@ -4,7 +4,6 @@
 
 #include <fmt/format.h>
 
-#include <cctype>
 #include <charconv>
 #include <nlohmann/json.hpp>
 
@@ -101,11 +100,6 @@ Json act_json(const v1::Act& act) {
   return json;
 }
 
-std::string lower_case(std::string text) {
-  for (char& c : text) c = static_cast<char>(std::tolower(static_cast<unsigned char>(c)));
-  return text;
-}
-
 }  // namespace
 
 struct Page::Act {
@@ -164,8 +158,7 @@ void Page::answered(const Answered& answered) try {
   act->at_ms = std::chrono::duration_cast<std::chrono::milliseconds>(at.time_since_epoch()).count();
   act->total_ms = std::chrono::duration<double, std::milli>(answered.sent - answered.request.at).count();
   act->client = answered.request.client, act->name = answered.request.name, act->code = answered.code();
-  act->in = text_of(answered.in), act->out = text_of(answered.out);
-  keep(act);
+  keep(act, answered.in, answered.out);
 } catch (const std::exception&) {  // no memory: viewers miss this one
 }
 
@@ -177,15 +170,15 @@ bool Page::show(const Recording::Record& record) {
   act->at_ms = static_cast<std::int64_t>(record.at_ns / 1'000'000);
   act->total_ms = response.chunk().queue_ms() + response.chunk().engine_ms();
   act->client = fmt::format("{:08x}", record.client >> 32);
-  act->code = response.has_error() ? lower_case(v1::Error::Code_Name(response.error().code())) : "ok";
-  act->in = record.request, act->out = record.response;
-  keep(act);
+  act->code = response.has_error() ? code_name(wire::code_of(response.error().code())) : "ok";
+  keep(act, std::as_bytes(std::span(record.request)), std::as_bytes(std::span(record.response)));
   return true;
 }
 
-void Page::keep(const std::shared_ptr<Act>& act) {
-  act->size = act->in.size() + act->out.size();
+void Page::keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, std::span<const std::byte> out) {
+  act->size = in.size() + out.size();
   if (act->size > kMaxBytes) return;
+  act->in = text_of(in), act->out = text_of(out);
   const std::lock_guard lock(mutex_);
   acts_.push_back(act);
   act->id = ++n_act_;

@@ -47,7 +47,7 @@ class Page final : public Observer {
 
  private:
   explicit Page(Sources sources) : sources_(std::move(sources)) {}
-  void keep(const std::shared_ptr<Act>& act);
+  void keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, std::span<const std::byte> out);
   HttpReply reply(const std::string& path, const std::string& query);
   HttpReply acts_after(std::uint64_t id);
   HttpReply image(std::uint64_t id, std::size_t view);
