@@ -26,8 +26,7 @@ struct Received {
   Kind kind = Kind::unknown;
   std::size_t size = 0;  // bytes of the request
   Clock::time_point at;
-  bool is_first = false;    // of its connection
-  std::string policy_name;  // of an act: as the client has it and, once it is in line, as the server has it
+  bool is_first = false;  // of its connection
 };
 
 /// A connection that the server ended.

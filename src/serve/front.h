@@ -52,6 +52,7 @@ class Call {
 /// A request on its way through the server.
 struct Job : Received {
   std::unique_ptr<Call> call;
+  std::string policy_name;                   // as the client gives it; empty for the only one or the default
   std::shared_ptr<ServedPolicy> policy;      // that answers, once it is in line
   net::Share share;                          // whose turn it is
   std::optional<std::uint64_t> deadline_ms;  // from its receipt: when its turn has to have come

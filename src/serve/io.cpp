@@ -104,7 +104,6 @@ void Io::submit(Job job) {
   Result<std::shared_ptr<ServedPolicy>> policy = policies_.find(job.policy_name);
   if (!policy) return refuse(std::move(job), [&] { return policy.error(); });
   job.policy = std::move(*policy);
-  job.policy_name = job.policy->name;
   if (const auto allowed = job.deadline_ms) {
     if (*allowed == 0 || *allowed > kMaxDeadlineMs)
       return refuse(std::move(job), [&] {

@@ -170,13 +170,14 @@ Status Server::add(const std::string& name, std::shared_ptr<Engine> engine) {
 }
 
 Status Server::begin() {
-  if (fronts_.size() == 1 && policies_.all().size() > 1 && options_.default_policy.empty()) return {};
   const auto policy = policies_.find("");
-  if (!policy)
+  if (!policy && (fronts_.size() > 1 || !options_.default_policy.empty()))
     return Error{Code::usage, "--default-policy", policy.error().expected,
                  options_.default_policy.empty() ? "none" : options_.default_policy,
                  "clients of other protocols name no policy"};
-  for (const auto& front : fronts_) VLA_CHECK(front->serve(**policy));
+  if (policy) {
+    for (const auto& front : fronts_) VLA_CHECK(front->serve(**policy));
+  }
   return {};
 }
 
@@ -285,10 +286,10 @@ void Server::compute(Act& act) {
   if (!act.answer.error) attempt(act, [&] { return respond(act); });
   act.answer.finished = loop_.now();
   act.request = {};
-  const Status failure = act.policy().engine->device().failure();
+  const Status device = act.policy().engine->device().failure();
   exchange_.put(std::move(act.answer));
-  if (failure) return;
-  lost_device_ = failure;
+  if (device) return;
+  lost_device_ = device;
   state_.device_lost = true;  // no act after this one can succeed
   stop();
 }
