@@ -7,6 +7,7 @@
 #include <atomic>
 
 #include "serve/support.h"
+#include "wire/interface.h"
 
 using namespace vla;
 using namespace vla::test;
@@ -55,6 +56,16 @@ TEST_CASE("a version takes the place of another only where clients can go on wit
   CHECK(*policies.put(second) == first);
   CHECK(policies.put(policy_of("pick", 9)).error().code == Code::incompatible);
   CHECK(*policies.find("pick") == second);
+}
+
+TEST_CASE("which bundles robots have is no part of what clients rely on, and which states they have is") {
+  v1::Description one;
+  one.add_embodiments()->mutable_bundle()->set_checksum("xxh3:1");
+  v1::Description other = one;
+  other.mutable_embodiments(0)->mutable_bundle()->set_checksum("xxh3:2");
+  CHECK(wire::interface_of(one) == wire::interface_of(other));
+  other.mutable_embodiments(0)->add_states()->set_name("arm");
+  CHECK(wire::interface_of(one) != wire::interface_of(other));
 }
 
 TEST_CASE("the last policy and the default stay") {
