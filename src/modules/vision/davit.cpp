@@ -93,8 +93,8 @@ SpatialBlock::SpatialBlock(const Scope& s, const DavitStage& stage)
 void SpatialBlock::keep(Graph& g, Cache& cache) const {
   if (!windows_.reach_beyond()) return;
   const Tensor zero = full(g, 0.0f, d_model_, 1);
-  cache.put(g, path() + ".beyond.k", split_heads(g, products_.k.forward(g, zero), n_head_));
-  cache.put(g, path() + ".beyond.v", split_heads(g, products_.v.forward(g, zero), n_head_));
+  put(g, cache, path() + ".beyond",
+      {split_heads(g, products_.k.forward(g, zero), n_head_), split_heads(g, products_.v.forward(g, zero), n_head_)});
 }
 
 Tensor SpatialBlock::forward(Graph& g, Tensor x, const Cache& cache) const {
@@ -116,11 +116,9 @@ Tensor SpatialBlock::attend(Graph& g, Tensor x, const Cache& cache) const {
     std::vector<KeyValue> segments = {{heads(k), heads(v)}};
     std::vector<int> copies(static_cast<std::size_t>(kind.n_cell), 1);
     if (kind.n_beyond > 0) {
-      const auto of_all = [&](const char* which) {
-        const Tensor one = cache.get(g, path() + which);
-        return g.add(op::Repeat{}, {one}, {one.dim(0), n_head_, 1, n_window});
-      };
-      segments.push_back({of_all(".beyond.k"), of_all(".beyond.v")});
+      const KeyValue one = get(g, cache, path() + ".beyond");
+      const auto of_all = [&](Tensor rows) { return g.add(op::Repeat{}, {rows}, {rows.dim(0), n_head_, 1, n_window}); };
+      segments.push_back({of_all(one.key), of_all(one.value)});
       copies.push_back(kind.n_beyond);
     }
     seen.push_back(flatten_views(g, attention(g, heads(q), segments, copies_mask(g, copies, kind.n_cell))));

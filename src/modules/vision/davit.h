@@ -4,8 +4,7 @@
 
 #include <vector>
 
-#include "graph/cache.h"
-#include "nn/attention.h"
+#include "modules/attention.h"
 #include "nn/convolution.h"
 #include "nn/mlp.h"
 
