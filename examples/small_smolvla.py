@@ -106,10 +106,15 @@ def save(policy: Any, before: Any, after: Any, out: Path) -> None:
     policy.config.vlm_model_name = steps[0].tokenizer_name = local
 
 
+def features(state: List[str], action: List[str]) -> Dict[str, Dict[str, Any]]:
+    """The numbers of a LeRobot data set, by their names."""
+    named = {"observation.state": state, "action": action}
+    return {key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in named.items()}
+
+
 def describe(out: Path, rate_hz: float, state: List[str], action: List[str]) -> None:
     """meta/info.json as a LeRobot data set has it: the names of the numbers and the control rate, for the converter."""
-    features = {"observation.state": state, "action": action}
-    info = {"fps": rate_hz, "features": {k: {"dtype": "float32", "shape": [len(names)], "names": names} for k, names in features.items()}}
+    info = {"fps": rate_hz, "features": features(state, action)}
     (out / "meta").mkdir(exist_ok=True)
     (out / "meta" / "info.json").write_text(json.dumps(info, indent=1) + "\n")
 

@@ -31,7 +31,11 @@ from expert import LIMIT, Expert
 from vla_cpp.eval.environments.libero import REST, SENTENCES, SETTLE, THINGS, Libero
 
 TASKS = len(THINGS)
-HORIZON = 16  # steps in a chunk
+SEEN = Libero.declare("libero_object/0")  # what every scene shows and takes
+VIEWS, RATE_HZ = tuple(SEEN.views), int(SEEN.rate_hz)
+STATE_NAMES = ["x", "y", "z", "rx", "ry", "rz", "finger_left", "finger_right"]
+ACTION_NAMES = ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"]
+HORIZON, EXECUTE = 16, SEEN.replan_every  # steps in a chunk, and how many of them are executed
 AFTER = 8  # steps kept after success
 NOISE = (0.0, 0.1, 0.25)  # standard deviation of the noise on the three displacements, one of them per episode
 FIRST = 10000  # seed of the first episode of a scene

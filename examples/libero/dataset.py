@@ -12,19 +12,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from vla_cpp.eval import lerobot_reference  # noqa: F401  (before lerobot)
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import small_smolvla as small  # noqa: E402  (before lerobot)
 import numpy as np  # noqa: E402
-
-NAMES = {"observation.state": ["x", "y", "z", "rx", "ry", "rz", "finger_left", "finger_right"],
-         "action": ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"]}  # fmt: skip
-VIEWS = ("image", "image2")
-RATE_HZ = 20
+from collect import ACTION_NAMES, RATE_HZ, STATE_NAMES, VIEWS  # noqa: E402
 
 
 def features(side):
-    numbers = {key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in NAMES.items()}
     frames = {f"observation.images.{view}": {"dtype": "image", "shape": (side, side, 3), "names": ["height", "width", "channels"]} for view in VIEWS}
-    return numbers | frames
+    return small.features(STATE_NAMES, ACTION_NAMES) | frames
 
 
 def rows(episode):

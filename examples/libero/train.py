@@ -27,15 +27,13 @@ import small_smolvla as small  # noqa: E402  (before torch and lerobot)
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
+from collect import ACTION_NAMES, EXECUTE, HORIZON, RATE_HZ, STATE_NAMES, VIEWS  # noqa: E402
 from vla_cpp.eval.environments.libero import SENTENCES  # noqa: E402
+from vla_cpp.eval.environments.libero import SIZE as FRAME  # noqa: E402
 
-SIZE, FRAME = 128, 256  # pixels: what the policy sees, and what LIBERO shows it
+SIZE = FRAME // 2  # pixels: what the policy sees of what LIBERO shows; collect.py halves it as well
 VISION = 128  # width of the vision tower
-HORIZON, EXECUTE, RATE_HZ = 16, 8, 20
 N_TOKEN = 20  # of a sentence, padded
-VIEWS = ("image", "image2")
-STATE_NAMES = ["x", "y", "z", "rx", "ry", "rz", "finger_left", "finger_right"]
-ACTION_NAMES = ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"]
 DISTANCE = 0.1  # metres that the question for places counts as 1
 AVERAGE = 0.995  # of the weights that are written: what remains of the mean after a step
 
