@@ -27,7 +27,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from expert import LIMIT, Expert
+from expert import LIMIT, Expert, centre
 from vla_cpp.eval.environments.libero import REST, SENTENCES, SETTLE, THINGS, Libero
 
 TASKS = len(THINGS)
@@ -88,10 +88,6 @@ def halved(frame):
     """(256, 256, 3) uint8 -> (128, 128, 3) uint8, as a policy for 128 x 128 scales it: the mean of each four pixels."""
     h, w, _ = frame.shape
     return (frame.reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3)) + 0.5).astype(np.uint8)
-
-
-def centre(corners):
-    return (corners.min(axis=0) + corners.max(axis=0)) / 2
 
 
 def chunks(actions, every):

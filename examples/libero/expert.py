@@ -37,6 +37,11 @@ def turn_of(matrix):
     return axis if sine == 0 else axis / sine * np.arctan2(sine, (np.trace(matrix) - 1) / 2)
 
 
+def centre(corners):
+    """(n, 3) -> (3,): the middle of the box around them"""
+    return (corners.min(axis=0) + corners.max(axis=0)) / 2
+
+
 class Expert:
     """Decides step by step for one episode of an environment that was reset.
 
@@ -70,9 +75,8 @@ class Expert:
         widths = [np.ptp(corners[:, :2] @ np.array([-np.sin(a), np.cos(a)])) for a in angles]
         fitting = [a for a, width in zip(angles, widths) if width < SPAN]
         self._yaw = fitting[0] if fitting else angles[int(np.argmin(widths))]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        self._grasp = (low + high) / 2
-        self._grasp[2] = max(self._grasp[2], high[2] - 0.07, 0.01)  # the palm stays above a tall object
+        self._grasp = centre(corners)
+        self._grasp[2] = max(self._grasp[2], corners[:, 2].max() - 0.07, 0.01)  # the palm stays above a tall object
 
     def _turn(self) -> np.ndarray:
         """The rotation vector (world, radians) from the hand's orientation to the one that is wanted."""
@@ -129,8 +133,7 @@ class Expert:
         return self._over_basket, self._waited < 15
 
     def _place(self) -> np.ndarray:
-        corners = self._env.corners(self._object)
-        return (corners.min(axis=0) + corners.max(axis=0)) / 2
+        return centre(self._env.corners(self._object))
 
 
 def episode(environment: Libero, seed: int):
