@@ -7,28 +7,25 @@ import json
 import numpy as np
 import pytest
 
+from configs import of_config, sizes_of
 from goldens import act
-from goldens.files import write_json
 from manifests import check_keys, check_parameters
 from vla_cpp.convert import batch_norm
-from vla_cpp.convert.archs import Options, load
 from vla_cpp.convert.archs.act import mapping
 from vla_cpp.convert.archs.act.config import read_sizes
-from vla_cpp.convert.checkpoint import Checkpoint, open_checkpoint
+from vla_cpp.convert.checkpoint import open_checkpoint
 from vla_cpp.convert.errors import ConvertError, Problems
 from vla_cpp.convert.images import standardized
 from vla_cpp.convert.normalization import Normalization
 
+ARCH = "act"
 SMALL = act.Checkpoint(act.policy(3, 8, 2, 12, (1, 1, 1)), {"top": (33, 40), "wrist": (33, 40)}, d_state=2, d_action=2, imagenet=False)
 PUBLISHED = act.published({"top": (480, 640), "wrist": (480, 640)})
 ONES = {"mean": np.ones(3, np.float32), "std": np.full(3, 0.5, np.float32)}
 
 
-def sizes_of(config):
-    problems = Problems("published")
-    sizes = read_sizes(Checkpoint("published", "", "", config, {}, {}, {}, None), Options(), problems)
-    problems.raise_any()
-    return sizes
+def sizes_at(config):
+    return sizes_of(read_sizes, of_config(config))
 
 
 def sources(sizes):
@@ -38,69 +35,24 @@ def sources(sizes):
     return out
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("act")
-    SMALL.write(1, path)
-    return path
-
-
-@pytest.fixture
-def planned(folder, tmp_path):
-    """Plans a checkpoint with another config, or other processor files."""
-
-    def plan(changes=(), processor=None, options=None):
-        config = SMALL.config
-        for path, value in dict(changes).items():
-            *parents, last = path.split("/")
-            place = config
-            for parent in parents:
-                place = place[parent]
-            if value is None and last in place and parents:
-                del place[last]
-            else:
-                place[last] = value
-        for file in folder.iterdir():
-            (tmp_path / file.name).symlink_to(file)
-        (tmp_path / "config.json").unlink()
-        write_json(tmp_path / "config.json", config)
-        if processor:
-            content = json.loads((folder / "policy_preprocessor.json").read_text())
-            processor(content)
-            (tmp_path / "policy_preprocessor.json").unlink()
-            write_json(tmp_path / "policy_preprocessor.json", content)
-        checkpoint, problems = open_checkpoint(str(tmp_path), {}), Problems("test")
-        made = load("act").plan(checkpoint, options or Options(), problems)
-        problems.raise_any()
-        return made, checkpoint
-
-    return plan
-
-
-def refusal(planned, *args, **kwargs):
-    with pytest.raises(ConvertError) as caught:
-        planned(*args, **kwargs)
-    return str(caught.value)
-
-
 def test_the_published_config_asks_for_the_tensors_of_the_reference():
-    sizes = sizes_of(PUBLISHED.config)
+    sizes = sizes_at(PUBLISHED.config)
     assert sources(sizes) == PUBLISHED.shapes()
     assert sum(int(np.prod(shape)) for shape in sources(sizes).values()) == pytest.approx(51.6e6, rel=0.01)
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares():
-    check_parameters("act", mapping.weights(sizes_of(PUBLISHED.config)))
+    check_parameters("act", mapping.weights(sizes_at(PUBLISHED.config)))
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest():
-    check_keys("act", mapping.network_keys(sizes_of(PUBLISHED.config)))
+    check_keys("act", mapping.network_keys(sizes_at(PUBLISHED.config)))
 
 
 @pytest.mark.parametrize("change", [{"pre_norm": True}, {"use_vae": False}, {"vision_backbone": "resnet34"}, {"n_decoder_layers": 7}])
 def test_every_arrangement_asks_for_the_tensors_of_the_reference(change):
     checkpoint = act.Checkpoint(act.policy(3, 8, 2, 12, (2, 1, 3)) | change, {"top": (33, 40)}, d_environment=5)
-    assert sources(sizes_of(checkpoint.config)) == checkpoint.shapes()
+    assert sources(sizes_at(checkpoint.config)) == checkpoint.shapes()
 
 
 def test_a_convolution_with_its_batch_norm_is_one_convolution(folder):
@@ -120,8 +72,8 @@ def test_a_convolution_with_its_batch_norm_is_one_convolution(folder):
 
 
 def test_cameras_with_other_statistics_have_ops_of_their_own(planned):
-    made, _ = planned()
-    ops = json.loads(next(key.value for key in made.keys if key.name == "processor.recipe"))["image"]
+    keys, made = planned()
+    ops = json.loads(keys["processor.recipe"])["image"]
     assert [op["op"] for op in ops] == ["camera_size", "size", "standardize", "standardize"]
     assert [op["view"] for op in ops[2:]] == [0, 1] and ops[2]["mean"] != ops[3]["mean"]
     assert not any(name.startswith("stats.observation.images") for name in made.statistics)
@@ -142,45 +94,39 @@ def test_cameras_with_the_same_statistics_share_an_op():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("path", "value", "message"),
     [
-        ({"vision_backbone": "resnet50"}, "vision_backbone: expected resnet18 or resnet34"),
-        ({"replace_final_stride_with_dilation": True}, "replace_final_stride_with_dilation: expected False"),
-        ({"feedforward_activation": "glu"}, "feedforward_activation: expected relu or gelu"),
-        ({"pre_norm": 1}, "pre_norm: expected true or false"),
-        ({"n_heads": 3}, "n_heads: expected a divisor of dim_model 8"),
-        ({"dim_model": 6}, "dim_model: expected a multiple of 4"),
-        ({"temporal_ensemble_coeff": -0.1}, "temporal_ensemble_coeff: expected 0 or more"),
-        ({"n_obs_steps": 2}, "n_obs_steps: expected 1"),
-        ({"chunk_size": 2}, "n_action_steps: expected at most chunk_size 2"),
-        ({"soft_prompt": 1}, "soft_prompt: expected a key of ACTConfig"),
-        ({"input_features/observation.images.top/shape": [3, 20, 40]}, "expected cameras of one size, found 40 x 20, 40 x 33"),
-        ({"input_features/observation.velocity": {"type": "STATE", "shape": [2]}}, "input_features.observation.velocity: expected cameras"),
-        ({"input_features/observation.state": None}, "input_features.observation.state: expected type STATE"),
-        ({"input_features": {"observation.state": {"type": "STATE", "shape": [2]}}}, "expected a VISUAL feature or several"),
+        ("vision_backbone", "resnet50", "vision_backbone: expected resnet18 or resnet34"),
+        ("replace_final_stride_with_dilation", True, "replace_final_stride_with_dilation: expected False"),
+        ("feedforward_activation", "glu", "feedforward_activation: expected relu or gelu"),
+        ("pre_norm", 1, "pre_norm: expected true or false"),
+        ("n_heads", 3, "n_heads: expected a divisor of dim_model 8"),
+        ("dim_model", 6, "dim_model: expected a multiple of 4"),
+        ("temporal_ensemble_coeff", -0.1, "temporal_ensemble_coeff: expected 0 or more"),
+        ("n_obs_steps", 2, "n_obs_steps: expected 1"),
+        ("chunk_size", 2, "n_action_steps: expected at most chunk_size 2"),
+        ("soft_prompt", 1, "soft_prompt: expected a key of ACTConfig"),
+        ("input_features/observation.images.top/shape", [3, 20, 40], "expected cameras of one size, found 40 x 20, 40 x 33"),
+        ("input_features/observation.velocity", {"type": "STATE", "shape": [2]}, "input_features.observation.velocity: expected cameras"),
+        ("input_features", {"observation.images.top": {"type": "VISUAL", "shape": [3, 33, 40]}}, "input_features.observation.state: expected type STATE"),
+        ("input_features", {"observation.state": {"type": "STATE", "shape": [2]}}, "expected a VISUAL feature or several"),
     ],
 )
-def test_what_the_runtime_does_not_do_is_refused_by_name(planned, change, message):
-    assert message in refusal(planned, change)
+def test_what_the_runtime_does_not_do_is_refused_by_name(refusal, path, value, message):
+    assert message in refusal(path=path, value=value)
 
 
-def test_missing_statistics_of_a_camera_are_refused(planned):
-    def other_file(content):
-        step = next(step for step in content["steps"] if "state_file" in step)
-        del step["state_file"]
-
-    message = refusal(planned, processor=other_file)
+def test_missing_statistics_of_a_camera_are_refused(refusal):
+    message = refusal("policy_preprocessor.json", "steps/3/state_file", None)
     assert "statistics of observation.images.wrist: mean: expected 3 numbers for MEAN_STD" in message
 
 
-def test_a_feature_that_the_processor_leaves_out_is_refused(planned):
-    def narrowed(content):
-        step = next(step for step in content["steps"] if step["registry_name"] == "normalizer_processor")
-        step["config"]["normalize_observation_keys"] = ["observation.state"]
-
-    assert "normalize_observation_keys: expected observation.images.top among them" in refusal(planned, processor=narrowed)
+def test_a_feature_that_the_processor_leaves_out_is_refused(refusal):
+    message = refusal("policy_preprocessor.json", "steps/3/config/normalize_observation_keys", ["observation.state"])
+    assert "normalize_observation_keys: expected observation.images.top among them" in message
 
 
-def test_ensembling_is_the_clients_and_told(planned):
-    _, checkpoint = planned({"temporal_ensemble_coeff": 0.01, "n_action_steps": 1})
+def test_ensembling_is_the_clients_and_told():
+    checkpoint = of_config(SMALL.config | {"temporal_ensemble_coeff": 0.01, "n_action_steps": 1})
+    sizes_of(read_sizes, checkpoint)
     assert any('blend="ensemble", decay=0.01' in note for note in checkpoint.notes)

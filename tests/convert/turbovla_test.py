@@ -3,19 +3,18 @@
 """TurboVLA: names against the reference's and the runtime's, its backbones' configs, its tokenizer, refusals."""
 
 import json
-import shutil
 
 import pytest
 
+from configs import of_config, sizes_of
 from goldens import turbovla
 from goldens.files import write_json
 from manifests import check_keys, check_parameters
-from vla_cpp.convert.archs import Options, load
+from vla_cpp.convert.archs import Options
 from vla_cpp.convert.archs.turbovla import mapping
 from vla_cpp.convert.archs.turbovla.config import read_sizes
-from vla_cpp.convert.checkpoint import Checkpoint, open_checkpoint
-from vla_cpp.convert.errors import ConvertError, Problems
 
+ARCH = "turbovla"
 VIEWS = {"top": (33, 40), "wrist": (20, 24)}
 SMALL = turbovla.Checkpoint(
     turbovla.vision(24, 1, 3, 20, 4, 2), turbovla.text(20, 1, 2, 28, 16), turbovla.policy(3, 8, 2, 12, (1, 1), 8, max_language_tokens=6), VIEWS, 2, 2
@@ -23,72 +22,29 @@ SMALL = turbovla.Checkpoint(
 PUBLISHED = turbovla.published({"image": (256, 256), "wrist_image": (256, 256)})
 
 
-def configs(checkpoint, folder):
-    """A checkpoint of the same configs without weights, whose tower is known by its name."""
+def sizes_at(checkpoint, folder):
+    """Of the same configs, with the tower known by its name."""
     write_json(folder / "config.json", checkpoint.config)
     language = {"model_type": "bert", "vocab_size": checkpoint.n_vocab} | checkpoint.text
     write_json(folder / "language_encoder/config.json", language)
-    return Checkpoint("published", str(folder), "", checkpoint.config, {}, {}, {}, None)
-
-
-def sizes_of(checkpoint):
-    problems = Problems("published")
-    sizes = read_sizes(checkpoint, Options(), problems)
-    problems.raise_any()
-    return sizes
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("turbovla")
-    SMALL.write(1, path)
-    return path
-
-
-@pytest.fixture
-def planned(folder, tmp_path):
-    """Plans a checkpoint of which a JSON file has another value at a path."""
-
-    def plan(file="config.json", path=None, value=None, options=None, without=None):
-        shutil.copytree(folder, tmp_path / "policy")
-        if path is not None:
-            content = json.loads((tmp_path / "policy" / file).read_text())
-            *parents, last = path.split("/")
-            place = content
-            for parent in parents:
-                place = place[int(parent) if isinstance(place, list) else parent]
-            place[last] = value
-            write_json(tmp_path / "policy" / file, content)
-        if without:
-            shutil.rmtree(tmp_path / "policy" / without)
-        checkpoint, problems = open_checkpoint(str(tmp_path / "policy"), {}), Problems("test")
-        made = load("turbovla").plan(checkpoint, options or Options(), problems)
-        problems.raise_any()
-        return {key.name: key.value for key in made.keys}, made
-
-    return plan
-
-
-def refusal(planned, *args, **kwargs):
-    with pytest.raises(ConvertError) as caught:
-        planned(*args, **kwargs)
-    return str(caught.value)
+    return sizes_of(read_sizes, of_config(checkpoint.config, folder=folder))
 
 
 @pytest.mark.parametrize("checkpoint", [PUBLISHED, *(case.checkpoint for case in turbovla.CASES.values())])
 def test_every_config_asks_for_the_tensors_of_the_reference(checkpoint, tmp_path):
-    checkpoint.write(1, tmp_path) if checkpoint is not PUBLISHED else configs(checkpoint, tmp_path)
-    sizes = sizes_of(configs(checkpoint, tmp_path))
+    if checkpoint is not PUBLISHED:
+        checkpoint.write(1, tmp_path)
+    sizes = sizes_at(checkpoint, tmp_path)
     rows = [*mapping.weights(sizes), *mapping.dropped(sizes)]
     assert {row.source: row.stored for row in rows} == checkpoint.shapes()
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares(tmp_path):
-    check_parameters("turbovla", mapping.weights(sizes_of(configs(PUBLISHED, tmp_path))))
+    check_parameters("turbovla", mapping.weights(sizes_at(PUBLISHED, tmp_path)))
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest(tmp_path):
-    check_keys("turbovla", mapping.network_keys(sizes_of(configs(PUBLISHED, tmp_path))))
+    check_keys("turbovla", mapping.network_keys(sizes_at(PUBLISHED, tmp_path)))
 
 
 def test_the_recipe_is_that_of_the_reference(planned):
@@ -119,18 +75,17 @@ def test_a_model_of_an_older_file_states_no_type(planned, folder):
 
 
 def test_the_language_models_folder_is_given_or_inside(planned, folder):
-    keys, _ = planned(without="language_encoder", options=Options(backbone=str(folder / "language_encoder")))
+    keys, _ = planned(without=["language_encoder"], options=Options(backbone=str(folder / "language_encoder")))
     assert keys["lm.d_model"] == 20
 
 
-def test_without_the_language_models_config_the_option_is_named(planned):
-    assert "expected --backbone DIR, or language_encoder/ inside the checkpoint" in refusal(planned, without="language_encoder")
+def test_without_the_language_models_config_the_option_is_named(refusal):
+    assert "expected --backbone DIR, or language_encoder/ inside the checkpoint" in refusal(without=["language_encoder"])
 
 
-def test_another_tower_needs_its_config(planned):
-    assert "vision_backbone: expected facebook/dinov3-vits16-pretrain-lvd1689m or" in refusal(
-        planned, path="vision_backbone", value="facebook/dinov3-vith16plus-pretrain-lvd1689m", without="vision_encoder"
-    )
+def test_another_tower_needs_its_config(refusal):
+    message = refusal(path="vision_backbone", value="facebook/dinov3-vith16plus-pretrain-lvd1689m", without=["vision_encoder"])
+    assert "vision_backbone: expected facebook/dinov3-vits16-pretrain-lvd1689m or" in message
 
 
 @pytest.mark.parametrize(
@@ -165,5 +120,5 @@ def test_another_tower_needs_its_config(planned):
         ("language_encoder/tokenizer_config.json", "tokenizer_class", "BertJapaneseTokenizer", "tokenizer_class: expected"),
     ],
 )
-def test_what_the_runtime_does_not_do_is_refused_by_name(planned, file, path, value, message):
-    assert message in refusal(planned, file, path, value)
+def test_what_the_runtime_does_not_do_is_refused_by_name(refusal, file, path, value, message):
+    assert message in refusal(file, path, value)

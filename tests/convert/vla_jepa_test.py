@@ -8,16 +8,18 @@ import shutil
 import numpy as np
 import pytest
 
+from configs import of_config, sizes_of
 from goldens import vla_jepa
 from goldens.files import write_json
 from manifests import check_keys, check_parameters
-from vla_cpp.convert.archs import Options, load
+from vla_cpp.convert.archs import Options
 from vla_cpp.convert.archs.vla_jepa import mapping
 from vla_cpp.convert.archs.vla_jepa.config import read_sizes
 from vla_cpp.convert.checkpoint import open_checkpoint
 from vla_cpp.convert.conversion import convert_checkpoint
-from vla_cpp.convert.errors import ConvertError, Problems
+from vla_cpp.convert.errors import ConvertError
 
+ARCH = "vla_jepa"
 VIEWS = {"top": (30, 40), "wrist": (30, 40)}
 SIZES = vla_jepa.vision(8, 2, 1, 12, 3, (0, 1)), vla_jepa.text(12, 2, 2, 1, 8, 16, (2, 1, 1))
 POLICY = vla_jepa.policy(3, 2, (1, 6), 2, 8, 2, resize_images_to=[20, 20], num_action_tokens_per_timestep=2)
@@ -34,72 +36,26 @@ class Odd(vla_jepa.Checkpoint):
         return out | {"model.action_model.extra.weight": (2, 2), "model.action_model.action_decoder.layer2.bias": (8,)}
 
 
-def opened(checkpoint, folder):
+def sizes_at(checkpoint, folder):
     checkpoint.write(1, folder)
-    return open_checkpoint(str(folder), {})
-
-
-def sizes_of(checkpoint):
-    problems = Problems("test")
-    sizes = read_sizes(checkpoint, Options(), problems)
-    problems.raise_any()
-    return sizes
+    return sizes_of(read_sizes, open_checkpoint(str(folder), {}))
 
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory):
-    """Configs without weights."""
-    from vla_cpp.convert.checkpoint import Checkpoint
-
+    """Sizes at the published configs."""
     folder = tmp_path_factory.mktemp("published")
     PUBLISHED.backbone.write_backbone(folder / "vlm")
-    return sizes_of(Checkpoint("published", str(folder), "", PUBLISHED.config, {}, {}, {}, None))
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("vla_jepa")
-    SMALL.write(1, path)
-    return path
-
-
-@pytest.fixture
-def planned(folder, tmp_path):
-    """Plans a checkpoint of which a JSON file has another value at a path; none: without what is there."""
-
-    def plan(file="config.json", path=None, value=None, without=()):
-        shutil.copytree(folder, tmp_path / "policy")
-        if path is not None:
-            content = json.loads((tmp_path / "policy" / file).read_text())
-            *parents, last = path.split("/")
-            place = content
-            for parent in parents:
-                place = place[int(parent) if isinstance(place, list) else parent]
-            place[int(last) if isinstance(place, list) else last] = value
-            write_json(tmp_path / "policy" / file, content)
-        for name in without:
-            (tmp_path / "policy" / name).unlink()
-        checkpoint, problems = open_checkpoint(str(tmp_path / "policy"), {}), Problems("test")
-        made = load("vla_jepa").plan(checkpoint, Options(), problems)
-        problems.raise_any()
-        return {key.name: key.value for key in made.keys}, made
-
-    return plan
+    return sizes_of(read_sizes, of_config(PUBLISHED.config, folder=folder))
 
 
 def recipe_of(keys):
     return json.loads(keys["processor.recipe"])
 
 
-def refusal(planned, *args, **kwargs):
-    with pytest.raises(ConvertError) as caught:
-        planned(*args, **kwargs)
-    return str(caught.value)
-
-
 @pytest.mark.parametrize("case", vla_jepa.CASES.values())
 def test_every_config_asks_for_the_tensors_of_the_reference(case, tmp_path):
-    sizes = sizes_of(opened(case.checkpoint, tmp_path))
+    sizes = sizes_at(case.checkpoint, tmp_path)
     sizes.lm.n_vocab = case.checkpoint.n_row
     rows = {row.source: row.stored for row in [*mapping.weights(sizes), *mapping.dropped(sizes)]}
     stored = case.checkpoint.shapes()
@@ -194,8 +150,8 @@ def test_tensors_of_a_world_model_that_the_config_denies_are_refused(tmp_path, f
         convert_checkpoint(str(tmp_path / "policy"), str(tmp_path / "odd.gguf"), Options())
 
 
-def test_without_pipelines_nothing_is_assumed(planned):
-    message = refusal(planned, without=("policy_preprocessor.json", "policy_postprocessor.json"))
+def test_without_pipelines_nothing_is_assumed(refusal):
+    message = refusal(without=["policy_preprocessor.json", "policy_postprocessor.json"])
     assert "expected the pipelines that LeRobot saves with this policy" in message
 
 
@@ -234,14 +190,14 @@ def test_without_pipelines_nothing_is_assumed(planned):
         ("policy_postprocessor.json", "steps/0/registry_name", "vla_jepa_wink", "expected one of unnormalizer_processor"),
     ],
 )
-def test_what_the_runtime_does_not_do_is_refused_by_name(planned, file, path, value, message):
-    assert message in refusal(planned, file, path, value)
+def test_what_the_runtime_does_not_do_is_refused_by_name(refusal, file, path, value, message):
+    assert message in refusal(file, path, value)
 
 
 def test_cameras_of_several_sizes_need_a_size_of_the_policys(tmp_path):
     mixed = vla_jepa.Checkpoint(*SIZES, POLICY | {"resize_images_to": None}, {"top": (30, 40), "wrist": (20, 20)}, 2, 7, side=24)
     with pytest.raises(ConvertError, match="input_features: expected cameras of one size, since resize_images_to is null"):
-        sizes_of(opened(mixed, tmp_path))
+        sizes_at(mixed, tmp_path)
 
 
 def test_a_world_model_without_its_encoder_leaves_the_prompt_open(tmp_path):
@@ -250,4 +206,4 @@ def test_a_world_model_without_its_encoder_leaves_the_prompt_open(tmp_path):
             return {}
 
     with pytest.raises(ConvertError, match="patch_embeddings.proj.weight: expected \\(width, 3, frames, 16, 16\\)"):
-        sizes_of(opened(Half(*SIZES, POLICY, VIEWS, 2, 7, side=24), tmp_path))
+        sizes_at(Half(*SIZES, POLICY, VIEWS, 2, 7, side=24), tmp_path)

@@ -3,22 +3,21 @@
 """X-VLA: names against the reference's and the runtime's, both spellings of its backbone, domains, its tokenizer, refusals."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
 
+from configs import of_config, sizes_of
 from goldens import xvla
-from goldens.files import write_json
 from manifests import check_keys, check_parameters
-from vla_cpp.convert.archs import Options, load
+from vla_cpp.convert.archs import Options
 from vla_cpp.convert.archs.xvla import mapping
 from vla_cpp.convert.archs.xvla.config import read_sizes
-from vla_cpp.convert.checkpoint import Checkpoint, open_checkpoint
-from vla_cpp.convert.conversion import _pieces
-from vla_cpp.convert.embodiments import plan_robots
-from vla_cpp.convert.errors import ConvertError, Problems
+from vla_cpp.convert.checkpoint import open_checkpoint
+from vla_cpp.convert.conversion import _pieces, convert_checkpoint
+from vla_cpp.convert.errors import ConvertError
 
+ARCH = "xvla"
 VIEWS = {"top": (33, 40), "wrist": (20, 24)}
 SMALL = xvla.Checkpoint(
     xvla.vision((8, 12), (1, 1), (2, 3), (2, 4), 2, 8),
@@ -31,65 +30,23 @@ SMALL = xvla.Checkpoint(
 PUBLISHED = xvla.published({"image": (256, 256), "image2": (256, 256), "image3": (256, 256)})
 
 
-def sizes_of(checkpoint):
-    problems = Problems("published")
-    tensors = dict.fromkeys(checkpoint.stored())
-    sizes = read_sizes(Checkpoint("published", "", "", checkpoint.config, tensors, {}, {}, None), Options(), problems)
-    problems.raise_any()
-    return sizes
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("xvla")
-    SMALL.write(1, path)
-    return path
-
-
-@pytest.fixture
-def planned(folder, tmp_path):
-    """Plans a checkpoint of which a JSON file has another value at a path."""
-
-    def plan(file="config.json", path=None, value=None, options=None, without=None):
-        shutil.copytree(folder, tmp_path / "policy")
-        if path is not None:
-            content = json.loads((tmp_path / "policy" / file).read_text())
-            *parents, last = path.split("/")
-            place = content
-            for parent in parents:
-                place = place[int(parent) if isinstance(place, list) else parent]
-            place[int(last) if isinstance(place, list) else last] = value
-            write_json(tmp_path / "policy" / file, content)
-        if without:
-            gone = tmp_path / "policy" / without
-            shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
-        checkpoint, problems = open_checkpoint(str(tmp_path / "policy"), {}), Problems("test")
-        made = plan_robots(load("xvla"), checkpoint, options or Options(), problems)
-        problems.raise_any()
-        return {key.name: key.value for key in made.keys}, made
-
-    return plan
-
-
-def refusal(planned, *args, **kwargs):
-    with pytest.raises(ConvertError) as caught:
-        planned(*args, **kwargs)
-    return str(caught.value)
+def sizes_at(checkpoint):
+    return sizes_of(read_sizes, of_config(checkpoint.config, checkpoint.stored()))
 
 
 @pytest.mark.parametrize("checkpoint", [PUBLISHED, *(case.checkpoint for case in xvla.CASES.values())])
 def test_every_config_asks_for_the_tensors_of_the_reference(checkpoint):
-    sizes = sizes_of(checkpoint)
+    sizes = sizes_at(checkpoint)
     rows = [*mapping.weights(sizes), *(row for row in mapping.dropped(sizes) if not row.source.endswith("final_logits_bias"))]
     assert {row.source: row.stored for row in rows} == {name: shape for name, (_, shape) in checkpoint.stored().items()}
 
 
 def test_names_shapes_and_storage_are_those_that_the_runtime_declares():
-    check_parameters("xvla", mapping.weights(sizes_of(PUBLISHED)))
+    check_parameters("xvla", mapping.weights(sizes_at(PUBLISHED)))
 
 
 def test_sizes_at_the_published_config_are_those_of_the_runtimes_manifest():
-    sizes = sizes_of(PUBLISHED)
+    sizes = sizes_at(PUBLISHED)
     sizes.n_token, sizes.pad_token = 50, 1
     check_keys("xvla", mapping.network_keys(sizes))
 
@@ -125,18 +82,18 @@ def test_frames_that_are_not_resized_have_the_size_of_the_features():
     state = {"type": "STATE", "shape": [20]}
     features = {"observation.state": state, "observation.images.top": same, "observation.images.wrist": same}
     config = SMALL.config | {"resize_imgs_with_padding": None, "input_features": features}
-    sizes = read_sizes(Checkpoint("x", "", "", config, {}, {}, {}, None), Options(), Problems("x"))
+    sizes = sizes_of(read_sizes, of_config(config))
     assert sizes.frame == (40, 33) and not sizes.resizes
 
 
 def test_the_first_row_behind_two_is_that_of_the_first_position():
-    row = next(row for row in mapping.weights(sizes_of(SMALL)) if row.target == "lm.position.weight")
+    row = next(row for row in mapping.weights(sizes_at(SMALL)) if row.target == "lm.position.weight")
     assert row.first == 2 and row.stored[0] == row.shape[0] + 2
 
 
 def test_a_domains_matrix_and_a_convolution_come_as_they_are_multiplied(folder):
     checkpoint = open_checkpoint(str(folder), {})
-    sizes = sizes_of(SMALL)
+    sizes = sizes_at(SMALL)
     sizes.domain = 1
     rows = {row.target: row for row in mapping.weights(sizes)}
 
@@ -167,34 +124,29 @@ def test_several_domains_share_all_but_their_layers(planned):
 
 
 @pytest.mark.parametrize("domain", ["3", "-1", "01", "arm"])
-def test_a_domain_that_there_is_none_of_is_refused(planned, domain):
-    message = refusal(planned, options=Options(embodiment=domain))
+def test_a_domain_that_there_is_none_of_is_refused(refusal, domain):
+    message = refusal(options=Options(embodiment=domain))
     assert "--embodiment: expected the number of a domain, below num_domains 3, found " + domain in message
 
 
-def test_a_checkpoint_without_processor_files_is_refused(folder, tmp_path):
-    shutil.copytree(folder, tmp_path / "policy")
-    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
-        (tmp_path / "policy" / name).unlink()
-    with pytest.raises(ConvertError, match="policy_preprocessor.json: expected the file beside model.safetensors"):
-        load("xvla").plan(open_checkpoint(str(tmp_path / "policy"), {}), Options(), Problems("test"))
+def test_a_checkpoint_without_processor_files_is_refused(refusal):
+    message = refusal(without=["policy_preprocessor.json", "policy_postprocessor.json"])
+    assert "policy_preprocessor.json: expected the file beside model.safetensors" in message
 
 
 def test_the_tokenizers_folder_is_given_or_inside(planned, folder):
-    keys, _ = planned(without="tokenizer", options=Options(backbone=str(folder / "tokenizer")))
+    keys, _ = planned(without=["tokenizer"], options=Options(backbone=str(folder / "tokenizer")))
     assert keys["tokenizer.kind"] == "byte_level_bpe"
 
 
-def test_without_a_tokenizer_the_option_is_named(planned):
-    assert "expected --backbone DIR, or tokenizer/ inside the checkpoint" in refusal(planned, without="tokenizer")
+def test_without_a_tokenizer_the_option_is_named(refusal):
+    assert "expected --backbone DIR, or tokenizer/ inside the checkpoint" in refusal(without=["tokenizer"])
 
 
 def test_a_space_of_which_the_state_has_another_width_is_refused():
     config = SMALL.config | {"action_mode": "so101_bimanual", "max_state_dim": 22}
-    problems = Problems("x")
-    read_sizes(Checkpoint("x", "", "", config, {}, {}, {}, None), Options(), problems)
     with pytest.raises(ConvertError, match="max_state_dim: expected 20, with use_proprio, for action_mode so101_bimanual"):
-        problems.raise_any()
+        sizes_of(read_sizes, of_config(config))
 
 
 def test_a_float32_checkpoint_that_the_reference_rounds_is_rounded(planned):
@@ -241,14 +193,12 @@ def test_a_float32_checkpoint_that_the_reference_rounds_is_rounded(planned):
         ("tokenizer/tokenizer_config.json", "pad_token", "<none>", "pad_token: expected a token"),
     ],
 )
-def test_what_the_runtime_does_not_do_is_refused_by_name(planned, file, path, value, message):
-    assert message in refusal(planned, file, path, value)
+def test_what_the_runtime_does_not_do_is_refused_by_name(refusal, file, path, value, message):
+    assert message in refusal(file, path, value)
 
 
 @pytest.mark.parametrize("vendored", [False, True])
 def test_missing_extra_and_misshapen_tensors_are_named_in_one_error(tmp_path, vendored):
-    from vla_cpp.convert.conversion import convert_checkpoint
-
     class Wrong(xvla.Checkpoint):
         def shapes(self):
             shapes = super().shapes()
