@@ -52,7 +52,7 @@ def write_observation(case, folder):
         if frame:
             image = Image.fromarray(smooth_frame(frame[0], frame[1], generator))
             image.save(folder / images[view], **({"quality": 92} if frame[2] == "jpg" else {"optimize": True}))
-    widths = getattr(checkpoint, "states", None)  # feature -> width
+    widths = getattr(checkpoint, "states", None if checkpoint.d_state else {})  # feature -> width; None: all are of one feature
     state = generator.normal(checkpoint.d_state if widths is None else sum(widths.values())) * f32(0.4)
     for i in checkpoint.zero_spread:  # what never moved in the data does not move here; otherwise eps would rule the chunk
         state[i] = statistics(checkpoint.d_state, checkpoint.d_action, case.seed)["observation.state"]["mean"][i]

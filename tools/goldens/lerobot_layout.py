@@ -20,9 +20,11 @@ def feature(kind, *shape):
 
 
 def features(views, d_state, d_action, empty=()):
-    """(input features, output features).  views: name -> (height, width); empty: those of the cameras that a policy adds."""
+    """(input features, output features).  views: name -> (height, width); d_state: 0 where a policy reads no state; empty: the views of the
+    cameras that a policy adds."""
+    state = {"observation.state": feature("STATE", d_state)} if d_state else {}
     shown = {f"observation.images.{v}": feature("VISUAL", 3, *size) for v, size in (*views.items(), *empty)}
-    return {"observation.state": feature("STATE", d_state)} | shown, {"action": feature("ACTION", d_action)}
+    return state | shown, {"action": feature("ACTION", d_action)}
 
 
 def empty_cameras(n, height, width):

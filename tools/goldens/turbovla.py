@@ -45,14 +45,7 @@ class Checkpoint:
     @property
     def config(self):
         inputs, outputs = layout.features(self.views, self.d_state, self.d_action)
-        if not self.d_state:
-            del inputs["observation.state"]
         return {"type": "turbovla"} | layout.COMMON | {"input_features": inputs, "output_features": outputs} | CONFIG | self.policy
-
-    @property
-    def states(self):
-        """Width by feature, where it is not the one."""
-        return None if self.d_state else {}
 
     def shapes(self):
         c, d, fusion, decoder = self.config, self.config["dim_model"], "model.vl_interaction.", "model.action_decoder."

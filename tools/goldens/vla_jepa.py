@@ -64,15 +64,8 @@ class Checkpoint:
     @property
     def config(self):
         inputs, outputs = layout.features(self.views, self.d_state, self.d_action)
-        if not self.d_state:
-            del inputs["observation.state"]
         widths = {"action_dim": self.d_action, "state_dim": self.d_state}
         return {"type": "vla_jepa"} | layout.COMMON | {"input_features": inputs, "output_features": outputs} | CONFIG | widths | self.policy
-
-    @property
-    def states(self):
-        """Width by feature, where it is not the one."""
-        return None if self.d_state else {}
 
     @property
     def backbone(self):

@@ -62,8 +62,6 @@ class Checkpoint:
     @property
     def config(self):
         inputs, outputs = layout.features(self.views, self.d_state, self.d_action)
-        if not self.d_state:
-            del inputs["observation.state"]
         return {"type": "xvla"} | layout.COMMON | {"input_features": inputs, "output_features": outputs} | CONFIG | self.policy | {
             "florence_config": self.florence}
 
@@ -78,11 +76,6 @@ class Checkpoint:
             text["model_type"] = "florence2_language"
         return {"model_type": "florence2", "pad_token_id": 1, "bos_token_id": 0, "eos_token_id": 2, "projection_dim": vision["projection_dim"],
                 "vision_config": vision, "text_config": text}
-
-    @property
-    def states(self):
-        """Width by feature, where it is not the one."""
-        return None if self.d_state else {}
 
     @property
     def d_token(self):
