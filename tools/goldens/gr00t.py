@@ -6,7 +6,6 @@ A checkpoint serves several robots, with cameras, keys and statistics of their o
 case is.
 """
 
-import contextlib
 import json
 import math
 from dataclasses import dataclass, field
@@ -24,19 +23,6 @@ RELATIVE = ABSOLUTE | {"rep": "RELATIVE"}
 # Where residual streams begin, and what is added to them.
 FAINT = ("patch_embed", "pos_embed", "attn.proj", "linear_fc2", "embed_tokens", "o_proj", "down_proj", "vlln", "to_out", "ff.net.2",
          "state_encoder.layer2", "W3", "position_embedding")
-
-
-@contextlib.contextmanager
-def given_noise(noise):
-    """The head draws its start itself: here it gets `noise`."""
-    import torch
-
-    draw, torch.randn = torch.randn, lambda size, dtype, device: noise.reshape(size).to(dtype)
-    try:
-        with torch.inference_mode():
-            yield
-    finally:
-        torch.randn = draw
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ from . import gr00t
 from .cases import backbone_folder, copy_tokenizer
 from .draw import bfloat16
 from .files import write_json
-from .gr00t import POSE, HeadTaps, Robot, case, embodiment, given_noise, head
+from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
 from .parameters import decoder, linear, norm, siglip, tower
+from .recorder import given_noise
 from .train_tokenizer import EAGLE
 
 N_MERGE = 60

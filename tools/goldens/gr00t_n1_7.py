@@ -16,8 +16,9 @@ from pathlib import Path
 from . import gr00t
 from .cases import backbone_folder, copy_tokenizer
 from .files import write_json
-from .gr00t import POSE, HeadTaps, Robot, case, embodiment, given_noise, head
+from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
 from .parameters import decoder, linear, norm
+from .recorder import given_noise
 from .train_tokenizer import QWEN_VL
 
 HUB_NAME = "nvidia/Cosmos-Reason2-2B"

@@ -9,6 +9,7 @@ views are dropped everywhere, since a runtime need not represent them.
 Needs torch, lerobot and gguf; importing this module does not.
 """
 
+import contextlib
 import importlib.machinery
 import importlib.metadata
 import json
@@ -126,6 +127,19 @@ def read_observation(case):
             pixels = np.asarray(Image.open(case / file).convert("RGB"))
             batch[f"observation.images.{view}"] = torch.from_numpy(pixels.copy()).permute(2, 0, 1).float().div(255)
     return batch
+
+
+@contextlib.contextmanager
+def given_noise(noise):
+    """Of a reference that draws its start itself: inside, what it draws is `noise`, and no gradients are kept."""
+    import torch
+
+    draw, torch.randn = torch.randn, lambda *sizes, size=None, dtype, device: noise.reshape(size or sizes).to(dtype)
+    try:
+        with torch.inference_mode():
+            yield
+    finally:
+        torch.randn = draw
 
 
 class Taps:

@@ -18,6 +18,7 @@ from .cases import Case, backbone_folder
 from .files import bfloat16_bits, write_json, write_stream
 from .gr00t_n1_7 import N_VOCAB, TOKENS, QwenTaps, text, vision
 from .parameters import linear, parameter, statistics
+from .recorder import given_noise
 
 NAMES = {"vla_jepa": "lerobot.policies.vla_jepa.VLAJEPAPolicy"}
 HUB_NAME = "Qwen/Qwen3-VL-2B-Instruct"
@@ -198,19 +199,6 @@ CASES = {
 
 
 # --- the reference ---------------------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def given_noise(noise):
-    """The head draws its start itself: here it gets `noise`."""
-    import torch
-
-    draw, torch.randn = torch.randn, lambda *size, dtype, device: noise.reshape(size).to(dtype)
-    try:
-        with torch.inference_mode():
-            yield
-    finally:
-        torch.randn = draw
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from . import lerobot_layout as layout
 from .cases import Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics
-from .recorder import Taps
+from .recorder import Taps, given_noise
 
 NAMES = {"xvla": "lerobot.policies.xvla.XVLAPolicy"}
 HUB_NAME = "facebook/bart-large"
@@ -277,22 +277,15 @@ def load(checkpoint, dtype="float32"):
     policy = XVLAPolicy.from_pretrained(folder, config=config).eval()
     generate, space = policy._get_action_chunk, policy.model.action_space
     finish, space.postprocess = space.postprocess, lambda x: x[..., : finish(x.clone()).shape[-1]]
-    policy.predict_action_chunk = lambda batch, noise: generated(generate, batch, noise)
+
+    def predict(batch, noise):
+        with given_noise(noise):
+            return generate(dict(batch))
+
+    policy.predict_action_chunk = predict
     tokenizer = {"tokenizer_processor": {"tokenizer_name": str(Path(checkpoint) / "tokenizer")}}
     before, after = make_pre_post_processors(config, pretrained_path=folder, preprocessor_overrides=tokenizer)
     return policy, before, lambda chunk: after(finish(chunk.clone()))
-
-
-def generated(generate, batch, noise):
-    """The reference draws its start itself: here it gets `noise`."""
-    import torch
-
-    draw, torch.randn = torch.randn, lambda *size, dtype, device: noise.reshape(size).to(dtype)
-    try:
-        with torch.inference_mode():
-            return generate(dict(batch))
-    finally:
-        torch.randn = draw
 
 
 class Recorder(Taps):
