@@ -225,9 +225,6 @@ def case(seed, frames, instruction, description, **more):
 
 POSE = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 1)
 
-FRAMES = {view: (256, 256, "png") for view in ("image", "wrist_image")}  # of a case of the published size
-
-
 def published(checkpoint, views, tag, index, vision, text, head, *how, **more):
     """The published size, for a robot of LIBERO's with these views."""
     robot = Robot(tuple(views), POSE | {"gripper": 2}, POSE | {"gripper": 1}, 16)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from . import gr00t
-from .cases import backbone_folder, copy_tokenizer
+from .cases import LIBERO_FRAMES, backbone_folder, copy_tokenizer
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
 from .gr00t_n1_6 import N_VOCAB, TOKENS, text, text_config
@@ -142,7 +142,7 @@ CASES = {
 
 
 OPTIONS = {"variant": "data_config.json", "embodiment": "my_arm"}
-FRAMES = gr00t.FRAMES
+FRAMES = LIBERO_FRAMES
 
 
 def published(views, arch="gr00t_n1_5"):

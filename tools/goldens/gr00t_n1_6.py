@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from . import gr00t
-from .cases import backbone_folder, copy_tokenizer
+from .cases import LIBERO_FRAMES, backbone_folder, copy_tokenizer
 from .draw import bfloat16
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
@@ -139,7 +139,7 @@ CASES = {
 
 
 OPTIONS = {"embodiment": "libero_panda"}
-FRAMES = gr00t.FRAMES
+FRAMES = LIBERO_FRAMES
 
 
 def published(views, arch="gr00t_n1_6"):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import gr00t
-from .cases import backbone_folder, copy_tokenizer
+from .cases import LIBERO_FRAMES, backbone_folder, copy_tokenizer
 from .files import write_json
 from .gr00t import POSE, HeadTaps, Robot, case, embodiment, head
 from .parameters import decoder, linear, norm
@@ -161,7 +161,7 @@ CASES = {
 
 
 OPTIONS = {"embodiment": "libero_sim"}
-FRAMES = gr00t.FRAMES
+FRAMES = LIBERO_FRAMES
 
 
 def published(views, arch="gr00t_n1_7"):

@@ -7,14 +7,13 @@ the policy and is not asked at inference, it has two tensors of each half.
 """
 
 import contextlib
-import json
 import types
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import gr00t_n1_7
 from . import lerobot_layout as layout
-from .cases import Case, backbone_folder
+from .cases import LIBERO_FRAMES, LIBERO_TEXT, Case, backbone_folder
 from .files import bfloat16_bits, write_json, write_stream
 from .gr00t_n1_7 import N_VOCAB, TOKENS, QwenTaps, text, vision
 from .parameters import linear, parameter, statistics
@@ -142,8 +141,7 @@ def head_shapes(c, d_context):
     return out | {f"{HEAD}future_tokens.weight": (c["num_embodied_action_tokens_per_instruction"], d), f"{HEAD}position_embedding.weight": (n_position, d)}
 
 
-FRAMES = {"image": (256, 256, "png"), "wrist_image": (256, 256, "png")}  # of the published size
-TEXT = "pick up the black bowl between the plate and the ramekin and place it on the plate"
+FRAMES, TEXT = LIBERO_FRAMES, LIBERO_TEXT
 
 
 def published(views, arch="vla_jepa"):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import Case, copy_tokenizer
+from .cases import LIBERO_TEXT, Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps, given_noise
@@ -194,8 +194,7 @@ def old_name(name):
     return name
 
 
-FRAMES = {"image": (256, 256, "png"), "image2": (256, 256, "png"), "image3": (256, 256, "png")}  # of the published size
-TEXT = "pick up the black bowl between the plate and the ramekin and place it on the plate"
+FRAMES, TEXT = {view: (256, 256, "png") for view in ("image", "image2", "image3")}, LIBERO_TEXT  # of the published size
 
 
 def published(views, arch="xvla"):
