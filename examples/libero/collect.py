@@ -22,12 +22,12 @@ Work that is already on disk is kept: run the same command again to continue.
 import argparse
 import multiprocessing
 import os
-import queue
 import sys
 from pathlib import Path
 
 import numpy as np
 from expert import LIMIT, Expert, centre
+from vla_cpp.eval.demonstrations import chunks, leave, reports, write
 from vla_cpp.eval.environments.libero import REST, SENTENCES, SETTLE, THINGS, Libero
 
 TASKS = len(THINGS)
@@ -90,12 +90,6 @@ def halved(frame):
     return (frame.reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3)) + 0.5).astype(np.uint8)
 
 
-def chunks(actions, every):
-    """Actions of an episode -> (n, 16, 7) the chunk at every kept step, and (n, 16) where it is not beyond the end."""
-    steps = np.arange(0, len(actions), every)[:, None] + np.arange(HORIZON)
-    return np.stack(actions)[np.minimum(steps, len(actions) - 1)], steps < len(actions)
-
-
 def demonstration(scene, seed, every):
     """One episode as arrays (see above); empty if the expert failed within the limit."""
     rng = np.random.default_rng([seed, int(scene.task.rpartition("/")[2])])
@@ -123,11 +117,11 @@ def demonstration(scene, seed, every):
             break
     if left is None:
         return {}
-    action, valid = chunks(actions, every)
+    action, valid = chunks(actions, every, HORIZON)
     return {key: np.stack(rows) for key, rows in kept.items()} | {"action": action, "valid": valid, "sentence": scene.instruction()}
 
 
-def work(jobs, done, every):
+def work(jobs, every, done):
     """One process: takes (task, seeds, files) and reports each episode."""
     os.nice(19)
     for task, episodes in iter(jobs.get, None):
@@ -135,15 +129,10 @@ def work(jobs, done, every):
         for seed, path in episodes:
             arrays = demonstration(scene, seed, every)
             if arrays:
-                partial = Path(path).with_suffix(".part")
-                with partial.open("wb") as file:
-                    np.savez(file, task=task, seed=seed, **arrays)
-                partial.replace(path)
+                write(path, {"task": task, "seed": seed, **arrays})
             done.put((task, len(arrays.get("state", ()))))
         scene.close()
-    done.close()
-    done.join_thread()
-    os._exit(0)  # MuJoCo's destructors print errors at a normal exit
+    leave(done)
 
 
 def plan(out, demos):
@@ -166,22 +155,12 @@ def main():
     a = parser.parse_args()
     a.out.mkdir(parents=True, exist_ok=True)
     rounds = plan(a.out, a.demos)
-    context = multiprocessing.get_context("spawn")
-    jobs, done = context.Queue(), context.Queue()
+    jobs = multiprocessing.get_context("spawn").Queue()
     for one in [*rounds, *[None] * a.processes]:
         jobs.put(one)
-    workers = [context.Process(target=work, args=(jobs, done, a.every), daemon=True) for _ in range(a.processes)]
-    for worker in workers:
-        worker.start()
-    count, total, failed = 0, sum(len(episodes) for _, episodes in rounds), 0
-    while count < total:
-        try:
-            task, n = done.get(timeout=5)
-        except queue.Empty:
-            if not any(worker.is_alive() for worker in workers):
-                raise SystemExit("the simulator processes stopped early; their error is above. Run the same command to continue.") from None
-            continue
-        count, failed = count + 1, failed + (n == 0)
+    total, failed = sum(len(episodes) for _, episodes in rounds), 0
+    for count, (task, n) in enumerate(reports(work, [(jobs, a.every)] * a.processes, total), 1):
+        failed += n == 0
         print(f"{count}/{total}: scene {task}, {n or 'not solved, no'} frames", flush=True)
     have = {task: len(list(a.out.glob(f"{task}-*.npz"))) for task in range(TASKS)}
     print(", ".join(f"scene {task}: {n}" for task, n in have.items()) + f"; {failed} tries failed and were left out")

@@ -14,6 +14,7 @@ import os
 import sys
 
 import numpy as np
+from vla_cpp.eval.demonstrations import leave
 from vla_cpp.eval.environments.libero import Libero
 from vla_cpp.eval.statistics import wilson
 
@@ -171,8 +172,7 @@ def _work(tasks, seeds, results):
             results.put((task, seed, *episode(environment, seed), environment.instruction()))
         environment.close()
     results.put(None)
-    results.close(), results.join_thread()
-    os._exit(0)  # MuJoCo's destructors print errors at a normal exit
+    leave(results)
 
 
 def main():

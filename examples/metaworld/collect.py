@@ -16,16 +16,14 @@ thus sees how to come back from mistakes.  Each episode starts with up to 11 mov
 steps after success.  Work that is already on disk is kept: run the same command again to continue.
 """
 import argparse
-import multiprocessing
-import os
-import queue
 import sys
 import zlib
 from pathlib import Path
-from typing import Dict, List, Tuple
+from typing import Any, Dict, List, Tuple
 
 import numpy as np
 
+from vla_cpp.eval.demonstrations import chunks, leave, reports, write
 from sim import HORIZON, LIMIT, TASKS, Scene
 
 STRIDE = 2  # a frame is kept every second step
@@ -58,12 +56,11 @@ def demonstration(scene: Scene, seed: int) -> Dict[str, np.ndarray]:
                 break
     if left is None:
         return {}
-    steps = np.arange(0, len(actions), STRIDE)[:, None] + np.arange(HORIZON)
-    label = np.stack(actions)[np.minimum(steps, len(actions) - 1)]
-    return {"frame": np.stack(frames), "state": np.stack(states), "action": label, "valid": steps < len(actions)}
+    label, valid = chunks(actions, STRIDE, HORIZON)
+    return {"frame": np.stack(frames), "state": np.stack(states), "action": label, "valid": valid}
 
 
-def work(jobs: List[Tuple[str, int, str]], done) -> None:
+def work(jobs: List[Tuple[str, int, str]], done: Any) -> None:
     """One process: makes the episodes (task, seed, file) in order and reports each."""
     scenes: Dict[str, Scene] = {}
     for task, seed, path in jobs:
@@ -71,14 +68,9 @@ def work(jobs: List[Tuple[str, int, str]], done) -> None:
             scenes[task] = Scene(task)
         arrays = demonstration(scenes[task], seed)
         if arrays:
-            partial = Path(path).with_suffix(".part")
-            with partial.open("wb") as f:
-                np.savez(f, task=task, **arrays)
-            partial.replace(path)
+            write(path, {"task": task, **arrays})
         done.put((task, len(arrays.get("frame", ()))))
-    done.close()
-    done.join_thread()
-    os._exit(0)  # the renderer's destructors print errors at a normal exit
+    leave(done)
 
 
 def main() -> int:
@@ -95,20 +87,9 @@ def main() -> int:
     missing = [j for j in jobs if not Path(j[2]).exists()]
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar:
         row = bar.add_task("episodes", total=len(jobs), completed=len(jobs) - len(missing))
-        context = multiprocessing.get_context("spawn")
-        done = context.Queue()
-        workers = [context.Process(target=work, args=(missing[i :: a.processes], done), daemon=True) for i in range(a.processes)]
-        for w in workers:
-            w.start()
-        failed, left = 0, len(missing)
-        while left:
-            try:
-                task, n = done.get(timeout=5)
-            except queue.Empty:
-                if not any(w.is_alive() for w in workers):
-                    raise SystemExit("the simulator processes stopped early; their error is above. Run the same command to continue.")
-                continue
-            failed, left = failed + (n == 0), left - 1
+        failed = 0
+        for task, n in reports(work, [(missing[i :: a.processes],) for i in range(a.processes)], len(missing)):
+            failed += n == 0
             bar.update(row, advance=1, description=f"episodes ({task}: {n} frames)")
     have = {t: len(list(a.out.glob(f"{t}-*.npz"))) for t in TASKS}
     print(", ".join(f"{t} {n}" for t, n in have.items()) + f"; {failed} tries failed and were left out")

@@ -81,7 +81,7 @@ def test_frames_are_halved_by_the_mean_of_four_pixels():
 
 def test_chunks_repeat_the_last_action_and_say_so():
     actions = [np.full(7, i, np.float32) for i in range(20)]
-    chunk, valid = collect.chunks(actions, 8)
+    chunk, valid = collect.chunks(actions, 8, collect.HORIZON)
     assert chunk.shape == (3, 16, 7) and chunk[:, :, 0].tolist() == [[*range(16)], [*range(8, 20)] + [19] * 4, [*range(16, 20)] + [19] * 12]
     assert valid.sum(axis=1).tolist() == [16, 12, 4]
 
@@ -142,7 +142,7 @@ def need(*modules):
 
 def episode_file(path, n, every=1):
     rng = np.random.default_rng(n)
-    action, valid = collect.chunks([rng.uniform(-1, 1, 7).astype(np.float32) for _ in range(n)], every)
+    action, valid = collect.chunks([rng.uniform(-1, 1, 7).astype(np.float32) for _ in range(n)], every, collect.HORIZON)
     rows = len(action)
     frames = {view: rng.integers(0, 255, (rows, 128, 128, 3), dtype=np.uint8) for view in ("image", "image2")}
     state, place = rng.normal(size=(rows, 8)).astype(np.float32), rng.normal(size=(rows, 6)).astype(np.float32)
