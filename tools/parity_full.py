@@ -36,7 +36,8 @@ def write_case(case, arch):
     """The published size with random weights, two smooth frames, a state, noise."""
     module = family(arch)
     frames, options = getattr(module, "FRAMES", FRAMES), getattr(module, "OPTIONS", {})
-    text, views = getattr(module, "TEXT", "pick up the red cube and place it in the basket"), {view: frame[:2] for view, frame in frames.items()}
+    text = getattr(module, "INSTRUCTION", "pick up the red cube and place it in the basket")
+    views = {view: frame[:2] for view, frame in frames.items()}
     described = cases.Case(SEED, frames, text, module.published(views, arch), options=options)
     cases.write_observation(described, case)
     print(f"{cases.write_checkpoint(described, case):,} random parameters")

@@ -171,7 +171,7 @@ def layer(at, d, d_ff, attentions):
 
 
 FRAMES = {"top": (480, 640, "png"), "wrist": (480, 640, "png")}  # of the published size
-TEXT = ""
+INSTRUCTION = ""
 
 
 def published(views, arch="act"):

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RECORDED = ROOT / "tests/golden"  # what is kept: observations, noise and the reference's taps
 # An observation of LIBERO, for cases of the published size.
 LIBERO_FRAMES = {view: (256, 256, "png") for view in ("image", "wrist_image")}
-LIBERO_TEXT = "pick up the black bowl between the plate and the ramekin and place it on the plate"
+LIBERO_INSTRUCTION = "pick up the black bowl between the plate and the ramekin and place it on the plate"
 
 
 @dataclass(frozen=True)

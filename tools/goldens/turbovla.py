@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import LIBERO_FRAMES, LIBERO_TEXT, Case, copy_tokenizer
+from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics, tower
 from .recorder import Taps
@@ -130,7 +130,7 @@ def mlp(at, d, d_ff):
     return linear(at + "linear1", d_ff, d) | linear(at + "linear2", d, d_ff)
 
 
-FRAMES, TEXT = LIBERO_FRAMES, LIBERO_TEXT
+FRAMES, INSTRUCTION = LIBERO_FRAMES, LIBERO_INSTRUCTION
 
 
 def published(views, arch="turbovla"):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from . import gr00t_n1_7
 from . import lerobot_layout as layout
-from .cases import LIBERO_FRAMES, LIBERO_TEXT, Case, backbone_folder
+from .cases import LIBERO_FRAMES, LIBERO_INSTRUCTION, Case, backbone_folder
 from .files import bfloat16_bits, write_json, write_stream
 from .gr00t_n1_7 import N_VOCAB, TOKENS, QwenTaps, text, vision
 from .parameters import linear, parameter, statistics
@@ -141,7 +141,7 @@ def head_shapes(c, d_context):
     return out | {f"{HEAD}future_tokens.weight": (c["num_embodied_action_tokens_per_instruction"], d), f"{HEAD}position_embedding.weight": (n_position, d)}
 
 
-FRAMES, TEXT = LIBERO_FRAMES, LIBERO_TEXT
+FRAMES, INSTRUCTION = LIBERO_FRAMES, LIBERO_INSTRUCTION
 
 
 def published(views, arch="vla_jepa"):

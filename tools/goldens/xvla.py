@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from . import lerobot_layout as layout
-from .cases import LIBERO_TEXT, Case, copy_tokenizer
+from .cases import LIBERO_INSTRUCTION, Case, copy_tokenizer
 from .files import bfloat16_bits, write_json, write_stream
 from .parameters import linear, norm, parameter, statistics
 from .recorder import Taps, given_noise
@@ -194,7 +194,7 @@ def old_name(name):
     return name
 
 
-FRAMES, TEXT = {view: (256, 256, "png") for view in ("image", "image2", "image3")}, LIBERO_TEXT  # of the published size
+FRAMES, INSTRUCTION = {view: (256, 256, "png") for view in ("image", "image2", "image3")}, LIBERO_INSTRUCTION  # of the published size
 
 
 def published(views, arch="xvla"):
