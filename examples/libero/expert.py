@@ -185,7 +185,7 @@ def main():
     a = parser.parse_args()
     if a.record:
         record(a.record)
-        return 0
+        os._exit(0)  # MuJoCo's destructors print errors at a normal exit
     context = multiprocessing.get_context("spawn")
     tasks, results = context.Queue(), context.Queue()
     for task in [*a.tasks.split(","), *[None] * a.workers]:
@@ -211,6 +211,4 @@ def main():
 
 
 if __name__ == "__main__":
-    code = main()
-    sys.stdout.flush()
-    os._exit(code)  # MuJoCo's destructors print errors at a normal exit
+    sys.exit(main())
