@@ -5,36 +5,36 @@ head, for one robot."""
 
 from __future__ import annotations
 
-from typing import Dict, List
+from typing import Dict, List, TypeVar
 
-from ...bundle import Key, keys_by_type
+from ...bundle import Key
 from ...layers import linear
 from .. import TABLE, Dropped, Weight
-from ..gr00t import head, language, qwen3_vl
+from ..gr00t import head, qwen3_vl
+from ..gr00t.plan import network_keys_of
 from .config import Sizes
 
 QWEN, HEAD = "model.qwen.model.", "model.action_model."
-TABLE_NAME = QWEN + "model.language_model.embed_tokens.weight"
+GROOT_QWEN = "backbone.model."  # where GR00T has it
+Row = TypeVar("Row", Weight, Dropped)
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    groups: Dict[str, Dict[str, object]] = {"u32": {"policy.n_future": s.n_embodied, "policy.n_embodied": s.n_embodied}}
-    for part in (head.keys(s), qwen3_vl.keys(s), language.keys(s)):
-        for kind, values in part.items():
-            groups[kind] = {**groups.get(kind, {}), **{key: value for key, value in values.items() if not key.startswith("vl.")}}
-    return keys_by_type(groups)
+    """The head has no self-attention over the features in front of it."""
+    own: Dict[str, object] = {"policy.n_future": s.n_embodied, "policy.n_embodied": s.n_embodied}
+    return [key for key in network_keys_of(qwen3_vl, s, own) if not key.name.startswith("vl.")]
 
 
 def weights(s: Sizes) -> List[Weight]:
     """The head is float32 in the reference whatever the backbone is."""
-    backbone = [_moved(row, "backbone.model.", QWEN)._replace(in_bf16=s.in_bf16) for row in qwen3_vl.weights(s)]
+    backbone = [_moved(row, GROOT_QWEN, QWEN)._replace(in_bf16=s.in_bf16) for row in qwen3_vl.weights(s)]
     return [*backbone, *(row._replace(keep_f32=True) for row in _head(s))]
 
 
-def _moved(row: Weight, ours: str, theirs: str) -> Weight:
+def _moved(row: Row, theirs: str, ours: str) -> Row:
     """A tensor of GR00T at the place where this policy has it."""
-    assert row.source.startswith(ours)
-    return row._replace(source=theirs + row.source[len(ours) :])
+    assert row.source.startswith(theirs)
+    return row._replace(source=ours + row.source[len(theirs) :])
 
 
 def _head(s: Sizes) -> List[Weight]:
@@ -56,10 +56,8 @@ def _head(s: Sizes) -> List[Weight]:
 
 
 def dropped(s: Sizes) -> List[Dropped]:
-    norm = "final language norm: the head reads the last layer as it is before it"
     return [
-        Dropped(QWEN + "model.language_model.norm.weight", (s.lm.d_model,), norm),
-        Dropped(QWEN + "lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "language head"),
+        *(_moved(row, GROOT_QWEN, QWEN) for row in qwen3_vl.dropped(s)),
         *(Dropped(name, shape, "world model, which learns beside the policy") for name, shape in s.world_model.items()),
     ]
 
