@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot's own SmolVLA class at five million parameters, from random weights: what the trainings of these examples share.
 
-Tokenizer and backbone (without weights), the policy, its files in the published layout, and the schedule of the learning rate.
+Tokenizer and backbone (without weights), statistics, the policy, its files in the published layout, and the state of a training.
 """
 
 import json
-import math
 from pathlib import Path
 from typing import Any, Dict, List, Mapping, Sequence, Tuple
 
@@ -90,6 +89,16 @@ def make_policy(backbone: Path, views: Mapping[str, int], d_state: int, d_action
     return (policy, *make_smolvla_pre_post_processors(config, statistics))
 
 
+def measure(state: torch.Tensor, action: torch.Tensor, pad: torch.Tensor) -> Dict[str, Dict[str, torch.Tensor]]:
+    """Mean and standard deviation, with a floor that keeps the deviation of a gripper usable, which hardly moves.
+
+    state (n, d); action (n, horizon, d); pad (n, horizon), true beyond an episode's end, which does not count
+    """
+    action = action[~pad]
+    return {"observation.state": {"mean": state.mean(0), "std": state.std(0).clamp_min(0.01)},
+            "action": {"mean": action.mean(0), "std": action.std(0).clamp_min(0.05)}}  # fmt: skip
+
+
 def save(policy: Any, before: Any, after: Any, out: Path) -> None:
     """Rounds the parameters to bfloat16 values, stored as float32, and writes the published layout.
 
@@ -126,6 +135,8 @@ def light(frames: torch.Tensor, random: torch.Generator) -> torch.Tensor:
     return (frames * gain + 0.03 * torch.randn(n, 3, 1, 1, generator=random)).clamp(0, 1)
 
 
-def rate(progress: float, step: int, warm_up: int) -> float:
-    """Share of the peak learning rate: linear over the first steps, then a cosine that is 0 at progress 1."""
-    return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+def keep(state: Dict[str, Any], file: Path) -> None:
+    """What a training goes on from; an interruption leaves the file before it."""
+    partial = file.with_suffix(".part")
+    torch.save(state, partial)
+    partial.replace(file)

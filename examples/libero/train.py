@@ -88,12 +88,6 @@ class Demonstrations:
         frames = {f"observation.images.{view}": small.light(kept[pick].permute(0, 3, 1, 2).float() / 255, random) for view, kept in self.frames.items()}
         return {**frames, "observation.state": self.state[pick], "action": self.action[pick], "task": [self.sentence[i] for i in pick]}
 
-    def statistics(self):
-        """Mean and standard deviation of state and action, with a floor for what hardly moves."""
-        action = self.action[~self.pad]
-        return {"observation.state": {"mean": self.state.mean(0), "std": self.state.std(0).clamp_min(0.01)},
-                "action": {"mean": action.mean(0), "std": action.std(0).clamp_min(0.05)}}  # fmt: skip
-
 
 def losses(policy, asked, batch, pad, place, draws):
     """(flow matching, places): mean squared errors. Each look passes the backbone once and the expert `draws` times."""
@@ -129,7 +123,7 @@ class Training:
         self.a, self.data, self.state_file = a, data, a.out / "state.pt"
         torch.manual_seed(a.seed)
         saved = torch.load(self.state_file, weights_only=True) if self.state_file.exists() else None
-        self.statistics = saved["statistics"] if saved else data.statistics()
+        self.statistics = saved["statistics"] if saved else small.measure(data.state, data.action, data.pad)
         save_backbone(a.out / "vlm")
         self.policy, self.before, self.after = make_policy(a.out / "vlm", self.statistics)
         self.asked = torch.nn.Linear(192, 6)
@@ -146,10 +140,8 @@ class Training:
         torch.manual_seed(a.seed + self.step)
 
     def keep(self):
-        partial = self.state_file.with_suffix(".part")
         parts = {name: getattr(self, name).state_dict() for name in ("policy", "asked", "mean", "optimizer")}
-        torch.save({**parts, "statistics": self.statistics, "step": self.step, "spent": self.spent, "curve": self.curve}, partial)
-        partial.replace(self.state_file)
+        small.keep({**parts, "statistics": self.statistics, "step": self.step, "spent": self.spent, "curve": self.curve}, self.state_file)
 
     def export(self):
         small.save(copy.deepcopy(self.mean), self.before, self.after, self.a.out)

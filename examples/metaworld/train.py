@@ -16,6 +16,7 @@ differences between runtimes come from their arithmetic alone.
 """
 import argparse
 import json
+import math
 import sys
 import time
 from pathlib import Path
@@ -73,11 +74,9 @@ def read_demonstrations(folder: Path) -> Tuple[Dict[str, torch.Tensor], List[str
     return data, sentences
 
 
-def measure(data: Dict[str, torch.Tensor]) -> Dict[str, Dict[str, torch.Tensor]]:
-    """Mean and standard deviation of state and action.  The gripper hardly moves: a floor keeps its deviation usable."""
-    action = data["action"][~data["pad"]]
-    return {"observation.state": {"mean": data["state"].mean(0), "std": data["state"].std(0).clamp_min(0.01)},
-            "action": {"mean": action.mean(0), "std": action.std(0).clamp_min(0.05)}}
+def rate(progress: float, step: int) -> float:
+    """Share of the peak learning rate: linear over the first 100 steps, then a cosine that is 0 at progress 1."""
+    return min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
 def main() -> int:
@@ -98,7 +97,7 @@ def main() -> int:
     data, sentences = read_demonstrations(a.data)
     a.out.mkdir(parents=True, exist_ok=True)
     save_backbone(a.out / "vlm")
-    policy, before, after = make_policy(a.out / "vlm", measure(data))
+    policy, before, after = make_policy(a.out / "vlm", small.measure(data["state"], data["action"], data["pad"]))
     size = sum(p.numel() for p in policy.parameters())
     print(f"{len(sentences):,} frames, {size:,} parameters, camera {CAMERA}")
 
@@ -115,10 +114,8 @@ def main() -> int:
         print(f"continuing at step {step}, {spent / 60:.1f} minutes in")
 
     def keep() -> None:
-        partial = state_file.with_suffix(".part")
-        torch.save({"policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "step": step, "spent": spent,
-                    "losses": losses}, partial)
-        partial.replace(state_file)
+        parts = {"policy": policy.state_dict(), "optimizer": optimizer.state_dict()}
+        small.keep({**parts, "step": step, "spent": spent, "losses": losses}, state_file)
 
     policy.train()
     order = torch.randperm(len(sentences), generator=random)
@@ -137,7 +134,7 @@ def main() -> int:
                 CAMERA_KEY: small.light(data["frame"][pick].float() / 255, random), "observation.state": data["state"][pick],
                 "action": data["action"][pick], "action_is_pad": data["pad"][pick], "task": [sentences[i] for i in pick]})
             for group in optimizer.param_groups:
-                group["lr"] = a.rate * small.rate(progress, step, 100)
+                group["lr"] = a.rate * rate(progress, step)
             loss, _ = policy.forward(dict(batch))
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
