@@ -194,6 +194,11 @@ def test_what_the_runtime_does_not_do_is_refused_by_name(refusal, file, path, va
     assert message in refusal(file, path, value)
 
 
+def test_another_backbone_is_refused_with_the_name_of_the_policys(refusal):
+    message = refusal("vlm/config.json", "model_type", "qwen2_5_vl")
+    assert "Qwen/Qwen3-VL-2B-Instruct" in message and "Cosmos" not in message
+
+
 def test_cameras_of_several_sizes_need_a_size_of_the_policys(tmp_path):
     mixed = vla_jepa.Checkpoint(*SIZES, POLICY | {"resize_images_to": None}, {"top": (30, 40), "wrist": (20, 20)}, 2, 7, side=24)
     with pytest.raises(ConvertError, match="input_features: expected cameras of one size, since resize_images_to is null"):

@@ -70,9 +70,10 @@ IMAGE_IGNORED = set(
 )
 
 
-def read(folder: str, kept: int, s: Sizes, problems: Problems) -> None:
+def read(folder: str, kept: int, s: Sizes, problems: Problems, hint: str = FOLDER) -> None:
+    """`hint`: whose folder --backbone needs."""
     config = read_json(os.path.join(folder, "config.json"))
-    Section(WHERE, config, {}, problems).check_fixed({"model_type": (None, "qwen3_vl")}, FOLDER)
+    Section(WHERE, config, {}, problems).check_fixed({"model_type": (None, "qwen3_vl")}, hint)
     text = Section(WHERE + ": text_config", member(config, "text_config", dict, WHERE), TEXT, problems)
     language.read(text, kept, s)
     _read_rope(text, s)
@@ -195,8 +196,8 @@ def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
     return {"u32": u32, "f32": f32, "u32[]": lists}
 
 
-def read_prompt(tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems) -> Prompt:
-    prompt = prompts.read_prompt(TEMPLATE, tokenizer, FOLDER, s, problems)
+def read_prompt(tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems, hint: str = FOLDER) -> Prompt:
+    prompt = prompts.read_prompt(TEMPLATE, tokenizer, hint, s, problems)
     own = (OPEN, CLOSE, IMAGE)
     _check_ids(folder, dict(zip(own, special_ids(tokenizer.keys, own, "", Problems("")))), problems)
     _check_template(folder, problems)

@@ -88,7 +88,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     check_widths(policy, {})
     s = Sizes()
     s.folder = find_backbone(checkpoint, options.backbone, policy.get("qwen_model_name"), "qwen_model_name")
-    qwen3_vl.read(s.folder, MAX_LAYERS, s, problems)
+    qwen3_vl.read(s.folder, MAX_LAYERS, s, problems, FOLDER)
     s.views, _ = read_views(policy, checkpoint)
     s.max_views = len(s.views)
     _read_images(policy, s, problems)
