@@ -22,7 +22,9 @@ def views_of(views: Sequence[str], aliases: Sequence[str], optional: Sequence[in
 
 
 def states_of(dims: Dict[str, int]) -> List[Key]:
-    return [Key("observation.states", "string[]", list(dims)), Key("observation.state_dims", "u32[]", list(dims.values()))]
+    """`dims`: widths of vectors; that of the action is left out."""
+    states = {feature: dim for feature, dim in dims.items() if feature != ACTION}
+    return [Key("observation.states", "string[]", list(states)), Key("observation.state_dims", "u32[]", list(states.values()))]
 
 
 def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problems: Problems) -> List[Key]:

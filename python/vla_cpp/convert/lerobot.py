@@ -117,6 +117,14 @@ def view_keys(
     return views_of(views, aliases, [int(view in empty) for view in views])
 
 
+def required_view_keys(
+    checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems
+) -> List[Key]:
+    """Of a policy whose reference needs every view."""
+    aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
+    return views_of(views, aliases, [0] * len(views), len(views))
+
+
 def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
     """The tokenizer that the checkpoint brings: the one that its processor declares, or that lies there while --backbone names no
     other; empty when there is none."""

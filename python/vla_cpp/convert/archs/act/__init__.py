@@ -14,8 +14,9 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of, views_of
+from ...features import feature_keys, states_of
 from ...images import standardized
+from ...lerobot import required_view_keys
 from .. import Options, Plan
 from .config import ENVIRONMENT, Sizes, read_sizes
 from .mapping import dropped, hints, network_keys, weights
@@ -60,11 +61,9 @@ def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems)
 def _feature_keys(
     checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems
 ) -> List[Key]:
-    """The reference needs every view."""
     dims = {recipe.STATE: s.d_state, **({ENVIRONMENT: s.d_environment} if s.d_environment else {})}
-    aliases = recipe.view_aliases(s.views, processors, checkpoint.notes, problems)
     return [
-        *views_of(s.views, aliases, [0] * len(s.views), len(s.views)),
+        *required_view_keys(checkpoint, s.views, processors, problems),
         *states_of(dims),
         Key("observation.max_text_tokens", "u32", 0),
         *feature_keys(options.dataset_info, {**dims, recipe.ACTION: s.d_action}, checkpoint.notes, problems),

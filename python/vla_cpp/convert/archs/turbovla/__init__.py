@@ -15,7 +15,8 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of, views_of
+from ...features import feature_keys, states_of
+from ...lerobot import required_view_keys
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan
 from .config import Sizes, read_sizes
@@ -34,7 +35,10 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     problems.raise_any()
     keys = [
         *network_keys(s),
-        *_feature_keys(checkpoint, options, s, dims, processors, problems),
+        *required_view_keys(checkpoint, s.views, processors, problems),
+        *states_of(dims),
+        Key("observation.max_text_tokens", "u32", s.max_tokens),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
         *tokenizer.keys,
         Key("processor.recipe", "string", json.dumps(recipe_document(s, processors, tokenizer.truncate), ensure_ascii=False)),
     ]
@@ -53,16 +57,3 @@ def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str) -> D
         "state": processors.state.op("normalize", recipe.STATE) if s.d_state else [],
         "action": processors.action.op("unnormalize", recipe.ACTION),
     }
-
-
-def _feature_keys(
-    checkpoint: Checkpoint, options: Options, s: Sizes, dims: Dict[str, int], processors: recipe.Processors, problems: Problems
-) -> List[Key]:
-    """The reference needs every view."""
-    aliases = recipe.view_aliases(s.views, processors, checkpoint.notes, problems)
-    return [
-        *views_of(s.views, aliases, [0] * len(s.views), len(s.views)),
-        *states_of({name: dim for name, dim in dims.items() if name == recipe.STATE}),
-        Key("observation.max_text_tokens", "u32", s.max_tokens),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-    ]

@@ -9,7 +9,7 @@ processor_vla_jepa.py) and transformers models/qwen3_vl.
 from __future__ import annotations
 
 import json
-from typing import Dict, List
+from typing import List
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import PROCESSORS, Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of, views_of
+from ...features import feature_keys, states_of
 from ...files import member
+from ...lerobot import required_view_keys
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan
 from ..gr00t import qwen3_vl
@@ -56,7 +57,9 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     keys = [
         *network_keys(s),
         *prompt.keys(),
-        *_feature_keys(checkpoint, options, s, dims, processors, problems),
+        *required_view_keys(checkpoint, s.views, processors, problems),
+        *states_of(dims),
+        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
         *tokenizer.keys,
         Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
     ]
@@ -116,15 +119,3 @@ def gripper_ops(name: str, where: str, config: dict, s: Sizes, problems: Problem
     if name == SNAP:
         return [{"op": "threshold", "columns": [column], "above": float(np.nextafter(above, np.float32(-np.inf))), "then": 1.0, "else": 0.0}]
     return [{"op": "threshold", "columns": [column], "above": float(above), "then": -1.0, "else": 1.0}]
-
-
-def _feature_keys(
-    checkpoint: Checkpoint, options: Options, s: Sizes, dims: Dict[str, int], processors: recipe.Processors, problems: Problems
-) -> List[Key]:
-    """The reference needs every view."""
-    aliases = recipe.view_aliases(s.views, processors, checkpoint.notes, problems)
-    return [
-        *views_of(s.views, aliases, [0] * len(s.views), len(s.views)),
-        *states_of({name: dim for name, dim in dims.items() if name == recipe.STATE}),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-    ]

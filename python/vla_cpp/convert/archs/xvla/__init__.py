@@ -65,7 +65,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     keys = [
         *network_keys(s),
         *view_keys(checkpoint, s.views, processors, problems),
-        *states_of({name: dim for name, dim in dims.items() if name == recipe.STATE}),
+        *states_of(dims),
         Key("observation.max_text_tokens", "u32", processors.max_tokens),
         *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
         *tokenizer.keys,
