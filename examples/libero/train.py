@@ -55,30 +55,31 @@ def describe(out):
 class Demonstrations:
     """All kept steps of all files of a folder; `read` adds those that are new.
 
-    image, image2 (n, 3, 128, 128) uint8; state (n, 8); action (n, 16, 7); pad (n, 16); place (n, 6); sentence: n strings
+    frames: of each view (n, 128, 128, 3) uint8; state (n, 8); action (n, 16, 7); pad (n, 16); place (n, 6); sentence: n strings
     """
 
-    KEYS = ("image", "image2", "state", "action", "valid", "place")
+    KEYS = (*VIEWS, "state", "action", "valid", "place")
 
     def __init__(self, folder):
-        self.folder, self._known, self._parts, self.sentence = folder, set(), {key: [] for key in self.KEYS}, []
+        self.folder, self._known, self._kept, self.sentence = folder, set(), {}, []
         self.read()
         if not self.sentence:
             raise SystemExit(f"no demonstrations in {folder}: run  python collect.py --out {folder}")
 
     def read(self):
-        for path in sorted(self.folder.glob("*.npz")):
-            if path.name in self._known:
-                continue
-            self._known.add(path.name)
+        new = [path for path in sorted(self.folder.glob("*.npz")) if path.name not in self._known]
+        if not new:
+            return
+        parts = {key: [self._kept[key]] if self._kept else [] for key in self.KEYS}
+        for path in new:
             with np.load(path) as episode:
                 for key in self.KEYS:
-                    self._parts[key].append(torch.from_numpy(episode[key]))
-                self.sentence += [str(episode["sentence"])] * len(self._parts["state"][-1])
-        joined = {key: torch.cat(parts) for key, parts in self._parts.items()}
-        self._parts = {key: [whole] for key, whole in joined.items()}
-        self.state, self.action, self.place, self.pad = joined["state"], joined["action"], joined["place"], ~joined["valid"]
-        self.frames = {view: joined[view] for view in VIEWS}
+                    parts[key].append(torch.from_numpy(episode[key]))
+                self.sentence += [str(episode["sentence"])] * len(parts["state"][-1])
+        self._known.update(path.name for path in new)
+        self._kept = kept = {key: torch.cat(part) for key, part in parts.items()}
+        self.state, self.action, self.place, self.pad = kept["state"], kept["action"], kept["place"], ~kept["valid"]
+        self.frames = {view: kept[view] for view in VIEWS}
 
     def episodes(self):
         return len(self._known)

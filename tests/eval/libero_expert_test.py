@@ -171,6 +171,25 @@ def test_lerobot_reads_the_demonstrations(tmp_path):
         list(dataset.rows(gaps))
 
 
+def test_training_reads_what_was_added_and_asks_for_demonstrations(tmp_path):
+    need("torch", "lerobot")
+    import train
+
+    with pytest.raises(SystemExit, match="no demonstrations in .*: run  python collect.py"):
+        train.Demonstrations(tmp_path)
+    first, second = (episode_file(tmp_path / f"{n}.npz", n) for n in (5, 7))
+    (tmp_path / "7.npz").rename(tmp_path / "7")
+    data = train.Demonstrations(tmp_path)
+    assert (data.episodes(), len(data.state), len(data.sentence)) == (1, 5, 5)
+    (tmp_path / "7").rename(tmp_path / "7.npz")
+    for _ in range(2):
+        data.read()
+        assert (data.episodes(), len(data.sentence)) == (2, 12)
+        assert data.state.numpy().tolist() == [*first["state"].tolist(), *second["state"].tolist()]
+        assert data.frames["image2"][5:].numpy().tobytes() == second["image2"].tobytes()
+        assert data.pad.tolist() == (~np.concatenate([first["valid"], second["valid"]])).tolist()
+
+
 def test_the_training_loss_is_lerobots(tmp_path):
     """One draw, the same noise: what the expert is trained on is what LeRobot's own forward computes."""
     need("torch", "lerobot")
