@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels that a policy normalizes by statistics of its cameras."""
+"""Pixels that a policy normalizes: by statistics of its cameras, or by those of ImageNet whatever the data."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from .errors import Problems
 from .normalization import Normalization
 
 MIN_SPREAD = 1e-6  # that the recipe divides by
+IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 
 
 def standardized(views: Sequence[Tuple[str, Normalization]], problems: Problems) -> List[dict]:

@@ -28,6 +28,7 @@ from ...checkpoint import Checkpoint, Layout, Tensors, find_backbone
 from ...errors import Code, Problems, refuse
 from ...features import feature_keys, states_of, views_of
 from ...files import member, read_json
+from ...images import IMAGENET
 from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim
 from ...networks import MAX_LAYERS
 from ...normalization import Normalization
@@ -45,9 +46,6 @@ from .mapping import (
     read_hf_backbone,
 )
 
-# ImageNet's, literals of both references.
-MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
-
 
 @dataclass
 class Source:
@@ -63,9 +61,10 @@ class Source:
 
 
 def image_ops(side: int, filter_name: str, arithmetic: str) -> List[dict]:
+    """The statistics are literals of both references."""
     return [
         {"op": "resize", "width": side, "height": side, "filter": filter_name},
-        {"op": "standardize", "mean": MEAN, "std": STD, "arithmetic": arithmetic},
+        {"op": "standardize", **IMAGENET, "arithmetic": arithmetic},
     ]
 
 

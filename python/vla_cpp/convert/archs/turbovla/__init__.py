@@ -16,14 +16,12 @@ from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...features import feature_keys, states_of
+from ...images import IMAGENET
 from ...lerobot import required_view_keys
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan
 from .config import Sizes, read_sizes
 from .mapping import dropped, hints, network_keys, weights
-
-# What the reference's own normalization subtracts and divides by, whatever the data.
-IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 
 
 def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:

@@ -19,6 +19,7 @@ from ...checkpoint import Checkpoint
 from ...errors import Code, Problems, refuse
 from ...features import feature_keys, states_of
 from ...files import HUB_FORM, read_json
+from ...images import IMAGENET
 from ...lerobot import tokenizer_folder, view_keys
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from ...tokenizer_parts import CONFIG_FILE, content_of
@@ -36,8 +37,6 @@ STEPS: recipe.Steps = {
         DOMAIN: {"domain_id": recipe.ANY},
     }
 }
-# What the reference's own normalization subtracts and divides by, whatever the data.
-IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
 
 
 def embodiments(checkpoint: Checkpoint) -> List[str]:
