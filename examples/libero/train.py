@@ -127,7 +127,7 @@ class Training:
         self.statistics = saved["statistics"] if saved else small.measure(data.state, data.action, data.pad)
         save_backbone(a.out / "vlm")
         self.policy, self.before, self.after = make_policy(a.out / "vlm", self.statistics)
-        self.asked = torch.nn.Linear(192, 6)
+        self.asked = torch.nn.Linear(self.policy.model.vlm_with_expert.config.text_config.hidden_size, 6)
         self.mean = copy.deepcopy(self.policy)
         self.trained = [p for p in (*self.policy.parameters(), *self.asked.parameters()) if p.requires_grad]
         self.optimizer = torch.optim.AdamW(self.trained, lr=a.rate, betas=(0.9, 0.95), weight_decay=0.01)
@@ -151,10 +151,13 @@ class Training:
                    "episodes": self.data.episodes(), "looks": len(self.data.sentence), "curve": self.curve}  # fmt: skip
         (self.a.out / "training.json").write_text(json.dumps(summary, indent=1) + "\n")
 
+    def progress(self):
+        """1 where the minutes or the steps are used up."""
+        return max(self.spent / (60 * self.a.minutes), self.step / self.a.steps)
+
     def rate(self):
         """Share of the peak learning rate."""
-        progress = max(self.spent / (60 * self.a.minutes), self.step / self.a.steps)
-        return min(1.0, (self.step + 1) / 100, max(0.0, 4 * (1 - progress)))
+        return min(1.0, (self.step + 1) / 100, max(0.0, 4 * (1 - self.progress())))
 
     def improve(self, pick):
         """One step on the looks of these numbers -> the two losses."""
@@ -178,7 +181,7 @@ class Training:
     def run(self):
         self.policy.train()
         at, order, recent, clock, exported = 0, [], [], time.monotonic(), self.spent
-        while self.spent < 60 * self.a.minutes and self.step < self.a.steps:
+        while self.progress() < 1:
             if at + self.a.batch > len(order):
                 order, at = torch.randperm(len(self.data.sentence), generator=self.random), 0
             recent.append(self.improve(order[at : at + self.a.batch]))
