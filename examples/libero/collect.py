@@ -36,7 +36,7 @@ VIEWS, RATE_HZ = tuple(SEEN.views), int(SEEN.rate_hz)
 STATE_NAMES = ["x", "y", "z", "rx", "ry", "rz", "finger_left", "finger_right"]
 ACTION_NAMES = ["dx", "dy", "dz", "drx", "dry", "drz", "gripper"]
 HORIZON, EXECUTE = 16, SEEN.replan_every  # steps in a chunk, and how many of them are executed
-AFTER = 8  # steps kept after success
+AFTER = 8  # steps kept from success on
 NOISE = (0.0, 0.1, 0.25)  # standard deviation of the noise on the three displacements, one of them per episode
 FIRST = 10000  # seed of the first episode of a scene
 ROUND = 6  # episodes of a scene before the next one is made
@@ -100,7 +100,7 @@ def demonstration(scene, seed, every):
         scene.step(push)
     expert, sigma, noise = Expert(scene), rng.choice(NOISE), np.zeros(3)
     kept = {key: [] for key in ("image", "image2", "state", "place")}
-    actions, left = [], None
+    actions, end = [], None
     for step in range(LIMIT):
         if step % every == 0:
             seen, (thing, basket) = scene.observe(), scene.objects()
@@ -111,11 +111,11 @@ def demonstration(scene, seed, every):
         actions.append(expert.act())
         noise = 0.8 * noise + 0.6 * rng.normal(0, sigma, 3)  # stationary: its deviation stays sigma
         done = scene.step(np.clip(actions[-1] + [*noise, 0, 0, 0, 0], -1, 1))
-        left = AFTER if left is None and done else left
-        left = left if left is None else left - 1
-        if left == 0:
+        if done and end is None:
+            end = step + AFTER
+        if step + 1 == end:
             break
-    if left is None:
+    if end is None:
         return {}
     action, valid = chunks(actions, every, HORIZON)
     return {key: np.stack(rows) for key, rows in kept.items()} | {"action": action, "valid": valid, "sentence": scene.instruction()}
