@@ -270,12 +270,12 @@ class Client(Handle):
         return pending._asked.check(chunk) if pending._asked else chunk
 
     def _check_bundle(self, bundle: Any) -> None:
-        known = self._spec.bundle if self._spec else bundle
-        if bundle.checksum != known.checksum and self._spec and self.policy is not None:
-            self._spec = replace(self._spec, bundle=wire.bundle_of(bundle))  # the server sees to it that nothing else differs
-        elif bundle.checksum != known.checksum:
-            expected, found = (f"{b.name} ({b.checksum})" for b in (known, bundle))
+        if self._spec is None or bundle.checksum == self._spec.bundle.checksum:
+            return
+        if self.policy is None:
+            expected, found = (f"{b.name} ({b.checksum})" for b in (self._spec.bundle, bundle))
             raise Incompatible(self.address, expected, found, "make a new Client, and read its spec")
+        self._spec = replace(self._spec, bundle=wire.bundle_of(bundle))  # the server sees to it that nothing else differs
 
     def _describe(self, request: Any) -> bytes:
         request.describe.policy = self.policy or ""
