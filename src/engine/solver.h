@@ -14,9 +14,8 @@ namespace vla {
 /// The solver as data: the times at which the action head is evaluated, and the update rule.
 ///   euler, euler_float32  x <- x + dt * velocity(x, t_k), with equal steps from t_start to t_end
 ///   direct                one pass: x <- what the network gives, from a start of zeros
-///   renoise               the network gives actions, x <- t * start + (1 - t) * actions at the next step's time t,
-///   from
-///                         1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
+///   renoise               the network gives actions: x <- t * start + (1 - t) * actions, where t is the next step's
+///                         time, from 1 to 0 (lerobot policies/xvla/modeling_xvla.py generate_actions)
 struct Solver {
   int n_step = 0;
   bool direct = false, renoises = false;
