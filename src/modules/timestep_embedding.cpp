@@ -38,22 +38,36 @@ Tensor TimestepEmbedding::operator()(Graph& g, std::span<const SolverTime> times
                     {d_, static_cast<std::int64_t>(times.size()), 1, 1});
 }
 
-std::vector<float> bucket_embedding(std::span<const int> buckets, int d, BucketWaves waves) {
+namespace {
+
+float wave_exponent(float i, float n, TimeWaves waves) {
+  const auto ln = static_cast<float>(std::log(waves == TimeWaves::slow_cosines ? 100.0 : 10000.0));
+  switch (waves) {
+    case TimeWaves::cosines_first:
+      return -ln * i / (n - 1);
+    case TimeWaves::sines_first:
+      return -i * (ln / n);
+    case TimeWaves::slow_cosines:
+      break;
+  }
+  return -ln * i / n;
+}
+
+}  // namespace
+
+std::vector<float> wave_embedding(std::span<const float> times, int d, TimeWaves waves) {
   const int half = d / 2;
-  const auto ln = static_cast<float>(std::log(10000.0));
-  const auto frequency = [&](int i) {
-    const auto n = static_cast<float>(i), m = static_cast<float>(half);
-    const float exponent = waves == BucketWaves::cosines_first ? -ln * n / (m - 1) : -n * (ln / m);
-    return static_cast<float>(std::exp(double{exponent}));
-  };
   std::vector<float> table;
-  for (const int bucket : buckets)
+  for (const float time : times) {
     for (const bool first : {true, false})
       for (int i = 0; i < half; ++i) {
-        const double angle = static_cast<float>(bucket) * frequency(i);
-        const bool cosine = first == (waves == BucketWaves::cosines_first);
+        const float exponent = wave_exponent(static_cast<float>(i), static_cast<float>(half), waves);
+        const double angle = time * static_cast<float>(std::exp(double{exponent}));
+        const bool cosine = first == (waves != TimeWaves::sines_first);
         table.push_back(static_cast<float>(cosine ? std::cos(angle) : std::sin(angle)));
       }
+    if (d % 2 == 1) table.push_back(0.0f);
+  }
   return table;
 }
 

@@ -34,13 +34,14 @@ class TimestepEmbedding {
   double min_period_, max_period_;
 };
 
-/// How a reference embeds a whole-numbered time t, with n = d/2 and float32 angles t * exp(-ln(10000) i / m):
-/// `cosines_first` with m = n - 1 (diffusers models/embeddings.py get_timestep_embedding, flip_sin_to_cos),
-/// `sines_first` with m = n (lerobot policies/groot/groot_n1_7.py SinusoidalPositionalEncoding). The exponents are
-/// rounded as each rounds them: at t = 750 an exponent's last bit turns an angle by 5e-5.
-enum class BucketWaves { cosines_first, sines_first };
+/// How a reference embeds a time t: cosines or sines first, of n = d/2 float32 angles t * exp(-ln(P) i / m).
+///   cosines_first  P = 10000, m = n - 1 (diffusers models/embeddings.py get_timestep_embedding, flip_sin_to_cos)
+///   sines_first    P = 10000, m = n (lerobot policies/groot/groot_n1_7.py SinusoidalPositionalEncoding)
+///   slow_cosines   P = 100, m = n, cosines first (lerobot policies/xvla/soft_transformer.py timestep_embedding)
+/// The exponents are rounded as each rounds them: at t = 750 an exponent's last bit turns an angle by 5e-5.
+enum class TimeWaves { cosines_first, sines_first, slow_cosines };
 
-/// Values of [d, buckets.size()], one column per time; `d` is even and above 2.
-std::vector<float> bucket_embedding(std::span<const int> buckets, int d, BucketWaves waves);
+/// Values of [d, times.size()], one column per time. An odd d ends in a zero; `cosines_first` takes d from 4 on.
+std::vector<float> wave_embedding(std::span<const float> times, int d, TimeWaves waves);
 
 }  // namespace vla

@@ -83,9 +83,7 @@ class Evo1 final : public Policy {
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
-    if (shape.n_view > places_.max_views())
-      return Error{Code::bad_bundle, "policy.max_views", fmt::format("{} or more, one for each view", shape.n_view),
-                   std::to_string(places_.max_views())};
+    VLA_CHECK(check_views("policy.max_views", shape.n_view, places_.max_views()));
     if (shape.n_text < places_.min_tokens() || shape.n_text > n_token_)
       return Error{Code::bad_bundle, "processor.recipe.text",
                    fmt::format("{} to {} tokens", places_.min_tokens(), n_token_), std::to_string(shape.n_text)};

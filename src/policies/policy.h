@@ -77,6 +77,9 @@ class Policy {
 /// Errors: unsupported.
 Status check_prefix(int n_view, int n_token, int n_other);
 
+/// Whether the network has places for so many views. `key` is what counts them. Errors: bad_bundle.
+Status check_views(const char* key, int n_view, int max_views);
+
 /// A policy that the registry knows.
 struct PolicyEntry {
   std::string name;

@@ -27,6 +27,11 @@ Status check_prefix(int n_view, int n_token, int n_other) {
                std::to_string(n_prefix), "use smaller images or fewer views"};
 }
 
+Status check_views(const char* key, int n_view, int max_views) {
+  if (n_view <= max_views) return {};
+  return Error{Code::bad_bundle, key, fmt::format("{} or more, one for each view", n_view), std::to_string(max_views)};
+}
+
 const std::vector<PolicyEntry>& policy_registry() {
   static const std::vector<PolicyEntry> entries = {
 #define POLICY(name) name##_policy(),

@@ -62,9 +62,7 @@ class TurboVla final : public Policy {
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
     VLA_CHECK(lm_.check(shape.n_text));
-    if (shape.n_view > n_view_)
-      return Error{Code::bad_bundle, "policy.n_view", std::to_string(shape.n_view) + " or more, one for each view",
-                   std::to_string(n_view_)};
+    VLA_CHECK(check_views("policy.n_view", shape.n_view, n_view_));
     return check_prefix(shape.n_view, vision_.n_patch(), shape.n_text + 1);
   }
 

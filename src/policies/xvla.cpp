@@ -9,7 +9,6 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <cmath>
 #include <optional>
 
 #include "modules/encoder_block.h"
@@ -26,7 +25,7 @@ class XVla final : public Policy {
   int d_state_, horizon_, n_view_, n_token_, pad_token_;
   std::vector<int> grippers_;
   Davit vision_;  // observation rate
-  int d_vision_;
+  int d_vision_, n_cell_position_;
   Embedding column_, row_;
   const Param* temporal_;
   BartEncoder lm_;
@@ -52,8 +51,9 @@ class XVla final : public Policy {
         grippers_(s.integers("grippers", {0, 65535})),
         vision_(s / "vision"),
         d_vision_(vision_.d_model()),
-        column_(s / "column", d_vision_ - d_vision_ / 2, (s / "vision").dim("n_position", 4096)),
-        row_(s / "row", d_vision_ / 2, (s / "vision").dim("n_position", 4096)),
+        n_cell_position_((s / "vision").dim("n_position", 4096)),
+        column_(s / "column", d_vision_ - d_vision_ / 2, n_cell_position_),
+        row_(s / "row", d_vision_ / 2, n_cell_position_),
         temporal_((s / "temporal").vector("weight", d_vision_)),
         lm_(s / "lm"),
         projector_(s / "projector", d_vision_, lm_.d_model(), Bias::no),
@@ -78,19 +78,16 @@ class XVla final : public Policy {
     for (const int gripper : grippers_)
       s.require(gripper < s.dim("d_action") && (d_state_ == 0 || gripper < d_state_), "grippers",
                 "columns of actions and state", std::to_string(gripper));
-    const int n_position = (s / "vision").dim("n_position", 4096);
+    const int n_side = std::max(vision_.n_column(), vision_.n_row());
     (s / "vision")
-        .require(vision_.n_column() <= n_position && vision_.n_row() <= n_position, "n_position",
-                 fmt::format("{} or more, one for each row and column of cells",
-                             std::max(vision_.n_column(), vision_.n_row())),
-                 std::to_string(n_position));
+        .require(n_side <= n_cell_position_, "n_position",
+                 fmt::format("{} or more, one for each row and column of cells", n_side),
+                 std::to_string(n_cell_position_));
   }
 
   Status check(const InputShape& shape) const override {
     VLA_CHECK(vision_.check(shape.width, shape.height));
-    if (shape.n_view > n_view_)
-      return Error{Code::bad_bundle, "policy.n_view", std::to_string(shape.n_view) + " or more, one for each view",
-                   std::to_string(n_view_)};
+    VLA_CHECK(check_views("policy.n_view", shape.n_view, n_view_));
     const int n_text = std::max(shape.n_text, n_token_), n_seen = horizon_ + n_view_ * n_image() + n_text;
     VLA_CHECK(lm_.check(n_image() + n_text));
     if (n_seen > n_position_)
@@ -99,21 +96,11 @@ class XVla final : public Policy {
     return check_prefix(n_view_, n_image(), n_text + horizon_);
   }
 
-  /// Source: soft_transformer.py timestep_embedding. An odd width ends in a zero.
   Tensor condition(Graph& g, std::span<const SolverTime> times) const override {
-    const int half = d_time_ / 2;
-    std::vector<float> table;
-    for (const SolverTime& time : times) {
-      const auto angle = [&](int i) {
-        const auto log = static_cast<float>(-std::log(100.0));
-        const float exponent = log * static_cast<float>(i) / static_cast<float>(half);
-        return double{time.value * static_cast<float>(std::exp(double{exponent}))};
-      };
-      for (int i = 0; i < half; ++i) table.push_back(static_cast<float>(std::cos(angle(i))));
-      for (int i = 0; i < half; ++i) table.push_back(static_cast<float>(std::sin(angle(i))));
-      if (d_time_ % 2 == 1) table.push_back(0.0f);
-    }
-    return g.constant(table, {d_time_, static_cast<std::int64_t>(times.size()), 1, 1});
+    std::vector<float> values;
+    for (const SolverTime& time : times) values.push_back(time.value);
+    return g.constant(wave_embedding(values, d_time_, TimeWaves::slow_cosines),
+                      {d_time_, static_cast<std::int64_t>(times.size()), 1, 1});
   }
 
   void constants(Graph& g, const std::function<Tensor()>& /*absent_view*/, Cache& cache) const override {
@@ -180,10 +167,10 @@ class XVla final : public Policy {
   /// The reference hides no padding: its tokens are seen like words (XVLAModel.forward_vlm).
   Tensor text_tokens(Graph& g, Tensor ids) const {
     const int n_pad = n_token_ - static_cast<int>(ids.dim(0));
-    const Tensor words = lm_.embed(g, ids);
+    const Tensor words = lm_.token().forward(g, ids);
     if (n_pad <= 0) return words;
     const std::vector<std::int32_t> pads(static_cast<std::size_t>(n_pad), pad_token_);
-    return concat_tokens(g, {words, lm_.embed(g, constant_ids(g, fmt::format("padding/{}", n_pad), pads))});
+    return concat_tokens(g, {words, lm_.token().forward(g, constant_ids(g, fmt::format("padding/{}", n_pad), pads))});
   }
 
   /// All but the first of several. Absent ones come last, wherever they stand among the features, and are zeros where

@@ -26,9 +26,9 @@ TEST_CASE("double precision keeps the shortest period exact where float32 would 
 
 TEST_CASE("whole-numbered times are embedded as either reference rounds, which naive double precision does not") {
   // Values of diffusers 0.35 and lerobot 0.6 with torch 2.13, at time 750.
-  const int buckets[] = {0, 750};
-  const auto cosines = bucket_embedding(buckets, 256, BucketWaves::cosines_first);
-  const auto sines = bucket_embedding(buckets, 1536, BucketWaves::sines_first);
+  const float buckets[] = {0, 750};
+  const auto cosines = wave_embedding(buckets, 256, TimeWaves::cosines_first);
+  const auto sines = wave_embedding(buckets, 1536, TimeWaves::sines_first);
   REQUIRE(cosines.size() == 512);
   REQUIRE(sines.size() == 3072);
   CHECK(cosines[127] == 1);
@@ -43,4 +43,20 @@ TEST_CASE("whole-numbered times are embedded as either reference rounds, which n
   CHECK(close(sines[1536 + 300], 0.993069768));
   CHECK(close(sines[1536 + 768 + 16], -0.987330973));
   CHECK_FALSE(close(cosines[256 + 2], std::cos(750 * std::pow(1e4, -2.0 / 127))));
+}
+
+TEST_CASE("slow waves put cosines first, and an odd width ends in a zero") {
+  // Values of lerobot 0.6's timestep_embedding with torch 2.13, at time 0.7.
+  const float times[] = {1.0f, 0.7f};
+  const auto table = wave_embedding(times, 33, TimeWaves::slow_cosines);
+  REQUIRE(table.size() == 66);
+  const auto close = [&](std::size_t i, double expected) { return std::abs(table[33 + i] - expected) <= 6e-8; };
+  CHECK(close(0, 0.764842212));
+  CHECK(close(1, 0.865361035));
+  CHECK(close(15, 0.999956429));
+  CHECK(close(16, 0.64421767));
+  CHECK(close(25, 0.0524684861));
+  CHECK(close(31, 0.00933451392));
+  CHECK(table[32] == 0);
+  CHECK(table[65] == 0);
 }

@@ -4,6 +4,8 @@
 
 #include <fmt/format.h>
 
+#include <cmath>
+
 #include "nn/tokens.h"
 
 namespace vla {
@@ -54,14 +56,14 @@ GrootHead::GrootHead(const Scope& s, int d_context, GrootFamily family)
 
 Tensor GrootHead::condition(Graph& g, std::span<const SolverTime> times) const {
   // The reference makes an integer of the time in double.
-  std::vector<int> buckets;
-  for (const SolverTime& time : times) buckets.push_back(static_cast<int>(time.exact * n_bucket_));
-  const auto embedded = [&](int d, BucketWaves waves) {
-    return g.constant(bucket_embedding(buckets, d, waves), {d, static_cast<std::int64_t>(buckets.size()), 1, 1});
+  std::vector<float> buckets;
+  for (const SolverTime& time : times) buckets.push_back(static_cast<float>(std::trunc(time.exact * n_bucket_)));
+  const auto embedded = [&](int d, TimeWaves waves) {
+    return g.constant(wave_embedding(buckets, d, waves), {d, static_cast<std::int64_t>(buckets.size()), 1, 1});
   };
-  const Tensor hidden = silu(g, time_in_(g, embedded(d_time_, BucketWaves::cosines_first)));
+  const Tensor hidden = silu(g, time_in_(g, embedded(d_time_, TimeWaves::cosines_first)));
   const Tensor modulations = dit_.modulations(g, silu(g, time_out_(g, hidden)));
-  return concat_features(g, modulations, embedded(dit_.d_model(), BucketWaves::sines_first));
+  return concat_features(g, modulations, embedded(dit_.d_model(), TimeWaves::sines_first));
 }
 
 Tensor GrootHead::context(Graph& g, Tensor features) const {

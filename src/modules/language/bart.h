@@ -15,14 +15,14 @@ class BartEncoder {
  public:
   explicit BartEncoder(const Scope& s);
 
-  /// ids [n] i32 -> rows of the token table, [d_model, n].
-  Tensor embed(Graph& g, Tensor ids) const { return token_.forward(g, ids); }
+  const Embedding& token() const { return token_; }
   /// x [d_model, n] -> the same shape.
   Tensor operator()(Graph& g, Tensor x) const;
   /// Errors: bad_bundle for more tokens than positions.
   Status check(int n_token) const;
 
   int d_model() const { return family_.d_model; }
+  int n_position() const { return n_position_; }
 
  private:
   DetrFamily family_;

@@ -6,31 +6,16 @@
 
 namespace vla {
 
-Bert::Bert(const Scope& s)
-    : family_({s.dim("d_model"), s.dim("n_head", 1024), s.dim("d_ff"), Activation::gelu_erf, false,
-               s.number("norm_eps", kNormEps)}),
-      n_position_(s.dim("n_position")),
-      token_(s / "token_embd", family_.d_model, s.dim("n_vocab", 1 << 24)),
-      sentence_((s / "sentence").vector("weight", family_.d_model)),
-      position_(s / "position", family_.d_model, n_position_),
-      norm_(s / "embd_norm", family_.d_model, family_.norm_eps) {
-  s.require(family_.d_model % family_.n_head == 0, "n_head", fmt::format("a divisor of d_model {}", family_.d_model),
-            std::to_string(family_.n_head));
-  const int n_layer = s.n_layer("n_layer");
-  for (int i = 0; i < n_layer; ++i) layers_.emplace_back(s / "blk" / i, family_);
-}
+Bert::Bert(const Scope& s) : encoder_(s), sentence_((s / "sentence").vector("weight", encoder_.d_model())) {}
 
 Status Bert::check(int n_text) const {
-  if (n_text <= n_position_) return {};
-  return Error{Code::bad_bundle, "processor.recipe.text", fmt::format("at most {} tokens (lm.n_position)", n_position_),
-               std::to_string(n_text)};
+  if (n_text <= encoder_.n_position()) return {};
+  return Error{Code::bad_bundle, "processor.recipe.text",
+               fmt::format("at most {} tokens (lm.n_position)", encoder_.n_position()), std::to_string(n_text)};
 }
 
 Tensor Bert::operator()(Graph& g, Tensor ids) const {
-  Tensor x = add(g, token_(g, ids), g.parameter(sentence_));
-  x = norm_(g, add(g, x, position_(g, arange(g, static_cast<int>(ids.dim(0))))));
-  for (const DetrEncoderLayer& layer : layers_) x = layer(g, x, Tensor());
-  return x;
+  return encoder_(g, add(g, encoder_.token()(g, ids), g.parameter(sentence_)));
 }
 
 }  // namespace vla

@@ -2,15 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <vector>
-
-#include "modules/detr.h"
-#include "nn/embedding.h"
+#include "modules/language/bart.h"
 
 namespace vla {
 
-/// BERT over one sentence: all tokens see each other, norms are behind the sums, positions are learned. Its pooler is
-/// not part of it. Source: transformers modeling_bert.py BertModel.
+/// BERT over one sentence: BART's encoder over tokens to each of which the sentence's row is added. Its pooler is not
+/// part of it. Source: transformers modeling_bert.py BertModel.
 class Bert {
  public:
   explicit Bert(const Scope& s);
@@ -20,16 +17,11 @@ class Bert {
   /// Errors: bad_bundle for more tokens than positions.
   Status check(int n_text) const;
 
-  int d_model() const { return family_.d_model; }
+  int d_model() const { return encoder_.d_model(); }
 
  private:
-  DetrFamily family_;
-  int n_position_;
-  Embedding token_;
+  BartEncoder encoder_;
   const Param* sentence_;  // the row of the first of two sentences
-  Embedding position_;
-  LayerNorm norm_;
-  std::vector<DetrEncoderLayer> layers_;
 };
 
 }  // namespace vla

@@ -120,11 +120,8 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   if (bytes == nullptr)
     return Error{Code::bad_observation, where, "pixels of 8 bits", "float pixels",
                  "send the camera's bytes: this policy's images are resized as bytes"};
-  for (const ByteOp& op : pipeline.ops) {
-    const auto* camera = std::get_if<CameraSize>(&op);
-    if (camera != nullptr && (camera->width != frame.width || camera->height != frame.height))
-      return wrong_camera(frame, *camera, where);
-  }
+  for (const ByteOp& op : pipeline.ops)
+    if (const auto* camera = std::get_if<CameraSize>(&op)) VLA_CHECK(check_camera(frame, *camera, where));
   // All sizes come before any image, so that none is made which nothing needs or no memory holds.
   const double most_grown = most_pixels_grown(frame);
   std::vector<Size> sizes = {{static_cast<double>(frame.width), static_cast<double>(frame.height)}};
@@ -156,10 +153,11 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
   return {};
 }
 
-Error wrong_camera(const Frame& frame, const CameraSize& camera, const std::string& where) {
-  return {Code::bad_observation, where, fmt::format("an image of {} x {}", camera.width, camera.height),
-          fmt::format("{} x {}", frame.width, frame.height),
-          "this policy takes the images of the cameras that it was trained with"};
+Status check_camera(const Frame& frame, const CameraSize& camera, const std::string& where) {
+  if (frame.width == camera.width && frame.height == camera.height) return {};
+  return Error{Code::bad_observation, where, fmt::format("an image of {} x {}", camera.width, camera.height),
+               fmt::format("{} x {}", frame.width, frame.height),
+               "this policy takes the images of the cameras that it was trained with"};
 }
 
 std::optional<CameraSize> camera_size(const Fit& fit) {

@@ -85,8 +85,8 @@ Status run_pipeline(const Frame& frame, const Pipeline& pipeline, std::span<floa
 /// The work of a fit with a frame of this size, counted in pixels of about 10 ns; 0 where it depends on the size it
 /// makes.
 std::int64_t fit_work(const Fit& fit, int width, int height);
-/// The error for a frame of another camera than the one whose frames alone are taken.
-Error wrong_camera(const Frame& frame, const CameraSize& camera, const std::string& where);
+/// Checks that a frame is of the camera whose frames alone are taken. Errors: bad_observation.
+Status check_camera(const Frame& frame, const CameraSize& camera, const std::string& where);
 /// The size of frames where only one is taken.
 std::optional<CameraSize> camera_size(const Fit& fit);
 /// Half a pixel for each that an op reads.

@@ -22,8 +22,7 @@ std::vector<float> float_pixels(const Frame& frame) {
 }  // namespace
 
 Status resize_floats(const Frame& frame, const FloatResizes& to, std::span<float> out, const std::string& where) {
-  if (to.camera && (to.camera->width != frame.width || to.camera->height != frame.height))
-    return wrong_camera(frame, *to.camera, where);
+  if (to.camera) VLA_CHECK(check_camera(frame, *to.camera, where));
   std::vector<float> pixels = float_pixels(frame);
   int width = frame.width, height = frame.height;
   for (const FloatResize& size : to.sizes) {
