@@ -38,9 +38,10 @@ SETTLE = 10  # steps in which objects fall into place before an episode begins
 REST = [0.0] * 6 + [-1.0]
 MUJOCO = "3.3.2"
 CAMERAS = {"image": "agentview", "image2": "robot0_eye_in_hand"}
-# `--swap` tells a scene of libero_object to pick up another thing that lies in it: they form pairs, by the tasks' order.
+# What the tasks of libero_object pick up, in their order.
 THINGS = ("alphabet soup", "cream cheese", "salad dressing", "bbq sauce", "ketchup", "tomato sauce", "butter", "milk", "chocolate pudding", "orange juice")
 SENTENCES = {f"libero_object/{i}": f"pick up the {thing} and place it in the basket" for i, thing in enumerate(THINGS)}
+# `--swap` asks for another thing, which lies in the scene as well: scenes whose things lie in each other's form pairs.
 OPPOSITE = {f"libero_object/{i}": f"libero_object/{j}" for a, b in ((0, 1), (2, 4), (3, 8), (5, 7), (6, 9)) for i, j in ((a, b), (b, a))}
 INSTALL = "`make libero` at the root of vla.cpp, or pip install -r examples/libero/requirements.txt --no-deps --require-hashes"
 
