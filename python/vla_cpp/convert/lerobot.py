@@ -11,8 +11,9 @@ from . import recipe
 from .archs import Options
 from .bundle import Key
 from .checkpoint import Checkpoint
-from .errors import Code, Problems
+from .errors import Code, Problems, refuse
 from .features import views_of
+from .files import HUB_FORM
 from .section import Section
 
 EMPTY_CAMERA = "observation.images.empty_camera_"
@@ -133,3 +134,12 @@ def tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recip
         return ""
     checkpoint.notes.append("tokenizer: from {}/ inside the checkpoint".format(own))
     return checkpoint.path(own)
+
+
+def given_tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Processors, name: str) -> str:
+    """The checkpoint's own, or that of --backbone, where no config says which it is. `name`: that of the reference. Errors: I/O."""
+    found = tokenizer_folder(checkpoint, options, processors) or options.backbone
+    if found:
+        return found
+    hint = "the reference takes that of {}, which --backbone {} fetches".format(name, HUB_FORM)
+    raise refuse("tokenizer", "--backbone DIR, or tokenizer/ inside the checkpoint", "neither", hint, Code.IO)

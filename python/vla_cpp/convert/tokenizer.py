@@ -40,6 +40,11 @@ class TokenizerPlan(NamedTuple):
     keys: List[Key]  # the bundle's `tokenizer.*`
     truncate: str  # the side on which a text that is too long loses tokens: left or right
 
+    @property
+    def tokens(self) -> List[str]:
+        """Their texts, by id."""
+        return next(key.value for key in self.keys if key.name == "tokenizer.tokens")
+
 
 def read_tokenizer(
     folder: str, n_vocab: int, problems: Problems, notes: List[str], more: Sequence[str] = ()

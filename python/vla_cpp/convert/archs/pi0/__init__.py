@@ -11,12 +11,10 @@ import json
 from functools import partial
 from typing import List
 
-from ... import recipe
 from ...bundle import Key
 from ...checkpoint import OPENPI, Checkpoint
-from ...errors import Code, Problems, refuse
-from ...files import HUB_FORM
-from ...lerobot import tokenizer_folder
+from ...errors import Problems
+from ...lerobot import given_tokenizer
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from .. import Options, Plan
 from .layouts import read_lerobot, read_openpi, variants_of
@@ -31,9 +29,8 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
     checkpoint.tensors = rename(
         checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems
     )
-    tokenizer = read_tokenizer(
-        _tokenizer(checkpoint, options, source.processors), source.sizes.lm.n_vocab, problems, checkpoint.notes
-    )
+    folder = given_tokenizer(checkpoint, options, source.processors, TOKENIZER)
+    tokenizer = read_tokenizer(folder, source.sizes.lm.n_vocab, problems, checkpoint.notes)
     _check_newline(source.text, tokenizer, problems)
     tokenize = {"op": "tokenize", "max_tokens": source.max_tokens, "truncate": tokenizer.truncate}
     document = {
@@ -54,26 +51,11 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
     return Plan(keys, rows, dropped(family, source.sizes, checkpoint), source.statistics, hints(source.sizes))
 
 
-def _tokenizer(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
-    """The folder with the tokenizer: the checkpoint's own, or --backbone."""
-    own = tokenizer_folder(checkpoint, options, processors) or options.backbone
-    if own:
-        return own
-    raise refuse(
-        "tokenizer",
-        "--backbone DIR, or tokenizer/ inside the checkpoint",
-        "neither",
-        "the reference takes {}, which --backbone {} fetches".format(TOKENIZER, HUB_FORM),
-        Code.IO,
-    )
-
-
 def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problems) -> None:
     """openpi encodes the newline apart from the text. The same ids come out of both together unless a token spans them."""
     if not any(op["op"] == "ensure_suffix" for op in text):
         return
-    tokens = next(key.value for key in tokenizer.keys if key.name == "tokenizer.tokens")
-    spanning = next((token for token in tokens if token.endswith("\n") and token.strip("\n")), None)
+    spanning = next((token for token in tokenizer.tokens if token.endswith("\n") and token.strip("\n")), None)
     if spanning is not None:
         problems.unsupported("tokenizer.json: model.vocab", "a newline in no token but its own runs", repr(spanning))
 

@@ -45,7 +45,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     tokenizer = read_tokenizer(s.folder, s.lm.n_vocab + len(own), problems, checkpoint.notes, own)
     problems.raise_any()
     # The reference gives its table of tokens more rows where it has too few.
-    s.lm.n_vocab = max(s.lm.n_vocab, *(len(key.value) for key in tokenizer.keys if key.name == "tokenizer.tokens"))
+    s.lm.n_vocab = max(s.lm.n_vocab, len(tokenizer.tokens))
     prompt = qwen3_vl.read_prompt(tokenizer, s.folder, s, problems, FOLDER)
     prompt = prompt._replace(n_token=min(prompt.n_token + len(s.prompt.encode()), s.n_context))
     document = {

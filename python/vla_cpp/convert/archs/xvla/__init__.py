@@ -18,9 +18,9 @@ from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Code, Problems, refuse
 from ...features import feature_keys, states_of
-from ...files import HUB_FORM, read_json
+from ...files import read_json
 from ...images import IMAGENET
-from ...lerobot import tokenizer_folder, view_keys
+from ...lerobot import given_tokenizer, view_keys
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from ...tokenizer_parts import CONFIG_FILE, content_of
 from .. import Options, Plan
@@ -56,7 +56,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     dims = {**({recipe.STATE: s.state_dim} if s.state_dim else {}), recipe.ACTION: s.action_dim}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     _check_order(list(steps), problems)
-    folder = _tokenizer_folder(checkpoint, options, processors)
+    folder = given_tokenizer(checkpoint, options, processors, TOKENIZER)
     tokenizer = read_tokenizer(folder, s.n_vocab, problems, checkpoint.notes)
     if steps.get("tokenizer_processor", {}).get("padding", "max_length") == "max_length":
         s.n_token, s.pad_token = processors.max_tokens, _pad_token(folder, tokenizer, problems)
@@ -105,20 +105,11 @@ def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str, is_n
     }
 
 
-def _tokenizer_folder(checkpoint: Checkpoint, options: Options, processors: recipe.Processors) -> str:
-    found = tokenizer_folder(checkpoint, options, processors) or options.backbone
-    if found:
-        return found
-    hint = "the reference takes that of {}, which --backbone {} fetches".format(TOKENIZER, HUB_FORM)
-    raise refuse("tokenizer", "--backbone DIR, or tokenizer/ inside the checkpoint", "neither", hint, Code.IO)
-
-
 def _pad_token(folder: str, tokenizer: TokenizerPlan, problems: Problems) -> int:
     """The reference hides no padding from its network, so that its id counts."""
     path = os.path.join(folder, CONFIG_FILE)
     stated = content_of((read_json(path) if os.path.exists(path) else {}).get("pad_token", "<pad>"))
-    tokens = next(key.value for key in tokenizer.keys if key.name == "tokenizer.tokens")
-    if stated in tokens:
-        return tokens.index(stated)
+    if stated in tokenizer.tokens:
+        return tokenizer.tokens.index(stated)
     problems.add(CONFIG_FILE + ": pad_token", "a token, since text is padded", repr(stated))
     return 0
