@@ -100,6 +100,15 @@ def test_int8_is_near_float32_and_told_and_must_be_asked_for():
     assert distance(None) < distance("int8") < 0.02
 
 
+def test_the_policy_for_libero_answers_a_recorded_look_as_pytorch_did():
+    look = ROOT / "examples/libero/look"
+    told, expected = json.loads((look / "look.json").read_text()), np.load(look / "expected.npy")
+    frames = {view: (look / f"{view}.png").read_bytes() for view in ("image", "image2")}
+    with vla_cpp.Policy(ROOT / "models/libero-object-tiny.gguf", threads=1, kernels="float32") as policy:
+        chunk = policy.act(images=frames, state=told["state"], text=told["sentence"], noise=np.load(look / "noise.npy"))
+    assert np.abs(np.asarray(chunk) - expected).max() < 1e-6 * np.abs(expected).max()
+
+
 def test_without_seed_and_noise_the_seed_that_was_drawn_gives_the_chunk_again(act):
     first, second = act(seed=None), act(seed=None)
     assert first.seed != second.seed and not np.array_equal(first, second)
