@@ -12,7 +12,7 @@ CMAKE_ARGS ?=
 
 help:
 	@echo "make demo      install what is needed, build, and film the shipped policy at work in a simulator (RECORDED=1: without one)"
-	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), and one of its tasks drawn as proof"
+	@echo "make libero    the benchmark LIBERO in $(LIBERO) for vla-eval (0.7 GB to download), one of its tasks drawn as proof, and \`vla\`"
 	@echo "make test      build and run the whole test suite, also under the sanitizers"
 	@echo "make test-cuda   all tests of our kernels for CUDA, without a GPU (downloads 102 MB: NVIDIA's compiler)"
 	@echo "make test-vulkan all golden cases on --device vulkan, of which make test tries one of each family"
@@ -109,6 +109,10 @@ libero:
 	@scripts/packages.sh demo
 	@$(MAKE) --no-print-directory $(LIBERO_STAMP)
 	$(LIBERO)/bin/python examples/libero/proof.py out/libero.png
+	@test -f build/cpu/build.ninja || cmake --preset cpu $(CMAKE_ARGS)
+	cmake --build --preset cpu --target vla
+	@echo
+	@echo "next:  $(LIBERO)/bin/vla-eval libero --vla build/cpu/bin/vla --bundle models/libero-object-tiny.gguf --task libero_object/4 --episodes 1 --film all"
 
 asan: packages $(STAMP)
 	@test -f build/asan/build.ninja || cmake --preset asan $(CMAKE_ARGS)
