@@ -17,11 +17,16 @@ from lerobot_calls import BEGIN, PIECE, Robot, piece  # noqa: E402
 from lerobot_pickles import Bomb, TimedObservation, dumps, setup_of  # noqa: E402
 from server_process import SECONDS, VLA, frames  # noqa: E402
 
-@pytest.fixture(scope="module")
-def served(case):
+
+@pytest.fixture(scope="module", autouse=True)
+def needs_grpc(case):
     options = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--lerobot", "here"]
     if "libgrpc++" in subprocess.run(options, capture_output=True, text=True).stderr:
         pytest.skip("a build without libgrpc++")
+
+
+@pytest.fixture(scope="module")
+def served(case):
     with serving(case, "--lerobot", "127.0.0.1:0") as (line, address):
         yield address("grpc://"), line
 
