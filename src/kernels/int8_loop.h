@@ -40,6 +40,7 @@ VLA_INLINE void scale_sums(const LinearJob::Part& part, const Stripe& s, const R
 ///     and write rows up to kRows.
 /// Where products have a unit of their own (kBeside), multiply calls between() for every 64 of the depth before it
 /// writes sums: some rows of the tile before are finished there.
+/// Where registers are left for it (kFirstExpands), the first tile of many rows expands bytes while it multiplies.
 /// Where an instruction takes two rows by two columns (kPairs), rows are copied in pairs and elements of any width
 /// rearranged, both by the tile: pair(first, second, depth, to) and expand(strips, depth, to); then multiply has the
 /// latter's bytes for `strips` and no between().
@@ -52,9 +53,11 @@ class Int8Loop {
   using Finish = typename Stripes::Finish;
   static constexpr std::int64_t kRows = Tile::kRows, kColumns = Tile::kColumns, kBlockRows = Tile::kBlockRows;
   static constexpr int kStrips = Tile::kColumns / static_cast<int>(Int8Panels::kColumns);
+  using Numbers = typename Weights::template Strips<kStrips>;
   static constexpr std::int64_t kFewRows = 32;   // which the tile unpacks weights for
   static constexpr std::int64_t kMinItems = 16;  // for each thread, where there are so many
   static constexpr bool kPacked = !std::is_same_v<Weights, BytePanels>;
+  static constexpr bool kFirstExpands = requires { Tile::kFirstExpands; };
   static constexpr std::int32_t kOffset = Tile::kSigned ? 0 : Weights::kOffset;
   static_assert(kColumns % Int8Panels::kColumns == 0 && Tile::kStep % kQuantizedUnit == 0);
 
@@ -160,14 +163,14 @@ class Int8Loop {
     const std::int64_t step = even_block(depth, Tile::kStep, kQuantizedUnit);
     const std::byte* strips = part.weight + s.column / Int8Panels::kColumns * Weights::strip_size(job_.d_in);
     for (std::int64_t k = 0; k < depth; k += step) {
-      const typename Weights::template Strips<kStrips> numbers(strips, job_.d_in, k);
+      const Numbers numbers(strips, job_.d_in, k);
       const std::int64_t d = min(step, depth - k);
       bool expands = false;
       if constexpr (kPairs) {
         Tile::expand(numbers, d, scratch_->panel);
       } else if constexpr (kPacked) {
         expands = job_.n_row > kFewRows;
-        if (expands) expand<typename V::Int, kStrips>(numbers, 0, d, scratch_->panel);
+        if (expands && !kFirstExpands) expand<typename V::Int, kStrips>(numbers, 0, d, scratch_->panel);
       }
       for (std::int64_t t = 0; t < n_tile; ++t) {
         const std::int64_t r = Stripes::first_row(s.n_row, t), n_row = Stripes::first_row(s.n_row, t + 1) - r;
@@ -183,8 +186,11 @@ class Int8Loop {
                          scratch_->panel, d, sums, k > 0);
         else if (!expands)
           multiply(numbers);
+        else if constexpr (kFirstExpands && kPacked)
+          t == 0 ? multiply(ExpandingStrips<kStrips, Numbers>{scratch_->panel, numbers})
+                 : multiply(ExpandedStrips<kStrips, Numbers>{scratch_->panel, numbers});
         else if constexpr (kPacked)
-          multiply(ExpandedStrips<kStrips, std::remove_const_t<decltype(numbers)>>{scratch_->panel, numbers});
+          multiply(ExpandedStrips<kStrips, Numbers>{scratch_->panel, numbers});
         if (k + d < depth) continue;
         summed_ = {this, &part, s, gate, r, n_row, 0, Finish(job_, s, scratch_->scaled, r, n_row)};
         if constexpr (!Tile::kBeside) summed_.finish();

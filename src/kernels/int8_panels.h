@@ -49,8 +49,8 @@ struct BytePanels : Int8Panels {
 };
 
 /// The elements of a panel of kStrips as a tile reads them, with their offset: load(k, s, i, byte) is a vector from a
-/// byte on of the line that holds elements k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16. Here they lie as they
-/// are multiplied.
+/// byte on of the line that holds elements k + 4 s to k + 4 s + 3 of strip i, k a multiple of 16, and all of one block
+/// of 64. Here they lie as they are multiplied.
 template <int kStrips>
 struct BytePanels::Strips {
   const std::byte* strips;
@@ -100,8 +100,8 @@ struct TernaryPanels::Strips {
   VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
     typedef std::uint64_t Words __attribute__((vector_size(sizeof(Vector))));
     Words words;
-    std::memcpy(&words, strips + i * strip + k * 4 + byte, sizeof(words));
-    return std::bit_cast<Vector>((words >> 2 * s) & 0x0303030303030303U);
+    std::memcpy(&words, strips + i * strip + k * 4 + s / 4 * kLine + byte, sizeof(words));
+    return std::bit_cast<Vector>((words >> s % 4 * 2) & 0x0303030303030303U);
   }
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
 };
@@ -155,10 +155,12 @@ struct Int4Codes::Strips {
   template <class Vector>
   VLA_INLINE Vector step(std::int64_t k, int i, int byte) const {
     using Columns = typename VectorOf<std::uint8_t, sizeof(Vector) / 4>::Type;
+    using Twos = typename VectorOf<std::uint16_t, sizeof(Vector) / 2>::Type;
     using Fours = typename VectorOf<std::uint32_t, sizeof(Vector)>::Type;
     Columns columns;
     std::memcpy(&columns, steps + i * strip + k / Int4Block::kElements * kColumns + byte / 4, sizeof(columns));
-    const Fours step = __builtin_convertvector(columns, Fours);
+    // In two steps: GCC 12 widens bytes to four of them one by one.
+    const Fours step = __builtin_convertvector(__builtin_convertvector(columns, Twos), Fours);
     return std::bit_cast<Vector>(step | step << 16);
   }
   VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
@@ -172,14 +174,18 @@ struct Int4Panels::Strips : Int4Codes::Strips<kStrips> {
   template <class Vector>
   VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
     using Pairs = typename VectorOf<std::uint16_t, sizeof(Vector)>::Type;
-    using Bytes = typename VectorOf<std::uint8_t, sizeof(Vector)>::Type;
     const auto step = Packed::template step<Pairs>(k, i, byte);
-    const auto zeros = std::bit_cast<Bytes>(step << 3 | step << 11);          // kZero * step, in each byte
-    const auto numbers = Packed::template load<Pairs>(k, s, i, byte) * step;  // no byte carries: 15 * kMaxStep is 255
-    return std::bit_cast<Vector>(std::bit_cast<Bytes>(numbers) - (zeros - static_cast<std::uint8_t>(kOffset)));
+    // Two bytes at once, with an offset that keeps each from 0 to 255 and so from its neighbour: of code * step, and of
+    // the difference.
+    const auto codes = Packed::template load<Pairs>(k, s, i, byte);
+    const auto numbers = codes * step + (kHalf * kBoth - step * (Int4Block::kZero * kBoth));
+    return std::bit_cast<Vector>(numbers ^ (kHalf - kOffset) * kBoth);
   }
+
+ private:
+  static constexpr std::uint16_t kHalf = 128, kBoth = 0x0101;
 };
-static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kZero == 8);
+static_assert(15 * Int4Block::kMaxStep <= 255 && Int4Block::kMost * Int4Block::kMaxStep < 128);
 
 /// Elements of a panel that were expanded to bytes: lines of 64 with four elements of 16 columns, of one strip after
 /// the other, then the next four elements. fetch(k, s, i) asks for the line that is loaded kAhead groups of four
@@ -206,16 +212,32 @@ struct ExpandedStrips {
   }
 };
 
-/// Writes the lines that ExpandedStrips reads, of `depth` elements from k on; Vector as wide as the machine's.
-template <class Vector, int kStrips, class Strips>
+/// The same where they are read for the first time: what is loaded is written to the lines.
+template <int kStrips, class Packed>
+struct ExpandingStrips {
+  std::byte* lines;
+  const Packed& packed;
+
+  template <class Vector>
+  VLA_INLINE Vector load(std::int64_t k, int s, int i, int byte) const {
+    const auto numbers = packed.template load<Vector>(k, s, i, byte);
+    std::memcpy(lines + (k + 4 * s) * kStrips * 16 + i * Int8Panels::kLine + byte, &numbers, sizeof(numbers));
+    return numbers;
+  }
+  VLA_INLINE void fetch(std::int64_t /*k*/, int /*s*/, int /*i*/) const {}
+};
+
+/// Writes the lines that ExpandedStrips reads, of `depth` elements from k on, kUnit at a time; Vector as wide as the
+/// machine's.
+template <class Vector, int kStrips, int kUnit = kQuantizedUnit, class Strips>
 VLA_INLINE void expand(const Strips& strips, std::int64_t k, std::int64_t depth, std::byte* to) {
-  for (const std::int64_t end = k + depth; k < end; k += Int8Panels::kGroup)
+  for (const std::int64_t end = k + depth; k < end; k += kUnit)
 #pragma GCC unroll 4
     for (int i = 0; i < kStrips; ++i)
 #pragma GCC unroll 8
       for (int byte = 0; byte < Int8Panels::kLine; byte += static_cast<int>(sizeof(Vector)))
-#pragma GCC unroll 4
-        for (int s = 0; s < 4; ++s) {
+#pragma GCC unroll 16
+        for (int s = 0; s < kUnit / 4; ++s) {
           const auto numbers = strips.template load<Vector>(k, s, i, byte);
           std::memcpy(to + ((k - end + depth) / 4 + s) * kStrips * Int8Panels::kLine + i * Int8Panels::kLine + byte,
                       &numbers, sizeof(numbers));

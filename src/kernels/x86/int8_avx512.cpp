@@ -14,6 +14,7 @@ struct VnniTile {
   static constexpr std::int64_t kBlockKiB = 1600;
   static constexpr bool kEven = true, kBeside = false, kSigned = false;
   static constexpr RoundedLayout kLayout = RoundedLayout::none;
+  static constexpr bool kFirstExpands = true;
   struct Session {};
 
   template <class Strips, class Between>
@@ -42,21 +43,23 @@ struct VnniTile {
 #pragma GCC unroll 4
       for (int j = 0; j < kStrips; ++j)
         sum[r][j] = add ? _mm512_loadu_si512(sums + r * kColumns + 16 * j) : _mm512_setzero_si512();
-    for (std::int64_t k = 0; k < depth; k += Int8Panels::kGroup)
+    for (std::int64_t k = 0; k < depth; k += kQuantizedUnit)
+      for (int group = 0; group < kQuantizedUnit / 4; group += 4)
 #pragma GCC unroll 4
-      for (int s = 0; s < 4; ++s, x += 4) {
-        __m512i numbers[kStrips];
+        for (int s = group; s < group + 4; ++s, x += 4) {
+          __m512i numbers[kStrips];
 #pragma GCC unroll 4
-        for (int j = 0; j < kStrips; ++j) numbers[j] = strips.template load<__m512i>(k, s, j, 0), strips.fetch(k, s, j);
+          for (int j = 0; j < kStrips; ++j)
+            numbers[j] = strips.template load<__m512i>(k, s, j, 0), strips.fetch(k, s, j);
 #pragma GCC unroll 6
-        for (int r = 0; r < kCount; ++r) {
-          std::int32_t four;
-          std::memcpy(&four, x + r * x_stride, sizeof(four));
-          const __m512i codes = _mm512_set1_epi32(four);
+          for (int r = 0; r < kCount; ++r) {
+            std::int32_t four;
+            std::memcpy(&four, x + r * x_stride, sizeof(four));
+            const __m512i codes = _mm512_set1_epi32(four);
 #pragma GCC unroll 4
-          for (int j = 0; j < kStrips; ++j) add_products(sum[r][j], numbers[j], codes);
+            for (int j = 0; j < kStrips; ++j) add_products(sum[r][j], numbers[j], codes);
+          }
         }
-      }
 #pragma GCC unroll 6
     for (int r = 0; r < kCount; ++r)
 #pragma GCC unroll 4
@@ -70,7 +73,7 @@ bool supports(const MatrixDesc& desc, Features use) { return !is_float(desc.type
 
 extern const LinearKernel kTernaryAvx512, kInt4Avx512, kInt8Avx512;
 const LinearKernel kTernaryAvx512 = Int8Loop<VnniTile<2560>, TernaryPanels>::kernel("avx512_int8", supports);
-const LinearKernel kInt4Avx512 = Int8Loop<VnniTile<512>, Int4Panels>::kernel("avx512_int8", supports);
+const LinearKernel kInt4Avx512 = Int8Loop<VnniTile<2560>, Int4Panels>::kernel("avx512_int8", supports);
 const LinearKernel kInt8Avx512 = Int8Loop<VnniTile<512>, BytePanels>::kernel("avx512_int8", supports);
 
 }  // namespace vla::kernels

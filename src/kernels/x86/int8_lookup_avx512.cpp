@@ -292,7 +292,7 @@ class LookupLoop {
     for (std::int64_t k = 0; k < step.n_lookup; k += 16)
       make_indices(line(step.k + 3 * k), strip, numbers.indices + k * kStrips / 2 * kRegister);
     const TernaryPanels::Strips<kStrips> multiplied(line(step.multiplied()), job_.d_in, 0);
-    kernels::expand<V::Int, kStrips>(multiplied, 0, 4 * step.n_group, numbers.multiplied);
+    kernels::expand<V::Int, kStrips, Int8Panels::kGroup>(multiplied, 0, 4 * step.n_group, numbers.multiplied);
   }
 
   /// A step of kRows rows from r on by n panels. Rows behind the block's are read (kMaxTernaryRows), and their sums
