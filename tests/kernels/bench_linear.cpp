@@ -2,8 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How fast each row of the matrix product is on this machine, as a share of the multiply-add peak that is measured
-// beside it; of products of ternary, int4 and int8 weights also how much faster than the float32 kernel that takes
-// turns with them. Not a test: what it prints depends on what else the machine does.
+// beside it; of products of ternary, int4 and int8 weights also how much faster than the kernel of bf16 weights that
+// takes turns with them, and of int4 ones than that of int8. Not a test: what it prints depends on what else the
+// machine does.
 //
 //   bench_linear [threads] [rounds] [kernel]
 #include <fmt/format.h>
@@ -41,7 +42,8 @@ constexpr Shape kShapes[] = {{1024, 768, 768},   {1024, 768, 3072}, {1024, 3072,
 /// Of BitVLA's language model and tower.
 constexpr Shape kInt8Shapes[] = {{640, 2560, 2560}, {300, 2560, 6912}, {640, 2560, 6912}, {640, 6912, 2560},
                                  {640, 2560, 640},  {512, 1152, 1152}, {512, 1152, 4304}, {512, 4304, 1152},
-                                 {1, 2560, 6912},   {16, 2560, 6912}};
+                                 {1, 2560, 6912},   {16, 2560, 6912},  {1, 4096, 16384},  {16, 4096, 16384},
+                                 {50, 4096, 16384}};
 
 /// Memory at a multiple of a page.
 struct Block {
@@ -132,22 +134,32 @@ double median(std::vector<double> values) {
   return values[values.size() / 2];
 }
 
+/// A kernel that takes turns with the one that is measured, and its weights.
+struct Rival {
+  const LinearKernel* kernel;
+  DType weights;
+};
+
 /// `rounded`: x and y lie as this kernel's products leave them for each other, and y has a GELU; else they are float32
-/// rows. `versus`: a kernel that takes turns with this one, or null.
+/// rows.
 void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& probe, const MatrixDesc& desc,
-             std::int64_t n_row, int n_round, bool rounded, const LinearKernel* versus) {
+             std::int64_t n_row, int n_round, bool rounded, const std::vector<Rival>& rivals) {
   const int n_thread = executor.n_thread();
   const Trial trial(kernel, desc, n_row, n_thread, rounded);
   const Shape& s = trial.s;
-  std::optional<Trial> other;
-  if (versus != nullptr) other.emplace(*versus, MatrixDesc{DType::bf16, s.d_in, s.d_out}, s.n_row, n_thread, false);
+  std::vector<std::unique_ptr<Trial>> others;
+  for (const Rival& rival : rivals)
+    others.push_back(
+        std::make_unique<Trial>(*rival.kernel, MatrixDesc{rival.weights, s.d_in, s.d_out}, s.n_row, n_thread, false));
   const double flop = 2.0 * static_cast<double>(s.n_row * s.d_in * s.d_out);
-  std::vector<double> rates, peaks, shares, factors;
+  std::vector<double> rates, peaks, shares;
+  std::vector<std::vector<double>> factors(rivals.size());
   for (int i = 0; i < n_round; ++i) {  // alternating, since the machine's speed may change for seconds at a time
     peaks.push_back(measure_peak(probe, n_thread, 0.02));
     rates.push_back(flop / best_time(executor, *trial.product, 0.05));
     shares.push_back(rates.back() / peaks.back());
-    if (other) factors.push_back(rates.back() / flop * best_time(executor, *other->product, 0.05));
+    for (std::size_t j = 0; j < others.size(); ++j)
+      factors[j].push_back(rates.back() / flop * best_time(executor, *others[j]->product, 0.05));
   }
   const double best = *std::max_element(rates.begin(), rates.end()),
                peak = *std::max_element(peaks.begin(), peaks.end());
@@ -156,7 +168,8 @@ void measure(Executor& executor, const LinearKernel& kernel, const PeakProbe& pr
              100 * median(shares), best / flop * static_cast<double>(trial.stored.n) * 1e-9);
   fmt::print("  packed at {:.1f} GB/s", static_cast<double>(trial.stored.n) / trial.pack_seconds * 1e-9);
   if (rounded) fmt::print("  rounded, GELU");
-  if (versus != nullptr) fmt::print("  {:.2f} x {}", median(factors), versus->name);
+  for (std::size_t j = 0; j < rivals.size(); ++j)
+    fmt::print("  {:.2f} x {} {}", median(factors[j]), rivals[j].kernel->name, dtype_name(rivals[j].weights));
   fmt::print("\n");
   std::fflush(stdout);
 }
@@ -187,7 +200,7 @@ int main(int argc, char** argv) {
           for (const bool rounded : {false, true}) {
             if (rounded && kernel->y_layout(shape.d_in) == RoundedLayout::none) continue;
             measure(**executor, *kernel, peak_probe_of(set.uses), {DType::bf16, shape.d_in, shape.d_out}, shape.n_row,
-                    n_round, rounded, nullptr);
+                    n_round, rounded, {});
           }
   }
   const std::pair<DType, std::span<const LinearKernel* const>> int8[] = {
@@ -196,9 +209,11 @@ int main(int argc, char** argv) {
     for (const LinearKernel* kernel : kernels) {
       const PeakProbe* probe = probe_of(*kernel);
       if (probe == nullptr || !wants(*kernel)) continue;
+      std::vector<Rival> rivals = {{choose_linear({DType::bf16, 64, 64}, this_cpu()), DType::bf16}};
+      for (const LinearKernel* other : int8_kernels())
+        if (weights == DType::int4 && other->name == std::string(kernel->name)) rivals.push_back({other, DType::i8});
       if (!(*executor)->reserve(kernel->scratch_size).ok()) return 1;
       for (const Shape& shape : kInt8Shapes)
-        measure(**executor, *kernel, *probe, {weights, shape.d_in, shape.d_out}, shape.n_row, n_round, false,
-                choose_linear({DType::bf16, 64, 64}, this_cpu()));
+        measure(**executor, *kernel, *probe, {weights, shape.d_in, shape.d_out}, shape.n_row, n_round, false, rivals);
     }
 }
