@@ -12,7 +12,7 @@
 #include "bundle/gguf_writer.h"
 #include "graph/rounding.h"
 #include "kernels/numbers.h"
-#include "lower/cpu/recode.h"
+#include "lower/host/recode.h"
 #include "policies/policy.h"
 
 namespace vla {

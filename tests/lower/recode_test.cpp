@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/recode.h"
+#include "lower/host/recode.h"
 
 #include <doctest/doctest.h>
 
@@ -60,6 +60,15 @@ TEST_CASE("bf16 is the nearest one, ties to even") {
   const Recoded rounded = recoded({1 + 0x1p-8f, -1 - 0x1.8p-8f, 0x1p-130f, 3.0e38f}, DType::f32, {DType::bf16});
   CHECK(rounded.bytes == test::store_as(DType::bf16, expected));
   CHECK(rounded.scales.empty());
+}
+
+TEST_CASE("floats become float32 without a change") {
+  for (const DType stored : {DType::f16, DType::bf16}) {
+    std::vector<float> values = {1, -0.3f, 1000, 0};
+    const Recoded wide = recoded(values, stored, {DType::f32});
+    test::store_as(stored, values);
+    CHECK(wide.bytes == test::store_as(DType::f32, values));
+  }
 }
 
 TEST_CASE("codes become float32 by the scale of their group") {

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/segments.h"
+#include "lower/host/segments.h"
 
 #include <doctest/doctest.h>
 

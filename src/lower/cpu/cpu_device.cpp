@@ -12,7 +12,7 @@
 #include "kernels/pages.h"
 #include "lower/cpu/cpu_program.h"
 #include "lower/cpu/precision.h"
-#include "lower/cpu/weight_plan.h"
+#include "lower/host/weight_plan.h"
 
 namespace vla::lower {
 namespace {
@@ -79,7 +79,10 @@ Status CpuDevice::load(const ParamList& params, bool fill, const WeightPlan& pla
 }
 
 Result<WeightPlan> CpuDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
-  return plan_streams(weights_, static_cast<const CpuProgram&>(prefix), static_cast<const CpuProgram&>(step), size);
+  const auto &first = static_cast<const CpuProgram&>(prefix), &then = static_cast<const CpuProgram&>(step);
+  return plan_streams({std::span(first.reads()).subspan(first.n_prepare()), then.reads(),
+                       [&](const Param& matrix) { return weights_.size_of(matrix); }, weights_.size()},
+                      size);
 }
 
 Status CpuDevice::allocate(Slots& slots) {

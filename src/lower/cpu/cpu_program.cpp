@@ -2,8 +2,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "lower/cpu/cpu_program.h"
 
-#include <fmt/format.h>
-
 #include <algorithm>
 #include <cstring>
 
@@ -99,14 +97,11 @@ void CpuProgram::make_taps(const CpuLowering& l) {
 }
 
 Status CpuProgram::cut(const CpuWeights& weights) {
-  std::vector<Groups> groups(phases_.size());
-  for (std::size_t i = 0; i < phases_.size(); ++i)
-    for (const MatrixUse& use : uses_[i]) groups[i].add(weights.group_of(use.matrix->id));
-  for (const Groups& all : groups)
-    if (all.last - all.first >= WeightStream::kWindows)
-      return Error{Code::unsupported, "memory",
-                   fmt::format("phases that read at most {} groups of matrices", WeightStream::kWindows),
-                   std::to_string(all.last - all.first + 1), "give a larger budget"};
+  for (const MatrixUses& phase : uses_) {
+    reads_.emplace_back();
+    for (const MatrixUse& use : phase) reads_.back().push_back(use.matrix);
+  }
+  VLA_TRY(const std::vector<Groups> groups, find_groups(reads_, weights.groups()));
   prepare_ = cut_phases(std::span(groups).first(n_prepare_), 0);
   run_ = cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_);
   return {};

@@ -5,7 +5,7 @@
 #include <deque>
 
 #include "lower/cpu/emit.h"
-#include "lower/cpu/segments.h"
+#include "lower/host/segments.h"
 
 namespace vla::lower {
 
@@ -25,7 +25,7 @@ class CpuProgram final : public Program {
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
   /// The matrices that each phase reads: first those of `prepare`, then those of `run`.
-  const std::vector<MatrixUses>& uses() const { return uses_; }
+  const MatrixReads& reads() const { return reads_; }
   std::size_t n_prepare() const { return n_prepare_; }
   std::size_t size() const override { return own_.size() + host_size_; }
 
@@ -47,7 +47,8 @@ class CpuProgram final : public Program {
   Memory arena_, own_;  // own: constants, and what prepare leaves
   std::shared_ptr<const WeightTable> weights_;
   std::vector<MatrixUses> uses_;  // of each phase
-  std::uint64_t bound_ = 0;       // the version of the table that tasks know
+  MatrixReads reads_;
+  std::uint64_t bound_ = 0;  // the version of the table that tasks know
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;
   std::vector<Segment> prepare_, run_;

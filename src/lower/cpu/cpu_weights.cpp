@@ -10,6 +10,7 @@
 #include <map>
 
 #include "kernels/executor.h"
+#include "lower/host/weight_plan.h"
 
 namespace vla::lower {
 namespace {
@@ -43,7 +44,7 @@ std::string describe(const std::map<std::string, std::map<std::string, int>>& co
 }  // namespace
 
 bool CpuWeights::has_int8() const {
-  return std::ranges::any_of(places_, [](const MatrixPlace& place) {
+  return std::ranges::any_of(places_, [](const Place& place) {
     return place.encoding.type == DType::i8 || place.encoding.type == DType::int4;
   });
 }
@@ -65,10 +66,12 @@ Status CpuWeights::choose(const ParamList& list, const Options& options) {
   const auto tables = std::make_shared<Tables>();
   tables_ = tables;
   for (const Param& param : list.params()) {
-    MatrixPlace& place = places_.emplace_back();
+    Place& place = places_.emplace_back();
     if (param.storage == Storage::matrix) {
       place.encoding = resident_encoding(param, options.rounding);
       place.kernel = kernels::choose_linear({place.encoding.type, param.shape[0], param.shape[1]}, options.use);
+      place.packing = {place.kernel->packed_size, place.kernel->pack};
+      if (param.scales == nullptr) place.n_scale = place.encoding.n_scale(param.count());  // they are made
       ++counts[place.kernel->name][dtype_name(param.encoding.type)];
     } else if (param.storage == Storage::table && param.source != nullptr) {
       VLA_TRY(std::unique_ptr<TableRows> rows, TableRows::make(*list.bundle(), param));
@@ -82,11 +85,9 @@ Status CpuWeights::choose(const ParamList& list, const Options& options) {
 
 /// Resident parameters one after the other, then the windows.
 Status CpuWeights::give_places(const ParamList& list, const Options& options, const WeightPlan& plan) {
-  groups_.assign(places_.size(), -1);
-  for (std::size_t i = 0; i < plan.streamed.size(); ++i)
-    for (const Param* matrix : plan.streamed[i]) groups_[static_cast<std::size_t>(matrix->id)] = static_cast<int>(i);
+  groups_ = groups_by_id(plan, places_.size());
   const auto size_in_memory = [&](const Param& param) {
-    if (param.storage == Storage::matrix) return group_of(param.id) < 0 ? size_of(param) : 0;
+    if (param.storage == Storage::matrix) return is_streamed(param) ? 0 : size_of(param);
     return param.storage == Storage::vector ? aligned(static_cast<std::size_t>(param.count()) * sizeof(float)) : 0;
   };
   std::size_t size = 0;
@@ -97,8 +98,8 @@ Status CpuWeights::give_places(const ParamList& list, const Options& options, co
 
   std::byte* next = memory_.data();
   for (const Param& param : list.params()) {
-    MatrixPlace& at = place(&param);
-    if (at.kernel != nullptr && group_of(param.id) < 0) at.put(param, next);
+    Place& at = place(&param);
+    if (at.kernel != nullptr && !is_streamed(param)) at.put(param, next);
     if (at.kernel == nullptr) at.data = next;
     next += size_in_memory(param);
   }
@@ -108,7 +109,7 @@ Status CpuWeights::give_places(const ParamList& list, const Options& options, co
   }
   table_ = std::make_shared<WeightTable>();
   for (const Param& param : list.params()) {
-    const MatrixPlace& at = place(&param);
+    const Place& at = place(&param);
     const bool has_vector = at.kernel != nullptr && param.scales != nullptr;
     table_->entries.push_back({at.data, has_vector ? reinterpret_cast<float*>(place(param.scales).data) : at.scales});
   }
@@ -119,7 +120,7 @@ Status CpuWeights::give_places(const ParamList& list, const Options& options, co
 Status CpuWeights::fill(const ParamList& list, const WeightPlan& plan, int n_thread) const {
   PackTask task;
   for (const Param& param : list.params()) {
-    if (param.storage == Storage::table || group_of(param.id) >= 0) continue;
+    if (param.storage == Storage::table || is_streamed(param)) continue;
     if (param.storage == Storage::matrix)
       add_parts(param, place(&param), task.parts);
     else

@@ -9,7 +9,7 @@
 
 #include "graph/device.h"
 #include "lower/cpu/table_rows.h"
-#include "lower/cpu/weight_stream.h"
+#include "lower/host/weight_stream.h"
 
 namespace vla::lower {
 
@@ -51,8 +51,8 @@ class CpuWeights {
   const kernels::LinearKernel* kernel(const Param* matrix) const { return place(matrix).kernel; }
   /// Bytes of a matrix.
   std::size_t size_of(const Param& matrix) const { return place(&matrix).size_of(matrix); }
-  /// Its group among those of the plan that are streamed, or -1.
-  int group_of(int matrix) const { return groups_[static_cast<std::size_t>(matrix)]; }
+  /// By Param::id, its group among those of the plan that are streamed, or -1.
+  const std::vector<int>& groups() const { return groups_; }
   /// The stream that reads those; null where there are none, or nothing is filled.
   const std::shared_ptr<WeightStream>& stream() const { return stream_; }
   /// The addresses of all parameters; programs keep the table.
@@ -72,8 +72,12 @@ class CpuWeights {
   const std::string& text() const { return text_; }
 
  private:
-  const MatrixPlace& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
-  MatrixPlace& place(const Param* param) { return places_[static_cast<std::size_t>(param->id)]; }
+  struct Place : MatrixPlace {
+    const kernels::LinearKernel* kernel = nullptr;  // of a matrix
+  };
+  const Place& place(const Param* param) const { return places_[static_cast<std::size_t>(param->id)]; }
+  Place& place(const Param* param) { return places_[static_cast<std::size_t>(param->id)]; }
+  bool is_streamed(const Param& param) const { return groups_[static_cast<std::size_t>(param.id)] >= 0; }
   Status choose(const ParamList& list, const Options& options);
   Status give_places(const ParamList& list, const Options& options, const WeightPlan& plan);
   Status fill(const ParamList& list, const WeightPlan& plan, int n_thread) const;
@@ -83,7 +87,7 @@ class CpuWeights {
   std::shared_ptr<WeightTable> table_;
   std::shared_ptr<const Tables> tables_;
   std::size_t table_size_ = 0;
-  std::vector<MatrixPlace> places_;
+  std::vector<Place> places_;
   std::vector<int> groups_;
   std::string text_;
   std::shared_ptr<WeightStream> stream_;  // goes before the memory that it writes to

@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "bundle/params.h"
-#include "lower/cpu/memory.h"
+#include "lower/host/memory.h"
 
 namespace vla::lower {
 

@@ -1,8 +1,10 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/segments.h"
+#include "lower/host/segments.h"
 
 #include <algorithm>
+
+#include "lower/host/weight_stream.h"
 
 namespace vla::lower {
 namespace {
@@ -32,6 +34,18 @@ int released(const Groups& now, const Groups& then) {
 void Groups::add(int group) {
   if (group < 0) return;
   first = any() ? std::min(first, group) : group, last = std::max(last, group);
+}
+
+Result<std::vector<Groups>> find_groups(const MatrixReads& phases, const std::vector<int>& groups) {
+  std::vector<Groups> found(phases.size());
+  for (std::size_t i = 0; i < phases.size(); ++i) {
+    for (const Param* matrix : phases[i]) found[i].add(groups[static_cast<std::size_t>(matrix->id)]);
+    if (found[i].last - found[i].first >= WeightStream::kWindows)
+      return Error{Code::unsupported, "memory",
+                   "phases that read at most " + std::to_string(WeightStream::kWindows) + " groups of matrices",
+                   std::to_string(found[i].last - found[i].first + 1), "give a larger budget"};
+  }
+  return found;
 }
 
 std::vector<Segment> cut_phases(std::span<const Groups> phases, std::size_t begin) {

@@ -6,6 +6,8 @@
 #include <span>
 #include <vector>
 
+#include "lower/host/weight_plan.h"
+
 namespace vla::lower {
 
 /// Groups of streamed matrices (weight_stream.h) that phases read: from `first` to `last`, or none.
@@ -23,6 +25,10 @@ struct Segment {
   Groups groups = {};
   int released = -1;  // groups up to this one are needed no more then; -1: none
 };
+
+/// The groups that each of some phases reads, where a matrix of id i is in groups[i]. Errors: unsupported where a phase
+/// reads more of them than there are windows.
+Result<std::vector<Groups>> find_groups(const MatrixReads& phases, const std::vector<int>& groups);
 
 /// Cuts phases, of which the first has the number `begin`, where groups must come and where one is needed no more.
 std::vector<Segment> cut_phases(std::span<const Groups> phases, std::size_t begin);

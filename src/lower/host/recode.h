@@ -4,7 +4,7 @@
 
 #include "bundle/content.h"
 #include "bundle/encoding.h"
-#include "lower/cpu/memory.h"
+#include "lower/host/memory.h"
 
 namespace vla::lower {
 

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/packing.h"
+#include "lower/host/packing.h"
 
 #include <algorithm>
 #include <cstring>
@@ -20,32 +20,34 @@ kernels::MatrixDesc desc_of(const Param& matrix, const Encoding& encoding) {
   return {encoding.type, matrix.shape[0], matrix.shape[1]};
 }
 
-/// Scales that the bundle does not have.
-std::int64_t n_made_scale(const Param& matrix, const Encoding& encoding) {
-  return matrix.scales == nullptr ? encoding.n_scale(matrix.count()) : 0;
+/// Those of elements from `first` on, where they are needed: for float32, or beside the packed matrix.
+std::span<const std::byte> scales_of(const Param& matrix, const MatrixPlace& place, std::int64_t first,
+                                     std::int64_t count) {
+  const Encoding& stored = matrix.encoding;
+  if (matrix.scales == nullptr || (stored.type == place.encoding.type && place.scales == nullptr)) return {};
+  const std::int64_t begin = first / stored.group, end = (first + count - 1) / stored.group + 1;
+  return matrix.scales->source->data.subspan(static_cast<std::size_t>(begin) * sizeof(float),
+                                             static_cast<std::size_t>(end - begin) * sizeof(float));
 }
 
-/// Those of elements from `first` on, where float32 needs them.
-std::span<const std::byte> scales_of(const Param& matrix, const Encoding& wanted, std::int64_t first,
-                                     std::int64_t count) {
-  if (wanted.type == matrix.encoding.type || matrix.scales == nullptr) return {};
-  const auto size = [&](std::int64_t n) {
-    return static_cast<std::size_t>(matrix.encoding.n_scale(n)) * sizeof(float);
-  };
-  return matrix.scales->source->data.subspan(size(first), size(count));
+/// A scale a row, where there may be one for all.
+void copy_scales(const float* from, std::size_t n_from, std::int64_t n_row, float* to) {
+  for (std::int64_t row = 0; row < n_row; ++row) to[row] = from[n_from > 1 ? row : 0];
 }
 
 }  // namespace
 
+std::size_t MatrixPlace::scales_begin(const Param& param) const {
+  return aligned(packing.size(desc_of(param, encoding)));
+}
+
 std::size_t MatrixPlace::size_of(const Param& param) const {
-  return aligned(kernel->packed_size(desc_of(param, encoding))) +
-         aligned(static_cast<std::size_t>(n_made_scale(param, encoding)) * sizeof(float));
+  return scales_begin(param) + aligned(static_cast<std::size_t>(n_scale) * sizeof(float));
 }
 
 void MatrixPlace::put(const Param& param, std::byte* to) {
   data = to;
-  if (n_made_scale(param, encoding) > 0)
-    scales = reinterpret_cast<float*>(to + aligned(kernel->packed_size(desc_of(param, encoding))));
+  if (n_scale > 0) scales = reinterpret_cast<float*>(to + scales_begin(param));
 }
 
 void add_parts(const Param& matrix, const MatrixPlace& place, std::vector<PackPart>& parts) {
@@ -55,16 +57,16 @@ void add_parts(const Param& matrix, const MatrixPlace& place, std::vector<PackPa
   const std::int64_t step = kernels::round_up(kPartSize / row + 1, kPartRows);
   for (std::int64_t first = 0; first < n_row; first += step) {
     desc.d_out = first;
-    std::byte* const to = place.data + place.kernel->packed_size(desc);
+    std::byte* const to = place.data + place.packing.size(desc);
     desc.d_out = std::min(step, n_row - first);
     parts.push_back(
         {.from = all.subspan(static_cast<std::size_t>(first * row), static_cast<std::size_t>(desc.d_out * row)),
          .to = to,
          .desc = desc,
-         .kernel = place.kernel,
+         .pack = place.packing.pack,
          .recode = {matrix.encoding, place.encoding},
-         .scales = place.scales != nullptr ? place.scales + place.encoding.n_scale(first * desc.d_in) : nullptr,
-         .from_scales = scales_of(matrix, place.encoding, first * desc.d_in, desc.d_out * desc.d_in)});
+         .scales = place.scales != nullptr ? place.scales + first : nullptr,
+         .from_scales = scales_of(matrix, place, first * desc.d_in, desc.d_out * desc.d_in)});
   }
 }
 
@@ -80,13 +82,15 @@ bool Packer::run(const Content& content, const PackPart& part) {
   const std::byte* read = content.read(part.from, read_);
   const std::byte* scales = content.read(part.from_scales, scales_);
   if (read == nullptr || (scales == nullptr && !part.from_scales.empty())) return false;
-  if (part.kernel == nullptr) {
+  if (part.pack == nullptr) {
     std::memcpy(part.to, read, part.from.size());
-  } else {
-    const auto* const from_scales = reinterpret_cast<const float*>(scales);
-    const std::int64_t count = part.desc.d_in * part.desc.d_out;
-    part.kernel->pack(part.desc, part.recode(read, from_scales, count, recoded_, part.scales), part.to);
+    return true;
   }
+  const auto* const from_scales = reinterpret_cast<const float*>(scales);
+  const std::int64_t count = part.desc.d_in * part.desc.d_out;
+  part.pack(part.desc, part.recode(read, from_scales, count, recoded_, part.scales), part.to);
+  if (part.scales != nullptr && scales != nullptr)
+    copy_scales(from_scales, part.from_scales.size() / sizeof(float), part.desc.d_out, part.scales);
   return true;
 }
 

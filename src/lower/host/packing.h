@@ -7,20 +7,30 @@
 
 #include "bundle/params.h"
 #include "kernels/linear_kernel.h"
-#include "lower/cpu/recode.h"
+#include "lower/host/recode.h"
 
 namespace vla::lower {
+
+/// How a kernel wants matrices: bytes of one, and its rows on their way there. Rows from a multiple of 64 on are packed
+/// behind those before.
+struct Packing {
+  std::size_t (*size)(const kernels::MatrixDesc& desc) = nullptr;
+  void (*pack)(const kernels::MatrixDesc& desc, const std::byte* stored, std::byte* packed) = nullptr;
+};
 
 /// A matrix as it lies in memory, and where.
 struct MatrixPlace {
   Encoding encoding;
-  const kernels::LinearKernel* kernel = nullptr;
+  Packing packing;
+  std::int64_t n_scale = 0;  // that lie behind it: those of the bundle, or that are made of floats
   std::byte* data = nullptr;
-  float* scales = nullptr;  // that are made of floats, as they are rounded to codes; null where there are none
+  float* scales = nullptr;  // null where none lie behind it
 
-  /// Bytes of the packed matrix `param` with the scales that are made, each aligned.
+  /// Bytes of the packed matrix `param` with the scales behind it, each aligned.
   std::size_t size_of(const Param& param) const;
-  /// The packed matrix goes to `to`, and scales that are made behind it.
+  /// Bytes from it to its scales.
+  std::size_t scales_begin(const Param& param) const;
+  /// The packed matrix goes to `to`, and scales behind it.
   void put(const Param& param, std::byte* to);
 };
 
@@ -29,10 +39,10 @@ struct PackPart {
   std::span<const std::byte> from;
   std::byte* to = nullptr;
   kernels::MatrixDesc desc = {};
-  const kernels::LinearKernel* kernel = nullptr;  // null: a copy
+  decltype(Packing::pack) pack = nullptr;  // null: a copy
   Recode recode = {};
-  float* scales = nullptr;                      // where they are made
-  std::span<const std::byte> from_scales = {};  // of codes that become floats
+  float* scales = nullptr;                      // where they go, one a row
+  std::span<const std::byte> from_scales = {};  // of codes: one a row, or one for all
 };
 
 /// Cuts a matrix into parts of about a megabyte.

@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/memory.h"
+#include "lower/host/memory.h"
 
 #include <fmt/format.h>
 #include <sys/mman.h>

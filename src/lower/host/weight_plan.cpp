@@ -1,9 +1,11 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/weight_plan.h"
+#include "lower/host/weight_plan.h"
 
 #include <algorithm>
 #include <set>
+
+#include "lower/host/weight_stream.h"
 
 namespace vla::lower {
 namespace {
@@ -12,17 +14,16 @@ using Group = std::vector<const Param*>;
 
 class Planner {
  public:
-  Planner(const CpuWeights& weights, const CpuProgram& prefix, const CpuProgram& step) : weights_(weights) {
-    for (const MatrixUses& phase : step.uses())
-      for (const MatrixUse& use : phase) resident_.insert(use.matrix);
-    group_phases(prefix);
+  explicit Planner(const WeightUse& use) : use_(use) {
+    for (const Group& phase : use.step) resident_.insert(phase.begin(), phase.end());
+    group_phases();
   }
 
   /// The plan that streams least of those that fit.
   WeightPlan plan(std::size_t size) const {
     WeightPlan plan;
     plan.smallest = memory(groups_);
-    if (weights_.size() <= size || plan.smallest == weights_.size()) return plan;
+    if (use_.size <= size || plan.smallest == use_.size) return plan;
     plan.window = window_;
     for (std::size_t n = WeightStream::kWindows + 1; n <= groups_.size(); ++n) {
       plan.streamed = spread(n);
@@ -35,13 +36,13 @@ class Planner {
 
  private:
   /// Phases that follow each other, as many to a group as the largest of them has room for.
-  void group_phases(const CpuProgram& prefix) {
+  void group_phases() {
     std::vector<Group> phases;
     std::set<const Param*> seen = resident_;
-    for (std::size_t i = prefix.n_prepare(); i < prefix.uses().size(); ++i) {
+    for (const Group& all : use_.prefix) {
       Group& phase = phases.emplace_back();
-      for (const MatrixUse& use : prefix.uses()[i])
-        if (seen.insert(use.matrix).second) phase.push_back(use.matrix);
+      for (const Param* matrix : all)
+        if (seen.insert(matrix).second) phase.push_back(matrix);
       window_ = std::max(window_, size(phase));
     }
     for (const Group& phase : phases) {
@@ -60,17 +61,17 @@ class Planner {
 
   std::size_t size(const Group& group) const {
     std::size_t bytes = 0;
-    for (const Param* matrix : group) bytes += weights_.size_of(*matrix);
+    for (const Param* matrix : group) bytes += use_.size_of(*matrix);
     return bytes;
   }
   /// Bytes of all parameters, where these groups are streamed if that saves something.
   std::size_t memory(const std::vector<Group>& streamed) const {
-    std::size_t bytes = weights_.size() + WeightStream::kWindows * window_;
+    std::size_t bytes = use_.size + WeightStream::kWindows * window_;
     for (const Group& group : streamed) bytes -= size(group);
-    return std::min(bytes, weights_.size());
+    return std::min(bytes, use_.size);
   }
 
-  const CpuWeights& weights_;
+  const WeightUse& use_;
   std::set<const Param*> resident_;
   std::vector<Group> groups_;
   std::size_t window_ = 0;
@@ -78,8 +79,13 @@ class Planner {
 
 }  // namespace
 
-WeightPlan plan_streams(const CpuWeights& weights, const CpuProgram& prefix, const CpuProgram& step, std::size_t size) {
-  return Planner(weights, prefix, step).plan(size);
+WeightPlan plan_streams(const WeightUse& use, std::size_t size) { return Planner(use).plan(size); }
+
+std::vector<int> groups_by_id(const WeightPlan& plan, std::size_t n_param) {
+  std::vector<int> groups(n_param, -1);
+  for (std::size_t i = 0; i < plan.streamed.size(); ++i)
+    for (const Param* matrix : plan.streamed[i]) groups[static_cast<std::size_t>(matrix->id)] = static_cast<int>(i);
+  return groups;
 }
 
 }  // namespace vla::lower

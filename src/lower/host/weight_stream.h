@@ -9,7 +9,7 @@
 #include <thread>
 #include <vector>
 
-#include "lower/cpu/packing.h"
+#include "lower/host/packing.h"
 
 namespace vla::lower {
 

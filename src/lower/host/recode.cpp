@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/recode.h"
+#include "lower/host/recode.h"
 
 #include <cassert>
 #include <cstring>
@@ -9,6 +9,10 @@
 
 namespace vla::lower {
 namespace {
+
+void widen(DType type, const std::byte* stored, std::int64_t n, float* to) {
+  for (std::int64_t i = 0; i < n; ++i) to[i] = kernels::stored_number(type, stored, i);
+}
 
 void round_to_bf16(DType type, const std::byte* stored, std::int64_t n, std::byte* to) {
   for (std::int64_t i = 0; i < n; ++i) {
@@ -26,6 +30,8 @@ const std::byte* Recode::operator()(const std::byte* from, const float* from_sca
   if (!is_float(stored.type)) {
     assert(stored.group > 0 && wanted.type == DType::f32);
     widen_codes(stored, from, from_scales, count, reinterpret_cast<float*>(to));
+  } else if (wanted.type == DType::f32) {
+    widen(stored.type, from, count, reinterpret_cast<float*>(to));
   } else if (wanted.type == DType::bf16) {
     round_to_bf16(stored.type, from, count, to);
   } else {

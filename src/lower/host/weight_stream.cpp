@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "lower/cpu/weight_stream.h"
+#include "lower/host/weight_stream.h"
 
 #include "base/thread.h"
 
