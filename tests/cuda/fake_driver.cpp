@@ -68,19 +68,21 @@ struct State {
   std::map<Handle, std::shared_ptr<Nodes>> graphs;
   std::set<void*> host;
   Nodes waiting, captured;
+  std::vector<bool> was_run;  // of those that wait: what others still come after
   std::minstd_rand random;
 };
 State state;
 std::mutex calls;  // one at a time
 
-/// Nodes one after the other, in any order that their dependencies allow.
-void run_all(const Nodes& nodes) {
+/// Some nodes one after the other, in any order that their dependencies allow; what they depend on beside was run.
+void run_some(const Nodes& nodes, const std::vector<bool>& some) {
   std::vector<std::size_t> n_before(nodes.size());
   std::vector<std::vector<std::size_t>> next(nodes.size());
   std::vector<std::size_t> ready;
   for (std::size_t i = 0; i < nodes.size(); ++i) {
-    n_before[i] = nodes[i].after.size();
-    for (std::size_t before : nodes[i].after) next[before].push_back(i);
+    if (!some[i]) continue;
+    for (std::size_t before : nodes[i].after)
+      if (some[before]) next[before].push_back(i), ++n_before[i];
     if (n_before[i] == 0) ready.push_back(i);
   }
   while (!ready.empty()) {
@@ -93,27 +95,39 @@ void run_all(const Nodes& nodes) {
   }
 }
 
+void run_all(const Nodes& nodes) { run_some(nodes, std::vector<bool>(nodes.size(), true)); }
+
 /// Takes everything that waits away from its streams.
 Nodes take_waiting() {
   Nodes nodes;
-  nodes.swap(state.waiting);
+  nodes.swap(state.waiting), state.was_run.clear();
   for (auto& [handle, stream] : state.streams) stream->captures ? stream->kept.clear() : stream->last.clear();
   for (auto& [handle, event] : state.events)
     if (!event->captured) event->nodes.clear();
   return nodes;
 }
-/// Runs it.
-int run_waiting() {
-  const Nodes nodes = take_waiting();
+/// Runs those of it, and what they come after.
+int run_waiting(std::vector<bool> wanted) {
+  state.was_run.resize(state.waiting.size(), false);
+  for (std::size_t i = wanted.size(); i-- > 0;) {
+    for (std::size_t before : state.waiting[i].after)
+      if (wanted[i]) wanted[before] = true;
+    if (state.was_run[i]) wanted[i] = false;
+  }
   try {
-    run_all(nodes);
+    run_some(state.waiting, wanted);
+    for (std::size_t i = 0; i < wanted.size(); ++i)
+      if (wanted[i]) state.was_run[i] = true;
+    if (std::find(state.was_run.begin(), state.was_run.end(), false) == state.was_run.end()) take_waiting();
   } catch (const Fault& fault) {
+    take_waiting();
     state.driver.fault = fault.what();
     state.is_lost = true, state.driver.failure = kLaunchFailed;
     return kLaunchFailed;
   }
   return 0;
 }
+int run_waiting() { return run_waiting(std::vector<bool>(state.waiting.size(), true)); }
 
 /// A module's text is read once.
 std::shared_ptr<const PtxModule> parsed(const std::string& text) {
@@ -252,7 +266,11 @@ struct Calls {
   static int stream_wait(Handle handle) {
     Stream* stream = find(state.streams, handle);
     if (stream == nullptr) return kInvalidHandle;
-    return captures() ? kCaptureUnsupported : run_waiting();
+    if (captures()) return kCaptureUnsupported;
+    // A device may be ahead with everything else, or have done nothing of it.
+    std::vector<bool> wanted(state.waiting.size(), state.random() % 2 == 0);
+    for (std::size_t node : stream->last) wanted[node] = true;
+    return run_waiting(std::move(wanted));
   }
   static int stream_wait_event(Handle handle, Handle of, unsigned) {
     Stream* stream = find(state.streams, handle);

@@ -10,7 +10,8 @@
 #include "cuda/driver/driver.h"
 
 /// NVIDIA's driver without a device. Nothing runs before somebody waits: operations become nodes that know which ones
-/// they come after, and run in any order that this allows, so that a stream that is not waited for shows. A captured
+/// they come after, and run in any order that this allows: those that are waited for, and now and then all others, so
+/// that a stream that is not waited for shows. A captured
 /// graph is such nodes, run again at each launch. Kernels run on the emulated machine; a module is PTX, or kHostModule.
 namespace vla::test::cuda {
 
