@@ -64,7 +64,7 @@ Status Engine::build(const WeightPlan& plan, bool dry) {
 Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
   VLA_CHECK(build({}, true));
   VLA_TRY(const Plan* largest, plans_->for_shape(robot().network(), robot().largest_shape()));
-  budget_.size = budget, budget_.process = resident_size();
+  budget_.size = budget, budget_.process = device_->is_host() ? resident_size() : 0;
   const std::size_t others = budget_.process + memory().total() - device_->weights_size();
   VLA_TRY(WeightPlan plan,
           device_->plan_weights(largest->prefix(), largest->step(), budget > others ? budget - others : 0));

@@ -27,7 +27,7 @@ struct EngineOptions {
   std::string embodiment = {};  // the robot, by its tag; empty where the bundle is for one
   bool all_robots = false;      // without a tag: every robot of a bundle of several
   std::function<void(const Graph&)> see_graph = {};  // is shown the graphs of every plan, before they are lowered
-  std::size_t memory = 0;  // bytes that the process may take, for which matrices stay in the file; 0: no limit
+  std::size_t memory = 0;  // bytes that the process, or on a GPU the policy there, may take; 0: no limit
 };
 
 /// Memory by what it holds, in bytes: parameters and tables; inputs and cache of the plans; what graphs share while
@@ -40,7 +40,7 @@ struct MemoryUse {
 /// How EngineOptions::memory is kept, in bytes.
 struct MemoryBudget {
   std::size_t size = 0;
-  std::size_t process = 0;   // what the process took without the engine's memory
+  std::size_t process = 0;   // what the process took without the engine's memory; 0 on a GPU
   std::size_t smallest = 0;  // the least budget that would do
   std::size_t n_read = 0;    // of the file, in every act; 0: all matrices stay in memory
 };

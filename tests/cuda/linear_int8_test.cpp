@@ -52,7 +52,7 @@ class Trial {
       std::memcpy(row + depth() + 4, &sum, 4);
     }
     packed_.resize(packed_int8_size(kind, c.d_in, c.d_out));
-    pack_int8(kind, weight_.data(), c.d_in, c.d_out, packed_.data());
+    pack_int8(kind, stored().data(), c.d_in, c.d_out, packed_.data());
   }
 
   /// y of the kernel that `shape` names.
@@ -74,6 +74,19 @@ class Trial {
     launch(linear_int8(kind_, shape, job), job);
     if (c_.n_split > 1) launch(finish_int8_partial(job), job);
     return y.host();
+  }
+
+  /// The matrix as a bundle has it: int8, or two bits, in rows of whole bytes.
+  std::vector<std::byte> stored() const {
+    const std::int64_t per_byte = kind_ == CodeKind::ternary ? 4 : 1, row = (c_.d_in + per_byte - 1) / per_byte;
+    std::vector<std::byte> bytes(size(c_.d_out, row));
+    for (std::int64_t n = 0; n < c_.d_out; ++n)
+      for (std::int64_t k = 0; k < c_.d_in; ++k) {
+        const int code = weight_[size(n, c_.d_in) + static_cast<std::size_t>(k)];
+        bytes[size(n, row) + static_cast<std::size_t>(k / per_byte)] |=
+            static_cast<std::byte>(kind_ == CodeKind::ternary ? (code + 1) << 2 * (k % 4) : code);
+      }
+    return bytes;
   }
 
   /// The same a rounding at a time.

@@ -41,8 +41,8 @@ enum class CodeKind { ternary, int8 };
 
 /// Bytes of a packed matrix.
 std::size_t packed_int8_size(CodeKind kind, std::int64_t d_in, std::int64_t d_out);
-/// codes: d_out rows of d_in elements.
-void pack_int8(CodeKind kind, const std::int8_t* codes, std::int64_t d_in, std::int64_t d_out, std::byte* packed);
+/// stored: d_out rows of d_in elements as a bundle has them: int8, or ternary in two bits (DType::ternary).
+void pack_int8(CodeKind kind, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, std::byte* packed);
 
 /// Rows of a block on tensor cores.
 enum class Int8Shape { few, rows64, rows128 };

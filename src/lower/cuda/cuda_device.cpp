@@ -11,9 +11,6 @@
 namespace vla::lower {
 namespace {
 
-constexpr std::size_t kAlignment = 256;
-constexpr std::size_t aligned(std::size_t size) { return (size + kAlignment - 1) / kAlignment * kAlignment; }
-
 /// Kernels that take one product at a time; those that round x norm it on the way.
 class CudaTarget final : public Target {
  public:
@@ -31,7 +28,7 @@ class CudaTarget final : public Target {
   bool takes_relu(const Param&) const override { return true; }
   const Encoding& encoding(const Param& matrix) const override { return weights_[matrix].encoding; }
   std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
-  std::size_t alignment() const override { return kAlignment; }
+  std::size_t alignment() const override { return kDeviceAlignment; }
 
  private:
   static constexpr char kKinds[4] = {};  // places to tell them apart
@@ -58,14 +55,22 @@ Result<std::unique_ptr<Device>> CudaDevice::model(const std::string& name, Round
   return std::unique_ptr<Device>(std::move(device));
 }
 
-Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan&) {
+Status CudaDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   if (model_ && fill) return Error{Code::usage, "model", "a device that is there", name_, "it says times alone"};
-  if (!fill) queue_->set_dry();
-  VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, *queue_));
+  queue_->set_dry(!fill);
+  arena_.reset();  // it may be that of a dry load
+  VLA_TRY(weights_, CudaWeights::load(params, rounding_, fill, plan, queue_));
   // Attention rounds where products do, as on the CPU.
   const bool rounds = weights_.has(MatrixKind::bf16) || weights_.has(MatrixKind::int8);
   min_rounded_keys_ = rounds ? vla::min_rounded_keys(params) : std::numeric_limits<std::int64_t>::max();
   return {};
+}
+
+Result<WeightPlan> CudaDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
+  const auto &first = static_cast<const CudaProgram&>(prefix), &then = static_cast<const CudaProgram&>(step);
+  return plan_streams({std::span(first.reads()).subspan(first.n_prepare()), then.reads(),
+                       [&](const Param& matrix) { return weights_.size_of(matrix); }, weights_.memory()->size()},
+                      size);
 }
 
 Precision CudaDevice::precision() const {
@@ -78,10 +83,10 @@ std::string CudaDevice::kernels() const {
 
 Status CudaDevice::allocate(Slots& slots) {
   std::size_t size = 0;
-  for (const Slot& slot : slots.all()) size += aligned(slot.size());
+  for (const Slot& slot : slots.all()) size += device_aligned(slot.size());
   VLA_TRY(const std::shared_ptr<cuda::Buffer> memory, queue_->allocate(size, "inputs and cache"));
   cuda::Address place = memory->address();
-  for (Slot& slot : slots.all()) slot.place = reinterpret_cast<void*>(place), place += aligned(slot.size());
+  for (Slot& slot : slots.all()) slot.place = reinterpret_cast<void*>(place), place += device_aligned(slot.size());
   VLA_CHECK(queue_->fill_zeros(*memory));
   // With the device, which must not go before its memory.
   slots.hold(std::make_shared<std::pair<std::shared_ptr<CudaQueue>, std::shared_ptr<cuda::Buffer>>>(queue_, memory),

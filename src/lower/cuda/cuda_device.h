@@ -19,6 +19,7 @@ class CudaDevice final : public Device {
   static Result<std::unique_ptr<Device>> model(const std::string& name, Rounding at_load);
 
   Status load(const ParamList& params, bool fill, const WeightPlan& plan) override;
+  Result<WeightPlan> plan_weights(const Program& prefix, const Program& step, std::size_t size) const override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;

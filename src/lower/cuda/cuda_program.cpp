@@ -19,7 +19,7 @@ Result<std::unique_ptr<Program>> CudaProgram::make(CudaLowering& l, std::shared_
                                                    std::vector<std::shared_ptr<cuda::Buffer>> memory,
                                                    const GpuModel* model) {
   std::unique_ptr<CudaProgram> program(new CudaProgram);
-  program->queue_ = std::move(queue), program->memory_ = std::move(memory);
+  program->queue_ = std::move(queue), program->memory_ = std::move(memory), program->windows_ = l.weights.windows();
   VLA_CHECK(program->give_addresses(l, *program->memory_.back()));
   VLA_TRY(const std::vector<int> n_launch, program->make_parts(l));
   VLA_CHECK(program->make_marks(l));
@@ -66,41 +66,69 @@ Status CudaProgram::give_addresses(CudaLowering& l, const cuda::Buffer& arena) {
 }
 
 CudaProgram::~CudaProgram() {
-  queue_->forget(prepare_);
-  queue_->forget(run_);
+  for (const auto* pieces : {&prepare_, &run_})
+    for (const Piece& piece : *pieces) queue_->forget(piece.part);
+}
+
+Status CudaProgram::run(const std::vector<Piece>& pieces) {
+  for (const Piece& piece : pieces) {
+    if (piece.groups.any()) VLA_CHECK(windows_->bring(piece.groups));
+    VLA_CHECK(queue_->run(piece.part));
+  }
+  return {};
 }
 
 Result<std::vector<int>> CudaProgram::make_parts(const CudaLowering& l) {
   std::vector<int> n_launch;
   for (const Graph::Stage& stage : l.graph.stages()) stages_.push_back({stage.name, {}});
   work_.resize(stages_.size() + 1);
-  prepare_.phases.resize(static_cast<std::size_t>(l.n_prepare));
-  run_.phases.resize(static_cast<std::size_t>(l.n_phase - l.n_prepare));
+  n_prepare_ = static_cast<std::size_t>(l.n_prepare);
+  std::vector<std::vector<Calls>> phases(static_cast<std::size_t>(l.n_phase));
+  reads_.resize(phases.size());
   for (const CudaOp& op : l.ops) {
     VLA_TRY(Calls calls, emit(l, op));
-    const bool is_prepared = op.phase < l.n_prepare;
-    CudaPart& part = is_prepared ? prepare_ : run_;
     if (!op.invariant) work_[stage_of(l, op)] += work_of(l, op);
     text_ += text_of(l, op, calls);
     n_launch.push_back(static_cast<int>(calls.size()));
-    part.phases[static_cast<std::size_t>(is_prepared ? op.phase : op.phase - l.n_prepare)].push_back(std::move(calls));
+    const auto phase = static_cast<std::size_t>(op.phase);
+    phases[phase].push_back(std::move(calls));
+    if (const auto* product = std::get_if<LinearOp>(&op.op))
+      for (const Node* node : product->linears) reads_[phase].push_back(node->as<op::Linear>()->weight);
   }
+  VLA_TRY(const std::vector<Groups> groups, find_groups(reads_, l.weights.groups()));
+  prepare_ = pieces(cut_phases(std::span(groups).first(n_prepare_), 0), phases);
+  run_ = pieces(cut_phases(std::span(groups).subspan(n_prepare_), n_prepare_), phases);
+  if (run_.empty()) run_.emplace_back();  // for marks
   return n_launch;
+}
+
+std::vector<CudaProgram::Piece> CudaProgram::pieces(const std::vector<Segment>& segments,
+                                                    std::vector<std::vector<Calls>>& phases) {
+  std::vector<Piece> pieces;
+  for (const Segment& segment : segments) {
+    Piece& piece = pieces.emplace_back();
+    piece.groups = segment.groups;
+    for (std::size_t i = segment.begin; i < segment.end; ++i) piece.part.phases.push_back(std::move(phases[i]));
+  }
+  return pieces;
 }
 
 /// A mark behind the last phase of each stage, and one at the end.
 Status CudaProgram::make_marks(const CudaLowering& l) {
+  const std::size_t n_run = reads_.size() - n_prepare_;
   std::vector<std::size_t> ends(stages_.size(), 0);
   for (const CudaOp& op : l.ops)
     for (std::size_t stage = stage_of(l, op); op.phase >= l.n_prepare && stage < ends.size(); ++stage)
       ends[stage] = std::max(ends[stage], static_cast<std::size_t>(op.phase - l.n_prepare + 1));
   const auto add = [&](std::size_t n_phase, Time* time) -> Status {
     VLA_TRY(cuda::Owned event, queue_->event());
-    run_.marks.push_back({n_phase, std::move(event), time});
+    auto piece = run_.begin();
+    for (; n_phase > piece->part.phases.size(); ++piece) n_phase -= piece->part.phases.size();
+    piece->part.marks.push_back({n_phase, std::move(event), time});
     return {};
   };
   for (std::size_t i = 0; i < stages_.size(); ++i) VLA_CHECK(add(ends[i], &stages_[i].done));
-  return stages_.empty() ? Status() : add(run_.phases.size(), &ended_);
+  return stages_.empty() ? Status() : add(n_run, &ended_);
 }
 
 std::optional<Program::Time> CudaProgram::ended() const {

@@ -18,8 +18,8 @@ class CudaProgram final : public Program {
                                                const GpuModel* model);
   ~CudaProgram() override;
 
-  Status prepare() override { return queue_->run(prepare_); }
-  Status run() override { return queue_->run(run_); }
+  Status prepare() override { return run(prepare_); }
+  Status run() override { return run(run_); }
   std::optional<Time> ended() const override;
   const std::vector<Stage>& stages() const override { return stages_; }
   std::vector<Work> work() const override { return work_; }
@@ -28,12 +28,22 @@ class CudaProgram final : public Program {
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
   std::size_t size() const override { return own_->size(); }
+  /// The matrices that each phase reads: first those of `prepare`, then those of `run`.
+  const MatrixReads& reads() const { return reads_; }
+  std::size_t n_prepare() const { return n_prepare_; }
 
  private:
   struct TapPlace {
     cuda::Address data;
     Shape shape, stride;
   };
+  /// A part that is launched once its groups are on the device.
+  struct Piece {
+    Groups groups;
+    CudaPart part;
+  };
+  static std::vector<Piece> pieces(const std::vector<Segment>& segments, std::vector<std::vector<Calls>>& phases);
+  Status run(const std::vector<Piece>& pieces);
   Status give_addresses(CudaLowering& l, const cuda::Buffer& arena);
   /// How many kernels each operation is.
   Result<std::vector<int>> make_parts(const CudaLowering& l);
@@ -43,7 +53,10 @@ class CudaProgram final : public Program {
   std::shared_ptr<CudaQueue> queue_;
   std::vector<std::shared_ptr<cuda::Buffer>> memory_;  // weights and arena
   std::shared_ptr<cuda::Buffer> own_;                  // what prepare leaves, and constants
-  CudaPart prepare_, run_;
+  std::shared_ptr<CudaWindows> windows_;               // null where all matrices are resident
+  std::vector<Piece> prepare_, run_;                   // one, but where there are windows
+  MatrixReads reads_;
+  std::size_t n_prepare_ = 0;
   std::vector<Stage> stages_;
   Time ended_;
   std::vector<Work> work_;

@@ -167,6 +167,16 @@ Status CudaQueue::download(void* to, cuda::Address from, std::size_t size) {
   return note_times();
 }
 
+Status CudaQueue::flush() {
+  VLA_CHECK(failure_);
+  return keep(launch());
+}
+
+Status CudaQueue::record(const cuda::Owned& event) {
+  VLA_CHECK(gpu_->use());
+  return main_->record(event);
+}
+
 Status CudaQueue::start_uploads() {
   for (const Upload& upload : uploads_) VLA_CHECK(main_->upload(upload.to, staging_.at(upload.begin), upload.size));
   uploads_.clear();

@@ -13,6 +13,12 @@
 
 namespace vla::lower {
 
+/// Parameters, slots and values begin at multiples of it.
+constexpr std::size_t kDeviceAlignment = 256;
+constexpr std::size_t device_aligned(std::size_t size) {
+  return (size + kDeviceAlignment - 1) / kDeviceAlignment * kDeviceAlignment;
+}
+
 /// A launch and what the kernel takes.
 struct Call {
   cuda::Launch how;
@@ -49,8 +55,8 @@ class CudaQueue {
   /// As the driver names the device.
   std::string device_name() const { return gpu_ ? gpu_->name() : ""; }
   const Status& failure() const { return failure_; }
-  /// From now on nothing is allocated, and what would be written is passed over.
-  void set_dry() { is_dry_ = true; }
+  /// Whether nothing is allocated from now on, and what would be written is passed over.
+  void set_dry(bool dry) { is_dry_ = dry; }
 
   /// Device memory, which the caller gives back before the queue goes.
   Result<std::shared_ptr<cuda::Buffer>> allocate(std::size_t size, const std::string& what);
@@ -69,6 +75,14 @@ class CudaQueue {
   Status run(const CudaPart& part);
   /// Waits for all that was asked for. Marks have their times then.
   void get(void* to, cuda::Address from, std::size_t size);
+  /// Launches what was asked for.
+  Status flush();
+  /// `event` stands for all that was launched.
+  Status record(const cuda::Owned& event);
+  /// Keeps the first failure of the device, also of a stream beside the queue's.
+  Status keep(Status status);
+  /// Null of a queue without a device.
+  const std::shared_ptr<cuda::Gpu>& gpu() const { return gpu_; }
   /// A part that goes.
   void forget(const CudaPart& part);
 
@@ -86,7 +100,6 @@ class CudaQueue {
     std::size_t begin, size;  // in staging_
   };
 
-  Status keep(Status status);
   Status grow(HostMemory& memory, std::size_t size);
   Status stage(cuda::Address to, const void* from, std::size_t size);
   Status copy(cuda::Address to, const CudaSent& sent, std::size_t size);

@@ -7,14 +7,10 @@
 #include <map>
 
 #include "cuda/kernels/linear_int8.h"
-#include "kernels/numbers.h"
-#include "kernels/quantize_weights.h"
+#include "kernels/cores.h"
 
 namespace vla::lower {
 namespace {
-
-constexpr std::size_t kAlignment = 256;
-constexpr std::size_t aligned(std::size_t size) { return (size + kAlignment - 1) / kAlignment * kAlignment; }
 
 constexpr const char* kKernels[] = {"linear_f32", "linear_bf16", "linear_ternary", "linear_int8"};
 
@@ -26,96 +22,50 @@ MatrixKind kind_of(const Param& param, const Encoding& encoding, Rounding roundi
 }
 
 bool has_codes(MatrixKind kind) { return kind == MatrixKind::ternary || kind == MatrixKind::int8; }
-cuda::CodeKind code_kind(MatrixKind kind) {
-  return kind == MatrixKind::ternary ? cuda::CodeKind::ternary : cuda::CodeKind::int8;
+
+std::size_t f32_size(const kernels::MatrixDesc& desc) { return dtype_size(DType::f32, desc.d_in * desc.d_out); }
+void pack_f32(const kernels::MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
+  std::memcpy(packed, stored, f32_size(desc));
 }
 
-std::size_t size_of(const Param& param, MatrixKind kind) {
-  if (param.storage == Storage::table) return dtype_size(param.encoding.type, param.count());
-  if (has_codes(kind)) return cuda::packed_int8_size(code_kind(kind), param.shape[0], param.shape[1]);
-  if (kind == MatrixKind::bf16) return static_cast<std::size_t>(bf16_stride(param.shape[0]) * param.shape[1]) * 2;
-  return static_cast<std::size_t>(param.count()) * sizeof(float);
+std::size_t bf16_size(const kernels::MatrixDesc& desc) {
+  return dtype_size(DType::bf16, bf16_stride(desc.d_in) * desc.d_out);
+}
+void pack_bf16(const kernels::MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
+  const std::size_t row = dtype_size(DType::bf16, desc.d_in), stride = dtype_size(DType::bf16, bf16_stride(desc.d_in));
+  for (std::int64_t i = 0; i < desc.d_out; ++i, stored += row, packed += stride) {
+    std::memcpy(packed, stored, row);
+    std::memset(packed + row, 0, stride - row);
+  }
 }
 
-/// One parameter on its way from the bundle, in rooms that are used again.
-class Reader {
- public:
-  explicit Reader(const Content& content) : content_(content) {}
+template <cuda::CodeKind kKind>
+std::size_t code_size(const kernels::MatrixDesc& desc) {
+  return cuda::packed_int8_size(kKind, desc.d_in, desc.d_out);
+}
+template <cuda::CodeKind kKind>
+void pack_codes(const kernels::MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
+  cuda::pack_int8(kKind, stored, desc.d_in, desc.d_out, packed);
+}
 
-  /// Bytes as they are resident, and scales where it has codes. False where the file has changed.
-  bool read(const Param& param, const CudaWeight& to) {
-    stored_ = content_.read(param.source->data, room_);
-    if (stored_ == nullptr) return false;
-    stored_scales_ = nullptr;
-    if (param.scales != nullptr) {
-      stored_scales_ = reinterpret_cast<const float*>(content_.read(param.scales->source->data, scale_room_));
-      if (stored_scales_ == nullptr) return false;
-    }
-    data_ = stored_;
-    if (param.storage == Storage::table) return true;
-    if (has_codes(to.kind))
-      pack(param, to);
-    else if (to.kind == MatrixKind::bf16)
-      round(param);
-    else if (param.encoding.type != DType::f32)
-      widen(param);
-    return true;
-  }
-  const std::byte* data() const { return data_; }
-  const std::vector<float>& scales() const { return scales_; }
+/// By MatrixKind.
+constexpr Packing kPacking[] = {{f32_size, pack_f32},
+                                {bf16_size, pack_bf16},
+                                {code_size<cuda::CodeKind::ternary>, pack_codes<cuda::CodeKind::ternary>},
+                                {code_size<cuda::CodeKind::int8>, pack_codes<cuda::CodeKind::int8>}};
 
- private:
-  static std::size_t at(std::int64_t i) { return static_cast<std::size_t>(i); }
+MatrixPlace place_of(const Param& matrix, const CudaWeight& weight) {
+  MatrixPlace place;
+  place.encoding = has_codes(weight.kind)            ? weight.encoding
+                   : weight.kind == MatrixKind::bf16 ? Encoding{DType::bf16}
+                                                     : Encoding{DType::f32};
+  place.packing = kPacking[static_cast<int>(weight.kind)];
+  place.n_scale = has_codes(weight.kind) ? matrix.shape[1] : 0;
+  return place;
+}
 
-  void widen(const Param& param) {
-    wide_.resize(at(param.count()));
-    if (is_float(param.encoding.type))
-      for (std::int64_t i = 0; i < param.count(); ++i)
-        wide_[at(i)] = kernels::stored_number(param.encoding.type, stored_, i);
-    else
-      widen_codes(param.encoding, stored_, stored_scales_, param.count(), wide_.data());
-    data_ = reinterpret_cast<const std::byte*>(wide_.data());
-  }
-  void round(const Param& param) {
-    const std::int64_t d_in = param.shape[0], stride = bf16_stride(d_in);
-    bytes_.assign(size_of(param, MatrixKind::bf16), std::byte{0});
-    for (std::int64_t i = 0; i < param.count(); ++i) {
-      const std::uint16_t half = to_bf16(kernels::stored_number(param.encoding.type, stored_, i));
-      std::memcpy(&bytes_[at(i / d_in * stride + i % d_in) * 2], &half, sizeof(half));
-    }
-    data_ = bytes_.data();
-  }
-  void pack(const Param& param, const CudaWeight& to) {
-    const std::int64_t d_in = param.shape[0], d_out = param.shape[1];
-    codes_.resize(at(param.count())), scales_.resize(at(d_out));
-    if (is_float(param.encoding.type)) {
-      wide_.resize(at(d_in));
-      kernels::quantize_weights(param.encoding.type, stored_, d_in, d_out, reinterpret_cast<std::byte*>(codes_.data()),
-                                scales_.data(), wide_.data());
-    } else {
-      for (std::int64_t row = 0; row < d_out; ++row)
-        scales_[at(row)] = stored_scales_[row * d_in / param.encoding.group];
-      if (param.encoding.type == DType::i8)
-        std::memcpy(codes_.data(), stored_, codes_.size());
-      else
-        for (std::int64_t row = 0, row_bytes = (d_in + 3) / 4; row < d_out; ++row)
-          for (std::int64_t i = 0; i < d_in; ++i)
-            codes_[at(row * d_in + i)] =
-                static_cast<std::int8_t>((std::to_integer<int>(stored_[row * row_bytes + i / 4]) >> i % 4 * 2 & 3) - 1);
-    }
-    bytes_.resize(size_of(param, to.kind));
-    cuda::pack_int8(code_kind(to.kind), codes_.data(), d_in, d_out, bytes_.data());
-    data_ = bytes_.data();
-  }
-
-  const Content& content_;
-  Room room_, scale_room_;
-  const std::byte *stored_ = nullptr, *data_ = nullptr;
-  const float* stored_scales_ = nullptr;
-  std::vector<float> wide_, scales_;
-  std::vector<std::byte> bytes_;
-  std::vector<std::int8_t> codes_;
-};
+/// Threads that read what is streamed: a GPU leaves the cores to them, and four are faster than most disks.
+int n_reader() { return std::clamp(static_cast<int>(kernels::allowed_cores().size()) / 2, 1, 4); }
 
 }  // namespace
 
@@ -123,37 +73,103 @@ bool CudaWeights::has(MatrixKind kind) const {
   return std::any_of(all_.begin(), all_.end(), [&](const CudaWeight& weight) { return weight.kind == kind; });
 }
 
-Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, bool fill, CudaQueue& queue) {
+std::size_t CudaWeights::size_of(const Param& matrix) const {
+  return device_aligned(place_of(matrix, (*this)[matrix]).size_of(matrix));
+}
+
+Result<CudaWeights> CudaWeights::load(const ParamList& list, Rounding rounding, bool fill, const WeightPlan& plan,
+                                      const std::shared_ptr<CudaQueue>& queue) {
   VLA_CHECK(check_rounding(list, rounding));
   CudaWeights weights;
+  weights.choose(list, rounding);
+  VLA_CHECK(weights.give_places(list, plan, *queue));
+  if (!fill || list.params().empty()) return weights;
+  VLA_CHECK(weights.fill(list, *queue));
+  VLA_CHECK(weights.start_stream(list, plan, queue));
+  return weights;
+}
+
+/// How each parameter is kept, and what multiplies by it.
+void CudaWeights::choose(const ParamList& list, Rounding rounding) {
   std::map<std::pair<MatrixKind, std::string>, int> counts;
-  std::size_t size = 0;
   for (const Param& param : list.params()) {
-    CudaWeight weight;
+    CudaWeight& weight = all_.emplace_back();
     weight.encoding = resident_encoding(param, rounding);
     weight.kind = kind_of(param, weight.encoding, rounding);
-    weight.data = size, size += aligned(size_of(param, weight.kind));
-    if (has_codes(weight.kind)) weight.scales = size, size += aligned(static_cast<std::size_t>(param.shape[1]) * 4);
     if (param.storage == Storage::matrix) ++counts[{weight.kind, dtype_name(param.encoding.type)}];
-    weights.all_.push_back(weight);
   }
   for (const auto& [what, n] : counts)
-    weights.text_ += (weights.text_.empty() ? "" : ", ") + std::string(kKernels[static_cast<int>(what.first)]) + " (" +
-                     std::to_string(n) + " " + what.second + ")";
-  VLA_TRY(weights.memory_, queue.allocate(size, "weights"));
-  for (CudaWeight& weight : weights.all_)
-    weight.data += weights.memory_->address(), weight.scales += weights.memory_->address();
-  if (!fill || list.params().empty()) return weights;
-  Reader reader(*list.bundle()->content());
+    text_ += (text_.empty() ? "" : ", ") + std::string(kKernels[static_cast<int>(what.first)]) + " (" +
+             std::to_string(n) + " " + what.second + ")";
+}
+
+/// Resident parameters one after the other, then the windows.
+Status CudaWeights::give_places(const ParamList& list, const WeightPlan& plan, CudaQueue& queue) {
+  groups_ = groups_by_id(plan, all_.size());
+  std::size_t size = 0;
   for (const Param& param : list.params()) {
-    if (param.source == nullptr) continue;
-    const CudaWeight& weight = weights[param];
-    if (!reader.read(param, weight)) return list.bundle()->content()->changed();
-    VLA_CHECK(queue.upload(weight.data, reader.data(), size_of(param, weight.kind)));
-    if (has_codes(weight.kind))
-      VLA_CHECK(queue.upload(weight.scales, reader.scales().data(), reader.scales().size() * 4));
+    if (is_streamed(param)) continue;
+    at(param).data = size;
+    size += param.storage == Storage::matrix ? size_of(param)
+                                             : device_aligned(dtype_size(param.encoding.type, param.count()));
   }
-  return weights;
+  const std::size_t windows = plan.streamed.empty() ? 0 : WeightStream::kWindows * plan.window;
+  for (std::size_t i = 0; i < plan.streamed.size(); ++i) {
+    std::size_t place = size + static_cast<std::size_t>(WeightStream::window_of(i)) * plan.window;
+    for (const Param* matrix : plan.streamed[i]) at(*matrix).data = place, place += size_of(*matrix);
+  }
+  VLA_TRY(memory_, queue.allocate(size + windows, "weights"));
+  for (const Param& param : list.params()) {
+    CudaWeight& weight = at(param);
+    weight.data += memory_->address();
+    if (has_codes(weight.kind)) weight.scales = weight.data + place_of(param, weight).scales_begin(param);
+  }
+  return {};
+}
+
+/// Reads what is resident.
+Status CudaWeights::fill(const ParamList& list, CudaQueue& queue) const {
+  const Content& content = *list.bundle()->content();
+  Packer packer;
+  Room room;
+  for (const Param& param : list.params()) {
+    if (param.source == nullptr || is_streamed(param)) continue;
+    std::vector<PackPart> parts;
+    std::size_t size = param.source->data.size();
+    if (param.storage == Storage::matrix) {
+      MatrixPlace place = place_of(param, (*this)[param]);
+      size = place.size_of(param);
+      place.put(param, room.take(size));
+      add_parts(param, place, parts);
+    } else {
+      parts.push_back({.from = param.source->data, .to = room.take(size)});
+    }
+    for (const PackPart& part : parts)
+      if (!packer.run(content, part)) return content.changed();
+    VLA_CHECK(queue.upload((*this)[param].data, room.take(size), size));
+  }
+  return {};
+}
+
+Status CudaWeights::start_stream(const ParamList& list, const WeightPlan& plan,
+                                 const std::shared_ptr<CudaQueue>& queue) {
+  if (plan.streamed.empty()) return {};
+  const cuda::Address end = memory_->address() + memory_->size();
+  VLA_TRY(windows_, CudaWindows::open(queue, end - WeightStream::kWindows * plan.window, plan.window));
+  std::vector<std::vector<PackPart>> groups;
+  std::vector<std::size_t> sizes;
+  for (const std::vector<const Param*>& group : plan.streamed) {
+    std::byte* const window = windows_->host(groups.size());
+    std::vector<PackPart>& parts = groups.emplace_back();
+    std::size_t& size = sizes.emplace_back(0);
+    for (const Param* matrix : group) {
+      MatrixPlace place = place_of(*matrix, (*this)[*matrix]);
+      place.put(*matrix, window + size);
+      add_parts(*matrix, place, parts);
+      size += size_of(*matrix);
+    }
+  }
+  return windows_->start(list.bundle()->content(), std::move(groups), std::move(sizes), n_reader());
 }
 
 }  // namespace vla::lower

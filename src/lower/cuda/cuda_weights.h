@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "graph/rounding.h"
-#include "lower/cuda/cuda_queue.h"
+#include "lower/cuda/cuda_windows.h"
 
 namespace vla::lower {
 
@@ -29,18 +29,35 @@ class CudaWeights {
  public:
   /// Matrices that are stored as bf16 are multiplied so, and with bf16 or
   /// int8 large ones of floats become that; with float32 all but ternary ones are float32. fill: whether to read them.
-  /// Errors: out_of_memory, bad_bundle, device.
-  static Result<CudaWeights> load(const ParamList& list, Rounding rounding, bool fill, CudaQueue& queue);
+  /// plan: which matrices come from the file in every act instead. Errors: out_of_memory, bad_bundle, device.
+  static Result<CudaWeights> load(const ParamList& list, Rounding rounding, bool fill, const WeightPlan& plan,
+                                  const std::shared_ptr<CudaQueue>& queue);
 
   const CudaWeight& operator[](const Param& param) const { return all_[static_cast<std::size_t>(param.id)]; }
+  /// Of all parameters, and the windows of those that are streamed.
   const std::shared_ptr<cuda::Buffer>& memory() const { return memory_; }
+  /// Bytes of a matrix.
+  std::size_t size_of(const Param& matrix) const;
+  /// By Param::id, its group among those of the plan that are streamed, or -1.
+  const std::vector<int>& groups() const { return groups_; }
+  /// Where those come to; null where there are none, or nothing is filled.
+  const std::shared_ptr<CudaWindows>& windows() const { return windows_; }
   bool has(MatrixKind kind) const;
   /// `linear_bf16 (98 bf16), linear_f32 (3 f32)`
   const std::string& text() const { return text_; }
 
  private:
+  CudaWeight& at(const Param& param) { return all_[static_cast<std::size_t>(param.id)]; }
+  bool is_streamed(const Param& param) const { return groups_[static_cast<std::size_t>(param.id)] >= 0; }
+  void choose(const ParamList& list, Rounding rounding);
+  Status give_places(const ParamList& list, const WeightPlan& plan, CudaQueue& queue);
+  Status fill(const ParamList& list, CudaQueue& queue) const;
+  Status start_stream(const ParamList& list, const WeightPlan& plan, const std::shared_ptr<CudaQueue>& queue);
+
   std::vector<CudaWeight> all_;  // by Param::id
+  std::vector<int> groups_;
   std::shared_ptr<cuda::Buffer> memory_;
+  std::shared_ptr<CudaWindows> windows_;
   std::string text_;
 };
 
