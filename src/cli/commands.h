@@ -54,7 +54,7 @@ CLI::Option* add_bytes(CLI::App& command, const char* name, Bytes& bytes, const 
   return command.add_option(name, bytes, help)->type_name("BYTES")->transform(CLI::Validator(read_bytes, ""));
 }
 
-/// The memory that the process may take, wherever a policy is loaded.
+/// The memory that the process may take, or on a GPU the policy, wherever one is loaded.
 void add_memory(CLI::App& command, std::size_t& bytes);
 
 /// Replaces a name `hub:OWNER/NAME@REVISION` by the file that vla-pull has put there; other text names a file. What
