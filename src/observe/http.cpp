@@ -36,10 +36,14 @@ constexpr const char* kPolicy =
     "frame-ancestors 'none'";
 constexpr auto kPatience = std::chrono::seconds(2);  // from the connection to the last byte of its answer
 
+struct Handlers {
+  HttpHandler get, post;
+};
+
 /// One request and its answer. Whoever holds the shared pointer last, the pending operation as a rule, closes it.
 class Connection : public std::enable_shared_from_this<Connection> {
  public:
-  Connection(tcp::socket socket, const HttpHandler& handler) : stream_(std::move(socket)), handler_(handler) {
+  Connection(tcp::socket socket, const Handlers& handlers) : stream_(std::move(socket)), handlers_(handlers) {
     parser_.header_limit(kMaxHeader);
   }
 
@@ -54,11 +58,11 @@ class Connection : public std::enable_shared_from_this<Connection> {
  private:
   void answer() {
     const auto& request = parser_.get();
-    HttpReply reply = {405, "text/plain; charset=utf-8", "GET only\n"};
-    if (request.method() == http::verb::get || request.method() == http::verb::head) {
+    HttpReply reply = {405, "text/plain; charset=utf-8", handlers_.post ? "GET and POST only\n" : "GET only\n"};
+    if (const HttpHandler* handler = handler_of(request.method()); handler != nullptr && *handler) {
       const std::string target(request.target());
       const std::size_t end = std::min(target.find('?'), target.size());
-      reply = handler_(target.substr(0, end), target.substr(std::min(end + 1, target.size())));
+      reply = (*handler)(target.substr(0, end), target.substr(std::min(end + 1, target.size())));
     }
     response_.version(request.version());
     response_.result(static_cast<unsigned>(reply.status));
@@ -77,8 +81,13 @@ class Connection : public std::enable_shared_from_this<Connection> {
     });
   }
 
+  const HttpHandler* handler_of(http::verb method) const {
+    if (method == http::verb::get || method == http::verb::head) return &handlers_.get;
+    return method == http::verb::post ? &handlers_.post : nullptr;
+  }
+
   beast::tcp_stream stream_;
-  const HttpHandler& handler_;
+  const Handlers& handlers_;
   beast::flat_buffer buffer_{2 * kMaxHeader};
   http::request_parser<http::empty_body> parser_;
   Response response_;
@@ -88,7 +97,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
 
 class Http::Server {
  public:
-  explicit Server(HttpHandler handler) : handler_(std::move(handler)) {}
+  explicit Server(Handlers handlers) : handlers_(std::move(handlers)) {}
   ~Server() {
     context_.stop();
     if (thread_.joinable()) thread_.join();
@@ -121,12 +130,12 @@ class Http::Server {
       if (const auto oldest = open_.front().lock()) oldest->close();
       open_.pop_front();
     }
-    const auto connection = std::make_shared<Connection>(std::move(socket), handler_);
+    const auto connection = std::make_shared<Connection>(std::move(socket), handlers_);
     open_.push_back(connection);
     connection->start();
   }
 
-  const HttpHandler handler_;
+  const Handlers handlers_;
   std::string address_;
   boost::asio::io_context context_{1};
   std::optional<net::Listener<tcp>> listener_;
@@ -138,11 +147,11 @@ Http::Http(std::unique_ptr<Server> server) : server_(std::move(server)) {}
 Http::~Http() = default;
 const std::string& Http::address() const { return server_->address(); }
 
-Result<std::unique_ptr<Http>> Http::open(const std::string& address, const char* option, bool insecure,
-                                         HttpHandler handler) {
+Result<std::unique_ptr<Http>> Http::open(const std::string& address, const char* option, bool insecure, HttpHandler get,
+                                         HttpHandler post) {
   std::unique_ptr<Server> server;
   try {
-    server = std::make_unique<Server>(std::move(handler));
+    server = std::make_unique<Server>(Handlers{std::move(get), std::move(post)});
   } catch (const boost::system::system_error& error) {
     return Error{Code::io, option, "what sockets need of the system", error.code().message()};
   }

@@ -16,7 +16,7 @@ struct HttpReply {
   std::string body;
 };
 
-/// The answer to GET of a path; `query` is what follows its question mark.
+/// The answer to GET of a path, or to POST; `query` is what follows its question mark. A body is not read.
 using HttpHandler = std::function<HttpReply(const std::string& path, const std::string& query)>;
 
 /// HTTP for those who watch the server. One thread serves all connections and waits for none of them. A connection has
@@ -25,10 +25,10 @@ using HttpHandler = std::function<HttpReply(const std::string& path, const std::
 class Http {
  public:
   /// Listens at once, at HOST:PORT, HOST an IPv4 address, an IPv6 address in brackets, or `*`. An address that others
-  /// can reach needs `insecure`: HTTP has no keys. The handler is called on the thread of Http. `option`: where errors
-  /// are. Errors: usage, io, out_of_memory.
+  /// can reach needs `insecure`: HTTP has no keys. The handlers are called on the thread of Http; without one for POST
+  /// that is refused. `option`: where errors are. Errors: usage, io, out_of_memory.
   static Result<std::unique_ptr<Http>> open(const std::string& address, const char* option, bool insecure,
-                                            HttpHandler handler);
+                                            HttpHandler get, HttpHandler post = {});
   ~Http();
 
   /// The bound address, the port filled in.

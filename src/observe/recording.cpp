@@ -97,7 +97,7 @@ void Recorder::describe(const v1::Description& description) {
 }
 
 void Recorder::answered(const Answered& answered) {
-  if (stopped_ || answered.out.empty()) return;
+  if (!why_stopped_.empty() || answered.out.empty()) return;
   const std::string& client = answered.request.client;
   const auto at = epoch_ + answered.request.at.time_since_epoch();
   add({XXH3_64bits(client.data(), client.size()), static_cast<std::uint64_t>(at.count())}, answered.in, answered.out);
@@ -117,9 +117,10 @@ void Recorder::add(const Came& came, std::span<const std::byte> in, std::span<co
 }
 
 void Recorder::stop(const char* why) {
-  stopped_ = true;
+  why_stopped_ = "no memory";  // which this text takes none of
   try {
-    if (tell_) tell_(why, n_record_ == 0 ? 0 : n_record_ - 1);
+    why_stopped_ = why;
+    if (tell_) tell_(why_stopped_, n_recorded());
   } catch (const std::exception&) {  // no memory to tell it
   }
 }

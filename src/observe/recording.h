@@ -33,6 +33,9 @@ class Recorder final : public Observer {
   void describe(const v1::Description& description);
   void answered(const Answered& answered) override;
   bool records() const override { return true; }
+  std::uint64_t n_recorded() const { return n_record_ == 0 ? 0 : n_record_ - 1; }
+  std::uint64_t n_byte() const { return bytes_; }
+  const std::string& why_stopped() const { return why_stopped_; }  // empty: it has not
 
   /// Called once, when it stops before the server does: at the limit, or when the disk fails or is too slow. From then
   /// on nothing is recorded, so that a recording has no holes.
@@ -51,7 +54,7 @@ class Recorder final : public Observer {
   const std::chrono::nanoseconds epoch_;  // of the steady clock, since 1970
   std::uint64_t bytes_ = 0;
   std::uint32_t n_record_ = 0;
-  bool stopped_ = false;
+  std::string why_stopped_;
   std::function<void(const std::string&, std::uint64_t)> tell_;
   Writer writer_;
 };
