@@ -11,6 +11,7 @@
 
 #include "cli/commands.h"
 #include "serve/native/codec.h"
+#include "serve/native/seen.h"
 #include "serve/token.h"
 
 namespace vla::cli {
@@ -51,22 +52,37 @@ std::string drawn_token() {
   return token;
 }
 
+void describe_for_page(serve::Page& page, const v1::Description& description, const Engine& engine) {
+  std::map<std::string, serve::Page::Range> ranges;
+  for (const Robot* robot : engine.robots()) add_ranges(*robot, ranges);
+  const auto max_pixels = static_cast<std::int64_t>(description.limits().max_pixels());
+  page.describe(description, ranges, [&engine, max_pixels](const v1::Act& act, int view) {
+    return serve::seen(act, view, engine, max_pixels);
+  });
+}
+
 void add_observability_options(CLI::App& command, ObservabilityOptions& options) {
   add_text(command, "--metrics", options.metrics, "ADDRESS:PORT",
            "HTTP: /metrics (Prometheus), /healthz, /readyz; port 0 takes a free one");
-  add_text(command, "--page", options.page, "ADDRESS:PORT",
-           "A page for a browser that shows frames, actions and times as they come; the ready line has its address, "
-           "which ends with a token");
+  CLI::Option* page = add_text(
+      command, "--page", options.page, "ADDRESS:PORT",
+      "A page for a browser that shows frames, actions and times as they come; the ready line has its address, "
+      "which ends with a token");
   command.add_option("--log", options.log, "Format of the log on standard error: text or json")
       ->check(CLI::IsMember({"text", "json"}));
   command.add_option("--log-level", options.level, "debug (every request), info (default with --log), warn, error")
       ->check(CLI::IsMember({"debug", "info", "warn", "error"}));
   add_text(command, "--trace", options.trace, "FILE",
            "Write a trace of requests and stages for Perfetto, a .json file");
-  add_text(command, "--record", options.record, "DIR", "Keep requests and answers in this folder, for vla replay");
-  command.add_option("--record-limit", options.record_limit_mb, "Largest size of the recording, in MB")
+  CLI::Option* record = add_text(
+      command, "--record", options.record, "DIR",
+      "Keep requests and answers in this folder, for vla replay; further recordings, which the page begins, in "
+      "folders below");
+  command.add_option("--record-limit", options.record_limit_mb, "Largest size of all recordings together, in MB")
       ->check(CLI::Range(1, 1 << 20))
       ->capture_default_str();
+  command.add_flag("--record-paused", options.record_paused, "With --record and --page: record when the page says so")
+      ->needs(record, page);
 }
 
 Observability::Observability(const ObservabilityOptions& options, const serve::Server& server)
@@ -95,17 +111,25 @@ Status Observability::open(const ObservabilityOptions& options, bool insecure) {
                                            {[this] { return metrics_->text(server_.health()); },
                                             [this] { return not_ready_reason(); }}));
   }
+  if (!options.record.empty()) {
+    recordings_ = std::make_unique<serve::Recordings>(options.record, options.record_limit_mb * 1'000'000);
+    recordings_->on_change([this](const serve::Recordings::Standing& recording) { log_recording(recording); });
+  }
   if (!options.page.empty()) {
-    VLA_TRY(page_, serve::Page::open(options.page, insecure,
-                                     {drawn_token(), serve::is_same_secret, [this] { return server_.health(); }}));
+    VLA_TRY(page_, serve::Page::open(
+                       options.page, insecure,
+                       {drawn_token(), serve::is_same_secret, [this] { return server_.health(); }, recordings_.get()}));
   }
-  if (!options.record.empty()) {  // last: it makes a file that must not be there
-    VLA_TRY(recorder_, serve::Recorder::open(options.record, options.record_limit_mb * 1'000'000));
-    recorder_->on_stop([this](const std::string& why, std::uint64_t n) {
-      log_.event(Level::warn, "record_stopped", {{"why", why}, {"requests", n}});
-    });
-  }
-  return {};
+  // Last, since it makes a file that must not be there.
+  return recordings_ && !options.record_paused ? recordings_->open() : Status();
+}
+
+void Observability::log_recording(const serve::Recordings::Standing& recording) {
+  if (recording.why.empty())
+    log_.event(Level::info, "recording",
+               {{"on", recording.on}, {"folder", recording.folder}, {"requests", recording.n_request}});
+  else
+    log_.event(Level::warn, "record_stopped", {{"why", recording.why}, {"requests", recording.n_request}});
 }
 
 Observability::~Observability() {
@@ -122,12 +146,8 @@ std::string Observability::not_ready_reason() const {
 void Observability::loaded(const std::string& name, const Engine& engine) {
   const v1::Description description = server_.describe(name, engine);
   if (metrics_) metrics_->describe(description, engine.memory());
-  if (recorder_) recorder_->describe(description);
-  if (page_) {
-    std::map<std::string, serve::Page::Range> ranges;
-    for (const Robot* robot : engine.robots()) add_ranges(*robot, ranges);
-    page_->describe(description, ranges);
-  }
+  if (recordings_) recordings_->describe(description);
+  if (page_) describe_for_page(*page_, description, engine);
   const v1::Bundle& bundle = description.bundle();
   if (phase_ != nullptr) phase_ = "warming up";
   log_.event(Level::info, "loaded",
@@ -161,7 +181,7 @@ void Observability::ended(const Status& status) {
 std::vector<serve::Observer*> Observability::observers() {
   std::vector<serve::Observer*> all;
   for (serve::Observer* observer :
-       std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recorder_.get(), page_.get()})
+       std::initializer_list<serve::Observer*>{&log_, metrics_.get(), trace_.get(), recordings_.get(), page_.get()})
     if (observer != nullptr) all.push_back(observer);
   return all;
 }

@@ -13,7 +13,7 @@
 #include "observe/metrics.h"
 #include "observe/monitor.h"
 #include "observe/page.h"
-#include "observe/recording.h"
+#include "observe/recordings.h"
 #include "observe/trace.h"
 #include "serve/server.h"
 
@@ -22,10 +22,15 @@ namespace vla::cli {
 struct ObservabilityOptions {
   std::string metrics, page, log, level, trace, record;
   std::uint64_t record_limit_mb = 1024;
+  bool record_paused = false;
 };
 
 /// What a page asks of who wants to see it: 128 bits of the system's, as hexadecimal digits.
 std::string drawn_token();
+
+/// How a policy that is loaded is shown: where its states were in training, and how it sees. The engine outlives the
+/// page.
+void describe_for_page(serve::Page& page, const v1::Description& description, const Engine& engine);
 
 void add_observability_options(CLI::App& command, ObservabilityOptions& options);
 
@@ -55,13 +60,14 @@ class Observability {
   Observability(const ObservabilityOptions& options, const serve::Server& server);
   Status open(const ObservabilityOptions& options, bool insecure);
   std::string not_ready_reason() const;
+  void log_recording(const serve::Recordings::Standing& recording);
 
   const serve::Server& server_;
   std::atomic<const char*> phase_ = "loading";  // null: serving
   serve::Log log_;
   std::unique_ptr<serve::Metrics> metrics_;
   std::unique_ptr<serve::Trace> trace_;
-  std::unique_ptr<serve::Recorder> recorder_;
+  std::unique_ptr<serve::Recordings> recordings_;
   std::unique_ptr<serve::Page> page_;
   std::unique_ptr<serve::Monitor> monitor_;  // last: asks the others
 };

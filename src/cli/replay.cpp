@@ -14,6 +14,7 @@
 #include "cli/commands.h"
 #include "cli/observability.h"
 #include "cli/say.h"
+#include "serve/native/codec.h"
 #include "serve/server.h"
 #include "serve/token.h"
 
@@ -93,13 +94,38 @@ Result<serve::ReplayReport> replay_bundle(serve::Recording& recording, ReplayOpt
   return std::move(*result);
 }
 
+/// The recorded policy's bundle, of which only the way in is needed: what it makes of frames, and where its states were
+/// in training. Errors: usage for another bundle, which would not have seen the same.
+Result<std::unique_ptr<Engine>> open_recorded(const v1::Description& recorded, const ReplayOptions& options) {
+  VLA_TRY(std::unique_ptr<Engine> engine, Engine::load(options.bundle, {.n_thread = options.n_thread,
+                                                                        .kernels = options.kernels,
+                                                                        .device = options.device,
+                                                                        .dry = true,
+                                                                        .embodiment = options.embodiment,
+                                                                        .all_robots = true}));
+  const std::string& checksum = recorded.bundle().checksum();
+  const std::string found = serve::describe(*engine, {}).bundle().checksum();
+  if (found != checksum)
+    return Error{Code::usage, "--bundle", "the recorded policy's bundle, checksum " + checksum, "checksum " + found};
+  return engine;
+}
+
 /// Shows the recording at the pace at which it came, and its acts until the process is ended.
 Status show(serve::Recording& recording, const ReplayOptions& options) {
   std::atomic<std::uint64_t> n_shown = 0;
   const auto health = [&n_shown] { return serve::Health{.ready = true, .n_chunk = n_shown}; };
+  const v1::Description& description = recording.description();
+  std::unique_ptr<Engine> engine;
   VLA_TRY(const std::unique_ptr<serve::Page> page,
-          serve::Page::open(options.page, false, {drawn_token(), serve::is_same_secret, health}));
-  page->describe(recording.description(), {});
+          serve::Page::open(
+              options.page, false,
+              {.token = drawn_token(), .is_same = serve::is_same_secret, .health = health, .is_server = false}));
+  page->describe(description, {}, {});
+  if (!options.bundle.empty()) {
+    VLA_CHECK(limits_of(description.limits()));
+    VLA_TRY(engine, open_recorded(description, options));
+    describe_for_page(*page, description, *engine);
+  }
   say(stdout, "page={}\n", page->url());
   std::fflush(stdout);
   std::optional<std::uint64_t> first_ns;
@@ -154,8 +180,8 @@ Command add_replay(CLI::App& app) {
       ->check(CLI::Range(0, 512));
   CLI::Option* page = add_text(*command, "--page", options->page, "ADDRESS:PORT",
                                "Show the recording in a browser instead, at its own pace; the line that is printed has "
-                               "the address, which ends with a token");
-  page->excludes(connect)->excludes(bundle);
+                               "the address, which ends with a token. With --bundle also what the policy saw");
+  page->excludes(connect);
   command->add_option("--speed", options->speed, "With --page: so many times as fast as it happened")
       ->needs(page)
       ->check(CLI::Range(0.1, 1000.0))

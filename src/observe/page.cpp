@@ -14,6 +14,10 @@ using Json = nlohmann::ordered_json;
 
 constexpr std::size_t kMaxBytes = 96 << 20;  // of the acts that are kept, as they went over the wire
 constexpr std::size_t kMaxAnswer = 40;       // acts in an answer
+constexpr std::size_t kMaxSeen = 8;          // pictures that are kept for a second viewer
+
+constexpr const char* kForbidden = "open the address that vla serve has printed: it ends with a token\n";
+constexpr const char* kNoFolder = "vla serve was started without a folder for recordings: --record DIR\n";
 
 constexpr char kHtml[] =
 #include "observe/page_html.inc"
@@ -54,6 +58,19 @@ const char* kind_of(const v1::View& view) {
     default:
       return "absent";
   }
+}
+
+Error no_recipe() { return {Code::unsupported, "recipe", "the bundle", "none", "give vla replay its --bundle"}; }
+
+Json record_json(const Recordings& recordings) {
+  const Recordings::Standing standing = recordings.standing();
+  return {{"on", standing.on},       {"folder", standing.folder},           {"requests", standing.n_request},
+          {"bytes", standing.bytes}, {"max_bytes", recordings.max_bytes()}, {"why", standing.why}};
+}
+
+/// A PPM file, which the page draws itself: encoding would cost more than all else.
+HttpReply pixmap(std::uint32_t width, std::uint32_t height, std::string_view rgb) {
+  return {.type = "image/x-portable-pixmap", .body = fmt::format("P6 {} {} 255\n", width, height).append(rgb)};
 }
 
 Json dimensions_json(const google::protobuf::RepeatedPtrField<v1::Dimension>& dimensions) {
@@ -134,20 +151,28 @@ Result<std::unique_ptr<Page>> Page::open(const std::string& address, bool insecu
   const auto handle = [page = page.get()](const std::string& path, const std::string& query) {
     return page->reply(path, query);
   };
-  VLA_TRY(page->http_, Http::open(address, "--page", insecure, handle));
+  const auto handle_post = [page = page.get()](const std::string& path, const std::string& query) {
+    return page->reply_to_post(path, query);
+  };
+  VLA_TRY(page->http_, Http::open(address, "--page", insecure, handle, handle_post));
   return page;
 }
 
 std::string Page::url() const { return fmt::format("http://{}/?token={}", address(), sources_.token); }
 
-void Page::describe(const v1::Description& description, const std::map<std::string, Range>& ranges) {
-  Json json = {{"bundle", description.bundle().name()},      {"arch", description.bundle().arch()},
-               {"device", description.runtime().device()},   {"precision", description.runtime().precision()},
-               {"kernels", description.runtime().kernels()}, {"robots", Json::array()}};
+void Page::describe(const v1::Description& description, const std::map<std::string, Range>& ranges, See see) {
+  Json json = {{"bundle", description.bundle().name()},
+               {"arch", description.bundle().arch()},
+               {"device", description.runtime().device()},
+               {"precision", description.runtime().precision()},
+               {"kernels", description.runtime().kernels()},
+               {"sees", see != nullptr},
+               {"robots", Json::array()}};
   for (const v1::Description& robot : description.embodiments()) json["robots"].push_back(robot_json(robot, ranges));
   if (json["robots"].empty()) json["robots"].push_back(robot_json(description, ranges));
   const std::lock_guard lock(mutex_);
   policy_ = text_of(json);
+  see_ = std::move(see);
 }
 
 void Page::answered(const Answered& answered) try {
@@ -186,15 +211,29 @@ void Page::keep(const std::shared_ptr<Act>& act, std::span<const std::byte> in, 
   for (; bytes_ > kMaxBytes; acts_.pop_front()) bytes_ -= acts_.front()->size;
 }
 
+bool Page::may_ask(const std::string& query) const {
+  return sources_.is_same(value_of(query, "token"), sources_.token);
+}
+
 HttpReply Page::reply(const std::string& path, const std::string& query) {
-  if (!sources_.is_same(value_of(query, "token"), sources_.token))
-    return {.status = 403, .body = "open the address that vla serve has printed: it ends with a token\n"};
+  if (!may_ask(query)) return {.status = 403, .body = kForbidden};
   if (path == "/") return {.type = "text/html; charset=utf-8", .body = kHtml};
   if (path == "/acts") return acts_after(number_of(query, "after"));
-  if (path == "/image") return image(number_of(query, "act"), number_of(query, "view"));
+  if (path == "/image")
+    return image(number_of(query, "act"), number_of(query, "view"), value_of(query, "as") == "seen");
   if (path != "/policy") return {.status = 404, .body = "not here\n"};
   const std::lock_guard lock(mutex_);
   return {.type = "application/json", .body = policy_};
+}
+
+HttpReply Page::reply_to_post(const std::string& path, const std::string& query) {
+  if (!may_ask(query)) return {.status = 403, .body = kForbidden};
+  const std::string_view on = value_of(query, "on");
+  if (path != "/record" || (on != "0" && on != "1")) return {.status = 404, .body = "not here\n"};
+  if (sources_.recordings == nullptr) return {.status = 409, .body = kNoFolder};
+  const Status done = on == "1" ? sources_.recordings->begin() : sources_.recordings->end();
+  if (!done) return {.status = 409, .body = done.error().message() + "\n"};
+  return {.type = "application/json", .body = text_of(record_json(*sources_.recordings))};
 }
 
 /// The newest acts after this one, oldest first.
@@ -208,6 +247,8 @@ HttpReply Page::acts_after(std::uint64_t id) {
       found.push_back(*act);
   }
   const Health health = sources_.health();
+  Json record;  // null of a recording that is shown
+  if (sources_.is_server) record = sources_.recordings ? record_json(*sources_.recordings) : Json{{"on", false}};
   const Json json = {{"ready", health.ready},
                      {"waiting", health.n_waiting},
                      {"computing", health.computing},
@@ -215,7 +256,8 @@ HttpReply Page::acts_after(std::uint64_t id) {
                      {"errors", health.n_error},
                      {"uptime_s", health.uptime_s},
                      {"first", first},
-                     {"last", last}};
+                     {"last", last},
+                     {"record", record}};
   std::string body = text_of(json);
   body.back() = ',';
   body += "\"acts\":[";
@@ -226,7 +268,20 @@ HttpReply Page::acts_after(std::uint64_t id) {
   return {.type = "application/json", .body = body + "]}"};
 }
 
-HttpReply Page::image(std::uint64_t id, std::size_t view) {
+const Result<Frame>& Page::seen(const Act& act, std::size_t view) {
+  for (const Seen& kept : seen_)
+    if (kept.act == act.id && kept.view == view) return kept.picture;
+  See see;
+  {
+    const std::lock_guard lock(mutex_);
+    see = see_;
+  }
+  seen_.push_back({act.id, view, see ? see(act.request.act(), static_cast<int>(view)) : no_recipe()});
+  if (seen_.size() > kMaxSeen) seen_.pop_front();
+  return seen_.back().picture;
+}
+
+HttpReply Page::image(std::uint64_t id, std::size_t view, bool as_seen) {
   std::shared_ptr<Act> act;
   {
     const std::lock_guard lock(mutex_);
@@ -235,13 +290,18 @@ HttpReply Page::image(std::uint64_t id, std::size_t view) {
   if (act) act->read();
   if (!act || view >= static_cast<std::size_t>(act->request.act().views_size()))
     return {.status = 404, .body = "gone, or never there\n"};
+  if (as_seen) {
+    const Result<Frame>& picture = seen(*act, view);
+    if (!picture) return {.status = 404, .body = picture.error().message() + "\n"};
+    const auto& rgb = std::get<std::vector<std::uint8_t>>(picture->rgb);
+    return pixmap(static_cast<std::uint32_t>(picture->width), static_cast<std::uint32_t>(picture->height),
+                  text_of(std::as_bytes(std::span(rgb))));
+  }
   const v1::View& found = act->request.act().views(static_cast<int>(view));
   if (found.has_jpeg()) return {.type = "image/jpeg", .body = found.jpeg()};
   if (found.has_png()) return {.type = "image/png", .body = found.png()};
   if (!found.has_rgb()) return {.status = 404, .body = "absent\n"};
-  // A PPM file, which the page draws itself: encoding would cost more than all else.
-  return {.type = "image/x-portable-pixmap",
-          .body = fmt::format("P6 {} {} 255\n", found.rgb().width(), found.rgb().height()) + found.rgb().rows()};
+  return pixmap(found.rgb().width(), found.rgb().height(), found.rgb().rows());
 }
 
 }  // namespace vla::serve

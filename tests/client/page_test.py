@@ -16,9 +16,11 @@ from urllib.parse import parse_qs, urlencode, urlsplit
 
 import numpy as np
 import pytest
+from golden_cases import Golden, tensors
 from server_process import SECONDS, VLA, frames
 
 import vla_cpp
+from vla_cpp.recording import Recording, acts_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
@@ -34,15 +36,30 @@ class Shown:
         self.url = self.told["page"]
         self.token = parse_qs(urlsplit(self.url).query)["token"][0]
 
-    def get(self, path, token=None, **query):
+    def get(self, path, token=None, method="GET", **query):
         """Status, type and body."""
         parts = urlsplit(self.url)
         query = urlencode({"token": self.token if token is None else token, **query})
+        request = urllib.request.Request(f"http://{parts.netloc}/{path}?{query}", method=method)
         try:
-            with urllib.request.urlopen(f"http://{parts.netloc}/{path}?{query}", timeout=SECONDS) as reply:
+            with urllib.request.urlopen(request, timeout=SECONDS) as reply:
                 return reply.status, reply.headers["Content-Type"], reply.read()
         except urllib.error.HTTPError as error:
             return error.code, error.headers["Content-Type"], error.read()
+
+    def post(self, on, **options):
+        """Asks for a recording, or its end: status, and the answer."""
+        status, kind, body = self.get("record", method="POST", on=on, **options)
+        return status, json.loads(body) if kind == "application/json" else body.decode()
+
+    def picture(self, **query):
+        """A frame that comes as pixels, (height, width, 3)."""
+        status, kind, body = self.get("image", **query)
+        assert (status, kind) == (200, "image/x-portable-pixmap"), body
+        head, _, rows = body.partition(b"\n")
+        mark, width, height, largest = head.split()
+        assert (mark, largest) == (b"P6", b"255")
+        return np.frombuffer(rows, np.uint8).reshape(int(height), int(width), 3)
 
     def acts(self, after=0):
         """Waits for the last act: it may be answered before the page knows."""
@@ -122,6 +139,100 @@ def test_an_act_is_told_with_its_frames(watched):
         else:
             assert (kind, body) == ("image/png", watched.files[view["name"]])
     assert watched.get("image", act=act["id"], view=9)[0] == watched.get("image", act=10**18, view=0)[0] == 404
+
+
+def pixels_of(case, folder):
+    """What the network gets of the case's frames, (n_view, 3, height, width)."""
+    subprocess.run([VLA, *map(str, case.arguments(options=("--tap", "pixels", "--taps-out", folder / "taps.gguf")))], check=True, capture_output=True)
+    return tensors(folder / "taps.gguf")["pixels"]
+
+
+def check_picture(shown, pixels):
+    """Bytes of planes (3, height, width) that the recipe ends with 2 x - 1, but for how halves are rounded."""
+    expected = 255 * (pixels.transpose(1, 2, 0) * 0.5 + 0.5)
+    assert shown.shape == expected.shape and np.abs(shown - expected).max() < 0.501
+
+
+def test_frames_are_shown_as_the_network_gets_them(watched, tmp_path):
+    sent, watched.sent, watched.files = (watched.sent, watched.files), frames(watched.case), {}
+    watched.act()
+    watched.sent, watched.files = sent
+    act = watched.acts()["acts"][-1]
+    pixels = pixels_of(watched.case, tmp_path)
+    for index, view in enumerate(act["views"]):
+        shown = watched.picture(act=act["id"], view=index, **{"as": "seen"})
+        check_picture(shown, pixels[list(watched.case.images).index(view["name"])])
+        assert watched.picture(act=act["id"], view=index).shape != shown.shape, "the recipe resizes"
+    assert json.loads(watched.get("policy")[2])["sees"]
+
+
+def test_of_a_view_that_no_policy_has_there_is_no_picture(watched):
+    last = watched.acts()["last"]
+    with pytest.raises(vla_cpp.BadObservation):
+        (first, frame), *_ = watched.sent.items()
+        watched.robot.act(images={first: frame, "tail": np.zeros((4, 4, 3), np.uint8)}, state=watched.case.state, text="go", seed=1)
+    watched.n_act += 1
+    (act,) = watched.acts(after=last)["acts"]
+    index = [view["name"] for view in act["views"]].index("tail")
+    status, _, body = watched.get("image", act=act["id"], view=index, **{"as": "seen"})
+    assert status == 404 and b"tail" in body
+    assert watched.picture(act=act["id"], view=index).shape == (4, 4, 3)
+
+
+def texts(folder):
+    """The instructions of a recording that is whole."""
+    recording = Recording(folder)
+    found = [act.text for act in acts_of(recording)]
+    assert recording.is_whole
+    return found
+
+
+def test_a_recording_is_ended_and_another_begun(case, tmp_path):
+    watched = Watched(case, "--record", tmp_path / "r", "--record-limit", "100")
+    watched.act(text="first")
+    watched.acts()
+    record = watched.acts()["record"]
+    assert record["on"] and record["folder"] == str(tmp_path / "r") and record["max_bytes"] == 100_000_000
+    status, ended = watched.post(0)
+    assert status == 200 and not ended["on"] and not ended["why"] and ended["requests"] >= 1
+    assert texts(tmp_path / "r") == ["first"], "whole once it is ended, while the server runs"
+    watched.act(text="between")
+    watched.acts()
+    assert watched.post(0)[0] == 409, "none runs"
+    status, begun = watched.post(1)
+    assert status == 200 and begun["on"] and begun["requests"] == 0 and begun["bytes"] >= ended["bytes"]
+    assert watched.post(1)[0] == 409, "one runs"
+    watched.act(text="second")
+    watched.acts()
+    assert watched.acts()["record"]["requests"] == 1
+    assert watched.stop() == 0
+    (below,) = [path for path in (tmp_path / "r").iterdir() if path.is_dir()]
+    assert str(below) == begun["folder"] and texts(below) == ["second"]
+    assert texts(tmp_path / "r") == ["first"]
+
+
+def test_a_paused_recording_waits_for_the_page(case, tmp_path):
+    watched = Watched(case, "--record", tmp_path / "r", "--record-paused")
+    watched.act(text="before")
+    told = watched.acts()["record"]
+    assert not told["on"] and told["folder"] == "" and not (tmp_path / "r").exists()
+    assert watched.post(1)[0] == 200
+    watched.act(text="asked for")
+    watched.acts()
+    assert watched.stop() == 0
+    (folder,) = (tmp_path / "r").iterdir()
+    assert texts(folder) == ["asked for"]
+
+
+def test_a_recording_is_begun_by_those_who_have_the_token_and_where_there_is_a_folder(watched):
+    for token in ("", watched.token[:-1]):
+        assert watched.post(1, token=token)[0] == 403
+    status, why = watched.post(1)
+    assert status == 409 and "--record DIR" in why
+    assert watched.get("record", on=1)[0] == 404, "by POST alone"
+    assert watched.post("x")[0] == watched.get("acts", method="POST")[0] == 404
+    assert watched.get("acts", method="DELETE")[0] == 405
+    assert watched.acts()["record"] == {"on": False}
 
 
 def test_the_policy_is_told_with_the_range_of_its_states(watched):
@@ -224,6 +335,48 @@ def test_a_browser_shows_what_happens_and_can_step_back(watched, browser):
     page.close()
 
 
+def test_a_browser_switches_to_what_the_policy_sees_and_records(case, browser, tmp_path):
+    watched = Watched(case, "--record", tmp_path / "r", "--record-paused")
+    faults = []
+    page = browser.new_page()
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+    try:
+        watched.act()
+        page.goto(watched.url)
+        widths = "[...document.querySelectorAll('#frames canvas')].map(c => c.width)"
+        wait_for(page, f"{widths}.includes(60)")  # as it was sent
+        page.select_option("#as", "seen")
+        _, height, width = pixels_of(case, tmp_path)[0].shape
+        wait_for(page, f"{widths}.length === 2 && {widths}.every(w => w === {width})")
+        assert "recipe" in page.inner_text("#recipe") and f"{width} x {height}" in page.inner_text("#frames")
+        read = f"document.querySelector('#frames canvas').getContext('2d').getImageData(0, 0, {width}, {height}).data"
+        shown = np.array(page.evaluate(f"Array.from({read})"), np.uint8).reshape(height, width, 4)[..., :3]
+        assert np.array_equal(shown, watched.picture(act=1, view=0, **{"as": "seen"}))
+        assert page.inner_text("#record") == "Record"
+        page.click("#record")
+        wait_for(page, "document.getElementById('record').textContent === 'Stop recording'")
+        watched.act(text="for the record")
+        wait_for(page, "document.getElementById('recorded').textContent.startsWith('1 requests')")
+        page.click("#record")
+        wait_for(page, "document.getElementById('record').textContent === 'Record'")
+        (folder,) = (tmp_path / "r").iterdir()
+        assert texts(folder) == ["for the record"]
+        assert not faults
+    finally:
+        page.close()
+        assert watched.stop() == 0
+
+
+def test_a_browser_is_told_why_nothing_is_recorded(watched, browser):
+    page = browser.new_page()
+    page.goto(watched.url)
+    wait_for(page, "!document.getElementById('record').hidden")
+    page.click("#record")
+    wait_for(page, "document.getElementById('recorded').textContent.includes('--record DIR')")
+    page.close()
+
+
 def test_a_recording_is_shown_as_it_happened(case, tmp_path):
     recorder = subprocess.Popen([VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--threads", "1", "--record", tmp_path / "r"],
                                 stdout=subprocess.PIPE, text=True)  # fmt: skip
@@ -245,8 +398,27 @@ def test_a_recording_is_shown_as_it_happened(case, tmp_path):
             assert act["code"] == "ok" and abs(act["at_ms"] / 1000 - time.time()) < 60
             assert act["total_ms"] == pytest.approx(chunk.queue_ms + sum(chunk.timing.values()))
         assert shown.get("image", act=1, view=0)[0] == 200
-        assert json.loads(shown.get("policy")[2])["robots"][0]["horizon"] == chunks[0].actions.shape[0]
+        policy = json.loads(shown.get("policy")[2])
+        assert policy["robots"][0]["horizon"] == chunks[0].actions.shape[0] and not policy["sees"]
+        status, _, why = shown.get("image", act=1, view=0, **{"as": "seen"})
+        assert status == 404 and b"--bundle" in why
+        assert shown.acts()["record"] is None and shown.post(1)[0] == 409
         assert shown.process.stdout.readline() == "3 acts were shown; Ctrl-C ends the page\n"
     finally:
         shown.process.terminate()
         shown.process.communicate(timeout=SECONDS)
+    seen = Shown("replay", tmp_path / "r", "--speed", "1000", "--bundle", case.bundle)
+    try:
+        seen.n_act = 3
+        policy, act = json.loads(seen.get("policy")[2]), seen.acts()["acts"][0]
+        (state,) = policy["robots"][0]["states"]
+        assert policy["sees"] and len(state["low"]) == len(state["high"]) == 6
+        pixels = pixels_of(case, tmp_path)
+        for index, view in enumerate(act["views"]):
+            check_picture(seen.picture(act=1, view=index, **{"as": "seen"}), pixels[list(case.images).index(view["name"])])
+    finally:
+        seen.process.terminate()
+        seen.process.communicate(timeout=SECONDS)
+    other = Golden("one_view").bundle
+    refused = subprocess.run([VLA, "replay", tmp_path / "r", "--bundle", other, "--page", "127.0.0.1:0"], capture_output=True, text=True, timeout=SECONDS)
+    assert refused.returncode == 2 and "the recorded policy's bundle" in refused.stderr

@@ -8,8 +8,10 @@
 #include <string_view>
 
 #include "processor/image_codecs.h"
+#include "processor/picture.h"
 #include "processor/unicode.h"
 #include "serve/native/codec.h"
+#include "serve/native/seen.h"
 #include "wire/fields.h"
 
 namespace vla::serve {
@@ -222,6 +224,20 @@ Result<ActRequest> decode_act(std::span<const std::byte> bytes, const ActLimits&
   VLA_CHECK(decode_start(act, limits, request));
   VLA_CHECK(decode_leftover(act, limits, request));
   return request;
+}
+
+Result<Frame> seen(const v1::Act& act, int view, const Engine& engine, std::int64_t max_pixels) {
+  VLA_TRY(const Robot* robot, engine.robot(act.embodiment()));
+  const Processor& processor = robot->processor();
+  const v1::View& given = act.views(view);
+  VLA_TRY(const int place, processor.views().find(given.name()));
+  const std::string& name = processor.views().names()[static_cast<std::size_t>(place)];
+  const ActLimits limits = {.max_pixels = max_pixels, .fit = processor.recipe().fit.get()};
+  ActLimits left = limits;
+  VLA_CHECK(check_cost(given, name, left));
+  VLA_TRY(const std::optional<Frame> frame, decode_view(given, name, limits));
+  if (!frame) return bad_observation(name, "an image", "none");
+  return picture_of(processor, *frame, place);
 }
 
 Result<std::string> read_describe(std::span<const std::byte> describe) {
