@@ -17,14 +17,6 @@ namespace {
 
 constexpr double kFewMs = 250;  // an act that is so short may be faster on one thread
 
-/// The share of the peak that float networks of every architecture reach (docs/performance.md). With other kernels they
-/// differ too much from one network to the next.
-struct KnownShare {
-  const char* kernels;
-  double share;
-};
-constexpr KnownShare kShares[] = {{"avx2", 0.78}};
-
 std::string content(const char* path) {
   std::ifstream in(path);
   std::ostringstream text;
@@ -43,11 +35,19 @@ double median_cores(const Report& report) {
   return quantile(cores, 0.5);
 }
 
-void add_stages(Checkup& checkup) {
+/// Milliseconds of a stage, or of all of them as `network`; 0 without a prediction.
+double predicted_ms(const StagePredictions& stages, const std::string& name) {
+  double seconds = 0;
+  for (const auto& [stage, prediction] : stages)
+    if (stage == name || name == "network") seconds += prediction.seconds;
+  return 1e3 * seconds;
+}
+
+void add_stages(Checkup& checkup, const StagePredictions& predicted) {
   const Report& report = checkup.report;
   for (const StageRow& row : report.stages)
     if (row.work.flop > 0 && row.name != "total")
-      checkup.stages.push_back({row.name, 1e3 * predict(row.work, report.before, report), row.p50});
+      checkup.stages.push_back({row.name, predicted_ms(predicted, row.name), row.p50});
   checkup.total = report.find("total")->p50;
   checkup.host = checkup.total - report.find("network")->p50;
 }
@@ -80,15 +80,10 @@ Result<Machine> examine_machine() {
 
 int Checkup::replan_rows() const { return std::max(1, static_cast<int>(std::ceil(1e-3 * best() * rate_hz))); }
 
-double predict(const Work& work, const Roofs& roofs, const Report& report) {
-  if (!report.conditions.on_cpu() || work.int8 > 0) return 0;
-  for (const auto& [kernels, share] : kShares)
-    if (report.conditions.kernels == kernels) return work.flop / (share * roofs.peak(report.peak_name));
-  return 0;
-}
-
 Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher) {
   Checkup checkup;
+  StagePredictions predicted;
+  const bool on_cpu = request.device.empty() || request.device == "cpu";
   {  // sizes alone
     VLA_TRY(const std::unique_ptr<Engine> dry, Engine::load(request.bundle, {.n_thread = request.n_thread,
                                                                              .kernels = request.kernels,
@@ -98,17 +93,20 @@ Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, 
     checkup.predicted_memory = dry->memory().total();
     checkup.horizon = describe(*dry, dry->robot()).horizon;
     checkup.rate_hz = describe(*dry, dry->robot()).rate_hz;
+    if (on_cpu && free_memory > 0 && checkup.predicted_memory > free_memory)
+      return Error{Code::out_of_memory, request.bundle,
+                   fmt::format("{:.1f} GB of free memory", 1e-9 * static_cast<double>(checkup.predicted_memory)),
+                   fmt::format("{:.1f} GB", 1e-9 * static_cast<double>(free_memory)),
+                   "vla quantize makes a smaller bundle"};
+    if (on_cpu) {
+      watcher.tell("timing one block of each kind");
+      VLA_TRY(predicted, dry->predict());
+    }
   }
-  const bool on_cpu = request.device.empty() || request.device == "cpu";
-  if (on_cpu && free_memory > 0 && checkup.predicted_memory > free_memory)
-    return Error{Code::out_of_memory, request.bundle,
-                 fmt::format("{:.1f} GB of free memory", 1e-9 * static_cast<double>(checkup.predicted_memory)),
-                 fmt::format("{:.1f} GB", 1e-9 * static_cast<double>(free_memory)),
-                 "vla quantize makes a smaller bundle"};
   const auto accept = [](const Conditions&) { return Status(); };
   VLA_TRY(checkup.report, measure(request, accept, watcher));
   checkup.cores = median_cores(checkup.report);
-  add_stages(checkup);
+  add_stages(checkup, predicted);
   if (on_cpu && checkup.total < kFewMs && checkup.report.conditions.n_thread > 1) {
     Request one = request;
     one.n_thread = 1;

@@ -28,7 +28,7 @@ std::size_t free_memory(const std::string& meminfo, const std::string& limit, co
 /// A stage of the network as it should be here, and as it was.
 struct StageCheck {
   std::string name;
-  double predicted = 0, measured = 0;  // ms; 0: no prediction for these kernels
+  double predicted = 0, measured = 0;  // ms; 0: no prediction for this device
 };
 
 /// A policy on this machine. Times are milliseconds, medians of the rounds.
@@ -51,12 +51,9 @@ struct Checkup {
   bool holds_rate() const { return rate_hz == 0 || replan_rows() <= horizon; }
 };
 
-/// Seconds that a stage should take: its arithmetic at the machine's peak, over the share of it that these kernels
-/// reach. 0 where that share is not known: for int8, other devices and most kernels.
-double predict(const Work& work, const Roofs& roofs, const Report& report);
-
-/// Loads the bundle and measures a few acts; on one thread too where an act takes less than a quarter of a second.
-/// Errors: out_of_memory, before anything is loaded, where it would not fit; those of `measure`.
+/// Predicts from one phase of each kind (Engine::predict), loads the bundle and measures a few acts; on one thread
+/// too where an act takes less than a quarter of a second. Errors: out_of_memory, before anything is loaded, where it
+/// would not fit; those of `measure`.
 Result<Checkup> examine_policy(const Request& request, std::size_t free_memory, const Watcher& watcher);
 
 }  // namespace vla::bench

@@ -150,6 +150,7 @@ Result<std::string> Engine::program_text(Part part) {
 }
 
 Result<StagePredictions> Engine::predict() {
+  if (!dry_) return StagePredictions();  // what it runs overwrites what is in memory
   VLA_TRY(const Plan* plan, plans_->for_shape(robot().network(), robot().largest_shape()));
   return plan->predict(robot().solver().n_step);
 }

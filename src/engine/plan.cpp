@@ -158,8 +158,9 @@ StagePredictions Plan::predict(int n_step) const {
   StagePredictions parts;
   for (std::size_t i = 0; i + 2 < prefix.size(); ++i) parts.emplace_back(prefix_->stages()[i].name, prefix[i]);
   parts.emplace_back("prefix", prefix[prefix.size() - 2]);
-  Program::Prediction steps = step.back();  // once for all of them
+  Program::Prediction steps;
   for (int k = 0; k < n_step; ++k) steps += step.front();
+  (device_.is_host() ? parts.back().second : steps) += step.back();  // once, before or after `prefix_ended`
   parts.emplace_back("steps", steps);
   return parts;
 }

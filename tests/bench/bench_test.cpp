@@ -241,19 +241,6 @@ TEST_CASE("memory that a process could take is what the system and its group lea
   CHECK(free_memory("", "", "") == 0);
 }
 
-TEST_CASE("a stage is predicted from its arithmetic, for kernels whose share of the peak is known") {
-  Report report = report_of(10);
-  const Work work = {.flop = 4e9, .bytes = 1e9};
-  CHECK(predict(work, report.before, report) == doctest::Approx(4e9 / (0.78 * 2e12)));
-  Work codes = work;
-  codes.int8 = 1e9;
-  CHECK(predict(codes, report.before, report) == 0);
-  report.conditions.kernels = "amx";
-  CHECK(predict(work, report.before, report) == 0);
-  report.conditions.kernels = "avx2", report.conditions.device = "cuda:0";
-  CHECK(predict(work, report.before, report) == 0);
-}
-
 TEST_CASE("a rate is held while a chunk lasts until the next one is there") {
   Checkup checkup;
   checkup.horizon = 16, checkup.rate_hz = 80, checkup.total = 190;

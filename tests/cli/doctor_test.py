@@ -36,14 +36,13 @@ def test_json_has_machine_build_and_policy(report):
     assert policy["act_ms"] == pytest.approx(network + policy["host_ms"], rel=1e-3)
 
 
-def test_prediction_and_measurement_agree(vla):
+@pytest.mark.parametrize("kernels", ["float32", "int8"])
+def test_prediction_and_measurement_agree(vla, kernels):
     if vla.is_sanitized():
         pytest.skip("a sanitizer slows the kernels down")
-    policy = vla("doctor", DEMO, "--threads", 1, "--json").json()["policy"]
-    if policy["kernels"] != "avx2":
-        assert policy["stages"]["network"]["predicted_ms"] is None
-        pytest.skip(f"no prediction for {policy['kernels']}")
-    network = policy["stages"]["network"]
+    policy = vla("doctor", DEMO, "--threads", 1, "--kernels", kernels, "--json").json()["policy"]
+    *stages, network = policy["stages"].values()
+    assert sum(stage["predicted_ms"] for stage in stages) == pytest.approx(network["predicted_ms"])
     seconds_of_core = network["measured_ms"] * min(1, policy["cores"])  # others may run
     assert seconds_of_core == pytest.approx(network["predicted_ms"], rel=0.4)
 

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <map>
 
 #include "lower/cpu/emit.h"
 
@@ -66,6 +67,8 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
   n_prepare_ = static_cast<std::size_t>(l.n_prepare);
   phases_.resize(static_cast<std::size_t>(l.n_phase)), uses_.resize(phases_.size());
   const auto& stages = l.graph.stages();
+  std::vector<std::string> likeness(phases_.size());
+  counted_.resize(phases_.size());
   work_.resize(stages.size() + 1);
   std::vector<std::size_t> stage_end(stages.size(), 0);  // the last phase of each, and one
   for (const CpuOp& op : l.ops) {
@@ -73,12 +76,19 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
     tasks_.push_back(emit(l, op, uses_[phase]));
     tasks_.back()->kind = kind_of(op), tasks_.back()->clock = clock_.get();
     phases_[phase].tasks.push_back(tasks_.back().get());
-    text_ += text_of(l, op) + "\n";
+    const std::string text = text_of(l, op);
+    text_ += text + "\n";
     const std::size_t stage = stage_of(l, op);
-    if (!op.invariant) work_[stage] += work_of(l, op);
+    const Work work = work_of(l, op);
+    if (!op.invariant) work_[stage] += work;
+    likeness[phase] += likeness_of(text) + "\n";
+    counted_[phase].entry = op.invariant ? work_.size() : stage, counted_[phase].weights += work.weights;
     if (stage < stages.size() && !op.invariant) stage_end[stage] = std::max(stage_end[stage], phase + 1);
     host_size_ += kTaskSize;
   }
+  std::map<std::string, int> kinds;
+  for (std::size_t i = 0; i < phases_.size(); ++i)
+    counted_[i].kind = kinds.try_emplace(likeness[i], static_cast<int>(kinds.size())).first->second;
   for (const Graph::Stage& stage : stages) stages_.push_back({stage.name, {}});
   for (std::size_t i = 0; i < stages.size(); ++i)
     if (stage_end[i] > 0) phases_[stage_end[i] - 1].done = &stages_[i].done;
@@ -111,7 +121,7 @@ Status CpuProgram::prepare() { return run(prepare_); }
 Status CpuProgram::run() { return run(run_); }
 
 /// Matrices are where the table has them.
-void CpuProgram::bind() {
+void CpuProgram::bind() const {
   for (const MatrixUses& phase : uses_)
     for (const auto& [part, matrix] : phase) {
       const auto& [data, scales] = weights_->at(matrix);

@@ -21,6 +21,9 @@ class CpuProgram final : public Program {
   Status run() override;
   const std::vector<Stage>& stages() const override { return stages_; }
   std::vector<Work> work() const override { return work_; }
+  /// From one phase of each kind, which is run for the purpose: what is in memory is lost, so of a program that was
+  /// lowered for its sizes alone. Reading the weights from memory is counted on top.
+  std::vector<Prediction> predictions() const override;
   const std::vector<Tap>& taps() const override { return taps_; }
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
@@ -35,11 +38,12 @@ class CpuProgram final : public Program {
     Shape shape, stride;
   };
   Status run(const std::vector<Segment>& segments);
-  void bind();
+  void bind() const;
   Status give_addresses(CpuLowering& l);
   Status make_tasks(const CpuLowering& l);
   Status cut(const CpuWeights& weights);
   void make_taps(const CpuLowering& l);
+  std::vector<double> seconds_of_kinds() const;
 
   std::shared_ptr<kernels::Executor> executor_;
   std::shared_ptr<kernels::KindClock> clock_;
@@ -48,9 +52,16 @@ class CpuProgram final : public Program {
   std::shared_ptr<const WeightTable> weights_;
   std::vector<MatrixUses> uses_;  // of each phase
   MatrixReads reads_;
-  std::uint64_t bound_ = 0;  // the version of the table that tasks know
+  mutable std::uint64_t bound_ = 0;  // the version of the table that tasks know
   std::vector<std::unique_ptr<kernels::Task>> tasks_;
   std::vector<kernels::Phase> phases_;
+  /// What a prediction has to know of each phase.
+  struct Counted {
+    int kind = 0;           // the same number for phases that take the same time, in the order in which they come first
+    std::size_t entry = 0;  // of `predictions`
+    double weights = 0;     // bytes
+  };
+  std::vector<Counted> counted_;
   std::vector<Segment> prepare_, run_;
   std::shared_ptr<WeightStream> stream_;  // null where all matrices are resident
   std::size_t n_prepare_ = 0, host_size_ = 0;

@@ -3,6 +3,8 @@
 #pragma once
 
 #include <memory>
+#include <string>
+#include <string_view>
 
 #include "kernels/attention_kernel.h"
 #include "kernels/executor.h"
@@ -32,5 +34,7 @@ Work work_of(const CpuLowering& l, const CpuOp& op);
 kernels::KindClock::Kind kind_of(const CpuOp& op);
 /// One line: what is computed, the kernel, shapes and layouts.
 std::string text_of(const CpuLowering& l, const CpuOp& op);
+/// Such a line without the numbers that tell places apart: operations that share it take the same time.
+std::string likeness_of(std::string_view text);
 
 }  // namespace vla::lower

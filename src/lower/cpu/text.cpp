@@ -70,4 +70,16 @@ std::string text_of(const CpuLowering& l, const CpuOp& op) {
                      1e-6 * work.bytes, words.what, layout(l, words.x), fmt::join(results, ", "));
 }
 
+/// The phase stands in front, the number of a block behind a dot, that of a value behind %.
+std::string likeness_of(std::string_view text) {
+  std::string likeness;
+  bool in_place = true;  // numbers are left out
+  for (const char c : text) {
+    if (in_place && (c == ' ' || (c >= '0' && c <= '9'))) continue;
+    likeness += c;
+    in_place = c == '.' || c == '%' || c == '\n';
+  }
+  return likeness;
+}
+
 }  // namespace vla::lower

@@ -29,7 +29,9 @@ Result<Memory> Memory::allocate(std::size_t size, const std::string& what) {
 }
 
 Result<Memory> Memory::reserve(std::size_t size, const std::string& what) {
-  return map(size, what, PROT_NONE, MAP_NORESERVE);
+  VLA_TRY(Memory memory, map(size, what, PROT_READ, MAP_NORESERVE));
+  if (size > 0) want_large_pages(memory.data(), size);
+  return memory;
 }
 
 }  // namespace vla::lower

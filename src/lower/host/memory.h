@@ -20,7 +20,7 @@ class Memory {
   Memory() = default;
   /// `what` is for the error. Errors: out_of_memory.
   static Result<Memory> allocate(std::size_t size, const std::string& what);
-  /// Addresses that nobody may read or write, also of more than the system has.
+  /// Addresses that nobody may write, also of more than the system has. They read as zeros, which take no memory.
   static Result<Memory> reserve(std::size_t size, const std::string& what);
 
   std::byte* data() const { return data_.get(); }
