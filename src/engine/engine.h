@@ -84,8 +84,8 @@ class Engine {
   /// The work of the network for the last observation; empty before the first, and where its plan is gone.
   StageWork work() const;
 
-  /// How long a model of a device (EngineOptions::model) says that the first robot's largest observation takes. Errors:
-  /// out_of_memory.
+  /// How long the first robot's largest observation takes, of a dry engine: by a model of the device, or on the CPU by
+  /// one phase of each kind, which is run (Program::predictions). Else empty. Errors: out_of_memory.
   Result<StagePredictions> predict();
 
   const Device& device() const { return *device_; }

@@ -70,7 +70,7 @@ class Plan {
   /// The work of the network for one observation: the prefix, stage by stage, and `n_step` solver steps.
   StageWork work(int n_step) const;
 
-  /// How long a model of a device says that takes; of other devices nothing (Program::predictions).
+  /// How long that takes; nothing of devices that predict nothing (Program::predictions).
   StagePredictions predict(int n_step) const;
 
   /// Appends the taps that the last step recorded, as `step.<k>.<path>`.

@@ -54,7 +54,7 @@ class Program {
   virtual std::optional<Time> ended() const { return {}; }
   /// The work of a run: one entry for each stage, then one for all that follows the last.
   virtual std::vector<Work> work() const = 0;
-  /// The time of a run that a model of a device that is not there predicts.
+  /// The time of a run, predicted by a model of a device that is not there, or from parts of the program.
   struct Prediction {
     double seconds = 0;
     // Of them, if nothing overlapped: products at the rate of their units, bytes at the memory's, and launches.
