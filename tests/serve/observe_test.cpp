@@ -15,6 +15,7 @@
 #include "observe/log.h"
 #include "observe/metrics.h"
 #include "observe/monitor.h"
+#include "observe/recordings.h"
 #include "observe/replay.h"
 #include "observe/trace.h"
 #include "serve/native/codec.h"
@@ -424,6 +425,45 @@ TEST_CASE("a recorder stops at its limit, tells once, and what it has stays whol
   for (auto record = recording->next(); record.ok() && *record; record = recording->next()) ++n;
   CHECK(n == 3);
   CHECK(recording->is_whole());
+}
+
+TEST_CASE("recordings of one server follow each other, are whole each, and share a limit") {
+  Folder folder;
+  Sample sample;
+  std::vector<Recordings::Standing> told;
+  Recordings recordings(folder / "r", 4000);
+  recordings.on_change([&](const Recordings::Standing& now) { told.push_back(now); });
+  CHECK(recordings.begin().error().code == Code::usage);  // no policy yet
+  CHECK(recordings.end().error().code == Code::usage);
+  REQUIRE(recordings.open().ok());
+  recordings.describe({});
+  CHECK(recordings.begin().error().code == Code::usage);  // one runs
+  recordings.answered(sample.answered(false, 1000));
+  REQUIRE(recordings.end().ok());
+  recordings.answered(sample.answered(false));
+  const Recordings::Standing first = recordings.standing();
+  CHECK((!first.on && first.n_request == 1 && first.bytes > 1000 && first.bytes < 1200 && first.why.empty()));
+
+  REQUIRE(recordings.begin().ok());
+  CHECK((recordings.standing().on && recordings.standing().n_request == 0));
+  for (int i = 0; i < 9; ++i) recordings.answered(sample.answered(false, 1000));
+  const Recordings::Standing full = recordings.standing();
+  CHECK((!full.on && full.n_request == 2 && full.bytes <= 4000 && full.why == "it reached its limit"));
+  REQUIRE(told.size() == 3);
+  CHECK((!told[0].on && told[1].on && !told[2].on && told[2].why == full.why));
+
+  CHECK(recordings.end().error().code == Code::usage);  // it ended by itself
+  REQUIRE(recordings.begin().ok());                     // of which no room is left for an act
+  recordings.answered(sample.answered(false, 1000));
+  CHECK((!recordings.standing().on && recordings.standing().n_request == 0));
+  int n = 0;
+  for (const std::string& path : {first.folder, full.folder}) {
+    auto recording = Recording::open(path);
+    REQUIRE(recording.ok());
+    for (auto record = recording->next(); record.ok() && *record; record = recording->next()) ++n;
+    CHECK(recording->is_whole());
+  }
+  CHECK(n == 3);
 }
 
 TEST_CASE("answers are compared by content: times, bundle and runtime may differ, one bit of an action may not") {
