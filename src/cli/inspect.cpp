@@ -137,7 +137,8 @@ void print_budget(const Engine& engine) {
   const auto size = [](std::size_t bytes) { return human_size(static_cast<double>(bytes)); };
   const std::size_t file = engine.robot().bundle().file_size();
   say(stdout, "budget       {}{}; {:.0f} MB is the least that does\n", size(budget.size),
-      engine.device().is_host() ? ", of which the process itself takes " + size(budget.process) : " of the device's memory",
+      engine.device().is_host() ? ", of which the process itself takes " + size(budget.process)
+                                : " of the device's memory",
       std::ceil(1e-6 * static_cast<double>(budget.smallest)));
   if (budget.n_read == 0) return say(stdout, "             all matrices stay in memory\n");
   const double rate = engine.robot().bundle().content()->read_rate();

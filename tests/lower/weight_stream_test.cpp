@@ -141,7 +141,9 @@ TEST_CASE("matrices that are streamed give the bits of resident ones") {
         CAPTURE(set.name);
         CAPTURE(n_thread);
         const Chain chain(type, kDepth);
-        const auto open = [&] { return std::move(*CpuDevice::open(n_thread, *Arithmetic::on_cpu(set.name, this_cpu()))); };
+        const auto open = [&] {
+          return std::move(*CpuDevice::open(n_thread, *Arithmetic::on_cpu(set.name, this_cpu())));
+        };
         test::ChainAnswers resident(chain, open(), false), streamed(chain, open(), true);
         for (int seed = 0; seed < 4; ++seed) CHECK(streamed.run(seed) == resident.run(seed));
       }
