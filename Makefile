@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test lerobot arm64 test-arm64 test-cuda test-vulkan build vulkan cuda wheel wheel-arm64 deb deb-arm64 packages asan tsan fuzz format clean
+.PHONY: help demo libero test lerobot arm64 test-arm64 test-cuda test-vulkan build vulkan cuda wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -23,6 +23,7 @@ help:
 	@echo "make cuda GGML=1   libvla-cuda-ggml.so too, for --kernels ggml there (downloads 525 MB more, with cuBLAS)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make deb       out/vla_*.deb for this system: the program, its manual, and the server as a unit of systemd"
+	@echo "make image     that package in the image of packaging/Containerfile, without a registry, and one act served from it (Debian 12; needs root)"
 	@echo "make deb-arm64, make wheel-arm64   the same two for 64-bit ARM, built here"
 	@echo "make tsan      run the tests of executor, engine and server under the thread sanitizer"
 	@echo "make fuzz      install clang, build the fuzz targets and run each for SECONDS=600"
@@ -67,6 +68,10 @@ deb: packages
 	cpack --config build/deb/CPackConfig.cmake -B out
 	@rm -rf out/_CPack_Packages
 	$(PYTHON) scripts/sbom.py build/deb out
+
+# For Debian 12, which the package is then made on. The image is tried and thrown away: podman makes one to keep.
+image: deb $(STAMP)
+	PYTHON=$(VENV)/bin/python packaging/image.sh out
 
 # The simulator has an environment of its own. RECORDED=1: recorded camera frames instead, where MuJoCo cannot draw.
 SIM       := .venv-sim
