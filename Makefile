@@ -61,7 +61,8 @@ wheel: packages $(STAMP)
 	VLA_BUILD_DIR=build/wheel $(VENV)/bin/pip wheel --quiet --disable-pip-version-check --no-deps -w out ./python
 	$(PYTHON) scripts/sbom.py build/wheel out
 
-deb: packages
+deb:
+	@scripts/packages.sh deb
 	@test -f build/deb/CMakeCache.txt || cmake -S . -B build/deb -G Ninja -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX=/usr \
 	  -DVLA_BUILD_TESTS=OFF -DVLA_DEB=ON $(CMAKE_ARGS)
 	cmake --build build/deb --target vla vla_shared

@@ -5,7 +5,8 @@
 # Installs the Debian or Ubuntu packages that the build needs, or says which are missing where that takes a password.
 # `packages.sh demo` adds what the simulator draws with, `packages.sh fuzz` the compiler that has libFuzzer, `packages.sh vulkan` what
 # libvla-vulkan.so is built with and Mesa's software driver for its tests, `packages.sh lerobot` gRPC for `vla serve --lerobot`,
-# `packages.sh test` an emulator of processors, `packages.sh arm64` the same and a compiler for 64-bit ARM.
+# `packages.sh deb` what CPack tells with which libraries a program needs, `packages.sh test` an emulator of processors, `packages.sh arm64`
+# the same and a compiler for 64-bit ARM.
 set -euo pipefail
 
 packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
@@ -30,6 +31,7 @@ if [ "${1:-}" = fuzz ]; then
   if apt-cache show "libclang-rt-$version-dev" >/dev/null 2>&1; then packages+=("libclang-rt-$version-dev"); fi
 fi
 if [ "${1:-}" = test ]; then packages+=(qemu-user); fi
+if [ "${1:-}" = deb ]; then packages+=(dpkg-dev file); fi
 if [ "${1:-}" = lerobot ]; then packages+=(libgrpc++-dev); fi
 if [ "${1:-}" = arm64 ]; then packages+=(qemu-user g++-aarch64-linux-gnu); fi
 if [ "${1:-}" = vulkan ]; then packages+=(glslc libvulkan-dev spirv-headers mesa-vulkan-drivers); fi
