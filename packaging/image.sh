@@ -5,8 +5,8 @@
 # packaging/image.sh [FOLDER]: builds packaging/Containerfile with buildah where no registry of images is reached, and
 # tries the image: its user, its size, and an act of the shipped policy, served in it and asked for from outside. FOLDER
 # has a package of `make deb` on Debian 12, which stands in for the first stage and its quarter of an hour of compiling.
-# IMAGE_ARGS goes to `buildah build`, MIRROR to debootstrap. Needs root, buildah, debootstrap, and a PYTHON with numpy,
-# pyzmq and protobuf; takes two minutes and 1 GB of disk.
+# IMAGE_ARGS goes to `buildah build`, MIRROR to debootstrap in the place of its own. Needs root, buildah, debootstrap,
+# and a PYTHON with numpy, pyzmq and protobuf; takes two minutes and 1 GB of disk.
 set -eu
 package=${1:+$(cd "$1" && pwd)}
 cd "$(dirname "$0")/.."
@@ -37,8 +37,7 @@ image_of() {  # FOLDER NAME
 # Debian's published images are made of minbase too. The slim one is without what packages bring for people to read.
 echo "image: a base by debootstrap"
 base=$work/base
-debootstrap --variant=minbase bookworm "$base" "${MIRROR:-http://deb.debian.org/debian}" >"$work/log" ||
-  fail "$work/log"
+debootstrap --variant=minbase bookworm "$base" ${MIRROR:+"$MIRROR"} >"$work/log" || fail "$work/log"
 rm -rf "$base"/var/cache/apt/* "$base"/var/lib/apt/lists/*
 [ -n "$package" ] || image_of "$base" docker.io/library/debian:12
 find "$base/usr/share/doc" -type f ! -name copyright -delete
