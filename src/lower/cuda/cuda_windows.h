@@ -40,10 +40,9 @@ class CudaWindows {
     cuda::Owned read;  // stands for all kernels that read it until now
     int held = -1;     // the group in it
   };
-  Window& window(int group) { return windows_[static_cast<std::size_t>(group % WeightStream::kWindows)]; }
-  std::size_t offset(std::size_t group) const {
-    return static_cast<std::size_t>(WeightStream::window_of(group)) * size_;
-  }
+  static std::size_t number(std::size_t group) { return static_cast<std::size_t>(WeightStream::window_of(group)); }
+  Window& window(int group) { return windows_[number(static_cast<std::size_t>(group))]; }
+  std::size_t offset(std::size_t group) const { return number(group) * size_; }
   Status note_read();
   Status upload(int group);
   Status copy(int group);
