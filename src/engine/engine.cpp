@@ -80,11 +80,11 @@ Result<WeightPlan> Engine::plan_weights(std::size_t budget) {
 /// The largest plan of every robot is built, so that the working memory is known before the first request and does not
 /// grow after it.
 Status Engine::make_plans(bool dry) {
-  plans_.emplace(PlanContext{*device_, tap_pattern_, dry, nullptr, see_graph_});
+  plans_.emplace(PlanContext{*device_, tap_pattern_, dry, nullptr, see_graph_, see_tap_});
   for (const auto& robot : robots_)
     if (const auto plan = plans_->for_shape(robot->network(), robot->largest_shape()); !plan) return plan.error();
   // Injected values fit the shape of their observation.
-  if (!injected_.empty()) plans_.emplace(PlanContext{*device_, tap_pattern_, dry, &injected_});
+  if (!injected_.empty()) plans_.emplace(PlanContext{*device_, tap_pattern_, dry, &injected_, {}, see_tap_});
   return {};
 }
 
@@ -217,6 +217,8 @@ Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   clock.lap(timing, "postprocess");
   record(taps, "chunk", {chunk.d_action, chunk.horizon}, chunk.normalized);
   record(taps, "actions", {chunk.d_action, chunk.horizon}, chunk.actions);  // the same in world units
+  if (see_tap_)
+    for (const Tap& tap : std::exchange(taps, {})) see_tap_(tap.path, tap.shape, tap.values);
   chunk.timing = std::move(timing), chunk.taps = std::move(taps);
   return chunk;
 }

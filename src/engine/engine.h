@@ -27,6 +27,9 @@ struct EngineOptions {
   std::string embodiment = {};  // the robot, by its tag; empty where the bundle is for one
   bool all_robots = false;      // without a tag: every robot of a bundle of several
   std::function<void(const Graph&)> see_graph = {};  // is shown the graphs of every plan, before they are lowered
+  /// Is shown values at taps, most of them as soon as they are computed, in the place of ActionChunk::taps, which keeps
+  /// all of them.
+  TapVisitor see_tap = {};
   std::size_t memory = 0;  // bytes that the process, or on a GPU the policy there, may take; 0: no limit
 };
 
@@ -113,6 +116,7 @@ class Engine {
   explicit Engine(const EngineOptions& options)
       : tap_pattern_(options.tap_pattern),
         see_graph_(options.see_graph),
+        see_tap_(options.see_tap),
         dry_(options.dry),
         chose_kernels_(!options.kernels.empty()) {}
   Status open_robots(Bundle file, const EngineOptions& options);
@@ -130,6 +134,7 @@ class Engine {
 
   std::string tap_pattern_;
   std::function<void(const Graph&)> see_graph_;
+  TapVisitor see_tap_;
   bool dry_, chose_kernels_;         // somebody chose them
   std::vector<Tap> injected_;        // of the network
   std::vector<Tap> injected_input_;  // of what it reads

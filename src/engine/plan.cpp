@@ -67,6 +67,14 @@ Tensor Plan::steered(Graph& g, Tensor x, Tensor k, Tensor velocity) const {
   return add(g, multiply(g, velocity, of_rows(keep_)), multiply(g, off, of_rows(pull_)));
 }
 
+TapVisitor Plan::visitor_of_steps(const TapVisitor& see) const {
+  if (!see) return {};
+  return [this, see](const std::string& path, auto shape, auto values) {
+    const std::string of_step = fmt::format("step.{}.{}", i_step_, path);
+    if (match_path(tap_pattern_, of_step)) see(of_step, shape, values);
+  };
+}
+
 Status Plan::lower(const Network& network, const PlanContext& context) {
   Graph prefix(slots_, prefix_filter(tap_pattern_), injection_.of_prefix());
   Graph step(slots_, step_filter(tap_pattern_, network.solver.n_step), injection_.of_step(network.solver.n_step));
@@ -75,7 +83,7 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
   const Tensor x = step.input(x_), k = step.input(k_);
   const Tensor condition = network.conditions != nullptr ? column(step, step.input(network.conditions), k) : Tensor();
   Tensor answer = network.policy.velocity(step, x, condition, cache_);
-  LowerOptions changing = {{x_, k_}};
+  LowerOptions changing = {{x_, k_}, visitor_of_steps(context.see_tap)};
   if (target_ != nullptr) {
     answer = steered(step, x, k, answer);
     changing.varying.insert(changing.varying.end(), {target_, keep_, pull_});
@@ -88,7 +96,7 @@ Status Plan::lower(const Network& network, const PlanContext& context) {
     for (const Graph* graph : {&prefix, &step}) context.see_graph(*graph);
   VLA_CHECK(injection_.check());
   VLA_CHECK(device_.allocate(slots_));
-  LowerOptions varying = {{images_}};
+  LowerOptions varying = {{images_}, context.see_tap};
   for (const Slot* slot : {tokens_, state_})
     if (slot != nullptr) varying.varying.push_back(slot);
   for (const Slot* slot : injection_.slots()) varying.varying.push_back(slot), changing.varying.push_back(slot);
@@ -138,6 +146,7 @@ Status Plan::run_prefix(std::vector<Tap>& taps) {
 }
 
 Status Plan::run_step(int k) {
+  i_step_ = k;
   if (k > 0) injection_.set(device_, k);
   return step_->run();
 }

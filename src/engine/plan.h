@@ -36,6 +36,7 @@ struct PlanContext {
   bool dry;                               // nothing is computed
   const std::vector<Tap>* injected = {};  // null: nothing
   std::function<void(const Graph&)> see_graph = {};
+  TapVisitor see_tap = {};
 };
 
 /// The two programs of one input shape, with the memory that outlives a run: inputs, cache, x. Built once, then only
@@ -82,6 +83,7 @@ class Plan {
  private:
   Plan(const Network& network, const InputShape& shape, const PlanContext& context);
   Status lower(const Network& network, const PlanContext& context);
+  TapVisitor visitor_of_steps(const TapVisitor& see) const;
   Tensor steered(Graph& step, Tensor x, Tensor k, Tensor velocity) const;
 
   std::string tap_pattern_;
@@ -93,6 +95,7 @@ class Plan {
   std::uint32_t views_;
   Cache cache_;
   Injection injection_;
+  int i_step_ = 0;  // that runs, or ran last
   std::unique_ptr<Program> prefix_, step_;
   Program::Time prefix_ended_;
 };

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <chrono>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <span>
@@ -84,10 +85,17 @@ class Program {
   virtual std::size_t size() const = 0;
 };
 
+/// Is shown the value of a tap: its elements one after the other, which are gone afterwards.
+using TapVisitor =
+    std::function<void(const std::string& path, std::span<const std::int64_t> shape, std::span<const float> values)>;
+
 /// How a graph is to be lowered.
 struct LowerOptions {
   /// Slots that change from run to run. What depends on none of them is computed by Program::prepare, if this is given.
   std::vector<const Slot*> varying;
+  /// Is shown what would be Program::taps: by `run`, as soon as a value is there, so that none is kept. Our own kernels
+  /// for CPUs do this; other programs leave it alone and have their taps.
+  TapVisitor see_tap = {};
 };
 
 /// A device that is there.

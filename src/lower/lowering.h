@@ -2,6 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <algorithm>
 #include <string>
 #include <variant>
 #include <vector>
@@ -42,6 +43,7 @@ struct Value {
   std::size_t size = 0, begin = 0;  // bytes, and those before it in the arena or
                                     // among what is kept
   const Slot* slot = nullptr;
+  int made = -1;  // the phase that computes it; -1: none does
 };
 
 /// Rows of queries or keys, and the nodes that were fused to prepare them, or
@@ -145,13 +147,16 @@ struct Lowering {
   const Value& value(ValueId id) const { return values[static_cast<std::size_t>(id)]; }
   Value& base(ValueId id) { return value(value(id).base); }
   const Value& base(ValueId id) const { return value(value(id).base); }
+  /// The phase of a run behind which a value is there.
+  int there_in(ValueId id) const { return std::max(base(id).made, n_prepare); }
 };
 
 /// Which stage an operation belongs to, by when its node was recorded.
 std::size_t stage_of(const Lowering& l, const Step& step);
 /// Strides of elements that lie one after the other.
 Shape contiguous_strides(const Shape& shape);
-bool is_contiguous(const Value& value);
+bool is_contiguous(const Shape& shape, const Shape& stride);
+inline bool is_contiguous(const Value& value) { return is_contiguous(value.shape, value.stride); }
 /// The elements of a value one after the other.
 std::vector<float> contiguous(const float* data, const Shape& shape, const Shape& stride);
 /// Whether all rows lie at the same distance: then that, else -1.

@@ -22,7 +22,8 @@ std::vector<Lifetime> find_lifetimes(const Lowering& l, const std::vector<Step*>
   for (const Step* step : steps)
     for (const ValueId id : step->reads) at(id).last = std::max(at(id).last, step->phase);
   for (const Node& node : l.graph.nodes())
-    if (node.tapped) at(node.id).last = l.n_phase;
+    if (node.tapped)
+      at(node.id).last = std::max(at(node.id).last, l.target.keeps_taps() ? l.n_phase : l.there_in(node.id));
   return lifetimes;
 }
 

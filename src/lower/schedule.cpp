@@ -33,8 +33,7 @@ struct SlotUse {
 
 /// The first phase behind all that an operation needs, and behind those who read or write a slot before it does. Stages
 /// follow each other.
-int schedule_part(const Lowering& l, const std::vector<Step*>& steps, bool invariant, int first) {
-  std::vector<int> made(l.values.size(), first - 1);  // the phase that makes a value
+int schedule_part(Lowering& l, const std::vector<Step*>& steps, bool invariant, int first) {
   std::map<const Slot*, SlotUse> slots;
   const auto use_of = [&](ValueId id) -> SlotUse* {
     return l.base(id).placement == Value::Placement::slot ? &slots[l.base(id).slot] : nullptr;
@@ -46,7 +45,7 @@ int schedule_part(const Lowering& l, const std::vector<Step*>& steps, bool invar
     if (stage_of(l, *step) != stage) stage = stage_of(l, *step), stage_first = end;
     int phase = stage_first;
     for (const ValueId id : step->reads) {
-      phase = std::max(phase, 1 + made[static_cast<std::size_t>(l.value(id).base)]);
+      phase = std::max(phase, 1 + l.base(id).made);
       if (const SlotUse* use = use_of(id)) phase = std::max(phase, 1 + use->written);
     }
     for (const ValueId id : step->writes)
@@ -57,7 +56,7 @@ int schedule_part(const Lowering& l, const std::vector<Step*>& steps, bool invar
       if (SlotUse* use = use_of(id)) use->read = std::max(use->read, phase);
     for (const ValueId id : step->writes) {
       if (SlotUse* use = use_of(id)) use->written = std::max(use->written, phase);
-      made[static_cast<std::size_t>(l.value(id).base)] = phase;
+      l.base(id).made = phase;
     }
   }
   return end;

@@ -11,10 +11,10 @@ Shape contiguous_strides(const Shape& shape) {
   return {1, shape[0], shape[0] * shape[1], shape[0] * shape[1] * shape[2]};
 }
 
-bool is_contiguous(const Value& value) {
-  const Shape packed = contiguous_strides(value.shape);
+bool is_contiguous(const Shape& shape, const Shape& stride) {
+  const Shape packed = contiguous_strides(shape);
   for (std::size_t i = 0; i < 4; ++i)
-    if (value.shape[i] != 1 && value.stride[i] != packed[i]) return false;
+    if (shape[i] != 1 && stride[i] != packed[i]) return false;
   return true;
 }
 

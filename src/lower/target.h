@@ -31,6 +31,8 @@ class Target {
   virtual const Encoding& encoding(const Param& matrix) const = 0;
   /// Attention over fewer keys is float32.
   virtual std::int64_t min_rounded_keys() const = 0;
+  /// Whether taps are read when a run has ended; else behind the phase that makes their value.
+  virtual bool keeps_taps() const { return true; }
   /// Every value starts at a multiple of so many bytes.
   virtual std::size_t alignment() const = 0;
 };

@@ -137,6 +137,38 @@ TEST_CASE("taps do not change the answer, and without a pattern nothing is recor
   CHECK(max_difference(plain->actions, tapped->actions) <= 1e-5);
 }
 
+namespace {
+
+/// Acts with taps that are kept, and with taps that are seen.
+void check_seen(const std::string& path, const std::string& kernels) {
+  CAPTURE(path);
+  CAPTURE(kernels);
+  const GoldenCase golden = GoldenCase::read(path);
+  const auto keeping = load_engine(golden.bundle(), "*", kernels);
+  const auto kept = keeping->act(golden.observation, golden.noise);
+  REQUIRE(kept.ok());
+  std::vector<Tap> seen;
+  const auto see = [&](const std::string& tap, auto shape, auto values) {
+    seen.push_back({tap, {shape.begin(), shape.end()}, {values.begin(), values.end()}});
+  };
+  const auto engine =
+      Engine::load(golden.bundle(), {.n_thread = 2, .kernels = kernels, .tap_pattern = "*", .see_tap = see});
+  REQUIRE(engine.ok());
+  const auto chunk = (*engine)->act(golden.observation, golden.noise);
+  REQUIRE(chunk.ok());
+  CHECK(chunk->taps.empty());
+  REQUIRE(seen.size() == kept->taps.size());
+  for (const Tap& tap : kept->taps) CHECK_MESSAGE(find_tap(seen, tap.path).values == tap.values, tap.path);
+  if (kernels == "float32") CHECK((*engine)->memory().working < keeping->memory().working);
+}
+
+}  // namespace
+
+TEST_CASE("a visitor sees the values that taps keep without it, in less memory") {
+  for (const std::string& path : golden_paths()) check_seen(path, "float32");
+  check_seen(golden_paths().front(), "ggml");
+}
+
 TEST_CASE("a second request, and one after a request of another shape, give the same bytes as the first") {
   for (const std::string& path : golden_paths()) {
     CAPTURE(path);

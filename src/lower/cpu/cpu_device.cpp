@@ -22,8 +22,8 @@ constexpr std::int64_t kNoKeys = std::numeric_limits<std::int64_t>::max();
 
 class CpuTarget final : public Target {
  public:
-  CpuTarget(const CpuWeights& weights, std::int64_t min_rounded_keys)
-      : weights_(weights), min_rounded_keys_(min_rounded_keys) {}
+  CpuTarget(const CpuWeights& weights, std::int64_t min_rounded_keys, bool keeps_taps)
+      : weights_(weights), min_rounded_keys_(min_rounded_keys), keeps_taps_(keeps_taps) {}
 
   const void* multiplier(const Param& matrix) const override { return weights_.kernel(&matrix); }
   std::size_t max_products() const override { return kernels::LinearJob::kMaxPart; }
@@ -32,11 +32,13 @@ class CpuTarget final : public Target {
   bool takes_relu(const Param& matrix) const override { return takes_windows(matrix); }
   const Encoding& encoding(const Param& matrix) const override { return weights_.encoding(&matrix); }
   std::int64_t min_rounded_keys() const override { return min_rounded_keys_; }
+  bool keeps_taps() const override { return keeps_taps_; }
   std::size_t alignment() const override { return kAlignment; }
 
  private:
   const CpuWeights& weights_;
   std::int64_t min_rounded_keys_;
+  bool keeps_taps_;
 };
 
 std::vector<Step*> steps(CpuLowering& l) {
@@ -103,7 +105,7 @@ Result<std::unique_ptr<Program>> CpuDevice::lower(const Graph& graph, const Lowe
   if (!graph.problem().empty())
     return Error{Code::internal, "graph", "operands that fit", graph.problem(), "please report this"};
   VLA_CHECK(check_attention(graph));
-  const CpuTarget target(weights_, rounds_to_bf16(arithmetic_.use) ? min_rounded_keys_ : kNoKeys);
+  const CpuTarget target(weights_, rounds_to_bf16(arithmetic_.use) ? min_rounded_keys_ : kNoKeys, !options.see_tap);
   CpuLowering l = {{.graph = graph, .options = options, .target = target}, weights_, arithmetic_.use, n_thread()};
   start(l);
   std::vector<FusedOp> ops = fuse(l);

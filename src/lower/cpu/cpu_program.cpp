@@ -97,12 +97,16 @@ Status CpuProgram::make_tasks(const CpuLowering& l) {
 }
 
 void CpuProgram::make_taps(const CpuLowering& l) {
+  see_tap_ = l.options.see_tap;
   for (const Node& node : l.graph.nodes()) {
     if (!node.tapped) continue;
     const Value& value = l.value(node.id);
     const auto* data = reinterpret_cast<const float*>(l.address(value.base)) + value.offset;
-    taps_.push_back({node.path, node.shape});
-    tap_places_.push_back({data, value.shape, value.stride});
+    const TapPlace place = {data, value.shape, value.stride};
+    if (see_tap_)
+      seen_.emplace(l.there_in(node.id), std::pair(node.path, place));
+    else
+      taps_.push_back({node.path, node.shape}), tap_places_.push_back(place);
   }
 }
 
@@ -134,11 +138,27 @@ Status CpuProgram::run(const std::vector<Segment>& segments) {
   if (bound_ != weights_->version) bind();
   for (const Segment& segment : segments) {
     if (segment.groups.any()) VLA_CHECK(stream_->bring(segment.groups.first, segment.groups.last));
-    executor_->run(std::span(phases_).subspan(segment.begin, segment.end - segment.begin));
+    run_phases(segment.begin, segment.end);
     if (segment.released >= 0) stream_->release(segment.released);
   }
   for (const auto& [param, rows] : *tables_) VLA_CHECK(rows->status());
   return {};
+}
+
+/// Stops behind each phase that makes a value for the visitor, since the next one may overwrite it.
+void CpuProgram::run_phases(std::size_t begin, std::size_t end) {
+  for (auto next = seen_.lower_bound(begin); begin < end;) {
+    const std::size_t stop = next != seen_.end() ? std::min(end, next->first + 1) : end;
+    executor_->run(std::span(phases_).subspan(begin, stop - begin));
+    for (; next != seen_.end() && next->first < stop; ++next) {
+      const auto& [path, place] = next->second;
+      if (is_contiguous(place.shape, place.stride))
+        see_tap_(path, place.shape, {place.data, static_cast<std::size_t>(count(place.shape))});
+      else
+        see_tap_(path, place.shape, contiguous(place.data, place.shape, place.stride));
+    }
+    begin = stop;
+  }
 }
 
 std::vector<float> CpuProgram::tap(std::size_t i) const {

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <deque>
+#include <map>
 
 #include "lower/cpu/emit.h"
 #include "lower/host/segments.h"
@@ -38,6 +39,7 @@ class CpuProgram final : public Program {
     Shape shape, stride;
   };
   Status run(const std::vector<Segment>& segments);
+  void run_phases(std::size_t begin, std::size_t end);
   void bind() const;
   Status give_addresses(CpuLowering& l);
   Status make_tasks(const CpuLowering& l);
@@ -69,6 +71,8 @@ class CpuProgram final : public Program {
   std::vector<Work> work_;
   std::vector<Tap> taps_;
   std::vector<TapPlace> tap_places_;
+  TapVisitor see_tap_;                                                 // is shown the taps in their place
+  std::multimap<std::size_t, std::pair<std::string, TapPlace>> seen_;  // by the phase behind which they are there
   std::string text_;
 };
 
