@@ -22,7 +22,8 @@ struct QuantizeOptions {
   std::string recording;    // to judge by
   std::string calibration;  // to smooth by
   Bound bound;
-  int n_observation = 32, n_thread = 0;
+  int n_observation = 32;
+  EngineOptions engine = {.all_robots = true};  // that observations are computed by
 };
 
 std::string megabytes(std::int64_t bytes) { return fmt::format("{:.1f}", static_cast<double>(bytes) / 1e6); }
@@ -102,7 +103,7 @@ Result<Chunks> quantized_chunks(const QuantizeOptions& options, const std::strin
   const std::string trial = options.to + ".trial";
   if (const auto made = quantize(bundle, trial, all(options.dtype), {}, [](QuantizeProgress) {}); !made)
     return made.error();
-  Result<Chunks> chunks = chunks_of(trial, {.n_thread = options.n_thread, .all_robots = true}, judged);
+  Result<Chunks> chunks = chunks_of(trial, options.engine, judged);
   std::error_code ignored;
   std::filesystem::remove(trial, ignored);
   return chunks;
@@ -111,12 +112,10 @@ Result<Chunks> quantized_chunks(const QuantizeOptions& options, const std::strin
 /// Writes a smoothed bundle, if the observations move less with it. What the new bundle says of it, or nothing.
 Result<std::string> smooth_first(const QuantizeOptions& options, const std::string& smoothed) {
   VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
-  VLA_TRY(const Smoothed made, smooth(options.from, smoothed, seen, options.n_thread));
-  const EngineOptions float32 = {.n_thread = options.n_thread, .kernels = "float32", .all_robots = true};
-  VLA_TRY(const Chunks expected, chunks_of(options.from, float32, seen));
+  VLA_TRY(const Smoothed made, smooth(options.from, smoothed, seen, options.engine));
   VLA_TRY(const Chunks as_it_was, quantized_chunks(options, options.from, seen));
   VLA_TRY(const Chunks as_smoothed, quantized_chunks(options, smoothed, seen));
-  const Moved before = moved(expected, as_it_was), after = moved(expected, as_smoothed);
+  const Moved before = moved(made.chunks, as_it_was), after = moved(made.chunks, as_smoothed);
   const bool helps = after.rms < before.rms;
   const std::string text = fmt::format(
       "{} over {} observations: {} channels of {} norms and MLPs divided, by {:g} at most; {} moves chunks by {} "
@@ -134,7 +133,7 @@ Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, bo
     if (shows) say(stderr, "\rtrial {:>3}: {:<40}", trial, percent(moved));
   };
   VLA_TRY(const Found found,
-          search(options.from, options.to + ".trial", judged, options.bound, options.n_thread, progress));
+          search(options.from, options.to + ".trial", judged, options.bound, options.engine, progress));
   if (shows) say(stderr, "\r{:<60}\r", "");
   if (!options.quiet) print(found, judged.size());
   if (std::ranges::all_of(found.blocks, [](const Block& block) { return block.codes == Rounding::none; }))
@@ -163,7 +162,9 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
   error->excludes("--dtype");
   command.add_option("--observations", options.n_observation, "Of a recording, evenly spread (1 to 4096; default 32)")
       ->check(CLI::Range(1, 4096));
-  command.add_option("--threads", options.n_thread, "CPU threads; 0 takes every core")->check(CLI::Range(0, 512));
+  add_memory(command, options.engine.memory);
+  command.add_option("--threads", options.engine.n_thread, "CPU threads; 0 takes every core")
+      ->check(CLI::Range(0, 512));
 }
 #endif
 

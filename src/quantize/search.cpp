@@ -41,10 +41,9 @@ double beyond(double larger, double smaller) { return std::sqrt(std::max(0.0, la
 class Search {
  public:
   using Report = std::function<void(int, const Moved&)>;
-  Search(std::string from, std::string trial, std::span<const Judged> judged, int n_thread, const Report& report)
-      : from_(std::move(from)), trial_(std::move(trial)), judged_(judged), report_(report) {
-    options_.n_thread = n_thread, options_.all_robots = true;
-  }
+  Search(std::string from, std::string trial, std::span<const Judged> judged, const EngineOptions& options,
+         const Report& report)
+      : from_(std::move(from)), trial_(std::move(trial)), judged_(judged), options_(options), report_(report) {}
 
   Status open() {
     VLA_TRY(const std::vector<Quantizable> matrices, quantizable(from_));
@@ -184,8 +183,8 @@ class Search {
 
   const std::string from_, trial_;
   const std::span<const Judged> judged_;
+  const EngineOptions& options_;
   const Report& report_;
-  EngineOptions options_;
   std::int64_t n_byte_ = 0;  // of the file as it is
   bool knows_int8_ = false;
   Chunks expected_;
@@ -225,8 +224,9 @@ Choice choice_of(const std::vector<Block>& blocks) {
 }
 
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
-                     const Bound& bound, int n_thread, const std::function<void(int, const Moved&)>& report) {
-  Search search(from, trial, judged, n_thread, report);
+                     const Bound& bound, const EngineOptions& options,
+                     const std::function<void(int, const Moved&)>& report) {
+  Search search(from, trial, judged, options, report);
   VLA_CHECK(search.open());
   const Status done = bound.error ? search.to_error(*bound.error) : search.to_size(*bound.bytes);
   std::error_code ignored;

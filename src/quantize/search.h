@@ -51,10 +51,11 @@ struct Found {
 /// Chooses int4, int8 or the stored floats for every block, so that the bound holds with the fewest bytes, or within
 /// these bytes with the least error. Each block alone is int4 once, to see how far the actions move; errors of blocks
 /// are taken to add in squares, and the choice is then computed as it is, until it holds. `trial`: a file that is
-/// written over and over, and removed. Errors: those of `quantize` and of Engine; unsupported where the bound cannot
-/// hold, with what can.
+/// written over and over, and removed. `options`: of the engines. Errors: those of `quantize` and of Engine;
+/// unsupported where the bound cannot hold, with what can.
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
-                     const Bound& bound, int n_thread, const std::function<void(int trial, const Moved&)>& report);
+                     const Bound& bound, const EngineOptions& options,
+                     const std::function<void(int trial, const Moved&)>& report);
 
 /// The choice of a search, by tensor.
 Choice choice_of(const std::vector<Block>& blocks);

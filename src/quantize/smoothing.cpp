@@ -25,29 +25,27 @@ constexpr int kLeastPower = 2, kMostPower = 12;
 /// The largest magnitude of each channel of a value, over tokens, solver steps and observations.
 using Ranges = std::map<std::string, std::vector<float>>;
 
-void widen_range(std::vector<float>& range, const Tap& tap) {
-  const auto d = static_cast<std::size_t>(tap.shape.front());
+void widen_range(std::vector<float>& range, std::size_t d, std::span<const float> values) {
   range.resize(d);
-  for (std::size_t i = 0; i < tap.values.size(); ++i) range[i % d] = std::max(range[i % d], std::abs(tap.values[i]));
+  for (std::size_t i = 0; i < values.size(); i += d)
+    for (std::size_t k = 0; k < d; ++k) range[k] = std::max(range[k], std::abs(values[i + k]));
 }
 
 /// `lm.blk.0.attn_norm` of `step.3.lm.blk.0.attn_norm`.
-std::string path_of(const Tap& tap) {
-  if (!tap.path.starts_with("step.")) return tap.path;
-  return tap.path.substr(tap.path.find('.', tap.path.find('.') + 1) + 1);
+std::string without_step(const std::string& path) {
+  return path.starts_with("step.") ? path.substr(path.find('.', path.find('.') + 1) + 1) : path;
 }
 
+/// `chunks`: receives those of the observations.
 Result<Ranges> measure_ranges(const std::string& bundle, const std::vector<SmoothingPlace>& places,
-                              std::span<const Judged> observations, int n_thread) {
-  EngineOptions options = {.n_thread = n_thread, .kernels = "float32", .all_robots = true};
+                              std::span<const Judged> observations, EngineOptions options, Chunks& chunks) {
+  Ranges ranges;
+  options.see_tap = [&](const std::string& path, auto shape, auto values) {
+    widen_range(ranges[without_step(path)], static_cast<std::size_t>(shape.front()), values);
+  };
   for (const SmoothingPlace& place : places) options.tap_pattern += fmt::format("{0},step.*.{0},", place.path);
   options.tap_pattern.pop_back();
-  VLA_TRY(const std::unique_ptr<Engine> engine, Engine::load(bundle, options));
-  Ranges ranges;
-  for (const Judged& one : observations) {
-    VLA_TRY(const ActionChunk chunk, engine->act(one.observation, one.noise));
-    for (const Tap& tap : chunk.taps) widen_range(ranges[path_of(tap)], tap);
-  }
+  VLA_TRY(chunks, chunks_of(bundle, options, observations));
   return ranges;
 }
 
@@ -183,22 +181,23 @@ Status write_tensors(const Bundle& bundle, Scaling& scaling, BundleFile& out) {
 }  // namespace
 
 Result<Smoothed> smooth(const std::string& from, const std::string& to, std::span<const Judged> observations,
-                        int n_thread) {
+                        EngineOptions options) {
+  options.kernels = "float32";
   SmoothingPlaces finder;
   VLA_TRY(const std::unique_ptr<Engine> engine,
-          Engine::load(from, {.n_thread = n_thread,
-                              .kernels = "float32",
+          Engine::load(from, {.n_thread = options.n_thread,
+                              .kernels = options.kernels,
                               .dry = true,
-                              .all_robots = true,
+                              .all_robots = options.all_robots,
                               .see_graph = [&](const Graph& graph) { finder.see(graph); }}));
   const std::vector<SmoothingPlace> places = finder.found();
   if (places.empty())
     return Error{Code::unsupported, from, "norms or gated MLPs whose channels may be divided", "none",
                  "leave out --calibrate"};
-  VLA_TRY(const Ranges ranges, measure_ranges(from, places, observations, n_thread));
+  Smoothed told;
+  VLA_TRY(const Ranges ranges, measure_ranges(from, places, observations, options, told.chunks));
   VLA_TRY(const Bundle bundle, Bundle::open(from));
   Scaling scaling(bundle, engine->robot().bundle());
-  Smoothed told;
   for (const SmoothingPlace& place : places)
     if (const auto range = ranges.find(place.path); range != ranges.end())
       VLA_CHECK(scaling.add(place, range->second, told));

@@ -6,11 +6,12 @@
 
 namespace vla {
 
-/// The extent of a smoothing.
+/// The extent of a smoothing, and what it was measured by.
 struct Smoothed {
   int n_place = 0;    // norms and gated MLPs whose matrices all are floats and read nothing else
   int n_channel = 0;  // of them that were divided
   float largest = 1;  // factor
+  Chunks chunks;      // of the observations, in float32
 };
 
 /// Writes a bundle of the same function whose activations and matrices lose less when they become codes. Where a
@@ -18,9 +19,9 @@ struct Smoothed {
 /// power of two in the norm, or in the product of a gated MLP, that it comes from, and the columns of the matrices that
 /// read it are multiplied by the same. Powers of two change no digit, so that actions in float32 are the same to the
 /// bit. A channel's factor is sqrt(max |x| / max |W|) beside that of the others, x over the observations. Source of the
-/// rule: SmoothQuant, alpha = 0.5 (arXiv 2211.10438). Errors: those of Engine; unsupported where the policy has no such
-/// place; io.
+/// rule: SmoothQuant, alpha = 0.5 (arXiv 2211.10438). `options`: of the engines, all in
+/// float32. Errors: those of Engine; unsupported where the policy has no such place; io.
 Result<Smoothed> smooth(const std::string& from, const std::string& to, std::span<const Judged> observations,
-                        int n_thread);
+                        EngineOptions options);
 
 }  // namespace vla

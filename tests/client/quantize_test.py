@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""`vla quantize --judge`: codes chosen block by block, by how far the actions of a recording move."""
+"""`vla quantize --judge` and `--calibrate`: codes chosen, and channels divided, by the acts of a recording."""
 
 import re
 import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -143,3 +144,29 @@ def test_channels_that_are_far_larger_than_the_others_are_smoothed(recording, tm
     assert re.match(r"smoothed over 2 observations: \d+ channels of \d+ norms and MLPs divided, by \d+ at most; int8 moves chunks by ", told)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["planted.gguf", "rough.gguf", "smooth.gguf"]
     assert "smoothed over 2 observations" in read_bundle(str(tmp_path / "smooth.gguf")).keys["vla.quantization"]
+
+
+@pytest.mark.parametrize("what", [["--calibrate"], ["--error", 0.025, "--judge"]])
+def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what):
+    def made(name, *memory):
+        return peak_of("quantize", SHIPPED.bundle, "-o", tmp_path / name, "--threads", 1, *what, recording, *memory)
+
+    roomy, _ = made("roomy.gguf")
+    _, refused = made("none.gguf", "--memory", "1MB")
+    for _ in range(20):  # the least is not the same in every run: a process differs
+        least = int(re.fullmatch(r"error: out_of_memory: memory: expected (\d+) MB or more, found \d+ MB; .*\n", refused)[1])
+        tight, refused = made("tight.gguf", "--memory", f"{least + 1}MB")
+        if not refused:
+            break
+    assert not refused
+    assert tight < roomy - 2_000_000 or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
+    assert (tmp_path / "tight.gguf").read_bytes() == (tmp_path / "roomy.gguf").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["roomy.gguf", "tight.gguf"]
+
+
+def peak_of(*arguments):
+    """The most bytes that a call took, and what it said was wrong. Between this process and the call stands a small one, since the
+    system counts the memory of the parent as well, until the program is there."""
+    small = "import resource, subprocess, sys; subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL); print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    answer = subprocess.run([sys.executable, "-c", small, VLA, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+    return 1024 * int(answer.stdout), answer.stderr

@@ -116,7 +116,7 @@ TEST_CASE("a smoothed policy acts as before in float32, to the bit") {
     const GoldenCase golden = GoldenCase::read(name);
     const std::string to = write_file("smoothed.gguf", "");
     const Judged seen = {golden.observation, golden.noise};
-    const auto smoothed = smooth(golden.bundle(), to, std::span(&seen, 1), 1);
+    const auto smoothed = smooth(golden.bundle(), to, std::span(&seen, 1), {.n_thread = 1, .all_robots = true});
     if (!smoothed) {
       CHECK_MESSAGE(smoothed.error().code == Code::unsupported, smoothed.error().message());
       continue;
