@@ -117,16 +117,15 @@ class Network:
         return laps.stages, x
 
 
-def quantize(folder, to, config, args):
+def quantize(folder, to, n_step, observations):
     """NNCF's quantization after training, as its guide has it for transformers."""
     import nncf
     import openvino
 
     seen = {name: [] for name in PARTS}
-    network = Network(folder, config.num_steps, {"INFERENCE_PRECISION_HINT": "f32"})
-    for seed in range(1, 1 + N_CALIBRATION):
-        network.infer(observation(config, args.views, args.tokens, seed),
-                      lambda part, given: seen[part].append([np.array(getattr(x, "data", x)) for x in given]))
+    network = Network(folder, n_step, {"INFERENCE_PRECISION_HINT": "f32"})
+    for inputs in observations:
+        network.infer(inputs, lambda part, given: seen[part].append([np.array(getattr(x, "data", x)) for x in given]))
     del network
     to.mkdir(exist_ok=True)
     for name in PARTS:
@@ -170,7 +169,8 @@ def main():
     options = {"INFERENCE_NUM_THREADS": args.threads, "PERFORMANCE_HINT": "LATENCY"}
     if args.hint == "int8":
         if not are_in(folder / "int8"):
-            quantize(folder, folder / "int8", config, args)
+            others = [observation(config, args.views, args.tokens, seed) for seed in range(1, 1 + N_CALIBRATION)]
+            quantize(folder, folder / "int8", config.num_steps, others)
         folder /= "int8"
     elif args.hint != "default":
         options["INFERENCE_PRECISION_HINT"] = args.hint
