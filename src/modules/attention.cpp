@@ -59,6 +59,7 @@ KeyValue KeyValueProjection::operator()(Graph& g, Tensor key_context, Tensor val
 
 Attention::Attention(const Scope& s, int d_model, int d_context, const Heads& heads)
     : heads_(heads),
+      heads_path_((s / "attn_heads").path()),
       q_(s / "attn_q", d_model, heads.d_query(), heads.bias, heads.rule),
       norm_(head_norm(s / "attn_q_norm", heads)),
       kv_(s, d_context, heads),
@@ -68,7 +69,8 @@ Attention::Attention(const Scope& s, int d_model, int d_context, const Heads& he
 
 Tensor Attention::operator()(Graph& g, Tensor x, Tensor rotary, const std::vector<KeyValue>& segments,
                              Tensor mask) const {
-  const Tensor y = attention(g, head_rows(g, q_(g, x), heads_.n_head, norm_, rotary), segments, mask);
+  const Tensor q = head_rows(g, q_(g, x), heads_.n_head, norm_, rotary);
+  const Tensor y = g.name(heads_path_, attention(g, q, segments, mask));
   return out_(g, sub_norm_ ? (*sub_norm_)(g, y) : y);
 }
 

@@ -60,8 +60,8 @@ class KeyValueProjection {
 };
 
 /// Attention of tokens [d_model, n, ...] to a context [d_context, n_key, ...] or to themselves: the products
-/// `attn_q`, `attn_k`, `attn_v` and `attn_out`, with `attn_q_norm` and `attn_k_norm` where heads are normalized, and
-/// `attn_sub_norm` where what they give is.
+/// `attn_q`, `attn_k`, `attn_v` and, of what all heads give (`attn_heads`), `attn_out`, with `attn_q_norm` and
+/// `attn_k_norm` where heads are normalized, and `attn_sub_norm` where what they give is.
 class Attention {
  public:
   Attention(const Scope& s, int d_model, int d_context, const Heads& heads);
@@ -78,6 +78,7 @@ class Attention {
 
  private:
   Heads heads_;
+  std::string heads_path_;
   Linear q_;
   std::optional<RmsNorm> norm_;
   KeyValueProjection kv_;

@@ -15,12 +15,16 @@ namespace vla {
 class Mlp {
  public:
   Mlp(const Scope& s, int d_model, int d_ff, Activation activation, Rule rule = Rule::floats)
-      : up_(s / "ffn_up", d_model, d_ff, Bias::yes, rule),
+      : hidden_path_((s / "ffn_hidden").path()),
+        up_(s / "ffn_up", d_model, d_ff, Bias::yes, rule),
         down_(s / "ffn_down", d_ff, d_model, Bias::yes, rule),
         activation_(activation) {}
-  Tensor operator()(Graph& g, Tensor x) const { return down_(g, activate(g, up_(g, x), activation_)); }
+  Tensor operator()(Graph& g, Tensor x) const {
+    return down_(g, g.name(hidden_path_, activate(g, up_(g, x), activation_)));
+  }
 
  private:
+  std::string hidden_path_;
   Linear up_, down_;
   Activation activation_;
 };
