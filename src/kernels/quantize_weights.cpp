@@ -6,6 +6,8 @@
 
 #include <algorithm>
 #include <limits>
+#include <span>
+#include <vector>
 
 namespace vla::kernels {
 namespace {
@@ -48,24 +50,31 @@ float try_step(const float* x, float step, float* codes) {
   return sum;
 }
 
-/// The block with the least error of those whose step is a multiple of `unit`: the one that its largest number needs,
-/// or a smaller one, which cuts that number and is finer for the others.
-Int4Block best_block(const float* x, float unit) {
+/// The step with the least error of those that are a multiple of `unit`, and its codes: the step that the block's
+/// largest number needs, or a smaller one, which cuts that number and is finer for the others. 0 for a block of zeros.
+int best_step(const float* x, float unit, float* best_codes) {
   constexpr int kMaxStep = Int4Block::kMaxStep;
-  float max_abs = 0, codes[Int4Block::kElements], best_codes[Int4Block::kElements] = {};
+  float max_abs = 0, codes[Int4Block::kElements];
   for (int k = 0; k < Int4Block::kElements; ++k) max_abs = std::max(max_abs, std::max(x[k], -x[k]));
-  const int widest = std::min(kMaxStep, static_cast<int>(max_abs / (Int4Block::kMost * unit)) + 1);
-  Int4Block block = {.step = 0, .codes = {}};
+  std::fill(best_codes, best_codes + Int4Block::kElements, 0.0f);
+  if (!(max_abs > 0)) return 0;
+  const int widest = static_cast<int>(std::min(max_abs / (Int4Block::kMost * unit), kMaxStep - 1.0f)) + 1;
+  int best = 0;
   float least = std::numeric_limits<float>::infinity();
-  for (int step = widest; max_abs > 0 && step > 0 && 2 * step >= widest; --step) {
+  for (int step = widest; step > 0 && 2 * step >= widest; --step) {
     const float missed = try_step(x, static_cast<float>(step) * unit, codes);
     if (missed >= least) continue;
-    least = missed, block.step = static_cast<std::uint8_t>(step);
+    least = missed, best = step;
     std::copy(codes, codes + Int4Block::kElements, best_codes);
   }
+  return best;
+}
+
+Int4Block packed(int step, const float* codes) {
+  Int4Block block = {.step = static_cast<std::uint8_t>(step), .codes = {}};
   for (std::size_t i = 0; i < block.codes.size(); ++i) {
-    const int low = static_cast<int>(best_codes[2 * i]) + Int4Block::kZero;
-    const int high = static_cast<int>(best_codes[2 * i + 1]) + Int4Block::kZero;
+    const int low = static_cast<int>(codes[2 * i]) + Int4Block::kZero;
+    const int high = static_cast<int>(codes[2 * i + 1]) + Int4Block::kZero;
     block.codes[i] = static_cast<std::uint8_t>(low | high << 4);
   }
   return block;
@@ -80,6 +89,73 @@ float fitted_scale(const float* row, const Int4Block* blocks, std::int64_t n, fl
   }
   return square > 0 ? static_cast<float>(product / square) : otherwise;
 }
+
+/// What the blocks of a row share.
+struct Int4Row {
+  float unit;  // of which steps are multiples
+  bool is_finite;
+};
+
+/// Widens a row; one that is not finite, or is nearly zero, becomes zeros.
+Int4Row widen_for_int4(DType type, const std::byte* stored, std::int64_t d_in, float* row) {
+  const float max_abs = widen(type, stored, d_in, row);
+  const bool is_finite = max_abs <= std::numeric_limits<float>::max();
+  const bool is_zero = !is_finite || max_abs <= kMinScale;
+  if (is_zero) std::fill(row, row + d_in, 0.0f);
+  return {is_zero ? 0 : max_abs / (Int4Block::kMost * Int4Block::kMaxStep), is_finite};
+}
+
+/// Columns whose errors later ones make good, of some rows.
+class Stretch {
+ public:
+  /// rows: the first one's element of the first column; feedback: [n, n].
+  Stretch(const float* rows, std::int64_t d_in, std::span<const float> units, const float* feedback, std::int64_t n)
+      : rows_(rows), d_in_(d_in), units_(units), feedback_(feedback), n_(n), asked_(units.size() * size(n)) {}
+
+  /// Makes the blocks that begin at column `begin` of each row. blocks: that of the first row.
+  void round(std::int64_t begin, Int4Block* blocks) {
+    const std::size_t first = size(begin);
+    std::vector<int> steps;
+    std::vector<float> codes(units_.size() * kElements);
+    for (std::size_t r = 0; r < units_.size(); ++r) {
+      float wanted[kElements], unused[kElements];
+      for (std::size_t k = 0; k < kElements; ++k) wanted[k] = row(r)[first + k] + asked(r)[first + k];
+      steps.push_back(best_step(wanted, units_[r], unused));
+    }
+    // Rows in the inner loop, so that a row of the feedback is read once.
+    for (std::size_t k = 0; k < kElements; ++k)
+      for (std::size_t r = 0; r < units_.size(); ++r)
+        codes[r * kElements + k] = round(r, first + k, static_cast<float>(steps[r]) * units_[r]);
+    for (std::size_t r = 0; r < units_.size(); ++r)
+      blocks[static_cast<std::int64_t>(r) * d_in_ / Int4Block::kElements] =
+          packed(steps[r], codes.data() + r * kElements);
+  }
+
+ private:
+  static constexpr auto kElements = static_cast<std::size_t>(Int4Block::kElements);
+  static std::size_t size(std::int64_t n) { return static_cast<std::size_t>(n); }
+  const float* row(std::size_t r) const { return rows_ + static_cast<std::int64_t>(r) * d_in_; }
+  float* asked(std::size_t r) { return asked_.data() + r * size(n_); }
+
+  /// The code of one element, whose error later columns of the row are asked to make good.
+  float round(std::size_t r, std::size_t k, float step) {
+    constexpr auto kMost = static_cast<float>(Int4Block::kMost);
+    float* const more = asked(r);
+    const float wanted = row(r)[k] + more[k];
+    const float code = step > 0 ? std::min(std::max(wanted / step + kRound - kRound, -kMost), kMost) : 0;
+    const float error = row(r)[k] - code * step;
+    const float* const of_error = feedback_ + k * size(n_);
+    for (std::size_t j = k + 1; j < size(n_); ++j) more[j] += error * of_error[j];
+    return code;
+  }
+
+  const float* rows_;
+  std::int64_t d_in_;
+  std::span<const float> units_;
+  const float* feedback_;
+  std::int64_t n_;
+  std::vector<float> asked_;  // for every row, what was added to its columns
+};
 
 }  // namespace
 
@@ -99,12 +175,30 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
                       float* scales, float* row) {
   const std::int64_t n_block = d_in / Int4Block::kElements;
   for (std::int64_t n = 0; n < d_out; ++n, stored += d_in * number_size(type), blocks += n_block) {
-    const float max_abs = widen(type, stored, d_in, row);
-    const bool is_finite = max_abs <= std::numeric_limits<float>::max();
-    if (!is_finite || max_abs <= kMinScale) std::fill(row, row + d_in, 0.0f);
-    const float unit = max_abs / (Int4Block::kMost * Int4Block::kMaxStep);
-    for (std::int64_t i = 0; i < n_block; ++i) blocks[i] = best_block(row + i * Int4Block::kElements, unit);
-    scales[n] = is_finite ? fitted_scale(row, blocks, d_in, 0) : std::numeric_limits<float>::quiet_NaN();
+    const Int4Row of = widen_for_int4(type, stored, d_in, row);
+    float codes[Int4Block::kElements];
+    for (std::int64_t i = 0; i < n_block; ++i) {
+      const int step = best_step(row + i * Int4Block::kElements, of.unit, codes);
+      blocks[i] = packed(step, codes);
+    }
+    scales[n] = of.is_finite ? fitted_scale(row, blocks, d_in, 0) : std::numeric_limits<float>::quiet_NaN();
+  }
+}
+
+void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
+                      Int4Block* blocks, float* scales, float* rows) {
+  std::vector<float> units;
+  for (std::int64_t n = 0; n < d_out; ++n) {
+    const Int4Row of = widen_for_int4(type, stored + n * d_in * number_size(type), d_in, rows + n * d_in);
+    units.push_back(of.unit);
+    scales[n] = of.is_finite ? of.unit : std::numeric_limits<float>::quiet_NaN();
+  }
+  for (std::int64_t first = 0; first < d_in; first += kStretch) {
+    const std::int64_t n = std::min(kStretch, d_in - first);
+    Stretch stretch(rows + first, d_in, units, feedback, n);
+    for (std::int64_t begin = 0; begin < n; begin += Int4Block::kElements)
+      stretch.round(begin, blocks + (first + begin) / Int4Block::kElements);
+    feedback += n * n;
   }
 }
 

@@ -17,4 +17,14 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, Int4Block* blocks,
                       float* scales, float* row);
 
+/// Columns so far apart are rounded as if they had nothing to do with each other.
+constexpr std::int64_t kStretch = 1024;
+
+/// The same where it is known what the matrix multiplies, from which follows how an error in one column is made good
+/// by those behind it. feedback: for each stretch of n <= kStretch columns an [n, n] matrix, whose row j says what is
+/// added to the columns k > j for an error of 1 in column j. Each block gets its step from what is then left of it, and
+/// codes column by column. rows: room for d_out * d_in floats.
+void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, const float* feedback,
+                      Int4Block* blocks, float* scales, float* rows);
+
 }  // namespace vla::kernels

@@ -117,3 +117,65 @@ TEST_CASE("int4: rows of zeros, of tiny weights and of weights that are not fini
     CHECK(int4_of(row).blocks[0][3] == 0);
   }
 }
+
+namespace {
+
+/// A random matrix as int4 with this feedback.
+std::vector<Int4> int4_of(const std::vector<float>& rows, std::int64_t d_in, const std::vector<float>& feedback) {
+  const std::int64_t d_out = static_cast<std::int64_t>(rows.size()) / d_in, n_block = d_in / 64;
+  std::vector<Int4Block> blocks(static_cast<std::size_t>(d_out * n_block));
+  std::vector<float> scales(static_cast<std::size_t>(d_out)), room(rows.size());
+  quantize_weights(DType::f32, reinterpret_cast<const std::byte*>(rows.data()), d_in, d_out, feedback.data(),
+                   blocks.data(), scales.data(), room.data());
+  std::vector<Int4> result;
+  for (std::int64_t n = 0; n < d_out; ++n)
+    result.push_back(
+        {{blocks.begin() + n * n_block, blocks.begin() + (n + 1) * n_block}, scales[static_cast<std::size_t>(n)]});
+  return result;
+}
+
+}  // namespace
+
+TEST_CASE("int4 with feedback: columns that are always equal share what they miss") {
+  constexpr std::size_t kWidth = 128;
+  std::mt19937 random(6);
+  std::normal_distribution<float> normal;
+  std::vector<float> rows(4 * kWidth), feedback(kWidth * kWidth);
+  for (float& value : rows) value = normal(random);
+  for (std::size_t j = 0; j < kWidth; ++j)
+    for (std::size_t k = j + 1; k < kWidth; ++k) feedback[j * kWidth + k] = 1;
+  const std::vector<Int4> with = int4_of(rows, kWidth, feedback);
+  for (std::size_t r = 0; r < with.size(); ++r) {
+    const std::vector<float> row(rows.begin() + static_cast<std::ptrdiff_t>(r * kWidth),
+                                 rows.begin() + static_cast<std::ptrdiff_t>((r + 1) * kWidth));
+    const Int4 without = int4_of(row);
+    double sum = 0, sum_with = 0, sum_without = 0;
+    for (std::size_t k = 0; k < kWidth; ++k)
+      sum += row[k], sum_with += with[r].value(k), sum_without += without.value(k);
+    CHECK(std::abs(sum_with - sum) < 0.5 * with[r].scale * 17);  // no more than the last column misses
+    CHECK(missed(row, [&](std::size_t k) { return with[r].value(k); }) <
+          4 * missed(row, [&](std::size_t k) { return without.value(k); }));
+  }
+}
+
+TEST_CASE("int4 without feedback in any column are the codes that it has without") {
+  std::vector<float> row(1088), none(1024 * 1024 + 64 * 64);
+  std::mt19937 random(7);
+  std::normal_distribution<float> normal;
+  for (float& value : row) value = normal(random);
+  const Int4 with = int4_of(row, 1088, none).front(), without = int4_of(row);
+  for (std::size_t i = 0; i < with.blocks.size(); ++i) {
+    CHECK(with.blocks[i].step == without.blocks[i].step);
+    CHECK(with.blocks[i].codes == without.blocks[i].codes);
+  }
+}
+
+TEST_CASE("int4 with feedback: rows of zeros and of weights that are not finite") {
+  std::vector<float> rows(128), feedback(64 * 64, 1.0f);
+  rows[70] = std::numeric_limits<float>::infinity();
+  const std::vector<Int4> got = int4_of(rows, 64, feedback);
+  CHECK(got[0].scale == 0);
+  CHECK(std::isnan(got[1].scale));
+  for (const Int4& row : got)
+    for (std::size_t k = 0; k < 64; ++k) CHECK(row.blocks[0][static_cast<std::int64_t>(k)] == 0);
+}
