@@ -56,6 +56,8 @@ class Bundle {
   /// A one- or two-dimensional f32 or f64 tensor of finite values, for statistics: row by row. Errors: bad_bundle.
   Result<std::vector<double>> stats(std::string_view name) const;
   std::size_t file_size() const { return content_->bytes().size(); }
+  /// Where bytes of a tensor are in the file.
+  std::ptrdiff_t offset(const std::byte* data) const { return data - content_->bytes().data(); }
   /// The bytes of a tensor or of a part of it, in `room` where they come from a file. Errors: bad_bundle, where the
   /// file has been changed since it was opened.
   Result<std::span<const std::byte>> read(std::span<const std::byte> part, Room& room) const;

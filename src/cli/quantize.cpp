@@ -1,6 +1,6 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
-#include "quantize/smoothing.h"
+#include "quantize/calibrate.h"
 
 #include <fmt/format.h>
 #include <unistd.h>
@@ -97,43 +97,14 @@ Result<std::vector<Judged>> observations(const QuantizeOptions& options, const s
   return read_observations(recording, options.from, static_cast<std::size_t>(options.n_observation));
 }
 
-/// The chunks of `bundle` where it is quantized.
-Result<Chunks> quantized_chunks(const QuantizeOptions& options, const std::string& bundle,
-                                std::span<const Judged> judged) {
-  const std::string trial = options.to + ".trial";
-  if (const auto made = quantize(bundle, trial, all(options.dtype), {}, [](QuantizeProgress) {}); !made)
-    return made.error();
-  Result<Chunks> chunks = chunks_of(trial, options.engine, judged);
-  std::error_code ignored;
-  std::filesystem::remove(trial, ignored);
-  return chunks;
-}
-
-/// Writes a smoothed bundle, if the observations move less with it. What the new bundle says of it, or nothing.
-Result<std::string> smooth_first(const QuantizeOptions& options, const std::string& smoothed) {
-  VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
-  VLA_TRY(const Smoothed made, smooth(options.from, smoothed, seen, options.engine));
-  VLA_TRY(const Chunks as_it_was, quantized_chunks(options, options.from, seen));
-  VLA_TRY(const Chunks as_smoothed, quantized_chunks(options, smoothed, seen));
-  const Moved before = moved(made.chunks, as_it_was), after = moved(made.chunks, as_smoothed);
-  const bool helps = after.rms < before.rms;
-  const std::string text = fmt::format(
-      "{} over {} observations: {} channels of {} norms and MLPs divided, by {:g} at most; {} moves chunks by {} "
-      "instead of {}",
-      helps ? "smoothed" : "not smoothed", seen.size(), made.n_channel, made.n_place, made.largest, options.dtype,
-      percent(after), percent(before));
-  if (!options.quiet) say(stdout, "{}\n\n", text);
-  return helps ? text : std::string();
-}
-
 /// Codes block by block, and why.
-Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, bool shows) {
+Result<std::pair<Choice, std::string>> choose(const QuantizeOptions& options, const Int4Codes& int4, bool shows) {
   VLA_TRY(const std::vector<Judged> judged, observations(options, options.recording));
   const auto progress = [shows](int trial, const Moved& moved) {
     if (shows) say(stderr, "\rtrial {:>3}: {:<40}", trial, percent(moved));
   };
   VLA_TRY(const Found found,
-          search(options.from, options.to + ".trial", judged, options.bound, options.engine, progress));
+          search(options.from, options.to + ".trial", judged, options.bound, options.engine, int4, progress));
   if (shows) say(stderr, "\r{:<60}\r", "");
   if (!options.quiet) print(found, judged.size());
   if (std::ranges::all_of(found.blocks, [](const Block& block) { return block.codes == Rounding::none; }))
@@ -156,7 +127,8 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
                                 "The least error of a file of at most so many bytes: 1.8GB, 900MB");
   add_text(command, "--calibrate", options.calibration, "DIR",
            "A recording of vla serve --record: first divide channels of activations that are far larger than the "
-           "others, and multiply the matrices that read them. Float32's actions stay as they are");
+           "others, and multiply the matrices that read them, which leaves float32's actions as they are; then round "
+           "int4 column by column, each making good the errors of those before it. Kept is what moves actions less");
   error->needs(judge)->excludes(size);
   size->needs(judge)->excludes("--dtype");
   error->excludes("--dtype");
@@ -168,43 +140,60 @@ void add_search(CLI::App& command, QuantizeOptions& options) {
 }
 #endif
 
-/// `smoothing`: what was done to `options.from` before.
-Status write_codes(const QuantizeOptions& options, const std::string& smoothing) {
-  const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
-  const auto progress = [shows](QuantizeProgress at) {
+std::function<void(QuantizeProgress)> progress(bool shows) {
+  return [shows](QuantizeProgress at) {
     if (shows) print_progress(at);
   };
-  std::pair<Choice, std::string> chosen(all(options.dtype), smoothing);
+}
+
+/// `why`: what was done to `options.from` before.
+Status write_codes(const QuantizeOptions& options, const Int4Codes& int4, const std::string& why) {
+  const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
+  std::pair<Choice, std::string> chosen(all(options.dtype), why);
 #ifdef VLA_SERVER
   if (!options.recording.empty()) {
     if (!options.bound.error && !options.bound.bytes)
       return Error{Code::usage, "--judge", "--error or --size", "neither"};
-    VLA_TRY(chosen, choose(options, shows));
-    if (!smoothing.empty()) chosen.second = smoothing + "; " + chosen.second;
+    VLA_TRY(chosen, choose(options, int4, shows));
+    if (!why.empty()) chosen.second = why + "; " + chosen.second;
   }
 #endif
   VLA_TRY(const std::vector<QuantizedModule> rows,
-          quantize(options.from, options.to, chosen.first, chosen.second, progress));
+          quantize(options.from, options.to, chosen.first, chosen.second, progress(shows), int4));
   if (shows) say(stderr, "\r{:<16}\r", "");
   if (!options.quiet) print(rows);
   return {};
 }
 
-Status run(QuantizeOptions options) {
+#ifdef VLA_SERVER
+Status calibrate_first(QuantizeOptions options) {
+  const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
+  VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
+  const Rounding codes = options.dtype == "int4" ? Rounding::int4 : Rounding::int8;
+  const bool has_int4 = codes == Rounding::int4 || !options.recording.empty();
+  VLA_TRY(const Calibrated made,
+          calibrate(options.from, options.to, codes, has_int4, seen, options.engine, progress(shows)));
+  for (const std::string& line : made.told)
+    if (!options.quiet) say(stdout, "{}\n\n", line);
+  options.from = made.bundle;
+  if (made.int4.empty()) return write_codes(options, {}, made.why);
+  VLA_TRY(const Bundle int4, Bundle::open(made.int4));
+  return write_codes(options, {.feedback = {}, .made = &int4}, made.why);
+}
+#endif
+
+Status run(const QuantizeOptions& options) {
   std::error_code ignored;
   if (std::filesystem::exists(options.to, ignored) && !options.force)
     return Error{Code::usage, options.to, "a new file", "one that exists", "name another, or --force"};
 #ifdef VLA_SERVER
   if (!options.calibration.empty()) {
-    const std::string smoothed = options.to + ".smoothed";
-    const Result<std::string> smoothing = smooth_first(options, smoothed);
-    if (smoothing && !smoothing->empty()) options.from = smoothed;
-    const Status written = smoothing ? write_codes(options, *smoothing) : Status(smoothing.error());
-    std::filesystem::remove(smoothed, ignored);
+    const Status written = calibrate_first(options);
+    for (const char* ending : {".smoothed", ".int4", ".trial"}) std::filesystem::remove(options.to + ending, ignored);
     return written;
   }
 #endif
-  return write_codes(options, "");
+  return write_codes(options, {}, "");
 }
 
 }  // namespace

@@ -12,8 +12,8 @@
 #include "bundle/gguf_writer.h"
 #include "graph/rounding.h"
 #include "kernels/numbers.h"
-#include "lower/host/recode.h"
 #include "policies/policy.h"
+#include "quantize/code_maker.h"
 
 namespace vla {
 namespace {
@@ -76,8 +76,9 @@ struct Squares {
 /// Writes the tensors, one after the other.
 class Writer {
  public:
-  Writer(const Bundle& bundle, BundleFile& out, const std::function<void(QuantizeProgress)>& report)
-      : bundle_(bundle), out_(out), report_(report) {}
+  Writer(const Bundle& bundle, const Int4Codes& int4, BundleFile& out,
+         const std::function<void(QuantizeProgress)>& report)
+      : bundle_(bundle), int4_(int4), out_(out), report_(report) {}
 
   Status copy(const TensorInfo& tensor) {
     return out_.copy(bundle_, tensor, [this](std::size_t size) { tell(size); });
@@ -89,13 +90,14 @@ class Writer {
     const std::size_t row = tensor.data.size() / static_cast<std::size_t>(d_out);
     std::vector<float> scales(static_cast<std::size_t>(d_out));
     std::vector<float> widened(static_cast<std::size_t>(kPartRows * d_in));
+    VLA_TRY(CodeMaker maker, CodeMaker::open(bundle_, tensor, wanted, int4_));
     Squares squares;
     for (std::int64_t first = 0; first < d_out; first += kPartRows) {
       const std::int64_t n = std::min(kPartRows, d_out - first);
       VLA_TRY(const auto part,
               read(tensor.data.subspan(static_cast<std::size_t>(first) * row, static_cast<std::size_t>(n) * row)));
       float* const to = scales.data() + first;
-      const std::byte* codes = lower::Recode{{tensor.type}, wanted}(part.data(), nullptr, n * d_in, codes_, to);
+      VLA_TRY(const std::byte* const codes, maker.make(part.data(), first, n, to));
       widen_codes(wanted, codes, to, n * d_in, widened.data());
       squares.add(tensor.type, part.data(), std::span(widened).first(static_cast<std::size_t>(n * d_in)));
       out_.put({codes, dtype_size(wanted.type, n * d_in)});
@@ -117,9 +119,10 @@ class Writer {
   }
 
   const Bundle& bundle_;
+  const Int4Codes& int4_;
   BundleFile& out_;
   const std::function<void(QuantizeProgress)>& report_;
-  Room room_, codes_;
+  Room room_;
   std::int64_t done_ = 0;
 };
 
@@ -219,7 +222,8 @@ Result<std::vector<Quantizable>> quantizable(const std::string& path) {
 
 Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, const Choice& choice,
                                               const std::string& why,
-                                              const std::function<void(QuantizeProgress)>& progress) {
+                                              const std::function<void(QuantizeProgress)>& progress,
+                                              const Int4Codes& int4) {
   VLA_TRY(const Bundle bundle, Bundle::open(from));
   VLA_TRY(const Matrices matrices, find_matrices(bundle, choice));
   const std::vector<TensorInfo> tensors = quantized_tensors(bundle, matrices);
@@ -228,7 +232,7 @@ Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std
   Status made;
   const Status written = write_file(to, [&](int file) {
     BundleFile out(file, quantized_keys(bundle, matrices, why), tensors);
-    Writer writer(bundle, out, progress);
+    Writer writer(bundle, int4, out, progress);
     made = write_tensors(bundle, matrices, writer, report);
     return made && out.seal();
   });

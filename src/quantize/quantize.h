@@ -4,10 +4,11 @@
 
 #include <cstdint>
 #include <functional>
+#include <span>
 #include <string>
 #include <vector>
 
-#include "base/result.h"
+#include "bundle/bundle.h"
 #include "graph/rounding.h"
 
 namespace vla {
@@ -36,13 +37,22 @@ struct Quantizable {
 /// none.
 Result<std::vector<Quantizable>> quantizable(const std::string& bundle);
 
+/// Codes of int4 that are not made of a matrix alone.
+struct Int4Codes {
+  /// What makes the errors of a matrix good (hessian.h); empty where nothing is known of it. Asked in the file's order.
+  std::function<Result<std::span<const float>>(const Bundle& bundle, const TensorInfo& tensor)> feedback;
+  /// The same bundle with all of them made, from which they are copied; may be null.
+  const Bundle* made = nullptr;
+};
+
 /// Writes a bundle whose large matrices are int8 or int4 codes with a scale for each row: where all are of one kind,
 /// those that `--kernels int8` or `int4` makes at every load, so that the chunk is the same to the bit. Norms, biases,
 /// tables, and matrices from or to fewer than 144 elements stay as they are (graph/rounding.h), and so does a tensor
 /// that something else reads too. `why`, which the bundle keeps as vla.quantization, says what chose; it may be empty.
-/// Errors: those of `quantizable`; unsupported where nothing is chosen; io.
+/// Errors: those of `quantizable` and of `int4`; unsupported where nothing is chosen; io.
 Result<std::vector<QuantizedModule>> quantize(const std::string& from, const std::string& to, const Choice& choice,
                                               const std::string& why,
-                                              const std::function<void(QuantizeProgress)>& report);
+                                              const std::function<void(QuantizeProgress)>& report,
+                                              const Int4Codes& int4 = {});
 
 }  // namespace vla

@@ -42,8 +42,13 @@ class Search {
  public:
   using Report = std::function<void(int, const Moved&)>;
   Search(std::string from, std::string trial, std::span<const Judged> judged, const EngineOptions& options,
-         const Report& report)
-      : from_(std::move(from)), trial_(std::move(trial)), judged_(judged), options_(options), report_(report) {}
+         const Int4Codes& int4, const Report& report)
+      : from_(std::move(from)),
+        trial_(std::move(trial)),
+        judged_(judged),
+        options_(options),
+        int4_(int4),
+        report_(report) {}
 
   Status open() {
     VLA_TRY(const std::vector<Quantizable> matrices, quantizable(from_));
@@ -105,7 +110,9 @@ class Search {
   Result<Moved> compute(const std::vector<Block>& blocks) {
     const bool is_stored = std::ranges::all_of(blocks, [](const Block& b) { return b.codes == Rounding::none; });
     if (!is_stored)
-      if (const auto made = quantize(from_, trial_, choice_of(blocks), {}, [](QuantizeProgress) {}); !made)
+      if (const auto made = quantize(
+              from_, trial_, choice_of(blocks), {}, [](QuantizeProgress) {}, int4_);
+          !made)
         return made.error();
     VLA_TRY(const auto got, chunks_of(is_stored ? from_ : trial_, options_, judged_));
     const Moved result = moved(expected_, got);
@@ -184,6 +191,7 @@ class Search {
   const std::string from_, trial_;
   const std::span<const Judged> judged_;
   const EngineOptions& options_;
+  const Int4Codes& int4_;
   const Report& report_;
   std::int64_t n_byte_ = 0;  // of the file as it is
   bool knows_int8_ = false;
@@ -201,6 +209,10 @@ Result<Chunks> chunks_of(const std::string& bundle, const EngineOptions& options
     chunks.push_back(std::move(chunk.normalized));
   }
   return chunks;
+}
+
+std::string without_step(const std::string& path) {
+  return path.starts_with("step.") ? path.substr(path.find('.', path.find('.') + 1) + 1) : path;
 }
 
 Moved moved(const Chunks& expected, const Chunks& got) {
@@ -224,9 +236,9 @@ Choice choice_of(const std::vector<Block>& blocks) {
 }
 
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
-                     const Bound& bound, const EngineOptions& options,
+                     const Bound& bound, const EngineOptions& options, const Int4Codes& int4,
                      const std::function<void(int, const Moved&)>& report) {
-  Search search(from, trial, judged, options, report);
+  Search search(from, trial, judged, options, int4, report);
   VLA_CHECK(search.open());
   const Status done = bound.error ? search.to_error(*bound.error) : search.to_size(*bound.bytes);
   std::error_code ignored;

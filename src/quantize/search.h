@@ -25,6 +25,8 @@ struct Judged {
 using Chunks = std::vector<std::vector<float>>;
 /// Those of a bundle. Errors: those of Engine.
 Result<Chunks> chunks_of(const std::string& bundle, const EngineOptions& options, std::span<const Judged> judged);
+/// `lm.blk.0.attn_norm` of the tap `step.3.lm.blk.0.attn_norm`.
+std::string without_step(const std::string& path);
 Moved moved(const Chunks& expected, const Chunks& got);
 
 /// One of the two.
@@ -51,10 +53,10 @@ struct Found {
 /// Chooses int4, int8 or the stored floats for every block, so that the bound holds with the fewest bytes, or within
 /// these bytes with the least error. Each block alone is int4 once, to see how far the actions move; errors of blocks
 /// are taken to add in squares, and the choice is then computed as it is, until it holds. `trial`: a file that is
-/// written over and over, and removed. `options`: of the engines. Errors: those of `quantize` and of Engine;
-/// unsupported where the bound cannot hold, with what can.
+/// written over and over, and removed. `options`: of the engines; `int4`: as `quantize` takes them. Errors: those of
+/// `quantize` and of Engine; unsupported where the bound cannot hold, with what can.
 Result<Found> search(const std::string& from, const std::string& trial, std::span<const Judged> judged,
-                     const Bound& bound, const EngineOptions& options,
+                     const Bound& bound, const EngineOptions& options, const Int4Codes& int4,
                      const std::function<void(int trial, const Moved&)>& report);
 
 /// The choice of a search, by tensor.

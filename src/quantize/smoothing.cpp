@@ -31,11 +31,6 @@ void widen_range(std::vector<float>& range, std::size_t d, std::span<const float
     for (std::size_t k = 0; k < d; ++k) range[k] = std::max(range[k], std::abs(values[i + k]));
 }
 
-/// `lm.blk.0.attn_norm` of `step.3.lm.blk.0.attn_norm`.
-std::string without_step(const std::string& path) {
-  return path.starts_with("step.") ? path.substr(path.find('.', path.find('.') + 1) + 1) : path;
-}
-
 /// `chunks`: receives those of the observations.
 Result<Ranges> measure_ranges(const std::string& bundle, const std::vector<SmoothingPlace>& places,
                               std::span<const Judged> observations, EngineOptions options, Chunks& chunks) {
@@ -130,7 +125,7 @@ void multiply(std::vector<float>& factors, const std::vector<float>& by, bool in
 class Scaling {
  public:
   Scaling(const Bundle& bundle, const Bundle& opened) : opened_(opened), scaler_(bundle) {
-    for (const TensorInfo& tensor : bundle.tensors()) by_offset_[offset(bundle, tensor)] = &tensor;
+    for (const TensorInfo& tensor : bundle.tensors()) by_offset_[bundle.offset(tensor.data.data())] = &tensor;
   }
 
   Status add(const SmoothingPlace& place, const std::vector<float>& range, Smoothed& told) {
@@ -158,10 +153,9 @@ class Scaling {
   Scaler& scaler() { return scaler_; }
 
  private:
-  static std::ptrdiff_t offset(const Bundle& bundle, const TensorInfo& tensor) {
-    return tensor.data.data() - bundle.content()->bytes().data();
+  const TensorInfo& tensor_of(const Param* param) const {
+    return *by_offset_.at(opened_.offset(param->source->data.data()));
   }
-  const TensorInfo& tensor_of(const Param* param) const { return *by_offset_.at(offset(opened_, *param->source)); }
 
   const Bundle& opened_;  // whose parameters these are
   Scaler scaler_;

@@ -4,6 +4,8 @@
 
 #include <algorithm>
 
+#include "quantize/matrix_inputs.h"
+
 namespace vla {
 namespace {
 
@@ -14,12 +16,6 @@ Readers readers_of(const Graph& graph) {
   for (const Node& node : graph.nodes())
     for (const Tensor in : node.in) readers[in.node()].push_back(&node);
   return readers;
-}
-
-/// Some tokens of the same channels.
-bool is_view_of_channels(const Node& node) {
-  if (const auto* slice = node.as<op::Slice>()) return slice->dim != 0;
-  return node.as<op::Reshape>() != nullptr && node.shape[0] == node.in[0].dim(0);
 }
 
 /// The products that read a value, also through views of it. False where something else does.

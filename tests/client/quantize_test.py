@@ -19,8 +19,8 @@ SHIPPED = SimpleNamespace(bundle=ROOT / "models/metaworld-tiny.gguf")
 SCENES = [("faucet-open", "open the faucet"), ("drawer-close", "close the drawer")]
 
 
-def scene(name, text):
-    frame = (ROOT / f"examples/metaworld/episodes/{name}/step_00.png").read_bytes()
+def scene(name, text, step=0):
+    frame = (ROOT / f"examples/metaworld/episodes/{name}/step_{step:02}.png").read_bytes()
     return dict(images={"corner4": frame}, state=[0.0045, 0.4003, 0.1957, 1], text=text, seed=7)
 
 
@@ -41,15 +41,15 @@ def quantize(*arguments, bundle=SHIPPED.bundle):
     return subprocess.run([VLA, "quantize", bundle, *map(str, arguments)], capture_output=True, text=True, timeout=300)
 
 
-def chunks(bundle, kernels=None):
+def chunks(bundle, kernels=None, step=0):
     with vla_cpp.Policy(bundle, kernels=kernels, threads=1) as policy:
-        return np.array([policy.act(**scene(*s)).normalized for s in SCENES])
+        return np.array([policy.act(**scene(*s, step)).normalized for s in SCENES])
 
 
-def moved(bundle, kernels=None):
+def moved(bundle, kernels=None, step=0):
     """Of float32's chunks of the shipped policy, by root mean square."""
-    expected = chunks(SHIPPED.bundle, "float32")
-    return np.sqrt(np.mean((chunks(bundle, kernels) - expected) ** 2) / np.mean(expected**2))
+    expected = chunks(SHIPPED.bundle, "float32", step)
+    return np.sqrt(np.mean((chunks(bundle, kernels, step) - expected) ** 2) / np.mean(expected**2))
 
 
 def test_blocks_get_the_codes_that_keep_the_error(recording, tmp_path):
@@ -146,7 +146,33 @@ def test_channels_that_are_far_larger_than_the_others_are_smoothed(recording, tm
     assert "smoothed over 2 observations" in read_bundle(str(tmp_path / "smooth.gguf")).keys["vla.quantization"]
 
 
-@pytest.mark.parametrize("what", [["--calibrate"], ["--error", 0.025, "--judge"]])
+def test_int4_by_hessians_moves_chunks_a_fraction(recording, tmp_path):
+    """Judged by acts that were not calibrated by: the same scenes a few steps later."""
+    plain, made = tmp_path / "plain.gguf", tmp_path / "made.gguf"
+    assert quantize("-o", plain, "--dtype", "int4").returncode == 0
+    answer = quantize("-o", made, "--dtype", "int4", "--calibrate", recording, "--threads", 1)
+    assert answer.returncode == 0, answer.stderr
+    told = re.search(r"^rounded by Hessians over 2 observations: errors of (\d+) of (\d+) matrices made good by later columns \(GPTQ\); int4 moves", answer.stdout, re.M)
+    assert told and int(told[1]) > 0.9 * int(told[2])
+    assert "rounded by Hessians" in read_bundle(str(made)).keys["vla.quantization"]
+    assert plain.stat().st_size == pytest.approx(made.stat().st_size, abs=1024)
+    assert moved(made, step=4) < 0.5 * moved(plain, step=4)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["made.gguf", "plain.gguf"]
+
+
+def test_a_search_takes_int4_by_hessians(recording, tmp_path):
+    def size(name, *options):
+        answer = quantize("-o", tmp_path / name, *options, "--judge", recording, "--error", 0.02, "--threads", 1)
+        assert answer.returncode == 0, answer.stderr
+        return (tmp_path / name).stat().st_size, answer.stdout
+
+    (rough, _), (fine, told) = size("rough.gguf"), size("fine.gguf", "--calibrate", recording)
+    assert fine < rough, (fine, rough)
+    assert moved(tmp_path / "fine.gguf") < 0.0205
+    assert "rounded by Hessians" in told
+
+
+@pytest.mark.parametrize("what", [["--calibrate"], ["--dtype", "int4", "--calibrate"], ["--error", 0.025, "--judge"]])
 def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what):
     def made(name, *memory):
         return peak_of("quantize", SHIPPED.bundle, "-o", tmp_path / name, "--threads", 1, *what, recording, *memory)

@@ -1,0 +1,34 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <vector>
+
+#include "quantize/quantize.h"
+
+namespace vla {
+
+/// Makes the codes of a matrix, some rows at a time.
+class CodeMaker {
+ public:
+  /// The codes of `wanted`: int8 or int4. Errors: those of `int4`.
+  static Result<CodeMaker> open(const Bundle& bundle, const TensorInfo& matrix, const Encoding& wanted,
+                                const Int4Codes& int4);
+
+  /// Codes of `n` rows from `first` on, of which `stored` are the bytes. They stay until the next call; scales [n].
+  /// Errors: bad_bundle, of Int4Codes::made.
+  Result<const std::byte*> make(const std::byte* stored, std::int64_t first, std::int64_t n, float* scales);
+
+ private:
+  CodeMaker(const TensorInfo& matrix, const Encoding& wanted) : matrix_(&matrix), wanted_(wanted) {}
+  Result<const std::byte*> copy(std::int64_t first, std::int64_t n, float* scales);
+
+  const TensorInfo* matrix_;
+  Encoding wanted_;
+  const Bundle* made_ = nullptr;
+  std::span<const float> feedback_;
+  Room codes_, scales_;
+  std::vector<float> rows_;
+};
+
+}  // namespace vla
