@@ -72,7 +72,10 @@ CudaProgram::~CudaProgram() {
 
 Status CudaProgram::run(const std::vector<Piece>& pieces) {
   for (const Piece& piece : pieces) {
-    if (piece.groups.any()) VLA_CHECK(windows_->bring(piece.groups));
+    if (piece.groups.any()) {
+      VLA_CHECK(queue_->flush());  // the device computes what was asked while these come
+      VLA_CHECK(windows_->bring(piece.groups));
+    }
     VLA_CHECK(queue_->run(piece.part));
   }
   return {};

@@ -53,7 +53,7 @@ class CudaProgram final : public Program {
   std::shared_ptr<CudaQueue> queue_;
   std::vector<std::shared_ptr<cuda::Buffer>> memory_;  // weights and arena
   std::shared_ptr<cuda::Buffer> own_;                  // what prepare leaves, and constants
-  std::shared_ptr<CudaWindows> windows_;               // null where all matrices are resident
+  std::shared_ptr<DeviceWindows> windows_;             // null where all matrices are resident
   std::vector<Piece> prepare_, run_;                   // one, but where there are windows
   MatrixReads reads_;
   std::size_t n_prepare_ = 0;

@@ -7,7 +7,6 @@
 #include <map>
 
 #include "cuda/kernels/linear_int8.h"
-#include "kernels/cores.h"
 
 namespace vla::lower {
 namespace {
@@ -63,9 +62,6 @@ MatrixPlace place_of(const Param& matrix, const CudaWeight& weight) {
   place.n_scale = has_codes(weight.kind) ? matrix.shape[1] : 0;
   return place;
 }
-
-/// Threads that read what is streamed: a GPU leaves the cores to them, and four are faster than most disks.
-int n_reader() { return std::clamp(static_cast<int>(kernels::allowed_cores().size()) / 2, 1, 4); }
 
 }  // namespace
 
@@ -155,21 +151,13 @@ Status CudaWeights::start_stream(const ParamList& list, const WeightPlan& plan,
                                  const std::shared_ptr<CudaQueue>& queue) {
   if (plan.streamed.empty()) return {};
   const cuda::Address end = memory_->address() + memory_->size();
-  VLA_TRY(windows_, CudaWindows::open(queue, end - WeightStream::kWindows * plan.window, plan.window));
-  std::vector<std::vector<PackPart>> groups;
-  std::vector<std::size_t> sizes;
-  for (const std::vector<const Param*>& group : plan.streamed) {
-    std::byte* const window = windows_->host(groups.size());
-    std::vector<PackPart>& parts = groups.emplace_back();
-    std::size_t& size = sizes.emplace_back(0);
-    for (const Param* matrix : group) {
-      MatrixPlace place = place_of(*matrix, (*this)[*matrix]);
-      place.put(*matrix, window + size);
-      add_parts(*matrix, place, parts);
-      size += size_of(*matrix);
-    }
-  }
-  return windows_->start(list.bundle()->content(), std::move(groups), std::move(sizes), n_reader());
+  VLA_TRY(std::unique_ptr<WindowMemory> memory,
+          CudaWindows::open(queue, end - WeightStream::kWindows * plan.window, plan.window));
+  VLA_TRY(windows_, DeviceWindows::start(
+                        std::move(memory), list.bundle()->content(), plan,
+                        [this](const Param& matrix) { return place_of(matrix, (*this)[matrix]); },
+                        [this](const Param& matrix) { return size_of(matrix); }));
+  return {};
 }
 
 }  // namespace vla::lower

@@ -41,7 +41,7 @@ class CudaWeights {
   /// By Param::id, its group among those of the plan that are streamed, or -1.
   const std::vector<int>& groups() const { return groups_; }
   /// Where those come to; null where there are none, or nothing is filled.
-  const std::shared_ptr<CudaWindows>& windows() const { return windows_; }
+  const std::shared_ptr<DeviceWindows>& windows() const { return windows_; }
   bool has(MatrixKind kind) const;
   /// `linear_bf16 (98 bf16), linear_f32 (3 f32)`
   const std::string& text() const { return text_; }
@@ -57,7 +57,7 @@ class CudaWeights {
   std::vector<CudaWeight> all_;  // by Param::id
   std::vector<int> groups_;
   std::shared_ptr<cuda::Buffer> memory_;
-  std::shared_ptr<CudaWindows> windows_;
+  std::shared_ptr<DeviceWindows> windows_;
   std::string text_;
 };
 
