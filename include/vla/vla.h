@@ -97,7 +97,7 @@ typedef struct vla_options {
                            fails with VLA_DEVICE, and `expected` lists what is there */
   const char* embodiment; /* of a bundle for several robots: tag of the one that is loaded; NULL: all of them. A tag
                              that the bundle does not have fails with VLA_USAGE, and `expected` lists them */
-  uint64_t memory;        /* bytes that the process may take, or with "cuda" the policy of the GPU's; 0: no limit.
+  uint64_t memory;        /* bytes that the process may take, or on a GPU the policy of its memory; 0: no limit.
                              Matrices that do not fit stay in the file and are read in every act; actions are the same
                              to the bit. Too few fail with VLA_OUT_OF_MEMORY, and `expected` tells how many would do */
 } vla_options;

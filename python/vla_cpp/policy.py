@@ -36,7 +36,7 @@ class Policy(Handle):
     strict_state  refuse a state far beyond what the policy has seen (BadObservation) instead of answering with a note
     device   "cpu", "vulkan", "vulkan:1", "cuda", ...; None: "cpu". A device that is absent is a DeviceError, which lists what is there
     embodiment  of a bundle for several robots, the tag of the one to load; None: all of them, and each `act` names its robot
-    memory   bytes that the process may take, or with "cuda" the policy of the GPU's; 0: no limit. Matrices that do not fit stay in
+    memory   bytes that the process may take, or on a GPU the policy of its memory; 0: no limit. Matrices that do not fit stay in
              the file and are read in every act; actions are the same to the bit. Too few are an OutOfMemory that tells how many would do
 
     Threads may share a policy; their calls take turns, and other Python threads run meanwhile. A child process cannot use the policy

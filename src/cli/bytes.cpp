@@ -38,7 +38,7 @@ std::string read_bytes(std::string& text) {
 
 void add_memory(CLI::App& command, std::size_t& bytes) {
   add_bytes(command, "--memory", bytes,
-            "What the process may take, or with --device cuda the policy of the GPU's memory: 1.5GB, 800MB. Matrices "
+            "What the process may take, or with --device the policy of the GPU's memory: 1.5GB, 800MB. Matrices "
             "that do not fit stay in the file and are read in every act while others are multiplied; actions are the "
             "same to the bit. vla inspect BUNDLE --memory tells what is read and the least that does. Not given: no "
             "limit");

@@ -9,58 +9,12 @@
 #include <cstring>
 #include <vector>
 
-#include "base/bf16.h"
+#include "ggml/ggml_packing.h"
 #include "ggml/ggml_program.h"
+#include "ggml/ggml_windows.h"
 #include "ggml/reference.h"
 
 namespace vla {
-namespace {
-
-ggml_type type_of(DType type) {
-  switch (type) {
-    case DType::bf16:
-      return GGML_TYPE_BF16;
-    case DType::f16:
-      return GGML_TYPE_F16;
-    case DType::i32:
-      return GGML_TYPE_I32;
-    case DType::i8:
-    case DType::ternary:  // its bytes
-    case DType::int4:
-      return GGML_TYPE_I8;
-    case DType::f64:  // of statistics alone, which no graph reads
-    case DType::f32:
-      break;
-  }
-  return GGML_TYPE_F32;
-}
-
-/// scales: what the encoding has of them.
-void upload(ggml_tensor* tensor, const Param& param, const std::byte* data, const float* scales) {
-  const DType type = param.encoding.type;
-  if (is_float(type) && type_of(type) == tensor->type)
-    return ggml_backend_tensor_set(tensor, data, 0, param.source->data.size());
-  std::vector<float> values(static_cast<std::size_t>(param.count()));
-  if (type == DType::ternary)
-    for (std::size_t i = 0; i < values.size(); ++i)
-      values[i] = static_cast<float>(std::to_integer<int>(data[i / 4]) >> 2 * (i % 4) & 3) - 1.0f;
-  else if (type == DType::i8 || type == DType::int4)
-    widen_codes(param.encoding, data, scales, param.count(), values.data());
-  else if (type == DType::f32)
-    std::memcpy(values.data(), data, param.source->data.size());
-  else if (type == DType::bf16)
-    ggml_bf16_to_fp32_row(reinterpret_cast<const ggml_bf16_t*>(data), values.data(), param.count());
-  else
-    ggml_fp16_to_fp32_row(reinterpret_cast<const ggml_fp16_t*>(data), values.data(), param.count());
-  if (tensor->type == GGML_TYPE_F32)
-    return ggml_backend_tensor_set(tensor, values.data(), 0, values.size() * sizeof(float));
-  std::vector<std::uint16_t> rounded(values.size());
-  for (std::size_t i = 0; i < values.size(); ++i) rounded[i] = to_bf16(values[i]);
-  ggml_backend_tensor_set(tensor, rounded.data(), 0, rounded.size() * sizeof(std::uint16_t));
-}
-
-}  // namespace
-
 void GgmlDevice::FreePool::operator()(ggml_threadpool* pool) const { ggml_threadpool_free(pool); }
 
 Result<std::unique_ptr<Device>> GgmlDevice::cpu(int n_thread) {
@@ -114,35 +68,93 @@ ggml_type GgmlDevice::resident_type(const Param& param) const {
   return param.storage == Storage::table || (param.storage == Storage::matrix && kept) ? type : GGML_TYPE_F32;
 }
 
-Status GgmlDevice::load(const ParamList& params, bool fill, const WeightPlan&) {
+Status GgmlDevice::load(const ParamList& params, bool fill, const WeightPlan& plan) {
   VLA_CHECK(check_rounding(params, rounding_));
-  if (!fill) memory().set_dry();
-  VLA_TRY(weight_context_, make_context(params.params().size()));
+  memory().set_dry(!fill);
+  held_->working.clear();  // of programs that are gone
+  windows_.reset();
+  VLA_CHECK(make_tensors(params, plan));
+  if (weights_.empty()) return {};
+  VLA_CHECK(give_places(plan));
+  if (!fill) return {};
+  VLA_CHECK(upload(params));
+  return start_stream(params, plan);
+}
+
+Status GgmlDevice::make_tensors(const ParamList& params, const WeightPlan& plan) {
+  const std::size_t n = params.params().size();
+  groups_ = lower::groups_by_id(plan, n);
+  VLA_TRY(weight_context_, make_context(n + lower::WeightStream::kWindows));
+  VLA_TRY(streamed_context_, make_context(n));
+  weights_.clear(), linear_text_.clear();
   int n_f32 = 0, n_f16 = 0, n_bf16 = 0;
   for (const Param& param : params.params()) {
     const ggml_type type = resident_type(param);
     if (param.storage == Storage::matrix) ++(type == GGML_TYPE_F16 ? n_f16 : type == GGML_TYPE_BF16 ? n_bf16 : n_f32);
-    weights_.push_back(
-        ggml_new_tensor(weight_context_.get(), type, static_cast<int>(param.shape.size()), param.shape.data()));
+    ggml_context* context = is_streamed(param) ? streamed_context_.get() : weight_context_.get();
+    weights_.push_back(ggml_new_tensor(context, type, static_cast<int>(param.shape.size()), param.shape.data()));
     ggml_set_name(weights_.back(), param.name.c_str());
   }
   if (n_bf16 > 0) precision_ = Precision::bf16;
-  for (const auto& [n, type] : {std::pair{n_f32, "f32"}, {n_f16, "f16"}, {n_bf16, "bf16"}})
-    if (n > 0) linear_text_ += fmt::format("{}{} {}", linear_text_.empty() ? "ggml (" : " + ", n, type);
+  for (const auto& [n_of, type] : {std::pair{n_f32, "f32"}, {n_f16, "f16"}, {n_bf16, "bf16"}})
+    if (n_of > 0) linear_text_ += fmt::format("{}{} {}", linear_text_.empty() ? "ggml (" : " + ", n_of, type);
   if (!linear_text_.empty()) linear_text_ += ")";
-  if (weights_.empty()) return {};
+  return {};
+}
+
+/// Resident parameters and windows one after the other, and what is streamed in the windows.
+Status GgmlDevice::give_places(const WeightPlan& plan) {
+  window_tensors_.clear();
+  for (int i = 0; i < lower::WeightStream::kWindows && !plan.streamed.empty(); ++i)
+    window_tensors_.push_back(
+        ggml_new_tensor_1d(weight_context_.get(), GGML_TYPE_I8, static_cast<std::int64_t>(plan.window)));
   VLA_TRY(weights_size_, memory().place(weight_context_.get(), "weights", &weight_memory_));
-  Room room, scales_room;
-  for (const Param& param : params.params()) {
-    if (!fill) break;
-    VLA_TRY(const auto data, params.bundle()->read(param.source->data, room));
-    std::span<const std::byte> scales;
-    if (param.scales != nullptr) {
-      VLA_TRY(scales, params.bundle()->read(param.scales->source->data, scales_room));
+  for (std::size_t i = 0; i < plan.streamed.size(); ++i) {
+    const ggml_tensor* window = window_tensors_[static_cast<std::size_t>(lower::WeightStream::window_of(i))];
+    std::size_t offset = 0;
+    for (const Param* matrix : plan.streamed[i]) {
+      VLA_CHECK(memory().place_inside(*window, offset, weight(matrix)));
+      offset += size_of(*matrix);
     }
-    const auto* const values = reinterpret_cast<const float*>(scales.data());
-    VLA_CHECK(guarded([&] { upload(weight(&param), param, data.data(), values); }));
   }
+  return {};
+}
+
+/// Bytes from a matrix to what lies behind it.
+std::size_t GgmlDevice::size_of(const Param& matrix) const { return memory().size_of(weight(&matrix)); }
+
+Status GgmlDevice::upload(const ParamList& params) {
+  const Content& content = *params.bundle()->content();
+  lower::Packer packer;
+  Room room;
+  for (const Param& param : params.params()) {
+    if (is_streamed(param)) continue;
+    ggml_tensor* tensor = weight(&param);
+    std::span<const std::byte> data;
+    if (param.storage == Storage::matrix) {
+      lower::MatrixPlace place = place_of(param, tensor->type);
+      place.put(param, room.take(ggml_nbytes(tensor)));
+      std::vector<lower::PackPart> parts;
+      lower::add_parts(param, place, parts);
+      for (const lower::PackPart& part : parts)
+        if (!packer.run(content, part)) return content.changed();
+      data = {place.data, ggml_nbytes(tensor)};
+    } else {
+      VLA_TRY(data, params.bundle()->read(param.source->data, room));
+    }
+    VLA_CHECK(guarded([&] { ggml_backend_tensor_set(tensor, data.data(), 0, data.size()); }));
+  }
+  return {};
+}
+
+Status GgmlDevice::start_stream(const ParamList& params, const WeightPlan& plan) {
+  if (plan.streamed.empty()) return {};
+  VLA_TRY(std::unique_ptr<GgmlWindows> memory, GgmlWindows::open(*this, window_tensors_));
+  held_->windows = memory->held();
+  VLA_TRY(windows_, lower::DeviceWindows::start(
+                        std::move(memory), params.bundle()->content(), plan,
+                        [this](const Param& matrix) { return place_of(matrix, weight(&matrix)->type); },
+                        [this](const Param& matrix) { return size_of(matrix); }));
   return {};
 }
 
@@ -167,26 +179,29 @@ Status GgmlDevice::allocate(Slots& slots) {
   });
 }
 
-/// Memory of the host from which the device takes what is uploaded, of the driver's own kind where it has one. Null
-/// where there is none.
+Result<ggml_backend_buffer_ptr> GgmlDevice::allocate_host(std::size_t size) const {
+  ggml_backend_buffer_type_t type = ggml_backend_dev_host_buffer_type(ggml_backend_get_device(backend()));
+  if (type == nullptr) type = ggml_backend_cpu_buffer_type();
+  ggml_backend_buffer_ptr buffer;
+  VLA_CHECK(guarded([&] {
+    buffer.reset(ggml_backend_buft_alloc_buffer(type, size));
+    if (buffer == nullptr) throw std::bad_alloc();
+  }));
+  return buffer;
+}
+
+/// Null where there is no memory.
 std::byte* GgmlDevice::staging(std::size_t size) {
   ggml_backend_buffer_ptr& staging = held_->staging;
   if (staging != nullptr && size <= ggml_backend_buffer_get_size(staging.get()))
     return static_cast<std::byte*>(ggml_backend_buffer_get_base(staging.get()));
-  ggml_backend_dev_t device = ggml_backend_get_device(backend());
-  ggml_backend_buffer_type_t type = ggml_backend_dev_host_buffer_type(device);
-  if (type == nullptr) type = ggml_backend_cpu_buffer_type();
   constexpr std::size_t kRest = 65536;  // images come first: what follows them fits as well
-  ggml_backend_buffer_ptr larger;
-  const Status done = guarded([&] {
-    larger.reset(ggml_backend_buft_alloc_buffer(type, size + kRest));
-    if (larger == nullptr) throw std::bad_alloc();
-  });
-  if (!done) return nullptr;
-  void* to = ggml_backend_buffer_get_base(larger.get());
+  auto larger = allocate_host(size + kRest);
+  if (!larger) return nullptr;
+  void* to = ggml_backend_buffer_get_base(larger->get());
   if (!uploads_.empty())
     std::memcpy(to, ggml_backend_buffer_get_base(staging.get()), uploads_.back().begin + uploads_.back().size);
-  staging.swap(larger);
+  staging.swap(*larger);
   return static_cast<std::byte*>(to);
 }
 
@@ -235,10 +250,15 @@ void GgmlDevice::get(const Slot& slot, void* data, std::size_t size) const {
 
 Status GgmlDevice::failure() const { return failure_ ? Status(*failure_) : Status(); }
 
-Status GgmlDevice::compute(ggml_cgraph* graph) {
+Status GgmlDevice::bring(const lower::Groups& groups) {
+  VLA_CHECK(flush());
+  return windows_->bring(groups);
+}
+
+Status GgmlDevice::launch(ggml_cgraph* graph) {
   VLA_CHECK(flush());
   ggml_status status = GGML_STATUS_FAILED;
-  const auto run = [&] { status = ggml_backend_graph_compute(backend(), graph); };
+  const auto run = [&] { status = ggml_backend_graph_compute_async(backend(), graph); };
   if (held_->pool) {
     run();
   } else {
@@ -248,6 +268,10 @@ Status GgmlDevice::compute(ggml_cgraph* graph) {
     return Error{Code::out_of_memory, "graph", "", "the device ran out of memory"};
   if (status != GGML_STATUS_SUCCESS) failure_ = lost_device(text_, ggml_status_to_string(status));
   return failure();
+}
+
+Status GgmlDevice::wait() {
+  return guarded([&] { ggml_backend_synchronize(backend()); });
 }
 
 Result<std::shared_ptr<ggml_gallocr>> GgmlDevice::place(ggml_cgraph* graph) {
@@ -277,8 +301,16 @@ Result<std::unique_ptr<Program>> GgmlDevice::lower(const Graph& graph, const Low
   return GgmlProgram::make(graph, *this);
 }
 
+/// On the host a budget is of the process, which would have the windows twice.
+Result<WeightPlan> GgmlDevice::plan_weights(const Program& prefix, const Program& step, std::size_t size) const {
+  if (is_host()) return Device::plan_weights(prefix, step, size);
+  const auto &first = static_cast<const GgmlProgram&>(prefix), &then = static_cast<const GgmlProgram&>(step);
+  return lower::plan_streams(
+      {first.reads(), then.reads(), [&](const Param& matrix) { return size_of(matrix); }, weights_size_}, size);
+}
+
 std::size_t GgmlDevice::working_size() const {
-  std::size_t size = 0;
+  std::size_t size = memory().idle_size();
   for (const Working& working : held_->working) size += working.size;
   return size;
 }

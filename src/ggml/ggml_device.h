@@ -12,6 +12,7 @@
 #include "ggml/guard.h"
 #include "graph/device.h"
 #include "graph/rounding.h"
+#include "lower/host/device_windows.h"
 
 namespace vla {
 
@@ -28,6 +29,7 @@ class GgmlDevice final : public Device {
   ~GgmlDevice() override;
 
   Status load(const ParamList& params, bool fill, const WeightPlan& plan) override;
+  Result<WeightPlan> plan_weights(const Program& prefix, const Program& step, std::size_t size) const override;
   Status allocate(Slots& slots) override;
   void set(const Slot& slot, const void* data, std::size_t size) override;
   void get(const Slot& slot, void* data, std::size_t size) const override;
@@ -47,7 +49,12 @@ class GgmlDevice final : public Device {
 
   ggml_backend_t backend() const { return held_->backend.get(); }
   ggml_tensor* weight(const Param* param) const { return weights_[static_cast<std::size_t>(param->id)]; }
-  GgmlMemory& memory() { return *held_->memory; }
+  /// By Param::id, the group that a matrix is streamed in, or -1.
+  const std::vector<int>& groups() const { return groups_; }
+  GgmlMemory& memory() const { return *held_->memory; }
+  /// Memory of the host from which the device takes what is uploaded, of the driver's own kind where it has one.
+  /// Errors: device, out_of_memory.
+  Result<ggml_backend_buffer_ptr> allocate_host(std::size_t size) const;
   /// Gives the values of a graph their places in memory that programs share, since one runs at a time. What comes back
   /// keeps it. Errors: out_of_memory.
   Result<std::shared_ptr<ggml_gallocr>> place(ggml_cgraph* graph);
@@ -61,8 +68,12 @@ class GgmlDevice final : public Device {
     if (!done) failure_ = done.error();
     return done;
   }
-  /// Errors: device, out_of_memory.
-  Status compute(ggml_cgraph* graph);
+  /// Has groups of streamed matrices in memory for what is launched next, until others are wanted. Errors: bad_bundle
+  /// where the file has not their bytes any more, device.
+  Status bring(const lower::Groups& groups);
+  /// Computes, at the latest when somebody waits. Errors: device, out_of_memory.
+  Status launch(ggml_cgraph* graph);
+  Status wait();
 
  private:
   struct FreePool {
@@ -77,6 +88,12 @@ class GgmlDevice final : public Device {
     const ggml_tensor* first;
     std::size_t begin, size;  // in `Held::staging`
   };
+  bool is_streamed(const Param& param) const { return groups_[static_cast<std::size_t>(param.id)] >= 0; }
+  Status make_tensors(const ParamList& params, const WeightPlan& plan);
+  Status give_places(const WeightPlan& plan);
+  std::size_t size_of(const Param& matrix) const;
+  Status upload(const ParamList& params);
+  Status start_stream(const ParamList& params, const WeightPlan& plan);
   std::byte* staging(std::size_t size);
   Status flush() const;
 
@@ -88,7 +105,8 @@ class GgmlDevice final : public Device {
     std::optional<GgmlMemory> memory;
     std::vector<Working> working;  // the last serves new programs; those before it belong to older ones
     ggml_backend_buffer_ptr staging;
-    Held* next = nullptr;  // of those that are not freed
+    std::shared_ptr<void> windows;  // GgmlWindows::held
+    Held* next = nullptr;           // of those that are not freed
   };
   ggml_type resident_type(const Param& param) const;
 
@@ -98,10 +116,13 @@ class GgmlDevice final : public Device {
   bool keeps_f16_ = false;
   Rounding rounding_ = Rounding::none;
   Precision precision_ = Precision::f32;
-  ggml_context_ptr weight_context_;
+  ggml_context_ptr weight_context_, streamed_context_;
   std::shared_ptr<void> weight_memory_;
   std::size_t weights_size_ = 0;
-  std::vector<ggml_tensor*> weights_;
+  std::vector<ggml_tensor*> weights_;         // by Param::id
+  std::vector<int> groups_;                   // the same
+  std::vector<ggml_tensor*> window_tensors_;  // none where all weights are resident
+  std::shared_ptr<lower::DeviceWindows> windows_;
   std::string linear_text_;
   mutable std::vector<Upload> uploads_;
   mutable std::optional<Error> failure_;

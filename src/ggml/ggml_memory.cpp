@@ -50,45 +50,52 @@ Status GgmlMemory::check_free(std::size_t size, const char* what) const {
   if (device_ == nullptr || dry_) return {};
   std::size_t free = 0, total = 0;
   VLA_CHECK(guarded(name_, [&] { ggml_backend_dev_memory(device_, &free, &total); }));
-  for (const auto& buffer : *kept_) free += ggml_backend_buffer_get_size(buffer.get());
+  free += idle_size();
   if (size <= free) return {};
   return Error{Code::out_of_memory, what, fmt::format("{} free on {}", size_text(size), name_),
                fmt::format("{} of {}", size_text(free), size_text(total)),
                "free memory of the device or use a smaller model"};
 }
 
-/// A buffer that was given back and fits without much waste.
-ggml_backend_buffer_t GgmlMemory::take(std::size_t size) const {
-  const auto fits = [&](const ggml_backend_buffer_ptr& buffer) {
-    const std::size_t has = ggml_backend_buffer_get_size(buffer.get());
-    return has >= size && has <= 2 * size + 65536;
-  };
+std::size_t GgmlMemory::idle_size() const {
+  std::size_t size = 0;
+  for (const Buffer& buffer : *kept_) size += buffer.size;
+  return size;
+}
+
+/// A buffer that was given back and fits without much waste, or another one.
+GgmlMemory::Buffer GgmlMemory::take(std::size_t size) const {
+  const auto fits = [&](const Buffer& buffer) { return buffer.size >= size && buffer.size <= 2 * size + 65536; };
   const auto found = std::find_if(kept_->begin(), kept_->end(), fits);
-  if (found == kept_->end()) return ggml_backend_buft_alloc_buffer(type_, size);
-  ggml_backend_buffer_t buffer = found->release();
+  if (found == kept_->end())
+    return {size, ggml_backend_buffer_ptr(dry_ ? nullptr : ggml_backend_buft_alloc_buffer(type_, size))};
+  Buffer buffer = std::move(*found);
   kept_->erase(found);
   return buffer;
 }
 
 Result<std::size_t> GgmlMemory::place(ggml_context* tensors, const char* what, std::shared_ptr<void>* holder) {
   const std::vector<Part> parts = cut(tensors);
-  std::size_t total = 0;
-  for (const Part& part : parts) total += part.size;
-  VLA_CHECK(check_free(total, what));
+  std::size_t wanted = 0, total = 0;
+  for (const Part& part : parts) wanted += part.size;
+  VLA_CHECK(check_free(wanted, what));
   const std::shared_ptr<Buffers> buffers(new Buffers, [kept = kept_](Buffers* given) {
     std::move(given->begin(), given->end(), std::back_inserter(*kept));
     delete given;
   });
   *holder = buffers;
   for (const Part& part : parts) {
+    VLA_CHECK(guarded(name_, [&] { buffers->push_back(take(part.size)); }));
+    total += buffers->back().size;
     if (dry_) {
       for (ggml_tensor* tensor : part.tensors) tensor->data = kNowhere;
       continue;
     }
-    ggml_backend_buffer_t buffer = nullptr;
-    VLA_CHECK(guarded(name_, [&] { buffer = take(part.size); }));
-    if (buffer == nullptr) return refused(part, what);
-    buffers->emplace_back(buffer);
+    ggml_backend_buffer_t buffer = buffers->back().memory.get();
+    if (buffer == nullptr) {
+      buffers->pop_back();
+      return refused(part, what);
+    }
     ggml_tallocr places = ggml_tallocr_new(buffer);
     VLA_CHECK(guarded(name_, [&] {
       for (ggml_tensor* tensor : part.tensors) ggml_tallocr_alloc(&places, tensor);
@@ -97,12 +104,25 @@ Result<std::size_t> GgmlMemory::place(ggml_context* tensors, const char* what, s
   return total;
 }
 
+Status GgmlMemory::place_inside(const ggml_tensor& larger, std::size_t offset, ggml_tensor* tensor) const {
+  if (dry_) {
+    tensor->data = kNowhere;
+    return {};
+  }
+  return guarded(
+      name_, [&] { ggml_backend_tensor_alloc(larger.buffer, tensor, static_cast<std::byte*>(larger.data) + offset); });
+}
+
+std::size_t GgmlMemory::size_of(const ggml_tensor* tensor) const {
+  return GGML_PAD(ggml_backend_buft_get_alloc_size(type_, tensor), ggml_backend_buft_get_alignment(type_));
+}
+
 /// Tensors one after the other, as many as a buffer holds.
 std::vector<GgmlMemory::Part> GgmlMemory::cut(ggml_context* tensors) const {
-  const std::size_t alignment = ggml_backend_buft_get_alignment(type_), most = ggml_backend_buft_get_max_size(type_);
+  const std::size_t most = ggml_backend_buft_get_max_size(type_);
   std::vector<Part> parts;
   for (ggml_tensor* t = ggml_get_first_tensor(tensors); t != nullptr; t = ggml_get_next_tensor(tensors, t)) {
-    const std::size_t size = GGML_PAD(ggml_backend_buft_get_alloc_size(type_, t), alignment);
+    const std::size_t size = size_of(t);
     if (parts.empty() || parts.back().size + size > most) parts.emplace_back();
     parts.back().size += size;
     parts.back().tensors.push_back(t);

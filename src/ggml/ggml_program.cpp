@@ -249,7 +249,7 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
   std::size_t n = 64;
   for (const Node& node : graph.nodes()) n += kMaxPerNode + 2 * node.in.size();
   const std::size_t n_stage = graph.stages().size() + 1;
-  VLA_TRY(program->context_, make_context(n, (n_stage + 1) * ggml_graph_overhead_custom(n, false)));
+  VLA_TRY(program->context_, make_context(n, ggml_graph_overhead_custom(n, false)));
   VLA_TRY(program->constant_context_, make_context(graph.nodes().size() + 1));
   ggml_context* c = program->context_.get();
   program->graph_ = ggml_new_graph_custom(c, n, false);
@@ -257,12 +257,13 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
   Translator translate(c, program->constant_context_.get(), device);
   const std::vector<bool> needed = graph.needed();
   std::vector<std::pair<ggml_tensor*, const Node*>> constants;
-  std::vector<int> stage_end;
+  std::vector<int> phase_end;          // nodes of ggml
+  std::vector<std::size_t> stage_end;  // phases
   program->work_.resize(n_stage);
   for (const Node& node : graph.nodes()) {
     while (stage_end.size() < graph.stages().size() &&
            static_cast<std::size_t>(node.id) >= graph.stages()[stage_end.size()].n_node)
-      stage_end.push_back(ggml_graph_n_nodes(program->graph_));
+      stage_end.push_back(phase_end.size());
     ggml_tensor* made = needed[static_cast<std::size_t>(node.id)] ? translate(node) : nullptr;
     translate.keep(made);
     if (made == nullptr) continue;
@@ -278,8 +279,11 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
     ggml_build_forward_expand(program->graph_, made);
     VLA_CHECK(check_supported(device, program->graph_, n_before, node));
     program->work_[stage_end.size()] += work_of(node);
+    phase_end.push_back(ggml_graph_n_nodes(program->graph_));
+    std::vector<const Param*>& reads = program->reads_.emplace_back();
+    if (const auto* linear = node.as<op::Linear>()) reads.push_back(linear->weight);
   }
-  while (stage_end.size() < n_stage) stage_end.push_back(ggml_graph_n_nodes(program->graph_));
+  while (stage_end.size() < n_stage) stage_end.push_back(phase_end.size());
   for (const Graph::Stage& stage : graph.stages()) program->stages_.push_back({stage.name, {}});
 
   VLA_TRY(const std::size_t n_constant,
@@ -292,27 +296,46 @@ Result<std::unique_ptr<Program>> GgmlProgram::make(const Graph& graph, GgmlDevic
     }));
   }
   VLA_TRY(program->places_, device.place(program->graph_));
-  int begin = 0;
-  for (const int end : stage_end) {
-    ggml_cgraph* part = ggml_new_graph_custom(c, static_cast<std::size_t>(end - begin) + 1, false);
-    for (int i = begin; i < end; ++i) {
-      ggml_tensor* node = ggml_graph_node(program->graph_, i);
-      ggml_graph_add_node(part, node);
-      program->text_ += fmt::format("{:>4} {:<12} [{}, {}, {}, {}]\n", i, ggml_op_desc(node), node->ne[0], node->ne[1],
-                                    node->ne[2], node->ne[3]);
+  VLA_CHECK(program->cut(phase_end, stage_end));
+  for (int i = 0; i < ggml_graph_n_nodes(program->graph_); ++i) {
+    const ggml_tensor* node = ggml_graph_node(program->graph_, i);
+    program->text_ += fmt::format("{:>4} {:<12} [{}, {}, {}, {}]\n", i, ggml_op_desc(node), node->ne[0], node->ne[1],
+                                  node->ne[2], node->ne[3]);
+  }
+  program->size_ = n_constant + (device.is_host() ? ggml_used_mem(c) : 0);
+  return std::unique_ptr<Program>(std::move(program));
+}
+
+/// Where a stage ends, and where groups of streamed matrices must come.
+Status GgmlProgram::cut(const std::vector<int>& phase_end, const std::vector<std::size_t>& stage_end) {
+  VLA_TRY(const std::vector<lower::Groups> groups, lower::find_groups(reads_, device_.groups()));
+  std::size_t begin = 0;
+  int first = 0;  // node of ggml
+  for (const std::size_t end : stage_end) {
+    std::vector<Part>& parts = parts_.emplace_back();
+    for (const lower::Segment& segment : lower::cut_phases(std::span(groups).subspan(begin, end - begin), begin)) {
+      const int last = phase_end[segment.end - 1];
+      const auto size = static_cast<std::size_t>(last - first) + 1;
+      Part& part = parts.emplace_back(Part{segment.groups, {}, nullptr});
+      VLA_TRY(part.context, make_context(0, ggml_graph_overhead_custom(size, false)));
+      part.graph = ggml_new_graph_custom(part.context.get(), size, false);
+      for (; first < last; ++first) ggml_graph_add_node(part.graph, ggml_graph_node(graph_, first));
     }
-    program->parts_.push_back(part);
     begin = end;
   }
-  if (program->parts_.size() == 1) program->parts_.front() = program->graph_;  // which knows what a backend may fuse
-  program->size_ = n_constant + ggml_used_mem(c);
-  return std::unique_ptr<Program>(std::move(program));
+  const bool is_whole = parts_.size() == 1 && parts_.front().size() == 1;
+  if (is_whole) parts_.front().front().graph = graph_;  // which knows what a backend may fuse
+  return {};
 }
 
 Status GgmlProgram::run() {
   VLA_CHECK(device_.failure());
   for (std::size_t i = 0; i < parts_.size(); ++i) {
-    VLA_CHECK(device_.compute(parts_[i]));
+    for (const Part& part : parts_[i]) {
+      if (part.groups.any()) VLA_CHECK(device_.bring(part.groups));
+      VLA_CHECK(device_.launch(part.graph));
+    }
+    VLA_CHECK(device_.wait());
     if (i < stages_.size()) stages_[i].done = std::chrono::steady_clock::now();
   }
   return {};

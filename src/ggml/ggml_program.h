@@ -19,16 +19,26 @@ class GgmlProgram final : public Program {
   std::vector<float> tap(std::size_t i) const override;
   std::string text() const override { return text_; }
   std::size_t size() const override { return size_; }
+  /// The matrices that each phase reads.
+  const lower::MatrixReads& reads() const { return reads_; }
 
  private:
+  /// A stretch of the graph that is computed once its groups are on the device.
+  struct Part {
+    lower::Groups groups;
+    ggml_context_ptr context;
+    ggml_cgraph* graph;
+  };
   explicit GgmlProgram(GgmlDevice& device) : device_(device) {}
+  Status cut(const std::vector<int>& phase_end, const std::vector<std::size_t>& stage_end);
 
   GgmlDevice& device_;
   ggml_context_ptr context_, constant_context_;
   std::shared_ptr<void> constant_memory_;
   std::shared_ptr<ggml_gallocr> places_;  // of all other values
   ggml_cgraph* graph_ = nullptr;
-  std::vector<ggml_cgraph*> parts_;  // of the graph, stage by stage
+  std::vector<std::vector<Part>> parts_;  // of the graph, stage by stage
+  lower::MatrixReads reads_;
   std::vector<Stage> stages_;
   std::vector<Work> work_;
   std::vector<Tap> taps_;

@@ -1,19 +1,24 @@
 // SPDX-FileCopyrightText: The vla.cpp authors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A libvla-cuda.so for machines without a GPU: ggml's CPU behind a driver that counts its calls and fails when told to,
-// as ggml-cuda does: by an abort of the library's own ggml, in every call from the first that fails, freeing too.
+// A libvla-cuda.so for machines without a GPU: ggml's CPU behind a driver that computes a graph as late as it may, when
+// somebody waits for it. It counts its calls and fails when told to, as ggml-cuda does: by an abort of the library's
+// own ggml, in every call from the first that fails, freeing too.
 //   VLA_FAKE_FAILS_AT=N    the N-th call (from 1) fails
+//   VLA_FAKE_MEMORY=N      buffers of more than N bytes together are refused
 //   VLA_FAKE_COMPUTES=no   graphs are not computed
+//   VLA_FAKE_AT_ONCE=yes   they are computed when they are asked for
 //   VLA_FAKE_TAKES_MS=N    the driver sleeps so long before it computes a graph
-//   VLA_FAKE_COUNTS=FILE   a line for each call: compute, set, get, memset, allocate or free
+//   VLA_FAKE_COUNTS=FILE   a line for each call: compute, synchronize, record, wait, set, get, memset, allocate or free
 #include <ggml-backend-impl.h>
 #include <ggml-cpu.h>
 
 #include <chrono>
+#include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <deque>
 #include <thread>
 
 #include "ggml/ggml_library.h"
@@ -22,7 +27,8 @@ namespace {
 
 struct Driver {
   long n_call = 0, fails_at = 0;
-  bool computes = true;
+  std::size_t memory = SIZE_MAX, used = 0;
+  bool computes = true, at_once = false;
   int takes_ms = 0;
   std::FILE* counts = nullptr;
   // Of ggml's CPU: what is done where nothing fails.
@@ -31,6 +37,14 @@ struct Driver {
   ggml_backend_buffer_type_i type;
   ggml_backend_device_i device;
 } driver;
+
+/// Graphs that nobody waited for yet, in their order.
+struct Asked {
+  ggml_backend_t backend;
+  ggml_cgraph* graph;
+};
+std::deque<Asked> asked;
+std::size_t n_computed = 0;
 
 ggml_backend_buffer_type buffer_type;
 
@@ -45,12 +59,42 @@ void call(const char* what) {
   GGML_ABORT("in %s", what);
 }
 
+void compute_to(std::size_t n) {
+  for (; n_computed < n; ++n_computed, asked.pop_front()) {
+    std::this_thread::sleep_for(std::chrono::milliseconds(driver.takes_ms));
+    if (driver.computes) driver.backend.graph_compute(asked.front().backend, asked.front().graph);
+  }
+}
+
 ggml_status compute(ggml_backend_t backend, ggml_cgraph* graph) {
   call("compute");
-  std::this_thread::sleep_for(std::chrono::milliseconds(driver.takes_ms));
-  return driver.computes ? driver.backend.graph_compute(backend, graph) : GGML_STATUS_SUCCESS;
+  asked.push_back({backend, graph});
+  if (driver.at_once) compute_to(n_computed + asked.size());
+  return GGML_STATUS_SUCCESS;
 }
-void synchronize(ggml_backend_t) { call("synchronize"); }
+void synchronize(ggml_backend_t) {
+  call("synchronize");
+  compute_to(n_computed + asked.size());
+}
+
+/// Of an event: how many graphs had been asked for.
+std::size_t& stands_for(ggml_backend_event_t event) { return *static_cast<std::size_t*>(event->context); }
+ggml_backend_event_t make_event(ggml_backend_dev_t device) {
+  return new ggml_backend_event{device, new std::size_t(0)};
+}
+void free_event(ggml_backend_dev_t, ggml_backend_event_t event) {
+  delete &stands_for(event);
+  delete event;
+}
+void record(ggml_backend_t, ggml_backend_event_t event) {
+  call("record");
+  stands_for(event) = n_computed + asked.size();
+}
+void wait(ggml_backend_dev_t, ggml_backend_event_t event) {
+  call("wait");
+  compute_to(stands_for(event));
+}
+
 void free_backend(ggml_backend_t backend) {
   call("free");
   driver.backend.free(backend);
@@ -70,11 +114,14 @@ void fill(ggml_backend_buffer_t buffer, ggml_tensor* tensor, uint8_t value, size
 }
 void free_buffer(ggml_backend_buffer_t buffer) {
   call("free");
+  driver.used -= buffer->size;
   driver.buffer.free_buffer(buffer);
 }
 
 ggml_backend_buffer_t allocate(ggml_backend_buffer_type_t type, size_t size) {
   call("allocate");
+  if (size > driver.memory - driver.used) return nullptr;
+  driver.used += size;
   ggml_backend_buffer_t buffer = driver.type.alloc_buffer(type, size);
   driver.buffer = buffer->iface;
   buffer->iface.set_tensor = set;
@@ -91,6 +138,7 @@ ggml_backend_t init(ggml_backend_dev_t device, const char* params) {
   driver.backend = backend->iface;
   backend->iface.graph_compute = compute;
   backend->iface.synchronize = synchronize;
+  backend->iface.event_record = record;
   backend->iface.free = free_backend;
   backend->device = device;
   return backend;
@@ -100,8 +148,11 @@ ggml_backend_reg_t open() {
   const char* fails_at = std::getenv("VLA_FAKE_FAILS_AT");
   const char* computes = std::getenv("VLA_FAKE_COMPUTES");
   const char* counts = std::getenv("VLA_FAKE_COUNTS");
+  const char* memory = std::getenv("VLA_FAKE_MEMORY");
   const char* takes_ms = std::getenv("VLA_FAKE_TAKES_MS");
   if (fails_at != nullptr) driver.fails_at = std::atol(fails_at);
+  driver.at_once = std::getenv("VLA_FAKE_AT_ONCE") != nullptr;
+  if (memory != nullptr) driver.memory = static_cast<std::size_t>(std::atol(memory));
   driver.computes = computes == nullptr || std::strcmp(computes, "no") != 0;
   if (takes_ms != nullptr) driver.takes_ms = std::atoi(takes_ms);
   if (counts != nullptr) driver.counts = std::fopen(counts, "a");
@@ -116,6 +167,9 @@ ggml_backend_reg_t open() {
   buffer_type.device = &device;
   device.reg = &registry;
   device.iface.init_backend = init;
+  device.iface.event_new = make_event;
+  device.iface.event_free = free_event;
+  device.iface.event_synchronize = wait;
   device.iface.get_buffer_type = [](ggml_backend_dev_t) -> ggml_backend_buffer_type_t { return &buffer_type; };
   registry.iface.get_device = [](ggml_backend_reg_t, size_t) -> ggml_backend_dev_t { return &device; };
   return &registry;

@@ -17,9 +17,9 @@ PROGRAM = f"""
 import json, sys
 sys.path[:0] = [{str(ROOT / "python")!r}]
 import vla_cpp
-bundle, images, state, text, leftover, counts = json.loads(sys.argv[1])
+bundle, images, state, text, leftover, memory, counts = json.loads(sys.argv[1])
 images = {{view: file and open(file, "rb").read() for view, file in images.items()}}
-with vla_cpp.Policy(bundle, device="cuda") as policy:
+with vla_cpp.Policy(bundle, device="cuda", memory=memory) as policy:
     rest = {{}}
     act = lambda: policy.act(images=images, state=state, text=text, seed=1, **rest)
     first = act()
@@ -32,11 +32,11 @@ with vla_cpp.Policy(bundle, device="cuda") as policy:
 """
 
 
-def calls_of_an_act(fake, case, leftover=None):
+def calls_of_an_act(fake, case, leftover=None, memory=0):
     """Of one whose plan is there. Programs run once for each stage of the prefix and each step, and ggml waits for each."""
     environment = {**fake.program(counts=fake.counts).environment, "VLA_LIBRARY": str(fake.library)}
     images = {view: file and str(file) for view, file in case.images.items()}
-    arguments = json.dumps([str(case.bundle), images, case.state, case.text, leftover, str(fake.counts)])
+    arguments = json.dumps([str(case.bundle), images, case.state, case.text, leftover, memory, str(fake.counts)])
     subprocess.run([sys.executable, "-c", PROGRAM, arguments], check=True, timeout=60, env=environment)
     lines = fake.counts.read_text(encoding="utf-8").splitlines()
     counts = Counter(lines[lines.index("from here") + 1 : lines.index("to here")])

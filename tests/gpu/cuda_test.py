@@ -96,20 +96,3 @@ def test_a_prediction_is_called_one_and_takes_no_option_of_a_measurement(vla):
     vla(*arguments, "h100", "--markdown").refused("usage", "--model")
     vla("bench", "--arch", "smolvla", "--size", "full", "--model", "h100").refused("usage", "model: expected device cuda")
     assert json.loads(vla(*arguments, "h100", "--steps", "5", "--json").out)["n_step"] == 5
-
-
-def test_within_a_budget_of_device_memory_answers_are_the_same_and_the_least_is_told(vla):
-    case = Golden("smolvla/sparse_expert")
-    inspect = lambda budget, *options: vla("inspect", case.bundle, "--memory", budget, *IN_FLOAT32, *options).out  # noqa: E731
-    told = json.loads(inspect("1GB", "--json"))["memory_budget_bytes"]
-    assert told["process"] == told["read_in_every_act"] == 0
-    least = str(told["smallest"])
-    tight = json.loads(inspect(least, "--json"))
-    assert tight["memory_budget_bytes"]["read_in_every_act"] > 0 and tight["memory_bytes"]["total"] == int(least)
-    assert "of the device's memory; 1 MB is the least that does" in inspect(least)
-    run = lambda *options: vla(*case.arguments(options=["--json", *IN_FLOAT32, *options]), limit=300)  # noqa: E731
-    assert run("--memory", least).json()["actions"] == run().json()["actions"]
-    run("--memory", str(int(least) - 1)).refused("out_of_memory", "memory", "1 MB or more")
-    once = ["--runs", "1", "--warmup", "0", "--json", "--memory", least]
-    told = vla("bench", case.bundle, *once, *IN_FLOAT32, limit=300).json()["memory_bytes"]
-    assert told["read_in_every_act"] == tight["memory_budget_bytes"]["read_in_every_act"]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from budgets import budgets, check_changing_file
 from gguf import GGUFReader
 from golden_cases import FLOAT32, NAMES, ROOT, Golden, tensors
 from conftest import BINARY, KIND
@@ -167,6 +168,32 @@ def with_environment(vla, **environment):
     changed = copy.copy(vla)
     changed.environment = {**vla.environment, **environment}
     return changed
+
+
+@pytest.mark.parametrize("name", ["smolvla/sparse_expert", "gr00t_n1_6/faint"])
+def test_within_a_budget_of_device_memory_answers_are_the_same_bytes(vla, name):
+    case = Golden(name)
+    run = lambda *options: vla(*case.arguments(options=["--json", *DEVICE, *options]), limit=LIMIT)  # noqa: E731
+    expected = run().json()["actions"]
+    least, middle = budgets(vla, case.bundle, DEVICE)
+    for budget in (least, middle):
+        assert run("--memory", str(budget)).json()["actions"] == expected
+    run("--memory", str(least - 1)).refused("out_of_memory", "memory", f"{-(-least // 1_000_000)} MB or more")
+
+
+def test_a_file_that_changes_while_it_is_read_is_refused_and_the_device_goes_on(vla, tmp_path):
+    case = Golden("smolvla/sparse_expert")
+    least, _ = budgets(vla, case.bundle, DEVICE)
+    check_changing_file(case, tmp_path / "policy.gguf", vla.environment, device=KIND, memory=least, **KERNELS)
+
+
+def test_a_budget_is_told_by_inspect_and_bench(vla):
+    case = Golden("smolvla/sparse_expert")
+    least, _ = budgets(vla, case.bundle, DEVICE)
+    text = vla("inspect", case.bundle, "--memory", str(least), *DEVICE, limit=LIMIT).out
+    assert f"of the device's memory; {-(-least // 1_000_000)} MB is the least that does" in text
+    once = ["--runs", "1", "--warmup", "0", "--json", "--memory", str(least)]
+    assert vla("bench", case.bundle, *once, *DEVICE, limit=LIMIT).json()["memory_bytes"]["read_in_every_act"] > 0
 
 
 @LIMITS_OF_VULKAN

@@ -19,7 +19,7 @@ MAY_INCLUDE = {
     "bundle": {"base"},
     "graph": {"base", "bundle"},
     "kernels": {"base", "bundle"},
-    "ggml": GRAPH,
+    "ggml": GRAPH | {"lower"},  # its host folder: matrices on their way from the file
     "vulkan": GRAPH | {"ggml"},  # compiled into a library of its own, as is the next
     "cuda": GRAPH | {"ggml"},
     "lower": GRAPH | {"kernels", "cuda"},

@@ -42,7 +42,7 @@ TEST_CASE("memory that was given back is used again, for what fits without much 
 
 TEST_CASE("a dry memory has the same sizes and takes nothing") {
   GgmlMemory memory("cpu", ggml_backend_cpu_buffer_type(), nullptr), dry = memory;
-  dry.set_dry();
+  dry.set_dry(true);
   std::shared_ptr<void> holder, nothing;
   const auto real = tensors({1000, 3, 70}), counted = tensors({1000, 3, 70});
   const auto taken = memory.place(real.get(), "here", &holder), predicted = dry.place(counted.get(), "here", &nothing);
