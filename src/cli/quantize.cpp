@@ -204,7 +204,8 @@ Command add_quantize(CLI::App& app) {
       "quantize", "Write a bundle with its large matrices in int8 or int4: a half or a quarter of bf16");
   command->footer(
       "The codes are those that --kernels int8 or int4 makes at every load, so the actions are the same; the file is\n"
-      "smaller and ready sooner. int4 has codes of four bits and a step for each 64 of a row, and moves actions more.\n"
+      "smaller and ready sooner. int4 has codes of four bits and a step for each 64 of a row, and moves actions more,\n"
+      "less so with --calibrate, which looks at what the matrices multiply.\n"
       "How far actions move from float32 is judged on your own observations, by the program or by you:\n"
       "  vla quantize policy.gguf -o policy.small.gguf --judge RECORDING --error 0.01\n"
       "  vla quantize policy.gguf -o policy.small.gguf --calibrate RECORDING --judge RECORDING --size 1.8GB\n"
