@@ -12,8 +12,8 @@
 namespace vla {
 
 /// The Hessians of a bundle's matrices, from what they multiply in the acts of some observations. Those of as many
-/// matrices as a gigabyte or a quarter of the budget holds are measured at a time, so matrices are best asked for in the
-/// file's order.
+/// matrices as a gigabyte or a quarter of the budget holds are measured at a time, so matrices are best asked for in
+/// the file's order.
 class Hessians {
  public:
   /// Finds what is multiplied. `observations` must outlive this. Errors: those of Engine.
