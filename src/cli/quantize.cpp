@@ -57,10 +57,7 @@ void print_progress(QuantizeProgress at) {
   say(stderr, "\rquantizing {:>3} %{}", percent, percent >= 100 ? "\n" : "");
 }
 
-/// The same codes for all matrices.
-Choice all(const std::string& dtype) {
-  return [codes = dtype == "int4" ? Rounding::int4 : Rounding::int8](const std::string&) { return codes; };
-}
+Rounding codes_of(const std::string& dtype) { return dtype == "int4" ? Rounding::int4 : Rounding::int8; }
 
 #ifdef VLA_SERVER
 std::string percent(const Moved& moved) {
@@ -149,7 +146,7 @@ std::function<void(QuantizeProgress)> progress(bool shows) {
 /// `why`: what was done to `options.from` before.
 Status write_codes(const QuantizeOptions& options, const Int4Codes& int4, const std::string& why) {
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
-  std::pair<Choice, std::string> chosen(all(options.dtype), why);
+  std::pair<Choice, std::string> chosen(all_as(codes_of(options.dtype)), why);
 #ifdef VLA_SERVER
   if (!options.recording.empty()) {
     if (!options.bound.error && !options.bound.bytes)
@@ -169,7 +166,7 @@ Status write_codes(const QuantizeOptions& options, const Int4Codes& int4, const 
 Status calibrate_first(QuantizeOptions options) {
   const bool shows = !options.quiet && ::isatty(STDERR_FILENO) != 0;
   VLA_TRY(const std::vector<Judged> seen, observations(options, options.calibration));
-  const Rounding codes = options.dtype == "int4" ? Rounding::int4 : Rounding::int8;
+  const Rounding codes = codes_of(options.dtype);
   const bool has_int4 = codes == Rounding::int4 || !options.recording.empty();
   VLA_TRY(const Calibrated made,
           calibrate(options.from, options.to, codes, has_int4, seen, options.engine, progress(shows)));

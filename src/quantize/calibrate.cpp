@@ -12,10 +12,6 @@
 namespace vla {
 namespace {
 
-Choice all(Rounding codes) {
-  return [codes](const std::string&) { return codes; };
-}
-
 const char* name_of(Rounding codes) { return codes == Rounding::int4 ? "int4" : "int8"; }
 
 /// The steps of `calibrate`, and what they share.
@@ -37,6 +33,7 @@ class Calibration {
                      smoothed.n_place, smoothed.largest, name_of(codes)),
          "smoothed", before, after);
     keep(made_.bundle, to, before, after);
+    if (codes == Rounding::int4) int4_moves_ = after.rms < before.rms ? after : before;
     return {};
   }
 
@@ -50,9 +47,12 @@ class Calibration {
     VLA_TRY(Hessians hessians, Hessians::of(made_.bundle, observations_, options_));
     const Int4Codes codes = {
         [&](const Bundle& bundle, const TensorInfo& tensor) { return hessians.feedback(bundle, tensor); }};
-    if (const auto made = quantize(made_.bundle, to, all(Rounding::int4), {}, report_, codes); !made)
+    if (const auto made = quantize(made_.bundle, to, all_as(Rounding::int4), {}, report_, codes); !made)
       return made.error();
-    VLA_TRY(const Moved before, moved_by(made_.bundle, Rounding::int4));
+    if (!int4_moves_) {
+      VLA_TRY(int4_moves_, moved_by(made_.bundle, Rounding::int4));
+    }
+    const Moved before = *int4_moves_;
     VLA_TRY(const Chunks chunks, chunks_of(to, options_, observations_));
     const Moved after = moved(expected_, chunks);
     tell(fmt::format("errors of {} of {} matrices made good by later columns (GPTQ); int4 moves", hessians.n_known(),
@@ -73,7 +73,8 @@ class Calibration {
   /// How far the chunks are moved by one kind of codes alone.
   Result<Moved> moved_by(const std::string& bundle, Rounding codes) {
     const std::string trial = to_ + ".trial";
-    if (const auto made = quantize(bundle, trial, all(codes), {}, [](QuantizeProgress) {}); !made) return made.error();
+    if (const auto made = quantize(bundle, trial, all_as(codes), {}, [](QuantizeProgress) {}); !made)
+      return made.error();
     VLA_TRY(const Chunks chunks, chunks_of(trial, options_, observations_));
     return moved(expected_, chunks);
   }
@@ -98,7 +99,8 @@ class Calibration {
   const std::span<const Judged> observations_;
   const EngineOptions& options_;
   const std::function<void(QuantizeProgress)>& report_;
-  Chunks expected_;  // in float32
+  Chunks expected_;                  // in float32
+  std::optional<Moved> int4_moves_;  // by int4 of `made_.bundle` as `quantize` makes it alone
   Calibrated made_;
 };
 

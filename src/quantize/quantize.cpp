@@ -208,9 +208,8 @@ Error nothing_to_quantize(const std::string& path) {
 
 Result<std::vector<Quantizable>> quantizable(const std::string& path) {
   VLA_TRY(const Bundle bundle, Bundle::open(path));
-  const auto all = [](Rounding codes) { return [codes](const std::string&) { return codes; }; };
-  VLA_TRY(const Matrices int8, find_matrices(bundle, all(Rounding::int8)));
-  VLA_TRY(const Matrices int4, find_matrices(bundle, all(Rounding::int4)));
+  VLA_TRY(const Matrices int8, find_matrices(bundle, all_as(Rounding::int8)));
+  VLA_TRY(const Matrices int4, find_matrices(bundle, all_as(Rounding::int4)));
   std::vector<Quantizable> found;
   for (const TensorInfo& tensor : bundle.tensors())
     if (const auto bytes = int8.find(tensor))

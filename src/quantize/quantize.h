@@ -27,6 +27,10 @@ struct QuantizeProgress {
 
 /// Chooses what the matrix of a tensor becomes: int8, int4, or none.
 using Choice = std::function<Rounding(const std::string& tensor)>;
+/// The same for every matrix.
+inline Choice all_as(Rounding codes) {
+  return [codes](const std::string&) { return codes; };
+}
 
 /// A large matrix of floats, and its bytes as stored, as int8 and as int4, scales included.
 struct Quantizable {
