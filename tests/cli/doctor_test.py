@@ -11,11 +11,14 @@ from conftest import ROOT
 from golden_cases import sealed
 
 DEMO = ROOT / "models/metaworld-tiny.gguf"
+LATE = 16
 
 
 @pytest.fixture(scope="module")
 def report(vla):
-    return vla("doctor", DEMO, "--json").json()
+    answer = vla("doctor", DEMO, "--json")
+    assert answer.code in (0, LATE), answer.err  # late: a busy machine, or one whose kernels a sanitizer slows down
+    return json.loads(answer.out)
 
 
 def test_the_machine_and_the_build_are_told_without_a_bundle(vla):
@@ -52,7 +55,7 @@ def test_an_act_of_a_few_milliseconds_is_measured_on_one_thread_too(vla, report)
     assert ("one_thread_act_ms" in policy) == (policy["threads"] > 1 and policy["act_ms"] < 250)
     answer = vla("doctor", DEMO, "--threads", 1)
     is_late = "the rate is not held" in answer.out  # as under a sanitizer
-    assert answer.code == (16 if is_late else 0) and "predicted ms  measured ms" in answer.out and "replan every" in answer.out
+    assert answer.code == (LATE if is_late else 0) and "predicted ms  measured ms" in answer.out and "replan every" in answer.out
     assert answer.out.count("\n") <= 40
 
 
@@ -73,4 +76,4 @@ def test_a_chunk_that_ends_before_the_next_is_there_has_its_exit_code(vla, tmp_p
     struct.pack_into("<f", data, at + 4, 1e5)
     (tmp_path / "fast.gguf").write_bytes(sealed(bytes(data)))
     answer = vla("doctor", tmp_path / "fast.gguf", "--threads", 1)
-    assert answer.code == 16 and "the rate is not held" in answer.out and "error: late" in answer.err
+    assert answer.code == LATE and "the rate is not held" in answer.out and "error: late" in answer.err

@@ -60,7 +60,9 @@ def serving(vla, serve, options, more):
 
 @pytest.mark.parametrize("kernels", ["float32", "bf16", "int8", "portable"])
 @pytest.mark.parametrize("threads", ["1", "2"])
-def test_actions_are_the_same_to_the_bit_within_any_budget(run, kernels, threads):
+def test_actions_are_the_same_to_the_bit_within_any_budget(vla, run, kernels, threads):
+    if kernels == "bf16" and "bf16" not in vla.cpu():
+        pytest.skip(f"this processor multiplies no bf16: {vla.cpu()}")
     options = ("--kernels", kernels, "--threads", threads)
     expected = run(*options).json()["actions"]
     for more in (1, 2, 3, 100):
@@ -79,7 +81,9 @@ def test_a_budget_is_kept(vla, serve):
         pytest.skip("a sanitizer takes more memory than the policy")
     options = (SHIPPED, "--bind", "tcp://127.0.0.1:0", "--kernels", "float32")
     tight, roomy = serving(vla, serve, options, 1), serve(*options)
-    assert memory_of(tight) < memory_of(roomy) - 2_000_000
+    told = float(roomy.ready["memory_mb"]) - float(tight.ready["memory_mb"])
+    around = 1.5  # megabytes that the reading itself takes: its thread, and what an allocator keeps
+    assert told > around and memory_of(roomy) - memory_of(tight) > (told - around) * 1e6
     assert float(tight.ready["read_mb"]) > 1 and "read_mb" not in roomy.ready
 
 

@@ -64,6 +64,10 @@ class Program:
         with open(self.path, "rb") as file:
             return b"__asan_init" in file.read()
 
+    def cpu(self):
+        """What the program says of the processor: memory, precision of products, kernels."""
+        return next(line for line in self("inspect", "--devices").out.splitlines() if line.startswith("cpu "))
+
     def __call__(self, *args, stdout=None, limit=60, memory=None):
         """memory: bytes of address space that the program may take."""
         with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
