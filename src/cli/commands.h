@@ -13,9 +13,8 @@ namespace vla::cli {
 constexpr const char* kKernelsHelp =
     "ggml, portable, neon, neon_bf16, avx2, avx512, avx512_bf16, amx, or float32: the best that does not round to "
     "bf16, "
-    "or bf16: the best that does, with large matrices rounded to it, or int8: the best, with large matrices quantized, "
-    "faster "
-    "and less exact; "
+    "or bf16: the best that does, with large matrices rounded to it, or int8 or int4: the best, with large matrices "
+    "quantized, faster and less exact; "
     "not given: on the CPU the best for the bundle's dtype, which multiplies bf16 (by neon_bf16, avx512_bf16 or amx) "
     "if the "
     "bundle is stored as bf16. On Vulkan float32 (not given) or bf16; on CUDA as stored (not given), float32, bf16, "
