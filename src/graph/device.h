@@ -129,7 +129,7 @@ class Device {
   /// unsupported of devices that keep all parameters.
   virtual Result<WeightPlan> plan_weights(const Program& /*prefix*/, const Program& /*step*/,
                                           std::size_t /*size*/) const {
-    return Error{Code::unsupported, "memory", "our own kernels for CPUs or CUDA, which read matrices as they need them",
+    return Error{Code::unsupported, "memory", "our own kernels, or Vulkan, which read matrices as they need them",
                  name() + ", which keeps all of them", "leave the budget out, or use --device cpu"};
   }
   /// Gives slots memory, filled with zeros. Errors: out_of_memory.
