@@ -15,12 +15,13 @@ int dtype_bits(DType type) {
 }
 
 void widen_codes(const Encoding& encoding, const std::byte* codes, const float* scales, std::int64_t n, float* to) {
-  const auto* blocks = reinterpret_cast<const Int4Block*>(codes);
-  for (std::int64_t i = 0; i < n; ++i) {
-    const int code = encoding.type == DType::int4 ? blocks[i / Int4Block::kElements][i % Int4Block::kElements]
-                                                  : std::to_integer<std::int8_t>(codes[i]);
-    to[i] = static_cast<float>(code) * scales[i / encoding.group];
-  }
+  const auto* row = reinterpret_cast<const Int4Block*>(codes);
+  for (std::int64_t begin = 0; begin < n; begin += encoding.group, row += Int4Block::n_of(encoding.group))
+    for (std::int64_t k = 0; k < encoding.group; ++k) {
+      const int code = encoding.type == DType::int4 ? row[k / Int4Block::kElements][k % Int4Block::kElements]
+                                                    : std::to_integer<std::int8_t>(codes[begin + k]);
+      to[begin + k] = static_cast<float>(code) * scales[begin / encoding.group];
+    }
 }
 
 }  // namespace vla

@@ -62,10 +62,11 @@ const char* codes_text(DType type) {
                                 : "-127 to 127, file has -128";
 }
 
-/// How the bundle's tensor of a matrix that may be floats is encoded; codes have a scale for each row.
+/// How the bundle's tensor of a matrix that may be floats is encoded; codes have a scale for each row. As many bytes as
+/// elements are int8: of two widths, 33 and 66, blocks of int4 would have them too.
 Encoding encoding_of(const TensorInfo& tensor, const std::vector<std::int64_t>& shape) {
   if (tensor.type != DType::i8) return {tensor.type};
-  const bool is_int4 = shape[0] % Int4Block::kElements == 0 && !tensor.shape.empty() &&
+  const bool is_int4 = !tensor.shape.empty() && tensor.shape[0] != shape[0] &&
                        tensor.shape[0] == static_cast<std::int64_t>(dtype_size(DType::int4, shape[0]));
   return {is_int4 ? DType::int4 : DType::i8, shape[0]};
 }

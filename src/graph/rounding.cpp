@@ -15,8 +15,7 @@ Encoding resident_encoding(const Param& param, Rounding rounding) {
                      std::min(param.shape[0], param.shape[1]) < kMinRounded;
   if (keeps) return param.encoding;
   if (rounding == Rounding::bf16) return Encoding{DType::bf16};
-  const bool has_blocks = rounding == Rounding::int4 && param.shape[0] % Int4Block::kElements == 0;
-  return {has_blocks ? DType::int4 : DType::i8, param.shape[0]};
+  return {rounding == Rounding::int4 ? DType::int4 : DType::i8, param.shape[0]};
 }
 
 Status check_rounding(const ParamList& list, Rounding rounding) {

@@ -11,10 +11,9 @@ namespace vla {
 /// ones become float32 again.
 enum class Rounding { none, bf16, int8, int4, float32 };
 
-/// The encoding of a parameter in memory; int8 and int4 have a scale for each row of a matrix. Rows that are no whole
-/// blocks of int4 become int8. Matrices from or to fewer than 144
-/// elements keep theirs: they take no time worth an error, and padded states and actions of robots have up to 132
-/// elements (GR00T N1.7).
+/// The encoding of a parameter in memory; int8 and int4 have a scale for each row of a matrix. Matrices from or to
+/// fewer than 144 elements keep theirs: they take no time worth an error, and padded states and actions of robots have
+/// up to 132 elements (GR00T N1.7).
 Encoding resident_encoding(const Param& param, Rounding rounding);
 
 /// Errors: unsupported where no matrix would have the encoding that was asked for.

@@ -117,18 +117,18 @@ class Stretch {
     const std::size_t first = size(begin);
     std::vector<int> steps;
     std::vector<float> codes(units_.size() * kElements);
+    const std::size_t n = std::min(kElements, size(n_) - first);
     for (std::size_t r = 0; r < units_.size(); ++r) {
-      float wanted[kElements], unused[kElements];
-      for (std::size_t k = 0; k < kElements; ++k) wanted[k] = row(r)[first + k] + asked(r)[first + k];
+      float wanted[kElements] = {}, unused[kElements];
+      for (std::size_t k = 0; k < n; ++k) wanted[k] = row(r)[first + k] + asked(r)[first + k];
       steps.push_back(best_step(wanted, units_[r], unused));
     }
     // Rows in the inner loop, so that a row of the feedback is read once.
-    for (std::size_t k = 0; k < kElements; ++k)
+    for (std::size_t k = 0; k < n; ++k)
       for (std::size_t r = 0; r < units_.size(); ++r)
         codes[r * kElements + k] = round(r, first + k, static_cast<float>(steps[r]) * units_[r]);
     for (std::size_t r = 0; r < units_.size(); ++r)
-      blocks[static_cast<std::int64_t>(r) * d_in_ / Int4Block::kElements] =
-          packed(steps[r], codes.data() + r * kElements);
+      blocks[static_cast<std::int64_t>(r) * Int4Block::n_of(d_in_)] = packed(steps[r], codes.data() + r * kElements);
   }
 
  private:
@@ -173,9 +173,10 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
 
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, Int4Block* blocks,
                       float* scales, float* row) {
-  const std::int64_t n_block = d_in / Int4Block::kElements;
+  const std::int64_t n_block = Int4Block::n_of(d_in);
   for (std::int64_t n = 0; n < d_out; ++n, stored += d_in * number_size(type), blocks += n_block) {
     const Int4Row of = widen_for_int4(type, stored, d_in, row);
+    std::fill(row + d_in, row + n_block * Int4Block::kElements, 0.0f);
     float codes[Int4Block::kElements];
     for (std::int64_t i = 0; i < n_block; ++i) {
       const int step = best_step(row + i * Int4Block::kElements, of.unit, codes);

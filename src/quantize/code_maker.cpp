@@ -26,7 +26,7 @@ Result<const std::byte*> CodeMaker::make(const std::byte* stored, std::int64_t f
   const std::int64_t d_in = matrix_->shape[0];
   if (feedback_.empty()) return lower::Recode{{matrix_->type}, wanted_}(stored, nullptr, n * d_in, codes_, scales);
   rows_.resize(static_cast<std::size_t>(n * d_in));
-  std::byte* const codes = codes_.take(dtype_size(DType::int4, n * d_in));
+  std::byte* const codes = codes_.take(wanted_.size(n * d_in));
   kernels::quantize_weights(matrix_->type, stored, d_in, n, feedback_.data(), reinterpret_cast<Int4Block*>(codes),
                             scales, rows_.data());
   return static_cast<const std::byte*>(codes);

@@ -100,7 +100,7 @@ class Writer {
       VLA_TRY(const std::byte* const codes, maker.make(part.data(), first, n, to));
       widen_codes(wanted, codes, to, n * d_in, widened.data());
       squares.add(tensor.type, part.data(), std::span(widened).first(static_cast<std::size_t>(n * d_in)));
-      out_.put({codes, dtype_size(wanted.type, n * d_in)});
+      out_.put({codes, wanted.size(n * d_in)});
     }
     out_.end_tensor();
     out_.put(std::as_bytes(std::span(scales)));
@@ -129,7 +129,7 @@ class Writer {
 /// Codes and scales.
 std::int64_t quantized_size(const TensorInfo& tensor, const Encoding& encoding) {
   const std::size_t scales = static_cast<std::size_t>(tensor.shape[1]) * sizeof(float);
-  return static_cast<std::int64_t>(dtype_size(encoding.type, tensor.count()) + scales);
+  return static_cast<std::int64_t>(encoding.size(tensor.count()) + scales);
 }
 
 /// The tensors of the quantized file; of their data only the sizes count.
@@ -141,7 +141,7 @@ std::vector<TensorInfo> quantized_tensors(const Bundle& bundle, const Matrices& 
     if (!wanted) continue;
     TensorInfo& codes = tensors.back();
     codes.type = DType::i8;
-    codes.data = tensor.data.first(dtype_size(wanted->type, tensor.count()));
+    codes.data = tensor.data.first(wanted->size(tensor.count()));
     codes.shape[0] = static_cast<std::int64_t>(dtype_size(wanted->type, codes.shape[0]));
     const std::int64_t d_out = tensor.shape[1];
     // No bundle has a matrix with rows of fewer bytes than a scale.

@@ -16,7 +16,7 @@ sys.path.append(str(ROOT / "tools"))
 from goldens import act, all_cases, bitvla, cases, evo1, families, gr00t, gr00t_n1_5, gr00t_n1_6, gr00t_n1_7  # noqa: E402
 from goldens import pi, smolvla, turbovla, vla_jepa, xvla  # noqa: E402
 
-D, FF = 192, 256  # widths, of whole blocks of int4; heads have 64 elements
+D, FF = 192, 272  # widths, of whole blocks of int4 and not; heads have 64 elements
 FEW_ROWS = 144  # matrices from or to fewer elements stay as they are
 TABLES = ("lm.token_embd.weight", "time.weight", "action_position.weight")
 SECTIONS = (16, 8, 8)  # of a head's rotation
@@ -62,7 +62,7 @@ def distance(got, expected):
     return np.sqrt(np.mean((got - expected) ** 2) / np.mean(expected**2))
 
 
-@pytest.mark.parametrize("dtype, bound", [("int8", 0.05), ("int4", 0.5)])
+@pytest.mark.parametrize("dtype, bound", [("int8", 0.05), ("int4", 0.6)])
 def test_codes_of_a_family_act_as_its_floats_rounded_at_load_and_near_them(vla, wide, tmp_path, dtype, bound):
     def chunk(bundle, *options):
         answer = vla(*wide.arguments(bundle, options=("--tap", "chunk", "--taps-out", tmp_path / "taps.gguf", *options)))

@@ -84,16 +84,19 @@ struct Matrix {
   std::vector<std::byte> stored;
 };
 
-Matrix random_matrix(Numbers& numbers, DType weights, std::int64_t count) {
-  Matrix matrix = {std::vector<float>(static_cast<std::size_t>(count)), {}};
+Matrix random_matrix(Numbers& numbers, DType weights, std::int64_t d_in, std::int64_t d_out) {
+  Matrix matrix = {std::vector<float>(static_cast<std::size_t>(d_in * d_out)), {}};
   if (weights == DType::int4) {
-    std::vector<int> codes(matrix.numbers.size()), steps(codes.size() / Int4Block::kElements);
+    const std::int64_t n_block = Int4Block::n_of(d_in);
+    std::vector<int> codes(matrix.numbers.size()), steps(static_cast<std::size_t>(n_block * d_out));
     for (int& step : steps) step = static_cast<int>(numbers.below(Int4Block::kMaxStep + 1));
     for (std::size_t i = 0; i < codes.size(); ++i) {
+      const std::int64_t row = static_cast<std::int64_t>(i) / d_in, k = static_cast<std::int64_t>(i) % d_in;
       codes[i] = static_cast<int>(numbers.below(15)) - 7;
-      matrix.numbers[i] = static_cast<float>(codes[i] * steps[i / Int4Block::kElements]);
+      matrix.numbers[i] =
+          static_cast<float>(codes[i] * steps[static_cast<std::size_t>(row * n_block + k / Int4Block::kElements)]);
     }
-    matrix.stored = test::store_int4(codes, steps);
+    matrix.stored = test::store_int4(codes, d_in, steps);
     return matrix;
   }
   const bool ternary = weights == DType::ternary;
@@ -104,19 +107,17 @@ Matrix random_matrix(Numbers& numbers, DType weights, std::int64_t count) {
 }
 
 /// All of its numbers are one: the smallest or the largest that there are.
-Matrix extreme_matrix(DType weights, bool largest, std::int64_t count) {
-  const auto n = static_cast<std::size_t>(count);
+Matrix extreme_matrix(DType weights, bool largest, std::int64_t d_in, std::int64_t d_out) {
+  const auto n = static_cast<std::size_t>(d_in * d_out);
   const float number = (largest ? 1 : -1) * (weights == DType::ternary ? 1.0f : weights == DType::int4 ? 119 : 127);
   Matrix matrix = {std::vector<float>(n, weights == DType::i8 && !largest ? -128 : number), {}};
   if (weights == DType::ternary) matrix.stored = test::store_ternary(matrix.numbers);
   if (weights == DType::i8) matrix.stored = test::store_int8(matrix.numbers);
   if (weights == DType::int4)
-    matrix.stored = test::store_int4(std::vector<int>(n, largest ? 7 : -7), std::vector<int>(n / 64, 17));
+    matrix.stored = test::store_int4(std::vector<int>(n, largest ? 7 : -7), d_in,
+                                     std::vector<int>(static_cast<std::size_t>(Int4Block::n_of(d_in) * d_out), 17));
   return matrix;
 }
-
-/// A depth that the weights can have.
-std::int64_t depth_of(DType weights, std::int64_t d_in) { return weights == DType::int4 ? round_up(d_in, 64) : d_in; }
 
 struct Case {
   Shape shape;
@@ -129,7 +130,6 @@ struct Case {
 class Trial {
  public:
   Trial(const LinearKernel& kernel, const Case& c) : kernel_(kernel), weights_(weights_of(kernel)), case_(c) {
-    case_.shape.d_in = depth_of(weights_, c.shape.d_in);
     const auto [n_row, d_in, unused] = case_.shape;
     x_ = difficult_rows(numbers_, n_row, d_in);
     for (std::int64_t r = 0; r < n_row; ++r) codes_.push_back(codes_of(&x_[static_cast<std::size_t>(r * d_in)], d_in));
@@ -193,7 +193,7 @@ class Trial {
 
   Part make_part(std::int64_t width) {
     Part part;
-    const Matrix matrix = random_matrix(numbers_, weights_, case_.shape.d_in * width);
+    const Matrix matrix = random_matrix(numbers_, weights_, case_.shape.d_in, width);
     part.weight = matrix.numbers;
     part.bias = numbers_.floats(width);
     part.residual = numbers_.floats(case_.shape.n_row * width);
@@ -267,9 +267,9 @@ void check_codes(const LinearKernel& kernel) {
 
 void check_not_finite(const LinearKernel& kernel) {
   const DType weights = weights_of(kernel);
-  const std::int64_t d_in = depth_of(weights, 68), d_out = 5;
+  const std::int64_t d_in = 68, d_out = 5;
   const std::vector<float> scale(d_out, 1.0f);
-  const Matrix matrix = extreme_matrix(weights, true, d_in * d_out);
+  const Matrix matrix = extreme_matrix(weights, true, d_in, d_out);
   const test::Pages packed = test::packed(kernel, {weights, d_in, d_out}, matrix.stored.data());
   for (const float bad : {std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::quiet_NaN(),
                           std::numeric_limits<float>::quiet_NaN()})
@@ -341,10 +341,10 @@ void check_golden(const LinearKernel& kernel) {
 /// Codes and weights as large as they get, which overflow 16 bits where pairs of products are summed to them.
 void check_extremes(const LinearKernel& kernel) {
   const DType weights = weights_of(kernel);
-  const std::int64_t d_in = depth_of(weights, 4304), d_out = 33, n_row = 40;
+  const std::int64_t d_in = 4304, d_out = 33, n_row = 40;
   for (const bool largest : {false, true}) {
     const std::vector<float> scale(d_out, 127.0f);
-    const Matrix matrix = extreme_matrix(weights, largest, d_in * d_out);
+    const Matrix matrix = extreme_matrix(weights, largest, d_in, d_out);
     const test::Pages packed = test::packed(kernel, {weights, d_in, d_out}, matrix.stored.data());
     std::vector<std::byte> rows(static_cast<std::size_t>(quantized_size(n_row, d_in)));
     for (std::int64_t r = 0; r < n_row; ++r) {

@@ -62,8 +62,8 @@ struct Int4 {
 };
 
 Int4 int4_of(const std::vector<float>& row) {
-  Int4 result = {std::vector<Int4Block>(row.size() / 64)};
-  std::vector<float> room(row.size());
+  Int4 result = {std::vector<Int4Block>((row.size() + 63) / 64)};
+  std::vector<float> room(64 * result.blocks.size(), NAN);
   quantize_weights(DType::f32, reinterpret_cast<const std::byte*>(row.data()), static_cast<std::int64_t>(row.size()), 1,
                    result.blocks.data(), &result.scale, room.data());
   return result;
@@ -106,6 +106,20 @@ TEST_CASE("int4: of normal numbers it misses less than the nearest multiples of 
   }
 }
 
+TEST_CASE("int4: a row that ends within a block is one with zeros behind it") {
+  std::vector<float> row(80);
+  for (std::size_t k = 0; k < row.size(); ++k) row[k] = std::sin(static_cast<float>(k));
+  const Int4 q = int4_of(row);
+  row.resize(128);
+  const Int4 padded = int4_of(row);
+  REQUIRE(q.blocks.size() == 2);
+  CHECK(q.scale == padded.scale);
+  for (std::size_t i = 0; i < 2; ++i) {
+    CHECK(q.blocks[i].step == padded.blocks[i].step);
+    CHECK(q.blocks[i].codes == padded.blocks[i].codes);
+  }
+}
+
 TEST_CASE("int4: rows of zeros, of tiny weights and of weights that are not finite") {
   std::vector<float> row(64);
   CHECK(int4_of(row).scale == 0);
@@ -122,7 +136,7 @@ namespace {
 
 /// A random matrix as int4 with this feedback.
 std::vector<Int4> int4_of(const std::vector<float>& rows, std::int64_t d_in, const std::vector<float>& feedback) {
-  const std::int64_t d_out = static_cast<std::int64_t>(rows.size()) / d_in, n_block = d_in / 64;
+  const std::int64_t d_out = static_cast<std::int64_t>(rows.size()) / d_in, n_block = Int4Block::n_of(d_in);
   std::vector<Int4Block> blocks(static_cast<std::size_t>(d_out * n_block));
   std::vector<float> scales(static_cast<std::size_t>(d_out)), room(rows.size());
   quantize_weights(DType::f32, reinterpret_cast<const std::byte*>(rows.data()), d_in, d_out, feedback.data(),
@@ -159,11 +173,12 @@ TEST_CASE("int4 with feedback: columns that are always equal share what they mis
 }
 
 TEST_CASE("int4 without feedback in any column are the codes that it has without") {
-  std::vector<float> row(1088), none(1024 * 1024 + 64 * 64);
+  constexpr std::size_t kWidth = 1024 + 80;
+  std::vector<float> row(kWidth), none(1024 * 1024 + 80 * 80);
   std::mt19937 random(7);
   std::normal_distribution<float> normal;
   for (float& value : row) value = normal(random);
-  const Int4 with = int4_of(row, 1088, none).front(), without = int4_of(row);
+  const Int4 with = int4_of(row, kWidth, none).front(), without = int4_of(row);
   for (std::size_t i = 0; i < with.blocks.size(); ++i) {
     CHECK(with.blocks[i].step == without.blocks[i].step);
     CHECK(with.blocks[i].codes == without.blocks[i].codes);

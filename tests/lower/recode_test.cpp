@@ -81,15 +81,17 @@ TEST_CASE("codes become float32 by the scale of their group") {
 }
 
 TEST_CASE("int4 codes become float32 by their step and the scale of their row") {
-  std::vector<int> codes(128);
-  codes[0] = -7, codes[1] = 5, codes[64] = 2;
-  const std::vector<std::byte> stored = test::store_int4(codes, {17, 3});
-  const float scale = 0.1f;
+  constexpr int kWidth = 70;  // two blocks
+  std::vector<int> codes(2 * kWidth);
+  codes[0] = -7, codes[1] = 5, codes[64] = 2, codes[kWidth + 69] = 3;
+  const std::vector<std::byte> stored = test::store_int4(codes, kWidth, {17, 3, 1, 2});
+  const std::vector<float> scales = {0.1f, 0.5f};
   Room room;
-  const std::byte* to = Recode{{DType::int4, 128}, {DType::f32}}(stored.data(), &scale, 128, room, nullptr);
+  const std::byte* to = Recode{{DType::int4, kWidth}, {DType::f32}}(stored.data(), scales.data(), 140, room, nullptr);
   const auto* values = reinterpret_cast<const float*>(to);
   CHECK(values[0] == -119 * 0.1f);
   CHECK(values[1] == 85 * 0.1f);
   CHECK(values[64] == 6 * 0.1f);
+  CHECK(values[kWidth + 69] == 6 * 0.5f);
   CHECK(values[2] == 0);
 }

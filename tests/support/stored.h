@@ -27,13 +27,19 @@ inline std::vector<std::byte> store_int8(const std::vector<float>& values) {
   return out;
 }
 
-/// Codes from -7 to 7 and a step for each 64 of them as blocks of int4.
-inline std::vector<std::byte> store_int4(const std::vector<int>& codes, const std::vector<int>& steps) {
-  std::vector<Int4Block> blocks(steps.size());
+/// Rows of codes from -7 to 7, and a step for each of a row's blocks, as int4 is stored.
+inline std::vector<std::byte> store_int4(const std::vector<int>& codes, std::int64_t d_in,
+                                         const std::vector<int>& steps) {
+  std::vector<Int4Block> blocks;
+  for (const int step : steps) {
+    blocks.push_back({.step = static_cast<std::uint8_t>(step), .codes = {}});
+    blocks.back().codes.fill(0x88);
+  }
   for (std::size_t i = 0; i < codes.size(); ++i) {
-    Int4Block& block = blocks[i / Int4Block::kElements];
-    block.step = static_cast<std::uint8_t>(steps[i / Int4Block::kElements]);
-    block.codes[i % Int4Block::kElements / 2] |= static_cast<std::uint8_t>((codes[i] + 8) << i % 2 * 4);
+    const std::int64_t row = static_cast<std::int64_t>(i) / d_in, k = static_cast<std::int64_t>(i) % d_in;
+    Int4Block& block = blocks[static_cast<std::size_t>(row * Int4Block::n_of(d_in) + k / Int4Block::kElements)];
+    block.codes[static_cast<std::size_t>(k % Int4Block::kElements / 2)] ^=
+        static_cast<std::uint8_t>(((codes[i] + 8) ^ 8) << k % 2 * 4);
   }
   const auto bytes = std::as_bytes(std::span(blocks));
   return {bytes.begin(), bytes.end()};

@@ -394,7 +394,7 @@ Work work_of(const CpuLowering& l, const CpuOp& op) {
   if (const auto* linear = std::get_if<LinearOp>(&op.op)) {
     for (const Node* node : linear->linears) {
       const auto& product = *node->as<op::Linear>();
-      work.weights += static_cast<double>(dtype_size(l.weights.encoding(product.weight).type, product.weight->count()));
+      work.weights += static_cast<double>(l.weights.encoding(product.weight).size(product.weight->count()));
       if (product.bias != nullptr) work.weights += 4.0 * static_cast<double>(product.bias->shape[0]);
     }
     work.bytes += work.weights;

@@ -36,7 +36,7 @@ const std::byte* Recode::operator()(const std::byte* from, const float* from_sca
     round_to_bf16(stored.type, from, count, to);
   } else {
     assert(wanted.type == DType::i8 || wanted.type == DType::int4);
-    auto* const row = reinterpret_cast<float*>(to + aligned(dtype_size(wanted.type, count)));
+    auto* const row = reinterpret_cast<float*>(to + aligned(wanted.size(count)));
     const std::int64_t d_in = wanted.group, d_out = count / d_in;
     if (wanted.type == DType::i8)
       kernels::quantize_weights(stored.type, from, d_in, d_out, to, scales, row);

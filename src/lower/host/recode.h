@@ -16,7 +16,8 @@ struct Recode {
   bool changes() const { return wanted.type != stored.type; }
   /// Bytes that `operator()` takes of its room.
   std::size_t room_for(std::int64_t count) const {
-    return aligned(dtype_size(wanted.type, count)) + static_cast<std::size_t>(wanted.group) * sizeof(float);
+    const std::int64_t row = Int4Block::n_of(wanted.group) * Int4Block::kElements;
+    return aligned(wanted.size(count)) + static_cast<std::size_t>(row) * sizeof(float);
   }
   /// `count` elements, whole groups of them, as they are wanted: in `room`, or `from` itself where nothing changes.
   /// from_scales: those of codes that become floats; scales: room for those that codes get.
