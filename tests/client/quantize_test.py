@@ -75,8 +75,8 @@ def test_blocks_get_the_codes_that_keep_the_error(recording, tmp_path):
 
 def test_what_cannot_be_is_refused_with_what_can(recording, tmp_path):
     out = tmp_path / "small.gguf"
-    answer = quantize("-o", out, "--judge", recording, "--size", "3MB")
-    assert answer.returncode == 6 and re.search(r"--size: expected \d+ bytes or more, found 3000000", answer.stderr), answer
+    answer = quantize("-o", out, "--judge", recording, "--size", "2.5MB")
+    assert answer.returncode == 6 and re.search(r"--size: expected \d+ bytes or more, found 2500000", answer.stderr), answer
     answer = quantize("-o", out, "--judge", recording)
     assert answer.returncode == 2 and "expected --error or --size, found neither" in answer.stderr
     assert quantize("-o", out, "--error", 0.1).returncode == 2
@@ -185,7 +185,7 @@ def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what):
         if not refused:
             break
     assert not refused
-    assert tight < roomy - 2_000_000 or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
+    assert tight < roomy - 1_000_000 or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
     assert (tmp_path / "tight.gguf").read_bytes() == (tmp_path / "roomy.gguf").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["roomy.gguf", "tight.gguf"]
 
