@@ -94,7 +94,7 @@ struct Trial {
         s{n_row, d.d_in, d.d_out},
         x(static_cast<std::size_t>(quantized_size(round_up(s.n_row, kTileSide), s.d_in)) * 4),
         y(static_cast<std::size_t>(round_up(s.n_row, kTileSide) * round_up(s.d_out, kTileSide)) * 4),
-        stored(dtype_size(d.type, s.d_in * s.d_out)),
+        stored(Encoding{d.type, s.d_in}.size(s.d_in * s.d_out)),
         packed(kernel.packed_size(desc)),
         scale(static_cast<std::size_t>(s.d_out), 1.0f) {
     LinearJob job = {};
