@@ -15,13 +15,15 @@ int dtype_bits(DType type) {
 }
 
 void widen_codes(const Encoding& encoding, const std::byte* codes, const float* scales, std::int64_t n, float* to) {
-  const auto* row = reinterpret_cast<const Int4Block*>(codes);
-  for (std::int64_t begin = 0; begin < n; begin += encoding.group, row += Int4Block::n_of(encoding.group))
+  const std::size_t row_size = dtype_size(encoding.type, encoding.group);
+  for (std::int64_t begin = 0; begin < n; begin += encoding.group, codes += row_size, ++scales) {
+    const auto* blocks = reinterpret_cast<const Int4Block*>(codes);
     for (std::int64_t k = 0; k < encoding.group; ++k) {
-      const int code = encoding.type == DType::int4 ? row[k / Int4Block::kElements][k % Int4Block::kElements]
-                                                    : std::to_integer<std::int8_t>(codes[begin + k]);
-      to[begin + k] = static_cast<float>(code) * scales[begin / encoding.group];
+      const int code = encoding.type == DType::int4 ? blocks[k / Int4Block::kElements][k % Int4Block::kElements]
+                                                    : std::to_integer<std::int8_t>(codes[k]);
+      to[begin + k] = static_cast<float>(code) * *scales;
     }
+  }
 }
 
 }  // namespace vla

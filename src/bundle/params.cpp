@@ -62,8 +62,8 @@ const char* codes_text(DType type) {
                                 : "-127 to 127, file has -128";
 }
 
-/// How the bundle's tensor of a matrix that may be floats is encoded; codes have a scale for each row. As many bytes as
-/// elements are int8: of two widths, 33 and 66, blocks of int4 would have them too.
+/// How the bundle's tensor of a matrix that may be floats is encoded; codes have a scale for each row. A row with as
+/// many bytes as elements is int8, also where it has 33 or 66, which blocks of int4 would take too.
 Encoding encoding_of(const TensorInfo& tensor, const std::vector<std::int64_t>& shape) {
   if (tensor.type != DType::i8) return {tensor.type};
   const bool is_int4 = !tensor.shape.empty() && tensor.shape[0] != shape[0] &&

@@ -9,9 +9,7 @@ namespace {
 
 using kernels::MatrixDesc;
 
-std::size_t size_of(const MatrixDesc& desc) {
-  return dtype_size(desc.type, desc.d_in) * static_cast<std::size_t>(desc.d_out);
-}
+std::size_t size_of(const MatrixDesc& desc) { return dtype_size(desc.type, desc.d_in * desc.d_out); }
 void copy(const MatrixDesc& desc, const std::byte* stored, std::byte* packed) {
   std::memcpy(packed, stored, size_of(desc));
 }

@@ -13,7 +13,7 @@ void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, st
                       float* scales, float* row);
 
 /// The same as int4: each block gets the step with which the squares of its errors sum to the least, and the row then
-/// the scale that fits its codes best. blocks: Int4Block::n_of(d_in) of a row; row: room for so many elements.
+/// the scale that fits its codes best. blocks: Int4Block::n_of(d_in) of a row; row: room for all their elements.
 void quantize_weights(DType type, const std::byte* stored, std::int64_t d_in, std::int64_t d_out, Int4Block* blocks,
                       float* scales, float* row);
 

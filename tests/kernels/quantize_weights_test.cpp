@@ -62,7 +62,7 @@ struct Int4 {
 };
 
 Int4 int4_of(const std::vector<float>& row) {
-  Int4 result = {std::vector<Int4Block>((row.size() + 63) / 64)};
+  Int4 result = {std::vector<Int4Block>(static_cast<std::size_t>(Int4Block::n_of(std::ssize(row))))};
   std::vector<float> room(64 * result.blocks.size(), NAN);
   quantize_weights(DType::f32, reinterpret_cast<const std::byte*>(row.data()), static_cast<std::int64_t>(row.size()), 1,
                    result.blocks.data(), &result.scale, room.data());
