@@ -17,7 +17,8 @@ LATE = 16
 @pytest.fixture(scope="module")
 def report(vla):
     answer = vla("doctor", DEMO, "--json")
-    assert answer.code in (0, LATE), answer.err  # late: a busy machine, or one whose kernels a sanitizer slows down
+    is_late = "error: late: " in answer.err  # on a busy machine, or under a sanitizer
+    assert answer.code == (LATE if is_late else 0), answer.err
     return json.loads(answer.out)
 
 

@@ -181,11 +181,11 @@ def test_a_budget_changes_no_byte_and_is_kept(recording, tmp_path, what):
     _, refused = made("none.gguf", "--memory", "1MB")
     for _ in range(20):  # the least is not the same in every run: a process differs
         least = int(re.fullmatch(r"error: out_of_memory: memory: expected (\d+) MB or more, found \d+ MB; .*\n", refused)[1])
-        tight, refused = made("tight.gguf", "--memory", f"{least + 1}MB")
+        tight, refused = made("tight.gguf", "--memory", f"{least}MB")
         if not refused:
             break
     assert not refused
-    assert tight < roomy - 1_000_000 or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
+    assert tight < roomy - 2_000_000 or b"__asan_init" in VLA.read_bytes()  # a sanitizer takes more than the policy
     assert (tmp_path / "tight.gguf").read_bytes() == (tmp_path / "roomy.gguf").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["roomy.gguf", "tight.gguf"]
 
