@@ -37,9 +37,7 @@ def check_undivided(keys: Sequence[Key], own: Sequence[str], texts: Sequence[str
     for token in json.loads(_value(keys, "tokenizer.added")):
         content = token["content"]
         if content not in own and any(content in text for text in texts):
-            problems.unsupported(
-                "tokenizer: added token " + repr(content), "no added token within the prompt's own words", "one"
-            )
+            problems.unsupported("tokenizer: added token " + repr(content), "no added token within the prompt's own words", "one")
 
 
 def _value(keys: Sequence[Key], name: str):

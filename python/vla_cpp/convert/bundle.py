@@ -85,10 +85,7 @@ def _header(keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> bytes:
     offset = 0
     for tensor in tensors:
         shape = tensor.shape[::-1]  # GGUF lists the fastest dimension first
-        parts.append(
-            _string(tensor.name)
-            + struct.pack("<I{}QIQ".format(len(shape)), len(shape), *shape, GGML_TYPES[tensor.dtype], offset)
-        )
+        parts.append(_string(tensor.name) + struct.pack("<I{}QIQ".format(len(shape)), len(shape), *shape, GGML_TYPES[tensor.dtype], offset))
         offset += tensor.n_bytes + len(_padding(tensor.n_bytes))
     header = b"".join(parts)
     return header + _padding(len(header))
@@ -155,9 +152,7 @@ class BundleWriter:
 
     def _finish(self) -> None:
         if self.left or self.next != len(self.tensors):
-            raise AssertionError(
-                "{} of {} tensors written, {} bytes missing".format(self.next, len(self.tensors), self.left)
-            )
+            raise AssertionError("{} of {} tensors written, {} bytes missing".format(self.next, len(self.tensors), self.left))
         digits = self.header.index(CHECKSUM_ZERO.encode()) + len("xxh3:")
         digest = file_digest(self.file)
         self.file.seek(digits)
@@ -192,13 +187,7 @@ def _check_digest(path: str) -> None:
         digits = data.find(CHECKSUM_KEY.encode()) + len(CHECKSUM_KEY) + 4 + 8 + len("xxh3:")
         stated, found = data[digits : digits + 16].decode("latin1"), file_digest(file, digits)
     if found != stated:
-        raise refuse(
-            path,
-            "content with checksum xxh3:" + stated,
-            "xxh3:" + found,
-            "the file was damaged or edited",
-            Code.BAD_BUNDLE,
-        )
+        raise refuse(path, "content with checksum xxh3:" + stated, "xxh3:" + found, "the file was damaged or edited", Code.BAD_BUNDLE)
 
 
 class BundleContent(NamedTuple):

@@ -66,18 +66,14 @@ def _shards(folder: str, problems: Problems) -> List[str]:
     for file, entries in found.items():
         for name in entries:
             if index.get(name) != file:
-                problems.add(
-                    "tensor " + name, "the tensor in {}".format(index.get(name, "no file, as " + INDEX + " says")), file
-                )
+                problems.add("tensor " + name, "the tensor in {}".format(index.get(name, "no file, as " + INDEX + " says")), file)
     return files
 
 
 def _weight_files(folder: str, problems: Problems) -> List[str]:
     single, index = (os.path.exists(os.path.join(folder, name)) for name in (WEIGHTS, INDEX))
     if single and index:
-        raise refuse(
-            folder, "either {} or {}".format(WEIGHTS, INDEX), "both", "remove the one that is not the policy's"
-        )
+        raise refuse(folder, "either {} or {}".format(WEIGHTS, INDEX), "both", "remove the one that is not the policy's")
     if not single and not index:
         hint = "give the folder that holds config.json and " + WEIGHTS
         raise refuse(folder, WEIGHTS, "no such file", hint, Code.IO)
@@ -123,11 +119,7 @@ def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
     if not all(present):
         missing = PROCESSORS[present.index(False)]
         raise refuse(
-            os.path.join(folder, missing),
-            "the file beside " + PROCESSORS[present.index(True)],
-            "none",
-            "save the policy again",
-            Code.IO,
+            os.path.join(folder, missing), "the file beside " + PROCESSORS[present.index(True)], "none", "save the policy again", Code.IO
         )
     return read_json(os.path.join(folder, PROCESSORS[0])), read_json(os.path.join(folder, PROCESSORS[1]))
 
@@ -188,9 +180,7 @@ def find_backbone(checkpoint: Checkpoint, given: str, named, key: str = "vlm_mod
         checkpoint.notes.append("backbone config and tokenizer: from {}/ inside the checkpoint".format(own))
         return inside
     if isinstance(named, str) and os.path.isabs(named) and os.path.isdir(named):
-        checkpoint.notes.append(
-            "backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named))
-        )
+        checkpoint.notes.append("backbone config and tokenizer: from the folder {} that config.json names".format(os.path.basename(named)))
         return named
     raise refuse(
         "backbone {}, which config.json: {} names".format(str(named)[:100], key),
@@ -207,9 +197,7 @@ def read_statistic(entry: Entry) -> np.ndarray:
     """A small tensor as float32, as the reference loads statistics."""
     if entry.dtype not in STATISTICS or entry.n_bytes > MAX_STATISTIC:
         raise refuse(
-            "{}: tensor {}".format(entry.path, entry.name),
-            "a statistic in F32",
-            "{} bytes of {}".format(entry.n_bytes, entry.dtype),
+            "{}: tensor {}".format(entry.path, entry.name), "a statistic in F32", "{} bytes of {}".format(entry.n_bytes, entry.dtype)
         )
     parts = [to_f32(part, entry.dtype) for part in entry.chunks()]
     return (np.concatenate(parts) if parts else np.zeros(0, np.float32)).reshape(entry.shape)

@@ -54,9 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add(
-        "checkpoint", metavar="CHECKPOINT", help="folder with config.json and weights, or hub:OWNER/NAME@REVISION"
-    )
+    add("checkpoint", metavar="CHECKPOINT", help="folder with config.json and weights, or hub:OWNER/NAME@REVISION")
     add("-o", "--out", metavar="OUT.gguf", required=True, help="the bundle to write; appears only when it is complete")
     for option in COMMON:
         add(option.flag, help=option.help, **option.arguments())
@@ -70,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _merged(helps: Dict[str, str]) -> str:
-    """"openpi: ...; GR00T N1.6, GR00T N1.7: ..." of the help of each layout."""
+    """ "openpi: ...; GR00T N1.6, GR00T N1.7: ..." of the help of each layout."""
     layouts: Dict[str, List[str]] = {}
     for layout, text in helps.items():
         layouts.setdefault(text, []).append(layout)
@@ -84,13 +82,7 @@ def _progress(quiet: bool):
         yield lambda *_: None
         return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description:<32.32}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
@@ -110,8 +102,7 @@ def report(summary: Summary) -> str:
         lines.append("  rounding  {} codes of {}; vla inspect shows what became of each matrix".format(summary.codes, summary.dtype))
     elif summary.dtype != "f32":
         lines.append(
-            "  rounding  "
-            + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor))
+            "  rounding  " + ("none: every number is exact" if error == 0 else "largest error {:.3g}, in {}".format(error, tensor))
         )
     margin, tensor = summary.ternary
     if tensor:

@@ -46,9 +46,7 @@ class Summary:
     ternary: Tuple[float, str] = (1.0, "")  # smallest distance of a number from where its code changes, and its tensor
 
 
-def convert_checkpoint(
-    source: str, out: str, options: Options, force: bool = False, progress: Progress = lambda *_: None
-) -> Summary:
+def convert_checkpoint(source: str, out: str, options: Options, force: bool = False, progress: Progress = lambda *_: None) -> Summary:
     """Writes `out` or raises ConvertError and leaves nothing behind."""
     _check_out(out, force)
     if options.dtype in CODES:
@@ -112,9 +110,7 @@ def _match(checkpoint: Checkpoint, plan: Plan, problems: Problems) -> Dict[str, 
     for source in expected:
         shared = checkpoint.aliases.get(source)
         if source not in checkpoint.tensors and shared in checkpoint.tensors:
-            checkpoint.tensors[source] = (
-                checkpoint.tensors[shared] if shared in expected else checkpoint.tensors.pop(shared)
-            )
+            checkpoint.tensors[source] = checkpoint.tensors[shared] if shared in expected else checkpoint.tensors.pop(shared)
             checkpoint.notes.append("{}: stored once, as {}".format(source, shared))
     for source in sorted(set(expected) | set(checkpoint.tensors)):
         entry, shape = checkpoint.tensors.get(source), expected.get(source)
@@ -133,10 +129,7 @@ def _check_entry(source: str, entry, shape, plan: Plan, problems: Problems) -> N
     if entry is None:
         problems.add(where, str(shape), "none")
     elif shape is None:
-        why = next(
-            (text for prefix, text in plan.hints.items() if source.startswith(prefix)),
-            "no part of this policy reads it",
-        )
+        why = next((text for prefix, text in plan.hints.items() if source.startswith(prefix)), "no part of this policy reads it")
         problems.add(where, "no such tensor", "{} {}".format(entry.dtype, entry.shape), why)
     elif entry.shape != shape:
         problems.add(where, str(shape), str(entry.shape))
@@ -178,13 +171,8 @@ def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
 
 def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
-    tensors = [
-        TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype))
-        for w in plan.weights
-    ]
-    tensors += [
-        TensorInfo(name, value.shape, "f64" if value.dtype == np.float64 else "f32") for name, value in plan.statistics.items()
-    ]
+    tensors = [TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype)) for w in plan.weights]
+    tensors += [TensorInfo(name, value.shape, "f64" if value.dtype == np.float64 else "f32") for name, value in plan.statistics.items()]
     total = sum(tensor.n_bytes for tensor in tensors)
     done = 0
     try:
@@ -222,9 +210,7 @@ def _pieces(entry: Entry, weight: Weight) -> Iterator[np.ndarray]:
     yield (whole.T if weight.transpose else whole).ravel()
 
 
-def _stream(
-    checkpoint: Checkpoint, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems
-) -> None:
+def _stream(checkpoint: Checkpoint, weight: Weight, tensor: TensorInfo, out: BundleWriter, summary: Summary, problems: Problems) -> None:
     entry = checkpoint.tensors[weight.source]
     if weight.kind in (TERNARY, SCALE):
         return _stream_ternary(entry, weight, out, summary, problems)

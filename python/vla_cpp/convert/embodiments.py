@@ -80,10 +80,7 @@ def merge(tags: Sequence[str], plans: Sequence[Plan]) -> Plan:
 def _merged(tags: Sequence[str], parts: Sequence[Dict[str, Any]]) -> Dict[str, Any]:
     shared = {name: value for name, value in parts[0].items() if all(_same(part.get(name), value) for part in parts[1:])}
     own = {
-        "embodiment.{}.{}".format(tag, name): value
-        for tag, part in zip(tags, parts)
-        for name, value in part.items()
-        if name not in shared
+        "embodiment.{}.{}".format(tag, name): value for tag, part in zip(tags, parts) for name, value in part.items() if name not in shared
     }
     return {**shared, **own}
 

@@ -34,9 +34,7 @@ def feature_keys(info_path: str, dims: Dict[str, int], notes: List[str], problem
         _check_info(info, info_path, dims, problems)
     names = {feature: _names(info, info_path, feature, dim, notes, problems) for feature, dim in dims.items()}
     if not info_path:
-        notes.append(
-            "names of state and action numbers are generated; --dataset-info meta/info.json gives the data set's"
-        )
+        notes.append("names of state and action numbers are generated; --dataset-info meta/info.json gives the data set's")
     rate = info.get("fps", 0)
     if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
         problems.add(info_path + ": fps", "a rate in Hz", repr(rate))
@@ -86,9 +84,7 @@ def _stated_names(feature) -> Optional[list]:
     """The spellings of data sets: a list, an object around one list ({"motors": [...]}), or an object from name to index."""
     names = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(names, dict) and names and all(isinstance(index, int) for index in names.values()):
-        return (
-            sorted(names, key=names.get) if sorted(names.values()) == list(range(len(names))) else list(names.values())
-        )
+        return sorted(names, key=names.get) if sorted(names.values()) == list(range(len(names))) else list(names.values())
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))
     return names if isinstance(names, list) else None

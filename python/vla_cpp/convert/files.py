@@ -137,9 +137,7 @@ def _download(source: str, repo: str, revision: str, patterns) -> str:
         raise missing_extra("huggingface_hub")
     except Exception as error:  # noqa: BLE001 - the library has a class for every kind of failure
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise refuse(
-            source, "a reachable hub repository", reason[:200], "download it and give the folder", Code.IO
-        )
+        raise refuse(source, "a reachable hub repository", reason[:200], "download it and give the folder", Code.IO)
 
 
 def missing_extra(package: str) -> ConvertError:

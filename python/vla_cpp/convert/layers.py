@@ -49,9 +49,11 @@ def encoder_block(target: str, block: str, names: EncoderNames, d: int, d_ff: in
         scale = vector(target + part + "_scale.weight", block + names.scales[i], d) if names.scales else []
         return [*norm(target + part + "_norm", block + names.norms[i], d), *rows, *scale]
 
-    qkv = stacked(target, block + names.qkv[0], d) if len(names.qkv) == 1 else [
-        row for part, name in zip("qkv", names.qkv) for row in product(target + "attn_" + part, block + name, d, d, bias=True)
-    ]
+    qkv = (
+        stacked(target, block + names.qkv[0], d)
+        if len(names.qkv) == 1
+        else [row for part, name in zip("qkv", names.qkv) for row in product(target + "attn_" + part, block + name, d, d, bias=True)]
+    )
     up = product(target + "ffn_up", block + names.up, d_ff, d, bias=True)
     return [
         *branch(0, "attn", [*qkv, *product(target + "attn_out", block + names.out, d, d, bias=True)]),
@@ -71,11 +73,7 @@ def stacked(target: str, source: str, d: int) -> List[Weight]:
 
 
 SIGLIP = EncoderNames(
-    ("layer_norm1", "layer_norm2"),
-    tuple("self_attn.{}_proj".format(part) for part in "qkv"),
-    "self_attn.out_proj",
-    "mlp.fc1",
-    "mlp.fc2",
+    ("layer_norm1", "layer_norm2"), tuple("self_attn.{}_proj".format(part) for part in "qkv"), "self_attn.out_proj", "mlp.fc1", "mlp.fc2"
 )
 
 
@@ -95,9 +93,7 @@ def siglip(
     return rows + (norm("vision.post_norm", source + "post_layernorm", d) if post_norm else [])
 
 
-def gated_block(
-    target: str, block: str, d: int, d_q: int, d_kv: int, d_kv_in: int, d_ff: int, product=linear
-) -> Dict[str, List[Weight]]:
+def gated_block(target: str, block: str, d: int, d_q: int, d_kv: int, d_kv_in: int, d_ff: int, product=linear) -> Dict[str, List[Weight]]:
     """The block of Llama and Gemma by part. `product`: the kind of its matrices."""
     return {
         "attn_norm": vector(target + "attn_norm.weight", block + "input_layernorm.weight", d),

@@ -48,12 +48,7 @@ def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tup
         policy.fixed(key, value, hint)
     rtc = policy.get("rtc_config")
     if rtc is not None and (not isinstance(rtc, dict) or rtc.get("enabled", True)):
-        policy.bad(
-            "rtc_config",
-            "none, or one that is not enabled",
-            hint="real-time chunking changes the velocity",
-            unsupported=True,
-        )
+        policy.bad("rtc_config", "none, or one that is not enabled", hint="real-time chunking changes the velocity", unsupported=True)
 
 
 def no_position_rule(policy: Section, options: Options, problems: Problems) -> None:
@@ -106,9 +101,7 @@ def check_widths(policy: Section, widths: Dict[str, Tuple[int, int]]) -> None:
         policy.bad("n_action_steps", "at most chunk_size {}".format(policy.count("chunk_size")), hint=hint)
 
 
-def view_keys(
-    checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems
-) -> List[Key]:
+def view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems) -> List[Key]:
     """One view must be present. The cameras that `empty_cameras` adds to the features stand in no data set, so nobody need declare
     them absent."""
     empty = [view for view in views if view.startswith(EMPTY_CAMERA)]
@@ -118,9 +111,7 @@ def view_keys(
     return views_of(views, aliases, [int(view in empty) for view in views])
 
 
-def required_view_keys(
-    checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems
-) -> List[Key]:
+def required_view_keys(checkpoint: Checkpoint, views: Sequence[str], processors: recipe.Processors, problems: Problems) -> List[Key]:
     """Of a policy whose reference needs every view."""
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
     return views_of(views, aliases, [0] * len(views), len(views))

@@ -72,9 +72,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
     if missing and feature in context.identity:
         context.degraded.append(feature)
         context.notes.append(
-            "DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(
-                feature, ", ".join(missing)
-            )
+            "DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(feature, ", ".join(missing))
         )
         return Normalization()
     for name in missing:
@@ -82,8 +80,7 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
             "statistics of {}: {}".format(feature, name),
             "{} numbers for {}".format(dim, mode),
             "none" + _others(found.features),
-            "fine-tune or save the policy with its data set's statistics, or accept unnormalized numbers by --identity-stats "
-            + feature,
+            "fine-tune or save the policy with its data set's statistics, or accept unnormalized numbers by --identity-stats " + feature,
         )
     chosen = {name: _plain(found.values[name]) for name in names if name in found.values}
     for name, value in chosen.items():
@@ -107,18 +104,13 @@ def _check_statistic(where: str, name: str, value: np.ndarray, widths: Tuple[int
         context.problems.add(where, wanted, str(value.shape))
     elif not np.isfinite(value).all():
         context.problems.add(
-            where,
-            "finite numbers",
-            str(value[~np.isfinite(value)][0]),
-            "the statistics were never filled in: save the policy again",
+            where, "finite numbers", str(value[~np.isfinite(value)][0]), "the statistics were never filled in: save the policy again"
         )
     elif name == "std" and (value < 0).any():
         context.problems.add(where, "numbers >= 0", str(value.min()))
     elif name == "std" and (value == 0).any():
         dead = ", ".join(str(i) for i in np.flatnonzero(value == 0))
-        context.notes.append(
-            "{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead)
-        )
+        context.notes.append("{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead))
 
 
 def from_file(path: str, feature: str) -> Found:

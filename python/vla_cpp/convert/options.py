@@ -41,9 +41,7 @@ COMMON = (
         "DIR",
     ),
     Option(
-        "--dtype",
-        "storage of matrices and tables; vectors and statistics are always f32",
-        choices=("f32", "bf16", "f16", STORED, *CODES),
+        "--dtype", "storage of matrices and tables; vectors and statistics are always f32", choices=("f32", "bf16", "f16", STORED, *CODES)
     ),
     Option("--dataset-info", "meta/info.json of the LeRobot data set: names of state and action numbers, control rate", "INFO.json"),
     Option(
@@ -61,15 +59,10 @@ COMMON = (
     ),
 )
 IDENTITY_STATS = Option(
-    "--identity-stats",
-    "let FEATURE (observation.state or action) pass unnormalized when its statistics are missing",
-    "FEATURE",
-    (),
+    "--identity-stats", "let FEATURE (observation.state or action) pass unnormalized when its statistics are missing", "FEATURE", ()
 )
 POSITION_PRECISION = Option(
-    "--position-precision",
-    "rule for the rows of the vision position table; see below",
-    choices=("float32", "bfloat16", "shifted"),
+    "--position-precision", "rule for the rows of the vision position table; see below", choices=("float32", "bfloat16", "shifted")
 )
 
 

@@ -16,14 +16,7 @@ import numpy as np
 from .checkpoint import Checkpoint
 from .errors import Code, Problems
 from .files import member, plain_name
-from .normalization import (
-    Context,
-    Found,
-    Normalization,
-    choose,
-    from_file,
-    from_weights,
-)
+from .normalization import Context, Found, Normalization, choose, from_file, from_weights
 
 STATE, ACTION = "observation.state", "action"
 MAX_TOKENS = 1 << 16  # far above any instruction
@@ -129,9 +122,7 @@ class _Reader:
             return
         for key, allowed in known.items():
             if allowed is not ANY and key in config and config[key] not in allowed:
-                self.problems.unsupported(
-                    "{}: {}".format(where, key), " or ".join(map(repr, allowed)), repr(config[key])
-                )
+                self.problems.unsupported("{}: {}".format(where, key), " or ".join(map(repr, allowed)), repr(config[key]))
         handler = getattr(self, "_" + name.replace("_processor", ""), None)
         if handler:
             handler(where, config, step)
@@ -180,9 +171,7 @@ class _Reader:
             self.problems.unsupported(where, "un-normalization before it", "the opposite order")
         if bool(config.get("enabled", False)) != self.result.relative:
             self.problems.add(
-                where + ": enabled",
-                "{} as the relative_actions_processor has it".format(self.result.relative),
-                str(config.get("enabled")),
+                where + ": enabled", "{} as the relative_actions_processor has it".format(self.result.relative), str(config.get("enabled"))
             )
 
     def _tokenizer(self, where: str, config: dict, step: dict) -> None:
@@ -215,11 +204,7 @@ class _Reader:
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
         width = self.context.dims[STATE]
         if stated.get("shape") not in ([width], [self.context.min_widths.get(STATE, width)]) or stated.get("type") != "STATE":
-            self.problems.add(
-                "{}: features.{}".format(where, STATE),
-                "STATE of [{}] as in config.json".format(width),
-                str(stated)[:80],
-            )
+            self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(width), str(stated)[:80])
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
 
     def _unnormalizer(self, where: str, config: dict, step: dict) -> None:
@@ -229,19 +214,12 @@ class _Reader:
         modes = member(config, "norm_map", dict, where)
         if modes.get("VISUAL", "IDENTITY") != "IDENTITY" and not self.normalizes_pixels():
             self.problems.unsupported(
-                where + ": norm_map.VISUAL",
-                "IDENTITY",
-                str(modes["VISUAL"]),
-                "the recipe does not normalize pixels by statistics",
+                where + ": norm_map.VISUAL", "IDENTITY", str(modes["VISUAL"]), "the recipe does not normalize pixels by statistics"
             )
         stated = member(self.checkpoint.config, "normalization_mapping", dict, "config.json")
         for key in (kind, "VISUAL"):
             if stated.get(key, modes.get(key)) != modes.get(key):
-                self.problems.add(
-                    "{}: norm_map.{}".format(where, key),
-                    "{} as in config.json".format(stated[key]),
-                    str(modes.get(key)),
-                )
+                self.problems.add("{}: norm_map.{}".format(where, key), "{} as in config.json".format(stated[key]), str(modes.get(key)))
         found = Found({}, [])
         if plain_name(step.get("state_file")):
             found = from_file(self.checkpoint.path(step["state_file"]), feature)
@@ -304,16 +282,13 @@ def read_processors(
 
 def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
     """Reference: lerobot processor/migrate_policy_normalization.py, which builds today's pipelines for such checkpoints."""
-    checkpoint.notes.append(
-        "no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them"
-    )
+    checkpoint.notes.append("no processor files: older layout, statistics from the weights, pipelines as LeRobot's migration makes them")
     config = checkpoint.config
     modes = member(config, "normalization_mapping", dict, "config.json")
     if modes.get("VISUAL", "IDENTITY") != "IDENTITY" and not reader.normalizes_pixels():
         reader.problems.unsupported("config.json: normalization_mapping.VISUAL", "IDENTITY", str(modes["VISUAL"]))
     result = Processors(
-        newline=True,
-        max_tokens=reader.token_count("config.json: tokenizer_max_length", config.get("tokenizer_max_length", 48)),
+        newline=True, max_tokens=reader.token_count("config.json: tokenizer_max_length", config.get("tokenizer_max_length", 48))
     )
     for feature, kind, attribute in ((STATE, "STATE", "state"), (ACTION, "ACTION", "action")):
         found = from_weights(checkpoint, feature, reader.problems)
@@ -342,10 +317,7 @@ def view_aliases(views: Sequence[str], processors: Processors, notes: List[str],
         where = "{}: rename_map".format(PRE)
         if new == STATE:
             problems.unsupported(
-                where,
-                "renamings of views",
-                "{} -> {}".format(old, new),
-                "remove the entry and send the state as " + STATE,
+                where, "renamings of views", "{} -> {}".format(old, new), "remove the entry and send the state as " + STATE
             )
         elif new not in aliases:
             notes.append("{}: {} -> {} renames nothing that the policy reads".format(where, old, new))

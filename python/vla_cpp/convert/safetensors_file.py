@@ -38,9 +38,7 @@ class Entry(NamedTuple):
     def rows(self, first: int, count: int) -> "Entry":
         """A run of rows, for a tensor that stacks several: `first` and `count` lie within its first dimension."""
         row = self.n_bytes // self.shape[0]
-        return self._replace(
-            shape=(count, *self.shape[1:]), offset=self.offset + first * row, n_bytes=count * row
-        )
+        return self._replace(shape=(count, *self.shape[1:]), offset=self.offset + first * row, n_bytes=count * row)
 
     def chunks(self, chunk_bytes: int = CHUNK_BYTES) -> Iterator[np.ndarray]:
         """The tensor's elements in order, as flat arrays of bounded size (BF16 as uint16 bits)."""
@@ -51,11 +49,7 @@ class Entry(NamedTuple):
             while left:
                 part = np.fromfile(file, dtype=kind, count=min(left, chunk_bytes // kind.itemsize))
                 if part.size == 0:
-                    raise refuse(
-                        "{}: tensor {}".format(self.path, self.name),
-                        "{} more elements".format(left),
-                        "the end of the file",
-                    )
+                    raise refuse("{}: tensor {}".format(self.path, self.name), "{} more elements".format(left), "the end of the file")
                 left -= part.size
                 yield part
 
@@ -88,12 +82,7 @@ def _read_header(path: str) -> Tuple[dict, int, int]:
         size = os.fstat(file.fileno()).st_size
         length = int.from_bytes(file.read(8), "little")
         if size < 8 or length > min(size - 8, MAX_HEADER):
-            raise refuse(
-                path,
-                "a safetensors header inside the file",
-                "a header of {} bytes in a file of {}".format(length, size),
-                hint,
-            )
+            raise refuse(path, "a safetensors header inside the file", "a header of {} bytes in a file of {}".format(length, size), hint)
         text = file.read(length)
     check_count(path, text.count(b'"data_offsets"'))
     try:
@@ -120,16 +109,9 @@ def _read_entry(path: str, name: str, value, start: int, size: int) -> Entry:
     for dim in shape:
         n_bytes *= dim
     if offsets[1] - offsets[0] != n_bytes:
-        raise refuse(
-            where, "{} bytes for {} of {}".format(n_bytes, shape, dtype), "{} bytes".format(offsets[1] - offsets[0])
-        )
+        raise refuse(where, "{} bytes for {} of {}".format(n_bytes, shape, dtype), "{} bytes".format(offsets[1] - offsets[0]))
     if start + offsets[1] > size:
-        raise refuse(
-            where,
-            "data up to byte {}".format(start + offsets[1]),
-            "a file of {} bytes".format(size),
-            "the file is truncated",
-        )
+        raise refuse(where, "data up to byte {}".format(start + offsets[1]), "a file of {} bytes".format(size), "the file is truncated")
     return Entry(name, dtype, tuple(shape), path, start + offsets[0], n_bytes)
 
 
@@ -138,19 +120,10 @@ def _check_layout(path: str, entries: Dict[str, Entry], start: int, size: int) -
     position = start
     for entry in sorted(entries.values(), key=lambda e: (e.offset, e.n_bytes)):
         if entry.offset != position:
-            raise refuse(
-                "{}: tensor {}".format(path, entry.name),
-                "data at byte {}".format(position),
-                "byte {}".format(entry.offset),
-            )
+            raise refuse("{}: tensor {}".format(path, entry.name), "data at byte {}".format(position), "byte {}".format(entry.offset))
         position += entry.n_bytes
     if position != size:
-        raise refuse(
-            path,
-            "a file of {} bytes".format(position),
-            "{} bytes".format(size),
-            "the file is damaged: download or save it again",
-        )
+        raise refuse(path, "a file of {} bytes".format(position), "{} bytes".format(size), "the file is damaged: download or save it again")
 
 
 def read_safetensors(path: str) -> SafetensorsFile:

@@ -11,13 +11,7 @@ from __future__ import annotations
 import os
 from typing import List, NamedTuple, Sequence, Tuple
 
-from . import (
-    tokenizer_byte_fallback,
-    tokenizer_byte_level,
-    tokenizer_sentencepiece,
-    tokenizer_vocab_files,
-    tokenizer_wordpiece,
-)
+from . import tokenizer_byte_fallback, tokenizer_byte_level, tokenizer_sentencepiece, tokenizer_vocab_files, tokenizer_wordpiece
 from .bundle import Key
 from .errors import Code, Problems, refuse
 from .files import member, read_json
@@ -46,9 +40,7 @@ class TokenizerPlan(NamedTuple):
         return next(key.value for key in self.keys if key.name == "tokenizer.tokens")
 
 
-def read_tokenizer(
-    folder: str, n_vocab: int, problems: Problems, notes: List[str], more: Sequence[str] = ()
-) -> TokenizerPlan:
+def read_tokenizer(folder: str, n_vocab: int, problems: Problems, notes: List[str], more: Sequence[str] = ()) -> TokenizerPlan:
     """`n_vocab`: rows of the embedding table, which no id may reach. `more`: special tokens that the reference's own code adds."""
     spec, config = _read_files(folder, problems, notes)
     model = member(spec, "model", dict, JSON_FILE)

@@ -13,27 +13,11 @@ from typing import List
 from .bundle import Key
 from .errors import Problems
 from .files import member
-from .tokenizer_parts import (
-    GENERIC,
-    JSON_FILE,
-    Tokenizer,
-    check_class,
-    check_model,
-    check_symbols,
-    one_or_sequence,
-    prefix_ids,
-    to_json,
-)
+from .tokenizer_parts import GENERIC, JSON_FILE, Tokenizer, check_class, check_model, check_symbols, one_or_sequence, prefix_ids, to_json
 
 KIND = "byte_fallback_bpe"
 GEMMA = ("GemmaTokenizer", "GemmaTokenizerFast")
-GEMMA_TOKENS = {
-    "unk_token": "<unk>",
-    "bos_token": "<bos>",
-    "eos_token": "<eos>",
-    "pad_token": "<pad>",
-    "mask_token": "<mask>",
-}
+GEMMA_TOKENS = {"unk_token": "<unk>", "bos_token": "<bos>", "eos_token": "<eos>", "pad_token": "<pad>", "mask_token": "<mask>"}
 BYTES = ["<0x{:02X}>".format(byte) for byte in range(256)]
 MODEL = {
     "type": ("BPE",),
@@ -65,9 +49,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
         )
     for step in one_or_sequence(spec.get("pre_tokenizer"), "pretokenizers"):
         if not isinstance(step, dict) or step.get("type") != "Split" or step.get("pattern") != BLANK:
-            problems.unsupported(
-                JSON_FILE + ": pre_tokenizer", "none, or Split at blanks, which are gone by then", to_json(step)[:120]
-            )
+            problems.unsupported(JSON_FILE + ": pre_tokenizer", "none, or Split at blanks, which are gone by then", to_json(step)[:120])
     _check_characters(tokenizer, problems)
     return [Key("tokenizer.prefix_ids", "u32[]", prefix_ids(tokenizer, problems))]
 
@@ -83,7 +65,5 @@ def _check_characters(tokenizer: Tokenizer, problems: Problems) -> None:
     for token in tokenizer.added:
         if len(token["content"]) == 1 and token["content"] not in vocab:
             problems.unsupported(
-                JSON_FILE + ": added_tokens",
-                "single characters that the model's vocabulary has too",
-                repr(token["content"]),
+                JSON_FILE + ": added_tokens", "single characters that the model's vocabulary has too", repr(token["content"])
             )

@@ -34,13 +34,10 @@ GPT2 = ("GPT2Tokenizer", "GPT2TokenizerFast")
 QWEN2 = ("Qwen2Tokenizer", "Qwen2TokenizerFast")
 BART = ("BartTokenizer", "BartTokenizerFast", "RobertaTokenizer", "RobertaTokenizerFast")  # one class under several names
 # The splitting expressions of Qwen2 and Llama 3, as src/processor/pretokenizer.h has them.
-QWEN2_WORDS = (
-    r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
-)
+QWEN2_WORDS = r"(?i:'s|'t|'re|'ve|'m|'ll|'d)|[^\r\n\p{L}\p{N}]?\p{L}+|\p{N}| ?[^\s\p{L}\p{N}]+[\r\n]*|\s*[\r\n]+|\s+(?!\S)|\s+"
 LLAMA3_WORDS = QWEN2_WORDS.replace(r"|\p{N}|", r"|\p{N}{1,3}|")
 SPLITS = {
-    words: {"type": "Split", "pattern": {"Regex": words}, "behavior": "Isolated", "invert": False}
-    for words in (QWEN2_WORDS, LLAMA3_WORDS)
+    words: {"type": "Split", "pattern": {"Regex": words}, "behavior": "Isolated", "invert": False} for words in (QWEN2_WORDS, LLAMA3_WORDS)
 }
 # What a class names where its config is silent.
 DEFAULTS = {
@@ -87,9 +84,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
     _check_surroundings(tokenizer, problems)
     spec, config = tokenizer.spec, tokenizer.config
     front, behind = _around(tokenizer, problems)
-    splitting = _Splitting(
-        _pre_tokenizer(spec.get("pre_tokenizer"), problems), _normalization(spec.get("normalizer"), problems)
-    )
+    splitting = _Splitting(_pre_tokenizer(spec.get("pre_tokenizer"), problems), _normalization(spec.get("normalizer"), problems))
     own = _of_class(config)
     if own is not None and own != splitting:
         notes.append(
@@ -98,9 +93,7 @@ def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key
             )
         )
     splitting = own or splitting
-    normalization = (
-        [Key("tokenizer.normalization", "string", splitting.normalization)] if splitting.normalization else []
-    )
+    normalization = [Key("tokenizer.normalization", "string", splitting.normalization)] if splitting.normalization else []
     return [
         Key("tokenizer.pre", "string", to_json(splitting.pre)),
         *normalization,
@@ -141,9 +134,7 @@ def _byte_level(prefix_space: bool, use_regex: bool) -> dict:
 def _normalization(normalizer, problems: Problems) -> Optional[str]:
     steps = one_or_sequence(normalizer, "normalizers")
     if steps not in ([], [{"type": "NFC"}]):
-        problems.unsupported(
-            JSON_FILE + ": normalizer", "none or NFC", to_json(normalizer)[:80], "the runtime implements these two"
-        )
+        problems.unsupported(JSON_FILE + ": normalizer", "none or NFC", to_json(normalizer)[:80], "the runtime implements these two")
     return "nfc" if steps else None
 
 

@@ -45,9 +45,7 @@ def check_model(model: dict, allowed: Dict[str, tuple], what: str, problems: Pro
     for key, values in allowed.items():
         found = model.get(key, "BPE" if key == "type" and "merges" in model else None)
         if found not in values:
-            problems.unsupported(
-                "{}: model.{}".format(JSON_FILE, key), repr(values[0]), repr(found), "the runtime implements " + what
-            )
+            problems.unsupported("{}: model.{}".format(JSON_FILE, key), repr(values[0]), repr(found), "the runtime implements " + what)
 
 
 def check_class(config: dict, names: Tuple[str, ...], problems: Problems) -> None:
@@ -108,11 +106,7 @@ def check_config_tokens(config: dict, added: List[dict], problems: Problems) -> 
     for key in NAMED:
         value = config.get(key)
         values = (
-            list(value.values())
-            if isinstance(value, dict) and "content" not in value
-            else value
-            if isinstance(value, list)
-            else [value]
+            list(value.values()) if isinstance(value, dict) and "content" not in value else value if isinstance(value, list) else [value]
         )
         for token in (content_of(v) for v in values if v is not None):
             if not isinstance(token, str) or token not in by_content:
@@ -147,9 +141,7 @@ def vocabulary(tokenizer: Tokenizer, problems: Problems) -> List[str]:
     by_id: Dict[int, str] = {}
     for text, number in [*vocab.items(), *((token["content"], token["id"]) for token in tokenizer.added)]:
         if by_id.setdefault(number, text) != text or vocab.get(text, number) != number:
-            problems.add(
-                "{}: id {}".format(JSON_FILE, number), "one token", "{!r} and {!r}".format(by_id[number], text)
-            )
+            problems.add("{}: id {}".format(JSON_FILE, number), "one token", "{!r} and {!r}".format(by_id[number], text))
     check_ids(vocab, tokenizer.n_vocab, problems)
     _check_utf8(by_id.values(), problems)
     # A hole gets a text that no merge and no word can produce: symbols contain no blank.
@@ -162,11 +154,7 @@ def check_symbols(model: dict, symbols: List[str], problems: Problems) -> None:
     vocab = member(model, "vocab", dict, JSON_FILE)
     missing = [symbol for symbol in symbols if symbol not in vocab]
     if missing:
-        problems.add(
-            JSON_FILE + ": model.vocab",
-            "all 256 byte symbols",
-            "{} missing, the first is {!r}".format(len(missing), missing[0]),
-        )
+        problems.add(JSON_FILE + ": model.vocab", "all 256 byte symbols", "{} missing, the first is {!r}".format(len(missing), missing[0]))
 
 
 def check_ids(ids: Dict[str, int], n_vocab: int, problems: Problems) -> None:
@@ -194,14 +182,10 @@ def merges_of(merges, vocab: Dict[str, int], problems: Problems) -> List[str]:
     for rank, merge in enumerate(merges if isinstance(merges, list) else []):
         pair = merge.split(" ") if isinstance(merge, str) else merge
         valid = (
-            isinstance(pair, list)
-            and len(pair) == 2
-            and all(isinstance(part, str) and part in vocab and " " not in part for part in pair)
+            isinstance(pair, list) and len(pair) == 2 and all(isinstance(part, str) and part in vocab and " " not in part for part in pair)
         )
         if not valid or pair[0] + pair[1] not in vocab:
-            problems.add(
-                "{}: model.merges[{}]".format(JSON_FILE, rank), "two tokens whose union is a token", to_json(merge)[:80]
-            )
+            problems.add("{}: model.merges[{}]".format(JSON_FILE, rank), "two tokens whose union is a token", to_json(merge)[:80])
             return result
         result.append(" ".join(pair))
     if not isinstance(merges, list):

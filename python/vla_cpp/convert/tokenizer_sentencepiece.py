@@ -70,9 +70,7 @@ def _parse(path: str):
         from google.protobuf.message import DecodeError
         from sentencepiece import sentencepiece_model_pb2
     except ImportError as error:
-        raise refuse(
-            path, "the package that reads SentencePiece models", str(error), "pip install sentencepiece", Code.UNSUPPORTED
-        )
+        raise refuse(path, "the package that reads SentencePiece models", str(error), "pip install sentencepiece", Code.UNSUPPORTED)
     model = sentencepiece_model_pb2.ModelProto()
     try:
         model.ParseFromString(read_file(path, MAX_SIZE))
@@ -99,9 +97,7 @@ def _check_settings(model, name: str, problems: Problems) -> None:
     }
     for key, (value, wanted) in found.items():
         if value != wanted:
-            problems.unsupported(
-                "{}: {}".format(name, key), "{} as in Gemma's".format(wanted), str(value), "give its tokenizer.json"
-            )
+            problems.unsupported("{}: {}".format(name, key), "{} as in Gemma's".format(wanted), str(value), "give its tokenizer.json")
     kinds = {piece.type for piece in model.pieces} - {NORMAL, UNKNOWN, CONTROL, USER_DEFINED, BYTE}
     if kinds:
         problems.unsupported(name + ": pieces", "pieces that are all used", "pieces of type {}".format(sorted(kinds)))

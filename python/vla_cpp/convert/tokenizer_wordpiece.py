@@ -13,22 +13,19 @@ from typing import List
 from .bundle import Key
 from .errors import Problems
 from .files import member
-from .tokenizer_parts import (
-    CONFIG_FILE,
-    GENERIC,
-    JSON_FILE,
-    Tokenizer,
-    around_ids,
-    check_class,
-    check_model,
-    to_json,
-)
+from .tokenizer_parts import CONFIG_FILE, GENERIC, JSON_FILE, Tokenizer, around_ids, check_class, check_model, to_json
 
 KIND = "wordpiece"
 BERT = ("BertTokenizer", "BertTokenizerFast")
 MODEL = {"type": ("WordPiece",), "continuing_subword_prefix": ("##",), "max_input_chars_per_word": (100,)}
 NORMALIZER = {"clean_text": (True,), "handle_chinese_chars": (True,), "strip_accents": (None, True), "lowercase": (True,)}
-CONFIG = {"do_lower_case": (True,), "tokenize_chinese_chars": (True,), "strip_accents": (None, True), "do_basic_tokenize": (True,), "never_split": (None, [])}
+CONFIG = {
+    "do_lower_case": (True,),
+    "tokenize_chinese_chars": (True,),
+    "strip_accents": (None, True),
+    "do_basic_tokenize": (True,),
+    "never_split": (None, []),
+}
 TOKENS = {name + "_token": "[{}]".format(name.upper()) for name in ("unk", "sep", "pad", "cls", "mask")}
 
 
@@ -43,7 +40,9 @@ def with_defaults(config: dict) -> dict:
 
 
 def keys(tokenizer: Tokenizer, problems: Problems, notes: List[str]) -> List[Key]:
-    check_model({"type": untyped(tokenizer.model), **tokenizer.model}, MODEL, "byte-level BPE, BPE with byte fallback and WordPiece", problems)
+    check_model(
+        {"type": untyped(tokenizer.model), **tokenizer.model}, MODEL, "byte-level BPE, BPE with byte fallback and WordPiece", problems
+    )
     check_class(tokenizer.config, GENERIC + BERT, problems)
     _check_settings(tokenizer.spec.get("normalizer"), "normalizer", "BertNormalizer", problems)
     _check_settings(tokenizer.spec.get("pre_tokenizer"), "pre_tokenizer", "BertPreTokenizer", problems)

@@ -90,11 +90,7 @@ def _parameter(arguments: tuple):
     return arguments[0]
 
 
-CALLS = {
-    "torch._utils _rebuild_tensor_v2": _tensor,
-    "torch._utils _rebuild_parameter": _parameter,
-    "collections OrderedDict": ordered_dict,
-}
+CALLS = {"torch._utils _rebuild_tensor_v2": _tensor, "torch._utils _rebuild_parameter": _parameter, "collections OrderedDict": ordered_dict}
 
 
 def _entries(path: str) -> Dict[str, Stored]:

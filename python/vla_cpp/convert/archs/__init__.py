@@ -71,9 +71,7 @@ class Plan:
     weights: List[Weight]
     dropped: List[Dropped]
     statistics: Dict[str, np.ndarray]
-    hints: Dict[str, str] = field(
-        default_factory=dict
-    )  # prefix of an unexpected tensor's name -> why it is not expected
+    hints: Dict[str, str] = field(default_factory=dict)  # prefix of an unexpected tensor's name -> why it is not expected
 
 
 def names() -> List[str]:
@@ -99,7 +97,9 @@ def load(name):
 
 
 LAYOUTS = {
-    LEROBOT: Layout("LeRobot", (IDENTITY_STATS, POSITION_PRECISION, DOMAIN, stats("whose, where the weights have those of several data sets"))),
+    LEROBOT: Layout(
+        "LeRobot", (IDENTITY_STATS, POSITION_PRECISION, DOMAIN, stats("whose, where the weights have those of several data sets"))
+    ),
     OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),)),
 }
 

@@ -40,7 +40,9 @@ TOP_IGNORED = set(
 BACKBONE_FIXED: Fixed = {"project_to_dim": (1536, None), "reproject_vision": (False, False)}
 BACKBONE_IGNORED = {"tune_llm", "tune_visual", "eagle_path", "use_flash_attention", "load_bf16"}
 # FlowmatchingActionHeadConfig, of whose sizes none has the published checkpoint's value by default: they must be stated.
-HEAD = dict.fromkeys("""max_state_dim action_dim action_horizon hidden_size input_embedding_dim backbone_embedding_dim num_inference_timesteps\n    num_target_vision_tokens diffusion_model_cfg vl_self_attention_cfg""".split())
+HEAD = dict.fromkeys(
+    """max_state_dim action_dim action_horizon hidden_size input_embedding_dim backbone_embedding_dim num_inference_timesteps\n    num_target_vision_tokens diffusion_model_cfg vl_self_attention_cfg""".split()
+)
 HEAD = {**HEAD, "max_seq_len": 1024, "num_timestep_buckets": 1000, "max_num_embodiments": 32}
 HEAD_FIXED: Fixed = {"add_pos_embed": (True, True), "use_vlln": (True, True)}
 HEAD_IGNORED = set(
@@ -96,9 +98,7 @@ CONFIGS = {
     "so100_dualcam": DataConfig(("front", "wrist"), _all("single_arm gripper"), _all("single_arm gripper")),
     "unitree_g1": DataConfig(("rs_view",), _all(ARMS), _all(ARMS)),
     "unitree_g1_full_body": DataConfig(("rs_view",), _all("left_leg right_leg waist " + ARMS), _all(ARMS)),
-    "agibot_genie1": DataConfig(
-        ("top_head", "hand_left", "hand_right"), _all(AGIBOT), _all(AGIBOT + " robot_velocity")
-    ),
+    "agibot_genie1": DataConfig(("top_head", "hand_left", "hand_right"), _all(AGIBOT), _all(AGIBOT + " robot_velocity")),
     "bimanual_panda_gripper": DataConfig(
         ("right_wrist_view", "left_wrist_view", "front_view"),
         _modes(
@@ -106,29 +106,22 @@ CONFIGS = {
             " left_arm_eef_pos:min_max left_arm_eef_quat left_gripper_qpos:min_max"
         ),
         _modes(
-            "right_arm_eef_pos right_arm_eef_rot right_gripper_close:binary"
-            " left_arm_eef_pos left_arm_eef_rot left_gripper_close:binary"
+            "right_arm_eef_pos right_arm_eef_rot right_gripper_close:binary left_arm_eef_pos left_arm_eef_rot left_gripper_close:binary"
         ),
         rotations=TWO_ARMS,
     ),
     "bimanual_panda_hand": DataConfig(
         ("right_wrist_view", "left_wrist_view", "ego_view"),
         _modes(
-            "right_arm_eef_pos:min_max right_arm_eef_quat right_hand:min_max"
-            " left_arm_eef_pos:min_max left_arm_eef_quat left_hand:min_max"
+            "right_arm_eef_pos:min_max right_arm_eef_quat right_hand:min_max left_arm_eef_pos:min_max left_arm_eef_quat left_hand:min_max"
         ),
-        _modes(
-            "right_arm_eef_pos right_arm_eef_rot right_hand:min_max left_arm_eef_pos left_arm_eef_rot left_hand:min_max"
-        ),
+        _modes("right_arm_eef_pos right_arm_eef_rot right_hand:min_max left_arm_eef_pos left_arm_eef_rot left_hand:min_max"),
         rotations=TWO_ARMS,
     ),
     "single_panda_gripper": DataConfig(
         ("left_view", "right_view", "wrist_view"),
         _all("end_effector_position_relative end_effector_rotation_relative gripper_qpos base_position base_rotation"),
-        _modes(
-            "end_effector_position:min_max end_effector_rotation:min_max gripper_close:binary base_motion:min_max"
-            " control_mode:binary"
-        ),
+        _modes("end_effector_position:min_max end_effector_rotation:min_max gripper_close:binary base_motion:min_max control_mode:binary"),
         rotations=dict.fromkeys(("state.end_effector_rotation_relative", "state.base_rotation"), "rotation_6d"),
     ),
     "oxe_droid": DataConfig(
@@ -150,9 +143,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     s.max_views = len(config.video)
     s.embodiment = config.index if config.index >= 0 else EMBODIMENTS.get(options.embodiment, -1)
     if not 0 <= s.embodiment < s.n_embodiment:
-        expected = "one of {}, or a projector_index below {} in --variant".format(
-            ", ".join(EMBODIMENTS), s.n_embodiment
-        )
+        expected = "one of {}, or a projector_index below {} in --variant".format(", ".join(EMBODIMENTS), s.n_embodiment)
         problems.add("--embodiment " + options.embodiment, expected, str(s.embodiment), code=Code.USAGE)
     _read_horizon(config, s, problems)
     robot = _robot(config, metadata, s.horizon, problems)
@@ -218,9 +209,7 @@ def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:
         section.bad("video", "names of cameras, and a crop of at most 1", str(video))
     horizon, index = section.count("horizon", maximum=4096), section.count("projector_index", minimum=0)
     problems.raise_any()
-    return DataConfig(
-        tuple(video), modes[0], modes[1], horizon, crop, index if "projector_index" in section.values else -1, rotations
-    )
+    return DataConfig(tuple(video), modes[0], modes[1], horizon, crop, index if "projector_index" in section.values else -1, rotations)
 
 
 def read_sizes(config: dict, folder: str, problems: Problems) -> Tuple[Sizes, int]:
@@ -248,9 +237,7 @@ def _robot(config: DataConfig, metadata: dict, n_row: int, problems: Problems) -
     return Robot(list(config.video), groups[0], groups[1], n_row)
 
 
-def _group(
-    part: str, key: str, mode: Optional[str], metadata: dict, rotations: Mapping[str, str], problems: Problems
-) -> Group:
+def _group(part: str, key: str, mode: Optional[str], metadata: dict, rotations: Mapping[str, str], problems: Problems) -> Group:
     where = "{}: statistics.{}.{}".format(METADATA, part, key)
     table = member(member(metadata, "statistics", dict, METADATA), part, dict, METADATA)
     kind, names = MODES[mode]
@@ -276,9 +263,7 @@ def _group(
     return group
 
 
-def _converted(
-    group: Group, part: str, mode: Optional[str], target: str, described: dict, place: str, problems: Problems
-) -> Group:
+def _converted(group: Group, part: str, mode: Optional[str], target: str, described: dict, place: str, problems: Problems) -> Group:
     """A rotation that the network has in another representation than the robot. Statistics are those of the robot's, so that only an
     absolute one is normalized, by the bounds of the network's. On other pairs the reference fails, mostly since it counts with the
     robot's width, but for other pairs of Euler angles and axis_angle, which no data config of it has."""
@@ -307,18 +292,11 @@ def _images(config: DataConfig, metadata: dict, s: Sizes, problems: Problems) ->
     size = sizes[0]
     sound = isinstance(size, list) and len(size) == 2 and all(type(n) is int and 2 <= n <= 8192 for n in size)
     if not sound or any(other != size for other in sizes):
-        problems.add(
-            METADATA + ": modalities.video", "one resolution for the cameras " + ", ".join(config.video), str(sizes)
-        )
+        problems.add(METADATA + ": modalities.video", "one resolution for the cameras " + ", ".join(config.video), str(sizes))
         size = [EDGE, EDGE]
     width, height = size
     crop = {"op": "center_crop", "width": max(1, int(width * config.crop)), "height": max(1, int(height * config.crop))}
     side = s.image_width
     resize = {"op": "resize", "width": side, "height": side, "filter": "torch_bilinear_cut"}
-    ops = [
-        {"op": "camera_size", "width": width, "height": height},
-        crop,
-        resize,
-        {"op": "size", "width": side, "height": side},
-    ]
+    ops = [{"op": "camera_size", "width": width, "height": height}, crop, resize, {"op": "size", "width": side, "height": side}]
     return Images(side, side, [*ops, STANDARDIZE])

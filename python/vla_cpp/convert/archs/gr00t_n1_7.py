@@ -34,11 +34,7 @@ RELEASE = Release(
         "rtc_ramp_rate": 6.0,  # of LeRobot's class; the authors' callers give it
         "model_name": "nvidia/Cosmos-Reason2-2B",
     },
-    fixed={
-        "exclude_state": (False, False),
-        "strict_action_padding_mask": (False, False),
-        "use_tactile": (False, False),
-    },
+    fixed={"exclude_state": (False, False), "strict_action_padding_mask": (False, False), "use_tactile": (False, False)},
     ignored={"use_mean_std", "tactile_state_keys", "tactile_input_shape", "tactile_embed_dim"},
     embodiments={
         "simpler_env_google": 0,

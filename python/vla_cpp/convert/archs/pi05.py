@@ -13,12 +13,6 @@ from .pi0 import make_plan
 from .pi0.layouts import variants_of
 from .pi0.mapping import Family
 
-FAMILY = Family(
-    arch="pi05",
-    config_class="PI05Config",
-    max_tokens=200,
-    time_mlp="time_mlp",
-    other_time_mlp="action_time_mlp",
-)
+FAMILY = Family(arch="pi05", config_class="PI05Config", max_tokens=200, time_mlp="time_mlp", other_time_mlp="action_time_mlp")
 VARIANTS = variants_of("pi05")
 plan = partial(make_plan, FAMILY)

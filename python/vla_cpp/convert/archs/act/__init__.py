@@ -30,11 +30,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, {}, others=others, reads_text=False)
     problems.raise_any()
     document = json.dumps(recipe_document(s, processors, problems), ensure_ascii=False)
-    keys = [
-        *network_keys(s),
-        *_feature_keys(checkpoint, options, s, processors, problems),
-        Key("processor.recipe", "string", document),
-    ]
+    keys = [*network_keys(s), *_feature_keys(checkpoint, options, s, processors, problems), Key("processor.recipe", "string", document)]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(without=s.views), hints(s))
 
@@ -51,16 +47,12 @@ def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems)
             *standardized([(view, processors.others[view]) for view in s.views], problems),
         ],
         "text": [],
-        "state": [
-            {**op, **({"feature": name} if s.d_environment else {})} for name, norm in states for op in norm.op("normalize", name)
-        ],
+        "state": [{**op, **({"feature": name} if s.d_environment else {})} for name, norm in states for op in norm.op("normalize", name)],
         "action": processors.action.op("unnormalize", recipe.ACTION),
     }
 
 
-def _feature_keys(
-    checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems
-) -> List[Key]:
+def _feature_keys(checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[Key]:
     dims = {recipe.STATE: s.d_state, **({ENVIRONMENT: s.d_environment} if s.d_environment else {})}
     return [
         *required_view_keys(checkpoint, s.views, processors, problems),

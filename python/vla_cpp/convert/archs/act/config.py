@@ -35,9 +35,7 @@ POLICY = {
     "n_vae_encoder_layers": 4,
     "temporal_ensemble_coeff": None,
 }
-FIXED = {
-    "replace_final_stride_with_dilation": (False, "torchvision has no ResNet-18 or -34 with dilation either"),
-}
+FIXED = {"replace_final_stride_with_dilation": (False, "torchvision has no ResNet-18 or -34 with dilation either")}
 # Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
 IGNORED = set("pretrained_backbone_weights dropout kl_weight optimizer_lr_backbone".split())
 # torchvision models/resnet.py: blocks of each stage. Those of the others have another block.
@@ -130,7 +128,7 @@ def _note_ensemble(policy: Section, checkpoint: Checkpoint) -> None:
         policy.bad("temporal_ensemble_coeff", "0 or more, or null", hint=hint, unsupported=True)
     else:
         checkpoint.notes.append(
-            'temporal_ensemble_coeff {0}: chunks are as without it; the client ensembles them: ChunkLoop(replan_every=1, '
+            "temporal_ensemble_coeff {0}: chunks are as without it; the client ensembles them: ChunkLoop(replan_every=1, "
             'blend="ensemble", decay={0})'.format(coefficient)
         )
 

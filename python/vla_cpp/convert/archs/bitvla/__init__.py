@@ -251,10 +251,7 @@ def _prompt(checkpoint: Checkpoint, tokenizer: TokenizerPlan, s: Sizes, problems
         {"op": "template", "text": before + "{instruction}" + END + "Assistant: "},
         {"op": "tokenize", "max_tokens": limit, "truncate": "right"},
     ]
-    return text, [
-        Key("policy.view_starts", "u32[]", starts),
-        Key("observation.max_text_tokens", "u32", limit),
-    ]
+    return text, [Key("policy.view_starts", "u32[]", starts), Key("observation.max_text_tokens", "u32", limit)]
 
 
 def _features(views: List[str], options: Options, notes: List[str], s: Sizes, problems: Problems) -> List[Key]:

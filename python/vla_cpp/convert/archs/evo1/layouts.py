@@ -36,15 +36,7 @@ from ...options import Option, stats, variant, views
 from ...section import Section
 from ...torch_file import read_torch
 from .. import Options
-from .mapping import (
-    AUTHORS,
-    LEROBOT,
-    Names,
-    Sizes,
-    check_head,
-    read_chat_backbone,
-    read_hf_backbone,
-)
+from .mapping import AUTHORS, LEROBOT, Names, Sizes, check_head, read_chat_backbone, read_hf_backbone
 
 
 @dataclass
@@ -133,10 +125,7 @@ class Revision(NamedTuple):
     pad: float  # the number in state columns that the robot does not have
 
 
-REVISIONS = {
-    "r1": Revision(32, 1000.0, "float32_then_bfloat16", -1.0),
-    "r2": Revision(50, 999.0, "bfloat16", 0.0),
-}
+REVISIONS = {"r1": Revision(32, 1000.0, "float32_then_bfloat16", -1.0), "r2": Revision(50, 999.0, "bfloat16", 0.0)}
 AUTHORS_CONFIG = {
     "vlm_name": "OpenGVLab/InternVL3-1B",
     "horizon": 16,
@@ -287,9 +276,7 @@ class _Normalized(NamedTuple):
     statistics: Dict[str, np.ndarray]
 
 
-def _normalization(
-    feature: str, op: str, name: str, stats: dict, checkpoint: Checkpoint, problems: Problems
-) -> Tuple[_Normalized, bool]:
+def _normalization(feature: str, op: str, name: str, stats: dict, checkpoint: Checkpoint, problems: Problems) -> Tuple[_Normalized, bool]:
     """The op with its statistics, and whether it is followed by a clip."""
     kind, names, clip = KINDS[name]
     stated = stats.get(feature) if isinstance(stats.get(feature), dict) else {}
@@ -368,11 +355,7 @@ GRIPPER = {
     "gripper_below_threshold_value": 1.0,
     "gripper_above_threshold_value": -1.0,
 }
-LEROBOT_FIXED = {
-    "action_head": ("flowmatching", "flowmatching"),
-    "num_categories": (1, 1),
-    "return_cls_only": (False, False),
-}
+LEROBOT_FIXED = {"action_head": ("flowmatching", "flowmatching"), "num_categories": (1, 1), "return_cls_only": (False, False)}
 # Keys that no number of an action chunk depends on.
 LEROBOT_IGNORED = set(
     """
@@ -481,8 +464,7 @@ def _read_pipelines(policy: Section, checkpoint: Checkpoint, options: Options, s
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS, min_widths)
     problems.raise_any()
     pre, post = (
-        [(step.get("registry_name", step.get("class")), step.get("config", {})) for step in file["steps"]]
-        for file in checkpoint.processors
+        [(step.get("registry_name", step.get("class")), step.get("config", {})) for step in file["steps"]] for file in checkpoint.processors
     )
     order, configs = [name for name, _ in pre], dict(pre + post)
     if "tokenizer_processor" in order:
@@ -544,15 +526,12 @@ def _gripper(policy: Section, width: int) -> List[dict]:
     if column >= width:
         policy.bad("gripper_index", "a column of the action, below {}".format(width), hint="the reference refuses it too")
     above, high, low = (
-        policy.number("gripper_" + name, above=-1e30)
-        for name in ("threshold", "above_threshold_value", "below_threshold_value")
+        policy.number("gripper_" + name, above=-1e30) for name in ("threshold", "above_threshold_value", "below_threshold_value")
     )
     return [{"op": "threshold", "columns": [column], "above": above, "then": high, "else": low}]
 
 
-def _view_keys(
-    views: List[str], n_empty: int, processors: recipe.Processors, checkpoint: Checkpoint, problems: Problems
-) -> List[Key]:
+def _view_keys(views: List[str], n_empty: int, processors: recipe.Processors, checkpoint: Checkpoint, problems: Problems) -> List[Key]:
     """The reference takes an unmentioned camera as absent, of any name, but no more of them than `empty_cameras`."""
     aliases = recipe.view_aliases(views, processors, checkpoint.notes, problems)
     return views_of(views, aliases, [1] * len(views), max(1, len(views) - n_empty))

@@ -85,11 +85,7 @@ TEXT = {
     "rope_theta": 10000.0,
     "max_position_embeddings": 32768,
 }
-TEXT_FIXED: Fixed = {
-    "model_type": ("qwen2", "qwen2"),
-    "hidden_act": ("silu", "silu"),
-    "use_sliding_window": (False, False),
-}
+TEXT_FIXED: Fixed = {"model_type": ("qwen2", "qwen2"), "hidden_act": ("silu", "silu"), "use_sliding_window": (False, False)}
 
 
 @dataclass
@@ -220,6 +216,7 @@ def network_keys(s: Sizes) -> List[Key]:
 
 
 # --- tensors: the authors' names and LeRobot's, which differ in the towers and not in the head ------------------------------------------
+
 
 class Names(NamedTuple):
     vision: str

@@ -86,9 +86,7 @@ class Eagle:
             rope.bad("rope_type", "'default'", unsupported=True)
         s.lm.rope_base = (rope if "rope_theta" in rope.values else text).number("rope_theta")
         s.merge = self.merge
-        self._read_vision(
-            Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s
-        )
+        self._read_vision(Section(WHERE + ": vision_config", member(config, "vision_config", dict, WHERE), VISION, problems), s)
 
     def _read_vision(self, vision: Section, s: Sizes) -> None:
         vision.check_fixed(VISION_FIXED)
@@ -127,12 +125,7 @@ class Eagle:
             # Patches are flattened pixel by pixel there, channel by channel here.
             source, shape = vision + "embeddings.patch_embedding.weight", (s.vision.d_model, 3 * s.vision.patch_size**2)
             rows[0] = Weight("vision.patch_embed.weight", source, MATRIX, shape, shape, regroup=3)
-        return [
-            *rows,
-            *self._connector(s),
-            *language.weights(s, self.LM),
-            *vector("lm.norm.weight", self.LM + "norm.weight", s.lm.d_model),
-        ]
+        return [*rows, *self._connector(s), *language.weights(s, self.LM), *vector("lm.norm.weight", self.LM + "norm.weight", s.lm.d_model)]
 
     def _connector(self, s: Sizes) -> List[Weight]:
         source = self.root + "mlp1."
@@ -158,11 +151,7 @@ class Eagle:
         u32 = s.vision_keys()
         if self.merge == 1:
             u32["vision.image_size"] = s.image_width
-            return {
-                "u32": u32,
-                "f32": {"vision.norm_eps": s.vision.norm_eps},
-                "string": {"vision.position_rule": "row_major"},
-            }
+            return {"u32": u32, "f32": {"vision.norm_eps": s.vision.norm_eps}, "string": {"vision.position_rule": "row_major"}}
         u32.update(
             {
                 "vision.image_width": s.image_width,

@@ -48,9 +48,7 @@ def read(policy: Section, s: Sizes) -> None:
     if "state_history_length" in policy.defaults:
         s.state_history = policy.count("state_history_length", maximum=64)
     s.d_state, s.horizon = policy.count("max_state_dim") * s.state_history, policy.count("action_horizon")
-    s.d_hidden, s.n_position, s.n_embodiment = (
-        policy.count(key) for key in ("hidden_size", "max_seq_len", "max_num_embodiments")
-    )
+    s.d_hidden, s.n_position, s.n_embodiment = (policy.count(key) for key in ("hidden_size", "max_seq_len", "max_num_embodiments"))
     s.n_step, s.n_bucket = policy.count("num_inference_timesteps"), policy.count("num_timestep_buckets")
     if "rtc_ramp_rate" in policy.defaults:
         s.rtc_ramp_rate = policy.number("rtc_ramp_rate")
@@ -102,12 +100,7 @@ def weights(s: Sizes) -> List[Weight]:
 def _attention_and_ffn(target: str, block: str, d: int, d_in: int, d_ff: int) -> List[Weight]:
     """`d_in`: width of what keys and values are made from."""
     rows: List[Weight] = []
-    for ours, theirs, width in (
-        ("attn_q", "to_q", d),
-        ("attn_k", "to_k", d_in),
-        ("attn_v", "to_v", d_in),
-        ("attn_out", "to_out.0", d),
-    ):
+    for ours, theirs, width in (("attn_q", "to_q", d), ("attn_k", "to_k", d_in), ("attn_v", "to_v", d_in), ("attn_out", "to_out.0", d)):
         rows += linear(target + ours, block + "attn1." + theirs, d, width, bias=True)
     rows += linear(target + "ffn_up", block + "ff.net.0.proj", d_ff, d, bias=True)
     return rows + linear(target + "ffn_down", block + "ff.net.2", d, d_ff, bias=True)
@@ -125,9 +118,7 @@ def _features(s: Sizes) -> List[Weight]:
 def transformer_rows(s: Sizes) -> List[Weight]:
     d, source = s.d_dit, HEAD + "model."
     time = source + "timestep_encoder.timestep_embedder."
-    rows = linear("time_in", time + "linear_1", d, s.d_time, bias=True) + linear(
-        "time_out", time + "linear_2", d, d, bias=True
-    )
+    rows = linear("time_in", time + "linear_1", d, s.d_time, bias=True) + linear("time_out", time + "linear_2", d, d, bias=True)
     for i in range(s.n_dit_layer):
         target, block = "dit.blk.{}.".format(i), "{}transformer_blocks.{}.".format(source, i)
         rows += linear(target + "ada", block + "norm1.linear", 2 * d, d, bias=True)
@@ -141,15 +132,7 @@ def _of_robot(target: str, source: str, s: Sizes, d_out: int, d_in: int) -> List
     """The robot's part of a matrix that is stored for all of them, inputs before outputs."""
     pick = (0, s.embodiment)
     return [
-        Weight(
-            target + ".weight",
-            source + ".W",
-            MATRIX,
-            (s.n_embodiment, d_in, d_out),
-            (d_out, d_in),
-            pick=pick,
-            transpose=True,
-        ),
+        Weight(target + ".weight", source + ".W", MATRIX, (s.n_embodiment, d_in, d_out), (d_out, d_in), pick=pick, transpose=True),
         Weight(target + ".bias", source + ".b", VECTOR, (s.n_embodiment, d_out), (d_out,), pick=pick),
     ]
 

@@ -57,9 +57,7 @@ def read_images(processor: Section, area: Area, options: Options, notes: List[st
     ops += [{"op": "size", "width": width, "height": height}, STANDARDIZE]
     if not pad:
         notes.append(
-            "images keep their aspect: those of {} are taken, others are refused ({})".format(
-                camera_size or "square cameras", DOCS
-            )
+            "images keep their aspect: those of {} are taken, others are refused ({})".format(camera_size or "square cameras", DOCS)
         )
     return Images(width, height, ops)
 
@@ -69,13 +67,7 @@ def _pair(processor: Section, key: str) -> int:
     value = processor.get(key)
     if value is None:
         return 0
-    if (
-        isinstance(value, list)
-        and len(value) == 2
-        and value[0] == value[1]
-        and type(value[0]) is int
-        and 0 < value[0] <= MAX_SIDE
-    ):
+    if isinstance(value, list) and len(value) == 2 and value[0] == value[1] and type(value[0]) is int and 0 < value[0] <= MAX_SIDE:
         return value[0]
     processor.bad(key, "[side, side] or null", unsupported=True)
     return 0

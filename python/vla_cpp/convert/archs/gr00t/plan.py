@@ -161,13 +161,7 @@ class Parts(NamedTuple):
 
 
 def assemble(
-    parts: Parts,
-    keys: List[Key],
-    rows: List[Weight],
-    checkpoint: Checkpoint,
-    options: Options,
-    s: Sizes,
-    problems: Problems,
+    parts: Parts, keys: List[Key], rows: List[Weight], checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems
 ) -> Plan:
     """`keys`, `rows`: the network's."""
     robot, backbone = parts.robot, parts.backbone
@@ -215,12 +209,7 @@ def _processor(release: Release, checkpoint: Checkpoint, problems: Problems) -> 
 def read_sizes(release: Release, config: dict, folder: str, problems: Problems) -> Sizes:
     """`folder`: the backbone's."""
     defaults = {**CONFIG, **release.config}
-    fixed: Fixed = {
-        "model_type": (None, release.model_type),
-        "backbone_model_type": (release.backbone_type,) * 2,
-        **FIXED,
-        **release.fixed,
-    }
+    fixed: Fixed = {"model_type": (None, release.model_type), "backbone_model_type": (release.backbone_type,) * 2, **FIXED, **release.fixed}
     s, policy = Sizes(), Section(POLICY, config, defaults, problems, nullable=("diffusion_model_cfg",))
     policy.refuse_unknown({*defaults, *fixed, *IGNORED, *release.ignored})
     policy.check_fixed(fixed)

@@ -102,9 +102,7 @@ def _read_vision(vision: Section, s: Sizes) -> None:
         or sorted(set(layers)) != layers
         or not 1 <= len(layers) <= s.lm.n_layer
     ):
-        expected = "rising numbers of layers below {}, no more than the {} language layers".format(
-            s.vision.n_layer, s.lm.n_layer
-        )
+        expected = "rising numbers of layers below {}, no more than the {} language layers".format(s.vision.n_layer, s.lm.n_layer)
         vision.bad("deepstack_visual_indexes", expected)
         layers = []
     s.deepstack_layers = layers
@@ -209,11 +207,7 @@ def _check_ids(folder: str, ids: dict, problems: Problems) -> None:
     config = read_json(os.path.join(folder, "config.json"))
     for key, default, text in (("image_token_id", 151655, IMAGE), ("vision_start_token_id", 151652, OPEN)):
         if config.get(key, default) != ids[text]:
-            problems.add(
-                "{}: {}".format(WHERE, key),
-                "{}, the tokenizer's {}".format(ids[text], text),
-                repr(config.get(key, default)),
-            )
+            problems.add("{}: {}".format(WHERE, key), "{}, the tokenizer's {}".format(ids[text], text), repr(config.get(key, default)))
 
 
 def _check_template(folder: str, problems: Problems) -> None:
@@ -227,9 +221,7 @@ def _check_template(folder: str, problems: Problems) -> None:
     if not isinstance(text, str):
         return
     if OPEN + IMAGE + CLOSE not in text or "You are a helpful assistant" in text:
-        problems.unsupported(
-            name + ": chat_template", "Qwen3-VL's, which puts no words of its own before a user's", repr(text[:60])
-        )
+        problems.unsupported(name + ": chat_template", "Qwen3-VL's, which puts no words of its own before a user's", repr(text[:60]))
 
 
 def dropped(s: Sizes) -> List[Dropped]:

@@ -35,11 +35,7 @@ ROBOT_OPTIONS = (  # what every release leaves open
         "pad images to squares even if the checkpoint does not say so, as the authors' servers have done since March 2026",
         default=False,
     ),
-    Option(
-        "--gripper-sign",
-        "map the action KEY to -1 above 0.5 and to 1 elsewhere, as LIBERO's simulator expects its gripper",
-        "KEY",
-    ),
+    Option("--gripper-sign", "map the action KEY to -1 above 0.5 and to 1 elsewhere, as LIBERO's simulator expects its gripper", "KEY"),
 )
 
 
@@ -75,9 +71,7 @@ def processor_file(checkpoint: Checkpoint, name: str) -> str:
     """Beside the weights or below processor/. Errors: bad_bundle where both exist, io where none does."""
     places = [place for place in (name, os.path.join("processor", name)) if os.path.exists(checkpoint.path(place))]
     if len(places) > 1:
-        raise refuse(
-            checkpoint.folder, "{} once".format(name), " and ".join(places), "remove the one that is not the policy's"
-        )
+        raise refuse(checkpoint.folder, "{} once".format(name), " and ".join(places), "remove the one that is not the policy's")
     if not places:
         hint = "it lies beside the weights, or below processor/, of the published checkpoint"
         raise refuse(checkpoint.path(name), "a file", "none", hint, Code.IO)
@@ -94,9 +88,7 @@ def choose(configs: dict, tag: str) -> dict:
     """The modalities of a tag. Errors: usage, with the tags that there are."""
     if tag in configs and isinstance(configs[tag], dict):
         return configs[tag]
-    listed = "; ".join(
-        "{} (cameras {})".format(name, ", ".join(_keys(value, "video")) or "none") for name, value in configs.items()
-    )
+    listed = "; ".join("{} (cameras {})".format(name, ", ".join(_keys(value, "video")) or "none") for name, value in configs.items())
     raise refuse(
         "--embodiment",
         "the tag of the robot, one of: " + (listed or "none, since {} lists no robots".format(PROCESSOR)),
@@ -106,22 +98,16 @@ def choose(configs: dict, tag: str) -> dict:
     )
 
 
-def embodiment_index(
-    checkpoint: Checkpoint, tag: str, built_in: Dict[str, int], n_embodiment: int, problems: Problems
-) -> int:
+def embodiment_index(checkpoint: Checkpoint, tag: str, built_in: Dict[str, int], n_embodiment: int, problems: Problems) -> int:
     """The row of the weights that belongs to a tag. `built_in`: what the authors' processor gives to tags that
     embodiment_id.json does not have."""
     stated = read_json(processor_file(checkpoint, EMBODIMENTS))
     if tag not in stated and tag in built_in:
-        checkpoint.notes.append(
-            "{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, built_in[tag])
-        )
+        checkpoint.notes.append("{} has no {}: index {}, as in the authors' table".format(EMBODIMENTS, tag, built_in[tag]))
     index = stated.get(tag, built_in.get(tag))
     if type(index) is int and 0 <= index < n_embodiment:
         return index
-    problems.add(
-        "{}: {}".format(EMBODIMENTS, tag), "an index below max_num_embodiments {}".format(n_embodiment), str(index)
-    )
+    problems.add("{}: {}".format(EMBODIMENTS, tag), "an index below max_num_embodiments {}".format(n_embodiment), str(index))
     return 0
 
 
@@ -132,9 +118,7 @@ class _Reader:
         self.clips, self.sin_cos = processor.get("clip_outliers"), processor.get("apply_sincos_state_encoding")
         self.statistics = member(statistics, tag, dict, STATISTICS)
         if tag not in statistics:
-            problems.add(
-                "{}: {}".format(STATISTICS, tag), "statistics", "none", "the checkpoint was not trained for this robot"
-            )
+            problems.add("{}: {}".format(STATISTICS, tag), "statistics", "none", "the checkpoint was not trained for this robot")
 
     def modality(self, name: str) -> Section:
         where = "{}: {}.{}".format(PROCESSOR, self.tag, name)
@@ -143,12 +127,7 @@ class _Reader:
             if key not in MODALITY and value not in (None, False):
                 section.bad(key, "a key that this converter knows", hint="it may change numbers", unsupported=True)
         keys = section.get("modality_keys")
-        if (
-            not isinstance(keys, list)
-            or not keys
-            or not all(isinstance(k, str) and k for k in keys)
-            or len(set(keys)) != len(keys)
-        ):
+        if not isinstance(keys, list) or not keys or not all(isinstance(k, str) and k for k in keys) or len(set(keys)) != len(keys):
             section.bad("modality_keys", "different names")
             section.values = {**section.values, "modality_keys": []}
         return section
@@ -172,8 +151,7 @@ class _Reader:
         nested = n_row > 0 and isinstance(values, list) and any(isinstance(row, list) for row in values)
         rows = values if nested else [values]
         sound = all(
-            isinstance(row, list) and row and len(row) == len(rows[0]) and all(type(v) in (int, float) for v in row)
-            for row in rows
+            isinstance(row, list) and row and len(row) == len(rows[0]) and all(type(v) in (int, float) for v in row) for row in rows
         )
         if not sound or len(rows[0]) > MAX_WIDTH:
             self.problems.add(where, "numbers", "none" if not values else str(values)[:80])

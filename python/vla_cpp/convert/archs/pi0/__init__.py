@@ -26,19 +26,12 @@ TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
 def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     read = read_openpi if checkpoint.layout == OPENPI else read_lerobot
     source = read(family, checkpoint, options, problems)
-    checkpoint.tensors = rename(
-        checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems
-    )
+    checkpoint.tensors = rename(checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems)
     folder = given_tokenizer(checkpoint, options, source.processors, TOKENIZER)
     tokenizer = read_tokenizer(folder, source.sizes.lm.n_vocab, problems, checkpoint.notes)
     _check_newline(source.text, tokenizer, problems)
     tokenize = {"op": "tokenize", "max_tokens": source.max_tokens, "truncate": tokenizer.truncate}
-    document = {
-        "image": source.image,
-        "text": [*source.text, tokenize],
-        "state": source.state,
-        "action": source.action,
-    }
+    document = {"image": source.image, "text": [*source.text, tokenize], "state": source.state, "action": source.action}
     keys = [
         *network_keys(source.sizes),
         *source.features,
@@ -60,12 +53,6 @@ def _check_newline(text: List[dict], tokenizer: TokenizerPlan, problems: Problem
         problems.unsupported("tokenizer.json: model.vocab", "a newline in no token but its own runs", repr(spanning))
 
 
-FAMILY = Family(
-    arch="pi0",
-    config_class="PI0Config",
-    max_tokens=48,
-    time_mlp="action_time_mlp",
-    other_time_mlp="time_mlp",
-)
+FAMILY = Family(arch="pi0", config_class="PI0Config", max_tokens=48, time_mlp="action_time_mlp", other_time_mlp="time_mlp")
 VARIANTS = variants_of("pi0")
 plan = partial(make_plan, FAMILY)

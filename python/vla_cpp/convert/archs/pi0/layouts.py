@@ -151,9 +151,10 @@ def _read_policy(family: Family, policy: Section, s: Sizes) -> None:
 
 
 def _check_pipelines(family: Family, policy: Section, processors: recipe.Processors) -> None:
-    wanted, found = ("pi0_new_line_processor", processors.newline) if family.state_token else (
-        "pi05_prepare_state_tokenizer_processor_step",
-        processors.discrete_state,
+    wanted, found = (
+        ("pi0_new_line_processor", processors.newline)
+        if family.state_token
+        else ("pi05_prepare_state_tokenizer_processor_step", processors.discrete_state)
     )
     if not found or (processors.newline and processors.discrete_state):
         policy.problems.add(recipe.PRE + ": steps", "{}, and not the other family's".format(wanted), "other steps")
@@ -211,25 +212,10 @@ ALOHA = Robot(
     n_action=14,
     decode=(
         FLIP,
-        {
-            "op": "horn_angle",
-            "columns": GRIPPERS,
-            "scale": 0.05800 - 0.01844,
-            "shift": 0.01844,
-            "arm_length": 0.036,
-            "horn_radius": 0.022,
-        },
+        {"op": "horn_angle", "columns": GRIPPERS, "scale": 0.05800 - 0.01844, "shift": 0.01844, "arm_length": 0.036, "horn_radius": 0.022},
         {"op": "affine", "columns": GRIPPERS, "scale": 1 / (1.6296 - 0.5476), "shift": -0.5476 / (1.6296 - 0.5476)},
     ),
-    encode=(
-        FLIP,
-        {
-            "op": "affine",
-            "columns": GRIPPERS,
-            "scale": 1 / (1.4910 + 0.6213),
-            "shift": (0.5476 + 0.6213) / (1.4910 + 0.6213),
-        },
-    ),
+    encode=(FLIP, {"op": "affine", "columns": GRIPPERS, "scale": 1 / (1.4910 + 0.6213), "shift": (0.5476 + 0.6213) / (1.4910 + 0.6213)}),
 )
 DROID = Robot(
     views=(
@@ -240,9 +226,7 @@ DROID = Robot(
     n_action=8,
 )
 LIBERO = Robot(
-    views=(("image", "observation/image", False), ("wrist_image", "observation/wrist_image", False)),
-    states=(("state", 8),),
-    n_action=7,
+    views=(("image", "observation/image", False), ("wrist_image", "observation/wrist_image", False)), states=(("state", 8),), n_action=7
 )
 # Joints that actions are relative to; grippers are absolute (make_bool_mask).
 ALOHA_JOINTS = [*range(6), *range(7, 13)]
@@ -380,9 +364,7 @@ def _values(stats: dict, key: str, name: str, width: int, where: str, problems: 
     numbers = isinstance(values, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
     if not numbers or len(values) < width:
         found = "none" if values is None else "{} numbers".format(len(values)) if numbers else repr(values)[:80]
-        problems.add(
-            place, "{} numbers".format(width), found, "compute the data set's statistics again with openpi's script"
-        )
+        problems.add(place, "{} numbers".format(width), found, "compute the data set's statistics again with openpi's script")
         return np.zeros(width, np.float32)
     with np.errstate(over="ignore"):  # told below
         chosen = np.asarray(values[:width], np.float32)
@@ -393,9 +375,7 @@ def _values(stats: dict, key: str, name: str, width: int, where: str, problems: 
     return chosen
 
 
-def _openpi_features(
-    robot: Robot, states: List[str], s: Sizes, checkpoint: Checkpoint, options: Options, problems: Problems
-) -> List[Key]:
+def _openpi_features(robot: Robot, states: List[str], s: Sizes, checkpoint: Checkpoint, options: Options, problems: Problems) -> List[Key]:
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
     return [
         *views_of(

@@ -76,9 +76,7 @@ class Sizes:
 def read_towers(policy: Section, checkpoint: Checkpoint, problems: Problems) -> Sizes:
     """The sizes of the three towers; `policy` names the variants of two."""
     dims = _dims(checkpoint, problems)
-    lm, expert = (
-        _gemma(policy, key, dims, problems) for key in ("paligemma_variant", "action_expert_variant")
-    )
+    lm, expert = (_gemma(policy, key, dims, problems) for key in ("paligemma_variant", "action_expert_variant"))
     vision = Section(DIMS_FILE + ": vision", member(dims, "vision", dict, DIMS_FILE), SIGLIP, problems)
     _known(vision)
     for key in ("depth", "num_heads", "num_kv_heads", "head_dim"):
@@ -135,9 +133,7 @@ def _gemma(policy: Section, key: str, dims: dict, problems: Problems) -> Section
     if not isinstance(variant, str) or variant not in VARIANTS:
         policy.bad(key, " or ".join(VARIANTS), unsupported=True, hint="merge adapters into the policy and save it again")
         variant = "gemma_300m"
-    section = Section(
-        "{}: {}".format(DIMS_FILE, variant), member(dims, variant, dict, DIMS_FILE), VARIANTS[variant], problems
-    )
+    section = Section("{}: {}".format(DIMS_FILE, variant), member(dims, variant, dict, DIMS_FILE), VARIANTS[variant], problems)
     _known(section)
     return section
 
@@ -202,9 +198,7 @@ def canonical(name: str, time_mlp: str, other_time_mlp: str) -> str:
     return name
 
 
-def rename(
-    tensors: Dict[str, Entry], time_mlp: str, other_time_mlp: str, notes: List[str], problems: Problems
-) -> Dict[str, Entry]:
+def rename(tensors: Dict[str, Entry], time_mlp: str, other_time_mlp: str, notes: List[str], problems: Problems) -> Dict[str, Entry]:
     renamed: Dict[str, Entry] = {}
     moved = []
     for stored, entry in tensors.items():

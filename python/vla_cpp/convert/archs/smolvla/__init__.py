@@ -52,9 +52,7 @@ def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str) -> D
     }
 
 
-def _feature_keys(
-    checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems
-) -> List[Key]:
+def _feature_keys(checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[Key]:
     """One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same."""
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
     return [

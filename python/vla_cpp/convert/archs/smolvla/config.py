@@ -136,13 +136,7 @@ def _read_policy(policy: Section, s: Sizes) -> None:
     policy.count("prefix_length", ANY_INT)  # pads the prefix with masked tokens, which changes no number
     frame = policy.get("resize_imgs_with_padding")
     if frame is None:
-        policy.bad(
-            "resize_imgs_with_padding",
-            "[width, height]",
-            "null",
-            "frames of any size would reach the tower",
-            unsupported=True,
-        )
+        policy.bad("resize_imgs_with_padding", "[width, height]", "null", "frames of any size would reach the tower", unsupported=True)
     elif not isinstance(frame, list) or len(frame) != 2 or not all(isinstance(n, int) and n > 0 for n in frame):
         policy.bad("resize_imgs_with_padding", "[width, height]")
     else:
@@ -172,10 +166,7 @@ def _read_vision(vision: Section, backbone: Section, s: Sizes) -> None:
     key = "config.json: resize_imgs_with_padding"
     if width != height:
         backbone.problems.unsupported(
-            key,
-            "a square",
-            "{} x {}".format(width, height),
-            "the reference's pixel shuffle takes a square grid of patches",
+            key, "a square", "{} x {}".format(width, height), "the reference's pixel shuffle takes a square grid of patches"
         )
     elif width and width % (s.vision.patch_size * s.factor):
         backbone.problems.unsupported(
@@ -191,11 +182,7 @@ def _position_precision(policy: Section, vision: Section, options: Options, chec
     stated = vision.get("dtype") or vision.get("torch_dtype")
     if stated not in (None, "float32", "bfloat16"):
         vision.bad(
-            "dtype",
-            "float32 or bfloat16",
-            repr(stated),
-            "choose the rule for the position table by --position-precision",
-            unsupported=True,
+            "dtype", "float32 or bfloat16", repr(stated), "choose the rule for the position table by --position-precision", unsupported=True
         )
     bfloat16 = policy.get("load_vlm_weights") is True or stated == "bfloat16"
     precision = "bfloat16" if bfloat16 else "float32"
@@ -206,9 +193,7 @@ def _position_precision(policy: Section, vision: Section, options: Options, chec
         if bfloat16
         else "the tower runs in float32"
     )
-    checkpoint.notes.append(
-        "position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why)
-    )
+    checkpoint.notes.append("position rows of patches: as computed in {} ({}); --position-precision overrides".format(precision, why))
     return precision
 
 
@@ -249,11 +234,7 @@ def read_expert(policy: Section, s: Sizes) -> None:
         )
     s.n_expert_layer = wanted if wanted > 0 else s.lm.n_layer
     if s.lm.n_layer % s.n_expert_layer:
-        policy.bad(
-            "num_expert_layers",
-            "a divisor of the {} language-model layers".format(s.lm.n_layer),
-            hint="the reference asserts it",
-        )
+        policy.bad("num_expert_layers", "a divisor of the {} language-model layers".format(s.lm.n_layer), hint="the reference asserts it")
         return
     s.layer_kinds = layer_kinds(s.lm.n_layer, s.n_expert_layer, mode, every)
     _check_expert_layers(policy, s, mode, every)

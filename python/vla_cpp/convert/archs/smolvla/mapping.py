@@ -70,10 +70,7 @@ def _expert(s: Sizes) -> List[Weight]:
 
 def dropped(s: Sizes) -> List[Dropped]:
     head = "model.vlm_with_expert.vlm.lm_head.weight"
-    return [
-        Dropped(head, (s.lm.n_vocab, s.lm.d_model), "no action depends on the language head"),
-        *dropped_of_last(s.lm, TEXT),
-    ]
+    return [Dropped(head, (s.lm.n_vocab, s.lm.d_model), "no action depends on the language head"), *dropped_of_last(s.lm, TEXT)]
 
 
 def hints(s: Sizes) -> Dict[str, str]:

@@ -38,9 +38,7 @@ def network_keys(s: Sizes) -> List[Key]:
             "policy": dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, n_view=len(s.views)),
             "vision": {**vars(s.vision), "rope_base": s.rope_base, "n_register": s.n_register},
             "lm": vars(s.lm),
-            "transformer": dict(
-                d_model=s.d_model, n_head=s.n_head, d_ff=s.d_ff, activation=s.activation, norm="before", norm_eps=NORM_EPS
-            ),
+            "transformer": dict(d_model=s.d_model, n_head=s.n_head, d_ff=s.d_ff, activation=s.activation, norm="before", norm_eps=NORM_EPS),
             "fusion": dict(n_layer=s.n_fusion),
             "decoder": dict(n_layer=s.n_decoder),
             "solver": dict(steps=1, kind="direct", noise="none"),

@@ -117,5 +117,7 @@ def gripper_ops(name: str, where: str, config: dict, s: Sizes, problems: Problem
         return []
     above = np.float32(threshold)
     if name == SNAP:
-        return [{"op": "threshold", "columns": [column], "above": float(np.nextafter(above, np.float32(-np.inf))), "then": 1.0, "else": 0.0}]
+        return [
+            {"op": "threshold", "columns": [column], "above": float(np.nextafter(above, np.float32(-np.inf))), "then": 1.0, "else": 0.0}
+        ]
     return [{"op": "threshold", "columns": [column], "above": float(above), "then": -1.0, "else": 1.0}]

@@ -182,7 +182,9 @@ def _read_prompt(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
     text = template[: template.index(PLACES[2])].replace(PLACES[1], frames)
     s.prompt = text + embodied * s.n_embodied
     if len(s.prompt.encode()) > MAX_TEMPLATE:
-        policy.bad("prompt_template", "a prompt of at most {} bytes".format(MAX_TEMPLATE), "{}".format(len(s.prompt.encode())), unsupported=True)
+        policy.bad(
+            "prompt_template", "a prompt of at most {} bytes".format(MAX_TEMPLATE), "{}".format(len(s.prompt.encode())), unsupported=True
+        )
 
 
 def _is_template(text: str) -> bool:
@@ -203,7 +205,9 @@ def _n_moment(policy: Section, checkpoint: Checkpoint, s: Sizes) -> int:
         s.world_model = {name: entry.shape for name, entry in checkpoint.tensors.items() if name.startswith("model.video_")}
         shape = s.world_model.get(ENCODER, ())
         if len(shape) != 5 or shape[2] < 1:
-            policy.problems.add("tensor " + ENCODER, "(width, 3, frames, 16, 16), which tells the frames that become one", str(shape or "none"))
+            policy.problems.add(
+                "tensor " + ENCODER, "(width, 3, frames, 16, 16), which tells the frames that become one", str(shape or "none")
+            )
         else:
             tubelet = shape[2]
     if n_frame // tubelet < 2:

@@ -68,7 +68,11 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         Key("observation.max_text_tokens", "u32", processors.max_tokens),
         *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(recipe_document(s, processors, tokenizer.truncate, NORMALIZE in steps), ensure_ascii=False)),
+        Key(
+            "processor.recipe",
+            "string",
+            json.dumps(recipe_document(s, processors, tokenizer.truncate, NORMALIZE in steps), ensure_ascii=False),
+        ),
     ]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))

@@ -227,7 +227,11 @@ def _read_views(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
         policy.bad("num_image_views", "at most 32 views", str(s.n_view), unsupported=True)
     size = policy.get("resize_imgs_with_padding")
     s.resizes = size is not None
-    shapes = {tuple(features[view]["shape"][1:]) for view in listed if not view.startswith(EMPTY_CAMERA)} if not s.resizes else {tuple(size or ())}
+    shapes = (
+        {tuple(features[view]["shape"][1:]) for view in listed if not view.startswith(EMPTY_CAMERA)}
+        if not s.resizes
+        else {tuple(size or ())}
+    )
     height, width = next(iter(shapes)) if len(shapes) == 1 and len(next(iter(shapes))) == 2 else (None, None)
     if not all(type(side) is int and 0 < side <= 4096 for side in (height, width)):
         wanted = "(height, width)" if s.resizes else "a size, or views of one size"
@@ -239,7 +243,9 @@ def _read_views(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
 def _read_florence(policy: Section, s: Sizes, problems: Problems) -> None:
     where = "config.json: florence_config"
     florence = member(policy.values, "florence_config", dict, "config.json")
-    _read_vision(Section(where + ".vision_config", _translated(member(florence, "vision_config", dict, where), problems), VISION, problems), s)
+    _read_vision(
+        Section(where + ".vision_config", _translated(member(florence, "vision_config", dict, where), problems), VISION, problems), s
+    )
     text = Section(where + ".text_config", member(florence, "text_config", dict, where), TEXT, problems)
     if text.values.get("model_type", TEXT_TYPES[1]) not in TEXT_TYPES:
         text.bad("model_type", " or ".join(TEXT_TYPES), unsupported=True)
@@ -286,9 +292,13 @@ def _read_vision(vision: Section, s: Sizes) -> None:
     s.window, s.d_lm = vision.count("window_size", maximum=1024), vision.count("projection_dim")
     s.n_cell_position, s.n_moment = vision.count("max_position_embeddings", maximum=4096), vision.count("max_temporal_embeddings")
     if len({len(column) for column in columns}) > 1 or not 1 <= len(columns[0]) <= MAX_STAGE:
-        vision.bad("embed_dim", "lists of as many numbers as stages, at most {}".format(MAX_STAGE), str([len(column) for column in columns]))
+        vision.bad(
+            "embed_dim", "lists of as many numbers as stages, at most {}".format(MAX_STAGE), str([len(column) for column in columns])
+        )
         return
-    s.stages = [Stage(d, n, heads, groups, int(d * ratio), size, stride, pre) for d, n, heads, groups, size, stride, _, pre in zip(*columns)]
+    s.stages = [
+        Stage(d, n, heads, groups, int(d * ratio), size, stride, pre) for d, n, heads, groups, size, stride, _, pre in zip(*columns)
+    ]
     for stage, padding in zip(s.stages, columns[names.index("patch_padding")]):
         if stage.patch_size % 2 == 0 or padding != stage.patch_size // 2:
             vision.bad("patch_padding", "half of an odd patch_size", unsupported=True)
@@ -311,7 +321,9 @@ def _numbers(vision: Section, name: str) -> list:
 def _read_names(checkpoint: Checkpoint, s: Sizes) -> None:
     """Reference: modeling_xvla.py _is_vendored_florence_state_dict. Of the token table's two names a file may have either."""
     prefix = "model.vlm."
-    s.vendored = any(name == prefix + "image_projection" or name.startswith(prefix + "language_model.model.") for name in checkpoint.tensors)
+    s.vendored = any(
+        name == prefix + "image_projection" or name.startswith(prefix + "language_model.model.") for name in checkpoint.tensors
+    )
     at = prefix + ("language_model.model." if s.vendored else "language_model.")
     s.tokens = at + "shared.weight"
     if s.tokens not in checkpoint.tensors and at + "encoder.embed_tokens.weight" in checkpoint.tensors:
