@@ -12,6 +12,25 @@ from .files import member, read_json
 from .recipe import ACTION
 
 
+def view_name(name: str) -> str:
+    return name if name.startswith("observation.images.") else "observation.images." + name
+
+
+def robot_keys(
+    views: List[Key],
+    dims: Dict[str, int],
+    info_path: str,
+    notes: List[str],
+    problems: Problems,
+    max_tokens: Optional[int] = None,
+    states: Optional[Dict[str, int]] = None,
+) -> List[Key]:
+    """Views, states and actions. `dims`: widths of vectors. `max_tokens`: of text, where no other key of the plan states them. `states`:
+    where the bundle has other ones than the data set."""
+    tokens = [] if max_tokens is None else [Key("observation.max_text_tokens", "u32", max_tokens)]
+    return [*views, *states_of(states or dims), *tokens, *feature_keys(info_path, dims, notes, problems)]
+
+
 def views_of(views: Sequence[str], aliases: Sequence[str], optional: Sequence[int], min_views: int = 1) -> List[Key]:
     return [
         Key("observation.views", "string[]", views),

@@ -1,20 +1,23 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of mappings that several architectures share: single tensors, the SigLIP tower, the gated block of Llama and Gemma."""
+"""Rows of mappings: single tensors, and the blocks that architectures share, each written once with its shapes. A mapping says what a
+checkpoint calls their parts."""
 
 from __future__ import annotations
 
-from typing import Dict, List, NamedTuple, Sequence
+from typing import Callable, List, NamedTuple, Sequence, Tuple
 
 from .archs import MATRIX, SCALE, TABLE, TERNARY, VECTOR, Weight
 
+Rows = List[Weight]
 
-def linear(target: str, source: str, d_out: int, d_in: int, bias: bool = False) -> List[Weight]:
+
+def linear(target: str, source: str, d_out: int, d_in: int, bias: bool = True) -> Rows:
     rows = [Weight(target + ".weight", source + ".weight", MATRIX, (d_out, d_in), (d_out, d_in))]
     return rows + (vector(target + ".bias", source + ".bias", d_out) if bias else [])
 
 
-def ternary(target: str, source: str, d_out: int, d_in: int, bias: bool = False) -> List[Weight]:
+def ternary(target: str, source: str, d_out: int, d_in: int, bias: bool = True) -> Rows:
     """A matrix that the reference rounds to -1, 0 and 1 times a factor, four numbers in a byte."""
     rows = [
         Weight(target + ".weight", source + ".weight", TERNARY, (d_out, d_in), (d_out, d_in // 4)),
@@ -23,47 +26,62 @@ def ternary(target: str, source: str, d_out: int, d_in: int, bias: bool = False)
     return rows + (vector(target + ".bias", source + ".bias", d_out) if bias else [])
 
 
-def vector(target: str, source: str, size: int) -> List[Weight]:
-    return [Weight(target, source, VECTOR, (size,), (size,))]
+def vector(target: str, source: str, size: int, stored: Tuple[int, ...] = (), **how) -> Rows:
+    return [Weight(target, source, VECTOR, stored or (size,), (size,), **how)]
 
 
-def norm(target: str, source: str, size: int) -> List[Weight]:
-    return vector(target + ".weight", source + ".weight", size) + vector(target + ".bias", source + ".bias", size)
+def table(target: str, source: str, n_row: int, d: int, stored: Tuple[int, ...] = (), **how) -> Rows:
+    """`source`: the whole name; the reference's own parameters do not end in "weight"."""
+    return [Weight(target + ".weight", source, TABLE, stored or (n_row, d), (n_row, d), **how)]
 
 
-class EncoderNames(NamedTuple):
-    """Parts of a layer. `qkv`: three names, or a single one that ends before "weight" where their rows are stacked. `scales`: LayerScale."""
-
-    norms: Sequence[str]
-    qkv: Sequence[str]
-    out: str
-    up: str
-    down: str
-    scales: Sequence[str] = ()
+def norm(target: str, source: str, d: int) -> Rows:
+    return vector(target + ".weight", source + ".weight", d) + vector(target + ".bias", source + ".bias", d)
 
 
-def encoder_block(target: str, block: str, names: EncoderNames, d: int, d_ff: int, product=linear) -> List[Weight]:
-    """`product`: the kind of its matrices."""
-
-    def branch(i: int, part: str, rows: List[Weight]) -> List[Weight]:
-        scale = vector(target + part + "_scale.weight", block + names.scales[i], d) if names.scales else []
-        return [*norm(target + part + "_norm", block + names.norms[i], d), *rows, *scale]
-
-    qkv = (
-        stacked(target, block + names.qkv[0], d)
-        if len(names.qkv) == 1
-        else [row for part, name in zip("qkv", names.qkv) for row in product(target + "attn_" + part, block + name, d, d, bias=True)]
-    )
-    up = product(target + "ffn_up", block + names.up, d_ff, d, bias=True)
-    return [
-        *branch(0, "attn", [*qkv, *product(target + "attn_out", block + names.out, d, d, bias=True)]),
-        *branch(1, "ffn", [*up, *product(target + "ffn_down", block + names.down, d, d_ff, bias=True)]),
-    ]
+def rms_norm(target: str, source: str, d: int) -> Rows:
+    return vector(target + ".weight", source + ".weight", d)
 
 
-def stacked(target: str, source: str, d: int) -> List[Weight]:
+def gemma_norm(target: str, source: str, d: int) -> Rows:
+    return vector(target + ".weight", source + ".weight", d, plus_one=True)
+
+
+def patch_embed(source: str, d: int, size: int) -> Rows:
+    """A convolution whose stride is its kernel is a matrix over the flattened patch: channel, row, column."""
+    stored, at = (d, 3, size, size), "vision.patch_embed"
+    return [Weight(at + ".weight", source + ".weight", MATRIX, stored, (d, 3 * size**2)), *vector(at + ".bias", source + ".bias", d)]
+
+
+class Names(NamedTuple):
+    """What a checkpoint calls the parts of a block, with blanks between them. `attn`: q, k, v and the projection behind them; or, where the
+    rows of q, k and v are stacked, their name up to "weight" or "bias", and the projection. `ffn`: up, down. `cross`: a second attention.
+    `norms`: one for each of these in turn, if they have any; `scales`, of LayerScale, too."""
+
+    attn: str
+    ffn: str
+    norms: str = ""
+    cross: str = ""
+    scales: str = ""
+
+
+SIGLIP = Names("self_attn.q_proj self_attn.k_proj self_attn.v_proj self_attn.out_proj", "mlp.fc1 mlp.fc2", "layer_norm1 layer_norm2")
+
+
+def attention(target: str, source: str, names: str, d: int, d_in: int = 0, product=linear) -> Rows:
+    """`d_in`: width of what keys and values are made from, d by default."""
+    *qkv, out = names.split()
+    if len(qkv) == 1:
+        rows = stacked(target, source + qkv[0], d)
+    else:
+        parts = zip("qkv", qkv, (d, d_in or d, d_in or d))
+        rows = [row for part, name, width in parts for row in product(target + "attn_" + part, source + name, d, width)]
+    return rows + product(target + "attn_out", source + out, d, d)
+
+
+def stacked(target: str, source: str, d: int) -> Rows:
     """q, k and v of width d as thirds of the rows of one matrix and one bias."""
-    rows: List[Weight] = []
+    rows: Rows = []
     for i, part in enumerate(("attn_q", "attn_k", "attn_v")):
         rows += [
             Weight(target + part + ".weight", source + "weight", MATRIX, (3 * d, d), (d, d), first=i * d),
@@ -72,41 +90,57 @@ def stacked(target: str, source: str, d: int) -> List[Weight]:
     return rows
 
 
-SIGLIP = EncoderNames(
-    ("layer_norm1", "layer_norm2"), tuple("self_attn.{}_proj".format(part) for part in "qkv"), "self_attn.out_proj", "mlp.fc1", "mlp.fc2"
-)
+def block(target: str, source: str, names: Names, d: int, d_ff: int, d_in: int = 0, product=linear) -> Rows:
+    """Attention, or self-attention and cross-attention, and an MLP."""
+    (up, down), norms, scales = names.ffn.split(), names.norms.split(), names.scales.split()
+    parts = [("attn", attention(target, source, names.attn, d, d_in, product))]
+    if names.cross:
+        parts.append(("cross.attn", attention(target + "cross.", source, names.cross, d)))
+    parts.append(("ffn", product(target + "ffn_up", source + up, d_ff, d) + product(target + "ffn_down", source + down, d, d_ff)))
+    rows: Rows = []
+    for i, (part, own) in enumerate(parts):
+        rows += norm(target + part + "_norm", source + norms[i], d) if norms else []
+        rows += own
+        rows += vector(target + part + "_scale.weight", source + scales[i], d) if scales else []
+    return rows
 
 
-def siglip(
-    source: str, d: int, d_ff: int, n_layer: int, patch_size: int, n_position: int, product=linear, post_norm: bool = True
-) -> List[Weight]:
-    """The tower below `source`, which ends in a dot, as `vision.*`. `product`: the kind of its blocks' matrices."""
-    patches, table = source + "embeddings.patch_embedding", (n_position, d)
-    rows = [
-        # A convolution whose stride is its kernel is a matrix over the flattened patch: channel, row, column.
-        Weight("vision.patch_embed.weight", patches + ".weight", MATRIX, (d, 3, patch_size, patch_size), (d, 3 * patch_size**2)),
-        *vector("vision.patch_embed.bias", patches + ".bias", d),
-        Weight("vision.position.weight", source + "embeddings.position_embedding.weight", TABLE, table, table),
-    ]
-    for i in range(n_layer):
-        rows += encoder_block("vision.blk.{}.".format(i), "{}encoder.layers.{}.".format(source, i), SIGLIP, d, d_ff, product)
-    return rows + (norm("vision.post_norm", source + "post_layernorm", d) if post_norm else [])
+def blocks(target: str, source: str, names: Names, n_layer: int, d: int, d_ff: int, product=linear) -> Rows:
+    """`source`: with {} for the number of the layer, up to the dot."""
+    layers = ((target + "blk.{}.".format(i), source.format(i)) for i in range(n_layer))
+    return [row for at, theirs in layers for row in block(at, theirs, names, d, d_ff, product=product)]
 
 
-def gated_block(target: str, block: str, d: int, d_q: int, d_kv: int, d_kv_in: int, d_ff: int, product=linear) -> Dict[str, List[Weight]]:
-    """The block of Llama and Gemma by part. `product`: the kind of its matrices."""
-    return {
-        "attn_norm": vector(target + "attn_norm.weight", block + "input_layernorm.weight", d),
-        "attn_q": product(target + "attn_q", block + "self_attn.q_proj", d_q, d),
-        "attn_k": product(target + "attn_k", block + "self_attn.k_proj", d_kv, d_kv_in),
-        "attn_v": product(target + "attn_v", block + "self_attn.v_proj", d_kv, d_kv_in),
-        "attn_out": product(target + "attn_out", block + "self_attn.o_proj", d, d_q),
-        "ffn_norm": vector(target + "ffn_norm.weight", block + "post_attention_layernorm.weight", d),
-        "ffn_gate": product(target + "ffn_gate", block + "mlp.gate_proj", d_ff, d),
-        "ffn_up": product(target + "ffn_up", block + "mlp.up_proj", d_ff, d),
-        "ffn_down": product(target + "ffn_down", block + "mlp.down_proj", d, d_ff),
-    }
+class Decoder(NamedTuple):
+    """In what the blocks of Llama, Qwen, Gemma and BitNet differ."""
+
+    norm: Callable[..., Rows] = rms_norm
+    product: Callable[..., Rows] = linear
+    qkv_bias: bool = False
+    sub_norms: bool = False  # in front of the last product of attention and of the MLP
+    head_norms: bool = False  # of queries and keys
 
 
-# Of the last layer of a prefix only keys and values are read.
-KEPT_OF_LAST = ("attn_norm", "attn_k", "attn_v")
+LLAMA, GEMMA, QWEN2, QWEN3 = Decoder(), Decoder(gemma_norm), Decoder(qkv_bias=True), Decoder(head_norms=True)
+BITNET = Decoder(product=ternary, sub_norms=True)
+
+
+def gated_block(target: str, source: str, d: int, d_ff: int, heads: Sequence[int], kind: Decoder = LLAMA, d_in: int = 0) -> Rows:
+    """`heads`: widths of queries, of keys, of a head. `d_in`: width of what keys and values are made from, d by default."""
+    (d_q, d_kv, d_head), at, mlp, rows = (
+        heads,
+        source + "self_attn.",
+        source + "mlp.",
+        kind.norm(target + "attn_norm", source + "input_layernorm", d),
+    )
+    for part, d_out, width in (("q", d_q, d), ("k", d_kv, d_in or d), ("v", d_kv, d_in or d)):
+        rows += kind.product(target + "attn_" + part, at + part + "_proj", d_out, width, bias=kind.qkv_bias)
+    rows += kind.product(target + "attn_out", at + "o_proj", d, d_q, bias=False)
+    rows += rms_norm(target + "attn_sub_norm", at + "attn_sub_norm", d_q) if kind.sub_norms else []
+    rows += kind.norm(target + "ffn_norm", source + "post_attention_layernorm", d)
+    for part, d_out, width in (("gate", d_ff, d), ("up", d_ff, d), ("down", d, d_ff)):
+        rows += kind.product(target + "ffn_" + part, mlp + part + "_proj", d_out, width, bias=False)
+    rows += rms_norm(target + "ffn_sub_norm", mlp + "ffn_sub_norm", d_ff) if kind.sub_norms else []
+    for part in ("q", "k") if kind.head_norms else ():
+        rows += rms_norm(target + "attn_{}_norm".format(part), at + part + "_norm", d_head)
+    return rows

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from typing import Dict, List, Sequence, Set, Tuple
+from typing import Callable, Dict, List, Sequence, Set, Tuple
 
 from . import recipe
 from .archs import Options
@@ -62,9 +62,8 @@ def _features(policy: Section, key: str) -> dict:
     return policy.get(key) if isinstance(policy.get(key), dict) else {}
 
 
-def read_views(policy: Section, checkpoint: Checkpoint) -> Tuple[List[str], int]:
-    """Names of the cameras in their order, and how many of them `empty_cameras` adds."""
-    n_empty = policy.count("empty_cameras", 0, MAX_EMPTY)
+def listed_views(policy: Section, others: Callable[[str, object], None]) -> List[str]:
+    """Names of the cameras that the config lists, in their order. `others`: what to say of further features, by name and type."""
     views = []
     for name, feature in _features(policy, "input_features").items():
         kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
@@ -73,12 +72,28 @@ def read_views(policy: Section, checkpoint: Checkpoint) -> Tuple[List[str], int]
             if not isinstance(shape, list) or len(shape) != 3 or shape[0] != 3:
                 policy.bad("input_features." + name, "a frame of shape [3, height, width]", str(shape))
         elif name != recipe.STATE:
-            checkpoint.notes.append("input feature {} ({}): not read by this policy".format(name, kind))
+            others(name, kind)
+    return views
+
+
+def read_views(policy: Section, checkpoint: Checkpoint) -> Tuple[List[str], int]:
+    """Names of the cameras in their order, and how many of them `empty_cameras` adds."""
+    n_empty, note = policy.count("empty_cameras", 0, MAX_EMPTY), "input feature {} ({}): not read by this policy".format
+    views = listed_views(policy, lambda name, kind: checkpoint.notes.append(note(name, kind)))
     if not views:
         policy.bad("input_features", "a VISUAL feature or several", "none")
     # The reference's config class adds these itself (validate_features), to whatever the file lists.
     added = [EMPTY_CAMERA + str(i) for i in range(n_empty)]
     return views + [name for name in added if name not in views], n_empty
+
+
+def strict_views(policy: Section) -> List[str]:
+    """Names of the cameras, where what the reference does not read is refused: it may be a misspelt feature."""
+    expected = "cameras and {}".format(recipe.STATE)
+    views = listed_views(policy, lambda name, kind: policy.bad("input_features." + name, expected, str(kind), unsupported=True))
+    if not views:
+        policy.bad("input_features", "a VISUAL feature or several", "none")
+    return views
 
 
 def vector_dim(policy: Section, key: str, name: str, kind: str) -> int:

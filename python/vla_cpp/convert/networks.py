@@ -5,14 +5,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Dict, List, Mapping, Union
+from typing import Dict, List, Mapping, Sequence, Tuple, Union
 
-from .archs import TABLE, Dropped, Weight
+from .archs import Dropped
 from .bundle import Key, keys_by_type
-from .layers import KEPT_OF_LAST, gated_block, vector
+from .layers import LLAMA, SIGLIP, Decoder, Rows, blocks, gated_block, linear, norm, patch_embed, rms_norm, table
 from .section import Section
 
 MAX_LAYERS = 1024
+NORM_EPS = 1e-5  # of torch.nn.LayerNorm
 
 
 @dataclass
@@ -47,33 +48,56 @@ class Language:
     rope_base: float = 0.0
 
     @property
-    def d_q(self) -> int:
-        return self.n_head * self.d_head
-
-    @property
-    def d_kv(self) -> int:
-        return self.n_head_kv * self.d_head
+    def heads(self) -> Tuple[int, int, int]:
+        """Widths of queries, of keys, of a head."""
+        return self.n_head * self.d_head, self.n_head_kv * self.d_head, self.d_head
 
 
-DOUBLES = ("policy.time_scale", "time.min_period", "time.max_period", "solver.t_start", "solver.t_end")
+@dataclass
+class TextEncoder:
+    """Keys `lm.*` of BERT and BART."""
+
+    d_model: int = 0
+    n_layer: int = 0
+    n_head: int = 0
+    d_ff: int = 0
+    n_vocab: int = 0
+    n_position: int = 0
+    norm_eps: float = 0.0
+
+
+DOUBLES = ("policy.time_scale", "policy.rtc_ramp_rate", "time.min_period", "time.max_period", "solver.t_start", "solver.t_end")
 KINDS = {int: "u32", float: "f32", str: "string"}
+Fields = Union[Vision, Language, TextEncoder, Mapping[str, object]]
 
 
-Modules = Mapping[str, Union[Vision, Language, Mapping[str, object]]]
+def kind_of(key: str, value: object) -> str:
+    if isinstance(value, (list, tuple)):
+        return "string[]" if value and isinstance(value[0], str) else "u32[]"
+    return "f64" if key in DOUBLES else KINDS[type(value)]
 
 
-def typed(modules: Modules) -> Dict[str, Dict[str, object]]:
-    """Numbers and names of modules, by type."""
-    groups: Dict[str, Dict[str, object]] = {"u32": {}, "f32": {}, "f64": {}, "string": {}}
-    for module, fields in modules.items():
+def keys_of(*parts: Mapping[str, Fields]) -> List[Key]:
+    """Numbers, names and lists of modules, by type. `parts`: fields by module."""
+    groups: Dict[str, Dict[str, object]] = {kind: {} for kind in ("u32", "f32", "f64", "string", "u32[]", "string[]")}
+    for module, fields in (item for part in parts for item in part.items()):
         for name, value in (fields if isinstance(fields, Mapping) else vars(fields)).items():
             key = "{}.{}".format(module, name)
-            groups["f64" if key in DOUBLES else KINDS[type(value)]][key] = value
-    return groups
+            groups[kind_of(key, value)][key] = list(value) if isinstance(value, tuple) else value
+    return keys_by_type(groups)
 
 
-def keys_of(modules: Modules) -> List[Key]:
-    return keys_by_type(typed(modules))
+def pick(sizes: object, names: str) -> Dict[str, object]:
+    """Some of the attributes, by name."""
+    return {name: getattr(sizes, name) for name in names.split()}
+
+
+SIZES = ("hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads")
+
+
+def defaults(*sizes: int, **others: object) -> Dict[str, object]:
+    """Of a config class of transformers. `sizes`: those of SIZES."""
+    return {**dict(zip(SIZES, sizes)), **others}
 
 
 def read_vision(section: Section, image_size: int, patch_size: int) -> Vision:
@@ -128,44 +152,48 @@ def pooling_head(tower: str, vision: Vision, reason: str) -> List[Dropped]:
     return [Dropped("{}head.{}".format(tower, name), shape, reason) for name, shape in shapes.items()]
 
 
-def plus_one(weights: List[Weight]) -> List[Weight]:
-    """Norms of Gemma."""
-    return [weight._replace(plus_one=True) for weight in weights]
-
-
-def embedding(lm: Language, source: str) -> Weight:
-    return Weight("lm.token_embd.weight", source, TABLE, (lm.n_vocab, lm.d_model), (lm.n_vocab, lm.d_model))
-
-
-def language_block(lm: Language, source: str, i: int, qkv_bias: bool = False, gemma: bool = False) -> Dict[str, List[Weight]]:
-    """Layer i by part. `source`: where the layers are, up to the dot."""
-    target = "lm.blk.{}.".format(i)
-    block = gated_block(target, "{}layers.{}.".format(source, i), lm.d_model, lm.d_q, lm.d_kv, lm.d_model, lm.d_ff)
-    for part in ("attn_q", "attn_k", "attn_v") if qkv_bias else ():
-        weight = block[part][0]
-        block[part] += vector(target + part + ".bias", weight.source[: -len("weight")] + "bias", weight.shape[0])
-    for part in ("attn_norm", "ffn_norm") if gemma else ():
-        block[part] = plus_one(block[part])
-    return block
-
-
-def keys_and_values(lm: Language, source: str, gemma: bool = False) -> List[Weight]:
-    """The layers of a language model of which only keys and values are read, so that the last one needs no more."""
+def siglip(source: str, v: Vision, n_position: int = 0, product=linear, post_norm: bool = True) -> Rows:
+    """The tower below `source`, which ends in a dot, as `vision.*`. `product`: the kind of its blocks' matrices."""
     return [
-        weight
-        for i in range(lm.n_layer)
-        for part, weights in language_block(lm, source, i, gemma=gemma).items()
-        if i < lm.n_layer - 1 or part in KEPT_OF_LAST
-        for weight in weights
+        *patch_embed(source + "embeddings.patch_embedding", v.d_model, v.patch_size),
+        *table("vision.position", source + "embeddings.position_embedding.weight", n_position or v.n_patch, v.d_model),
+        *blocks("vision.", source + "encoder.layers.{}.", SIGLIP, v.n_layer, v.d_model, v.d_ff, product),
+        *(norm("vision.post_norm", source + "post_layernorm", v.d_model) if post_norm else []),
     ]
+
+
+# Of the last layer of a prefix only keys and values are read.
+KEPT_OF_LAST = ("attn_norm.weight", "attn_k.weight", "attn_v.weight")
+
+
+def decoder(lm: Language, source: str, kind: Decoder = LLAMA, end: str = "norm", tokens: str = "") -> Rows:
+    """The language model below `source`, which ends in a dot. `end`: "norm"; "layers", without it; "cache", where only keys and values are
+    read, so that the last layer needs no more. `tokens`: the whole name of the embedding, where it stands elsewhere."""
+    rows = table("lm.token_embd", tokens or source + "embed_tokens.weight", lm.n_vocab, lm.d_model)
+    for i in range(lm.n_layer):
+        own = _layer(lm, source, i, kind)
+        rows += own if end != "cache" or i < lm.n_layer - 1 else [row for row in own if row.target.endswith(KEPT_OF_LAST)]
+    return rows + (rms_norm("lm.norm", source + "norm", lm.d_model) if end == "norm" else [])
+
+
+def _layer(lm: Language, source: str, i: int, kind: Decoder = LLAMA) -> Rows:
+    return gated_block("lm.blk.{}.".format(i), "{}layers.{}.".format(source, i), lm.d_model, lm.d_ff, lm.heads, kind)
 
 
 def dropped_of_last(lm: Language, source: str) -> List[Dropped]:
-    """What `keys_and_values` leaves out."""
-    block = language_block(lm, source, lm.n_layer - 1)
-    rest = [weight for part, weights in block.items() if part not in KEPT_OF_LAST for weight in weights]
+    """What `decoder` leaves out of a prefix."""
     reason = "the last language layer leaves only keys and values"
+    rest = [row for row in _layer(lm, source, lm.n_layer - 1) if not row.target.endswith(KEPT_OF_LAST)]
     return [
         Dropped(source + "norm.weight", (lm.d_model,), "the prefix leaves only keys and values"),
-        *(Dropped(weight.source, weight.stored, reason) for weight in rest),
+        *(Dropped(row.source, row.stored, reason) for row in rest),
     ]
+
+
+def expert(source: str, d: int, d_ff: int, lm: Language, kind: Decoder = LLAMA, d_in: Sequence[int] = ()) -> Rows:
+    """The layers below `source`, which ends in a dot, that attend together with those of a language model, as `expert.*`. `d_in`: by layer
+    the width of what keys and values are made from, d by default."""
+    rows: Rows = []
+    for i, width in enumerate(d_in or [d] * lm.n_layer):
+        rows += gated_block("expert.blk.{}.".format(i), "{}layers.{}.".format(source, i), d, d_ff, lm.heads, kind, width)
+    return rows + kind.norm("expert.norm", source + "norm", d)

@@ -8,11 +8,13 @@ Reference: lerobot src/lerobot/processor (normalize_processor.py, tokenizer_proc
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Dict, List, Mapping, Optional, Sequence
 
 import numpy as np
 
+from .bundle import Key
 from .checkpoint import Checkpoint
 from .errors import Code, Problems
 from .files import member, plain_name
@@ -297,6 +299,11 @@ def _from_weights(checkpoint: Checkpoint, reader: _Reader) -> Processors:
         found = from_weights(checkpoint, feature, reader.problems)
         result.others[feature] = choose(feature, modes.get(kind, "IDENTITY"), 1e-8, found, reader.context)
     return result
+
+
+def recipe_key(document: Dict[str, List[dict]]) -> Key:
+    """`document`: ops of image, text, state and action."""
+    return Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False))
 
 
 def letterbox(width: int, height: int, align: str, antialias: bool = False) -> dict:

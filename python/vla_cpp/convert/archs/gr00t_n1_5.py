@@ -19,10 +19,11 @@ from ..bundle import Key
 from ..checkpoint import Checkpoint, Layout, find_backbone
 from ..errors import Code, Problems, refuse
 from ..files import member, read_json
+from ..layers import Rows, table
 from ..networks import MAX_LAYERS
 from ..options import variant
 from ..section import Fixed, Section
-from . import TABLE, Options, Plan, Weight
+from . import Options, Plan
 from .gr00t import head
 from .gr00t.eagle import EAGLE_2_5
 from .gr00t.images import STANDARDIZE, Images
@@ -168,13 +169,11 @@ def _read_horizon(config: DataConfig, s: Sizes, problems: Problems) -> None:
 
 
 def network_keys(s: Sizes, n_future: int) -> List[Key]:
-    return network_keys_of(EAGLE_2_5, s, {"policy.n_future": n_future})
+    return network_keys_of(EAGLE_2_5, s, {"policy": dict(n_future=n_future)})
 
 
-def weights(s: Sizes, n_future: int) -> List[Weight]:
-    table = (n_future, s.d_dit)
-    future = Weight("future.weight", head.HEAD + "future_tokens.weight", TABLE, table, table)
-    return [*EAGLE_2_5.weights(s), *head.weights(s), future]
+def weights(s: Sizes, n_future: int) -> Rows:
+    return [*EAGLE_2_5.weights(s), *head.weights(s), *table("future", head.HEAD + "future_tokens.weight", n_future, s.d_dit)]
 
 
 def _data_config(checkpoint: Checkpoint, name: str) -> DataConfig:

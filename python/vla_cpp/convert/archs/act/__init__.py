@@ -7,14 +7,12 @@ Reference: lerobot src/lerobot/policies/act (configuration_act.py, modeling_act.
 
 from __future__ import annotations
 
-import json
 from typing import Dict, List
 
 from ... import recipe
-from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of
+from ...features import robot_keys
 from ...images import standardized
 from ...lerobot import required_view_keys
 from .. import Options, Plan
@@ -29,8 +27,9 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     dims = {recipe.STATE: s.d_state, recipe.ACTION: s.d_action, ENVIRONMENT: s.d_environment, **dict.fromkeys(s.views, 3)}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, {}, others=others, reads_text=False)
     problems.raise_any()
-    document = json.dumps(recipe_document(s, processors, problems), ensure_ascii=False)
-    keys = [*network_keys(s), *_feature_keys(checkpoint, options, s, processors, problems), Key("processor.recipe", "string", document)]
+    document, views = recipe_document(s, processors, problems), required_view_keys(checkpoint, s.views, processors, problems)
+    widths = {recipe.STATE: s.d_state, **({ENVIRONMENT: s.d_environment} if s.d_environment else {}), recipe.ACTION: s.d_action}
+    keys = [*network_keys(s), *robot_keys(views, widths, options.dataset_info, checkpoint.notes, problems, 0), recipe.recipe_key(document)]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(without=s.views), hints(s))
 
@@ -50,13 +49,3 @@ def recipe_document(s: Sizes, processors: recipe.Processors, problems: Problems)
         "state": [{**op, **({"feature": name} if s.d_environment else {})} for name, norm in states for op in norm.op("normalize", name)],
         "action": processors.action.op("unnormalize", recipe.ACTION),
     }
-
-
-def _feature_keys(checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[Key]:
-    dims = {recipe.STATE: s.d_state, **({ENVIRONMENT: s.d_environment} if s.d_environment else {})}
-    return [
-        *required_view_keys(checkpoint, s.views, processors, problems),
-        *states_of(dims),
-        Key("observation.max_text_tokens", "u32", 0),
-        *feature_keys(options.dataset_info, {**dims, recipe.ACTION: s.d_action}, checkpoint.notes, problems),
-    ]

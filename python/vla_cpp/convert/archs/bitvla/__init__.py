@@ -12,7 +12,6 @@ bitvla/bitnet_action_tokenizer.py, convert_ckpt.py).
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from typing import Dict, List, Tuple
@@ -24,12 +23,12 @@ from ...ascii_bpe import Encoder, check_undivided, special_ids
 from ...bundle import Key
 from ...checkpoint import Checkpoint, Layout, Tensors, read_stored
 from ...errors import Problems, refuse
-from ...features import feature_keys, states_of, views_of
+from ...features import robot_keys, view_name, views_of
 from ...files import member, read_json, read_text
 from ...options import Option, stats, views
 from ...section import Fixed, Section
-from ...torch_file import read_torch
 from ...tokenizer import TokenizerPlan, read_tokenizer
+from ...torch_file import read_torch
 from .. import Options, Plan
 from .mapping import HEAD, PROPRIO, Sizes, dropped, network_keys, read_sizes, weights
 
@@ -91,7 +90,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         *prompt_keys,
         *_features(views, options, checkpoint.notes, s, problems),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+        recipe.recipe_key(document),
     ]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), statistics)
@@ -255,12 +254,7 @@ def _prompt(checkpoint: Checkpoint, tokenizer: TokenizerPlan, s: Sizes, problems
 
 
 def _features(views: List[str], options: Options, notes: List[str], s: Sizes, problems: Problems) -> List[Key]:
-    def full(name: str) -> str:
-        return name if name.startswith("observation.images.") else "observation.images." + name
-
-    aliases = [full(alias) for alias in ALIASES] if tuple(views) == VIEWS else [""] * len(views)
-    return [
-        *views_of([full(view) for view in views], aliases, [0] * len(views), len(views)),
-        *states_of({recipe.STATE: s.d_state}),
-        *feature_keys(options.dataset_info, {recipe.STATE: s.d_state, recipe.ACTION: s.d_action}, notes, problems),
-    ]
+    names = [view_name(view) for view in views]
+    aliases = [view_name(alias) for alias in ALIASES] if tuple(views) == VIEWS else [""] * len(views)
+    keys, dims = views_of(names, aliases, [0] * len(views), len(views)), {recipe.STATE: s.d_state, recipe.ACTION: s.d_action}
+    return robot_keys(keys, dims, options.dataset_info, notes, problems)

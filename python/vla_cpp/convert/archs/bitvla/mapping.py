@@ -9,29 +9,33 @@ openvla-oft/prismatic/models (action_heads.py, projectors.py).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import List
 
 from ...bundle import Key
 from ...errors import Problems
 from ...files import member
-from ...layers import gated_block, linear, norm, siglip, ternary, vector
-from ...networks import Language, Vision, check_heads, embedding, keys_of, pooling_head, read_language, read_vision
+from ...layers import BITNET, Rows, linear, norm, ternary
+from ...networks import (
+    NORM_EPS,
+    Language,
+    Vision,
+    check_heads,
+    decoder,
+    defaults,
+    keys_of,
+    pick,
+    pooling_head,
+    read_language,
+    read_vision,
+    siglip,
+)
 from ...section import Fixed, Section
-from .. import Dropped, Weight
+from .. import Dropped
 
 WHERE = "config.json"
-N_HEAD_LAYER, HEAD_EPS = 2, 1e-5  # literals of the action head, the second torch's
-VISION = {
-    "hidden_size": 768,
-    "intermediate_size": 3072,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 12,
-    "image_size": 224,
-    "patch_size": 16,
-    "layer_norm_eps": 1e-6,
-    "vision_use_head": True,
-}
+N_HEAD_LAYER = 2  # a literal of the action head
+VISION = defaults(768, 3072, 12, 12, image_size=224, patch_size=16, layer_norm_eps=1e-6, vision_use_head=True)
 # Towers of other numbers are plain ones: to the reference, an absent key means 32 bits.
 VISION_FIXED: Fixed = {
     "model_type": ("siglip_vision_model", "siglip_vision_model"),
@@ -40,17 +44,9 @@ VISION_FIXED: Fixed = {
 }
 BITS: Fixed = {"vit_weight_bits": (32, 1), "vit_act_bits": (32, 8)}
 METHODS = {"vit_weight_quant_method": "absmean", "vit_act_quant_method": "absmax_per_token"}
-TEXT = {
-    "hidden_size": 2560,
-    "intermediate_size": 6912,
-    "num_hidden_layers": 30,
-    "num_attention_heads": 20,
-    "num_key_value_heads": 5,
-    "vocab_size": 128256,
-    "rms_norm_eps": 1e-5,
-    "rope_theta": 500000.0,
-    "max_position_embeddings": 2048,
-}
+TEXT = defaults(
+    2560, 6912, 30, 20, num_key_value_heads=5, vocab_size=128256, rms_norm_eps=1e-5, rope_theta=500000.0, max_position_embeddings=2048
+)
 TEXT_FIXED: Fixed = {
     "model_type": (None, "BitNet"),
     "attention_bias": (False, False),
@@ -129,13 +125,12 @@ def _check_widths(section: Section, sizes) -> None:
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, max_views=s.max_views, stop_token=s.stop_token)
     return keys_of(
         {
-            "policy": policy,
+            "policy": pick(s, "d_state d_action horizon max_views stop_token"),
             "vision": {**vars(s.vision), "position_rule": "row_major"},
             "lm": s.lm,
-            "head": dict(n_layer=N_HEAD_LAYER, norm_eps=HEAD_EPS),
+            "head": dict(n_layer=N_HEAD_LAYER, norm_eps=NORM_EPS),
             "solver": dict(steps=1, kind="direct", noise="none"),
         }
     )
@@ -144,47 +139,37 @@ def network_keys(s: Sizes) -> List[Key]:
 TOWER, LM, HEAD, PROPRIO = "vision_tower.vision_model.", "language_model.model.", "action_head.model.", "proprio_projector."
 
 
-def weights(s: Sizes) -> List[Weight]:
-    return [*_vision(s.vision, s.vision.n_layer), *_connector(s), *_language(s.lm), *_head(s)]
-
-
-def _vision(v: Vision, n_layer: int) -> List[Weight]:
-    return siglip(TOWER, v.d_model, v.d_ff, n_layer, v.patch_size, v.n_patch, product=ternary, post_norm=False)
-
-
-def _connector(s: Sizes) -> List[Weight]:
+def weights(s: Sizes) -> Rows:
+    """The proprio projector and the head are trained and stored in float32."""
     source, d = "multi_modal_projector.linear_", s.lm.d_model
-    rows = linear("connector_up", source + "1", d, s.vision.d_model, bias=True) + linear("connector_down", source + "2", d, d, bias=True)
-    state = linear("state_in", PROPRIO + "fc1", d, s.d_state, bias=True) + linear("state_out", PROPRIO + "fc2", d, d, bias=True)
-    return rows + [row._replace(in_bf16=True) for row in state]  # trained and stored in float32
+    state = linear("state_in", PROPRIO + "fc1", d, s.d_state) + linear("state_out", PROPRIO + "fc2", d, d)
+    return [
+        *_vision(s.vision),
+        *linear("connector_up", source + "1", d, s.vision.d_model),
+        *linear("connector_down", source + "2", d, d),
+        *(row._replace(in_bf16=True) for row in state),
+        *decoder(s.lm, LM, BITNET),
+        *(row._replace(in_bf16=True) for row in _head(s)),
+    ]
 
 
-def _language(lm: Language) -> List[Weight]:
-    rows = [embedding(lm, LM + "embed_tokens.weight")]
-    for i in range(lm.n_layer):
-        target, block = "lm.blk.{}.".format(i), "{}layers.{}.".format(LM, i)
-        parts = gated_block(target, block, lm.d_model, lm.d_q, lm.d_kv, lm.d_model, lm.d_ff, product=ternary)
-        parts["attn_out"] += vector(target + "attn_sub_norm.weight", block + "self_attn.attn_sub_norm.weight", lm.d_q)
-        parts["ffn_down"] += vector(target + "ffn_sub_norm.weight", block + "mlp.ffn_sub_norm.weight", lm.d_ff)
-        rows += [row for part in parts.values() for row in part]
-    return rows + vector("lm.norm.weight", LM + "norm.weight", lm.d_model)
+def _vision(v: Vision) -> Rows:
+    return siglip(TOWER, v, product=ternary, post_norm=False)
 
 
-def _head(s: Sizes) -> List[Weight]:
+def _head(s: Sizes) -> Rows:
     d, d_in = s.lm.d_model, s.d_action * s.lm.d_model
-    rows = norm("head.in_norm", HEAD + "layer_norm1", d_in) + linear("head.in", HEAD + "fc1", d, d_in, bias=True)
+    rows = norm("head.in_norm", HEAD + "layer_norm1", d_in) + linear("head.in", HEAD + "fc1", d, d_in)
     for i in range(N_HEAD_LAYER):
         target, block = "head.blk.{}.".format(i), "{}mlp_resnet_blocks.{}.ffn.".format(HEAD, i)
-        rows += norm(target + "norm", block + "0", d) + linear(target + "linear", block + "1", d, d, bias=True)
-    rows += norm("head.out_norm", HEAD + "layer_norm2", d) + linear("head.out", HEAD + "fc2", s.d_action, d, bias=True)
-    return [row._replace(in_bf16=True) for row in rows]
+        rows += norm(target + "norm", block + "0", d) + linear(target + "linear", block + "1", d, d)
+    return rows + norm("head.out_norm", HEAD + "layer_norm2", d) + linear("head.out", HEAD + "fc2", s.d_action, d)
 
 
 def dropped(s: Sizes) -> List[Dropped]:
     """What the policy never reads: everything behind the tower's layer, and the language head."""
-    v, d, unread = s.vision, s.vision.d_model, "features are read in front of it"
-    kept = len(_vision(v, v.n_layer))
-    rows = [Dropped(row.source, row.stored, unread) for row in _vision(v, s.n_stored_layer)[kept:]]
-    rows += pooling_head(TOWER, v, unread)
-    rows += [Dropped("{}post_layernorm.{}".format(TOWER, part), (d,), unread) for part in ("weight", "bias")]
+    v, unread = s.vision, "features are read in front of it"
+    stored = _vision(replace(v, n_layer=s.n_stored_layer))[len(_vision(v)) :]
+    rows = [Dropped(row.source, row.stored, unread) for row in stored] + pooling_head(TOWER, v, unread)
+    rows += [Dropped("{}post_layernorm.{}".format(TOWER, part), (v.d_model,), unread) for part in ("weight", "bias")]
     return rows + [Dropped("language_model.lm_head.weight", (s.lm.n_vocab, s.lm.d_model), "no action depends on the language head")]

@@ -16,10 +16,12 @@ from ...bundle import Key
 from ...checkpoint import LEROBOT, Checkpoint
 from ...errors import Problems
 from ...files import read_json
+from ...recipe import recipe_key
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from ...tokenizer_byte_level import with_defaults
 from .. import Options, Plan
-from .layouts import LAYOUT as LAYOUT, Source, read_authors, read_lerobot
+from .layouts import LAYOUT as LAYOUT
+from .layouts import Source, read_authors, read_lerobot
 from .mapping import network_keys, weights
 
 
@@ -48,7 +50,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         *source.features,
         Key("observation.max_text_tokens", "u32", sizes.n_token),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+        recipe_key(document),
     ]
     problems.raise_any()
     lm = source.names.lm + "layers."

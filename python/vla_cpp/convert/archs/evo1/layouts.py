@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Dict, List, NamedTuple, Sequence, Tuple
+from typing import Dict, List, NamedTuple, Tuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint, Layout, Tensors, find_backbone
 from ...errors import Code, Problems, refuse
-from ...features import feature_keys, states_of, views_of
+from ...features import robot_keys, view_name, views_of
 from ...files import member, read_json
 from ...images import IMAGENET
 from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim
@@ -36,13 +36,13 @@ from ...options import Option, stats, variant, views
 from ...section import Section
 from ...torch_file import read_torch
 from .. import Options
-from .mapping import AUTHORS, LEROBOT, Names, Sizes, check_head, read_chat_backbone, read_hf_backbone
+from .mapping import AUTHORS, LEROBOT, Sizes, Spelling, check_head, read_chat_backbone, read_hf_backbone
 
 
 @dataclass
 class Source:
     sizes: Sizes
-    names: Names
+    names: Spelling
     tokenizer: str  # its folder
     image_token: object  # the id that the backbone's config states, None where it states none
     image: List[dict]
@@ -200,7 +200,7 @@ def _ask(problems: Problems, flag: str, expected: str, found: str) -> None:
 def _check_answers(options: Options, problems: Problems) -> None:
     if options.variant not in REVISIONS:
         _ask(problems, "--variant", "r1 or r2, a revision of the authors' code", options.variant)
-    max_views, views = options.max_views, [_view_name(name) for name in options.views]
+    max_views, views = options.max_views, [view_name(name) for name in options.views]
     if not 1 <= max_views <= MAX_SLOTS:
         _ask(problems, "--max-views", "a count from 1 to {}".format(MAX_SLOTS), str(max_views or ""))
     if not views or len(set(views)) != len(views) or "" in options.views or (max_views and len(views) > max_views):
@@ -310,20 +310,12 @@ def _width(statistics: Dict[str, np.ndarray]) -> int:
     return next(iter(statistics.values())).size
 
 
-def _view_name(name: str) -> str:
-    return name if name.startswith("observation.images.") else "observation.images." + name
-
-
 def _authors_features(checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems) -> List[Key]:
     """Every view may stay away: its slot is masked, as a client of the reference masks the images that it does not have."""
-    views: Sequence[str] = [_view_name(name) for name in options.views]
-    dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
-    return [
-        # The server gets an image for every slot, and the client says which of them are none: nothing is absent by silence.
-        *views_of(views, [""] * len(views), [0] * len(views)),
-        *states_of({recipe.STATE: s.state_dim}),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-    ]
+    names = [view_name(name) for name in options.views]
+    # The server gets an image for every slot, and the client says which of them are none: nothing is absent by silence.
+    views = views_of(names, [""] * len(names), [0] * len(names))
+    return robot_keys(views, {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}, options.dataset_info, checkpoint.notes, problems)
 
 
 # --- LeRobot's layout ------------------------------------------------------------------------------------------------------------------
@@ -412,11 +404,9 @@ def read_lerobot(checkpoint: Checkpoint, options: Options, problems: Problems) -
             *processors.action.op("unnormalize", recipe.ACTION),
             *_gripper(policy, sizes.action_dim),
         ],
-        features=[
-            *_view_keys(views, n_empty, processors, checkpoint, problems),
-            *states_of({recipe.STATE: sizes.state_dim}),
-            *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-        ],
+        features=robot_keys(
+            _view_keys(views, n_empty, processors, checkpoint, problems), dims, options.dataset_info, checkpoint.notes, problems
+        ),
         statistics=processors.statistics(),
     )
 

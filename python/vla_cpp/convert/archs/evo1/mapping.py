@@ -10,29 +10,20 @@ stay without effect there too.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import List, NamedTuple, Sequence
+from typing import List, NamedTuple
 
 from ...bundle import Key
 from ...errors import Problems
 from ...files import member
-from ...layers import EncoderNames, encoder_block, linear, norm, vector
-from ...networks import Language, Vision, check_heads, embedding, keys_of, language_block, read_language, read_vision
+from ...layers import QWEN2, Names, Rows, blocks, linear, norm, patch_embed, table, vector
+from ...networks import NORM_EPS, Language, Vision, check_heads, decoder, defaults, keys_of, pick, read_language, read_vision
 from ...section import Fixed, Section
-from .. import MATRIX, TABLE, VECTOR, Weight
 
 WHERE = "backbone config.json"
 N_TIME = 1000  # rows of the time table, a literal of the reference
 
 # InternVisionConfig and InternVLChatConfig of the InternVL repository; Qwen2Config of transformers.
-CHAT_VISION = {
-    "hidden_size": 3200,
-    "intermediate_size": 12800,
-    "num_hidden_layers": 48,
-    "num_attention_heads": 25,
-    "image_size": 224,
-    "patch_size": 14,
-    "layer_norm_eps": 1e-6,
-}
+CHAT_VISION = defaults(3200, 12800, 48, 25, image_size=224, patch_size=14, layer_norm_eps=1e-6)
 CHAT_VISION_FIXED: Fixed = {
     "hidden_act": ("gelu", "gelu"),
     "norm_type": ("rms_norm", "layer_norm"),
@@ -48,15 +39,7 @@ CHAT_FIXED: Fixed = {
     "use_llm_lora": (0, 0),
 }
 # InternVLVisionConfig and InternVLConfig of transformers.
-HF_VISION = {
-    "hidden_size": 1024,
-    "intermediate_size": 4096,
-    "num_hidden_layers": 24,
-    "num_attention_heads": 16,
-    "image_size": [448, 448],
-    "patch_size": [14, 14],
-    "layer_norm_eps": 1e-6,
-}
+HF_VISION = defaults(1024, 4096, 24, 16, image_size=[448, 448], patch_size=[14, 14], layer_norm_eps=1e-6)
 HF_VISION_FIXED: Fixed = {
     "hidden_act": ("gelu", "gelu"),
     "norm_type": ("layer_norm", "layer_norm"),
@@ -74,17 +57,9 @@ HF_FIXED: Fixed = {
     "vision_feature_layer": (-1, -1),
     "vision_feature_select_strategy": ("default", "default"),
 }
-TEXT = {
-    "hidden_size": 4096,
-    "intermediate_size": 22016,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 32,
-    "num_key_value_heads": 32,
-    "vocab_size": 151936,
-    "rms_norm_eps": 1e-6,
-    "rope_theta": 10000.0,
-    "max_position_embeddings": 32768,
-}
+TEXT = defaults(
+    4096, 22016, 32, 32, num_key_value_heads=32, vocab_size=151936, rms_norm_eps=1e-6, rope_theta=10000.0, max_position_embeddings=32768
+)
 TEXT_FIXED: Fixed = {"model_type": ("qwen2", "qwen2"), "hidden_act": ("silu", "silu"), "use_sliding_window": (False, False)}
 
 
@@ -200,16 +175,14 @@ def check_head(policy: Section, s: Sizes, embed_dim: int) -> None:
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, d_robot=s.d_robot, max_views=s.max_views, n_token=s.n_token)
-    head = dict(n_layer=s.n_head_layer, n_head=s.n_head_head, d_ff=4 * s.lm.d_model, d_hidden=s.d_hidden)
-    eps = 1e-5  # torch's default, which the reference leaves as it is
+    head = dict(n_layer=s.n_head_layer, n_head=s.n_head_head, d_ff=4 * s.lm.d_model, **pick(s, "d_hidden d_state_hidden"))
     return keys_of(
         {
-            "policy": dict(policy, time_scale=s.time_scale, masked_rows=s.masked_rows, absent_views=s.absent_views),
+            "policy": pick(s, "d_state d_action horizon d_robot max_views n_token time_scale masked_rows absent_views"),
             "vision": s.vision,
-            "connector": dict(factor=2, norm_eps=eps),
+            "connector": dict(factor=2, norm_eps=NORM_EPS),
             "lm": s.lm,
-            "head": dict(head, d_state_hidden=s.d_state_hidden, norm_eps=eps),
+            "head": dict(head, norm_eps=NORM_EPS),
             "solver": dict(steps=s.n_step, t_start=0.0, t_end=1.0, kind="euler", noise="uniform"),
         }
     )
@@ -218,109 +191,84 @@ def network_keys(s: Sizes) -> List[Key]:
 # --- tensors: the authors' names and LeRobot's, which differ in the towers and not in the head ------------------------------------------
 
 
-class Names(NamedTuple):
+class Spelling(NamedTuple):
+    """Names of either; the first three below `vision`, those of the connector below `connector`."""
+
     vision: str
     class_token: str
     position: str
     patch: str
     blocks: str
-    block: EncoderNames
-    connector: Sequence[str]
+    block: Names
+    connector: str
     lm: str
     head: str
 
 
-AUTHORS = Names(
+AUTHORS = Spelling(
     vision="embedder.model.vision_model.",
     class_token="embeddings.class_embedding",
     position="embeddings.position_embedding",
     patch="embeddings.patch_embedding",
     blocks="encoder.layers.{}.",
-    block=EncoderNames(("norm1", "norm2"), ("attn.qkv.",), "attn.proj", "mlp.fc1", "mlp.fc2", ("ls1", "ls2")),
-    connector=tuple("embedder.model.mlp1." + part for part in "013"),
+    block=Names("attn.qkv. attn.proj", "mlp.fc1 mlp.fc2", "norm1 norm2", scales="ls1 ls2"),
+    connector="embedder.model.mlp1. 0 1 3",
     lm="embedder.model.language_model.model.",
     head="action_head.",
 )
-LEROBOT = Names(
+LEROBOT = Spelling(
     vision="model.embedder.model.vision_tower.",
     class_token="embeddings.cls_token",
     position="embeddings.position_embeddings",
     patch="embeddings.patch_embeddings.projection",
     blocks="encoder.layer.{}.",
-    block=EncoderNames(
-        ("layernorm_before", "layernorm_after"),
-        tuple("attention.{}_proj".format(part) for part in "qkv"),
-        "attention.projection_layer",
-        "mlp.fc1",
-        "mlp.fc2",
-        ("lambda_1", "lambda_2"),
+    block=Names(
+        "attention.q_proj attention.k_proj attention.v_proj attention.projection_layer",
+        "mlp.fc1 mlp.fc2",
+        "layernorm_before layernorm_after",
+        scales="lambda_1 lambda_2",
     ),
-    connector=tuple("model.embedder.model.multi_modal_projector." + part for part in ("layer_norm", "linear_1", "linear_2")),
+    connector="model.embedder.model.multi_modal_projector. layer_norm linear_1 linear_2",
     lm="model.embedder.model.language_model.",
     head="model.action_head.",
 )
-HEAD = EncoderNames(("norm1", "norm2"), ("attn.in_proj_",), "attn.out_proj", "ff.0", "ff.2")
+HEAD = Names("attn.in_proj_ attn.out_proj", "ff.0 ff.2", "norm1 norm2")
 
 
-def weights(s: Sizes, names: Names) -> List[Weight]:
-    return [*_vision(s, names), *_connector(s, names), *_language(s, names), *_head(s, names.head)]
-
-
-def _vision(s: Sizes, names: Names) -> List[Weight]:
-    v, source = s.vision, names.vision + names.patch
-    d, patch, n_position = v.d_model, v.patch_size, v.n_patch + 1
-    rows = [
-        Weight("vision.class_token.weight", names.vision + names.class_token, VECTOR, (1, 1, d), (d,)),
-        # A convolution whose stride is its kernel is a matrix over the flattened patch: channel, row, column.
-        Weight("vision.patch_embed.weight", source + ".weight", MATRIX, (d, 3, patch, patch), (d, 3 * patch**2)),
-        *vector("vision.patch_embed.bias", source + ".bias", d),
-        Weight("vision.position.weight", names.vision + names.position, TABLE, (1, n_position, d), (n_position, d)),
-    ]
-    for i in range(v.n_layer):
-        rows += encoder_block("vision.blk.{}.".format(i), names.vision + names.blocks.format(i), names.block, d, v.d_ff)
-    return rows
-
-
-def _connector(s: Sizes, names: Names) -> List[Weight]:
-    (first, up, down), d = names.connector, s.lm.d_model
+def weights(s: Sizes, names: Spelling) -> Rows:
+    v, d, at, n_position = s.vision, s.lm.d_model, names.vision, s.vision.n_patch + 1
+    connector, first, up, down = names.connector.split()
     return [
-        *norm("connector.norm", first, 4 * s.vision.d_model),
-        *linear("connector.up", up, d, 4 * s.vision.d_model, bias=True),
-        *linear("connector.down", down, d, d, bias=True),
+        *vector("vision.class_token.weight", at + names.class_token, v.d_model, (1, 1, v.d_model)),
+        *patch_embed(at + names.patch, v.d_model, v.patch_size),
+        *table("vision.position", at + names.position, n_position, v.d_model, (1, n_position, v.d_model)),
+        *blocks("vision.", at + names.blocks, names.block, v.n_layer, v.d_model, v.d_ff),
+        *norm("connector.norm", connector + first, 4 * v.d_model),
+        *linear("connector.up", connector + up, d, 4 * v.d_model),
+        *linear("connector.down", connector + down, d, d),
+        *decoder(s.lm, names.lm, QWEN2),
+        *_head(s, names.head),
     ]
 
 
-def _language(s: Sizes, names: Names) -> List[Weight]:
-    rows = [embedding(s.lm, names.lm + "embed_tokens.weight")]
-    for i in range(s.lm.n_layer):
-        for part in language_block(s.lm, names.lm, i, qkv_bias=True).values():
-            rows += part
-    return rows + vector("lm.norm.weight", names.lm + "norm.weight", s.lm.d_model)
-
-
-def _table(target: str, source: str, n_row: int, d: int) -> Weight:
+def _waves(target: str, source: str, n_row: int, d: int) -> Rows:
     """Sines and cosines, which are no parameters: stored in float32 they stay so, whatever the matrices are."""
-    return Weight(target, source, TABLE, (1, n_row, d), (n_row, d), keep_f32=True)
+    return table(target, source, n_row, d, (1, n_row, d), keep_f32=True)
 
 
-def _head(s: Sizes, head: str) -> List[Weight]:
-    d, encoder, out = s.lm.d_model, head + "action_encoder.", s.horizon * s.d_action
-    rows = [
-        *linear("state_in", head + "state_encoder.fc1.linear", s.d_state_hidden, s.d_state, bias=True),
-        *linear("state_out", head + "state_encoder.fc2.linear", d, s.d_state_hidden, bias=True),
-        _table("time.weight", head + "time_pos_enc.pe", N_TIME, d),
-        *linear("action_in", encoder + "W1.linear", d, s.d_action, bias=True),
-        *linear("action_mix", encoder + "W2.linear", d, d, bias=True),
-        *linear("action_token", encoder + "W3.linear", d, d, bias=True),
-        _table("action_position.weight", encoder + "pos_encoding.pe", s.horizon, d),
-    ]
-    for i in range(s.n_head_layer):
-        target, block = "head.blk.{}.".format(i), "{}transformer_blocks.{}.".format(head, i)
-        rows += encoder_block(target, block, HEAD, d, 4 * d)
+def _head(s: Sizes, head: str) -> Rows:
+    d, encoder = s.lm.d_model, head + "action_encoder."
     return [
-        *rows,
+        *linear("state_in", head + "state_encoder.fc1.linear", s.d_state_hidden, s.d_state),
+        *linear("state_out", head + "state_encoder.fc2.linear", d, s.d_state_hidden),
+        *_waves("time", head + "time_pos_enc.pe", N_TIME, d),
+        *linear("action_in", encoder + "W1.linear", d, s.d_action),
+        *linear("action_mix", encoder + "W2.linear", d, d),
+        *linear("action_token", encoder + "W3.linear", d, d),
+        *_waves("action_position", encoder + "pos_encoding.pe", s.horizon, d),
+        *blocks("head.", head + "transformer_blocks.{}.", HEAD, s.n_head_layer, d, 4 * d),
         *norm("head.norm", head + "norm_out", d),
-        *linear("pool", head + "seq_pool_proj", d, s.horizon * d, bias=True),
-        *linear("velocity_in", head + "mlp_head.fc1.linear", s.d_hidden, d, bias=True),
-        *linear("velocity_out", head + "mlp_head.fc2.linear", out, s.d_hidden, bias=True),
+        *linear("pool", head + "seq_pool_proj", d, s.horizon * d),
+        *linear("velocity_in", head + "mlp_head.fc1.linear", s.d_hidden, d),
+        *linear("velocity_out", head + "mlp_head.fc2.linear", s.horizon * s.d_action, s.d_hidden),
     ]

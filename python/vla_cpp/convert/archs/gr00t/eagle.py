@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Dict, List
+from typing import Dict, List, Mapping
 
 from ...ascii_bpe import special_ids
 from ...errors import Problems
 from ...files import member, read_json
-from ...layers import linear, norm, siglip, vector
-from ...networks import pooling_head, read_vision
+from ...layers import QWEN3, Rows, linear, norm
+from ...networks import NORM_EPS, decoder, defaults, pick, pooling_head, read_vision, siglip
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
-from .. import MATRIX, Dropped, Weight
+from .. import Dropped
 from . import language
 from . import prompt as prompts
 from .images import Area
@@ -30,16 +30,7 @@ IMAGE = "<IMG_CONTEXT>"
 SYSTEM = START + "system\nYou are a helpful assistant." + END + "\n" + START + "user\n"
 OPEN, CLOSE = "<image {i}><img>", "</img>"
 # SiglipVisionConfig, Siglip2VisionConfig and Qwen3Config of transformers.
-VISION = {
-    "hidden_size": 768,
-    "intermediate_size": 3072,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 12,
-    "image_size": 224,
-    "num_patches": 256,
-    "patch_size": 16,
-    "layer_norm_eps": 1e-6,
-}
+VISION = defaults(768, 3072, 12, 12, image_size=224, num_patches=256, patch_size=16, layer_norm_eps=1e-6)
 VISION_FIXED: Fixed = {
     "hidden_act": ("gelu_pytorch_tanh", "gelu_pytorch_tanh"),
     "num_channels": (3, 3),
@@ -118,28 +109,23 @@ class Eagle:
             problems.add(WHERE + ": image_token_index", expected, repr(config.get("image_token_index")))
         return prompt
 
-    def weights(self, s: Sizes) -> List[Weight]:
+    def weights(self, s: Sizes) -> Rows:
         vision = self.root + "vision_model.vision_model."
-        rows = siglip(vision, s.vision.d_model, s.vision.d_ff, s.vision.n_layer, s.vision.patch_size, s.n_position_side**2)
+        rows = siglip(vision, s.vision, s.n_position_side**2)
         if self.merge > 1:
             # Patches are flattened pixel by pixel there, channel by channel here.
-            source, shape = vision + "embeddings.patch_embedding.weight", (s.vision.d_model, 3 * s.vision.patch_size**2)
-            rows[0] = Weight("vision.patch_embed.weight", source, MATRIX, shape, shape, regroup=3)
-        return [*rows, *self._connector(s), *language.weights(s, self.LM), *vector("lm.norm.weight", self.LM + "norm.weight", s.lm.d_model)]
+            rows[0] = rows[0]._replace(stored=rows[0].shape, regroup=3)
+        return [*rows, *self._connector(s), *decoder(s.lm, self.LM, QWEN3)]
 
-    def _connector(self, s: Sizes) -> List[Weight]:
+    def _connector(self, s: Sizes) -> Rows:
         source = self.root + "mlp1."
         if self.merge == 1:
-            return linear("projector", source + "0", s.lm.d_model, s.vision.d_model, bias=True)
+            return linear("projector", source + "0", s.lm.d_model, s.vision.d_model)
         # The patches of a square stand side by side for each feature there, the features of each patch here.
         n_patch, d = self.merge**2, self.merge**2 * s.vision.d_model
-        up = linear("connector.up", source + "1", s.lm.d_model, d, bias=True)
-        return [
-            *(row._replace(regroup=n_patch) for row in norm("connector.norm", source + "0", d)),
-            up[0]._replace(regroup=n_patch),
-            up[1],
-            *linear("connector.down", source + "3", s.lm.d_model, s.lm.d_model, bias=True),
-        ]
+        *regrouped, bias = norm("connector.norm", source + "0", d) + linear("connector.up", source + "1", s.lm.d_model, d)
+        down = linear("connector.down", source + "3", s.lm.d_model, s.lm.d_model)
+        return [*(row._replace(regroup=n_patch) for row in regrouped), bias, *down]
 
     def dropped(self, s: Sizes) -> List[Dropped]:
         rows = pooling_head(self.root + "vision_model.vision_model.", s.vision, "pooling head of the tower")
@@ -147,20 +133,12 @@ class Eagle:
         mask = Dropped("action_head.mask_token", (1, 1, s.d_dit), "stands for the state in training")
         return [*rows, lm_head, mask]
 
-    def keys(self, s: Sizes) -> Dict[str, Dict[str, object]]:
-        u32 = s.vision_keys()
+    def keys(self, s: Sizes) -> Dict[str, Mapping[str, object]]:
+        vision = dict(s.vision_keys(), norm_eps=s.vision.norm_eps)
         if self.merge == 1:
-            u32["vision.image_size"] = s.image_width
-            return {"u32": u32, "f32": {"vision.norm_eps": s.vision.norm_eps}, "string": {"vision.position_rule": "row_major"}}
-        u32.update(
-            {
-                "vision.image_width": s.image_width,
-                "vision.image_height": s.image_height,
-                "vision.n_position_side": s.n_position_side,
-                "connector.factor": self.merge,
-            }
-        )
-        return {"u32": u32, "f32": {"vision.norm_eps": s.vision.norm_eps, "connector.norm_eps": 1e-5}}
+            return {"vision": dict(vision, image_size=s.image_width, position_rule="row_major")}
+        own = pick(s, "image_width image_height n_position_side")
+        return {"vision": {**vision, **own}, "connector": dict(factor=self.merge, norm_eps=NORM_EPS)}
 
 
 EAGLE_2_5 = Eagle(

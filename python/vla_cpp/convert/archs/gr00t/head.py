@@ -8,13 +8,13 @@ robot. Reference: Isaac-GR00T gr00t/model/modules/dit.py, embodiment_conditioned
 
 from __future__ import annotations
 
-from typing import Dict, List
+from typing import Dict, Mapping
 
 from ...files import member
-from ...layers import linear, norm
-from ...networks import MAX_LAYERS
+from ...layers import Names, Rows, block, linear, norm, table, vector
+from ...networks import MAX_LAYERS, NORM_EPS, pick
 from ...section import Fixed, Section
-from .. import MATRIX, TABLE, VECTOR, Weight
+from .. import MATRIX, Weight
 from .sizes import Sizes
 
 HEAD = "action_head."
@@ -93,91 +93,61 @@ def _read_attention(policy: Section, s: Sizes) -> None:
         attention.bad("num_attention_heads", "heads that make the language model's width {}".format(s.lm.d_model))
 
 
-def weights(s: Sizes) -> List[Weight]:
+BLOCK = Names("attn1.to_q attn1.to_k attn1.to_v attn1.to_out.0", "ff.net.0.proj ff.net.2")
+
+
+def weights(s: Sizes) -> Rows:
     return [*_features(s), *transformer_rows(s), *_robot(s)]
 
 
-def _attention_and_ffn(target: str, block: str, d: int, d_in: int, d_ff: int) -> List[Weight]:
-    """`d_in`: width of what keys and values are made from."""
-    rows: List[Weight] = []
-    for ours, theirs, width in (("attn_q", "to_q", d), ("attn_k", "to_k", d_in), ("attn_v", "to_v", d_in), ("attn_out", "to_out.0", d)):
-        rows += linear(target + ours, block + "attn1." + theirs, d, width, bias=True)
-    rows += linear(target + "ffn_up", block + "ff.net.0.proj", d_ff, d, bias=True)
-    return rows + linear(target + "ffn_down", block + "ff.net.2", d, d_ff, bias=True)
-
-
-def _features(s: Sizes) -> List[Weight]:
+def _features(s: Sizes) -> Rows:
     d, rows = s.lm.d_model, norm("vl.norm", HEAD + "vlln", s.lm.d_model)
     for i in range(s.n_vl_layer):
-        target, block = "vl.blk.{}.".format(i), "{}vl_self_attention.transformer_blocks.{}.".format(HEAD, i)
-        rows += norm(target + "attn_norm", block + "norm1", d) + norm(target + "ffn_norm", block + "norm3", d)
-        rows += _attention_and_ffn(target, block, d, d, s.d_vl_ff)
+        target, source = "vl.blk.{}.".format(i), "{}vl_self_attention.transformer_blocks.{}.".format(HEAD, i)
+        rows += norm(target + "attn_norm", source + "norm1", d) + norm(target + "ffn_norm", source + "norm3", d)
+        rows += block(target, source, BLOCK, d, s.d_vl_ff)
     return rows
 
 
-def transformer_rows(s: Sizes) -> List[Weight]:
+def transformer_rows(s: Sizes) -> Rows:
     d, source = s.d_dit, HEAD + "model."
     time = source + "timestep_encoder.timestep_embedder."
-    rows = linear("time_in", time + "linear_1", d, s.d_time, bias=True) + linear("time_out", time + "linear_2", d, d, bias=True)
+    rows = linear("time_in", time + "linear_1", d, s.d_time) + linear("time_out", time + "linear_2", d, d)
     for i in range(s.n_dit_layer):
-        target, block = "dit.blk.{}.".format(i), "{}transformer_blocks.{}.".format(source, i)
-        rows += linear(target + "ada", block + "norm1.linear", 2 * d, d, bias=True)
+        target, theirs = "dit.blk.{}.".format(i), "{}transformer_blocks.{}.".format(source, i)
         # Even blocks read the features, odd ones themselves.
-        rows += _attention_and_ffn(target, block, d, d if i % 2 else s.lm.d_model, s.d_dit_ff)
-    rows += linear("dit.out_ada", source + "proj_out_1", 2 * d, d, bias=True)
-    return rows + linear("dit.out", source + "proj_out_2", s.d_out, d, bias=True)
+        rows += linear(target + "ada", theirs + "norm1.linear", 2 * d, d)
+        rows += block(target, theirs, BLOCK, d, s.d_dit_ff, d if i % 2 else s.lm.d_model)
+    return rows + linear("dit.out_ada", source + "proj_out_1", 2 * d, d) + linear("dit.out", source + "proj_out_2", s.d_out, d)
 
 
-def _of_robot(target: str, source: str, s: Sizes, d_out: int, d_in: int) -> List[Weight]:
+def _of_robot(target: str, source: str, s: Sizes, d_out: int, d_in: int) -> Rows:
     """The robot's part of a matrix that is stored for all of them, inputs before outputs."""
-    pick = (0, s.embodiment)
-    return [
-        Weight(target + ".weight", source + ".W", MATRIX, (s.n_embodiment, d_in, d_out), (d_out, d_in), pick=pick, transpose=True),
-        Weight(target + ".bias", source + ".b", VECTOR, (s.n_embodiment, d_out), (d_out,), pick=pick),
-    ]
+    pick, n = (0, s.embodiment), s.n_embodiment
+    matrix = Weight(target + ".weight", source + ".W", MATRIX, (n, d_in, d_out), (d_out, d_in), pick=pick, transpose=True)
+    return [matrix, *vector(target + ".bias", source + ".b", d_out, (n, d_out), pick=pick)]
 
 
-def _robot(s: Sizes) -> List[Weight]:
-    d, table = s.d_dit, (s.n_position, s.d_dit)
+def _robot(s: Sizes) -> Rows:
+    d, encoder = s.d_dit, HEAD + "action_encoder."
     return [
         *_of_robot("state_in", HEAD + "state_encoder.layer1", s, s.d_hidden, s.d_state),
         *_of_robot("state_out", HEAD + "state_encoder.layer2", s, d, s.d_hidden),
-        *_of_robot("action_in", HEAD + "action_encoder.W1", s, d, s.d_action),
-        *_of_robot("action_mix", HEAD + "action_encoder.W2", s, d, 2 * d),
-        *_of_robot("action_token", HEAD + "action_encoder.W3", s, d, d),
-        Weight("action_position.weight", HEAD + "position_embedding.weight", TABLE, table, table),
+        *_of_robot("action_in", encoder + "W1", s, d, s.d_action),
+        *_of_robot("action_mix", encoder + "W2", s, d, 2 * d),
+        *_of_robot("action_token", encoder + "W3", s, d, d),
+        *table("action_position", HEAD + "position_embedding.weight", s.n_position, d),
         *_of_robot("decode_in", HEAD + "action_decoder.layer1", s, s.d_hidden, s.d_out),
         *_of_robot("decode_out", HEAD + "action_decoder.layer2", s, s.d_action, s.d_hidden),
     ]
 
 
-def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
-    """By type. Numbers that no config states are literals of the reference."""
-    u32 = {
-        "policy.d_state": s.d_state * s.n_state_row,
-        "policy.d_action": s.d_action,
-        "policy.horizon": s.horizon,
-        "policy.n_position": s.n_position,
-        "policy.max_views": s.max_views,
-        "vl.n_layer": s.n_vl_layer,
-        "vl.n_head": s.n_vl_head,
-        "vl.d_ff": s.d_vl_ff,
-        "dit.d_model": s.d_dit,
-        "dit.n_layer": s.n_dit_layer,
-        "dit.n_head": s.n_dit_head,
-        "dit.d_ff": s.d_dit_ff,
-        "dit.d_out": s.d_out,
-        "dit.d_time": s.d_time,
-        "dit.n_bucket": s.n_bucket,
-        "dit.d_hidden": s.d_hidden,
-        "solver.steps": s.n_step,
-    }
-    f64: Dict[str, object] = {"solver.t_start": 0.0, "solver.t_end": 1.0}
-    if s.rtc_ramp_rate is not None:
-        f64["policy.rtc_ramp_rate"] = s.rtc_ramp_rate
+def keys(s: Sizes) -> Dict[str, Mapping[str, object]]:
+    """By module. Numbers that no config states are literals of the reference."""
+    dit = dict(d_model=s.d_dit, n_layer=s.n_dit_layer, n_head=s.n_dit_head, d_ff=s.d_dit_ff, **pick(s, "d_out d_time n_bucket d_hidden"))
     return {
-        "u32": u32,
-        "f32": {"vl.norm_eps": 1e-5, "dit.norm_eps": 1e-5, "dit.out_eps": 1e-6},
-        "f64": f64,
-        "string": {"solver.kind": "euler", "solver.noise": "normal"},
+        "policy": dict(d_state=s.d_state * s.n_state_row, **pick(s, "d_action horizon n_position max_views")),
+        "vl": dict(n_layer=s.n_vl_layer, n_head=s.n_vl_head, d_ff=s.d_vl_ff, norm_eps=NORM_EPS),
+        "dit": dict(dit, norm_eps=NORM_EPS, out_eps=1e-6),
+        "solver": dict(steps=s.n_step, t_start=0.0, t_end=1.0, kind="euler", noise="normal"),
     }

@@ -1,29 +1,16 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""The language model, a Qwen3 of which the policy keeps the first layers: its part of a config, its tensors, and its keys."""
+"""The language model, a Qwen3 of which the policy keeps the first layers: its part of a config."""
 
 from __future__ import annotations
 
-from typing import Dict, List
-
 from ...files import member
-from ...layers import vector
-from ...networks import embedding, language_block, read_language, typed
+from ...networks import defaults, read_language
 from ...section import Fixed, Section
-from .. import Weight
 from .sizes import Sizes
 
 # Qwen3Config and Qwen3VLTextConfig of transformers, which differ in two keys more.
-TEXT = {
-    "vocab_size": 151936,
-    "hidden_size": 4096,
-    "intermediate_size": 22016,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 32,
-    "num_key_value_heads": 32,
-    "head_dim": 128,
-    "rms_norm_eps": 1e-6,
-}
+TEXT = defaults(4096, 22016, 32, 32, vocab_size=151936, num_key_value_heads=32, head_dim=128, rms_norm_eps=1e-6)
 TEXT_FIXED: Fixed = {"hidden_act": ("silu", "silu"), "attention_bias": (False, False)}
 
 
@@ -42,19 +29,3 @@ def rope_section(text: Section, defaults: dict) -> Section:
     key = "rope_scaling" if text.get("rope_parameters") is None else "rope_parameters"
     values = member(text.values, key, dict, text.where)
     return Section("{}: {}".format(text.where, key), values, defaults, text.problems)
-
-
-def weights(s: Sizes, source: str) -> List[Weight]:
-    """`source`: where its tensors stand, up to the dot."""
-    rows = [embedding(s.lm, source + "embed_tokens.weight")]
-    for i in range(s.lm.n_layer):
-        target, block = "lm.blk.{}.".format(i), "{}layers.{}.".format(source, i)
-        for part in language_block(s.lm, source, i).values():
-            rows += part
-        rows += vector(target + "attn_q_norm.weight", block + "self_attn.q_norm.weight", s.lm.d_head)
-        rows += vector(target + "attn_k_norm.weight", block + "self_attn.k_norm.weight", s.lm.d_head)
-    return rows
-
-
-def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
-    return typed({"lm": s.lm})

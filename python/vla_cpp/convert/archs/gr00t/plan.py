@@ -7,19 +7,19 @@ The two differ in their backbone and in what their configs may say: that is a `R
 
 from __future__ import annotations
 
-import json
 from typing import Any, Collection, Dict, List, NamedTuple
 
 from ... import recipe
-from ...bundle import Key, keys_by_type
+from ...bundle import Key
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import member, read_json
-from ...networks import MAX_LAYERS
+from ...layers import Rows
+from ...networks import MAX_LAYERS, keys_of
 from ...section import Fixed, Section
 from ...tokenizer import read_tokenizer
-from .. import Options, Plan, Weight
-from . import head, language
+from .. import Options, Plan
+from . import head
 from .images import Images, read_images
 from .prompt import text_ops
 from .robot import PROCESSOR, STATISTICS, Robot, choose, embodiment_index, processor_file, read_robot
@@ -160,9 +160,7 @@ class Parts(NamedTuple):
     formalize: bool  # instructions are cleaned
 
 
-def assemble(
-    parts: Parts, keys: List[Key], rows: List[Weight], checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems
-) -> Plan:
+def assemble(parts: Parts, keys: List[Key], rows: Rows, checkpoint: Checkpoint, options: Options, s: Sizes, problems: Problems) -> Plan:
     """`keys`, `rows`: the network's."""
     robot, backbone = parts.robot, parts.backbone
     tokenizer = read_tokenizer(parts.folder, s.lm.n_vocab, problems, checkpoint.notes)
@@ -181,7 +179,7 @@ def assemble(
         *prompt.keys(),
         *feature_description(robot, options, checkpoint.notes, problems),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+        recipe.recipe_key(document),
     ]
     problems.raise_any()
     tensors = {**statistics_of(recipe.STATE, robot.states), **statistics_of(recipe.ACTION, robot.actions)}
@@ -220,25 +218,24 @@ def read_sizes(release: Release, config: dict, folder: str, problems: Problems) 
 
 
 def network_keys(release: Release, s: Sizes) -> List[Key]:
-    own: Dict[str, object] = {"dit.attend_text_every_n_blocks": s.attend_text_every_n_blocks}
+    own: Dict[str, Dict[str, object]] = {"dit": dict(attend_text_every_n_blocks=s.attend_text_every_n_blocks)}
     if release.state_rows:
-        own["policy.n_state_row"] = s.n_state_row
+        own["policy"] = dict(n_state_row=s.n_state_row)
     keys = network_keys_of(release.backbone, s, own)
-    if "vl_self_attention_cfg" in release.config:
-        return keys
-    return [key for key in keys if key.name not in ("vl.n_layer", "vl.n_head", "vl.d_ff")]
+    return (
+        keys
+        if "vl_self_attention_cfg" in release.config
+        else [key for key in keys if key.name not in ("vl.n_layer", "vl.n_head", "vl.d_ff")]
+    )
 
 
-def network_keys_of(backbone: Any, s: Sizes, own: Dict[str, object]) -> List[Key]:
-    """`own`: counts that a release has of its own."""
-    groups: Dict[str, Dict[str, object]] = {"u32": own}
-    for part in (head.keys(s), backbone.keys(s), language.keys(s)):
-        for kind, values in part.items():
-            groups[kind] = {**groups.get(kind, {}), **values}
-    return keys_by_type(groups)
+def network_keys_of(backbone: Any, s: Sizes, own: Dict[str, Dict[str, object]]) -> List[Key]:
+    """`own`: what a release has of its own, by module."""
+    chunking = {} if s.rtc_ramp_rate is None else {"policy": dict(rtc_ramp_rate=s.rtc_ramp_rate)}
+    return keys_of(own, head.keys(s), chunking, backbone.keys(s), {"lm": s.lm})
 
 
-def weights(release: Release, s: Sizes) -> List[Weight]:
+def weights(release: Release, s: Sizes) -> Rows:
     return [*release.backbone.weights(s), *head.weights(s)]
 
 

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 import os
-from typing import Dict, List
+from typing import Dict, List, Mapping
 
 from ...ascii_bpe import special_ids
 from ...errors import Code, Problems, refuse
 from ...files import member, read_json, read_text
-from ...layers import EncoderNames, encoder_block, linear, norm, vector
-from ...networks import MAX_LAYERS
+from ...layers import QWEN3, Names, Rows, blocks, linear, norm, patch_embed, table
+from ...networks import MAX_LAYERS, decoder, pick
 from ...section import Fixed, Section
 from ...tokenizer import TokenizerPlan
-from .. import MATRIX, TABLE, Dropped, Weight
+from .. import Dropped
 from . import language
 from . import prompt as prompts
 from .images import Area
@@ -26,7 +26,7 @@ from .prompt import END, START, Prompt, Template
 from .sizes import WHERE, Sizes
 
 VISUAL, LM = "backbone.model.model.visual.", "backbone.model.model.language_model."
-BLOCK = EncoderNames(("norm1", "norm2"), ("attn.qkv.",), "attn.proj", "mlp.linear_fc1", "mlp.linear_fc2")
+BLOCK = Names("attn.qkv. attn.proj", "mlp.linear_fc1 mlp.linear_fc2", "norm1 norm2")
 OPEN, CLOSE, IMAGE = "<|vision_start|>", "<|vision_end|>", "<|image_pad|>"
 # One turn without a system turn, the images before the instruction.
 TEMPLATE = Template(START + "user\n", END + "\n", OPEN, IMAGE, CLOSE)
@@ -146,52 +146,35 @@ def read_area(folder: str, s: Sizes, problems: Problems) -> Area:
     return Area(FILE, "torch_bicubic_16bit", 0, 2 * s.vision.patch_size, *limits)
 
 
-def weights(s: Sizes) -> List[Weight]:
-    return [*_vision(s), *language.weights(s, LM)]
-
-
-def _patch(target: str, s: Sizes, time: int) -> Weight:
-    """One time slice of the convolution, whose stride is its kernel: a matrix over channel, row, column."""
-    side, source = s.vision.patch_size, VISUAL + "patch_embed.proj.weight"
-    return Weight(target, source, MATRIX, (s.vision.d_model, 3, 2, side, side), (s.vision.d_model, 3 * side**2), pick=(2, time))
-
-
-def _merger(target: str, source: str, s: Sizes, d_norm: int) -> List[Weight]:
-    d = 4 * s.vision.d_model
-    return [
-        *norm(target + "norm", source + "norm", d_norm),
-        *linear(target + "up", source + "linear_fc1", d, d, bias=True),
-        *linear(target + "down", source + "linear_fc2", s.lm.d_model, d, bias=True),
-    ]
-
-
-def _vision(s: Sizes) -> List[Weight]:
-    d, table = s.vision.d_model, (s.n_position_side**2, s.vision.d_model)
+def weights(s: Sizes) -> Rows:
+    v = s.vision
+    patch, bias = patch_embed(VISUAL + "patch_embed.proj", v.d_model, v.patch_size)
+    # Of both moments of a frame, which are the same frame here.
+    side = patch.stored[-1]
+    moments = [patch._replace(stored=(v.d_model, 3, 2, side, side), pick=(2, time)) for time in (0, 1)]
     rows = [
-        _patch("vision.patch_embed.weight", s, 0),
-        _patch("vision.patch_embed_next.weight", s, 1),
-        *vector("vision.patch_embed.bias", VISUAL + "patch_embed.proj.bias", d),
-        Weight("vision.position.weight", VISUAL + "pos_embed.weight", TABLE, table, table),
+        moments[0],
+        moments[1]._replace(target="vision.patch_embed_next.weight"),
+        bias,
+        *table("vision.position", VISUAL + "pos_embed.weight", s.n_position_side**2, v.d_model),
+        *blocks("vision.", VISUAL + "blocks.{}.", BLOCK, v.n_layer, v.d_model, v.d_ff),
+        *_merger("connector.", VISUAL + "merger.", s, v.d_model),
     ]
-    for i in range(s.vision.n_layer):
-        rows += encoder_block("vision.blk.{}.".format(i), "{}blocks.{}.".format(VISUAL, i), BLOCK, d, s.vision.d_ff)
-    rows += _merger("connector.", VISUAL + "merger.", s, d)
     for k in range(len(s.deepstack_layers)):
-        rows += _merger("deepstack.{}.".format(k), "{}deepstack_merger_list.{}.".format(VISUAL, k), s, 4 * d)
-    return rows
+        rows += _merger("deepstack.{}.".format(k), "{}deepstack_merger_list.{}.".format(VISUAL, k), s, 4 * v.d_model)
+    return rows + decoder(s.lm, LM, QWEN3, "layers")
 
 
-def keys(s: Sizes) -> Dict[str, Dict[str, object]]:
-    u32 = {
-        **s.vision_keys(),
-        "vision.image_width": s.image_width,
-        "vision.image_height": s.image_height,
-        "vision.n_position_side": s.n_position_side,
-        "vision.merge": s.merge,
-    }
-    f32 = {"vision.norm_eps": 1e-6, "vision.rope_base": 1e4}  # literals of the reference
-    lists = {"vision.deepstack_layers": s.deepstack_layers, "lm.rope_sections": s.rope_sections}
-    return {"u32": u32, "f32": f32, "u32[]": lists}
+def _merger(target: str, source: str, s: Sizes, d_norm: int) -> Rows:
+    d = 4 * s.vision.d_model
+    up, down = linear(target + "up", source + "linear_fc1", d, d), linear(target + "down", source + "linear_fc2", s.lm.d_model, d)
+    return [*norm(target + "norm", source + "norm", d_norm), *up, *down]
+
+
+def keys(s: Sizes) -> Dict[str, Mapping[str, object]]:
+    literals = dict(norm_eps=1e-6, rope_base=1e4)  # of the reference
+    own = pick(s, "image_width image_height n_position_side merge deepstack_layers")
+    return {"vision": {**s.vision_keys(), **own, **literals}, "lm": dict(rope_sections=s.rope_sections)}
 
 
 def read_prompt(tokenizer: TokenizerPlan, folder: str, s: Sizes, problems: Problems, hint: str = FOLDER) -> Prompt:

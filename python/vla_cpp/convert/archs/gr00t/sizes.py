@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Dict, List, Optional
 
-from ...networks import Language, Vision
+from ...networks import Language, Vision, pick
 
 WHERE = "backbone config.json"
 
@@ -57,7 +57,7 @@ class Sizes:
 
     def vision_keys(self) -> Dict[str, object]:
         """What the towers of all releases have."""
-        return {"vision." + name: getattr(self.vision, name) for name in ("d_model", "n_layer", "n_head", "d_ff", "patch_size")}
+        return pick(self.vision, "d_model n_layer n_head d_ff patch_size")
 
     @property
     def n_view_token(self) -> int:

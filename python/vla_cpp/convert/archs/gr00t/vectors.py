@@ -11,7 +11,7 @@ import numpy as np
 from ... import recipe
 from ...bundle import Key
 from ...errors import Code, Problems
-from ...features import feature_keys
+from ...features import feature_keys, view_name, views_of
 from .. import Options
 from .robot import BINARY, DEVIATION, PROCESSOR, RANGE, SIN_COS, STATISTICS, Group, Robot
 from .sizes import Sizes
@@ -133,17 +133,13 @@ def _relative_ops(robot: Robot) -> List[dict]:
     return [*([{"op": "add_state", "columns": columns, **others}] if columns else []), *poses]
 
 
-def _view(key: str) -> str:
-    return key if key.startswith("observation.images.") else "observation.images." + key
-
-
 def _names(groups: Sequence[Group]) -> List[str]:
     return [g.key if g.width == 1 else "{}.{}".format(g.key, i) for g in groups for i in range(g.width)]
 
 
 def feature_description(robot: Robot, options: Options, notes: List[str], problems: Problems) -> List[Key]:
     """All cameras are needed. Numbers are named by their keys where no data set names them."""
-    views, n = [_view(key) for key in robot.cameras], len(robot.cameras)
+    views, n = [view_name(key) for key in robot.cameras], len(robot.cameras)
     if len(set(views)) != n:
         problems.add(PROCESSOR + ": video: modality_keys", "cameras of different names", ", ".join(views))
     dims = {recipe.STATE: _total(robot.states), recipe.ACTION: _total(robot.actions)}
@@ -152,10 +148,7 @@ def feature_description(robot: Robot, options: Options, notes: List[str], proble
         own = {"observation.state_names": _names(robot.states), "action.names": _names(robot.actions)}
         keys = [Key(key.name, key.kind, own.get(key.name, key.value)) for key in keys]
     return [
-        Key("observation.views", "string[]", views),
-        Key("observation.view_aliases", "string[]", [""] * n),
-        Key("observation.view_optional", "u32[]", [0] * n),
-        Key("observation.min_views", "u32", n),
+        *views_of(views, [""] * n, [0] * n, n),
         Key("observation.states", "string[]", ["state." + group.key for group in robot.states]),
         Key("observation.state_dims", "u32[]", [group.width for group in robot.states]),
         *keys,

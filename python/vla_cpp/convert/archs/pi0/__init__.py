@@ -7,7 +7,6 @@ Reference: lerobot src/lerobot/policies/pi0 and openpi src/openpi/models_pytorch
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from typing import List
 
@@ -15,6 +14,7 @@ from ...bundle import Key
 from ...checkpoint import OPENPI, Checkpoint
 from ...errors import Problems
 from ...lerobot import given_tokenizer
+from ...recipe import recipe_key
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from .. import Options, Plan
 from .layouts import read_lerobot, read_openpi, variants_of
@@ -37,7 +37,7 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
         *source.features,
         Key("observation.max_text_tokens", "u32", source.max_tokens),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+        recipe_key(document),
     ]
     problems.raise_any()
     rows = [row._replace(keep_f32=not rounded(row)) for row in weights(family, source.sizes, checkpoint)]

@@ -25,7 +25,7 @@ from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of, views_of
+from ...features import robot_keys, views_of
 from ...files import member, read_json
 from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim, view_keys
 from ...section import Section
@@ -111,11 +111,7 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
     dims = {recipe.STATE: sizes.state_dim, recipe.ACTION: sizes.action_dim}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     _check_pipelines(family, policy, processors)
-    features = [
-        *view_keys(checkpoint, views, processors, problems),
-        *states_of({recipe.STATE: sizes.state_dim}),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-    ]
+    keys = view_keys(checkpoint, views, processors, problems)
     return Source(
         sizes=sizes,
         processors=processors,
@@ -127,7 +123,7 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
         text=_text(processors),
         state=_state(family, sizes, processors),
         action=_action(sizes, processors),
-        features=features,
+        features=robot_keys(keys, dims, options.dataset_info, checkpoint.notes, problems),
         statistics=processors.statistics(),
         max_tokens=processors.max_tokens,
     )
@@ -377,12 +373,7 @@ def _values(stats: dict, key: str, name: str, width: int, where: str, problems: 
 
 def _openpi_features(robot: Robot, states: List[str], s: Sizes, checkpoint: Checkpoint, options: Options, problems: Problems) -> List[Key]:
     dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
-    return [
-        *views_of(
-            ["observation.images." + name for name, _, _ in robot.views],
-            [alias for _, alias, _ in robot.views],
-            [int(optional) for _, _, optional in robot.views],
-        ),
-        *states_of(dict(zip(states, (width for _, width in robot.states)))),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-    ]
+    names, aliases, optional = zip(*robot.views)
+    views = views_of(["observation.images." + name for name in names], list(aliases), [int(flag) for flag in optional])
+    widths = dict(zip(states, (width for _, width in robot.states)))
+    return robot_keys(views, dims, options.dataset_info, checkpoint.notes, problems, states=widths)

@@ -15,8 +15,8 @@ from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...files import member, read_json
-from ...layers import gated_block, linear, siglip, vector
-from ...networks import MAX_LAYERS, Language, Vision, dropped_of_last, embedding, keys_and_values, keys_of, plus_one, read_vision
+from ...layers import GEMMA, Decoder, Rows, linear
+from ...networks import MAX_LAYERS, Language, Vision, decoder, defaults, dropped_of_last, expert, keys_of, pick, read_vision, siglip
 from ...safetensors_file import Entry
 from ...section import Section
 from .. import Dropped, Weight
@@ -44,14 +44,7 @@ VARIANTS = {
     "gemma_300m": dict(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
 }
 # SigLIP-So400m/14 as PaliGemma's config and modeling_pi0.py (PaliGemmaWithExpertModel) have it.
-SIGLIP = dict(
-    hidden_size=1152,
-    num_hidden_layers=27,
-    num_attention_heads=16,
-    intermediate_size=4304,
-    patch_size=14,
-    image_size=0,  # as the configuration says, which for openpi is a literal
-)
+SIGLIP = defaults(1152, 4304, 27, 16, patch_size=14, image_size=0)
 N_VOCAB = 257152
 EPS, ROPE_BASE = 1e-6, 10000.0  # of both Gemma configs and of the tower, which state no others
 
@@ -144,15 +137,13 @@ def _known(section: Section) -> None:
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    policy = dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, text_scale=s.lm.d_model**0.5)
-    expert = dict(d_model=s.d_expert, n_layer=s.lm.n_layer, d_ff=s.d_expert_ff, norm_eps=EPS, rope_base=ROPE_BASE)
     return keys_of(
         {
-            "policy": policy,
+            "policy": dict(pick(s, "d_state d_action horizon"), text_scale=s.lm.d_model**0.5),
             "vision": {**vars(s.vision), "position_rule": "row_major"},
             "lm": s.lm,
-            "expert": expert,
-            "time": dict(min_period=s.min_period, max_period=s.max_period),
+            "expert": dict(d_model=s.d_expert, n_layer=s.lm.n_layer, d_ff=s.d_expert_ff, norm_eps=EPS, rope_base=ROPE_BASE),
+            "time": pick(s, "min_period max_period"),
             "solver": dict(steps=s.n_step, t_start=1.0, t_end=0.0, kind=s.solver, noise="normal"),
         }
     )
@@ -223,45 +214,31 @@ def rounded(weight: Weight) -> bool:
     return weight.target.startswith(("lm.", "expert.blk.")) and ".dense." not in weight.target
 
 
-def weights(family: Family, s: Sizes, checkpoint: Checkpoint) -> List[Weight]:
-    table, v = EMBEDDING if EMBEDDING in checkpoint.tensors else LM_HEAD, s.vision
+def weights(family: Family, s: Sizes, checkpoint: Checkpoint) -> Rows:
+    d, tokens = s.d_expert, EMBEDDING if EMBEDDING in checkpoint.tensors else LM_HEAD
     return [
-        *siglip(VISION, v.d_model, v.d_ff, v.n_layer, v.patch_size, v.n_patch),
-        *linear("projector", PROJECTOR, s.lm.d_model, v.d_model, bias=True),
-        embedding(s.lm, table),
-        *keys_and_values(s.lm, LM, gemma=True),
-        *_projections(family, s),
-        *_expert(family, s),
-        *linear("action_out", ROOT + "action_out_proj", s.d_action, s.d_expert, bias=True),
+        *siglip(VISION, s.vision),
+        *linear("projector", PROJECTOR, s.lm.d_model, s.vision.d_model),
+        *decoder(s.lm, LM, GEMMA, "cache", tokens),
+        *linear("action_in", ROOT + "action_in_proj", d, s.d_action),
+        *(linear("state_in", ROOT + "state_proj", d, s.d_state) if family.state_token else []),
+        *_time(family, s),
+        *expert(EXPERT, d, s.d_expert_ff, s.lm, GEMMA if family.state_token else ADAPTIVE),
+        *linear("action_out", ROOT + "action_out_proj", s.d_action, d),
     ]
 
 
-def _projections(family: Family, s: Sizes) -> List[Weight]:
-    d, root = s.d_expert, ROOT
-    rows = linear("action_in", root + "action_in_proj", d, s.d_action, bias=True)
-    if not family.state_token:
-        rows += linear("time_mlp_in", root + "time_mlp_in", d, d, bias=True)
-        return rows + linear("time_mlp_out", root + "time_mlp_out", d, d, bias=True)
-    rows += linear("state_in", root + "state_proj", d, s.d_state, bias=True)
-    rows += linear("action_time_in", root + "action_time_mlp_in", d, 2 * d, bias=True)
-    return rows + linear("action_time_out", root + "action_time_mlp_out", d, d, bias=True)
+def _time(family: Family, s: Sizes) -> Rows:
+    target, d = "action_time" if family.state_token else "time_mlp", s.d_expert
+    source = ROOT + family.time_mlp
+    return linear(target + "_in", source + "_in", d, 2 * d if family.state_token else d) + linear(target + "_out", source + "_out", d, d)
 
 
-def _expert(family: Family, s: Sizes) -> List[Weight]:
-    rows: List[Weight] = []
-    for i in range(s.lm.n_layer):
-        target, source = "expert.blk.{}.".format(i), "{}layers.{}.".format(EXPERT, i)
-        block = gated_block(target, source, s.d_expert, s.lm.d_q, s.lm.d_kv, s.d_expert, s.d_expert_ff)
-        block["attn_norm"] = _expert_norm(family, s, target + "attn_norm", source + "input_layernorm")
-        block["ffn_norm"] = _expert_norm(family, s, target + "ffn_norm", source + "post_attention_layernorm")
-        rows += [weight for part in block.values() for weight in part]
-    return rows + _expert_norm(family, s, "expert.norm", EXPERT + "norm")
+def _adaptive_norm(target: str, source: str, d: int) -> Rows:
+    return linear(target + ".dense", source + ".dense", 3 * d, d)
 
 
-def _expert_norm(family: Family, s: Sizes, target: str, source: str) -> List[Weight]:
-    if family.state_token:
-        return plus_one(vector(target + ".weight", source + ".weight", s.d_expert))
-    return linear(target + ".dense", source + ".dense", 3 * s.d_expert, s.d_expert, bias=True)
+ADAPTIVE = Decoder(_adaptive_norm)
 
 
 def dropped(family: Family, s: Sizes, checkpoint: Checkpoint) -> List[Dropped]:

@@ -8,14 +8,12 @@ transformers models/smolvlm. Shapes come from the configs alone; a tensor of ano
 
 from __future__ import annotations
 
-import json
 from typing import Dict, List
 
 from ... import recipe
-from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of
+from ...features import robot_keys
 from ...lerobot import tokenizer_folder, view_keys
 from ...tokenizer import read_tokenizer
 from .. import Options, Plan
@@ -32,12 +30,13 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     folder = tokenizer_folder(checkpoint, options, processors) or sizes.backbone
     tokenizer = read_tokenizer(folder, sizes.lm.n_vocab, problems, checkpoint.notes)
-    document = json.dumps(recipe_document(sizes, processors, tokenizer.truncate), ensure_ascii=False)
+    # One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same.
+    views = view_keys(checkpoint, sizes.views, processors, problems)
     keys = [
         *network_keys(sizes),
-        *_feature_keys(checkpoint, options, sizes, processors, problems),
+        *robot_keys(views, dims, options.dataset_info, checkpoint.notes, problems, processors.max_tokens),
         *tokenizer.keys,
-        Key("processor.recipe", "string", document),
+        recipe.recipe_key(recipe_document(sizes, processors, tokenizer.truncate)),
     ]
     problems.raise_any()
     return Plan(keys, weights(sizes), dropped(sizes), processors.statistics(), hints(sizes))
@@ -50,14 +49,3 @@ def recipe_document(s: Sizes, processors: recipe.Processors, truncate: str) -> D
         "state": [*processors.state.op("normalize", recipe.STATE), {"op": "pad", "size": s.d_state}],
         "action": [{"op": "take", "size": s.action_dim}, *processors.action.op("unnormalize", recipe.ACTION)],
     }
-
-
-def _feature_keys(checkpoint: Checkpoint, options: Options, s: Sizes, processors: recipe.Processors, problems: Problems) -> List[Key]:
-    """One view is enough: the reference (prepare_images) drops every view that is missing, or masks it, which is the same."""
-    dims = {recipe.STATE: s.state_dim, recipe.ACTION: s.action_dim}
-    return [
-        *view_keys(checkpoint, s.views, processors, problems),
-        *states_of({recipe.STATE: s.state_dim}),
-        Key("observation.max_text_tokens", "u32", processors.max_tokens),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
-    ]

@@ -15,7 +15,7 @@ from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import member, read_json
 from ...lerobot import check_keys, check_widths, read_views, vector_dim
-from ...networks import Language, Vision, read_language, read_vision
+from ...networks import Language, Vision, defaults, read_language, read_vision
 from ...recipe import ACTION, STATE
 from ...section import ANY_INT, Section
 from .. import Options
@@ -52,23 +52,8 @@ FIXED = {
 # Keys that no number of an action chunk depends on, beside those of every policy of LeRobot.
 IGNORED = set("pad_language_to freeze_vision_encoder train_expert_only train_state_proj".split())
 # SmolVLMVisionConfig and LlamaConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
-VISION = {
-    "hidden_size": 1152,
-    "intermediate_size": 3072,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 16,
-    "image_size": 224,
-    "patch_size": 32,
-    "layer_norm_eps": 1e-6,
-}
-TEXT = {
-    "hidden_size": 4096,
-    "intermediate_size": 11008,
-    "num_hidden_layers": 32,
-    "num_attention_heads": 32,
-    "vocab_size": 32000,
-    "rms_norm_eps": 1e-6,
-}
+VISION = defaults(1152, 3072, 12, 16, image_size=224, patch_size=32, layer_norm_eps=1e-6)
+TEXT = defaults(4096, 11008, 32, 32, vocab_size=32000, rms_norm_eps=1e-6)
 VISION_FIXED = {"hidden_act": "gelu_pytorch_tanh", "num_channels": 3}
 TEXT_FIXED = {"hidden_act": "silu", "attention_bias": False, "mlp_bias": False, "model_type": "llama"}
 TEXT_NULLABLE = ("num_key_value_heads", "head_dim")
@@ -243,7 +228,7 @@ def read_expert(policy: Section, s: Sizes) -> None:
 def _check_expert_layers(policy: Section, s: Sizes, mode: str, every: int) -> None:
     """The reference counts in expert layers when it builds k and v, and in language-model layers when it runs them, so with
     fewer expert layers the two can disagree; it also cannot run self-attention where the expert has no layer."""
-    d_kv, ratio = s.lm.d_kv, s.lm.n_layer // s.n_expert_layer
+    d_kv, ratio = s.lm.heads[1], s.lm.n_layer // s.n_expert_layer
     s.d_kv_in = [d_kv if is_cross(j, mode, every) else s.d_expert for j in range(s.n_expert_layer)]
     for i, kind in enumerate(s.layer_kinds):
         cross = is_cross(i, mode, every)

@@ -8,14 +8,12 @@ processor_turbovla.py) and transformers models/dinov3_vit and models/bert.
 
 from __future__ import annotations
 
-import json
 from typing import Dict, List
 
 from ... import recipe
-from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of
+from ...features import robot_keys
 from ...images import IMAGENET
 from ...lerobot import required_view_keys
 from ...tokenizer import read_tokenizer
@@ -31,14 +29,12 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, {}, reads_text=False)
     tokenizer = read_tokenizer(s.lm_folder, s.lm.n_vocab, problems, checkpoint.notes)
     problems.raise_any()
+    views = required_view_keys(checkpoint, s.views, processors, problems)
     keys = [
         *network_keys(s),
-        *required_view_keys(checkpoint, s.views, processors, problems),
-        *states_of(dims),
-        Key("observation.max_text_tokens", "u32", s.max_tokens),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+        *robot_keys(views, dims, options.dataset_info, checkpoint.notes, problems, s.max_tokens),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(recipe_document(s, processors, tokenizer.truncate), ensure_ascii=False)),
+        recipe.recipe_key(recipe_document(s, processors, tokenizer.truncate)),
     ]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))

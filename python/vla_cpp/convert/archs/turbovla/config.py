@@ -15,8 +15,8 @@ from typing import Sequence
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import read_json
-from ...lerobot import check_keys, check_widths, no_position_rule, vector_dim
-from ...networks import MAX_LAYERS, Vision, read_vision
+from ...lerobot import check_keys, check_widths, no_position_rule, strict_views, vector_dim
+from ...networks import MAX_LAYERS, TextEncoder, Vision, defaults, read_vision
 from ...recipe import ACTION, STATE
 from ...section import Section
 from .. import Options
@@ -43,8 +43,7 @@ MIN_TOKENS = 3  # one word between the tokens that stand around every text
 
 
 def release(d_model: int, n_layer: int, n_head: int) -> dict:
-    sizes = {"hidden_size": d_model, "num_hidden_layers": n_layer, "num_attention_heads": n_head, "intermediate_size": 4 * d_model}
-    return {"model_type": "dinov3_vit", **sizes, "num_register_tokens": 4}
+    return defaults(d_model, 4 * d_model, n_layer, n_head, model_type="dinov3_vit", num_register_tokens=4)
 
 
 # Configs of DINOv3's vision transformers with plain MLPs, as they are published.
@@ -55,16 +54,7 @@ DINOV3 = {
     "facebook/dinov3-vitl16-pretrain-sat493m": release(1024, 24, 16),
 }
 # DINOv3ViTConfig and BertConfig, with the defaults of the classes. Keys that they do not read stay without effect there too.
-VISION = {
-    "hidden_size": 384,
-    "intermediate_size": 1536,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 6,
-    "patch_size": 16,
-    "layer_norm_eps": 1e-5,
-    "rope_theta": 100.0,
-    "num_register_tokens": 0,
-}
+VISION = defaults(384, 1536, 12, 6, patch_size=16, layer_norm_eps=1e-5, rope_theta=100.0, num_register_tokens=0)
 VISION_FIXED = {
     "model_type": (None, "dinov3_vit"),
     "hidden_act": ("gelu", "gelu"),
@@ -76,35 +66,13 @@ VISION_FIXED = {
     "mlp_bias": (True, True),
     "use_gated_mlp": (False, False),
 }
-TEXT = {
-    "hidden_size": 768,
-    "intermediate_size": 3072,
-    "num_hidden_layers": 12,
-    "num_attention_heads": 12,
-    "vocab_size": 30522,
-    "max_position_embeddings": 512,
-    "type_vocab_size": 2,
-    "layer_norm_eps": 1e-12,
-}
+TEXT = defaults(768, 3072, 12, 12, vocab_size=30522, max_position_embeddings=512, type_vocab_size=2, layer_norm_eps=1e-12)
 TEXT_FIXED = {
     "model_type": (None, "bert"),
     "hidden_act": ("gelu", "gelu"),
     "position_embedding_type": ("absolute", "absolute"),
     "is_decoder": (False, False),
 }
-
-
-@dataclass
-class Bert:
-    """Keys `lm.*`."""
-
-    d_model: int
-    n_layer: int
-    n_head: int
-    d_ff: int
-    n_vocab: int
-    n_position: int
-    norm_eps: float
 
 
 @dataclass
@@ -123,7 +91,7 @@ class Sizes:
     vision: Vision
     rope_base: float
     n_register: int
-    lm: Bert
+    lm: TextEncoder
     n_sentence: int  # rows of the table that tells two sentences apart
     lm_folder: str
 
@@ -144,7 +112,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     features = policy.get("input_features")
     has_state = isinstance(features, dict) and STATE in features
     s = Sizes(
-        views=_read_views(policy),
+        views=strict_views(policy),
         d_state=vector_dim(policy, "input_features", STATE, "STATE") if has_state else 0,
         d_action=vector_dim(policy, "output_features", ACTION, "ACTION"),
         horizon=policy.count("chunk_size", maximum=4096),
@@ -185,8 +153,8 @@ def _vision_config(policy: Section, checkpoint: Checkpoint) -> dict:
     return release(768, 12, 12)
 
 
-def _read_bert(text: Section) -> Bert:
-    bert = Bert(
+def _read_bert(text: Section) -> TextEncoder:
+    bert = TextEncoder(
         d_model=text.count("hidden_size"),
         n_layer=text.count("num_hidden_layers", maximum=MAX_LAYERS),
         n_head=text.count("num_attention_heads"),
@@ -198,20 +166,3 @@ def _read_bert(text: Section) -> Bert:
     if bert.d_model % bert.n_head:
         text.bad("num_attention_heads", "a divisor of hidden_size {}".format(bert.d_model))
     return bert
-
-
-def _read_views(policy: Section) -> Sequence[str]:
-    """Cameras in their order. What the reference does not read is refused: it may be a misspelt feature."""
-    features = policy.get("input_features")
-    views = []
-    for name, feature in (features if isinstance(features, dict) else {}).items():
-        kind, shape = (feature.get("type"), feature.get("shape")) if isinstance(feature, dict) else (None, None)
-        if kind == "VISUAL":
-            views.append(name)
-            if not isinstance(shape, list) or len(shape) != 3 or shape[0] != 3:
-                policy.bad("input_features." + name, "a frame of shape [3, height, width]", str(shape))
-        elif name != STATE:
-            policy.bad("input_features." + name, "cameras and {}".format(STATE), str(kind), unsupported=True)
-    if not views:
-        policy.bad("input_features", "a VISUAL feature or several", "none")
-    return views

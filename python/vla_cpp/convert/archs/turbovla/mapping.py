@@ -1,44 +1,52 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of the network and names, storage and shapes of every tensor of TurboVLA."""
+"""Keys of the network and names of every tensor of TurboVLA."""
 
 from __future__ import annotations
 
 from typing import Dict, List
 
 from ...bundle import Key
-from ...layers import EncoderNames, encoder_block, linear, norm, vector
-from ...networks import keys_of
-from .. import MATRIX, TABLE, VECTOR, Dropped, Weight
+from ...layers import Names, Rows, block, blocks, linear, norm, patch_embed, table, vector
+from ...networks import NORM_EPS, keys_of, pick
+from .. import Dropped
 from .config import Sizes
 
 VISION, LANGUAGE = "model.vision_encoder.", "model.language_encoder."
-NORM_EPS = 1e-5  # of torch.nn.LayerNorm
-QKV = ("q_proj", "k_proj", "v_proj", "out_proj")
-DINOV3 = EncoderNames(
-    ("norm1", "norm2"),
-    tuple("attention.{}_proj".format(part) for part in "qkv"),
-    "attention.o_proj",
-    "mlp.up_proj",
-    "mlp.down_proj",
-    ("layer_scale1.lambda1", "layer_scale2.lambda1"),
+FUSION, DECODER = "model.vl_interaction.", "model.action_decoder."
+DINOV3 = Names(
+    "attention.q_proj attention.k_proj attention.v_proj attention.o_proj",
+    "mlp.up_proj mlp.down_proj",
+    "norm1 norm2",
+    scales="layer_scale1.lambda1 layer_scale2.lambda1",
 )
-BERT = EncoderNames(
-    ("attention.output.LayerNorm", "output.LayerNorm"),
-    tuple("attention.self." + part for part in ("query", "key", "value")),
-    "attention.output.dense",
-    "intermediate.dense",
-    "output.dense",
+BERT = Names(
+    "attention.self.query attention.self.key attention.self.value attention.output.dense",
+    "intermediate.dense output.dense",
+    "attention.output.LayerNorm output.LayerNorm",
+)
+
+
+def _attention(name: str) -> str:
+    return " ".join("{}.{}_proj".format(name, part) for part in ("q", "k", "v", "out"))
+
+
+FUSED = {
+    "image": Names(_attention("text_to_vision_attn"), "vision_ffn.linear1 vision_ffn.linear2", "norm_vision_attn norm_vision_ffn"),
+    "text": Names(_attention("vision_to_text_attn"), "text_ffn.linear1 text_ffn.linear2", "norm_text_attn norm_text_ffn"),
+}
+DECODED = Names(
+    _attention("self_attn"), "ffn.linear1 ffn.linear2", "norm_self_attn norm_cross_attn norm_ffn", cross=_attention("cross_attn")
 )
 
 
 def network_keys(s: Sizes) -> List[Key]:
     return keys_of(
         {
-            "policy": dict(d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, n_view=len(s.views)),
-            "vision": {**vars(s.vision), "rope_base": s.rope_base, "n_register": s.n_register},
-            "lm": vars(s.lm),
-            "transformer": dict(d_model=s.d_model, n_head=s.n_head, d_ff=s.d_ff, activation=s.activation, norm="before", norm_eps=NORM_EPS),
+            "policy": dict(pick(s, "d_state d_action horizon"), n_view=len(s.views)),
+            "vision": {**vars(s.vision), **pick(s, "rope_base n_register")},
+            "lm": s.lm,
+            "transformer": dict(pick(s, "d_model n_head d_ff activation"), norm="before", norm_eps=NORM_EPS),
             "fusion": dict(n_layer=s.n_fusion),
             "decoder": dict(n_layer=s.n_decoder),
             "solver": dict(steps=1, kind="direct", noise="none"),
@@ -46,85 +54,53 @@ def network_keys(s: Sizes) -> List[Key]:
     )
 
 
-def weights(s: Sizes) -> List[Weight]:
-    d, fusion, decoder = s.d_model, "model.vl_interaction.", "model.action_decoder."
+def weights(s: Sizes) -> Rows:
+    d, n_patch = s.d_model, s.vision.n_patch
     rows = [
         *_vision(s),
         *_language(s),
-        *linear("projector", "model.vision_proj", d, s.vision.d_model, bias=True),
-        *linear("text_in", "model.language_proj", d, s.lm.d_model, bias=True),
-        Weight("position.weight", "model.patch_pos_embed", TABLE, (1, s.vision.n_patch, d), (s.vision.n_patch, d)),
-        Weight("camera.weight", "model.camera_embed.weight", TABLE, (len(s.views), d), (len(s.views), d)),
-        *norm("fusion.image_norm", fusion + "norm_vision", d),
-        *norm("fusion.text_norm", fusion + "norm_text", d),
-        Weight("query.weight", decoder + "query_embed.weight", TABLE, (s.horizon, d), (s.horizon, d)),
-        *norm("decoder.norm", decoder + "norm", d),
-        *linear("action_out", decoder + "action_head", s.d_action, d, bias=True),
+        *linear("projector", "model.vision_proj", d, s.vision.d_model),
+        *linear("text_in", "model.language_proj", d, s.lm.d_model),
+        *table("position", "model.patch_pos_embed", n_patch, d, (1, n_patch, d)),
+        *table("camera", "model.camera_embed.weight", len(s.views), d),
+        *norm("fusion.image_norm", FUSION + "norm_vision", d),
+        *norm("fusion.text_norm", FUSION + "norm_text", d),
+        *table("query", DECODER + "query_embed.weight", s.horizon, d),
+        *norm("decoder.norm", DECODER + "norm", d),
+        *linear("action_out", DECODER + "action_head", s.d_action, d),
     ]
     if s.d_state:
-        rows += linear("state_in", "model.state_proj", d, s.d_state, bias=True)
-        rows.append(Weight("state_token.weight", "model.state_embed", VECTOR, (1, 1, d), (d,)))
+        rows += linear("state_in", "model.state_proj", d, s.d_state)
+        rows += vector("state_token.weight", "model.state_embed", d, (1, 1, d))
     for i in range(s.n_fusion):
-        target, source = "fusion.blk.{}.".format(i), "{}layers.{}.".format(fusion, i)
-        rows += _attention(target + "image.", source, "norm_vision_attn", "text_to_vision_attn", s)
-        rows += _mlp(target + "image.", source + "norm_vision_ffn", source + "vision_ffn", s)
-        rows += _attention(target + "text.", source, "norm_text_attn", "vision_to_text_attn", s)
-        rows += _mlp(target + "text.", source + "norm_text_ffn", source + "text_ffn", s)
-    for i in range(s.n_decoder):
-        target, source = "decoder.blk.{}.".format(i), "{}layers.{}.".format(decoder, i)
-        rows += _attention(target, source, "norm_self_attn", "self_attn", s)
-        rows += _attention(target + "cross.", source, "norm_cross_attn", "cross_attn", s)
-        rows += _mlp(target, source + "norm_ffn", source + "ffn", s)
-    return rows
+        for part, names in FUSED.items():
+            rows += block("fusion.blk.{}.{}.".format(i, part), "{}layers.{}.".format(FUSION, i), names, d, s.d_ff)
+    return rows + blocks("decoder.", DECODER + "layers.{}.", DECODED, s.n_decoder, d, s.d_ff)
 
 
-def _attention(target: str, source: str, norm_name: str, attention: str, s: Sizes) -> List[Weight]:
-    """An attention with its norm."""
-    rows = norm(target + "attn_norm", source + norm_name, s.d_model)
-    for part, name in zip(("attn_q", "attn_k", "attn_v", "attn_out"), QKV):
-        rows += linear(target + part, "{}{}.{}".format(source, attention, name), s.d_model, s.d_model, bias=True)
-    return rows
-
-
-def _mlp(target: str, norm_name: str, mlp: str, s: Sizes) -> List[Weight]:
-    return [
-        *norm(target + "ffn_norm", norm_name, s.d_model),
-        *linear(target + "ffn_up", mlp + ".linear1", s.d_ff, s.d_model, bias=True),
-        *linear(target + "ffn_down", mlp + ".linear2", s.d_model, s.d_ff, bias=True),
-    ]
-
-
-def _vision(s: Sizes) -> List[Weight]:
+def _vision(s: Sizes) -> Rows:
     v, at = s.vision, VISION + "embeddings."
-    patch = (v.d_model, 3, v.patch_size, v.patch_size)
-    rows = [
-        Weight("vision.patch_embed.weight", at + "patch_embeddings.weight", MATRIX, patch, (v.d_model, 3 * v.patch_size**2)),
-        *vector("vision.patch_embed.bias", at + "patch_embeddings.bias", v.d_model),
-        Weight("vision.class_token.weight", at + "cls_token", VECTOR, (1, 1, v.d_model), (v.d_model,)),
+    registers = (1, s.n_register, v.d_model)
+    rows = blocks("vision.", VISION + "model.layer.{}.", DINOV3, v.n_layer, v.d_model, v.d_ff)
+    return [
+        *patch_embed(at + "patch_embeddings", v.d_model, v.patch_size),
+        *vector("vision.class_token.weight", at + "cls_token", v.d_model, (1, 1, v.d_model)),
         *norm("vision.post_norm", VISION + "norm", v.d_model),
+        *(table("vision.registers", at + "register_tokens", s.n_register, v.d_model, registers) if s.n_register else []),
+        *(row for row in rows if not row.target.endswith("attn_k.bias")),
     ]
-    if s.n_register:
-        stored = (1, s.n_register, v.d_model)
-        rows.append(Weight("vision.registers.weight", at + "register_tokens", TABLE, stored, stored[1:]))
-    for i in range(v.n_layer):
-        block = encoder_block("vision.blk.{}.".format(i), "{}model.layer.{}.".format(VISION, i), DINOV3, v.d_model, v.d_ff)
-        rows += [row for row in block if not row.target.endswith("attn_k.bias")]
-    return rows
 
 
-def _language(s: Sizes) -> List[Weight]:
+def _language(s: Sizes) -> Rows:
     lm, at = s.lm, LANGUAGE + "embeddings."
-    token, position = (lm.n_vocab, lm.d_model), (lm.n_position, lm.d_model)
-    rows = [
-        Weight("lm.token_embd.weight", at + "word_embeddings.weight", TABLE, token, token),
-        Weight("lm.position.weight", at + "position_embeddings.weight", TABLE, position, position),
+    return [
+        *table("lm.token_embd", at + "word_embeddings.weight", lm.n_vocab, lm.d_model),
+        *table("lm.position", at + "position_embeddings.weight", lm.n_position, lm.d_model),
         # An instruction is the first of two sentences.
-        Weight("lm.sentence.weight", at + "token_type_embeddings.weight", VECTOR, (s.n_sentence, lm.d_model), (lm.d_model,), pick=(0, 0)),
+        *vector("lm.sentence.weight", at + "token_type_embeddings.weight", lm.d_model, (s.n_sentence, lm.d_model), pick=(0, 0)),
         *norm("lm.embd_norm", at + "LayerNorm", lm.d_model),
+        *blocks("lm.", LANGUAGE + "encoder.layer.{}.", BERT, lm.n_layer, lm.d_model, lm.d_ff),
     ]
-    for i in range(lm.n_layer):
-        rows += encoder_block("lm.blk.{}.".format(i), "{}encoder.layer.{}.".format(LANGUAGE, i), BERT, lm.d_model, lm.d_ff)
-    return rows
 
 
 def dropped(s: Sizes) -> List[Dropped]:

@@ -8,16 +8,14 @@ processor_vla_jepa.py) and transformers models/qwen3_vl.
 
 from __future__ import annotations
 
-import json
 from typing import List
 
 import numpy as np
 
 from ... import recipe
-from ...bundle import Key
 from ...checkpoint import PROCESSORS, Checkpoint
 from ...errors import Problems
-from ...features import feature_keys, states_of
+from ...features import robot_keys
 from ...files import member
 from ...lerobot import required_view_keys
 from ...tokenizer import read_tokenizer
@@ -54,14 +52,13 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
         "state": processors.state.op("normalize", recipe.STATE) if s.d_state else [],
         "action": action_ops(checkpoint, s, processors, problems),
     }
+    views = required_view_keys(checkpoint, s.views, processors, problems)
     keys = [
         *network_keys(s),
         *prompt.keys(),
-        *required_view_keys(checkpoint, s.views, processors, problems),
-        *states_of(dims),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+        *robot_keys(views, dims, options.dataset_info, checkpoint.notes, problems),
         *tokenizer.keys,
-        Key("processor.recipe", "string", json.dumps(document, ensure_ascii=False)),
+        recipe.recipe_key(document),
     ]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Dict, List, TypeVar
 
 from ...bundle import Key
-from ...layers import linear
-from .. import TABLE, Dropped, Weight
+from ...layers import Rows, linear, table
+from .. import Dropped, Weight
 from ..gr00t import head, qwen3_vl
 from ..gr00t.plan import network_keys_of
 from .config import Sizes
@@ -21,11 +21,11 @@ Row = TypeVar("Row", Weight, Dropped)
 
 def network_keys(s: Sizes) -> List[Key]:
     """The head has no self-attention over the features in front of it."""
-    own: Dict[str, object] = {"policy.n_future": s.n_embodied, "policy.n_embodied": s.n_embodied}
-    return [key for key in network_keys_of(qwen3_vl, s, own) if not key.name.startswith("vl.")]
+    keys = network_keys_of(qwen3_vl, s, {"policy": dict(n_future=s.n_embodied, n_embodied=s.n_embodied)})
+    return [key for key in keys if not key.name.startswith("vl.")]
 
 
-def weights(s: Sizes) -> List[Weight]:
+def weights(s: Sizes) -> Rows:
     """The head is float32 in the reference whatever the backbone is."""
     backbone = [_moved(row, GROOT_QWEN, QWEN)._replace(in_bf16=s.in_bf16) for row in qwen3_vl.weights(s)]
     return [*backbone, *(row._replace(keep_f32=True) for row in _head(s))]
@@ -37,21 +37,21 @@ def _moved(row: Row, theirs: str, ours: str) -> Row:
     return row._replace(source=ours + row.source[len(theirs) :])
 
 
-def _head(s: Sizes) -> List[Weight]:
-    d, positions, future = s.d_dit, (s.n_position, s.d_dit), (s.n_embodied, s.d_dit)
+def _head(s: Sizes) -> Rows:
+    d, encoder = s.d_dit, HEAD + "action_encoder."
     rows = [_moved(row, head.HEAD, HEAD) for row in head.transformer_rows(s)]
     if s.d_state:
-        rows += linear("state_in", HEAD + "state_encoder.layer1", s.d_hidden, s.d_state, bias=True)
-        rows += linear("state_out", HEAD + "state_encoder.layer2", d, s.d_hidden, bias=True)
+        rows += linear("state_in", HEAD + "state_encoder.layer1", s.d_hidden, s.d_state)
+        rows += linear("state_out", HEAD + "state_encoder.layer2", d, s.d_hidden)
     return [
         *rows,
-        *linear("action_in", HEAD + "action_encoder.layer1", d, s.d_action, bias=True),
-        *linear("action_mix", HEAD + "action_encoder.layer2", d, 2 * d, bias=True),
-        *linear("action_token", HEAD + "action_encoder.layer3", d, d, bias=True),
-        Weight("action_position.weight", HEAD + "position_embedding.weight", TABLE, positions, positions),
-        Weight("future.weight", HEAD + "future_tokens.weight", TABLE, future, future),
-        *linear("decode_in", HEAD + "action_decoder.layer1", s.d_hidden, s.d_hidden, bias=True),
-        *linear("decode_out", HEAD + "action_decoder.layer2", s.d_action, s.d_hidden, bias=True),
+        *linear("action_in", encoder + "layer1", d, s.d_action),
+        *linear("action_mix", encoder + "layer2", d, 2 * d),
+        *linear("action_token", encoder + "layer3", d, d),
+        *table("action_position", HEAD + "position_embedding.weight", s.n_position, d),
+        *table("future", HEAD + "future_tokens.weight", s.n_embodied, d),
+        *linear("decode_in", HEAD + "action_decoder.layer1", s.d_hidden, s.d_hidden),
+        *linear("decode_out", HEAD + "action_decoder.layer2", s.d_action, s.d_hidden),
     ]
 
 

@@ -9,15 +9,13 @@ processor_xvla.py) and transformers models/florence2 and models/bart.
 
 from __future__ import annotations
 
-import json
 import os
 from typing import Dict, List, Sequence
 
 from ... import recipe
-from ...bundle import Key
 from ...checkpoint import Checkpoint
 from ...errors import Code, Problems, refuse
-from ...features import feature_keys, states_of
+from ...features import robot_keys
 from ...files import read_json
 from ...images import IMAGENET
 from ...lerobot import given_tokenizer, view_keys
@@ -57,22 +55,16 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, STEPS)
     _check_order(list(steps), problems)
     folder = given_tokenizer(checkpoint, options, processors, TOKENIZER)
-    tokenizer = read_tokenizer(folder, s.n_vocab, problems, checkpoint.notes)
+    tokenizer = read_tokenizer(folder, s.lm.n_vocab, problems, checkpoint.notes)
     if steps.get("tokenizer_processor", {}).get("padding", "max_length") == "max_length":
         s.n_token, s.pad_token = processors.max_tokens, _pad_token(folder, tokenizer, problems)
     problems.raise_any()
+    views = view_keys(checkpoint, s.views, processors, problems)
     keys = [
         *network_keys(s),
-        *view_keys(checkpoint, s.views, processors, problems),
-        *states_of(dims),
-        Key("observation.max_text_tokens", "u32", processors.max_tokens),
-        *feature_keys(options.dataset_info, dims, checkpoint.notes, problems),
+        *robot_keys(views, dims, options.dataset_info, checkpoint.notes, problems, processors.max_tokens),
         *tokenizer.keys,
-        Key(
-            "processor.recipe",
-            "string",
-            json.dumps(recipe_document(s, processors, tokenizer.truncate, NORMALIZE in steps), ensure_ascii=False),
-        ),
+        recipe.recipe_key(recipe_document(s, processors, tokenizer.truncate, NORMALIZE in steps)),
     ]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))

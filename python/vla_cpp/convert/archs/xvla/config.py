@@ -15,7 +15,7 @@ from ...checkpoint import Checkpoint
 from ...errors import Code, Problems
 from ...files import member
 from ...lerobot import EMPTY_CAMERA, check_keys, check_widths, no_position_rule, read_views, vector_dim
-from ...networks import MAX_LAYERS
+from ...networks import MAX_LAYERS, NORM_EPS, TextEncoder
 from ...recipe import ACTION, STATE
 from ...section import Section
 from .. import Options
@@ -135,12 +135,7 @@ class Sizes:
     window: int = 0
     n_cell_position: int = 0
     n_moment: int = 0
-    d_lm: int = 0
-    n_lm_layer: int = 0
-    n_lm_head: int = 0
-    d_lm_ff: int = 0
-    n_vocab: int = 0
-    n_lm_position: int = 0
+    lm: TextEncoder = field(default_factory=TextEncoder)
     d_model: int = 0
     n_layer: int = 0
     n_head: int = 0
@@ -250,13 +245,20 @@ def _read_florence(policy: Section, s: Sizes, problems: Problems) -> None:
     if text.values.get("model_type", TEXT_TYPES[1]) not in TEXT_TYPES:
         text.bad("model_type", " or ".join(TEXT_TYPES), unsupported=True)
     text.check_fixed(TEXT_FIXED, "the runtime's language model of this policy is BART's encoder")
-    d_lm, s.n_vocab, s.n_lm_position = text.count("d_model"), text.count("vocab_size"), text.count("max_position_embeddings")
-    s.n_lm_layer, s.n_lm_head = text.count("encoder_layers", maximum=MAX_LAYERS), text.count("encoder_attention_heads")
-    s.d_lm_ff = text.count("encoder_ffn_dim")
-    if d_lm != s.d_lm:
-        text.bad("d_model", "projection_dim {} of the vision_config".format(s.d_lm))
-    if d_lm % s.n_lm_head:
-        text.bad("encoder_attention_heads", "a divisor of d_model {}".format(d_lm))
+    d_projected = s.lm.d_model
+    s.lm = TextEncoder(
+        d_model=text.count("d_model"),
+        n_vocab=text.count("vocab_size"),
+        n_position=text.count("max_position_embeddings"),
+        n_layer=text.count("encoder_layers", maximum=MAX_LAYERS),
+        n_head=text.count("encoder_attention_heads"),
+        d_ff=text.count("encoder_ffn_dim"),
+        norm_eps=NORM_EPS,
+    )
+    if s.lm.d_model != d_projected:
+        text.bad("d_model", "projection_dim {} of the vision_config".format(d_projected))
+    if s.lm.d_model % s.lm.n_head:
+        text.bad("encoder_attention_heads", "a divisor of d_model {}".format(s.lm.d_model))
 
 
 def _translated(vision: dict, problems: Problems) -> dict:
@@ -289,7 +291,7 @@ def _read_vision(vision: Section, s: Sizes) -> None:
     names = ("embed_dim", "depths", "num_heads", "num_groups", "patch_size", "patch_stride", "patch_padding", "patch_prenorm")
     columns = [_numbers(vision, name) for name in names]
     ratio = vision.number("mlp_ratio")
-    s.window, s.d_lm = vision.count("window_size", maximum=1024), vision.count("projection_dim")
+    s.window, s.lm.d_model = vision.count("window_size", maximum=1024), vision.count("projection_dim")
     s.n_cell_position, s.n_moment = vision.count("max_position_embeddings", maximum=4096), vision.count("max_temporal_embeddings")
     if len({len(column) for column in columns}) > 1 or not 1 <= len(columns[0]) <= MAX_STAGE:
         vision.bad(

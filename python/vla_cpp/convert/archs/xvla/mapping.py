@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of the network and names, storage and shapes of every tensor of X-VLA."""
+"""Keys of the network and names of every tensor of X-VLA."""
 
 from __future__ import annotations
 
@@ -8,24 +8,20 @@ import re
 from typing import Dict, List
 
 from ...bundle import Key
-from ...layers import EncoderNames, encoder_block, linear, norm, vector
-from ...networks import keys_of
-from .. import MATRIX, TABLE, VECTOR, Dropped, Weight
+from ...layers import Names, Rows, block, blocks, linear, norm, table, vector
+from ...networks import NORM_EPS, keys_of, pick
+from .. import MATRIX, VECTOR, Dropped, Weight
 from .config import Sizes, Stage
 
 VLM, HEAD = "model.vlm.", "model.transformer."
 TOWER, PROJECTOR, ENCODER = VLM + "vision_tower.", VLM + "multi_modal_projector.", VLM + "language_model.encoder."
-NORM_EPS = 1e-5  # of torch.nn.LayerNorm
 POSITION_OFFSET = 2  # rows in front of the first position (transformers modeling_bart.py BartLearnedPositionalEmbedding)
-DAVIT = {"spatial": "window_attn", "channel": "channel_attn"}
-BART = EncoderNames(
-    ("self_attn_layer_norm", "final_layer_norm"),
-    tuple("self_attn.{}_proj".format(part) for part in "qkv"),
-    "self_attn.out_proj",
-    "fc1",
-    "fc2",
-)
-BLOCK = EncoderNames(("norm1", "norm2"), ("attn.qkv.",), "attn.proj", "mlp.fc1", "mlp.fc2")
+DAVIT = {
+    kind: Names("{0}.qkv. {0}.proj".format(attention), "ffn.fc1 ffn.fc2", "norm1 norm2")
+    for kind, attention in (("spatial", "window_attn"), ("channel", "channel_attn"))
+}
+BART = Names("self_attn.q_proj self_attn.k_proj self_attn.v_proj self_attn.out_proj", "fc1 fc2", "self_attn_layer_norm final_layer_norm")
+BLOCK = Names("attn.qkv. attn.proj", "mlp.fc1 mlp.fc2", "norm1 norm2")
 # transformers' names of Florence-2's parts -> those of the authors' own code, whose inverse is the reference's
 # _remap_vendored_florence_state_dict (modeling_xvla.py).
 VENDORED = [
@@ -44,61 +40,39 @@ VENDORED = [
 
 
 def network_keys(s: Sizes) -> List[Key]:
-    keys = keys_of(
+    frame = dict(image_width=s.frame[0], image_height=s.frame[1], n_position=s.n_cell_position)
+    stages = {name: [int(getattr(stage, name)) for stage in s.stages] for name in Stage._fields}
+    sizes = pick(s, "d_model n_layer n_head d_ff d_time n_prompt n_position")
+    return keys_of(
         {
-            "policy": dict(
-                d_state=s.d_state, d_action=s.d_action, horizon=s.horizon, n_view=s.n_view, n_token=s.n_token, pad_token=s.pad_token
-            ),
-            "vision": dict(
-                window=s.window, image_width=s.frame[0], image_height=s.frame[1], n_position=s.n_cell_position, norm_eps=NORM_EPS
-            ),
-            "lm": dict(
-                d_model=s.d_lm,
-                n_layer=s.n_lm_layer,
-                n_head=s.n_lm_head,
-                d_ff=s.d_lm_ff,
-                n_vocab=s.n_vocab,
-                n_position=s.n_lm_position,
-                norm_eps=NORM_EPS,
-            ),
-            "transformer": dict(
-                d_model=s.d_model,
-                n_layer=s.n_layer,
-                n_head=s.n_head,
-                d_ff=s.d_ff,
-                d_time=s.d_time,
-                n_prompt=s.n_prompt,
-                n_position=s.n_position,
-                norm_eps=NORM_EPS,
-            ),
+            "policy": pick(s, "d_state d_action horizon n_view n_token pad_token grippers"),
+            "vision": dict(window=s.window, **frame, norm_eps=NORM_EPS, **stages),
+            "lm": s.lm,
+            "transformer": dict(sizes, norm_eps=NORM_EPS),
             "solver": dict(kind="renoise", steps=s.n_step, noise="normal"),
         }
     )
-    lists = {name: [int(getattr(stage, name)) for stage in s.stages] for name in Stage._fields}
-    return [
-        *keys,
-        Key("policy.grippers", "u32[]", s.grippers),
-        *(Key("vision." + name, "u32[]", numbers) for name, numbers in lists.items()),
-    ]
 
 
-def weights(s: Sizes) -> List[Weight]:
+def weights(s: Sizes) -> Rows:
     d, d_token = s.d_model, s.d_action + s.d_state + s.d_time
-    rows = [*_florence(s), *norm("transformer.norm", HEAD + "norm", d)]
-    for i in range(s.n_layer):
-        rows += encoder_block("transformer.blk.{}.".format(i), "{}blocks.{}.".format(HEAD, i), BLOCK, d, s.d_ff)
-    rows.append(Weight("position.weight", HEAD + "pos_emb", TABLE, (1, s.n_position, d), (s.n_position, d)))
+    rows = [
+        *_florence(s),
+        *norm("transformer.norm", HEAD + "norm", d),
+        *blocks("transformer.", HEAD + "blocks.{}.", BLOCK, s.n_layer, d, s.d_ff),
+        *table("position", HEAD + "pos_emb", s.n_position, d, (1, s.n_position, d)),
+    ]
     for target, source in (("vlm_in", "vlm_proj"), ("aux_in", "aux_visual_proj")):
-        rows += of_domain(target, HEAD + source, d, s.d_lm, s) if s.hetero else linear(target, HEAD + source, d, s.d_lm, bias=True)
+        rows += of_domain(target, HEAD + source, d, s.lm.d_model, s) if s.hetero else linear(target, HEAD + source, d, s.lm.d_model)
     rows += of_domain("action_in", HEAD + "action_encoder", d, d_token, s)
     rows += of_domain("action_out", HEAD + "action_decoder", s.d_action, d, s)
     if s.n_prompt:
         stored = (s.n_domain, s.n_prompt * d)
-        rows.append(Weight("prompt.weight", HEAD + "soft_prompt_hub.weight", TABLE, stored, (s.n_prompt, d), pick=(0, s.domain)))
+        rows += table("prompt", HEAD + "soft_prompt_hub.weight", s.n_prompt, d, stored, pick=(0, s.domain))
     return [row._replace(in_bf16=s.in_bf16) for row in rows]
 
 
-def of_domain(target: str, source: str, d_out: int, d_in: int, s: Sizes) -> List[Weight]:
+def of_domain(target: str, source: str, d_out: int, d_in: int, s: Sizes) -> Rows:
     """A layer that each domain has of its own: a row of a table is its matrix (in, out)."""
     pick = (0, s.domain)
     return [
@@ -107,7 +81,7 @@ def of_domain(target: str, source: str, d_out: int, d_in: int, s: Sizes) -> List
     ]
 
 
-def _florence(s: Sizes) -> List[Weight]:
+def _florence(s: Sizes) -> Rows:
     rows = [*_tower(s), *_projector(s), *_encoder(s)]
     return [_vendored(row, s) for row in rows] if s.vendored else rows
 
@@ -125,7 +99,7 @@ def old_name(source: str) -> str:
     return source
 
 
-def _tower(s: Sizes) -> List[Weight]:
+def _tower(s: Sizes) -> Rows:
     rows, d_in = [], 3
     for i, stage in enumerate(s.stages):
         d, size, here, conv = stage.d_model, stage.patch_size, "vision.stage.{}.".format(i), "{}convs.{}.".format(TOWER, i)
@@ -135,59 +109,52 @@ def _tower(s: Sizes) -> List[Weight]:
             *vector(here + "embed.conv.bias", conv + "conv.bias", d),
             *norm(here + "embed.norm", conv + "norm", d_in if stage.pre_norm else d),
         ]
-        for b in range(stage.n_layer):
-            for kind, attention in DAVIT.items():
-                names = EncoderNames(("norm1", "norm2"), (attention + ".qkv.",), attention + ".proj", "ffn.fc1", "ffn.fc2")
-                target, source = "{}blk.{}.{}.".format(here, b, kind), "{}blocks.{}.{}.{}_block.".format(TOWER, i, b, kind)
-                rows += encoder_block(target, source, names, d, stage.d_ff)
-                for name in ("conv1", "conv2"):
-                    kernel = (d, 1, 3, 3)
-                    rows.append(Weight(target + name + ".kernel", source + name + ".weight", VECTOR, kernel, (9 * d,), axes=(1, 2, 3, 0)))
-                    rows += vector(target + name + ".bias", source + name + ".bias", d)
+        for b, (kind, names) in ((b, item) for b in range(stage.n_layer) for item in DAVIT.items()):
+            target, source = "{}blk.{}.{}.".format(here, b, kind), "{}blocks.{}.{}.{}_block.".format(TOWER, i, b, kind)
+            rows += block(target, source, names, d, stage.d_ff)
+            for name in ("conv1", "conv2"):
+                rows += vector(target + name + ".kernel", source + name + ".weight", 9 * d, (d, 1, 3, 3), axes=(1, 2, 3, 0))
+                rows += vector(target + name + ".bias", source + name + ".bias", d)
         d_in = d
     return rows
 
 
-def _projector(s: Sizes) -> List[Weight]:
-    d, n = s.stages[-1].d_model, s.n_cell_position
-    half = d // 2
+def _projector(s: Sizes) -> Rows:
+    d, n, cell = s.stages[-1].d_model, s.n_cell_position, PROJECTOR + "image_position_embed."
     return [
-        *linear("projector", PROJECTOR + "image_projection", s.d_lm, d),
-        *norm("projector.norm", PROJECTOR + "image_proj_norm", s.d_lm),
-        Weight("row.weight", PROJECTOR + "image_position_embed.row_embeddings.weight", TABLE, (n, half), (n, half)),
-        Weight("column.weight", PROJECTOR + "image_position_embed.column_embeddings.weight", TABLE, (n, d - half), (n, d - half)),
+        *linear("projector", PROJECTOR + "image_projection", s.lm.d_model, d, bias=False),
+        *norm("projector.norm", PROJECTOR + "image_proj_norm", s.lm.d_model),
+        *table("row", cell + "row_embeddings.weight", n, d // 2),
+        *table("column", cell + "column_embeddings.weight", n, d - d // 2),
         # A frame is the first moment, and there is no other.
-        Weight("temporal.weight", PROJECTOR + "visual_temporal_embed.pos_idx_to_embed", VECTOR, (s.n_moment, d), (d,), pick=(0, 0)),
+        *vector("temporal.weight", PROJECTOR + "visual_temporal_embed.pos_idx_to_embed", d, (s.n_moment, d), pick=(0, 0)),
     ]
 
 
-def _encoder(s: Sizes) -> List[Weight]:
-    d, table = s.d_lm, (s.n_vocab, s.d_lm)
-    stored = (s.n_lm_position + POSITION_OFFSET, d)
-    position = Weight("lm.position.weight", ENCODER + "embed_positions.weight", TABLE, stored, (s.n_lm_position, d), first=POSITION_OFFSET)
-    rows = [
-        Weight("lm.token_embd.weight", s.tokens, TABLE, table, table),
-        position,
+def _encoder(s: Sizes) -> Rows:
+    lm, d = s.lm, s.lm.d_model
+    stored = (lm.n_position + POSITION_OFFSET, d)
+    return [
+        *table("lm.token_embd", s.tokens, lm.n_vocab, d),
+        *table("lm.position", ENCODER + "embed_positions.weight", lm.n_position, d, stored, first=POSITION_OFFSET),
         *norm("lm.embd_norm", ENCODER + "layernorm_embedding", d),
+        *blocks("lm.", ENCODER + "layers.{}.", BART, lm.n_layer, d, lm.d_ff),
     ]
-    for i in range(s.n_lm_layer):
-        rows += encoder_block("lm.blk.{}.".format(i), "{}layers.{}.".format(ENCODER, i), BART, d, s.d_lm_ff)
-    return rows
 
 
 def dropped(s: Sizes) -> List[Dropped]:
-    table, at = (s.n_vocab, s.d_lm), VLM + "language_model."
+    tokens, at = (s.lm.n_vocab, s.lm.d_model), VLM + "language_model."
     names = [old_name(at + name) if s.vendored else at + name for name in ("shared.weight", "encoder.embed_tokens.weight")]
     return [
-        *(Dropped(name, table, "the same table as " + s.tokens) for name in names if name != s.tokens),
-        Dropped(at + "final_logits_bias", (1, s.n_vocab), "the policy generates no text"),
+        *(Dropped(name, tokens, "the same table as " + s.tokens) for name in names if name != s.tokens),
+        Dropped(at + "final_logits_bias", (1, s.lm.n_vocab), "the policy generates no text"),
     ]
 
 
 def hints(s: Sizes) -> Dict[str, str]:
     return {
         TOWER + "blocks.": "depths of the vision_config are {}".format([stage.n_layer for stage in s.stages]),
-        old_name(ENCODER) if s.vendored else ENCODER: "encoder_layers is {}".format(s.n_lm_layer),
+        old_name(ENCODER) if s.vendored else ENCODER: "encoder_layers is {}".format(s.lm.n_layer),
         VLM + "language_model.": "the policy reads the encoder alone",
         HEAD + "blocks.": "depth is {}".format(s.n_layer),
         HEAD + "soft_prompt_hub": "len_soft_prompts is {}".format(s.n_prompt),
