@@ -94,7 +94,7 @@ def write_bundle(folder, out=None, dtype="bf16"):
     checkpoint = folder / "checkpoint"
     backbone = backbone_folder(checkpoint)
     code = cli.main([str(checkpoint), *(["--backbone", str(backbone)] if backbone else []), "-o", str(out or folder / "bundle.gguf"),
-                     "--dtype", dtype, "--force", "--quiet", *conversion_options(folder)])
+                     "--dtype", dtype, "--force", "--quiet", "--vla", "none", *conversion_options(folder)])
     if code:
         raise SystemExit(code)
 

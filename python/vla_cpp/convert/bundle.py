@@ -14,7 +14,7 @@ import os
 import struct
 import tempfile
 from contextlib import suppress
-from typing import BinaryIO, Dict, List, NamedTuple, Sequence, Tuple
+from typing import BinaryIO, Callable, Dict, List, NamedTuple, Sequence, Tuple
 
 import numpy as np
 
@@ -99,10 +99,13 @@ def _umask() -> int:
 
 class BundleWriter:
     """`with BundleWriter(path, keys, tensors) as out:` and then `out.write(name, array)` in the order of `tensors`, in pieces
-    if one likes. Leaving the block completes the file; an exception removes it."""
+    if one likes. Leaving the block completes the file; an exception removes it. `check`: called with the complete file under its
+    temporary name; its exception removes that too."""
 
-    def __init__(self, path: str, keys: Sequence[Key], tensors: Sequence[TensorInfo]) -> None:
-        self.path = path
+    def __init__(
+        self, path: str, keys: Sequence[Key], tensors: Sequence[TensorInfo], check: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self.path, self.check = path, check
         self.tensors: List[TensorInfo] = list(tensors)
         checksum = Key(CHECKSUM_KEY, "string", CHECKSUM_ZERO)
         # The checksum stands first, so that the text of its key is found before any vocabulary could contain it.
@@ -146,6 +149,7 @@ class BundleWriter:
             if kind is None:
                 self._finish()
                 self.file.close()
+                self.check(self.part)
                 os.replace(self.part, self.path)
         finally:
             self._drop()

@@ -22,7 +22,7 @@ from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
 from .embodiments import plan_robots
 from .errors import Code, Problems, refuse
 from .options import CODES, STORED
-from .quantized import program, quantize
+from .runtime import NONE, check, find, program, quantize
 from .safetensors_file import Entry
 from .ternary import quantize as quantize_ternary
 from .units import add_units
@@ -52,6 +52,7 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
     if options.dtype in CODES:
         return _convert_to_codes(source, out, options, force, progress)
     _check_state_bound(options)
+    vla = find(options.vla)
     checkpoint = open_checkpoint(source, archs.authors())
     options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
@@ -68,14 +69,14 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
     if options.dtype == STORED:
         plan.weights = [weight._replace(keep_f32=weight.keep_f32 or not weight.in_bf16) for weight in plan.weights]
     summary = Summary(out, arch, dtype, dropped=dropped, notes=checkpoint.notes)
-    _write(checkpoint, plan, summary, problems, progress)
+    _write(checkpoint, plan, summary, problems, progress, _opener(vla, options.vla == NONE, out, plan, summary))
     summary.n_bytes = os.path.getsize(out)
     return summary
 
 
 def _convert_to_codes(source: str, out: str, options: Options, force: bool, progress: Progress) -> Summary:
     """By way of a bundle of the stored floats, which lies beside `out` meanwhile."""
-    vla = program()
+    vla = program(options.vla)
     with tempfile.TemporaryDirectory(dir=os.path.dirname(os.path.abspath(out)), prefix=".vla-convert-") as folder:
         stored = os.path.join(folder, "stored.gguf")
         summary = convert_checkpoint(source, stored, options.replaced(dtype=""), progress=progress)
@@ -169,14 +170,28 @@ def _tensor_dtype(weight: Weight, stored: str, dtype: str) -> str:
     return "f32" if exact else dtype
 
 
-def _write(checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress) -> None:
+def _opener(vla: str, silent: bool, out: str, plan: Plan, summary: Summary) -> Callable[[str], None]:
+    """Opens the complete file with `vla`, and notes unless `silent` that it could not."""
+    robots = next((list(key.value) for key in plan.keys if key.name == "embodiments"), [])
+
+    def open_it(part: str) -> None:
+        failure = check(vla, part, out, robots) if vla else "there is no vla here"
+        if failure and not silent:
+            summary.notes.append("not opened by the runtime ({}): vla inspect {} tells whether it runs".format(failure, out))
+
+    return open_it
+
+
+def _write(
+    checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress, opener: Callable[[str], None]
+) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
     tensors = [TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype)) for w in plan.weights]
     tensors += [TensorInfo(name, value.shape, "f64" if value.dtype == np.float64 else "f32") for name, value in plan.statistics.items()]
     total = sum(tensor.n_bytes for tensor in tensors)
     done = 0
     try:
-        with BundleWriter(summary.path, keys, tensors) as out:
+        with BundleWriter(summary.path, keys, tensors, opener) as out:
             for weight, tensor in zip(plan.weights, tensors):
                 progress(weight.target, done, total)
                 _stream(checkpoint, weight, tensor, out, summary, problems)

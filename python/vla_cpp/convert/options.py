@@ -43,6 +43,12 @@ COMMON = (
     Option(
         "--dtype", "storage of matrices and tables; vectors and statistics are always f32", choices=("f32", "bf16", "f16", STORED, *CODES)
     ),
+    Option(
+        "--vla",
+        "the runtime, which opens the bundle before it gets its name and whose refusal is one of the conversion; by default VLA_BINARY, the one"
+        " beside this package or that on PATH, if there is one. none: the bundle is not opened",
+        "PROGRAM",
+    ),
     Option("--dataset-info", "meta/info.json of the LeRobot data set: names of state and action numbers, control rate", "INFO.json"),
     Option(
         "--units",
