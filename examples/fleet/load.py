@@ -88,8 +88,9 @@ class Robot(threading.Thread):
         try:
             return "right" if self.connect().act(**observation).actions.tobytes() == expected else "wrong"
         except vla_cpp.VlaError as problem:
-            print(f"lost: {problem}", file=sys.stderr)
-            return "lost"
+            kind = "wrong" if isinstance(problem, (vla_cpp.Incompatible, vla_cpp.BadAction)) else "lost"
+            print(f"{kind}: {problem}", file=sys.stderr)
+            return kind
 
 
 def kill_most_asked(robots) -> str:

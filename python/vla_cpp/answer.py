@@ -1,11 +1,15 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a server answers, compared with what was asked and with what it said of its policy before: a robot moves by it."""
+"""What a server answers, compared with what was asked and with what it said of its policy before: a robot moves by it.
+
+Every client of this package hands out what `checked` returns, and nothing else.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Any, Dict, Optional, Tuple
+from typing import Any, Dict, Iterable, Optional, Tuple
 
 import numpy as np
 
@@ -14,8 +18,10 @@ from .errors import BadAction, Incompatible
 from .printable import printable
 from .spec import Spec
 
-# Beyond any joint in degrees, position in millimetres or count of an encoder that a policy commands.
+MAX_ANSWER = 16 << 20  # bytes, of any server
+# Beyond any joint in degrees, position in millimetres or count of an encoder that a policy commands: a note.
 FAR_ACTION = 1e6
+MAX_ACTION = 2.0**32  # beyond what an encoder of 32 bits counts: refused
 
 
 @dataclass(frozen=True)
@@ -31,16 +37,8 @@ class Asked:
     notes: Tuple[str, ...] = ()
 
     def check(self, chunk: Chunk) -> Chunk:
-        """The chunk, with notes: of the observation, and where its actions are far out. Errors: Incompatible, BadAction."""
-        for what, expected, found in self._facts(chunk):
-            if expected != found:
-                hint = "what listens there? a new Client reads what its policy gives"
-                raise Incompatible(f"{self.address}: {what} of the answer", _shown(expected), _shown(found), hint)
-        for part in (chunk.actions, chunk.normalized):
-            if part is not None and not np.isfinite(part).all():
-                raise BadAction("answer", "finite actions", "one that is not")
-        notes = (*self.notes, *_far(chunk.actions, chunk.names))
-        return replace(chunk, notes=(*chunk.notes, *notes)) if notes else chunk
+        """As `checked`, with the notes of the observation."""
+        return checked(self.address, chunk, self._facts(chunk), self.notes)
 
     def _facts(self, chunk: Chunk) -> Tuple[Tuple[str, Any, Any], ...]:
         spec, rows = self.spec, chunk.normalized
@@ -55,12 +53,35 @@ class Asked:
         )
 
 
+def checked(address: str, chunk: Chunk, facts: Iterable[Tuple[str, Any, Any]], notes: Tuple[str, ...] = ()) -> Chunk:
+    """The chunk, with these notes and one for each column whose actions are far out.
+
+    facts  (what, expected, found): pairs that must be equal
+
+    Errors: Incompatible, BadAction.
+    """
+    for what, expected, found in facts:
+        if expected != found:
+            hint = "what listens there? a new client reads what its policy gives"
+            raise Incompatible(f"{address}: {what} of the answer", _shown(expected), _shown(found), hint)
+    for part in (chunk.actions, chunk.normalized):
+        if part is not None and not np.isfinite(part).all():
+            raise BadAction("answer", "finite actions", "one that is not")
+        if part is not None and part.size and np.abs(part).max() > MAX_ACTION:
+            raise BadAction("answer", f"actions within {MAX_ACTION:g}, as those of any robot are", f"{np.abs(part).max():g}")
+    for what, value in (("rate_hz", chunk.rate_hz), ("queue_ms", chunk.queue_ms), *chunk.timing.items()):
+        if not math.isfinite(value):
+            raise Incompatible(f"{address}: {what} of the answer", "a finite number", str(value))
+    notes = (*notes, *_far(chunk.actions, chunk.names))
+    return replace(chunk, notes=(*chunk.notes, *notes)) if notes else chunk
+
+
 def _far(actions: np.ndarray, names: Tuple[str, ...]) -> Tuple[str, ...]:
     """One note for each column with a value that no robot is commanded."""
     largest = np.abs(actions).max(axis=0)
     return tuple(
         f'action "{name}": {value:.3g}, beyond {FAR_ACTION:g}, which no unit of a robot explains'
-        for name, value in zip(names, largest)
+        for name, value in zip(names or map(str, range(len(largest))), largest)
         if value > FAR_ACTION
     )
 

@@ -23,6 +23,7 @@ from .frozen import CameraWatch
 from .handle import Handle, wrong_process
 from .observation import Image, Leftover, State, check_start, robot_of
 from .pending import Health, Pending
+from .printable import printable
 from .spec import Spec
 
 
@@ -82,11 +83,7 @@ class Client(Handle):
     @property
     def spec(self) -> Spec:
         """What the policy takes and gives; asked for once. Errors: Timeout, Disconnected, Incompatible."""
-        with self._lock:
-            if self._spec is None:
-                description = self._ask("description", self.timeout, self._describe).result()
-                self._spec, self._limits = wire.spec_of(description), description.limits
-            return self._spec
+        return self._spec or self._learn(self.timeout)
 
     def act(
         self,
@@ -140,8 +137,9 @@ class Client(Handle):
         """
         check_start(seed, noise)
         timeout = self.timeout if timeout is None else timeout
-        spec, limits = robot_of(self.spec, embodiment), self._limits
         deadline_ms = timeout * 1000 if deadline_ms is None else deadline_ms
+        begun = time.monotonic()
+        spec, limits = robot_of(self._spec or self._learn(timeout), embodiment), self._limits
 
         def write(request: Any) -> bytes:
             request.act.policy = self.policy or ""
@@ -149,7 +147,8 @@ class Client(Handle):
 
         capture_time_ns = observation.get("capture_time_ns")
         notes = self._cameras.notes(spec, observation.get("images", {}), observation.get("state"))
-        return self._ask("chunk", timeout, write, Asked(self.address, spec, seed, noise is not None, capture_time_ns, notes))
+        asked = Asked(self.address, spec, seed, noise is not None, capture_time_ns, notes)
+        return self._ask("chunk", timeout, write, asked, begun)
 
     def health(self, timeout: Optional[float] = None) -> Health:
         """Answered also while the server computes. Errors: Timeout, Disconnected, Incompatible."""
@@ -171,13 +170,24 @@ class Client(Handle):
 
     # --- requests and answers ------------------------------------------------------------------------------------------------
 
-    def _ask(self, kind: str, timeout: float, write: Callable[[Any], bytes], asked: Optional[Asked] = None) -> Pending:
-        """Sends a request that `write` completes. kind: the field of the Response that answers it; asked: what a chunk must go with."""
+    def _learn(self, timeout: float) -> Spec:
+        """The description, for which threads may ask twice, so that none waits for another's timeout."""
+        description = self._ask("description", timeout, self._describe).result()
+        with self._lock:
+            if self._spec is None:
+                self._spec, self._limits = wire.spec_of(description), description.limits
+            return self._spec
+
+    def _ask(
+        self, kind: str, timeout: float, write: Callable[[Any], bytes], asked: Optional[Asked] = None, begun: Optional[float] = None
+    ) -> Pending:
+        """Sends a request that `write` completes. kind: the field of the Response that answers it; asked: what a chunk must go with;
+        begun: when the caller's time began, where it was not now."""
         with self._lock:
             connection = self._connect()
             request = self._new_request()
             data = write(request)
-            pending = Pending(self, request.request_id, kind, timeout, asked)
+            pending = Pending(self, request.request_id, kind, timeout, asked, begun)
             connection.send(data)
             self._pending[pending._id] = pending
             return pending
@@ -234,9 +244,9 @@ class Client(Handle):
         try:
             if len(frames) != 1:
                 raise DecodeError(f"{len(frames)} frames")
-            response = wire.Response.FromString(frames[0])
+            response = wire.response_of(frames[0])
         except DecodeError as problem:
-            found = f"other bytes ({problem})"
+            found = printable(f"other bytes ({problem})")
             raise Incompatible(self.address, "answers of vla serve", found, "what listens there?") from None
         kind = response.WhichOneof("kind")
         error = wire.exception_of(response.error) if kind == "error" else None

@@ -18,10 +18,12 @@ import zmq
 from zmq.utils import z85
 from zmq.utils.monitor import recv_monitor_message
 
+from .answer import MAX_ANSWER
 from .errors import Disconnected, UsageError
 
 HEARTBEAT_MS = 1000  # a server that is cut off, and so cannot say that it goes, is missed after three of these
 RECONNECT_MS = 100
+MAX_WAITING = 8  # answers that wait to be read; a server that sends more waits
 
 _REFUSED = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 
@@ -54,6 +56,8 @@ class Connection:
         self._socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
         self._socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * HEARTBEAT_MS)
         self._socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_ANSWER)  # a larger frame ends the connection
+        self._socket.setsockopt(zmq.RCVHWM, MAX_WAITING)
         self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED | _REFUSED)
         self._poller = zmq.Poller()
         self._poller.register(self._socket, zmq.POLLIN)
@@ -74,13 +78,13 @@ class Connection:
             raise Disconnected(self._address, "a server that reads", "a full queue", "ask less often") from None
 
     def receive(self, seconds: float) -> List[List[bytes]]:
-        """Waits for the first message at most so long, and returns all that have come. Errors: Disconnected.
+        """Waits for the first message at most so long, and returns it with others that have come. Errors: Disconnected.
 
         What arrived before the loss is returned first; the next call tells of the loss.
         """
         events = dict(self._poller.poll(max(0, math.ceil(seconds * 1000))))
         messages: List[List[bytes]] = []
-        while self._socket in events:
+        while self._socket in events and len(messages) < MAX_WAITING:  # one that sends without end may not keep the caller
             try:
                 messages.append(self._socket.recv_multipart(zmq.DONTWAIT))
             except zmq.Again:

@@ -1,35 +1,31 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""A policy at any server that speaks openpi's protocol: msgpack over WebSocket. Needs the extra `openpi`.
-
-Whatever a server sends is data: arrays come as bytes with a dtype, and nothing of it is executed.
-"""
+"""A policy at any server that speaks openpi's protocol: msgpack over WebSocket. Needs the extra `openpi`."""
 
 from __future__ import annotations
 
-import contextlib
+import math
+import re
 import socket
 import threading
 import time
-from typing import Any, Dict, List, Mapping, Optional, Sequence, Tuple
+from contextlib import contextmanager
+from typing import Any, Dict, Iterator, List, Mapping, NamedTuple, Optional, Sequence, Tuple
 
 import numpy as np
 
+from .answer import MAX_ANSWER, checked
 from .chunk import Chunk
 from .errors import BadObservation, Disconnected, Incompatible, Timeout, Unsupported, UsageError, VlaError, error_of
 from .handle import Handle
-from .installed import extra_hint
+from .msgpack_message import pack, unpack
 from .observation import floats, image_arg, is_pillow, named
+from .printable import printable
 from .spec import BundleInfo
+from .websocket import WebSocket, WebSocketException
 
-try:
-    import msgpack
-    from websockets.exceptions import WebSocketException
-    from websockets.sync.client import connect
-except ImportError as error:
-    raise ImportError(f"{error}; {extra_hint('openpi')}") from error
-
-MAX_ANSWER = 64 << 20  # bytes
+MAX_RATE_HZ = 1e6
+_CODE = re.compile("[a-z_]{1,32}")
 TEXT = "text"  # what the key of the instruction stands for
 
 
@@ -48,7 +44,8 @@ class OpenpiClient(Handle):
 
     metadata  what the server says of its policy when a connection begins: a dict, empty at many servers
 
-    A connection that was lost, or that the server ended with an error, is made again by the next call. Threads take turns.
+    A connection that was lost, or that the server ended with an error, is made again by the next call: Incompatible where another
+    policy answers then. Threads take turns.
     Errors: UsageError, Disconnected, Timeout, Incompatible.
     """
 
@@ -61,13 +58,16 @@ class OpenpiClient(Handle):
         self.address, self.timeout = address, timeout
         self._url = f"ws://{rest}" if scheme == "openpi" else address
         self._names = pairs_of(names)
-        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
+        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else {}
         self._lock = threading.Lock()
-        self._connection: Any = None
+        self._connection: Optional[WebSocket] = None
         self._is_closed = False
+        self._said: Optional[_Said] = None
+        self._shape: Optional[Tuple[int, int]] = None  # of all chunks: what the server says, or else the first one's
         self.metadata: Dict[str, Any] = {}
-        with self._lock:
-            self._connected(time.monotonic() + timeout)
+        until = time.monotonic() + timeout
+        with self._turn(until):
+            self._connected(until)
 
     @property
     def takes_seeds(self) -> bool:
@@ -96,26 +96,35 @@ class OpenpiClient(Handle):
         """
         message = self._message(images, state, text)
         until = time.monotonic() + (self.timeout if timeout is None else timeout)
-        with self._lock:
+        with self._turn(until):
             connection = self._connected(until)
             if seed is not None:
                 message["vla"] = {"seed": self._checked(seed)}
             try:
-                connection.send(pack(message))
-                answer = connection.recv(timeout=max(0.0, until - time.monotonic()))
+                connection.send(pack(message), until)
+                answer = connection.receive(until)
             except Exception as problem:  # a late answer must not be taken for that of the next call
                 self._drop()
                 raise self._error_of(problem) from problem
             if isinstance(answer, str):
                 self._drop()  # the server ends the connection after it
                 raise _refusal(self.address, answer)
-        return self._chunk_of(unpack(answer, self.address))
+            return self._chunk_of(unpack(answer, self.address, is_answer=True), seed)
 
     def close(self) -> None:
         """Ends the connection. A second call does nothing."""
         with self._lock:
             self._is_closed = True
             self._drop()
+
+    @contextmanager
+    def _turn(self, until: float) -> Iterator[None]:
+        if not self._lock.acquire(timeout=max(0.0, until - time.monotonic())):
+            raise Timeout(self.address, "a turn of this client in time", "none", "threads that act at once need a client each")
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def _checked(self, seed: int) -> int:
         if not self.takes_seeds:
@@ -146,68 +155,77 @@ class OpenpiClient(Handle):
         message.update((key, text) for key, name in self._names if name == TEXT)
         return message
 
-    def _connected(self, until: float) -> Any:
+    def _connected(self, until: float) -> WebSocket:
         if self._is_closed:
             raise Disconnected(self.address, "an open client", "one that was closed")
+        if self._connection is not None and not self._connection.is_silent():
+            self._drop()  # it was lost meanwhile, or what comes next would be no answer to what is asked
         if self._connection is None:
             try:
-                self._connection = connect(
-                    self._url, compression=None, max_size=MAX_ANSWER, additional_headers=self._headers,
-                    open_timeout=max(0.001, until - time.monotonic()), ping_interval=None, proxy=None,
-                ).__enter__()  # fmt: skip
-                greeting = self._connection.recv(timeout=max(0.0, until - time.monotonic()))
+                self._connection = WebSocket(self._url, self._headers, MAX_ANSWER, until)
+                greeting = self._connection.receive(until)
+                self._greet(greeting)
             except Exception as problem:
                 self._drop()
                 raise self._error_of(problem) from problem
-            metadata = None if isinstance(greeting, str) else unpack(greeting, self.address)
-            if not isinstance(metadata, dict):
-                self._drop()
-                raise Incompatible(self.address, "the metadata of an openpi server", f"{type(metadata).__name__}")
-            self.metadata = metadata
         return self._connection
+
+    def _greet(self, greeting: Any) -> None:
+        """Takes the metadata. Errors: Incompatible, also where another policy greets than before."""
+        metadata = None if isinstance(greeting, str) else unpack(greeting, self.address, is_answer=True)
+        if not isinstance(metadata, dict):
+            raise Incompatible(self.address, "the metadata of an openpi server", type(metadata).__name__)
+        said = _said(self.address, metadata)
+        if self._said is not None and self._said != said:
+            raise Incompatible(self.address, f"the policy as before: {self._said}", str(said), "make a new OpenpiClient")
+        self.metadata, self._said, self._shape = metadata, said, said.shape or self._shape
 
     def _drop(self) -> None:
         connection, self._connection = self._connection, None
         if connection is not None:
-            with contextlib.suppress(OSError):  # no closing handshake: a server that computes would let us wait for it
-                connection.socket.shutdown(socket.SHUT_RDWR)
+            connection.close()
 
-    def _error_of(self, problem: Exception) -> VlaError:
-        if isinstance(problem, TimeoutError):
+    def _error_of(self, problem: Exception) -> Exception:
+        if isinstance(problem, (TimeoutError, socket.timeout)):
             return Timeout(self.address, "an answer in time", "none", "give more time, or see whether the server is up")
         if isinstance(problem, (OSError, WebSocketException)):
-            return Disconnected(self.address, "an openpi server", str(problem) or type(problem).__name__)
-        raise problem
+            return Disconnected(self.address, "an openpi server", printable(str(problem)) or type(problem).__name__)
+        return problem
 
-    def _chunk_of(self, answer: Any) -> Chunk:
+    def _chunk_of(self, answer: Any, seed: Optional[int]) -> Chunk:
         if isinstance(answer, dict) and answer.get("type") == "error":  # of servers that keep the connection
             raise _refusal(self.address, str(answer.get("message", "")))
         reply = answer if isinstance(answer, dict) else {"actions": answer}
         actions = reply.get("actions")
-        if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.dtype.kind != "f":
+        if not isinstance(actions, np.ndarray) or actions.ndim != 2 or actions.dtype.kind != "f" or not actions.size:
             found = (
                 f"{actions.dtype} {actions.shape}"
                 if isinstance(actions, np.ndarray)
-                else ", ".join(map(str, reply)) or "nothing"
+                else printable(", ".join(map(str, reply))) or "nothing"
             )
             raise Incompatible(self.address, "`actions`, floats (horizon, d_action)", found)
-        try:
-            return self._chunk(actions.astype(np.float32), reply)
-        except (TypeError, ValueError, AttributeError) as problem:
-            raise Incompatible(self.address, "numbers and texts beside `actions`", str(problem)) from None
+        with np.errstate(over="ignore"):  # infinity, which is refused
+            chunk = self._chunk(actions.astype(np.float32), reply)
+        shape, width = chunk.actions.shape, chunk.actions.shape[1]
+        facts = [("shape", self._shape or shape, shape), ("number of columns", len(chunk.names) or width, width)]
+        if seed is not None and chunk.seed is not None:
+            facts.append(("seed", int(seed), chunk.seed))
+        chunk, self._shape = checked(self.address, chunk, facts), shape
+        return chunk
 
     def _chunk(self, actions: np.ndarray, reply: Mapping[str, Any]) -> Chunk:
-        server, model = reply.get("server_timing", {}), reply.get("policy_timing", {})
-        times = {"infer": model.get("infer_ms", server.get("infer_ms"))}
+        server, model = (_part(self.address, reply, key, dict, {}) for key in ("server_timing", "policy_timing"))
+        infer = _number(self.address, model, "infer_ms", _number(self.address, server, "infer_ms", None))
+        notes = _part(self.address, reply, "notes", list, [])
         return Chunk(
             actions=actions,
-            names=tuple(map(str, self.metadata.get("action_names", ()))),
-            rate_hz=float(self.metadata.get("control_hz", 0.0)),
+            names=self._said.names,
+            rate_hz=self._said.rate_hz,
             bundle=BundleInfo(self.name, "", self.identity, ""),
-            timing={name: float(ms) for name, ms in times.items() if ms is not None},
-            queue_ms=float(server.get("queue_ms", 0.0)),
-            seed=None if reply.get("seed") is None else int(reply["seed"]),
-            notes=tuple(map(str, reply.get("notes", ()))),
+            timing={} if infer is None else {"infer": infer},
+            queue_ms=_number(self.address, server, "queue_ms", 0.0),
+            seed=_part(self.address, reply, "seed", int, None),
+            notes=tuple(str(note) for note in notes),
         )
 
     @property
@@ -237,42 +255,52 @@ def _frame(name: str, image: Any) -> np.ndarray:
     return np.asarray(image_arg(name, image)[1])
 
 
-def pack(value: Any) -> bytes:
-    """A message with NumPy arrays in it."""
-    return msgpack.packb(value, default=_packed)
+class _Said(NamedTuple):
+    """What a server's metadata says of its policy, and its answers must keep to. shape: None, names: empty, where it says nothing."""
+
+    checksum: str
+    names: Tuple[str, ...]
+    shape: Optional[Tuple[int, int]]
+    rate_hz: float
 
 
-def _packed(value: Any) -> Any:
-    """An array as openpi's own client writes it."""
-    return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+def _said(address: str, metadata: Mapping[str, Any]) -> _Said:
+    """Errors: Incompatible."""
+    names = _part(address, metadata, "action_names", list, [])
+    if not all(isinstance(name, str) for name in names):
+        raise Incompatible(address, "texts as `action_names`", "others")
+    horizon, width = (_part(address, metadata, key, int, None) for key in ("action_horizon", "action_dim"))
+    rate_hz = _number(address, metadata, "control_hz", 0.0)
+    if not 0 <= rate_hz <= MAX_RATE_HZ:
+        raise Incompatible(address, f"`control_hz` from 0 to {MAX_RATE_HZ:g}", f"{rate_hz:g}")
+    shape = None if horizon is None or width is None else (horizon, width)
+    return _Said(str(metadata.get("checksum", "")), tuple(names), shape, rate_hz)
 
 
-def _array(value: Dict[Any, Any]) -> Any:
-    """The array that a map stands for, in the layout of openpi or of msgpack-numpy, keys as bytes or text; else the map."""
-    fields = {key.decode("utf-8", "replace") if isinstance(key, bytes) else key: item for key, item in value.items()}
-    if not {"__ndarray__", "__npgeneric__", "nd"} & set(fields):
-        return value
-    dtype = np.dtype(str(fields.get("dtype", fields.get("type"))))
-    if dtype.kind not in "biufU":
-        raise ValueError(f"an array of {dtype}")
-    if "__npgeneric__" in fields:
-        return fields["data"]
-    shape = fields.get("shape", ())
-    return np.frombuffer(fields["data"], dtype).reshape(shape) if shape else np.frombuffer(fields["data"], dtype, 1)[0]
+def _part(address: str, owner: Mapping[str, Any], key: str, kind: type, default: Any) -> Any:
+    """A member of an answer, of this type. Errors: Incompatible."""
+    value = owner.get(key)
+    if value is None:
+        return default
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise Incompatible(address, f"`{key}` of the type {kind.__name__} beside `actions`", type(value).__name__)
+    return value
 
 
-def unpack(data: bytes, address: str) -> Any:
-    """A message, whose arrays are those of `pack` or of the package msgpack-numpy; `address` is where it came from. Errors: Incompatible."""
-    try:
-        return msgpack.unpackb(data, object_hook=_array, strict_map_key=False)
-    except (ValueError, TypeError, KeyError, RecursionError, msgpack.UnpackException) as problem:
-        raise Incompatible(address, "msgpack with NumPy arrays", f"other bytes ({problem})") from None
+def _number(address: str, owner: Mapping[str, Any], key: str, default: Optional[float]) -> Any:
+    """The same for a number. Errors: Incompatible, also where it is not finite."""
+    value = owner.get(key)
+    if value is None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
+        raise Incompatible(address, f"a finite number as `{key}`", printable(repr(value)))
+    return float(value)
 
 
 def _refusal(address: str, text: str) -> VlaError:
     """`vla serve` puts its code first; others send a traceback, whose last line says what it was."""
     code, _, rest = text.partition(": ")
-    if code.replace("_", "").isalpha() and code.islower():
-        return error_of(code, address, found=rest)
+    if _CODE.fullmatch(code):
+        return error_of(code, address, found=printable(rest))
     lines = text.strip().splitlines()
-    return VlaError(address, found=lines[-1] if lines else "an error without a word")
+    return VlaError(address, found=printable(lines[-1]) if lines else "an error without a word")

@@ -30,9 +30,11 @@ class Health:
 class Pending:
     """An answer that is under way."""
 
-    def __init__(self, client: Client, request_id: int, kind: str, timeout: float, asked: Optional[Asked] = None) -> None:
+    def __init__(
+        self, client: Client, request_id: int, kind: str, timeout: float, asked: Optional[Asked], begun: Optional[float]
+    ) -> None:
         self._client, self._id, self._kind, self._asked = client, request_id, kind, asked
-        self._timeout, self._until = timeout, time.monotonic() + timeout
+        self._timeout, self._until = timeout, (time.monotonic() if begun is None else begun) + timeout
         self._answer: Any = None
         self._error: Optional[VlaError] = None
 

@@ -10,19 +10,23 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Dict, List, Mapping, Optional, Sequence
+from typing import Any, Dict, Iterable, List, Mapping, Optional, Sequence, Tuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
 
 from .chunk import Chunk
-from .errors import BadAction, BadObservation, TooLarge, UsageError, VlaError, error_of
+from .errors import BadAction, BadObservation, Incompatible, TooLarge, UsageError, VlaError, error_of
 from .observation import Image, Leftover, State, image_arg, leftover_of, named, noise_of, place, states_of
 from .printable import printable
 from .spec import BundleInfo, Spec, StateSpec, ViewSpec
 
 PROTOCOL_VERSION = 1
 DESCRIPTOR = Path(__file__).with_name("vla.desc")
+MAX_PARTS = 1 << 16  # messages and texts of one answer
+MAX_NOISE = 1 << 22  # numbers of one act's noise
+_MOST = {"horizon": 1 << 16, "noise_rows": 1 << 16, "d_noise": 1 << 16, "rate_hz": 1e6}  # numbers of a description
 
 
 def _load_messages() -> Dict[str, Any]:
@@ -160,33 +164,66 @@ def _check_limits(raw: Mapping[str, np.ndarray], size: int, limits: Any, views: 
         raise TooLarge("observation", f"at most {limits.max_message_bytes} bytes", str(size), hint)
 
 
+def response_of(data: bytes) -> Any:
+    """A Response. Errors: DecodeError, also for one of more than MAX_PARTS messages and texts: to read them would take seconds."""
+    response = Response.FromString(data)
+    _count(response, MAX_PARTS)
+    return response
+
+
+def _count(message: Any, left: int) -> int:
+    """What is left of `left` after the repeated messages and texts of a message, and of those in it."""
+    for _, value in message.ListFields():
+        if hasattr(value, "ListFields"):
+            left = _count(value, left)
+        elif not isinstance(value, (str, bytes)) and hasattr(value, "__len__") and len(value):
+            is_message = hasattr(value[0], "ListFields")
+            left -= len(value) if is_message or isinstance(value[0], str) else 0
+            if left < 0:
+                raise DecodeError(f"more than {MAX_PARTS} parts")
+            for part in value if is_message else ():
+                left = _count(part, left)
+    return left
+
+
 def spec_of(description: Any) -> Spec:
+    """Errors: Incompatible where a number is none of a policy."""
+    for name, most in _MOST.items():
+        value = getattr(description, name)
+        if not 0 <= value <= most:  # which NaN is not either
+            raise Incompatible("description", f"{name} from 0 to {most:g}", f"{value:g}")
+    if description.noise_rows * description.d_noise > MAX_NOISE:
+        raise Incompatible("description", f"noise of up to {MAX_NOISE} numbers", f"{description.noise_rows} x {description.d_noise}")
     runtime = description.runtime
     return Spec(
-        views=tuple(ViewSpec(v.name, v.optional, v.width, v.height, tuple(v.aliases)) for v in description.views),
+        views=tuple(ViewSpec(printable(v.name), v.optional, v.width, v.height, _texts(v.aliases)) for v in description.views),
         min_views=description.min_views,
         states=tuple(
             StateSpec(
-                s.name, len(s.dimensions), tuple(d.unit for d in s.dimensions), tuple(d.name for d in s.dimensions)
+                printable(s.name), len(s.dimensions), _texts(d.unit for d in s.dimensions), _texts(d.name for d in s.dimensions)
             )
             for s in description.states
         ),
-        action_names=tuple(d.name for d in description.actions),
-        action_units=tuple(d.unit for d in description.actions),
+        action_names=_texts(d.name for d in description.actions),
+        action_units=_texts(d.unit for d in description.actions),
         horizon=description.horizon,
         d_action=len(description.actions),
         d_noise=description.d_noise,
         noise_rows=description.noise_rows,
-        noise=description.noise_kind,
-        real_time_chunking=description.real_time_chunking,
-        embodiment=description.embodiment,
-        robots={robot.embodiment: spec_of(robot) for robot in description.embodiments},
+        noise=printable(description.noise_kind),
+        real_time_chunking=printable(description.real_time_chunking),
+        embodiment=printable(description.embodiment),
+        robots={printable(robot.embodiment): spec_of(robot) for robot in description.embodiments},
         rate_hz=description.rate_hz,
         bundle=bundle_of(description.bundle),
-        precision=runtime.precision,
-        kernels=runtime.kernels,
-        device=runtime.device,
+        precision=printable(runtime.precision),
+        kernels=printable(runtime.kernels),
+        device=printable(runtime.device),
     )
+
+
+def _texts(texts: Iterable[str]) -> Tuple[str, ...]:
+    return tuple(map(printable, texts))
 
 
 def bundle_of(bundle: Any) -> BundleInfo:
@@ -199,20 +236,18 @@ def chunk_of(message: Any) -> Chunk:
     actions = np.array(message.actions, np.float32)
     if actions.size != message.horizon * message.d_action or not actions.size:
         raise BadAction("answer", f"{message.horizon} x {message.d_action} actions", str(actions.size))
-    if not np.isfinite(actions).all():
-        raise BadAction("answer", "finite actions", "one that is not")
     normalized = np.array(message.normalized, np.float32)
     if normalized.size not in (0, actions.size):
         raise BadAction("answer", f"{actions.size} normalized numbers", str(normalized.size))
     return Chunk(
         actions=actions.reshape(message.horizon, message.d_action),
-        names=tuple(message.names),
+        names=_texts(message.names),
         rate_hz=message.rate_hz,
         bundle=bundle_of(message.bundle),
         timing={printable(stage.name): stage.ms for stage in message.stages},
         queue_ms=message.queue_ms,
         seed=message.seed if message.HasField("seed") else None,
-        notes=tuple(map(printable, message.notes)),
+        notes=_texts(message.notes),
         capture_time_ns=message.capture_time_ns or None,
         normalized=normalized.reshape(message.horizon, message.d_action) if normalized.size else None,
     )

@@ -199,9 +199,9 @@ def test_a_chunk_that_does_not_go_with_the_request_and_the_description_is_refuse
 
 def test_actions_that_no_robot_is_commanded_come_with_a_note_for_each_column(faulty, client):
     told = chunk(0.5)
-    told.actions[3] = -1e30
+    told.actions[3] = -2e6
     faulty.on_act = lambda request: [response(request, chunk=told)]
-    assert client.act(**OBSERVATION).notes == ('action "b": 1e+30, beyond 1e+06, which no unit of a robot explains',)
+    assert client.act(**OBSERVATION).notes == ('action "b": 2e+06, beyond 1e+06, which no unit of a robot explains',)
 
 
 def test_what_a_server_says_is_shown_without_what_a_terminal_obeys(faulty, client):

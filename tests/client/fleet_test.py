@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 
@@ -100,6 +101,13 @@ def test_an_observation_that_does_not_fit_is_refused_by_name(engine, cases, chan
 @pytest.mark.parametrize("message", [b"", b"\xc1", b"\x93", "text", openpi.pack([1]), openpi.pack({"nd": True, "type": "O", "data": b""})])
 def test_other_bytes_are_refused(engine, message):
     assert re.match("incompatible: message|bad_observation: message", engine.act(message))
+
+
+def test_a_message_of_many_values_is_refused_at_once(engine):
+    n = 60_000_000
+    start = time.process_time()
+    assert "more than 4096 values" in engine.act(b"\xdd" + n.to_bytes(4, "big") + b"\x80" * n)
+    assert time.process_time() - start < 1
 
 
 # --- the door
