@@ -41,7 +41,9 @@ struct Comparison {
   std::vector<Difference> differences;
 
   void field(const char* name, const std::string& recorded, const std::string& replayed) {
-    if (recorded != replayed) differences.push_back({0, 0, name, recorded, replayed});
+    constexpr std::size_t kShown = 500;  // bytes: a server may say as much as a message holds
+    if (recorded != replayed)
+      differences.push_back({0, 0, name, recorded.substr(0, kShown), replayed.substr(0, kShown)});
   }
   void actions(const v1::ActionChunk& recorded, const v1::ActionChunk& replayed);
   void chunk(const v1::ActionChunk& recorded, const v1::ActionChunk& replayed);
@@ -110,6 +112,8 @@ class Line {
   Line(const ReplayOptions& options) : options_(options), socket_(context_, zmq::socket_type::dealer) {
     socket_.set(zmq::sockopt::linger, 0);
     socket_.set(zmq::sockopt::immediate, true);  // nothing is sent before there is a connection
+    socket_.set(zmq::sockopt::maxmsgsize, kMaxAnswer);
+    socket_.set(zmq::sockopt::rcvhwm, 8);
     socket_.set(zmq::sockopt::sndtimeo, kConnectMs);
     if (zmq_socket_monitor(socket_.handle(), kMonitor, ZMQ_EVENT_DISCONNECTED) != 0) throw zmq::error_t();
     monitor_ = zmq::socket_t(context_, zmq::socket_type::pair);
@@ -128,13 +132,14 @@ class Line {
       return items[1].revents != 0 ? missing("an answer", "the server ended the connection")
                                    : missing(fmt::format("an answer within {} s", options_.timeout_ms / 1000), "");
     v1::Response response;
-    if (!response.ParseFromArray(message.data(), static_cast<int>(message.size())))
+    if (message.more() || !response.ParseFromArray(message.data(), static_cast<int>(message.size())))
       return Error{Code::io, options_.address, "a Response", "bytes that are none"};
     return response;
   }
 
  private:
   static constexpr int kConnectMs = 5000;
+  static constexpr std::int64_t kMaxAnswer = 16 << 20;  // bytes; a server that sends more loses the connection
   static constexpr const char* kMonitor = "inproc://monitor";
   Error missing(std::string expected, std::string hint) const {
     return {Code::io, options_.address, std::move(expected), "none", std::move(hint)};
@@ -150,6 +155,8 @@ Result<v1::Description> describe(Line& line) {
   request.set_protocol_version(wire::kMaxVersion);
   request.mutable_describe();
   VLA_TRY(const v1::Response response, line.ask(request.SerializeAsString()));
+  if (!response.has_description())
+    return Error{Code::io, "the server", "a description of its policy", name_of(response.kind_case())};
   return response.description();
 }
 

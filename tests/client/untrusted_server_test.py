@@ -8,6 +8,7 @@ import hashlib
 import resource
 import socket
 import struct
+import subprocess
 import threading
 import time
 
@@ -20,9 +21,10 @@ pytest.importorskip("websockets")
 from drop_in import openpi_array, pack  # noqa: E402
 from faulty_server import chunk, response  # noqa: E402
 from hostile import HANDSHAKE, long_frame, websocket_frame  # noqa: E402
-from server_process import SECONDS  # noqa: E402
+from server_process import SECONDS, VLA, Robot, Server  # noqa: E402
 
 import vla_cpp  # noqa: E402
+from vla_cpp import wire  # noqa: E402
 from vla_cpp.msgpack_message import MAX_DEPTH, MAX_VALUES, unpack  # noqa: E402
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\nready \u202e"
@@ -461,3 +463,45 @@ def test_an_act_ends_in_time_at_a_native_server_that(behaviour):
         with pytest.raises((vla_cpp.Timeout, vla_cpp.Disconnected, vla_cpp.Incompatible)):
             policy.act(images={}, state=[0], text="go", timeout=TIMEOUT)
         assert time.monotonic() - start < TIMEOUT + SLACK
+
+
+# --- vla replay ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recording(case, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recording") / "folder"
+    server = Server(case, "--record", str(folder))
+    with Robot(server.address, case) as robot:
+        robot.acts(2)
+    assert server.stop() == 0
+    return folder
+
+
+def refusal(where):
+    return lambda request: [response(request, error=wire.MESSAGES["Error"](code=14, where=where, expected=where, found=where, hint=where))]
+
+
+@pytest.mark.parametrize(
+    "on_act, code, told",
+    [
+        (refusal(ESCAPES), 10, "owned"),
+        (refusal("x" * 3_000_000), 10, "answers differ"),
+        (lambda request: [bytes(17 << 20)], 9, "the server ended the connection"),
+        (lambda request: [b"no response"], 9, "bytes that are none"),
+        (lambda request: [response(request, chunk=chunk(float("nan")))], 10, "answers differ"),
+    ],
+    ids=["escapes", "long", "large", "bytes", "nan"],
+)
+def test_a_replay_takes_no_more_from_a_server_than_it_shows(recording, faulty, on_act, code, told):
+    faulty.on_act = on_act
+    command = [VLA, "replay", recording, "--connect", faulty.address]
+    ran = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=3 * SECONDS)
+    assert ran.returncode == code and told in ran.stdout + ran.stderr, ran
+    assert all(line.isprintable() for line in (ran.stdout + ran.stderr).split("\n")) and len(ran.stdout + ran.stderr) < 100_000
+
+
+def test_a_replay_is_told_of_a_server_that_describes_nothing(recording, faulty):
+    faulty._answers = lambda request: [response(request, error=wire.MESSAGES["Error"](code=14))]
+    ran = subprocess.run([str(VLA), "replay", str(recording), "--connect", faulty.address], capture_output=True, text=True, timeout=SECONDS)
+    assert ran.returncode == 9 and "a description of its policy" in ran.stderr
