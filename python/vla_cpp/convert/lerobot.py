@@ -106,6 +106,29 @@ def vector_dim(policy: Section, key: str, name: str, kind: str) -> int:
     return 1
 
 
+def state_width(policy: Section, checkpoint: Checkpoint, options: Options, padded: bool = True) -> int:
+    """Of a fine-tune the feature may still be that of the base. The reference never looks at it where it pads the state, but its statistics
+    must have the robot's width."""
+    return _width(policy, checkpoint, options, "input_features", recipe.STATE, "STATE", padded)
+
+
+def action_width(policy: Section, checkpoint: Checkpoint, options: Options) -> int:
+    """Where the feature contradicts the statistics the reference cannot un-normalize, so that nobody but the user knows."""
+    return _width(policy, checkpoint, options, "output_features", recipe.ACTION, "ACTION", False)
+
+
+def _width(policy: Section, checkpoint: Checkpoint, options: Options, key: str, name: str, kind: str, follows: bool) -> int:
+    found = recipe.statistics_width(checkpoint, name, kind)
+    if not found or options.widths == "config" or not (follows or options.widths):
+        return vector_dim(policy, key, name, kind)
+    stated = vector_dim(policy, key, name, kind) if name in _features(policy, key) else "none"
+    if stated == found:
+        return found
+    text = "{} has {} numbers, as its statistics do, and not the {} of config.json: {}"
+    checkpoint.notes.append(text.format(name, found, stated, "--widths config would follow that" if follows else "--widths statistics"))
+    return found
+
+
 def check_widths(policy: Section, widths: Dict[str, Tuple[int, int]]) -> None:
     """`widths`: key of the padded width -> (padded, the feature's)."""
     for key, (padded, real) in widths.items():

@@ -16,6 +16,7 @@ from .checkpoint import Checkpoint, read_statistic
 from .errors import Code, Problems
 from .safetensors_file import read_safetensors
 
+BUFFER = ".buffer."  # between a data set and a feature
 # Normalization mode -> the recipe's kind and the statistics that its formula reads.
 MODES = {
     "IDENTITY": ("identity", ()),
@@ -24,6 +25,9 @@ MODES = {
     "QUANTILES": ("quantiles", ("q01", "q99")),
     "QUANTILE10": ("quantile10", ("q10", "q90")),
 }
+
+
+WIDTHS = "config.json's feature says the first; where that is out of date, --widths statistics follows the statistics"
 
 
 @dataclass
@@ -45,6 +49,7 @@ class Found(NamedTuple):
 
     values: Dict[str, np.ndarray]
     features: List[str]
+    robot: str = ""  # whose, where --stats chose them
 
 
 class Context(NamedTuple):
@@ -69,11 +74,11 @@ def choose(feature: str, mode: str, eps: float, found: Found, context: Context) 
     if not names:
         return Normalization()
     missing = [name for name in names if name not in found.values]
-    if missing and feature in context.identity:
+    own = found.robot and not found.values  # what the data set that --stats chose has none of, passes as in the reference
+    if missing and (feature in context.identity or own):
+        why = "--stats {} has none".format(found.robot) if own else "--identity-stats allows it"
         context.degraded.append(feature)
-        context.notes.append(
-            "DEGRADED: {} passes through unchanged: no statistics {}, and --identity-stats allows it".format(feature, ", ".join(missing))
-        )
+        context.notes.append("DEGRADED: {} passes through unchanged: no statistics {}, and {}".format(feature, ", ".join(missing), why))
         return Normalization()
     for name in missing:
         problems.add(
@@ -101,7 +106,7 @@ def _others(known: Sequence[str]) -> str:
 def _check_statistic(where: str, name: str, value: np.ndarray, widths: Tuple[int, int], context: Context) -> None:
     if value.ndim != 1 or not widths[0] <= value.size <= widths[1]:
         wanted = "shape " + " to ".join("({},)".format(width) for width in sorted(set(widths)))
-        context.problems.add(where, wanted, str(value.shape))
+        context.problems.add(where, wanted, str(value.shape), WIDTHS if value.ndim == 1 else "")
     elif not np.isfinite(value).all():
         context.problems.add(
             where, "finite numbers", str(value[~np.isfinite(value)][0]), "the statistics were never filled in: save the policy again"
@@ -113,12 +118,19 @@ def _check_statistic(where: str, name: str, value: np.ndarray, widths: Tuple[int
         context.notes.append("{} is 0 at index {}: the reference divides by 0 + eps there, and so does the recipe".format(where, dead))
 
 
-def from_file(path: str, feature: str) -> Found:
-    """Statistics as a processor step stores them, "<feature>.<statistic>"."""
+def from_file(path: str, feature: str, checkpoint: Checkpoint, problems: Problems) -> Found:
+    """Statistics as a processor step stores them, "<feature>.<statistic>". LeRobot's migration of a policy that was trained on several data
+    sets left "<data set>.buffer.<feature>.<statistic>" for each, which LeRobot itself does not find."""
     entries = read_safetensors(path).entries
-    prefix = feature + "."
+    features = sorted({name.rsplit(".", 1)[0] for name in entries})
+    prefix, own = feature + ".", ""
+    if checkpoint.robot or feature not in features:
+        robots = sorted({name.partition(BUFFER)[0] for name in features if BUFFER in name})
+        own = _robot(checkpoint, robots or [""], problems)
+        if own and (own + BUFFER + feature in features or feature not in features):
+            prefix = own + BUFFER + prefix
     values = {name[len(prefix) :]: read_statistic(entry) for name, entry in entries.items() if name.startswith(prefix)}
-    return Found(values, sorted({name.rsplit(".", 1)[0] for name in entries}))
+    return Found(values, features, checkpoint.robot and own)
 
 
 def from_weights(checkpoint: Checkpoint, feature: str, problems: Problems) -> Found:

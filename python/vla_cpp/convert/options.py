@@ -72,6 +72,12 @@ POSITION_PRECISION = Option(
 )
 
 
+WIDTHS = Option(
+    "--widths",
+    "which is right where features of config.json and statistics contradict each other; by default the statistics for a state that the"
+    " policy pads, and otherwise a refusal",
+    choices=("config", "statistics"),
+)
 DOMAIN = Option(
     "--embodiment",
     "X-VLA: number of the domain, that of the preprocessor by default; A,B,... puts several into one bundle, all every one",

@@ -16,9 +16,9 @@ import numpy as np
 
 from .bundle import Key
 from .checkpoint import Checkpoint
-from .errors import Code, Problems
+from .errors import Code, ConvertError, Problems
 from .files import member, plain_name
-from .normalization import Context, Found, Normalization, choose, from_file, from_weights
+from .normalization import MODES, Context, Found, Normalization, choose, from_file, from_weights
 
 STATE, ACTION = "observation.state", "action"
 MAX_TOKENS = 1 << 16  # far above any instruction
@@ -205,7 +205,9 @@ class _Reader:
             self.problems.unsupported(where + ": normalize_observation_keys", STATE + " among them", str(keys)[:80])
         stated = member(member(config, "features", dict, where), STATE, dict, where + ": features")
         width = self.context.dims[STATE]
-        if stated.get("shape") not in ([width], [self.context.min_widths.get(STATE, width)]) or stated.get("type") != "STATE":
+        listed = member(member(self.checkpoint.config, "input_features", dict, "config.json"), STATE, dict, "config.json: input_features")
+        widths = ([width], [self.context.min_widths.get(STATE, width)], listed.get("shape"))
+        if stated.get("shape") not in widths or stated.get("type") != "STATE":
             self.problems.add("{}: features.{}".format(where, STATE), "STATE of [{}] as in config.json".format(width), str(stated)[:80])
         self.result.state = self.normalization(where, config, step, STATE, "STATE")
 
@@ -224,7 +226,7 @@ class _Reader:
                 self.problems.add("{}: norm_map.{}".format(where, key), "{} as in config.json".format(stated[key]), str(modes.get(key)))
         found = Found({}, [])
         if plain_name(step.get("state_file")):
-            found = from_file(self.checkpoint.path(step["state_file"]), feature)
+            found = from_file(self.checkpoint.path(step["state_file"]), feature, self.checkpoint, self.problems)
         elif step.get("state_file") is not None:
             self.problems.add(where + ": state_file", "a file beside the JSON", repr(step["state_file"]))
         eps = config.get("eps", 1e-8)
@@ -248,6 +250,24 @@ def relative_columns(width: int, names: Optional[Sequence[str]], exclude: Sequen
     return [i for i in range(width) if i >= len(known) or not any(word in known[i] for word in exclude)]
 
 
+def statistics_width(checkpoint: Checkpoint, feature: str, kind: str) -> int:
+    """Numbers of the statistics that the feature's mode reads; 0 where they are not all of one width, or there are none. What is amiss with
+    them is told where they are read."""
+    problems, modes = Problems(""), checkpoint.config.get("normalization_mapping")
+    try:
+        if checkpoint.processors is None:
+            found = from_weights(checkpoint, feature, problems)
+        else:
+            name = "normalizer_processor" if feature == STATE else "unnormalizer_processor"
+            steps = checkpoint.processors[0 if feature == STATE else 1]["steps"]
+            step = next(step for step in steps if step.get("registry_name") == name)
+            modes, found = step["config"]["norm_map"], from_file(checkpoint.path(step["state_file"]), feature, checkpoint, problems)
+        shapes = {found.values[name].shape for name in MODES[modes[kind]][1]}
+    except (ConvertError, KeyError, TypeError, AttributeError, StopIteration):
+        return 0
+    return next(iter(shapes))[0] if len(shapes) == 1 and all(len(shape) == 1 for shape in shapes) else 0
+
+
 def read_processors(
     checkpoint: Checkpoint,
     dims: Dict[str, int],
@@ -268,9 +288,6 @@ def read_processors(
             problems.add("--identity-stats", " or ".join(dims), feature, code=Code.USAGE)
     if checkpoint.processors is None:
         return _from_weights(checkpoint, reader)
-    if checkpoint.robot:
-        found = "processor files, which have those of one robot"
-        problems.add("--stats", "a checkpoint with statistics of several robots", found, "leave the option out", Code.USAGE)
     required = {PRE: ["normalizer_processor"], POST: ["unnormalizer_processor"]}
     if min_widths is None and reads_text:
         required[PRE].insert(0, "tokenizer_processor")

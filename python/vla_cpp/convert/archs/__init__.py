@@ -17,7 +17,7 @@ import numpy as np
 from ..bundle import Key
 from ..checkpoint import LEROBOT, OPENPI, Layout
 from ..errors import Code, Problems, refuse
-from ..options import COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, Option, stats, variant
+from ..options import COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, WIDTHS, Option, stats, variant
 
 MATRIX, TABLE, VECTOR = "matrix", "table", "vector"
 TERNARY, SCALE = "ternary", "scale"  # of a matrix of -1, 0 and 1 and one factor: its codes, and the factor
@@ -98,7 +98,7 @@ def load(name):
 
 LAYOUTS = {
     LEROBOT: Layout(
-        "LeRobot", (IDENTITY_STATS, POSITION_PRECISION, DOMAIN, stats("whose, where the weights have those of several data sets"))
+        "LeRobot", (IDENTITY_STATS, POSITION_PRECISION, WIDTHS, DOMAIN, stats("whose, where the weights have those of several data sets"))
     ),
     OPENPI: Layout("openpi", (variant("the training configuration, e.g. pi05_droid"),)),
 }

@@ -12,8 +12,8 @@ from typing import Sequence, Tuple
 
 from ...checkpoint import Checkpoint
 from ...errors import Problems
-from ...lerobot import check_keys, check_widths, no_position_rule, vector_dim
-from ...recipe import ACTION, STATE
+from ...lerobot import action_width, check_keys, check_widths, no_position_rule, state_width, vector_dim
+from ...recipe import STATE
 from ...section import Section
 from .. import Options
 
@@ -78,9 +78,9 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     s = Sizes(
         views=views,
         frame=frame,
-        d_state=vector_dim(policy, "input_features", STATE, "STATE"),
+        d_state=state_width(policy, checkpoint, options, padded=False),
         d_environment=vector_dim(policy, "input_features", ENVIRONMENT, "ENV") if has_environment else 0,
-        d_action=vector_dim(policy, "output_features", ACTION, "ACTION"),
+        d_action=action_width(policy, checkpoint, options),
         horizon=policy.count("chunk_size", maximum=4096),
         n_block=BACKBONES.get(policy.get("vision_backbone"), (1, 1, 1, 1)),
         d_model=policy.count("dim_model"),

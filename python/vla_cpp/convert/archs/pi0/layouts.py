@@ -27,7 +27,7 @@ from ...checkpoint import Checkpoint
 from ...errors import Problems
 from ...features import robot_keys, views_of
 from ...files import member, read_json
-from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim, view_keys
+from ...lerobot import action_width, check_keys, check_widths, no_position_rule, read_views, state_width, view_keys
 from ...section import Section
 from .. import Options
 from .mapping import Family, Sizes, check_image, read_towers
@@ -98,7 +98,7 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
     sizes = read_towers(policy, checkpoint, problems)
     check_image(policy, "image_resolution", sizes, policy.get("image_resolution"))
     views, _ = read_views(policy, checkpoint)
-    _read_policy(family, policy, sizes)
+    _read_policy(family, policy, checkpoint, options, sizes)
     problems.raise_any()
     if checkpoint.processors is None:
         problems.unsupported(
@@ -129,14 +129,14 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
     )
 
 
-def _read_policy(family: Family, policy: Section, s: Sizes) -> None:
+def _read_policy(family: Family, policy: Section, checkpoint: Checkpoint, options: Options, s: Sizes) -> None:
     """A state or an action that the config does not list has the padded width (PI0Config.validate_features)."""
     d_state, s.d_action = policy.count("max_state_dim"), policy.count("max_action_dim")
     s.state_dim, s.action_dim = d_state, s.d_action
     if recipe.STATE in (policy.get("input_features") or {}):
-        s.state_dim = vector_dim(policy, "input_features", recipe.STATE, "STATE")
+        s.state_dim = state_width(policy, checkpoint, options)
     if recipe.ACTION in (policy.get("output_features") or {}):
-        s.action_dim = vector_dim(policy, "output_features", recipe.ACTION, "ACTION")
+        s.action_dim = action_width(policy, checkpoint, options)
     s.d_state = d_state if family.state_token else 0
     widths = {"max_state_dim": (d_state, s.state_dim)} if family.state_token else {}
     check_widths(policy, {**widths, "max_action_dim": (s.d_action, s.action_dim)})

@@ -14,9 +14,8 @@ from typing import List, Sequence, Tuple
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import member, read_json
-from ...lerobot import check_keys, check_widths, read_views, vector_dim
+from ...lerobot import action_width, check_keys, check_widths, read_views, state_width
 from ...networks import Language, Vision, defaults, read_language, read_vision
-from ...recipe import ACTION, STATE
 from ...section import ANY_INT, Section
 from .. import Options
 
@@ -96,8 +95,8 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     backbone = Section(where, config, {"scale_factor": 2}, problems)
     backbone.fixed("model_type", "smolvlm", "--backbone needs the folder of the SmolVLM backbone")
     sizes.views, sizes.empty_cameras = read_views(policy, checkpoint)
-    sizes.state_dim = vector_dim(policy, "input_features", STATE, "STATE")
-    sizes.action_dim = vector_dim(policy, "output_features", ACTION, "ACTION")
+    sizes.state_dim = state_width(policy, checkpoint, options)
+    sizes.action_dim = action_width(policy, checkpoint, options)
     _read_policy(policy, sizes)
     _read_text(policy, text, sizes)
     _read_vision(vision, backbone, sizes)

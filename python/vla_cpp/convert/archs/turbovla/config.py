@@ -15,9 +15,9 @@ from typing import Sequence
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
 from ...files import read_json
-from ...lerobot import check_keys, check_widths, no_position_rule, strict_views, vector_dim
+from ...lerobot import action_width, check_keys, check_widths, no_position_rule, state_width, strict_views
 from ...networks import MAX_LAYERS, TextEncoder, Vision, defaults, read_vision
-from ...recipe import ACTION, STATE
+from ...recipe import STATE
 from ...section import Section
 from .. import Options
 
@@ -113,8 +113,8 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     has_state = isinstance(features, dict) and STATE in features
     s = Sizes(
         views=strict_views(policy),
-        d_state=vector_dim(policy, "input_features", STATE, "STATE") if has_state else 0,
-        d_action=vector_dim(policy, "output_features", ACTION, "ACTION"),
+        d_state=state_width(policy, checkpoint, options, padded=False) if has_state else 0,
+        d_action=action_width(policy, checkpoint, options),
         horizon=policy.count("chunk_size", maximum=4096),
         max_tokens=policy.count("max_language_tokens", MIN_TOKENS, text.count("max_position_embeddings")),
         d_model=policy.count("dim_model"),

@@ -14,9 +14,9 @@ from typing import Dict, Sequence, Tuple
 
 from ...checkpoint import Checkpoint, find_backbone
 from ...errors import Problems
-from ...lerobot import check_keys, check_widths, no_position_rule, read_views, vector_dim
+from ...lerobot import action_width, check_keys, check_widths, no_position_rule, read_views, state_width
 from ...networks import MAX_LAYERS
-from ...recipe import ACTION, STATE
+from ...recipe import STATE
 from ...section import Section
 from .. import Options
 from ..gr00t import qwen3_vl, sizes
@@ -92,7 +92,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     s.views, _ = read_views(policy, checkpoint)
     s.max_views = len(s.views)
     _read_images(policy, s, problems)
-    _read_head(policy, s)
+    _read_head(policy, checkpoint, options, s)
     _read_prompt(policy, checkpoint, s)
     dtype = policy.get("torch_dtype")
     if dtype not in ("bfloat16", "float32"):
@@ -128,7 +128,7 @@ def _frame(policy: Section, view: str) -> Tuple[int, int]:
     return sides[1], sides[0]
 
 
-def _read_head(policy: Section, s: Sizes) -> None:
+def _read_head(policy: Section, checkpoint: Checkpoint, options: Options, s: Sizes) -> None:
     preset = policy.get("action_model_type")
     if preset not in PRESETS:
         policy.bad("action_model_type", " or ".join(PRESETS), unsupported=True)
@@ -140,19 +140,19 @@ def _read_head(policy: Section, s: Sizes) -> None:
     s.d_out = s.d_hidden
     if s.d_dit % 2:
         policy.bad("action_num_heads", "heads of an even width together")
-    s.d_action = vector_dim(policy, "output_features", ACTION, "ACTION")
-    s.d_state = _read_state(policy)
+    s.d_action = action_width(policy, checkpoint, options)
+    s.d_state = _read_state(policy, checkpoint, options)
     s.horizon, s.n_step = policy.count("chunk_size", maximum=4096), policy.count("num_inference_timesteps")
     s.n_bucket = policy.count("action_num_timestep_buckets")
     s.n_embodied = policy.count("num_embodied_action_tokens_per_instruction", maximum=4096)
     s.n_position = max(1024, s.horizon + policy.count("num_action_tokens_per_timestep") + 4)  # as the reference makes the table
 
 
-def _read_state(policy: Section) -> int:
+def _read_state(policy: Section, checkpoint: Checkpoint, options: Options) -> int:
     """Width of the state, 0 where the policy reads none. Without the feature a robot's state would come to the network as it is."""
     features = policy.get("input_features")
     if isinstance(features, dict) and STATE in features:
-        return vector_dim(policy, "input_features", STATE, "STATE")
+        return state_width(policy, checkpoint, options, padded=False)
     if policy.get("state_dim") != 0:
         hint = "without the feature nothing normalizes the state that the network expects"
         policy.bad("state_dim", "0, since input_features has no " + STATE, hint=hint, unsupported=True)

@@ -14,9 +14,9 @@ from typing import Dict, List, NamedTuple, Sequence, Tuple
 from ...checkpoint import Checkpoint
 from ...errors import Code, Problems
 from ...files import member
-from ...lerobot import EMPTY_CAMERA, check_keys, check_widths, no_position_rule, read_views, vector_dim
+from ...lerobot import EMPTY_CAMERA, action_width, check_keys, check_widths, no_position_rule, read_views, state_width
 from ...networks import MAX_LAYERS, NORM_EPS, TextEncoder
-from ...recipe import ACTION, STATE
+from ...recipe import ACTION
 from ...section import Section
 from .. import Options
 
@@ -154,7 +154,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     check_keys(policy, "XVLAConfig", set(POLICY) | IGNORED, FIXED)
     s = Sizes()
     _read_policy(policy, s)
-    _read_spaces(policy, checkpoint, s)
+    _read_spaces(policy, checkpoint, options, s)
     _read_views(policy, checkpoint, s)
     _read_florence(policy, s, problems)
     _read_names(checkpoint, s)
@@ -190,18 +190,18 @@ def _read_policy(policy: Section, s: Sizes) -> None:
         policy.bad("num_heads", "a divisor of hidden_size {}".format(s.d_model))
 
 
-def _read_spaces(policy: Section, checkpoint: Checkpoint, s: Sizes) -> None:
+def _read_spaces(policy: Section, checkpoint: Checkpoint, options: Options, s: Sizes) -> None:
     """Widths of actions and state. The reference cuts a wider state; its feature should say what is read."""
     mode = policy.get("action_mode")
     if not isinstance(mode, str) or mode.lower() not in SPACES:
         policy.bad("action_mode", " or ".join(SPACES), unsupported=True)
         mode = "auto"
-    space, feature = SPACES[mode.lower()], vector_dim(policy, "output_features", ACTION, "ACTION")
+    space, feature = SPACES[mode.lower()], action_width(policy, checkpoint, options)
     s.d_action, s.action_dim, s.grippers = space.columns or policy.count("max_action_dim"), space.actions or feature, [*space.grippers]
     if feature != s.action_dim:
         checkpoint.notes.append("output feature {}: its width is {}, actions of {} have {}".format(ACTION, feature, mode, s.action_dim))
     if policy.get("use_proprio") is True:
-        s.state_dim = vector_dim(policy, "input_features", STATE, "STATE")
+        s.state_dim = state_width(policy, checkpoint, options)
         s.d_state = policy.count("max_state_dim")
     check_widths(policy, {"max_state_dim": (s.d_state, s.state_dim), "max_action_dim": (s.d_action, s.action_dim)})
     lowest = max(s.grippers, default=-1) + 1
