@@ -197,7 +197,7 @@ void collect_keys(const Value& map, const std::string& prefix, std::vector<std::
     if (prefix.empty() && map.items[i].data == kExtension) continue;
     const std::string key = prefix + std::string(map.items[i].data);
     const Value& value = map.items[i + 1];
-    if (value.is_map() && !msgpack::is_array(value)) {
+    if (value.is_map() && !msgpack::framing_of(value)) {
       collect_keys(value, key + "/", keys);
     } else {
       keys.push_back(key);
@@ -329,9 +329,9 @@ Result<Observation> observe(const Value& message, const Names& names, const ActL
   for (const Names::Entry& entry : names.views) {
     const Value* value = at(message, entry.key);
     if (value == nullptr) continue;  // the engine says which views must be there
-    VLA_TRY(const msgpack::Array array, msgpack::array_of(*value, entry.key));
+    VLA_TRY(const Array array, msgpack::array_of(*value, entry.key));
     const ImageLimits pixels{left.max_pixels, Code::too_large};
-    VLA_TRY(Frame frame, msgpack::frame_of(array, entry.key, pixels, entry.convention.is_bgr));
+    VLA_TRY(Frame frame, frame_of(array, entry.key, pixels, entry.convention.is_bgr));
     VLA_CHECK(spend(left, frame.width, frame.height, std::int64_t{frame.width} * frame.height, entry.key));
     observation.views.emplace(entry.feature, std::move(frame));
   }

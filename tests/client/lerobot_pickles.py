@@ -111,6 +111,17 @@ def main(folder):
         "bomb": dumps({"a": Bomb()}),
         "half": dumps({"arm.0": np.float16(0.5)}),
     }
+    floats = np.linspace(0, 1, 48).reshape(4, 4, 3)
+    arrays = {
+        "frame_f2": floats.astype(np.float16),
+        "frame_f4": floats.astype(np.float32),
+        "frame_f4_big": floats.astype(">f4"),
+        "frame_f8": floats,
+        "frame_i8": frame.astype(np.int64),
+        "frame_fortran": np.asfortranarray(frame),
+    }
+    for name, array in arrays.items():
+        seeds[name] = dumps(TimedObservation(1.7e9, 3, {**seen, "image": array}, True))
     for name, data in seeds.items():
         (Path(folder) / name).write_bytes(data)
 

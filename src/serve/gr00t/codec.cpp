@@ -16,7 +16,6 @@
 namespace vla::serve::gr00t {
 namespace {
 
-using msgpack::Array;
 using msgpack::Framing;
 using msgpack::Value;
 
@@ -42,7 +41,7 @@ struct Flattening {
 
   Status add(std::string key, const Value& value) {
     if (is_instruction(key)) key = kText;
-    if (msgpack::is_array(value)) VLA_CHECK(look_at(key, value));
+    if (const auto framing = msgpack::framing_of(value)) VLA_CHECK(look_at(key, value, *framing));
     observed.keys.push_back(std::move(key));
     const std::string& kept = observed.keys.back();
     if (observed.flat.find(kept) != nullptr) return bad(printable(kept), "one value", "two");
@@ -52,17 +51,17 @@ struct Flattening {
   }
 
   /// Batches and series of frames are told here by name: their elements alone would look like a wrong size.
-  Status look_at(const std::string& key, const Value& value) {
+  Status look_at(const std::string& key, const Value& value, Framing framing) {
     VLA_TRY(const Array array, msgpack::array_of(value, printable(key)));
-    observed.dialect.framing = array.framing;
+    observed.dialect.framing = framing;
     has_array = true;
     const bool is_video = key.starts_with("video."), is_state = key.starts_with("state.");
-    const std::size_t n_own = is_video ? 3 : 1, rank = array.shape.size();
+    const std::size_t n_own = is_video ? 3 : 1, rank = array.shape().size();
     if (is_state) all_states_batched = all_states_batched && rank >= 3;
     for (std::size_t i = 0; (is_video || is_state) && i + n_own < rank; ++i)
-      if (array.shape[i] != 1)
+      if (array.shape()[i] != 1)
         return bad(printable(key), "one observation of one time step",
-                   fmt::format("{} in dimension {}", array.shape[i], i));
+                   fmt::format("{} in dimension {}", array.shape()[i], i));
     return {};
   }
 

@@ -37,7 +37,7 @@ Result<const Value*> attribute(const Value& object, const char* key, Type type) 
 
 Status check_class(const Value& object, const char* name) {
   if (object.type == Type::object && object.name.ends_with(std::string(".") + name)) return {};
-  return bad(Code::bad_request, "pickle", name, object.type == Type::object ? object.name : "another value");
+  return bad(Code::bad_request, "pickle", name, object.type == Type::object ? std::string(object.name) : "another value");
 }
 
 std::string text_of(const Value& value) { return printable(std::string(value.data.substr(0, 200))); }
@@ -153,7 +153,7 @@ Result<ActRequest> decode_act(const Observed& observed, const Setup& setup, cons
     if (value == nullptr || value->type != Type::array)
       return bad(Code::bad_observation, where, "an array of pixels", value == nullptr ? "none" : "another value");
     const ImageLimits pixels{left.max_pixels, Code::too_large};
-    VLA_TRY(Frame frame, msgpack::frame_of(value->array, where, pixels, camera.entry->convention.is_bgr));
+    VLA_TRY(Frame frame, frame_of(*value->array, where, pixels, camera.entry->convention.is_bgr));
     VLA_CHECK(spend(left, frame.width, frame.height, std::int64_t{frame.width} * frame.height, where));
     observation.views.emplace(camera.entry->feature, std::move(frame));
   }

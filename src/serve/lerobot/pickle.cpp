@@ -8,8 +8,8 @@
 
 #include <array>
 #include <bit>
-#include <charconv>
 #include <cstring>
+#include <set>
 
 #include "base/printable.h"
 #include "processor/unicode.h"
@@ -22,69 +22,40 @@ namespace {
 
 static_assert(std::endian::native == std::endian::little);
 
-constexpr std::size_t kMaxRank = 8;
-
 Error bad(std::string expected, std::string found) {
   return {Code::bad_request, "pickle", std::move(expected), std::move(found)};
 }
 
 /// The names that stand for data. Both places of NumPy's functions, and of LeRobot's classes, are in use.
-constexpr std::array kFunctions = {"multiarray._reconstruct", "multiarray.scalar", "numeric._frombuffer"};
-constexpr std::array kLeRobot = {"RemotePolicyConfig", "TimedObservation"};
-
-bool is_known(const std::string& name) {
-  if (name == "numpy.ndarray" || name == "numpy.dtype") return true;
-  for (const char* function : kFunctions)
-    if (name == std::string("numpy.core.") + function || name == std::string("numpy._core.") + function) return true;
-  for (const char* of : kLeRobot)
-    if (name == std::string("lerobot.async_inference.helpers.") + of ||
-        name == std::string("lerobot.scripts.server.helpers.") + of)
-      return true;
-  return false;
+const std::set<std::string, std::less<>>& known_names() {
+  static const std::set<std::string, std::less<>> names = [] {
+    std::set<std::string, std::less<>> all = {"numpy.ndarray", "numpy.dtype"};
+    for (const char* module : {"numpy.core.", "numpy._core."})
+      for (const char* function : {"multiarray._reconstruct", "multiarray.scalar", "numeric._frombuffer"})
+        all.insert(std::string(module) + function);
+    for (const char* module : {"lerobot.async_inference.helpers.", "lerobot.scripts.server.helpers."})
+      for (const char* name : {"RemotePolicyConfig", "TimedObservation"}) all.insert(std::string(module) + name);
+    return all;
+  }();
+  return names;
 }
 
-/// f4, u1, i8 and so on.
-bool read_dtype(std::string_view text, msgpack::Array& array) {
-  if (text.starts_with('<') || text.starts_with('|') || text.starts_with('>')) {
-    array.is_big_endian = text[0] == '>';
-    text.remove_prefix(1);
+Error not_c_order() {
+  Error error = bad("arrays in C order", "Fortran order");
+  error.hint = "send numpy.ascontiguousarray of it";
+  return error;
+}
+
+/// The array of a dtype, a shape and its elements.
+Result<serve::Array> make_array(const Value& dtype, const Value& shape, std::string_view elements) {
+  const std::string type = std::string(dtype.name.empty() ? "|" : dtype.name) + std::string(dtype.data);
+  VLA_TRY(const serve::ElementType element, serve::ElementType::read(type, "pickle"));
+  std::vector<std::int64_t> sizes;
+  for (const Value* size : shape.items) {
+    if (size->type != Type::integer) return bad("a shape of integers", "another value");
+    sizes.push_back(size->integer);
   }
-  if (text.size() != 2 || std::string_view("biuf").find(text[0]) == std::string_view::npos) return false;
-  array.kind = text[0];
-  array.item = static_cast<std::size_t>(text[1] - '0');
-  const bool is_size = array.item == 1 || array.item == 2 || array.item == 4 || array.item == 8;
-  return is_size && (array.kind != 'f' || array.item > 1) && (array.kind != 'b' || array.item == 1);
-}
-
-/// Whether the elements are as many as shape and dtype say.
-bool fits(const msgpack::Array& array) {
-  std::size_t size = array.item;
-  for (const std::int64_t n : array.shape) {
-    if (n < 0 || __builtin_mul_overflow(size, static_cast<std::size_t>(n), &size)) return false;
-  }
-  return array.shape.size() <= kMaxRank && size == array.data.size();
-}
-
-template <class T>
-double element(std::string_view data) {
-  T value;
-  std::memcpy(&value, data.data(), sizeof(T));
-  return static_cast<double>(value);
-}
-
-double number_of(const msgpack::Array& array) {
-  switch (array.item) {
-    case 1:
-      return array.kind == 'i' ? element<std::int8_t>(array.data) : element<std::uint8_t>(array.data);
-    case 2:
-      return array.kind == 'i' ? element<std::int16_t>(array.data) : element<std::uint16_t>(array.data);
-    case 4:
-      if (array.kind == 'f') return element<float>(array.data);
-      return array.kind == 'i' ? element<std::int32_t>(array.data) : element<std::uint32_t>(array.data);
-    default:
-      if (array.kind == 'f') return element<double>(array.data);
-      return array.kind == 'i' ? element<std::int64_t>(array.data) : element<std::uint64_t>(array.data);
-  }
+  return serve::Array::make(element, std::move(sizes), elements, "pickle");
 }
 
 }  // namespace
@@ -118,7 +89,7 @@ class Reader {
     if (!left_.empty()) return bad("the end", fmt::format("{} bytes behind it", left_.size()));
     if (stack_.size() != 1 || !marks_.empty()) return bad("one value", fmt::format("{}", stack_.size()));
     for (const Value& value : out_.values_)
-      if (!value.is_whole) return bad("whole arrays", "one without elements");
+      if (value.type == Type::array && !value.array) return bad("whole arrays", "one without elements");
     out_.root_ = stack_[0];
     return std::move(out_);
   }
@@ -307,11 +278,12 @@ class Reader {
   }
 
   Status push_name(std::string_view module, std::string_view name) {
-    std::string whole = std::string(module.substr(0, 200)) + "." + std::string(name.substr(0, 200));
-    if (!is_known(whole))
+    const std::string whole = std::string(module.substr(0, 200)) + "." + std::string(name.substr(0, 200));
+    const auto known = known_names().find(whole);
+    if (known == known_names().end())
       return Error{Code::bad_request, "pickle", "data, and the names that LeRobot's client and NumPy's arrays use",
                    "the name " + printable(whole), "nothing of the message was executed"};
-    return push({.type = Type::name, .name = std::move(whole)});
+    return push({.type = Type::name, .name = *known});
   }
   Status push_global() {
     std::array<std::string_view, 2> parts;
@@ -338,9 +310,8 @@ class Reader {
     if (made_of.type != Type::name || !made_of.name.starts_with("lerobot.") || arguments.type != Type::list ||
         !arguments.items.empty())
       return bad("an object of LeRobot's classes without arguments", "another");
-    std::string name = made_of.name;
     stack_.resize(stack_.size() - 2);
-    return push({.type = Type::object, .name = std::move(name)});
+    return push({.type = Type::object, .name = made_of.name});
   }
 
   /// Pushes what a call of NumPy's functions would make.
@@ -351,48 +322,31 @@ class Reader {
     stack_.resize(stack_.size() - 2);
     const std::vector<const Value*>& given = arguments.items;
     const auto has = [&](std::size_t i, Type type) { return i < given.size() && given[i]->type == type; };
-    if (function.name == "numpy.dtype" && has(0, Type::text)) {
-      Value made{.type = Type::dtype, .is_whole = false};
-      if (!read_dtype(given[0]->data, made.array)) return bad_dtype(given[0]->data);
-      return push(std::move(made));
-    }
+    if (function.name == "numpy.dtype" && has(0, Type::text))
+      return push({.type = Type::dtype, .data = given[0]->data});
     if (function.name.ends_with("._reconstruct") && has(0, Type::name) && given[0]->name == "numpy.ndarray")
-      return push({.type = Type::array, .is_whole = false});
-    if (function.name.ends_with(".scalar") && has(0, Type::dtype) && has(1, Type::bytes)) {
-      msgpack::Array array = given[0]->array;
-      array.data = given[1]->data;
-      const bool is_half = array.kind == 'f' && array.item == 2;
-      if (!fits(array) || array.is_big_endian || is_half) return bad("a number of its dtype, f4 or f8", "another");
-      const double value = number_of(array);
-      if (array.kind == 'f') return push({.type = Type::real, .real = value});
-      std::int64_t bits = 0;
-      std::memcpy(&bits, array.data.data(), array.item);
-      if (array.kind == 'i' && array.item < 8) bits = static_cast<std::int64_t>(value);
-      return push({.type = array.kind == 'b' ? Type::boolean : Type::integer, .integer = bits, .real = value});
+      return push({.type = Type::array});
+    if (function.name.ends_with(".scalar") && has(0, Type::dtype) && has(1, Type::bytes))
+      return push_scalar(*given[0], given[1]->data);
+    if (function.name.ends_with("._frombuffer") && has(0, Type::bytes) && has(1, Type::dtype) && has(2, Type::list) &&
+        has(3, Type::text)) {
+      if (given[3]->data != "C") return not_c_order();
+      VLA_TRY(serve::Array array, make_array(*given[1], *given[2], given[0]->data));
+      return push({.type = Type::array, .array = std::make_unique<const serve::Array>(std::move(array))});
     }
-    if (function.name.ends_with("._frombuffer") && has(0, Type::bytes) && has(1, Type::dtype) && has(3, Type::text)) {
-      if (given[3]->data != "C") return bad("arrays in C order", "another");
-      VLA_CHECK(push({.type = Type::array}));
-      return fill(*stack_.back(), *given[1], *given[2], *given[0]);
-    }
-    return bad("a call of NumPy's functions for arrays", printable(function.name) + " with other arguments");
+    return bad("a call of NumPy's functions for arrays", std::string(function.name) + " with other arguments");
   }
 
-  static Status bad_dtype(std::string_view text) {
-    return bad("a dtype of numbers", printable(std::string(text.substr(0, 40))));
-  }
-  static Status fill(Value& array, const Value& dtype, const Value& shape, const Value& elements) {
-    if (!dtype.is_whole && dtype.array.item > 1) return bad("a dtype with its byte order", "none");
-    array.array = dtype.array;
-    for (const Value* n : shape.items) {
-      if (n->type != Type::integer || array.array.shape.size() == kMaxRank) return bad("a shape", "another value");
-      array.array.shape.push_back(n->integer);
-    }
-    array.array.data = elements.data;
-    if (shape.type != Type::list || !fits(array.array))
-      return bad("as many elements as the shape says", "another number");
-    array.is_whole = true;
-    return {};
+  Status push_scalar(const Value& dtype, std::string_view bytes) {
+    VLA_TRY(const serve::Array array, make_array(dtype, {}, bytes));
+    if (array.type().is_text()) return bad("a number", "text of NumPy");
+    return array.visit([&]<class T>(const serve::Elements<T>& elements) -> Status {
+      const T value = elements[0];
+      if constexpr (std::is_floating_point_v<T>) return push({.type = Type::real, .real = value});
+      if constexpr (std::is_same_v<T, std::uint64_t>)
+        if (value > INT64_MAX) return bad("integers of 64 bits with a sign", std::to_string(value));
+      return push_integer(std::is_same_v<T, bool> ? Type::boolean : Type::integer, static_cast<std::int64_t>(value));
+    });
   }
 
   /// The second step of an object, an array or a dtype.
@@ -405,20 +359,20 @@ class Reader {
       return {};
     }
     const std::vector<const Value*>& given = state.items;
-    if (made.type == Type::dtype && !made.is_whole && state.type == Type::list && given.size() >= 5 &&
+    if (made.type == Type::dtype && made.name.empty() && state.type == Type::list && given.size() >= 5 &&
         given[1]->type == Type::text) {
       for (std::size_t i = 2; i < 5; ++i)
         if (given[i]->type != Type::none) return bad("a dtype of numbers", "one with fields");
-      const std::string_view order = given[1]->data;
-      if (order != "<" && order != ">" && order != "|") return bad("a byte order", "another text");
-      made.array.is_big_endian = order == ">";
-      made.is_whole = true;
+      if (given[1]->data.empty()) return bad("a byte order", "none");
+      made.name = given[1]->data;
       return {};
     }
-    if (made.type == Type::array && !made.is_whole && state.type == Type::list && given.size() == 5 &&
+    if (made.type == Type::array && !made.array && state.type == Type::list && given.size() == 5 &&
         given[1]->type == Type::list && given[2]->type == Type::dtype && given[4]->type == Type::bytes) {
-      if (given[3]->type != Type::boolean || given[3]->integer != 0) return bad("arrays in C order", "another");
-      return fill(made, *given[2], *given[1], *given[4]);
+      if (given[3]->type != Type::boolean || given[3]->integer != 0) return not_c_order();
+      VLA_TRY(serve::Array array, make_array(*given[2], *given[1], given[4]->data));
+      made.array = std::make_unique<const serve::Array>(std::move(array));
+      return {};
     }
     return bad("the state of an object or an array", "another");
   }

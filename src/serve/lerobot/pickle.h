@@ -3,13 +3,14 @@
 #pragma once
 
 #include <deque>
+#include <memory>
 #include <span>
 #include <string>
 #include <string_view>
 #include <vector>
 
 #include "base/result.h"
-#include "serve/msgpack/array.h"
+#include "serve/array.h"
 
 namespace vla::pickle {
 
@@ -20,19 +21,18 @@ struct Value {
   Type type = Type::none;
   std::int64_t integer = 0;  // of a boolean too
   double real = 0;           // also where it is an integer or a boolean
-  std::string_view data;     // of text and bytes
-  std::string name;          // of a class or function, and of an object's class: `module.name`
+  std::string_view data;     // of text and bytes; of a dtype its letters, such as f4
+  std::string_view name;     // of a class or function, and of an object's class: `module.name`; of a dtype its order
   std::vector<const Value*>
-      items;             // of a list or tuple; of a map keys and values by turns; an object's map of attributes
-  msgpack::Array array;  // of an array; of a dtype all but the shape and the elements
-  bool is_whole = true;  // an array and a dtype come in two steps
+      items;  // of a list or tuple; of a map keys and values by turns; an object's map of attributes
+  std::unique_ptr<const serve::Array> array;  // of an array, which comes in two steps: null before the second
 
   bool is_number() const { return type == Type::boolean || type == Type::integer || type == Type::real; }
   /// The value at a key that is text; null where there is none or this has no keys.
   const Value* find(std::string_view key) const;
 };
 
-constexpr std::size_t kMaxSteps = 1 << 16;  // opcodes of a message
+constexpr std::size_t kMaxSteps = 1 << 14;  // opcodes of a message
 constexpr std::size_t kMaxMarks = 64;       // containers that are open at once
 
 /// A message that Python's pickle wrote, protocol 2 to 5. Nothing of it is executed: names of classes and functions are

@@ -10,6 +10,7 @@
 #include "processor/image_codecs.h"
 #include "processor/picture.h"
 #include "processor/unicode.h"
+#include "serve/array.h"
 #include "serve/native/codec.h"
 #include "serve/native/seen.h"
 #include "wire/fields.h"
@@ -95,10 +96,9 @@ ImageLimits image_limits(const ActLimits& limits) { return {limits.max_pixels, C
 Result<Frame> decode_raw(const v1::RawRgb& raw, const std::string& where, const ActLimits& limits) {
   const std::int64_t width = raw.width(), height = raw.height();
   VLA_CHECK(codecs::check_size(width, height, where, image_limits(limits)));
-  const std::string& rows = raw.rows();
-  if (rows.size() != static_cast<std::size_t>(width * height * 3))
-    return bad_observation(where, fmt::format("{} bytes for {} x {} RGB", width * height * 3, width, height),
-                           fmt::format("{} bytes", rows.size()));
+  VLA_TRY(const ElementType bytes, ElementType::read("|u1", where));
+  VLA_TRY(const Array array, Array::make(bytes, {height, width, 3}, raw.rows(), where));
+  const std::string_view rows = array.data();
   return Frame{static_cast<int>(width), static_cast<int>(height), std::vector<std::uint8_t>(rows.begin(), rows.end())};
 }
 
