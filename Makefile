@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test lerobot arm64 test-arm64 test-cuda test-vulkan build vulkan cuda wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
+.PHONY: help demo libero test arm64 test-arm64 test-cuda test-vulkan build vulkan cuda wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -130,11 +130,7 @@ tsan: packages
 	cmake --build --preset tsan
 	ctest --preset tsan --no-tests=error
 
-# What vla serve --lerobot is built with, where it is to be had; without it the tests of that door skip by name.
-lerobot:
-	@scripts/packages.sh lerobot || echo "make: vla serve --lerobot is not built"
-
-test: lerobot build vulkan asan
+test: build vulkan asan
 	@scripts/packages.sh test || echo "make: tests on an emulated processor skip"
 	@scripts/cuda.sh .cache/nvcc nvcc || echo "make: tests of what nvcc makes of our kernels skip"
 	$(VENV)/bin/python scripts/test.py

@@ -118,17 +118,6 @@ if(VLA_BUILD_SERVER)
   find_library(VLA_PROMETHEUS_LIBRARY prometheus-cpp-core REQUIRED)
   find_path(VLA_BOOST_DIR boost/beast/http.hpp REQUIRED)  # Asio and Beast, headers only
   find_path(VLA_MSGPACK_DIR msgpack.hpp REQUIRED)         # headers only
-  # LeRobot's protocol, where libgrpc++-dev is installed, of a release whose callbacks are no experiment any more.
-  find_path(VLA_GRPC_DIR grpcpp/grpcpp.h)
-  find_package(PkgConfig REQUIRED)
-  pkg_check_modules(VLA_GRPC_RELEASE QUIET grpc++>=1.41)
-  set(VLA_GRPC_LIBRARIES)
-  foreach(library grpc++ grpc gpr absl_synchronization)
-    find_library(VLA_LIBRARY_${library} ${library})
-    list(APPEND VLA_GRPC_LIBRARIES ${VLA_LIBRARY_${library}})
-  endforeach()
-  if(NOT VLA_LEROBOT OR NOT VLA_GRPC_RELEASE_FOUND OR NOT VLA_GRPC_DIR OR "${VLA_GRPC_LIBRARIES}" MATCHES NOTFOUND)
-    set(VLA_GRPC_LIBRARIES)
-    message(STATUS "vla serve --lerobot is not built: it needs VLA_LEROBOT=ON and libgrpc++-dev 1.41 or later")
-  endif()
+  find_path(VLA_NGHTTP2_DIR nghttp2/nghttp2.h REQUIRED)  # LeRobot's protocol
+  find_library(VLA_NGHTTP2_LIBRARY nghttp2 REQUIRED)
 endif()

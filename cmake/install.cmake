@@ -12,6 +12,12 @@ target_link_options(vla_shared PRIVATE -Wl,--disable-new-dtags)
 target_link_options(vla PRIVATE -Wl,--disable-new-dtags)
 
 install(TARGETS vla RUNTIME DESTINATION ${CMAKE_INSTALL_BINDIR} COMPONENT program)
+if(VLA_BUILD_SERVER)  # where `vla serve` looks for it; a Python wheel has it beside vla
+  set_target_properties(vla_door_lerobot PROPERTIES INSTALL_RPATH
+                        "$ORIGIN/../../${CMAKE_INSTALL_LIBDIR}:$ORIGIN/../${CMAKE_INSTALL_LIBDIR}")
+  target_link_options(vla_door_lerobot PRIVATE -Wl,--disable-new-dtags)
+  install(TARGETS vla_door_lerobot RUNTIME DESTINATION libexec/vla COMPONENT program)
+endif()
 install(TARGETS vla_shared EXPORT vlaTargets
         LIBRARY DESTINATION ${CMAKE_INSTALL_LIBDIR} COMPONENT library NAMELINK_COMPONENT development)
 install(FILES include/vla/vla.h DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/vla)

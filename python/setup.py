@@ -103,10 +103,11 @@ def build_runtime(package):
     for folder in ("lib", "bin"):
         shutil.rmtree(package / folder, ignore_errors=True)  # of an earlier build
         (package / folder).mkdir(parents=True)
-    library, program = next(prefix.rglob(LIBRARY)), prefix / "bin/vla"
+    library, programs = next(prefix.rglob(LIBRARY)), [prefix / "bin/vla", prefix / "libexec/vla/vla-door-lerobot"]
     shutil.copy(library, package / "lib")
-    shutil.copy(program, package / "bin")
-    for name, path in loaded(program, library).items():
+    for program in programs:
+        shutil.copy(program, package / "bin")
+    for name, path in loaded(*programs, library).items():
         shutil.copy(path, package / "lib" / name)
         copy_licence(path, package / "lib")
     for notice in ("LICENSE", "LICENSES-third-party.md"):
@@ -122,7 +123,7 @@ class BuildWithRuntime(build_py):
 
 def needed_libc(package):
     """The oldest glibc 2.N of a system that has what the carried files need of its C and C++ libraries, as auditwheel tells it."""
-    files = [*package.glob("lib/*.so*"), package / "bin/vla"]
+    files = [*package.glob("lib/*.so*"), *package.glob("bin/*")]
     needs = output("readelf", "--version-info", "--wide", *files)
     c, cpp = (max(map(int, re.findall(rf"\b{name}(\d+)\b", needs))) for name in (r"GLIBC_2\.", r"GLIBCXX_3\.4\."))
     if cpp > 30:  # newer than the table: as new as here

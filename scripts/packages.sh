@@ -4,14 +4,13 @@
 #
 # Installs the Debian or Ubuntu packages that the build needs, or says which are missing where that takes a password.
 # `packages.sh demo` adds what the simulator draws with, `packages.sh fuzz` the compiler that has libFuzzer, `packages.sh vulkan` what
-# libvla-vulkan.so is built with and Mesa's software driver for its tests, `packages.sh lerobot` gRPC for `vla serve --lerobot`,
-# `packages.sh deb` what CPack tells with which libraries a program needs, `packages.sh test` an emulator of processors, `packages.sh arm64`
-# the same and a compiler for 64-bit ARM.
+# libvla-vulkan.so is built with and Mesa's software driver for its tests, `packages.sh deb` what CPack tells with which libraries a
+# program needs, `packages.sh test` an emulator of processors, `packages.sh arm64` the same and a compiler for 64-bit ARM.
 set -euo pipefail
 
 packages=(build-essential cmake ninja-build pkg-config python3 python3-pip python3-venv
           libcli11-dev nlohmann-json3-dev libfmt-dev libpng-dev libjpeg-dev libxxhash-dev libutf8proc-dev doctest-dev
-          libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev protobuf-compiler prometheus-cpp-dev libboost-dev)
+          libzmq3-dev cppzmq-dev libsodium-dev libprotobuf-dev protobuf-compiler prometheus-cpp-dev libboost-dev libnghttp2-dev)
 if apt-cache show libmsgpack-cxx-dev >/dev/null 2>&1 || ! apt-cache show libmsgpack-dev >/dev/null 2>&1; then
   packages+=(libmsgpack-cxx-dev)
 else
@@ -32,7 +31,6 @@ if [ "${1:-}" = fuzz ]; then
 fi
 if [ "${1:-}" = test ]; then packages+=(qemu-user); fi
 if [ "${1:-}" = deb ]; then packages+=(dpkg-dev file); fi
-if [ "${1:-}" = lerobot ]; then packages+=(libgrpc++-dev); fi
 if [ "${1:-}" = arm64 ]; then packages+=(qemu-user g++-aarch64-linux-gnu); fi
 if [ "${1:-}" = vulkan ]; then packages+=(glslc libvulkan-dev spirv-headers mesa-vulkan-drivers); fi
 

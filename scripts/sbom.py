@@ -51,7 +51,7 @@ def owner(library):
 
 
 def loaded(build):
-    files = [build / "bin/vla", next(build.glob("lib/libvla.so.?"))]
+    files = [build / "bin/vla", build / "bin/vla-door-lerobot", next(build.glob("lib/libvla.so.?"))]
     found = {}
     for path in sorted(set(re.findall(r"=> (/\S+)", output("ldd", *files)))):
         component = found.setdefault(owner(path), {**debian(owner(path)), "properties": []})

@@ -252,7 +252,7 @@ void add_other_protocols(CLI::App& command, serve::ServerOptions& server) {
            "Answer openpi's clients too: WebSocket (docs/drop_in.md)");
   add_text(command, "--gr00t", server.gr00t, "ADDRESS:PORT", "Answer the clients of GR00T's policy server too");
   add_text(command, "--lerobot", server.lerobot, "ADDRESS:PORT",
-           "Answer the robot_client of LeRobot too; in builds with libgrpc++");
+           "Answer the robot_client of LeRobot too, from a process of its own");
   add_text(command, "--preset", server.preset, "NAME",
            "With --openpi, the keys of a published robot: " + serve::presets());
   command

@@ -19,7 +19,12 @@ class Listener {
   Listener(boost::asio::io_context& context, const typename Protocol::endpoint& endpoint)
       : acceptor_(context, endpoint), retry_(context) {}
 
+  /// Takes the descriptor of a socket that listens already.
+  Listener(boost::asio::io_context& context, const Protocol& protocol, int descriptor)
+      : acceptor_(context, protocol, descriptor), retry_(context) {}
+
   typename Protocol::endpoint endpoint() const { return acceptor_.local_endpoint(); }
+  int descriptor() { return acceptor_.native_handle(); }
 
   /// Calls `taken` with each connection from now on. To be called again where something was thrown on the way.
   void listen(std::function<void(Socket)> taken) {

@@ -32,7 +32,8 @@ struct Received {
 /// A connection that the server ended.
 struct Dropped {
   std::string client, peer, name;
-  std::string why;  // handshake, key, protocol, size, memory, silent, connections or receipt
+  std::string
+      why;  // handshake, key, protocol, size, memory, silent, connections, receipt, calls, flood, stalled or door
   std::string detail;
 };
 

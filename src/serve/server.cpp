@@ -17,11 +17,10 @@
 #include "base/thread.h"
 #include "net/descriptors.h"
 #include "processor/ops/pipeline.h"
-#include "serve/gr00t/front.h"
-#ifdef VLA_LEROBOT
-#include "serve/lerobot/front.h"
-#endif
+#include "serve/door/front.h"
 #include "serve/double_buffer.h"
+#include "serve/gr00t/front.h"
+#include "serve/lerobot/codec.h"
 #include "serve/native/codec.h"
 #include "serve/native/front.h"
 #include "serve/openpi/front.h"
@@ -33,17 +32,52 @@ constexpr std::size_t kQueueMessages = 8;  // acts that wait may hold so many ti
 /// Kept from connections for whoever watches the server, log, recording, and the sockets that listen.
 constexpr std::size_t kKeptDescriptors = 16;
 
+using Opened = Result<std::unique_ptr<Front>>;
+
+template <class Protocol>
+Opened open_front(net::Loop& loop, const ServerOptions& options) {
+  VLA_TRY(std::unique_ptr<Front> front, Protocol::open(loop, options));
+  return front;
+}
+
+const DoorFront::Door kLeRobot{"vla-door-lerobot",
+                               "--lerobot",
+                               "lerobot",
+                               "grpc://",
+                               &ServerOptions::lerobot,
+                               [](const ServerOptions& options, const ServedPolicy& policy) -> Result<std::string> {
+                                 VLA_CHECK(check_one_robot(*policy.engine, "--lerobot"));
+                                 VLA_TRY(const Names names, lerobot::lerobot_names(options.map, policy.description));
+                                 return names.told();
+                               }};
+
+/// A protocol and its front end.
+struct Protocol {
+  std::string ServerOptions::*address;  // it is served where this is not empty; null: always
+  std::size_t n_descriptor;             // of this process for a connection
+  Opened (*open)(net::Loop& loop, const ServerOptions& options);
+
+  bool is_wanted(const ServerOptions& options) const { return address == nullptr || !(options.*address).empty(); }
+};
+const Protocol kProtocols[] = {
+    {nullptr, 1, open_front<NativeFront>},
+    {&ServerOptions::openpi, 1, open_front<openpi::Front>},
+    {&ServerOptions::gr00t, 1, open_front<gr00t::Front>},
+    {&ServerOptions::lerobot, 0,
+     [](net::Loop& loop, const ServerOptions& options) { return DoorFront::open(loop, options, kLeRobot); }},
+};
+
 /// The options with as few connections as there are descriptors for: what watches a server has to reach one that has
 /// all of its connections.
 Result<ServerOptions> within_descriptors(ServerOptions options) {
-  const std::size_t n_front =
-      std::size_t{1} + !options.openpi.empty() + !options.gr00t.empty() + 2 * !options.lerobot.empty();  // gRPC's too
+  std::size_t n_each = 0;
+  for (const Protocol& protocol : kProtocols) n_each += protocol.is_wanted(options) ? protocol.n_descriptor : 0;
   const std::size_t spare = net::spare_descriptors();
-  if (spare < kKeptDescriptors + n_front)
+  if (spare < kKeptDescriptors + n_each)
     return Error{Code::io, "ulimit -n",
-                 fmt::format("{} file descriptors that can be opened", kKeptDescriptors + n_front),
+                 fmt::format("{} file descriptors that can be opened", kKeptDescriptors + n_each),
                  std::to_string(spare), "raise the limit for this process"};
-  options.max_connections = std::min(options.max_connections, (spare - kKeptDescriptors) / n_front);
+  options.max_connections = std::min(options.max_connections, (spare - kKeptDescriptors) / n_each);
   return options;
 }
 
@@ -109,24 +143,10 @@ Result<std::unique_ptr<Server>> Server::open(const ServerOptions& asked, Now now
   VLA_TRY(const ServerOptions options, within_descriptors(asked));
   std::unique_ptr<Server> server(new Server(options, now));
   if (server->exchange_.fd() < 0) return Error{Code::io, "eventfd", "a free file descriptor", "none"};
-  VLA_TRY(auto native, NativeFront::open(server->loop_, options));
-  server->fronts_.push_back(std::move(native));
-  if (!options.openpi.empty()) {
-    VLA_TRY(auto front, openpi::Front::open(server->loop_, options));
+  for (const Protocol& protocol : kProtocols) {
+    if (!protocol.is_wanted(options)) continue;
+    VLA_TRY(auto front, protocol.open(server->loop_, options));
     server->fronts_.push_back(std::move(front));
-  }
-  if (!options.gr00t.empty()) {
-    VLA_TRY(auto front, gr00t::Front::open(server->loop_, options));
-    server->fronts_.push_back(std::move(front));
-  }
-  if (!options.lerobot.empty()) {
-#ifdef VLA_LEROBOT
-    VLA_TRY(auto front, lerobot::Front::open(server->loop_, options));
-    server->fronts_.push_back(std::move(front));
-#else
-    return Error{Code::unsupported, "--lerobot", "a build with libgrpc++", "one without",
-                 "install libgrpc++-dev, configure and build again"};
-#endif
   }
   return server;
 } catch (const std::runtime_error& no_descriptor) {  // of Asio

@@ -3,7 +3,6 @@
 """What a peer of LeRobot's protocol may take from others. Its calls are made without gRPC's library."""
 
 import argparse
-import subprocess
 import threading
 import time
 
@@ -15,16 +14,9 @@ pytest.importorskip("msgpack")
 from drop_in import serving  # noqa: E402
 from lerobot_calls import Peer  # noqa: E402
 from lerobot_pickles import TimedObservation, dumps, setup_of  # noqa: E402
-from server_process import ROOT, VLA, frames  # noqa: E402
+from server_process import ROOT, frames  # noqa: E402
 
 ROBOT, OTHER = "127.0.0.1", "127.0.0.2"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def has_lerobot(case):
-    options = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--lerobot", "here"]
-    if "libgrpc++" in subprocess.run(options, capture_output=True, text=True).stderr:
-        pytest.skip("a build without libgrpc++")
 
 
 def connects(views, state):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
-"""LeRobot's asynchronous inference as `vla serve --lerobot` speaks it. Needs grpcio, and a build with libgrpc++."""
+"""LeRobot's asynchronous inference as `vla serve --lerobot` speaks it. Needs grpcio."""
 
 import subprocess
 import time
@@ -16,13 +16,6 @@ from drop_in import serving  # noqa: E402
 from lerobot_calls import BEGIN, PIECE, Robot, piece  # noqa: E402
 from lerobot_pickles import Bomb, TimedObservation, dumps, setup_of  # noqa: E402
 from server_process import SECONDS, VLA, frames  # noqa: E402
-
-
-@pytest.fixture(scope="module", autouse=True)
-def needs_grpc(case):
-    options = [VLA, "serve", case.bundle, "--bind", "tcp://127.0.0.1:0", "--lerobot", "here"]
-    if "libgrpc++" in subprocess.run(options, capture_output=True, text=True).stderr:
-        pytest.skip("a build without libgrpc++")
 
 
 @pytest.fixture(scope="module")

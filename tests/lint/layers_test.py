@@ -36,6 +36,7 @@ MAY_INCLUDE = {
     "wire": {"base"},
     "observe": {"base", "engine", "net", "wire"},
     "serve": {"engine", "processor", "bundle", "base", "net", "zmtp", "wire", "observe"},
+    "door": {"base", "net", "wire", "serve"},  # the process that a front end has of its own
     "capi": {"engine", "policies", "processor", "bundle", "base"},
     "cli": {"engine", "policies", "processor", "bundle", "base", "serve", "observe", "zmtp", "wire", "bench", "quantize"},  # front ends that the program opens
 }
@@ -52,9 +53,10 @@ EXTERNAL = [
     (re.compile(r"utf8proc\.h"), {"processor"}),
     (re.compile(r"png\.h"), {"processor", "bench"}),
     (re.compile(r"google/protobuf/.*"), {"wire", "serve"}),
+    (re.compile(r"nghttp2/.*"), {"door"}),
     (re.compile(r"prometheus/.*"), {"observe", "cli"}),  # cli keeps the metrics
     (re.compile(r"zmq\.h(pp)?"), {"observe", "zmtp"}),  # of a client; keys in Z85
-    (re.compile(r"boost/.*"), {"net", "zmtp", "observe", "serve"}),
+    (re.compile(r"boost/.*"), {"net", "zmtp", "observe", "serve", "door"}),
     (re.compile(r"msgpack\.hpp"), {"serve"}),
     (re.compile(r"sodium\.h"), {"zmtp"}),
 ]

@@ -2,6 +2,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <doctest/doctest.h>
 
+#include <filesystem>
+#include <map>
+
 #include "fuzz/lerobot_target.h"
 #include "serve/support.h"
 #include "support/editable_bundle.h"
@@ -44,15 +47,21 @@ TEST_CASE("a set-up names the motors in the state's order and the cameras") {
 TEST_CASE("observations of every protocol of pickle and of both modules are the same act") {
   const lerobot::Setup known = setup();
   for (const char* name : {"observation", "observation_p5", "observation_old"}) {
-    const auto observed = lerobot::read_observation(seed(name), known);
-    REQUIRE_MESSAGE(observed, name);
-    CHECK((*observed)->timestep == 3);
-    CHECK((*observed)->must_go);
-    CHECK((*observed)->state == std::vector<float>{1.5f, 2.5f, -1});
-    const auto act = lerobot::decode_act(**observed, known, names(), {1 << 12, 100, 4, 2, 3, 3}, "");
+    CAPTURE(name);
+    const std::string bytes = seed(name);
+    const auto message = pickle::Pickle::read(std::as_bytes(std::span(bytes)));
+    REQUIRE(message);
+    const auto observed = lerobot::read_observation(*message, known);
+    REQUIRE(observed);
+    CHECK(observed->timestep == 3);
+    CHECK(observed->must_go);
+    CHECK(observed->state == std::vector<float>{1.5f, 2.5f, -1});
+    const auto act = lerobot::act_of(*message, *observed, known, names(), fuzz::small_limits());
     REQUIRE(act);
-    CHECK(act->observation.text == "go");
-    const Frame& frame = *act->observation.views.at("observation.images.image");
+    const Observation observation = fuzz::served(*act);
+    CHECK(observation.text == "go");
+    CHECK(observation.states.at("state.arm") == std::vector<float>{1.5f, 2.5f, -1});
+    const Frame& frame = *observation.views.at("observation.images.image");
     CHECK(frame.width == 4);
     CHECK(std::get<std::vector<std::uint8_t>>(frame.rgb)[47] == 47);
   }
@@ -70,7 +79,18 @@ TEST_CASE("a number in half precision is refused, and no other number is made of
   const std::string bytes = seed("half");
   const auto read = pickle::Pickle::read(std::as_bytes(std::span(bytes)));
   REQUIRE(!read);
-  CHECK(read.error().expected.find("f4 or f8") != std::string::npos);
+  CHECK(read.error().found == "dtype <f2");
+  CHECK(read.error().expected.find("float32") != std::string::npos);
+}
+
+TEST_CASE("what fuzzing starts from is an act or refused") {
+  std::map<std::string, bool> is_act;
+  for (const auto& file : std::filesystem::directory_iterator(test::source_path("tests/fuzz/regressions/lerobot"))) {
+    const std::string bytes = test::read_text(file.path());
+    is_act[file.path().filename()] = fuzz::check_lerobot(std::as_bytes(std::span(bytes)));
+  }
+  for (const char* name : {"observation", "frame_f4", "frame_f4_big", "frame_f8"}) CHECK_MESSAGE(is_act[name], name);
+  for (const char* name : {"frame_f2", "frame_i8", "frame_fortran", "bomb"}) CHECK_MESSAGE(!is_act[name], name);
 }
 
 TEST_CASE("opcodes that do anything but make data, and what is beyond the bounds, are refused") {
@@ -86,10 +106,8 @@ TEST_CASE("opcodes that do anything but make data, and what is beyond the bounds
 }
 
 TEST_CASE("what is computed follows the reference's rules") {
-  const lerobot::Setup known = setup();
-  const auto read = lerobot::read_observation(seed("observation"), known);
   lerobot::Observed first;
-  first.timestep = (*read)->timestep, first.state = (*read)->state;
+  first.timestep = 3, first.state = {1.5f, 2.5f, -1};
   first.must_go = false;
   lerobot::Filter filter;
   CHECK(filter.takes(first));  // the first one

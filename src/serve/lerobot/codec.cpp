@@ -11,6 +11,7 @@
 #include <cmath>
 
 #include "base/printable.h"
+#include "serve/lerobot/setup.pb.h"
 
 namespace vla::serve::lerobot {
 
@@ -37,7 +38,8 @@ Result<const Value*> attribute(const Value& object, const char* key, Type type) 
 
 Status check_class(const Value& object, const char* name) {
   if (object.type == Type::object && object.name.ends_with(std::string(".") + name)) return {};
-  return bad(Code::bad_request, "pickle", name, object.type == Type::object ? std::string(object.name) : "another value");
+  return bad(Code::bad_request, "pickle", name,
+             object.type == Type::object ? std::string(object.name) : "another value");
 }
 
 std::string text_of(const Value& value) { return printable(std::string(value.data.substr(0, 200))); }
@@ -52,6 +54,11 @@ Result<std::vector<std::string>> motors_of(const Value* feature) {
     motors.emplace_back(name->data);
   }
   return motors;
+}
+
+const Names::Entry* view_of(const Names& names, std::string_view key) {
+  const auto found = std::find_if(names.views.begin(), names.views.end(), [&](const auto& e) { return e.key == key; });
+  return found == names.views.end() ? nullptr : &*found;
 }
 
 }  // namespace
@@ -96,15 +103,14 @@ Result<Setup> read_setup(std::span<const std::byte> message, const Names& names,
   for (std::size_t i = 0; i + 1 < features->items.size(); i += 2) {
     const Value& key = *features->items[i];
     if (key.type != Type::text || !key.data.starts_with(kImages)) continue;
-    const auto entry =
-        std::find_if(names.views.begin(), names.views.end(), [&](const auto& e) { return e.key == key.data; });
+    const Names::Entry* const entry = view_of(names, key.data);
     const bool is_ignored =
         std::any_of(names.ignored.begin(), names.ignored.end(), [&](const auto& e) { return e.key == key.data; });
-    if (entry == names.views.end()) {
+    if (entry == nullptr) {
       if (!is_ignored) unknown.push_back(text_of(key));
       continue;
     }
-    setup.cameras.push_back({std::string(key.data.substr(kImages.size())), &*entry});
+    setup.cameras.push_back({std::string(key.data.substr(kImages.size())), entry});
   }
   if (!unknown.empty() || (setup.cameras.empty() && !names.views.empty()))
     return Error{Code::bad_observation, "lerobot_features", fmt::format("cameras of {}", fmt::join(wanted, ", ")),
@@ -113,70 +119,94 @@ Result<Setup> read_setup(std::span<const std::byte> message, const Names& names,
   return setup;
 }
 
-Result<std::shared_ptr<const Observed>> read_observation(std::string bytes, const Setup& setup) {
-  auto observed = std::make_shared<Observed>();
-  observed->bytes = std::move(bytes);
-  VLA_TRY(observed->message, pickle::Pickle::read(std::as_bytes(std::span(observed->bytes))));
-  const Value& root = observed->message.root();
+std::string bytes_of(const Setup& setup) {
+  setup::Setup out;
+  out.set_n_action(setup.n_action);
+  for (const std::string& motor : setup.motors) out.add_motors(motor);
+  for (const Setup::Camera& camera : setup.cameras) out.add_cameras(camera.key);
+  return out.SerializeAsString();
+}
+
+Result<Setup> setup_of(std::string_view bytes, const Names& names) {
+  setup::Setup in;
+  if (!in.ParseFromArray(bytes.data(), static_cast<int>(bytes.size())))
+    return bad(Code::bad_request, "setup", "one that was kept", "other bytes");
+  Setup setup;
+  setup.n_action = in.n_action();
+  setup.motors.assign(in.motors().begin(), in.motors().end());
+  for (const std::string& key : in.cameras()) {
+    const Names::Entry* const entry = view_of(names, std::string(kImages) + key);
+    if (entry == nullptr) return bad(Code::bad_request, "setup", "cameras of the policy", "another");
+    setup.cameras.push_back({key, entry});
+  }
+  return setup;
+}
+
+bool is_same(const Setup& a, const Setup& b) { return bytes_of(a) == bytes_of(b); }
+
+Result<Observed> read_observation(const pickle::Pickle& message, const Setup& setup) {
+  const Value& root = message.root();
   VLA_CHECK(check_class(root, "TimedObservation"));
   VLA_TRY(const Value* timestep, attribute(root, "timestep", Type::integer));
   VLA_TRY(const Value* timestamp, attribute(root, "timestamp", Type::real));
   VLA_TRY(const Value* must_go, attribute(root, "must_go", Type::boolean));
   VLA_TRY(const Value* values, attribute(root, "observation", Type::map));
-  observed->timestep = timestep->integer;
-  observed->timestamp = timestamp->real;
-  observed->must_go = must_go->integer != 0;
-  observed->module = root.name.substr(0, root.name.rfind('.'));
-  if (observed->timestep < 0 || observed->timestep > kMaxTimestep)
+  Observed observed;
+  observed.timestep = timestep->integer;
+  observed.timestamp = timestamp->real;
+  observed.must_go = must_go->integer != 0;
+  observed.module = root.name.substr(0, root.name.rfind('.'));
+  if (observed.timestep < 0 || observed.timestep > kMaxTimestep)
     return bad(Code::bad_observation, "timestep", fmt::format("0 to {}", kMaxTimestep),
-               std::to_string(observed->timestep));
-  if (!std::isfinite(observed->timestamp)) return bad(Code::bad_observation, "timestamp", "seconds", "not finite");
+               std::to_string(observed.timestep));
+  if (!std::isfinite(observed.timestamp)) return bad(Code::bad_observation, "timestamp", "seconds", "not finite");
   for (const std::string& motor : setup.motors) {
     const Value* const reading = values->find(motor);
     if (reading == nullptr || !reading->is_number())
       return bad(Code::bad_observation, printable(motor.substr(0, 200)), "a number",
                  reading == nullptr ? "none" : "another value");
-    observed->state.push_back(static_cast<float>(reading->real));
+    observed.state.push_back(static_cast<float>(reading->real));
   }
-  return std::shared_ptr<const Observed>(std::move(observed));
+  return observed;
 }
 
-Result<ActRequest> decode_act(const Observed& observed, const Setup& setup, const Names& names, const ActLimits& limits,
-                              const std::string& embodiment) {
-  const Value& values = *observed.message.root().find("observation");
-  ActRequest request;
-  Observation& observation = request.observation;
-  ActLimits left = limits;
+Result<v1::Act> act_of(const pickle::Pickle& message, const Observed& observed, const Setup& setup, const Names& names,
+                       const v1::Limits& limits) {
+  const Value& values = *message.root().find("observation");
+  v1::Act act;
+  const ImageLimits pixels{static_cast<std::int64_t>(limits.max_pixels()), Code::too_large};
   for (const Setup::Camera& camera : setup.cameras) {
     const std::string where = printable(camera.key.substr(0, 200));
     const Value* const value = values.find(camera.key);
     if (value == nullptr || value->type != Type::array)
       return bad(Code::bad_observation, where, "an array of pixels", value == nullptr ? "none" : "another value");
-    const ImageLimits pixels{left.max_pixels, Code::too_large};
-    VLA_TRY(Frame frame, frame_of(*value->array, where, pixels, camera.entry->convention.is_bgr));
-    VLA_CHECK(spend(left, frame.width, frame.height, std::int64_t{frame.width} * frame.height, where));
-    observation.views.emplace(camera.entry->feature, std::move(frame));
+    VLA_TRY(const Frame frame, frame_of(*value->array, where, pixels, camera.entry->convention.is_bgr));
+    v1::View& view = *act.add_views();
+    view.set_name(camera.entry->feature);
+    view.mutable_rgb()->set_width(static_cast<std::uint32_t>(frame.width));
+    view.mutable_rgb()->set_height(static_cast<std::uint32_t>(frame.height));
+    const auto& rows = std::get<std::vector<std::uint8_t>>(frame.rgb);
+    view.mutable_rgb()->set_rows(rows.data(), rows.size());
   }
-  const Names::Entry& state = names.states.front();
-  std::vector<float>& to = observation.states[state.feature];
-  for (const float x : observed.state) to.push_back(state.convention.to_policy(x));
+  const Names::Entry& entry = names.states.front();
+  v1::State& state = *act.add_states();
+  state.set_name(entry.feature);
+  for (const float x : observed.state) state.add_values(entry.convention.to_policy(x));
   const Value* const task = values.find("task");
   if (task == nullptr || task->type != Type::text) return bad(Code::bad_observation, "task", "an instruction", "none");
-  if (task->data.size() > limits.max_text)
-    return bad(Code::too_large, "task", fmt::format("at most {} bytes", limits.max_text),
+  if (task->data.size() > limits.max_text_bytes())
+    return bad(Code::too_large, "task", fmt::format("at most {} bytes", limits.max_text_bytes()),
                fmt::format("{} bytes", task->data.size()));
-  observation.text = task->data;
-  observation.embodiment = embodiment;
-  request.seed = fresh_seed();
-  request.noise = *request.seed;
-  return request;
+  act.set_text(std::string(task->data));
+  return act;
 }
 
-std::string encode_actions(Reply reply, const Observed& observed, const Setup& setup, const Names& names,
-                           double period) {
-  const auto width = static_cast<std::size_t>(reply.chunk.d_action);
-  names.to_client(reply.chunk.actions, width);
-  const auto n_row = std::min<std::int64_t>(reply.chunk.horizon, setup.n_action);
+std::string encode_actions(const v1::ActionChunk& chunk, const Observed& observed, const Setup& setup,
+                           const Names& names, double period) {
+  const auto width = static_cast<std::size_t>(chunk.d_action());
+  std::vector<float> actions(chunk.actions().begin(), chunk.actions().end());
+  names.to_client(actions, width);
+  const auto n_row = std::min<std::int64_t>(chunk.horizon(), setup.n_action);
   pickle::Writer out;
   out.op(']').op('(');
   for (std::int64_t i = 0; i < n_row; ++i) {
@@ -184,7 +214,7 @@ std::string encode_actions(Reply reply, const Observed& observed, const Setup& s
     out.text("timestamp").real(observed.timestamp + static_cast<double>(i) * period);
     out.text("timestep").integer(observed.timestep + i);
     out.text("action").name("torch", "FloatTensor").op(']').op('(');
-    for (std::size_t j = 0; j < width; ++j) out.real(reply.chunk.actions[static_cast<std::size_t>(i) * width + j]);
+    for (std::size_t j = 0; j < width; ++j) out.real(actions[static_cast<std::size_t>(i) * width + j]);
     out.op('e').op('\x85').op('R').op('u').op('b');
   }
   return out.op('e').take();

@@ -2,12 +2,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <memory>
+#include <optional>
 #include <set>
 
-#include "serve/front.h"
 #include "serve/lerobot/pickle.h"
 #include "serve/names.h"
+#include "wire/vla.pb.h"
 
 namespace vla::serve::lerobot {
 
@@ -29,10 +29,13 @@ struct Setup {
 /// the set-up. Errors: bad_request; bad_observation with both lists where cameras or the state's width do not fit.
 Result<Setup> read_setup(std::span<const std::byte> message, const Names& names, const v1::Description& description);
 
-/// A pickled TimedObservation. Values lie in the bytes.
+/// A set-up as bytes that `setup_of` reads again. `names` outlives what is read. Errors: bad_request.
+std::string bytes_of(const Setup& setup);
+Result<Setup> setup_of(std::string_view bytes, const Names& names);
+bool is_same(const Setup& a, const Setup& b);
+
+/// What a pickled TimedObservation says before its images and its text are looked at.
 struct Observed {
-  std::string bytes;
-  pickle::Pickle message;
   std::int64_t timestep = 0;
   double timestamp = 0;  // seconds, by the robot's clock
   bool must_go = false;
@@ -40,16 +43,16 @@ struct Observed {
   std::string module;        // of its classes
 };
 /// Errors: bad_request, bad_observation.
-Result<std::shared_ptr<const Observed>> read_observation(std::string bytes, const Setup& setup);
+Result<Observed> read_observation(const pickle::Pickle& message, const Setup& setup);
 
-/// Errors: bad_observation, too_large.
-Result<ActRequest> decode_act(const Observed& observed, const Setup& setup, const Names& names, const ActLimits& limits,
-                              const std::string& embodiment);
+/// The act that it is. `limits`: of the description. Errors: bad_observation, too_large.
+Result<v1::Act> act_of(const pickle::Pickle& message, const Observed& observed, const Setup& setup, const Names& names,
+                       const v1::Limits& limits);
 
 /// The pickled list of TimedAction, each with a float32 tensor of torch: row i belongs to the observation's timestep +
 /// i. `period`: seconds between rows.
-std::string encode_actions(Reply reply, const Observed& observed, const Setup& setup, const Names& names,
-                           double period);
+std::string encode_actions(const v1::ActionChunk& chunk, const Observed& observed, const Setup& setup,
+                           const Names& names, double period);
 
 /// Which observations of a robot are computed: the reference's rules.
 class Filter {

@@ -7,6 +7,7 @@
 #include "base/out_of_memory.h"
 #include "net/endpoint.h"
 #include "serve/io.h"
+#include "serve/native/call.h"
 #include "serve/native/codec.h"
 #include "zmtp/curve.h"
 
@@ -33,38 +34,24 @@ Result<std::optional<zmtp::CurveKeys>> guard(const ServerOptions& options) {
 
 }  // namespace
 
-class NativeFront::Request final : public Call {
+class NativeFront::Request final : public NativeCall {
  public:
   Request(NativeFront& front, std::uint64_t connection, zmtp::Message message, const wire::Envelope& envelope)
-      : front_(front),
+      : NativeCall(front.options_, std::move(message.bytes), envelope),
+        front_(front),
         connection_(connection),
-        delimiter_(message.delimiter),
-        bytes_(std::move(message.bytes)),
-        envelope_(envelope) {}
+        delimiter_(message.delimiter) {}
 
-  Result<ActRequest> decode(const ServedPolicy& policy) override {
-    return front_.decode(envelope_.body(bytes_.span()), policy);
-  }
-  std::string encode(Reply reply, const ServedPolicy& policy) override {
-    v1::Response response = response_to(envelope_.request_id);
-    const v1::Description& description = description_of(policy.description, reply.request.observation.embodiment);
-    *response.mutable_chunk() = encode_chunk(std::move(reply), description);
-    return response.SerializeAsString();
-  }
-  std::string encode(const Error& error) override { return refusal(envelope_.request_id, error); }
   void send(const std::string& answer) override { front_.hub_.send(connection_, answer, delimiter_); }
   void send_out_of_memory() noexcept override {
-    bytes_ = {};
-    front_.send_out_of_memory(connection_, envelope_.request_id, delimiter_);
+    free();
+    front_.send_out_of_memory(connection_, request_id(), delimiter_);
   }
-  const net::Bytes* native() const override { return &bytes_; }
 
  private:
   NativeFront& front_;
   const std::uint64_t connection_;
   const bool delimiter_;  // the client put an empty frame before the request, as REQ sockets do
-  net::Bytes bytes_;      // the serialized Request
-  const wire::Envelope envelope_;
 };
 
 Result<std::unique_ptr<NativeFront>> NativeFront::open(net::Loop& loop, const ServerOptions& options) {
@@ -168,14 +155,6 @@ Result<v1::Response> NativeFront::answer_now(zmtp::Client& client, const Job& jo
   reply.set_chunks_served(now.n_chunk);
   reply.set_errors_served(now.n_error);
   return response;
-}
-
-Result<ActRequest> NativeFront::decode(std::span<const std::byte> act, const ServedPolicy& policy) const {
-  VLA_TRY(const std::string embodiment, named_embodiment(act));
-  VLA_TRY(const Robot* robot, policy.engine->robot(embodiment));
-  ActLimits limits = act_limits(options_, *robot);
-  limits.max_views = policy.description.limits().max_views();  // of all robots, as the description tells
-  return decode_act(act, limits, robot->processor().views(), robot->processor().states());
 }
 
 }  // namespace vla::serve

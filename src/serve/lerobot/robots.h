@@ -1,0 +1,100 @@
+// SPDX-FileCopyrightText: The vla.cpp authors
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <deque>
+#include <map>
+
+#include "serve/lerobot/calls.h"
+#include "serve/lerobot/setups.h"
+
+namespace vla::serve::lerobot {
+
+/// The robots that speak LeRobot's asynchronous inference, one of each connection: what they are, what they saw last,
+/// and who waits for actions. Pickles are read without executing anything, and nothing of them is kept but the act.
+class Robots final : public CallHandler {
+ public:
+  /// The server that computes.
+  class Server {
+   public:
+    virtual ~Server() = default;
+    virtual void opened(const Peer& peer) = 0;
+    virtual void closed(const Peer& peer, const std::string& why, const std::string& detail) = 0;
+    /// A serialized v1::Request; false where too many have not been taken yet.
+    virtual bool ask(std::uint64_t connection, const std::string& request) = 0;
+    /// A call that was refused here.
+    virtual void refused(std::uint64_t connection) = 0;
+    /// To be given to `restore` where this process is started again; empty: not any more.
+    virtual void keep(const std::string& address, const std::string& bytes) = 0;
+  };
+  struct Limits {
+    std::size_t observed = 0;   // bytes of observations that nobody asked for yet, of all robots
+    std::size_t message = 0;    // of one
+    std::size_t addresses = 0;  // whose set-ups are remembered
+  };
+  Robots(Now now, const Limits& limits, Calls& calls, Server& server)
+      : now_(now), limits_(limits), calls_(calls), server_(server), setups_(limits.addresses) {}
+
+  /// The policy that is served; before any call.
+  void serve(Names names, const v1::Description& description);
+  void restore(const std::string& address, std::string_view bytes) { setups_.restore(address, bytes, names_, now_()); }
+
+  void called(Rpc rpc) override;
+  void cancelled(std::uint64_t id) override;
+  void opened(const Peer& peer) override { server_.opened(peer); }
+  void closed(const Peer& peer, const std::string& why, const std::string& detail) override;
+  /// The server's answer to a request of the connection: a serialized v1::Response.
+  void answered(std::uint64_t connection, std::span<const std::byte> response);
+  /// Once a second.
+  void sweep();
+  /// Refuses what waits.
+  void stop();
+
+ private:
+  using Shared = Setups::Shared;
+  struct Seen {
+    Observed observed;
+    v1::Request request;
+    std::size_t size = 0;
+  };
+  struct Waiting {
+    std::uint64_t rpc;
+    Clock::time_point since;
+  };
+  struct Asked {
+    std::uint64_t rpc;
+    Observed observed;
+    Shared setup;
+  };
+  struct Client {
+    Peer peer;
+    Shared setup;
+    Filter filter;
+    std::optional<Seen> seen;              // the newest that is to be computed
+    std::deque<Waiting> waiting;           // for actions
+    std::map<std::uint64_t, Asked> asked;  // by the number of the request
+    std::uint64_t n_request = 0;
+    Clock::time_point used = {};
+  };
+
+  Result<std::string> answer_now(Rpc& rpc, Client& client);
+  Status observe(const Rpc& rpc, Client& client);
+  Status check_setup(const Rpc& rpc, Client& client);
+  void adopt(Client& client, Shared setup);
+  void bound_seen();
+  void ask(Client& client);
+  Result<std::string> actions_of(const v1::Response& response, const Asked& asked) const;
+  void keep(const std::string& address);
+
+  const Now now_;
+  const Limits limits_;
+  Calls& calls_;
+  Server& server_;
+  Names names_;
+  v1::Description description_;
+  double period_ = 0;  // seconds between rows of a chunk
+  std::map<std::uint64_t, Client> clients_;
+  Setups setups_;
+};
+
+}  // namespace vla::serve::lerobot
