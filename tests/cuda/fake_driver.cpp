@@ -311,19 +311,22 @@ struct Calls {
   }
   static int event_destroy(Handle event) { return take_back(state.events, event); }
 
-  static int module_load(Handle* to, const void* image, unsigned, int*, void**) {
+  static int module_load(Handle* to, const void* image, unsigned n_option, int* options, void** values) {
+    if (captures()) return kCaptureUnsupported;
     auto module = std::make_unique<Module>();
     const std::string text = static_cast<const char*>(image);
     try {
       if (text != kHostModule) module->ptx = parsed(text);
     } catch (const Fault& fault) {
       state.driver.fault = fault.what();
+      write_log(fault.what(), n_option, options, values);
       return kInvalidPtx;
     }
     return give(state.modules, to, std::move(module)), 0;
   }
   static int module_unload(Handle module) { return take_back(state.modules, module); }
   static int module_function(Handle* to, Handle handle, const char* name) {
+    if (captures()) return kCaptureUnsupported;
     const Module* module = find(state.modules, handle);
     if (module == nullptr) return kInvalidHandle;
     auto function = std::make_unique<Function>();
@@ -334,6 +337,7 @@ struct Calls {
     return 0;
   }
   static int function_attribute(Handle handle, int attribute, int value) {
+    if (captures()) return kCaptureUnsupported;
     Function* function = find(state.functions, handle);
     if (function == nullptr) return kInvalidHandle;
     if (attribute != 8 || value < 0 || static_cast<unsigned>(value) > vla::cuda::kMaxShared) return kInvalidValue;
@@ -403,6 +407,16 @@ struct Calls {
   static int executable_destroy(Handle executable) { return take_back(state.graphs, executable); }
 
  private:
+  /// What the compiler says, where the options ask for it: 5 the room for its errors, 6 how many bytes that has.
+  static void write_log(const char* text, unsigned n_option, const int* options, void* const* values) {
+    char* room = nullptr;
+    std::size_t size = 0;
+    for (unsigned i = 0; i < n_option; ++i) {
+      if (options[i] == 5) room = static_cast<char*>(values[i]);
+      if (options[i] == 6) size = reinterpret_cast<std::size_t>(values[i]);
+    }
+    if (room != nullptr) std::snprintf(room, size, "ptxas application ptx input; %s\n", text);
+  }
   static int keep(Handle* to, const std::shared_ptr<Nodes>& nodes) {
     *to = nodes.get();
     state.graphs[*to] = nodes, ++state.driver.n_handle;

@@ -57,6 +57,7 @@ class Program {
                         MapOperation::add,
                         Activation::none,
                         false};
+    for (const Launch& kernel : {norm_rows(one), norm_rows(other), map_elements(add)}) VLA_CHECK(gpu->prepare(kernel));
     VLA_CHECK(main.begin_capture());
     VLA_CHECK(side.after(main));
     VLA_CHECK(main.launch(norm_rows(one), one));
@@ -178,11 +179,17 @@ TEST_CASE("capturing refuses what no graph can hold, and a stream that is not wa
   const MapJob job = {
       memory->as<float>(), nullptr, memory->as<float>(), {16, 1, 1, 1, 1, 1}, {1}, {}, {1}, 1, MapOperation::copy,
       Activation::none,    false};
+  const Launch map = map_elements(job);
+  const Launch large = {"linear_bf16_64", {}, 128, 96 << 10};
+  REQUIRE((*gpu)->prepare(map));
+  REQUIRE((*gpu)->prepare({large.kernel, {}, 128}));
   REQUIRE(main->begin_capture());
   CHECK(!(*gpu)->allocate(64, "memory"));
+  CHECK(!(*gpu)->prepare({"norm_rows", {}, 32}));  // that the driver would load,
+  CHECK(!(*gpu)->prepare(large));                  // or would give more shared memory
   CHECK(!main->wait());
   REQUIRE(side->after(*main));
-  REQUIRE(side->launch(map_elements(job), job));
+  REQUIRE(side->launch(map, job));
   CHECK(!main->end_capture());
   CHECK(!main->launch({"absent", {}, 32}, job));
   CHECK(main->wait());

@@ -163,6 +163,11 @@ Result<float> Gpu::elapsed(const Owned& first, const Owned& second) const {
   return ms;
 }
 
+Status Gpu::prepare(const Launch& how) {
+  VLA_TRY([[maybe_unused]] const Handle function, kernel(how));
+  return {};
+}
+
 /// The function of a kernel, which is allowed the shared memory that the launch asks for.
 Result<Handle> Gpu::kernel(const Launch& how) {
   const auto [found, is_new] = functions_.try_emplace(how.kernel, Function{nullptr, kFreeShared});

@@ -118,6 +118,9 @@ class Gpu {
   /// Blocks of big kernels that run at a time, about.
   int n_sm() const { return n_sm_; }
   const std::string& name() const { return name_; }
+  /// Has the driver load a kernel and allow it its shared memory, as the first launch does. Before a capture: a driver
+  /// may have to wait or to allocate for it, which no stream that captures allows.
+  Status prepare(const Launch& how);
   /// out_of_memory with both sizes where less is free.
   Result<Buffer> allocate(std::size_t size, const std::string& what);
   /// Memory of the host that the device reads and writes without the processor.

@@ -216,6 +216,10 @@ Status CudaQueue::note_times() {
 }
 
 Status CudaQueue::capture(const Parts& parts) {
+  for (const CudaPart* part : parts)
+    for (const auto& phase : part->phases)
+      for (const Calls& calls : phase)
+        for (const Call& call : calls) VLA_CHECK(gpu_->prepare(call.how));
   VLA_CHECK(main_->begin_capture());
   for (const CudaPart* part : parts) VLA_CHECK(capture(*part));
   VLA_CHECK(main_->note_time(end_));
