@@ -168,6 +168,8 @@ TEST_CASE("what a device lacks is refused with what was expected and found") {
                              {".version 9.0\n.visible .entry k(\n.param .u64 p\n)\n{\nbrx.idx %r1, $x;\n}\n"});
   REQUIRE(!gpu);
   CHECK(gpu.error().where == "cuda module_load");
+  CHECK(gpu.error().found.find("as the test wants it: ptxas application ptx input; " + fake_driver().fault) !=
+        std::string::npos);
 }
 
 TEST_CASE("capturing refuses what no graph can hold, and a stream that is not waited for") {

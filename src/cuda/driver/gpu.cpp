@@ -2,6 +2,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "cuda/driver/gpu.h"
 
+#include <algorithm>
+#include <array>
+
+#include "base/printable.h"
+
 namespace vla::cuda {
 namespace {
 
@@ -10,6 +15,7 @@ constexpr int kOutOfMemory = 2, kNotFound = 500;
 constexpr int kCapabilityMajor = 75, kCapabilityMinor = 76, kCountSm = 16, kMaxDynamicShared = 8;
 constexpr unsigned kNonBlocking = 1, kNoTiming = 2, kFreeShared = 48 << 10;
 constexpr int kThreadLocal = 1;
+constexpr int kErrorLog = 5, kErrorLogSize = 6;  // options of module_load
 
 std::string version_text(int version) {
   return std::to_string(version / 1000) + "." + std::to_string(version % 1000 / 10);
@@ -93,12 +99,26 @@ Status Gpu::start(int device, const std::vector<std::string>& modules) {
   VLA_CHECK(CALL(context_retain, &context_, device_));
   VLA_CHECK(use());
   for (const std::string& text : modules) {
-    Handle module = nullptr;
-    const int result = driver_.module_load(&module, text.c_str(), 0, nullptr, nullptr);
-    VLA_TRY(Owned loaded, own("module_load", result, module, driver_.module_unload));
+    VLA_TRY(Owned loaded, load(text));
     modules_.push_back(std::move(loaded));
   }
   return {};
+}
+
+/// Where the driver's compiler refuses the module, the error has what that says.
+Result<Owned> Gpu::load(const std::string& module) const {
+  std::array<char, 4096> log = {};
+  int options[] = {kErrorLog, kErrorLogSize};
+  void* values[] = {log.data(), reinterpret_cast<void*>(log.size() - 1)};
+  Handle loaded = nullptr;
+  const int result = driver_.module_load(&loaded, module.c_str(), 2, options, values);
+  Result<Owned> owned = own("module_load", result, loaded, driver_.module_unload);
+  if (owned || log[0] == '\0') return owned;
+  std::string said = log.data();
+  std::replace(said.begin(), said.end(), '\n', ' ');
+  Error error = owned.error();
+  error.found += ": " + printable(said.substr(0, said.find_last_not_of(' ') + 1));
+  return error;
 }
 
 Gpu::~Gpu() {

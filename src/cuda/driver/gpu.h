@@ -138,6 +138,7 @@ class Gpu {
   friend class Stream;
   explicit Gpu(const Driver& driver) : driver_(driver) {}
   Status start(int device, const std::vector<std::string>& modules);
+  Result<Owned> load(const std::string& module) const;
   Result<Handle> kernel(const Launch& how);
   Status check(const char* call, int result) const;
   /// Checks a call that made a handle.
