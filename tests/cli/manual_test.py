@@ -51,6 +51,7 @@ def test_the_unit_of_the_server_is_sound_and_exposes_little(vla, tmp_path):
         pytest.skip("no systemd-analyze")
     unit = tmp_path / "vla@.service"
     text = (ROOT / "packaging/vla@.service").read_text().replace("/usr/bin/vla", vla.path)
+    assert "\nEnvironment=CUDA_CACHE_PATH=%S/vla/cuda\n" in text  # in what StateDirectory=vla lets it write to
     unit.write_text(text.replace("Documentation=man:vla(1)\n", ""))
     done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
     told = [line for line in done.stderr.splitlines() if "vla@" in line]
