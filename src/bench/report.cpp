@@ -79,10 +79,8 @@ Json peaks_json(const Report& report) {
 Json rounds_json(const Report& report) {
   Json rounds = Json::array();
   for (const Round& round : report.rounds) {
-    Json json = {{"total_ms", round.total()},
-                 {"peak_gflops", 1e-9 * round.peak},
-                 {"cores", round.cores},
-                 {"disturbed", report.is_disturbed(round)}};
+    Json json = {{"total_ms", round.total()}, {"cores", round.cores}, {"disturbed", report.is_disturbed(round)}};
+    if (round.peak > 0) json["peak_gflops"] = 1e-9 * round.peak;
     if (round.int8_peak > 0) json["int8_peak_gops"] = 1e-9 * round.int8_peak;
     for (const auto& [stage, ms] : round.stages) json["stages"][stage] = ms;
     rounds.push_back(std::move(json));

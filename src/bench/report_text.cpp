@@ -52,9 +52,12 @@ std::vector<std::string> around(const Report& report) {
                   1e-9 * report.before.bandwidth, 1e-9 * report.after.bandwidth, report.ridge()));
   std::vector<double> cores, peaks;
   for (const Round& round : report.rounds) cores.push_back(round.cores), peaks.push_back(1e-9 * round.peak);
-  lines.push_back(
-      fmt::format("measured rounds: {}, each beside its own peak ({:.1f} to {:.1f} GFLOP/s), on {:.2f} cores (median)",
-                  report.rounds.size(), quantile(peaks, 0), quantile(peaks, 1), quantile(cores, 0.5)));
+  const std::string beside =
+      report.conditions.on_cpu()
+          ? fmt::format("each beside its own peak ({:.1f} to {:.1f} GFLOP/s)", quantile(peaks, 0), quantile(peaks, 1))
+          : "one after the other";
+  lines.push_back(fmt::format("measured rounds: {}, {}, on {:.2f} cores (median)", report.rounds.size(), beside,
+                              quantile(cores, 0.5)));
   std::vector<std::string> shares;
   for (const auto& [kind, share] : report.shares) shares.push_back(fmt::format("{} {:.1f} %", kind, 100 * share));
   if (!shares.empty()) lines.push_back(fmt::format("time of the threads: {}", fmt::join(shares, ", ")));

@@ -48,9 +48,12 @@ double Round::total() const {
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher) {
   const Features use = engine.device().features();
   const kernels::PeakProbe& probe = kernels::peak_probe_of(use);
+  // A GPU would lower its clock while the CPU is probed, and its times stand beside no peak of the CPU.
+  const bool has_peaks = engine.device().is_host();
   const kernels::PeakProbe* int8 =
-      engine.has_int8_products() ? kernels::int8_probe_of(use, engine.has_ternary()) : nullptr;
+      has_peaks && engine.has_int8_products() ? kernels::int8_probe_of(use, engine.has_ternary()) : nullptr;
   const auto measure_peaks = [&](Round& round) {  // half of what is before and after
+    if (!has_peaks) return;
     const int n_thread = engine.device().n_thread();
     round.peak += kernels::measure_peak(probe, n_thread, kProbeSeconds) / 2;
     if (int8 != nullptr) round.int8_peak += kernels::measure_peak(*int8, n_thread, kProbeSeconds) / 2;
@@ -71,8 +74,8 @@ Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int 
     VLA_TRY(Round round, run_round(engine, workload));
     measure_peaks(peaks);
     round.peak = peaks.peak, round.int8_peak = peaks.int8_peak;
-    watcher.tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores, peak {:.1f} GFLOP/s{}", i + 1, n_round,
-                             round.total(), round.cores, 1e-9 * round.peak,
+    watcher.tell(fmt::format("round {}/{}: {:.1f} ms on {:.2f} cores{}{}", i + 1, n_round, round.total(), round.cores,
+                             has_peaks ? fmt::format(", peak {:.1f} GFLOP/s", 1e-9 * round.peak) : "",
                              int8 != nullptr ? fmt::format(", int8 {:.1f} GOP/s", 1e-9 * round.int8_peak) : ""));
     series.rounds.push_back(std::move(round));
   }

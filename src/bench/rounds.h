@@ -11,10 +11,10 @@
 
 namespace vla::bench {
 
-/// One observation, timed, between two short probes of the machine's peak.
+/// One observation, timed; on the CPU between two short probes of the machine's peak.
 struct Round {
   Timing stages;         // ms; "decode" first
-  double peak = 0;       // operations per second of all threads, the mean of before and after
+  double peak = 0;       // operations per second of all threads, the mean of before and after; 0 beside a GPU
   double cores = 0;      // CPU time over wall time: how many cores the run really had
   double int8_peak = 0;  // the same of int8 products, where the network has any
 
@@ -36,7 +36,8 @@ struct Watcher {
   std::function<Status()> before_round;
 };
 
-/// Runs the loop: probe, observation, probe, ..., after rounds that are not counted. Errors: those of Engine::act.
+/// Runs the loop: probe, observation, probe, ..., or without probes on another device, after rounds that are not
+/// counted. Errors: those of Engine::act.
 Result<Series> run_series(Engine& engine, Workload& workload, int n_warmup, int n_round, const Watcher& watcher);
 
 /// total(T) = prefix + T * step, fitted by least squares to the median times of the network alone. In ms.
