@@ -86,7 +86,9 @@ std::vector<float> run(const Operands& of, Multiply multiply) {
 
 }  // namespace
 
-TEST_CASE("bf16 products of every shape are within 1e-6 of doubles, or a rounding of y; few rows are not rounded") {
+TEST_CASE(
+    "bf16 products of every shape are as near to doubles as sums in float32, or a rounding of y, are; few rows are not "
+    "rounded") {
   counts = {};
   for (const Case& c : kCases) {
     for (Bf16Shape shape : {Bf16Shape::few, Bf16Shape::rows64, Bf16Shape::rows128}) {
@@ -113,7 +115,7 @@ TEST_CASE("bf16 products of every shape are within 1e-6 of doubles, or a roundin
           launch(linear_bf16(shape, job), job);
           if (c.n_split > 1) launch(finish_bf16_partial(job), job);
         });
-        CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : 1e-6));
+        CHECK(error(y, expected) < (c.is_bf16 ? 4e-3 : 1e-6 + (is_few ? 0 : bf16_sum_error(c.depth))));
       });
     }
   }

@@ -11,7 +11,8 @@
 #include "cuda/kernels/launch.h"
 #include "cuda/shared_memory.h"
 
-/// A device that is not there: it runs kernels as the host's compiler made them, or the PTX that nvcc made of them.
+/// A device that is not there: it runs kernels as the host's compiler made them, or the PTX that nvcc made of them. In
+/// test_kernels_gpu it is a real one (library/real_machine.cpp).
 namespace vla::test::cuda {
 
 /// Throws Fault where the kernel does what none may, and where a device would refuse the launch.
@@ -23,6 +24,10 @@ void launch(const vla::cuda::Launch& how, const Job& job) {
 
 /// Whether kernels run as PTX: where VLA_CUDA_PTX names files, FILE:FILE.
 bool runs_ptx();
+
+/// How far a bf16 product's sum over a depth may be from the exact one, beside the rounding of the result: nothing on
+/// the emulated machine, which adds exact products in float32. As a share of the largest result.
+double bf16_sum_error(int depth);
 
 /// The files of VLA_CUDA_PTX as texts, or what the fake driver knows the host's kernels by.
 std::vector<std::string> modules_of_tests();

@@ -3,13 +3,20 @@
 //
 // Times products in every shape of blocks and split of the depth on the first GPU, one JSON object a line. Run by
 // scripts/measure_gpu.sh. On the driver of tests the times say nothing.
+//
+// Operands are random: a card clocks higher on zeros. `us` is of matrices in turn that no cache holds together, as in
+// an act, where each comes from memory; `warm_us` of one matrix again and again.
 #include <fmt/format.h>
 
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
+#include <random>
+#include <span>
 #include <utility>
 
+#include "base/bf16.h"
 #include "cuda/driver/gpu.h"
 #include "cuda/driver/modules.h"
 #include "cuda/kernels/linear_bf16.h"
@@ -20,105 +27,215 @@ namespace {
 
 using namespace vla;
 using namespace vla::cuda;
+using Bytes = std::vector<std::byte>;
 
 struct Size {
   int n_row, depth, n_column;
 };
 // Of steps of a few rows, of action experts, of language models and of vision towers.
-constexpr Size kSizes[] = {{1, 2048, 2048},   {4, 960, 2560},    {50, 720, 2048},   {50, 1024, 4096},
-                           {113, 960, 2560},  {642, 2560, 2560}, {642, 2560, 6912}, {642, 6912, 2560},
-                           {512, 1152, 4304}, {968, 2048, 16384}};
+constexpr Size kSizes[] = {{1, 2048, 2048},   {4, 960, 2560},     {50, 720, 2048},   {50, 1024, 4096},
+                           {113, 960, 2560},  {642, 2560, 2560},  {642, 2560, 6912}, {642, 6912, 2560},
+                           {512, 1152, 4304}, {560, 16384, 2048}, {968, 2048, 16384}};
 constexpr int kSplits[] = {1, 2, 4, 8};
+/// More than the largest cache of a GPU.
+constexpr std::size_t kBeyondCaches = 200u << 20;
 
-/// Microseconds of one of a graph of so many launches.
-template <class Job>
-Result<float> time_launches(Gpu& gpu, Stream& stream, const Job& job, const std::vector<Launch>& launches,
-                            int n_launch) {
-  VLA_TRY(const Owned first, gpu.event(true));
-  VLA_TRY(const Owned last, gpu.event(true));
-  VLA_CHECK(stream.begin_capture());
-  VLA_CHECK(stream.note_time(first));
-  for (int i = 0; i < n_launch; ++i)
-    for (const Launch& launch : launches) VLA_CHECK(stream.launch(launch, job));
-  VLA_CHECK(stream.note_time(last));
-  VLA_TRY(const Owned graph, stream.end_capture());
-  for (int i = 0; i < 2; ++i) VLA_CHECK(stream.launch(graph));  // the first one warms it up
-  VLA_CHECK(stream.wait());
-  VLA_TRY(const float ms, gpu.elapsed(first, last));
-  return 1e3f * ms / static_cast<float>(n_launch);
-}
+struct Repeats {
+  int n_launch, n_time;
+};
 
-void tell(const char* kind, const Size& size, const char* shape, int n_split, float us) {
-  const double flop = 2.0 * size.n_row * size.depth * size.n_column;
-  fmt::print(
-      R"({{"kind": "{}", "rows": {}, "depth": {}, "columns": {}, "shape": "{}", "splits": {}, "us": {:.2f}, "tera": {:.3f}}})"
-      "\n",
-      kind, size.n_row, size.depth, size.n_column, shape, n_split, us, 1e-6 * flop / us);
-}
+std::size_t bytes(std::int64_t n) { return static_cast<std::size_t>(n); }
 
-Status run(int n_size, int n_launch) {
-  VLA_TRY(const Driver driver, load_driver());
-  VLA_TRY(const std::unique_ptr<Gpu> gpu, Gpu::open(driver, 0, kernel_modules()));
-  VLA_TRY(Stream stream, gpu->stream());
-  for (int i = 0; i < n_size; ++i) {
-    const Size& size = kSizes[i];
-    const std::int64_t rows = size.n_row, columns = size.n_column, depth = size.depth;
-    const std::int64_t x_stride = kernels::quantized_stride(depth);
-    const auto bytes = [](std::int64_t n) { return static_cast<std::size_t>(n); };
-    VLA_TRY(const Buffer x, gpu->allocate(bytes(4 * rows * std::max(x_stride, depth)), "x"));
-    VLA_TRY(const Buffer weight, gpu->allocate(bytes(2 * columns * round_up(depth, 64) + (1 << 20)), "weight"));
-    VLA_TRY(const Buffer scale, gpu->allocate(bytes(4 * columns), "scales"));
-    VLA_TRY(const Buffer partial, gpu->allocate(bytes(4 * 8 * rows * columns), "partial sums"));
-    VLA_TRY(const Buffer y, gpu->allocate(bytes(4 * rows * columns), "y"));
-    for (const Buffer* buffer : {&x, &weight, &scale}) VLA_CHECK(stream.fill(buffer->address(), 0, buffer->size()));
+/// Random numbers as operands are stored.
+class Numbers {
+ public:
+  Bytes floats(std::int64_t n) {
+    return made<float>(n, [&] { return normal_(random_); });
+  }
+  Bytes bf16(std::int64_t n) {
+    return made<std::uint16_t>(n, [&] { return to_bf16(normal_(random_)); });
+  }
+  Bytes int8(std::int64_t n) {
+    return made<std::uint8_t>(n, [&] { return static_cast<std::uint8_t>(random_()); });
+  }
+  /// Four codes a byte, each plus 1.
+  Bytes ternary(std::int64_t n) {
+    return made<std::uint8_t>(n, [&] {
+      unsigned byte = 0;
+      for (int i = 0; i < 4; ++i) byte = byte << 2 | static_cast<unsigned>(random_() % 3);
+      return static_cast<std::uint8_t>(byte);
+    });
+  }
+  /// Rows of codes with their scales, as kernels/quantized.h has them.
+  Bytes quantized(std::int64_t n_row, std::int64_t depth) {
+    const std::int64_t stride = kernels::quantized_stride(depth);
+    Bytes rows = int8(n_row * stride);
+    constexpr kernels::RowScale kScale = {100, 0};
+    for (std::int64_t row = 0; row < n_row; ++row)
+      std::memcpy(&rows[bytes(row * stride + kernels::quantized_depth(depth))], &kScale, sizeof(kScale));
+    return rows;
+  }
+
+ private:
+  template <class T, class Make>
+  static Bytes made(std::int64_t n, Make make) {
+    Bytes all(bytes(n) * sizeof(T));
+    for (std::size_t i = 0; i < all.size(); i += sizeof(T)) {
+      const T value = make();
+      std::memcpy(&all[i], &value, sizeof(T));
+    }
+    return all;
+  }
+  std::mt19937 random_{7};
+  std::normal_distribution<float> normal_{0, 0.1f};
+};
+
+class Bench {
+ public:
+  static Result<std::unique_ptr<Bench>> open(Repeats repeats) {
+    VLA_TRY(const Driver driver, load_driver());
+    VLA_TRY(std::unique_ptr<Gpu> gpu, Gpu::open(driver, 0, kernel_modules()));
+    VLA_TRY(Stream stream, gpu->stream());
+    return std::unique_ptr<Bench>(new Bench(std::move(gpu), std::move(stream), repeats));
+  }
+
+  /// Every kind of matrix, shape and split of a size.
+  Status run(const Size& size) {
+    const std::int64_t rows = size.n_row, columns = size.n_column;
+    VLA_TRY(const Buffer partial, gpu_->allocate(bytes(4 * 8 * rows * columns), "partial sums"));
+    VLA_TRY(const Buffer y, gpu_->allocate(bytes(4 * rows * columns), "y"));
     Epilogue end = {};
     end.y = y.as<void>(), end.y_stride = columns;
-    for (const int n_split : kSplits) {
-      const LinearBf16Job bf16 = {x.as<void>(),        weight.as<std::uint16_t>(),
-                                  round_up(depth, 8),  round_up(depth, 8),
-                                  size.n_row,          size.n_column,
-                                  size.depth,          n_split,
-                                  partial.as<float>(), end};
+    VLA_CHECK(run_bf16(size, partial, end));
+    VLA_CHECK(run_codes("ternary", CodeKind::ternary, numbers_.ternary(kPattern), size, partial, end));
+    return run_codes("int8", CodeKind::int8, numbers_.int8(kPattern), size, partial, end);
+  }
+
+ private:
+  Bench(std::unique_ptr<Gpu> gpu, Stream stream, Repeats repeats)
+      : gpu_(std::move(gpu)), stream_(std::move(stream)), repeats_(repeats) {}
+
+  Status run_bf16(const Size& size, const Buffer& partial, const Epilogue& end) {
+    const std::int64_t stride = round_up(size.depth, 8);
+    VLA_TRY(const Buffer x, upload(numbers_.bf16(size.n_row * stride)));
+    VLA_TRY(const Buffer x_few, upload(numbers_.floats(size.n_row * stride)));
+    VLA_TRY(const auto matrices, fill_matrices(bytes(2 * size.n_column * stride), numbers_.bf16(kPattern / 2)));
+    for (const int n_split : kSplits)
       for (const auto& [name, shape] :
            {std::pair{"few", Bf16Shape::few}, {"64", Bf16Shape::rows64}, {"128", Bf16Shape::rows128}}) {
         if (shape == Bf16Shape::few && size.n_row > 4 * kBf16FewRows) continue;
-        std::vector<Launch> launches = {linear_bf16(shape, bf16)};
-        if (n_split > 1) launches.push_back(finish_bf16_partial(bf16));
-        VLA_TRY(const float us, time_launches(*gpu, stream, bf16, launches, n_launch));
-        tell("bf16", size, name, n_split, us);
+        std::vector<LinearBf16Job> jobs;
+        for (const Buffer& matrix : matrices)
+          jobs.push_back({shape == Bf16Shape::few ? x_few.as<void>() : x.as<void>(), matrix.as<std::uint16_t>(), stride,
+                          stride, size.n_row, size.n_column, size.depth, n_split, partial.as<float>(), end});
+        std::vector<Launch> launches = {linear_bf16(shape, jobs[0])};
+        if (n_split > 1) launches.push_back(finish_bf16_partial(jobs[0]));
+        VLA_CHECK(tell("bf16", size, name, n_split, jobs, launches));
       }
-      const LinearInt8Job codes = {x.as<std::byte>(),
-                                   weight.as<std::byte>(),
-                                   scale.as<float>(),
-                                   x_stride,
-                                   size.n_row,
-                                   size.n_column,
-                                   static_cast<int>(kernels::quantized_depth(depth)),
-                                   n_split,
-                                   partial.as<int>(),
-                                   end};
-      for (const auto& [kind, code] : {std::pair{"ternary", CodeKind::ternary}, {"int8", CodeKind::int8}})
-        for (const auto& [name, shape] :
-             {std::pair{"few", Int8Shape::few}, {"64", Int8Shape::rows64}, {"128", Int8Shape::rows128}}) {
-          if (shape == Int8Shape::few && size.n_row > 16) continue;
-          std::vector<Launch> launches = {linear_int8(code, shape, codes)};
-          if (n_split > 1) launches.push_back(finish_int8_partial(codes));
-          VLA_TRY(const float us, time_launches(*gpu, stream, codes, launches, n_launch));
-          tell(kind, size, name, n_split, us);
-        }
-    }
+    return {};
   }
+
+  Status run_codes(const char* kind, CodeKind code, const Bytes& pattern, const Size& size, const Buffer& partial,
+                   const Epilogue& end) {
+    const std::int64_t stride = kernels::quantized_stride(size.depth);
+    VLA_TRY(const Buffer x, upload(numbers_.quantized(size.n_row, size.depth)));
+    VLA_TRY(const Buffer scale, upload(numbers_.floats(size.n_column)));
+    VLA_TRY(const auto matrices, fill_matrices(packed_int8_size(code, size.depth, size.n_column), pattern));
+    for (const int n_split : kSplits)
+      for (const auto& [name, shape] :
+           {std::pair{"few", Int8Shape::few}, {"64", Int8Shape::rows64}, {"128", Int8Shape::rows128}}) {
+        if (shape == Int8Shape::few && size.n_row > 16) continue;
+        std::vector<LinearInt8Job> jobs;
+        for (const Buffer& matrix : matrices)
+          jobs.push_back({x.as<std::byte>(), matrix.as<std::byte>(), scale.as<float>(), stride, size.n_row,
+                          size.n_column, static_cast<int>(kernels::quantized_depth(size.depth)), n_split,
+                          partial.as<int>(), end});
+        std::vector<Launch> launches = {linear_int8(code, shape, jobs[0])};
+        if (n_split > 1) launches.push_back(finish_int8_partial(jobs[0]));
+        VLA_CHECK(tell(kind, size, name, n_split, jobs, launches));
+      }
+    return {};
+  }
+
+  Result<Buffer> upload(const Bytes& values) {
+    VLA_TRY(Buffer buffer, gpu_->allocate(values.size(), "operands"));
+    VLA_CHECK(stream_.upload(buffer.address(), values.data(), values.size()));
+    VLA_CHECK(stream_.wait());
+    return buffer;
+  }
+  /// As many matrices as no cache holds together, but no more than there are launches, of the pattern again and again.
+  Result<std::vector<Buffer>> fill_matrices(std::size_t size, const Bytes& pattern) {
+    const std::size_t n = std::clamp<std::size_t>(kBeyondCaches / size + 1, 1, bytes(repeats_.n_launch));
+    std::vector<Buffer> matrices;
+    while (matrices.size() < n) {
+      VLA_TRY(Buffer matrix, gpu_->allocate(size, "matrices"));
+      for (std::size_t at = 0; at < size; at += pattern.size())
+        VLA_CHECK(stream_.upload(matrix.address() + at, pattern.data(), std::min(pattern.size(), size - at)));
+      matrices.push_back(std::move(matrix));
+    }
+    VLA_CHECK(stream_.wait());
+    return matrices;
+  }
+
+  /// Microseconds of one launch of a graph of so many, whose jobs take turns: the median of several graphs' launches.
+  template <class Job>
+  Result<float> time_launches(std::span<const Job> jobs, const std::vector<Launch>& launches) {
+    VLA_TRY(const Owned first, gpu_->event(true));
+    VLA_TRY(const Owned last, gpu_->event(true));
+    for (const Launch& launch : launches) VLA_CHECK(gpu_->prepare(launch));
+    VLA_CHECK(stream_.begin_capture());
+    VLA_CHECK(stream_.note_time(first));
+    for (int i = 0; i < repeats_.n_launch; ++i)
+      for (const Launch& launch : launches) VLA_CHECK(stream_.launch(launch, jobs[bytes(i) % jobs.size()]));
+    VLA_CHECK(stream_.note_time(last));
+    VLA_TRY(const Owned graph, stream_.end_capture());
+    std::vector<float> times;
+    for (int i = 0; i <= repeats_.n_time; ++i) {
+      VLA_CHECK(stream_.launch(graph));
+      VLA_CHECK(stream_.wait());
+      VLA_TRY(const float ms, gpu_->elapsed(first, last));
+      if (i > 0) times.push_back(1e3f * ms / static_cast<float>(repeats_.n_launch));  // the first one warms it up
+    }
+    std::sort(times.begin(), times.end());
+    return times[times.size() / 2];
+  }
+
+  template <class Job>
+  Status tell(const char* kind, const Size& size, const char* shape, int n_split, const std::vector<Job>& jobs,
+              const std::vector<Launch>& launches) {
+    VLA_TRY(const float us, time_launches(std::span<const Job>(jobs), launches));
+    VLA_TRY(const float warm, time_launches(std::span<const Job>(jobs).first(1), launches));
+    const double flop = 2.0 * size.n_row * size.depth * size.n_column;
+    fmt::print(
+        R"({{"kind": "{}", "rows": {}, "depth": {}, "columns": {}, "shape": "{}", "splits": {}, "us": {:.2f}, "warm_us": {:.2f}, "tera": {:.3f}}})"
+        "\n",
+        kind, size.n_row, size.depth, size.n_column, shape, n_split, us, warm, 1e-6 * flop / us);
+    return {};
+  }
+
+  static constexpr std::int64_t kPattern = 4 << 20;  // bytes
+  std::unique_ptr<Gpu> gpu_;
+  Stream stream_;
+  Repeats repeats_;
+  Numbers numbers_;
+};
+
+Status run(int n_size, Repeats repeats) {
+  VLA_TRY(const std::unique_ptr<Bench> bench, Bench::open(repeats));
+  for (int i = 0; i < n_size; ++i) VLA_CHECK(bench->run(kSizes[i]));
   return {};
 }
 
 }  // namespace
 
-/// bench_products [N [LAUNCHES]]: the first N sizes, all without it; so many launches for each time, else 20.
+/// bench_products [SIZES [LAUNCHES [TIMES]]]: the first sizes, all without it; launches of a graph, else 20; how often
+/// it is timed, else 5.
 int main(int n_argument, char** arguments) {
-  constexpr int kMost = static_cast<int>(std::size(kSizes));
-  const int n_size = n_argument > 1 ? std::clamp(std::atoi(arguments[1]), 1, kMost) : kMost;
-  const int n_launch = n_argument > 2 ? std::clamp(std::atoi(arguments[2]), 1, 1000) : 20;
-  const Status status = run(n_size, n_launch);
+  const auto number = [&](int i, int otherwise, int most) {
+    return n_argument > i ? std::clamp(std::atoi(arguments[i]), 1, most) : otherwise;
+  };
+  constexpr int kAll = static_cast<int>(std::size(kSizes));
+  const Status status = run(number(1, kAll, kAll), {number(2, 20, 1000), number(3, 5, 1000)});
   if (!status) fmt::print(stderr, "error: {}\n", status.error().message());
   return status ? 0 : 1;
 }
