@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: The vla.cpp authors
 # SPDX-License-Identifier: Apache-2.0
 
-.PHONY: help demo libero test arm64 test-arm64 test-cuda test-vulkan build vulkan cuda wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
+.PHONY: help demo libero test arm64 test-arm64 test-cuda test-vulkan build vulkan cuda gpu-kit wheel wheel-arm64 deb deb-arm64 image packages asan tsan fuzz format clean
 .DEFAULT_GOAL := help
 
 PYTHON ?= python3
@@ -21,6 +21,7 @@ help:
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 102 MB: NVIDIA's compiler)"
 	@echo "make cuda GGML=1   libvla-cuda-ggml.so too, for --kernels ggml there (downloads 525 MB more, with cuBLAS)"
+	@echo "make gpu-kit   out/vla-gpu-kit.tar.gz, what tries and measures a GPU elsewhere (docs/gpu.md)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make deb       out/vla_*.deb for this system: the program, its manual, and the server as a unit of systemd"
 	@echo "make image     that package in the image of packaging/Containerfile, without a registry, and one act served from it (Debian 12; needs root)"
@@ -52,7 +53,11 @@ vulkan: build
 # libvla-cuda.so for build/cpu. With GGML=1 also ggml's backend.
 cuda: build
 	cmake build/cpu -DVLA_CUDA=ON -DVLA_CUDA_GGML=$(if $(GGML),ON,OFF) >/dev/null
-	cmake --build --preset cpu --target vla_cuda $(if $(GGML),vla_cuda_ggml)
+	cmake --build --preset cpu --target vla_cuda bench_products test_kernels_gpu $(if $(GGML),vla_cuda_ggml)
+
+# What a machine with NVIDIA's driver and Python needs to try a board, in one archive.
+gpu-kit: cuda
+	$(VENV)/bin/python scripts/gpu_kit/pack.py
 
 # A wheel for any x86-64 machine with a system as old as this one's: pip installs it in seconds.
 wheel: packages $(STAMP)

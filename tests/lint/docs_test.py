@@ -24,7 +24,7 @@ PROGRAMS = {  # program -> files in whose text its flags are written
     "vla-pull": ("python/vla_cpp/pull.py",),
     "vla-export": ("python/vla_cpp/export/*.py",),
 }
-ANY_OF_OURS = ("src/cli/*.cpp", "python/**/*.py", "scripts/*", "tools/**/*.py", "examples/**/*.py", "tests/lint/*.py")
+ANY_OF_OURS = ("src/cli/*.cpp", "python/**/*.py", "scripts/*", "scripts/gpu_kit/*.py", "tools/**/*.py", "examples/**/*.py", "tests/lint/*.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 
@@ -73,7 +73,8 @@ def sources_of(command):
         return PROGRAMS[program]
     if program.startswith("--") or program.startswith("[--"):
         return ANY_OF_OURS
-    scripts = [w.removeprefix("./") for w in words[:2] if w.endswith((".py", ".sh"))]
+    # The kit's programs are packed from that folder.
+    scripts = [w.removeprefix("./").replace("vla-gpu-kit/", "scripts/gpu_kit/") for w in words[:2] if w.endswith((".py", ".sh"))]
     return tuple(scripts) or None
 
 

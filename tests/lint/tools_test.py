@@ -17,7 +17,7 @@ sys.path.append(str(ROOT / "tools"))
 import parity_full  # noqa: E402
 from goldens import families, family  # noqa: E402
 
-PROGRAMS = sorted(str(file.relative_to(ROOT)) for folder in ("tools", "tools/peers", "scripts") for file in (ROOT / folder).glob("*.py"))
+PROGRAMS = sorted(str(file.relative_to(ROOT)) for folder in ("tools", "tools/peers", "scripts", "scripts/gpu_kit") for file in (ROOT / folder).glob("*.py"))
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

@@ -32,10 +32,10 @@ using Bytes = std::vector<std::byte>;
 struct Size {
   int n_row, depth, n_column;
 };
-// Of steps of a few rows, of action experts, of language models and of vision towers.
-constexpr Size kSizes[] = {{1, 2048, 2048},   {4, 960, 2560},     {50, 720, 2048},   {50, 1024, 4096},
-                           {113, 960, 2560},  {642, 2560, 2560},  {642, 2560, 6912}, {642, 6912, 2560},
-                           {512, 1152, 4304}, {560, 16384, 2048}, {968, 2048, 16384}};
+// Of a chunk's end, of steps of a few rows, of action experts, of language models and of vision towers.
+constexpr Size kSizes[] = {{50, 720, 32},     {1, 2048, 2048},   {4, 960, 2560},     {50, 720, 2048},
+                           {50, 1024, 4096},  {113, 960, 2560},  {642, 2560, 2560},  {642, 2560, 6912},
+                           {642, 6912, 2560}, {512, 1152, 4304}, {560, 16384, 2048}, {968, 2048, 16384}};
 constexpr int kSplits[] = {1, 2, 4, 8};
 /// More than the largest cache of a GPU.
 constexpr std::size_t kBeyondCaches = 200u << 20;
