@@ -21,7 +21,7 @@ help:
 	@echo "make vulkan    libvla-vulkan.so beside it, which --device vulkan loads"
 	@echo "make cuda      libvla-cuda.so beside it, which --device cuda loads (downloads 102 MB: NVIDIA's compiler)"
 	@echo "make cuda GGML=1   libvla-cuda-ggml.so too, for --kernels ggml there (downloads 525 MB more, with cuBLAS)"
-	@echo "make gpu-kit   out/vla-gpu-kit.tar.gz, what tries and measures a GPU elsewhere (docs/gpu.md)"
+	@echo "make gpu-kit   out/vla-gpu-kit.tar.xz, what tries and measures a GPU elsewhere (docs/gpu.md)"
 	@echo "make wheel     out/vla_cpp-*.whl, the Python package with the runtime inside"
 	@echo "make deb       out/vla_*.deb for this system: the program, its manual, and the server as a unit of systemd"
 	@echo "make image     that package in the image of packaging/Containerfile, without a registry, and one act served from it (Debian 12; needs root)"

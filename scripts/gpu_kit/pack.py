@@ -3,9 +3,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Packs what tries vla.cpp on a GPU elsewhere into one archive: programs, their libraries, tests of kernels, golden cases and a small policy.
 
-    .venv/bin/python scripts/gpu_kit/pack.py [--build build/cpu] [--out out]     # make gpu-kit
+    .venv/bin/python scripts/gpu_kit/pack.py [--build build/cpu] [--out out] [--small]     # make gpu-kit
 
-There, on a machine with NVIDIA's driver and Python: tar xf vla-gpu-kit.tar.gz && python3 vla-gpu-kit/try_gpu.py RESULT"""
+There, on a machine with NVIDIA's driver and Python: python3 -m tarfile -e vla-gpu-kit.tar.xz && python3 vla-gpu-kit/try_gpu.py RESULT"""
 
 import argparse
 import json
@@ -22,6 +22,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(ROOT / "scripts"), str(ROOT / "tools"), str(ROOT / "tests/cli")]
 
 NAME, MOST = "vla-gpu-kit", 48 << 20  # bytes of the archive; what takes it elsewhere may have a limit of 64 MiB
+LARGE = 4 << 20  # bytes of a bundle
 SCRIPTS = ("try_gpu.py", "trace.py", "cublas.py", "probe.py")
 # Of the C library, which every machine has with its loader; and the run time of C++, which an old machine lacks.
 OF_THE_SYSTEM = re.compile(r"(libc|libm|libdl|libpthread|librt|libresolv|ld-linux[^/]*|libcuda)\.so")
@@ -75,13 +76,23 @@ def copy_tiny(vla, kit):
     (kit / "tiny/act.json").write_text(json.dumps({"arguments": asked("tiny/frame.png"), "answers": answers}))
 
 
-def copy_cases(kit, names=None):
-    """Golden cases, all without names, as command lines, with how far PyTorch's bf16 is from float32 there."""
+def chosen_cases(is_small):
+    """All golden cases, but of those with a large bundle (ACT's, whose vision tower has one size) the smallest of an architecture, or none."""
+    from golden_cases import NAMES, Golden
+
+    by_size = sorted(NAMES, key=lambda name: Golden(name).bundle.stat().st_size)
+    is_large = {name: Golden(name).bundle.stat().st_size > LARGE for name in NAMES}
+    first = {name.split("/")[0]: name for name in reversed(by_size)}
+    return [name for name in NAMES if not is_large[name] or (not is_small and name in first.values())]
+
+
+def copy_cases(kit, names):
+    """Golden cases as command lines, with how far PyTorch's bf16 is from float32 there."""
     import numpy as np
-    from golden_cases import NAMES, Golden, tensors
+    from golden_cases import Golden, tensors
 
     packed = []
-    for name in names or NAMES:
+    for name in names:
         case, inside = Golden(name), f"cases/{name}"
         for file in {case.bundle, case.noise, case.expected, *filter(None, case.images.values())}:
             copy = kit / inside / file.relative_to(case.folder)
@@ -117,17 +128,18 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--build", type=Path, default=ROOT / "build/cpu")
     parser.add_argument("--out", type=Path, default=ROOT / "out")
+    parser.add_argument("--small", action="store_true", help="without ACT's golden case, 20 MiB less")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         kit = Path(folder) / NAME
         kit.mkdir()
         copy_programs(options.build, kit)
         copy_tiny(options.build / "bin/vla", kit)
-        copy_cases(kit)
+        copy_cases(kit, chosen_cases(options.small))
         copy_scripts(kit)
         options.out.mkdir(parents=True, exist_ok=True)
-        archive = options.out / f"{NAME}.tar.gz"
-        with tarfile.open(archive, "w:gz", compresslevel=9) as tar:
+        archive = options.out / f"{NAME}.tar.xz"
+        with tarfile.open(archive, "w:xz") as tar:
             tar.add(kit, arcname=NAME, filter=owned_by_nobody)
     size = archive.stat().st_size
     print(f"{archive}: {size / (1 << 20):.1f} MiB")
