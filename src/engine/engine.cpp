@@ -19,6 +19,15 @@ namespace {
 /// short enough to need no memory.
 Error no_memory() { return {Code::out_of_memory, "act", "", "no memory left", "free memory"}; }
 
+/// Sets what the network reads.
+void set_inputs(Plan& plan, const EncodedObservation& observation) {
+  const Inputs& in = observation.inputs;
+  const std::optional<Steering>& steering = observation.steering;
+  plan.set_inputs(in.pixels, observation.pixels_ahead.get(), in.tokens, in.state);
+  plan.set_x(steering ? steering->start : observation.x);
+  if (steering) plan.set_steering(*steering);
+}
+
 }  // namespace
 
 Result<std::unique_ptr<Engine>> Engine::load(const std::string& path, const EngineOptions& options) {
@@ -186,27 +195,48 @@ Result<ActionChunk> Engine::act(EncodedObservation& prepared) noexcept try {
   return no_memory();
 }
 
+std::optional<ActShape> Engine::last_shape() const {
+  if (!last_) return {};
+  return ActShape{last_->first->bundle().embodiment(), last_->second};
+}
+
+Status Engine::warm_up(const ActShape& act) noexcept try {
+  VLA_TRY(const Robot* of, robot(act.embodiment));
+  VLA_TRY(const EncodedObservation zeros, of->zeros(act.inputs));
+  VLA_TRY(Plan * plan, plans_->for_shape(of->network(), act.inputs));
+  set_inputs(*plan, zeros);
+  std::vector<Tap> taps;
+  VLA_CHECK(solve(*plan, of->solver().n_step, taps));
+  static_cast<void>(plan->x());  // waits
+  return device_->failure();
+} catch (const std::bad_alloc&) {
+  return no_memory();
+}
+
+/// Prefix and steps of what was set.
+Status Engine::solve(Plan& plan, int n_step, std::vector<Tap>& taps) {
+  VLA_CHECK(plan.run_prefix(taps));
+  for (int k = 0; k < n_step; ++k) {
+    VLA_CHECK(plan.run_step(k));
+    plan.collect_step_taps(k, taps);
+  }
+  return {};
+}
+
 Result<ActionChunk> Engine::run(EncodedObservation& observation) {
   const Robot& robot = *observation.robot;
   const Inputs& in = observation.inputs;
-  const std::optional<Steering>& steering = observation.steering;
   StageClock clock;
   Timing timing = std::move(observation.timing);
   std::vector<Tap> taps;
   last_ = {&robot, robot.shape_of(observation)};
   VLA_TRY(Plan * plan, plans_->for_shape(robot.network(), last_->second));
-  plan->set_inputs(in.pixels, observation.pixels_ahead.get(), in.tokens, in.state);
-  plan->set_x(steering ? steering->start : observation.x);
-  if (steering) plan->set_steering(*steering);
+  set_inputs(*plan, observation);
   record(taps, "pixels", {in.width, in.height, 3, in.n_view}, in.pixels);
   if (!in.tokens.empty()) record(taps, "tokens", {static_cast<std::int64_t>(in.tokens.size())}, in.tokens);
   if (!in.state.empty()) record(taps, "state", {static_cast<std::int64_t>(in.state.size())}, in.state);
   clock.lap(timing, "plan");
-  VLA_CHECK(plan->run_prefix(taps));
-  for (int k = 0; k < robot.solver().n_step; ++k) {
-    VLA_CHECK(plan->run_step(k));
-    plan->collect_step_taps(k, taps);
-  }
+  VLA_CHECK(solve(*plan, robot.solver().n_step, taps));
   const std::vector<float> x = plan->x();  // other devices than the CPU are waited for here
   VLA_CHECK(device_->failure());
   observation.pixels_ahead.reset();

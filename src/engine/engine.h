@@ -77,6 +77,12 @@ class Engine {
                  EncodedObservation& to) const noexcept;
   Result<ActionChunk> act(EncodedObservation& prepared) noexcept;
 
+  /// Of the last act: whose, and of which size. None before the first.
+  std::optional<ActShape> last_shape() const;
+  /// Computes an act of zeros, so that the first one of this size finds its plan, and on a GPU its graph. Errors:
+  /// bad_observation (no observation of this bundle has that size), device, out_of_memory, internal.
+  Status warm_up(const ActShape& act) noexcept;
+
   /// Solves for the first robot in another number of steps than the bundle asks for, to measure what a step costs; no
   /// other thread may prepare meanwhile. Errors: bad_bundle, out_of_memory, device.
   Status set_steps(int n_step);
@@ -128,6 +134,7 @@ class Engine {
                 EncodedObservation& to) const noexcept;
   Status inject_inputs(Inputs& inputs) const;
   Result<ActionChunk> run(EncodedObservation& observation);
+  Status solve(Plan& plan, int n_step, std::vector<Tap>& taps);
   template <class T>
   void record(std::vector<Tap>& taps, const char* path, std::vector<std::int64_t> shape,
               const std::vector<T>& values) const;

@@ -125,6 +125,33 @@ Status Robot::encode(const Observation& observation, const Noise& noise, const s
   return {};
 }
 
+Result<EncodedObservation> Robot::zeros(const InputShape& shape) const {
+  const InputShape most = largest_shape();
+  const bool fits = shape.width == most.width && shape.height == most.height && shape.d_state == most.d_state &&
+                    shape.n_view > 0 && shape.n_view <= most.n_view && shape.n_text >= 0 &&
+                    shape.n_text <= most.n_text && view_key(shape.views) == shape.views &&
+                    (!shape.steered || real_time_chunking().kind != RealTimeChunking::Kind::none);
+  if (!fits)
+    return Error{
+        Code::bad_observation, "warm-up",
+        fmt::format("{} x {}, up to {} views and {} tokens", most.width, most.height, most.n_view, most.n_text),
+        fmt::format("{} x {}, {} views, {} tokens", shape.width, shape.height, shape.n_view, shape.n_text)};
+  VLA_CHECK(policy_->check(shape));
+  const auto size = [](std::int64_t n) { return static_cast<std::size_t>(n); };
+  EncodedObservation to;
+  to.robot = this;
+  to.inputs.width = shape.width, to.inputs.height = shape.height;
+  to.inputs.n_view = shape.n_view, to.inputs.views = shape.views;
+  to.inputs.pixels.resize(size(std::int64_t{3} * shape.width * shape.height * shape.n_view));
+  to.inputs.tokens.resize(size(shape.n_text)), to.inputs.state.resize(size(shape.d_state));
+  to.x.resize(size(std::int64_t{horizon_} * d_action_));
+  if (shape.steered) {
+    const std::vector<float> rates(size(std::int64_t{solver_.n_step} * horizon_));
+    to.steering = Steering{to.x, to.x, rates, rates};
+  }
+  return to;
+}
+
 Result<std::vector<float>> Robot::start(const Noise& noise) const {
   const std::size_t count = static_cast<std::size_t>(horizon_) * static_cast<std::size_t>(d_action_);
   if (const auto* seed = std::get_if<std::uint64_t>(&noise)) return draw_noise(solver_.noise, *seed, count);

@@ -19,6 +19,13 @@ namespace vla {
 
 class Robot;
 
+/// What an act's plan is made for: the robot's tag, empty where a bundle is for one, and the size of the inputs.
+struct ActShape {
+  std::string embodiment;
+  InputShape inputs;
+  auto operator<=>(const ActShape&) const = default;
+};
+
 /// The host's part of one observation, made before the device is needed. Vectors keep their memory when filled again.
 struct EncodedObservation {
   const Robot* robot = nullptr;  // that the observation names
@@ -59,6 +66,8 @@ class Robot {
   /// Fills all of `to` but its robot. Errors: bad_observation, unsupported.
   Status encode(const Observation& observation, const Noise& noise, const std::optional<Leftover>& leftover,
                 EncodedObservation& to) const;
+  /// The same of zeros, of this size. Errors: bad_observation where no observation has it.
+  Result<EncodedObservation> zeros(const InputShape& shape) const;
   /// Turns the network's answer, (solver_horizon, d_action_padded), into the robot's rows and columns, with notes.
   /// Errors: bad_action.
   Result<ActionChunk> decode(const std::vector<float>& x, const Inputs& inputs) const;

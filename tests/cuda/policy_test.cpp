@@ -140,6 +140,40 @@ TEST_CASE_FIXTURE(Driver, "so is an act that continues the last chunk, after ano
   }
 }
 
+TEST_CASE_FIXTURE(Driver, "an act of a size that was warmed up makes no graph, also one that continues a chunk") {
+  reset_without_computing();
+  GoldenCase golden = small_case();
+  std::vector<ActShape> sizes;
+  std::optional<Leftover> leftover;
+  {
+    const auto engine = load_engine(golden.bundle(), "", "float32");
+    CHECK(!engine->last_shape());
+    for (const char* text : {"go", "put the cube into the basket"}) {
+      golden.observation.text = text;
+      const auto chunk = engine->act(golden.observation, golden.noise, leftover);
+      REQUIRE(chunk.ok());
+      sizes.push_back(*engine->last_shape());
+      const auto skipped = static_cast<std::ptrdiff_t>(2 * chunk->d_action);
+      leftover = {{chunk->normalized.begin() + skipped, chunk->normalized.end()}, 1, "linear", 5.0};
+    }
+  }
+  CHECK(sizes[0].inputs.n_text < sizes[1].inputs.n_text);
+  const auto engine = load_engine(golden.bundle(), "", "float32");
+  for (const ActShape& size : sizes) REQUIRE(engine->warm_up(size));
+  const Counts before = fake_driver().n_call;
+  REQUIRE(engine->act(golden.observation, golden.noise, leftover).ok());
+  CHECK(calls_since(before) == kAct);
+  golden.observation.text = "to";
+  CHECK(engine->act(golden.observation, golden.noise).ok());
+  CHECK(calls_since(before)["cuGraphInstantiateWithFlags"] == 0);
+
+  ActShape other = sizes[0];
+  other.inputs.n_text = 100000;
+  CHECK(engine->warm_up(other).error().code == Code::bad_observation);
+  other = sizes[0], other.embodiment = "absent";
+  CHECK(engine->warm_up(other).error().code == Code::bad_observation);
+}
+
 TEST_CASE_FIXTURE(Driver, "images of an act that is prepared travel before the act before is computed") {
   reset_without_computing();
   const GoldenCase golden = small_case();
