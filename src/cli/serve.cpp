@@ -30,7 +30,7 @@ namespace {
 
 struct ServeOptions {
   std::vector<std::string> bundles;  // FILE or NAME=FILE
-  std::string kernels, device, embodiment, control;
+  std::string kernels, device, embodiment, control, sizes;
   int n_thread = 0;
   std::size_t memory = 0;
   bool restarts = false;
@@ -210,11 +210,21 @@ Status serve(ServeOptions& options, bool& ready) {
   VLA_TRY(const std::unique_ptr<serve::Server> server, serve::Server::open(options.server));
   VLA_TRY(const std::unique_ptr<Observability> observability,
           Observability::start(options.observability, *server, options.server.insecure));
+  std::unique_ptr<serve::SeenSizes> sizes;
+  if (!options.sizes.empty()) {
+    VLA_TRY(sizes, serve::SeenSizes::open(options.sizes, [](const Error& error) {
+              say(stderr, "warning: --warm-up: {}\n", error.message());
+            }));
+  }
+  const auto warm_up = [&](Engine& engine) {
+    return serve::warm_up(engine, sizes ? sizes->of(engine) : std::vector<ActShape>());
+  };
+  server->keep_sizes(sizes.get());
   std::unique_ptr<serve::Control> control;
   if (!options.control.empty()) {
-    const auto load = [&options](const std::string& bundle) -> Result<serve::LoadedPolicy> {
+    const auto load = [&options, &warm_up](const std::string& bundle) -> Result<serve::LoadedPolicy> {
       VLA_TRY(serve::LoadedPolicy policy, load_policy(options, bundle));
-      VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));
+      VLA_TRY(policy.warm_up_ms, warm_up(*policy.engine));
       return policy;
     };
     Observability& observed = *observability;
@@ -231,7 +241,7 @@ Status serve(ServeOptions& options, bool& ready) {
     serve::LoadedPolicy& policy = policies[name];
     VLA_CHECK(server->add(name, policy.engine));
     observability->loaded(name, *policy.engine);
-    VLA_TRY(policy.warm_up_ms, serve::warm_up(*policy.engine));
+    VLA_TRY(policy.warm_up_ms, warm_up(*policy.engine));
     warm_up_ms += policy.warm_up_ms;
   }
   VLA_CHECK(server->begin());
@@ -308,6 +318,8 @@ Command add_serve(CLI::App& app) {
   add_memory(*command, options->memory);
   add_text(*command, "--embodiment", options->embodiment, "TAG",
            "Serve one robot of a bundle for several; not given: all");
+  add_text(*command, "--warm-up", options->sizes, "FILE",
+           "Keep the sizes of acts in FILE, made if it is not there, and compute one of each before the first client");
   command->add_option("--max-message", options->max_message_mb, "Largest request, in MiB")
       ->check(CLI::Range(1, 1024))
       ->capture_default_str();

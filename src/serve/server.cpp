@@ -123,15 +123,19 @@ Observation largest_observation(const Robot& robot) {
 
 }  // namespace
 
-Result<double> warm_up(Engine& engine) {
+Result<double> warm_up(Engine& engine, const std::vector<ActShape>& sizes) {
   const auto start = Clock::now();
+  const auto is_refused = [](const Error& error) {
+    return error.code == Code::bad_observation || error.code == Code::bad_action;
+  };
   for (const Robot* robot : engine.robots()) {
     EncodedObservation prepared;  // its memory is not kept: every act that is served brings its own
     const Status valid = engine.prepare(largest_observation(*robot), Noise(std::uint64_t{0}), {}, prepared);
     const auto chunk = valid ? engine.act(prepared) : Result<ActionChunk>(valid.error());
-    if (!chunk && chunk.error().code != Code::bad_observation && chunk.error().code != Code::bad_action)
-      return chunk.error();
+    if (!chunk && !is_refused(chunk.error())) return chunk.error();
   }
+  for (const ActShape& size : sizes)
+    if (const Status done = engine.warm_up(size); !done && !is_refused(done.error())) return done.error();
   return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
 }
 
@@ -306,8 +310,11 @@ void Server::compute(Act& act) {
   if (!act.answer.error) attempt(act, [&] { return respond(act); });
   act.answer.finished = loop_.now();
   act.request = {};
-  const Status device = act.policy().engine->device().failure();
+  const std::shared_ptr<ServedPolicy> policy = act.answer.job.policy;
+  const Status device = policy->engine->device().failure();
+  const bool is_answered = !act.answer.error;
   exchange_.put(std::move(act.answer));
+  if (sizes_ != nullptr && is_answered) sizes_->add(*policy->engine);
   if (device) return;
   lost_device_ = device;
   state_.device_lost = true;  // no act after this one can succeed

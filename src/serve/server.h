@@ -10,13 +10,15 @@
 #include "engine/engine.h"
 #include "serve/io.h"
 #include "serve/options.h"
+#include "serve/seen_sizes.h"
 
 namespace vla::serve {
 
 /// Computes one act of a synthetic observation with every view and the longest text, so that the first client does not
 /// pay for what happens once. A policy may refuse such an observation; what fails otherwise would fail every act.
-/// Milliseconds. Errors: device, out_of_memory, internal.
-Result<double> warm_up(Engine& engine);
+/// One of each of `sizes` too, but for those that observations of this policy cannot have. Milliseconds. Errors:
+/// device, out_of_memory, internal.
+Result<double> warm_up(Engine& engine, const std::vector<ActShape>& sizes = {});
 
 /// Resident policies behind the sockets of the front ends. It keeps nothing between requests.
 class Server {
@@ -51,6 +53,8 @@ class Server {
   /// the next act meanwhile. Observers outlive the call. Once for each server, after `begin`. Errors: device,
   /// out_of_memory.
   Status run(std::span<Observer* const> observers = {});
+  /// Keeps the sizes of acts that are computed; they outlive `run`.
+  void keep_sizes(SeenSizes* sizes) { sizes_ = sizes; }
   /// The answer to `describe` once this engine is served under this name.
   v1::Description describe(const std::string& name, const Engine& engine) const;
   /// From any thread or signal handler: what waits is refused.
@@ -92,6 +96,7 @@ class Server {
   ServerOptions options_;
   std::span<Observer* const> observers_;
   bool records_ = false;  // one of them does
+  SeenSizes* sizes_ = nullptr;
   Status lost_device_;
   Policies policies_;  // of the I/O thread once it runs
   ServerState state_;

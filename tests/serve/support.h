@@ -139,7 +139,7 @@ class Brake : public serve::Observer {
 class Running {
  public:
   explicit Running(serve::ServerOptions options = {}, std::vector<serve::Observer*> observers = {},
-                   Brake* brake = nullptr)
+                   Brake* brake = nullptr, serve::SeenSizes* sizes = nullptr)
       : engine(load_engine(kGolden + "/bundle.gguf")), observers_(std::move(observers)), brake_(brake) {
     if (brake_ != nullptr) observers_.push_back(brake_);
     if (options.bind == serve::ServerOptions().bind) options.bind = {"tcp://127.0.0.1:0"};
@@ -148,6 +148,7 @@ class Running {
     server = std::move(*opened);
     const Status loaded = server->add("policy", engine);
     REQUIRE_MESSAGE(loaded.ok(), (loaded ? "" : loaded.error().message()));
+    server->keep_sizes(sizes);
     REQUIRE(server->begin());
     thread_ = std::thread([this] { status_ = server->run(observers_); });
   }
