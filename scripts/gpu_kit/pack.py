@@ -56,7 +56,7 @@ def copy_programs(build, kit):
                 shutil.copy(library, kit / ("runtime" if name in RUNTIME else "lib") / name)
     for ptx in (build / "src/cuda/ptx").glob("*.ptx"):
         shutil.copy(ptx, kit / "ptx")
-    for folder in ("python/vla_cpp", "tools/goldens"):
+    for folder in ("python/vla_cpp", "tools/goldens", "tests/golden/tokenizers/smolvla"):
         shutil.copytree(ROOT / folder, kit / folder, ignore=shutil.ignore_patterns("__pycache__", "eval", "export"))
     (kit / "tools/peers").mkdir()
     for program in ("gpu.py", "peer.py"):

@@ -274,7 +274,7 @@ def cpu(visit):
     with open("/proc/cpuinfo", encoding="utf-8") as file:
         visit.result["processor"] = next((line.split(":")[1].strip() for line in file if line.startswith("model name")), "")
     for family in visit.families if visit.options.families else ("smolvla", "pi05"):
-        for threads in ("2", str(os.cpu_count())):
+        for threads in dict.fromkeys(("2", str(os.cpu_count()))):
             found = visit.result["families"].setdefault(family, {}).setdefault("cpu", {})
             found[threads] = bench(visit, f"{family} on the CPU, {threads} threads", family, ["--threads", threads], 240)
     visit.save()
