@@ -79,6 +79,22 @@ def test_main_loops_have_the_tensor_instructions_that_they_need(machine_code):
         assert tensor == (dict([MAIN_LOOPS[name]]) if name in MAIN_LOOPS else {}), (sm, name)
 
 
+def test_predictions_count_the_instructions_of_main_loops(machine_code):
+    """The table is of sm_90; before it the compiler writes other address arithmetic, and after it instructions that wait."""
+    if not cuda_kernels.tool("nvdisasm"):
+        pytest.skip("no nvdisasm: it is beside the nvcc that `make test` downloads")
+    table = (cuda_kernels.SOURCES / "lower/cuda/gpu_model.cpp").read_text()
+    rows = {name: list(map(int, row.split(","))) for name, row in re.findall(r'\{"(\w+)", (\d+, \d+, \d+), ', table)}
+    assert rows.keys() == MAIN_LOOPS.keys()
+    for sm in [sm for sm in ARCHITECTURES if sm <= 90]:
+        for name, (instructions, tensor, registers) in rows.items():
+            used, loop = machine_code[sm, name]
+            assert tensor == MAIN_LOOPS[name][1]
+            assert instructions * 5 / 6 <= loop.total() <= instructions * 6 / 5, (sm, name, loop.total())
+            if sm == 90:
+                assert (loop.total(), used["registers"]) == (instructions, registers), name
+
+
 def test_ternary_products_leave_half_of_the_tensor_time_to_spare(machine_code):
     """By published rates: other units need at most half of it on AGX Orin and on an RTX 3060."""
     if not cuda_kernels.tool("nvdisasm"):

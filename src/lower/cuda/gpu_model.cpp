@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <string>
 
 namespace vla::lower {
 namespace {
@@ -17,50 +18,86 @@ constexpr GpuModel kModels[] = {
     {.name = "orin-agx",
      .description = "Jetson AGX Orin 64 GB, 16 SMs at 1.3 GHz",
      .n_sm = 16,
+     .clock = 1.3 * kGiga,
      .bf16 = 42.6 * kTera,
      .int8 = 85 * kTera,
      .f32 = 5.3 * kTera,
      .dot4 = 10.6 * kTera,
      .bandwidth = 204.8 * kGiga,
-     .launch = 2.5 * kMicro,
-     .attention = 1.35},
+     .shared = 164 << 10,
+     .launch = 2.5 * kMicro},
     {.name = "rtx-3060",
      .description = "GeForce RTX 3060 12 GB, 28 SMs at 1.78 GHz",
      .n_sm = 28,
+     .clock = 1.78 * kGiga,
      .bf16 = 25.5 * kTera,
      .int8 = 102 * kTera,
      .f32 = 12.7 * kTera,
      .dot4 = 25.5 * kTera,
      .bandwidth = 360 * kGiga,
-     .launch = 1.3 * kMicro,
-     .attention = 1.0},
+     .shared = 100 << 10,
+     .launch = 1.3 * kMicro},
     {.name = "rtx-5090",
      .description = "GeForce RTX 5090 32 GB, 170 SMs at 2.41 GHz",
      .n_sm = 170,
+     .clock = 2.41 * kGiga,
      .bf16 = 209.5 * kTera,
      .int8 = 838 * kTera,
      .f32 = 104.8 * kTera,
      .dot4 = 209.6 * kTera,
      .bandwidth = 1792 * kGiga,
-     .launch = 1.0 * kMicro,
-     .attention = 1.0},
+     .shared = 100 << 10,
+     .launch = 1.0 * kMicro},
     {.name = "h100",
      .description = "H100 SXM 80 GB, 132 SMs at 1.83 GHz",
      .n_sm = 132,
+     .clock = 1.83 * kGiga,
      .bf16 = 0.62 * 989 * kTera,
      .int8 = 0.62 * 1979 * kTera,
      .f32 = 66.9 * kTera,
      .dot4 = 133.8 * kTera,
      .bandwidth = 3350 * kGiga,
-     .launch = 1.0 * kMicro,
-     .attention = 1.35},
+     .shared = 228 << 10,
+     .launch = 1.0 * kMicro},
 };
+
+// Assumptions, never measured: issue slots that a quarter of an SM fills where nothing else holds it up; the time of
+// the smallest kernel from its first block to its last, in cycles; how long memory takes to answer.
+constexpr double kIssue = 0.75, kKernelCycles = 4000, kMemoryLatency = 0.8 * kMicro;
+
+/// The main loop of a kernel on tensor cores, whose blocks have a warp for each quarter of an SM. The counts are of
+/// machine code for sm_90 (scripts/cuda_kernels.py cubins; tests/cuda/ptx_test.py compares); attention's have the
+/// branch of a mask in them.
+struct Loop {
+  const char* kernel;
+  int instructions, tensor;  // of a warp in a step
+  int registers;             // of a thread
+  int step;                  // elements of the depth, or keys
+  int stage, n_stage;        // bytes that a step reads, and steps that there is shared memory for
+};
+constexpr Loop kLoops[] = {
+    {"linear_bf16_64", 167, 16, 90, 32, 2 * 64 * 64, 4},
+    {"linear_bf16_128", 333, 64, 227, 32, 2 * 128 * 64, 4},
+    {"linear_ternary_64", 122, 16, 88, 64, 64 * (64 + 16), 4},
+    {"linear_ternary_128", 228, 64, 204, 64, 128 * (64 + 16), 4},
+    {"linear_int8_64", 98, 16, 96, 64, 2 * 64 * 64, 3},
+    {"linear_int8_128", 200, 64, 238, 64, 2 * 128 * 64, 3},
+    {"attention_bf16_64", 1270, 64, 168, 64, 2 * 64 * (2 * 64 + 16), 2},
+    {"attention_bf16_80", 1301, 80, 199, 64, 2 * 64 * (2 * 80 + 16), 2},
+    {"attention_bf16_128", 1404, 128, 229, 64, 2 * 64 * (2 * 128 + 16), 2},
+    {"attention_bf16_256", 1276, 128, 243, 32, 2 * 32 * (2 * 256 + 16), 2},
+};
+
+const Loop& loop_of(const std::string& kernel) {
+  return *std::find_if(std::begin(kLoops), std::end(kLoops), [&](const Loop& loop) { return kernel == loop.kernel; });
+}
 
 /// An operation's cost on a GPU.
 struct Cost {
   double products = 0;  // seconds of all SMs, were they all at work
   double alone = 0;     // seconds where nothing else runs: whole waves of blocks
   double bytes = 0;
+  double fetch = 0;  // seconds of them where nothing else runs: as much as its blocks ask for at a time
   int n_launch = 0;
 };
 
@@ -73,17 +110,30 @@ class Costs {
     Cost cost;
     cost.n_launch = n_launch;
     cost.bytes = work_of(l, op).bytes;
+    cost.fetch = cost.bytes / gpu.bandwidth;
     if (const auto* linear = std::get_if<LinearOp>(&op.op)) add_products(cost, op, *linear);
     if (const auto* attention = std::get_if<AttentionOp>(&op.op)) add_attention(cost, op, *attention);
     return cost;
   }
 
  private:
-  /// Blocks of equal work, which SMs take one after the other.
-  void add_blocks(Cost& cost, double n_block, double flop, double rate) const {
-    const double of_block = flop / n_block / (rate / gpu.n_sm), n_sm = gpu.n_sm;
-    cost.products += flop / rate;
-    cost.alone += std::ceil(n_block / n_sm) * of_block;
+  /// Blocks of equal work in seconds of an SM, which takes them one after the other.
+  void add_blocks(Cost& cost, double n_block, double of_block) const {
+    cost.products += n_block * of_block / gpu.n_sm;
+    cost.alone += std::ceil(n_block / gpu.n_sm) * of_block;
+  }
+  /// Blocks of a kernel on tensor cores: each quarter of an SM issues the instructions of its warps, and its tensor
+  /// unit multiplies, side by side.
+  void add_loops(Cost& cost, double n_block, double n_step, const Loop& loop, double rate,
+                 double of_instruction) const {
+    const double tensor_cycles = of_instruction * 4 * gpu.n_sm * gpu.clock / rate;
+    const double cycles = std::max(loop.tensor * tensor_cycles, loop.instructions / kIssue);
+    add_blocks(cost, n_block, n_step * cycles / gpu.clock);
+    const int registers = (loop.registers + 7) / 8 * 8 * 128;
+    const double most = std::min((64 << 10) / registers, gpu.shared / (loop.n_stage * loop.stage));
+    const double at_work = std::min(n_block, gpu.n_sm * most);
+    const double asked = at_work * (loop.n_stage - 1) * loop.stage;  // bytes that are on their way
+    cost.fetch = std::max(cost.fetch, cost.bytes / (asked / kMemoryLatency));
   }
   void add_products(Cost& cost, const CudaOp& op, const LinearOp& linear) const {
     for (const Node* node : linear.linears) {
@@ -91,28 +141,35 @@ class Costs {
       const MatrixKind kind = l.matrix(*node).kind;
       const std::int64_t columns = weight.shape[1], rows = count(node->shape) / columns;
       const bool has_codes = kind == MatrixKind::ternary || kind == MatrixKind::int8;
-      ProductShape shape = product_shape(kind, rows, columns, l.n_sm);
-      if (kind == MatrixKind::f32) shape = ProductShape::rows64;
-      const std::int64_t size = shape == ProductShape::rows128 ? 128 : 64;
+      const ProductShape shape = product_shape(kind, rows, columns, l.n_sm);
+      const std::int64_t size = shape == ProductShape::rows128 && kind != MatrixKind::f32 ? 128 : 64;
       const double tiles = static_cast<double>((columns + size - 1) / size * ((rows + size - 1) / size));
-      // Rows and columns behind the last are multiplied as well.
-      const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
-      if (shape == ProductShape::few)
-        add_blocks(cost, gpu.n_sm, flop_of(*node), has_codes ? gpu.dot4 : gpu.f32);
-      else
-        add_blocks(cost, tiles * op.n_split, padded,
-                   has_codes                  ? gpu.int8
-                   : kind == MatrixKind::bf16 ? gpu.bf16
-                                              : gpu.f32);
+      if (kind == MatrixKind::f32) {  // rows and columns behind the last are multiplied as well
+        const double padded = tiles * static_cast<double>(size * size) * 2 * static_cast<double>(weight.shape[0]);
+        add_blocks(cost, tiles, padded / tiles / (gpu.f32 / gpu.n_sm));
+      } else if (shape == ProductShape::few) {
+        add_blocks(cost, gpu.n_sm, flop_of(*node) / (has_codes ? gpu.dot4 : gpu.f32));
+      } else {
+        const char* name = kind == MatrixKind::bf16 ? "bf16" : kind == MatrixKind::int8 ? "int8" : "ternary";
+        const Loop& loop = loop_of(std::string("linear_") + name + (size == 128 ? "_128" : "_64"));
+        const double n_step = std::ceil(static_cast<double>(weight.shape[0]) / loop.step / op.n_split);
+        add_loops(cost, tiles * op.n_split, n_step, loop, has_codes ? gpu.int8 : gpu.bf16,
+                  2 * 16 * 8 * (has_codes ? 32 : 16));
+      }
     }
   }
   void add_attention(Cost& cost, const CudaOp& op, const AttentionOp& attention) const {
     const Shape& q = l.value(attention.q.x).shape;
-    const std::int64_t size = attention.rounds ? 64 : 8;
-    const double blocks = static_cast<double>((q[2] + size - 1) / size * q[1] * q[3]) * op.n_split;
-    const double padded = static_cast<double>((q[2] + size - 1) / size * size) / static_cast<double>(q[2]);
-    add_blocks(cost, blocks, flop_of(*attention.node) * (attention.rounds ? padded * gpu.attention : 1),
-               attention.rounds ? gpu.bf16 : gpu.f32);
+    if (!attention.rounds) {
+      const double n_block = static_cast<double>((q[2] + 7) / 8 * q[1] * q[3]) * op.n_split;
+      return add_blocks(cost, n_block, flop_of(*attention.node) / n_block / (gpu.f32 / gpu.n_sm));
+    }
+    const int depth = q[0] <= 64 ? 64 : q[0] <= 80 ? 80 : q[0] <= 128 ? 128 : 256;
+    const Loop& loop = loop_of("attention_bf16_" + std::to_string(depth));
+    // Scores and weighted values are two multiply-adds for each query, key and element of a head.
+    const double n_key = flop_of(*attention.node) / (4.0 * static_cast<double>(count(q)));
+    const double n_block = static_cast<double>((q[2] + 63) / 64 * q[1] * q[3]) * op.n_split;
+    add_loops(cost, n_block, std::ceil(n_key / loop.step / op.n_split), loop, gpu.bf16, 2 * 16 * 8 * 16);
   }
 
   const CudaLowering& l;
@@ -137,17 +194,19 @@ std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vecto
   // Operations of a phase run side by side, and share units and memory.
   for (std::size_t first = 0, end = 0; first < l.ops.size(); first = end) {
     Cost together;
-    double alone = 0;
+    double alone = 0, fetch = 0;
     int longest = 0, n_kernel = 0;
     for (; end < l.ops.size() && l.ops[end].phase == l.ops[first].phase; ++end) {
       const Cost cost = costs.of(l.ops[end], n_launch[end]);
       together.products += cost.products, together.bytes += cost.bytes;
-      alone = std::max(alone, cost.alone), longest = std::max(longest, cost.n_launch), n_kernel += cost.n_launch;
+      alone = std::max(alone, cost.alone), fetch = std::max(fetch, cost.fetch);
+      longest = std::max(longest, cost.n_launch), n_kernel += cost.n_launch;
     }
     const bool is_prepared = l.ops[first].phase < l.n_prepare;
     Program::Prediction prediction;
-    prediction.products = std::max(together.products, alone), prediction.bytes = together.bytes / gpu.bandwidth;
-    prediction.launches = longest * gpu.launch, prediction.n_launch = n_kernel;
+    prediction.products = std::max(together.products, alone);
+    prediction.bytes = std::max(together.bytes / gpu.bandwidth, fetch);
+    prediction.launches = longest * (gpu.launch + kKernelCycles / gpu.clock), prediction.n_launch = n_kernel;
     prediction.seconds = std::max(prediction.products, prediction.bytes) + prediction.launches;
     all[is_prepared ? n_stage : stage_of(l, l.ops[first])] += prediction;
   }

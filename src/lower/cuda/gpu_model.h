@@ -13,19 +13,21 @@ namespace vla::lower {
 struct GpuModel {
   const char *name, *description;
   int n_sm;
+  double clock;       // Hz
   double bf16, int8;  // operations a second of tensor units by our instructions (mma.sync), sums in float32 and int32
   double f32, dot4;   // of fused multiply-adds of floats, and of four bytes at a time
   double bandwidth;   // bytes a second
+  int shared;         // bytes of shared memory of an SM
   double launch;      // seconds between a kernel of a graph and one that waits for it
-  double attention;   // times the tensor units' time, as other units need more (docs/gpu.md)
 };
 
 /// Errors: usage.
 Result<GpuModel> find_gpu_model(const std::string& name);
 
-/// How long the phases of a program take on it at best: products in whole waves of blocks at the peak of their units,
-/// or all operands once over the memory, whichever takes longer, and a launch. Entries as Program::predictions has
-/// them. n_launch: of the kernels that each operation is.
+/// How long the phases of a program take on it: products and attention in whole waves of blocks, by the issue slots or
+/// the tensor time of their main loops, or all operands once over the memory, whichever takes longer; then launches,
+/// and what the smallest kernel takes. Entries as Program::predictions has them. n_launch: of the kernels that each
+/// operation is.
 std::vector<Program::Prediction> predict(const CudaLowering& l, const std::vector<int>& n_launch, const GpuModel& gpu);
 
 }  // namespace vla::lower
