@@ -50,7 +50,6 @@ CASES = {  # what the message must contain: (change, class)
     ),
     "config.json: adapt_to_pi_aloha: expected False, found True": (config(adapt_to_pi_aloha=True), UNSUPPORTED),
     "config.json: use_cache: expected True, found False": (config(use_cache=False), UNSUPPORTED),
-    "config.json: use_peft: expected False, found True; merge the adapter": (config(use_peft=True), UNSUPPORTED),
     "config.json: n_obs_steps: expected 1, found 2": (config(n_obs_steps=2), UNSUPPORTED),
     "config.json: rtc_config: expected none": (config(rtc_config={"enabled": True}), UNSUPPORTED),
     "resize_imgs_with_padding: expected a square, found 16 x 32": (
@@ -75,7 +74,7 @@ CASES = {  # what the message must contain: (change, class)
     "config.json: max_action_dim: expected at least the feature's width 2": (config(max_action_dim=1), BAD),
     "an even expert width, for the time embedding, found 12 * 0.6 = 7": (config(expert_width_multiplier=0.6), BAD),
     "input_features.observation.state: expected type STATE": (
-        lambda t: t.config["input_features"].pop("observation.state"),
+        lambda t: t.config["input_features"]["observation.state"].update(type="ENV"),
         BAD,
     ),
     "input_features.observation.images.top: expected a frame": (
