@@ -101,12 +101,12 @@ def test_the_folder_above_a_trainers_policy_is_told_where_the_policy_is(converte
     assert "give " + str(converter.folder / "pretrained_model") in error.message() and error.code == IO
 
 
-def test_a_lora_adapter_is_refused_with_what_to_merge_it_into(converter):
+def test_a_lora_adapter_without_its_base_is_refused_with_how_to_give_it(converter):
     converter.folder.mkdir()
     (converter.folder / "adapter_config.json").write_text(json.dumps({"base_model_name_or_path": "lerobot/smolvla_base"}))
     (converter.folder / "adapter_model.safetensors").write_bytes(b"")
     error = converter.refusal()
-    assert "found a LoRA adapter (adapter_config.json); merge it into lerobot/smolvla_base" in error.message()
+    assert "found a LoRA adapter of lerobot/smolvla_base; --base DIR, or --base hub:lerobot/smolvla_base@main" in error.message()
     assert error.code == Code.UNSUPPORTED
 
 

@@ -15,6 +15,7 @@ from goldens.files import write_json, write_safetensors
 
 VLM = "model.vlm_with_expert.vlm.model."
 EXPERT = "model.vlm_with_expert.lm_expert."
+TEXT_EMBEDDING = VLM + "text_model.embed_tokens"
 STATE_DIM, ACTION_DIM, D_STATE, D_ACTION = 3, 2, 4, 5
 D_VISION, D_VISION_FF, PATCH, IMAGE, FACTOR = 8, 12, 4, 16, 2
 D_MODEL, D_FF, N_HEAD, N_KV, D_HEAD, N_VOCAB = 12, 10, 3, 1, 4, 300

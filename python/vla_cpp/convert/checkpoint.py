@@ -11,6 +11,9 @@ from typing import Callable, Dict, List, Mapping, NamedTuple, Optional, Tuple
 
 import numpy as np
 
+from .adapters import CONFIG as ADAPTER_CONFIG
+from .adapters import WEIGHTS_FILE as ADAPTER_WEIGHTS
+from .adapters import Adapter, base_of, is_adapter_name, parse, read_adapter
 from .dtypes import STATISTICS, to_f32
 from .errors import Code, Problems, refuse
 from .files import BACKBONE_PATTERNS, HUB_FORM, HUB_PATTERNS, hub_folder, plain_name, read_json
@@ -48,10 +51,14 @@ class Checkpoint:
     notes: List[str] = field(default_factory=list)
     robot: str = ""  # whose statistics to use, where there are those of several
     backbone: str = ""  # the repository and commit that --backbone fetched
+    base: str = ""  # the folder of the policy that an adapter was trained on
+    adapter: Optional[Adapter] = None
     degraded: List[str] = field(default_factory=list)  # features that pass unnormalized because --identity-stats allows it
 
     def path(self, name: str) -> str:
-        return os.path.join(self.folder, name)
+        """Of an adapter what its folder does not have is the base's."""
+        own = os.path.join(self.folder, name)
+        return os.path.join(self.base, name) if self.base and not os.path.exists(own) else own
 
 
 def _shards(folder: str, problems: Problems) -> List[str]:
@@ -124,26 +131,113 @@ def _read_processors(folder: str) -> Optional[Tuple[dict, dict]]:
     return read_json(os.path.join(folder, PROCESSORS[0])), read_json(os.path.join(folder, PROCESSORS[1]))
 
 
-def open_checkpoint(source: str, authors: Mapping[str, Layout]) -> Checkpoint:
-    """A folder, or a repository as hub_folder() reads it. `authors`: layouts by architecture. Errors: io, bad_bundle."""
-    hub = hub_folder(source, HUB_PATTERNS)
-    if hub is None and not os.path.isdir(source):
-        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", instead_of(source), Code.IO)
-    folder, revision = (hub.folder, hub.commit) if hub else (source, "")
-    name = hub.repo if hub else os.path.basename(os.path.abspath(folder))
+def open_checkpoint(source: str, authors: Mapping[str, Layout], base: str = "") -> Checkpoint:
+    """A folder, or a repository as hub_folder() reads it. `authors`: layouts by architecture. `base`: what an adapter was trained on, by
+    --base. Errors: usage, io, bad_bundle."""
+    name, folder, revision = _opened(source)
     check_is_policy(folder)
+    below = _base_of(folder, base)  # where the weights are
     # openpi's training writes no config.json, its converter from JAX one without a type.
     has_assets = os.path.isdir(os.path.join(folder, "assets"))
-    has_config = os.path.exists(os.path.join(folder, "config.json"))
-    config = read_json(os.path.join(folder, "config.json")) if has_config or not has_assets else {}
-    layout = _layout(folder, config, has_assets, authors)
-    problems = Problems(name)
+    own = folder if os.path.exists(os.path.join(folder, "config.json")) or not below else below.folder
+    has_config = os.path.exists(os.path.join(own, "config.json"))
+    config = read_json(os.path.join(own, "config.json")) if has_config or not has_assets else {}
+    layout = _layout(below.folder if below else folder, config, has_assets, authors)
+    problems, notes = Problems(name), []
     read = authors[layout].read if layout in authors else read_stored
-    tensors, aliases = read(folder, problems)
+    tensors, aliases = read(below.folder if below else folder, problems)
+    problems.raise_any()
+    tensors, aliases = without_prefix(tensors, aliases, layout, notes)
+    adapter = read_adapter(folder, problems) if below else _adapter_inside(folder, tensors, problems)
+    if below:
+        notes.append("adapter of {}{}".format(below.name, " at revision " + below.revision if below.revision else ""))
+        name = "{} on {}".format(name, below.name + ("@" + below.revision if below.revision else ""))
     problems.raise_any()
     old = {key: entry for key, entry in tensors.items() if key.startswith(OLD_GROUPS)}
     weights = {key: entry for key, entry in tensors.items() if key not in old}
-    return Checkpoint(name, folder, revision, config, weights, aliases, old, _read_processors(folder), layout)
+    if config.get("use_peft") and adapter is None:
+        notes.append("use_peft is true, but the weights are complete without an adapter: read as merged")
+    processors = _read_processors(folder) or (_read_processors(below.folder) if below and own == below.folder else None)
+    others = below.folder if below else ""
+    return Checkpoint(name, folder, revision, config, weights, aliases, old, processors, layout, notes, base=others, adapter=adapter)
+
+
+class Opened(NamedTuple):
+    """A repository or the name of a folder, the folder, and the commit of a repository."""
+
+    name: str
+    folder: str
+    revision: str
+
+
+def _opened(source: str) -> Opened:
+    hub = hub_folder(source, HUB_PATTERNS)
+    if hub is None and not os.path.isdir(source):
+        raise refuse(source, "a checkpoint folder or " + HUB_FORM, "neither", instead_of(source), Code.IO)
+    return Opened(hub.repo, hub.folder, hub.commit) if hub else Opened(os.path.basename(os.path.abspath(source)), source, "")
+
+
+def _base_of(folder: str, given: str) -> Optional[Opened]:
+    """The policy that a folder is an adapter of; None for a policy with all of its weights. Errors: usage, io, unsupported."""
+    is_adapter = os.path.exists(os.path.join(folder, ADAPTER_CONFIG))
+    is_whole = any(os.path.exists(os.path.join(folder, name)) for name in (WEIGHTS, INDEX))
+    if given and not is_adapter:
+        raise refuse("--base", "a LoRA adapter, with " + ADAPTER_CONFIG, "a policy", "leave the option out", Code.USAGE)
+    if not is_adapter or (is_whole and not given):
+        if is_adapter and os.path.exists(os.path.join(folder, ADAPTER_WEIGHTS)) and _uses_adapter(folder):
+            hint = "remove {} and {} if the weights are merged; --base {} if they are not".format(ADAPTER_CONFIG, ADAPTER_WEIGHTS, HUB_FORM)
+            raise refuse(folder, "a merged policy or an adapter", "both {} and {}".format(WEIGHTS, ADAPTER_WEIGHTS), hint)
+        return None
+    stated = base_of(folder)
+    if not given and not os.path.isdir(stated):
+        hint = "--base DIR, or --base hub:{}@main fetches it".format(stated[:100]) if stated else "--base DIR or " + HUB_FORM
+        found = "a LoRA adapter of " + (stated[:100] or "a policy that {} does not name".format(ADAPTER_CONFIG))
+        raise refuse(folder, "the policy that the adapter was trained on", found, hint, Code.UNSUPPORTED)
+    below = _opened(given or stated)
+    if os.path.exists(os.path.join(below.folder, ADAPTER_CONFIG)):
+        hint = "merge that one first (merge_and_unload of peft) and save the policy"
+        raise refuse(below.folder, "a policy with all of its weights", "another adapter", hint, Code.UNSUPPORTED)
+    return below
+
+
+def _uses_adapter(folder: str) -> bool:
+    path = os.path.join(folder, "config.json")
+    return os.path.exists(path) and bool(read_json(path).get("use_peft"))
+
+
+def _adapter_inside(folder: str, tensors: Dict[str, Entry], problems: Problems) -> Optional[Adapter]:
+    """Of weights that were saved with their adapter, as PEFT's modules hold both; these become the base's alone."""
+    own = {name: tensors.pop(name) for name in list(tensors) if is_adapter_name(name)}
+    for name in [name for name in tensors if ".base_layer." in name]:
+        tensors[name.replace(".base_layer.", ".")] = tensors.pop(name)
+    if not own:
+        return None
+    path = os.path.join(folder, ADAPTER_CONFIG)
+    if not os.path.exists(path):
+        hint = "merge the adapter (merge_and_unload of peft) and save the policy, or put the adapter's {} there".format(ADAPTER_CONFIG)
+        problems.unsupported("tensor " + next(iter(own)), "merged weights", "an adapter whose alpha nothing states", hint)
+        return None
+    return parse(read_json(path), own, problems)
+
+
+# What wrappers put in front of all names of a module: torch's for several GPUs, its compiler, and a class around the policy.
+WRAPPERS = ("module.", "_orig_mod.", "base_model.model.")
+
+
+def without_prefix(tensors: Dict[str, Entry], aliases: Dict[str, str], layout: str, notes: List[str]) -> Tensors:
+    """Names without a prefix that stands in front of all of them and is no part of the policy's own."""
+    cut = ""
+    while tensors:
+        own = "model." if layout not in (LEROBOT, OPENPI) else "model.model."
+        found = next((p for p in (*WRAPPERS, own) if all(name.startswith(cut + p) for name in tensors)), "")
+        if not found:
+            break
+        cut += "model." if found == "model.model." else found
+    if not cut:
+        return tensors, aliases
+    notes.append("names of all tensors begin with {}, which is left out".format(cut))
+    n = len(cut)
+    return {name[n:]: entry._replace(name=name[n:]) for name, entry in tensors.items()}, {k[n:]: v[n:] for k, v in aliases.items()}
 
 
 def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:

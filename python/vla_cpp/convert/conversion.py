@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import __version__
 from . import archs
+from .adapters import merge, stored_dtype
 from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
 from .batch_norm import folded, shapes
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
@@ -53,7 +54,7 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
         return _convert_to_codes(source, out, options, force, progress)
     _check_state_bound(options)
     vla = find(options.vla)
-    checkpoint = open_checkpoint(source, archs.authors())
+    checkpoint = open_checkpoint(source, archs.authors(), options.base)
     options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
@@ -63,6 +64,7 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
     add_units(plan, options.units, checkpoint.notes, problems)
     if options.state_bound is not None:
         plan.keys.append(Key("observation.state_bound", "f32", options.state_bound))
+    merge(checkpoint.tensors, checkpoint.adapter, checkpoint.notes, problems)
     dropped = _match(checkpoint, plan, problems)
     problems.raise_any()
     dtype = _choose_dtype(checkpoint, plan, options.dtype)
@@ -144,7 +146,7 @@ def _choose_dtype(checkpoint: Checkpoint, plan: Plan, wanted: str) -> str:
     if wanted not in ("", STORED):
         return wanted
     stored = Counter(
-        "BF16" if weight.in_bf16 else checkpoint.tensors[weight.source].dtype
+        "BF16" if weight.in_bf16 else stored_dtype(checkpoint.tensors[weight.source])
         for weight in plan.weights
         if weight.kind in (MATRIX, TABLE) and not weight.keep_f32
     )
@@ -186,7 +188,7 @@ def _write(
     checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress, opener: Callable[[str], None]
 ) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
-    tensors = [TensorInfo(w.target, w.shape, _tensor_dtype(w, checkpoint.tensors[w.source].dtype, summary.dtype)) for w in plan.weights]
+    tensors = [TensorInfo(w.target, w.shape, _tensor_dtype(w, stored_dtype(checkpoint.tensors[w.source]), summary.dtype)) for w in plan.weights]
     tensors += [TensorInfo(name, value.shape, "f64" if value.dtype == np.float64 else "f32") for name, value in plan.statistics.items()]
     total = sum(tensor.n_bytes for tensor in tensors)
     done = 0

@@ -9,12 +9,11 @@ import os
 import re
 
 from .errors import Code, refuse
-from .files import HUB_NAME, MAX_JSON, read_json
+from .files import HUB_NAME
 
 POLICY = "pretrained_model"  # where LeRobot's training saves a policy
 # Below the folder of a checkpoint, of a run, and of runs by name or by date and time.
 BELOW = ("", "last", "*", "checkpoints/last", "checkpoints/*", "*/checkpoints/last", "*/*/checkpoints/last")
-ADAPTER = "adapter_config.json"
 
 
 def instead_of(source: str) -> str:
@@ -27,13 +26,8 @@ def instead_of(source: str) -> str:
 
 
 def check_is_policy(folder: str) -> None:
-    """Refuses a LoRA adapter, and a folder that has policies only further down. Errors: unsupported, io."""
-    names = [name for name in ("model.safetensors", "model.safetensors.index.json", "assets") if _has(folder, name)]
-    if _has(folder, ADAPTER) and not names:
-        hint = "merge it into {} (merge_and_unload of peft), save that policy, and give its folder"
-        raise refuse(
-            folder, "a policy with all of its weights", "a LoRA adapter ({})".format(ADAPTER), hint.format(_base(folder)), Code.UNSUPPORTED
-        )
+    """Refuses a folder that has policies only further down. Errors: io."""
+    names = [name for name in ("model.safetensors", "model.safetensors.index.json", "assets", "adapter_config.json") if _has(folder, name)]
     if _has(folder, "config.json") or names:
         return
     policies = _policies_below(folder)
@@ -44,12 +38,6 @@ def check_is_policy(folder: str) -> None:
 
 def _has(folder: str, name: str) -> bool:
     return os.path.exists(os.path.join(folder, name))
-
-
-def _base(folder: str) -> str:
-    file = os.path.join(folder, ADAPTER)
-    stated = read_json(file).get("base_model_name_or_path") if os.path.getsize(file) <= MAX_JSON else None
-    return stated[:100] if isinstance(stated, str) and stated else "the policy that it was trained on"
 
 
 def _policies_below(folder: str) -> list:

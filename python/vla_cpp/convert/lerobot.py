@@ -24,14 +24,11 @@ IGNORED = set(
     type input_features output_features normalization_mapping rtc_config device use_amp push_to_hub repo_id
     private tags license pretrained_path pretrained_revision optimizer_lr optimizer_betas optimizer_eps
     optimizer_weight_decay optimizer_grad_clip_norm scheduler_warmup_steps scheduler_decay_steps
-    scheduler_decay_lr compile_model compile_mode
+    scheduler_decay_lr compile_model compile_mode use_peft
     """.split()
 )
 # Keys whose other values ask for something that the runtime does not do.
-FIXED = {
-    "n_obs_steps": (1, "the reference reads one observation"),
-    "use_peft": (False, "merge the adapter into the policy and save it again"),
-}
+FIXED = {"n_obs_steps": (1, "the reference reads one observation")}
 
 
 def check_keys(policy: Section, name: str, known: Set[str], fixed: Dict[str, Tuple[object, str]]) -> None:

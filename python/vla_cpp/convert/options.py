@@ -32,6 +32,7 @@ class Option(NamedTuple):
         return {"metavar": self.metavar, "type": self.read, "default": self.default}
 
 
+HUB = "hub:OWNER/NAME@REVISION"
 STORED = "stored"  # --dtype: every matrix as it is stored
 CODES = ("int8", "int4")  # --dtype: by `vla quantize`
 COMMON = (
@@ -40,6 +41,7 @@ COMMON = (
         "folder with the backbone's config.json and tokenizer.json, where they live elsewhere, or hub:OWNER/NAME@REVISION",
         "DIR",
     ),
+    Option("--base", "the policy that a LoRA adapter was trained on, where adapter_config.json names no folder, or " + HUB, "DIR"),
     Option(
         "--dtype", "storage of matrices and tables; vectors and statistics are always f32", choices=("f32", "bf16", "f16", STORED, *CODES)
     ),

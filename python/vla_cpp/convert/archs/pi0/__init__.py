@@ -18,7 +18,7 @@ from ...recipe import recipe_key
 from ...tokenizer import TokenizerPlan, read_tokenizer
 from .. import Options, Plan
 from .layouts import read_lerobot, read_openpi, variants_of
-from .mapping import Family, dropped, hints, network_keys, rename, rounded, weights
+from .mapping import Family, canonical, dropped, hints, network_keys, rename, rounded, weights
 
 TOKENIZER = "google/paligemma-3b-pt-224"  # a literal of the reference
 
@@ -27,6 +27,8 @@ def make_plan(family: Family, checkpoint: Checkpoint, options: Options, problems
     read = read_openpi if checkpoint.layout == OPENPI else read_lerobot
     source = read(family, checkpoint, options, problems)
     checkpoint.tensors = rename(checkpoint.tensors, family.time_mlp, family.other_time_mlp, checkpoint.notes, problems)
+    if checkpoint.adapter:
+        checkpoint.adapter = checkpoint.adapter.renamed(lambda name: canonical(name, family.time_mlp, family.other_time_mlp))
     folder = given_tokenizer(checkpoint, options, source.processors, TOKENIZER)
     tokenizer = read_tokenizer(folder, source.sizes.lm.n_vocab, problems, checkpoint.notes)
     _check_newline(source.text, tokenizer, problems)
