@@ -241,8 +241,8 @@ def without_prefix(tensors: Dict[str, Entry], aliases: Dict[str, str], layout: s
 
 
 def _layout(folder: str, config: dict, has_assets: bool, authors: Mapping[str, Layout]) -> str:
-    """LeRobot's config states a type, and none of the others does."""
-    if "type" in config:
+    """LeRobot's config states a type and features, and none of the others does."""
+    if "type" in config or "input_features" in config:
         return LEROBOT
     for arch, layout in authors.items():
         if config.get("model_type") in layout.model_types:

@@ -18,7 +18,7 @@ from .adapters import merge, stored_dtype
 from .archs import MATRIX, SCALE, TABLE, TERNARY, Options, Plan, Weight
 from .batch_norm import folded, shapes
 from .bundle import BUNDLE_VERSION, BundleWriter, Key, TensorInfo
-from .checkpoint import Checkpoint, given_backbone, open_checkpoint
+from .checkpoint import LEROBOT, Checkpoint, given_backbone, open_checkpoint
 from .dtypes import BUNDLE_NAME, WEIGHTS, convert, from_f32, to_f32
 from .embodiments import plan_robots
 from .errors import Code, Problems, refuse
@@ -57,6 +57,8 @@ def convert_checkpoint(source: str, out: str, options: Options, force: bool = Fa
     checkpoint = open_checkpoint(source, archs.authors(), options.base)
     options = options.replaced(backbone=given_backbone(checkpoint, options.backbone))
     problems = Problems(checkpoint.name)
+    if checkpoint.layout == LEROBOT:
+        archs.told_by_tensors(checkpoint)
     archs.check_options(checkpoint.layout, checkpoint.config, options)
     arch = archs.arch_of(checkpoint.config, checkpoint.layout, options.variant)
     checkpoint.robot = options.stats
@@ -188,7 +190,9 @@ def _write(
     checkpoint: Checkpoint, plan: Plan, summary: Summary, problems: Problems, progress: Progress, opener: Callable[[str], None]
 ) -> None:
     keys = _identity_keys(checkpoint, summary) + plan.keys
-    tensors = [TensorInfo(w.target, w.shape, _tensor_dtype(w, stored_dtype(checkpoint.tensors[w.source]), summary.dtype)) for w in plan.weights]
+    tensors = [
+        TensorInfo(w.target, w.shape, _tensor_dtype(w, stored_dtype(checkpoint.tensors[w.source]), summary.dtype)) for w in plan.weights
+    ]
     tensors += [TensorInfo(name, value.shape, "f64" if value.dtype == np.float64 else "f32") for name, value in plan.statistics.items()]
     total = sum(tensor.n_bytes for tensor in tensors)
     done = 0

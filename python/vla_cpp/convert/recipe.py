@@ -49,6 +49,12 @@ STEPS: Steps = {
 }
 
 
+RELATIVE: Steps = {  # of policies that may have learned actions relative to the state
+    PRE: {"relative_actions_processor": {"enabled": (True, False), "exclude_joints": ANY, "action_names": ANY}},
+    POST: {"absolute_actions_processor": {"enabled": (True, False)}},
+}
+
+
 @dataclass
 class Processors:
     """What the two pipelines say, free of their format."""
@@ -163,10 +169,9 @@ class _Reader:
             self.problems.add(where + ": action_names", "names of the action's numbers", str(names)[:80])
             return
         self.result.add_state = relative_columns(width, names, [str(name).lower() for name in exclude if name])
-        if width > self.context.dims[STATE]:
-            self.problems.unsupported(
-                where, "a state with a number for each of the {} actions".format(width), str(self.context.dims[STATE])
-            )
+        n_state = self.context.dims.get(STATE, 0)
+        if width > n_state:
+            self.problems.unsupported(where, "a state with a number for each of the {} actions".format(width), str(n_state))
 
     def _absolute_actions(self, where: str, config: dict, step: dict) -> None:
         if "unnormalizer_processor" not in self.seen:

@@ -15,7 +15,7 @@ from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 import numpy as np
 
 from ..bundle import Key
-from ..checkpoint import LEROBOT, OPENPI, Layout
+from ..checkpoint import LEROBOT, OPENPI, Checkpoint, Layout
 from ..errors import Code, Problems, refuse
 from ..options import COMMON, DOMAIN, IDENTITY_STATS, POSITION_PRECISION, WIDTHS, Option, stats, variant
 
@@ -116,6 +116,29 @@ def declared() -> List[Tuple[Option, Dict[str, str]]]:
         for option in layout.options:
             found.setdefault(option.name, (option, {}))[1][layout.name] = option.help
     return list(found.values())
+
+
+# What names of tensors of a LeRobot policy begin with, that no other one has.
+PALIGEMMA = "model.paligemma_with_expert."
+TELLING = {
+    "smolvla": ("model.vlm_with_expert.",),
+    "pi0": (PALIGEMMA, "model.action_time_mlp_in."),
+    "pi05": (PALIGEMMA, "model.time_mlp_in."),
+    "act": ("model.encoder_latent_input_proj.",),
+    "xvla": ("model.vlm.", "model.transformer."),
+    "evo1": ("model.embedder.model.",),
+    "turbovla": ("model.vl_interaction.",),
+    "vla_jepa": ("model.qwen.",),
+}
+
+
+def told_by_tensors(checkpoint: Checkpoint) -> None:
+    """Of a LeRobot config without a type: the only architecture that has its tensors."""
+    names = list(checkpoint.tensors)
+    found = [arch for arch, all_of in TELLING.items() if all(any(name.startswith(one) for name in names) for one in all_of)]
+    if len(found) == 1 and "type" not in checkpoint.config and "model_type" not in checkpoint.config:
+        checkpoint.config["type"] = found[0]
+        checkpoint.notes.append("config.json states no type: read as {}, the only policy with such tensors".format(found[0]))
 
 
 def check_options(layout: str, config: dict, options: Options) -> None:

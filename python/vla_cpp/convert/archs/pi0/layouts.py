@@ -24,7 +24,7 @@ import numpy as np
 from ... import recipe
 from ...bundle import Key
 from ...checkpoint import Checkpoint
-from ...errors import Problems
+from ...errors import Code, Problems, refuse
 from ...features import robot_keys, views_of
 from ...files import member, read_json
 from ...lerobot import action_width, check_keys, check_widths, no_position_rule, read_views, state_width, view_keys
@@ -77,13 +77,15 @@ LEROBOT_IGNORED = set(
     freeze_vision_encoder train_expert_only gradient_checkpointing rtc_training_max_delay
     """.split()
 )
+# Of the class before, which had no processor files.
+OLDER = set("proj_width attention_implementation num_steps resize_imgs_with_padding adapt_to_pi_aloha train_state_proj".split())
 STEPS: recipe.Steps = {
     recipe.PRE: {
         "pi0_new_line_processor": {},
         "pi05_prepare_state_tokenizer_processor_step": {"max_state_dim": recipe.ANY, "task_key": ("task",)},
-        "relative_actions_processor": {"enabled": (True, False), "exclude_joints": recipe.ANY, "action_names": recipe.ANY},
+        **recipe.RELATIVE[recipe.PRE],
     },
-    recipe.POST: {"absolute_actions_processor": {"enabled": (True, False)}},
+    recipe.POST: recipe.RELATIVE[recipe.POST],
 }
 CLEAN = [{"op": "strip"}, {"op": "replace", "from": "_", "to": " "}, {"op": "replace", "from": "\n", "to": " "}]
 PROMPT = {"op": "template", "text": "Task: {instruction}, State: {state};\nAction: "}
@@ -91,6 +93,7 @@ BINS = {"op": "bins", "low": -1.0, "high": 1.0, "count": 256}
 
 
 def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, problems: Problems) -> Source:
+    _refuse_older(checkpoint)
     policy = Section("config.json", checkpoint.config, LEROBOT_CONFIG, problems)
     no_position_rule(policy, options, problems)
     memory = {key for key in policy.values if key.startswith("memory_")}  # of the two kinds that LEROBOT_FIXED refuses
@@ -127,6 +130,15 @@ def read_lerobot(family: Family, checkpoint: Checkpoint, options: Options, probl
         statistics=processors.statistics(),
         max_tokens=processors.max_tokens,
     )
+
+
+def _refuse_older(checkpoint: Checkpoint) -> None:
+    """Errors: unsupported, for a policy of LeRobot's first PI0Config, whose network had another arithmetic."""
+    found = sorted(OLDER & set(checkpoint.config))
+    if found and checkpoint.processors is None:
+        hint = "today's LeRobot cannot load it either: LeRobot 0.3.3 serves it, or fine-tune today's base, lerobot/pi0_base"
+        expected, where = "a policy that LeRobot saved in September 2025 or later", "config.json"
+        raise refuse(where, expected, "an older layout, by its keys {}".format(", ".join(found)), hint, Code.UNSUPPORTED)
 
 
 def _read_policy(family: Family, policy: Section, checkpoint: Checkpoint, options: Options, s: Sizes) -> None:

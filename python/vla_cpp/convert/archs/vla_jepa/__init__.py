@@ -26,7 +26,11 @@ from .mapping import dropped, hints, network_keys, weights
 
 CLIP, SNAP, BINARIZE = "vla_jepa_clip_actions", "vla_jepa_pre_snap_gripper", "vla_jepa_binarize_gripper"
 GRIPPER = {"gripper_dim": recipe.ANY, "threshold": recipe.ANY}
-OWN_STEPS: recipe.Steps = {recipe.POST: {CLIP: {}, SNAP: GRIPPER, BINARIZE: GRIPPER}}
+PREPARE = "vla_jepa_image_prep"  # of releases after 0.6.1: the resizing that the policy did before; frames have three channels here
+OWN_STEPS: recipe.Steps = {
+    recipe.PRE: {PREPARE: {"resize_to": recipe.ANY, "expand_channels": (True,)}, **recipe.RELATIVE[recipe.PRE]},
+    recipe.POST: {CLIP: {}, SNAP: GRIPPER, BINARIZE: GRIPPER, **recipe.RELATIVE[recipe.POST]},
+}
 # Of processor_vla_jepa.py. LeRobot saves neither number with the steps, and loads them as these again.
 GRIPPER_DIM, GRIPPER_THRESHOLD = 6, 0.5
 
@@ -39,6 +43,7 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     problems.raise_any()
     dims = {**({recipe.STATE: s.d_state} if s.d_state else {}), recipe.ACTION: s.d_action}
     processors = recipe.read_processors(checkpoint, dims, options.identity_stats, problems, OWN_STEPS, reads_text=False)
+    _check_steps(checkpoint, processors, problems)
     own = [*s.action_tokens, s.embodied_token]
     tokenizer = read_tokenizer(s.folder, s.lm.n_vocab + len(own), problems, checkpoint.notes, own)
     problems.raise_any()
@@ -62,6 +67,18 @@ def plan(checkpoint: Checkpoint, options: Options, problems: Problems) -> Plan:
     ]
     problems.raise_any()
     return Plan(keys, weights(s), dropped(s), processors.statistics(), hints(s))
+
+
+def _check_steps(checkpoint: Checkpoint, processors: recipe.Processors, problems: Problems) -> None:
+    """What config.json and the pipelines both say."""
+    size, relative = checkpoint.config.get("resize_images_to"), bool(checkpoint.config.get("use_relative_actions"))
+    for step in member(checkpoint.processors[0], "steps", list, recipe.PRE):
+        stated = member(step, "config", dict, recipe.PRE).get("resize_to", size) if step.get("registry_name") == PREPARE else size
+        if stated != size:
+            problems.add("{}: {}: resize_to".format(recipe.PRE, PREPARE), "{} as config.json has it".format(size), str(stated)[:80])
+    if processors.relative != relative:
+        expected = "{} as the pipelines have it".format(processors.relative)
+        problems.add("config.json: use_relative_actions", expected, str(relative))
 
 
 def image_ops(s: Sizes) -> List[dict]:
@@ -94,6 +111,8 @@ def action_ops(checkpoint: Checkpoint, s: Sizes, processors: recipe.Processors, 
         name = step["registry_name"]
         if name == "unnormalizer_processor":
             ops += processors.action.op("unnormalize", recipe.ACTION)
+        elif name == "absolute_actions_processor" and processors.add_state:
+            ops.append({"op": "add_state", "columns": list(processors.add_state)})
         elif name == CLIP:
             ops.append({"op": "clip", "low": -1.0, "high": 1.0})
         elif name in (SNAP, BINARIZE):

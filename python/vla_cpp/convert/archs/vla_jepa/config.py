@@ -47,6 +47,7 @@ POLICY = {
     "num_video_frames": 8,
     "jepa_tubelet_size": 2,
     "resize_images_to": None,
+    "use_relative_actions": False,
     "torch_dtype": "bfloat16",
 }
 # Keys that no number of an action chunk depends on, beside those of every policy of LeRobot: those of training, of the world model, and
@@ -55,8 +56,14 @@ IGNORED = set(
     """jepa_encoder_name reinit_modules tokenizer_padding_side action_dropout action_noise_beta_alpha action_noise_beta_beta
     action_noise_s num_target_vision_tokens action_max_seq_len predictor_depth predictor_num_heads predictor_mlp_ratio
     predictor_dropout world_model_loss_weight repeated_diffusion_steps binarize_gripper_action pre_snap_gripper_action
-    clip_normalized_actions gripper_dim gripper_threshold optimizer_grad_clip_norm""".split()
+    clip_normalized_actions gripper_dim gripper_threshold optimizer_grad_clip_norm relative_exclude_joints action_feature_names
+    gripper_joint_names""".split()
 )
+# Keys of later releases, whose other values ask for something that the runtime does not do.
+FIXED = {
+    "causal_world_model_context": (False, "the prompt would have other moments"),
+    "world_model_num_views": (None, "the world model would see other views"),
+}
 PRESETS = {"DiT-B": (12, 64), "DiT-L": (32, 48), "DiT-test": (2, 8)}  # heads and the width of one (action_head.py DIT_PRESETS)
 PLACES = ("{instruction}", "{actions}", "{e_actions}")
 FOLDER = "--backbone needs the folder of Qwen/Qwen3-VL-2B-Instruct, or of the model that qwen_model_name names"
@@ -84,7 +91,7 @@ def read_sizes(checkpoint: Checkpoint, options: Options, problems: Problems) -> 
     # The class has no empty_cameras.
     policy = Section("config.json", checkpoint.config, {**POLICY, "empty_cameras": 0}, problems)
     no_position_rule(policy, options, problems)
-    check_keys(policy, "VLAJEPAConfig", set(POLICY) | IGNORED, {})
+    check_keys(policy, "VLAJEPAConfig", set(POLICY) | IGNORED, FIXED)
     check_widths(policy, {})
     s = Sizes()
     s.folder = find_backbone(checkpoint, options.backbone, policy.get("qwen_model_name"), "qwen_model_name")
