@@ -111,10 +111,11 @@ struct Shared : net::Connections<Connection> {
   std::map<std::uint64_t, Call*> calls = {};                              // that are not answered
   std::uint64_t n_id = 0;
   std::size_t n_call = 0;
-  bool is_stopping = false;
+  bool is_stopping = false, is_handling = false;
 
   void bound_calls();
   void hand_over(Call& call, Rpc rpc);
+  void handle_later();
   void handle_next();
 
   /// Calls that came whole are handled one after the other, by turns of the groups.
@@ -469,11 +470,23 @@ void Shared::hand_over(Call& call, Rpc rpc) {
   auto turn = std::find_if(turns.begin(), turns.end(), [&](const auto& t) { return t.first == group; });
   if (turn == turns.end()) turn = turns.insert(turns.end(), {group, {}});
   turn->second.push_back(std::move(rpc));
-  asio::post(loop.context(), [this] { handle_next(); });
+  handle_later();
+}
+
+/// Between two of them every socket has its turn.
+void Shared::handle_later() {
+  if (turns.empty() || std::exchange(is_handling, true)) return;
+  asio::post(loop.context(), [this] {
+    is_handling = false;
+    try {
+      handle_next();
+    } catch (const std::exception&) {  // no memory for an answer: the client's patience ends its call
+    }
+    handle_later();
+  });
 }
 
 void Shared::handle_next() {
-  if (turns.empty()) return;
   Rpc rpc = std::move(turns.front().second.front());
   turns.front().second.pop_front();
   if (turns.front().second.empty()) {

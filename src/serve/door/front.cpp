@@ -21,7 +21,7 @@ using Say = LinkMessage::Kind;
 
 constexpr int kStartPatience = 10'000, kEndPatience = 1'000;  // ms
 constexpr auto kBeat = std::chrono::milliseconds(200);
-constexpr int kMaxSilent = 5, kMaxStarting = 50;  // beats
+constexpr int kMaxStopped = 5, kMaxSilent = 50;  // beats without an answer: of one that is stopped, of any
 constexpr auto kFirstDelay = std::chrono::milliseconds(100), kLongestDelay = std::chrono::milliseconds(5'000);
 constexpr auto kStable = std::chrono::seconds(10);
 constexpr std::size_t kEnvelope = 1 << 20;  // what a request may be larger than the message that it was made of
@@ -66,7 +66,7 @@ DoorFront::DoorFront(net::Loop& loop, const ServerOptions& options, const Door& 
 /// The process ends where its link does, once it has told its clients.
 DoorFront::~DoorFront() {
   link_.reset();
-  if (!process_.wait_for(kEndPatience)) process_.kill();
+  if (process_.is_stopped() || !process_.wait_for(kEndPatience)) process_.kill();
 }
 
 Status DoorFront::start() {
@@ -75,7 +75,6 @@ Status DoorFront::start() {
   VLA_TRY(process_, Process::start(door_.program, arguments, listener_->descriptor(), door_.option));
   link_.emplace(loop_.context(), process_.take_socket(), options_.max_message + kEnvelope);
   started_ = loop_.now();
-  is_ready_ = false;
   n_silent_ = 0;
   ++generation_;
   first_ = last_;
@@ -106,12 +105,13 @@ void DoorFront::begin(Io& io) {
   beat();
 }
 
-/// A process that answers nothing for a second is stopped or hangs, and another one takes its connections.
+/// A process that is stopped, or that answers nothing for long, is ended, and another one takes its connections.
 void DoorFront::beat() {
   timer_.expires_after(kBeat);
   timer_.async_wait([this](boost::system::error_code cancelled) {
     if (cancelled) return;
-    if (++n_silent_ > (is_ready_ ? kMaxSilent : kMaxStarting)) return fail("it does not answer");
+    if (++n_silent_ > kMaxSilent || (n_silent_ > kMaxStopped && process_.is_stopped()))
+      return fail("it does not answer");
     link_->send(Say::ping);
     beat();
   });
@@ -149,8 +149,6 @@ void DoorFront::start_again() {
 void DoorFront::came(LinkMessage message) {
   switch (message.kind) {
     case Say::ready:
-      is_ready_ = true;
-      return;
     case Say::pong:
       n_silent_ = 0;
       return;

@@ -69,7 +69,7 @@ class DoorFront final : public Front, Link::Handler {
   Process process_;
   std::optional<Link> link_;
   boost::asio::steady_timer timer_;
-  bool is_begun_ = false, is_ready_ = false;
+  bool is_begun_ = false;
   int n_silent_ = 0, n_failure_ = 0;  // beats without an answer; ends in a row
   Clock::time_point started_ = {};
   std::uint64_t generation_ = 0, first_ = 0, last_ = 0;  // of connections: before the process's first, its newest

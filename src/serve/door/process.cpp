@@ -13,6 +13,7 @@
 #include <csignal>
 #include <cstring>
 #include <filesystem>
+#include <fstream>
 
 namespace vla::serve {
 namespace {
@@ -91,6 +92,15 @@ Process& Process::operator=(Process&& other) noexcept {
   socket_ = std::exchange(other.socket_, -1);
   status_ = other.status_;
   return *this;
+}
+
+/// The state follows the name, which is in brackets and may hold anything.
+bool Process::is_stopped() const {
+  std::ifstream file(fmt::format("/proc/{}/stat", pid_));
+  std::string line;
+  std::getline(file, line);
+  const std::size_t end = line.rfind(") ");
+  return end != std::string::npos && line.size() > end + 2 && (line[end + 2] == 'T' || line[end + 2] == 't');
 }
 
 bool Process::wait_for(int milliseconds) {

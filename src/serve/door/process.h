@@ -27,6 +27,8 @@ class Process {
 
   /// Our end of the socket, which the caller has to close; once.
   int take_socket() { return std::exchange(socket_, -1); }
+  /// Whether somebody has stopped it (SIGSTOP).
+  bool is_stopped() const;
   /// Waits for its end, so long at most; false where it goes on.
   bool wait_for(int milliseconds);
   /// Ends it at once. How it had ended, or that it was killed, for people.
